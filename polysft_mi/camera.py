@@ -1,0 +1,104 @@
+"""The pinhole camera: intrinsics K in pixels, read, checked, and written as a Mitsuba sensor."""
+
+import json
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from .errors import InputError
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A pinhole camera in its own frame (OpenCV: x right, y down, z forward, origin at the centre of projection).
+
+    A point (X, Y, Z) is seen at pixel ``(fx X/Z + cx, fy Y/Z + cy)``; the centre of the first pixel is (0.5, 0.5).
+    All values are in pixels.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+    def __post_init__(self):
+        values = (self.fx, self.fy, self.cx, self.cy)
+        if not all(math.isfinite(v) for v in values) or min(self.fx, self.fy) <= 0:
+            raise InputError(f"camera: (fx, fy, cx, cy) = {values} is not a pinhole; finite values and positive focal lengths are needed")
+        if self.width < 1 or self.height < 1:
+            raise InputError(f"camera: image size {self.width}x{self.height}; both must be positive")
+
+    def matrix(self):
+        """K, shape (3, 3)."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=np.float64)
+
+    def project(self, points):
+        """Pixels (N, 2) of the points (N, 3) [m, camera frame]."""
+        points = np.asarray(points, dtype=np.float64)
+        return points[:, :2] / points[:, 2:] * (self.fx, self.fy) + (self.cx, self.cy)
+
+    @classmethod
+    def from_matrix(cls, K, width, height, where="camera"):
+        """From K (3, 3). Raises InputError where K is not that of a pinhole without skew."""
+        K = np.asarray(K, dtype=np.float64)
+        if K.shape != (3, 3) or not np.isfinite(K).all():
+            raise InputError(f"{where}: K has shape {K.shape} or values that are not finite; a finite 3x3 matrix is needed")
+        if np.abs(K[[1, 2, 2], [0, 0, 1]]).max() > 1e-9 or abs(K[2, 2] - 1) > 1e-9:
+            raise InputError(f"{where}: K = {K.tolist()} is not a pinhole; it must read [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
+        if abs(K[0, 1]) > 1e-6 * abs(K[0, 0]):
+            raise InputError(f"{where}: K has skew {K[0, 1]:g}; only a pinhole without skew is supported")
+        return cls(K[0, 0], K[1, 1], K[0, 2], K[1, 2], int(width), int(height))
+
+    @classmethod
+    def from_json(cls, path):
+        """From a JSON file with the keys fx, fy, cx, cy, width, height."""
+        try:
+            with open(path, encoding="utf-8") as file:
+                data = json.load(file)
+        except FileNotFoundError:
+            raise InputError(f"{path}: no such file; a camera file holds fx, fy, cx, cy, width, height in pixels") from None
+        except (json.JSONDecodeError, UnicodeDecodeError) as error:
+            raise InputError(f"{path}: not JSON ({error})") from None
+        try:
+            return cls(*(float(data[k]) for k in ("fx", "fy", "cx", "cy")), int(data["width"]), int(data["height"]))
+        except (KeyError, TypeError, ValueError) as error:
+            if isinstance(error, InputError):
+                raise InputError(f"{path}: {error}") from None
+            raise InputError(f"{path}: {error} missing or not a number; fx, fy, cx, cy, width, height are needed") from None
+
+    def sensor_xml(self, indent="    "):
+        """The ``<sensor>`` element: Mitsuba's ``perspective`` where the pixels are square, else our ``pinhole``.
+
+        Only ``perspective`` is accepted by path replay with moving silhouettes (``prb_projective``).
+        """
+        if math.isclose(self.fx, self.fy, rel_tol=1e-6):
+            fov = math.degrees(2 * math.atan(self.width / (2 * self.fx)))
+            lens = [
+                '<sensor type="perspective">',
+                f'    <float name="fov" value="{fov:.12g}"/>',
+                '    <string name="fov_axis" value="x"/>',
+                f'    <float name="principal_point_offset_x" value="{0.5 - self.cx / self.width:.12g}"/>',
+                f'    <float name="principal_point_offset_y" value="{0.5 - self.cy / self.height:.12g}"/>',
+                '    <float name="near_clip" value="0.001"/>',
+            ]
+        else:
+            lens = ['<sensor type="pinhole">'] + [
+                f'    <float name="{k}" value="{getattr(self, k):.12g}"/>' for k in ("fx", "fy", "cx", "cy")
+            ]
+        lines = lens + [
+            '    <transform name="to_world">',
+            '        <lookat origin="0, 0, 0" target="0, 0, 1" up="0, -1, 0"/>',
+            "    </transform>",
+            '    <film type="hdrfilm">',
+            f'        <integer name="width" value="{self.width}"/>',
+            f'        <integer name="height" value="{self.height}"/>',
+            '        <string name="pixel_format" value="rgba"/>',
+            '        <rfilter type="box"/>',
+            '        <boolean name="sample_border" value="true"/>',
+            "    </film>",
+            "</sensor>",
+        ]
+        return "\n".join(indent + line for line in lines)
