@@ -1,0 +1,95 @@
+"""The settings of an experiment: names, types, defaults and meanings, in one place.
+
+A scene file carries each of them as a ``<default>`` and hands it to the ``polysft`` plugin; ``-D name=value`` overrides it.
+"""
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+
+from .errors import InputError
+
+
+def _setting(default, doc, *, choices=None, low=-math.inf, high=math.inf, above=None):
+    return field(default=default, metadata={"doc": doc, "choices": choices, "low": low, "high": high, "above": above})
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Everything about an experiment but its files. The metadata of each field holds its meaning and its bounds."""
+
+    first: int = _setting(0, "first image to use, counted from 0 in the sorted list", low=0)
+    last: int = _setting(-1, "last image to use, inclusive; -1 for the end of the video", low=-1)
+    stride: int = _setting(1, "use every stride-th image", low=1)
+    order: int = _setting(4, "order n of the jet", low=1, high=10)
+    fit_tolerance: float = _setting(
+        0.05, "largest distance of the template from its jet, as a share of the template's radius, before it is refused", above=0
+    )
+    k_rgb: float = _setting(1.0, "weight of the photometric loss", low=0)
+    k_silhouette: float = _setting(1.0, "weight of the silhouette loss (needs masks)", low=0)
+    k_mi: float = _setting(0.1, "weight of mesh inextensibility", low=0)
+    k_tc: float = _setting(0.05, "weight of temporal consistency", low=0)
+    rgb_norm: str = _setting("l2", "norm of the photometric residual", choices=("l2", "l1", "charbonnier"))
+    rgb_scale: float = _setting(0.1, "residual at which the Charbonnier norm turns from quadratic to linear", above=0)
+    brightness: str = _setting(
+        "none", "compensation of lighting before images are compared", choices=("none", "gain", "local")
+    )
+    blur: float = _setting(0.0, "standard deviation of the Gaussian blur of both images before they are compared [pixels]", low=0)
+    spp: int = _setting(1, "samples a pixel; raster takes square numbers (1, 4, 9, ...)", low=1)
+    seed: int = _setting(0, "seed of the renderer's random numbers (path replay)", low=0)
+    solver: str = _setting("adam", "solver of each window", choices=("adam",))
+    window: int = _setting(3, "frames W in the sliding window", low=1)
+    patience: int = _setting(100, "iterations without improvement after which the window moves on", low=1)
+    period: int = _setting(500, "largest number of iterations of a window", low=1)
+    lr_uv: float = _setting(1e-3, "Adam's step size of the uv displacements", low=0)
+    lr_alpha: float = _setting(1e-2, "Adam's step size of the jet coefficients", low=0)
+    lr_rigid: float = _setting(1e-4, "Adam's step size of rotation and translation", low=0)
+
+    def __post_init__(self):
+        for f in dataclasses.fields(self):
+            value, meta = getattr(self, f.name), f.metadata
+            if meta["choices"] and value not in meta["choices"]:
+                raise InputError(f"setting {f.name} = {value!r}; known values: {', '.join(meta['choices'])}")
+            if f.type in ("int", "float", int, float):
+                if not math.isfinite(value) or not meta["low"] <= value <= meta["high"]:
+                    raise InputError(f"setting {f.name} = {value!r}; it must lie in [{meta['low']}, {meta['high']}]")
+                if meta["above"] is not None and value <= meta["above"]:
+                    raise InputError(f"setting {f.name} = {value!r}; it must be above {meta['above']}")
+
+
+_XML_TYPE = {"int": "integer", "float": "float", "str": "string"}
+
+
+def _type_name(f):
+    return f.type if isinstance(f.type, str) else f.type.__name__
+
+
+def defaults_xml(indent="    ", **overrides):
+    """One ``<default>`` line a setting, with ``overrides`` in place of the defaults."""
+    settings = Settings(**overrides)
+    return "\n".join(
+        f'{indent}<default name="{f.name}" value="{getattr(settings, f.name)}"/>' for f in dataclasses.fields(Settings)
+    )
+
+
+def properties_xml(indent="        "):
+    """One property line a setting, each reading the default of its name."""
+    return "\n".join(
+        f'{indent}<{_XML_TYPE[_type_name(f)]} name="{f.name}" value="${f.name}"/>' for f in dataclasses.fields(Settings)
+    )
+
+
+def from_properties(props):
+    """Settings from a plugin's properties (a mapping); what is not given keeps its default."""
+    values = {}
+    for f in dataclasses.fields(Settings):
+        if f.name in props:
+            value = props[f.name]
+            kind = {"int": int, "float": float, "str": str}[_type_name(f)]
+            if kind is int and isinstance(value, float) and value != int(value):
+                raise InputError(f"setting {f.name} = {value!r}; a whole number is needed")
+            try:
+                values[f.name] = kind(value)
+            except (TypeError, ValueError):
+                raise InputError(f"setting {f.name} = {value!r}; a {_type_name(f)} is needed") from None
+    return Settings(**values)
