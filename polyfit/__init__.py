@@ -1,0 +1,31 @@
+"""PolyFit: surfaces as jets in a canonical frame (paper, section "PolyFit"), in torch.
+
+This version holds what a single patch needs: its canonical frame and its least-squares jet.
+"""
+
+_EXPORTS = {
+    "CanonicalFrame": "frames",
+    "exponents": "jets",
+    "height": "jets",
+    "height_derivatives": "jets",
+    "point": "jets",
+    "tangents": "jets",
+    "normal": "jets",
+    "metric": "jets",
+    "fit": "jets",
+}
+
+__all__ = sorted(_EXPORTS)
+
+
+def __getattr__(name):
+    # torch is loaded on first use, so that `import polyfit` stays instant
+    if name in _EXPORTS:
+        from importlib import import_module
+
+        return getattr(import_module(f".{_EXPORTS[name]}", __name__), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__():
+    return sorted(list(globals()) + __all__)

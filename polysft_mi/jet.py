@@ -1,0 +1,74 @@
+"""n-jets in Dr.Jit: the functions of ``polyfit.jets``, by the same names, on Mitsuba's types.
+
+Arrays: ``alpha`` is a Float of A = (n+1)(n+2)/2 coefficients in the paper's order (``polyfit.jets.exponents``), shared by
+all points; ``u`` and ``v`` are Floats of N chart coordinates. Lengths are in the chart's unit.
+Import only after a Mitsuba variant is set.
+"""
+
+import drjit as dr
+import mitsuba as mi
+
+from polyfit.jets import exponents, order_of
+
+
+def _powers(x, order):
+    out = [None, x]  # x^0 is never multiplied in
+    for _ in range(order - 1):
+        out.append(out[-1] * x)
+    return out
+
+
+def _term(coefficient, pu, pv, a, b):
+    for powers, k in ((pu, a), (pv, b)):
+        if k:
+            coefficient = coefficient * powers[k]
+    return coefficient
+
+
+def _coefficients(alpha, like):
+    """alpha_k for every point: a gather, whose gradient is one scatter in the same kernel."""
+    zero = dr.zeros(mi.UInt32, dr.width(like))
+    return [dr.gather(mi.Float, alpha, zero + k) for k in range(dr.width(alpha))]
+
+
+def height_and_derivatives(alpha, u, v):
+    """(z, z_u, z_v), Floats of N."""
+    order = order_of(dr.width(alpha))
+    pu, pv = _powers(u, order), _powers(v, order)
+    z, zu, zv = mi.Float(0), mi.Float(0), mi.Float(0)
+    for c, (a, b) in zip(_coefficients(alpha, u), exponents(order).tolist()):
+        z = z + _term(c, pu, pv, a, b)
+        if a:
+            zu = zu + _term(c * a, pu, pv, a - 1, b)
+        if b:
+            zv = zv + _term(c * b, pu, pv, a, b - 1)
+    return z, zu, zv
+
+
+def height(alpha, u, v):
+    """z(u, v), a Float of N."""
+    return height_and_derivatives(alpha, u, v)[0]
+
+
+def point(alpha, u, v):
+    """phi(u, v) = (u, v, z), a Point3f of N."""
+    return mi.Point3f(u, v, height(alpha, u, v))
+
+
+def tangents(alpha, u, v):
+    """phi_u = (1, 0, z_u) and phi_v = (0, 1, z_v), Vector3f of N."""
+    _, zu, zv = height_and_derivatives(alpha, u, v)
+    one, zero = dr.ones(mi.Float, dr.width(zu)), dr.zeros(mi.Float, dr.width(zu))
+    return mi.Vector3f(one, zero, zu), mi.Vector3f(zero, one, zv)
+
+
+def normal(alpha, u, v):
+    """Unit normal (-z_u, -z_v, 1) / |.|, a Normal3f of N."""
+    _, zu, zv = height_and_derivatives(alpha, u, v)
+    return dr.normalize(mi.Normal3f(-zu, -zv, 1))
+
+
+def metric(alpha, u, v):
+    """First fundamental form (E, F, G) = (1 + z_u^2, z_u z_v, 1 + z_v^2), Floats of N."""
+    _, zu, zv = height_and_derivatives(alpha, u, v)
+    return 1 + zu * zu, zu * zv, 1 + zv * zv

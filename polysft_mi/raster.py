@@ -1,0 +1,501 @@
+"""The ``raster`` integrator: primary visibility, attached shading, analytic antialiasing of silhouettes.
+
+One ray a pixel finds the visible triangle (detached). Its hit point, texture coordinates and colour are then recomputed
+with gradients. Where two neighbouring pixels see different sheets, the silhouette edge between their centres is found by walking
+over the mesh from the nearer one, and the two colours are blended by where the edge crosses, which makes the image a continuous,
+differentiable function of the vertices (after Laine et al. 2020, "Modular Primitives for High-Performance Differentiable
+Rendering", section 3.5; here the edge need not belong to the triangles seen at the two centres). ``docs/raster.md`` explains it.
+
+Import only after a Mitsuba variant is set.
+"""
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .errors import InputError
+
+_NEAR = 1e-6  # depth [m] below which a triangle takes no part in antialiasing
+_MAX_STEPS = 64  # triangles crossed between two neighbouring pixel centres before the walk gives up
+_AOVS = {"depth": 1, "normal": 3, "uv": 2, "triangle": 1}
+_AOV_CHANNELS = {"depth": "Z", "normal": "XYZ", "uv": "UV", "triangle": "I"}
+
+
+class Pinhole:
+    """A pinhole sensor as a linear map, read off its rays: any sensor whose rays meet in a point, any crop.
+
+    With C = ``basis`` (3x3, camera-to-world applied), the pixel (x, y) of the crop window sees along C (x, y, 1), scaled so that
+    depth is the coordinate along the optical axis; ``project`` is the inverse.
+    """
+
+    def __init__(self, sensor):
+        film = sensor.film()
+        self.width, self.height = (int(x) for x in film.crop_size())
+
+        corners = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], dtype=np.float32)
+        with dr.suspend_grad():
+            ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(corners.T.copy()), mi.Point2f(0.5), True)
+            to_world = sensor.world_transform()
+        o, d = np.array(ray.o, dtype=np.float64).T, np.array(ray.d, dtype=np.float64).T
+        matrix = np.array(to_world.matrix, dtype=np.float64).reshape(4, 4)
+        axis = matrix[:3, 2] / np.linalg.norm(matrix[:3, 2])
+        d /= (d @ axis)[:, None]  # depth 1 along the axis
+        self.origin = matrix[:3, 3]
+        # what every ray of a pinhole passes through, and what the fourth corner must be if the map is linear
+        drift = np.linalg.norm(np.cross(o - self.origin, d / np.linalg.norm(d, axis=1, keepdims=True)), axis=1).max()
+        skewed = np.abs(d[3] - (d[1] + d[2] - d[0])).max()
+        if drift > 1e-4 * max(1.0, np.linalg.norm(self.origin)) or skewed > 1e-4:
+            raise InputError(f"sensor {type(sensor).__name__}: its rays are not those of a pinhole; use perspective or pinhole")
+        self.basis = np.stack([(d[1] - d[0]) / self.width, (d[2] - d[0]) / self.height, d[0]], axis=1)
+        self.inverse = np.linalg.inv(self.basis)
+
+    def device(self, scale=1):
+        """The map as opaque Dr.Jit values (so that no number of it is baked into a kernel); ``scale`` samples a pixel and axis."""
+        basis, inverse = self.basis.copy(), self.inverse.copy()
+        basis[:, :2] /= scale
+        inverse[:2] *= scale
+        values = [mi.Matrix3f(basis), mi.Matrix3f(inverse), mi.Point3f(self.origin)]
+        dr.make_opaque(values)
+        return values
+
+
+class Topology:
+    """Triangles of all meshes of a scene in one numbering, with their neighbours. Detached; vertices that coincide are one."""
+
+    def __init__(self, scene):
+        self.shapes = scene.shapes()
+        for shape in self.shapes:
+            if not shape.is_mesh():
+                raise InputError(f"shape {shape.id()!r}: raster renders triangle meshes only; {type(shape).__name__} is none")
+        self.key = _topology_key(self.shapes)
+        faces, neighbours, face_offset, vertex_offset = [], [], [0], [0]
+        for shape in self.shapes:
+            f = np.array(shape.faces_buffer(), dtype=np.int64).reshape(-1, 3)
+            v = np.array(shape.vertex_positions_buffer()).reshape(-1, 3)
+            _, welded = np.unique(v, axis=0, return_inverse=True)
+            n = _neighbours(welded.reshape(-1)[f])
+            faces.append(f + vertex_offset[-1])
+            neighbours.append(np.where(n >= 0, n + face_offset[-1], -1))
+            face_offset.append(face_offset[-1] + len(f))
+            vertex_offset.append(vertex_offset[-1] + len(v))
+        self.face_count, self.vertex_count = face_offset[-1], vertex_offset[-1]
+        self.faces = mi.UInt32(np.concatenate(faces).ravel().astype(np.uint32))
+        self.neighbours = mi.Int32(np.concatenate(neighbours).ravel().astype(np.int32))
+        # from a shape's place in the registry to its first triangle
+        self.face_offset = dr.zeros(mi.UInt32, 1 + max(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(s))[0] for s in self.shapes))
+        for shape, offset in zip(self.shapes, face_offset):
+            dr.scatter(self.face_offset, mi.UInt32(offset), dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape)))
+        dr.eval(self.faces, self.neighbours, self.face_offset)
+
+    def positions(self):
+        """Positions of all vertices, a flat Float of 3V, attached."""
+        return _joined([s.vertex_positions_buffer() for s in self.shapes])
+
+    def texcoords(self):
+        """Texture coordinates of all vertices, a flat Float of 2V; zeros for meshes that have none."""
+        return _joined(
+            [
+                s.vertex_texcoords_buffer() if s.has_vertex_texcoords() else dr.zeros(mi.Float, 2 * s.vertex_count())
+                for s in self.shapes
+            ]
+        )
+
+
+def _topology_key(shapes):
+    return tuple((id(s), s.face_count(), s.vertex_count()) if s.is_mesh() else id(s) for s in shapes)
+
+
+def _joined(arrays):
+    return arrays[0] if len(arrays) == 1 else dr.concat(arrays)
+
+
+def _neighbours(faces):
+    """Across edge k of each triangle, from corner k to corner k+1: the other triangle, or -1. faces (F, 3) -> (F, 3)."""
+    edge = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], -1).reshape(-1, 2), axis=1)
+    _, edge_id, count = np.unique(edge, axis=0, return_inverse=True, return_counts=True)
+    edge_id = edge_id.reshape(-1)
+    half = np.argsort(edge_id, kind="stable")
+    first = np.concatenate([[0], np.cumsum(count)[:-1]])
+    out = np.full(len(edge), -1, dtype=np.int64)
+    two = first[count == 2]
+    out[half[two]], out[half[two + 1]] = half[two + 1] // 3, half[two] // 3
+    return out.reshape(-1, 3)
+
+
+def _cross2(a, b):
+    return a.x * b.y - a.y * b.x
+
+
+class RasterIntegrator(mi.SamplingIntegrator):
+    """
+
+    .. pluginparameters::
+
+     * - shading
+       - |string|
+       - ``unlit``: the diffuse reflectance itself, from both sides. ``bsdf``: the BSDF under the scene's
+         emitters at the first hit, by ``shading_samples`` samples of the emitters, with shadows; the
+         environment shows behind the surface. (Default: ``unlit``)
+     * - shading_samples
+       - |int|
+       - Emitter samples of each image sample where ``shading`` is ``bsdf``. (Default: 1)
+     * - antialias
+       - |bool|
+       - Blend the colours across silhouettes. Without it silhouettes carry no gradient. (Default: true)
+     * - aovs
+       - |string|
+       - Comma-separated channels behind colour and alpha: ``depth`` (z along the optical axis [m]),
+         ``normal`` (unit, world frame, towards the camera), ``uv`` (texture coordinates), ``triangle`` (index over all meshes
+         in the scene's order, -1 for none). They are not antialiased. (Default: none)
+
+    What it is for: fitting a surface to an image and its silhouette together, from one noise-free
+    render. RGB is over black (premultiplied by alpha) where ``shading`` is ``unlit``. ``spp`` takes square numbers: 4 is a grid of
+    2x2 samples a pixel, each pixel their mean. The film's reconstruction filter is not used: a pixel is its own square.
+
+    It is used like any integrator: ``mi.render(scene, params, integrator=...)``, in forward and reverse mode. Called directly under
+    Dr.Jit's AD, ``render()`` returns an attached image in one pass.
+    """
+
+    def __init__(self, props):
+        super().__init__(props)
+        self.shading = props.get("shading", "unlit")
+        self.shading_samples = props.get("shading_samples", 1)
+        self.antialias = props.get("antialias", True)
+        self.aovs = [name.strip() for name in props.get("aovs", "").split(",") if name.strip()]
+        if self.shading not in ("unlit", "bsdf"):
+            raise InputError(f"raster: shading = {self.shading!r}; known: unlit, bsdf")
+        if self.shading_samples < 1:
+            raise InputError(f"raster: shading_samples = {self.shading_samples}; it must be at least 1")
+        for name in self.aovs:
+            if name not in _AOVS:
+                raise InputError(f"raster: aov {name!r}; known: {', '.join(_AOVS)}")
+        self._topology = None
+        self._cameras = {}
+
+    def aov_names(self):
+        return [f"{name}.{channel}" for name in self.aovs for channel in _AOV_CHANNELS[name]]
+
+    def to_string(self):
+        return f"RasterIntegrator[shading = {self.shading}, antialias = {self.antialias}, aovs = {self.aovs}]"
+
+    # -- Mitsuba's interface ------------------------------------------------
+
+    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        """Image tensor (H, W, C) of the crop window, attached to whatever the scene is attached to."""
+        sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+        image = self._image(scene, sensor, int(seed) if not dr.is_array_v(seed) else seed, spp)
+        film = sensor.film()
+        if not dr.grad_enabled(image):  # let the film have it too, for whoever develops or writes that
+            film.prepare(self.aov_names())
+            film.put_block(self._block(film, image))
+            if evaluate:
+                dr.eval(image)
+        return image if develop else mi.TensorXf()
+
+    def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
+        image = self.render(scene, sensor, seed, spp)
+        dr.forward_to(image)
+        return dr.grad(image)
+
+    def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
+        image = self.render(scene, sensor, seed, spp)
+        dr.backward_from(dr.dot(image.array, dr.detach(grad_in.array)))
+
+    def _block(self, film, image):
+        """The image as the film expects it: colour, alpha, weight, AOVs."""
+        height, width, channels = image.shape
+        data, n, k = image.array, width * height, len(self.aov_names())
+        base = channels - k
+        pixel = dr.arange(mi.UInt32, n)
+        film_channels = film.prepare(self.aov_names())
+        has_weight = film_channels - channels
+        out = dr.zeros(mi.Float, n * film_channels)
+        for c in range(film_channels):
+            if c < base:
+                value = dr.gather(mi.Float, data, pixel * channels + c)
+            elif has_weight and c == base:
+                value = mi.Float(1)
+            else:
+                value = dr.gather(mi.Float, data, pixel * channels + (c - has_weight))
+            dr.scatter(out, value, pixel * film_channels + c)
+        block = mi.TensorXf(out, (height, width, film_channels))
+        return mi.ImageBlock(block, film.crop_offset(), border=False)
+
+    # -- the image ----------------------------------------------------------
+
+    def _camera(self, sensor):
+        film = sensor.film()
+        key = (id(sensor), tuple(film.crop_size()), tuple(film.crop_offset()))
+        if key not in self._cameras:
+            self._cameras = {key: Pinhole(sensor)}
+        return self._cameras[key]
+
+    def _image(self, scene, sensor, seed, spp):
+        spp = spp or sensor.sampler().sample_count()
+        scale = math.isqrt(spp)
+        if scale * scale != spp:
+            raise InputError(f"raster: spp = {spp}; a square number is needed (1, 4, 9, 16, ...)")
+        camera = self._camera(sensor)
+        if self._topology is None or self._topology.key != _topology_key(scene.shapes()):
+            self._topology = Topology(scene)
+        topology = self._topology
+        width, height = camera.width * scale, camera.height * scale
+        basis, inverse, origin = camera.device(scale)
+
+        positions = topology.positions()
+        vertex = dr.gather(mi.Point3f, positions, dr.arange(mi.UInt32, topology.vertex_count))
+        relative = inverse @ (vertex - origin)  # (x z, y z, z): pixels times depth
+        screen = mi.Point3f(relative.x / relative.z, relative.y / relative.z, relative.z)
+        dr.eval(screen)
+        x0, y0, w, h = self._bounds(screen, width, height)
+
+        with dr.suspend_grad():
+            x0_, y0_, w_ = (dr.opaque(mi.UInt32, k) for k in (x0, y0, w))
+            local = dr.arange(mi.UInt32, w * h)
+            ly = local // w_
+            px, py = local - ly * w_ + x0_, ly + y0_
+            centre = mi.Point2f(mi.Float(px) + 0.5, mi.Float(py) + 0.5)
+            direction = basis @ mi.Vector3f(centre.x, centre.y, 1)
+            length = dr.norm(direction)
+            ray = mi.Ray3f(origin, direction / length)
+            pi = scene.ray_intersect_preliminary(ray, coherent=True)
+            hit = pi.is_valid()
+            shape = dr.reinterpret_array(mi.UInt32, pi.shape)
+            triangle = dr.select(hit, mi.Int32(dr.gather(mi.UInt32, topology.face_offset, shape, hit) + pi.prim_index), -1)
+            depth = dr.select(hit, pi.t / length, dr.inf)
+            dr.eval(triangle, depth)
+
+        si, z = self._interaction(topology, positions, pi, triangle, ray, length, hit)
+        if self.shading == "unlit":
+            colour = si.bsdf().eval_diffuse_reflectance(si, hit) & hit
+        else:
+            colour = self._lit(scene, pi, ray, hit, seed)
+        channels = [*mi.Color3f(colour), dr.select(hit, mi.Float(1), 0)]
+        if self.antialias:
+            channels = self._antialias(topology, screen, triangle, depth, channels, (x0_, y0_, w_, w, h))
+        for name in self.aovs:
+            channels += self._aov(name, si, z, triangle, ray, hit)
+
+        if not mi.has_flag(sensor.film().flags(), mi.FilmFlags.Alpha):
+            del channels[3]
+        return self._assemble(channels, (x0_, y0_, w_, w, h), camera, scale)
+
+    def _bounds(self, screen, width, height):
+        """Pixels that the surface can cover: (x, y, width, height), at least one pixel."""
+        if self.shading != "unlit":
+            return 0, 0, width, height  # the environment is seen everywhere
+        with dr.suspend_grad():
+            low = dr.minimum(dr.min(screen.x), 1e9), dr.minimum(dr.min(screen.y), 1e9)
+            box = dr.ravel(mi.Point4f(low[0], low[1], dr.max(screen.x), dr.max(screen.y)))
+            near = dr.min(screen.z)
+            dr.eval(box, near)
+            (xa, ya, xb, yb), near = box.numpy().tolist(), near[0]
+        if not near > _NEAR or not all(map(math.isfinite, (xa, ya, xb, yb))):
+            return 0, 0, width, height
+        # one pixel of margin, for the neighbours that antialiasing blends with
+        xa, ya = max(0, math.floor(min(xa, width)) - 1), max(0, math.floor(min(ya, height)) - 1)
+        xb, yb = min(width, math.ceil(max(xb, 0)) + 1), min(height, math.ceil(max(yb, 0)) + 1)
+        if xb <= xa or yb <= ya:
+            return 0, 0, 1, 1
+        return xa, ya, xb - xa, yb - ya
+
+    def _interaction(self, topology, positions, pi, triangle, ray, length, hit):
+        """Surface interaction of the fixed rays with the moving triangles (attached), and depth along the axis."""
+        t = mi.UInt32(dr.select(hit, triangle, 0))
+        index = [dr.gather(mi.UInt32, topology.faces, 3 * t + k, hit) for k in range(3)]
+        p0, p1, p2 = (dr.gather(mi.Point3f, positions, i, hit) for i in index)
+        e1, e2 = p1 - p0, p2 - p0
+        # Moeller-Trumbore, without its tests: the ray is known to hit
+        pv = dr.cross(ray.d, e2)
+        inverse = dr.select(hit, dr.rcp(dr.dot(e1, pv)), 0)
+        tv = ray.o - p0
+        qv = dr.cross(tv, e1)
+        b1, b2 = dr.dot(tv, pv) * inverse, dr.dot(ray.d, qv) * inverse
+        distance = dr.dot(e2, qv) * inverse
+        texcoords = topology.texcoords()
+        c0, c1, c2 = (dr.gather(mi.Point2f, texcoords, i, hit) for i in index)
+
+        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(triangle))
+        si.t = dr.select(hit, distance, dr.inf)
+        si.p = ray.o + ray.d * distance
+        si.uv = c0 + (c1 - c0) * b1 + (c2 - c0) * b2
+        n = dr.normalize(dr.cross(e1, e2))
+        si.n = dr.mulsign(n, -dr.dot(n, ray.d))  # both sides face the camera
+        si.sh_frame.n = si.n
+        si.wi = mi.Vector3f(0, 0, 1)  # unlit: as seen from the front
+        si.shape = pi.shape
+        si.prim_index = pi.prim_index
+        return si, distance / length
+
+    def _lit(self, scene, pi, ray, hit, seed):
+        """Emitted and directly reflected radiance at the first hit; the environment where there is none."""
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.All, hit)
+        bsdf = si.bsdf()
+        colour = si.emitter(scene).eval(si)
+        emitters = len(scene.emitters())
+        if emitters:
+            n = self.shading_samples
+            rng = mi.PCG32(size=dr.width(hit), initstate=seed + 1)
+            context = mi.BSDFContext()
+            for _ in range(n):
+                sample = mi.Point2f(rng.next_float32(), rng.next_float32())
+                ds, weight = scene.sample_emitter_direction(si, sample, True, hit)
+                colour += (
+                    bsdf.eval(context, si, si.to_local(ds.d), hit & (ds.pdf != 0)) * weight / n
+                )
+        return colour
+
+    def _aov(self, name, si, z, triangle, ray, hit):
+        if name == "depth":
+            return [dr.select(hit, z, 0)]
+        if name == "normal":
+            return [dr.select(hit, x, 0) for x in si.n]
+        if name == "uv":
+            return [dr.select(hit, x, 0) for x in si.uv]
+        return [mi.Float(triangle)]
+
+    def _antialias(self, topology, screen, triangle, depth, channels, region):
+        """Blend the channels (Floats of w*h) across the silhouettes that run between neighbouring pixel centres."""
+        x0, y0, w_, w, h = region
+        out = [mi.Float(c) for c in channels]
+        dr.eval(out)  # what is gathered from must be in memory
+        source = out
+        out = [c + 0 for c in source]
+        for step, count in (((1, 0), (w - 1) * h), ((0, 1), w * (h - 1))):
+            if count <= 0:
+                continue
+            with dr.suspend_grad():
+                k = dr.arange(mi.UInt32, count)
+                columns = w_ - step[0]
+                y = k // columns
+                a = y * w_ + (k - y * columns)
+                b = a + (1 if step[0] else w_)
+                ta, tb = dr.gather(mi.Int32, triangle, a), dr.gather(mi.Int32, triangle, b)
+                pair = dr.compress(ta != tb)
+                if dr.width(pair) == 0:
+                    continue
+                y = pair // columns
+                a = y * w_ + (pair - y * columns)
+                b = a + (1 if step[0] else w_)
+                swap = dr.gather(mi.Float, depth, b) < dr.gather(mi.Float, depth, a)
+                near, far = dr.select(swap, b, a), dr.select(swap, a, b)
+                found, va, vb, near, far = self._silhouette(topology, screen, triangle, near, far, x0, y0, w_, step[0] == 1)
+                dr.eval(found, va, vb, near, far)  # in one kernel: compress and gather would each walk again
+                kept = dr.compress(found)
+                if dr.width(kept) == 0:
+                    continue
+                va, vb, near, far = (dr.gather(mi.UInt32, i, kept) for i in (va, vb, near, far))
+                cn, cf = (self._centre(i, x0, y0, w_) for i in (near, far))
+            # where the edge crosses, from the near centre (0) to the far one (1): attached
+            ea, eb = (_point2(screen, i) for i in (va, vb))
+            if step[0]:
+                t = (ea.x + (cn.y - ea.y) * (eb.x - ea.x) / (eb.y - ea.y) - cn.x) / (cf.x - cn.x)
+            else:
+                t = (ea.y + (cn.x - ea.x) * (eb.y - ea.y) / (eb.x - ea.x) - cn.y) / (cf.y - cn.y)
+            beyond = dr.detach(t) > 0.5  # the near sheet covers a part of the far pixel, else the far one a part of the near
+            weight = dr.clip(dr.abs(t - 0.5), 0, 0.5)
+            target, other = dr.select(beyond, far, near), dr.select(beyond, near, far)
+            for c in range(len(out)):
+                difference = dr.gather(mi.Float, source[c], other) - dr.gather(mi.Float, source[c], target)
+                dr.scatter_add(out[c], weight * difference, target)
+        return out
+
+    @staticmethod
+    def _centre(pixel, x0, y0, w):
+        y = pixel // w
+        return mi.Point2f(mi.Float(pixel - y * w + x0) + 0.5, mi.Float(y + y0) + 0.5)
+
+    def _silhouette(self, topology, screen, triangle, near, far, x0, y0, w, horizontal):
+        """Vertices (va, vb) of the silhouette edge between the centres of two pixels, and which pixel it occludes.
+
+        Walks from the near pixel's triangle towards the far centre; where that sheet has no silhouette in between, from the far one's. An edge
+        counts only in the pairs across its steeper axis, so that no edge counts twice.
+        """
+        found, va, vb = self._walk(topology, screen, triangle, near, far, x0, y0, w, mi.Bool(True))
+        again = ~found & (dr.gather(mi.Int32, triangle, far) >= 0)
+        found2, va2, vb2 = self._walk(topology, screen, triangle, far, near, x0, y0, w, again)
+        near, far = dr.select(found2, far, near), dr.select(found2, near, far)
+        va, vb, found = dr.select(found2, va2, va), dr.select(found2, vb2, vb), found | found2
+        edge = _point2(screen, vb, found) - _point2(screen, va, found)
+        steep = dr.abs(edge.y) >= dr.abs(edge.x)
+        return found & (steep if horizontal else ~steep), va, vb, near, far
+
+    def _walk(self, topology, screen, triangle, start, end, x0, y0, w, active):
+        c0, c1 = self._centre(start, x0, y0, w), self._centre(end, x0, y0, w)
+
+        def corners(t, mask):
+            return [dr.gather(mi.UInt32, topology.faces, 3 * mi.UInt32(t) + k, mask) for k in range(3)]
+
+        def area(points):
+            return _cross2(points[1] - points[0], points[2] - points[0])
+
+        flat = dr.ravel(dr.detach(screen))
+        dr.eval(flat)
+
+        def step(active, current, found, va, vb, steps):
+            index = corners(current, active)
+            p = [dr.gather(mi.Point3f, flat, i, active) for i in index]
+            q = [mi.Point2f(x.x, x.y) for x in p]
+            sign = dr.sign(area(q))
+            # the segment leaves a convex triangle by the first edge behind which it gets
+            exit_at, exit_edge = mi.Float(dr.inf), mi.UInt32(0)
+            for k in range(3):
+                edge = q[(k + 1) % 3] - q[k]
+                at0, at1 = sign * _cross2(edge, c0 - q[k]), sign * _cross2(edge, c1 - q[k])
+                t = at0 / (at0 - at1)
+                first = (at1 < at0) & (t < exit_at)
+                exit_at, exit_edge = dr.select(first, t, exit_at), dr.select(first, k, exit_edge)
+            usable = (dr.minimum(dr.minimum(p[0].z, p[1].z), p[2].z) > _NEAR) & (sign != 0)
+            leaves = active & usable & (exit_at < 1)
+            across = dr.gather(mi.Int32, topology.neighbours, 3 * mi.UInt32(current) + exit_edge, leaves)
+            inner = leaves & (across >= 0)
+            r = [dr.gather(mi.Point3f, flat, i, inner) for i in corners(across, inner)]
+            silhouette = leaves & ((across < 0) | (area(r) * sign <= 0))
+            ea = dr.select(exit_edge == 0, index[0], dr.select(exit_edge == 1, index[1], index[2]))
+            eb = dr.select(exit_edge == 0, index[1], dr.select(exit_edge == 1, index[2], index[0]))
+            va, vb = dr.select(silhouette, ea, va), dr.select(silhouette, eb, vb)
+            steps += 1
+            going = leaves & ~silhouette & (steps < _MAX_STEPS)
+            return going, dr.select(going, across, current), found | silhouette, va, vb, steps
+
+        current = dr.gather(mi.Int32, triangle, start, active)
+        n = dr.width(current)
+        state = (
+            active & (current >= 0) & dr.full(mi.Bool, True, n),
+            current,
+            dr.full(mi.Bool, False, n),
+            dr.zeros(mi.UInt32, n),
+            dr.zeros(mi.UInt32, n),
+            dr.zeros(mi.UInt32, n),
+        )
+        _, _, found, va, vb, _ = dr.while_loop(state, lambda active, *_: active, step, label="walk")
+        return found, va, vb
+
+    def _assemble(self, channels, region, camera, scale):
+        """Put the region into the full image and shape it (H, W, C): colours averaged over the samples of a pixel, AOVs of its middle one."""
+        x0, y0, w_, w, h = region
+        width, height, count = camera.width, camera.height, len(channels)
+        colours = count - len(self.aov_names())
+        index = dr.arange(mi.UInt32, w * h)
+        y = index // w_
+        sx, sy = index - y * w_ + x0, y + y0
+        px, py = sx // scale, sy // scale
+        middle = (sx - px * scale == scale // 2) & (sy - py * scale == scale // 2)
+        pixel = py * dr.opaque(mi.UInt32, width) + px
+        out = dr.zeros(mi.Float, width * height * count)
+        if "triangle" in self.aovs:  # no triangle is -1, outside the region too
+            channel = colours + self.aov_names().index("triangle.I")
+            dr.scatter(out, mi.Float(-1), dr.arange(mi.UInt32, width * height) * count + channel)
+        for c, value in enumerate(channels):
+            if c < colours and scale > 1:
+                dr.scatter_add(out, value / (scale * scale), pixel * count + c)
+            else:
+                dr.scatter(out, value, pixel * count + c, middle)
+        return mi.TensorXf(out, (height, width, count))
+
+
+def _point2(screen, index, mask=True):
+    """Screen positions of the vertices ``index``, attached to ``screen``."""
+    return mi.Point2f(dr.gather(mi.Float, screen.x, index, mask), dr.gather(mi.Float, screen.y, index, mask))
