@@ -1,0 +1,154 @@
+"""Our Mitsuba plugins, and their registration: ``polysft``, ``raster``, ``silhouette_projective``, ``pinhole``, ``varol_template``.
+
+Import only after a Mitsuba variant is set; :func:`register` may be called any number of times.
+"""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from . import settings
+from .errors import InputError
+from .projective import SilhouetteProjective
+from .raster import RasterIntegrator
+
+
+class PolySfT(mi.SamplingIntegrator):
+    """
+
+    .. pluginparameters::
+
+     * - frames
+       - |string|
+       - The video: a folder of images, or a glob pattern.
+     * - masks
+       - |string|
+       - The silhouettes, in the same form; empty for none. (Default: none)
+     * - (every field of ``polysft_mi.settings.Settings``)
+       - |int|, |float| or |string|
+       - See ``docs/scene.md``.
+     * - (nested)
+       - |integrator|
+       - The integrator that renders the template: ``raster``, or a differentiable one of Mitsuba's.
+
+    A whole shape-from-template experiment beside the scene that it needs. Rendered as an integrator, it renders the template by the
+    nested one, so that ``mitsuba scene.xml`` shows what a fit starts from.
+    """
+
+    def __init__(self, props):
+        super().__init__(props)
+        nested = [props[k] for k in props.keys() if isinstance(props[k], mi.Integrator)]
+        if len(nested) != 1:
+            raise InputError(f"polysft: {len(nested)} nested integrators; exactly one is needed, e.g. <integrator type=\"raster\"/>")
+        self.renderer = nested[0]
+        for name in ("frames",):
+            if name not in props:
+                raise InputError(f"polysft: property {name!r} is missing; a folder of images or a glob pattern is needed")
+        resolve = mi.file_resolver().resolve
+        self.frames = str(resolve(str(props["frames"])))
+        masks = str(props.get("masks", ""))
+        self.masks = str(resolve(masks)) if masks else ""
+        self.settings = settings.from_properties(props)
+
+    def aov_names(self):
+        return self.renderer.aov_names()
+
+    def render(self, *args, **kwargs):
+        return self.renderer.render(*args, **kwargs)
+
+    def render_forward(self, *args, **kwargs):
+        return self.renderer.render_forward(*args, **kwargs)
+
+    def render_backward(self, *args, **kwargs):
+        return self.renderer.render_backward(*args, **kwargs)
+
+    def to_string(self):
+        return f"PolySfT[frames = {self.frames!r}, masks = {self.masks!r}, {self.settings}, renderer = {self.renderer}]"
+
+
+class PinholeSensor(mi.Sensor):
+    """
+
+    .. pluginparameters::
+
+     * - fx, fy, cx, cy
+       - |float|
+       - Focal lengths and principal point [pixels]; the centre of the first pixel is (0.5, 0.5).
+     * - to_world
+       - |transform|
+       - Camera to world, Mitsuba's camera frame (x left, y up, z forward). (Default: identity)
+
+    Mitsuba's ``perspective`` for pixels that are not square. Path replay with moving silhouettes does not take it.
+    """
+
+    def __init__(self, props):
+        super().__init__(props)
+        self.focal = [props[k] for k in ("fx", "fy")]
+        self.centre = [props[k] for k in ("cx", "cy")]
+        if min(self.focal) <= 0:
+            raise InputError(f"pinhole: (fx, fy) = {tuple(self.focal)}; positive focal lengths are needed")
+
+    def sample_ray(self, time, sample1, position, aperture, active=True):
+        film = self.film()
+        size, offset = film.crop_size(), film.crop_offset()
+        x = position.x * size[0] + offset[0]
+        y = position.y * size[1] + offset[1]
+        # Mitsuba's camera frame has x to the left and y up
+        d = mi.Vector3f((self.centre[0] - x) / self.focal[0], (self.centre[1] - y) / self.focal[1], 1)
+        wavelengths, weight = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample1, active)
+        to_world = self.world_transform()
+        return mi.Ray3f(to_world @ mi.Point3f(0), dr.normalize(to_world @ d), time, wavelengths), weight
+
+    def sample_ray_differential(self, time, sample1, position, aperture, active=True):
+        ray, weight = self.sample_ray(time, sample1, position, aperture, active)
+        size = self.film().crop_size()
+        out = mi.RayDifferential3f(ray)
+        for name, step in (("x", mi.Vector2f(1 / size[0], 0)), ("y", mi.Vector2f(0, 1 / size[1]))):
+            shifted, _ = self.sample_ray(time, sample1, position + step, aperture, active)
+            setattr(out, f"o_{name}", shifted.o)
+            setattr(out, f"d_{name}", shifted.d)
+        out.has_differentials = True
+        return out, weight
+
+    def bbox(self):
+        return mi.ScalarBoundingBox3f(mi.ScalarPoint3f(0))
+
+    def to_string(self):
+        return f"PinholeSensor[fx = {self.focal[0]}, fy = {self.focal[1]}, cx = {self.centre[0]}, cy = {self.centre[1]}]"
+
+
+def _varol_template(props):
+    """
+
+    .. pluginparameters::
+
+     * - folder
+       - |string|
+       - A sequence in the form of Kinect-Paper (Varol et al. 2012): ``mesh.pts``, ``mesh.tri``, ``cam.intr``, ``cam.ext``.
+     * - resolution
+       - |int|
+       - Vertices along each side of the subdivided grid. (Default: 33)
+
+    The sequence's flat template as a mesh in the camera frame, its texture coordinates the projection into the first image.
+    """
+    from .prepare import kinect_paper_template
+
+    folder = str(mi.file_resolver().resolve(str(props["folder"])))
+    vertices, faces, uv = kinect_paper_template(folder, int(props.get("resolution", 33)))
+    mesh = mi.Mesh("template", len(vertices), len(faces), has_vertex_texcoords=True, props=props)
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = mi.Float(np.ascontiguousarray(vertices, dtype=np.float32).ravel())
+    params["faces"] = mi.UInt32(np.ascontiguousarray(faces, dtype=np.uint32).ravel())
+    flipped = np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1)  # Mitsuba's v runs down
+    params["vertex_texcoords"] = mi.Float(flipped.astype(np.float32).ravel())
+    params.update()
+    return mesh
+
+
+def register():
+    """Register every plugin of ours with Mitsuba's current variant."""
+    mi.register_integrator("raster", RasterIntegrator)
+    mi.register_integrator("silhouette_projective", SilhouetteProjective)
+    mi.register_integrator("polysft", PolySfT)
+    mi.register_sensor("pinhole", PinholeSensor)
+    mi.register_shape("varol_template", _varol_template)

@@ -1,0 +1,185 @@
+"""The problem that a solver solves: unknowns of a window of frames in, the objective out.
+
+It knows the scene, the template's patch, the images and the weights; it knows nothing of how it is minimised.
+Import only after a Mitsuba variant is set.
+"""
+
+from collections import OrderedDict
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from . import objective
+from .errors import InputError
+from .patch import JetPatch
+from .raster import RasterIntegrator
+
+TERMS = ("rgb", "silhouette", "inextensibility", "temporal")
+_CACHED_FRAMES = 8
+
+
+@dataclass
+class Target:
+    """One image on the device: ``rgb`` (H, W, 3), cut out by the mask where there is one; ``mask`` Float of P or None; ``area`` [pixels]."""
+
+    rgb: mi.TensorXf
+    mask: mi.Float
+    area: mi.Float
+
+
+class Problem:
+    """Shape from template on one video.
+
+    ``experiment``: :class:`polysft_mi.scene.Experiment`; ``sequence``: :class:`polysft_mi.sequence.Sequence`.
+    """
+
+    def __init__(self, experiment, sequence):
+        self.experiment, self.sequence, self.settings = experiment, sequence, experiment.settings
+        self.template = experiment.template
+        self.patch = JetPatch(self.template)
+        self.width, self.height = experiment.size
+        self.pixels = self.width * self.height
+        edges = self.template.edges
+        self.edges = tuple(mi.UInt32(np.ascontiguousarray(edges[:, k], dtype=np.uint32)) for k in (0, 1))
+        lengths = np.linalg.norm(self.template.vertices[edges[:, 0]] - self.template.vertices[edges[:, 1]], axis=1)
+        self.edge_lengths = mi.Float(lengths.astype(np.float32))
+        self._corner = mi.UInt32(experiment.corner.astype(np.uint32))
+        self._identity = np.array_equal(experiment.corner, np.arange(len(self.template.vertices)))
+        self._params = mi.traverse(experiment.mesh)
+        self._targets = OrderedDict()
+        self._setup_renderer()
+
+    # -- rendering ----------------------------------------------------------
+
+    def _setup_renderer(self):
+        renderer = self.experiment.renderer
+        self._raster = isinstance(renderer, RasterIntegrator)
+        self._mask_renderer = None
+        if not self._raster:
+            if not str(self.experiment.sensor).startswith("PerspectiveCamera") and "projective" in type(renderer).__name__.lower():
+                raise InputError(
+                    f"{self.experiment.path}: path replay with silhouettes takes Mitsuba's perspective sensor only (square pixels); use raster"
+                )
+            self._mask_renderer = mi.load_dict({"type": "silhouette_projective"})
+
+    def place(self, vertices):
+        """Put the surface (Point3f of N, attached or not) into the scene."""
+        points = vertices
+        if not self._identity:
+            points = dr.gather(mi.Point3f, dr.ravel(vertices), self._corner)
+        self._params["vertex_positions"] = dr.ravel(points)
+        self._params.update()
+
+    def image(self, vertices, seed=0):
+        """Render the surface: (rgb tensor (H, W, 3), alpha Float of P), attached to the vertices."""
+        self.place(vertices)
+        scene, sensor, spp = self.experiment.scene, self.experiment.sensor, self.settings.spp
+        if self._raster:
+            image = self.experiment.renderer.render(scene, sensor, spp=spp)
+            alpha = None
+        else:
+            image = mi.render(scene, self._params, sensor=sensor, integrator=self.experiment.renderer, spp=spp, seed=seed)
+            mask = mi.render(scene, self._params, sensor=sensor, integrator=self._mask_renderer, spp=max(spp, 16), seed=seed + 1)
+            alpha = dr.gather(mi.Float, mask.array, dr.arange(mi.UInt32, self.pixels) * mask.shape[2])
+        channels = image.shape[2]
+        pixel = dr.arange(mi.UInt32, 3 * self.pixels)
+        rgb = dr.gather(mi.Float, image.array, pixel // 3 * channels + pixel % 3)
+        if alpha is None:
+            alpha = dr.gather(mi.Float, image.array, dr.arange(mi.UInt32, self.pixels) * channels + 3)
+        else:  # path replay shows the environment behind the surface: cut it away
+            rgb = rgb * dr.gather(mi.Float, dr.detach(alpha), pixel // 3)
+        return mi.TensorXf(rgb, (self.height, self.width, 3)), alpha
+
+    # -- images -------------------------------------------------------------
+
+    def target(self, frame):
+        """The image of the frame (counted in the selection), as the objective wants it."""
+        if frame not in self._targets:
+            rgb, mask = self.sequence.frame(frame), self.sequence.mask(frame)
+            if mask is not None:
+                rgb = rgb * mask[..., None]
+            tensor = objective.blur(mi.TensorXf(np.ascontiguousarray(rgb, dtype=np.float32)), self.settings.blur)
+            area = mi.Float(max(1.0, float(mask.sum()))) if mask is not None else None
+            device_mask = mi.Float(np.ascontiguousarray(mask, dtype=np.float32).ravel()) if mask is not None else None
+            if device_mask is not None and self.settings.brightness == "local":
+                tensor = objective.normalise_locally(tensor, self._weight_image(device_mask))
+            dr.eval(tensor, area, device_mask)
+            self._targets[frame] = Target(tensor, device_mask, area)
+            while len(self._targets) > _CACHED_FRAMES:
+                self._targets.popitem(last=False)
+        return self._targets[frame]
+
+    def _weight_image(self, weight):
+        return mi.TensorXf(weight, (self.height, self.width, 1))
+
+    # -- objective ----------------------------------------------------------
+
+    def frame_terms(self, unknowns, frame, seed=0):
+        """The weighted per-frame terms of the objective, name to Float of 1, attached."""
+        s = self.settings
+        vertices = self.patch.vertices(unknowns)
+        rgb, alpha = self.image(vertices, seed)
+        target = self.target(frame)
+        terms = {}
+        if target.mask is not None:
+            weight, area = dr.ones(mi.Float, self.pixels), target.area
+            terms["silhouette"] = s.k_silhouette * objective.silhouette(alpha, target.mask, area)
+        else:
+            weight = objective.interior(alpha)
+            area = dr.maximum(dr.sum(weight), 1)
+        rgb = objective.blur(rgb, s.blur)
+        wanted = target.rgb
+        if s.brightness == "local":
+            inside = alpha if target.mask is not None else weight
+            rgb = objective.normalise_locally(rgb, self._weight_image(dr.detach(inside)))
+            if target.mask is None:
+                wanted = objective.normalise_locally(wanted, self._weight_image(weight))
+        a, b = self._channels(rgb), self._channels(wanted)
+        if s.brightness == "gain":
+            g = objective.gain([dr.detach(x) for x in a], b, objective.interior(alpha))
+            a = [g * x for x in a]
+        terms["rgb"] = s.k_rgb * objective.photometric(a, b, weight, area, norm=s.rgb_norm, scale=s.rgb_scale)
+        terms["inextensibility"] = s.k_mi * objective.inextensibility(vertices, self.edges, self.edge_lengths, self.patch.scale)
+        return terms
+
+    def _channels(self, tensor):
+        index = dr.arange(mi.UInt32, self.pixels) * 3
+        return [dr.gather(mi.Float, tensor.array, index + c) for c in range(3)]
+
+    def temporal_term(self, window):
+        """The weighted temporal consistency of a list of Unknowns, a Float of 1, attached."""
+        return self.settings.k_tc * objective.temporal(window)
+
+    def evaluate(self, window, frames, *, backward=False, seed=0):
+        """The objective over a window: (total, terms), numbers; with ``backward``, the gradients are added to the unknowns.
+
+        ``window``: list of W Unknowns; ``frames``: their frames. Each frame's graph is traversed and freed before the next.
+        """
+        sums = dict.fromkeys(TERMS, 0.0)
+        parts = []
+        for k, (unknowns, frame) in enumerate(zip(window, frames)):
+            terms = {name: value / len(window) for name, value in self.frame_terms(unknowns, frame, seed + 2 * k).items()}
+            parts.append(self._finish(terms, backward))
+        if len(window) > 1:
+            parts.append(self._finish({"temporal": self.temporal_term(window)}, backward))
+        for part in parts:
+            for name, value in part.items():
+                sums[name] += float(value[0])
+        return sum(sums.values()), sums
+
+    @staticmethod
+    def _finish(terms, backward):
+        loss = sum(terms.values())
+        values = {name: dr.detach(value) for name, value in terms.items()}
+        dr.schedule(values)
+        if backward:
+            dr.backward(loss)
+        dr.eval()
+        return values
+
+    def surface(self, unknowns):
+        """Vertices (N, 3) [m, camera frame] as float32 NumPy."""
+        with dr.suspend_grad():
+            return np.array(self.patch.vertices(unknowns)).T.astype(np.float32).copy()
