@@ -265,16 +265,14 @@ class RasterIntegrator(mi.SamplingIntegrator):
             shape = dr.reinterpret_array(mi.UInt32, pi.shape)
             triangle = dr.select(hit, mi.Int32(dr.gather(mi.UInt32, topology.face_offset, shape, hit) + pi.prim_index), -1)
             depth = dr.select(hit, pi.t / length, dr.inf)
-            dr.eval(triangle, depth)
+            dr.eval(pi, triangle, depth)  # once: everything below reads it, and the scene may change before it is evaluated
 
-        si, z = self._interaction(topology, positions, pi, triangle, ray, length, hit)
-        if self.shading == "unlit":
-            colour = si.bsdf().eval_diffuse_reflectance(si, hit) & hit
-        else:
-            colour = self._lit(scene, pi, ray, hit, seed)
-        channels = [*mi.Color3f(colour), dr.select(hit, mi.Float(1), 0)]
+        si, z = self._interaction(topology, positions, pi.shape, triangle, ray, length, hit)
+        colour = self._unlit(si, hit) if self.shading == "unlit" else self._lit(scene, pi, ray, hit, seed)
+        channels = [*colour, dr.select(hit, mi.Float(1), 0)]
         if self.antialias:
-            channels = self._antialias(topology, screen, triangle, depth, channels, (x0_, y0_, w_, w, h))
+            region = (x0_, y0_, w_, w, h)
+            channels = self._antialias(topology, positions, screen, triangle, depth, pi, channels, region, (basis, origin))
         for name in self.aovs:
             channels += self._aov(name, si, z, triangle, ray, hit)
 
@@ -301,8 +299,8 @@ class RasterIntegrator(mi.SamplingIntegrator):
             return 0, 0, 1, 1
         return xa, ya, xb - xa, yb - ya
 
-    def _interaction(self, topology, positions, pi, triangle, ray, length, hit):
-        """Surface interaction of the fixed rays with the moving triangles (attached), and depth along the axis."""
+    def _interaction(self, topology, positions, shape, triangle, ray, length, hit):
+        """Surface interaction of rays with the planes of their triangles (attached), and depth along the axis."""
         t = mi.UInt32(dr.select(hit, triangle, 0))
         index = [dr.gather(mi.UInt32, topology.faces, 3 * t + k, hit) for k in range(3)]
         p0, p1, p2 = (dr.gather(mi.Point3f, positions, i, hit) for i in index)
@@ -325,9 +323,13 @@ class RasterIntegrator(mi.SamplingIntegrator):
         si.n = dr.mulsign(n, -dr.dot(n, ray.d))  # both sides face the camera
         si.sh_frame.n = si.n
         si.wi = mi.Vector3f(0, 0, 1)  # unlit: as seen from the front
-        si.shape = pi.shape
-        si.prim_index = pi.prim_index
+        si.shape = shape
         return si, distance / length
+
+    @staticmethod
+    def _unlit(si, hit):
+        """The texture's own colour, from either side: 3 Floats, 0 where there is no surface."""
+        return [dr.select(hit, c, 0) for c in mi.Color3f(si.bsdf().eval_diffuse_reflectance(si, hit))]
 
     def _lit(self, scene, pi, ray, hit, seed):
         """Emitted and directly reflected radiance at the first hit; the environment where there is none."""
@@ -345,7 +347,7 @@ class RasterIntegrator(mi.SamplingIntegrator):
                 colour += (
                     bsdf.eval(context, si, si.to_local(ds.d), hit & (ds.pdf != 0)) * weight / n
                 )
-        return colour
+        return list(mi.Color3f(colour))
 
     def _aov(self, name, si, z, triangle, ray, hit):
         if name == "depth":
@@ -356,50 +358,72 @@ class RasterIntegrator(mi.SamplingIntegrator):
             return [dr.select(hit, x, 0) for x in si.uv]
         return [mi.Float(triangle)]
 
-    def _antialias(self, topology, screen, triangle, depth, channels, region):
+    def _antialias(self, topology, positions, screen, triangle, depth, pi, channels, region, camera):
         """Blend the channels (Floats of w*h) across the silhouettes that run between neighbouring pixel centres."""
         x0, y0, w_, w, h = region
-        out = [mi.Float(c) for c in channels]
-        dr.eval(out)  # what is gathered from must be in memory
-        source = out
+        horizontal_count, count = (w - 1) * h, (w - 1) * h + w * (h - 1)
+        if count == 0:
+            return channels
+        source = [mi.Float(c) for c in channels]
+        dr.eval(source)  # what is gathered from must be in memory
+        with dr.suspend_grad():
+            split, columns = dr.opaque(mi.UInt32, horizontal_count), w_ - 1
+
+            def pixels(k):
+                """The pair's pixels, and whether it is horizontal."""
+                horizontal = k < split
+                y = dr.select(horizontal, k // dr.maximum(columns, 1), 0)
+                a = dr.select(horizontal, y * w_ + (k - y * columns), k - split)
+                return a, a + dr.select(horizontal, 1, w_), horizontal
+
+            a, b, _ = pixels(dr.arange(mi.UInt32, count))
+            pair = dr.compress(dr.gather(mi.Int32, triangle, a) != dr.gather(mi.Int32, triangle, b))
+            if dr.width(pair) == 0:
+                return channels
+            a, b, horizontal = pixels(pair)
+            swap = dr.gather(mi.Float, depth, b) < dr.gather(mi.Float, depth, a)
+            near, far = dr.select(swap, b, a), dr.select(swap, a, b)
+            found, va, vb, near, far = self._silhouette(topology, screen, triangle, near, far, x0, y0, w_, horizontal)
+            dr.eval(found, va, vb, near, far, horizontal)  # in one kernel: compress and gather would each walk again
+            kept = dr.compress(found)
+            if dr.width(kept) == 0:
+                return channels
+            va, vb, near, far = (dr.gather(mi.UInt32, i, kept) for i in (va, vb, near, far))
+            horizontal = dr.gather(mi.Bool, horizontal, kept)
+            cn, cf = (self._centre(i, x0, y0, w_) for i in (near, far))
+
+        # where the edge crosses, from the near centre (0) to the far one (1): attached
+        ea, eb = _point2(screen, va), _point2(screen, vb)
+        step = eb - ea
+        along, across = dr.select(horizontal, step.x, step.y), dr.select(horizontal, step.y, step.x)
+        slope = along / across
+        crossing = dr.select(horizontal, ea.x + (cn.y - ea.y) * slope, ea.y + (cn.x - ea.x) * slope)
+        start, end = dr.select(horizontal, cn.x, cn.y), dr.select(horizontal, cf.x, cf.y)
+        t = (crossing - start) / (end - start)
+        place = mi.Point2f(dr.select(horizontal, crossing, cn.x), dr.select(horizontal, cn.y, crossing))
+        # the near sheet covers a part of the far pixel, or the far one a part of the near
+        beyond = dr.detach(t) > 0.5
+        # The pairs across either axis would account for the whole edge; sin^2 and cos^2 of its angle share it between them.
+        weight = dr.clip(dr.abs(t - 0.5), 0, 0.5) * across * across / (along * along + across * across)
+        target, other = dr.select(beyond, far, near), dr.select(beyond, near, far)
+
+        # The colour that comes in is the other sheet's where the edge crosses, not at the other pixel's centre: so the image stays
+        # continuous when a pixel's centre passes from one sheet to the other.
+        incoming = [dr.gather(mi.Float, c, other) for c in source]
+        if self.shading == "unlit":
+            basis, origin = camera
+            direction = basis @ mi.Vector3f(place.x, place.y, 1)
+            length = dr.norm(direction)
+            shape = dr.gather(mi.UInt32, dr.reinterpret_array(mi.UInt32, pi.shape), other)
+            visible = dr.gather(mi.Int32, triangle, other)
+            si, _ = self._interaction(
+                topology, positions, dr.reinterpret_array(mi.ShapePtr, shape), visible, mi.Ray3f(origin, direction / length), length, visible >= 0
+            )
+            incoming[:3] = self._unlit(si, visible >= 0)
         out = [c + 0 for c in source]
-        for step, count in (((1, 0), (w - 1) * h), ((0, 1), w * (h - 1))):
-            if count <= 0:
-                continue
-            with dr.suspend_grad():
-                k = dr.arange(mi.UInt32, count)
-                columns = w_ - step[0]
-                y = k // columns
-                a = y * w_ + (k - y * columns)
-                b = a + (1 if step[0] else w_)
-                ta, tb = dr.gather(mi.Int32, triangle, a), dr.gather(mi.Int32, triangle, b)
-                pair = dr.compress(ta != tb)
-                if dr.width(pair) == 0:
-                    continue
-                y = pair // columns
-                a = y * w_ + (pair - y * columns)
-                b = a + (1 if step[0] else w_)
-                swap = dr.gather(mi.Float, depth, b) < dr.gather(mi.Float, depth, a)
-                near, far = dr.select(swap, b, a), dr.select(swap, a, b)
-                found, va, vb, near, far = self._silhouette(topology, screen, triangle, near, far, x0, y0, w_, step[0] == 1)
-                dr.eval(found, va, vb, near, far)  # in one kernel: compress and gather would each walk again
-                kept = dr.compress(found)
-                if dr.width(kept) == 0:
-                    continue
-                va, vb, near, far = (dr.gather(mi.UInt32, i, kept) for i in (va, vb, near, far))
-                cn, cf = (self._centre(i, x0, y0, w_) for i in (near, far))
-            # where the edge crosses, from the near centre (0) to the far one (1): attached
-            ea, eb = (_point2(screen, i) for i in (va, vb))
-            if step[0]:
-                t = (ea.x + (cn.y - ea.y) * (eb.x - ea.x) / (eb.y - ea.y) - cn.x) / (cf.x - cn.x)
-            else:
-                t = (ea.y + (cn.x - ea.x) * (eb.y - ea.y) / (eb.x - ea.x) - cn.y) / (cf.y - cn.y)
-            beyond = dr.detach(t) > 0.5  # the near sheet covers a part of the far pixel, else the far one a part of the near
-            weight = dr.clip(dr.abs(t - 0.5), 0, 0.5)
-            target, other = dr.select(beyond, far, near), dr.select(beyond, near, far)
-            for c in range(len(out)):
-                difference = dr.gather(mi.Float, source[c], other) - dr.gather(mi.Float, source[c], target)
-                dr.scatter_add(out[c], weight * difference, target)
+        for c in range(len(out)):
+            difference = incoming[c] - dr.gather(mi.Float, source[c], target)
+            dr.scatter_add(out[c], weight * difference, target)
         return out
 
     @staticmethod
@@ -410,8 +434,7 @@ class RasterIntegrator(mi.SamplingIntegrator):
     def _silhouette(self, topology, screen, triangle, near, far, x0, y0, w, horizontal):
         """Vertices (va, vb) of the silhouette edge between the centres of two pixels, and which pixel it occludes.
 
-        Walks from the near pixel's triangle towards the far centre; where that sheet has no silhouette in between, from the far one's. An edge
-        counts only in the pairs across its steeper axis, so that no edge counts twice.
+        Walks from the near pixel's triangle towards the far centre; where that sheet has no silhouette in between, from the far one's.
         """
         found, va, vb = self._walk(topology, screen, triangle, near, far, x0, y0, w, mi.Bool(True))
         again = ~found & (dr.gather(mi.Int32, triangle, far) >= 0)
@@ -419,8 +442,7 @@ class RasterIntegrator(mi.SamplingIntegrator):
         near, far = dr.select(found2, far, near), dr.select(found2, near, far)
         va, vb, found = dr.select(found2, va2, va), dr.select(found2, vb2, vb), found | found2
         edge = _point2(screen, vb, found) - _point2(screen, va, found)
-        steep = dr.abs(edge.y) >= dr.abs(edge.x)
-        return found & (steep if horizontal else ~steep), va, vb, near, far
+        return found & (dr.select(horizontal, edge.y, edge.x) != 0), va, vb, near, far
 
     def _walk(self, topology, screen, triangle, start, end, x0, y0, w, active):
         c0, c1 = self._centre(start, x0, y0, w), self._centre(end, x0, y0, w)
