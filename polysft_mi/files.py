@@ -1,0 +1,24 @@
+"""Files that are either whole or not there: written aside, then renamed."""
+
+import contextlib
+import os
+
+
+@contextlib.contextmanager
+def aside(path):
+    """``with aside(path) as temporary:`` write the file ``temporary``; it becomes ``path`` at the end of the block.
+
+    The name keeps its extension, because writers choose the format by it. On any exception (Ctrl-C included) what was written is
+    removed and what stood at ``path`` before stays.
+    """
+    folder, name = os.path.split(os.fspath(path))
+    temporary = os.path.join(folder, f".{os.getpid()}.partial.{name}")
+    try:
+        yield temporary
+        with open(temporary, "rb+") as file:  # a full disk shows here at the latest, before the rename
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        with contextlib.suppress(FileNotFoundError):
+            os.remove(temporary)
+        raise

@@ -1,0 +1,97 @@
+"""Videos that browsers play (H.264), and numbered PNGs where no encoder is."""
+
+import functools
+import os
+import re
+import subprocess
+
+import numpy as np
+
+from .files import aside
+
+# sRGB frames are marked and converted as Rec.709, which players assume for what is not marked, too, from HD upwards
+_COLOUR = ["-vf", "scale=out_color_matrix=bt709:out_range=tv", "-color_range", "tv"]
+_COLOUR += ["-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709"]
+_CODEC = ["-c:v", "libx264", "-preset", "medium", "-crf", "18", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
+
+
+@functools.lru_cache(maxsize=None)
+def encoder():
+    """Path of an ffmpeg that can encode H.264, or None. Found out once, by encoding two small frames."""
+    try:
+        import imageio_ffmpeg
+
+        path = imageio_ffmpeg.get_ffmpeg_exe()
+        command = [path, "-v", "error", "-f", "lavfi", "-i", "color=s=64x64:r=2:d=1", *_COLOUR, *_CODEC, "-f", "mp4", "-y", os.devnull]
+        command[command.index("+faststart")] = "+frag_keyframe"  # the null device cannot be read back
+        subprocess.run(command, check=True, stdin=subprocess.DEVNULL, capture_output=True, timeout=60)
+        return path
+    except (ImportError, RuntimeError, OSError, subprocess.SubprocessError):
+        return None
+
+
+def write_video(path, frames, fps=25):
+    """Write ``frames``, an iterable of (H, W, 3) uint8 sRGB images of one size, to ``path`` (.mp4), ``fps`` frames a second.
+
+    Sizes are padded to even numbers by repeating the last row or column. Where no encoder is, the frames become
+    ``000.png``, ``001.png``, ... in the folder that has ``path``'s name without its extension. Returns the path of what was
+    written. Raises ValueError for no frames or frames of another form, OSError where they cannot be written.
+    """
+    frames = _checked(frames)
+    if encoder() is None:
+        return _write_pngs(os.path.splitext(os.fspath(path))[0], frames)
+    with aside(path) as temporary:
+        _encode(temporary, frames, fps, os.fspath(path))
+    return os.fspath(path)
+
+
+def _checked(frames):
+    size = None
+    for k, frame in enumerate(frames):
+        frame = np.asarray(frame)
+        if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3 or size not in (None, frame.shape):
+            raise ValueError(f"video frame {k} is {frame.dtype} {frame.shape}; uint8 (H, W, 3) of one size are needed")
+        size = frame.shape
+        yield frame
+    if size is None:
+        raise ValueError("no video frames; at least one is needed")
+
+
+def _encode(temporary, frames, fps, path):
+    process = None
+    try:
+        for frame in frames:
+            frame = np.pad(frame, ((0, frame.shape[0] % 2), (0, frame.shape[1] % 2), (0, 0)), mode="edge")
+            if process is None:
+                source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{frame.shape[1]}x{frame.shape[0]}", "-r", f"{fps:g}", "-i", "-"]
+                command = [encoder(), "-v", "error", *source, *_COLOUR, *_CODEC, "-f", "mp4", "-y", temporary]
+                process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+            process.stdin.write(frame.tobytes())
+        _, message = process.communicate()
+    except BrokenPipeError:  # ffmpeg ended first; it says why
+        message = process.stderr.read()
+        process.wait()
+    except BaseException:
+        if process is not None:
+            process.kill()
+            process.communicate()
+        raise
+    if process.returncode:
+        lines = message.decode(errors="replace").split("\n")
+        raise OSError(None, f"ffmpeg cannot write the video: {lines[0].strip()}", path)
+
+
+def _write_pngs(folder, frames):
+    import cv2
+
+    os.makedirs(folder, exist_ok=True)
+    count = 0
+    for count, frame in enumerate(frames, start=1):
+        _, data = cv2.imencode(".png", frame[..., ::-1])
+        with aside(os.path.join(folder, f"{count - 1:03d}.png")) as temporary, open(temporary, "wb") as file:
+            file.write(data.tobytes())
+    for name in os.listdir(folder):  # what a longer video left before
+        number = re.fullmatch(r"(\d{3,})\.png", name)
+        if number and int(number[1]) >= count:
+            os.remove(os.path.join(folder, name))
+    return folder

@@ -1,0 +1,167 @@
+"""The evaluate command: the same figures as the benchmark's own scorer, and one line for what cannot be scored."""
+
+import json
+import math
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from polysft_mi import evaluate
+from polysft_mi.errors import InputError
+
+ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+SHARED = os.path.join(os.path.dirname(ROOT), "shared")
+SCORER = os.path.join(SHARED, "tools", "score_sft.py")
+needs_scorer = pytest.mark.skipif(not os.path.exists(SCORER), reason="needs ../shared/tools/score_sft.py and ../shared/data")
+
+
+def command(*arguments):
+    return subprocess.run([sys.executable, *map(str, arguments)], capture_output=True, text=True, cwd=ROOT)
+
+
+def agree(surface, truth, tmp_path):
+    """Both programs on the same surface; every figure of the scorer, found in ours to 1e-6."""
+    np.savez(tmp_path / "surface.npz", **surface)
+    theirs = json.loads(command(SCORER, tmp_path / "surface.npz", truth, "--json").stdout)
+    ours = json.loads(command("-m", "polysft_mi.evaluate", tmp_path, truth, "--json").stdout)
+    assert len(theirs) >= 3
+    for name, value in theirs.items():
+        if isinstance(value, dict):
+            assert set(ours[name]) == set(value)
+            assert all(math.isclose(ours[name][k], v, rel_tol=1e-6) for k, v in value.items()), name
+        else:
+            assert math.isclose(ours[name], value, rel_tol=1e-6), (name, ours[name], value)
+    return ours
+
+
+def bent(V, rng, size):
+    """Perturbed surfaces (T, N, 3): smooth bending and noise, as float32."""
+    wave = size * np.sin(20 * V + rng.uniform(0, 6, size=(len(V), 1, 3)))[..., ::-1]
+    return (V + wave + 0.2 * size * rng.normal(size=V.shape)).astype(np.float32)
+
+
+@needs_scorer
+def test_agrees_with_the_scorer_on_meshes(tmp_path):
+    truth = os.path.join(SHARED, "data", "cloth", "bend", "gt.npz")
+    gt = np.load(truth)
+    frames = np.array([2, 5, 11, 30, 44, 60])  # one past the end of the truth
+    V = bent(gt["vertices"][np.minimum(frames, 44)], np.random.default_rng(0), 0.004)
+    ours = agree({"vertices": V, "faces": gt["faces"], "frames": frames}, truth, tmp_path)
+    assert ours["frames"] == 5 and 2 < ours["rmse_mm"] < 10
+
+
+def sheet_in_view(points, n=25):
+    """A sheet through points (P, 3): a quadratic fit of their depth over their directions, smaller than their extent."""
+    xy = points[:, :2] / points[:, 2:]
+    basis = lambda p: np.stack([p[:, 0] ** i * p[:, 1] ** j for i in range(3) for j in range(3 - i)], 1)
+    c = np.linalg.lstsq(basis(xy), points[:, 2], rcond=None)[0]
+    low, high = np.quantile(xy, [0.1, 0.9], axis=0)
+    u, v = np.meshgrid(*(np.linspace(low[k], high[k], n) for k in (0, 1)))
+    p = np.stack([u.ravel(), v.ravel()], 1)
+    k = np.arange(n * n).reshape(n, n)
+    F = np.stack([k[:-1, :-1], k[1:, :-1], k[:-1, 1:], k[1:, :-1], k[1:, 1:], k[:-1, 1:]], -1).reshape(-1, 3)
+    return np.column_stack([p, np.ones(len(p))]) * (basis(p) @ c)[:, None], F
+
+
+@needs_scorer
+def test_agrees_with_the_scorer_on_depth_points(tmp_path):
+    folder = os.path.join(SHARED, "data", "kinect_paper")
+    gt = np.load(os.path.join(folder, "gt_points.npz"))
+    sheets = [sheet_in_view(P.astype(float)) for P in gt["points"][:5]]
+    V = bent(np.stack([V for V, _ in sheets]), np.random.default_rng(1), 0.003)
+    surface = {"vertices": V, "faces": sheets[0][1], "frames": gt["frames"][:5]}
+    ours = agree(surface, os.path.join(folder, "gt_points.npz"), tmp_path)
+    assert ours["frames"] == 5 and 0.3 < ours["hit"] < 0.95 and "depth_rmse_allpix_mm" in ours
+    assert evaluate.evaluate(tmp_path, folder) == ours  # the sequence's folder names the same truth
+
+
+@needs_scorer
+def test_agrees_with_the_scorer_on_clouds(tmp_path):
+    folder = os.path.join(SHARED, "data", "phi_sft_R1")
+    clouds = [np.load(os.path.join(folder, "clouds", f"cloud_{k:03d}.npz"))["points"].astype(float) for k in (0, 6)]
+    sheets = [sheet_in_view(P) for P in clouds]
+    V = bent(np.stack([V for V, _ in sheets]), np.random.default_rng(2), 0.003)
+    surface = {"vertices": V, "faces": sheets[0][1], "frames": np.array([0, 6])}
+    ours = agree(surface, os.path.join(folder, "clouds"), tmp_path)
+    assert ours["frames"] == 2 and ours["chamfer_1e4"] > 0
+
+
+@pytest.fixture
+def run_folder(tmp_path):
+    """A run's folder and its truth, a triangle that is 1 cm too far in two frames."""
+    G = np.array([[[0, 0, 1], [1, 0, 1], [0, 1, 1]]] * 2, dtype=np.float32)
+    F = np.array([[0, 1, 2]])
+    (tmp_path / "out").mkdir()
+    (tmp_path / "seq").mkdir()
+    np.savez(tmp_path / "out" / "surface.npz", vertices=G + np.float32([0, 0, 0.01]), faces=F, frames=np.arange(2))
+    np.savez(tmp_path / "seq" / "gt.npz", vertices=G, faces=F)
+    return tmp_path
+
+
+def test_table_and_json_with_image_figures(run_folder):
+    (run_folder / "out" / "metrics.json").write_text(json.dumps({"psnr": 31.25, "ssim": 0.9, "time_s": 3, "psnr_frames": [1, 2]}))
+    done = command("-m", "polysft_mi.evaluate", run_folder / "out", run_folder / "seq")
+    assert done.returncode == 0 and done.stderr == ""
+    table = dict(line.rsplit("  ", 1) for line in done.stdout.splitlines())
+    assert float({k.strip(): v for k, v in table.items()}["vertex RMSE [mm]"]) == pytest.approx(10, rel=1e-4)
+    figures = json.loads(command("-m", "polysft_mi.evaluate", run_folder / "out", run_folder / "seq" / "gt.npz", "--json").stdout)
+    assert figures["psnr"] == 31.25 and figures["ssim"] == 0.9 and "time_s" not in figures and "psnr_frames" not in figures
+    assert figures["frames"] == 2 and figures["rmse_mm"] == pytest.approx(10, rel=1e-4)
+    without = evaluate.evaluate(run_folder / "out" / "surface.npz", run_folder / "seq")
+    assert "psnr" not in without
+
+
+def test_a_terminal_gets_a_drawn_table(run_folder, monkeypatch, capsys):
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    assert evaluate.main([str(run_folder / "out"), str(run_folder / "seq")]) == 0
+    out = capsys.readouterr().out
+    assert "vertex RMSE [mm]" in out and any(c in out for c in "┃│┏+|")
+
+
+def test_finds_the_truth_of_a_folder(tmp_path):
+    (tmp_path / "clouds").mkdir()
+    (tmp_path / "clouds" / "cloud_004.npz").write_bytes(b"")
+    assert evaluate.find_truth(str(tmp_path)) == str(tmp_path / "clouds")
+    assert evaluate.find_truth(str(tmp_path / "clouds")) == str(tmp_path / "clouds")
+    (tmp_path / "gt_points.npz").write_bytes(b"")
+    assert evaluate.find_truth(str(tmp_path)) == str(tmp_path / "gt_points.npz")
+    (tmp_path / "gt.npz").write_bytes(b"")
+    assert evaluate.find_truth(str(tmp_path)) == str(tmp_path / "gt.npz")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="no ground truth"):
+        evaluate.find_truth(str(tmp_path / "empty"))
+
+
+GOOD = dict(vertices=np.ones((2, 3, 3)), faces=np.array([[0, 1, 2]]), frames=np.arange(2))
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (dict(frames=None), "holds no frames"),
+        (dict(vertices=np.ones((2, 3))), r"vertices \(2, 3\)"),
+        (dict(frames=np.arange(3)), r"frames \(3,\)"),
+        (dict(vertices=np.ones((0, 3, 3)), frames=np.arange(0)), "T > 0"),
+        (dict(faces=np.array([[0, 1, 3]])), "0 to 2 exist"),
+        (dict(faces=np.array([[0.0, 1, 2]])), "float64"),
+        (dict(vertices=np.full((2, 3, 3), np.inf)), "not finite"),
+    ],
+)
+def test_refuses_a_surface_of_another_form(tmp_path, change, words):
+    arrays = {k: v for k, v in {**GOOD, **change}.items() if v is not None}
+    np.savez(tmp_path / "surface.npz", **arrays)
+    with pytest.raises(InputError, match=words):
+        evaluate.read_surface(str(tmp_path))
+
+
+def test_bad_input_is_one_line_and_status_2(run_folder):
+    for out, truth in [("nowhere", "seq"), ("seq", "seq"), ("out", "nowhere"), ("out", "out")]:
+        done = command("-m", "polysft_mi.evaluate", run_folder / out, run_folder / truth)
+        assert done.returncode == 2 and done.stdout == ""
+        assert len(done.stderr.splitlines()) == 1 and done.stderr.startswith("error: ")
+    (run_folder / "out" / "metrics.json").write_text("{")
+    done = command("-m", "polysft_mi.evaluate", run_folder / "out", run_folder / "seq")
+    assert done.returncode == 2 and "metrics.json: not JSON" in done.stderr
