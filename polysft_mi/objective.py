@@ -92,14 +92,23 @@ def blur(image, sigma):
     return dr.convolve(dr.convolve(image, taps, axis=0), taps, axis=1)
 
 
+_POOL = 4  # local statistics are taken on an image this many times smaller
+
+
+def _smooth(image, sigma):
+    """A wide Gaussian blur (H, W, C) for slowly varying statistics: shrink, blur, enlarge; differentiable."""
+    height, width, channels = image.shape
+    small = dr.resample(image, (max(1, height // _POOL), max(1, width // _POOL), channels), filter="box")
+    return dr.resample(blur(small, sigma / _POOL), image.shape, filter="linear")
+
+
 def normalise_locally(image, weight, sigma=8.0, floor=0.02):
-    """Colours (H, W, 3) less their local mean, over their local standard deviation, both inside ``weight`` (H, W, 1) and under a Gaussian window."""
-    w = dr.maximum(blur(weight, sigma).array, 1e-4)
-    count = image.shape[0] * image.shape[1]
-    pixel = dr.arange(mi.UInt32, 3 * count) // 3
-    w3 = dr.gather(mi.Float, w, pixel)
-    m3 = dr.gather(mi.Float, weight.array, pixel)
-    mean = blur(mi.TensorXf(image.array * m3, image.shape), sigma).array / w3
-    centred = (image.array - mean) * m3
-    variance = blur(mi.TensorXf(dr.square(centred), image.shape), sigma).array / w3
-    return mi.TensorXf(centred * dr.rsqrt(variance + floor * floor), image.shape)
+    """Colours (H, W, 3) less their local mean, over their local standard deviation, both inside ``weight`` (H, W, 1) and under a window of
+    standard deviation ``sigma`` [pixels]; ``floor`` keeps flat areas from being blown up. Zero outside ``weight``."""
+    pixel = dr.arange(mi.UInt32, 3 * weight.shape[0] * weight.shape[1]) // 3
+    inside = dr.gather(mi.Float, weight.array, pixel)
+    share = dr.maximum(dr.gather(mi.Float, _smooth(weight, sigma).array, pixel), 1e-3)
+    mean = _smooth(mi.TensorXf(image.array * inside, image.shape), sigma).array / share
+    centred = (image.array - mean) * inside
+    variance = _smooth(mi.TensorXf(dr.square(centred), image.shape), sigma).array / share
+    return mi.TensorXf(centred * dr.rsqrt(dr.maximum(variance, 0) + floor * floor), image.shape)

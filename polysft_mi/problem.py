@@ -14,7 +14,7 @@ import numpy as np
 from . import objective
 from .errors import InputError
 from .patch import JetPatch
-from .raster import RasterIntegrator
+from .raster import Pinhole, RasterIntegrator
 
 TERMS = ("rgb", "silhouette", "inextensibility", "temporal")
 _CACHED_FRAMES = 8
@@ -49,6 +49,7 @@ class Problem:
         self._identity = np.array_equal(experiment.corner, np.arange(len(self.template.vertices)))
         self._params = mi.traverse(experiment.mesh)
         self._targets = OrderedDict()
+        self.camera = Pinhole(experiment.sensor)
         self._setup_renderer()
 
     # -- rendering ----------------------------------------------------------
@@ -178,6 +179,30 @@ class Problem:
             dr.backward(loss)
         dr.eval()
         return values
+
+    def check_start(self):
+        """Raise InputError where the template, as the scene places it, cannot be seen in the first frame."""
+        position, before = self.camera.project(self.template.vertices)
+        where = f"{self.experiment.path}: the template"
+        if not before.all():
+            raise InputError(f"{where} has {int((~before).sum())} of {len(before)} vertices behind the camera; it must stand in its pose of the first frame")
+        low, high = position.min(0).round(), position.max(0).round()
+        if self.visible_share(self.patch.rest()) == 0:
+            raise InputError(
+                f"{where} is out of view in the first frame: it projects to x {low[0]:g}..{high[0]:g}, y {low[1]:g}..{high[1]:g} "
+                f"of an image of {self.width}x{self.height} pixels"
+            )
+        mask = self.sequence.mask(0)
+        if mask is not None:
+            alpha = np.array(self.image(self.patch.vertices(self.patch.rest()))[1]).reshape(mask.shape)
+            if float((alpha * mask).sum()) == 0:
+                raise InputError(f"{where} does not meet the mask of the first frame: it projects to x {low[0]:g}..{high[0]:g}, y {low[1]:g}..{high[1]:g}")
+
+    def visible_share(self, unknowns):
+        """Share of the vertices that are before the camera and inside the image."""
+        position, inside = self.camera.project(self.surface(unknowns))
+        inside &= (position >= 0).all(1) & (position <= (self.width, self.height)).all(1)
+        return float(inside.mean())
 
     def surface(self, unknowns):
         """Vertices (N, 3) [m, camera frame] as float32 NumPy."""

@@ -50,6 +50,18 @@ class Pinhole:
             raise InputError(f"sensor {type(sensor).__name__}: its rays are not those of a pinhole; use perspective or pinhole")
         self.basis = np.stack([(d[1] - d[0]) / self.width, (d[2] - d[0]) / self.height, d[0]], axis=1)
         self.inverse = np.linalg.inv(self.basis)
+        # rows: right, down and forward of the OpenCV camera frame, in the world
+        self.axes = np.stack([np.cross(matrix[:3, 1], axis), -matrix[:3, 1], axis])
+
+    def project(self, points):
+        """Pixels (N, 2) of world points (N, 3) in the crop window, and whether each lies before the camera (N,)."""
+        x = (np.asarray(points, dtype=np.float64) - self.origin) @ self.inverse.T
+        before = x[:, 2] > _NEAR
+        return x[:, :2] / np.where(before, x[:, 2], 1)[:, None], before
+
+    def to_camera(self, points):
+        """World points (..., 3) in the OpenCV camera frame."""
+        return (np.asarray(points) - self.origin) @ self.axes.T
 
     def device(self, scale=1):
         """The map as opaque Dr.Jit values (so that no number of it is baked into a kernel); ``scale`` samples a pixel and axis."""

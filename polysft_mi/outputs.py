@@ -1,0 +1,217 @@
+"""What a run leaves in its folder: surfaces, unknowns, pictures, figures.
+
+Import only after a Mitsuba variant is set.
+"""
+
+import json
+import os
+import platform
+import sys
+import time
+import xml.etree.ElementTree as ET
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from . import __version__, figures, meshio, metrics
+from .exr import write_exr
+from .files import aside
+from .patch import Unknowns
+from .problem import TERMS
+from .raster import RasterIntegrator
+from .video import write_video
+
+RUN = "run.json"
+
+
+def srgb(linear):
+    """Linear values (..., 3) as sRGB in [0, 1]."""
+    x = np.clip(linear, 0, 1)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
+
+
+def versions():
+    """What a result depends on besides its scene."""
+    return {
+        "polysft_mi": __version__,
+        "mitsuba": mi.__version__,
+        "drjit": dr.__version__,
+        "python": platform.python_version(),
+        "variant": mi.variant(),
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+    }
+
+
+def write_json(path, value):
+    with aside(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
+        json.dump(value, file, indent=1, default=float)
+        file.write("\n")
+
+
+def resolved_scene(experiment):
+    """The scene file as text, with the defaults in force in place of its own and relative paths made absolute."""
+    folder = os.path.dirname(os.path.abspath(experiment.path))
+    tree = ET.parse(experiment.path, parser=ET.XMLParser(target=ET.TreeBuilder(insert_comments=True)))
+    for element in tree.getroot().iter():
+        if element.tag == "default":
+            value = experiment.defaults[element.get("name")]
+        elif element.tag == "string" and element.get("name") in ("filename", "frames", "masks", "folder"):
+            value = element.get("value")
+        else:
+            continue
+        place = os.path.join(folder, value)
+        if value and not value.startswith("$") and not os.path.isabs(value) and (os.path.exists(place) or "*" in value):
+            value = place
+        element.set("value", value)
+    return ET.tostring(tree.getroot(), encoding="unicode") + "\n"
+
+
+class Pictures:
+    """Renderings of the surface of a frame beside its image, as arrays."""
+
+    def __init__(self, problem):
+        self.problem = problem
+        # geometry comes from the rasteriser whatever renders the colours
+        self._raster = RasterIntegrator(mi.Properties("raster"))
+        self._raster.aovs = ["depth", "normal", "uv"]
+
+    def __call__(self, unknowns, frame):
+        """Layers (H, W[, C]) float32: ``target``, ``render`` (linear RGB), ``error`` (root mean square over channels), ``mask_target``,
+        ``mask_render``, ``depth`` [m], ``normal`` (camera frame, towards the camera), ``uv`` (texture coordinates, v up); 0 beyond the surface.
+        """
+        problem = self.problem
+        with dr.suspend_grad():
+            vertices = problem.patch.vertices(unknowns)
+            rgb, alpha = problem.image(vertices)
+            geometry = np.array(self._raster.render(problem.experiment.scene, problem.experiment.sensor, spp=1))[..., -6:]
+        render = np.array(rgb)
+        mask_render = np.array(alpha).reshape(render.shape[:2])
+        image, mask = problem.sequence.frame(frame), problem.sequence.mask(frame)
+        target = image * mask[..., None] if mask is not None else image
+        inside = np.ones_like(mask_render) if mask is not None else mask_render > 0.999
+        error = np.sqrt(((render - target) ** 2).mean(-1)) * inside
+        hit = geometry[..., :1] > 0
+        normal = geometry[..., 1:4] @ problem.camera.axes.T
+        uv = np.where(hit, np.stack([geometry[..., 4], 1 - geometry[..., 5]], -1), 0)
+        return {
+            "target": image.astype(np.float32),
+            "render": render,
+            "error": error.astype(np.float32),
+            "mask_target": mask if mask is not None else np.ones_like(mask_render),
+            "mask_render": mask_render,
+            "depth": geometry[..., 0],
+            "normal": normal.astype(np.float32),
+            "uv": uv.astype(np.float32),
+        }
+
+
+def _image_figures(layers, masked):
+    """PSNR and SSIM of the rendering, in sRGB, inside the surface (the target's mask, else the rendered interior)."""
+    inside = layers["mask_target"] > 0.5 if masked else layers["mask_render"] > 0.999
+    a, b = srgb(layers["render"]), srgb(layers["target"])
+    return {"psnr_mask": metrics.psnr(a, b, inside), "ssim_mask": metrics.ssim(a, b, inside)}
+
+
+def chosen(count, limit):
+    """At most ``limit`` of ``count`` frames, spread evenly, first and last among them."""
+    if limit >= count:
+        return list(range(count))
+    return sorted(set(np.linspace(0, count - 1, limit).round().astype(int).tolist())) if limit > 0 else []
+
+
+def write(problem, track, out, *, exr_frames=20, fps=25, command="", say=None):
+    """Write everything for the frames that ``track`` holds. Returns the summary that ``metrics.json`` begins with.
+
+    ``exr_frames``: how many comparison EXRs at most; ``say(text)``: told what is being written.
+    """
+    say = say or (lambda text: None)
+    sequence, template = problem.sequence, problem.template
+    count = len(track.states)
+    indices = np.asarray(sequence.indices[:count], dtype=np.int64)
+    unknowns = [Unknowns.from_numpy(s) for s in track.states]
+    world = np.stack([problem.surface(u) for u in unknowns])
+    vertices = problem.camera.to_camera(world).astype(np.float32)
+
+    with aside(os.path.join(out, "surface.npz")) as temporary:
+        np.savez_compressed(
+            temporary, vertices=vertices, faces=template.faces.astype(np.int32), uv=template.uv.astype(np.float32), frames=indices
+        )
+    arrays = {name: np.stack([s[name] for s in track.states]) for name in Unknowns.NAMES}
+    with aside(os.path.join(out, "params.npz")) as temporary:
+        np.savez_compressed(
+            temporary, frames=indices, alpha=template.alpha, chart=template.chart, scale=template.scale,
+            frame_rotation=template.rotation, frame_origin=template.origin, **arrays,
+        )  # fmt: skip
+    say("meshes")
+    for folder in ("meshes", "comparison"):
+        os.makedirs(os.path.join(out, folder), exist_ok=True)
+    for index, v in zip(indices, vertices):
+        meshio.write_ply(os.path.join(out, "meshes", f"{index:03d}.ply"), v, template.faces, template.uv)
+
+    say("pictures")
+    pictures = Pictures(problem)
+    masked = sequence.mask(0) is not None
+    exr = set(chosen(count, exr_frames))
+    sheet, per_frame = set(chosen(count, 5)), []
+    rows, view = [], figures.View.around(vertices)
+
+    def video_frames():
+        for k, u in enumerate(unknowns):
+            layers = pictures(u, k)
+            per_frame.append({"frame": int(indices[k]), **_image_figures(layers, masked)})
+            if k in exr:
+                metadata = {"frame": int(indices[k]), "scene": os.path.abspath(problem.experiment.path), **versions()}
+                write_exr(os.path.join(out, "comparison", f"{indices[k]:03d}.exr"), layers, metadata)
+            target, render = (np.round(255 * srgb(layers[n])).astype(np.uint8) for n in ("target", "render"))
+            if k in sheet:
+                surface = figures.shade_surface(vertices[k], template.faces, view, uv=template.uv, size=target.shape[1::-1])
+                rows.append(
+                    {"target": target, "render": render, "error": layers["error"], "surface": surface, "label": f"frame {indices[k]}"}
+                )
+            shade = figures.shade_surface(vertices[k], template.faces, view, uv=template.uv, size=target.shape[1::-1])
+            yield np.concatenate([target, render, _heat(layers["error"]), shade], axis=1)
+
+    video = write_video(os.path.join(out, "comparison.mp4"), video_frames(), fps)
+    figures.contact_sheet(os.path.join(out, "comparison.png"), rows)
+    with open(os.path.join(out, "log.jsonl"), encoding="utf-8") as file:
+        figures.loss_plot(os.path.join(out, "loss.png"), [json.loads(line) for line in file])
+
+    finite = {name: [p[name] for p in per_frame if np.isfinite(p[name])] for name in ("psnr_mask", "ssim_mask")}
+    summary = {
+        "frames": count,
+        "frames_wanted": len(sequence.indices),
+        "lost": {str(int(indices[k])): reason for k, reason in track.lost.items() if k < count},
+        **{name: float(np.mean(values)) for name, values in finite.items() if values},
+        "seconds_per_frame": float(sum(track.seconds) / count),
+        "iterations_per_window": float(np.mean(track.iterations)) if track.iterations else 0.0,
+        "order": template.order,
+        "template_residual_rms_mm": 1e3 * template.residual_rms,
+        "template_residual_max_mm": 1e3 * template.residual_max,
+        "solver": problem.settings.solver,
+    }
+    windows = [
+        {"first": int(indices[k]), "iterations": n, "seconds": t, **{name: terms.get(name) for name in TERMS}}
+        for k, (n, t, terms) in enumerate(zip(track.iterations, track.seconds, track.totals))
+    ]
+    write_json(
+        os.path.join(out, "metrics.json"), {**summary, "versions": versions(), "per_frame": per_frame, "windows": windows, "command": command}
+    )
+    return {**summary, "video": video}
+
+
+def _heat(error, peak=0.25):
+    """An error (H, W) in [0, peak] as a picture, black to white through red and yellow."""
+    x = np.clip(error / peak, 0, 1)[..., None]
+    return np.round(255 * np.clip(x * 3 - np.array([0, 1, 2]), 0, 1)).astype(np.uint8)
+
+
+def write_beginning(out, experiment, command):
+    """What stands in the folder from the first second: the resolved scene, and what the run is."""
+    with aside(os.path.join(out, "scene.xml")) as temporary, open(temporary, "w", encoding="utf-8") as file:
+        file.write(resolved_scene(experiment))
+    write_json(os.path.join(out, RUN), {"command": command, "started": time.strftime("%Y-%m-%dT%H:%M:%S"), "versions": versions()})
+
+
+def command_line():
+    return " ".join(["python -m polysft_mi.run", *sys.argv[1:]])

@@ -1,0 +1,134 @@
+"""The adaptive sliding window over a video (supplement, "Adaptive Window Optimization"), with checkpoints.
+
+Import only after a Mitsuba variant is set.
+"""
+
+import json
+import os
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from .errors import InputError
+from .files import aside
+from .patch import Unknowns
+from .problem import TERMS
+
+CHECKPOINT, LOG = "checkpoint.npz", "log.jsonl"
+_VISIBLE = 0.02  # share of the vertices inside the image below which the surface is said to have left it
+_LOG_EVERY = 10  # iterations between records of the log
+
+
+@dataclass
+class Track:
+    """The state of a run: unknowns of the frames reached so far, and what each window took.
+
+    ``states``: one dict of arrays (:meth:`Unknowns.to_numpy`) a frame; ``next_window``: first frame of the next window to solve;
+    ``iterations``, ``seconds``: one entry a solved window; ``totals``: its terms at the minimum; ``lost``: frame -> reason.
+    """
+
+    states: list = field(default_factory=list)
+    next_window: int = 0
+    iterations: list = field(default_factory=list)
+    seconds: list = field(default_factory=list)
+    totals: list = field(default_factory=list)
+    lost: dict = field(default_factory=dict)
+
+    def save(self, path):
+        arrays = {name: np.stack([s[name] for s in self.states]) for name in Unknowns.NAMES}
+        meta = {k: getattr(self, k) for k in ("next_window", "iterations", "seconds", "totals", "lost")}
+        with aside(path) as temporary:
+            np.savez(temporary, meta=json.dumps(meta), **arrays)
+
+    @classmethod
+    def load(cls, path):
+        try:
+            with np.load(path) as data:
+                meta = json.loads(str(data["meta"]))
+                arrays = {name: data[name] for name in Unknowns.NAMES}
+        except (OSError, ValueError, KeyError) as error:
+            raise InputError(f"{path}: not a checkpoint of a run ({error}); start again with --overwrite") from None
+        meta["lost"] = {int(k): v for k, v in meta["lost"].items()}
+        count = len(arrays["rotation"])
+        return cls(states=[{name: arrays[name][k] for name in arrays} for k in range(count)], **meta)
+
+
+def track(problem, solver, frames, out, *, resume=False, progress=None):
+    """Solve window after window; checkpoints and the log go to the folder ``out``. Returns the :class:`Track`.
+
+    ``frames``: number of frames. ``progress(frame, iteration, total, terms)`` is called after each evaluation. Where the objective stops being
+    finite, or the surface leaves the image, the new frame keeps the state of the one before, and the run goes on. KeyboardInterrupt passes
+    through; the checkpoint on disk is then that of the last whole window.
+    """
+    width = min(problem.settings.window, frames)
+    checkpoint, log_path = os.path.join(out, CHECKPOINT), os.path.join(out, LOG)
+    done = Track.load(checkpoint) if resume and os.path.exists(checkpoint) else Track()
+    _trim_log(log_path, done.next_window)
+    with open(log_path, "a", encoding="utf-8") as log:
+        for start in range(done.next_window, frames - width + 1):
+            _advance(problem, solver, done, start, width, log, progress)
+            log.flush()
+            done.save(checkpoint)
+    return done
+
+
+def _advance(problem, solver, done, start, width, log, progress):
+    """Solve the window of frames start .. start + width - 1."""
+    members = list(range(start, start + width))
+    while len(done.states) < start + width:
+        done.states.append(dict(done.states[-1]) if done.states else problem.patch.rest().to_numpy())
+    before = [Unknowns.from_numpy(done.states[k]) for k in members]
+    began = time.perf_counter()
+    latest = [0]
+
+    def report(iteration, total, terms):
+        latest[0] = iteration
+        if iteration % _LOG_EVERY == 0:
+            log.write(json.dumps(_record(members[-1], iteration, total, terms)) + "\n")
+        if progress:
+            progress(members[-1], iteration, total, terms)
+
+    reason, terms, iterations = None, dict.fromkeys(TERMS, float("nan")), 0
+    try:
+        window, total, terms, iterations = solver.solve(problem, before, members, report)
+        log.write(json.dumps(_record(members[-1], iterations - 1, total, terms) | {"best": True}) + "\n")
+    except FloatingPointError as error:
+        window, iterations, reason = before, latest[0] + 1, str(error)
+    states = [w.to_numpy() for w in window]
+    for place, k in enumerate(members):
+        failed = reason if place == width - 1 else None
+        if not all(np.isfinite(x).all() for x in states[place].values()):
+            failed = "the state is not finite"
+        elif problem.visible_share(window[place]) < _VISIBLE:
+            failed = "the surface left the image"
+        if failed:
+            states[place] = dict(states[place - 1] if place else before[0].to_numpy())
+            done.lost[k] = failed
+        else:
+            done.lost.pop(k, None)
+    for place, k in enumerate(members):
+        done.states[k] = states[place]
+    done.next_window = start + 1
+    done.iterations.append(iterations)
+    done.seconds.append(time.perf_counter() - began)
+    done.totals.append(terms)
+
+
+def _record(frame, iteration, total, terms):
+    return {"frame": frame, "iteration": iteration, "loss": total, **terms}
+
+
+def _trim_log(path, next_window):
+    """Keep the records of the windows that the checkpoint holds: each ends with one marked ``best``."""
+    if not os.path.exists(path):
+        return
+    kept, whole = [], 0
+    with open(path, encoding="utf-8") as file:
+        pending = []
+        for line in file:
+            pending.append(line)
+            if whole < next_window and '"best": true' in line:
+                kept, pending, whole = kept + pending, [], whole + 1
+    with aside(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
+        file.writelines(kept)
