@@ -9,7 +9,7 @@ def aside(path):
     """``with aside(path) as temporary:`` write the file ``temporary``; it becomes ``path`` at the end of the block.
 
     The name keeps its extension, because writers choose the format by it. On any exception (Ctrl-C included) what was written is
-    removed and what stood at ``path`` before stays.
+    removed and what stood at ``path`` before stays. An OSError of the write names ``path``.
     """
     folder, name = os.path.split(os.fspath(path))
     temporary = os.path.join(folder, f".{os.getpid()}.partial.{name}")
@@ -18,7 +18,9 @@ def aside(path):
         with open(temporary, "rb+") as file:  # a full disk shows here at the latest, before the rename
             os.fsync(file.fileno())
         os.replace(temporary, path)
-    except BaseException:
-        with contextlib.suppress(FileNotFoundError):
+    except BaseException as error:
+        with contextlib.suppress(OSError):
             os.remove(temporary)
+        if isinstance(error, OSError) and error.errno is not None and error.filename in (None, temporary):
+            error.filename = os.fspath(path)  # the name that the user knows; a full disk comes with none
         raise

@@ -167,16 +167,23 @@ def _check_topology(V, F, where):
     parts = _count_components(len(V), directed)
     if parts > 1:
         raise InputError(f"{where}: {parts} separate components; one connected mesh is needed")
-    # at a manifold vertex the faces form one fan: its corners are joined, from face to face, across the edges they share
-    edge_of = edge_of.ravel()
-    order = np.argsort(edge_of, kind="stable")
-    first = order[:-1][edge_of[order[:-1]] == edge_of[order[1:]]]
-    second = order[1:][edge_of[order[:-1]] == edge_of[order[1:]]]
-    following = lambda corner: corner - corner % 3 + (corner + 1) % 3  # edge k runs from corner k to the next
-    joined = np.concatenate([np.stack([first, following(second)], 1), np.stack([following(first), second], 1)])
-    fans = _count_components(F.size, joined)
+    fans = _count_fans(edge_of.ravel())
     if fans > len(V):
         raise InputError(f"{where}: {fans - len(V)} vertices join parts that share no edge there; a manifold is needed")
+
+
+def _count_fans(edge_of):
+    """How many fans the faces form around the vertices, one at each vertex of a manifold.
+
+    ``edge_of`` (3 F,): the edge from each corner to the next of its face. Two corners belong to one fan where their faces,
+    oriented alike, share an edge at the corners' vertex.
+    """
+    order = np.argsort(edge_of, kind="stable")
+    shared = edge_of[order[:-1]] == edge_of[order[1:]]
+    first, second = order[:-1][shared], order[1:][shared]  # the two sides of each inner edge, which run against each other
+    after_first, after_second = (corner - corner % 3 + (corner + 1) % 3 for corner in (first, second))
+    joined = np.concatenate([np.stack([first, after_second], axis=1), np.stack([after_first, second], axis=1)])
+    return _count_components(len(edge_of), joined)
 
 
 def _count_components(count, pairs):

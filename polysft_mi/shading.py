@@ -58,7 +58,6 @@ def shade_surface(vertices, faces, view=None, uv=None, size=(480, 480)):
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
     flat = np.cross(seen[F[:, 1]] - seen[F[:, 0]], seen[F[:, 2]] - seen[F[:, 0]])[triangle]
     away = flat[:, 2] > 0  # the triangle's own normal points away from the viewer
-    normal[np.sum(normal * flat, axis=1) < 0] *= -1
     normal[away] *= -1
     albedo = np.where(away[:, None], _BACK, _FRONT)
     if uv is not None:

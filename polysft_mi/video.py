@@ -9,9 +9,9 @@ import numpy as np
 
 from .files import aside
 
-# sRGB frames are marked and converted as Rec.709, which players assume for what is not marked, too, from HD upwards
-_COLOUR = ["-vf", "scale=out_color_matrix=bt709:out_range=tv", "-color_range", "tv"]
-_COLOUR += ["-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709"]
+# Rec.709, converted and marked: what is not marked, players take for Rec.601 or 709 by its size
+_MARKS = "range=tv:colorspace=bt709:color_primaries=bt709:color_trc=bt709"
+_COLOUR = ["-vf", f"scale=out_color_matrix=bt709:out_range=tv,format=yuv420p,setparams={_MARKS}"]
 _CODEC = ["-c:v", "libx264", "-preset", "medium", "-crf", "18", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
 
 

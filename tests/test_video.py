@@ -1,6 +1,7 @@
 """Videos decoded again, and the PNGs that stand in for them."""
 
 import os
+import subprocess
 
 import cv2
 import imageio
@@ -32,6 +33,17 @@ def test_decodes_to_the_same_frames(tmp_path):
     for want, got in zip(frames(), decoded):
         assert np.abs(got[4:40, 4:25].reshape(-1, 3).mean(0) - want[10, 10]).max() < 6
         assert np.abs(got[4:40, 40:60].reshape(-1, 3).mean(0) - 128).max() < 6
+
+
+@needs_encoder
+def test_colours_are_rec709_and_marked_so(tmp_path):
+    rgb = np.array([220, 40, 60])
+    video.write_video(tmp_path / "a.mp4", [np.full((64, 64, 3), rgb, np.uint8)] * 2)
+    command = [video.encoder(), "-i", tmp_path / "a.mp4", "-f", "rawvideo", "-pix_fmt", "yuv420p", "-"]
+    done = subprocess.run(command, capture_output=True, check=True)
+    luma = np.frombuffer(done.stdout, np.uint8)[: 64 * 64]
+    assert np.abs(luma - (16 + 219 / 255 * rgb @ (0.2126, 0.7152, 0.0722))).max() < 2  # Rec.601 has 98, Rec.709 84
+    assert b"yuv420p(tv, bt709" in done.stderr and b"unknown" not in done.stderr.split(b"Video:")[1].split(b"\n")[0]
 
 
 @needs_encoder

@@ -1,0 +1,295 @@
+"""Meshes written and read back, templates in the file's own order, and every reason to refuse one."""
+
+import os
+
+import numpy as np
+import pytest
+import trimesh
+
+from polysft_mi.errors import InputError
+from polysft_mi.files import aside
+from polysft_mi.meshio import _count_fans, check_template, read_template, write_ply
+
+SHARED = os.path.join(os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)))), "shared", "data")
+needs_data = pytest.mark.skipif(not os.path.isdir(SHARED), reason="needs ../shared/data")
+
+
+def sheet(n=4, m=3):
+    x, y = np.meshgrid(np.arange(n) / (n - 1), np.arange(m) / (m - 1))
+    V = np.stack([x, y, 1 + 0.1 * x * y], -1).reshape(-1, 3)
+    k = np.arange(n * m).reshape(m, n)
+    a, b, c, d = (i.ravel() for i in (k[:-1, :-1], k[:-1, 1:], k[1:, :-1], k[1:, 1:]))
+    return V, np.concatenate([np.stack([a, c, b], 1), np.stack([b, c, d], 1)]), V[:, :2] * (1, -1) + (0, 1)
+
+
+def test_ply_reads_back(tmp_path):
+    V, F, uv = sheet()
+    write_ply(tmp_path / "a.ply", V, F, uv)
+    vertices, faces, coordinates = read_template(tmp_path / "a.ply")
+    np.testing.assert_allclose(vertices, V, atol=1e-7)
+    np.testing.assert_array_equal(faces, F)
+    np.testing.assert_allclose(coordinates, uv, atol=1e-7)
+    mesh = trimesh.load(tmp_path / "a.ply", process=False)
+    np.testing.assert_allclose(mesh.visual.uv, uv, atol=1e-7)
+    assert os.listdir(tmp_path) == ["a.ply"]
+
+
+def test_ply_without_uv(tmp_path):
+    V, F, _ = sheet()
+    write_ply(tmp_path / "a.ply", V, F)
+    v, f, uv = read_template(tmp_path / "a.ply")
+    assert uv is None and len(v) == len(V)
+    np.testing.assert_array_equal(f, F)
+
+
+def test_ply_is_what_mitsuba_reads(tmp_path):
+    """In a process of its own: the variant is a setting of the whole process."""
+    pytest.importorskip("mitsuba", reason="the reader is Mitsuba")
+    import subprocess
+    import sys
+
+    V, F, uv = sheet()
+    write_ply(tmp_path / "a.ply", V, F, uv)
+    script = (
+        "import sys, numpy as np, mitsuba as mi; mi.set_variant('scalar_rgb')\n"
+        "m = mi.traverse(mi.load_dict({'type': 'ply', 'filename': sys.argv[1], 'flip_tex_coords': False}))\n"
+        "np.savez(sys.argv[2], **{k: np.array(m[k]) for k in ('vertex_positions', 'faces', 'vertex_texcoords')})"
+    )
+    subprocess.run([sys.executable, "-c", script, tmp_path / "a.ply", tmp_path / "a.npz"], check=True, timeout=60)
+    seen = np.load(tmp_path / "a.npz")
+    np.testing.assert_allclose(seen["vertex_positions"].reshape(-1, 3), V, atol=1e-6)
+    np.testing.assert_array_equal(seen["faces"].reshape(-1, 3), F)
+    np.testing.assert_allclose(seen["vertex_texcoords"].reshape(-1, 2), uv, atol=1e-6)
+
+
+OBJ = """# a comment
+v 0 0 1
+v 1 0 1 0.5 0.5 0.5
+v 1 1 1
+v 0 1 1
+v 2 0 1
+v 2 1 1
+
+vt 0 0
+vt 0.5 0
+vt 0.5 1
+vt 0 1
+vt 1 0
+vt 1 1
+vn 0 0 1
+"""
+ORDERED = np.array([[1, 4, 5], [1, 5, 2], [0, 1, 2], [0, 2, 3]])
+
+
+@pytest.mark.parametrize(
+    "faces",
+    [
+        "f 2/2/1 5/5/1 6/6/1 3/3/1\nf 1/1/1 2/2/1 3/3/1 4/4/1\n",
+        "f 2/2 5/5 6/6 3/3\n  f 1/1 2/2 3/3\nf 1/1 3/3 4/4\n",
+        "f -5/-5 -2/-2 -1/-1 -4/-4\nf -6/-6 -5/-5 -4/-4 -3/-3\n",
+    ],
+)
+def test_obj_keeps_the_files_order_and_uv(tmp_path, faces):
+    (tmp_path / "a.obj").write_text(OBJ + faces)
+    V, F, uv = read_template(tmp_path / "a.obj")
+    np.testing.assert_array_equal(V, [[0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1], [2, 0, 1], [2, 1, 1]])
+    np.testing.assert_array_equal(F, ORDERED)
+    np.testing.assert_array_equal(uv, V[:, :2] * (0.5, 1))
+
+
+@pytest.mark.parametrize(
+    "faces",
+    [
+        "f 2 5 6 3\nf 1 2 3 4\n",  # none
+        "f 2//1 5//1 6//1 3//1\nf 1//1 2//1 3//1 4//1\n",  # normals alone
+        "f 2/2 5/5 6/6 3/3\nf 1 2 3 4\n",  # on one face only
+        "f 2/2 5/5 6/6 3/3\nf 1/1 2/1 3/3 4/4\n",  # a seam
+    ],
+)
+def test_obj_without_one_uv_a_vertex(tmp_path, faces):
+    (tmp_path / "a.obj").write_text(OBJ + faces)
+    _, F, uv = read_template(tmp_path / "a.obj")
+    np.testing.assert_array_equal(F, ORDERED)
+    assert uv is None
+
+
+def test_obj_with_equal_uv_under_several_numbers(tmp_path):
+    (tmp_path / "a.obj").write_text(OBJ + "vt 0.5 0\nf 2/7 5/5 6/6 3/3\nf 1/1 2/2 3/3 4/4\n")
+    assert read_template(tmp_path / "a.obj")[2] is not None
+
+
+@needs_data
+@pytest.mark.parametrize("name", ["flag", "bend", "paper", "curtain", "corner"])
+def test_shared_cloth_has_the_truths_faces(name):
+    folder = os.path.join(SHARED, "cloth", name)
+    V, F, uv = read_template(os.path.join(folder, "template.obj"))
+    gt = np.load(os.path.join(folder, "gt.npz"))
+    np.testing.assert_array_equal(F, gt["faces"])
+    np.testing.assert_allclose(V, gt["vertices"][0], atol=1e-5)
+    check_template(V, F, uv)
+
+
+@needs_data
+def test_shared_quads_with_normals_keep_order_and_uv():
+    path = os.path.join(SHARED, "phi_sft_R1", "0_R1_quad.obj")
+    V, F, uv = read_template(path)
+    check_template(V, F, uv)
+    assert V.shape == (1024, 3) and F.shape == (1922, 3)
+    np.testing.assert_array_equal(F[:2], [[982, 981, 1013], [982, 1013, 1014]])  # the file's first quad
+    np.testing.assert_array_equal(V[0], [0.713166, 0.153658, 1.274754])  # and its first vertex
+
+
+@pytest.mark.parametrize(
+    "name, content, words",
+    [
+        ("a.obj", "v 0 0\n", "line 1: 'v 0 0' is not OBJ"),
+        ("a.obj", "v 0 0 x\n", "line 1"),
+        ("a.obj", OBJ + "f 1 2\n", "fewer than three"),
+        ("a.obj", OBJ + "f 1 2 9\n", "number 9 of 6 vertices"),
+        ("a.obj", OBJ + "f 1 2 0\n", "index 0"),
+        ("a.obj", OBJ + "f 1 2 -7\n", "index -7"),
+        ("a.obj", OBJ + "f 1/1 2/2 3/8\n", "number 8 of 6 texture"),
+        ("a.obj", OBJ + "f 1 2 b\n", "not OBJ"),
+        ("a.ply", "not a ply", "not a readable PLY"),
+        ("a.ply", "ply\nformat ascii 1.0\nelement vertex 9\nproperty float x\n", "a.ply: "),
+        ("a.stl", "solid", "'.stl'; .obj or .ply is needed"),
+    ],
+)
+def test_unreadable_files_are_one_line(tmp_path, name, content, words):
+    (tmp_path / name).write_text(content)
+    with pytest.raises(InputError) as error:
+        read_template(tmp_path / name)
+    assert words in str(error.value) and str(tmp_path / name) in str(error.value)
+
+
+def test_missing_file_and_folder(tmp_path):
+    (tmp_path / "folder.obj").mkdir()
+    for name in ("missing.obj", "missing.ply", "folder.obj"):
+        with pytest.raises(InputError, match=f"{name}: no such file"):
+            read_template(tmp_path / name)
+
+
+def test_a_ply_of_points_is_refused(tmp_path):
+    (tmp_path / "a.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n0 0 0\n"
+    )
+    with pytest.raises(InputError, match="holds no faces"):
+        read_template(tmp_path / "a.ply")
+
+
+def test_a_sheet_and_a_closed_surface_pass():
+    check_template(*sheet())
+    ball = trimesh.creation.icosphere(1)
+    check_template(ball.vertices, ball.faces, np.zeros((len(ball.vertices), 2)))
+
+
+def _change(kind):
+    V, F, uv = sheet()
+    if kind == "nan":
+        V[5, 1] = np.nan
+    elif kind == "inf":
+        V[5, 1] = np.inf
+    elif kind == "no uv":
+        uv = None
+    elif kind == "uv nan":
+        uv[3] = np.nan
+    elif kind == "uv shape":
+        uv = uv[:-1]
+    elif kind == "two vertices":
+        V, F, uv = V[:2], F[:0], uv[:2]
+    elif kind == "empty":
+        V, F, uv = V[:0], F[:0], uv[:0]
+    elif kind == "no faces":
+        F = F[:0]
+    elif kind == "index":
+        F[2, 1] = len(V)
+    elif kind == "repeated corner":
+        F = np.concatenate([F, [[0, 0, 1]]])
+    elif kind == "zero area":
+        V[1] = V[0]
+    elif kind == "fin":
+        V, uv = np.concatenate([V, [[0.1, 0.1, 0.5]]]), np.concatenate([uv, [[0, 0]]])
+        F = np.concatenate([F, [[4, 1, len(V) - 1]]])
+    elif kind == "flipped face":
+        F[3] = F[3, ::-1]
+    elif kind == "loose vertex":
+        V, uv = np.concatenate([V, [[0, 0, 1]]]), np.concatenate([uv, [[0, 0]]])
+    elif kind == "two sheets":
+        F = np.concatenate([F, F + len(V)])
+        V, uv = np.concatenate([V, V + 2]), np.concatenate([uv, uv])
+    elif kind == "bow tie":
+        V, uv = np.concatenate([V, [[-1, 0, 1], [-1, -1, 1.0]]]), np.concatenate([uv, [[0, 0], [0, 0]]])
+        F = np.concatenate([F, [[0, len(V) - 2, len(V) - 1]]])
+    return V, F, uv
+
+
+@pytest.mark.parametrize(
+    "kind, words",
+    [
+        ("nan", "1 vertices have coordinates that are not finite (the first is vertex 5"),
+        ("inf", "not finite"),
+        ("no uv", "no texture coordinates"),
+        ("uv nan", "texture coordinates are not finite (the first is vertex 3"),
+        ("uv shape", "(12, 2) is needed"),
+        ("two vertices", "2 vertices; a template has at least 3"),
+        ("empty", "0 vertices"),
+        ("no faces", "no faces"),
+        ("index", "0 to 11 exist"),
+        ("repeated corner", "1 faces have no area (the first is face 12"),
+        ("zero area", "faces have no area"),
+        ("fin", "1 edges have more than two faces (the first joins vertices 1 and 4)"),
+        ("flipped face", "oriented against each other"),
+        ("loose vertex", "1 vertices are in no face (the first is vertex 12"),
+        ("two sheets", "2 separate components"),
+        ("bow tie", "1 vertices join parts that share no edge"),
+    ],
+)
+def test_refuses_what_cannot_be_a_template(kind, words):
+    with pytest.raises(InputError) as error:
+        check_template(*_change(kind), where="cloth.obj")
+    assert str(error.value).startswith("cloth.obj: ") and words in str(error.value) and "\n" not in str(error.value)
+
+
+def slow_fans(F):
+    """Vertex after vertex, merge the faces there that share an edge with an end at it."""
+    count = 0
+    for v in np.unique(F):
+        groups = [set(face) - {v} for face in F.tolist() if v in face]
+        merged = True
+        while merged:
+            merged = False
+            for a in groups:
+                for b in groups:
+                    if a is not b and a & b:
+                        groups = [g for g in groups if g is not a and g is not b] + [a | b]
+                        merged = True
+                        break
+                if merged:
+                    break
+        count += len(groups)
+    return count
+
+
+def test_fans_agree_with_the_slow_reference():
+    rng = np.random.default_rng(0)
+    _, F, _ = sheet(7, 6)
+    counts = set()
+    for share in (0.3, 0.5, 0.7, 0.9, 1.0):
+        faces = F[rng.random(len(F)) <= share]
+        edges = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
+        edge_of = np.unique(edges, axis=0, return_inverse=True)[1].ravel()
+        assert _count_fans(edge_of) == slow_fans(faces)
+        counts.add(_count_fans(edge_of) - len(np.unique(faces)))
+    assert 0 in counts and len(counts) > 2
+
+
+def test_a_broken_write_leaves_the_older_file_and_names_it(tmp_path):
+    (tmp_path / "a.ply").write_text("older")
+    with pytest.raises(OSError) as error, aside(tmp_path / "a.ply") as temporary, open(temporary, "wb") as file:
+        file.write(b"half")
+        raise OSError(28, "No space left on device")
+    assert error.value.filename == str(tmp_path / "a.ply")
+    assert os.listdir(tmp_path) == ["a.ply"] and (tmp_path / "a.ply").read_text() == "older"
+    with pytest.raises(OSError) as error:
+        write_ply(tmp_path / "nowhere" / "a.ply", *sheet())
+    assert error.value.filename == str(tmp_path / "nowhere" / "a.ply")
