@@ -37,7 +37,8 @@ def read_template(path):
     """``(vertices (N, 3) float64, faces (F, 3) int64, uv (N, 2) float64 or None)`` of an OBJ or PLY file.
 
     Vertices keep the file's order. Polygons of an OBJ file become fans of triangles around their first corner, in the file's
-    order; those of a PLY file triangles in trimesh's order. uv is None where the file has none for some corner, or several for one vertex (a seam). Raises InputError in one line.
+    order; those of a PLY file triangles in trimesh's order. uv is None where the file has none for some corner, or several for
+    one vertex (a seam). Raises InputError in one line.
     """
     path = os.fspath(path)
     extension = os.path.splitext(path)[1].lower()

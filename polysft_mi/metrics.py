@@ -13,7 +13,6 @@ import numpy as np
 from .errors import InputError
 
 PIXELS = 640 * 480  # image size behind the published "all pixels" figures of Kinect-Paper
-_CHUNK = 1 << 20  # ray-triangle pairs held at once
 
 
 # ---- meshes of one topology -----------------------------------------------------------------------------------------
@@ -68,27 +67,44 @@ def normal_angle(V, G, F):
 def ray_depth(V, F, points):
     """Depth z (P,) [m] at which the rays from the camera through ``points`` (P, 3) first meet the mesh; NaN where they do not.
 
-    Moeller-Trumbore with the ray's origin at 0: each of its determinants is then linear in the ray's direction, so that all
-    rays and triangles are a few matrix products. Triangles count from both sides.
+    Moeller and Trumbore 1997, with the ray's origin at 0, for the pairs of :func:`_close_pairs`. Triangles count from both sides.
     """
     p, e1, e2 = V[F[:, 0]], V[F[:, 1]] - V[F[:, 0]], V[F[:, 2]] - V[F[:, 0]]
-    across, along = np.cross(e1, p), np.cross(p, e2)
-    normal = np.cross(e2, e1)
-    height = np.einsum("ij,ij->i", p, normal)  # = t * det, the same for every ray
-    rays = points / points[:, 2:3]
-    out = np.full(len(rays), np.nan)
-    step = max(1, _CHUNK // max(1, len(F)))
-    for i in range(0, len(rays), step):
-        r = rays[i : i + step]
-        det = r @ normal.T
-        usable = np.abs(det) > 1e-18
-        inverse = np.divide(1.0, det, out=np.zeros_like(det), where=usable)
-        b1, b2, t = (r @ along.T) * inverse, (r @ across.T) * inverse, height * inverse
-        # the slack keeps rays through the triangles' common edges
-        hit = usable & (b1 >= -1e-6) & (b2 >= -1e-6) & (b1 + b2 <= 1 + 1e-6) & (t > 0)
-        nearest = np.where(hit, t, np.inf).min(axis=1, initial=np.inf)
-        out[i : i + step] = np.where(np.isfinite(nearest), nearest, np.nan)
-    return out
+    across, along, normal = np.cross(e1, p), np.cross(p, e2), np.cross(e2, e1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        rays = points / points[:, 2:3]
+    directed = np.flatnonzero(np.isfinite(rays).all(axis=1))  # a point that is missing, or lies at z = 0, has no ray
+    triangle, ray = _close_pairs(V[F], rays[directed, :2])
+    ray = directed[ray]
+    dot = lambda a, b: np.einsum("ij,ij->i", a, b)
+    det = dot(rays[ray], normal[triangle])
+    usable = np.abs(det) > 1e-18
+    inverse = np.divide(1.0, det, out=np.zeros_like(det), where=usable)
+    b1, b2 = dot(rays[ray], along[triangle]) * inverse, dot(rays[ray], across[triangle]) * inverse
+    t = dot(p, normal)[triangle] * inverse
+    # the slack keeps rays through the triangles' common edges
+    hit = usable & (b1 >= -1e-6) & (b2 >= -1e-6) & (b1 + b2 <= 1 + 1e-6) & (t > 0)
+    nearest = np.full(len(rays), np.inf)
+    np.minimum.at(nearest, ray[hit], t[hit])
+    return np.where(np.isfinite(nearest), nearest, np.nan)
+
+
+def _close_pairs(corners, xy):
+    """(triangle, ray) of the pairs that may meet: the ray's xy (P, 2) at z = 1 lies in a circle around the triangle's projection.
+
+    ``corners`` (F, 3, 3). A triangle that reaches behind the camera has no such circle and is paired with every ray.
+    """
+    from scipy.spatial import cKDTree
+
+    before = (corners[:, :, 2] > 1e-9).all(axis=1)
+    flat = corners[before, :, :2] / corners[before, :, 2:]
+    centre = flat.mean(axis=1)
+    radius = 1.01 * np.linalg.norm(flat - centre[:, None], axis=2).max(axis=1) + 1e-9
+    near = cKDTree(xy).query_ball_point(centre, radius)
+    every = np.flatnonzero(~before)
+    triangle = np.concatenate([np.repeat(np.flatnonzero(before), [len(n) for n in near]), np.repeat(every, len(xy))])
+    ray = np.concatenate([np.asarray(n, dtype=np.int64) for n in near] + [np.tile(np.arange(len(xy)), len(every))])
+    return triangle.astype(np.int64), ray.astype(np.int64)
 
 
 def depth_rmse(V, F, points):

@@ -69,8 +69,7 @@ def _encode(temporary, frames, fps, path):
             process.stdin.write(frame.tobytes())
         _, message = process.communicate()
     except BrokenPipeError:  # ffmpeg ended first; it says why
-        message = process.stderr.read()
-        process.wait()
+        _, message = process.communicate()
     except BaseException:
         if process is not None:
             process.kill()

@@ -84,7 +84,7 @@ def test_normals_of_a_cylinder_and_of_a_tilt():
     assert metrics.normal_angle(flat * (1, 1, -1), flat * (1, 1, -1), F) == pytest.approx(0)
 
 
-def test_ray_depth_agrees_with_the_slow_reference(monkeypatch):
+def test_ray_depth_agrees_with_the_slow_reference():
     rng = np.random.default_rng(3)
     V, F = grid()
     V2 = np.concatenate([V, V * (0.5, 0.5, 0.7)])  # a second sheet in front of part of the first
@@ -94,9 +94,14 @@ def test_ray_depth_agrees_with_the_slow_reference(monkeypatch):
     want = slow_ray_depth(V2, F2, points)
     assert 20 < np.isnan(want).sum() < 100
     np.testing.assert_allclose(metrics.ray_depth(V2, F2, points), want, rtol=1e-9)
-    monkeypatch.setattr(metrics, "_CHUNK", 3 * len(F2) + 1)  # many small pieces
-    np.testing.assert_allclose(metrics.ray_depth(V2, F2, points), want, rtol=1e-9)
+    large = np.array([[-5, -4, -0.3], [5, -4, 0.9], [0, 6, 1.2], [0, 0.1, 0.5]])  # a triangle that passes beside the camera, a sliver
+    V3, F3 = np.concatenate([V2, large]), np.concatenate([F2, len(V2) + np.array([[0, 1, 2], [3, 1, 2]])])
+    want = slow_ray_depth(V3, F3, points)
+    np.testing.assert_allclose(metrics.ray_depth(V3, F3, points), want, rtol=1e-9)
     assert np.isnan(metrics.ray_depth(V2 * (1, 1, -1), F2, points)).all()  # a mesh behind the camera
+    assert np.isnan(metrics.ray_depth(V2, F2[:0], points)).all() and metrics.ray_depth(V2, F2, points[:0]).shape == (0,)
+    broken = np.concatenate([points, [[0.1, 0, 0], [np.nan, 0, 1]]])
+    np.testing.assert_allclose(metrics.ray_depth(V3, F3, broken), [*want, np.nan, np.nan], rtol=1e-9)
 
 
 def test_depth_rmse_of_a_shifted_plane_and_its_hits():
