@@ -180,7 +180,7 @@ def _read_exr(path):
     try:
         with OpenEXR.File(path, separate_channels=True) as file:
             planes = {name: np.asarray(channel.pixels, dtype=np.float32) for name, channel in file.channels().items()}
-    except RuntimeError as error:
+    except (RuntimeError, ValueError) as error:
         raise InputError(f"{path}: not a readable image ({error})") from None
     names = "BGR" if {"R", "G", "B"} <= set(planes) else [n for n in planes if n == "Y" or len(planes) == 1]
     if not names:
