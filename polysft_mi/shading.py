@@ -10,6 +10,9 @@ _BACKGROUND = 0.90  # linear
 _FRONT, _BACK = (0.80, 0.56, 0.33), (0.30, 0.47, 0.66)  # linear albedo of the two sides
 _KEY, _FILL = (-0.80, -0.50, -0.45), (0.60, -0.20, -0.80)  # towards the lights, in the view's frame
 _SUPERSAMPLE = 2
+_LINEAR = np.linspace(0, 1, 4096)
+_SRGB = np.where(_LINEAR <= 0.0031308, 12.92 * _LINEAR, 1.055 * _LINEAR ** (1 / 2.4) - 0.055)
+_SRGB = np.round(255 * _SRGB).astype(np.uint8)
 
 
 @dataclass(frozen=True)
@@ -50,67 +53,71 @@ def shade_surface(vertices, faces, view=None, uv=None, size=(480, 480)):
     width, height = (s * _SUPERSAMPLE for s in size)
     seen = (V - view.centre) @ view.rotation.T
     scale = 0.5 * min(width, height) / view.radius
-    xy = seen[:, :2] * scale + (width / 2, height / 2)
-    pixel, triangle, weight = _cover(xy[F], seen[F][:, :, 2], width, height)
-    image = np.full((height * width, 3), _BACKGROUND)
-    corners = F[triangle]
-    normal = np.einsum("pk,pkj->pj", weight, (vertex_normals(V, F) @ view.rotation.T)[corners])
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
-    flat = np.cross(seen[F[:, 1]] - seen[F[:, 0]], seen[F[:, 2]] - seen[F[:, 0]])[triangle]
-    away = flat[:, 2] > 0  # the triangle's own normal points away from the viewer
-    normal[away] *= -1
-    albedo = np.where(away[:, None], _BACK, _FRONT)
+    corners = (seen[:, :2] * scale + (width / 2, height / 2))[F]
+    edge1, edge2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    area = edge1[:, 0] * edge2[:, 1] - edge1[:, 1] * edge2[:, 0]
+    away = area > 0  # the triangle's own normal points away from the viewer
+    normals = vertex_normals(V, F) @ view.rotation.T
+    values = [seen[:, 2][F], np.where(away[:, None], _light(-normals)[F], _light(normals)[F])]
     if uv is not None:
-        albedo = albedo * _grid(np.asarray(uv, dtype=np.float64), F, triangle, weight)[:, None]
-    light = 0.10 + 0.95 * _lambert(normal, _KEY) + 0.20 * _lambert(normal, _FILL)
-    image[pixel] = albedo * light[:, None]
-    image = image.reshape(size[1], _SUPERSAMPLE, size[0], _SUPERSAMPLE, 3).mean(axis=(1, 3))
-    return (255 * _srgb(image) + 0.5).astype(np.uint8)
+        uv = np.asarray(uv, dtype=np.float64)
+        values += [*np.moveaxis(((uv - uv.min(axis=0)) / np.maximum(np.ptp(uv, axis=0), 1e-12) * 10)[F], 2, 0)]
+
+    triangle, x, y = _covered_pixels(corners, width, height)
+    right, down = x + 0.5 - corners[triangle, 0, 0], y + 0.5 - corners[triangle, 0, 1]
+
+    def inside(value, at):
+        """A value (F, 3), given at the corners, at the covered pixels ``at``: affine, because the view is orthographic."""
+        d1, d2 = value[:, 1] - value[:, 0], value[:, 2] - value[:, 0]
+        slope_x, slope_y = (d1 * edge2[:, 1] - d2 * edge1[:, 1]) / area, (d2 * edge1[:, 0] - d1 * edge2[:, 0]) / area
+        t = triangle[at]
+        return value[t, 0] + slope_x[t] * right[at] + slope_y[t] * down[at]
+
+    with np.errstate(divide="ignore", invalid="ignore"):  # triangles seen edge-on cover nothing
+        pixel, depth = y * width + x, inside(values[0], slice(None))
+        nearest = np.full(height * width, np.inf)
+        np.minimum.at(nearest, pixel, depth)
+        front = np.flatnonzero(depth == nearest[pixel])
+        light = np.clip(inside(values[1], front), 0, 2)
+        for value in values[2:]:
+            at = inside(value, front)
+            light *= 1 - 0.17 * np.clip(2 - np.abs(at - np.round(at)) / 0.03, 0, 1)
+    image = np.full((height * width, 3), _BACKGROUND)
+    image[pixel[front]] = np.where(away[triangle[front], None], _BACK, _FRONT) * light[:, None]
+    image = image.reshape(size[1], _SUPERSAMPLE, size[0], _SUPERSAMPLE, 3)
+    image = sum(image[:, i, :, j] for i in range(_SUPERSAMPLE) for j in range(_SUPERSAMPLE)) / _SUPERSAMPLE**2
+    return _SRGB[(np.clip(image, 0, 1) * (len(_SRGB) - 1)).astype(np.int64)]
 
 
-def _lambert(normal, direction):
-    direction = np.asarray(direction) / np.linalg.norm(direction)
-    return np.maximum(normal @ direction, 0)
+def _light(normals):
+    """Light on unit normals (N, 3) of the view's frame: (N,)."""
+    key, fill = (np.asarray(d) / np.linalg.norm(d) for d in (_KEY, _FILL))
+    return 0.10 + 0.95 * np.maximum(normals @ key, 0) + 0.20 * np.maximum(normals @ fill, 0)
 
 
-def _grid(uv, F, triangle, weight):
-    """1 in the cells of a 10 x 10 grid, darker on its lines: (P,)."""
-    span = np.maximum(np.ptp(uv, axis=0), 1e-12)
-    at = np.einsum("pk,pkj->pj", weight, ((uv - uv.min(axis=0)) / span * 10)[F[triangle]])
-    distance = np.abs(at - np.round(at)).min(axis=1)
-    return 1 - 0.3 * np.clip(2 - distance / 0.03, 0, 1)
+def _covered_pixels(corners, width, height):
+    """All pixels whose centres lie in the triangles ``corners`` (F, 3, 2) [pixels]: triangle, x, y, each (P,).
 
-
-def _srgb(x):
-    x = np.clip(x, 0, 1)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
-
-
-def _cover(corners, depth, width, height):
-    """The nearest triangle at each covered pixel: (pixel (P,), triangle (P,), barycentric weights (P, 3)).
-
-    ``corners`` (F, 3, 2) [pixels], ``depth`` (F, 3). All pixels of all bounding boxes are tried at once.
+    Row by row: the two edges that cross a row's centre line bound the triangle's pixels in that row.
     """
-    low = np.clip(np.ceil(corners.min(axis=1) - 0.5), 0, (width, height)).astype(np.int64)
-    high = np.clip(np.floor(corners.max(axis=1) - 0.5) + 1, 0, (width, height)).astype(np.int64)
-    columns, rows = np.maximum(high - low, 0).T
-    count = columns * rows
-    triangle = np.repeat(np.arange(len(corners)), count)
-    rank = np.arange(len(triangle)) - np.repeat(np.cumsum(count) - count, count)
-    x = low[triangle, 0] + rank % columns[triangle]
-    y = low[triangle, 1] + rank // columns[triangle]
-    a, b, c = (corners[triangle, k] for k in range(3))
-    area = _cross(b - a, c - a)
-    point = np.stack([x, y], axis=1) + 0.5
-    with np.errstate(divide="ignore", invalid="ignore"):
-        w1, w2 = _cross(point - a, c - a) / area, _cross(b - a, point - a) / area
-    weight = np.stack([1 - w1 - w2, w1, w2], axis=1)
-    keep = np.flatnonzero((weight >= -1e-9).all(axis=1))  # False for NaN, the triangles seen edge-on
-    triangle, weight, pixel = triangle[keep], weight[keep], (y * width + x)[keep]
-    order = np.lexsort((np.sum(weight * depth[triangle], axis=1), pixel))
-    nearest = order[np.concatenate([[True], np.diff(pixel[order]) > 0])] if len(order) else order
-    return pixel[nearest], triangle[nearest], weight[nearest]
+    low, high = corners[:, :, 1].min(axis=1), corners[:, :, 1].max(axis=1)
+    triangle, y = _ranges(np.ceil(low - 0.5), np.ceil(high - 0.5), height)
+    left, right = np.full(len(triangle), np.inf), np.full(len(triangle), -np.inf)
+    for k in range(3):
+        a, b = corners[triangle, k], corners[triangle, (k + 1) % 3]
+        swap = (a[:, 1] > b[:, 1])[:, None]  # so that two triangles find the same crossing of a common edge
+        a, b = np.where(swap, b, a), np.where(swap, a, b)
+        crosses = (a[:, 1] <= y + 0.5) & (y + 0.5 < b[:, 1])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            x = a[:, 0] + (y + 0.5 - a[:, 1]) * ((b[:, 0] - a[:, 0]) / (b[:, 1] - a[:, 1]))
+        left, right = np.where(crosses, np.minimum(left, x), left), np.where(crosses, np.maximum(right, x), right)
+    row, x = _ranges(np.ceil(left - 0.5), np.ceil(right - 0.5), width)
+    return triangle[row], x, y[row]
 
 
-def _cross(a, b):
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+def _ranges(start, stop, limit):
+    """The whole numbers from start to stop - 1, within 0 to limit - 1, for each pair: (index of the pair, number)."""
+    start = np.clip(start, 0, limit).astype(np.int64)
+    count = np.maximum(np.clip(stop, 0, limit).astype(np.int64) - start, 0)
+    index = np.repeat(np.arange(len(count)), count)
+    return index, np.arange(len(index)) - np.repeat(np.cumsum(count) - count - start, count)

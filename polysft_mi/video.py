@@ -11,7 +11,9 @@ from .files import aside
 
 # Rec.709, converted and marked: what is not marked, players take for Rec.601 or 709 by its size
 _MARKS = "range=tv:colorspace=bt709:color_primaries=bt709:color_trc=bt709"
-_COLOUR = ["-vf", f"scale=out_color_matrix=bt709:out_range=tv,format=yuv420p,setparams={_MARKS}"]
+_WIDEST = 3840  # beyond it, browsers and graphics cards give up
+_SIZE = rf"w=min(iw\,{_WIDEST}):h=-2:flags=area"
+_FILTER = ["-vf", f"scale={_SIZE}:out_color_matrix=bt709:out_range=tv,format=yuv420p,setparams={_MARKS}"]
 _CODEC = ["-c:v", "libx264", "-preset", "medium", "-crf", "18", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
 
 
@@ -22,7 +24,7 @@ def encoder():
         import imageio_ffmpeg
 
         path = imageio_ffmpeg.get_ffmpeg_exe()
-        command = [path, "-v", "error", "-f", "lavfi", "-i", "color=s=64x64:r=2:d=1", *_COLOUR, *_CODEC, "-f", "mp4", "-y", os.devnull]
+        command = [path, "-v", "error", "-f", "lavfi", "-i", "color=s=64x64:r=2:d=1", *_FILTER, *_CODEC, "-f", "mp4", "-y", os.devnull]
         command[command.index("+faststart")] = "+frag_keyframe"  # the null device cannot be read back
         subprocess.run(command, check=True, stdin=subprocess.DEVNULL, capture_output=True, timeout=60)
         return path
@@ -33,7 +35,7 @@ def encoder():
 def write_video(path, frames, fps=25):
     """Write ``frames``, an iterable of (H, W, 3) uint8 sRGB images of one size, to ``path`` (.mp4), ``fps`` frames a second.
 
-    Sizes are padded to even numbers by repeating the last row or column. Where no encoder is, the frames become
+    Sizes are padded to even numbers by repeating the last row or column, and shrunk to 3840 columns where there are more. Where no encoder is, the frames become
     ``000.png``, ``001.png``, ... in the folder that has ``path``'s name without its extension. Returns the path of what was
     written. Raises ValueError for no frames or frames of another form, OSError where they cannot be written.
     """
@@ -64,7 +66,7 @@ def _encode(temporary, frames, fps, path):
             frame = np.pad(frame, ((0, frame.shape[0] % 2), (0, frame.shape[1] % 2), (0, 0)), mode="edge")
             if process is None:
                 source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{frame.shape[1]}x{frame.shape[0]}", "-r", f"{fps:g}", "-i", "-"]
-                command = [encoder(), "-v", "error", *source, *_COLOUR, *_CODEC, "-f", "mp4", "-y", temporary]
+                command = [encoder(), "-v", "error", *source, *_FILTER, *_CODEC, "-f", "mp4", "-y", temporary]
                 process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
             process.stdin.write(frame.tobytes())
         _, message = process.communicate()

@@ -66,6 +66,8 @@ def test_views_around_keep_the_surface_in_the_picture():
         image = shade_surface(V, F, view, size=(90, 90))
         border = np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
         assert (border == BACKGROUND).all() and covered(image) > 0.1
+        background = np.all(image == BACKGROUND, axis=-1).astype(np.uint8)
+        assert cv2.connectedComponents(background)[0] == 2  # no holes between triangles
     right = View.around(V, 40, 0).rotation
     assert (right @ (1, 0, 0))[2] < 0  # seen from the right, the right side is the nearer one
     above = View.around(V, 0, 25).rotation

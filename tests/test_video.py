@@ -47,6 +47,13 @@ def test_colours_are_rec709_and_marked_so(tmp_path):
 
 
 @needs_encoder
+def test_very_wide_frames_shrink(tmp_path):
+    video.write_video(tmp_path / "a.mp4", [np.full((301, 5000, 3), 77, np.uint8)])
+    frame = imageio.mimread(tmp_path / "a.mp4")[0]
+    assert frame.shape == (232, 3840, 3) and np.abs(frame.astype(int) - 77).max() < 3
+
+
+@needs_encoder
 def test_the_index_stands_first_so_that_browsers_can_start(tmp_path):
     video.write_video(tmp_path / "a.mp4", frames())
     data = (tmp_path / "a.mp4").read_bytes()
