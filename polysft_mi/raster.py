@@ -18,6 +18,7 @@ import numpy as np
 from .errors import InputError
 
 _NEAR = 1e-6  # depth [m] below which a triangle takes no part in antialiasing
+_TOLERANCE = 1e-3  # pixels by which an edge through a centre may pass it: the ray and the projection round differently
 _MAX_STEPS = 64  # triangles crossed between two neighbouring pixel centres before the walk gives up
 _AOVS = {"depth": 1, "normal": 3, "uv": 2, "triangle": 1}
 _AOV_CHANNELS = {"depth": "Z", "normal": "XYZ", "uv": "UV", "triangle": "I"}
@@ -482,7 +483,7 @@ class RasterIntegrator(mi.SamplingIntegrator):
                 first = (at1 < at0) & (t < exit_at)
                 exit_at, exit_edge = dr.select(first, t, exit_at), dr.select(first, k, exit_edge)
             usable = (dr.minimum(dr.minimum(p[0].z, p[1].z), p[2].z) > _NEAR) & (sign != 0)
-            leaves = active & usable & (exit_at < 1)
+            leaves = active & usable & (exit_at < 1 + _TOLERANCE)
             across = dr.gather(mi.Int32, topology.neighbours, 3 * mi.UInt32(current) + exit_edge, leaves)
             inner = leaves & (across >= 0)
             r = [dr.gather(mi.Point3f, flat, i, inner) for i in corners(across, inner)]
