@@ -86,9 +86,9 @@ class Problem:
             alpha = dr.gather(mi.Float, mask.array, dr.arange(mi.UInt32, self.pixels) * mask.shape[2])
         channels = image.shape[2]
         pixel = dr.arange(mi.UInt32, 3 * self.pixels)
-        rgb = dr.gather(mi.Float, image.array, pixel // 3 * channels + pixel % 3)
+        rgb = dr.gather(mi.Float, image.array, pixel // 3 * channels + pixel % 3, mode=dr.ReduceMode.Permute)
         if alpha is None:
-            alpha = dr.gather(mi.Float, image.array, dr.arange(mi.UInt32, self.pixels) * channels + 3)
+            alpha = dr.gather(mi.Float, image.array, dr.arange(mi.UInt32, self.pixels) * channels + 3, mode=dr.ReduceMode.Permute)
         else:  # path replay shows the environment behind the surface: cut it away
             rgb = rgb * dr.gather(mi.Float, dr.detach(alpha), pixel // 3)
         return mi.TensorXf(rgb, (self.height, self.width, 3)), alpha
@@ -147,7 +147,7 @@ class Problem:
 
     def _channels(self, tensor):
         index = dr.arange(mi.UInt32, self.pixels) * 3
-        return [dr.gather(mi.Float, tensor.array, index + c) for c in range(3)]
+        return [dr.gather(mi.Float, tensor.array, index + c, mode=dr.ReduceMode.Permute) for c in range(3)]
 
     def temporal_term(self, window):
         """The weighted temporal consistency of a list of Unknowns, a Float of 1, attached."""

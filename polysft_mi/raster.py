@@ -422,7 +422,7 @@ class RasterIntegrator(mi.SamplingIntegrator):
 
         # The colour that comes in is the other sheet's where the edge crosses, not at the other pixel's centre: so the image stays
         # continuous when a pixel's centre passes from one sheet to the other.
-        incoming = [dr.gather(mi.Float, c, other) for c in source]
+        incoming = [_gather_pixel(c, other) for c in source]
         if self.shading == "unlit":
             basis, origin = camera
             direction = basis @ mi.Vector3f(place.x, place.y, 1)
@@ -435,8 +435,8 @@ class RasterIntegrator(mi.SamplingIntegrator):
             incoming[:3] = self._unlit(si, visible >= 0)
         out = [c + 0 for c in source]
         for c in range(len(out)):
-            difference = incoming[c] - dr.gather(mi.Float, source[c], target)
-            dr.scatter_add(out[c], weight * difference, target)
+            difference = incoming[c] - _gather_pixel(source[c], target)
+            dr.scatter_add(out[c], weight * difference, target, mode=dr.ReduceMode.Local)
         return out
 
     @staticmethod
@@ -525,10 +525,15 @@ class RasterIntegrator(mi.SamplingIntegrator):
             dr.scatter(out, mi.Float(-1), dr.arange(mi.UInt32, width * height) * count + channel)
         for c, value in enumerate(channels):
             if c < colours and scale > 1:
-                dr.scatter_add(out, value / (scale * scale), pixel * count + c)
+                dr.scatter_add(out, value / (scale * scale), pixel * count + c, mode=dr.ReduceMode.Local)
             else:
                 dr.scatter(out, value, pixel * count + c, middle)
         return mi.TensorXf(out, (height, width, count))
+
+
+def _gather_pixel(channel, pixel):
+    """Values of a region-sized array. Local reduction in its gradient: the default would bake the region's size into the kernel."""
+    return dr.gather(mi.Float, channel, pixel, mode=dr.ReduceMode.Local)
 
 
 def _point2(screen, index, mask=True):
