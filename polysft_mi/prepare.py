@@ -5,7 +5,6 @@ Three forms are known (:data:`FORMS`). Names of OBJ files and images, numbers an
 
 import argparse
 import contextlib
-import glob
 import os
 from dataclasses import dataclass, field
 from xml.sax.saxutils import escape, quoteattr
@@ -176,7 +175,7 @@ def prepare(folder, out=None, resolution=33, overwrite=False):
     layout = recognise(folder)
     camera = layout.camera
     masks = os.path.join(folder, layout.masks) if layout.masks else ""
-    sequence = Sequence.open(os.path.join(glob.escape(folder), layout.frames), masks, size=(camera.width, camera.height))
+    sequence = Sequence.open(os.path.join(folder, layout.frames), masks, size=(camera.width, camera.height))
     image_size(os.path.join(folder, layout.texture))
     template, where = None, "template.obj"
     if layout.obj is None:
