@@ -175,7 +175,7 @@ class Problem:
         loss = sum(terms.values())
         values = {name: dr.detach(value) for name, value in terms.items()}
         dr.schedule(values)
-        if backward:
+        if backward and dr.grad_enabled(loss):  # a weight of zero detaches
             dr.backward(loss)
         dr.eval()
         return values

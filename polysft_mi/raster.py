@@ -449,15 +449,18 @@ class RasterIntegrator(mi.SamplingIntegrator):
 
         Walks from the near pixel's triangle towards the far centre; where that sheet has no silhouette in between, from the far one's.
         """
-        found, va, vb = self._walk(topology, screen, triangle, near, far, x0, y0, w, mi.Bool(True))
-        again = ~found & (dr.gather(mi.Int32, triangle, far) >= 0)
-        found2, va2, vb2 = self._walk(topology, screen, triangle, far, near, x0, y0, w, again)
+        found, va, vb, last = self._walk(topology, screen, triangle, near, far, x0, y0, w, mi.Bool(True))
+        beyond = dr.gather(mi.Int32, triangle, far)
+        again = ~found & (beyond >= 0) & (last != beyond)  # else the two centres lie on one sheet
+        found2, va2, vb2, _ = self._walk(topology, screen, triangle, far, near, x0, y0, w, again)
         near, far = dr.select(found2, far, near), dr.select(found2, near, far)
         va, vb, found = dr.select(found2, va2, va), dr.select(found2, vb2, vb), found | found2
         edge = _point2(screen, vb, found) - _point2(screen, va, found)
         return found & (dr.select(horizontal, edge.y, edge.x) != 0), va, vb, near, far
 
     def _walk(self, topology, screen, triangle, start, end, x0, y0, w, active):
+        """From the triangle seen at pixel ``start`` over the sheet towards the centre of ``end``: whether a silhouette edge comes before
+        that centre, its vertices, and the last triangle reached."""
         c0, c1 = self._centre(start, x0, y0, w), self._centre(end, x0, y0, w)
 
         def corners(t, mask):
@@ -505,8 +508,8 @@ class RasterIntegrator(mi.SamplingIntegrator):
             dr.zeros(mi.UInt32, n),
             dr.zeros(mi.UInt32, n),
         )
-        _, _, found, va, vb, _ = dr.while_loop(state, lambda active, *_: active, step, label="walk")
-        return found, va, vb
+        _, last, found, va, vb, _ = dr.while_loop(state, lambda active, *_: active, step, label="walk")
+        return found, va, vb, last
 
     def _assemble(self, channels, region, camera, scale):
         """Put the region into the full image and shape it (H, W, C): colours averaged over the samples of a pixel, AOVs of its middle one."""
