@@ -20,6 +20,7 @@ from .files import aside
 from .patch import Unknowns
 from .problem import TERMS
 from .raster import RasterIntegrator
+from .scene import located
 from .video import write_video
 
 RUN = "run.json"
@@ -51,7 +52,6 @@ def write_json(path, value):
 
 def resolved_scene(experiment):
     """The scene file as text, with the defaults in force in place of its own and relative paths made absolute."""
-    folder = os.path.dirname(os.path.abspath(experiment.path))
     tree = ET.parse(experiment.path, parser=ET.XMLParser(target=ET.TreeBuilder(insert_comments=True)))
     for element in tree.getroot().iter():
         if element.tag == "default":
@@ -60,9 +60,9 @@ def resolved_scene(experiment):
             value = element.get("value")
         else:
             continue
-        place = os.path.join(folder, value)
-        if value and not value.startswith("$") and not os.path.isabs(value) and (os.path.exists(place) or "*" in value):
-            value = place
+        if value and "$" not in value:
+            place = located(experiment.path, value)
+            value = place if os.path.exists(place) or "*" in value else value
         element.set("value", value)
     return ET.tostring(tree.getroot(), encoding="unicode") + "\n"
 

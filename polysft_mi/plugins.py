@@ -3,6 +3,8 @@
 Import only after a Mitsuba variant is set; :func:`register` may be called any number of times.
 """
 
+import os
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -11,6 +13,18 @@ from . import settings
 from .errors import InputError
 from .projective import SilhouetteProjective
 from .raster import RasterIntegrator
+
+
+def _resolved(pattern):
+    """A folder or glob pattern as Mitsuba resolves file names: beside the scene file, else from the working directory."""
+    if not pattern:
+        return ""
+    resolve = mi.file_resolver().resolve
+    path = str(resolve(pattern))
+    if os.path.exists(path):
+        return path
+    folder, name = os.path.split(pattern)
+    return os.path.join(str(resolve(folder)), name) if folder else path
 
 
 class PolySfT(mi.SamplingIntegrator):
@@ -41,13 +55,9 @@ class PolySfT(mi.SamplingIntegrator):
         if len(nested) != 1:
             raise InputError(f"polysft: {len(nested)} nested integrators; exactly one is needed, e.g. <integrator type=\"raster\"/>")
         self.renderer = nested[0]
-        for name in ("frames",):
-            if name not in props:
-                raise InputError(f"polysft: property {name!r} is missing; a folder of images or a glob pattern is needed")
-        resolve = mi.file_resolver().resolve
-        self.frames = str(resolve(str(props["frames"])))
-        masks = str(props.get("masks", ""))
-        self.masks = str(resolve(masks)) if masks else ""
+        if "frames" not in props:
+            raise InputError("polysft: property 'frames' is missing; a folder of images or a glob pattern is needed")
+        self.frames, self.masks = (_resolved(str(props.get(name, ""))) for name in ("frames", "masks"))
         self.settings = settings.from_properties(props)
 
     def aov_names(self):
@@ -131,10 +141,10 @@ def _varol_template(props):
 
     The sequence's flat template as a mesh in the camera frame, its texture coordinates the projection into the first image.
     """
-    from .prepare import kinect_paper_template
+    from .kinect_paper import template
 
     folder = str(mi.file_resolver().resolve(str(props["folder"])))
-    vertices, faces, uv = kinect_paper_template(folder, int(props.get("resolution", 33)))
+    vertices, faces, uv = template(folder, int(props.get("resolution", 33)))
     mesh = mi.Mesh("template", len(vertices), len(faces), has_vertex_texcoords=True, props=props)
     params = mi.traverse(mesh)
     params["vertex_positions"] = mi.Float(np.ascontiguousarray(vertices, dtype=np.float32).ravel())

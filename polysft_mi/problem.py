@@ -20,6 +20,15 @@ TERMS = ("rgb", "silhouette", "inextensibility", "temporal")
 _CACHED_FRAMES = 8
 
 
+def _positions_key(params, mesh):
+    """The key of the mesh's vertex positions among a scene's parameters. (Mitsuba names meshes by id, or by address where they have none.)"""
+    keys = [k for k in params.keys() if k.endswith("vertex_positions")]
+    for key in keys:
+        if len(keys) == 1 or key.split(".")[0] == mesh.id():
+            return key
+    raise InputError(f"template {mesh.id()!r}: not found among the scene's parameters; give its shape id=\"template\"")
+
+
 @dataclass
 class Target:
     """One image on the device: ``rgb`` (H, W, 3), cut out by the mask where there is one; ``mask`` Float of P or None; ``area`` [pixels]."""
@@ -47,7 +56,9 @@ class Problem:
         self.edge_lengths = mi.Float(lengths.astype(np.float32))
         self._corner = mi.UInt32(experiment.corner.astype(np.uint32))
         self._identity = np.array_equal(experiment.corner, np.arange(len(self.template.vertices)))
-        self._params = mi.traverse(experiment.mesh)
+        # through the scene, not the mesh alone: only so does the scene rebuild what it traces rays with
+        self._params = mi.traverse(experiment.scene)
+        self._key = _positions_key(self._params, experiment.mesh)
         self._targets = OrderedDict()
         self.camera = Pinhole(experiment.sensor)
         self._setup_renderer()
@@ -70,7 +81,7 @@ class Problem:
         points = vertices
         if not self._identity:
             points = dr.gather(mi.Point3f, dr.ravel(vertices), self._corner)
-        self._params["vertex_positions"] = dr.ravel(points)
+        self._params[self._key] = dr.ravel(points)
         self._params.update()
 
     def image(self, vertices, seed=0):
@@ -133,8 +144,7 @@ class Problem:
         rgb = objective.blur(rgb, s.blur)
         wanted = target.rgb
         if s.brightness == "local":
-            inside = alpha if target.mask is not None else weight
-            rgb = objective.normalise_locally(rgb, self._weight_image(dr.detach(inside)))
+            rgb = objective.normalise_locally(rgb, self._weight_image(alpha if target.mask is not None else weight))
             if target.mask is None:
                 wanted = objective.normalise_locally(wanted, self._weight_image(weight))
         a, b = self._channels(rgb), self._channels(wanted)

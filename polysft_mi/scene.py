@@ -67,6 +67,12 @@ def resolved_defaults(path, overrides):
     return {**known, **overrides}
 
 
+def located(scene, path):
+    """A path of a scene file, found as Mitsuba finds it: beside the scene, else from the working directory."""
+    beside = os.path.join(os.path.dirname(os.path.abspath(scene)), path)
+    return os.path.abspath(path) if not os.path.exists(beside) and os.path.exists(path) else beside
+
+
 def load(path, overrides=None):
     """Load a scene file as an :class:`Experiment`; ``overrides`` maps names of its defaults to text.
 
@@ -76,6 +82,8 @@ def load(path, overrides=None):
     overrides = {k: str(v) for k, v in (overrides or {}).items()}
     defaults = resolved_defaults(path, overrides)
     plugins.register()
+    if defaults.get("data") and not os.path.isdir(located(path, defaults["data"])):
+        raise InputError(f"{path}: data = {defaults['data']}: no such folder, neither beside the scene nor here; give -D data=FOLDER")
     template_node = _check_nodes(path, overrides)
     try:
         scene = mi.load_file(path, optimize=False, **overrides)
@@ -117,11 +125,10 @@ def _check_nodes(path, overrides):
     except Exception as error:
         raise InputError(f"{path}: {_innermost(error)}") from None
     shapes = []
-    folder = os.path.dirname(os.path.abspath(path))
     for node in state.nodes:
         props = node.props
         if "filename" in props and isinstance(props["filename"], str):
-            name = os.path.join(folder, props["filename"])
+            name = located(path, props["filename"])
             if not os.path.isfile(name):
                 raise InputError(f"{name}: no such file (filename of <{props.plugin_name()}> in {path})")
             props["filename"] = name
