@@ -1,0 +1,227 @@
+"""What Mitsuba computes on: the variant, and the LLVM library that the CPU variants need.
+
+Dr.Jit compiles its CPU kernels with a libLLVM that it loads at run time, and takes the first one that it finds. LLVM 14 is refused, and LLVM 15
+ends the process in the middle of a render, past any ``try``; so the library is chosen here, before Dr.Jit starts.
+Command lines, tests and library users all call :func:`set_variant`. Importing this module has no side effect and needs the standard library alone;
+``python -m polysft_mi.backend`` prints the library that would be used.
+"""
+
+import ctypes
+import functools
+import glob
+import os
+import re
+import shutil
+import subprocess
+import sys
+
+from .errors import InputError, cli
+
+OLDEST_LLVM = 16
+VARIABLE = "DRJIT_LIBLLVM_PATH"  # Dr.Jit's own
+SUFFIX = "_ad_rgb"  # what the code needs of a variant: Dr.Jit arrays with derivatives, three colour channels
+
+# libLLVM-15.so.1, libLLVM-14.0.6.so.1, libLLVM.so.19.1, libLLVM.so, libLLVM.dylib; not libLLVM-C.so (a part of the interface alone)
+_NAME = re.compile(r"libLLVM(?:-(?P<before>\d[\d.]*))?\.(?:so|dylib)(?:\.(?P<after>\d[\d.]*))?")
+
+# Where packages of Linux distributions, FreeBSD and Homebrew put it
+_FOLDERS = (
+    "/usr/local/lib*",
+    "/usr/lib/*-linux-gnu*",
+    "/usr/lib64",
+    "/usr/lib",
+    "/lib64",
+    "/usr/lib*/llvm*/lib*",
+    "/usr/lib*/llvm/*/lib*",
+    "/usr/local/llvm*/lib",
+    "/usr/local/opt/llvm*/lib",
+    "/opt/homebrew/opt/llvm*/lib",
+)
+
+# In a process of its own: loading two LLVMs into one process, or one whose own libraries are missing, can end it.
+# LLVMGetVersion exists from LLVM 16 on, so a library without it is too old.
+_ASK_VERSION = """
+import ctypes, sys
+numbers = [ctypes.c_uint() for _ in range(3)]
+ctypes.CDLL(sys.argv[1]).LLVMGetVersion(*[ctypes.byref(number) for number in numbers])
+print(*[number.value for number in numbers])
+"""
+
+# One ray against one rectangle, and a derivative: needs a driver, a device, the compiler, and (on a GPU) OptiX
+_TRY_VARIANT = """
+import sys
+import mitsuba as mi
+mi.set_variant(sys.argv[1])
+import drjit as dr
+scene = mi.load_dict({"type": "scene", "shape": {"type": "rectangle"}})
+distance = mi.Float(2, 3)
+dr.enable_grad(distance)
+hit = scene.ray_intersect(mi.Ray3f(mi.Point3f(0, 0, distance), mi.Vector3f(0, 0, -1)))
+dr.backward(hit.t * distance)
+print([float(x) for x in dr.grad(distance)] == [4, 6])
+"""
+
+
+def find_libllvm(folders=None):
+    """The newest libLLVM that Dr.Jit can use, LLVM 16 or newer.
+
+    ``DRJIT_LIBLLVM_PATH`` goes before everything, and must then hold; else the files of ``folders`` (by default: the environment's, the
+    system's usual ones, and what ``ldconfig`` knows) are each asked for their version, in a process of their own.
+
+    Returns (path, version): the file's real path, and its version as a tuple of three ints.
+    Raises :class:`InputError` where ``DRJIT_LIBLLVM_PATH`` names what cannot be used, or where nothing is found.
+    """
+    chosen = os.environ.get(VARIABLE)
+    if chosen:
+        return chosen, _check_chosen(chosen)
+    best, older = None, set()
+    for path in _libraries(_search_folders() if folders is None else folders):
+        named = _named_version(path)
+        if named and named[0] < OLDEST_LLVM:  # not even loaded
+            older.add(named[0])
+            continue
+        version = _ask_version(path)
+        if version and version[0] >= OLDEST_LLVM and (best is None or version > best[1]):
+            best = path, version
+    if best is None:
+        found = f" (only LLVM {', '.join(str(v) for v in sorted(older))})" if older else ""
+        raise InputError(
+            f"no LLVM {OLDEST_LLVM} or newer found{found}, which rendering on the CPU needs: install it "
+            f"(Debian, Ubuntu: apt-get install libllvm19; Fedora: dnf install llvm-libs; macOS: brew install llvm), or set {VARIABLE} to the file of its libLLVM"
+        )
+    return best
+
+
+def set_variant(mode=None):
+    """Set Mitsuba's variant; a second call with the same mode does nothing. Best called before ``import mitsuba``, which makes Dr.Jit choose an LLVM.
+
+    ``mode``: a variant that ends in ``_ad_rgb``. None takes one that is already set and fits, else ``cuda_ad_rgb`` where a GPU
+    really works, else ``llvm_ad_rgb``.
+
+    Returns the variant's name. Raises :class:`InputError` where the mode is unknown or does not fit, a GPU is asked for and none works, or LLVM is missing.
+    """
+    mitsuba = sys.modules.get("mitsuba")
+    current = mitsuba and mitsuba.variant()
+    if current and (mode == current or mode is None) and current.endswith(SUFFIX):
+        return current
+    if mode is None:
+        mode = "cuda_ad_rgb" if gpu_works() else "llvm_ad_rgb"
+    try:  # before the import, which already starts Dr.Jit and makes it look for an LLVM
+        os.environ[VARIABLE] = find_libllvm()[0]
+    except InputError:
+        if mode.startswith("llvm"):
+            raise
+    import mitsuba as mi
+
+    known = [name for name in mi.variants() if name.endswith(SUFFIX)]
+    if mode not in known:
+        raise InputError(f"mode {mode!r}: one of {', '.join(known)} is needed")
+    if mode.startswith("cuda") and not gpu_works():
+        raise InputError(f"mode {mode!r}: no working GPU (NVIDIA, with its driver and OptiX) was found; leave the mode out, or give llvm_ad_rgb")
+    try:
+        mi.set_variant(mode)
+    except ImportError as error:
+        raise InputError(f"mode {mode!r} cannot be used here: {' '.join(str(error).split())}") from None
+    if mode.startswith("llvm"):
+        import drjit as dr
+
+        version = dr.detail.llvm_version()[0]
+        if version < OLDEST_LLVM:  # Mitsuba or Dr.Jit was imported before
+            raise InputError(f"Dr.Jit already runs on LLVM {version}: call polysft_mi.backend.set_variant before importing mitsuba or drjit, or set {VARIABLE}")
+    return mode
+
+
+@functools.cache
+def gpu_works():
+    """Whether ``cuda_ad_rgb`` computes and traces rays here; costs nothing on a machine without an NVIDIA driver."""
+    return _driver_sees_device() and variant_works("cuda_ad_rgb")
+
+
+def variant_works(mode, timeout=120.0):
+    """Whether a variant traces a ray and takes a derivative, in a process of its own so that a broken driver cannot end this one.
+
+    ``timeout``: seconds after which it counts as not working.
+    """
+    try:
+        tried = subprocess.run([sys.executable, "-c", _TRY_VARIANT, mode], capture_output=True, text=True, timeout=timeout, stdin=subprocess.DEVNULL)
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+    return tried.returncode == 0 and tried.stdout.split()[-1:] == ["True"]
+
+
+def add_mode_argument(parser):
+    """Give an ``argparse`` parser ``-m`` / ``--mode`` as Mitsuba's own command line has it; its value is for :func:`set_variant`."""
+    parser.add_argument("-m", "--mode", metavar="VARIANT", help="Mitsuba variant (default: cuda_ad_rgb where a GPU works, else llvm_ad_rgb)")
+
+
+def _driver_sees_device():
+    try:
+        driver = ctypes.CDLL("libcuda.so.1")
+        count = ctypes.c_int()
+        return driver.cuInit(0) == 0 and driver.cuDeviceGetCount(ctypes.byref(count)) == 0 and count.value > 0
+    except (OSError, AttributeError):
+        return False
+
+
+def _check_chosen(path):
+    accepted = f"the file of a libLLVM, {OLDEST_LLVM} or newer, is needed; unset it to have one searched"
+    named = _named_version(path)
+    if not os.path.isfile(path):
+        raise InputError(f"{VARIABLE}={path}: no such file; {accepted}")
+    version = named if named and named[0] < OLDEST_LLVM else _ask_version(path)
+    if version is None:
+        raise InputError(f"{VARIABLE}={path}: cannot be loaded as an LLVM {OLDEST_LLVM} or newer; {accepted}")
+    if version[0] < OLDEST_LLVM:
+        raise InputError(f"{VARIABLE}={path}: is LLVM {version[0]}; {accepted}")
+    return version
+
+
+def _search_folders():
+    prefixes = [os.environ.get("CONDA_PREFIX"), sys.prefix, sys.base_prefix]
+    folders = [os.path.join(prefix, "lib") for prefix in prefixes if prefix]
+    folders += [folder for folder in os.environ.get("LD_LIBRARY_PATH", "").split(":") if folder]
+    for pattern in _FOLDERS:
+        folders += sorted(glob.glob(pattern))
+    ldconfig = shutil.which("ldconfig", path=os.pathsep.join([os.environ.get("PATH", ""), "/sbin", "/usr/sbin"]))
+    if ldconfig and sys.platform.startswith("linux"):
+        listed = subprocess.run([ldconfig, "-p"], capture_output=True, text=True, stdin=subprocess.DEVNULL).stdout
+        folders += [os.path.dirname(line.rpartition("=> ")[2]) for line in listed.splitlines() if "libLLVM" in line and "=> " in line]
+    return folders
+
+
+def _libraries(folders):
+    """The libLLVM files in the folders, each real file once, in the folders' order."""
+    found = {}
+    for folder in folders:
+        for path in sorted(glob.glob(os.path.join(glob.escape(folder), "libLLVM*"))):
+            if _NAME.fullmatch(os.path.basename(path)) and os.path.isfile(path):
+                found.setdefault(os.path.realpath(path))
+    return list(found)
+
+
+def _named_version(path):
+    """The version that a file's name tells, as a tuple of ints, or None: libLLVM-14.0.6.so.1 is (14, 0, 6), libLLVM.so.19.1 is (19, 1)."""
+    name = _NAME.fullmatch(os.path.basename(os.path.realpath(path)))
+    text = name and (name["before"] or name["after"])
+    return tuple(int(part) for part in text.split(".") if part) if text else None
+
+
+def _ask_version(path):
+    """The version that the library itself tells, as a tuple of three ints; None where it does not load or is older than 16."""
+    try:
+        asked = subprocess.run(
+            [sys.executable, "-I", "-S", "-c", _ASK_VERSION, path], capture_output=True, text=True, timeout=60, stdin=subprocess.DEVNULL
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    numbers = asked.stdout.split()
+    return tuple(int(number) for number in numbers) if asked.returncode == 0 and len(numbers) == 3 else None
+
+
+def main():
+    path, version = find_libllvm()
+    print(f"LLVM {'.'.join(str(number) for number in version)}: {path}")
+
+
+if __name__ == "__main__":
+    cli(main)

@@ -1,0 +1,56 @@
+"""One variant for the whole session, a cleared Dr.Jit between modules, and the data that is not in the repository."""
+
+import gc
+import os
+from pathlib import Path
+
+import pytest
+
+from polysft_mi.backend import set_variant
+from polysft_mi.errors import InputError
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def pytest_addoption(parser):
+    parser.addoption("--mode", default="llvm_ad_rgb", help="Mitsuba variant of the tests (default: llvm_ad_rgb)")
+
+
+def pytest_configure(config):
+    # Before the test modules are imported: classes that derive from Mitsuba's can be defined only with a variant set
+    try:
+        config.variant = set_variant(config.getoption("--mode"))
+    except InputError as error:
+        raise pytest.UsageError(str(error)) from None
+
+
+def pytest_report_header(config):
+    return f"Mitsuba variant: {config.variant}"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cleared_dr_jit():
+    """Leave no scene, memory or flag of one module to the next; compiled kernels are kept, for they cost most of the tests' time.
+
+    An exception that pytest keeps for its report also keeps the scenes of its frames in Dr.Jit's registry, where the next module's virtual
+    function calls would still compile their code.
+    """
+    yield
+    import drjit as dr
+
+    gc.collect()
+    gc.collect()
+    dr.sync_thread()
+    dr.kernel_history_clear()
+    dr.flush_malloc_cache()
+    dr.detail.clear_registry()
+    dr.set_flag(dr.JitFlag.Default, True)
+
+
+@pytest.fixture(scope="session")
+def shared_data():
+    """The folder with the sequences that are too large or not free for the repository; POLYSFT_DATA names another."""
+    folder = Path(os.environ.get("POLYSFT_DATA") or ROOT.parent / "shared" / "data")
+    if not folder.is_dir():
+        pytest.skip(f"the sequences are not at {folder} (POLYSFT_DATA names another folder)")
+    return folder

@@ -1,0 +1,213 @@
+"""The search for libLLVM, on libraries compiled here, and the choice of the variant, in processes of their own."""
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from polysft_mi import backend
+from polysft_mi.errors import InputError
+
+ROOT = Path(__file__).resolve().parent.parent
+COMPILER = shutil.which("cc") or shutil.which("gcc")
+OLD_LLVM = [path for path in backend._libraries(backend._search_folders()) if (backend._named_version(path) or (0,))[0] == 15]
+needs_compiler = pytest.mark.skipif(not COMPILER, reason="needs a C compiler")
+
+
+def library(folder, name, version=None):
+    """A shared library in ``folder`` that tells ``version`` as LLVM 16 and newer do, or, as LLVM 15 and older, none."""
+    function = "void LLVMGetVersion(unsigned *a, unsigned *b, unsigned *c) { *a = %d; *b = %d; *c = %d; }" % version if version else "int unused;"
+    path = os.path.join(str(folder), name)
+    subprocess.run([COMPILER, "-shared", "-fPIC", "-x", "c", "-", "-o", path], input=function, text=True, check=True)
+    return path
+
+
+def python(code, **environment):
+    """Run ``code`` in a fresh interpreter; variables given as None are unset."""
+    env = {**os.environ, "PYTHONPATH": str(ROOT), **environment}
+    env = {name: value for name, value in env.items() if value is not None}
+    return subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, stdin=subprocess.DEVNULL)
+
+
+def one_line_and_status_2(process):
+    assert process.returncode == 2
+    assert process.stdout == ""
+    assert process.stderr.startswith("error: ") and process.stderr.count("\n") == 1, process.stderr
+    return process.stderr
+
+
+@pytest.fixture(autouse=True)
+def no_choice(monkeypatch):
+    monkeypatch.delenv(backend.VARIABLE, raising=False)
+
+
+@needs_compiler
+def test_newest_wins_by_number_and_not_by_text(tmp_path):
+    library(tmp_path, "libLLVM-9.so.1", (99, 0, 0))  # a name that says 9 is not even loaded
+    library(tmp_path, "libLLVM-16.so.1", (16, 0, 6))
+    newest = library(tmp_path, "libLLVM.so.19.1", (19, 1, 7))
+    library(tmp_path, "libLLVM.so.18.1", (18, 1, 8))
+    assert backend.find_libllvm([str(tmp_path)]) == (newest, (19, 1, 7))
+
+
+@needs_compiler
+def test_a_name_without_a_number_is_asked(tmp_path):
+    library(tmp_path, "libLLVM.so.17.0", (17, 0, 6))
+    plain = library(tmp_path, "libLLVM.so", (20, 1, 0))
+    assert backend.find_libllvm([str(tmp_path)]) == (plain, (20, 1, 0))
+
+
+@needs_compiler
+def test_what_the_library_tells_goes_before_its_name(tmp_path):
+    library(tmp_path, "libLLVM.so.21.1", (18, 1, 8))
+    newest = library(tmp_path, "libLLVM.so.19.1", (19, 1, 7))
+    assert backend.find_libllvm([str(tmp_path)])[0] == newest
+
+
+@needs_compiler
+def test_links_are_followed_and_folders_joined(tmp_path):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    real = library(tmp_path / "a", "libLLVM.so.19.1", (19, 1, 7))
+    os.symlink(real, tmp_path / "b" / "libLLVM-19.so")
+    library(tmp_path / "b", "libLLVM-16.so.1", (16, 0, 0))
+    assert backend.find_libllvm([str(tmp_path / "missing"), str(tmp_path / "b")])[0] == real
+
+
+@needs_compiler
+def test_unusable_files_are_passed_over(tmp_path):
+    (tmp_path / "libLLVM.so.22.1").write_text("not a library")
+    (tmp_path / "libLLVM-21.so.1").mkdir()
+    library(tmp_path, "libLLVM.so", None)  # loads, but is older than 16
+    library(tmp_path, "libLLVM-C.so.23", (23, 0, 0))  # not the whole interface
+    library(tmp_path, "libLLVMDemangle.so.23", (23, 0, 0))
+    usable = library(tmp_path, "libLLVM-16.so.1", (16, 0, 6))
+    assert backend.find_libllvm([str(tmp_path)])[0] == usable
+
+
+@needs_compiler
+def test_none_found_names_the_older_ones_and_what_to_install(tmp_path):
+    library(tmp_path, "libLLVM-15.so.1")
+    library(tmp_path, "libLLVM-14.0.6.so.1")
+    with pytest.raises(InputError, match=r"no LLVM 16 or newer found \(only LLVM 14, 15\).*apt-get install libllvm19.*DRJIT_LIBLLVM_PATH"):
+        backend.find_libllvm([str(tmp_path)])
+
+
+def test_none_found_ends_the_command_in_one_line(tmp_path):
+    message = one_line_and_status_2(python(f"from polysft_mi import backend; backend._search_folders = lambda: [{str(tmp_path)!r}]; backend.cli(backend.main)"))
+    assert "no LLVM 16 or newer found" in message and "libllvm19" in message
+
+
+@needs_compiler
+def test_the_users_choice_is_taken_before_newer_ones(tmp_path, monkeypatch):
+    library(tmp_path, "libLLVM.so.19.1", (19, 1, 7))
+    chosen = library(tmp_path, "mine.so", (17, 0, 6))
+    monkeypatch.setenv(backend.VARIABLE, chosen)
+    assert backend.find_libllvm([str(tmp_path)]) == (chosen, (17, 0, 6))
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    "name, make, complaint",
+    [
+        ("missing.so", lambda path: None, "no such file"),
+        ("libLLVM.so", lambda path: path.write_text("x"), "cannot be loaded"),
+        ("libLLVM.so", lambda path: library(path.parent, path.name), "cannot be loaded"),
+        ("libLLVM-15.so.1", lambda path: library(path.parent, path.name), "is LLVM 15"),
+        ("libLLVM.so", lambda path: library(path.parent, path.name, (12, 0, 1)), "is LLVM 12"),
+    ],
+)
+def test_a_bad_choice_is_refused_though_others_are_there(tmp_path, monkeypatch, name, make, complaint):
+    library(tmp_path, "libLLVM.so.19.1", (19, 1, 7))
+    make(tmp_path / name)
+    monkeypatch.setenv(backend.VARIABLE, str(tmp_path / name))
+    with pytest.raises(InputError, match=f"DRJIT_LIBLLVM_PATH={tmp_path / name}: {complaint}.*16 or newer, is needed"):
+        backend.find_libllvm([str(tmp_path)])
+
+
+def test_a_bad_choice_ends_the_command_in_one_line(tmp_path):
+    code = "from polysft_mi.backend import cli, set_variant; cli(lambda: set_variant('llvm_ad_rgb') and 0)"
+    message = one_line_and_status_2(python(code, DRJIT_LIBLLVM_PATH=str(tmp_path / "libLLVM.so")))
+    assert str(tmp_path / "libLLVM.so") in message
+
+
+def test_importing_has_no_side_effect():
+    code = "import os, sys, polysft_mi.backend; print([m for m in ('mitsuba', 'drjit', 'numpy', 'torch') if m in sys.modules], 'DRJIT_LIBLLVM_PATH' in os.environ)"
+    assert python(code, DRJIT_LIBLLVM_PATH=None).stdout.strip() == "[] False"
+
+
+def test_library_users_get_a_working_variant_and_the_same_on_a_second_call():
+    code = """
+from polysft_mi.backend import set_variant
+first = set_variant("llvm_ad_rgb")
+import mitsuba as mi, drjit as dr, os
+x = mi.Float(3)
+print(first, set_variant("llvm_ad_rgb"), set_variant(), dr.detail.llvm_version()[0] >= 16, os.path.isfile(os.environ["DRJIT_LIBLLVM_PATH"]), (x + 1)[0])
+"""
+    assert python(code, DRJIT_LIBLLVM_PATH=None).stdout.split() == ["llvm_ad_rgb"] * 3 + ["True", "True", "4.0"]
+
+
+@pytest.mark.skipif(not OLD_LLVM, reason="needs an LLVM 15 to start Dr.Jit on")
+def test_dr_jit_already_on_an_old_llvm_is_told():
+    """As where the caller imported Mitsuba before and LLVM 15 was found first: nothing may be computed then."""
+    code = """
+import os, mitsuba
+del os.environ["DRJIT_LIBLLVM_PATH"]
+from polysft_mi.backend import cli, set_variant
+cli(lambda: set_variant("llvm_ad_rgb") and 0)
+"""
+    assert "already runs on LLVM 15" in one_line_and_status_2(python(code, DRJIT_LIBLLVM_PATH=OLD_LLVM[0]))
+
+
+def test_a_fitting_variant_that_is_set_stays_and_another_is_replaced():
+    code = """
+import mitsuba as mi
+from polysft_mi.backend import set_variant
+mi.set_variant("scalar_rgb")
+print(set_variant("llvm_ad_rgb"), mi.variant())
+mi.set_variant("scalar_rgb")
+print(set_variant() in ("cuda_ad_rgb", "llvm_ad_rgb"), mi.variant() != "scalar_rgb")
+"""
+    assert python(code).stdout.split() == ["llvm_ad_rgb", "llvm_ad_rgb", "True", "True"]
+
+
+@pytest.mark.parametrize("mode", ["scalar_rgb", "llvm_ad_spectral", "llvm", "", "nonsense"])
+def test_an_unfit_mode_is_refused_with_the_fitting_ones(mode):
+    import mitsuba as mi
+
+    before = mi.variant()
+    with pytest.raises(InputError, match=f"mode '{mode}': one of .*llvm_ad_rgb"):
+        backend.set_variant(mode)
+    assert mi.variant() == before
+
+
+@pytest.mark.skipif(backend.gpu_works(), reason="a GPU works here")
+def test_without_a_gpu_the_default_is_llvm_and_cuda_is_refused():
+    assert python("from polysft_mi.backend import set_variant; print(set_variant())").stdout.strip() == "llvm_ad_rgb"
+    message = one_line_and_status_2(python("from polysft_mi.backend import cli, set_variant; cli(lambda: set_variant('cuda_ad_rgb') and 0)"))
+    assert "cuda_ad_rgb" in message and "GPU" in message
+
+
+@pytest.mark.skipif(not backend.gpu_works(), reason="needs a GPU")
+def test_with_a_gpu_the_default_is_cuda():
+    assert python("from polysft_mi.backend import set_variant; print(set_variant())").stdout.strip() == "cuda_ad_rgb"
+
+
+def test_trying_a_variant_tells_working_from_broken(monkeypatch):
+    """The GPU's own check, on the CPU's variant: it must see a ray and a derivative come out right, and survive a process that dies."""
+    assert backend.variant_works("llvm_ad_rgb")
+    assert not backend.variant_works("scalar_rgb")  # no Dr.Jit arrays
+    assert not backend.variant_works("llvm_ad_rgb", timeout=0.01)
+    monkeypatch.setenv(backend.VARIABLE, "/nonexistent/libLLVM.so")
+    assert not backend.variant_works("llvm_ad_rgb")
+
+
+def test_mode_on_the_command_line():
+    parser = argparse.ArgumentParser()
+    backend.add_mode_argument(parser)
+    assert parser.parse_args([]).mode is None
+    assert parser.parse_args(["-m", "cuda_ad_rgb"]).mode == parser.parse_args(["--mode", "cuda_ad_rgb"]).mode == "cuda_ad_rgb"
