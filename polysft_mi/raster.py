@@ -52,7 +52,7 @@ class Pinhole:
         self.basis = np.stack([(d[1] - d[0]) / self.width, (d[2] - d[0]) / self.height, d[0]], axis=1)
         self.inverse = np.linalg.inv(self.basis)
         # rows: right, down and forward of the OpenCV camera frame, in the world
-        self.axes = np.stack([np.cross(matrix[:3, 1], axis), -matrix[:3, 1], axis])
+        self.axes = np.stack([np.cross(axis, matrix[:3, 1]), -matrix[:3, 1], axis])
 
     def project(self, points):
         """Pixels (N, 2) of world points (N, 3) in the crop window, and whether each lies before the camera (N,)."""

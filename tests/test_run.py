@@ -1,0 +1,263 @@
+"""The whole way, from a scene file to what a run leaves: on a small sheet whose true surface is known."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import synthetic
+import trimesh
+
+from polysft_mi import evaluate, exr, metrics, prepare, run, scene, tracker
+
+ROOT = Path(__file__).resolve().parent.parent
+QUICK = ["-D", "period=30", "-D", "patience=30"]
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory):
+    """A sheet that bends and moves, as a folder with its scene.xml."""
+    truth = synthetic.cloth(tmp_path_factory.mktemp("run") / "sheet", frames=6, bend=2.0, turn=0.1)
+    prepare.main([str(truth.folder)])
+    return truth
+
+
+@pytest.fixture(scope="module")
+def result(sequence, tmp_path_factory):
+    out = tmp_path_factory.mktemp("out") / "full"
+    assert run.main([str(sequence.folder / "scene.xml"), "-o", str(out), "-q", "--exr", "3", "-D", "period=150"]) == 0
+    return out
+
+
+def command(*arguments, cwd=ROOT):
+    return [sys.executable, "-m", "polysft_mi.run", *map(str, arguments)]
+
+
+def surface(out):
+    with np.load(out / "surface.npz") as data:
+        return {k: data[k] for k in data}
+
+
+def test_reconstruction_is_right(sequence, result):
+    figures = evaluate.evaluate(str(result), str(sequence.folder))
+    still = {"vertices": np.repeat(sequence.vertices[:1], 6, 0), "faces": sequence.faces, "frames": np.arange(6)}
+    start = metrics.score(still, str(sequence.folder / "gt.npz"))
+    assert figures["frames"] == 6
+    assert figures["e3d"] < 0.25 * start["e3d"]
+    assert figures["rmse_mm"] < 2.0 and figures["en_deg"] < 4 < start["en_deg"]
+    assert figures["psnr_mask"] > 30 and figures["ssim_mask"] > 0.95
+
+
+def test_surface_keeps_the_templates_vertices_and_faces(sequence, result):
+    s = surface(result)
+    assert s["vertices"].shape == sequence.vertices.shape and s["vertices"].dtype == np.float32
+    assert np.array_equal(s["faces"], sequence.faces)
+    assert np.array_equal(s["frames"], np.arange(6))
+    assert np.abs(s["uv"] - sequence.uv).max() < 1e-6
+
+
+def test_unknowns_make_the_surface(result):
+    """params.npz is complete: the surface follows from it by the paper's formula."""
+    import torch
+    from scipy.spatial.transform import Rotation
+
+    from polyfit import jets
+
+    with np.load(result / "params.npz") as p:
+        p = {k: p[k] for k in p}
+    for k, expected in enumerate(surface(result)["vertices"]):
+        uv = p["chart"] + np.stack([p["delta_u"][k], p["delta_v"][k]], 1)
+        x = jets.point(torch.as_tensor(p["alpha"] + p["delta_alpha"][k]), torch.as_tensor(uv)).numpy()
+        x = x @ Rotation.from_quat(p["rotation"][k]).as_matrix().T + p["translation"][k]
+        assert np.abs(p["scale"] * x @ p["frame_rotation"].T + p["frame_origin"] - expected).max() < 1e-5
+
+
+def test_files_of_a_run(sequence, result):
+    assert sorted(f.name for f in (result / "meshes").iterdir()) == [f"{k:03d}.ply" for k in range(6)]
+    mesh = trimesh.load(result / "meshes" / "003.ply", process=False)
+    assert np.abs(mesh.vertices - surface(result)["vertices"][3]).max() < 1e-6
+    assert sorted(f.name for f in (result / "comparison").iterdir()) == ["000.exr", "002.exr", "005.exr"]
+    layers, header = exr.read_exr(result / "comparison" / "005.exr")
+    assert {k: v.shape for k, v in layers.items()} == {
+        "target": (72, 96, 3), "render": (72, 96, 3), "error": (72, 96, 1), "mask_target": (72, 96, 1),
+        "mask_render": (72, 96, 1), "depth": (72, 96, 1), "normal": (72, 96, 3), "uv": (72, 96, 2),
+    }  # fmt: skip
+    inside = layers["mask_render"][..., 0] > 0.999
+    V = surface(result)["vertices"][5]
+    assert np.abs(layers["depth"][inside].ravel() - V[:, 2].mean()).max() < np.ptp(V[:, 2])
+    assert (layers["normal"][inside][:, 2] < 0).all()  # towards the camera
+    assert layers["uv"][inside].min() >= 0 and layers["uv"][inside].max() <= 1
+    assert header["frame"] == 5
+    for name in ("loss.png", "comparison.png"):
+        assert (result / name).stat().st_size > 5000
+    assert (result / "comparison.mp4").exists()
+    figures = json.loads((result / "metrics.json").read_text())
+    assert figures["frames"] == 6 and figures["lost"] == {} and figures["versions"]["variant"].endswith("_ad_rgb")
+    records = [json.loads(line) for line in (result / "log.jsonl").read_text().splitlines()]
+    assert {r["frame"] for r in records} == {2, 3, 4, 5} and sum("best" in r for r in records) == 4
+
+
+def test_depth_of_the_exr_is_that_of_the_surface(result):
+    layers, _ = exr.read_exr(result / "comparison" / "002.exr")
+    s = surface(result)
+    experiment = scene.load(result / "scene.xml")
+    from polysft_mi.raster import Pinhole
+
+    camera = Pinhole(experiment.sensor)
+    y, x = np.nonzero(layers["mask_render"][..., 0] > 0.999)
+    rays = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1) @ camera.basis.T
+    z = metrics.ray_depth(s["vertices"][2].astype(float), s["faces"], camera.to_camera(rays))
+    ok = np.isfinite(z)
+    assert ok.mean() > 0.99
+    assert np.abs(z - layers["depth"][y, x, 0])[ok].max() < 1e-4
+
+
+def test_resolved_scene_runs_from_anywhere(result, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert run.main([str(result / "scene.xml"), "-o", "again", "-q", "-D", "last=2", *QUICK]) == 0
+    assert surface(tmp_path / "again")["vertices"].shape[0] == 3
+
+
+def test_resume_ends_with_the_same_result(sequence, tmp_path, monkeypatch):
+    arguments = [str(sequence.folder / "scene.xml"), "-q", *QUICK]
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    assert run.main([*arguments, "-o", str(whole)]) == 0
+
+    advance, calls = tracker._advance, []
+
+    def interrupted(*args):
+        calls.append(args)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        advance(*args)
+
+    monkeypatch.setattr(tracker, "_advance", interrupted)
+    assert run.main([*arguments, "-o", str(parts)]) == 130
+    assert surface(parts)["vertices"].shape[0] == 4  # two windows of three frames: valid, and shorter
+    assert json.loads((parts / "metrics.json").read_text())["frames"] == 4
+    monkeypatch.setattr(tracker, "_advance", advance)
+    assert run.main([*arguments, "-o", str(parts), "--resume"]) == 0
+    a, b = surface(whole), surface(parts)
+    assert a["vertices"].shape == b["vertices"].shape
+    assert np.abs(a["vertices"] - b["vertices"]).max() < 1e-5
+    lines = [(out / "log.jsonl").read_text().count("\n") for out in (whole, parts)]
+    assert lines[0] == lines[1]
+
+
+def test_ctrl_c_leaves_a_valid_shorter_result(sequence, tmp_path):
+    out = tmp_path / "out"
+    process = subprocess.Popen(
+        command(sequence.folder / "scene.xml", "-o", out, "-D", "patience=100000", "-D", "period=60"),
+        cwd=ROOT, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    checkpoint = out / "checkpoint.npz"
+    deadline = time.time() + 120
+    while not checkpoint.exists() and time.time() < deadline and process.poll() is None:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    stdout, stderr = process.communicate(timeout=120)
+    assert process.returncode == 130, stderr
+    assert "frames are kept; --resume goes on" in stderr and "Traceback" not in stderr
+    assert 3 <= surface(out)["vertices"].shape[0] < 6
+    assert np.isfinite(surface(out)["vertices"]).all()
+
+
+def test_a_frame_that_breaks_the_loss_is_reported_and_passed_over(sequence, tmp_path, capsys, monkeypatch):
+    from polysft_mi.sequence import Sequence
+
+    frame = Sequence.frame
+    monkeypatch.setattr(Sequence, "frame", lambda self, i: frame(self, i) * (np.nan if i == 3 else 1))
+    out = tmp_path / "out"
+    assert run.main([str(sequence.folder / "scene.xml"), "-o", str(out), "-q", *QUICK]) == 0
+    assert "frame 3: the loss is nan" in capsys.readouterr().err
+    s = surface(out)
+    assert np.isfinite(s["vertices"]).all() and s["vertices"].shape[0] == 6
+    assert np.array_equal(s["vertices"][3], s["vertices"][2])
+    assert "3" in json.loads((out / "metrics.json").read_text())["lost"]
+
+
+def test_a_surface_that_leaves_the_image_is_reported_and_held(sequence, tmp_path, capsys, monkeypatch):
+    from polysft_mi.solvers.adam import Adam
+
+    solve, thrown = Adam.solve, []
+
+    def thrown_out(self, problem, window, frames, report=None):
+        window, *rest = solve(self, problem, window, frames, report)
+        if frames[-1] == 4 and not thrown:
+            thrown.append(True)
+            window[-1].translation = window[-1].translation + 100
+        return window, *rest
+
+    monkeypatch.setattr(Adam, "solve", thrown_out)
+    out = tmp_path / "out"
+    assert run.main([str(sequence.folder / "scene.xml"), "-o", str(out), "-q", *QUICK, "-D", "last=4"]) == 0
+    assert "frame 4: the surface left the image; it keeps the state of the frame before" in capsys.readouterr().err
+    V = surface(out)["vertices"]
+    assert np.array_equal(V[4], V[3])
+
+
+def test_fewer_frames_than_the_window(sequence, tmp_path):
+    out = tmp_path / "out"
+    assert run.main([str(sequence.folder / "scene.xml"), "-o", str(out), "-q", *QUICK, "-D", "first=1", "-D", "last=1"]) == 0
+    assert surface(out)["frames"].tolist() == [1]
+
+
+def test_path_replay_runs_from_the_same_scene(sequence, tmp_path):
+    out = tmp_path / "out"
+    arguments = [str(sequence.folder / "scene.xml"), "-o", str(out), "-q", "-D", "integrator=prb_projective", "-D", "last=2", "-D", "window=2"]
+    assert run.main([*arguments, "-D", "period=12"]) == 0
+    records = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
+    first = [r for r in records if r["frame"] == 1]
+    assert first[-1]["loss"] < first[0]["loss"] and first[-1]["silhouette"] > 0
+
+
+def test_no_masks(sequence, tmp_path):
+    out = tmp_path / "out"
+    assert run.main([str(sequence.folder / "scene.xml"), "-o", str(out), "-q", "-D", "masks=", "-D", "last=3", "-D", "period=100"]) == 0
+    figures = metrics.score(surface(out), str(sequence.folder / "gt.npz"))
+    assert figures["rmse_mm"] < 4
+
+
+def test_the_form_of_phi_sft_with_its_other_frame_and_pixels(tmp_path):
+    truth = synthetic.phi_sft(tmp_path / "seq", frames=4, bend=1.0, turn=0.05)
+    prepare.main([str(truth.folder)])
+    out = tmp_path / "out"
+    assert run.main([str(truth.folder / "scene.xml"), "-o", str(out), "-q", "-D", "period=100"]) == 0
+    assert np.linalg.norm(surface(out)["vertices"] - truth.vertices, axis=-1).mean() < 2e-3
+
+
+def test_a_camera_elsewhere_gives_the_same_surface(sequence, result, tmp_path):
+    """The result is in the camera's frame, wherever the scene puts camera and template."""
+    import mitsuba as mi
+
+    folder = tmp_path / "moved"
+    shutil.copytree(sequence.folder, folder)
+    text = (folder / "scene.xml").read_text()
+    look = '<lookat origin="0, 0, 0" target="0, 0, 1" up="0, -1, 0"/>'
+    move = '<rotate x="0.2" y="1" z="0.1" angle="50"/><translate x="1" y="2" z="-0.5"/>'
+    assert text.count(look) == 1
+    text = text.replace(look, look + move)
+    text = text.replace('value="$data/template.obj"/>', f'value="$data/template.obj"/><transform name="to_world">{move}</transform>')
+    (folder / "scene.xml").write_text(text)
+    out = tmp_path / "out"
+    assert run.main([str(folder / "scene.xml"), "-o", str(out), "-q", "-D", "last=3", "-D", "period=100"]) == 0
+    assert np.linalg.norm(surface(out)["vertices"] - sequence.vertices[:4], axis=-1).mean() < 2e-3
+    assert mi.variant()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["flag", "kinect_paper", "phi_sft_R1"])
+def test_scenes_run_on_their_sequences(name, shared_data, tmp_path):
+    folder = shared_data / (name if name in ("kinect_paper", "phi_sft_R1") else f"cloth/{name}")
+    out = tmp_path / "out"
+    arguments = [str(ROOT / "scenes" / f"{name}.xml"), "-D", f"data={folder}", "-o", str(out), "-q", "-D", "last=3", "-D", "period=25"]
+    assert run.main(arguments) == 0
+    losses = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
+    assert losses[-1]["loss"] < losses[0]["loss"] * 1.5
+    assert os.path.getsize(out / "comparison.mp4") > 1000
