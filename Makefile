@@ -13,29 +13,30 @@ demo: venv
 test: venv
 	$(PY) -m pytest -q
 
-venv: llvm $(INSTALLED)
+venv: $(INSTALLED) llvm
 
 # Debian keeps venv's own pip in a package of its own (python3-venv); without it the system's pip puts one into the environment.
 $(INSTALLED): pyproject.toml constraints.txt
 	@if $(PYTHON) -c 'import ensurepip' 2>/dev/null; then $(PYTHON) -m venv .venv; else \
 	    $(PYTHON) -m venv --without-pip .venv && $(PYTHON) -m pip --python $(PY) install -q pip || \
 	    { rm -rf .venv; echo 'error: no virtual environment can be made: install python3-venv (Debian, Ubuntu: apt-get install python3-venv)' >&2; exit 2; }; fi
-	$(PY) -m pip install --disable-pip-version-check -c constraints.txt -e '.[test]'
+	$(PY) -m pip install --disable-pip-version-check -r constraints.txt
+	$(PY) -m pip install --disable-pip-version-check -q --no-build-isolation -c constraints.txt -e '.[test]'
 	@touch $@
 
 # Rendering on the CPU needs a libLLVM, which no Python package brings.
-llvm:
-	@$(PYTHON) -m polysft_mi.backend >/dev/null 2>&1 || { $(install_llvm); $(PYTHON) -m polysft_mi.backend; }
+llvm: $(INSTALLED)
+	@$(PY) -m polysft_mi.backend >/dev/null 2>&1 || { $(install_llvm); $(PY) -m polysft_mi.backend; }
 
-# The newest that Dr.Jit was tested with first. Does nothing where apt-get is not there or may not be used: the line above then says what to install.
+# 19 first, for it is tested most. Does nothing where apt-get is not there or may not be used: the line above then says what to install.
 define install_llvm
 if [ -z "$$DRJIT_LIBLLVM_PATH" ] && command -v apt-get >/dev/null; then \
     if [ "$$(id -u)" = 0 ]; then as_root='env DEBIAN_FRONTEND=noninteractive'; \
     elif sudo -n true 2>/dev/null; then as_root='sudo -n env DEBIAN_FRONTEND=noninteractive'; else as_root=; fi; \
     if [ -n "$$as_root" ]; then \
         echo 'installing libLLVM with apt-get'; $$as_root apt-get update -qq; \
-        for version in 19 18 17 16; do \
-            $$as_root apt-get install -qq --no-install-recommends -o DPkg::Lock::Timeout=300 libllvm$$version >/dev/null && break; \
+        for version in 19 20 18 17; do \
+            $$as_root apt-get install -qq -y --no-install-recommends -o DPkg::Lock::Timeout=300 libllvm$$version >/dev/null && break; \
         done; \
     fi; \
 fi

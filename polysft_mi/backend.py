@@ -1,7 +1,7 @@
 """What Mitsuba computes on: the variant, and the LLVM library that the CPU variants need.
 
-Dr.Jit compiles its CPU kernels with a libLLVM that it loads at run time, and takes the first one that it finds. LLVM 14 is refused, and LLVM 15
-ends the process in the middle of a render, past any ``try``; so the library is chosen here, before Dr.Jit starts.
+Dr.Jit compiles its CPU kernels with a libLLVM that it loads at run time, and takes the first one that it finds. LLVM 14 is refused, and LLVM 15 and
+16 end the process in the middle of a render, past any ``try`` (x86-64: "Cannot select: fminimum"); so the library is chosen here, before Dr.Jit starts.
 Command lines, tests and library users all call :func:`set_variant`. Importing this module has no side effect and needs the standard library alone;
 ``python -m polysft_mi.backend`` prints the library that would be used.
 """
@@ -14,10 +14,12 @@ import re
 import shutil
 import subprocess
 import sys
+import tempfile
 
 from .errors import InputError, cli
 
-OLDEST_LLVM = 16
+OLDEST_LLVM = 16  # the first that tells its version; an older one is not tried
+PROVEN_LLVM = (19, 22)  # what the tests passed with; any other is tried before it is used
 VARIABLE = "DRJIT_LIBLLVM_PATH"  # Dr.Jit's own
 SUFFIX = "_ad_rgb"  # what the code needs of a variant: Dr.Jit arrays with derivatives, three colour channels
 
@@ -47,7 +49,7 @@ ctypes.CDLL(sys.argv[1]).LLVMGetVersion(*[ctypes.byref(number) for number in num
 print(*[number.value for number in numbers])
 """
 
-# One ray against one rectangle, and a derivative: needs a driver, a device, the compiler, and (on a GPU) OptiX
+# One ray against one rectangle, a derivative, and the instruction that LLVM 15 and 16 lack: needs a driver, a device, the compiler, and (on a GPU) OptiX
 _TRY_VARIANT = """
 import sys
 import mitsuba as mi
@@ -57,16 +59,18 @@ scene = mi.load_dict({"type": "scene", "shape": {"type": "rectangle"}})
 distance = mi.Float(2, 3)
 dr.enable_grad(distance)
 hit = scene.ray_intersect(mi.Ray3f(mi.Point3f(0, 0, distance), mi.Vector3f(0, 0, -1)))
-dr.backward(hit.t * distance)
-print([float(x) for x in dr.grad(distance)] == [4, 6])
+area = dr.minimum(hit.t * distance, 8)
+dr.backward(area)
+print(list(area) == [4, 8] and list(dr.grad(distance)) == [4, 0])
 """
 
 
 def find_libllvm(folders=None):
-    """The newest libLLVM that Dr.Jit can use, LLVM 16 or newer.
+    """The newest libLLVM that Dr.Jit can use.
 
     ``DRJIT_LIBLLVM_PATH`` goes before everything, and must then hold; else the files of ``folders`` (by default: the environment's, the
-    system's usual ones, and what ``ldconfig`` knows) are each asked for their version, in a process of their own.
+    system's usual ones, and what ``ldconfig`` knows) are each asked for their version. One that is not in ``PROVEN_LLVM`` must compile and run a
+    kernel first. Asking and trying happen in processes of their own.
 
     Returns (path, version): the file's real path, and its version as a tuple of three ints.
     Raises :class:`InputError` where ``DRJIT_LIBLLVM_PATH`` names what cannot be used, or where nothing is found.
@@ -74,22 +78,22 @@ def find_libllvm(folders=None):
     chosen = os.environ.get(VARIABLE)
     if chosen:
         return chosen, _check_chosen(chosen)
-    best, older = None, set()
+    versions, unusable = {}, set()
     for path in _libraries(_search_folders() if folders is None else folders):
-        named = _named_version(path)
-        if named and named[0] < OLDEST_LLVM:  # not even loaded
-            older.add(named[0])
-            continue
-        version = _ask_version(path)
-        if version and version[0] >= OLDEST_LLVM and (best is None or version > best[1]):
-            best = path, version
-    if best is None:
-        found = f" (only LLVM {', '.join(str(v) for v in sorted(older))})" if older else ""
-        raise InputError(
-            f"no LLVM {OLDEST_LLVM} or newer found{found}, which rendering on the CPU needs: install it "
-            f"(Debian, Ubuntu: apt-get install libllvm19; Fedora: dnf install llvm-libs; macOS: brew install llvm), or set {VARIABLE} to the file of its libLLVM"
-        )
-    return best
+        version = _version(path)
+        if version and version[0] >= OLDEST_LLVM:
+            versions[path] = version
+        elif version:
+            unusable.add(version[0])
+    for path in sorted(versions, key=versions.get, reverse=True):
+        if _usable(path, versions[path]):
+            return path, versions[path]
+        unusable.add(versions[path][0])
+    found = f" (only LLVM {', '.join(str(v) for v in sorted(unusable))})" if unusable else ""
+    raise InputError(
+        f"no usable LLVM found{found}, which rendering on the CPU needs: install one "
+        f"(Debian, Ubuntu: apt-get install libllvm19; Fedora: dnf install llvm-libs; macOS: brew install llvm), or set {VARIABLE} to the file of its libLLVM"
+    )
 
 
 def set_variant(mode=None):
@@ -106,8 +110,9 @@ def set_variant(mode=None):
         return current
     if mode is None:
         mode = "cuda_ad_rgb" if gpu_works() else "llvm_ad_rgb"
+    version = None
     try:  # before the import, which already starts Dr.Jit and makes it look for an LLVM
-        os.environ[VARIABLE] = find_libllvm()[0]
+        os.environ[VARIABLE], version = find_libllvm()
     except InputError:
         if mode.startswith("llvm"):
             raise
@@ -125,9 +130,11 @@ def set_variant(mode=None):
     if mode.startswith("llvm"):
         import drjit as dr
 
-        version = dr.detail.llvm_version()[0]
-        if version < OLDEST_LLVM:  # Mitsuba or Dr.Jit was imported before
-            raise InputError(f"Dr.Jit already runs on LLVM {version}: call polysft_mi.backend.set_variant before importing mitsuba or drjit, or set {VARIABLE}")
+        running = dr.detail.llvm_version()
+        if running != version and running[0] not in PROVEN_LLVM:  # Mitsuba or Dr.Jit was imported before
+            raise InputError(
+                f"Dr.Jit already runs on LLVM {running[0]}: call polysft_mi.backend.set_variant before importing mitsuba or drjit, or set {VARIABLE}"
+            )
     return mode
 
 
@@ -137,15 +144,19 @@ def gpu_works():
     return _driver_sees_device() and variant_works("cuda_ad_rgb")
 
 
-def variant_works(mode, timeout=120.0):
-    """Whether a variant traces a ray and takes a derivative, in a process of its own so that a broken driver cannot end this one.
+def variant_works(mode, library=None, timeout=120.0):
+    """Whether a variant traces a ray and takes a derivative, in a process of its own so that a broken driver or compiler cannot end this one.
 
-    ``timeout``: seconds after which it counts as not working.
+    ``library``: the libLLVM to do it with (default: what Dr.Jit takes). ``timeout``: seconds after which it counts as not working.
     """
-    try:
-        tried = subprocess.run([sys.executable, "-c", _TRY_VARIANT, mode], capture_output=True, text=True, timeout=timeout, stdin=subprocess.DEVNULL)
-    except (OSError, subprocess.TimeoutExpired):
-        return False
+    with tempfile.TemporaryDirectory() as empty:
+        # Dr.Jit's cache on the disk would answer with kernels that another LLVM compiled
+        environment = {**os.environ, VARIABLE: library, "DRJIT_CACHE_DIR": empty} if library else None
+        code = [sys.executable, "-c", _TRY_VARIANT, mode]
+        try:
+            tried = subprocess.run(code, env=environment, capture_output=True, text=True, timeout=timeout, stdin=subprocess.DEVNULL)
+        except (OSError, subprocess.TimeoutExpired):
+            return False
     return tried.returncode == 0 and tried.stdout.split()[-1:] == ["True"]
 
 
@@ -164,16 +175,19 @@ def _driver_sees_device():
 
 
 def _check_chosen(path):
-    accepted = f"the file of a libLLVM, {OLDEST_LLVM} or newer, is needed; unset it to have one searched"
-    named = _named_version(path)
+    accepted = "the file of a newer libLLVM (19, say) is needed; unset it to have one searched"
     if not os.path.isfile(path):
         raise InputError(f"{VARIABLE}={path}: no such file; {accepted}")
-    version = named if named and named[0] < OLDEST_LLVM else _ask_version(path)
+    version = _version(path)
     if version is None:
         raise InputError(f"{VARIABLE}={path}: cannot be loaded as an LLVM {OLDEST_LLVM} or newer; {accepted}")
-    if version[0] < OLDEST_LLVM:
-        raise InputError(f"{VARIABLE}={path}: is LLVM {version[0]}; {accepted}")
+    if not _usable(path, version):
+        raise InputError(f"{VARIABLE}={path}: is LLVM {version[0]}, which Dr.Jit cannot use here; {accepted}")
     return version
+
+
+def _usable(path, version):
+    return version[0] >= OLDEST_LLVM and (version[0] in PROVEN_LLVM or variant_works("llvm_ad_rgb", library=path))
 
 
 def _search_folders():
@@ -206,12 +220,14 @@ def _named_version(path):
     return tuple(int(part) for part in text.split(".") if part) if text else None
 
 
-def _ask_version(path):
-    """The version that the library itself tells, as a tuple of three ints; None where it does not load or is older than 16."""
+def _version(path):
+    """A library's version as a tuple of ints, told by its name if that is too old to be loaded, else by itself; None where it does not load or does not tell."""
+    named = _named_version(path)
+    if named and named[0] < OLDEST_LLVM:
+        return named
+    code = [sys.executable, "-I", "-S", "-c", _ASK_VERSION, path]
     try:
-        asked = subprocess.run(
-            [sys.executable, "-I", "-S", "-c", _ASK_VERSION, path], capture_output=True, text=True, timeout=60, stdin=subprocess.DEVNULL
-        )
+        asked = subprocess.run(code, capture_output=True, text=True, timeout=60, stdin=subprocess.DEVNULL)
     except (OSError, subprocess.TimeoutExpired):
         return None
     numbers = asked.stdout.split()

@@ -56,14 +56,14 @@ def test_newest_wins_by_number_and_not_by_text(tmp_path):
 
 @needs_compiler
 def test_a_name_without_a_number_is_asked(tmp_path):
-    library(tmp_path, "libLLVM.so.17.0", (17, 0, 6))
-    plain = library(tmp_path, "libLLVM.so", (20, 1, 0))
-    assert backend.find_libllvm([str(tmp_path)]) == (plain, (20, 1, 0))
+    library(tmp_path, "libLLVM.so.19.1", (19, 1, 7))
+    plain = library(tmp_path, "libLLVM.so", (22, 1, 0))
+    assert backend.find_libllvm([str(tmp_path)]) == (plain, (22, 1, 0))
 
 
 @needs_compiler
 def test_what_the_library_tells_goes_before_its_name(tmp_path):
-    library(tmp_path, "libLLVM.so.21.1", (18, 1, 8))
+    library(tmp_path, "libLLVM.so.22.1", (18, 1, 8))
     newest = library(tmp_path, "libLLVM.so.19.1", (19, 1, 7))
     assert backend.find_libllvm([str(tmp_path)])[0] == newest
 
@@ -85,29 +85,47 @@ def test_unusable_files_are_passed_over(tmp_path):
     library(tmp_path, "libLLVM.so", None)  # loads, but is older than 16
     library(tmp_path, "libLLVM-C.so.23", (23, 0, 0))  # not the whole interface
     library(tmp_path, "libLLVMDemangle.so.23", (23, 0, 0))
-    usable = library(tmp_path, "libLLVM-16.so.1", (16, 0, 6))
+    usable = library(tmp_path, "libLLVM-19.so.1", (19, 0, 0))
     assert backend.find_libllvm([str(tmp_path)])[0] == usable
 
+
+@needs_compiler
+def test_a_version_that_is_not_proven_must_run_a_kernel_first(tmp_path):
+    library(tmp_path, "libLLVM.so.23.1", (23, 1, 0))  # tells a version, compiles nothing
+    library(tmp_path, "libLLVM-16.so.1", (16, 0, 6))
+    with pytest.raises(InputError, match=r"only LLVM 16, 23"):
+        backend.find_libllvm([str(tmp_path)])
+    proven = library(tmp_path, "libLLVM.so.19.1", (19, 1, 7))
+    assert backend.find_libllvm([str(tmp_path)])[0] == proven
+
+
+def test_the_trial_accepts_a_working_library_and_refuses_an_old_one(monkeypatch):
+    """With the machine's own libraries; as if no version were proven."""
+    monkeypatch.setattr(backend, "PROVEN_LLVM", ())
+    path, version = backend.find_libllvm()
+    assert os.path.isfile(path) and version[0] >= backend.OLDEST_LLVM
+    for old in OLD_LLVM:
+        assert not backend.variant_works("llvm_ad_rgb", library=old)
 
 @needs_compiler
 def test_none_found_names_the_older_ones_and_what_to_install(tmp_path):
     library(tmp_path, "libLLVM-15.so.1")
     library(tmp_path, "libLLVM-14.0.6.so.1")
-    with pytest.raises(InputError, match=r"no LLVM 16 or newer found \(only LLVM 14, 15\).*apt-get install libllvm19.*DRJIT_LIBLLVM_PATH"):
+    with pytest.raises(InputError, match=r"no usable LLVM found \(only LLVM 14, 15\).*apt-get install libllvm19.*DRJIT_LIBLLVM_PATH"):
         backend.find_libllvm([str(tmp_path)])
 
 
 def test_none_found_ends_the_command_in_one_line(tmp_path):
     message = one_line_and_status_2(python(f"from polysft_mi import backend; backend._search_folders = lambda: [{str(tmp_path)!r}]; backend.cli(backend.main)"))
-    assert "no LLVM 16 or newer found" in message and "libllvm19" in message
+    assert "no usable LLVM found" in message and "libllvm19" in message
 
 
 @needs_compiler
 def test_the_users_choice_is_taken_before_newer_ones(tmp_path, monkeypatch):
     library(tmp_path, "libLLVM.so.19.1", (19, 1, 7))
-    chosen = library(tmp_path, "mine.so", (17, 0, 6))
+    chosen = library(tmp_path, "mine.so", (19, 0, 0))
     monkeypatch.setenv(backend.VARIABLE, chosen)
-    assert backend.find_libllvm([str(tmp_path)]) == (chosen, (17, 0, 6))
+    assert backend.find_libllvm([str(tmp_path)]) == (chosen, (19, 0, 0))
 
 
 @needs_compiler
@@ -119,13 +137,14 @@ def test_the_users_choice_is_taken_before_newer_ones(tmp_path, monkeypatch):
         ("libLLVM.so", lambda path: library(path.parent, path.name), "cannot be loaded"),
         ("libLLVM-15.so.1", lambda path: library(path.parent, path.name), "is LLVM 15"),
         ("libLLVM.so", lambda path: library(path.parent, path.name, (12, 0, 1)), "is LLVM 12"),
+        ("libLLVM.so", lambda path: library(path.parent, path.name, (17, 0, 6)), "is LLVM 17, which Dr.Jit cannot use"),
     ],
 )
 def test_a_bad_choice_is_refused_though_others_are_there(tmp_path, monkeypatch, name, make, complaint):
     library(tmp_path, "libLLVM.so.19.1", (19, 1, 7))
     make(tmp_path / name)
     monkeypatch.setenv(backend.VARIABLE, str(tmp_path / name))
-    with pytest.raises(InputError, match=f"DRJIT_LIBLLVM_PATH={tmp_path / name}: {complaint}.*16 or newer, is needed"):
+    with pytest.raises(InputError, match=f"DRJIT_LIBLLVM_PATH={tmp_path / name}: {complaint}.*newer libLLVM.* is needed"):
         backend.find_libllvm([str(tmp_path)])
 
 
