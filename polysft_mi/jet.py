@@ -26,9 +26,10 @@ def _term(coefficient, pu, pv, a, b):
 
 
 def _coefficients(alpha, like):
-    """alpha_k for every point: a gather, whose gradient is one scatter in the same kernel."""
+    """alpha_k for every point: a gather, whose gradient is one scatter in the same kernel, in double so that its order does not show."""
     zero = dr.zeros(mi.UInt32, dr.width(like))
-    return [dr.gather(mi.Float, alpha, zero + k) for k in range(dr.width(alpha))]
+    alpha = mi.Float64(alpha)
+    return [mi.Float(dr.gather(mi.Float64, alpha, zero + k)) for k in range(dr.width(alpha))]
 
 
 def height_and_derivatives(alpha, u, v):

@@ -49,8 +49,8 @@ def interior(alpha):
 
 def edge_lengths(points, edges):
     """Lengths of the edges (pair of UInt32 of E) between points (Point3f of N): a Float of E [unit of the points]."""
-    flat = dr.ravel(points)
-    a, b = (dr.gather(mi.Point3f, flat, i) for i in edges)
+    flat = mi.Float64(dr.ravel(points))  # double for the gradients: their sum over a vertex's edges then does not depend on the order
+    a, b = (mi.Point3f(dr.gather(mi.Point3d, flat, i)) for i in edges)
     return dr.norm(a - b)
 
 

@@ -28,7 +28,7 @@ RUN = "run.json"
 
 def srgb(linear):
     """Linear values (..., 3) as sRGB in [0, 1]."""
-    x = np.clip(linear, 0, 1)
+    x = np.clip(np.nan_to_num(linear), 0, 1)
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
 
 
@@ -202,7 +202,7 @@ def write(problem, track, out, *, exr_frames=20, fps=25, command="", say=None):
 
 def _heat(error, peak=0.25):
     """An error (H, W) in [0, peak] as a picture, black to white through red and yellow."""
-    x = np.clip(error / peak, 0, 1)[..., None]
+    x = np.clip(np.nan_to_num(error) / peak, 0, 1)[..., None]
     return np.round(255 * np.clip(x * 3 - np.array([0, 1, 2]), 0, 1)).astype(np.uint8)
 
 

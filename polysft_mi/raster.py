@@ -103,8 +103,11 @@ class Topology:
         dr.eval(self.faces, self.neighbours, self.face_offset)
 
     def positions(self):
-        """Positions of all vertices, a flat Float of 3V, attached."""
-        return _joined([s.vertex_positions_buffer() for s in self.shapes])
+        """Positions of all vertices, a flat Float64 of 3V, attached.
+
+        In double precision for the sake of their gradients: threads add these up in any order, and only in float32 does the order show.
+        """
+        return mi.Float64(_joined([s.vertex_positions_buffer() for s in self.shapes]))
 
     def texcoords(self):
         """Texture coordinates of all vertices, a flat Float of 2V; zeros for meshes that have none."""
@@ -258,9 +261,9 @@ class RasterIntegrator(mi.SamplingIntegrator):
         basis, inverse, origin = camera.device(scale)
 
         positions = topology.positions()
-        vertex = dr.gather(mi.Point3f, positions, dr.arange(mi.UInt32, topology.vertex_count))
+        vertex = _gather_point(positions, dr.arange(mi.UInt32, topology.vertex_count))
         relative = inverse @ (vertex - origin)  # (x z, y z, z): pixels times depth
-        screen = mi.Point3f(relative.x / relative.z, relative.y / relative.z, relative.z)
+        screen = mi.Point3d(mi.Point3f(relative.x / relative.z, relative.y / relative.z, relative.z))
         dr.eval(screen)
         x0, y0, w, h = self._bounds(screen, width, height)
 
@@ -298,11 +301,9 @@ class RasterIntegrator(mi.SamplingIntegrator):
         if self.shading != "unlit":
             return 0, 0, width, height  # the environment is seen everywhere
         with dr.suspend_grad():
-            low = dr.minimum(dr.min(screen.x), 1e9), dr.minimum(dr.min(screen.y), 1e9)
-            box = dr.ravel(mi.Point4f(low[0], low[1], dr.max(screen.x), dr.max(screen.y)))
-            near = dr.min(screen.z)
-            dr.eval(box, near)
-            (xa, ya, xb, yb), near = box.numpy().tolist(), near[0]
+            box = [dr.min(screen.x), dr.min(screen.y), dr.max(screen.x), dr.max(screen.y), dr.min(screen.z)]
+            dr.eval(box)
+            xa, ya, xb, yb, near = (x[0] for x in box)
         if not near > _NEAR or not all(map(math.isfinite, (xa, ya, xb, yb))):
             return 0, 0, width, height
         # one pixel of margin, for the neighbours that antialiasing blends with
@@ -316,7 +317,7 @@ class RasterIntegrator(mi.SamplingIntegrator):
         """Surface interaction of rays with the planes of their triangles (attached), and depth along the axis."""
         t = mi.UInt32(dr.select(hit, triangle, 0))
         index = [dr.gather(mi.UInt32, topology.faces, 3 * t + k, hit) for k in range(3)]
-        p0, p1, p2 = (dr.gather(mi.Point3f, positions, i, hit) for i in index)
+        p0, p1, p2 = (_gather_point(positions, i, hit) for i in index)
         e1, e2 = p1 - p0, p2 - p0
         # Moeller-Trumbore, without its tests: the ray is known to hit
         pv = dr.cross(ray.d, e2)
@@ -377,7 +378,7 @@ class RasterIntegrator(mi.SamplingIntegrator):
         horizontal_count, count = (w - 1) * h, (w - 1) * h + w * (h - 1)
         if count == 0:
             return channels
-        source = [mi.Float(c) for c in channels]
+        source = [mi.Float64(c) for c in channels]  # double for the gradients, as positions are
         dr.eval(source)  # what is gathered from must be in memory
         with dr.suspend_grad():
             split, columns = dr.opaque(mi.UInt32, horizontal_count), w_ - 1
@@ -433,11 +434,11 @@ class RasterIntegrator(mi.SamplingIntegrator):
                 topology, positions, dr.reinterpret_array(mi.ShapePtr, shape), visible, mi.Ray3f(origin, direction / length), length, visible >= 0
             )
             incoming[:3] = self._unlit(si, visible >= 0)
-        out = [c + 0 for c in source]
+        out = [mi.Float64(c) for c in source]
         for c in range(len(out)):
             difference = incoming[c] - _gather_pixel(source[c], target)
-            dr.scatter_add(out[c], weight * difference, target, mode=dr.ReduceMode.Local)
-        return out
+            dr.scatter_add(out[c], mi.Float64(weight * difference), target, mode=dr.ReduceMode.Local)
+        return [mi.Float(c) for c in out]
 
     @staticmethod
     def _centre(pixel, x0, y0, w):
@@ -469,7 +470,7 @@ class RasterIntegrator(mi.SamplingIntegrator):
         def area(points):
             return _cross2(points[1] - points[0], points[2] - points[0])
 
-        flat = dr.ravel(dr.detach(screen))
+        flat = mi.Float(dr.ravel(dr.detach(screen)))
         dr.eval(flat)
 
         def step(active, current, found, va, vb, steps):
@@ -536,9 +537,14 @@ class RasterIntegrator(mi.SamplingIntegrator):
 
 def _gather_pixel(channel, pixel):
     """Values of a region-sized array. Local reduction in its gradient: the default would bake the region's size into the kernel."""
-    return dr.gather(mi.Float, channel, pixel, mode=dr.ReduceMode.Local)
+    return mi.Float(dr.gather(mi.Float64, channel, pixel, mode=dr.ReduceMode.Local))
+
+
+def _gather_point(positions, index, mask=True):
+    """Points of a flat Float64 array, attached to it."""
+    return mi.Point3f(dr.gather(mi.Point3d, positions, index, mask))
 
 
 def _point2(screen, index, mask=True):
     """Screen positions of the vertices ``index``, attached to ``screen``."""
-    return mi.Point2f(dr.gather(mi.Float, screen.x, index, mask), dr.gather(mi.Float, screen.y, index, mask))
+    return mi.Point2f(*(mi.Float(dr.gather(mi.Float64, x, index, mask)) for x in (screen.x, screen.y)))
