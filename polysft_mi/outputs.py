@@ -15,12 +15,12 @@ import mitsuba as mi
 import numpy as np
 
 from . import __version__, figures, meshio, metrics
+from .defaults import located
 from .exr import write_exr
 from .files import aside
 from .patch import Unknowns
 from .problem import TERMS
 from .raster import RasterIntegrator
-from .scene import located
 from .video import write_video
 
 RUN = "run.json"

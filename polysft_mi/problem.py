@@ -38,6 +38,14 @@ class Target:
     area: mi.Float
 
 
+class BadFrame(FloatingPointError):
+    """The objective of ``frame`` is not finite."""
+
+    def __init__(self, frame, value):
+        super().__init__(f"the loss is {value}")
+        self.frame = frame
+
+
 class Problem:
     """Shape from template on one video.
 
@@ -166,13 +174,17 @@ class Problem:
     def evaluate(self, window, frames, *, backward=False, seed=0):
         """The objective over a window: (total, terms), numbers; with ``backward``, the gradients are added to the unknowns.
 
-        ``window``: list of W Unknowns; ``frames``: their frames. Each frame's graph is traversed and freed before the next.
+        ``window``: list of W Unknowns; ``frames``: their frames. Each frame's graph is traversed and freed before the next. Raises
+        :class:`BadFrame` where a frame's part is not finite.
         """
         sums = dict.fromkeys(TERMS, 0.0)
         parts = []
         for k, (unknowns, frame) in enumerate(zip(window, frames)):
             terms = {name: value / len(window) for name, value in self.frame_terms(unknowns, frame, seed + 2 * k).items()}
             parts.append(self._finish(terms, backward))
+            value = sum(x[0] for x in parts[-1].values())
+            if not np.isfinite(value):
+                raise BadFrame(frame, value)
         if len(window) > 1:
             parts.append(self._finish({"temporal": self.temporal_term(window)}, backward))
         for part in parts:

@@ -55,7 +55,7 @@ def main(arguments=None):
 
     out = options.output
     _check_output(out, options)
-    from .scene import resolved_defaults
+    from .defaults import resolved_defaults
 
     resolved_defaults(options.scene, overrides)  # a wrong name is told before anything heavy is loaded
     from .backend import set_variant

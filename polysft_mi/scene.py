@@ -3,9 +3,7 @@
 Import only after a Mitsuba variant is set.
 """
 
-import difflib
 import os
-import xml.etree.ElementTree as ET
 from dataclasses import dataclass, field
 
 import drjit as dr
@@ -14,6 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from . import meshio, plugins
+from .defaults import located, resolved_defaults
 from .errors import InputError
 from .settings import Settings
 from .template import Template
@@ -43,34 +42,6 @@ class Experiment:
     def size(self):
         """(width, height) of the film's crop window, pixels."""
         return tuple(int(x) for x in self.sensor.film().crop_size())
-
-
-def known_defaults(path):
-    """Name to value of every ``<default>`` of a scene file. Raises InputError where the file is missing or not XML."""
-    if not os.path.isfile(path):
-        raise InputError(f"{path}: no such scene file")
-    try:
-        root = ET.parse(path).getroot()
-    except ET.ParseError as error:
-        raise InputError(f"{path}: not a readable XML scene: {error}") from None
-    return {e.get("name"): e.get("value") for e in root.iter("default") if e.get("name")}
-
-
-def resolved_defaults(path, overrides):
-    """The defaults of a scene file with ``overrides`` (name to text) in force. Raises InputError for a name that the file does not have."""
-    known = known_defaults(path)
-    for name in overrides:
-        if name not in known:
-            near = difflib.get_close_matches(name, known, 1)
-            hint = f"; did you mean {near[0]}?" if near else ""
-            raise InputError(f"-D {name}: {path} has no such setting{hint} Known: {', '.join(sorted(known)) or 'none'}")
-    return {**known, **overrides}
-
-
-def located(scene, path):
-    """A path of a scene file, found as Mitsuba finds it: beside the scene, else from the working directory."""
-    beside = os.path.join(os.path.dirname(os.path.abspath(scene)), path)
-    return os.path.abspath(path) if not os.path.exists(beside) and os.path.exists(path) else beside
 
 
 def load(path, overrides=None):

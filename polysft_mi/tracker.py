@@ -13,7 +13,7 @@ import numpy as np
 from .errors import InputError
 from .files import aside
 from .patch import Unknowns
-from .problem import TERMS
+from .problem import TERMS, BadFrame
 
 CHECKPOINT, LOG = "checkpoint.npz", "log.jsonl"
 _VISIBLE = 0.02  # share of the vertices inside the image below which the surface is said to have left it
@@ -25,7 +25,8 @@ class Track:
     """The state of a run: unknowns of the frames reached so far, and what each window took.
 
     ``states``: one dict of arrays (:meth:`Unknowns.to_numpy`) a frame; ``next_window``: first frame of the next window to solve;
-    ``iterations``, ``seconds``: one entry a solved window; ``totals``: its terms at the minimum; ``lost``: frame -> reason.
+    ``iterations``, ``seconds``: one entry a solved window; ``totals``: its terms at the minimum; ``lost``: frame -> reason for
+    those that keep the state of the frame before; ``unusable``: those among them whose image breaks the objective.
     """
 
     states: list = field(default_factory=list)
@@ -34,10 +35,11 @@ class Track:
     seconds: list = field(default_factory=list)
     totals: list = field(default_factory=list)
     lost: dict = field(default_factory=dict)
+    unusable: dict = field(default_factory=dict)
 
     def save(self, path):
         arrays = {name: np.stack([s[name] for s in self.states]) for name in Unknowns.NAMES}
-        meta = {k: getattr(self, k) for k in ("next_window", "iterations", "seconds", "totals", "lost")}
+        meta = {k: getattr(self, k) for k in ("next_window", "iterations", "seconds", "totals", "lost", "unusable")}
         with aside(path) as temporary:
             np.savez(temporary, meta=json.dumps(meta), **arrays)
 
@@ -49,7 +51,8 @@ class Track:
                 arrays = {name: data[name] for name in Unknowns.NAMES}
         except (OSError, ValueError, KeyError) as error:
             raise InputError(f"{path}: not a checkpoint of a run ({error}); start again with --overwrite") from None
-        meta["lost"] = {int(k): v for k, v in meta["lost"].items()}
+        for name in ("lost", "unusable"):
+            meta[name] = {int(k): v for k, v in meta[name].items()}
         count = len(arrays["rotation"])
         return cls(states=[{name: arrays[name][k] for name in arrays} for k in range(count)], **meta)
 
@@ -78,39 +81,44 @@ def _advance(problem, solver, done, start, width, log, progress):
     members = list(range(start, start + width))
     while len(done.states) < start + width:
         done.states.append(dict(done.states[-1]) if done.states else problem.patch.rest().to_numpy())
-    before = [Unknowns.from_numpy(done.states[k]) for k in members]
     began = time.perf_counter()
     latest = [0]
 
     def report(iteration, total, terms):
-        latest[0] = iteration
+        latest[0] = iteration + 1
         if iteration % _LOG_EVERY == 0:
             log.write(json.dumps(_record(members[-1], iteration, total, terms)) + "\n")
         if progress:
             progress(members[-1], iteration, total, terms)
 
-    reason, terms, iterations = None, dict.fromkeys(TERMS, float("nan")), 0
-    try:
-        window, total, terms, iterations = solver.solve(problem, before, members, report)
-        log.write(json.dumps(_record(members[-1], iterations - 1, total, terms) | {"best": True}) + "\n")
-    except FloatingPointError as error:
-        window, iterations, reason = before, latest[0] + 1, str(error)
-    states = [w.to_numpy() for w in window]
-    for place, k in enumerate(members):
-        failed = reason if place == width - 1 else None
-        if not all(np.isfinite(x).all() for x in states[place].values()):
-            failed = "the state is not finite"
-        elif problem.visible_share(window[place]) < _VISIBLE:
-            failed = "the surface left the image"
-        if failed:
-            states[place] = dict(states[place - 1] if place else before[0].to_numpy())
-            done.lost[k] = failed
-        else:
-            done.lost.pop(k, None)
-    for place, k in enumerate(members):
-        done.states[k] = states[place]
+    solved, terms, failed = {}, dict.fromkeys(TERMS, float("nan")), {}
+    while usable := [k for k in members if k not in done.unusable]:
+        before = [Unknowns.from_numpy(done.states[k]) for k in usable]
+        try:
+            window, total, terms, latest[0] = solver.solve(problem, before, usable, report)
+            solved = dict(zip(usable, window))
+            break
+        except BadFrame as error:
+            if latest[0]:  # it was finite at the start: the solver ran away, the image is not to blame
+                failed[members[-1]] = f"{error} at iteration {latest[0]}"
+                break
+            done.unusable[error.frame] = f"{error} from the start"
+    log.write(json.dumps(_record(members[-1], latest[0], sum(terms.values()), terms) | {"best": True}) + "\n")
+
+    for k in members:
+        if k in solved:
+            state = solved[k].to_numpy()
+            if not all(np.isfinite(x).all() for x in state.values()):
+                failed[k] = "its state is not finite"
+            elif problem.visible_share(solved[k]) < _VISIBLE:
+                failed[k] = "the surface left the image"
+            else:
+                done.states[k] = state
+        if k > 0 and (k in failed or k in done.unusable):
+            done.states[k] = dict(done.states[k - 1])
+    done.lost = {k: reason for k, reason in done.lost.items() if k not in members} | failed | done.unusable
     done.next_window = start + 1
-    done.iterations.append(iterations)
+    done.iterations.append(latest[0])
     done.seconds.append(time.perf_counter() - began)
     done.totals.append(terms)
 

@@ -20,7 +20,7 @@ class Adam:
     def solve(self, problem, window, frames, report=None):
         """Minimise ``problem`` over ``window`` (list of Unknowns) for ``frames``: (window, total, terms, iterations).
 
-        ``report(iteration, total, terms)`` is called after each evaluation. Raises FloatingPointError where the objective is not finite.
+        ``report(iteration, total, terms)`` is called after each evaluation. BadFrame passes through.
         """
         s = self.settings
         optimizer = mi.ad.Adam(lr=s.lr_uv)
@@ -40,8 +40,6 @@ class Adam:
         while True:
             current = [Unknowns(**{n: optimizer[f"{k}.{n}"] for n in Unknowns.NAMES}) for k in range(len(window))]
             total, terms = problem.evaluate(current, frames, backward=True, seed=s.seed + iteration)
-            if not math.isfinite(total):
-                raise FloatingPointError(f"the loss is {total} at iteration {iteration}")
             if total < best_total:
                 best, best_total, best_terms, since = [w.copy() for w in current], total, terms, 0
             else:
