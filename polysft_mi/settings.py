@@ -1,6 +1,7 @@
 """The settings of an experiment: names, types, defaults and meanings, in one place.
 
 A scene file carries each of them as a ``<default>`` and hands it to the ``polysft`` plugin; ``-D name=value`` overrides it.
+``python -m polysft_mi.settings`` prints them as the table in ``docs/scene.md``.
 """
 
 import dataclasses
@@ -93,3 +94,25 @@ def from_properties(props):
             except (TypeError, ValueError):
                 raise InputError(f"setting {f.name} = {value!r}; a {_type_name(f)} is needed") from None
     return Settings(**values)
+
+
+def table():
+    """All settings as a Markdown table."""
+    rows = ["| setting | type | default | accepted | meaning |", "|---|---|---|---|---|"]
+    for f in dataclasses.fields(Settings):
+        rows.append(f"| `{f.name}` | {_type_name(f)} | `{f.default}` | {_accepted(f.metadata)} | {f.metadata['doc']} |")
+    return "\n".join(rows)
+
+
+def _accepted(meta):
+    if meta["choices"]:
+        return ", ".join(f"`{c}`" for c in meta["choices"])
+    if meta["above"] is not None:
+        return f"above {meta['above']}"
+    if math.isinf(meta["high"]):
+        return f"at least {meta['low']}" if math.isfinite(meta["low"]) else "any"
+    return f"{meta['low']} to {meta['high']}"
+
+
+if __name__ == "__main__":
+    print(table())
