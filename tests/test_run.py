@@ -23,7 +23,7 @@ QUICK = ["-D", "period=30", "-D", "patience=30"]
 @pytest.fixture(scope="module")
 def sequence(tmp_path_factory):
     """A sheet that bends and moves, as a folder with its scene.xml."""
-    truth = synthetic.cloth(tmp_path_factory.mktemp("run") / "sheet", frames=6, bend=1.5, turn=0.05)
+    truth = synthetic.cloth(tmp_path_factory.mktemp("run") / "sheet", frames=6, bend=2.5, turn=0.1)
     prepare.main([str(truth.folder)])
     return truth
 
@@ -31,7 +31,7 @@ def sequence(tmp_path_factory):
 @pytest.fixture(scope="module")
 def result(sequence, tmp_path_factory):
     out = tmp_path_factory.mktemp("out") / "full"
-    assert run.main([str(sequence.folder / "scene.xml"), "-o", str(out), "-q", "--exr", "3", "-D", "period=150"]) == 0
+    assert run.main([str(sequence.folder / "scene.xml"), "-o", str(out), "-q", "--exr", "3", "-D", "period=350"]) == 0
     return out
 
 
@@ -49,8 +49,8 @@ def test_reconstruction_is_right(sequence, result):
     still = {"vertices": np.repeat(sequence.vertices[:1], 6, 0), "faces": sequence.faces, "frames": np.arange(6)}
     start = metrics.score(still, str(sequence.folder / "gt.npz"))
     assert figures["frames"] == 6
-    assert figures["e3d_proc"] < 0.25 * start["e3d_proc"]
-    assert figures["rmse_mm"] < 3.0 and figures["en_deg"] < 2.5 < start["en_deg"]
+    assert figures["e3d_proc"] < 0.5 * start["e3d_proc"]
+    assert figures["rmse_mm"] < 3.0 and figures["en_deg"] < 0.5 * start["en_deg"]
     assert figures["psnr_mask"] > 30 and figures["ssim_mask"] > 0.95
 
 
@@ -231,8 +231,10 @@ def test_the_form_of_phi_sft_with_its_other_frame_and_pixels(tmp_path):
     prepare.main([str(truth.folder)])
     out = tmp_path / "out"
     assert run.main([str(truth.folder / "scene.xml"), "-o", str(out), "-q", "-D", "period=100"]) == 0
-    still = np.linalg.norm(truth.vertices[:1] - truth.vertices, axis=-1).mean()
-    assert np.linalg.norm(surface(out)["vertices"] - truth.vertices, axis=-1).mean() < 0.3 * still
+    # so few iterations leave the depth open; what the image shows must fit all the same
+    seen, true = (v[..., :2] / v[..., 2:] * truth.K[[0, 1], [0, 1]] + truth.K[:2, 2] for v in (surface(out)["vertices"], truth.vertices))
+    still = np.linalg.norm(true - true[:1], axis=-1)[3].mean()
+    assert np.linalg.norm(seen - true, axis=-1).mean() < 0.25 < 0.1 * still
 
 
 def test_a_camera_elsewhere_gives_the_same_surface(sequence, result, tmp_path):
@@ -247,8 +249,9 @@ def test_a_camera_elsewhere_gives_the_same_surface(sequence, result, tmp_path):
     text = text.replace('value="$data/template.obj"/>', f'value="$data/template.obj"/><transform name="to_world">{move}</transform>')
     (folder / "scene.xml").write_text(text)
     out = tmp_path / "out"
-    assert run.main([str(folder / "scene.xml"), "-o", str(out), "-q", "-D", "last=2", "-D", "period=150"]) == 0
-    assert np.abs(surface(out)["vertices"] - surface(result)["vertices"][:3]).max() < 5e-3
+    assert run.main([str(folder / "scene.xml"), "-o", str(out), "-q", "-D", "last=2", "-D", "period=350"]) == 0
+    first = surface(result)["vertices"][0]  # settled in the first window, the only one that both runs share
+    assert np.abs(surface(out)["vertices"][0] - first).max() < 1e-3 < np.abs(first[:, 2] - first[0, 2]).max()
 
 
 @pytest.mark.slow
