@@ -163,14 +163,12 @@ def write(problem, track, out, *, exr_frames=20, fps=25, command="", say=None):
             if k in exr:
                 metadata = {"frame": int(indices[k]), "scene": os.path.abspath(problem.experiment.path), **versions()}
                 write_exr(os.path.join(out, "comparison", f"{indices[k]:03d}.exr"), layers, metadata)
-            target, render = (np.round(255 * srgb(layers[n])).astype(np.uint8) for n in ("target", "render"))
+            target, render, error = (_panel(layers[n]) for n in ("target", "render", "error"))
+            target, render = (np.round(255 * srgb(x)).astype(np.uint8) for x in (target, render))
+            surface = figures.shade_surface(vertices[k], template.faces, view, uv=template.uv, size=target.shape[1::-1])
             if k in sheet:
-                surface = figures.shade_surface(vertices[k], template.faces, view, uv=template.uv, size=target.shape[1::-1])
-                rows.append(
-                    {"target": target, "render": render, "error": layers["error"], "surface": surface, "label": f"frame {indices[k]}"}
-                )
-            shade = figures.shade_surface(vertices[k], template.faces, view, uv=template.uv, size=target.shape[1::-1])
-            yield np.concatenate([target, render, _heat(layers["error"]), shade], axis=1)
+                rows.append({"target": target, "render": render, "error": error, "surface": surface, "label": f"frame {indices[k]}"})
+            yield np.concatenate([target, render, _heat(error), surface], axis=1)
 
     video = write_video(os.path.join(out, "comparison.mp4"), video_frames(), fps)
     figures.contact_sheet(os.path.join(out, "comparison.png"), rows)
@@ -200,16 +198,24 @@ def write(problem, track, out, *, exr_frames=20, fps=25, command="", say=None):
     return {**summary, "video": video}
 
 
+def _panel(image, width=640):
+    """An image shrunk to at most ``width`` pixels across, for the video and the contact sheet."""
+    import cv2
+
+    scale = width / image.shape[1]
+    return image if scale >= 1 else cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+
+
 def _heat(error, peak=0.25):
     """An error (H, W) in [0, peak] as a picture, black to white through red and yellow."""
     x = np.clip(np.nan_to_num(error) / peak, 0, 1)[..., None]
     return np.round(255 * np.clip(x * 3 - np.array([0, 1, 2]), 0, 1)).astype(np.uint8)
 
 
-def write_beginning(out, experiment, command):
-    """What stands in the folder from the first second: the resolved scene, and what the run is."""
+def write_beginning(out, scene, command):
+    """What stands in the folder from the first second: the resolved scene (text), and what the run is."""
     with aside(os.path.join(out, "scene.xml")) as temporary, open(temporary, "w", encoding="utf-8") as file:
-        file.write(resolved_scene(experiment))
+        file.write(scene)
     write_json(os.path.join(out, RUN), {"command": command, "started": time.strftime("%Y-%m-%dT%H:%M:%S"), "versions": versions()})
 
 
