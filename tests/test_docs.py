@@ -1,0 +1,105 @@
+"""What the documentation says about files, commands, settings and plugins is so."""
+
+import importlib.util
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from polysft_mi import plugins, scene, settings
+from polysft_mi.problem import Problem
+from polysft_mi.sequence import Sequence
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = [p for p in [ROOT / "README.md", ROOT / "scenes" / "README.md", *sorted((ROOT / "docs").glob("*.md"))] if p.exists()]
+SCENE = (ROOT / "docs" / "scene.md").read_text(encoding="utf-8")
+FOLDERS = "polysft_mi|polyfit|onefit|scenes|tests|docs|benchmarks"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
+class TestPage:
+    def test_files_that_it_names_are_there(self, page):
+        named = set(re.findall(rf"(?<![\w/$.])((?:{FOLDERS})/[\w./-]*\w)", page.read_text(encoding="utf-8")))
+        assert [n for n in sorted(named) if not (ROOT / n).exists()] == []
+
+    def test_modules_and_names_that_it_names_are_there(self, page):
+        text = page.read_text(encoding="utf-8")
+        commands = set(re.findall(r"python -m ([\w.]+)", text)) - {"pytest", "pip", "venv"}
+        assert [m for m in sorted(commands) if importlib.util.find_spec(m) is None] == []
+        for name in re.findall(r"`((?:polysft_mi|polyfit|onefit)\.[\w.]+)", text):
+            module, _, attribute = name.partition(".")[2].partition(".")
+            found = importlib.import_module(f"{name.split('.')[0]}.{module}")
+            assert not attribute or hasattr(found, attribute), name
+
+    def test_links_lead_somewhere(self, page):
+        for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8")):
+            if re.match(r"[a-z]+:", link):
+                continue
+            path, _, anchor = link.partition("#")
+            target = (page.parent / path).resolve() if path else page
+            assert target.exists(), link
+            if anchor:
+                headings = re.findall(r"^#+ (.+)$", target.read_text(encoding="utf-8"), re.M)
+                assert anchor in [re.sub(r"[^\w\- ]", "", h).strip().lower().replace(" ", "-") for h in headings], link
+
+
+def test_table_of_settings_is_the_generated_one():
+    shown = re.search(r"<!-- settings -->\n(.*?)\n<!-- /settings -->", SCENE, re.S)
+    assert shown[1] == settings.table()
+
+
+def test_every_plugin_and_parameter_is_described():
+    parts = dict(re.findall(r"^### (\w+)\n(.*?)(?=^##)", SCENE, re.M | re.S))
+    registered = {
+        "polysft": plugins.PolySfT,
+        "raster": plugins.RasterIntegrator,
+        "silhouette_projective": plugins.SilhouetteProjective,
+        "pinhole": plugins.PinholeSensor,
+        "varol_template": plugins._varol_template,
+    }
+    assert sorted(parts) == sorted(registered)
+    for name, plugin in registered.items():
+        documented = re.findall(r"^\s*\* - ([\w, ]+)$", plugin.__doc__, re.M)
+        for parameter in ", ".join(documented).split(", ") if documented else []:
+            assert f"`{parameter}`" in parts[name], (name, parameter)
+        described = re.findall(r"`(\w+)`", " ".join(re.findall(r"^\| (`[^|]+)\|", parts[name], re.M)))
+        assert set(described) <= set(", ".join(documented).split(", ")), name
+
+
+def test_example_scene_runs(tmp_path):
+    (tmp_path / "example.xml").write_text(re.search(r"```xml\n(<scene.*?)```", SCENE, re.S)[1])
+    experiment = scene.load(tmp_path / "example.xml", {"data": str(ROOT / "scenes" / "demo"), "last": "0"})
+    sequence = Sequence.open(experiment.frames, experiment.masks, last=experiment.settings.last, size=experiment.size)
+    problem = Problem(experiment, sequence)
+    assert experiment.settings == settings.Settings(last=0)
+    _, alpha = problem.image(problem.patch.vertices(problem.patch.rest()))
+    mask = sequence.mask(0)
+    assert np.abs(np.array(alpha).reshape(mask.shape) - mask).mean() < 0.1 * mask.mean()
+
+
+def test_order_of_the_coefficients():
+    from polyfit.jets import exponents
+
+    text = (ROOT / "docs" / "conventions.md").read_text(encoding="utf-8")
+    power = {"": 1, "²": 2, "³": 3, "⁴": 4}
+    shown = {}
+    for index, monomial in re.findall(r"\| (\d+): ([1uv²³⁴]+) (?=\|)", text.replace("|", "| |")):
+        e = {name: power[p] for name, p in re.findall(r"([uv])([²³⁴]?)", monomial)}
+        shown[int(index)] = (e.get("u", 0), e.get("v", 0))
+    assert [shown[k] for k in range(15)] == [tuple(e) for e in exponents(4).tolist()]
+
+
+def test_files_of_a_run_are_described():
+    from polysft_mi import run
+
+    text = (ROOT / "docs" / "conventions.md").read_text(encoding="utf-8")
+    assert [n for n in (*run._OURS, *run._PICTURES) if f"`{n}`" not in text] == []
+    assert [n for n in run._FOLDERS if f"`{n}/NNN" not in text] == []
+
+
+def test_options_of_the_command_are_described():
+    from polysft_mi import run
+
+    options = [o for action in run.parser()._actions for o in action.option_strings if o not in ("-h", "--help", "-o", "--output")]
+    assert [o for o in options if f"`{o}" not in SCENE] == []
