@@ -33,6 +33,7 @@ class Pinhole:
 
     def __init__(self, sensor):
         film = sensor.film()
+        self._device = {}
         self.width, self.height = (int(x) for x in film.crop_size())
 
         corners = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], dtype=np.float32)
@@ -66,12 +67,14 @@ class Pinhole:
 
     def device(self, scale=1):
         """The map as opaque Dr.Jit values (so that no number of it is baked into a kernel); ``scale`` samples a pixel and axis."""
-        basis, inverse = self.basis.copy(), self.inverse.copy()
-        basis[:, :2] /= scale
-        inverse[:2] *= scale
-        values = [mi.Matrix3f(basis), mi.Matrix3f(inverse), mi.Point3f(self.origin)]
-        dr.make_opaque(values)
-        return values
+        if scale not in self._device:
+            basis, inverse = self.basis.copy(), self.inverse.copy()
+            basis[:, :2] /= scale
+            inverse[:2] *= scale
+            values = [mi.Matrix3f(basis), mi.Matrix3f(inverse), mi.Point3f(self.origin)]
+            dr.make_opaque(values)
+            self._device[scale] = values
+        return self._device[scale]
 
 
 class Topology:
@@ -188,7 +191,7 @@ class RasterIntegrator(mi.SamplingIntegrator):
             if name not in _AOVS:
                 raise InputError(f"raster: aov {name!r}; known: {', '.join(_AOVS)}")
         self._topology = None
-        self._cameras = {}
+        self._camera_of = self._pinhole = None
 
     def aov_names(self):
         return [f"{name}.{channel}" for name in self.aovs for channel in _AOV_CHANNELS[name]]
@@ -242,11 +245,14 @@ class RasterIntegrator(mi.SamplingIntegrator):
     # -- the image ----------------------------------------------------------
 
     def _camera(self, sensor):
+        """The sensor as a linear map, made anew when the sensor, its pose, its lens or its crop window has changed."""
         film = sensor.film()
-        key = (id(sensor), tuple(film.crop_size()), tuple(film.crop_offset()))
-        if key not in self._cameras:
-            self._cameras = {key: Pinhole(sensor)}
-        return self._cameras[key]
+        pose = [sensor.world_transform()] + ([sensor.projection_transform()] if hasattr(sensor, "projection_transform") else [])
+        with dr.suspend_grad():
+            key = (id(sensor), tuple(film.crop_size()), tuple(film.crop_offset()), *(np.array(t.matrix).tobytes() for t in pose))
+        if self._camera_of != key:
+            self._camera_of, self._pinhole = key, Pinhole(sensor)
+        return self._pinhole
 
     def _image(self, scene, sensor, seed, spp):
         spp = spp or sensor.sampler().sample_count()
@@ -285,16 +291,14 @@ class RasterIntegrator(mi.SamplingIntegrator):
 
         si, z = self._interaction(topology, positions, pi.shape, triangle, ray, length, hit)
         colour = self._unlit(si, hit) if self.shading == "unlit" else self._lit(scene, pi, ray, hit, seed)
-        channels = [*colour, dr.select(hit, mi.Float(1), 0)]
+        # red, green, blue and alpha packed; in double for the gradients, as positions are
+        rgba = dr.ravel(mi.Vector4d(*colour, dr.select(hit, mi.Float(1), 0)))
+        region = (x0_, y0_, w_, w, h)
         if self.antialias:
-            region = (x0_, y0_, w_, w, h)
-            channels = self._antialias(topology, positions, screen, triangle, depth, pi, channels, region, (basis, origin))
-        for name in self.aovs:
-            channels += self._aov(name, si, z, triangle, ray, hit)
-
-        if not mi.has_flag(sensor.film().flags(), mi.FilmFlags.Alpha):
-            del channels[3]
-        return self._assemble(channels, (x0_, y0_, w_, w, h), camera, scale)
+            rgba = self._antialias(topology, positions, screen, triangle, depth, pi, rgba, region, (basis, origin))
+        aovs = [channel for name in self.aovs for channel in self._aov(name, si, z, triangle, ray, hit)]
+        alpha = mi.has_flag(sensor.film().flags(), mi.FilmFlags.Alpha)
+        return self._assemble(rgba, aovs, region, camera, scale, alpha)
 
     def _bounds(self, screen, width, height):
         """Pixels that the surface can cover: (x, y, width, height), at least one pixel."""
@@ -372,14 +376,12 @@ class RasterIntegrator(mi.SamplingIntegrator):
             return [dr.select(hit, x, 0) for x in si.uv]
         return [mi.Float(triangle)]
 
-    def _antialias(self, topology, positions, screen, triangle, depth, pi, channels, region, camera):
-        """Blend the channels (Floats of w*h) across the silhouettes that run between neighbouring pixel centres."""
+    def _antialias(self, topology, positions, screen, triangle, depth, pi, rgba, region, camera):
+        """Blend the colours (packed, 4 w h) across the silhouettes that run between neighbouring pixel centres."""
         x0, y0, w_, w, h = region
         horizontal_count, count = (w - 1) * h, (w - 1) * h + w * (h - 1)
         if count == 0:
-            return channels
-        source = [mi.Float64(c) for c in channels]  # double for the gradients, as positions are
-        dr.eval(source)  # what is gathered from must be in memory
+            return rgba
         with dr.suspend_grad():
             split, columns = dr.opaque(mi.UInt32, horizontal_count), w_ - 1
 
@@ -393,7 +395,7 @@ class RasterIntegrator(mi.SamplingIntegrator):
             a, b, _ = pixels(dr.arange(mi.UInt32, count))
             pair = dr.compress(dr.gather(mi.Int32, triangle, a) != dr.gather(mi.Int32, triangle, b))
             if dr.width(pair) == 0:
-                return channels
+                return rgba
             a, b, horizontal = pixels(pair)
             swap = dr.gather(mi.Float, depth, b) < dr.gather(mi.Float, depth, a)
             near, far = dr.select(swap, b, a), dr.select(swap, a, b)
@@ -401,7 +403,7 @@ class RasterIntegrator(mi.SamplingIntegrator):
             dr.eval(found, va, vb, near, far, horizontal)  # in one kernel: compress and gather would each walk again
             kept = dr.compress(found)
             if dr.width(kept) == 0:
-                return channels
+                return rgba
             va, vb, near, far = (dr.gather(mi.UInt32, i, kept) for i in (va, vb, near, far))
             horizontal = dr.gather(mi.Bool, horizontal, kept)
             cn, cf = (self._centre(i, x0, y0, w_) for i in (near, far))
@@ -423,7 +425,8 @@ class RasterIntegrator(mi.SamplingIntegrator):
 
         # The colour that comes in is the other sheet's where the edge crosses, not at the other pixel's centre: so the image stays
         # continuous when a pixel's centre passes from one sheet to the other.
-        incoming = [_gather_pixel(c, other) for c in source]
+        # (Local reduction, because the default would bake the size of the region into the kernels.)
+        incoming = dr.gather(mi.Vector4d, rgba, other, mode=dr.ReduceMode.Local)
         if self.shading == "unlit":
             basis, origin = camera
             direction = basis @ mi.Vector3f(place.x, place.y, 1)
@@ -433,12 +436,11 @@ class RasterIntegrator(mi.SamplingIntegrator):
             si, _ = self._interaction(
                 topology, positions, dr.reinterpret_array(mi.ShapePtr, shape), visible, mi.Ray3f(origin, direction / length), length, visible >= 0
             )
-            incoming[:3] = self._unlit(si, visible >= 0)
-        out = [mi.Float64(c) for c in source]
-        for c in range(len(out)):
-            difference = incoming[c] - _gather_pixel(source[c], target)
-            dr.scatter_add(out[c], mi.Float64(weight * difference), target, mode=dr.ReduceMode.Local)
-        return [mi.Float(c) for c in out]
+            incoming = mi.Vector4d(*self._unlit(si, visible >= 0), incoming.w)
+        difference = incoming - dr.gather(mi.Vector4d, rgba, target, mode=dr.ReduceMode.Local)
+        out = rgba + 0
+        dr.scatter_add(out, weight * difference, target, mode=dr.ReduceMode.Local)
+        return out
 
     @staticmethod
     def _centre(pixel, x0, y0, w):
@@ -512,32 +514,32 @@ class RasterIntegrator(mi.SamplingIntegrator):
         _, last, found, va, vb, _ = dr.while_loop(state, lambda active, *_: active, step, label="walk")
         return found, va, vb, last
 
-    def _assemble(self, channels, region, camera, scale):
+    def _assemble(self, rgba, aovs, region, camera, scale, alpha):
         """Put the region into the full image and shape it (H, W, C): colours averaged over the samples of a pixel, AOVs of its middle one."""
         x0, y0, w_, w, h = region
-        width, height, count = camera.width, camera.height, len(channels)
-        colours = count - len(self.aov_names())
+        width, height = camera.width, camera.height
+        colours = 4 if alpha else 3
+        count = colours + len(aovs)
         index = dr.arange(mi.UInt32, w * h)
         y = index // w_
         sx, sy = index - y * w_ + x0, y + y0
         px, py = sx // scale, sy // scale
-        middle = (sx - px * scale == scale // 2) & (sy - py * scale == scale // 2)
         pixel = py * dr.opaque(mi.UInt32, width) + px
         out = dr.zeros(mi.Float, width * height * count)
-        if "triangle" in self.aovs:  # no triangle is -1, outside the region too
-            channel = colours + self.aov_names().index("triangle.I")
-            dr.scatter(out, mi.Float(-1), dr.arange(mi.UInt32, width * height) * count + channel)
-        for c, value in enumerate(channels):
-            if c < colours and scale > 1:
-                dr.scatter_add(out, value / (scale * scale), pixel * count + c, mode=dr.ReduceMode.Local)
+        value = mi.Vector4f(dr.unravel(mi.Vector4d, rgba))
+        value = value if alpha else mi.Vector3f(value.x, value.y, value.z)
+        place = [(value, pixel)] if not aovs else [(value[c], pixel * count + c) for c in range(colours)]
+        for part, at in place:
+            if scale > 1:
+                dr.scatter_add(out, part / (scale * scale), at, mode=dr.ReduceMode.Local)
             else:
-                dr.scatter(out, value, pixel * count + c, middle)
+                dr.scatter(out, part, at)
+        if "triangle" in self.aovs:  # no triangle is -1, outside the region too
+            dr.scatter(out, mi.Float(-1), dr.arange(mi.UInt32, width * height) * count + colours + self.aov_names().index("triangle.I"))
+        middle = (sx - px * scale == scale // 2) & (sy - py * scale == scale // 2)
+        for c, part in enumerate(aovs):
+            dr.scatter(out, part, pixel * count + colours + c, middle)
         return mi.TensorXf(out, (height, width, count))
-
-
-def _gather_pixel(channel, pixel):
-    """Values of a region-sized array. Local reduction in its gradient: the default would bake the region's size into the kernel."""
-    return mi.Float(dr.gather(mi.Float64, channel, pixel, mode=dr.ReduceMode.Local))
 
 
 def _gather_point(positions, index, mask=True):

@@ -340,3 +340,17 @@ def test_no_kernel_is_compiled_and_no_memory_grows_in_a_loop(tmp_path):
         history = dr.kernel_history((dr.KernelType.JIT,))
     assert len(history) > 50
     assert [h for h in history if not h["cache_hit"]] == []
+
+
+def test_a_moved_camera_is_noticed(tmp_path):
+    corners = np.array([[-0.2, -0.2, 1], [0.2, -0.2, 1], [0, 0.2, 1.0]])
+    scene, integrator = triangles(tmp_path, corners), raster()
+    before = np.array(mi.render(scene, integrator=integrator, spp=1))
+    params = mi.traverse(scene)
+    key = next(k for k in params.keys() if k.endswith("to_world"))
+    moved = mi.ScalarTransform4f().look_at(origin=[10 * pixel_size(), 0, 0], target=[10 * pixel_size(), 0, 1], up=[0, -1, 0])
+    params[key] = mi.Transform4f(moved.matrix)
+    params.update()
+    after = np.array(mi.render(scene, integrator=integrator, spp=1))
+    assert np.abs(after[:, :-10] - before[:, 10:]).max() < 2e-3
+    assert np.abs(after - before).max() > 0.5
