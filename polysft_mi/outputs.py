@@ -120,7 +120,7 @@ def chosen(count, limit):
     return sorted(set(np.linspace(0, count - 1, limit).round().astype(int).tolist())) if limit > 0 else []
 
 
-def write(problem, track, out, *, exr_frames=20, fps=25, command="", say=None):
+def write(problem, track, out, *, exr_frames, fps, command, say=None):
     """Write everything for the frames that ``track`` holds. Returns the summary that ``metrics.json`` begins with.
 
     ``exr_frames``: how many comparison EXRs at most; ``say(text)``: told what is being written.
@@ -141,7 +141,7 @@ def write(problem, track, out, *, exr_frames=20, fps=25, command="", say=None):
     with aside(os.path.join(out, "params.npz")) as temporary:
         np.savez_compressed(
             temporary, frames=indices, alpha=template.alpha, chart=template.chart, scale=template.scale,
-            frame_rotation=template.rotation, frame_origin=template.origin, **arrays,
+            frame_rotation=problem.camera.axes @ template.rotation, frame_origin=problem.camera.to_camera(template.origin), **arrays,
         )  # fmt: skip
     say("meshes")
     for folder in ("meshes", "comparison"):
@@ -189,7 +189,7 @@ def write(problem, track, out, *, exr_frames=20, fps=25, command="", say=None):
         "solver": problem.settings.solver,
     }
     windows = [
-        {"first": int(indices[k]), "iterations": n, "seconds": t, **{name: terms.get(name) for name in TERMS}}
+        {"frame": int(indices[count - len(track.iterations) + k]), "iterations": n, "seconds": t, **{name: terms[name] for name in TERMS}}
         for k, (n, t, terms) in enumerate(zip(track.iterations, track.seconds, track.totals))
     ]
     write_json(

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from . import settings
+from .camera import Intrinsics
 from .errors import InputError
 from .projective import SilhouetteProjective
 from .raster import RasterIntegrator
@@ -21,10 +22,10 @@ def _resolved(pattern):
         return ""
     resolve = mi.file_resolver().resolve
     path = str(resolve(pattern))
-    if os.path.exists(path):
-        return path
-    folder, name = os.path.split(pattern)
-    return os.path.join(str(resolve(folder)), name) if folder else path
+    if not os.path.exists(path):
+        folder, name = os.path.split(pattern)
+        path = os.path.join(str(resolve(folder or ".")), name)
+    return path.replace("/./", "/")
 
 
 class PolySfT(mi.SamplingIntegrator):
@@ -51,7 +52,7 @@ class PolySfT(mi.SamplingIntegrator):
 
     def __init__(self, props):
         super().__init__(props)
-        nested = [props[k] for k in props.keys() if isinstance(props[k], mi.Integrator)]
+        nested = [value for _, value in props.objects() if isinstance(value, mi.Integrator)]  # asks for no other: Mitsuba tells unknown ones
         if len(nested) != 1:
             raise InputError(f"polysft: {len(nested)} nested integrators; exactly one is needed, e.g. <integrator type=\"raster\"/>")
         self.renderer = nested[0]
@@ -93,10 +94,11 @@ class PinholeSensor(mi.Sensor):
 
     def __init__(self, props):
         super().__init__(props)
-        self.focal = [props[k] for k in ("fx", "fy")]
-        self.centre = [props[k] for k in ("cx", "cy")]
-        if min(self.focal) <= 0:
-            raise InputError(f"pinhole: (fx, fy) = {tuple(self.focal)}; positive focal lengths are needed")
+        missing = [k for k in ("fx", "fy", "cx", "cy") if k not in props]
+        if missing:
+            raise InputError(f"pinhole: property '{missing[0]}' is missing; fx, fy, cx, cy are needed, in pixels")
+        camera = Intrinsics(*(props[k] for k in ("fx", "fy", "cx", "cy")), *map(int, self.film().size()))
+        self.focal, self.centre = [camera.fx, camera.fy], [camera.cx, camera.cy]
 
     def sample_ray(self, time, sample1, position, aperture, active=True):
         film = self.film()

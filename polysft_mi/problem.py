@@ -75,13 +75,12 @@ class Problem:
 
     def _setup_renderer(self):
         renderer = self.experiment.renderer
+        renderer.hide_emitters = True  # what is behind the surface is black, with a silhouette's gradient towards black
         self._raster = isinstance(renderer, RasterIntegrator)
         self._mask_renderer = None
         if not self._raster:
-            if not str(self.experiment.sensor).startswith("PerspectiveCamera") and "projective" in type(renderer).__name__.lower():
-                raise InputError(
-                    f"{self.experiment.path}: path replay with silhouettes takes Mitsuba's perspective sensor only (square pixels); use raster"
-                )
+            if not str(self.experiment.sensor).startswith("PerspectiveCamera"):
+                raise InputError(f"{self.experiment.path}: {renderer.class_name()} takes Mitsuba's perspective sensor only (fx = fy); use raster")
             self._mask_renderer = mi.load_dict({"type": "silhouette_projective"})
 
     def place(self, vertices):
@@ -97,19 +96,17 @@ class Problem:
         self.place(vertices)
         scene, sensor, spp = self.experiment.scene, self.experiment.sensor, self.settings.spp
         if self._raster:
-            image = self.experiment.renderer.render(scene, sensor, spp=spp)
+            image = self.experiment.renderer.render(scene, sensor, spp=spp, seed=seed)
             alpha = None
         else:
             image = mi.render(scene, self._params, sensor=sensor, integrator=self.experiment.renderer, spp=spp, seed=seed)
-            mask = mi.render(scene, self._params, sensor=sensor, integrator=self._mask_renderer, spp=max(spp, 16), seed=seed + 1)
+            mask = mi.render(scene, self._params, sensor=sensor, integrator=self._mask_renderer, spp=max(spp, 16), seed=~seed & 0xFFFFFFFF)
             alpha = dr.gather(mi.Float, mask.array, dr.arange(mi.UInt32, self.pixels) * mask.shape[2])
         channels = image.shape[2]
         pixel = dr.arange(mi.UInt32, 3 * self.pixels)
         rgb = dr.gather(mi.Float, image.array, pixel // 3 * channels + pixel % 3, mode=dr.ReduceMode.Permute)
         if alpha is None:
             alpha = dr.gather(mi.Float, image.array, dr.arange(mi.UInt32, self.pixels) * channels + 3, mode=dr.ReduceMode.Permute)
-        else:  # path replay shows the environment behind the surface: cut it away
-            rgb = rgb * dr.gather(mi.Float, dr.detach(alpha), pixel // 3)
         return mi.TensorXf(rgb, (self.height, self.width, 3)), alpha
 
     # -- images -------------------------------------------------------------
@@ -120,7 +117,9 @@ class Problem:
             rgb, mask = self.sequence.frame(frame), self.sequence.mask(frame)
             if mask is not None:
                 rgb = rgb * mask[..., None]
-            tensor = objective.blur(mi.TensorXf(np.ascontiguousarray(rgb, dtype=np.float32)), self.settings.blur)
+            tensor = mi.TensorXf(np.ascontiguousarray(rgb, dtype=np.float32))
+            if mask is not None:
+                tensor = objective.blur(tensor, self.settings.blur)
             area = mi.Float(max(1.0, float(mask.sum()))) if mask is not None else None
             device_mask = mi.Float(np.ascontiguousarray(mask, dtype=np.float32).ravel()) if mask is not None else None
             if device_mask is not None and self.settings.brightness == "local":
@@ -149,8 +148,12 @@ class Problem:
         else:
             weight = objective.interior(alpha)
             area = dr.maximum(dr.sum(weight), 1)
-        rgb = objective.blur(rgb, s.blur)
         wanted = target.rgb
+        if target.mask is None and s.blur > 0:  # both cut out alike, else a band inside the silhouette would compare with the background
+            inside = dr.gather(mi.Float, weight, dr.arange(mi.UInt32, 3 * self.pixels) // 3)
+            rgb, wanted = (mi.TensorXf(x.array * inside, x.shape) for x in (rgb, wanted))
+            wanted = objective.blur(wanted, s.blur)
+        rgb = objective.blur(rgb, s.blur)
         if s.brightness == "local":
             rgb = objective.normalise_locally(rgb, self._weight_image(alpha if target.mask is not None else weight))
             if target.mask is None:
@@ -187,6 +190,8 @@ class Problem:
                 raise BadFrame(frame, value)
         if len(window) > 1:
             parts.append(self._finish({"temporal": self.temporal_term(window)}, backward))
+            if not np.isfinite(parts[-1]["temporal"][0]):
+                raise BadFrame(frames[-1], parts[-1]["temporal"][0])
         for part in parts:
             for name, value in part.items():
                 sums[name] += float(value[0])
@@ -219,6 +224,21 @@ class Problem:
             alpha = np.array(self.image(self.patch.vertices(self.patch.rest()))[1]).reshape(mask.shape)
             if float((alpha * mask).sum()) == 0:
                 raise InputError(f"{where} does not meet the mask of the first frame: it projects to x {low[0]:g}..{high[0]:g}, y {low[1]:g}..{high[1]:g}")
+
+        if not self._raster:
+            self._check_gradient()
+
+    def _check_gradient(self):
+        """Raise InputError where the integrator cannot be differentiated; Mitsuba tells only when it is."""
+        unknowns = self.patch.rest()
+        dr.enable_grad(unknowns)
+        try:
+            self.evaluate([unknowns], [0], backward=True, seed=self.settings.seed)
+        except FloatingPointError:
+            pass  # the image is to blame, which the tracker tells
+        except RuntimeError as error:
+            name, cause = self.experiment.renderer.class_name(), str(error).strip().splitlines()[0]
+            raise InputError(f"{self.experiment.path}: integrator {name} gives no gradients; raster or prb_projective is needed ({cause[:120]})") from None
 
     def visible_share(self, unknowns):
         """Share of the vertices that are before the camera and inside the image."""

@@ -68,6 +68,11 @@ def _check_output(out, options):
     """Refuse an OUT that cannot be used, before anything is computed."""
     if os.path.exists(out) and not os.path.isdir(out):
         raise InputError(f"{out}: is a file; OUT must be a folder")
+    existing = os.path.abspath(out)
+    while not os.path.lexists(existing):
+        existing = os.path.dirname(existing)
+    if not out or not os.path.isdir(existing) or not os.access(existing, os.W_OK | os.X_OK):
+        raise InputError(f"-o '{out}': {existing} is not a folder that can be written to; OUT must be a folder there, or a new one")
     holds_run = os.path.exists(os.path.join(out, "run.json"))
     if options.resume and not holds_run:
         raise InputError(f"{out}: holds no run to resume; leave out --resume to start one")
@@ -105,7 +110,7 @@ def _run(options, overrides, out, exr_frames):
     os.makedirs(out, exist_ok=True)
     command = outputs.command_line()
     if not options.resume:
-        outputs.write_beginning(out, experiment, command)
+        outputs.write_beginning(out, text, command)
 
     count = len(sequence.indices)
     began, status = time.perf_counter(), 0

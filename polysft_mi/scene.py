@@ -4,6 +4,7 @@ Import only after a Mitsuba variant is set.
 """
 
 import os
+import re
 from dataclasses import dataclass, field
 
 import drjit as dr
@@ -55,49 +56,55 @@ def load(path, overrides=None):
     plugins.register()
     if defaults.get("data") and not os.path.isdir(located(path, defaults["data"])):
         raise InputError(f"{path}: data = {defaults['data']}: no such folder, neither beside the scene nor here; give -D data=FOLDER")
-    template_node = _check_nodes(path, overrides)
+    source = _source(_check_nodes(path, overrides))
     try:
         scene = mi.load_file(path, optimize=False, **overrides)
     except Exception as error:  # whatever a plugin raised reaches us wrapped by the parser
-        raise InputError(f"{path}: {_innermost(error)}") from None
+        raise InputError(_told(error, path)) from None
 
-    experiment = scene.integrator()
-    if not isinstance(experiment, plugins.PolySfT):
-        raise InputError(f"{path}: its integrator is {type(experiment).__name__}; <integrator type=\"polysft\"> is needed")
     if len(scene.sensors()) != 1:
         raise InputError(f"{path}: {len(scene.sensors())} sensors; exactly one is needed")
     meshes = [s for s in scene.shapes() if s.is_mesh() and s.id() == "template"] or [s for s in scene.shapes() if s.is_mesh()]
     if len(meshes) != 1:
         raise InputError(f"{path}: {len(meshes)} meshes; give the template's shape id=\"template\"")
-    mesh, settings = meshes[0], experiment.settings
-    template, corner = _template(mesh, template_node, settings)
+    experiment, mesh = scene.integrator(), meshes[0]
+    settings = experiment.settings
+    template, corner = _template(mesh, source, settings)
     return Experiment(
         path, scene, scene.sensors()[0], experiment.renderer, mesh, template, corner, experiment.frames, experiment.masks, settings, defaults
     )
 
 
-def _innermost(error):
-    """The last line of a parser's message that says something, without its location prefix."""
-    text = str(error).split("Caused by:")[-1]
-    lines = [line.strip() for line in text.splitlines() if line.strip()]
-    useful = [line for line in lines if "Error" in line or "not" in line or "fail" in line.lower()]
-    line = (useful or lines or [repr(error)])[-1]
-    for prefix in ("polysft_mi.errors.InputError: ", "InputError: "):
-        if prefix in line:
-            line = line.split(prefix)[-1]
-    return line
+def _told(error, path):
+    """What Mitsuba's parser says of the scene at ``path``, in one line: the file, the line, and the cause."""
+    text = re.sub(r"\[\w+\.cpp:\d+\] *|\[[A-Z]\w+\] +", "", str(error))
+    here = re.search(rf"{re.escape(path)} \(line (\d+), col \d+\)", text)
+    if "InputError: " in text:  # raised by a plugin of ours, at the end of a traceback
+        text = text.rpartition("InputError: ")[2]
+    else:
+        lines = [line for line in text.splitlines() if not line.startswith(("Traceback", "  File"))]
+        text = " ".join(line.strip().removeprefix("- ") for line in lines)
+        text = re.sub(rf"(At|(Error )?[Ww]hile loading) {re.escape(path)} \(.*?\): ", "", text)
+        text = text.replace("unreferenced", "unknown").replace("Found 1 unknown property", "unknown property")
+    return f"{path}: {f'line {here[1]}: ' if here else ''}{text if len(text) <= 300 else text[:300] + ' ...'}"
 
 
 def _check_nodes(path, overrides):
-    """Parse the file, check that the files it names are there, and return the properties of the template's shape (or None)."""
+    """Parse the file, check its integrator, its sensor and that the files it names are there; return the properties of the template's shape (or None)."""
     config = mi.parser.ParserConfig(mi.variant())
     try:
         state = mi.parser.parse_file(config, path, **overrides)
     except Exception as error:
-        raise InputError(f"{path}: {_innermost(error)}") from None
+        raise InputError(_told(error, path)) from None
     shapes = []
+    top = [state.nodes[v.index()] for _, v in state.root.props.items() if isinstance(v, mi.Properties.ResolvedReference)]
+    integrators = [node.props.plugin_name() for node in top if node.type == mi.ObjectType.Integrator]
+    if integrators != ["polysft"]:
+        raise InputError(f"{path}: its integrator is {', '.join(integrators) or 'missing'}; one <integrator type=\"polysft\"> is needed")
     for node in state.nodes:
         props = node.props
+        if node.type == mi.ObjectType.Sensor and props.plugin_name() not in ("perspective", "pinhole"):
+            raise InputError(f"{mi.parser.file_location(state, node)}: sensor {props.plugin_name()!r} is not a pinhole; perspective or pinhole is needed")
         if "filename" in props and isinstance(props["filename"], str):
             name = located(path, props["filename"])
             if not os.path.isfile(name):
@@ -108,23 +115,32 @@ def _check_nodes(path, overrides):
     return next((p for p in shapes if p.id() == "template"), shapes[0] if shapes else None)
 
 
-def _template(mesh, props, settings):
+def _source(props):
+    """(file, vertices (N, 3), faces (F, 3)) of the template's shape in its file's own order, None where it has no file.
+
+    Read and checked before Mitsuba loads the scene, for its loaders tell less, and take files that are no meshes.
+    """
+    if props is None or "filename" not in props:
+        return None
+    where = props["filename"]
+    vertices, faces, _ = meshio.read_template(where)
+    if "to_world" in props:
+        m = np.array(props["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+        vertices = vertices @ m[:3, :3].T + m[:3, 3]
+    meshio.check_template(vertices, faces, np.zeros((len(vertices), 2)), where)
+    return where, vertices, faces
+
+
+def _template(mesh, source, settings):
     """The template that the mesh shows, in its file's own vertex order, and the map from rendered vertices to it."""
     rendered = np.array(mesh.vertex_positions_buffer(), dtype=np.float64).reshape(-1, 3)
-    where = f"template {mesh.id()!r}"
+    faces = np.array(mesh.faces_buffer(), dtype=np.int64).reshape(-1, 3)
+    where, vertices, faces = source or (f"template {mesh.id()!r}", rendered, faces)
     if not mesh.has_vertex_texcoords():
         raise InputError(f"{where}: it has no texture coordinates (uv); the texture cannot be placed on it")
     texcoords = np.array(mesh.vertex_texcoords_buffer(), dtype=np.float64).reshape(-1, 2)
-    if props is not None and "filename" in props:
-        where = props["filename"]
-        vertices, faces, _ = meshio.read_template(where)
-        if "to_world" in props:
-            m = np.array(props["to_world"].matrix, dtype=np.float64).reshape(4, 4)
-            vertices = vertices @ m[:3, :3].T + m[:3, 3]
-    else:
-        vertices, faces = rendered, np.array(mesh.faces_buffer(), dtype=np.int64).reshape(-1, 3)
-    if not (np.isfinite(vertices).all() and np.isfinite(rendered).all() and np.isfinite(texcoords).all()):
-        raise InputError(f"{where}: positions or texture coordinates are not finite (NaN)")
+    if not np.isfinite(rendered).all():
+        raise InputError(f"{where}: positions are not finite (NaN)")
     distance, corner = cKDTree(vertices).query(rendered)
     size = np.ptp(vertices, axis=0).max()
     if distance.max() > 1e-4 * size:

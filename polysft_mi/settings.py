@@ -52,12 +52,12 @@ class Settings:
             if meta["choices"] and value not in meta["choices"]:
                 raise InputError(f"setting {f.name} = {value!r}; known values: {', '.join(meta['choices'])}")
             if f.type in ("int", "float", int, float):
-                if not math.isfinite(value) or not meta["low"] <= value <= meta["high"]:
-                    raise InputError(f"setting {f.name} = {value!r}; it must lie in [{meta['low']}, {meta['high']}]")
-                if meta["above"] is not None and value <= meta["above"]:
-                    raise InputError(f"setting {f.name} = {value!r}; it must be above {meta['above']}")
+                inside = math.isfinite(value) and meta["low"] <= value <= meta["high"]
+                if not inside or meta["above"] is not None and value <= meta["above"]:
+                    raise InputError(f"setting {f.name} = {value!r}; {_NOUN[_type_name(f)]}, {_accepted(meta)}, is needed")
 
 
+_NOUN = {"int": "a whole number", "float": "a finite number", "str": "a text"}
 _XML_TYPE = {"int": "integer", "float": "float", "str": "string"}
 
 
@@ -81,18 +81,18 @@ def properties_xml(indent="        "):
 
 
 def from_properties(props):
-    """Settings from a plugin's properties (a mapping); what is not given keeps its default."""
+    """Settings from a plugin's properties, or from texts (a mapping); what is not given keeps its default."""
     values = {}
     for f in dataclasses.fields(Settings):
         if f.name in props:
             value = props[f.name]
             kind = {"int": int, "float": float, "str": str}[_type_name(f)]
             if kind is int and isinstance(value, float) and value != int(value):
-                raise InputError(f"setting {f.name} = {value!r}; a whole number is needed")
+                raise InputError(f"setting {f.name} = {value!r}; {_NOUN['int']} is needed")
             try:
                 values[f.name] = kind(value)
             except (TypeError, ValueError):
-                raise InputError(f"setting {f.name} = {value!r}; a {_type_name(f)} is needed") from None
+                raise InputError(f"setting {f.name} = {value!r}; {_NOUN[_type_name(f)]} is needed") from None
     return Settings(**values)
 
 

@@ -4,8 +4,10 @@ Import only after a Mitsuba variant is set.
 """
 
 import json
+import math
 import os
 import time
+import zipfile
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -49,7 +51,7 @@ class Track:
             with np.load(path) as data:
                 meta = json.loads(str(data["meta"]))
                 arrays = {name: data[name] for name in Unknowns.NAMES}
-        except (OSError, ValueError, KeyError) as error:
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             raise InputError(f"{path}: not a checkpoint of a run ({error}); start again with --overwrite") from None
         for name in ("lost", "unusable"):
             meta[name] = {int(k): v for k, v in meta[name].items()}
@@ -84,14 +86,18 @@ def _advance(problem, solver, done, start, width, log, progress):
     began = time.perf_counter()
     latest = [0]
 
+    def record(iteration, total, terms, **more):
+        numbers = {name: x if np.isfinite(x) else None for name, x in {"loss": total, **terms}.items()}  # JSON has no NaN
+        log.write(json.dumps({"frame": problem.sequence.indices[members[-1]], "iteration": iteration, **numbers, **more}) + "\n")
+
     def report(iteration, total, terms):
         latest[0] = iteration + 1
         if iteration % _LOG_EVERY == 0:
-            log.write(json.dumps(_record(members[-1], iteration, total, terms)) + "\n")
+            record(iteration, total, terms)
         if progress:
             progress(members[-1], iteration, total, terms)
 
-    solved, terms, failed = {}, dict.fromkeys(TERMS, float("nan")), {}
+    solved, terms, failed = {}, dict.fromkeys(TERMS, math.nan), {}
     while usable := [k for k in members if k not in done.unusable]:
         before = [Unknowns.from_numpy(done.states[k]) for k in usable]
         try:
@@ -103,7 +109,7 @@ def _advance(problem, solver, done, start, width, log, progress):
                 failed[members[-1]] = f"{error} at iteration {latest[0]}"
                 break
             done.unusable[error.frame] = f"{error} from the start"
-    log.write(json.dumps(_record(members[-1], latest[0], sum(terms.values()), terms) | {"best": True}) + "\n")
+    record(latest[0], sum(terms.values()), terms, best=True)
 
     for k in members:
         if k in solved:
@@ -120,11 +126,7 @@ def _advance(problem, solver, done, start, width, log, progress):
     done.next_window = start + 1
     done.iterations.append(latest[0])
     done.seconds.append(time.perf_counter() - began)
-    done.totals.append(terms)
-
-
-def _record(frame, iteration, total, terms):
-    return {"frame": frame, "iteration": iteration, "loss": total, **terms}
+    done.totals.append({name: x if np.isfinite(x) else None for name, x in terms.items()})
 
 
 def _trim_log(path, next_window):
