@@ -5,6 +5,17 @@ import os
 
 
 @contextlib.contextmanager
+def naming(path):
+    """An OSError of the block that names no file, as a full disk's does where a file is flushed, names ``path``."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is not None and error.filename is None:
+            error.filename = os.fspath(path)
+        raise
+
+
+@contextlib.contextmanager
 def aside(path):
     """``with aside(path) as temporary:`` write the file ``temporary``; it becomes ``path`` at the end of the block.
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from .errors import InputError
-from .files import aside
+from .files import aside, naming
 from .patch import Unknowns
 from .problem import TERMS, BadFrame
 
@@ -70,7 +70,7 @@ def track(problem, solver, frames, out, *, resume=False, progress=None):
     checkpoint, log_path = os.path.join(out, CHECKPOINT), os.path.join(out, LOG)
     done = Track.load(checkpoint) if resume and os.path.exists(checkpoint) else Track()
     _trim_log(log_path, done.next_window)
-    with open(log_path, "a", encoding="utf-8") as log:
+    with naming(log_path), open(log_path, "a", encoding="utf-8") as log:
         for start in range(done.next_window, frames - width + 1):
             _advance(problem, solver, done, start, width, log, progress)
             log.flush()
