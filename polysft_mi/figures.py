@@ -10,7 +10,7 @@ import warnings
 
 import numpy as np
 
-from .files import aside
+from .files import FULL, aside
 from .shading import View, shade_surface
 
 __all__ = ["View", "contact_sheet", "frame_plot", "loss_plot", "shade_surface"]
@@ -28,6 +28,8 @@ def _kept_safe(draw):
                 figure.savefig(temporary, facecolor="white")
             return os.fspath(path)
         except Exception as error:  # whatever it is, the results stand without the picture
+            if getattr(error, "errno", None) in FULL:
+                raise
             warnings.warn(f"{path}: picture not written ({type(error).__name__}: {error})", RuntimeWarning, stacklevel=2)
             return None
 

@@ -1,7 +1,10 @@
 """Files that are either whole or not there: written aside, then renamed."""
 
 import contextlib
+import errno
 import os
+
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # numbers of the OSErrors that say that no more can be written
 
 
 @contextlib.contextmanager

@@ -490,7 +490,7 @@ def small_disk(tmp_path):
         subprocess.run(["umount", place], check=True)
 
 
-@pytest.mark.parametrize("kibibytes", [4, 8, 16, 24, 48, 80])
+@pytest.mark.parametrize("kibibytes", [4, 8, 16, 24, 48, 80, 110])
 def test_full_disk(good, small_disk, capsys, kibibytes):
     out = small_disk(kibibytes) / "out"
     with pytest.raises(SystemExit) as ended:
@@ -498,6 +498,16 @@ def test_full_disk(good, small_disk, capsys, kibibytes):
     error = capsys.readouterr().err
     assert ended.value.code == 2 and error.count("\n") == 1, error
     assert error.startswith(f"error: {out}") and "No space left on device" in error
+    whole(out)
+
+
+def test_a_run_that_a_full_disk_stopped_is_resumed(good, small_disk):
+    out = small_disk(48) / "out"
+    with pytest.raises(OSError, match="No space left"):
+        run.main([str(good.folder / "scene.xml"), "-o", str(out), *QUICK])
+    subprocess.run(["mount", "-o", "remount,size=4m", out.parent], check=True)
+    assert run.main([str(good.folder / "scene.xml"), "-o", str(out), *QUICK, "--resume"]) == 0
+    assert {"surface.npz", "metrics.json", "comparison.mp4"} <= {p.name for p in out.iterdir()}
     whole(out)
 
 
