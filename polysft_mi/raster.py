@@ -160,6 +160,9 @@ class RasterIntegrator(mi.SamplingIntegrator):
      * - shading_samples
        - |int|
        - Emitter samples of each image sample where ``shading`` is ``bsdf``. (Default: 1)
+     * - hide_emitters
+       - |bool|
+       - Black instead of the environment behind the surface, where ``shading`` is ``bsdf``. (Default: false)
      * - antialias
        - |bool|
        - Blend the colours across silhouettes. Without it silhouettes carry no gradient. (Default: true)
@@ -302,7 +305,7 @@ class RasterIntegrator(mi.SamplingIntegrator):
 
     def _bounds(self, screen, width, height):
         """Pixels that the surface can cover: (x, y, width, height), at least one pixel."""
-        if self.shading != "unlit":
+        if self.shading != "unlit" and not self.hide_emitters:
             return 0, 0, width, height  # the environment is seen everywhere
         with dr.suspend_grad():
             box = [dr.min(screen.x), dr.min(screen.y), dr.max(screen.x), dr.max(screen.y), dr.min(screen.z)]
@@ -353,7 +356,8 @@ class RasterIntegrator(mi.SamplingIntegrator):
         """Emitted and directly reflected radiance at the first hit; the environment where there is none."""
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All, hit)
         bsdf = si.bsdf()
-        colour = si.emitter(scene).eval(si)
+        seen = hit if self.hide_emitters else mi.Bool(True)
+        colour = si.emitter(scene).eval(si, seen) & seen
         emitters = len(scene.emitters())
         if emitters:
             n = self.shading_samples

@@ -236,3 +236,24 @@ def test_padding_does_not_change_the_loss(tmp_path):
         p = Problem(experiment, Sequence.open(experiment.frames, experiment.masks, size=experiment.size))
         totals.append(p.evaluate([p.patch.rest()], [4])[0])
     assert totals[1] == pytest.approx(totals[0], rel=1e-3)
+
+
+def test_path_replay_gives_the_gradient_of_raster(tmp_path):
+    """On an unshadowed sheet under light from everywhere both integrators render the texture, so their gradients are the same but for noise."""
+    gradients = {}
+    for integrator, spp in (("raster", 1), ("prb_projective", 64)):
+        folder = tmp_path / integrator
+        folder.mkdir()
+        p, _ = problem(folder, integrator=integrator, spp=spp, k_mi=0)
+        rest = p.patch.rest().to_numpy()
+        rest["translation"] = np.array([0.02, -0.03, 0.05], np.float32)
+        unknowns = Unknowns.from_numpy(rest)
+        dr.enable_grad(unknowns.translation)
+        gradients[integrator] = {}
+        for name in ("rgb", "silhouette"):
+            dr.backward(p.frame_terms(unknowns, 2)[name])
+            gradients[integrator][name] = np.array(dr.grad(unknowns.translation))
+            dr.clear_grad(unknowns.translation)
+    for name in ("rgb", "silhouette"):
+        a, b = gradients["raster"][name], gradients["prb_projective"][name]
+        assert np.linalg.norm(a - b) < 0.25 * np.linalg.norm(a), (name, a, b)

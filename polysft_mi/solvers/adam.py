@@ -39,7 +39,7 @@ class Adam:
         best, best_total, best_terms, since, iteration = [w.copy() for w in window], math.inf, {}, 0, 0
         while True:
             current = [Unknowns(**{n: optimizer[f"{k}.{n}"] for n in Unknowns.NAMES}) for k in range(len(window))]
-            total, terms = problem.evaluate(current, frames, backward=True, seed=s.seed + iteration)
+            total, terms = problem.evaluate(current, frames, backward=True, seed=(s.seed + 7919 * iteration) % 2**31)
             if total < best_total:
                 best, best_total, best_terms, since = [w.copy() for w in current], total, terms, 0
             else:

@@ -1,0 +1,97 @@
+"""The benchmarks at tiny sizes: that they measure what they say. Their times are no part of the tests."""
+
+import importlib.util
+import json
+from pathlib import Path
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from polysft_mi import metrics, plugins
+
+ROOT = Path(__file__).resolve().parent.parent
+SIZE, POINTS = (64, 48), 9
+
+
+def load(name):
+    spec = importlib.util.spec_from_file_location(f"benchmark_{name}", ROOT / "benchmarks" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+raster, stability = load("raster"), load("stability")
+
+
+@pytest.fixture(autouse=True)
+def registered():
+    plugins.register()
+
+
+def test_contenders_show_the_same_sheet_on_half_of_the_image(tmp_path):
+    result = raster.measure_times(SIZE, POINTS, str(tmp_path), seconds=0)
+    assert {len(ms) for ms in result["passes"].values()} == {raster.LEAST_TURNS}
+    assert result["coverage"] == pytest.approx(0.5, abs=0.03)
+    assert result["mean_difference"] == pytest.approx(0, abs=0.01)
+    assert result["mean_absolute_difference"] < 0.1 * result["mean_colour"]
+
+
+def test_contenders_take_the_same_gradient(tmp_path):
+    gradients = {}
+    for name in raster.CONTENDERS:
+        contender = raster.Contender(name, SIZE, POINTS, str(tmp_path))
+        contender.place(-2.0)
+        gradients[name] = sum(np.array(contender.forward_backward(k), dtype=np.float64) for k in range(40 if contender.path_replay else 1))
+    g, through_mi, noisy = (gradients[name] for name in raster.CONTENDERS)
+    assert np.linalg.norm(g) > 0
+    assert through_mi == pytest.approx(g, rel=1e-3, abs=1e-3 * np.abs(g).max())
+    assert noisy.shape == g.shape and np.linalg.norm(noisy) > 0
+
+
+def test_iterations_of_raster_need_no_new_kernels(tmp_path):
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        result = raster.measure_kernels(SIZE, POINTS, str(tmp_path), 12)
+    summary = raster.judge_long_run({"resident_mb": [100.0] * 10 + [101.0, 103.0]}, result)
+    assert summary["kernels_an_iteration"] >= 2
+    assert summary["new_kernels_later"] == 0
+    assert summary["growth_mb"] == 3.0
+
+
+def test_kernels_that_come_late_are_counted():
+    summary = raster.judge_long_run({"resident_mb": [1.0] * 12}, {"launched": [5] * 12, "new": [5, 2, 0, 1] + [0] * 8})
+    assert (summary["new_kernels_first_two"], summary["new_kernels_later"], summary["iterations_with_new_kernels"]) == (7, 1, [1, 2, 4])
+
+
+def test_ratios_are_those_within_a_turn():
+    times = dict(passes={}, moves={}, coverage=0.5, mean_colour=0.5, mean_difference=0.0, mean_absolute_difference=0.0)
+    for name, ms in zip(raster.CONTENDERS, ([1, 10, 2], [1, 10, 2], [4, 40, 8])):  # the machine was busy in the second turn
+        times["passes"][name], times["moves"][name] = ms, [1, 1, 1]
+    case = raster.summarise("64x48", POINTS, times, {name: {} for name in raster.CONTENDERS})
+    assert case["contenders"]["prb_projective"]["ratio"] == 4
+    assert case["contenders"]["prb_projective"]["ratio_with_move"] == 3
+    assert case["triangles"] == 128
+
+
+DEMO = (str(ROOT / "scenes" / "demo.xml"), {"last": "1", "period": "4"})
+
+
+def test_snapshots_are_what_shorter_runs_return(tmp_path):
+    long = stability.run(*DEMO, [3, 8], str(tmp_path / "a"), say=str)
+    short = stability.run(*DEMO, [3], str(tmp_path / "b"), say=str)
+    problem, frame, surfaces, _, losses = long
+    assert frame == 1
+    assert np.abs(surfaces[3] - short[2][3]).max() < 1e-6
+    assert np.abs(surfaces[8] - surfaces[3]).max() > 1e-5
+    assert losses[8][0] < losses[3][0]
+
+
+def test_stability_writes_figures_and_picture(tmp_path, capsys):
+    stability.main([DEMO[0], "-D", "last=0", "--counts", "2", "6", "-o", str(tmp_path)])
+    report = json.loads((tmp_path / "stability.json").read_text())
+    assert report["frame"] == 0 and list(report["counts"]) == ["2", "6"]
+    assert report["counts"]["6"]["change_rms_mm"] == 0 < report["counts"]["2"]["change_rms_mm"]
+    truth = metrics.load_npz(ROOT / "scenes" / "demo" / "gt.npz")["vertices"][0]
+    assert report["counts"]["2"]["rmse_mm"] == pytest.approx(1e3 * np.linalg.norm(truth) / np.sqrt(len(truth)) * report["counts"]["2"]["e3d"], rel=1e-5)
+    assert (tmp_path / "stability.png").read_bytes().startswith(b"\x89PNG")
+    assert "stability.json" in capsys.readouterr().out
