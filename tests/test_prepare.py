@@ -279,7 +279,7 @@ def test_scenes_show_frame_0(name, shared_data):
 def test_demo():
     folder = ROOT / "scenes" / "demo"
     assert sum(p.stat().st_size for p in folder.rglob("*") if p.is_file()) < 1_900_000
-    assert recognise(str(folder)) == write_scenes.SCENES["demo"]
+    assert recognise(str(folder)) == dataclasses.replace(write_scenes.SCENES["demo"], settings={})  # shorter than what prepare would write
     experiment = loaded(str(ROOT / "scenes" / "demo.xml"))
     right, *mirrored = difference(experiment)
     assert right < 0.03 and min(mirrored) > 2 * right
