@@ -1,0 +1,430 @@
+"""How fast ``raster`` is beside Mitsuba's path replay: one forward and backward pass, gradient to all vertex positions.
+
+    python benchmarks/raster.py [--sizes 160x120 640x480 ...] [--grids 33 72 225] [-o out/benchmarks] [-m llvm_ad_rgb]
+
+The scene is a gently bent, textured sheet that fills half of the image, under a constant emitter of radiance 1; the loss is the squared difference to
+the picture of the sheet a little further bent. The contenders:
+
+    raster          ``render()`` under Dr.Jit's AD, as the solver calls it: RGB and alpha, unlit
+    raster, mi      the same through ``mi.render``, which renders once more for the backward pass
+    prb_projective  through ``mi.render``, 1 sample a pixel, depth 2, ``sppi = 0``: RGB alone
+
+Depth 2 is one bounce, the emitter's light off the sheet, which is the texture's own colour wherever the sheet does not shadow itself: what raster shows (depth 1
+would be black). ``sppi = 0`` leaves out the edges of shadows, which this scene does not have. That is in path replay's favour: by default it looks for them with
+512 samples a pixel in every backward pass, and takes hundreds of times as long as raster.
+
+All of a case's contenders run in one process, turn by turn; times are medians after a warm-up, ratios medians of the ratios within a turn, so that what else the
+machine does meanwhile falls on both. Moving the sheet (``params.update()``, which rebuilds what rays are traced with) is timed apart, for it is no part of
+either. Peak memory is measured in a process of its own for each contender and case; growth and compilation over many iterations too.
+
+Writes ``raster.json`` and ``raster.png``, anew after every case, so that an interrupted run leaves the cases that it reached.
+"""
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+
+import numpy as np
+
+ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+sys.path.insert(0, ROOT)
+
+from polysft_mi.backend import add_mode_argument, set_variant
+from polysft_mi.camera import Intrinsics
+from polysft_mi.errors import InputError, cli
+from polysft_mi.files import aside
+
+SIZES = ("160x120", "320x240", "640x480", "1280x720", "1920x1080")
+GRIDS = (33, 72, 225)  # vertices a side: 1,089 vertices, 10,082 and 100,352 triangles
+CONTENDERS = ("raster", "raster, mi", "prb_projective")
+TARGET = ("640x480", 33, 3.0)
+WARM_UP, LEAST_TURNS, MOST_TURNS = 2, 3, 60  # few where a turn takes seconds
+MEMORY_PASSES = 2
+
+_SCENE = """<scene version="3.0.0">
+{sensor}
+    <shape type="ply" id="template">
+        <string name="filename" value="{mesh}"/>
+        <bsdf type="twosided"><bsdf type="diffuse"><texture type="bitmap" name="reflectance">
+            <string name="filename" value="{texture}"/><string name="wrap_mode" value="clamp"/>
+        </texture></bsdf></bsdf>
+    </shape>
+    <emitter type="constant"/>
+</scene>"""
+
+
+def sheet(points, size):
+    """A bent sheet of points x points vertices before :func:`camera`: (vertices (N, 3) [m, camera frame], faces (F, 3), uv (N, 2))."""
+    u, v = (x.ravel() for x in np.meshgrid(np.linspace(0, 1, points), np.linspace(0, 1, points)))
+    extent = np.sqrt(0.5) * np.array([size[0], size[1]]) / camera(size).fx
+    x, y = (u - 0.5) * extent[0], (v - 0.5) * extent[1]
+    z = 1 + 0.1 * extent[0] * np.cos(np.pi * (u - 0.5 + 0.3 * v))
+    c, s = np.cos(np.radians(10)), np.sin(np.radians(10))  # so that its borders run slantwise over the pixels
+    k = np.arange(points * points).reshape(points, points)
+    a, b, d, e = (q.ravel() for q in (k[:-1, :-1], k[:-1, 1:], k[1:, :-1], k[1:, 1:]))
+    faces = np.stack([a, d, b, b, d, e], axis=1).reshape(-1, 3)
+    return np.stack([c * x - s * y, s * x + c * y, z], axis=1), faces, np.stack([u, 1 - v], axis=1)
+
+
+def camera(size):
+    width, height = size
+    return Intrinsics(1.1 * width, 1.1 * width, width / 2, height / 2, width, height)
+
+
+# ---- in a worker's process ------------------------------------------------------------------------------------------------
+
+
+class Contender:
+    """One way to render the scene, and the sheet in it."""
+
+    def __init__(self, name, size, points, folder):
+        import drjit as dr
+        import mitsuba as mi
+
+        from polysft_mi import meshio
+
+        self.name, self.path_replay = name, name.startswith("prb")
+        vertices, faces, uv = sheet(points, size)
+        mesh = os.path.join(folder, "sheet.ply")
+        meshio.write_ply(mesh, vertices, faces, uv)
+        sensor = camera(size).sensor_xml()
+        if self.path_replay:
+            sensor = sensor.replace("rgba", "rgb")
+        texture = os.path.join(ROOT, "scenes", "demo", "texture.jpg")
+        self.scene = mi.load_string(_SCENE.format(sensor=sensor, mesh=mesh, texture=texture), optimize=False)
+        integrator = {"type": "prb_projective", "max_depth": 2, "sppi": 0} if self.path_replay else {"type": "raster"}
+        self.integrator = mi.load_dict(integrator)
+        self.params, self.key = mi.traverse(self.scene), "template.vertex_positions"
+        self.rest = mi.Float(self.params[self.key])
+        bend = np.zeros_like(vertices)
+        bend[:, 2] = vertices[:, 0] ** 2
+        self.bend = mi.Float(bend.ravel().astype(np.float32))
+        self.place(0.5)
+        with dr.suspend_grad():
+            self.target = self.render(0).array
+            dr.eval(self.target)
+
+    def place(self, amount):
+        """Bend the sheet by ``amount`` [1/m], attached to its vertex positions."""
+        import drjit as dr
+        import mitsuba as mi
+
+        self.positions = mi.Float(self.rest + dr.opaque(mi.Float, amount) * self.bend)
+        dr.eval(self.positions)
+        dr.enable_grad(self.positions)
+        self.params[self.key] = self.positions
+        self.params.update()
+        dr.sync_thread()
+
+    def render(self, seed):
+        import mitsuba as mi
+
+        if self.name == "raster":
+            return self.integrator.render(self.scene, 0, spp=1)
+        return mi.render(self.scene, self.params, integrator=self.integrator, spp=1, seed=seed)
+
+    def forward_backward(self, seed):
+        """Gradient of the loss to the vertex positions, Float of 3N, evaluated."""
+        import drjit as dr
+
+        loss = dr.sum(dr.square(self.render(seed).array - self.target))
+        dr.backward(loss)
+        gradient = dr.grad(self.positions)
+        dr.eval(loss, gradient)
+        dr.sync_thread()
+        return gradient
+
+    def turn(self, k):
+        """Move the sheet and take a gradient: seconds of each."""
+        began = time.perf_counter()
+        self.place(amount(k))
+        placed = time.perf_counter()
+        self.forward_backward(k)
+        return placed - began, time.perf_counter() - placed
+
+
+def amount(k):
+    """How far the sheet is bent in iteration k [1/m]: never twice the same within hundreds, so that its outline changes as in a fit."""
+    return 0.3 * np.sin(0.37 * k)
+
+
+def resident():
+    """Memory of this process [MB] that is in use now."""
+    with open("/proc/self/statm") as file:
+        return int(file.read().split()[1]) * resource.getpagesize() / 1e6
+
+
+def peak_resident():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
+
+
+def measure_times(size, points, folder, seconds):
+    """Milliseconds of every turn, contender to list: ``passes`` and ``moves``; and how far the pictures differ."""
+    contenders = [Contender(name, size, points, folder) for name in CONTENDERS]
+    passes, moves = {name: [] for name in CONTENDERS}, {name: [] for name in CONTENDERS}
+    began = None
+    for k in range(WARM_UP + MOST_TURNS):
+        if k == WARM_UP:
+            began = time.perf_counter()
+        if k >= WARM_UP + LEAST_TURNS and time.perf_counter() - began > seconds:
+            break
+        for contender in contenders if k % 2 else contenders[::-1]:
+            move, one_pass = contender.turn(k)
+            if k >= WARM_UP:
+                moves[contender.name].append(1e3 * move)
+                passes[contender.name].append(1e3 * one_pass)
+    return {"passes": passes, "moves": moves, **compare_pictures(contenders[0], contenders[2])}
+
+
+def compare_pictures(raster, path_replay):
+    """That both show the same: share of the image that the sheet covers, mean colour on it, and mean difference of the two (of a 16-sample picture)."""
+    import mitsuba as mi
+
+    for contender in (raster, path_replay):
+        contender.place(0)
+    image = np.array(raster.render(0))
+    other = np.array(mi.render(path_replay.scene, integrator=path_replay.integrator, spp=16))
+    inside = image[..., 3] > 0.999
+    return {
+        "coverage": float(image[..., 3].mean()),
+        "mean_colour": float(image[inside, :3].mean()),
+        "mean_difference": float((image[inside, :3] - other[inside]).mean()),
+        "mean_absolute_difference": float(np.abs(image[inside, :3] - other[inside]).mean()),
+    }
+
+
+def measure_memory(size, points, folder, name):
+    """Peak memory of this process [MB], what it held before the first scene, and Dr.Jit's own peak."""
+    import drjit as dr
+    import mitsuba as mi
+
+    started = resident()
+    contender = Contender(name, size, points, folder)
+    for k in range(MEMORY_PASSES):
+        contender.turn(k)
+    backend = dr.JitBackend.CUDA if mi.variant().startswith("cuda") else dr.JitBackend.LLVM
+    return {"started_mb": started, "peak_mb": peak_resident(), "drjit_peak_mb": dr.detail.malloc_watermark(backend) / 1e6}
+
+
+def measure_growth(size, points, folder, iterations):
+    """Memory of the process [MB] after each iteration of raster."""
+    contender, held = Contender("raster", size, points, folder), []
+    for k in range(iterations):
+        contender.turn(k)
+        held.append(resident())
+    return {"resident_mb": held}
+
+
+def measure_kernels(size, points, folder, iterations):
+    """Kernels that each iteration of raster launched, and those that it did not find in Dr.Jit's memory: compiled, or read from its cache on the disk."""
+    import drjit as dr
+
+    dr.set_flag(dr.JitFlag.KernelHistory, True)
+    contender, launched, new = Contender("raster", size, points, folder), [], []
+    dr.kernel_history_clear()
+    for k in range(iterations):
+        contender.turn(k)
+        history = [entry for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT]  # reading clears it
+        launched.append(len(history))
+        new.append(sum(entry["cache_disk"] or not entry["cache_hit"] for entry in history))
+    return {"launched": launched, "new": new}
+
+
+MEASURES = {"times": measure_times, "memory": measure_memory, "growth": measure_growth, "kernels": measure_kernels}
+
+
+def worker(job):
+    """Do one measurement and print its result, a line of JSON."""
+    variant = set_variant(job["mode"])
+    from polysft_mi import outputs, plugins
+
+    plugins.register()
+    size = parse_size(job["size"])
+    with tempfile.TemporaryDirectory() as folder:
+        result = MEASURES[job["measure"]](size, job["grid"], folder, **job.get("options", {}))
+    print(json.dumps({**result, "variant": variant, "versions": outputs.versions()}))
+
+
+# ---- in the benchmark's own process, which stays small: a process counts its parent's memory as its own peak ---------------------
+
+
+def in_process(measure, size, grid, mode, **options):
+    job = {"measure": measure, "size": size, "grid": grid, "mode": mode, "options": options}
+    done = subprocess.run([sys.executable, os.path.abspath(__file__), "--worker", json.dumps(job)], stdout=subprocess.PIPE, text=True)
+    if done.returncode:
+        raise InputError(f"{measure} at {size}, {grid}x{grid} vertices: the measuring process ended with status {done.returncode}")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def parse_size(text):
+    try:
+        width, height = (int(x) for x in text.lower().split("x"))
+        if min(width, height) < 16:
+            raise ValueError
+    except ValueError:
+        raise InputError(f"--sizes {text}: WIDTHxHEIGHT is needed, at least 16x16, such as 640x480") from None
+    return width, height
+
+
+def summarise(size, grid, times, memory):
+    """The figures of a case: medians, quartiles, ratios."""
+    passes = {name: np.array(values) for name, values in times["passes"].items()}
+    whole = {name: passes[name] + np.array(times["moves"][name]) for name in passes}
+    case = {"size": size, "vertices": grid * grid, "triangles": 2 * (grid - 1) ** 2, "turns": len(passes["raster"]), "contenders": {}}
+    for name in CONTENDERS:
+        low, middle, high = np.percentile(passes[name], [25, 50, 75])
+        case["contenders"][name] = {
+            "ms": middle,
+            "ms_quartiles": [low, high],
+            "move_ms": float(np.median(times["moves"][name])),
+            "ratio": float(np.median(passes[name] / passes["raster"])),
+            "ratio_quartiles": list(np.percentile(passes[name] / passes["raster"], [25, 75])),
+            "ratio_with_move": float(np.median(whole[name] / whole["raster"])),
+            **{k: v for k, v in memory[name].items() if k.endswith("_mb")},
+        }
+    return {**case, **{k: times[k] for k in ("coverage", "mean_colour", "mean_difference", "mean_absolute_difference")}}
+
+
+def print_table(cases):
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(width=None if sys.stdout.isatty() else 120)
+    table = Table(title="One forward + backward pass in ms, how many times that of raster; peak memory of the process in MB (of Dr.Jit)")
+    table.add_column("image")
+    table.add_column("triangles", justify="right")
+    for name in CONTENDERS:
+        table.add_column(name, justify="right")
+    table.add_column("move, ms", justify="right")
+    for case in cases:
+        cells = []
+        for name in CONTENDERS:
+            c = case["contenders"][name]
+            ratio = "" if name == "raster" else f"  [bold]{c['ratio']:.1f}x[/bold]"
+            cells.append(f"{c['ms']:.1f}{ratio}\n{c['peak_mb']:.0f} ({c['drjit_peak_mb']:.0f})")
+        table.add_row(case["size"], f"{case['triangles']:,}", *cells, f"{case['contenders']['raster']['move_ms']:.1f}")
+    console.print(table)
+
+
+def plot(path, cases):
+    from matplotlib.figure import Figure
+
+    triangles = sorted({case["triangles"] for case in cases})
+    figure = Figure(figsize=(4.2 * len(triangles) + 0.6, 4), dpi=110, layout="constrained")
+    rows = figure.subplots(1, len(triangles), sharey=True, squeeze=False)[0]
+    colours = ("#c4572e", "#e0a58c", "#3b6ea5")
+    for axes, count in zip(rows, triangles):
+        chosen = [case for case in cases if case["triangles"] == count]
+        at = [np.prod(parse_size(case["size"])) for case in chosen]
+        for name, colour in zip(CONTENDERS, colours):
+            ms = [case["contenders"][name]["ms"] for case in chosen]
+            axes.plot(at, ms, color=colour, marker="o", markersize=4, label=name)
+            if name == "prb_projective":
+                for x, y, case in zip(at, ms, chosen):
+                    axes.annotate(f"{case['contenders'][name]['ratio']:.1f}×", (x, y), (0, 7), textcoords="offset points", ha="center", fontsize=8)
+        axes.set_xscale("log"), axes.set_yscale("log")
+        axes.set_xticks(at, [case["size"].replace("x", "×") for case in chosen], fontsize=8, rotation=30)
+        axes.minorticks_off()
+        axes.margins(y=0.12)
+        axes.set_title(f"{count:,} triangles", fontsize=10)
+        axes.grid(True, color="0.9", linewidth=0.6)
+        axes.spines[["top", "right"]].set_visible(False)
+    rows[0].set_ylabel("forward + backward [ms]")
+    rows[0].legend(frameon=False, fontsize=8)
+    with aside(path) as temporary:
+        figure.savefig(temporary, format="png", facecolor="white")
+
+
+def judge_long_run(growth, kernels):
+    """Memory between iteration 50 (or a sixth) and the end, and kernels that came new after the second iteration."""
+    held, new = growth["resident_mb"], kernels["new"]
+    early = min(50, len(held) // 6)
+    return {
+        "iterations": len(held),
+        "early_iteration": early,
+        "early_mb": held[early - 1],
+        "late_mb": held[-1],
+        "growth_mb": held[-1] - held[early - 1],
+        "kernels_an_iteration": float(np.median(kernels["launched"])),
+        "new_kernels_first_two": sum(new[:2]),
+        "new_kernels_later": sum(new[2:]),
+        "iterations_with_new_kernels": [k + 1 for k, n in enumerate(new) if n],
+    }
+
+
+def parser():
+    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument("--sizes", nargs="+", metavar="WxH", default=SIZES, help=f"image sizes (default: {' '.join(SIZES)})")
+    p.add_argument("--grids", nargs="+", type=int, metavar="N", default=GRIDS, help="vertices a side of the templates (default: 33 72 225)")
+    p.add_argument("--seconds", type=float, default=5, help=f"time for the turns of a case, of which there are at least {LEAST_TURNS} (default: 5)")
+    p.add_argument("--iterations", type=int, default=300, help="length of the run that must not grow or compile (default: 300)")
+    p.add_argument("-o", "--out", metavar="FOLDER", default="out/benchmarks", help="for raster.json and raster.png (default: out/benchmarks)")
+    add_mode_argument(p)
+    p.add_argument("--worker", help=argparse.SUPPRESS)
+    return p
+
+
+def main(arguments=None):
+    options = parser().parse_args(arguments)
+    if options.worker:
+        return worker(json.loads(options.worker))
+    for size in options.sizes:
+        parse_size(size)
+    if min(options.grids) < 2 or options.iterations < 12:
+        raise InputError(f"--grids {options.grids} --iterations {options.iterations}: at least 2 vertices a side and 12 iterations are needed")
+    os.makedirs(options.out, exist_ok=True)
+    began, cases = time.perf_counter(), []
+    size, grid = (TARGET[0] if TARGET[0] in options.sizes else options.sizes[0]), min(options.grids)
+    growth, kernels = (in_process(measure, size, grid, options.mode, iterations=options.iterations) for measure in ("growth", "kernels"))
+    report = {
+        "versions": growth["versions"],
+        "load": [os.getloadavg()[0]],  # before the first case and after each
+        "long_run": {"size": size, "vertices": grid**2, **judge_long_run(growth, kernels)},
+        "cases": cases,
+    }
+    for grid in options.grids:
+        for size in options.sizes:
+            times = in_process("times", size, grid, options.mode, seconds=options.seconds)
+            memory = {name: in_process("memory", size, grid, options.mode, name=name) for name in CONTENDERS}
+            cases.append(summarise(size, grid, times, memory))
+            report["load"].append(os.getloadavg()[0])
+            report["seconds"] = time.perf_counter() - began
+            write(report, options.out)
+            ratio = cases[-1]["contenders"]["prb_projective"]["ratio"]
+            print(f"{report['seconds']:4.0f} s  {size}, {grid}x{grid} vertices: {ratio:.1f} times", file=sys.stderr)
+    print_table(cases)
+    print_end(report, options.out)
+
+
+def write(report, out):
+    with aside(os.path.join(out, "raster.json")) as temporary, open(temporary, "w", encoding="utf-8") as file:
+        json.dump(report, file, indent=1)
+    plot(os.path.join(out, "raster.png"), report["cases"])
+
+
+def print_end(report, out):
+    size, grid, wanted = TARGET
+    for case in report["cases"]:
+        if (case["size"], case["vertices"]) == (size, grid * grid):
+            c = case["contenders"]["prb_projective"]
+            low, high = c["ratio_quartiles"]
+            print(
+                f"{size}, {grid * grid:,} vertices: raster, RGB and alpha, is {c['ratio']:.2f} times as fast as prb_projective, RGB "
+                f"(quartiles {low:.2f} to {high:.2f}; {c['ratio_with_move']:.2f} with the time to move the sheet); wanted: at least {wanted:g}"
+            )
+    r = report["long_run"]
+    print(
+        f"{r['iterations']} iterations of raster at {r['size']}: {r['growth_mb']:+.1f} MB between iteration {r['early_iteration']} and the last "
+        f"({r['late_mb']:.0f} MB); {r['kernels_an_iteration']:.0f} kernels an iteration, {r['new_kernels_later']} new after the second"
+    )
+    load = report["load"]
+    print(f"{report['versions']['variant']}, {report['versions']['machine']}, load {min(load):.1f} to {max(load):.1f}; in {out}: raster.json, raster.png")
+
+
+if __name__ == "__main__":
+    cli(main)

@@ -1,0 +1,244 @@
+"""Does the surface stay where it is when the optimisation goes on? (Supplement, "Stability test".)
+
+    python benchmarks/stability.py [scenes/demo.xml] [-D name=value ...] [--counts 50 300 1000 5000] [-o out/benchmarks] [-m llvm_ad_rgb]
+
+The video is reconstructed as usual up to the frame before the last. The last window is then solved once, from where that leaves it, with patience off, and what
+the solver would return after each of the counts is kept: the best unknowns so far. Beside it stands the solver's latest step, which shows how much it wanders.
+Figures are those of the window's newest frame; a shorter video (``-D last=20``) tests another.
+
+Writes ``stability.json`` and ``stability.png``.
+"""
+
+import argparse
+import dataclasses
+import math
+import os
+import sys
+import tempfile
+
+import numpy as np
+
+ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+sys.path.insert(0, ROOT)
+
+from polysft_mi.backend import add_mode_argument, set_variant
+from polysft_mi.errors import InputError, cli
+from polysft_mi.files import aside
+
+COUNTS = (50, 300, 1000, 5000)
+USUAL = 300  # iterations that the paper evaluates at
+CURVE = 25  # iterations between points of the curves
+
+
+class Watched:
+    """A problem whose solver is watched: what it has found, and where it is, after some numbers of evaluations.
+
+    Solvers see a problem only through its methods, so this works for any. ``found`` and ``latest`` map a count to the unknowns of the newest frame: the best
+    of so many evaluations, and those of the last one. ``losses`` maps it to (best, last).
+    """
+
+    def __init__(self, problem, counts):
+        self._problem, self._counts = problem, set(counts)
+        self._best, self._best_loss, self._evaluated = None, math.inf, 0
+        self.found, self.latest, self.losses = {}, {}, {}
+
+    def __getattr__(self, name):
+        return getattr(self._problem, name)
+
+    def evaluate(self, window, frames, **options):
+        total, terms = self._problem.evaluate(window, frames, **options)
+        self._evaluated += 1
+        if total < self._best_loss:
+            self._best, self._best_loss = window[-1].copy(), total
+        if self._evaluated in self._counts:
+            self.found[self._evaluated], self.latest[self._evaluated] = self._best, window[-1].copy()
+            self.losses[self._evaluated] = (self._best_loss, total)
+        return total, terms
+
+
+def run(scene, overrides, counts, folder, say=print):
+    """Solve the last window for as many iterations as the largest count.
+
+    Returns (problem, frame, surfaces, wandering, losses): the newest frame, counted in the selection; the surfaces found and the solver's latest, count to vertices
+    (N, 3) [m, camera frame]; count to (best, latest) loss. ``folder``, which exists, takes the checkpoints of the run up to there.
+    """
+    from polysft_mi import scene as scenes
+    from polysft_mi import solvers
+    from polysft_mi.patch import Unknowns
+    from polysft_mi.problem import Problem
+    from polysft_mi.sequence import Sequence
+    from polysft_mi.tracker import track
+
+    experiment = scenes.load(scene, overrides)
+    s = experiment.settings
+    sequence = Sequence.open(experiment.frames, experiment.masks, first=s.first, last=s.last, stride=s.stride, size=experiment.size)
+    problem = Problem(experiment, sequence)
+    problem.check_start()
+    frame = len(sequence.indices) - 1
+    states = [problem.patch.rest().to_numpy()]
+    if frame > 0:
+        say(f"frames 0 to {frame - 1} of the selection as usual ...")
+        states = track(problem, solvers.create(s), frame, folder).states
+        states.append(states[-1])  # each new frame is started from the last
+    window = [Unknowns.from_numpy(state) for state in states[-s.window :]]
+    members = list(range(frame + 1 - len(window), frame + 1))
+    last = max(counts)
+    say(f"frames {members[0]} to {frame}: {last} iterations ...")
+    watched = Watched(problem, {*counts, *range(CURVE, last + 1, CURVE)})
+    solvers.create(dataclasses.replace(s, patience=last, period=last)).solve(watched, window, members)
+    missing = sorted(set(counts) - set(watched.found))
+    if missing:
+        raise InputError(f"--counts {' '.join(map(str, missing))}: solver {s.solver} ended before")
+    surfaces, wandering = ({n: problem.surface(u).astype(np.float64) for n, u in kept.items()} for kept in (watched.found, watched.latest))
+    return problem, frame, surfaces, wandering, watched.losses
+
+
+def truth_of(problem, frame, path):
+    """True vertices (N, 3) of a frame, or None where nothing is known."""
+    from polysft_mi import evaluate, metrics
+    from polysft_mi.defaults import located
+
+    experiment = problem.experiment
+    if path is None and experiment.defaults.get("data"):
+        path = located(experiment.path, experiment.defaults["data"])
+        if not os.path.exists(os.path.join(path, "gt.npz")):
+            return None
+    if path is None:
+        return None
+    truth = metrics.load_npz(evaluate.find_truth(path))
+    index, count = problem.sequence.indices[frame], len(problem.template.vertices)
+    if "vertices" not in truth or truth["vertices"].shape[1] != count or index >= len(truth["vertices"]):
+        raise InputError(f"--truth {path}: true positions of {count} vertices in frame {index} are needed (vertices, shape (T, N, 3))")
+    return truth["vertices"][index].astype(np.float64)
+
+
+def figures_of(surfaces, wandering, losses, usual, truth):
+    """Count to figures: distance to the truth, and to the surface after ``usual`` iterations."""
+    from polysft_mi import metrics
+
+    out = {}
+    for n, V in surfaces.items():
+        moved = np.linalg.norm(V - surfaces[usual], axis=1)
+        row = {"loss": losses[n][0], "change_rms_mm": 1e3 * metrics.rmse(V, surfaces[usual]), "change_max_mm": 1e3 * float(moved.max())}
+        row["wandering_rms_mm"] = 1e3 * metrics.rmse(wandering[n], V)
+        if truth is not None:
+            row |= {"rmse_mm": 1e3 * metrics.rmse(V, truth), "e3d": metrics.e3d(V, truth), "e3d_proc": metrics.e3d_procrustes(V, truth)}
+            row["latest_e3d"] = metrics.e3d(wandering[n], truth)
+        out[n] = row
+    return out
+
+
+def picture(path, problem, frame, surfaces, counts, rows, usual, truth):
+    """The surfaces over the image and from the side, count beside count; below, what changes over the iterations."""
+    from matplotlib.figure import Figure
+
+    from polysft_mi import shading
+    from polysft_mi.outputs import srgb
+
+    template, image = problem.template, srgb(problem.sequence.frame(frame))
+    shown = [(f"{n} iterations", surfaces[n]) for n in counts] + ([("truth", truth)] if truth is not None else [])
+    view = shading.View.around(np.stack([V for _, V in shown]))
+    height, width = image.shape[:2]
+    projected = [problem.camera.project(V)[0] for _, V in shown]
+    low, high = np.concatenate(projected).min(axis=0), np.concatenate(projected).max(axis=0)
+    low, high = np.maximum(low - 12, 0), np.minimum(high + 12, (width, height))
+    figure = Figure(figsize=(3 * len(shown), 8), dpi=110, layout="constrained")
+    above, below = figure.subfigures(2, 1, height_ratios=(2.2, 1))
+    grid = above.subplots(2, len(shown), squeeze=False)
+    for k, ((label, V), xy) in enumerate(zip(shown, projected)):
+        over, beside = grid[:, k]
+        over.imshow(image, extent=(0, width, height, 0))
+        for j in range(2):  # lines of equal u and of equal v: the template's own grid of ten by ten cells
+            uv = template.uv[:, j]
+            levels = np.linspace(uv.min(), uv.max(), 11)[1:-1]
+            over.tricontour(xy[:, 0], xy[:, 1], template.faces, uv, levels=levels, colors="white", linewidths=0.6)
+        for edge in border(template.faces):
+            over.plot(xy[edge, 0], xy[edge, 1], color="#ffb000", linewidth=1.2)
+        over.set_xlim(low[0], high[0]), over.set_ylim(high[1], low[1])
+        over.set_title(label, fontsize=10)
+        beside.imshow(shading.shade_surface(V, template.faces, view, uv=template.uv, size=(360, 300)))
+        if k < len(counts):
+            row = rows[counts[k]]
+            text = f"e3d {row['e3d']:.4f}, " if truth is not None else ""
+            beside.set_xlabel(f"{text}{row['change_rms_mm']:.1f} mm from {usual}", fontsize=8)
+        for axes in (over, beside):
+            axes.set_xticks([]), axes.set_yticks([])
+    n = sorted(rows)
+    left, right = below.subplots(1, 2)
+    if truth is not None:
+        left.plot(n, [rows[k]["latest_e3d"] for k in n], color="0.75", linewidth=0.8, label="the solver's latest step")
+        left.plot(n, [rows[k]["e3d"] for k in n], color="#c4572e", label="what it would return")
+        left.set_title("e3d", fontsize=9, loc="left")
+    else:
+        left.plot(n, [rows[k]["loss"] for k in n], color="#c4572e", label="what it would return")
+        left.set_title("loss", fontsize=9, loc="left")
+    right.plot(n, [rows[k]["change_rms_mm"] for k in n], color="#3b6ea5", label="RMS over the vertices")
+    right.plot(n, [rows[k]["change_max_mm"] for k in n], color="#9db9d6", label="largest")
+    right.set_title(f"distance from the surface at {usual} iterations [mm]", fontsize=9, loc="left")
+    for axes in (left, right):
+        axes.set_xscale("log")
+        axes.set_xticks(counts, [str(c) for c in counts])
+        axes.minorticks_off()
+        axes.set_xlabel("iterations")
+        axes.set_ylim(bottom=0)
+        axes.grid(True, color="0.9", linewidth=0.6)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.legend(frameon=False, fontsize=8)
+    with aside(path) as temporary:
+        figure.savefig(temporary, format="png", facecolor="white")
+
+
+def border(faces):
+    """Edges (E, 2) that belong to one triangle alone."""
+    edges, count = np.unique(np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0, return_counts=True)
+    return edges[count == 1]
+
+
+def parser():
+    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument("scene", nargs="?", metavar="scene.xml", default=os.path.join(ROOT, "scenes", "demo.xml"), help="default: the demo")
+    p.add_argument("-D", dest="define", metavar="NAME=VALUE", action="append", default=[], help="override a <default> of the scene; may be repeated")
+    p.add_argument("--counts", nargs="+", type=int, metavar="N", default=COUNTS, help="iterations to look at (default: 50 300 1000 5000)")
+    p.add_argument("--truth", metavar="PATH", help="gt.npz, or a folder that holds it (default: the scene's data folder, where it does)")
+    p.add_argument("-o", "--out", metavar="FOLDER", default="out/benchmarks", help="for stability.json and stability.png (default: out/benchmarks)")
+    add_mode_argument(p)
+    return p
+
+
+def main(arguments=None):
+    options = parser().parse_args(arguments)
+    counts = sorted(set(options.counts))
+    if counts[0] < 1:
+        raise InputError(f"--counts {counts[0]}: at least 1 iteration is needed")
+    for text in options.define:
+        if "=" not in text:
+            raise InputError(f"-D {text}: NAME=VALUE is needed")
+    overrides = dict(text.split("=", 1) for text in options.define)
+    usual = min(USUAL, counts[-1])
+    set_variant(options.mode)
+    from polysft_mi import outputs
+
+    os.makedirs(options.out, exist_ok=True)
+    with tempfile.TemporaryDirectory() as folder:
+        problem, frame, surfaces, wandering, losses = run(options.scene, overrides, [*counts, usual], folder)
+    truth = truth_of(problem, frame, options.truth)
+    rows = figures_of(surfaces, wandering, losses, usual, truth)
+    picture(os.path.join(options.out, "stability.png"), problem, frame, surfaces, counts, rows, usual, truth)
+    report = {
+        "scene": os.path.basename(options.scene),
+        "overrides": overrides,
+        "frame": int(problem.sequence.indices[frame]),
+        "versions": outputs.versions(),
+        "counts": {str(n): rows[n] for n in counts},
+        "curve": {str(n): rows[n] for n in sorted(rows)},
+    }
+    outputs.write_json(os.path.join(options.out, "stability.json"), report)
+    names = list(rows[counts[0]])
+    print("iterations" + "".join(f"{name:>18s}" for name in names))
+    for n in counts:
+        print(f"{n:10d}" + "".join(f"{rows[n][name]:18.5g}" for name in names))
+    print(f"frame {report['frame']}; in {options.out}: stability.json, stability.png")
+
+
+if __name__ == "__main__":
+    cli(main)
