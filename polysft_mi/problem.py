@@ -14,7 +14,8 @@ import numpy as np
 from . import objective
 from .errors import InputError
 from .patch import JetPatch
-from .raster import Pinhole, RasterIntegrator
+from .pinhole import Pinhole
+from .raster import RasterIntegrator
 
 TERMS = ("rgb", "silhouette", "inextensibility", "temporal")
 _CACHED_FRAMES = 8

@@ -16,131 +16,13 @@ import mitsuba as mi
 import numpy as np
 
 from .errors import InputError
+from .pinhole import NEAR, Pinhole
+from .topology import Topology
 
-_NEAR = 1e-6  # depth [m] below which a triangle takes no part in antialiasing
 _TOLERANCE = 1e-3  # pixels by which an edge through a centre may pass it: the ray and the projection round differently
 _MAX_STEPS = 64  # triangles crossed between two neighbouring pixel centres before the walk gives up
 _AOVS = {"depth": 1, "normal": 3, "uv": 2, "triangle": 1}
 _AOV_CHANNELS = {"depth": "Z", "normal": "XYZ", "uv": "UV", "triangle": "I"}
-
-
-class Pinhole:
-    """A pinhole sensor as a linear map, read off its rays: any sensor whose rays meet in a point, any crop.
-
-    With C = ``basis`` (3x3, camera-to-world applied), the pixel (x, y) of the crop window sees along C (x, y, 1), scaled so that
-    depth is the coordinate along the optical axis; ``project`` is the inverse.
-    """
-
-    def __init__(self, sensor):
-        film = sensor.film()
-        self._device = {}
-        self.width, self.height = (int(x) for x in film.crop_size())
-
-        corners = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], dtype=np.float32)
-        with dr.suspend_grad():
-            ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(corners.T.copy()), mi.Point2f(0.5), True)
-            to_world = sensor.world_transform()
-        o, d = np.array(ray.o, dtype=np.float64).T, np.array(ray.d, dtype=np.float64).T
-        matrix = np.array(to_world.matrix, dtype=np.float64).reshape(4, 4)
-        axis = matrix[:3, 2] / np.linalg.norm(matrix[:3, 2])
-        d /= (d @ axis)[:, None]  # depth 1 along the axis
-        self.origin = matrix[:3, 3]
-        # what every ray of a pinhole passes through, and what the fourth corner must be if the map is linear
-        drift = np.linalg.norm(np.cross(o - self.origin, d / np.linalg.norm(d, axis=1, keepdims=True)), axis=1).max()
-        skewed = np.abs(d[3] - (d[1] + d[2] - d[0])).max()
-        if drift > 1e-4 * max(1.0, np.linalg.norm(self.origin)) or skewed > 1e-4:
-            raise InputError(f"sensor {type(sensor).__name__}: its rays are not those of a pinhole; use perspective or pinhole")
-        self.basis = np.stack([(d[1] - d[0]) / self.width, (d[2] - d[0]) / self.height, d[0]], axis=1)
-        self.inverse = np.linalg.inv(self.basis)
-        # rows: right, down and forward of the OpenCV camera frame, in the world
-        self.axes = np.stack([np.cross(axis, matrix[:3, 1]), -matrix[:3, 1], axis])
-
-    def project(self, points):
-        """Pixels (N, 2) of world points (N, 3) in the crop window, and whether each lies before the camera (N,)."""
-        x = (np.asarray(points, dtype=np.float64) - self.origin) @ self.inverse.T
-        before = x[:, 2] > _NEAR
-        return x[:, :2] / np.where(before, x[:, 2], 1)[:, None], before
-
-    def to_camera(self, points):
-        """World points (..., 3) in the OpenCV camera frame."""
-        return (np.asarray(points) - self.origin) @ self.axes.T
-
-    def device(self, scale=1):
-        """The map as opaque Dr.Jit values (so that no number of it is baked into a kernel); ``scale`` samples a pixel and axis."""
-        if scale not in self._device:
-            basis, inverse = self.basis.copy(), self.inverse.copy()
-            basis[:, :2] /= scale
-            inverse[:2] *= scale
-            values = [mi.Matrix3f(basis), mi.Matrix3f(inverse), mi.Point3f(self.origin)]
-            dr.make_opaque(values)
-            self._device[scale] = values
-        return self._device[scale]
-
-
-class Topology:
-    """Triangles of all meshes of a scene in one numbering, with their neighbours. Detached; vertices that coincide are one."""
-
-    def __init__(self, scene):
-        self.shapes = scene.shapes()
-        for shape in self.shapes:
-            if not shape.is_mesh():
-                raise InputError(f"shape {shape.id()!r}: raster renders triangle meshes only; {type(shape).__name__} is none")
-        self.key = _topology_key(self.shapes)
-        faces, neighbours, face_offset, vertex_offset = [], [], [0], [0]
-        for shape in self.shapes:
-            f = np.array(shape.faces_buffer(), dtype=np.int64).reshape(-1, 3)
-            v = np.array(shape.vertex_positions_buffer()).reshape(-1, 3)
-            _, welded = np.unique(v, axis=0, return_inverse=True)
-            n = _neighbours(welded.reshape(-1)[f])
-            faces.append(f + vertex_offset[-1])
-            neighbours.append(np.where(n >= 0, n + face_offset[-1], -1))
-            face_offset.append(face_offset[-1] + len(f))
-            vertex_offset.append(vertex_offset[-1] + len(v))
-        self.face_count, self.vertex_count = face_offset[-1], vertex_offset[-1]
-        self.faces = mi.UInt32(np.concatenate(faces).ravel().astype(np.uint32))
-        self.neighbours = mi.Int32(np.concatenate(neighbours).ravel().astype(np.int32))
-        # from a shape's place in the registry to its first triangle
-        self.face_offset = dr.zeros(mi.UInt32, 1 + max(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(s))[0] for s in self.shapes))
-        for shape, offset in zip(self.shapes, face_offset):
-            dr.scatter(self.face_offset, mi.UInt32(offset), dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape)))
-        dr.eval(self.faces, self.neighbours, self.face_offset)
-
-    def positions(self):
-        """Positions of all vertices, a flat Float64 of 3V, attached.
-
-        In double precision for the sake of their gradients: threads add these up in any order, and only in float32 does the order show.
-        """
-        return mi.Float64(_joined([s.vertex_positions_buffer() for s in self.shapes]))
-
-    def texcoords(self):
-        """Texture coordinates of all vertices, a flat Float of 2V; zeros for meshes that have none."""
-        return _joined(
-            [
-                s.vertex_texcoords_buffer() if s.has_vertex_texcoords() else dr.zeros(mi.Float, 2 * s.vertex_count())
-                for s in self.shapes
-            ]
-        )
-
-
-def _topology_key(shapes):
-    return tuple((id(s), s.face_count(), s.vertex_count()) if s.is_mesh() else id(s) for s in shapes)
-
-
-def _joined(arrays):
-    return arrays[0] if len(arrays) == 1 else dr.concat(arrays)
-
-
-def _neighbours(faces):
-    """Across edge k of each triangle, from corner k to corner k+1: the other triangle, or -1. faces (F, 3) -> (F, 3)."""
-    edge = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], -1).reshape(-1, 2), axis=1)
-    _, edge_id, count = np.unique(edge, axis=0, return_inverse=True, return_counts=True)
-    edge_id = edge_id.reshape(-1)
-    half = np.argsort(edge_id, kind="stable")
-    first = np.concatenate([[0], np.cumsum(count)[:-1]])
-    out = np.full(len(edge), -1, dtype=np.int64)
-    two = first[count == 2]
-    out[half[two]], out[half[two + 1]] = half[two + 1] // 3, half[two] // 3
-    return out.reshape(-1, 3)
 
 
 def _cross2(a, b):
@@ -263,7 +145,7 @@ class RasterIntegrator(mi.SamplingIntegrator):
         if scale * scale != spp:
             raise InputError(f"raster: spp = {spp}; a square number is needed (1, 4, 9, 16, ...)")
         camera = self._camera(sensor)
-        if self._topology is None or self._topology.key != _topology_key(scene.shapes()):
+        if self._topology is None or not self._topology.fits(scene):
             self._topology = Topology(scene)
         topology = self._topology
         width, height = camera.width * scale, camera.height * scale
@@ -311,7 +193,7 @@ class RasterIntegrator(mi.SamplingIntegrator):
             box = [dr.min(screen.x), dr.min(screen.y), dr.max(screen.x), dr.max(screen.y), dr.min(screen.z)]
             dr.eval(box)
             xa, ya, xb, yb, near = (x[0] for x in box)
-        if not near > _NEAR or not all(map(math.isfinite, (xa, ya, xb, yb))):
+        if not near > NEAR or not all(map(math.isfinite, (xa, ya, xb, yb))):
             return 0, 0, width, height
         # one pixel of margin, for the neighbours that antialiasing blends with
         xa, ya = max(0, math.floor(min(xa, width)) - 1), max(0, math.floor(min(ya, height)) - 1)
@@ -492,7 +374,7 @@ class RasterIntegrator(mi.SamplingIntegrator):
                 t = at0 / (at0 - at1)
                 first = (at1 < at0) & (t < exit_at)
                 exit_at, exit_edge = dr.select(first, t, exit_at), dr.select(first, k, exit_edge)
-            usable = (dr.minimum(dr.minimum(p[0].z, p[1].z), p[2].z) > _NEAR) & (sign != 0)
+            usable = (dr.minimum(dr.minimum(p[0].z, p[1].z), p[2].z) > NEAR) & (sign != 0)
             leaves = active & usable & (exit_at < 1 + _TOLERANCE)
             across = dr.gather(mi.Int32, topology.neighbours, 3 * mi.UInt32(current) + exit_edge, leaves)
             inner = leaves & (across >= 0)

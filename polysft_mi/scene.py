@@ -7,7 +7,6 @@ import os
 import re
 from dataclasses import dataclass, field
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 from scipy.spatial import cKDTree

@@ -107,7 +107,7 @@ def test_depth_of_the_exr_is_that_of_the_surface(result):
     layers, _ = exr.read_exr(result / "comparison" / "002.exr")
     s = surface(result)
     experiment = scene.load(result / "scene.xml")
-    from polysft_mi.raster import Pinhole
+    from polysft_mi.pinhole import Pinhole
 
     camera = Pinhole(experiment.sensor)
     y, x = np.nonzero(layers["mask_render"][..., 0] > 0.999)
