@@ -87,8 +87,8 @@ class Problem:
     def place(self, vertices):
         """Put the surface (Point3f of N, attached or not) into the scene."""
         points = vertices
-        if not self._identity:
-            points = dr.gather(mi.Point3f, dr.ravel(vertices), self._corner)
+        if not self._identity:  # in double, as wherever gradients are summed (objective.edge_lengths)
+            points = mi.Point3f(dr.gather(mi.Point3d, mi.Float64(dr.ravel(vertices)), self._corner))
         self._params[self._key] = dr.ravel(points)
         self._params.update()
 

@@ -129,6 +129,11 @@ def test_sensors_that_are_no_pinhole(sheet):
     has(refused(edited(sheet, "<sensor.*</sensor>", "", pattern=True)), "0 sensors; exactly one is needed")
 
 
+def test_film_without_alpha(sheet):
+    message = refused(edited(sheet, 'name="pixel_format" value="rgba"', 'name="pixel_format" value="rgb"'))
+    has(message, "the film has no alpha", "pixel_format rgba is needed")
+
+
 def pinhole(folder, **values):
     values = {"fx": 55, "fy": 50, "cx": 24, "cy": 18} | values
     floats = "".join(f'<float name="{k}" value="{v}"/>' for k, v in values.items() if v is not None)
