@@ -412,7 +412,7 @@ class RasterIntegrator(mi.SamplingIntegrator):
         px, py = sx // scale, sy // scale
         pixel = py * dr.opaque(mi.UInt32, width) + px
         out = dr.zeros(mi.Float, width * height * count)
-        value = mi.Vector4f(dr.unravel(mi.Vector4d, rgba))
+        value = mi.Vector4f(dr.gather(mi.Vector4d, rgba, index, mode=dr.ReduceMode.Local))
         value = value if alpha else mi.Vector3f(value.x, value.y, value.z)
         place = [(value, pixel)] if not aovs else [(value[c], pixel * count + c) for c in range(colours)]
         for part, at in place:
