@@ -28,7 +28,7 @@ def robust(squared, norm, scale):
     return 2 * scale * scale * (dr.sqrt(1 + squared / (scale * scale)) - 1)
 
 
-def photometric(render, target, weight, area, *, norm="l2", scale=0.1):
+def photometric(render, target, weight, area, *, norm="l1", scale=0.1):
     """Mean over the surface of rho(|I - T|^2 / 3).
 
     ``render``, ``target``: lists of 3 Floats of P pixels; ``weight``: Float of P, detached; ``area``: Float of 1, pixels.

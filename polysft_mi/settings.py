@@ -30,7 +30,7 @@ class Settings:
     k_silhouette: float = _setting(1.0, "weight of the silhouette loss (needs masks)", low=0)
     k_mi: float = _setting(0.1, "weight of mesh inextensibility", low=0)
     k_tc: float = _setting(0.05, "weight of temporal consistency", low=0)
-    rgb_norm: str = _setting("l2", "norm of the photometric residual", choices=("l2", "l1", "charbonnier"))
+    rgb_norm: str = _setting("l1", "norm of the photometric residual", choices=("l1", "l2", "charbonnier"))
     rgb_scale: float = _setting(0.1, "residual at which the Charbonnier norm turns from quadratic to linear", above=0)
     brightness: str = _setting(
         "none", "compensation of lighting before images are compared", choices=("none", "gain", "local")
