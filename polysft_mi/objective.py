@@ -4,6 +4,7 @@ What the paper leaves open is decided here and nowhere else (``docs/conventions.
 
 - Images are compared in linear RGB. Photometric and silhouette losses are sums over pixels divided by the area of the surface in the image
   (the target mask's, or the rendered interior's where there are no masks), so that neither the background nor the resolution weighs in.
+- The photometric norm is |r| by default: shading that the texture does not have, and what one patch cannot follow, weigh less than in r^2.
 - With masks, the target is cut out by its mask and the rendering stands over black. Without, the photometric loss lives inside the rendered
   silhouette (pixels that the surface fills, detached) and there is no silhouette loss.
 - Edge lengths, jet coefficients and uv are measured in the chart's unit s. Inextensibility is the sum over edges, as in eq. isometry_mesh;

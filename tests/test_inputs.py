@@ -190,7 +190,7 @@ def test_malformed_setting(sheet, text):
         ("fit_tolerance=0", "fit_tolerance = 0.0; a finite number, above 0, is needed"),
         ("window=0", "window = 0; a whole number, at least 1, is needed"),
         ("solver=newton", "solver = 'newton'; known values: adam"),
-        ("rgb_norm=l3", "rgb_norm = 'l3'; known values: l2, l1, charbonnier"),
+        ("rgb_norm=l3", "rgb_norm = 'l3'; known values: l1, l2, charbonnier"),
         ("spp=3", "raster: spp = 3; a square number is needed"),
         ("first=3", "first = 3; "),
         ("last=3", "last = 3; it must lie in [0, 2]"),

@@ -50,7 +50,7 @@ def test_reconstruction_is_right(sequence, result):
     start = metrics.score(still, str(sequence.folder / "gt.npz"))
     assert figures["frames"] == 6
     assert figures["e3d_proc"] < 0.5 * start["e3d_proc"]
-    assert figures["rmse_mm"] < 3.0 and figures["en_deg"] < 0.5 * start["en_deg"]
+    assert figures["rmse_mm"] < 3.0 and figures["en_deg"] < 0.7 * start["en_deg"]
     assert figures["psnr_mask"] > 30 and figures["ssim_mask"] > 0.95
 
 
@@ -234,7 +234,7 @@ def test_the_form_of_phi_sft_with_its_other_frame_and_pixels(tmp_path):
     # so few iterations leave the depth open; what the image shows must fit all the same
     seen, true = (v[..., :2] / v[..., 2:] * truth.K[[0, 1], [0, 1]] + truth.K[:2, 2] for v in (surface(out)["vertices"], truth.vertices))
     still = np.linalg.norm(true - true[:1], axis=-1)[3].mean()
-    assert np.linalg.norm(seen - true, axis=-1).mean() < 0.5 < 0.1 * still
+    assert np.linalg.norm(seen - true, axis=-1).mean() < 0.5 < 0.2 * still
 
 
 def test_a_camera_elsewhere_gives_the_same_surface(sequence, result, tmp_path):
