@@ -19,7 +19,7 @@ def _cloth(**settings):
 
 
 SCENES = {
-    "demo": Layout("cloth", Intrinsics(368, 368, 160, 120, 320, 240), "frames", "masks", "texture.jpg", "template.obj", settings={"period": 120, "patience": 50}),
+    "demo": Layout("cloth", Intrinsics(368, 368, 160, 120, 320, 240), "frames", "masks", "texture.jpg", "template.obj", settings={"period": 150, "patience": 50}),
     "flag": _cloth(),
     "bend": _cloth(),
     "paper": _cloth(),
