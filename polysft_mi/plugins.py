@@ -47,7 +47,7 @@ class PolySfT(mi.SamplingIntegrator):
        - The integrator that renders the template: ``raster``, or a differentiable one of Mitsuba's.
 
     A whole shape-from-template experiment beside the scene that it needs. Rendered as an integrator, it renders the template by the
-    nested one, so that ``mitsuba scene.xml`` shows what a fit starts from.
+    nested one, so that ``mi.render`` of a loaded scene file shows what a fit starts from.
     """
 
     def __init__(self, props):
