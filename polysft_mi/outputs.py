@@ -189,7 +189,7 @@ def write(problem, track, out, *, exr_frames, fps, command, say=None):
         "solver": problem.settings.solver,
     }
     windows = [
-        {"frame": int(indices[count - len(track.iterations) + k]), "iterations": n, "seconds": t, **{name: terms[name] for name in TERMS}}
+        {"frame": int(indices[count - len(track.iterations) + k]), "iterations": n, "seconds": t, **{name: x for name, x in terms.items()}}
         for k, (n, t, terms) in enumerate(zip(track.iterations, track.seconds, track.totals))
     ]
     write_json(

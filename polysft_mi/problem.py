@@ -123,7 +123,7 @@ class Problem:
                 tensor = objective.blur(tensor, self.settings.blur)
             area = mi.Float(max(1.0, float(mask.sum()))) if mask is not None else None
             device_mask = mi.Float(np.ascontiguousarray(mask, dtype=np.float32).ravel()) if mask is not None else None
-            if device_mask is not None and self.settings.brightness == "local":
+            if device_mask is not None and self.settings.lighting == "local":
                 tensor = objective.normalise_locally(tensor, self._weight_image(device_mask))
             dr.eval(tensor, area, device_mask)
             self._targets[frame] = Target(tensor, device_mask, area)
@@ -155,12 +155,12 @@ class Problem:
             rgb, wanted = (mi.TensorXf(x.array * inside, x.shape) for x in (rgb, wanted))
             wanted = objective.blur(wanted, s.blur)
         rgb = objective.blur(rgb, s.blur)
-        if s.brightness == "local":
+        if s.lighting == "local":
             rgb = objective.normalise_locally(rgb, self._weight_image(alpha if target.mask is not None else weight))
             if target.mask is None:
                 wanted = objective.normalise_locally(wanted, self._weight_image(weight))
         a, b = self._channels(rgb), self._channels(wanted)
-        if s.brightness == "gain":
+        if s.lighting == "gain":
             g = objective.gain([dr.detach(x) for x in a], b, objective.interior(alpha))
             a = [g * x for x in a]
         terms["rgb"] = s.k_rgb * objective.photometric(a, b, weight, area, norm=s.rgb_norm, scale=s.rgb_scale)

@@ -10,6 +10,7 @@ Import only after a Mitsuba variant is set.
 """
 
 import math
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -27,6 +28,28 @@ _AOV_CHANNELS = {"depth": "Z", "normal": "XYZ", "uv": "UV", "triangle": "I"}
 
 def _cross2(a, b):
     return a.x * b.y - a.y * b.x
+
+
+@dataclass
+class View:
+    """What the pixels of a region see, detached but for ``positions`` and ``screen``; region pixels run row by row.
+
+    ``region``: (x0, y0, width) opaque UInt32 and (width, height) ints; ``basis``, ``origin``: the camera as :meth:`Pinhole.device` gives it;
+    ``positions`` Float64 of 3V [m], ``screen`` Point3d of V (x, y [pixels], depth [m]): the vertices; ``ray``, and the ``length`` of its direction
+    before it was normalised (depth = t / length); ``hit``, ``triangle`` (-1 for none), ``depth``, and Mitsuba's preliminary intersection.
+    """
+
+    region: tuple
+    basis: mi.Matrix3f
+    origin: mi.Point3f
+    positions: mi.Float64
+    screen: mi.Point3d
+    ray: mi.Ray3f
+    length: mi.Float
+    hit: mi.Bool
+    triangle: mi.Int32
+    depth: mi.Float
+    intersection: mi.PreliminaryIntersection3f
 
 
 class RasterIntegrator(mi.SamplingIntegrator):
@@ -139,16 +162,16 @@ class RasterIntegrator(mi.SamplingIntegrator):
             self._camera_of, self._pinhole = key, Pinhole(sensor)
         return self._pinhole
 
-    def _image(self, scene, sensor, seed, spp):
-        spp = spp or sensor.sampler().sample_count()
-        scale = math.isqrt(spp)
-        if scale * scale != spp:
-            raise InputError(f"raster: spp = {spp}; a square number is needed (1, 4, 9, 16, ...)")
-        camera = self._camera(sensor)
+    def topology(self, scene):
+        """The :class:`Topology` of the scene, made anew where its meshes are others."""
         if self._topology is None or not self._topology.fits(scene):
             self._topology = Topology(scene)
-        topology = self._topology
-        width, height = camera.width * scale, camera.height * scale
+        return self._topology
+
+    def look(self, scene, sensor, scale=1):
+        """Trace one ray a pixel: the :class:`View` of the scene at ``scale`` pixels a pixel and axis (a fraction for a coarser grid)."""
+        camera, topology = self._camera(sensor), self.topology(scene)
+        width, height = int(camera.width * scale), int(camera.height * scale)
         basis, inverse, origin = camera.device(scale)
 
         positions = topology.positions()
@@ -173,17 +196,24 @@ class RasterIntegrator(mi.SamplingIntegrator):
             triangle = dr.select(hit, mi.Int32(dr.gather(mi.UInt32, topology.face_offset, shape, hit) + pi.prim_index), -1)
             depth = dr.select(hit, pi.t / length, dr.inf)
             dr.eval(pi, triangle, depth)  # once: everything below reads it, and the scene may change before it is evaluated
+        return View((x0_, y0_, w_, w, h), basis, origin, positions, screen, ray, length, hit, triangle, depth, pi)
 
-        si, z = self._interaction(topology, positions, pi.shape, triangle, ray, length, hit)
-        colour = self._unlit(si, hit) if self.shading == "unlit" else self._lit(scene, pi, ray, hit, seed)
+    def _image(self, scene, sensor, seed, spp):
+        spp = spp or sensor.sampler().sample_count()
+        scale = math.isqrt(spp)
+        if scale * scale != spp:
+            raise InputError(f"raster: spp = {spp}; a square number is needed (1, 4, 9, 16, ...)")
+        view = self.look(scene, sensor, scale)
+        topology, hit = self._topology, view.hit
+        si, z = self._interaction(topology, view.positions, view.intersection.shape, view.triangle, view.ray, view.length, hit)
+        colour = self._unlit(si, hit) if self.shading == "unlit" else self._lit(scene, view.intersection, view.ray, hit, seed)
         # red, green, blue and alpha packed; in double for the gradients, as positions are
         rgba = dr.ravel(mi.Vector4d(*colour, dr.select(hit, mi.Float(1), 0)))
-        region = (x0_, y0_, w_, w, h)
         if self.antialias:
-            rgba = self._antialias(topology, positions, screen, triangle, depth, pi, rgba, region, (basis, origin))
-        aovs = [channel for name in self.aovs for channel in self._aov(name, si, z, triangle, ray, hit)]
+            rgba = self._antialias(topology, view, rgba)
+        aovs = [channel for name in self.aovs for channel in self._aov(name, si, z, view.triangle, view.ray, hit)]
         alpha = mi.has_flag(sensor.film().flags(), mi.FilmFlags.Alpha)
-        return self._assemble(rgba, aovs, region, camera, scale, alpha)
+        return self._assemble(rgba, aovs, view.region, self._camera(sensor), scale, alpha)
 
     def _bounds(self, screen, width, height):
         """Pixels that the surface can cover: (x, y, width, height), at least one pixel."""
@@ -262,12 +292,16 @@ class RasterIntegrator(mi.SamplingIntegrator):
             return [dr.select(hit, x, 0) for x in si.uv]
         return [mi.Float(triangle)]
 
-    def _antialias(self, topology, positions, screen, triangle, depth, pi, rgba, region, camera):
-        """Blend the colours (packed, 4 w h) across the silhouettes that run between neighbouring pixel centres."""
-        x0, y0, w_, w, h = region
+    def crossings(self, view):
+        """The silhouette edges that run between neighbouring pixel centres of a :class:`View`: detached (va, vb, near, far, horizontal), None where
+        there are none.
+
+        Vertices of each edge, the region's pixel whose sheet ends there, the other pixel, and whether the two lie side by side.
+        """
+        topology, (x0, y0, w_, w, h) = self._topology, view.region
         horizontal_count, count = (w - 1) * h, (w - 1) * h + w * (h - 1)
         if count == 0:
-            return rgba
+            return None
         with dr.suspend_grad():
             split, columns = dr.opaque(mi.UInt32, horizontal_count), w_ - 1
 
@@ -279,23 +313,28 @@ class RasterIntegrator(mi.SamplingIntegrator):
                 return a, a + dr.select(horizontal, 1, w_), horizontal
 
             a, b, _ = pixels(dr.arange(mi.UInt32, count))
-            pair = dr.compress(dr.gather(mi.Int32, triangle, a) != dr.gather(mi.Int32, triangle, b))
+            pair = dr.compress(dr.gather(mi.Int32, view.triangle, a) != dr.gather(mi.Int32, view.triangle, b))
             if dr.width(pair) == 0:
-                return rgba
+                return None
             a, b, horizontal = pixels(pair)
-            swap = dr.gather(mi.Float, depth, b) < dr.gather(mi.Float, depth, a)
+            swap = dr.gather(mi.Float, view.depth, b) < dr.gather(mi.Float, view.depth, a)
             near, far = dr.select(swap, b, a), dr.select(swap, a, b)
-            found, va, vb, near, far = self._silhouette(topology, screen, triangle, near, far, x0, y0, w_, horizontal)
+            found, va, vb, near, far = self._silhouette(topology, view.screen, view.triangle, near, far, x0, y0, w_, horizontal)
             dr.eval(found, va, vb, near, far, horizontal)  # in one kernel: compress and gather would each walk again
             kept = dr.compress(found)
             if dr.width(kept) == 0:
-                return rgba
+                return None
             va, vb, near, far = (dr.gather(mi.UInt32, i, kept) for i in (va, vb, near, far))
-            horizontal = dr.gather(mi.Bool, horizontal, kept)
-            cn, cf = (self._centre(i, x0, y0, w_) for i in (near, far))
+            return va, vb, near, far, dr.gather(mi.Bool, horizontal, kept)
 
-        # where the edge crosses, from the near centre (0) to the far one (1): attached
-        ea, eb = _point2(screen, va), _point2(screen, vb)
+    def blend(self, view, ea, eb, near, far, horizontal):
+        """How an edge between two pixel centres blends them: (pixel that changes, pixel whose colour comes in, its weight, where the edge crosses).
+
+        ``ea``, ``eb``: the edge's ends [pixels], attached; the weight and the place are.
+        """
+        x0, y0, w_, _, _ = view.region
+        cn, cf = (self._centre(i, x0, y0, w_) for i in (near, far))
+        # where the edge crosses, from the near centre (0) to the far one (1)
         step = eb - ea
         along, across = dr.select(horizontal, step.x, step.y), dr.select(horizontal, step.y, step.x)
         slope = along / across
@@ -307,21 +346,28 @@ class RasterIntegrator(mi.SamplingIntegrator):
         beyond = dr.detach(t) > 0.5
         # The pairs across either axis would account for the whole edge; sin^2 and cos^2 of its angle share it between them.
         weight = dr.clip(dr.abs(t - 0.5), 0, 0.5) * across * across / (along * along + across * across)
-        target, other = dr.select(beyond, far, near), dr.select(beyond, near, far)
+        return dr.select(beyond, far, near), dr.select(beyond, near, far), weight, place
+
+    def _antialias(self, topology, view, rgba):
+        """Blend the colours (packed, 4 w h) across the silhouettes that run between neighbouring pixel centres."""
+        pairs = self.crossings(view)
+        if pairs is None:
+            return rgba
+        va, vb, near, far, horizontal = pairs
+        ea, eb = _point2(view.screen, va), _point2(view.screen, vb)
+        target, other, weight, place = self.blend(view, ea, eb, near, far, horizontal)
 
         # The colour that comes in is the other sheet's where the edge crosses, not at the other pixel's centre: so the image stays
         # continuous when a pixel's centre passes from one sheet to the other.
         # (Local reduction, because the default would bake the size of the region into the kernels.)
         incoming = dr.gather(mi.Vector4d, rgba, other, mode=dr.ReduceMode.Local)
         if self.shading == "unlit":
-            basis, origin = camera
-            direction = basis @ mi.Vector3f(place.x, place.y, 1)
+            direction = view.basis @ mi.Vector3f(place.x, place.y, 1)
             length = dr.norm(direction)
-            shape = dr.gather(mi.UInt32, dr.reinterpret_array(mi.UInt32, pi.shape), other)
-            visible = dr.gather(mi.Int32, triangle, other)
-            si, _ = self._interaction(
-                topology, positions, dr.reinterpret_array(mi.ShapePtr, shape), visible, mi.Ray3f(origin, direction / length), length, visible >= 0
-            )
+            shape = dr.gather(mi.UInt32, dr.reinterpret_array(mi.UInt32, view.intersection.shape), other)
+            visible = dr.gather(mi.Int32, view.triangle, other)
+            ray = mi.Ray3f(view.origin, direction / length)
+            si, _ = self._interaction(topology, view.positions, dr.reinterpret_array(mi.ShapePtr, shape), visible, ray, length, visible >= 0)
             incoming = mi.Vector4d(*self._unlit(si, visible >= 0), incoming.w)
         difference = incoming - dr.gather(mi.Vector4d, rgba, target, mode=dr.ReduceMode.Local)
         out = rgba + 0

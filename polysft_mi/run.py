@@ -159,8 +159,8 @@ class Progress:
     """Where the run is: a bar on a terminal, a line now and then elsewhere, nothing where quiet."""
 
     def __init__(self, frames, settings, quiet):
-        self.windows = frames - min(settings.window, frames) + 1
-        self.first = min(settings.window, frames) - 1  # newest frame of the first window
+        self.windows = frames - min(settings.width, frames) + 1
+        self.first = min(settings.width, frames) - 1  # newest frame of the first window
         self.period, self.quiet, self.terminal = settings.period, quiet, sys.stderr.isatty()
         self._frame, self._began, self._done, self._shown = None, time.perf_counter(), 0, 0.0
 

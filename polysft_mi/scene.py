@@ -150,5 +150,7 @@ def _template(mesh, source, settings):
     uv[corner[::-1]] = texcoords[::-1]
     uv[:, 1] = 1 - uv[:, 1]  # Mitsuba's v runs down, a file's up
     meshio.check_template(vertices, faces, uv, where)
-    template = Template.fit(vertices, faces, uv, settings.order, tolerance=settings.fit_tolerance, where=where)
+    template = Template.fit(
+        vertices, faces, uv, settings.order, capacity=settings.capacity, tolerance=settings.fit_tolerance, where=where
+    )
     return template, corner

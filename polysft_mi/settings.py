@@ -22,7 +22,8 @@ class Settings:
     first: int = _setting(0, "first image to use, counted from 0 in the sorted list", low=0)
     last: int = _setting(-1, "last image to use, inclusive; -1 for the end of the video", low=-1)
     stride: int = _setting(1, "use every stride-th image", low=1)
-    order: int = _setting(4, "order n of the jet", low=1, high=10)
+    order: int = _setting(4, "order n of the jet; gauss-newton starts with it", low=1, high=10)
+    order_max: int = _setting(10, "order up to which gauss-newton may raise the jet; at least ``order``", low=1, high=10)
     fit_tolerance: float = _setting(
         0.05, "largest distance of the template from its jet, as a share of the template's radius, before it is refused", above=0
     )
@@ -30,21 +31,38 @@ class Settings:
     k_silhouette: float = _setting(1.0, "weight of the silhouette loss (needs masks)", low=0)
     k_mi: float = _setting(0.1, "weight of mesh inextensibility", low=0)
     k_tc: float = _setting(0.05, "weight of temporal consistency", low=0)
+    k_bend: float = _setting(1e-6, "weight of the jet's mean squared second derivatives (gauss-newton)", low=0)
+    k_uv: float = _setting(1e-4, "weight of the differences of neighbours' uv displacements (gauss-newton)", low=0)
     rgb_norm: str = _setting("l1", "norm of the photometric residual", choices=("l1", "l2", "charbonnier"))
     rgb_scale: float = _setting(0.1, "residual at which the Charbonnier norm turns from quadratic to linear", above=0)
     brightness: str = _setting(
-        "none", "compensation of lighting before images are compared", choices=("none", "gain", "local")
+        "auto", "compensation of lighting before images are compared; auto: local for gauss-newton, none for adam", choices=("auto", "none", "gain", "local")
     )
     blur: float = _setting(0.0, "standard deviation of the Gaussian blur of both images before they are compared [pixels]", low=0)
     spp: int = _setting(1, "samples a pixel; raster takes square numbers (1, 4, 9, ...)", low=1)
     seed: int = _setting(0, "seed of the renderer's random numbers (path replay)", low=0)
-    solver: str = _setting("adam", "solver of each window", choices=("adam",))
-    window: int = _setting(3, "frames W in the sliding window", low=1)
-    patience: int = _setting(100, "iterations without improvement after which the window moves on", low=1)
-    period: int = _setting(500, "largest number of iterations of a window", low=1)
+    solver: str = _setting("gauss-newton", "solver of each window", choices=("gauss-newton", "adam"))
+    window: int = _setting(0, "frames W in the sliding window; 0: 1 for gauss-newton, 3 for adam", low=0)
+    patience: int = _setting(100, "iterations of adam without improvement after which the window moves on", low=1)
+    period: int = _setting(500, "largest number of iterations of adam in a window", low=1)
     lr_uv: float = _setting(1e-3, "Adam's step size of the uv displacements", low=0)
     lr_alpha: float = _setting(1e-2, "Adam's step size of the jet coefficients", low=0)
     lr_rigid: float = _setting(1e-4, "Adam's step size of rotation and translation", low=0)
+
+    @property
+    def width(self):
+        """Frames in the sliding window."""
+        return self.window or {"gauss-newton": 1, "adam": 3}[self.solver]
+
+    @property
+    def lighting(self):
+        """The compensation of lighting: none, gain or local."""
+        return self.brightness if self.brightness != "auto" else {"gauss-newton": "local", "adam": "none"}[self.solver]
+
+    @property
+    def capacity(self):
+        """The highest order that the solver may use."""
+        return max(self.order, self.order_max) if self.solver == "gauss-newton" else self.order
 
     def __post_init__(self):
         for f in dataclasses.fields(self):

@@ -17,7 +17,7 @@ class Template:
 
     ``vertices`` (N, 3) [m, camera frame] and ``faces`` (F, 3) as in the file; ``uv`` (N, 2) texture coordinates, v up;
     ``scale`` [m], ``rotation`` (3, 3), ``origin`` (3,) [m]: the orientation O = (s, R, T), p = s R x + T;
-    ``chart`` (N, 2): (u, v) of each vertex, at most 1 in norm; ``alpha`` (A,): the jet, in the chart's unit;
+    ``chart`` (N, 2): (u, v) of each vertex, at most 1 in norm; ``alpha`` (A,): the jet, in the chart's unit, zero beyond the order that was fitted;
     ``residual`` (N,) [m]: signed distance along the chart's normal that the jet leaves.
     """
 
@@ -33,6 +33,7 @@ class Template:
 
     @property
     def order(self):
+        """The order that the coefficients are for."""
         return jets.order_of(len(self.alpha))
 
     @property
@@ -52,8 +53,8 @@ class Template:
         return float(np.abs(self.residual).max())
 
     @classmethod
-    def fit(cls, vertices, faces, uv, order, *, tolerance=0.05, where="template"):
-        """Fit a jet of ``order`` to the mesh.
+    def fit(cls, vertices, faces, uv, order, *, capacity=None, tolerance=0.05, where="template"):
+        """Fit a jet of ``order`` to the mesh; it has the coefficients of order ``capacity`` (default: the same), the others zero.
 
         Raises InputError where the order is too high for the vertices, where the surface folds over in its chart (a closed surface does), or
         where the largest residual exceeds ``tolerance`` times the scale s.
@@ -74,7 +75,7 @@ class Template:
             frame.R.numpy(),
             frame.T.numpy(),
             x[:, :2].numpy(),
-            alpha.numpy(),
+            np.pad(alpha.numpy(), (0, len(jets.exponents(max(order, capacity or order))) - len(alpha))),
             residual,
         )
         measured = (

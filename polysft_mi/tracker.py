@@ -19,6 +19,7 @@ from .problem import TERMS, BadFrame
 
 CHECKPOINT, LOG = "checkpoint.npz", "log.jsonl"
 _VISIBLE = 0.02  # share of the vertices inside the image below which the surface is said to have left it
+_PAST = 20  # frames that a solver is told of
 _LOG_EVERY = 10  # iterations between records of the log
 
 
@@ -66,7 +67,7 @@ def track(problem, solver, frames, out, *, resume=False, progress=None):
     finite, or the surface leaves the image, the new frame keeps the state of the one before, and the run goes on. KeyboardInterrupt passes
     through; the checkpoint on disk is then that of the last whole window.
     """
-    width = min(problem.settings.window, frames)
+    width = min(problem.settings.width, frames)
     checkpoint, log_path = os.path.join(out, CHECKPOINT), os.path.join(out, LOG)
     done = Track.load(checkpoint) if resume and os.path.exists(checkpoint) else Track()
     _trim_log(log_path, done.next_window)
@@ -97,12 +98,13 @@ def _advance(problem, solver, done, start, width, log, progress):
         if progress:
             progress(members[-1], iteration, total, terms)
 
-    solved, terms, failed = {}, dict.fromkeys(TERMS, math.nan), {}
+    solved, terms, facts, failed = {}, dict.fromkeys(TERMS, math.nan), {}, {}
     while usable := [k for k in members if k not in done.unusable]:
         before = [Unknowns.from_numpy(done.states[k]) for k in usable]
         try:
-            window, total, terms, latest[0] = solver.solve(problem, before, usable, report)
-            solved = dict(zip(usable, window))
+            past = [(done.states[k], done.totals[k - width + 1]) for k in range(max(width - 1, members[-1] - _PAST), members[-1])]
+            solution = solver.solve(problem, before, usable, report, past)
+            solved, terms, facts, latest[0] = dict(zip(usable, solution.window)), solution.terms, solution.facts, solution.iterations
             break
         except BadFrame as error:
             if latest[0]:  # it was finite at the start: the solver ran away, the image is not to blame
@@ -126,7 +128,7 @@ def _advance(problem, solver, done, start, width, log, progress):
     done.next_window = start + 1
     done.iterations.append(latest[0])
     done.seconds.append(time.perf_counter() - began)
-    done.totals.append({name: x if np.isfinite(x) else None for name, x in terms.items()})
+    done.totals.append({name: x if np.isfinite(x) else None for name, x in {**terms, **facts}.items()})
 
 
 def _trim_log(path, next_window):

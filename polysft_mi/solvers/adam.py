@@ -5,6 +5,7 @@ import math
 import mitsuba as mi
 
 from ..patch import Unknowns
+from . import Solution
 
 
 class Adam:
@@ -17,8 +18,8 @@ class Adam:
     def __init__(self, settings):
         self.settings = settings
 
-    def solve(self, problem, window, frames, report=None):
-        """Minimise ``problem`` over ``window`` (list of Unknowns) for ``frames``: (window, total, terms, iterations).
+    def solve(self, problem, window, frames, report=None, past=()):
+        """Minimise ``problem`` over ``window`` (list of Unknowns) for ``frames``: a :class:`Solution`; ``past`` is not used.
 
         ``report(iteration, total, terms)`` is called after each evaluation. BadFrame passes through.
         """
@@ -48,5 +49,5 @@ class Adam:
                 report(iteration, total, terms)
             iteration += 1
             if since >= s.patience or iteration >= s.period:
-                return best, best_total, best_terms, iteration
+                return Solution(best, best_total, best_terms, iteration)
             optimizer.step()

@@ -1,0 +1,413 @@
+"""From second-order models at the vertices to a step in the unknowns of the jet patch: normal equations, and their elimination. NumPy and SciPy only.
+
+Unknowns of a frame: the 2N displacements (Δu, Δv), sparse like the mesh, and G = A + 6 global ones: the coefficients in an orthogonal basis, a rotation
+increment (axis times angle, before the rotation) and the translation T_c. The first are eliminated, what is left is small and dense.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.polynomial import legendre
+from scipy.linalg import LinAlgError, blas, cho_factor, cho_solve, lapack, solve_triangular
+from scipy.sparse.csgraph import reverse_cuthill_mckee
+from scipy.spatial.transform import Rotation
+
+from polyfit import jets
+
+
+@dataclass
+class State:
+    """Unknowns of a frame on the host, float64: ``alpha`` (A,), the offset of the coefficients in the basis of :class:`Chart`; ``uv`` (N, 2), (Δu, Δv);
+    ``rotation``: R_c; ``translation`` (3,): T_c, in the chart's unit."""
+
+    alpha: np.ndarray
+    uv: np.ndarray
+    rotation: Rotation
+    translation: np.ndarray
+
+    def moved(self, step, factor=1.0):
+        """The state after a step (global (G,), uv (N, 2)); coefficients beyond those of the step stay."""
+        g, uv = step
+        alpha = self.alpha.copy()
+        alpha[: len(g) - 6] += factor * g[:-6]
+        return State(
+            alpha, self.uv + factor * uv, Rotation.from_rotvec(factor * g[-6:-3]) * self.rotation, self.translation + factor * g[-3:]
+        )
+
+    def towards(self, other, factor):
+        """The state that goes on from this one past ``other``: other + factor (other - self)."""
+        turn = (other.rotation * self.rotation.inv()).as_rotvec()
+        return State(
+            other.alpha + factor * (other.alpha - self.alpha),
+            other.uv + factor * (other.uv - self.uv),
+            Rotation.from_rotvec(factor * turn) * other.rotation,
+            other.translation + factor * (other.translation - self.translation),
+        )
+
+
+@dataclass
+class Surface:
+    """The vertices (N, 3) [m, world] that a :class:`State` makes, with derivatives.
+
+    ``by_uv`` (N, 3, 2); by the coefficients: ``up`` (3,) times ``basis`` (N, A); by rotation and translation: ``by_motion`` (N, 3, 6).
+    """
+
+    vertices: np.ndarray
+    by_uv: np.ndarray
+    up: np.ndarray
+    basis: np.ndarray
+    by_motion: np.ndarray
+
+
+class Chart:
+    """The template's jet on the host, in a basis of products of Legendre polynomials, which stays well conditioned to order 10."""
+
+    def __init__(self, template):
+        self.template = template
+        self.order = template.order
+        exponents = jets.exponents(self.order)
+        self.degree = exponents.sum(1)  # of each coefficient
+        self._u, self._v = exponents.T
+        self.to_monomials = _legendre_to_monomials(self.order)
+        self._from_monomials = np.linalg.inv(self.to_monomials)
+        self._alpha = self._from_monomials @ template.alpha
+        self._axes = template.scale * template.rotation  # chart to world
+        # the derivative of sum c_k P_k has the coefficients D c
+        derivative = [np.pad(legendre.legder(row), (0, self.order + 1))[: self.order + 1] for row in np.eye(self.order + 1)]
+        self._derivative = np.array(derivative).T
+        self.bending = self._bending()
+
+    def size(self, order):
+        """How many coefficients a jet of ``order`` has."""
+        return int((self.degree <= order).sum())
+
+    def _bending(self):
+        """The mean square of the second derivatives over the unit disc, as a quadratic form of the coefficients, (A, A)."""
+        x, y = np.meshgrid(*2 * [np.linspace(-1, 1, 25)])
+        x, y = x[x * x + y * y <= 1], y[x * x + y * y <= 1]
+        d = self._derivative
+        parts = []
+        for du, dv, factor in ((2, 0, 1), (1, 1, np.sqrt(2)), (0, 2, 1)):
+            pu = legendre.legvander(x, self.order) @ np.linalg.matrix_power(d, du)
+            pv = legendre.legvander(y, self.order) @ np.linalg.matrix_power(d, dv)
+            parts.append(factor * pu[:, self._u] * pv[:, self._v])
+        return sum(p.T @ p for p in parts) / len(x)
+
+    def state(self, arrays):
+        """A :class:`State` from the arrays of ``Unknowns.to_numpy``."""
+        a = {name: np.asarray(x, dtype=np.float64) for name, x in arrays.items()}
+        return State(
+            self._from_monomials @ a["delta_alpha"], np.stack([a["delta_u"], a["delta_v"]], 1), Rotation.from_quat(a["rotation"]), a["translation"]
+        )
+
+    def rigid(self, rotation, translation):
+        """(R_c, T_c) that moves the template by p -> R p + t in the world (Rotation, (3,) [m])."""
+        t = self.template
+        turn = t.rotation.T @ rotation.as_matrix() @ t.rotation
+        return Rotation.from_matrix(turn), t.rotation.T @ (rotation.apply(t.origin) + translation - t.origin) / t.scale
+
+    def arrays(self, state):
+        """The reverse of :meth:`state`."""
+        return {
+            "delta_alpha": self.to_monomials @ state.alpha,
+            "delta_u": state.uv[:, 0],
+            "delta_v": state.uv[:, 1],
+            "rotation": state.rotation.as_quat(),
+            "translation": state.translation,
+        }
+
+    def surface(self, state, order=None):
+        """The :class:`Surface` of a state; its derivatives by the coefficients up to ``order`` (default: all)."""
+        t = self.template
+        uv = t.chart + state.uv
+        alpha = self._alpha + state.alpha
+        matrix = np.zeros((self.order + 1, self.order + 1))
+        matrix[self._u, self._v] = alpha
+        pu, pv = (legendre.legvander(uv[:, k], self.order) for k in (0, 1))
+        along = pu @ matrix
+        height = (along * pv).sum(1)
+        slope = np.stack([((pu @ (self._derivative @ matrix)) * pv).sum(1), (along * (pv @ self._derivative)).sum(1)], 1)
+        rotation = state.rotation.as_matrix()
+        turn = self._axes @ rotation
+        y = np.column_stack([uv, height])
+        size = len(self._u) if order is None else self.size(order)
+        by_motion = np.empty((len(y), 3, 6))
+        by_motion[:, :, 3:] = self._axes
+        x = y @ rotation.T
+        for k, (a, b) in enumerate(((1, 2), (2, 0), (0, 1))):  # axis k of the chart crossed with the point
+            by_motion[:, :, k] = x[:, a, None] * self._axes[:, b] - x[:, b, None] * self._axes[:, a]
+        return Surface(
+            y @ turn.T + (t.origin + self._axes @ state.translation),
+            turn[None, :, :2] + turn[None, :, 2:] * slope[:, None, :],
+            turn[:, 2],
+            pu[:, self._u[:size]] * pv[:, self._v[:size]],
+            by_motion,
+        )
+
+
+    def fitted(self, state, vertices, iterations=8, bending=1e-6):
+        """The state, from ``state`` on, whose vertices come closest to ``vertices`` (N, 3) [m, world], in the least-squares sense.
+
+        Each vertex slides freely in its tangent plane, so that only distances along the normals count for the other unknowns.
+        """
+        size = len(state.alpha)
+        prior = np.zeros((size + 6, size + 6))
+        prior[:size, :size] = bending * len(vertices) * self.template.scale**2 * self.bending
+        for _ in range(iterations):
+            surface = self.surface(state)
+            missing = vertices - surface.vertices
+            normal = np.cross(surface.by_uv[:, :, 0], surface.by_uv[:, :, 1])
+            normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+            rows = np.column_stack([(normal @ surface.up)[:, None] * surface.basis, np.einsum("nk,nkm->nm", normal, surface.by_motion)])
+            # sliding makes rotations in the plane and shifts along it free: a little damping holds them
+            square = rows.T @ rows + prior
+            right = rows.T @ np.einsum("nk,nk->n", normal, missing) - prior[:, :size] @ state.alpha
+            g = np.linalg.solve(square + 1e-6 * np.trace(square) / len(square) * np.eye(len(square)), right)
+            rest = missing - (surface.basis @ g[:size])[:, None] * surface.up - surface.by_motion @ g[size:]
+            square = surface.by_uv.transpose(0, 2, 1) @ surface.by_uv
+            uv = np.linalg.solve(square, np.einsum("nka,nk->na", surface.by_uv, rest)[:, :, None])[:, :, 0]
+            state = state.moved((g, uv))
+        return state
+
+
+def _legendre_to_monomials(order):
+    """The matrix (A, A) that takes coefficients of P_{i-j}(u) P_j(v), products of Legendre polynomials, to those of the monomials."""
+    exponents = jets.exponents(order)
+    leg = [np.pad(legendre.leg2poly(row), (0, order - k)) for k, row in enumerate(np.eye(k + 1)[k] for k in range(order + 1))]
+    return np.array([[leg[a][i] * leg[b][j] for a, b in exponents] for i, j in exponents])
+
+
+class Pattern:
+    """Which vertices of the mesh share an edge: the blocks of every matrix here, in the order of (row, column), and a narrow ordering."""
+
+    def __init__(self, faces, edges, count):
+        self.count, self.edges = count, edges
+        a, b = edges.T
+        each = np.arange(count)
+        self._keys = np.sort(np.concatenate([each * count + each, a * count + b, b * count + a]))
+        self.row, self.column = np.divmod(self._keys, count)
+        self.start = np.searchsorted(self.row, np.arange(count + 1))
+        self.diagonal = self.find(each, each)
+        corners = np.repeat(np.arange(3), 3), np.tile(np.arange(3), 3)
+        at = self.find(faces[:, corners[0]], faces[:, corners[1]])
+        self.from_faces = sp.csr_matrix((np.ones(at.size), (at.ravel(), np.arange(at.size))), shape=(len(self._keys), at.size))
+        graph = sp.csr_matrix((np.ones(len(self._keys)), (self.row, self.column)), shape=(count, count))
+        order = reverse_cuthill_mckee(graph, symmetric_mode=True)
+        self.place = np.empty(count, dtype=np.int64)  # of each vertex in the narrow ordering
+        self.place[order] = each
+        self.order = order
+        self.laplacian = np.zeros(len(self._keys))  # sum over edges of (x_a - x_b)^2
+        np.add.at(self.laplacian, self.find(a, a), 1)
+        np.add.at(self.laplacian, self.find(b, b), 1)
+        self.laplacian[self.find(a, b)] = self.laplacian[self.find(b, a)] = -1
+
+    def find(self, i, j):
+        """Indices of the blocks (i, j)."""
+        return np.searchsorted(self._keys, i * self.count + j)
+
+    @staticmethod
+    def add(blocks, at, values):
+        """Add values (K, ...) to blocks (B, ...) at indices (K,), which may repeat."""
+        flat, values = blocks.reshape(len(blocks), -1), values.reshape(len(at), -1)
+        for k in range(flat.shape[1]):
+            flat[:, k] += np.bincount(at, values[:, k], len(flat))
+
+
+class Blocks:
+    """A symmetric matrix with the pattern's 2x2 blocks, factorised as block tridiagonal in the narrow ordering, by LAPACK.
+
+    On these narrow meshes that is faster than general sparse Cholesky, above all with many right-hand sides (``benchmarks/factorisation.py``).
+    """
+
+    def __init__(self, pattern):
+        self.pattern = pattern
+        row, column = pattern.place[pattern.row], pattern.place[pattern.column]
+        width = max(8, int(np.abs(row - column).max()))  # vertices a block
+        self.count = -(-pattern.count // width)
+        self.width = width
+        at = 2 * row[:, None, None] + np.arange(2)[None, :, None], 2 * column[:, None, None] + np.arange(2)[None, None, :]
+        r, c = (np.broadcast_to(x, (len(row), 2, 2)) for x in at)
+        size = 2 * width
+        part, down = r // size, c // size
+        self._inside = (part == down).ravel()
+        self._below = (part == down + 1).ravel()
+        # Fortran order inside each block, which LAPACK takes without a copy
+        self._at_inside = ((part * size + c % size) * size + r % size).ravel()[self._inside]
+        self._at_below = ((down * size + r % size) * size + c % size).ravel()[self._below]  # transposed: the block above
+        self._order = (2 * pattern.order[:, None] + np.arange(2)).ravel()
+        self.size = size
+
+    def eliminate(self, blocks, columns):
+        """Factorise (B, 2, 2) = L L^T: returns an :class:`Elimination` with L^-1 columns for columns (2N, C). Raises LinAlgError where it is not positive."""
+        size, rest = self.size, 2 * self.pattern.count
+        values = blocks.ravel()
+        inside = np.zeros(self.count * size * size)
+        below = np.zeros(self.count * size * size)
+        inside[self._at_inside] = values[self._inside]
+        below[self._at_below] = values[self._below]
+        inside = inside.reshape(self.count, size, size)
+        below = below.reshape(self.count, size, size)
+        x = columns[self._order]
+        factors, coupling, parts = [], [], []
+        for k in range(self.count):
+            n = min(size, rest - k * size)
+            d, y = inside[k].T[:n, :n], x[k * size : k * size + n]
+            if k:
+                w = coupling[-1]
+                d = d - w.T @ w
+                y = y - w.T @ parts[-1]
+            factor, bad = lapack.dpotrf(d, lower=1, clean=1)
+            if bad:
+                raise LinAlgError("the uv block is not positive definite")
+            factors.append(factor)
+            parts.append(blas.dtrsm(1.0, factor, y, lower=1))
+            if k + 1 < self.count:
+                following = min(size, rest - (k + 1) * size)
+                coupling.append(blas.dtrsm(1.0, factor, below[k].T[:n, :following], lower=1))
+        return Elimination(self, factors, coupling, parts)
+
+
+class Elimination:
+    """L of a factorised block-tridiagonal matrix, and ``parts`` of L^-1 columns."""
+
+    def __init__(self, blocks, factors, coupling, parts):
+        self.blocks, self.factors, self.coupling = blocks, factors, coupling
+        self.columns = np.concatenate(parts)
+
+    def back(self, y):
+        """L^-T y, (2N,) or (2N, C), in the order of the vertices."""
+        size, x = self.blocks.size, [None] * len(self.factors)
+        flat = y[:, None] if y.ndim == 1 else y
+        for k in reversed(range(len(x))):
+            part = flat[k * size : k * size + len(self.factors[k])]
+            if k + 1 < len(x):
+                part = part - self.coupling[k] @ x[k + 1]
+            x[k] = blas.dtrsm(1.0, self.factors[k], part, lower=1, trans_a=1)
+        out = np.empty_like(flat)
+        out[self.blocks._order] = np.concatenate(x)
+        return out.reshape(y.shape)
+
+
+    def inverse_diagonal(self):
+        """The 2x2 blocks on the diagonal of the inverse, (N, 2, 2)."""
+        size, blocks = self.blocks.size, [None] * len(self.factors)
+        for k in reversed(range(len(blocks))):
+            inverse = lapack.dpotri(self.factors[k], lower=1)[0]
+            inverse = np.tril(inverse) + np.tril(inverse, -1).T
+            if k + 1 < len(blocks):
+                w = blas.dtrsm(1.0, self.factors[k], self.coupling[k], lower=1, trans_a=1)
+                inverse = inverse + w @ blocks[k + 1] @ w.T
+            blocks[k] = inverse
+        place = 2 * self.blocks.pattern.place
+        out = np.empty((len(place), 2, 2))
+        for k in range(2):
+            for m in range(2):
+                part, at = place // size, place % size
+                out[:, k, m] = [blocks[p][a + k, a + m] for p, a in zip(part, at)]
+        return out
+
+
+@dataclass
+class Normal:
+    """Normal equations of a frame: ``uv`` (B, 2, 2), ``cross`` (2N, G), ``glob`` (G, G) and the gradient ``uv_gradient`` (N, 2), ``gradient`` (G,)."""
+
+    uv: np.ndarray
+    cross: np.ndarray
+    glob: np.ndarray
+    uv_gradient: np.ndarray
+    gradient: np.ndarray
+
+
+def assemble(pattern, surface, projection, evaluation, lengths, stiffness):
+    """:class:`Normal` of the images and the edges, and the edges' energy.
+
+    ``projection`` (N, 2, 3): of the vertices; ``evaluation``: :class:`polysft_mi.registration.Evaluation`; ``lengths`` (E,) [m]: of the template's
+    edges; ``stiffness`` [1/m^2]: weight of the squared differences to them.
+    """
+    a, b = pattern.edges.T
+    edge = surface.vertices[a] - surface.vertices[b]
+    length = np.linalg.norm(edge, axis=1)
+    direction = edge / length[:, None]
+    excess = length - lengths
+    gradient = evaluation.gradient.copy()
+    pull = (2 * stiffness * excess)[:, None] * direction
+    for axis in range(3):
+        gradient[:, axis] += np.bincount(a, pull[:, axis], len(gradient)) - np.bincount(b, pull[:, axis], len(gradient))
+
+    # Each vertex moves by its own (u, v), by the height that all coefficients make there, and by the motion: blocks of the first three are
+    # sparse like the mesh, and the coefficients follow by the basis.
+    local = np.concatenate([surface.by_uv, np.broadcast_to(surface.up[:, None], (pattern.count, 3, 1))], 2)
+    screen, screen_motion = projection @ local, projection @ surface.by_motion  # (N, 2, 3), (N, 2, 6)
+    blocks = (pattern.from_faces @ evaluation.second.reshape(-1, 4)).reshape(-1, 2, 2)
+    total = screen[pattern.row].transpose(0, 2, 1) @ (blocks @ screen[pattern.column])  # (B, 3, 3)
+    matrix = sp.bsr_matrix((blocks, pattern.column, pattern.start), shape=2 * (2 * pattern.count,))
+    moved = (matrix @ screen_motion.reshape(-1, 6)).reshape(-1, 2, 6)
+    local_motion = screen.transpose(0, 2, 1) @ moved  # (N, 3, 6)
+    motion = screen_motion.reshape(-1, 6).T @ moved.reshape(-1, 6)
+
+    # edges and silhouettes: residuals of two vertices each
+    world = (a, b, direction, -direction, np.full(len(a), 2 * stiffness)), local, surface.by_motion
+    for (i, j, ci, cj, h), by_local, by_motion in [world] + ([(evaluation.rows, screen, screen_motion)] if evaluation.rows is not None else []):
+        ri, rj = (ci[:, None] @ by_local[i])[:, 0], (cj[:, None] @ by_local[j])[:, 0]
+        m = (ci[:, None] @ by_motion[i])[:, 0] + (cj[:, None] @ by_motion[j])[:, 0]
+        hi, hj, hm = ri * h[:, None], rj * h[:, None], m * h[:, None]
+        across = ri[:, :, None] * hj[:, None]
+        at = np.concatenate([pattern.find(i, i), pattern.find(j, j), pattern.find(i, j), pattern.find(j, i)])
+        pattern.add(total, at, np.concatenate([ri[:, :, None] * hi[:, None], rj[:, :, None] * hj[:, None], across, across.transpose(0, 2, 1)]))
+        pattern.add(local_motion, np.concatenate([i, j]), np.concatenate([ri[:, :, None] * hm[:, None], rj[:, :, None] * hm[:, None]]))
+        motion += m.T @ hm
+
+    basis = surface.basis
+    size = basis.shape[1]
+    lifted = [sp.csr_matrix((total[:, k, 2], pattern.column, pattern.start), shape=2 * (pattern.count,)) @ basis for k in range(3)]
+    glob = np.empty((size + 6, size + 6))
+    glob[:size, :size] = basis.T @ lifted[2]
+    glob[:size, size:] = basis.T @ local_motion[:, 2]
+    glob[size:, :size] = glob[:size, size:].T
+    glob[size:, size:] = motion
+    cross = np.concatenate([np.stack(lifted[:2], 1), local_motion[:, :2]], 2).reshape(-1, size + 6)
+    along = np.concatenate([basis.T @ (gradient @ surface.up), np.einsum("nk,nkm->m", gradient, surface.by_motion)])
+    normal = Normal(total[:, :2, :2].copy(), cross, glob, np.einsum("nk,nka->na", gradient, surface.by_uv), along)
+    return normal, stiffness * float((excess**2).sum())
+
+
+class Reduced:
+    """Normal equations with the uv block eliminated under Levenberg-Marquardt's ``damping``: ``schur`` (G, G) and ``right`` (G,) remain.
+
+    Raises LinAlgError where the damped uv block is not positive definite.
+    """
+
+    def __init__(self, blocks, normal, damping):
+        self.normal, self.blocks = normal, blocks
+        diagonal = blocks.pattern.diagonal
+        uv = normal.uv.copy()
+        for k in (0, 1):
+            d = uv[diagonal, k, k]
+            uv[diagonal, k, k] = d * (1 + damping) + 1e-9 * d.mean()
+        self.elimination = blocks.eliminate(uv, np.column_stack([normal.cross, normal.uv_gradient.ravel()]))
+        y = self.elimination.columns
+        whole = y.T @ y
+        main = np.diag(normal.glob)
+        self.schur = normal.glob + np.diag(damping * main + 1e-9 * main.mean()) - whole[:-1, :-1]
+        self.right = normal.gradient - whole[:-1, -1]
+
+    def step(self):
+        """The step (global (G,), uv (N, 2)), and the decrease that the model promises. Raises LinAlgError where what remains is not positive definite."""
+        g = -cho_solve(cho_factor(self.schur, check_finite=False), self.right, check_finite=False)
+        y = self.elimination.columns
+        uv = -self.elimination.back(y[:, -1] + y[:, :-1] @ g).reshape(-1, 2)
+        return (g, uv), -0.5 * float(g @ self.normal.gradient + (uv * self.normal.uv_gradient).sum())
+
+    def restricted(self, size):
+        """The decrease that the model promises where only the first ``size`` coefficients, the motion and the uv displacements may move."""
+        keep = np.r_[np.arange(size), np.arange(len(self.right) - 6, len(self.right))]
+        b, y = self.right[keep], self.elimination.columns[:, -1]
+        return 0.5 * float(b @ cho_solve(cho_factor(self.schur[np.ix_(keep, keep)], check_finite=False), b, check_finite=False) + y @ y)
+
+    def variance(self, by_uv, by_global):
+        """The diagonal of J H^-1 J^T (N,), where row i of J has the derivatives ``by_uv`` (N, 2) by the vertex's own (u, v) and ``by_global`` (N, G)."""
+        solved = self.elimination.back(self.elimination.columns[:, :-1]).reshape(len(by_uv), 2, -1)
+        rows = by_global - np.einsum("na,nag->ng", by_uv, solved)
+        half = solve_triangular(np.linalg.cholesky(self.schur), rows.T, lower=True, check_finite=False)
+        return (half * half).sum(0) + np.einsum("na,nab,nb->n", by_uv, self.elimination.inverse_diagonal(), by_uv)

@@ -1,0 +1,94 @@
+"""Levels of an image: blurred, freed from lighting by local normalisation, on a coarser grid; of the video's frames and of the template's texture
+alike. NumPy and OpenCV only."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+_POOL = 4  # local statistics are taken on an image this many times smaller
+_FLOOR = 0.02  # local standard deviation below which an area counts as flat: it is not blown up to the contrast of the rest
+
+
+@dataclass(frozen=True)
+class Level:
+    """How images are compared: blurred by ``sigma``, freed from lighting under a window of ``window`` (standard deviations, pixels of the video), on a grid
+    of every ``stride``-th pixel."""
+
+    sigma: float
+    stride: int = 1
+    window: float = 8.0
+
+
+@dataclass
+class LevelImage:
+    """A frame at a level: ``colour`` (h, w, 3) float32; ``inside`` (h, w), 1 where the sheet may be compared; with a mask, ``mask`` (h, w) in
+    [0, 1], and ``distance`` (h, w), pixels of this grid from the mask's contour, of either side."""
+
+    colour: np.ndarray
+    inside: np.ndarray
+    mask: np.ndarray = None
+    distance: np.ndarray = None
+
+
+def level_image(image, mask, level, normalise=True):
+    """A frame (H, W, 3), linear, with its mask (H, W) or None, at a :class:`Level`."""
+    colour = compared(image, mask, level.sigma, level.window, normalise)
+    inside = np.ones(image.shape[:2], np.float32) if mask is None else (mask > 0.5).astype(np.float32)
+    if level.stride > 1:
+        colour, inside = _shrink(colour, level.stride), _shrink(inside, level.stride)
+        inside = (inside > 0.5).astype(np.float32)
+    if mask is None:
+        return LevelImage(colour, inside)
+    small = _shrink(mask, level.stride)
+    on = (small > 0.5).astype(np.uint8)
+    distance = sum(cv2.distanceTransform(x, cv2.DIST_L2, 3) for x in (on, 1 - on))
+    return LevelImage(colour, inside, small, distance)
+
+
+def compared(image, weight, sigma, window, normalise):
+    """The image as it is compared: blurred by ``sigma`` and, with ``normalise``, freed from lighting under ``window`` [pixels]; only what is inside
+    ``weight`` (H, W) counts."""
+    image = blur(image, sigma, weight)
+    return normalised(image, window, weight) if normalise else image
+
+
+def blur(image, sigma, weight=None):
+    """Gaussian blur of (H, W, C), standard deviation ``sigma`` [pixels]; with ``weight`` (H, W), only of what is inside."""
+    if sigma <= 0:
+        return image
+    if weight is None:
+        return _gaussian(image, sigma)
+    return _gaussian(image * weight[..., None], sigma) / np.maximum(_gaussian(weight, sigma), 1e-3)[..., None]
+
+
+def normalised(image, sigma, weight=None):
+    """(H, W, C) less its local mean, over its local standard deviation (one for all channels), under a window of ``sigma`` [pixels]."""
+    pool = int(min(_POOL, max(1, sigma // 2)))
+    height, width = image.shape[:2]
+    small = (max(1, width // pool), max(1, height // pool))
+
+    def local(x):
+        return _gaussian(cv2.resize(x, small, interpolation=cv2.INTER_AREA), sigma / pool)
+
+    w = np.ones((height, width), np.float32) if weight is None else weight
+    share = np.maximum(local(w), 1e-3)
+    weighted = image if weight is None else image * w[..., None]
+    mean = local(weighted) / share[..., None]
+    power = local(np.einsum("hwc,hwc->hw", weighted, image) / image.shape[2]) / share
+    variance = power - (mean * mean).mean(-1)
+    scale = 1 / np.sqrt(np.maximum(variance, 0) + _FLOOR**2)
+    both = cv2.resize(np.concatenate([mean * scale[..., None], scale[..., None]], -1), (width, height), interpolation=cv2.INTER_LINEAR)
+    return image * both[..., 3:] - both[..., :3]
+
+
+def _gaussian(image, sigma):
+    return cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REFLECT_101)
+
+
+def _shrink(image, stride):
+    """Means of blocks of stride x stride pixels; what is left over at the right and below is dropped."""
+    if stride == 1:
+        return image
+    height, width = image.shape[0] // stride, image.shape[1] // stride
+    return cv2.resize(image[: height * stride, : width * stride], (width, height), interpolation=cv2.INTER_AREA)

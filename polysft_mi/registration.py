@@ -1,0 +1,338 @@
+"""The images' part of the objective to second order: how well a surface explains a frame, and how that changes with each vertex.
+
+Visibility comes from Mitsuba (one ray a pixel, :meth:`RasterIntegrator.look`), the texture from the template's BSDF, blurred like the frame; residuals
+and their derivatives are closed forms, summed on the device per triangle. Import only after a Mitsuba variant is set.
+"""
+
+from collections import OrderedDict
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy.interpolate import LinearNDInterpolator
+
+from .pyramid import compared, level_image
+
+_TEXELS = 1.5  # texels of the baked texture to a pixel of the first frame
+_PIXEL_BLUR = 0.29  # standard deviation of a pixel's own square [pixels]
+_CORNERS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+_PACKETS = 7  # 18 sums of second, 9 of first derivatives and one of weights a triangle, in packets of 4
+_MISFIT = 0.5  # residual, in local standard deviations, that counts half a misfit
+_FARTHEST = 30.0  # pixels of the grid beyond which a silhouette is pulled no harder
+_CACHED_FRAMES = 4
+
+
+@dataclass
+class Evaluation:
+    """A frame's images against a surface. Energies are weighted like the objective; a pixel is one of the level's grid.
+
+    ``photometric``, ``silhouette``: energies; ``gradient`` (N, 3) of both [1/m]; ``second`` (F, 9, 2, 2): the photometric term's Gauss-Newton
+    blocks of each triangle's corner pairs (row by row) with respect to the corners' projections [1/pixel^2]; ``rows``: the silhouette's
+    residuals as (i, j, ci, cj, h), each with derivative ci (K, 2) and cj by the projections of the vertices i and j and curvature h (K,);
+    ``pixels``: how many were compared; ``outlying``: the mean of r^2 / (r^2 + scale^2) over them, and ``misfit`` with a fixed scale.
+    """
+
+    photometric: float
+    silhouette: float
+    outlying: float
+    misfit: float
+    gradient: np.ndarray
+    second: np.ndarray
+    rows: tuple
+    pixels: float
+
+
+class Registration:
+    """Frames of a :class:`polysft_mi.problem.Problem` against its template's texture, level by level."""
+
+    def __init__(self, problem):
+        self.problem = problem
+        experiment = problem.experiment
+        self.scene, self.sensor, self.camera = experiment.scene, experiment.sensor, problem.camera
+        from .raster import RasterIntegrator
+
+        self.raster = experiment.renderer if isinstance(experiment.renderer, RasterIntegrator) else mi.load_dict({"type": "raster"})
+        mesh = experiment.mesh
+        faces = np.array(mesh.faces_buffer(), dtype=np.int64).reshape(-1, 3)
+        self.corner = experiment.corner
+        self.faces = self.corner[faces]  # the template's vertices at the corners of the rendered triangles, (F, 3)
+        self._texcoord = mi.Float(np.array(mesh.vertex_texcoords_buffer()))
+        self._bake(mesh, faces)
+        self._textures, self._frames = {}, OrderedDict()
+        self._reader = ThreadPoolExecutor(1)
+        self.levels = ()
+        self.normalise = problem.settings.lighting == "local"
+
+    # -- images -------------------------------------------------------------
+
+    def _bake(self, mesh, faces):
+        """The reflectance over the box of the template's texture coordinates, as an image of a few texels a pixel, with a margin."""
+        coordinates = np.array(mesh.vertex_texcoords_buffer(), dtype=np.float64).reshape(-1, 2)
+        low, size = coordinates.min(0), np.maximum(np.ptp(coordinates, axis=0), 1e-9)
+        position, _ = self.camera.project(self.problem.template.vertices[self.corner])
+
+        def lengths(x):  # of the edges along each axis of the texture, so that both get their own density
+            a, b = x[faces], x[np.roll(faces, -1, axis=1)]
+            return a - b
+
+        d = np.abs(lengths((coordinates - low) / size)).reshape(-1, 2)
+        span = np.linalg.norm(lengths(position), axis=-1).ravel()
+        straight = [d[:, k] > 4 * d[:, 1 - k] for k in (0, 1)]
+        pixels = [np.median(span[m] / d[m, k]) if m.any() else np.median(span / np.linalg.norm(d, axis=1)) for k, m in enumerate(straight)]
+        shape = [int(np.clip(round(_TEXELS * p), 8, 4096)) for p in pixels]
+        margin = 12
+        at = [low[k] + size[k] * (np.arange(-margin, shape[k] + margin) + 0.5) / shape[k] for k in (0, 1)]
+        total, fine = 0, 2
+        for dx in (np.arange(fine) + 0.5) / fine - 0.5:
+            for dy in (np.arange(fine) + 0.5) / fine - 0.5:
+                x, y = np.meshgrid(at[0] + dx * size[0] / shape[0], at[1] + dy * size[1] / shape[1])
+                si = dr.zeros(mi.SurfaceInteraction3f, x.size)
+                si.uv, si.wi = mi.Point2f(x.ravel().astype(np.float32), y.ravel().astype(np.float32)), mi.Vector3f(0, 0, 1)
+                total = total + np.array(mesh.bsdf().eval_diffuse_reflectance(si)).T
+        self.texture = (total / fine**2).reshape(len(at[1]), len(at[0]), 3).astype(np.float32)
+        x, y = np.meshgrid(*at)
+        self.texture_inside = ((x >= low[0]) & (x <= low[0] + size[0]) & (y >= low[1]) & (y <= low[1] + size[1])).astype(np.float32)
+        self._texel = [mi.Vector2f(*(float(shape[k] / size[k]) for k in (0, 1))), mi.Point2f(*(float(margin - 0.5 - low[k] * shape[k] / size[k]) for k in (0, 1)))]
+        dr.make_opaque(self._texel)
+
+    def on_template(self, texels):
+        """Points (K, 3) [m, world] of the undeformed template at pixels (K, 2) of ``texture`` (OpenCV's, whole at their centres); NaN beyond it."""
+        coordinates = np.array(self._texcoord, dtype=np.float64).reshape(-1, 2) * np.array(self._texel[0]).ravel() + np.array(self._texel[1]).ravel()
+        return LinearNDInterpolator(coordinates, self.problem.template.vertices[self.corner])(texels)
+
+    def _texture_level(self, level):
+        """The texture at a level: packed Float of 4 channels, width, height."""
+        if level not in self._textures:
+            sigma = _TEXELS * np.sqrt(level.sigma**2 + (_PIXEL_BLUR * level.stride) ** 2)
+            weight = self.texture_inside if self.problem.experiment.masks else None
+            image = compared(self.texture, weight, sigma, _TEXELS * level.window, self.normalise)
+            self.set_texture(level, image)
+        return self._textures[level]
+
+    def set_texture(self, level, image):
+        """Take an image (h, w, 3) of the baked texture's size as the texture at a level."""
+        packed = np.concatenate([image, np.zeros_like(image[..., :1])], -1).astype(np.float32)
+        entry = mi.Float(np.ascontiguousarray(packed).ravel()), image.shape[1], image.shape[0]
+        dr.eval(entry[0])
+        self._textures[level] = entry
+
+    def expect(self, frames, levels):
+        """Read and prepare frames in a second thread, for the levels given."""
+        for frame in frames:
+            for level in levels:
+                key = (frame, level)
+                if key not in self._frames:
+                    self._frames[key] = self._reader.submit(self._read, frame, level)
+        keep = _CACHED_FRAMES * max(1, len(levels))
+        while len(self._frames) > keep:
+            self._frames.popitem(last=False)
+
+    def _read(self, frame, level):
+        sequence = self.problem.sequence
+        return level_image(sequence.frame(frame), sequence.mask(frame), level, self.normalise)
+
+    def _frame_level(self, frame, level):
+        """The frame at a level, on the device: packed colour and weight; the mask or None; the :class:`LevelImage`; its area [pixels of the grid]."""
+        key = (frame, level)
+        if key not in self._frames:
+            self.expect([frame], [level])
+        entry = self._frames[key]
+        if not isinstance(entry, tuple):
+            image = entry.result()
+            packed = mi.Float(np.ascontiguousarray(np.concatenate([image.colour, image.inside[..., None]], -1)).ravel())
+            mask = mi.Float(np.ascontiguousarray(image.mask).ravel()) if image.mask is not None else None
+            area = max(1.0, float(image.mask.sum())) if image.mask is not None else None
+            self._frames[key] = entry = packed, mask, image, area
+        return entry
+
+    # -- evaluation ---------------------------------------------------------
+
+    def _place(self, vertices):
+        with dr.suspend_grad():
+            self.problem.place(mi.Point3f(np.ascontiguousarray(vertices.T, dtype=np.float32)))
+
+    def _pixels(self, view, frame, level):
+        """Residuals (Vector4f, its fourth entry 0) and weights of the region's pixels, and what their derivatives need."""
+        texture, texture_width, texture_height = self._texture_level(level)
+        packed, _, image, _ = self._frame_level(frame, level)
+        hit, topology = view.hit, self.raster.topology(self.scene)
+        triangle = mi.UInt32(dr.select(hit, view.triangle, 0))
+        index = [dr.gather(mi.UInt32, topology.faces, 3 * triangle + k, hit) for k in range(3)]
+        flat = mi.Float(view.positions)
+        p0, p1, p2 = (dr.gather(mi.Point3f, flat, i, hit) for i in index)
+        c0, c1, c2 = (dr.gather(mi.Point2f, self._texcoord, i, hit) for i in index)
+        e1, e2, ray = p1 - p0, p2 - p0, view.ray
+        pv = dr.cross(ray.d, e2)
+        inverse = dr.select(hit, dr.rcp(dr.dot(e1, pv)), 0)
+        tv = ray.o - p0
+        b1 = dr.dot(tv, pv) * inverse
+        b2 = dr.dot(ray.d, dr.cross(tv, e1)) * inverse
+        at = (c0 + (c1 - c0) * b1 + (c2 - c0) * b2) * self._texel[0] + self._texel[1]
+
+        # bilinear, with its derivatives
+        x = dr.clip(at.x, 0, mi.Float(dr.opaque(mi.UInt32, texture_width)) - 1.001)
+        y = dr.clip(at.y, 0, mi.Float(dr.opaque(mi.UInt32, texture_height)) - 1.001)
+        ix, iy = mi.UInt32(x), mi.UInt32(y)
+        fx, fy = x - mi.Float(ix), y - mi.Float(iy)
+        row = dr.opaque(mi.UInt32, texture_width)
+        first = iy * row + ix
+        t00, t10, t01, t11 = (dr.gather(mi.Vector4f, texture, first + k, hit) for k in (0, 1, row, row + 1))
+        top, bottom = t00 + (t10 - t00) * fx, t01 + (t11 - t01) * fx
+        by_x = ((t10 - t00) * (1 - fy) + (t11 - t01) * fy) * self._texel[0].x
+        by_y = (bottom - top) * self._texel[0].y
+
+        x0, y0, width, w, h = view.region
+        local = dr.arange(mi.UInt32, w * h)
+        ly = local // width
+        pixel = (ly + y0) * dr.opaque(mi.UInt32, image.colour.shape[1]) + (local - ly * width + x0)
+        target = dr.gather(mi.Vector4f, packed, pixel, hit)
+        weight = dr.select(hit, target.w, 0)
+        target.w = 0
+        residual = dr.select(weight > 0, top + (bottom - top) * fy - target, 0)
+        return residual, weight, triangle, (b1, b2), (p0, e1, e2), (c1 - c0, c2 - c0), (by_x, by_y)
+
+    def residuals(self, vertices, frame, level):
+        """Squared residuals r^2 = |T - I|^2 / 3 of the pixels that are compared, (P,) float32; vertices (N, 3) [m, world]."""
+        with dr.suspend_grad():
+            self._place(vertices)
+            view = self.raster.look(self.scene, self.sensor, 1 / level.stride)
+            residual, weight, *_ = self._pixels(view, frame, level)
+            squared = dr.squared_norm(residual) / 3
+            dr.eval(squared, weight)
+            return np.array(squared)[np.array(weight) > 0]
+
+    def evaluate(self, vertices, frame, level, scale):
+        """:class:`Evaluation` of the surface with vertices (N, 3) [m, world] against a frame, at a level, under the robust ``scale``."""
+        s = self.problem.settings
+        with dr.suspend_grad():
+            self._place(vertices)
+            view = self.raster.look(self.scene, self.sensor, 1 / level.stride)
+            residual, weight, triangle, (b1, b2), (p0, e1, e2), (c01, c02), (by_x, by_y) = self._pixels(view, frame, level)
+            squared = dr.squared_norm(residual) / 3
+            c2 = dr.opaque(mi.Float, scale * scale)
+            energy, count = dr.sum(weight * c2 * dr.log(1 + squared / c2)), dr.sum(weight)
+            outlying, misfit = (dr.sum(weight * squared / (squared + c)) for c in (c2, _MISFIT**2))
+
+            # the texture coordinate under a pixel moves against the triangle's plane, which slides along the ray
+            ray, depth = view.ray, view.depth
+            n = dr.cross(e1, e2)
+            inverse = dr.rcp(dr.squared_norm(n))
+            grad1, grad2 = dr.cross(e2, n) * inverse, dr.cross(n, e1) * inverse
+            grad_x, grad_y = c01.x * grad1 + c02.x * grad2, c01.y * grad1 + c02.y * grad2
+            slide = n * dr.rcp(dr.dot(n, ray.d))
+            robust = 2 * weight / (3 * (1 + squared / c2))
+            first = mi.Vector3f(0)
+            xx, xy, yy = mi.Float(0), mi.Float(0), mi.Float(0)
+            right = depth * mi.Vector3f(*(view.basis[k, 0] for k in range(3)))  # what one pixel to the right is at this depth
+            down = depth * mi.Vector3f(*(view.basis[k, 1] for k in range(3)))
+            for c in range(3):
+                k = grad_x * by_x[c] + grad_y * by_y[c]
+                g = slide * dr.dot(k, ray.d) - k
+                first += residual[c] * g
+                a, b = dr.dot(g, right), dr.dot(g, down)
+                xx, xy, yy = xx + a * a, xy + a * b, yy + b * b
+            first *= robust
+            xx, xy, yy = (robust * x for x in (xx, xy, yy))
+            corner = (1 - b1 - b2, b1, b2)
+            sums = []
+            for a, b in _CORNERS:
+                m = corner[a] * corner[b]
+                sums += [m * xx, m * xy, m * yy]
+            for b in corner:
+                sums += [b * first.x, b * first.y, b * first.z]
+            sums.append(robust)
+            active = view.hit & (weight > 0)
+            faces = len(self.faces)
+            out = dr.zeros(mi.Float64, 4 * _PACKETS * faces)
+            packet = dr.replace_type_t(mi.Vector4f, dr.VarType.Float64)
+            for k in range(_PACKETS):
+                dr.scatter_add(out, packet(*sums[4 * k : 4 * k + 4]), triangle * _PACKETS + k, active, mode=dr.ReduceMode.Local)
+            dr.eval(out, energy, count, outlying, misfit)
+            pairs = self._silhouette(view, frame, level) if s.k_silhouette > 0 else None
+        table = np.array(out).reshape(faces, 4 * _PACKETS)
+        *_, area = self._frame_level(frame, level)
+        pixels = float(count[0])
+        weight = s.k_rgb / (area or max(pixels, 1.0))
+        blocks = table[:, :18].reshape(-1, 6, 3)
+        second = blocks[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]][:, :, [0, 1, 1, 2]].reshape(-1, 9, 2, 2) * (weight / level.stride**2)
+        gradient = np.zeros((len(self.problem.template.vertices), 3))
+        for k in range(3):
+            for axis in range(3):
+                gradient[:, axis] += np.bincount(self.faces[:, k], table[:, 18 + 3 * k + axis] * weight, len(gradient))
+        silhouette, rows = 0.0, None
+        if pairs is not None:
+            silhouette, rows, pull = self._pull(vertices, pairs, frame, level, s.k_silhouette / area)
+            gradient += pull
+        share = 1 / max(pixels, 1.0)
+        return Evaluation(
+            weight * float(energy[0]), silhouette, share * float(outlying[0]), share * float(misfit[0]), gradient, second, rows, pixels * level.stride**2
+        )
+
+    # -- silhouettes --------------------------------------------------------
+
+    def _silhouette(self, view, frame, level):
+        """The rendered silhouette against the mask: (energy without its weight, per pair of pixels: va, vb, derivative of the pixel's alpha by the
+        edge's ends (K, 2) each, alpha less mask, distance to the mask's contour); None without masks."""
+        _, mask, image, _ = self._frame_level(frame, level)
+        if mask is None:
+            return None
+        x0, y0, width, w, h = view.region
+        local = dr.arange(mi.UInt32, w * h)
+        ly = local // width
+        pixel = (ly + y0) * dr.opaque(mi.UInt32, image.mask.shape[1]) + (local - ly * width + x0)
+        alpha = dr.select(view.hit, mi.Float(1), 0)
+        wanted = dr.gather(mi.Float, mask, pixel)
+        total = float((image.mask.astype(np.float64) ** 2).sum())  # of the whole frame, less the region's, which alpha is subtracted from
+        crossings = self.raster.crossings(view)
+        if crossings is None:
+            error = dr.sum(dr.square(alpha - wanted) - dr.square(wanted))
+            return total + float(error[0]), None
+        va, vb, near, far, horizontal = crossings
+        ea, eb = (mi.Point2f(*(mi.Float(dr.gather(mi.Float64, x, i)) for x in (view.screen.x, view.screen.y))) for i in (va, vb))
+        with dr.resume_grad():
+            dr.enable_grad(ea, eb)
+            to, other, weight, _ = self.raster.blend(view, ea, eb, near, far, horizontal)
+            dr.backward(weight)
+            weight, da, db = dr.detach(weight), dr.grad(ea), dr.grad(eb)
+        step = dr.gather(mi.Float, alpha, other) - dr.gather(mi.Float, alpha, to)
+        dr.scatter_add(alpha, weight * step, to)
+        error = dr.sum(dr.square(alpha - wanted) - dr.square(wanted))
+        excess = dr.gather(mi.Float, alpha - wanted, to)
+        at = dr.gather(mi.UInt32, pixel, to)
+        dr.eval(va, vb, da, db, step, excess, at, error)
+        kept = np.array(step) != 0  # where a sheet passes before the sheet itself, alpha does not change
+        at = np.array(at)[kept]
+        step = np.array(step)[kept][:, None]
+        ends = [self.corner[np.array(i)[kept]] for i in (va, vb)]
+        by = [np.array(d).T[kept].astype(np.float64) * step for d in (da, db)]
+        return total + float(error[0]), (*ends, *by, np.array(excess)[kept].astype(np.float64), image.distance.ravel()[at])
+
+    def _pull(self, vertices, pairs, frame, level, weight):
+        """Energy, rows and gradient (N, 3) of the silhouette term.
+
+        The curvature is that of the quadratic which has the term's slope here and its minimum at the mask's contour: a step then goes all the way,
+        where plain Gauss-Newton, whose residuals are pixels, would go one pixel.
+        """
+        energy, found = pairs
+        gradient = np.zeros((len(vertices), 3))
+        if found is None:
+            return weight * energy, None, gradient
+        i, j, ci, cj, excess, distance = found
+        slope = np.linalg.norm(ci + cj, axis=1)  # as the edge moves as a whole
+        curvature = 2 * weight / np.maximum(1.0, slope * np.minimum(distance, _FARTHEST))
+        scale = 1 / level.stride
+        jacobian = self.projection(vertices)
+        for k, c in ((i, ci), (j, cj)):
+            pull = np.einsum("ka,kab->kb", (2 * weight * excess * scale)[:, None] * c, jacobian[k])
+            for axis in range(3):
+                gradient[:, axis] += np.bincount(k, pull[:, axis], len(gradient))
+        return weight * energy, (i, j, ci * scale, cj * scale, curvature), gradient
+
+    def projection(self, vertices):
+        """Derivatives (N, 2, 3) of the vertices' projections [pixels of the video] by their positions [m, world]."""
+        x = (vertices - self.camera.origin) @ self.camera.inverse.T
+        z = x[:, 2]
+        position = x[:, :2] / z[:, None]
+        return (self.camera.inverse[None, :2] - position[:, :, None] * self.camera.inverse[None, 2:]) / z[:, None, None]

@@ -1,0 +1,238 @@
+"""Levenberg-Marquardt on the objective of a frame, coarse to fine, from several starts. Import only after a Mitsuba variant is set."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import LinAlgError
+
+from ..errors import InputError
+from ..normal_equations import Blocks, Chart, Pattern, Reduced, State, assemble
+from ..patch import Unknowns
+from ..problem import BadFrame
+from ..pyramid import Level
+from ..registration import Registration
+from ..relocate import Relocator
+from . import Solution
+
+_SHEET = 225.0  # width [pixels] of the sheet that the stages' blurs are given for; they grow with the sheet in the image
+_WINDOW = 8.0  # standard deviation of the window of the local statistics, likewise
+_FIRST_SCALE, _SCALES = 0.3, (0.2, 1.0)  # robust scale at the start of a frame, and its bounds, in local standard deviations
+_SMALL = 3e-4  # share of the objective that a step must promise for another one to follow
+_SUSPECT, _SUSPECT_MARGIN, _MEMORY = 1.25, 0.01, 15  # a misfit above this many times the median of the frames before (plus the margin) is suspect
+_RAISE, _LOWER = 0.02, 0.002  # share of the objective by which more coefficients must lower it to be taken, and fewer may raise it to be dropped
+_ORDER_STEP = 2
+_TEMPORAL = 2e-4  # of k_tc: here a frame is held to the one before it, which a window's frames are not in the paper
+
+
+@dataclass(frozen=True)
+class Stage:
+    """``blur`` [pixels at a sheet of _SHEET], ``stiffness`` (the factor of k_mi), and the most ``iterations``."""
+
+    blur: float
+    stiffness: float
+    iterations: int
+
+
+# Soft edges first, so that the texture coordinates register to the image before lengths are enforced: in a stiff flat sheet that is compressed
+# in the image, height has no first-order effect, and it would drift in depth instead of bending.
+STAGES = Stage(2.5, 1e2, 6), Stage(1.5, 1e3, 5), Stage(1.0, 1e4, 4)
+FAR = Stage(6.0, 1e2, 6)  # before the others where the sheet has moved far
+
+
+class GaussNewton:
+    """Second-order descent, frame by frame: Gauss-Newton curvatures of all terms, damped after Levenberg and Marquardt.
+
+    A frame starts from the one before or from where its motion leads, whichever explains the image better. Where it ends with a misfit far above that of
+    the frames before, other starts are tried: farther motion, and the rigid pose of the flat template by features. The order of the jet rises from
+    ``order`` to at most ``order_max`` where the objective asks for it, and falls where it does not.
+    """
+
+    def __init__(self, settings):
+        self.settings = settings
+        if settings.brightness == "gain":
+            raise InputError("setting brightness = 'gain' with solver = gauss-newton; auto, local or none is needed")
+        self._problem = None
+
+    def solve(self, problem, window, frames, report=None, past=()):
+        """Minimise over the newest of ``frames``, then in turn over all of the window: :class:`Solution`.
+
+        ``window``: list of Unknowns; ``past``: of the frames before the window's newest, oldest first, (arrays of ``Unknowns.to_numpy``, terms).
+        """
+        if problem is not self._problem:
+            self._prepare(problem)
+        self._report, self._count = report, 0
+        self._expect(frames[-1])
+        history = [self.chart.state(arrays) for arrays, _ in past[-2:]]
+        newest = self._newest(self.chart.state(window[-1].to_numpy()), frames[-1], history, [terms for _, terms in past])
+        states = [self.chart.state(w.to_numpy()) for w in window[:-1]] + [newest[0]]
+        terms = newest[1]
+        return self._solution(states, terms, frames)
+
+    # -- preparation --------------------------------------------------------
+
+    def _prepare(self, problem):
+        self._problem = problem
+        template = problem.template
+        self.registration = Registration(problem)
+        self.chart = Chart(template)
+        self.pattern = Pattern(self.registration.faces, template.edges, len(template.vertices))
+        self.blocks = Blocks(self.pattern)
+        self.lengths = np.array(problem.edge_lengths, dtype=np.float64)
+        position, _ = problem.camera.project(template.vertices)
+        corner = position[self.registration.faces]
+        a, b = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+        unit = math.sqrt(0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum()) / _SHEET
+        self.levels = {}
+        for stage in (FAR, *STAGES):
+            sigma = stage.blur * unit
+            self.levels[stage] = Level(sigma, max(1, int(0.8 * sigma)), max(_WINDOW * unit, 3 * sigma))
+        self._relocator = None
+
+    def _expect(self, frame):
+        """Have this frame and the next one read in a second thread."""
+        for k in (frame, frame + 1):
+            if k < len(self._problem.sequence):
+                self.registration.expect([k], [self.levels[s] for s in STAGES])
+
+    # -- one frame ----------------------------------------------------------
+
+    def _newest(self, start, frame, history, past):
+        """(state, terms) of a frame that starts at ``start``; ``history``: states of the one or two frames before."""
+        anchor = history[-1] if history else start
+        starts = [start]
+        if len(history) > 1:
+            starts += [history[-2].towards(history[-1], f) for f in (0.5, 1.0)]
+        orders = [t["order"] for t in past if t.get("order") is not None]
+        order = int(orders[-1]) if orders else self.settings.order
+        best = self._descend(self._nearest(starts, frame, STAGES[0]), anchor, frame, order, STAGES)
+        usual = [t["misfit"] for t in past[-_MEMORY:] if t.get("misfit") is not None]
+        if len(usual) >= 3 and best[1]["misfit"] > _SUSPECT * np.median(usual) + _SUSPECT_MARGIN:
+            self.registration.expect([frame], [self.levels[FAR]])
+            found = self._relocate(frame)
+            others = [self._nearest(starts, frame, FAR)] + ([found] if found else [])
+            for other in others:
+                other = self._descend(other, anchor, frame, order, (FAR, *STAGES))
+                best = min(best, other, key=lambda x: x[1]["misfit"])
+        return self._adapt_order(*best, anchor, frame)
+
+    def _nearest(self, starts, frame, stage):
+        """The start that explains the frame best."""
+        if len(starts) == 1:
+            return starts[0]
+
+        def misfit(state):
+            squared = self.registration.residuals(self.chart.surface(state, 0).vertices, frame, self.levels[stage])
+            return (squared / (squared + 0.25)).mean() if len(squared) else 1.0
+
+        return min(starts, key=misfit)
+
+    def _relocate(self, frame):
+        """The flat template in the pose that its features have in the frame; None where too few are found."""
+        if self._relocator is None:
+            self._relocator = Relocator(self.registration)
+        motion = self._relocator.pose(self._problem.sequence.frame(frame))
+        if motion is None:
+            return None
+        rest = self.chart.state(self._problem.patch.rest().to_numpy())
+        return State(rest.alpha, rest.uv, *self.chart.rigid(*motion))
+
+    def _descend(self, state, anchor, frame, order, stages):
+        scale = _FIRST_SCALE
+        for stage in stages:
+            state, terms, scale, normal = self._stage(state, anchor, frame, order, stage, scale)
+        return state, terms, scale, normal
+
+    def _stage(self, state, anchor, frame, order, stage, scale):
+        """Levenberg-Marquardt at one stage: (state, terms, robust scale, normal equations near the end)."""
+        normal, terms = self._linearise(state, anchor, frame, order, stage, scale)
+        fitting = self._robust_scale(terms["outlying"], scale)
+        if abs(math.log(fitting / scale)) > 0.1:  # a stage keeps its scale, for its energies are compared
+            scale = fitting
+            normal, terms = self._linearise(state, anchor, frame, order, stage, scale)
+        damping = 1e-4
+        for iteration in range(stage.iterations):
+            try:
+                step, promised = Reduced(self.blocks, normal, damping).step()
+            except LinAlgError:
+                damping = max(10 * damping, 1e-4)
+                continue
+            if promised < _SMALL * terms["total"]:
+                return state.moved(step), terms, scale, normal
+            trial = state.moved(step)
+            found = self._linearise(trial, anchor, frame, order, stage, scale)
+            if found[1]["total"] < terms["total"]:
+                if terms["total"] - found[1]["total"] > 0.5 * promised:
+                    damping = max(damping / 5, 1e-7)
+                state, (normal, terms) = trial, found
+            else:
+                damping *= 10
+        return state, terms, scale, normal
+
+    @staticmethod
+    def _robust_scale(outlying, scale):
+        """The scale at which a residual of 2/3 of it is the median, were the residuals' distribution only stretched."""
+        m = min(max(outlying, 0.02), 0.98)
+        return float(np.clip(scale * math.sqrt(m / (1 - m) / 0.44), *_SCALES))
+
+    def _linearise(self, state, anchor, frame, order, stage, scale):
+        """(Normal, terms) of the whole objective at a state. Raises BadFrame where it is not finite."""
+        s, chart = self.settings, self.chart
+        surface = chart.surface(state, order)
+        evaluation = self.registration.evaluate(surface.vertices, frame, self.levels[stage], scale)
+        stiffness = s.k_mi * stage.stiffness / chart.template.scale**2
+        projection = self.registration.projection(surface.vertices)
+        normal, inextensibility = assemble(self.pattern, surface, projection, evaluation, self.lengths, stiffness)
+        a = self.chart.size(order)
+        bend = 2 * s.k_bend * chart.bending
+        moved, slid = state.alpha - anchor.alpha, state.uv - anchor.uv
+        normal.glob[:a, :a] += bend[:a, :a] + 2 * s.k_tc * _TEMPORAL * np.eye(a)
+        normal.gradient[:a] += (bend @ state.alpha + 2 * s.k_tc * _TEMPORAL * moved)[:a]
+        i, j = self.pattern.edges.T
+        apart = state.uv[i] - state.uv[j]
+        pull = np.stack([np.bincount(i, apart[:, k], len(slid)) - np.bincount(j, apart[:, k], len(slid)) for k in (0, 1)], 1)
+        normal.uv_gradient += 2 * s.k_uv * pull + 2 * s.k_tc * _TEMPORAL * slid
+        for k in (0, 1):
+            normal.uv[:, k, k] += 2 * s.k_uv * self.pattern.laplacian
+            normal.uv[self.pattern.diagonal, k, k] += 2 * s.k_tc * _TEMPORAL
+        terms = {
+            "rgb": evaluation.photometric,
+            "silhouette": evaluation.silhouette,
+            "inextensibility": inextensibility,
+            "temporal": s.k_tc * _TEMPORAL * float((moved**2).sum() + (slid**2).sum()),
+            "smoothness": s.k_bend * float(state.alpha @ chart.bending @ state.alpha) + s.k_uv * float((apart**2).sum()),
+        }
+        total = sum(terms.values())
+        if not math.isfinite(total):
+            raise BadFrame(frame, total)
+        if self._report:
+            self._report(self._count, total, terms)
+        self._count += 1
+        return normal, {**terms, "total": total, "misfit": evaluation.misfit, "outlying": evaluation.outlying, "order": order}
+
+    # -- order --------------------------------------------------------------
+
+    def _adapt_order(self, state, terms, scale, normal, anchor, frame):
+        """Raise the order where the model says that it pays, and go on; else lower it where that costs nothing."""
+        s, order = self.settings, int(terms["order"])
+        stage = STAGES[-1]
+        top = min(order + _ORDER_STEP, s.capacity)
+        if top > order:
+            wide, there = self._linearise(state, anchor, frame, top, stage, scale)
+            try:
+                reduced = Reduced(self.blocks, wide, 1e-6)
+                promised = reduced.step()[1] - reduced.restricted(self.chart.size(order))
+            except LinAlgError:
+                promised = 0.0
+            if promised > _RAISE * there["total"]:
+                found = self._descend(state, anchor, frame, top, STAGES[1:])
+                if found[1]["total"] < (1 - 0.5 * _RAISE) * there["total"]:
+                    return found
+        return state, terms, scale, normal
+
+    # -- results ------------------------------------------------------------
+
+    def _solution(self, states, terms, frames):
+        window = [Unknowns.from_numpy(self.chart.arrays(state)) for state in states]
+        facts = {name: terms.pop(name) for name in ("misfit", "outlying", "order")}
+        return Solution(window, terms.pop("total"), terms, self._count, facts)
