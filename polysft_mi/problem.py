@@ -61,7 +61,9 @@ class Problem:
         self.pixels = self.width * self.height
         edges = self.template.edges
         self.edges = tuple(mi.UInt32(np.ascontiguousarray(edges[:, k], dtype=np.uint32)) for k in (0, 1))
-        lengths = np.linalg.norm(self.template.vertices[edges[:, 0]] - self.template.vertices[edges[:, 1]], axis=1)
+        # of the jet at rest, not of the mesh: what the jet smooths away of a noisy template would else be stretched for ever
+        rest = self.surface(self.patch.rest()).astype(np.float64)
+        lengths = np.linalg.norm(rest[edges[:, 0]] - rest[edges[:, 1]], axis=1)
         self.edge_lengths = mi.Float(lengths.astype(np.float32))
         self._corner = mi.UInt32(experiment.corner.astype(np.uint32))
         self._identity = np.array_equal(experiment.corner, np.arange(len(self.template.vertices)))
