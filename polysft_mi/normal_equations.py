@@ -399,6 +399,10 @@ class Reduced:
         uv = -self.elimination.back(y[:, -1] + y[:, :-1] @ g).reshape(-1, 2)
         return (g, uv), -0.5 * float(g @ self.normal.gradient + (uv * self.normal.uv_gradient).sum())
 
+    def slide(self):
+        """The step (N, 2) of the uv displacements alone."""
+        return -self.elimination.back(self.elimination.columns[:, -1]).reshape(-1, 2)
+
     def restricted(self, size):
         """The decrease that the model promises where only the first ``size`` coefficients, the motion and the uv displacements may move."""
         keep = np.r_[np.arange(size), np.arange(len(self.right) - 6, len(self.right))]

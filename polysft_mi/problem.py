@@ -94,6 +94,12 @@ class Problem:
         self._params[self._key] = dr.ravel(points)
         self._params.update()
 
+    def set_texcoords(self, texcoords):
+        """Replace the template's texture coordinates (Float of 2V, in the order of the rendered mesh)."""
+        key = self._key.removesuffix("positions") + "texcoords"
+        self._params[key] = texcoords
+        self._params.update()
+
     def image(self, vertices, seed=0):
         """Render the surface: (rgb tensor (H, W, 3), alpha Float of P), attached to the vertices."""
         self.place(vertices)

@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator
+from scipy.spatial import cKDTree
 
 from .pyramid import compared, level_image
 
@@ -117,6 +118,26 @@ class Registration:
         entry = mi.Float(np.ascontiguousarray(packed).ravel()), image.shape[1], image.shape[0]
         dr.eval(entry[0])
         self._textures[level] = entry
+
+    def shift_texture(self, chart, displaced):
+        """Move the texture on the template: what lies at ``chart`` (N, 2) is shown at ``displaced`` (N, 2) instead. Whether that could be done."""
+        coordinates = np.array(self._texcoord, dtype=np.float64).reshape(-1, 2)
+        if len(coordinates) != len(chart):
+            return False  # a seam: texture coordinates are not a function of the chart
+        shown = np.empty_like(coordinates)
+        shown[self.corner] = coordinates
+        inside = LinearNDInterpolator(displaced, shown)(chart)
+        # beyond the border: by the nearest vertices' affine map
+        missing = ~np.isfinite(inside).all(axis=1)
+        if missing.any():
+            _, near = cKDTree(displaced).query(chart[missing], k=12)
+            for i, k in zip(np.flatnonzero(missing), near):
+                rows = np.column_stack([np.ones(len(k)), displaced[k] - chart[i]])
+                inside[i] = np.linalg.lstsq(rows, shown[k], rcond=None)[0][0]
+        moved = inside[self.corner]
+        self._texcoord = mi.Float(moved.astype(np.float32).ravel())
+        self.problem.set_texcoords(self._texcoord)
+        return True
 
     def expect(self, frames, levels):
         """Read and prepare frames in a second thread, for the levels given."""

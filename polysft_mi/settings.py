@@ -38,6 +38,9 @@ class Settings:
     brightness: str = _setting(
         "auto", "compensation of lighting before images are compared; auto: local for gauss-newton, none for adam", choices=("auto", "none", "gain", "local")
     )
+    texture_fit: str = _setting(
+        "auto", "auto: where the texture lies elsewhere on the template than the first image shows, gauss-newton moves it", choices=("auto", "none")
+    )
     blur: float = _setting(0.0, "standard deviation of the Gaussian blur of both images before they are compared [pixels]", low=0)
     spp: int = _setting(1, "samples a pixel; raster takes square numbers (1, 4, 9, ...)", low=1)
     seed: int = _setting(0, "seed of the renderer's random numbers (path replay)", low=0)

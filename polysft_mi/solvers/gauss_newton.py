@@ -22,6 +22,9 @@ _SMALL = 3e-4  # share of the objective that a step must promise for another one
 _SUSPECT, _SUSPECT_MARGIN, _MEMORY = 1.25, 0.01, 15  # a misfit above this many times the median of the frames before (plus the margin) is suspect
 _RAISE, _LOWER = 0.02, 0.002  # share of the objective by which more coefficients must lower it to be taken, and fewer may raise it to be dropped
 _ORDER_STEP = 2
+# fitting the texture to the first frame: only above this misfit, if it falls by this factor, and no farther than this [chart units]
+_TEXTURE_MISFIT, _TEXTURE_GAIN, _TEXTURE_FARTHEST = 0.15, 0.6, 0.08
+_TEXTURE_ITERATIONS, _TEXTURE_STIFFNESS = 6, 1.0
 _TEMPORAL = 2e-4  # of k_tc: here a frame is held to the one before it, which a window's frames are not in the paper
 
 
@@ -88,6 +91,35 @@ class GaussNewton:
             sigma = stage.blur * unit
             self.levels[stage] = Level(sigma, max(1, int(0.8 * sigma)), max(_WINDOW * unit, 3 * sigma))
         self._relocator = None
+        self._report, self._count = None, 0
+        if self.settings.texture_fit == "auto":
+            self._fit_texture()
+
+    def _fit_texture(self):
+        """Where the template stands in the first frame but its texture does not lie where the image shows it, move the texture.
+
+        Else the difference would be taken for stretch, and depth, in every frame.
+        """
+        chart, reg = self.chart, self.registration
+        rest = chart.state(self._problem.patch.rest().to_numpy())
+        self._expect(0)
+        vertices = chart.surface(rest, 0).vertices
+        squared = reg.residuals(vertices, 0, self.levels[STAGES[-1]])
+        before = (squared / (squared + 0.25)).mean() if len(squared) else 0.0
+        if before < _TEXTURE_MISFIT:
+            return
+        state, scale = rest, _FIRST_SCALE
+        for stage in STAGES[:2]:
+            for _ in range(_TEXTURE_ITERATIONS):
+                try:
+                    normal, terms = self._linearise(state, rest, 0, self.settings.order, stage, scale, stiffness=_TEXTURE_STIFFNESS)
+                    state = State(rest.alpha, state.uv + Reduced(self.blocks, normal, 1e-3).slide(), rest.rotation, rest.translation)
+                except (BadFrame, LinAlgError):
+                    return
+        squared = reg.residuals(chart.surface(state, 0).vertices, 0, self.levels[STAGES[-1]])
+        after = (squared / (squared + 0.25)).mean() if len(squared) else 1.0
+        if after < _TEXTURE_GAIN * before and np.abs(state.uv).max() < _TEXTURE_FARTHEST:
+            reg.shift_texture(chart.template.chart, chart.template.chart + state.uv)
 
     def _expect(self, frame):
         """Have this frame and the next one read in a second thread."""
@@ -175,12 +207,12 @@ class GaussNewton:
         m = min(max(outlying, 0.02), 0.98)
         return float(np.clip(scale * math.sqrt(m / (1 - m) / 0.44), *_SCALES))
 
-    def _linearise(self, state, anchor, frame, order, stage, scale):
+    def _linearise(self, state, anchor, frame, order, stage, scale, stiffness=None):
         """(Normal, terms) of the whole objective at a state. Raises BadFrame where it is not finite."""
         s, chart = self.settings, self.chart
         surface = chart.surface(state, order)
         evaluation = self.registration.evaluate(surface.vertices, frame, self.levels[stage], scale)
-        stiffness = s.k_mi * stage.stiffness / chart.template.scale**2
+        stiffness = s.k_mi * (stage.stiffness if stiffness is None else stiffness) / chart.template.scale**2
         projection = self.registration.projection(surface.vertices)
         normal, inextensibility = assemble(self.pattern, surface, projection, evaluation, self.lengths, stiffness)
         a = self.chart.size(order)
