@@ -20,6 +20,7 @@ _TEXELS = 1.5  # texels of the baked texture to a pixel of the first frame
 _PIXEL_BLUR = 0.29  # standard deviation of a pixel's own square [pixels]
 _CORNERS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 _PACKETS = 7  # 18 sums of second, 9 of first derivatives and one of weights a triangle, in packets of 4
+_SILHOUETTE = 0.1  # of k_silhouette: robust, normalised residuals are smaller than colours, and masks are ragged
 _MISFIT = 0.5  # residual, in local standard deviations, that counts half a misfit
 _FARTHEST = 30.0  # pixels of the grid beyond which a silhouette is pulled no harder
 _CACHED_FRAMES = 4
@@ -122,10 +123,10 @@ class Registration:
     def shift_texture(self, chart, displaced):
         """Move the texture on the template: what lies at ``chart`` (N, 2) is shown at ``displaced`` (N, 2) instead. Whether that could be done."""
         coordinates = np.array(self._texcoord, dtype=np.float64).reshape(-1, 2)
-        if len(coordinates) != len(chart):
-            return False  # a seam: texture coordinates are not a function of the chart
-        shown = np.empty_like(coordinates)
+        shown = np.empty((len(chart), 2))
         shown[self.corner] = coordinates
+        if np.abs(shown[self.corner] - coordinates).max() > 1e-6:
+            return False  # a seam: texture coordinates are not a function of the chart
         inside = LinearNDInterpolator(displaced, shown)(chart)
         # beyond the border: by the nearest vertices' affine map
         missing = ~np.isfinite(inside).all(axis=1)
@@ -284,7 +285,7 @@ class Registration:
                 gradient[:, axis] += np.bincount(self.faces[:, k], table[:, 18 + 3 * k + axis] * weight, len(gradient))
         silhouette, rows = 0.0, None
         if pairs is not None:
-            silhouette, rows, pull = self._pull(vertices, pairs, frame, level, s.k_silhouette / area)
+            silhouette, rows, pull = self._pull(vertices, pairs, frame, level, _SILHOUETTE * s.k_silhouette / area)
             gradient += pull
         share = 1 / max(pixels, 1.0)
         return Evaluation(
