@@ -1,0 +1,270 @@
+"""The comparison of solvers at tiny sizes: the baseline descends towards the truth; results are kept, shown and not made twice."""
+
+import importlib.util
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import synthetic
+from scipy.spatial.transform import Rotation
+
+from polysft_mi import evaluate, metrics, prepare
+from polysft_mi.errors import InputError
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def load(name):
+    spec = importlib.util.spec_from_file_location(f"benchmark_{name}", ROOT / "benchmarks" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+sft, per_vertex = load("sft"), load("per_vertex")
+SETUP = {"frames": None, "threads": None, "define": [], "mode": None, "iterations": None}
+
+
+@pytest.fixture(scope="module")
+def sheet(tmp_path_factory):
+    """A sheet that bends and moves, as a folder ``flag`` with its scene.xml."""
+    truth = synthetic.cloth(tmp_path_factory.mktemp("data") / "flag", frames=2, bend=1.5, turn=0.05, shift=0.005)
+    prepare.main([str(truth.folder)])
+    return truth
+
+
+# ---- the baseline -------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def large_steps():
+    pytest.importorskip("cholespy", reason="mi.ad.LargeSteps needs cholespy")
+
+
+def test_baseline_starts_from_the_template_and_moves_what_its_unknowns_move(sheet, large_steps):
+    problem = per_vertex.load(str(sheet.folder / "scene.xml"), {})
+    rest = problem.patch.rest()
+    assert problem.surface(rest) == pytest.approx(sheet.vertices[0], abs=1e-6)
+    moved = sheet.vertices[1]  # any other place: the differential form and back
+    x = problem.patch._flat((moved - problem.template.origin) / problem.template.scale)
+    assert problem.surface(problem.patch._form.to_differential(x)) == pytest.approx(moved, abs=1e-5)
+
+
+def test_objective_of_the_baseline_is_adams(sheet, large_steps):
+    from polysft_mi import scene
+    from polysft_mi.problem import Problem
+    from polysft_mi.sequence import Sequence
+
+    baseline = per_vertex.load(str(sheet.folder / "scene.xml"), {})
+    experiment = scene.load(str(sheet.folder / "scene.xml"), {"solver": "adam"})
+    problem = Problem(experiment, Sequence.open(experiment.frames, experiment.masks, size=experiment.size))
+    mine, terms = baseline.evaluate([baseline.patch.rest()], [1])
+    theirs, wanted = problem.evaluate([problem.patch.rest()], [1])
+    assert mine == pytest.approx(theirs, rel=1e-3) and mine > 0
+    assert terms["silhouette"] == pytest.approx(wanted["silhouette"], rel=1e-3)
+
+
+def test_baseline_descends_towards_the_truth(sheet, large_steps, tmp_path):
+    out = tmp_path / "out"
+    arguments = [str(sheet.folder / "scene.xml"), "-o", str(out), "--iterations", "60", "--step", "0.01", "-q"]
+    assert not per_vertex.main(arguments)
+    first, second = json.loads((out / "metrics.json").read_text())["per_frame"]
+    assert second["loss"] < 0.5 * second["first_loss"] and second["iterations"] == 60
+    surface = evaluate.read_surface(str(out))
+    assert surface["vertices"].shape == sheet.vertices.shape and surface["uv"].shape == (len(sheet.uv), 2)
+    assert np.array_equal(surface["faces"], sheet.faces) and surface["frames"].tolist() == [0, 1]
+    still = metrics.rmse(sheet.vertices[0], sheet.vertices[1])
+    assert metrics.rmse(surface["vertices"][1].astype(float), sheet.vertices[1]) < 0.6 * still
+    with pytest.raises(InputError, match="holds another result"):
+        per_vertex.main(arguments)
+
+
+# ---- results and tables -------------------------------------------------------------------------------------------------
+
+
+def result(sequence="flag", method="adam", setup=SETUP, **more):
+    figures = {"frames": 45, "e3d": 0.02, "e3d_proc": 0.0123, "en_deg": 7.5}
+    base = {"sequence": sequence, "method": method, "setup": setup, "machine": "Some CPU, 2 cores", "frames": 45, "orders": [4, 4]}
+    return {**base, "seconds_a_frame": 5.25, "iterations": 150.4, "figures": figures, "versions": {"variant": "llvm_ad_rgb"}, **more}
+
+
+def test_table_shows_each_kind_of_truth_apart():
+    depth = {"frames": 97, "depth_rmse_mm": 6.5, "depth_rmse_mm_worst": 12.25, "depth_rmse_allpix_mm": 2.75, "hit": 1.0}
+    mesh = {"e3d": 0.002, "e3d_proc": 0.001, "en_deg": 2.0}
+    best = result(method=sft.JET, orders=[6, 6], figures=mesh, seconds_a_frame=None, iterations=None)
+    rows = [
+        best,
+        result("kinect_paper", "gauss-newton", orders=[4, 6], figures=depth, lost=3),
+        result(),
+        result("corner", "adam", figures={}, error="error: it broke"),
+    ]
+    meshes, points, failed = sft.table(rows).split("\n\n### ")
+    assert meshes.startswith("### True vertices")
+    cells = [[x.strip() for x in line.strip("|").split("|")] for line in meshes.splitlines()[2:]]
+    assert {len(row) for row in cells} == {9}
+    assert cells[2] == ["flag", "`adam`", "4", "45", "0.0123", "7.5", "0.02", "5.25", "150"]
+    assert cells[3] == ["flag", "*best jet*", "6", "45", "0.001", "2", "0.002", "–", "–"]
+    assert points.startswith("Depth points")
+    assert "| kinect_paper | `gauss-newton` | 4–6 | 45, 3 lost | 6.5 | 12.25 | 2.75 | 5.25 | 150 |" in points
+    assert failed.splitlines()[-1] == "- corner, `adam`: error: it broke"
+
+
+def test_what_has_no_truth_is_said(sheet, tmp_path, monkeypatch):
+    scenes, data = tmp_path / "scenes", tmp_path / "flag"
+    scenes.mkdir()
+    shutil.copy(sheet.folder / "scene.xml", scenes / "flag.xml")
+    shutil.copytree(sheet.folder, data)
+    np.savez(data / "gt_points.npz", points=np.ones((1, 4, 3)), frames=[7])
+    (data / "gt.npz").unlink()
+    monkeypatch.setattr(sft, "SCENES", str(scenes))
+    r = sft.run("flag", "adam", str(data), str(tmp_path / "out"), {**SETUP, "frames": 1, "define": ["period=2"], "mode": "llvm_ad_rgb"})
+    assert r["seconds_a_frame"] > 0 and r["figures"] == {} and "no frame in common" in r["unscored"]
+    assert r["unscored"].startswith("flag/gt_points.npz")
+    assert "### Without figures" in sft.table([r]) and "no frame in common" in sft.table([r])
+
+
+def test_report_writes_page_and_plot(tmp_path):
+    text = sft.report([result(), result(method="gauss-newton", seconds_a_frame=0.5)], str(tmp_path / "docs"))
+    page = (tmp_path / "docs" / "sft.md").read_text()
+    assert text in page and "Some CPU, 2 cores, `llvm_ad_rgb`" in page and "](sft.png)" in page
+    assert (tmp_path / "docs" / "sft.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_an_empty_report_has_no_plot(tmp_path):
+    sft.report([], str(tmp_path))
+    assert [p.name for p in tmp_path.iterdir()] == ["sft.md"]
+
+
+def test_results_replace_those_of_the_same_setup_only(tmp_path):
+    path = str(tmp_path / "sft.json")
+    short = {**SETUP, "frames": 3}
+    jets = [result(method=sft.JET, orders=[n, n]) for n in (4, 10)]
+    for r in (result(seconds_a_frame=9.0), result(setup=short), *jets, result()):
+        sft.add(path, r)
+    kept = sft.read(path)
+    assert len(kept) == 4
+    assert sft.find(kept, "flag", "adam", SETUP)["seconds_a_frame"] == 5.25
+    assert sft.find(kept, "flag", "adam", short)["setup"] == short
+    assert sft.find(kept, "flag", sft.JET, SETUP, 10)["orders"] == [10, 10]
+    assert sft.find(kept, "flag", "per-vertex", SETUP) is None
+
+
+def test_what_is_done_is_not_run_again_but_what_failed_is(sheet, tmp_path, monkeypatch, capsys):
+    ran = []
+
+    def run(sequence, method, folder, out, setup):
+        ran.append((sequence, method))
+        assert Path(folder) == sheet.folder
+        if method == "adam" and ran.count((sequence, method)) == 1:
+            return {"sequence": sequence, "method": method, "setup": setup, "error": "error: no power"}
+        return result(sequence, method, setup, orders=None)
+
+    monkeypatch.setattr(sft, "run", run)
+    places = ["--data", str(sheet.folder.parent), "-o", str(tmp_path), "--docs", str(tmp_path / "docs")]
+    arguments = [*places, "--methods", "adam", "gauss-newton"]
+    sft.main(arguments)
+    assert ran == [("flag", "adam"), ("flag", "gauss-newton")]
+    assert "error: no power" in (tmp_path / "docs" / "sft.md").read_text()
+    told = capsys.readouterr()
+    assert "bend: not in" in told.err and "`gauss-newton`" in told.out
+    sft.main(arguments)
+    assert ran[2:] == [("flag", "adam")]
+    assert "no power" not in (tmp_path / "docs" / "sft.md").read_text()
+    sft.main(arguments)
+    assert len(ran) == 3
+    sft.main([*arguments, "--again"])
+    assert len(ran) == 5
+
+
+def test_commands_are_those_of_a_user():
+    setup = {**SETUP, "frames": 5, "define": ["period=7"], "mode": "llvm_ad_rgb", "iterations": 9}
+    line = sft.command("bend", "gauss-newton", "/data/bend", "out/x", setup)
+    assert line[1:3] == ["-m", "polysft_mi.run"] and line[3].endswith("scenes/bend.xml") and "--iterations" not in line
+    assert [line[k + 1] for k, x in enumerate(line) if x == "-D"] == ["data=/data/bend", "period=7", "last=4", "solver=gauss-newton"]
+    line = sft.command("bend", "per-vertex", "/data/bend", "out/x", setup)
+    assert line[1].endswith("per_vertex.py") and line[line.index("--iterations") + 1] == "9"
+    assert [line[k + 1] for k, x in enumerate(line) if x == "-D"] == ["data=/data/bend", "period=7", "last=4"]
+    for sequence in sft.SEQUENCES:
+        assert Path(sft.command(sequence, "adam", "/data", "out", SETUP)[3]).is_file()
+
+
+def test_a_shortened_run_leaves_the_documentation_alone():
+    assert sft.is_whole(SETUP) and sft.is_whole({**SETUP, "mode": "cuda_ad_rgb"})
+    for name, value in {"frames": 3, "threads": 1, "define": ["period=3"], "iterations": 5}.items():
+        assert not sft.is_whole({**SETUP, name: value})
+
+
+def test_a_damaged_file_of_results_is_told(tmp_path):
+    (tmp_path / "sft.json").write_text("{")
+    with pytest.raises(InputError, match="not a file of results"):
+        sft.main(["--data", str(tmp_path), "-o", str(tmp_path), "--docs", str(tmp_path)])
+
+
+def test_a_sequence_is_found_one_folder_down(tmp_path):
+    (tmp_path / "cloth" / "flag").mkdir(parents=True)
+    assert sft.folder_of(str(tmp_path), "flag") == str(tmp_path / "cloth" / "flag")
+    assert sft.folder_of(str(tmp_path), "bend") is None
+
+
+def test_one_command_is_run_timed_and_scored(sheet, tmp_path, monkeypatch):
+    scenes = tmp_path / "scenes"
+    scenes.mkdir()
+    shutil.copy(sheet.folder / "scene.xml", scenes / "flag.xml")
+    monkeypatch.setattr(sft, "SCENES", str(scenes))
+    setup = {**SETUP, "threads": 1, "define": ["period=3"], "mode": "llvm_ad_rgb"}
+    r = sft.run("flag", "adam", str(sheet.folder), str(tmp_path / "runs" / "flag-adam"), setup)
+    assert "error" not in r and r["frames"] == 2 and r["iterations"] == 3 and r["orders"] == [4, 4]
+    assert r["seconds_a_frame"] == r["seconds"] / 2 > 0
+    assert r["figures"]["e3d_proc"] == evaluate.evaluate(str(tmp_path / "runs" / "flag-adam"), str(sheet.folder))["e3d_proc"]
+    assert r["versions"]["variant"] == "llvm_ad_rgb" and "core" in r["machine"]
+    broken = sft.run("flag", "adam", str(sheet.folder), str(tmp_path / "runs" / "broken"), {**setup, "define": ["perod=3"]})
+    assert "perod" in broken["error"] and "figures" not in broken
+
+
+# ---- best jets ------------------------------------------------------------------------------------------------------------
+
+
+def template_of(sheet, order):
+    from polysft_mi.template import Template
+
+    return Template.fit(sheet.vertices[0], sheet.faces, sheet.uv, order)
+
+
+def test_a_jet_that_was_turned_is_found_again(sheet):
+    from polysft_mi.normal_equations import Chart
+
+    template, rng = template_of(sheet, 4), np.random.default_rng(0)
+    chart = Chart(template)
+    arrays = {"delta_alpha": 0.1 * rng.standard_normal(15), "delta_u": np.zeros(99), "delta_v": np.zeros(99)}
+    turn = Rotation.from_euler("xyz", [0.3, -0.4, 0.2]).as_quat()
+    truth = chart.surface(chart.state({**arrays, "rotation": turn, "translation": [0.1, 0, 0.2]})).vertices
+    found = sft.best_jets(template, truth[None])
+    heights = chart.surface(chart.state(sft._standing_in(template, truth, template.rotation))).vertices
+    assert metrics.rmse(heights, truth) > 1e-4  # heights over the template's plane do not hold it: it is turned
+    assert metrics.rmse(found[0], truth) < 0.02 * metrics.rmse(heights, truth)
+
+
+def test_best_jets_get_better_with_their_order_and_than_heights(sheet):
+    truth = synthetic.sheet(1.0, 9, 11, bend=11.0)  # a cylinder of 150 degrees
+    distance = {}
+    for order in (2, 4, 6):
+        template = template_of(sheet, order)
+        distance[order] = metrics.rmse(sft.best_jets(template, truth[None])[0], truth)
+    assert distance[6] < distance[4] < distance[2]
+    assert distance[2] > 1e-4
+
+
+def test_best_jet_of_a_sequence_is_scored_like_a_run(sheet):
+    r = sft.jet_result("flag", str(sheet.folder), 4, {**SETUP, "frames": 1})
+    assert r["frames"] == 1 and r["orders"] == [4, 4] and r["figures"]["e3d_proc"] < 1e-5
+    whole = sft.jet_result("flag", str(sheet.folder), 4, SETUP)
+    assert whole["frames"] == 2 and whole["figures"]["e3d_proc"] < 1e-3
+
+
+def test_without_true_meshes_there_is_no_best_jet(tmp_path):
+    truth = synthetic.cloth(tmp_path / "flag", frames=1)
+    np.savez(truth.folder / "points.npz", points=np.ones((1, 4, 3)), frames=np.zeros(1, int))
+    (truth.folder / "gt.npz").unlink()
+    assert sft.jet_result("flag", str(truth.folder), 4, SETUP) is None
