@@ -46,6 +46,7 @@ class Settings:
     seed: int = _setting(0, "seed of the renderer's random numbers (path replay)", low=0)
     solver: str = _setting("gauss-newton", "solver of each window", choices=("gauss-newton", "adam"))
     window: int = _setting(0, "frames W in the sliding window; 0: 1 for gauss-newton, 3 for adam", low=0)
+    smooth: float = _setting(0.0, "weight that holds each frame to the middle of its neighbours in a last pass over the video, both ways (gauss-newton); 0 for none", low=0)
     patience: int = _setting(100, "iterations of adam without improvement after which the window moves on", low=1)
     period: int = _setting(500, "largest number of iterations of adam in a window", low=1)
     lr_uv: float = _setting(1e-3, "Adam's step size of the uv displacements", low=0)

@@ -20,6 +20,8 @@ from .problem import TERMS, BadFrame
 CHECKPOINT, LOG = "checkpoint.npz", "log.jsonl"
 _VISIBLE = 0.02  # share of the vertices inside the image below which the surface is said to have left it
 _PAST = 20  # frames that a solver is told of
+_AROUND, _SUSPECT, _SUSPECT_MARGIN = 5, 1.25, 0.05  # frames, and how far above their median misfit one is solved again
+_HOLD = 0.1  # weight that then holds it to the middle of its neighbours
 _LOG_EVERY = 10  # iterations between records of the log
 
 
@@ -29,7 +31,8 @@ class Track:
 
     ``states``: one dict of arrays (:meth:`Unknowns.to_numpy`) a frame; ``next_window``: first frame of the next window to solve;
     ``iterations``, ``seconds``: one entry a solved window; ``totals``: its terms at the minimum; ``lost``: frame -> reason for
-    those that keep the state of the frame before; ``unusable``: those among them whose image breaks the objective.
+    those that keep the state of the frame before; ``unusable``: those among them whose image breaks the objective; ``finished``: whether the
+    solver has looked back over the whole.
     """
 
     states: list = field(default_factory=list)
@@ -39,10 +42,11 @@ class Track:
     totals: list = field(default_factory=list)
     lost: dict = field(default_factory=dict)
     unusable: dict = field(default_factory=dict)
+    finished: bool = False
 
     def save(self, path):
         arrays = {name: np.stack([s[name] for s in self.states]) for name in Unknowns.NAMES}
-        meta = {k: getattr(self, k) for k in ("next_window", "iterations", "seconds", "totals", "lost", "unusable")}
+        meta = {k: getattr(self, k) for k in ("next_window", "iterations", "seconds", "totals", "lost", "unusable", "finished")}
         with aside(path) as temporary:
             np.savez(temporary, meta=json.dumps(meta), **arrays)
 
@@ -76,7 +80,29 @@ def track(problem, solver, frames, out, *, resume=False, progress=None):
             _advance(problem, solver, done, start, width, log, progress)
             log.flush()
             done.save(checkpoint)
+    if hasattr(solver, "revisit") and len(done.totals) == frames and not done.finished:
+        _look_back(problem, solver, done)
+        done.finished = True
+        done.save(checkpoint)
     return done
+
+
+def _look_back(problem, solver, done):
+    """Solve again, now that both neighbours are known: the frames that explain their image far worse than those around them; with ``smooth``, all."""
+    misfit = np.array([t.get("misfit") or math.nan for t in done.totals])
+    count, smooth = len(misfit), problem.settings.smooth
+    suspect = []
+    for k in range(1, count - 1):
+        around = np.r_[misfit[max(0, k - _AROUND) : k], misfit[k + 1 : k + 1 + _AROUND]]
+        if not misfit[k] <= _SUSPECT * np.nanmedian(around) + _SUSPECT_MARGIN:
+            suspect.append(k)
+    for k in suspect:
+        if k not in done.unusable:
+            done.states[k], done.totals[k] = solver.revisit(problem, k, done.states[k - 1], done.states[k + 1], done.totals[k], _HOLD)
+    if smooth > 0:
+        for k in [*range(count - 2, 0, -1), *range(1, count - 1)]:
+            if k not in done.unusable:
+                done.states[k], done.totals[k] = solver.revisit(problem, k, done.states[k - 1], done.states[k + 1], done.totals[k], smooth)
 
 
 def _advance(problem, solver, done, start, width, log, progress):

@@ -20,12 +20,19 @@ _WINDOW = 8.0  # standard deviation of the window of the local statistics, likew
 _FIRST_SCALE, _SCALES = 0.3, (0.2, 1.0)  # robust scale at the start of a frame, and its bounds, in local standard deviations
 _SMALL = 3e-4  # share of the objective that a step must promise for another one to follow
 _SUSPECT, _SUSPECT_MARGIN, _MEMORY = 1.25, 0.01, 15  # a misfit above this many times the median of the frames before (plus the margin) is suspect
-_RAISE, _LOWER = 0.02, 0.002  # share of the objective by which more coefficients must lower it to be taken, and fewer may raise it to be dropped
+_PATIENT = 18  # iterations a stage where a frame is suspect
+_RAISE = 0.02  # share of the objective by which more coefficients must lower it to be taken
 _ORDER_STEP = 2
 # fitting the texture to the first frame: only above this misfit, if it falls by this factor, and no farther than this [chart units]
 _TEXTURE_MISFIT, _TEXTURE_GAIN, _TEXTURE_FARTHEST = 0.15, 0.6, 0.08
 _TEXTURE_ITERATIONS, _TEXTURE_STIFFNESS = 6, 1.0
 _TEMPORAL = 2e-4  # of k_tc: here a frame is held to the one before it, which a window's frames are not in the paper
+
+
+def _cost(found):
+    """What starts are compared by: unlike the objective, free of the robust scale."""
+    terms = found[1]
+    return terms["misfit"] + terms["inextensibility"] + terms["smoothness"]
 
 
 @dataclass(frozen=True)
@@ -56,6 +63,7 @@ class GaussNewton:
         if settings.brightness == "gain":
             raise InputError("setting brightness = 'gain' with solver = gauss-newton; auto, local or none is needed")
         self._problem = None
+        self._hold = 0.0  # weight of the difference to the anchor, motion included, where a frame is solved again
 
     def solve(self, problem, window, frames, report=None, past=()):
         """Minimise over the newest of ``frames``, then in turn over all of the window: :class:`Solution`.
@@ -71,6 +79,26 @@ class GaussNewton:
         states = [self.chart.state(w.to_numpy()) for w in window[:-1]] + [newest[0]]
         terms = newest[1]
         return self._solution(states, terms, frames)
+
+    def revisit(self, problem, frame, before, after, terms, weight):
+        """Solve a frame again, held to the middle of its neighbours: (arrays, terms).
+
+        ``before``, ``after``: arrays of ``Unknowns.to_numpy`` of the frames on either side; ``terms``: of the frame so far; ``weight``: of the
+        squared difference to the middle.
+        """
+        if problem is not self._problem:
+            self._prepare(problem)
+        self._report, self._count = None, 0
+        a, b = self.chart.state(before), self.chart.state(after)
+        middle = a.towards(b, -0.5)
+        order = int(terms.get("order") or self.settings.order)
+        self._hold = weight
+        try:
+            state, found, *_ = self._descend(middle, middle, frame, order, STAGES)
+        finally:
+            self._hold = 0.0
+        solution = self._solution([state], found, [frame])
+        return solution.window[0].to_numpy(), {**solution.terms, **solution.facts}
 
     # -- preparation --------------------------------------------------------
 
@@ -139,13 +167,14 @@ class GaussNewton:
         order = int(orders[-1]) if orders else self.settings.order
         best = self._descend(self._nearest(starts, frame, STAGES[0]), anchor, frame, order, STAGES)
         usual = [t["misfit"] for t in past[-_MEMORY:] if t.get("misfit") is not None]
-        if len(usual) >= 3 and best[1]["misfit"] > _SUSPECT * np.median(usual) + _SUSPECT_MARGIN:
+        limit = _SUSPECT * np.median(usual) + _SUSPECT_MARGIN if len(usual) >= 3 else math.inf
+        if best[1]["misfit"] > limit:
             self.registration.expect([frame], [self.levels[FAR]])
-            found = self._relocate(frame)
-            others = [self._nearest(starts, frame, FAR)] + ([found] if found else [])
-            for other in others:
-                other = self._descend(other, anchor, frame, order, (FAR, *STAGES))
-                best = min(best, other, key=lambda x: x[1]["misfit"])
+            for other in (lambda: self._nearest(starts, frame, FAR), lambda: self._relocate(frame)):
+                if (other := other()) is not None:
+                    best = min(best, self._descend(other, anchor, frame, order, (FAR, *STAGES), _PATIENT), key=_cost)
+                if best[1]["misfit"] <= limit:
+                    break
         return self._adapt_order(*best, anchor, frame)
 
     def _nearest(self, starts, frame, stage):
@@ -169,13 +198,14 @@ class GaussNewton:
         rest = self.chart.state(self._problem.patch.rest().to_numpy())
         return State(rest.alpha, rest.uv, *self.chart.rigid(*motion))
 
-    def _descend(self, state, anchor, frame, order, stages):
+    def _descend(self, state, anchor, frame, order, stages, iterations=None):
+        """Stage after stage, each of at most its own or so many ``iterations``."""
         scale = _FIRST_SCALE
         for stage in stages:
-            state, terms, scale, normal = self._stage(state, anchor, frame, order, stage, scale)
+            state, terms, scale, normal = self._stage(state, anchor, frame, order, stage, scale, iterations or stage.iterations)
         return state, terms, scale, normal
 
-    def _stage(self, state, anchor, frame, order, stage, scale):
+    def _stage(self, state, anchor, frame, order, stage, scale, iterations):
         """Levenberg-Marquardt at one stage: (state, terms, robust scale, normal equations near the end)."""
         normal, terms = self._linearise(state, anchor, frame, order, stage, scale)
         fitting = self._robust_scale(terms["outlying"], scale)
@@ -183,7 +213,7 @@ class GaussNewton:
             scale = fitting
             normal, terms = self._linearise(state, anchor, frame, order, stage, scale)
         damping = 1e-4
-        for iteration in range(stage.iterations):
+        for _ in range(iterations):
             try:
                 step, promised = Reduced(self.blocks, normal, damping).step()
             except LinAlgError:
@@ -218,8 +248,12 @@ class GaussNewton:
         a = self.chart.size(order)
         bend = 2 * s.k_bend * chart.bending
         moved, slid = state.alpha - anchor.alpha, state.uv - anchor.uv
-        normal.glob[:a, :a] += bend[:a, :a] + 2 * s.k_tc * _TEMPORAL * np.eye(a)
-        normal.gradient[:a] += (bend @ state.alpha + 2 * s.k_tc * _TEMPORAL * moved)[:a]
+        temporal = s.k_tc + self._hold
+        normal.glob[:a, :a] += bend[:a, :a] + 2 * temporal * np.eye(a)
+        normal.gradient[:a] += (bend @ state.alpha + 2 * temporal * moved)[:a]
+        motion = np.concatenate([(state.rotation * anchor.rotation.inv()).as_rotvec(), state.translation - anchor.translation])
+        normal.glob[a:, a:] += 2 * self._hold * np.eye(6)
+        normal.gradient[a:] += 2 * self._hold * motion
         i, j = self.pattern.edges.T
         apart = state.uv[i] - state.uv[j]
         pull = np.stack([np.bincount(i, apart[:, k], len(slid)) - np.bincount(j, apart[:, k], len(slid)) for k in (0, 1)], 1)
@@ -231,7 +265,7 @@ class GaussNewton:
             "rgb": evaluation.photometric,
             "silhouette": evaluation.silhouette,
             "inextensibility": inextensibility,
-            "temporal": s.k_tc * _TEMPORAL * float((moved**2).sum() + (slid**2).sum()),
+            "temporal": temporal * float((moved**2).sum()) + s.k_tc * _TEMPORAL * float((slid**2).sum()) + self._hold * float((motion**2).sum()),
             "smoothness": s.k_bend * float(state.alpha @ chart.bending @ state.alpha) + s.k_uv * float((apart**2).sum()),
         }
         total = sum(terms.values())
