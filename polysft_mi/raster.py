@@ -168,8 +168,11 @@ class RasterIntegrator(mi.SamplingIntegrator):
             self._topology = Topology(scene)
         return self._topology
 
-    def look(self, scene, sensor, scale=1):
-        """Trace one ray a pixel: the :class:`View` of the scene at ``scale`` pixels a pixel and axis (a fraction for a coarser grid)."""
+    def look(self, scene, sensor, scale=1, box=None):
+        """Trace one ray a pixel: the :class:`View` of the scene at ``scale`` pixels a pixel and axis (a fraction for a coarser grid).
+
+        ``box`` (x, y, x, y) [pixels]: what the surface covers, where the caller knows; else it is computed.
+        """
         camera, topology = self._camera(sensor), self.topology(scene)
         width, height = int(camera.width * scale), int(camera.height * scale)
         basis, inverse, origin = camera.device(scale)
@@ -179,7 +182,7 @@ class RasterIntegrator(mi.SamplingIntegrator):
         relative = inverse @ (vertex - origin)  # (x z, y z, z): pixels times depth
         screen = mi.Point3d(mi.Point3f(relative.x / relative.z, relative.y / relative.z, relative.z))
         dr.eval(screen)
-        x0, y0, w, h = self._bounds(screen, width, height)
+        x0, y0, w, h = self._bounds(screen, width, height) if box is None else _margin([scale * x for x in box], width, height)
 
         with dr.suspend_grad():
             x0_, y0_, w_ = (dr.opaque(mi.UInt32, k) for k in (x0, y0, w))
@@ -225,12 +228,7 @@ class RasterIntegrator(mi.SamplingIntegrator):
             xa, ya, xb, yb, near = (x[0] for x in box)
         if not near > NEAR or not all(map(math.isfinite, (xa, ya, xb, yb))):
             return 0, 0, width, height
-        # one pixel of margin, for the neighbours that antialiasing blends with
-        xa, ya = max(0, math.floor(min(xa, width)) - 1), max(0, math.floor(min(ya, height)) - 1)
-        xb, yb = min(width, math.ceil(max(xb, 0)) + 1), min(height, math.ceil(max(yb, 0)) + 1)
-        if xb <= xa or yb <= ya:
-            return 0, 0, 1, 1
-        return xa, ya, xb - xa, yb - ya
+        return _margin((xa, ya, xb, yb), width, height)
 
     def _interaction(self, topology, positions, shape, triangle, ray, length, hit):
         """Surface interaction of rays with the planes of their triangles (attached), and depth along the axis."""
@@ -472,6 +470,14 @@ class RasterIntegrator(mi.SamplingIntegrator):
         for c, part in enumerate(aovs):
             dr.scatter(out, part, pixel * count + colours + c, middle)
         return mi.TensorXf(out, (height, width, count))
+
+
+def _margin(box, width, height):
+    """(x, y, width, height) of the pixels around a box (x, y, x, y) within the image, with a margin for the neighbours that antialiasing blends with."""
+    xa, ya, xb, yb = box
+    xa, ya = max(0, math.floor(min(xa, width)) - 1), max(0, math.floor(min(ya, height)) - 1)
+    xb, yb = min(width, math.ceil(max(xb, 0)) + 1), min(height, math.ceil(max(yb, 0)) + 1)
+    return (xa, ya, xb - xa, yb - ya) if xb > xa and yb > ya else (0, 0, 1, 1)
 
 
 def _gather_point(positions, index, mask=True):

@@ -19,7 +19,7 @@ from .pyramid import compared, level_image
 _TEXELS = 1.5  # texels of the baked texture to a pixel of the first frame
 _PIXEL_BLUR = 0.29  # standard deviation of a pixel's own square [pixels]
 _CORNERS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-_PACKETS = 7  # 18 sums of second, 9 of first derivatives and one of weights a triangle, in packets of 4
+_PACKETS = 8  # 18 sums of second, 9 of first derivatives and 4 of figures a triangle, in packets of 4
 _SILHOUETTE = 0.1  # of k_silhouette: robust, normalised residuals are smaller than colours, and masks are ragged
 _MISFIT = 0.5  # residual, in local standard deviations, that counts half a misfit
 _FARTHEST = 30.0  # pixels of the grid beyond which a silhouette is pulled no harder
@@ -175,6 +175,11 @@ class Registration:
         with dr.suspend_grad():
             self.problem.place(mi.Point3f(np.ascontiguousarray(vertices.T, dtype=np.float32)))
 
+    def _box(self, vertices):
+        """(x, y, x, y) [pixels of the video] around the projected vertices; None where one is not before the camera."""
+        position, before = self.camera.project(vertices)
+        return (*position.min(0), *position.max(0)) if before.all() else None
+
     def _pixels(self, view, frame, level):
         """Residuals (Vector4f, its fourth entry 0) and weights of the region's pixels, and what their derivatives need."""
         texture, texture_width, texture_height = self._texture_level(level)
@@ -219,7 +224,7 @@ class Registration:
         """Squared residuals r^2 = |T - I|^2 / 3 of the pixels that are compared, (P,) float32; vertices (N, 3) [m, world]."""
         with dr.suspend_grad():
             self._place(vertices)
-            view = self.raster.look(self.scene, self.sensor, 1 / level.stride)
+            view = self.raster.look(self.scene, self.sensor, 1 / level.stride, self._box(vertices))
             residual, weight, *_ = self._pixels(view, frame, level)
             squared = dr.squared_norm(residual) / 3
             dr.eval(squared, weight)
@@ -230,13 +235,10 @@ class Registration:
         s = self.problem.settings
         with dr.suspend_grad():
             self._place(vertices)
-            view = self.raster.look(self.scene, self.sensor, 1 / level.stride)
+            view = self.raster.look(self.scene, self.sensor, 1 / level.stride, self._box(vertices))
             residual, weight, triangle, (b1, b2), (p0, e1, e2), (c01, c02), (by_x, by_y) = self._pixels(view, frame, level)
             squared = dr.squared_norm(residual) / 3
             c2 = dr.opaque(mi.Float, scale * scale)
-            energy, count = dr.sum(weight * c2 * dr.log(1 + squared / c2)), dr.sum(weight)
-            outlying, misfit = (dr.sum(weight * squared / (squared + c)) for c in (c2, _MISFIT**2))
-
             # the texture coordinate under a pixel moves against the triangle's plane, which slides along the ray
             ray, depth = view.ray, view.depth
             n = dr.cross(e1, e2)
@@ -264,18 +266,18 @@ class Registration:
                 sums += [m * xx, m * xy, m * yy]
             for b in corner:
                 sums += [b * first.x, b * first.y, b * first.z]
-            sums.append(robust)
+            sums += [weight * c2 * dr.log(1 + squared / c2), weight, weight * squared / (squared + c2), weight * squared / (squared + _MISFIT**2), mi.Float(0)]
             active = view.hit & (weight > 0)
             faces = len(self.faces)
             out = dr.zeros(mi.Float64, 4 * _PACKETS * faces)
             packet = dr.replace_type_t(mi.Vector4f, dr.VarType.Float64)
             for k in range(_PACKETS):
                 dr.scatter_add(out, packet(*sums[4 * k : 4 * k + 4]), triangle * _PACKETS + k, active, mode=dr.ReduceMode.Local)
-            dr.eval(out, energy, count, outlying, misfit)
+            dr.eval(out)
             pairs = self._silhouette(view, frame, level) if s.k_silhouette > 0 else None
         table = np.array(out).reshape(faces, 4 * _PACKETS)
         *_, area = self._frame_level(frame, level)
-        pixels = float(count[0])
+        energy, pixels, outlying, misfit = table[:, 27:31].sum(0).tolist()
         weight = s.k_rgb / (area or max(pixels, 1.0))
         blocks = table[:, :18].reshape(-1, 6, 3)
         second = blocks[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]][:, :, [0, 1, 1, 2]].reshape(-1, 9, 2, 2) * (weight / level.stride**2)
@@ -289,7 +291,7 @@ class Registration:
             gradient += pull
         share = 1 / max(pixels, 1.0)
         return Evaluation(
-            weight * float(energy[0]), silhouette, share * float(outlying[0]), share * float(misfit[0]), gradient, second, rows, pixels * level.stride**2
+            weight * energy, silhouette, share * outlying, share * misfit, gradient, second, rows, pixels * level.stride**2
         )
 
     # -- silhouettes --------------------------------------------------------

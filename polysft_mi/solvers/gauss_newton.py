@@ -19,14 +19,14 @@ _SHEET = 225.0  # width [pixels] of the sheet that the stages' blurs are given f
 _WINDOW = 8.0  # standard deviation of the window of the local statistics, likewise
 _FIRST_SCALE, _SCALES = 0.3, (0.2, 1.0)  # robust scale at the start of a frame, and its bounds, in local standard deviations
 _SMALL = 3e-4  # share of the objective that a step must promise for another one to follow
-_SUSPECT, _SUSPECT_MARGIN, _MEMORY = 1.25, 0.01, 15  # a misfit above this many times the median of the frames before (plus the margin) is suspect
+_SUSPECT, _SUSPECT_MARGIN, _MEMORY = 1.25, 0.03, 5  # a misfit above this many times the median of the frames before (plus the margin) is suspect
 _PATIENT = 18  # iterations a stage where a frame is suspect
 _RAISE = 0.02  # share of the objective by which more coefficients must lower it to be taken
 _ORDER_STEP = 2
 # fitting the texture to the first frame: only above this misfit, if it falls by this factor, and no farther than this [chart units]
 _TEXTURE_MISFIT, _TEXTURE_GAIN, _TEXTURE_FARTHEST = 0.15, 0.6, 0.08
 _TEXTURE_ITERATIONS, _TEXTURE_STIFFNESS = 6, 1.0
-_TEMPORAL = 2e-4  # of k_tc: here a frame is held to the one before it, which a window's frames are not in the paper
+_TEMPORAL = 1e-3  # of k_tc: it holds a frame to the one before, in a stiffer basis than the monomials of the paper's window
 
 
 def _cost(found):
@@ -63,6 +63,7 @@ class GaussNewton:
         if settings.brightness == "gain":
             raise InputError("setting brightness = 'gain' with solver = gauss-newton; auto, local or none is needed")
         self._problem = None
+        self._scales, self._fitting = {}, {}
         self._hold = 0.0  # weight of the difference to the anchor, motion included, where a frame is solved again
 
     def solve(self, problem, window, frames, report=None, past=()):
@@ -74,6 +75,7 @@ class GaussNewton:
             self._prepare(problem)
         self._report, self._count = report, 0
         self._expect(frames[-1])
+        self._scales, self._fitting = self._scales_of(past[-1][1] if past else {}), {}
         history = [self.chart.state(arrays) for arrays, _ in past[-2:]]
         newest = self._newest(self.chart.state(window[-1].to_numpy()), frames[-1], history, [terms for _, terms in past])
         states = [self.chart.state(w.to_numpy()) for w in window[:-1]] + [newest[0]]
@@ -89,12 +91,13 @@ class GaussNewton:
         if problem is not self._problem:
             self._prepare(problem)
         self._report, self._count = None, 0
+        self._scales, self._fitting = self._scales_of(terms), {}
         a, b = self.chart.state(before), self.chart.state(after)
         middle = a.towards(b, -0.5)
         order = int(terms.get("order") or self.settings.order)
         self._hold = weight
         try:
-            state, found, *_ = self._descend(middle, middle, frame, order, STAGES)
+            state, found = self._descend(middle, middle, frame, order, STAGES)
         finally:
             self._hold = 0.0
         solution = self._solution([state], found, [frame])
@@ -136,11 +139,11 @@ class GaussNewton:
         before = (squared / (squared + 0.25)).mean() if len(squared) else 0.0
         if before < _TEXTURE_MISFIT:
             return
-        state, scale = rest, _FIRST_SCALE
+        state = rest
         for stage in STAGES[:2]:
             for _ in range(_TEXTURE_ITERATIONS):
                 try:
-                    normal, terms = self._linearise(state, rest, 0, self.settings.order, stage, scale, stiffness=_TEXTURE_STIFFNESS)
+                    normal, terms = self._linearise(state, rest, 0, self.settings.order, stage, _FIRST_SCALE, stiffness=_TEXTURE_STIFFNESS)
                     state = State(rest.alpha, state.uv + Reduced(self.blocks, normal, 1e-3).slide(), rest.rotation, rest.translation)
                 except (BadFrame, LinAlgError):
                     return
@@ -199,19 +202,15 @@ class GaussNewton:
         return State(rest.alpha, rest.uv, *self.chart.rigid(*motion))
 
     def _descend(self, state, anchor, frame, order, stages, iterations=None):
-        """Stage after stage, each of at most its own or so many ``iterations``."""
-        scale = _FIRST_SCALE
+        """Stage after stage, each of at most its own or so many ``iterations``: (state, terms)."""
         for stage in stages:
-            state, terms, scale, normal = self._stage(state, anchor, frame, order, stage, scale, iterations or stage.iterations)
-        return state, terms, scale, normal
+            state, terms = self._stage(state, anchor, frame, order, stage, iterations or stage.iterations)
+        return state, terms
 
-    def _stage(self, state, anchor, frame, order, stage, scale, iterations):
-        """Levenberg-Marquardt at one stage: (state, terms, robust scale, normal equations near the end)."""
+    def _stage(self, state, anchor, frame, order, stage, iterations):
+        """Levenberg-Marquardt at one stage: (state, terms). Its robust scale is the one that fitted the frame before."""
+        scale = self._scales.get(stage, _FIRST_SCALE)
         normal, terms = self._linearise(state, anchor, frame, order, stage, scale)
-        fitting = self._robust_scale(terms["outlying"], scale)
-        if abs(math.log(fitting / scale)) > 0.1:  # a stage keeps its scale, for its energies are compared
-            scale = fitting
-            normal, terms = self._linearise(state, anchor, frame, order, stage, scale)
         damping = 1e-4
         for _ in range(iterations):
             try:
@@ -220,7 +219,8 @@ class GaussNewton:
                 damping = max(10 * damping, 1e-4)
                 continue
             if promised < _SMALL * terms["total"]:
-                return state.moved(step), terms, scale, normal
+                state = state.moved(step)
+                break
             trial = state.moved(step)
             found = self._linearise(trial, anchor, frame, order, stage, scale)
             if found[1]["total"] < terms["total"]:
@@ -229,7 +229,13 @@ class GaussNewton:
                 state, (normal, terms) = trial, found
             else:
                 damping *= 10
-        return state, terms, scale, normal
+        self._fitting[stage] = self._robust_scale(terms["outlying"], scale)
+        return state, terms
+
+    @staticmethod
+    def _scales_of(terms):
+        """The robust scale of each stage that a frame left behind."""
+        return {stage: terms.get(f"scale_{k}") or _FIRST_SCALE for k, stage in enumerate((FAR, *STAGES))}
 
     @staticmethod
     def _robust_scale(outlying, scale):
@@ -248,7 +254,7 @@ class GaussNewton:
         a = self.chart.size(order)
         bend = 2 * s.k_bend * chart.bending
         moved, slid = state.alpha - anchor.alpha, state.uv - anchor.uv
-        temporal = s.k_tc + self._hold
+        temporal = s.k_tc * _TEMPORAL + self._hold
         normal.glob[:a, :a] += bend[:a, :a] + 2 * temporal * np.eye(a)
         normal.gradient[:a] += (bend @ state.alpha + 2 * temporal * moved)[:a]
         motion = np.concatenate([(state.rotation * anchor.rotation.inv()).as_rotvec(), state.translation - anchor.translation])
@@ -278,13 +284,13 @@ class GaussNewton:
 
     # -- order --------------------------------------------------------------
 
-    def _adapt_order(self, state, terms, scale, normal, anchor, frame):
+    def _adapt_order(self, state, terms, anchor, frame):
         """Raise the order where the model says that it pays, and go on; else lower it where that costs nothing."""
         s, order = self.settings, int(terms["order"])
         stage = STAGES[-1]
         top = min(order + _ORDER_STEP, s.capacity)
         if top > order:
-            wide, there = self._linearise(state, anchor, frame, top, stage, scale)
+            wide, there = self._linearise(state, anchor, frame, top, stage, self._scales.get(stage, _FIRST_SCALE))
             try:
                 reduced = Reduced(self.blocks, wide, 1e-6)
                 promised = reduced.step()[1] - reduced.restricted(self.chart.size(order))
@@ -294,11 +300,13 @@ class GaussNewton:
                 found = self._descend(state, anchor, frame, top, STAGES[1:])
                 if found[1]["total"] < (1 - 0.5 * _RAISE) * there["total"]:
                     return found
-        return state, terms, scale, normal
+        return state, terms
 
     # -- results ------------------------------------------------------------
 
     def _solution(self, states, terms, frames):
         window = [Unknowns.from_numpy(self.chart.arrays(state)) for state in states]
+        terms = dict(terms)
         facts = {name: terms.pop(name) for name in ("misfit", "outlying", "order")}
+        facts |= {f"scale_{k}": self._fitting.get(stage, _FIRST_SCALE) for k, stage in enumerate((FAR, *STAGES))}
         return Solution(window, terms.pop("total"), terms, self._count, facts)
