@@ -299,13 +299,12 @@ class Elimination:
                 w = blas.dtrsm(1.0, self.factors[k], self.coupling[k], lower=1, trans_a=1)
                 inverse = inverse + w @ blocks[k + 1] @ w.T
             blocks[k] = inverse
-        place = 2 * self.blocks.pattern.place
-        out = np.empty((len(place), 2, 2))
-        for k in range(2):
-            for m in range(2):
-                part, at = place // size, place % size
-                out[:, k, m] = [blocks[p][a + k, a + m] for p, a in zip(part, at)]
-        return out
+        part, at = np.divmod(2 * self.blocks.pattern.place, size)
+        padded = np.zeros((len(blocks), size, size))
+        for k, block in enumerate(blocks):
+            padded[k, : len(block), : len(block)] = block
+        two = np.arange(2)
+        return padded[part[:, None, None], at[:, None, None] + two[:, None], at[:, None, None] + two]
 
 
 @dataclass

@@ -133,9 +133,13 @@ def write(problem, track, out, *, exr_frames, fps, command, say=None):
     world = np.stack([problem.surface(u) for u in unknowns])
     vertices = problem.camera.to_camera(world).astype(np.float32)
 
+    sigma = {}
+    if track.sigma:
+        unknown = np.full(vertices.shape[1], np.nan, np.float32)
+        sigma["sigma"] = np.stack([track.sigma.get(k, unknown) for k in range(count)])
     with aside(os.path.join(out, "surface.npz")) as temporary:
         np.savez_compressed(
-            temporary, vertices=vertices, faces=template.faces.astype(np.int32), uv=template.uv.astype(np.float32), frames=indices
+            temporary, vertices=vertices, faces=template.faces.astype(np.int32), uv=template.uv.astype(np.float32), frames=indices, **sigma
         )
     arrays = {name: np.stack([s[name] for s in track.states]) for name in Unknowns.NAMES}
     with aside(os.path.join(out, "params.npz")) as temporary:

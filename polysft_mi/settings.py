@@ -45,7 +45,7 @@ class Settings:
     spp: int = _setting(1, "samples a pixel; raster takes square numbers (1, 4, 9, ...)", low=1)
     seed: int = _setting(0, "seed of the renderer's random numbers (path replay)", low=0)
     solver: str = _setting("gauss-newton", "solver of each window", choices=("gauss-newton", "adam"))
-    window: int = _setting(0, "frames W in the sliding window; 0: 1 for gauss-newton, 3 for adam", low=0)
+    window: int = _setting(3, "frames W in the sliding window of adam", low=1)
     smooth: float = _setting(0.0, "weight that holds each frame to the middle of its neighbours in a last pass over the video, both ways (gauss-newton); 0 for none", low=0)
     patience: int = _setting(100, "iterations of adam without improvement after which the window moves on", low=1)
     period: int = _setting(500, "largest number of iterations of adam in a window", low=1)
@@ -55,8 +55,8 @@ class Settings:
 
     @property
     def width(self):
-        """Frames in the sliding window."""
-        return self.window or {"gauss-newton": 1, "adam": 3}[self.solver]
+        """Frames that are solved together."""
+        return self.window if self.solver == "adam" else 1
 
     @property
     def lighting(self):

@@ -31,7 +31,8 @@ class Track:
 
     ``states``: one dict of arrays (:meth:`Unknowns.to_numpy`) a frame; ``next_window``: first frame of the next window to solve;
     ``iterations``, ``seconds``: one entry a solved window; ``totals``: its terms at the minimum; ``lost``: frame -> reason for
-    those that keep the state of the frame before; ``unusable``: those among them whose image breaks the objective; ``finished``: whether the
+    those that keep the state of the frame before; ``unusable``: those among them whose image breaks the objective; ``sigma``: frame ->
+    standard deviation of each vertex along its ray [m], from solvers that know; ``finished``: whether the
     solver has looked back over the whole.
     """
 
@@ -42,13 +43,16 @@ class Track:
     totals: list = field(default_factory=list)
     lost: dict = field(default_factory=dict)
     unusable: dict = field(default_factory=dict)
+    sigma: dict = field(default_factory=dict)
     finished: bool = False
 
     def save(self, path):
         arrays = {name: np.stack([s[name] for s in self.states]) for name in Unknowns.NAMES}
         meta = {k: getattr(self, k) for k in ("next_window", "iterations", "seconds", "totals", "lost", "unusable", "finished")}
+        known = sorted(self.sigma)
+        sigma = {"sigma_frames": np.array(known, dtype=np.int64), "sigma": np.stack([self.sigma[k] for k in known])} if known else {}
         with aside(path) as temporary:
-            np.savez(temporary, meta=json.dumps(meta), **arrays)
+            np.savez(temporary, meta=json.dumps(meta), **arrays, **sigma)
 
     @classmethod
     def load(cls, path):
@@ -56,12 +60,13 @@ class Track:
             with np.load(path) as data:
                 meta = json.loads(str(data["meta"]))
                 arrays = {name: data[name] for name in Unknowns.NAMES}
+                sigma = dict(zip(data["sigma_frames"].tolist(), data["sigma"])) if "sigma" in data else {}
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             raise InputError(f"{path}: not a checkpoint of a run ({error}); start again with --overwrite") from None
         for name in ("lost", "unusable"):
             meta[name] = {int(k): v for k, v in meta[name].items()}
         count = len(arrays["rotation"])
-        return cls(states=[{name: arrays[name][k] for name in arrays} for k in range(count)], **meta)
+        return cls(states=[{name: arrays[name][k] for name in arrays} for k in range(count)], sigma=sigma, **meta)
 
 
 def track(problem, solver, frames, out, *, resume=False, progress=None):
@@ -96,13 +101,26 @@ def _look_back(problem, solver, done):
         around = np.r_[misfit[max(0, k - _AROUND) : k], misfit[k + 1 : k + 1 + _AROUND]]
         if not misfit[k] <= _SUSPECT * np.nanmedian(around) + _SUSPECT_MARGIN:
             suspect.append(k)
-    for k in suspect:
-        if k not in done.unusable:
-            done.states[k], done.totals[k] = solver.revisit(problem, k, done.states[k - 1], done.states[k + 1], done.totals[k], _HOLD)
+    again = [(k, _HOLD) for k in suspect]
     if smooth > 0:
-        for k in [*range(count - 2, 0, -1), *range(1, count - 1)]:
-            if k not in done.unusable:
-                done.states[k], done.totals[k] = solver.revisit(problem, k, done.states[k - 1], done.states[k + 1], done.totals[k], smooth)
+        again += [(k, smooth) for k in (*range(count - 2, 0, -1), *range(1, count - 1))]
+    for k, weight in again:
+        if k in done.unusable:
+            continue
+        began = time.perf_counter()
+        try:
+            solution = solver.revisit(problem, k, done.states[k - 1], done.states[k + 1], done.totals[k], weight)
+        except BadFrame:
+            continue
+        done.states[k], done.totals[k] = solution.window[0].to_numpy(), _numbers({**solution.terms, **solution.facts})
+        done.sigma[k] = solution.sigma[0]
+        done.seconds[k] += time.perf_counter() - began
+        done.lost.pop(k, None)
+
+
+def _numbers(values):
+    """JSON has no NaN: None instead."""
+    return {name: x if np.isfinite(x) else None for name, x in values.items()}
 
 
 def _advance(problem, solver, done, start, width, log, progress):
@@ -114,7 +132,7 @@ def _advance(problem, solver, done, start, width, log, progress):
     latest = [0]
 
     def record(iteration, total, terms, **more):
-        numbers = {name: x if np.isfinite(x) else None for name, x in {"loss": total, **terms}.items()}  # JSON has no NaN
+        numbers = _numbers({"loss": total, **terms})
         log.write(json.dumps({"frame": problem.sequence.indices[members[-1]], "iteration": iteration, **numbers, **more}) + "\n")
 
     def report(iteration, total, terms):
@@ -124,13 +142,14 @@ def _advance(problem, solver, done, start, width, log, progress):
         if progress:
             progress(members[-1], iteration, total, terms)
 
-    solved, terms, facts, failed = {}, dict.fromkeys(TERMS, math.nan), {}, {}
+    solved, sigma, terms, facts, failed = {}, {}, dict.fromkeys(TERMS, math.nan), {}, {}
     while usable := [k for k in members if k not in done.unusable]:
         before = [Unknowns.from_numpy(done.states[k]) for k in usable]
         try:
             past = [(done.states[k], done.totals[k - width + 1]) for k in range(max(width - 1, members[-1] - _PAST), members[-1])]
             solution = solver.solve(problem, before, usable, report, past)
             solved, terms, facts, latest[0] = dict(zip(usable, solution.window)), solution.terms, solution.facts, solution.iterations
+            sigma = dict(zip(usable, solution.sigma or []))
             break
         except BadFrame as error:
             if latest[0]:  # it was finite at the start: the solver ran away, the image is not to blame
@@ -148,13 +167,15 @@ def _advance(problem, solver, done, start, width, log, progress):
                 failed[k] = "the surface left the image"
             else:
                 done.states[k] = state
+                if k in sigma:
+                    done.sigma[k] = sigma[k]
         if k > 0 and (k in failed or k in done.unusable):
             done.states[k] = dict(done.states[k - 1])
     done.lost = {k: reason for k, reason in done.lost.items() if k not in members} | failed | done.unusable
     done.next_window = start + 1
     done.iterations.append(latest[0])
     done.seconds.append(time.perf_counter() - began)
-    done.totals.append({name: x if np.isfinite(x) else None for name, x in {**terms, **facts}.items()})
+    done.totals.append(_numbers({**terms, **facts}))
 
 
 def _trim_log(path, next_window):

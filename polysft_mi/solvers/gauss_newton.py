@@ -53,7 +53,7 @@ FAR = Stage(6.0, 1e2, 6)  # before the others where the sheet has moved far
 class GaussNewton:
     """Second-order descent, frame by frame: Gauss-Newton curvatures of all terms, damped after Levenberg and Marquardt.
 
-    A frame starts from the one before or from where its motion leads, whichever explains the image better. Where it ends with a misfit far above that of
+    The window is the frame itself; ``revisit`` looks both ways. A frame starts from the one before or from where its motion leads, whichever explains the image better. Where it ends with a misfit far above that of
     the frames before, other starts are tried: farther motion, and the rigid pose of the flat template by features. The order of the jet rises from
     ``order`` to at most ``order_max`` where the objective asks for it, and falls where it does not.
     """
@@ -67,9 +67,9 @@ class GaussNewton:
         self._hold = 0.0  # weight of the difference to the anchor, motion included, where a frame is solved again
 
     def solve(self, problem, window, frames, report=None, past=()):
-        """Minimise over the newest of ``frames``, then in turn over all of the window: :class:`Solution`.
+        """Minimise over the only one of ``frames``: :class:`Solution`.
 
-        ``window``: list of Unknowns; ``past``: of the frames before the window's newest, oldest first, (arrays of ``Unknowns.to_numpy``, terms).
+        ``window``: its Unknowns, in a list; ``past``: of the frames before it, oldest first, (arrays of ``Unknowns.to_numpy``, terms and facts).
         """
         if problem is not self._problem:
             self._prepare(problem)
@@ -78,12 +78,10 @@ class GaussNewton:
         self._scales, self._fitting = self._scales_of(past[-1][1] if past else {}), {}
         history = [self.chart.state(arrays) for arrays, _ in past[-2:]]
         newest = self._newest(self.chart.state(window[-1].to_numpy()), frames[-1], history, [terms for _, terms in past])
-        states = [self.chart.state(w.to_numpy()) for w in window[:-1]] + [newest[0]]
-        terms = newest[1]
-        return self._solution(states, terms, frames)
+        return self._solution(*newest)
 
     def revisit(self, problem, frame, before, after, terms, weight):
-        """Solve a frame again, held to the middle of its neighbours: (arrays, terms).
+        """Solve a frame again, held to the middle of its neighbours: :class:`Solution`.
 
         ``before``, ``after``: arrays of ``Unknowns.to_numpy`` of the frames on either side; ``terms``: of the frame so far; ``weight``: of the
         squared difference to the middle.
@@ -100,8 +98,7 @@ class GaussNewton:
             state, found = self._descend(middle, middle, frame, order, STAGES)
         finally:
             self._hold = 0.0
-        solution = self._solution([state], found, [frame])
-        return solution.window[0].to_numpy(), {**solution.terms, **solution.facts}
+        return self._solution(state, found)
 
     # -- preparation --------------------------------------------------------
 
@@ -280,7 +277,11 @@ class GaussNewton:
         if self._report:
             self._report(self._count, total, terms)
         self._count += 1
-        return normal, {**terms, "total": total, "misfit": evaluation.misfit, "outlying": evaluation.outlying, "order": order}
+        # what the residuals' own size says of their noise; pixels closer than the blur are no evidence of their own
+        level = self.levels[stage]
+        noise = 2 * evaluation.photometric / (3 * max(evaluation.pixels, 1.0)) * max(1.0, 4 * math.pi * level.sigma**2)
+        facts = {"misfit": evaluation.misfit, "outlying": evaluation.outlying, "order": order, "model": (normal, surface, noise)}
+        return normal, {**terms, "total": total, **facts}
 
     # -- order --------------------------------------------------------------
 
@@ -304,9 +305,21 @@ class GaussNewton:
 
     # -- results ------------------------------------------------------------
 
-    def _solution(self, states, terms, frames):
-        window = [Unknowns.from_numpy(self.chart.arrays(state)) for state in states]
+    def _solution(self, state, terms):
         terms = dict(terms)
+        model = terms.pop("model")
         facts = {name: terms.pop(name) for name in ("misfit", "outlying", "order")}
         facts |= {f"scale_{k}": self._fitting.get(stage, _FIRST_SCALE) for k, stage in enumerate((FAR, *STAGES))}
-        return Solution(window, terms.pop("total"), terms, self._count, facts)
+        window = [Unknowns.from_numpy(self.chart.arrays(state))]
+        return Solution(window, terms.pop("total"), terms, self._count, facts, [self._sigma(*model)])
+
+    def _sigma(self, normal, surface, noise):
+        """Standard deviation (N,) [m, float32] of each vertex along its ray, from the curvatures of the whole objective: NaN where they are singular."""
+        ray = surface.vertices - self._problem.camera.origin
+        ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+        by_global = np.column_stack([(ray @ surface.up)[:, None] * surface.basis, np.einsum("nk,nkm->nm", ray, surface.by_motion)])
+        try:
+            variance = Reduced(self.blocks, normal, 1e-9).variance(np.einsum("nk,nka->na", ray, surface.by_uv), by_global)
+        except (LinAlgError, np.linalg.LinAlgError):
+            variance = np.full(len(ray), np.nan)
+        return np.sqrt(noise * variance).astype(np.float32)
