@@ -69,7 +69,7 @@ def run(scene, overrides, counts, folder, say=print):
     from polysft_mi.sequence import Sequence
     from polysft_mi.tracker import track
 
-    experiment = scenes.load(scene, overrides)
+    experiment = scenes.load(scene, {"solver": "adam", **overrides})
     s = experiment.settings
     sequence = Sequence.open(experiment.frames, experiment.masks, first=s.first, last=s.last, stride=s.stride, size=experiment.size)
     problem = Problem(experiment, sequence)
@@ -80,7 +80,7 @@ def run(scene, overrides, counts, folder, say=print):
         say(f"frames 0 to {frame - 1} of the selection as usual ...")
         states = track(problem, solvers.create(s), frame, folder).states
         states.append(states[-1])  # each new frame is started from the last
-    window = [Unknowns.from_numpy(state) for state in states[-s.window :]]
+    window = [Unknowns.from_numpy(state) for state in states[-s.width :]]
     members = list(range(frame + 1 - len(window), frame + 1))
     last = max(counts)
     say(f"frames {members[0]} to {frame}: {last} iterations ...")

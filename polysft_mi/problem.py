@@ -235,6 +235,9 @@ class Problem:
                 raise InputError(f"{where} does not meet the mask of the first frame: it projects to x {low[0]:g}..{high[0]:g}, y {low[1]:g}..{high[1]:g}")
 
         if not self._raster:
+            if self.settings.solver != "adam":
+                name = self.experiment.renderer.class_name()
+                raise InputError(f"{self.experiment.path}: solver {self.settings.solver} renders with raster, not with {name}; give solver=adam for that")
             self._check_gradient()
 
     def _check_gradient(self):

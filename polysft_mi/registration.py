@@ -4,16 +4,19 @@ Visibility comes from Mitsuba (one ray a pixel, :meth:`RasterIntegrator.look`), 
 and their derivatives are closed forms, summed on the device per triangle. Import only after a Mitsuba variant is set.
 """
 
+import math
 from collections import OrderedDict
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
+import cv2
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import cKDTree
 
+from .problem import BadFrame
 from .pyramid import compared, level_image
 
 _TEXELS = 1.5  # texels of the baked texture to a pixel of the first frame
@@ -110,15 +113,15 @@ class Registration:
             sigma = _TEXELS * np.sqrt(level.sigma**2 + (_PIXEL_BLUR * level.stride) ** 2)
             weight = self.texture_inside if self.problem.experiment.masks else None
             image = compared(self.texture, weight, sigma, _TEXELS * level.window, self.normalise)
-            self.set_texture(level, image)
+            trusted = np.ones_like(self.texture_inside)
+            if weight is None and self.normalise:  # the background goes into a frame's local statistics near the border
+                distance = cv2.distanceTransform(self.texture_inside.astype(np.uint8), cv2.DIST_L2, 3)
+                trusted = (distance > min(_TEXELS * level.window, 0.5 * distance.max())).astype(np.float32)
+            packed = np.concatenate([image, trusted[..., None]], -1).astype(np.float32)
+            entry = mi.Float(np.ascontiguousarray(packed).ravel()), image.shape[1], image.shape[0]
+            dr.eval(entry[0])
+            self._textures[level] = entry
         return self._textures[level]
-
-    def set_texture(self, level, image):
-        """Take an image (h, w, 3) of the baked texture's size as the texture at a level."""
-        packed = np.concatenate([image, np.zeros_like(image[..., :1])], -1).astype(np.float32)
-        entry = mi.Float(np.ascontiguousarray(packed).ravel()), image.shape[1], image.shape[0]
-        dr.eval(entry[0])
-        self._textures[level] = entry
 
     def shift_texture(self, chart, displaced):
         """Move the texture on the template: what lies at ``chart`` (N, 2) is shown at ``displaced`` (N, 2) instead. Whether that could be done."""
@@ -163,6 +166,8 @@ class Registration:
         entry = self._frames[key]
         if not isinstance(entry, tuple):
             image = entry.result()
+            if not np.isfinite(image.colour).all():
+                raise BadFrame(frame, math.nan)
             packed = mi.Float(np.ascontiguousarray(np.concatenate([image.colour, image.inside[..., None]], -1)).ravel())
             mask = mi.Float(np.ascontiguousarray(image.mask).ravel()) if image.mask is not None else None
             area = max(1.0, float(image.mask.sum())) if image.mask is not None else None
@@ -215,9 +220,10 @@ class Registration:
         ly = local // width
         pixel = (ly + y0) * dr.opaque(mi.UInt32, image.colour.shape[1]) + (local - ly * width + x0)
         target = dr.gather(mi.Vector4f, packed, pixel, hit)
-        weight = dr.select(hit, target.w, 0)
-        target.w = 0
-        residual = dr.select(weight > 0, top + (bottom - top) * fy - target, 0)
+        seen = top + (bottom - top) * fy
+        weight = dr.select(hit & (seen.w > 0.5), target.w, 0)
+        seen.w, target.w = 0, 0
+        residual = dr.select(weight > 0, seen - target, 0)
         return residual, weight, triangle, (b1, b2), (p0, e1, e2), (c1 - c0, c2 - c0), (by_x, by_y)
 
     def residuals(self, vertices, frame, level):
@@ -275,7 +281,8 @@ class Registration:
                 dr.scatter_add(out, packet(*sums[4 * k : 4 * k + 4]), triangle * _PACKETS + k, active, mode=dr.ReduceMode.Local)
             dr.eval(out)
             pairs = self._silhouette(view, frame, level) if s.k_silhouette > 0 else None
-        table = np.array(out).reshape(faces, 4 * _PACKETS)
+        # rounded, so that the order in which threads added does not show
+        table = np.array(out).astype(np.float32).astype(np.float64).reshape(faces, 4 * _PACKETS)
         *_, area = self._frame_level(frame, level)
         energy, pixels, outlying, misfit = table[:, 27:31].sum(0).tolist()
         weight = s.k_rgb / (area or max(pixels, 1.0))
@@ -321,7 +328,9 @@ class Registration:
             dr.backward(weight)
             weight, da, db = dr.detach(weight), dr.grad(ea), dr.grad(eb)
         step = dr.gather(mi.Float, alpha, other) - dr.gather(mi.Float, alpha, to)
-        dr.scatter_add(alpha, weight * step, to)
+        alpha = mi.Float64(alpha)
+        dr.scatter_add(alpha, mi.Float64(weight * step), to)
+        alpha = mi.Float(alpha)
         error = dr.sum(dr.square(alpha - wanted) - dr.square(wanted))
         excess = dr.gather(mi.Float, alpha - wanted, to)
         at = dr.gather(mi.UInt32, pixel, to)

@@ -141,7 +141,7 @@ def problem(folder, masks=True, **overrides):
     layout = prepare.recognise(str(truth.folder))
     path = folder / "scene.xml"
     path.write_text(prepare.scene_xml(layout, str(truth.folder)))
-    experiment = scene.load(path, overrides)
+    experiment = scene.load(path, {"solver": "adam", **overrides})
     return Problem(experiment, Sequence.open(experiment.frames, experiment.masks, size=experiment.size)), truth
 
 
@@ -232,7 +232,7 @@ def test_padding_does_not_change_the_loss(tmp_path):
             )
         path = tmp_path / f"{name}.xml"
         path.write_text(prepare.scene_xml(prepare.recognise(str(truth.folder)), str(truth.folder)))
-        experiment = scene.load(path)
+        experiment = scene.load(path, {"solver": "adam"})
         p = Problem(experiment, Sequence.open(experiment.frames, experiment.masks, size=experiment.size))
         totals.append(p.evaluate([p.patch.rest()], [4])[0])
     assert totals[1] == pytest.approx(totals[0], rel=1e-3)

@@ -113,7 +113,7 @@ class GaussNewton:
         position, _ = problem.camera.project(template.vertices)
         corner = position[self.registration.faces]
         a, b = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
-        unit = math.sqrt(0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum()) / _SHEET
+        unit = max(1.0, math.sqrt(0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum()) / _SHEET)
         self.levels = {}
         for stage in (FAR, *STAGES):
             sigma = stage.blur * unit
