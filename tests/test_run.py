@@ -226,7 +226,8 @@ def test_no_masks(tmp_path):
     truth = synthetic.cloth(tmp_path / "sheet", frames=4, size=(240, 180), masks=False, bend=1.5, turn=0.1)
     prepare.main([str(truth.folder)])
     out = tmp_path / "out"
-    assert run.main([str(truth.folder / "scene.xml"), "-o", str(out), "-q"]) == 0
+    # the smooth texture here has little that survives local normalisation
+    assert run.main([str(truth.folder / "scene.xml"), "-o", str(out), "-q", "-D", "brightness=none"]) == 0
     figures = metrics.score(surface(out), str(truth.folder / "gt.npz"))
     assert figures["rmse_mm"] < 4
 
