@@ -61,10 +61,10 @@ class Template:
         points = torch.as_tensor(np.asarray(vertices, dtype=np.float64))
         frame = CanonicalFrame.from_points(points)
         x = frame.to_chart(points)
-        try:
-            alpha = jets.fit(x, order)
-        except ValueError as error:
-            raise InputError(f"{where}: order = {order} is too high: {error}") from None
+        fitted = jets.fit(x, order)
+        if fitted.order < order:
+            raise InputError(f"{where}: order = {order} is too high: its {len(points)} vertices determine no more than order {int(fitted.order)}")
+        alpha = fitted.alpha
         residual = (x[:, 2] - jets.height(alpha, x[:, :2])).numpy() * float(frame.s)
         template = cls(
             np.asarray(vertices, dtype=np.float64),
