@@ -12,8 +12,15 @@ _EXPORTS = {
     "metric": "jets",
     "second_fundamental_form": "jets",
     "principal_curvatures": "jets",
+    "turned_over": "jets",
     "fit": "jets",
     "JetFit": "jets",
+    "Patches": "patches",
+    "patch_count": "patches",
+    "PatchedSurface": "surface",
+    "smoothed": "surface",
+    "read_mesh": "meshio",
+    "write_ply": "meshio",
     "InputError": "errors",
 }
 

@@ -20,14 +20,13 @@ class CanonicalFrame:
     T: torch.Tensor
 
     @classmethod
-    def from_points(cls, points, mask=None, *, weights=None, up=None):
+    def from_points(cls, points, mask=None, *, weights=None):
         """By principal components of points (..., P, 3): T is their mean, s their largest distance from it, z the direction of least spread.
 
         ``mask`` (..., P) bool: the points that exist; ``weights`` (..., P) not negative, for mean and spread. Signs are fixed by
         the data, so that the frame turns with the points: u and v point to the side where the third moment of the coordinate
         is positive (for a symmetric patch: to the side of the first point that is half as far out as the farthest), z follows by the right hand.
-        With ``up`` (..., 3), z points to its side instead, and v follows. In float64 inside, in the points' dtype outside, and without gradient:
-        a frame is a choice of coordinates. Raises InputError where a patch has no points, or points that are not finite or all the same.
+        In float64 inside, in the points' dtype outside, and without gradient: a frame is a choice of coordinates. Raises InputError where a patch has no points, or points that are not finite or all the same.
         """
         with torch.no_grad():
             dtype, points = points.dtype, points.detach().to(torch.float64)
@@ -45,15 +44,11 @@ class CanonicalFrame:
             _check(points, mask, s)
             x = centred / s[..., None, None]
             _, axes = torch.linalg.eigh((w[..., None] * x).mT @ x)
-            u, v, z = axes[..., 2], axes[..., 1], axes[..., 0]
+            u, v = axes[..., 2], axes[..., 1]
             # float32 points are symmetric only to their rounding
             level = 1e-9 if dtype == torch.float64 else 1e-6
             u = u * _side(x, u, w, mask, level)
-            if up is None:
-                v = v * _side(x, v, w, mask, level)
-            else:
-                z = torch.where((z * up.to(z.dtype)).sum(-1, keepdim=True) < 0, -z, z)
-                v = torch.linalg.cross(z, u)
+            v = v * _side(x, v, w, mask, level)
             R = torch.stack([u, v, torch.linalg.cross(u, v)], -1)
             return cls(s.to(dtype), R.to(dtype), T.to(dtype))
 
@@ -69,6 +64,10 @@ class CanonicalFrame:
         """The frame whose chart is turned by the unit quaternion (..., 4) in the order (x, y, z, w): R Q, so that a point of chart
         coordinates x has Q^T x in the new chart. Differentiable; the quaternion is divided by its norm."""
         return CanonicalFrame(self.s, self.R @ rotation_matrix(quaternion), self.T)
+
+    def turned_over(self):
+        """The frame with v and z pointing the other way: a half turn about u. :func:`polyfit.jets.turned_over` does it to a jet."""
+        return CanonicalFrame(self.s, self.R * self.R.new_tensor([1, -1, -1]), self.T)
 
     def __getitem__(self, index):
         return CanonicalFrame(self.s[index], self.R[index], self.T[index])

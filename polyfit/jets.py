@@ -101,6 +101,12 @@ def metric(alpha, uv):
     return _symmetric(1 + zu * zu, zu * zv, 1 + zv * zv)
 
 
+def turned_over(alpha):
+    """The jets alpha (..., A) in charts with v and z pointing the other way: z'(u, v) = -z(u, -v)."""
+    odd = torch.as_tensor(exponents(order_of(alpha.shape[-1]))[:, 1] % 2, device=alpha.device)
+    return torch.where(odd == 1, alpha, -alpha)
+
+
 def second_fundamental_form(alpha, uv):
     """(z_uu, z_uv, z_vv) / sqrt(1 + z_u^2 + z_v^2) as a matrix, (..., P, 2, 2); positive where the surface bends towards +z."""
     zu, zv, zuu, zuv, zvv = derivatives(alpha, uv, (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
