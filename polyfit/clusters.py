@@ -89,24 +89,39 @@ def _merged(label, feature, area, edges, count):
 
 def _relaxed(label, feature, area, edges):
     """Vertices at the boundaries given to the neighbouring cluster where that lowers the energy, until few move."""
-    label, both = label.copy(), np.concatenate([edges, edges[:, ::-1]])
-    half = (np.arange(len(label)) * 2654435761) >> 7 & 1  # neighbours seldom move in the same sweep
+    label = label.copy()
     for sweep in range(SWEEPS):
         total, size = _sums(label, feature, area)
         centre = total / size[:, None]
-        v, to = both[:, 0], label[both[:, 1]]
-        at = np.flatnonzero((label[v] != to) & (half[v] == sweep % 2))
-        v, to = v[at], to[at]
-        own, w = label[v], area[v]
-        rest = np.maximum(size[own] - w, 1e-12 * size[own])
-        cost = size[to] * w / (size[to] + w) * _squared(feature[v] - centre[to]) - size[own] * w / rest * _squared(feature[v] - centre[own])
-        best = np.lexsort((cost, v))
-        best = best[np.append(True, v[best[1:]] != v[best[:-1]])] if len(best) else best
-        best = best[(cost[best] < 0) & (np.bincount(label)[own[best]] > 1)]
-        label[v[best]] = to[best]
-        if len(best) < 1e-3 * len(at) + 1:
+
+        def cost(v, own, to):
+            w = area[v]
+            rest = np.maximum(size[own] - w, 1e-12 * size[own])
+            joined = size[to] * w / (size[to] + w) * _squared(feature[v] - centre[to])
+            return joined - size[own] * w / rest * _squared(feature[v] - centre[own])
+
+        if swept(label, edges, sweep, cost) < 1e-3:
             break
     return label
+
+
+def swept(label, edges, sweep, cost):
+    """Give, in place, vertices at the clusters' boundaries to that neighbouring cluster for which ``cost(vertices, own, to)`` (C,) is least, where it is negative.
+
+    Each sweep looks at every other vertex, so that neighbours seldom move together. Returns how many of those looked at moved, as a share.
+    """
+    between = edges[label[edges[:, 0]] != label[edges[:, 1]]]
+    both = np.concatenate([between, between[:, ::-1]])
+    both = both[(both[:, 0] * 2654435761 >> 7) % 2 == sweep % 2]
+    v, to = both[:, 0], label[both[:, 1]]
+    own, change = label[v], cost(v, label[v], to)
+    best = np.lexsort((change, v))
+    best = best[np.append(True, v[best[1:]] != v[best[:-1]])[: len(best)]]
+    best = best[change[best] < 0]
+    size, leaving = np.bincount(label), np.bincount(own[best], minlength=label.max() + 1)
+    best = best[(size > leaving)[own[best]]]
+    label[v[best]] = to[best]
+    return len(best) / max(1, len(np.unique(v)))
 
 
 def _sums(label, feature, area):

@@ -130,6 +130,27 @@ def principal_curvatures(alpha, uv):
     return torch.stack([mean - half, mean + half], -1)
 
 
+def nearest(alpha, x, steps=4):
+    """Chart coordinates uv (..., P, 2) of the jets' points nearest to points x (..., P, 3) of their charts, found from the points' own (u, v) by Gauss and Newton.
+
+    A step that does not bring the point nearer is not taken. Without gradient.
+    """
+    with torch.no_grad():
+        uv = x[..., :2].clone()
+        z, zu, zv = derivatives(alpha, uv, (0, 0), (1, 0), (0, 1))
+        for _ in range(steps):
+            r = torch.stack([uv[..., 0] - x[..., 0], uv[..., 1] - x[..., 1], z - x[..., 2]], -1)
+            a, b = r[..., 0] + zu * r[..., 2], r[..., 1] + zv * r[..., 2]
+            det = 1 + zu * zu + zv * zv
+            step = torch.stack([(1 + zv * zv) * a - zu * zv * b, (1 + zu * zu) * b - zu * zv * a], -1) / det[..., None]
+            tried = uv - step
+            found = derivatives(alpha, tried, (0, 0), (1, 0), (0, 1))
+            nearer = ((tried - x[..., :2]) ** 2).sum(-1) + (found[0] - x[..., 2]) ** 2 < (r * r).sum(-1)
+            uv = torch.where(nearer[..., None], tried, uv)
+            z, zu, zv = (torch.where(nearer, new, old) for new, old in zip(found, (z, zu, zv)))
+        return uv
+
+
 def _symmetric(a, b, c):
     return torch.stack([torch.stack([a, b], -1), torch.stack([b, c], -1)], -2)
 

@@ -1,4 +1,4 @@
-"""Patches: a mesh cut into clusters of equal area by ACVD (Valette & Chassery 2004; paper, section "PolyFit" and supplement)."""
+"""Patches: a mesh cut into connected clusters by ACVD (Valette & Chassery 2004; paper, section "PolyFit" and supplement)."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -24,8 +24,8 @@ class Patches:
     """A mesh and its cut.
 
     The cut is made on the mesh after ``levels`` subdivisions, ``vertices`` (M, 3) float64 [m] and ``faces`` (G, 3); the first N vertices are
-    those given, the ``given`` faces (F, 3) become the rows 4^levels f onwards. ``corner_patch`` (G, 3): the patch of each corner of each face.
-    All corners at a vertex agree, except where the surface is no manifold and several of its sheets meet.
+    those given, the ``given`` faces (F, 3) become the rows 4^levels f onwards. ``sheets`` (G, 3) are the same faces on vertices that are split where the
+    surface is no manifold (:func:`polyfit.mesh.sheets`), S of them, and ``label`` (S,) is the patch of each.
 
     A patch's *chart* holds all vertices of the faces that touch the patch, so that the charts of neighbours overlap by one row
     of faces. One vertex in one chart is an *entry*: ``entry_patch`` (E,), rising, and ``entry_vertex`` (E,).
@@ -36,7 +36,8 @@ class Patches:
     faces: np.ndarray
     given: np.ndarray
     levels: int
-    corner_patch: np.ndarray
+    sheets: np.ndarray
+    label: np.ndarray
     entry_patch: np.ndarray
     entry_vertex: np.ndarray
     face_entries: np.ndarray
@@ -69,9 +70,18 @@ class Patches:
             F, edges = mesh.subdivided(F)
             V = np.concatenate([V, V[edges].mean(axis=1)])
             split = mesh.subdivided(split)[0]
-        of_vertex = _cluster(V, F, split, np.repeat(part, 4**levels), count)
-        corner_patch = of_vertex[split]
-        return cls(V, F, given, levels, corner_patch, *_entries(len(V), F, corner_patch))
+        label = _cluster(V, F, split, np.repeat(part, 4**levels), count)
+        return cls(V, F, given, levels, split, label, *_entries(len(V), F, label[split]))
+
+    def relabelled(self, label):
+        """The same mesh cut otherwise: ``label`` (S,), each of 0 .. K - 1 used and connected."""
+        entries = _entries(len(self.vertices), self.faces, label[self.sheets])
+        return Patches(self.vertices, self.faces, self.given, self.levels, self.sheets, label, *entries)
+
+    @cached_property
+    def corner_patch(self):
+        """The patch of each corner of each face, (G, 3)."""
+        return self.label[self.sheets]
 
     @cached_property
     def vertex_entry(self):

@@ -17,7 +17,8 @@ class PatchedSurface:
     """S_k = {O_k, phi_k(u, v)}, k = 1..K: patches, their orientations, their jets, and the chart of every vertex.
 
     ``patches``: the :class:`polyfit.patches.Patches` of the mesh; ``frame``: the orientations, (K,); ``alpha`` (K, A): the
-    coefficients, in charts whose z points to the side of the faces' normals; ``order`` (K,): the order fitted; ``uv`` (E, 2): chart coordinates of the entries.
+    coefficients, in charts whose z points to the side of the faces' normals; ``order`` (K,): the order fitted; ``uv`` (E, 2): chart coordinates of
+    the entries, those of the jet's point nearest to the vertex.
     ``dataclasses.replace`` with another ``alpha`` or ``frame`` gives the deformed surface on the same charts; all that follows
     from them is differentiable. Charts overlap at the patches' boundaries, where :meth:`at` blends them.
     """
@@ -57,13 +58,22 @@ class PatchedSurface:
         over = frame.turned_over()
         frame = CanonicalFrame(frame.s, torch.where(under[:, None, None], over.R, frame.R), frame.T)
         alpha = torch.where(under[:, None], jets.turned_over(jet.alpha), jet.alpha)
-        uv = frame.to_chart(points)[..., :2][mask]
+        uv = jets.nearest(alpha, frame.to_chart(points))[mask]
         return cls(patches, frame, alpha, jet.order, uv)
 
     @classmethod
-    def from_mesh(cls, vertices, faces, count=None, order=4, **options):
-        """Cut the mesh (N, 3) [m], (F, 3) into patches (:meth:`polyfit.patches.Patches.cut`) and :meth:`fit` them with ``options``."""
-        return cls.fit(Patches.cut(vertices, faces, count), order, **options)
+    def from_mesh(cls, vertices, faces, count=None, order=4, *, rounds=5, where="mesh", **options):
+        """Cut the mesh (N, 3) [m], (F, 3) into patches (:meth:`polyfit.patches.Patches.cut`), :meth:`fit` them with ``options``, and let
+        the boundaries move to where the jets fit best, ``rounds`` times (:func:`polyfit.refine.refined`)."""
+        from .refine import refined
+
+        return refined(cls.fit(Patches.cut(vertices, faces, count, where=where), order, **options), rounds, **options)
+
+    @property
+    def residual(self):
+        """Distance of each entry's vertex from its chart's jet, (E,) [m], to first order: along z, divided by the slope."""
+        vertices = torch.as_tensor(self.patches.vertices, dtype=self.uv.dtype, device=self.uv.device)
+        return self.distance(self._index(self.patches.entry_patch), vertices[self._index(self.patches.entry_vertex)])
 
     # ---- patches and chart coordinates -> the surface -----------------------------------------------------------------
 
@@ -71,6 +81,13 @@ class PatchedSurface:
         """Points (..., 3) [m] at uv (..., 2) of the patches ``patch`` (...,)."""
         z = self._of(jets.height, patch, uv)
         return self._turned(patch, torch.cat([uv, z[..., None]], -1)) * self.frame.s[patch][..., None] + self.frame.T[patch]
+
+    def distance(self, patch, points):
+        """Distances (...,) [m] of points (..., 3) [m] from the jets of the patches ``patch`` (...,), to first order: along z, divided by the slope."""
+        frame = self.frame[patch]
+        x = frame.to_chart(points[..., None, :])
+        z, zu, zv = (d.squeeze(-1) for d in jets.derivatives(self.alpha[patch], x[..., :2], (0, 0), (1, 0), (0, 1)))
+        return frame.s * (z - x[..., 0, 2]).abs() / (1 + zu * zu + zv * zv).sqrt()
 
     def tangents(self, patch, uv):
         """Derivatives of the points along u and v, each (..., 3) [m]."""
