@@ -30,6 +30,8 @@ class CanonicalFrame:
         """
         with torch.no_grad():
             dtype, points = points.dtype, points.detach().to(torch.float64)
+            if points.shape[-2] == 0:
+                raise InputError("patches without points")
             w = points.new_ones(points.shape[:-1]) if weights is None else weights.detach().to(torch.float64)
             if mask is not None:
                 w = torch.where(mask, w, 0)
@@ -101,7 +103,7 @@ def _side(x, axis, w, mask, level):
 
 
 def _check(points, mask, s):
-    bad = ~(s > 0) | ~s.isfinite()
+    bad = ~(s > 1e-12 * points.abs().amax((-1, -2))) | ~s.isfinite()
     if not bad.any():
         return
     at = tuple(int(i) for i in bad.nonzero()[0])

@@ -179,6 +179,8 @@ def fit(points, order, *, weights=None, mask=None):
     if points.ndim < 2 or points.shape[-1] != 3:
         raise InputError(f"points of shape {tuple(points.shape)}; (..., points, 3) is needed")
     shape = points.shape[:-1]
+    if shape[-1] == 0:
+        raise InputError("patch 0 has no points")
     flat = points.reshape(-1, *points.shape[-2:])
     if mask is not None:
         mask = mask.expand(shape).reshape(flat.shape[:2])
@@ -189,8 +191,6 @@ def fit(points, order, *, weights=None, mask=None):
         weights = weights.expand(shape).reshape(flat.shape[:2])
         if mask is not None:
             weights = torch.where(mask, weights, 0)
-    if flat.shape[1] == 0 and flat.shape[0]:
-        raise InputError("patch 0 has no points")
     if mask is not None:  # padding is moved onto a point of the patch, where it changes neither box nor sums
         first = mask.to(torch.uint8).argmax(1)
         flat = torch.where(mask[..., None], flat, flat[torch.arange(len(flat), device=flat.device), first][:, None])
