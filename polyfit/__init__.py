@@ -22,6 +22,8 @@ _EXPORTS = {
     "read_mesh": "meshio",
     "write_ply": "meshio",
     "InputError": "errors",
+    "PolyFit": "stn",
+    "SpatialTransformer": "stn",
 }
 
 __all__ = sorted(_EXPORTS)

@@ -8,6 +8,9 @@ from dataclasses import dataclass
 
 import torch
 
+# curvature * |height| of a bend, at most, for the points farthest from its axis: they are stretched by 1.8 or shrunk to 0.2.
+STRONGEST = 0.8
+
 
 @dataclass(frozen=True)
 class SmoothMaps:
@@ -42,6 +45,9 @@ class SmoothMaps:
 def _bend(x, frame, curvature):
     """Rolls space about the second axis of ``frame`` (B, 3, 3; columns: along, across, up): the plane up = 0 becomes a cylinder of ``curvature`` (B, 1)."""
     along, across, up = (x @ frame).unbind(-1)
+    # at up = 1 / curvature space would shrink to a line, and turn inside out beyond
+    most = STRONGEST / up.detach().abs().amax(1, keepdim=True).clamp_min(1e-6)
+    curvature = torch.maximum(torch.minimum(curvature, most), -most)
     angle = curvature * along
     half = torch.special.sinc(angle / (2 * torch.pi))
     along, up = along * torch.special.sinc(angle / torch.pi) - up * torch.sin(angle), along * half * half * angle / 2 + up * torch.cos(angle)
@@ -54,7 +60,7 @@ def _frames(shape, generator):
     return q * torch.linalg.det(q)[..., None, None]
 
 
-def random(count, generator, *, stretch=0.3, bend=3.0, bends=2, waves=4, frequency=(1.0, 6.0), steepness=0.9):
+def random(count, generator, *, stretch=0.3, bend=4.0, bends=3, waves=4, frequency=(1.0, 6.0), steepness=0.9):
     """``count`` random maps, float32.
 
     ``stretch`` is the largest logarithm of a scale; ``bend`` the largest curvature of a bend; ``waves`` plane waves have wave numbers in ``frequency`` and together push

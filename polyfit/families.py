@@ -14,6 +14,7 @@ import math
 import torch
 
 from . import jets
+from .errors import InputError
 
 FAMILIES = ("jet", "trigonometric", "gaussian", "bessel")
 
@@ -61,11 +62,11 @@ def bessel(alpha, centre, uv):
 def sample(patches, points, generator, families=FAMILIES):
     """``patches`` random surfaces at ``points`` random places each: points (B, P, 3) and unit normals (B, P, 3), float64, z up.
 
-    ``families`` names the functions that are summed; ``generator`` is a CPU ``torch.Generator``. Raises ValueError for a name that is none of ``FAMILIES``.
+    ``families`` names the functions that are summed; ``generator`` is a CPU ``torch.Generator``. Raises InputError for a name that is none of ``FAMILIES``.
     """
     unknown = sorted(set(families) - set(FAMILIES))
     if unknown or not families:
-        raise ValueError(f"families {', '.join(unknown) or 'empty'}: choose among {', '.join(FAMILIES)}")
+        raise InputError(f"families {', '.join(unknown) or 'empty'}: choose among {', '.join(FAMILIES)}")
     uv = _uniform((patches, points, 2), -1, 1, generator)
     z, slope = torch.zeros(patches, points, dtype=torch.float64), torch.zeros(patches, points, 2, dtype=torch.float64)
 

@@ -1,6 +1,6 @@
 """Trains PolyFit's spatial transformer, or a network that it is held against.
 
-    python -m polyfit.train [MESH ...] -o OUT [--model polyfit] [--families jet trigonometric gaussian bessel] [--steps 5000] [--resume]
+    python -m polyfit.train [MESH ...] -o OUT [--model polyfit] [--families jet trigonometric gaussian bessel] [--steps 2500] [--resume]
     torchrun --nproc-per-node 2 -m polyfit.train ...
 
 MESH are garments (.obj, .ply), cut into patches and deformed at random; without any, the analytic families are all there is. OUT receives
@@ -55,7 +55,7 @@ class Settings:
     patches: int = 30_000
     points: int = 128
     reads: int = 64
-    steps: int = 5000
+    steps: int = 2500
     batch: int = 512
     lr: float = 1e-3
     charts: int = 25

@@ -17,7 +17,7 @@ VERSION = 1
 class Regressor(torch.nn.Module):
     """What both have in common: the PCA frame before, the layers from a patch's feature to alpha, the files of weights. ``points`` of each patch are read."""
 
-    def __init__(self, order, points, feature, hidden=128):
+    def __init__(self, order, points, feature, hidden=64):
         super().__init__()
         self.order, self.points = order, points
         self.head = torch.nn.Sequential(
@@ -54,7 +54,7 @@ class Regressor(torch.nn.Module):
 class PointNet(Regressor):
     """Each point alone through ``widths``, the maximum over points, two layers."""
 
-    def __init__(self, order=4, points=128, widths=(64, 128, 256)):
+    def __init__(self, order=4, points=64, widths=(32, 64, 128)):
         super().__init__(order, points, widths[-1])
         self.local = pointwise(widths)
 
@@ -65,7 +65,7 @@ class PointNet(Regressor):
 class DGCNN(Regressor):
     """EdgeConv layers over the ``neighbours`` nearest points, anew in each layer's features; their outputs together through one more layer, the maximum over points, two layers."""
 
-    def __init__(self, order=4, points=64, widths=(32, 64), neighbours=8, feature=256):
+    def __init__(self, order=4, points=64, widths=(32, 64), neighbours=8, feature=128):
         super().__init__(order, points, feature)
         self.neighbours = neighbours
         entries = [3, *widths[:-1]]
