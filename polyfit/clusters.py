@@ -13,8 +13,8 @@ import numpy as np
 
 from . import mesh
 
-# Weight w of the normals against positions.
-NORMALS = 1.5
+# Weights w of the normals against positions, tried in this order until no more than this share of the area is folded over.
+NORMALS, FOLDED = (1.5, 3.0, 6.0), 0.01
 # Clusters of the fine cut for each cluster asked for, and the vertices that each of them should have.
 FINE, FINE_VERTICES = 12, 4
 # Sweeps over the boundaries, at most.
@@ -24,15 +24,28 @@ SWEEPS = 100
 def clusters(points, normals, area, faces, edges, count):
     """Labels 0 .. count - 1 (P,) of a connected mesh: points (P, 3) [m], unit normals (P, 3), area (P,) [m^2] around each, faces (F, 3), edges (E, 2).
 
-    Every cluster is connected; there may be fewer than ``count``.
+    Every cluster is connected; there may be fewer than ``count``. Where clusters still fold over, the normals get more weight, as long as that helps.
     """
     radius = np.sqrt(area.sum() / (np.pi * count))
-    feature = np.concatenate([points / radius, NORMALS * normals], axis=1)
     fine = max(count, min(FINE * count, len(points) // FINE_VERTICES))
-    label = connected(_acvd(points, faces, fine), edges, area)
-    label = np.unique(label, return_inverse=True)[1]
-    label = _merged(label, feature, area, edges, count)
-    return connected(_relaxed(label, feature, area, edges), edges, area)
+    fine = connected(_acvd(points, faces, fine), edges, area)
+    fine = np.unique(fine, return_inverse=True)[1]
+    best, least = None, np.inf
+    for weight in NORMALS:
+        feature = np.concatenate([points / radius, weight * normals], axis=1)
+        label = connected(_relaxed(_merged(fine, feature, area, edges, count), feature, area, edges), edges, area)
+        folded = _folded(label, normals, area)
+        if folded < 0.9 * least:
+            best, least = label, folded
+        if folded <= FOLDED or folded > least:
+            break
+    return np.unique(best, return_inverse=True)[1]
+
+
+def _folded(label, normals, area):
+    """Share of the area that faces away from its cluster's mean normal."""
+    mean = _sums(label, normals, area)[0]
+    return area[(normals * mean[label]).sum(axis=1) < 0].sum() / area.sum()
 
 
 def _acvd(points, faces, count):
