@@ -52,14 +52,14 @@ class Template:
         return float(np.abs(self.residual).max())
 
     @classmethod
-    def fit(cls, vertices, faces, uv, order, *, tolerance=0.05, where="template"):
-        """Fit a jet of ``order`` to the mesh.
+    def fit(cls, vertices, faces, uv, order, *, frame=None, tolerance=0.05, where="template"):
+        """Fit a jet of ``order`` to the mesh, in ``frame``, a :class:`polyfit.frames.CanonicalFrame` in float64, or else in its PCA frame.
 
         Raises InputError where the order is too high for the vertices, where the surface folds over in its chart (a closed surface does), or
         where the largest residual exceeds ``tolerance`` times the scale s.
         """
         points = torch.as_tensor(np.asarray(vertices, dtype=np.float64))
-        frame = CanonicalFrame.from_points(points)
+        frame = frame or CanonicalFrame.from_points(points)
         x = frame.to_chart(points)
         fitted = jets.fit(x, order)
         if fitted.order < order:
