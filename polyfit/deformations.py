@@ -1,7 +1,9 @@
-"""Random smooth maps of space that fold, bend and stretch patches: how few garments become many (``polyfit.train``), and how held-out garments are posed.
+"""Random smooth maps of space that fold, bend and stretch patches: how few garments become many (``polyfit.train``), and how held-out
+garments are posed.
 
-A map is a stretch along random axes, then bends about random axes, then plane waves. Each is applied to a batch, one map a patch, and carries the normals with it by its
-own derivative. Coordinates are in the unit of the patch (or garment): a ball of radius 1 about the origin.
+A map is a stretch along random axes, then bends about random axes, then plane waves. Each is applied to a batch, one map a patch, and
+carries the normals with it by its own derivative. Coordinates are in the unit of the patch (or garment): a ball of radius 1 about the
+origin.
 """
 
 from dataclasses import dataclass
@@ -14,7 +16,9 @@ STRONGEST = 0.8
 
 @dataclass(frozen=True)
 class SmoothMaps:
-    """B maps of space. ``scale`` (B, 3), ``axes`` (B, 3, 3); ``bend_frames`` (B, M, 3, 3), ``bend`` (B, M); ``wave`` (B, W, 3), ``push`` (B, W, 3), ``phase`` (B, W)."""
+    """B maps of space. ``scale`` (B, 3), ``axes`` (B, 3, 3); ``bend_frames`` (B, M, 3, 3), ``bend`` (B, M); ``wave`` (B, W, 3), ``push``
+    (B, W, 3), ``phase`` (B, W).
+    """
 
     scale: torch.Tensor
     axes: torch.Tensor
@@ -43,15 +47,18 @@ class SmoothMaps:
 
 
 def _bend(x, frame, curvature):
-    """Rolls space about the second axis of ``frame`` (B, 3, 3; columns: along, across, up): the plane up = 0 becomes a cylinder of ``curvature`` (B, 1)."""
+    """Rolls space about the second axis of ``frame`` (B, 3, 3; columns: along, across, up): the plane up = 0 becomes a cylinder of
+    ``curvature`` (B, 1).
+    """
     along, across, up = (x @ frame).unbind(-1)
     # at up = 1 / curvature space would shrink to a line, and turn inside out beyond
     most = STRONGEST / up.detach().abs().amax(1, keepdim=True).clamp_min(1e-6)
     curvature = torch.maximum(torch.minimum(curvature, most), -most)
     angle = curvature * along
     half = torch.special.sinc(angle / (2 * torch.pi))
-    along, up = along * torch.special.sinc(angle / torch.pi) - up * torch.sin(angle), along * half * half * angle / 2 + up * torch.cos(angle)
-    return torch.stack([along, across, up], -1) @ frame.transpose(1, 2)
+    rolled = along * torch.special.sinc(angle / torch.pi) - up * torch.sin(angle)
+    raised = along * half * half * angle / 2 + up * torch.cos(angle)
+    return torch.stack([rolled, across, raised], -1) @ frame.transpose(1, 2)
 
 
 def _frames(shape, generator):
@@ -63,9 +70,10 @@ def _frames(shape, generator):
 def random(count, generator, *, stretch=0.3, bend=4.0, bends=3, waves=4, frequency=(1.0, 6.0), steepness=0.9):
     """``count`` random maps, float32.
 
-    ``stretch`` is the largest logarithm of a scale; ``bend`` the largest curvature of a bend; ``waves`` plane waves have wave numbers in ``frequency`` and together push
-    with a derivative of at most ``steepness`` (below 1 no wave folds space over itself). Every patch draws its own strength in [0, 1] for each of the three, so that
-    mild maps are as frequent as strong ones. ``generator`` is a CPU ``torch.Generator``.
+    ``stretch`` is the largest logarithm of a scale; ``bend`` the largest curvature of a bend; ``waves`` plane waves have wave numbers in
+    ``frequency`` and together push with a derivative of at most ``steepness`` (below 1 no wave folds space over itself). Every patch draws
+    its own strength in [0, 1] for each of the three, so that mild maps are as frequent as strong ones. ``generator`` is a CPU
+    ``torch.Generator``.
     """
 
     def uniform(*shape):

@@ -1,12 +1,14 @@
-"""The four analytic families that PolyFit is trained on (paper, supplement, "Training dataset"): surfaces z = f(u, v) with their exact normals.
+"""The four analytic families that PolyFit is trained on (paper, supplement, "Training dataset"): surfaces z = f(u, v) with their exact
+normals.
 
     jet             sum_i sum_j alpha_{i-j,j} u^(i-j) v^j, i <= 4
     trigonometric   alpha cos(theta sqrt(u^2 + v^2))
     gaussian        alpha exp(-((u - u0)^2 + (v - v0)^2) / (2 sigma^2))
     bessel          alpha J0(k sqrt((u - u0)^2 + (v - v0)^2))
 
-with alpha in [-0.5, 0.5], theta in [pi, 2 pi], sigma in [0.5, 1], k = 5, over (u, v) in [-1, 1]^2, and summed, as in the paper. The paper leaves the centres
-(u0, v0) open; here they are uniform in [-1, 1]^2. Numbers are uniform in their ranges, and each function of a patch draws its own.
+with alpha in [-0.5, 0.5], theta in [pi, 2 pi], sigma in [0.5, 1], k = 5, over (u, v) in [-1, 1]^2, and summed, as in the paper. The paper
+leaves the centres (u0, v0) open; here they are uniform in [-1, 1]^2. Numbers are uniform in their ranges, and each function of a patch
+draws its own.
 """
 
 import math
@@ -62,7 +64,8 @@ def bessel(alpha, centre, uv):
 def sample(patches, points, generator, families=FAMILIES):
     """``patches`` random surfaces at ``points`` random places each: points (B, P, 3) and unit normals (B, P, 3), float64, z up.
 
-    ``families`` names the functions that are summed; ``generator`` is a CPU ``torch.Generator``. Raises InputError for a name that is none of ``FAMILIES``.
+    ``families`` names the functions that are summed; ``generator`` is a CPU ``torch.Generator``. Raises InputError for a name that is none
+    of ``FAMILIES``.
     """
     unknown = sorted(set(families) - set(FAMILIES))
     if unknown or not families:

@@ -1,4 +1,6 @@
-"""Patches of garment meshes, to train on and to measure on: cut by ACVD, sampled evenly by area, with the mesh's normals; as they are, or posed."""
+"""Patches of garment meshes, to train on and to measure on: cut by ACVD, sampled evenly by area, with the mesh's normals; as they are, or
+posed.
+"""
 
 from dataclasses import dataclass
 
@@ -27,14 +29,18 @@ class GarmentPatches:
 
     @classmethod
     def cut(cls, vertices, faces, count, points, generator, where="mesh"):
-        """The mesh (N, 3) [m], (F, 3) cut into ``count`` patches (None: the paper's number), each sampled at ``points`` places; ``generator`` is NumPy's."""
+        """The mesh (N, 3) [m], (F, 3) cut into ``count`` patches (None: the paper's number), each sampled at ``points`` places;
+        ``generator`` is NumPy's.
+        """
         return cls.sample(Patches.cut(vertices, faces, count, where=where), points, generator)
 
     @classmethod
     def sample(cls, patches, points, generator, vertices=None):
-        """``points`` places, uniform in area, of every patch of a :class:`polyfit.patches.Patches`, with its vertices where they are or at ``vertices`` (M, 3) [m].
+        """``points`` places, uniform in area, of every patch of a :class:`polyfit.patches.Patches`, with its vertices where they are or at
+        ``vertices`` (M, 3) [m].
 
-        Normals are interpolated between those of the vertices, which are means of the faces around them. A face that touches several patches belongs to that of its first corner.
+        Normals are interpolated between those of the vertices, which are means of the faces around them. A face that touches several
+        patches belongs to that of its first corner.
         """
         V, F = patches.vertices if vertices is None else np.asarray(vertices, dtype=np.float64), patches.faces
         face_vectors = mesh.face_vectors(V, F)
@@ -54,23 +60,19 @@ class GarmentPatches:
         return cls(torch.as_tensor(x, dtype=torch.float32), torch.as_tensor(n, dtype=torch.float32))
 
     def deformed(self, count, generator, **strength):
-        """``count`` of the patches, drawn at random and each taken through a random smooth map in its own canonical frame; ``strength`` as in :func:`deformations.random`."""
+        """``count`` of the patches, drawn at random and each taken through a random smooth map in its own canonical frame; ``strength`` as
+        in :func:`deformations.random`.
+        """
         index = torch.randint(len(self), (count,), generator=generator)
         x, n = self.points[index], self.normals[index]
         frame = CanonicalFrame.from_points(x)
         return GarmentPatches(*deformations.random(count, generator, **strength).carry(frame.to_chart(x), n @ frame.R))
 
 
-def posed(vertices, generator, **strength):
-    """The vertices (N, 3) [m] of a whole garment taken through one random smooth map of the size of the garment."""
-    x = torch.as_tensor(vertices, dtype=torch.float32)
-    centre = (x.amax(0) + x.amin(0)) / 2
-    size = (x - centre).norm(dim=1).max()
-    return ((deformations.random(1, generator, **strength)((x - centre)[None] / size))[0] * size + centre).numpy()
-
-
 def cut_meshes(paths, counts, points, seed):
-    """:class:`GarmentPatches` of the mesh files ``paths``, each cut at every one of ``counts``. Raises InputError for a file that is no mesh."""
+    """:class:`GarmentPatches` of the mesh files ``paths``, each cut at every one of ``counts``. Raises InputError for a file that is no
+    mesh.
+    """
     generator = np.random.default_rng(seed)
     parts = []
     for path in paths:

@@ -1,9 +1,10 @@
 """PolyFit as a network: the PCA frame, a spatial transformer that refines it, the jet (paper, section "PolyFit").
 
-The plane of least spread is the wrong one for a patch that is large or folded: over it the patch is no height graph. The transformer sees the patch in its PCA frame and
-answers with a few unit quaternions, each a turn of the frame; the PCA frame itself is always one of them. The turn whose jet leaves the least height is kept. So the refined
-frame is never worse than PCA at the points that were read, and a patch with two plausible planes needs no guess between them. A rotation within the plane changes
-nothing, for a jet of full degree spans the same heights in any (u, v); what counts is where z points.
+The plane of least spread is the wrong one for a patch that is large or folded: over it the patch is no height graph. The transformer sees
+the patch in its PCA frame and answers with a few unit quaternions, each a turn of the frame; the PCA frame itself is always one of them.
+The turn whose jet leaves the least height is kept. So the refined frame is never worse than PCA at the points that were read, and a patch
+with two plausible planes needs no guess between them. A rotation within the plane changes nothing, for a jet of full degree spans the same
+heights in any (u, v); what counts is where z points.
 """
 
 import math
@@ -25,8 +26,9 @@ TILT = math.radians(55)  # between the PCA frame's z and the first guesses'
 class SpatialTransformer(torch.nn.Module):
     """A PointNet that reads a patch and answers with unit quaternions.
 
-    ``widths`` are those of the layers that see each point alone, ``hidden`` of the two layers after the maximum over points; at most ``points`` points are read,
-    every so many-th of the patch's own order. ``turns`` quaternions are learned; they start as tilts to all sides.
+    ``widths`` are those of the layers that see each point alone, ``hidden`` of the two layers after the maximum over points; at most
+    ``points`` points are read, every so many-th of the patch's own order. ``turns`` quaternions are learned; they start as tilts to all
+    sides.
     """
 
     def __init__(self, widths=(32, 64, 128), hidden=64, points=64, turns=5):
@@ -47,7 +49,8 @@ class SpatialTransformer(torch.nn.Module):
             self.head[-1].bias.copy_(first.flatten())
 
     def forward(self, x, mask=None):
-        """Unit quaternions (B, turns + 1, 4) in the order (x, y, z, w), the first the identity, for patches x (B, P, 3) in the chart of their PCA frame.
+        """Unit quaternions (B, turns + 1, 4) in the order (x, y, z, w), the first the identity, for patches x (B, P, 3) in the chart of
+        their PCA frame.
 
         ``mask`` (B, P) marks the points that count.
         """
@@ -94,7 +97,9 @@ def thinned(x, count, mask=None):
 
 @dataclass(frozen=True)
 class PatchFit:
-    """Patches as PolyFit holds them: ``frame``, the orientation O = (s, R, T), and ``jet``, a :class:`polyfit.jets.JetFit` with ``alpha`` (B, A) in that frame."""
+    """Patches as PolyFit holds them: ``frame``, the orientation O = (s, R, T), and ``jet``, a :class:`polyfit.jets.JetFit` with ``alpha``
+    (B, A) in that frame.
+    """
 
     frame: CanonicalFrame
     jet: jets.JetFit
@@ -103,7 +108,8 @@ class PatchFit:
 class PolyFit(torch.nn.Module):
     """Patches of points to frames and jets: PCA, spatial transformer, least squares.
 
-    ``order`` is that of the jets; ``stn`` a :class:`SpatialTransformer`, or None for the PCA frame alone. ``PolyFit.pretrained()`` has the weights of the package.
+    ``order`` is that of the jets; ``stn`` a :class:`SpatialTransformer`, or None for the PCA frame alone. ``PolyFit.pretrained()`` has the
+    weights of the package.
     """
 
     def __init__(self, order=4, stn=None):
@@ -116,7 +122,8 @@ class PolyFit(torch.nn.Module):
     def frame(self, points, mask=None):
         """The :class:`CanonicalFrame` of patches ``points`` (B, P, 3), of which ``mask`` (B, P) counts.
 
-        Differentiable with respect to the network's weights, through the turn that was kept. Raises InputError as :meth:`CanonicalFrame.from_points` does.
+        Differentiable with respect to the network's weights, through the turn that was kept. Raises InputError as
+        :meth:`CanonicalFrame.from_points` does.
         """
         frame = CanonicalFrame.from_points(points, mask)
         if self.stn is None:
@@ -134,7 +141,9 @@ class PolyFit(torch.nn.Module):
         return (jets.height(alpha, y[..., :2]) - y[..., 2]).square().mean(-1).argmin(-1)
 
     def forward(self, points, *, weights=None, mask=None):
-        """:class:`PatchFit` of patches ``points`` (B, P, 3) in any unit and frame; ``weights`` and ``mask`` (B, P) as in :func:`polyfit.jets.fit`."""
+        """:class:`PatchFit` of patches ``points`` (B, P, 3) in any unit and frame; ``weights`` and ``mask`` (B, P) as in
+        :func:`polyfit.jets.fit`.
+        """
         frame = self.frame(points, mask)
         return PatchFit(frame, jets.fit(frame.to_chart(points), self.order, weights=weights, mask=mask))
 
@@ -148,7 +157,9 @@ class PolyFit(torch.nn.Module):
 
     @classmethod
     def load(cls, path, order=None):
-        """PolyFit with the weights of the file ``path``, as ``polyfit.train`` writes them. Raises InputError where they are no such, of another version, or not for ``order``."""
+        """PolyFit with the weights of the file ``path``, as ``polyfit.train`` writes them. Raises InputError where they are no such, of
+        another version, or not for ``order``.
+        """
         weights, about = read_weights(path, "polyfit", VERSION)
         if order is not None and about["order"] != order:
             raise InputError(f"{path}: weights for jets of order {about['order']}, not {order}")

@@ -45,7 +45,9 @@ ATLAS_POINTS = 1000  # of a garment, and of its reconstruction
 
 @dataclass(frozen=True)
 class Settings:
-    """What decides the result. ``cuts``: the numbers of patches that each mesh is cut into; ``points`` are kept of each patch and ``reads`` of them read in a step."""
+    """What decides the result. ``cuts``: the numbers of patches that each mesh is cut into; ``points`` are kept of each patch and ``reads``
+    of them read in a step.
+    """
 
     model: str = "polyfit"
     order: int = 4
@@ -62,10 +64,8 @@ class Settings:
     seed: int = 0
 
     def __post_init__(self):
-        allowed = dict(model=MODELS)
-        for name, values in allowed.items():
-            if getattr(self, name) not in values:
-                raise InputError(f"{name} {getattr(self, name)}: choose among {', '.join(values)}")
+        if self.model not in MODELS:
+            raise InputError(f"model {self.model}: choose among {', '.join(MODELS)}")
         unknown = sorted(set(self.families) - set(families.FAMILIES))
         if unknown:
             raise InputError(f"families {', '.join(unknown)}: choose among {', '.join(families.FAMILIES)}")
@@ -146,7 +146,8 @@ class Training:
         tensors = {f"network.{k}": v for k, v in self.network.state_dict().items()}
         for k, state in self.optimiser.state_dict()["state"].items():
             tensors |= {f"adam.{k}.{name}": value for name, value in state.items()}
-        write_weights(path, tensors, dict(model="checkpoint", version=VERSION, settings=_plain(self.settings), done=self.done, seconds=self.seconds))
+        progress = dict(done=self.done, seconds=self.seconds)
+        write_weights(path, tensors, dict(model="checkpoint", version=VERSION, settings=_plain(self.settings), **progress))
 
     def restore(self, path):
         """Goes on from a checkpoint. Raises InputError where it was made with other settings."""
@@ -176,7 +177,8 @@ class _Patches:
         if settings.model != "polyfit":
             index = torch.randint(len(self.patches), (settings.batch,), generator=generator)
             return self._of_regressor(network, index[processes.rank :: processes.count].to(processes.device))
-        # half of the batch in proportion to what another axis than PCA's would gain: few patches are folded, and they have the most to teach
+        # half of the batch in proportion to what another axis than PCA's would gain: few patches are folded, and they have the most to
+        # teach
         index = torch.multinomial(self.likely, settings.batch, replacement=True, generator=generator)
         index = index[processes.rank :: processes.count].to(processes.device)
         read = torch.randperm(settings.points, generator=generator)[: settings.reads].to(processes.device)
@@ -220,7 +222,9 @@ def _plain(settings):
 
 
 def _prepare(settings, folder, processes, progress):
-    """The data that ``settings`` ask for; a training set is kept in ``folder``, and one of the same settings that lies there is used again."""
+    """The data that ``settings`` ask for; a training set is kept in ``folder``, and one of the same settings that lies there is used
+    again.
+    """
     if settings.model == "atlasnet":
         import numpy as np
 
@@ -247,7 +251,9 @@ def _prepare(settings, folder, processes, progress):
 
 
 def train(settings, folder, *, device="cpu", resume=False, until=None, every=120.0, command=None):
-    """Trains and leaves weights in ``folder``; returns their path. ``until`` (steps) ends early, with a checkpoint and no weights (None); ``every`` [s] checkpoints."""
+    """Trains and leaves weights in ``folder``; returns their path. ``until`` (steps) ends early, with a checkpoint and no weights (None);
+    ``every`` [s] checkpoints.
+    """
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     folder = Path(folder)
@@ -266,8 +272,8 @@ def train(settings, folder, *, device="cpu", resume=False, until=None, every=120
             if resume:
                 training.restore(checkpoint)
             task = progress.add_task("steps", total=settings.steps, completed=training.done)
-            if not _run(training, checkpoint, folder / "log.jsonl", min(until or settings.steps, settings.steps), every, lambda: progress.update(task, completed=training.done)):
-                return None
+            end = min(until or settings.steps, settings.steps)
+            _run(training, checkpoint, folder / "log.jsonl", end, every, lambda: progress.update(task, completed=training.done))
         if training.done < settings.steps:
             return None
         if processes.rank == 0:
@@ -279,7 +285,7 @@ def train(settings, folder, *, device="cpu", resume=False, until=None, every=120
 
 
 def _run(training, checkpoint, log, end, every, advance):
-    """Steps up to ``end``, with a checkpoint at least at the end, and at Ctrl-C."""
+    """Steps up to ``end``, with a checkpoint every so many seconds, at the end, and at Ctrl-C."""
     first = training.processes.rank == 0
     saved, losses = time.monotonic(), []
     with contextlib.ExitStack() as stack:
@@ -291,8 +297,8 @@ def _run(training, checkpoint, log, end, every, advance):
                 if not math.isfinite(losses[-1]):
                     raise InputError(f"the loss is {losses[-1]} at step {training.done}; a lower --lr may help")
                 if first and (training.done % 50 == 0 or training.done == end):
-                    line = dict(step=training.done, loss=sum(losses) / len(losses), lr=training.optimiser.param_groups[0]["lr"], seconds=round(training.seconds, 2))
-                    file.write(json.dumps(line) + "\n")
+                    line = dict(step=training.done, loss=sum(losses) / len(losses), lr=training.optimiser.param_groups[0]["lr"])
+                    file.write(json.dumps(line | dict(seconds=round(training.seconds, 2))) + "\n")
                     file.flush()
                     losses.clear()
                 if first and time.monotonic() - saved > every:
@@ -304,7 +310,6 @@ def _run(training, checkpoint, log, end, every, advance):
             raise
         if first:
             training.save(checkpoint)
-    return True
 
 
 def _finish(training, weights, command):

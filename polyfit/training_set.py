@@ -1,8 +1,9 @@
 """What is trained on: patches in the charts of their PCA frames, and how well a jet fits each of them from every side.
 
-A transformer that follows the gradient of a fit's error from the PCA frame finds the valley next to it, not the right one: across a fold the error first rises. So the
-height discrepancy is tabulated once for every patch, on axes all over the half sphere, and training reads the table, smoothed over directions
-(:meth:`TrainingSet.at`). The table is the loss itself, the jets' own fits; the smoothing narrows as training goes on.
+A transformer that follows the gradient of a fit's error from the PCA frame finds the valley next to it, not the right one: across a fold
+the error first rises. So the height discrepancy is tabulated once for every patch, on axes all over the half sphere, and training reads the
+table, smoothed over directions (:meth:`TrainingSet.at`). The table is the loss itself, the jets' own fits; the smoothing narrows as
+training goes on.
 """
 
 from dataclasses import dataclass, fields
@@ -22,8 +23,8 @@ NORMALS = 0.1  # weight of 1 - cosine of the normals against RMS of height
 
 @dataclass(frozen=True)
 class TrainingSet:
-    """``points`` and ``normals`` (N, P, 3) in the charts of the PCA frames; ``height`` and ``loss`` (N, D): RMS of height, and that plus ``NORMALS`` (1 - cosine) between
-    the normals, of the jets fitted with z along each of :func:`axes`. float32."""
+    """``points`` and ``normals`` (N, P, 3) in the charts of the PCA frames; ``height`` and ``loss`` (N, D): RMS of height, and that plus
+    ``NORMALS`` (1 - cosine) between the normals, of the jets fitted with z along each of :func:`axes`. float32."""
 
     points: torch.Tensor
     normals: torch.Tensor
@@ -37,7 +38,9 @@ class TrainingSet:
         return TrainingSet(*(getattr(self, f.name).to(device) for f in fields(self)))
 
     def at(self, index, z, sharpness):
-        """Height and loss, each (B, H), of patches ``index`` (B,) fitted along unit axes z (B, H, 3): means over the table, weighted by exp(``sharpness`` cos^2)."""
+        """Height and loss, each (B, H), of patches ``index`` (B,) fitted along unit axes z (B, H, 3): means over the table, weighted by
+        exp(``sharpness`` cos^2).
+        """
         weight = torch.softmax(sharpness * (z @ axes(z.device).T) ** 2, -1)
         return (weight * self.height[index][:, None]).sum(-1), (weight * self.loss[index][:, None]).sum(-1)
 
@@ -60,8 +63,8 @@ def rotations_to(z):
 def build(count, points, order, seed, *, garments=None, names=families.FAMILIES, device="cpu", advance=lambda done: None):
     """:class:`TrainingSet` of ``count`` patches of ``points`` points each, for jets of ``order``.
 
-    ``garments`` (:class:`GarmentPatches` or None) are deformed at random; ``names`` are the analytic families that are summed, or empty. ``advance`` is told how many
-    patches there are so far.
+    ``garments`` (:class:`GarmentPatches` or None) are deformed at random; ``names`` are the analytic families that are summed, or empty.
+    ``advance`` is told how many patches there are so far.
     """
     parts = []
     turns = rotations_to(axes())
@@ -73,7 +76,8 @@ def build(count, points, order, seed, *, garments=None, names=families.FAMILIES,
         if deformed:
             made.append(garments.deformed(deformed, generator))
         if size > deformed:
-            made.append(GarmentPatches(*(t.float() for t in families.sample(size - deformed, garments.points.shape[1] if garments else points, generator, names))))
+            samples = points if garments is None else garments.points.shape[1]
+            made.append(GarmentPatches(*(t.float() for t in families.sample(size - deformed, samples, generator, names))))
         made = GarmentPatches.join(made)
         parts.append(_tabulated(made.points[:, :points].to(device), made.normals[:, :points].to(device), turns.to(device), order))
         advance(first + size)

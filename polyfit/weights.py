@@ -8,14 +8,17 @@ from .files import aside
 
 def write_weights(path, weights, about):
     """Tensors by name, and what they are for; written aside and then renamed."""
-    from safetensors.torch import save_file
+    from safetensors.torch import save
 
-    with aside(path) as temporary:
-        save_file({k: v.detach().cpu().contiguous() for k, v in weights.items()}, temporary, {"about": json.dumps(about)})
+    data = save({k: v.detach().cpu().contiguous() for k, v in weights.items()}, {"about": json.dumps(about)})
+    with aside(path) as temporary, open(temporary, "wb") as file:
+        file.write(data)
 
 
 def read_weights(path, model, version):
-    """(tensors, description) of a file of :func:`write_weights`. Raises InputError where it cannot be read, or is of another model or version."""
+    """(tensors, description) of a file of :func:`write_weights`. Raises InputError where it cannot be read, or is of another model or
+    version.
+    """
     from safetensors import SafetensorError, safe_open
 
     try:
@@ -31,7 +34,8 @@ def read_weights(path, model, version):
     if about["model"] != model:
         raise InputError(f"{path}: weights of {about['model']}, not of {model}")
     if about.get("version") != version:
-        raise InputError(f"{path}: weights of version {about.get('version')}, and this is version {version}; python -m polyfit.train makes new ones")
+        this = f"and this is version {version}; python -m polyfit.train makes new ones"
+        raise InputError(f"{path}: weights of version {about.get('version')}, {this}")
     return weights, about
 
 

@@ -14,7 +14,9 @@ from polyfit.weights import read_weights, write_weights
 
 
 def bent_sheets(count, points=200, dtype=torch.float64, depth=(0.9, 1.6), width=(0.5, 0.9)):
-    """Narrow valleys z = depth |x / width|^3 in random positions: points and normals (B, P, 3). The deeper ones have their least spread across the valley."""
+    """Narrow valleys z = depth |x / width|^3 in random positions: points and normals (B, P, 3). The deeper ones have their least spread
+    across the valley.
+    """
     g = torch.Generator().manual_seed(3)
     low, high = (torch.tensor(x, dtype=dtype) for x in zip(depth, width))
     d, w = (low + (high - low) * torch.rand(count, 2, generator=g, dtype=dtype)).unbind(-1)
@@ -69,7 +71,8 @@ def test_a_turned_scaled_moved_patch_has_the_same_alpha(model, shipped):
     fit = equivariant(points)
     g = torch.Generator().manual_seed(9)
     Q = rotation_matrix(torch.randn(60, 4, generator=g, dtype=torch.float64))
-    scale, shift = 0.01 + 50 * torch.rand(60, 1, 1, generator=g, dtype=torch.float64), 10 * torch.randn(60, 1, 3, generator=g, dtype=torch.float64)
+    scale = 0.01 + 50 * torch.rand(60, 1, 1, generator=g, dtype=torch.float64)
+    shift = 10 * torch.randn(60, 1, 3, generator=g, dtype=torch.float64)
     moved = equivariant(scale * points @ Q.mT + shift)
     assert moved.jet.alpha.detach().numpy() == pytest.approx(fit.jet.alpha.detach().numpy(), abs=1e-7)
     assert moved.frame.s.numpy() == pytest.approx((scale[:, 0, 0] * fit.frame.s).numpy(), rel=1e-9)

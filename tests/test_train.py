@@ -124,9 +124,8 @@ def test_ctrl_c_leaves_a_checkpoint(tmp_path, monkeypatch):
 
 def test_two_processes_of_torchrun_do_what_one_does(tmp_path):
     command = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", "--master-port", "29731", "-m", "polyfit.train"]
-    done = subprocess.run(
-        [*command, *FLAGS, "-o", str(tmp_path / "two")], cwd=ROOT, capture_output=True, text=True, timeout=120, env=os.environ | {"OMP_NUM_THREADS": "1"}
-    )
+    command += [*FLAGS, "-o", str(tmp_path / "two")]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, env=os.environ | {"OMP_NUM_THREADS": "1"})
     assert done.returncode == 0, done.stderr[-2000:]
     assert json.loads((tmp_path / "two" / "weights.json").read_text())["processes"] == 2
     two, one = load_file(tmp_path / "two" / "weights.safetensors"), load_file(train.train(SMALL, tmp_path / "one"))

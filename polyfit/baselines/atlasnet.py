@@ -1,4 +1,6 @@
-"""AtlasNet's autoencoder with square charts (Groueix et al. 2018; paper, section "Experiments"): a PointNet encodes a surface, K small networks map a square each to a piece of it."""
+"""AtlasNet's autoencoder with square charts (Groueix et al. 2018; paper, section "Experiments"): a PointNet encodes a surface, K small
+networks map a square each to a piece of it.
+"""
 
 import torch
 
@@ -22,7 +24,8 @@ class AtlasNet(torch.nn.Module):
         self.encoder = torch.nn.Sequential(pointwise((64, 128)), torch.nn.Linear(128, latent))
         self.code = torch.nn.Linear(latent, latent)
         sizes = [latent + 2, *widths, 3]
-        self.weights = torch.nn.ParameterList(torch.randn(charts, i, o) * ((2 if o != 3 else 1) / i) ** 0.5 for i, o in zip(sizes, sizes[1:]))
+        layers = list(zip(sizes, sizes[1:]))
+        self.weights = torch.nn.ParameterList(torch.randn(charts, i, o) * ((1 if o == 3 else 2) / i) ** 0.5 for i, o in layers)
         self.biases = torch.nn.ParameterList(torch.zeros(charts, 1, o) for o in sizes[1:])
 
     def encode(self, points):
@@ -68,7 +71,9 @@ class AtlasNet(torch.nn.Module):
 
 
 def normalised(points):
-    """(points, centre, scale): points (..., P, 3) in the unit sphere about the centre (..., 1, 3) of their bounding box; scale (..., 1, 1)."""
+    """(points, centre, scale): points (..., P, 3) in the unit sphere about the centre (..., 1, 3) of their bounding box; scale (..., 1,
+    1).
+    """
     if not points.isfinite().all():
         raise InputError("points that are not finite")
     centre = (points.amax(-2, keepdim=True) + points.amin(-2, keepdim=True)) / 2

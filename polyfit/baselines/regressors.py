@@ -1,4 +1,5 @@
-"""PointNet (Qi et al. 2017) and DGCNN (Wang et al. 2019) that regress a jet's coefficients from a patch (paper, supplement, "Additional ablation studies").
+"""PointNet (Qi et al. 2017) and DGCNN (Wang et al. 2019) that regress a jet's coefficients from a patch (paper, supplement, "Additional
+ablation studies").
 
 Both see a patch in the chart of its PCA frame and answer with alpha (B, A) in that chart, where PolyFit solves for it.
 """
@@ -15,13 +16,18 @@ VERSION = 1
 
 
 class Regressor(torch.nn.Module):
-    """What both have in common: the PCA frame before, the layers from a patch's feature to alpha, the files of weights. ``points`` of each patch are read."""
+    """What both have in common: the PCA frame before, the layers from a patch's feature to alpha, the files of weights. ``points`` of each
+    patch are read.
+    """
 
     def __init__(self, order, points, feature, hidden=64):
         super().__init__()
         self.order, self.points = order, points
         self.head = torch.nn.Sequential(
-            torch.nn.LayerNorm(feature), *normalised_layer(feature, hidden), *normalised_layer(hidden, hidden), torch.nn.Linear(hidden, jets.size_of(order))
+            torch.nn.LayerNorm(feature),
+            *normalised_layer(feature, hidden),
+            *normalised_layer(hidden, hidden),
+            torch.nn.Linear(hidden, jets.size_of(order)),
         )
         with torch.no_grad():
             self.head[-1].weight.mul_(0.1)
@@ -38,7 +44,9 @@ class Regressor(torch.nn.Module):
 
     @classmethod
     def load(cls, path, order=None):
-        """The network with the weights of the file ``path``. Raises InputError where they are no such, of another version, or not for ``order``."""
+        """The network with the weights of the file ``path``. Raises InputError where they are no such, of another version, or not for
+        ``order``.
+        """
         weights, about = read_weights(path, cls.__name__.lower(), VERSION)
         if order is not None and about["order"] != order:
             raise InputError(f"{path}: weights for jets of order {about['order']}, not {order}")
@@ -63,7 +71,9 @@ class PointNet(Regressor):
 
 
 class DGCNN(Regressor):
-    """EdgeConv layers over the ``neighbours`` nearest points, anew in each layer's features; their outputs together through one more layer, the maximum over points, two layers."""
+    """EdgeConv layers over the ``neighbours`` nearest points, anew in each layer's features; their outputs together through one more layer,
+    the maximum over points, two layers.
+    """
 
     def __init__(self, order=4, points=64, widths=(32, 64), neighbours=8, feature=128):
         super().__init__(order, points, feature)
@@ -91,6 +101,7 @@ def nearest(x, count):
 def edge_convolution(x, neighbours, centre, edge):
     """max_j relu(centre(x_i) + edge(x_j - x_i)) over the ``neighbours`` (B, P, k) of each of x (B, P, C): (B, P, W)."""
     y = torch.nn.functional.linear(x, edge.weight)
-    at = neighbours.flatten(1)[..., None].expand(-1, -1, y.shape[-1])
-    highest = y.gather(1, at).unflatten(1, neighbours.shape[1:]).amax(2)
-    return torch.relu(centre(x) + edge.bias + highest - y)
+    with torch.no_grad():  # which neighbour is highest; gradients then pass through these alone
+        at = neighbours.flatten(1)[..., None].expand(-1, -1, y.shape[-1])
+        which = neighbours.gather(2, y.gather(1, at).unflatten(1, neighbours.shape[1:]).max(2).indices)
+    return torch.relu(centre(x) + edge.bias + y.gather(1, which) - y)
