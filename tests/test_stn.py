@@ -74,7 +74,7 @@ def test_a_turned_scaled_moved_patch_has_the_same_alpha(model, shipped):
     scale = 0.01 + 50 * torch.rand(60, 1, 1, generator=g, dtype=torch.float64)
     shift = 10 * torch.randn(60, 1, 3, generator=g, dtype=torch.float64)
     moved = equivariant(scale * points @ Q.mT + shift)
-    assert moved.jet.alpha.detach().numpy() == pytest.approx(fit.jet.alpha.detach().numpy(), abs=1e-7)
+    assert moved.jet.alpha.detach().numpy() == pytest.approx(fit.jet.alpha.detach().numpy(), rel=1e-6, abs=1e-7)
     assert moved.frame.s.numpy() == pytest.approx((scale[:, 0, 0] * fit.frame.s).numpy(), rel=1e-9)
     assert moved.frame.R.detach().numpy() == pytest.approx((Q @ fit.frame.R).detach().numpy(), abs=1e-8)
     uv = 0.3 * torch.randn(60, 5, 2, generator=g, dtype=torch.float64)
@@ -100,7 +100,7 @@ def test_padding_changes_nothing(model):
     mask.scatter_(1, at, True)
     with torch.no_grad():
         a, b = model(points), model(padded, mask=mask)
-    assert b.jet.alpha.numpy() == pytest.approx(a.jet.alpha.numpy(), abs=1e-9)
+    assert b.jet.alpha.numpy() == pytest.approx(a.jet.alpha.numpy(), rel=1e-6, abs=1e-9)
 
 
 def test_never_worse_than_pca_at_the_points_that_are_read():
@@ -158,17 +158,17 @@ def test_gradients_reach_the_network_s_weights():
 
 
 def test_shipped_weights_turn_narrow_valleys_the_right_way_up(model):
-    points, normals = bent_sheets(100, dtype=torch.float32)
+    points, normals = bent_sheets(200, dtype=torch.float32, depth=(0.8, 1.2), width=(0.8, 1.2))
     found = {}
     for name, m in (("pca", PolyFit(4)), ("stn", model)):
         with torch.no_grad():
             fit = m(points)
             n = normals @ fit.frame.R
             found[name] = behind(n).mean(), discrepancy(fit.jet.alpha, fit.frame.to_chart(points), n)
-    assert found["pca"][0] > 0.3  # from PCA's side most of them are seen edge on
-    assert found["stn"][0] < 0.3 * found["pca"][0]
+    assert found["pca"][0] > 0.2  # PCA looks at about half of them from the edge, where half of the patch is seen from behind
+    assert found["stn"][0] < 0.6 * found["pca"][0]
     for figure in ("height", "distance", "angle"):
-        assert getattr(found["stn"][1], figure).mean() < 0.8 * getattr(found["pca"][1], figure).mean(), figure
+        assert getattr(found["stn"][1], figure).mean() < 0.7 * getattr(found["pca"][1], figure).mean(), figure
 
 
 def test_what_made_the_shipped_weights_is_beside_them(model):
