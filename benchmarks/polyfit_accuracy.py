@@ -1,5 +1,5 @@
 """How closely jets fit patches of garments that were not trained on: by order, with and without the spatial transformer, against networks
-that regress jets.
+that regress jets; and what AtlasNet's autoencoder makes of garments that it has not seen.
 
     python benchmarks/polyfit_accuracy.py DATA [--runs out/polyfit] [--train] [-o out/benchmarks]
 
@@ -36,11 +36,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
 from polyfit import garments, jets, mesh
+from polyfit.baselines.atlasnet import AtlasNet, normalised
 from polyfit.baselines.regressors import DGCNN, PointNet
 from polyfit.errors import InputError, cli
 from polyfit.files import aside
@@ -58,13 +60,23 @@ HELD_OUT = [
     *(f"garments_snug/{name}.obj" for name in ("tshirt", "tank", "long_sleeve_top", "shorts", "pants")),
     *(f"garments_makehuman/{name}.obj" for name in ("f_skirt", "m_dungarees", "m_shirt_wrinkled")),
 ]
+SHORT = ["--steps", "800", "--patches", "15000"]
+ATLASNET = ["--model", "atlasnet", "--batch", "8", "--steps", "1000"]
 TRAININGS = {  # folder in RUNS: options of python -m polyfit.train, whether on garments
     "main": ([], True),
-    "families": ([], False),
-    "gaussian": (["--families", "gaussian"], False),
     "pointnet": (["--model", "pointnet"], True),
-    "dgcnn": (["--model", "dgcnn"], True),
+    "dgcnn": (["--model", "dgcnn", "--steps", "600"], True),  # a step takes four times as long: as much time as the others
+    "gaussian": (["--families", "gaussian", *SHORT], False),
+    "families": (SHORT, False),
+    "garments": (SHORT, True),
+    **{f"atlasnet{charts}": ([*ATLASNET, "--charts", str(charts)], True) for charts in (5, 25, 125)},
 }
+PAPER_ATLASNET = {  # Chamfer x 1e3 on T-shirt, tank, long-sleeve top, shorts, trousers
+    5: (0.531, 0.939, 0.481, 1.508, 0.963),
+    25: (0.490, 0.942, 0.420, 1.471, 0.992),
+    125: (0.531, 1.005, 0.490, 1.547, 0.858),
+}
+CLOUD = 10_000
 POINTS, ORDER, ORDERS = 256, 4, range(1, 9)
 LARGE, POSED_CUTS, POSED = 10, (10, 25, 100), 6000
 SHEETS, FRAMES = ("flag", "bend", "paper", "curtain", "corner"), 8
@@ -233,12 +245,38 @@ def measure(data, runs):
     table(f"Networks: height RMSE / normals °; time on {report['threads']} thread(s)", ("network", *patches, "ms a patch"), rows)
 
     sources = {"Gaussians only": ("gaussian", "0.0248 / 5.49"), "4 families": ("families", "0.0239 / 5.42")}
-    sources["4 families + garment patches"] = ("main", "0.0201 / 5.32")
+    sources["4 families + garment patches"] = ("garments", "0.0201 / 5.32")
     found = {title: (m, paper) for title, (run, paper) in sources.items() if (m := trained(runs, run, PolyFit.load))}
     report["sources"] = {title: on_all(m) for title, (m, _) in found.items()}
     rows = [(title, *(both(f[kind]) for kind in patches), found[title][1]) for title, f in report["sources"].items()]
-    table("What it was trained on: height RMSE / normals °", ("trained on", *patches, "paper, CLOTH3D"), rows)
+    table("What it was trained on, 800 steps each: height RMSE / normals °", ("trained on", *patches, "paper, CLOTH3D"), rows)
+
+    clouds = {path: cloud(Path(data) / path) for path in HELD_OUT[: len(PAPER_ATLASNET[5])]}
+    report["atlasnet"], rows = {}, []
+    for charts, paper in PAPER_ATLASNET.items():
+        path = Path(runs) / f"atlasnet{charts}" / "weights.safetensors"
+        if path.exists():
+            found = report["atlasnet"][charts] = {name: autoencoded(AtlasNet.load(path), points) for name, points in clouds.items()}
+            rows.append((f"AtlasNet, {charts} charts", *(f"{x:.3f} ({y:.3f})" for x, y in zip(found.values(), paper))))
+    table("AtlasNet's autoencoder, garments it has not seen: Chamfer x 1e3 (the paper's)", ("", *(Path(p).stem for p in clouds)), rows)
     return report
+
+
+def cloud(path):
+    """Points (2, 10,000, 3) of a mesh, uniform in area, in the unit sphere about the centre of its box: one cloud to encode, one to compare with."""
+    vertices, faces = read_mesh(path)[:2]
+    generator, area = np.random.default_rng(0), mesh.areas(vertices, faces)
+    chosen = generator.choice(len(faces), (2, CLOUD), p=area / area.sum())
+    points = np.einsum("cpj,cpjd->cpd", generator.dirichlet((1, 1, 1), chosen.shape), vertices[faces[chosen]])
+    return normalised(torch.as_tensor(points, dtype=torch.float32).flatten(0, 1))[0].reshape(2, CLOUD, 3)
+
+
+@torch.no_grad()
+def autoencoded(model, points):
+    """Symmetric Chamfer distance x 1e3 between a garment and what AtlasNet makes of it: the sum of both mean squared distances."""
+    made = model(points[:1], -(-CLOUD // model.charts), torch.Generator().manual_seed(0))[0, :CLOUD].numpy()
+    truth = points[1].numpy()
+    return 1e3 * float(sum((cKDTree(a).query(b)[0] ** 2).mean() for a, b in ((made, truth), (truth, made))))
 
 
 def main(argv=None):

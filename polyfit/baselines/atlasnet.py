@@ -52,11 +52,6 @@ class AtlasNet(torch.nn.Module):
         uv = torch.stack(torch.meshgrid(line, line, indexing="ij"), -1).reshape(1, -1, 2).expand(self.charts, -1, -1)
         return self.decode(code, uv)
 
-    @property
-    def parameters_of_decoders(self):
-        """How many numbers describe the surfaces of the charts, without the encoder."""
-        return sum(p.numel() for p in (*self.weights, *self.biases))
-
     @classmethod
     def load(cls, path):
         """The network with the weights of the file ``path``. Raises InputError where they are no such, or of another version."""
