@@ -119,13 +119,13 @@ class PolyFit(torch.nn.Module):
         self.order = order
         self.stn = stn
 
-    def frame(self, points, mask=None):
-        """The :class:`CanonicalFrame` of patches ``points`` (B, P, 3), of which ``mask`` (B, P) counts.
+    def frame(self, points, mask=None, *, weights=None):
+        """The :class:`CanonicalFrame` of patches ``points`` (B, P, 3), of which ``mask`` (B, P) counts; ``weights`` (B, P) for mean and spread.
 
         Differentiable with respect to the network's weights, through the turn that was kept. Raises InputError as
         :meth:`CanonicalFrame.from_points` does.
         """
-        frame = CanonicalFrame.from_points(points, mask)
+        frame = CanonicalFrame.from_points(points, mask, weights=weights)
         if self.stn is None:
             return frame
         x = frame.to_chart(points)
@@ -144,7 +144,7 @@ class PolyFit(torch.nn.Module):
         """:class:`PatchFit` of patches ``points`` (B, P, 3) in any unit and frame; ``weights`` and ``mask`` (B, P) as in
         :func:`polyfit.jets.fit`.
         """
-        frame = self.frame(points, mask)
+        frame = self.frame(points, mask, weights=weights)
         return PatchFit(frame, jets.fit(frame.to_chart(points), self.order, weights=weights, mask=mask))
 
     @classmethod

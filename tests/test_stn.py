@@ -103,6 +103,18 @@ def test_padding_changes_nothing(model):
     assert b.jet.alpha.numpy() == pytest.approx(a.jet.alpha.numpy(), rel=1e-6, abs=1e-9)
 
 
+def test_points_of_no_weight_change_nothing_but_the_scale():
+    """Without a transformer, which reads points whatever their weight: T, R and the jet are those of the points that have weight."""
+    points, _ = bent_sheets(5, points=80)
+    weights = torch.ones(5, 80, dtype=torch.float64)
+    weights[:, 60:] = 0
+    a, b = PolyFit(4)(points, weights=weights), PolyFit(4)(points[:, :60])
+    assert a.frame.T.numpy() == pytest.approx(b.frame.T.numpy(), abs=1e-12)
+    assert a.frame.R.abs().numpy() == pytest.approx(b.frame.R.abs().numpy(), abs=1e-9)
+    x = [f.frame.from_chart(jets.point(f.jet.alpha, f.frame.to_chart(points[:, :60])[..., :2])) for f in (a, b)]
+    assert x[0].numpy() == pytest.approx(x[1].numpy(), abs=1e-8)
+
+
 def test_never_worse_than_pca_at_the_points_that_are_read():
     points, _ = bent_sheets(200, points=60, depth=(0.1, 1.6))
     model = PolyFit(4, random_network()).eval()
