@@ -27,15 +27,14 @@ class LeastSquares(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, points, weights, order):
-        box = _Box.of(points)
+        x = points.movedim(-1, 0).to(torch.float64, memory_format=torch.contiguous_format, copy=True)  # (3, B, P)
+        box = _Box.of(x[:2])
         w, total = _normalised(weights, points)
-        x, y = box.normalise(points)
-        z = points[..., 2].to(torch.float64)
-        tx, ty = _chebyshev(x, 2 * order), _chebyshev(y, 2 * order)
+        tx, ty = _chebyshev(box.normalised(x[:2]), 2 * order).permute(1, 2, 0, 3)  # (B, 2n+1, P) of u and of v, each row contiguous
         wty = ty if w is None else w[:, None] * ty
         scale = 1 / points.shape[1] if w is None else 1
-        gram = _gram(tx @ wty.transpose(1, 2) * scale, order)
-        right = (tx[:, : order + 1] * z[:, None]) @ wty[:, : order + 1].transpose(1, 2) * scale
+        gram = _gram(tx @ wty.mT * scale, order)
+        right = (tx[:, : order + 1] * x[2, :, None]) @ wty[:, : order + 1].mT * scale
         e = jets.exponents(order)
         right = right[:, e[:, 0], e[:, 1]]
         _check(box, right)
@@ -74,14 +73,16 @@ class _Box:
     half: torch.Tensor
 
     @classmethod
-    def of(cls, points):
-        low, high = (torch.stack(x, 1).to(torch.float64) for x in zip(*(torch.aminmax(points[..., k], dim=1) for k in (0, 1))))
-        half = (high - low) / 2
+    def of(cls, uv):
+        """Of coordinates (2, B, P)."""
+        low, high = torch.aminmax(uv, dim=2)
+        half = ((high - low) / 2).T
         half = torch.maximum(half, NARROWEST * half.amax(1, keepdim=True))
-        return cls((low + high) / 2, torch.where(half > 0, half, 1))
+        return cls(((low + high) / 2).T, torch.where(half > 0, half, 1))
 
-    def normalise(self, points):
-        return ((points[..., k].to(torch.float64) - self.centre[:, k, None]) / self.half[:, k, None] for k in (0, 1))
+    def normalised(self, uv):
+        """The coordinates (2, B, P) in the box, from -1 to 1."""
+        return (uv - self.centre.T[..., None]) * (1 / self.half.T[..., None])
 
     def to_monomials(self, coefficients, order):
         """Coefficients (B, A) of T_a(x) T_b(y) turned into those of u^a v^b."""
@@ -113,13 +114,13 @@ def _chebyshev_in_powers(order):
 
 
 def _chebyshev(x, order):
-    """T_0 .. T_n of x (B, P): (B, n+1, P), each of them contiguous."""
+    """T_0 .. T_n of x (...): (n+1, ...)."""
     out = x.new_empty(order + 1, *x.shape)
     out[0], out[1] = 1, x
     twice = 2 * x
     for k in range(2, order + 1):
         torch.mul(twice, out[k - 1], out=out[k]).sub_(out[k - 2])
-    return out.transpose(0, 1)
+    return out
 
 
 def _normalised(weights, points):
