@@ -8,6 +8,7 @@ The same functions stand in Dr.Jit in ``polysft_mi.jet``, by the same names.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -15,8 +16,9 @@ import torch
 from .errors import InputError
 
 
+@lru_cache
 def exponents(order):
-    """Exponents (of u, of v) of the coefficients, shape (A, 2)."""
+    """Exponents (of u, of v) of the coefficients, shape (A, 2); the same array each time, not to be written to."""
     return np.array([(i - j, j) for i in range(order + 1) for j in range(i + 1)], dtype=np.int64)
 
 
@@ -36,10 +38,20 @@ def order_of(size):
 def matrix(alpha):
     """alpha (..., A) as the matrix m (..., n+1, n+1) of z = sum_ab m_ab u^a v^b; zero where a + b > n."""
     order = order_of(alpha.shape[-1])
-    e = exponents(order)
     out = alpha.new_zeros(*alpha.shape[:-1], (order + 1) ** 2)
-    out[..., torch.as_tensor(e[:, 0] * (order + 1) + e[:, 1], device=alpha.device)] = alpha
+    out[..., _places(order, alpha.device)] = alpha
     return out.unflatten(-1, (order + 1, order + 1))
+
+
+@lru_cache
+def _places(order, device):
+    """Where the coefficients stand in the flattened matrix, (A,)."""
+    return torch.as_tensor(exponents(order) @ (order + 1, 1), device=device)
+
+
+def from_matrix(m):
+    """The coefficients (..., A) of a matrix (..., n+1, n+1)."""
+    return m.flatten(-2)[..., _places(m.shape[-1] - 1, m.device)]
 
 
 def powers(x, order, derivative=0):

@@ -35,8 +35,7 @@ class LeastSquares(torch.autograd.Function):
         scale = 1 / points.shape[1] if w is None else 1
         gram = _gram(tx @ wty.mT * scale, order)
         right = (tx[:, : order + 1] * x[2, :, None]) @ wty[:, : order + 1].mT * scale
-        e = jets.exponents(order)
-        right = right[:, e[:, 0], e[:, 1]]
+        right = jets.from_matrix(right)
         _check(box, right)
         factor, fitted, kept = _factorise(gram, order)
         solution = torch.cholesky_solve((right * kept)[..., None], factor)[..., 0]
@@ -86,31 +85,31 @@ class _Box:
 
     def to_monomials(self, coefficients, order):
         """Coefficients (B, A) of T_a(x) T_b(y) turned into those of u^a v^b."""
-        U, V = self._axis(0, order), self._axis(1, order)
-        e = jets.exponents(order)
-        return (U.transpose(1, 2) @ jets.matrix(coefficients) @ V)[:, e[:, 0], e[:, 1]]
+        U, V = self._axes(order)
+        return jets.from_matrix(U.mT @ jets.matrix(coefficients) @ V)
 
     def to_monomials_transposed(self, coefficients, order):
-        U, V = self._axis(0, order), self._axis(1, order)
-        e = jets.exponents(order)
-        return (U @ jets.matrix(coefficients) @ V.transpose(1, 2))[:, e[:, 0], e[:, 1]]
+        """The transposed map of :meth:`to_monomials`, for gradients."""
+        U, V = self._axes(order)
+        return jets.from_matrix(U @ jets.matrix(coefficients) @ V.mT)
 
-    def _axis(self, k, order):
-        """(B, n+1, n+1): row a holds T_a((u - centre) / half) in powers of u."""
-        c, h = self.centre[:, k, None, None], self.half[:, k, None, None]
-        m, i = np.tril_indices(order + 1)
-        shift = c.new_zeros(len(c), order + 1, order + 1)
-        shifted = jets.powers(-self.centre[:, k], order)[:, m - i] * torch.as_tensor(binom(m, i), device=c.device)
-        shift[:, m, i] = shifted
-        return _chebyshev_in_powers(order).to(c.device) @ (shift / h ** torch.arange(order + 1, device=c.device)[:, None])
+    def _axes(self, order):
+        """For u and for v (B, n+1, n+1): row a holds T_a((u - centre) / half) in powers of u."""
+        chebyshev, binomial, power = _chebyshev_in_powers(order, self.centre.device)
+        shifted = jets.powers(-self.centre.T, order)[..., power] * binomial
+        scaled = shifted * jets.powers(1 / self.half.T, order)[..., None]
+        return chebyshev @ scaled
 
 
 @lru_cache
-def _chebyshev_in_powers(order):
+def _chebyshev_in_powers(order, device):
+    """Chebyshev polynomials in powers of x; and of (x - c)^m, for each power x^i, the binomial coefficient and the power of -c: (n+1, n+1) each."""
     rows = np.zeros((order + 1, order + 1))
     for k in range(order + 1):
         rows[k, : k + 1] = chebyshev.cheb2poly(np.eye(order + 1)[k])[: k + 1]
-    return torch.as_tensor(rows)
+    m, i = np.indices(rows.shape)
+    power = np.maximum(m - i, 0)
+    return tuple(torch.as_tensor(x, device=device) for x in (rows, binom(m, i), power))
 
 
 def _chebyshev(x, order):
