@@ -143,20 +143,20 @@ def _check(box, right):
 
 
 @lru_cache
-def _product_table(order):
-    """(A, A, 4) indices into the flat moments (2n+1)^2 whose mean is the product's moment."""
+def _products(order, device):
+    """Indices (4, A^2) into the flat moments (2n+1)^2, whose mean are the moments of the products of two basis functions."""
     e = jets.exponents(order)
     a, b = e[:, None, :], e[None, :, :]
-    plus, minus = a + b, np.abs(a - b)
     n = 2 * order + 1
-    return torch.as_tensor(np.stack([p[..., 0] * n + q[..., 1] for p in (plus, minus) for q in (plus, minus)], -1))
+    index = [p[..., 0] * n + q[..., 1] for p in (a + b, np.abs(a - b)) for q in (a + b, np.abs(a - b))]
+    return torch.as_tensor(np.stack(index).reshape(4, -1), device=device)
 
 
 def _gram(moments, order):
     """Gram matrices (B, A, A) of the products T_a(x) T_b(y), from the moments (B, 2n+1, 2n+1)."""
-    table = _product_table(order).to(moments.device)
-    flat = moments.flatten(1)
-    return sum(flat[:, table[..., k]] for k in range(4)) / 4
+    flat = moments.flatten(1).T.contiguous()  # whole rows of a moment each are gathered
+    total = sum(flat.index_select(0, index) for index in _products(order, moments.device)) / 4
+    return total.T.unflatten(1, (jets.size_of(order),) * 2)
 
 
 def _factorise(gram, order):
