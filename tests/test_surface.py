@@ -9,7 +9,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 import surfaces
-from polyfit import CanonicalFrame, InputError, PatchedSurface, Patches, mesh, patch_count, read_mesh, smoothed
+from polyfit import CanonicalFrame, InputError, PatchedSurface, Patches, PolyFit, mesh, patch_count, read_mesh, smoothed
 
 RNG = np.random.default_rng(3)
 
@@ -219,6 +219,16 @@ def test_a_tiny_closed_part_stays_in_its_place():
     off = (surface.vertices() - torch.as_tensor(surface.patches.vertices, dtype=torch.float32)).norm(dim=1)
     tiny = torch.as_tensor(np.linalg.norm(surface.patches.vertices, axis=1) < 0.1)
     assert off[tiny].max() < 0.01 and off[~tiny].square().mean().sqrt() < 1e-3
+
+
+def test_polyfit_may_choose_frames_and_order():
+    surface = PatchedSurface.from_mesh(*surfaces.tube(), 8, polyfit=PolyFit(3))
+    plain = PatchedSurface.from_mesh(*surfaces.tube(), 8, 3)
+    assert surface.alpha.shape == (8, 10)
+    assert (surface.vertices() - plain.vertices()).abs().max() < 1e-4
+    model = PolyFit.pretrained().requires_grad_(False)
+    rms = [s.residual.square().mean().sqrt() for s in (PatchedSurface.from_mesh(*surfaces.tube(), 4, polyfit=model), PatchedSurface.from_mesh(*surfaces.tube(), 4))]
+    assert rms[0] < 1.5 * rms[1]
 
 
 def test_surface_moves_to_another_type(ball):
