@@ -64,11 +64,7 @@ def sheets(F):
     At an edge of three or more faces, and at a vertex where parts meet that share no edge there, each part gets a vertex of
     its own; so the new faces are joined by edges of two faces only, as far as a local cut can achieve that. Winding does not matter.
     """
-    _, edge = edges_of(F)
-    order = np.argsort(edge.ravel(), kind="stable")
-    uses = np.bincount(edge.ravel())
-    start = (np.cumsum(uses) - uses)[uses == 2]
-    one, two = order[start], order[start + 1]  # the corners from which the two faces of an edge walk along it
+    one, two = _across(F)
     after = lambda corner: corner - corner % 3 + (corner + 1) % 3
     alike = F.ravel()[one] == F.ravel()[two]
     pairs = [
@@ -76,6 +72,30 @@ def sheets(F):
         (after(one), np.where(alike, after(two), two)),
     ]
     return components(F.size, np.concatenate([np.stack(p, axis=1) for p in pairs])).reshape(F.shape)
+
+
+def winding(F):
+    """1 or -1 for each face (F,): -1 where it is wound against most faces of its component, so that all agree after it is turned round.
+
+    Components that have no two sides (a Moebius strip) are left as they are. F as of :func:`sheets`.
+    """
+    one, two = _across(F)
+    against = (F.ravel()[one] == F.ravel()[two]) * len(F)
+    f, g = one // 3, two // 3  # faces f and g are wound alike, or f and g turned round are
+    pairs = np.concatenate([np.stack([f, g + against], axis=1), np.stack([f + len(F), g + len(F) - against], axis=1)])
+    kept, turned = components(2 * len(F), pairs).reshape(2, -1)
+    agree = np.bincount(kept, minlength=max(kept.max(), turned.max()) + 1)
+    more = (agree[kept] > agree[turned]) | ((agree[kept] == agree[turned]) & (kept <= turned))
+    return np.where(more, 1, -1)
+
+
+def _across(F):
+    """The edges of two faces: the corners (of F.ravel()) from which the one and the other walk along them."""
+    _, edge = edges_of(F)
+    order = np.argsort(edge.ravel(), kind="stable")
+    uses = np.bincount(edge.ravel())
+    start = (np.cumsum(uses) - uses)[uses == 2]
+    return order[start], order[start + 1]
 
 
 def components(count, pairs):

@@ -25,7 +25,8 @@ class Patches:
 
     The cut is made on the mesh after ``levels`` subdivisions, ``vertices`` (M, 3) float64 [m] and ``faces`` (G, 3); the first N vertices are
     those given, the ``given`` faces (F, 3) become the rows 4^levels f onwards. ``sheets`` (G, 3) are the same faces on vertices that are split where the
-    surface is no manifold (:func:`polyfit.mesh.sheets`), S of them, and ``label`` (S,) is the patch of each.
+    surface is no manifold (:func:`polyfit.mesh.sheets`), S of them, and ``label`` (S,) is the patch of each. ``side`` (G,) is -1 where a face is wound
+    against most of its part, else 1.
 
     A patch's *chart* holds all vertices of the faces that touch the patch, so that the charts of neighbours overlap by one row
     of faces. One vertex in one chart is an *entry*: ``entry_patch`` (E,), rising, and ``entry_vertex`` (E,).
@@ -38,6 +39,7 @@ class Patches:
     levels: int
     sheets: np.ndarray
     label: np.ndarray
+    side: np.ndarray
     entry_patch: np.ndarray
     entry_vertex: np.ndarray
     face_entries: np.ndarray
@@ -56,6 +58,7 @@ class Patches:
         """
         V, given = mesh.checked(vertices, faces, where)
         split = mesh.sheets(given)
+        side = mesh.winding(split)
         part = _components_of_faces(split)
         parts = int(part.max()) + 1
         area = mesh.areas(V, given)
@@ -70,13 +73,14 @@ class Patches:
             F, edges = mesh.subdivided(F)
             V = np.concatenate([V, V[edges].mean(axis=1)])
             split = mesh.subdivided(split)[0]
-        label = _cluster(V, F, split, np.repeat(part, 4**levels), count)
-        return cls(V, F, given, levels, split, label, *_entries(len(V), F, label[split]))
+        part, side = np.repeat(part, 4**levels), np.repeat(side, 4**levels)
+        label = _cluster(V, F, split, part, side, count)
+        return cls(V, F, given, levels, split, label, side, *_entries(len(V), F, label[split]))
 
     def relabelled(self, label):
         """The same mesh cut otherwise: ``label`` (S,), each of 0 .. K - 1 used and connected."""
         entries = _entries(len(self.vertices), self.faces, label[self.sheets])
-        return Patches(self.vertices, self.faces, self.given, self.levels, self.sheets, label, *entries)
+        return Patches(self.vertices, self.faces, self.given, self.levels, self.sheets, label, self.side, *entries)
 
     @cached_property
     def corner_patch(self):
@@ -112,8 +116,8 @@ class Patches:
 
     @cached_property
     def direction(self):
-        """Mean normals of the patches by their faces' winding, as long as the area they speak for, (K, 3) [m^2]."""
-        n = np.repeat(mesh.face_vectors(self.vertices, self.faces) / 6, 3, axis=0)
+        """Mean normals of the patches by the winding of most faces, as long as the area they speak for, (K, 3) [m^2]."""
+        n = np.repeat(self.side[:, None] * mesh.face_vectors(self.vertices, self.faces) / 6, 3, axis=0)
         return np.stack([np.bincount(self.corner_patch.ravel(), n[:, k], minlength=len(self)) for k in range(3)], axis=1)
 
     @cached_property
@@ -162,12 +166,12 @@ def _levels(vertices, area, count, density):
     return max(0, min(int(np.ceil(max(few, large))), int(most)))
 
 
-def _cluster(V, F, split, part, count):
+def _cluster(V, F, split, part, side, count):
     """The patch of each vertex of ``split`` (G, 3): clusters of each part of the surface, ``part`` (G,), as many as its share of the area."""
     size = int(split.max()) + 1
     points, of_vertex = np.empty((size, 3)), np.empty(size, dtype=np.int64)
     points[split], of_vertex[split] = V[F], part[:, None]
-    normals = np.stack([np.bincount(split.ravel(), np.repeat(x, 3), minlength=size) for x in mesh.face_vectors(points, split).T], axis=1)
+    normals = np.stack([np.bincount(split.ravel(), np.repeat(side * x, 3), minlength=size) for x in mesh.face_vectors(points, split).T], axis=1)
     area = np.bincount(split.ravel(), np.repeat(mesh.areas(points, split) / 3, 3), minlength=size)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
     area = np.maximum(area, 1e-9 * area.mean())

@@ -56,6 +56,19 @@ def test_a_vertex_where_two_cones_meet_is_split():
     assert len(np.unique(mesh.sheets(F))) == 18
 
 
+def test_faces_wound_the_other_way_are_found():
+    V, F = surfaces.joined(surfaces.sphere(subdivisions=2), surfaces.tube())
+    rng = np.random.default_rng(4)
+    turned = rng.random(len(F)) < 0.3
+    mixed = np.where(turned[:, None], F[:, ::-1], F)
+    assert (mesh.winding(F) == 1).all()
+    assert (mesh.winding(mixed) == np.where(turned, -1, 1)).all()
+    assert (mesh.winding(surfaces.moebius()[1]) == 1).all()
+    a, b = Patches.cut(V, F, 20), Patches.cut(V, mixed, 20)
+    rms = [np.linalg.norm(p.direction, axis=1).sum() for p in (a, b)]
+    assert rms[1] == pytest.approx(rms[0], rel=0.05)  # the patches of the one are as flat as those of the other
+
+
 SHAPES = {
     "sphere": (surfaces.sphere(), 20),
     "tube": (surfaces.tube(), 7),
@@ -106,7 +119,7 @@ def test_charts_overlap_by_the_faces_that_touch_several_patches(shape):
 def test_shares_of_area_and_direction_add_up(shape):
     _, _, _, p = shape
     assert p.entry_weight.sum() == pytest.approx(mesh.areas(p.vertices, p.faces).sum()) and p.entry_weight.min() >= 0
-    assert p.direction.sum(axis=0) == pytest.approx(mesh.face_vectors(p.vertices, p.faces).sum(axis=0) / 2, abs=1e-12)
+    assert p.direction.sum(axis=0) == pytest.approx((p.side[:, None] * mesh.face_vectors(p.vertices, p.faces)).sum(axis=0) / 2, abs=1e-12)
 
 
 def test_boundary_pairs_and_neighbours(shape):

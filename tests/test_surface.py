@@ -137,6 +137,14 @@ def test_normals_are_on_the_side_of_the_faces(ball):
     assert ((inverse.normals(inverse.vertex_patch, inverse.vertex_uv) * torch.as_tensor(inverse.patches.vertices)).sum(1) < -0.19).all()
 
 
+def test_normals_agree_where_the_winding_does_not():
+    V, F = surfaces.sphere(0.2)
+    F = np.where(np.random.default_rng(1).random(len(F))[:, None] < 0.3, F[:, ::-1], F)
+    mixed = PatchedSurface.from_mesh(V, F, 20, dtype=torch.float64)
+    outwards = (mixed.normals(mixed.vertex_patch, mixed.vertex_uv) * torch.as_tensor(mixed.patches.vertices)).sum(1)
+    assert (outwards > 0.19).all()
+
+
 def test_boundary_points_of_two_patches_are_the_same_place(sleeve):
     points, normals = sleeve.boundary()
     assert points.shape == normals.shape == (len(sleeve.patches.boundary), 2, 3)
