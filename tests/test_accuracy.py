@@ -80,6 +80,16 @@ def test_shipped_weights_saw_none_of_the_held_out_garments():
     assert not set(made["meshes"]) & {Path(m).name for m in accuracy.HELD_OUT}
 
 
+def test_trainings_that_are_missing_are_made_once(tmp_path, monkeypatch):
+    small = "--steps 2 --patches 60 --points 30 --reads 20 --batch 8".split()
+    monkeypatch.setattr(accuracy, "TRAININGS", {"families": (small, False)})
+    said = []
+    for _ in range(2):
+        accuracy.train_missing(tmp_path, tmp_path / "runs", said.append)
+    assert said == ["training families"]
+    assert accuracy.trained(tmp_path / "runs", "families", PolyFit.load).order == 4
+
+
 def test_missing_data_is_named(tmp_path):
     with pytest.raises(InputError, match="tshirt.obj: no such file"):
         accuracy.kinds(tmp_path)
