@@ -63,7 +63,8 @@ class Template:
         x = frame.to_chart(points)
         fitted = jets.fit(x, order)
         if fitted.order < order:
-            raise InputError(f"{where}: order = {order} is too high: its {len(points)} vertices determine no more than order {int(fitted.order)}")
+            wanted = f"a jet of order {order} has {jets.size_of(order)} coefficients"
+            raise InputError(f"{where}: order = {order} is too high: {wanted}, and the {len(points)} vertices determine no more than order {int(fitted.order)}")
         alpha = fitted.alpha
         residual = (x[:, 2] - jets.height(alpha, x[:, :2])).numpy() * float(frame.s)
         template = cls(
