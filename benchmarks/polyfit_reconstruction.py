@@ -2,11 +2,11 @@
 
     python benchmarks/polyfit_reconstruction.py DATA/garments_snug/*.obj
 
-First the paper's own measure at the paper's number of patches: the symmetric Chamfer distance between 10,000 points of the garment and 10,000 of
-the reconstruction, in the unit sphere about the box's centre, times 1e3. Its floor is that of two samplings of the garment itself.
-Then what does tell methods apart, for several numbers of patches: the distances between the surfaces (RMS and 95th percentile, of points of either
-one from the other) and the angle between their normals, beside AtlasNet's. Its charts (Groueix et al. 2018) are here fitted to the one
-surface, by Adam on the Chamfer distance, without an encoder: their decoders then have as many numbers as the jets.
+First the paper's own measure at the paper's number of patches: the symmetric Chamfer distance between 10,000 points of the garment and
+10,000 of the reconstruction, in the unit sphere about the box's centre, times 1e3. Its floor is that of two samplings of the garment
+itself. Then what does tell methods apart, for several numbers of patches: the distances between the surfaces (RMS and 95th percentile, of
+points of either one from the other) and the angle between their normals, beside AtlasNet's. Its charts (Groueix et al. 2018) are here
+fitted to the one surface, by Adam on the Chamfer distance, without an encoder: their decoders then have as many numbers as the jets.
 """
 
 import argparse
@@ -50,14 +50,16 @@ def to_surface(points, V, F):
 
 
 def between(V, F, W, G, points):
-    """RMS and 95th percentile [m] of the distances of points of two meshes from the other, and the mean angle [degrees] of their normals, turned alike."""
+    """RMS and 95th percentile [m] of the distances of points of two meshes from the other, and the mean angle [degrees] of their normals,
+    turned alike."""
     distances, angles = [], []
     for seed, (A, B, C, D) in enumerate(((V, F, W, G), (W, G, V, F))):
         rng = np.random.default_rng(seed)
         area = mesh.areas(A, B)
         face = rng.choice(len(B), points, p=area / area.sum())
         distance, nearest = to_surface(np.einsum("pj,pjc->pc", rng.dirichlet((1, 1, 1), points), A[B[face]]), C, D)
-        normals = [n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-300) for n in (mesh.face_vectors(A, B)[face], mesh.face_vectors(C, D)[nearest])]
+        normals = [mesh.face_vectors(A, B)[face], mesh.face_vectors(C, D)[nearest]]
+        normals = [n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-300) for n in normals]
         distances.append(distance)
         angles.append(np.degrees(np.arccos(np.clip(np.abs((normals[0] * normals[1]).sum(1)), 0, 1))))
     distance = np.concatenate(distances)
@@ -118,11 +120,12 @@ def paper_table(garments, order, seeds=3):
         floor = 1e3 * np.mean([chamfer(clouds[s], clouds[seeds + s]) for s in range(seeds)])
         own = 1e3 * np.mean([chamfer(unit(sample(POINTS, 100 + s)), clouds[s]) for s in range(seeds)])
         rms, p95, angle = between(V, F, W, G, POINTS)
-        rows.append(dict(garment=name, patches=int(_patches(V, F)), chamfer=own, floor=floor, over_floor=own / floor - 1, paper=PAPER.get(name), rms_mm=1e3 * rms))
-        rows[-1].update(p95_mm=1e3 * p95, normal_deg=angle, seconds=seconds)
-        r = rows[-1]
+        r = dict(garment=name, patches=int(_patches(V, F)), chamfer=own, floor=floor, over_floor=own / floor - 1, paper=PAPER.get(name))
+        r.update(rms_mm=1e3 * rms, p95_mm=1e3 * p95, normal_deg=angle, seconds=seconds)
+        rows.append(r)
         print(
-            f"{name:>18} K {r['patches']:3}  Chamfer {own:.3f}  floor {floor:.3f} ({100 * r['over_floor']:+.1f} %)  paper {r['paper'] or '-':>5}  "
+            f"{name:>18} K {r['patches']:3}  Chamfer {own:.3f}  floor {floor:.3f} ({100 * r['over_floor']:+.1f} %)  "
+            f"paper {r['paper'] or '-':>5}  "
             f"RMS {r['rms_mm']:.3f} mm  95 % {r['p95_mm']:.3f} mm  normals {angle:.2f} deg  {seconds:.1f} s",
             flush=True,
         )
@@ -135,6 +138,10 @@ def _patches(V, F):
     return min(len(V), patch_count(mesh.areas(V, F).sum()))
 
 
+def told(rms, p95, angle):
+    return f"RMS {rms:6.3f}  95 % {p95:6.3f} mm  normals {angle:5.2f} deg"
+
+
 def size_table(garments, order, iterations):
     rows = []
     for name, (V, F) in garments.items():
@@ -142,12 +149,12 @@ def size_table(garments, order, iterations):
             row = dict(garment=name, patches=count)
             W, G, row["numbers"], _ = jets(V, F, count, order)
             row["rms_mm"], row["p95_mm"], row["normal_deg"] = np.array(between(V, F, W, G, POINTS)) * (1e3, 1e3, 1)
-            line = f"{name:>18} K {count:3}  {row['numbers']:5} numbers: RMS {row['rms_mm']:6.3f}  95 % {row['p95_mm']:6.3f} mm  normals {row['normal_deg']:5.2f} deg"
+            line = f"{name:>18} K {count:3}  {row['numbers']:5} numbers: {told(row['rms_mm'], row['p95_mm'], row['normal_deg'])}"
             if iterations:
                 W, G, row["atlasnet_numbers"] = atlasnet(V, F, *CHARTS[count], iterations)
                 found = np.array(between(V, F, W, G, POINTS)) * (1e3, 1e3, 1)
                 row["atlasnet_rms_mm"], row["atlasnet_p95_mm"], row["atlasnet_normal_deg"] = found
-                line += f"   AtlasNet, {row['atlasnet_numbers']:5} numbers: RMS {found[0]:6.2f}  95 % {found[1]:6.2f} mm  normals {found[2]:5.2f} deg"
+                line += f"   AtlasNet, {row['atlasnet_numbers']:5} numbers: {told(*found)}"
             rows.append({k: float(v) if isinstance(v, np.floating) else v for k, v in row.items()})
             print(line, flush=True)
     return rows
@@ -161,7 +168,8 @@ def main(argv=None):
     parser.add_argument("-o", "--output", default="out/benchmarks")
     args = parser.parse_args(argv)
     garments = {Path(m).stem: read_mesh(m)[:2] for m in args.meshes}
-    report = dict(order=args.order, iterations=args.iterations, paper=paper_table(garments, args.order), sizes=size_table(garments, args.order, args.iterations))
+    report = dict(order=args.order, iterations=args.iterations, paper=paper_table(garments, args.order))
+    report["sizes"] = size_table(garments, args.order, args.iterations)
     Path(args.output).mkdir(parents=True, exist_ok=True)
     path = Path(args.output) / "polyfit_reconstruction.json"
     path.write_text(json.dumps(report, indent=1))

@@ -3,8 +3,9 @@
     python benchmarks/polyfit_speed.py [--threads 2] [--device cuda]
 
 Batches of 512 patches of 256 points by jets of order 4, milliseconds a patch: the fit alone, the PCA frame and the fit, and both with the
-spatial transformer; forward, and forward and backward. Then a mesh of 100,000 vertices cut into 400 patches, fitted, its boundaries moved. The
-median of repeated runs by the clock, and the least processor time (which a busy machine disturbs less); the peak of the process's memory (of the device's, on a GPU) is that after all of them.
+spatial transformer; forward, and forward and backward. Then a mesh of 100,000 vertices cut into 400 patches, fitted, its boundaries moved.
+The median of repeated runs by the clock, and the least processor time (which a busy machine disturbs less); the peak of the process's
+memory (of the device's, on a GPU) is that after all of them.
 """
 
 import argparse

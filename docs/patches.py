@@ -37,7 +37,8 @@ def shaped(V, F, colours, smooth):
     else:
         normals = vertex_normals(V, F)
     props = mi.Properties()
-    props["bsdf"] = mi.load_dict({"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_color"}}})
+    colour = {"type": "mesh_attribute", "name": "vertex_color"}
+    props["bsdf"] = mi.load_dict({"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": colour}})
     props["face_normals"] = not smooth
     out = mi.Mesh("garment", len(V), len(F), has_vertex_normals=smooth, props=props)
     out.add_attribute("vertex_color", 3, colours.astype(np.float32).ravel())

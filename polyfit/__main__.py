@@ -7,7 +7,9 @@ from .errors import InputError, cli
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(prog="python -m polyfit", description="Fit patches of jets to a mesh and write their surface, at any resolution.")
+    parser = argparse.ArgumentParser(
+        prog="python -m polyfit", description="Fit patches of jets to a mesh, write their surface at any resolution."
+    )
     parser.add_argument("mesh", help="an .obj or .ply file [m]")
     parser.add_argument("-o", "--output", required=True, help="the .ply file to write")
     parser.add_argument("--patches", type=int, help="how many; by default the paper's number for the mesh's area")
@@ -29,7 +31,8 @@ def main(argv=None):
     fine, fine_faces = surface.resampled(args.resolution, args.smoothing)
     write_ply(args.output, fine.numpy(), fine_faces.numpy())
     rms = surface.residual.square().mean().sqrt()
-    print(f"{len(surface)} patches, {surface.parameters} numbers, {1e3 * float(rms):.3f} mm RMS from the mesh; {args.output}: {len(fine)} vertices")
+    print(f"{len(surface)} patches, {surface.parameters} numbers, {1e3 * float(rms):.3f} mm RMS from the mesh")
+    print(f"written: {args.output}, {len(fine)} vertices")
 
 
 if __name__ == "__main__":

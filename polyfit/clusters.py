@@ -1,9 +1,9 @@
 """Clusters of vertices that one jet can hold: ACVD (Valette & Chassery 2004), with the normals in its energy.
 
-ACVD finds connected clusters of least sum of squared distances from their centroids, so round ones of equal area. A jet also
-needs its cluster to be a height graph, and a round cluster of a sleeve may go all the way around it. Here a vertex is the point (x / r, w n) in six dimensions, with r the radius of a
-disc of the clusters' mean area and n its normal; the energy is ACVD's. A fine cut by pyacvd is merged to the number asked for, each time where the energy
-grows least (Ward 1963), and the boundaries then move to where it is lowest.
+ACVD finds connected clusters of least sum of squared distances from their centroids, so round ones of equal area. A jet also needs its
+cluster to be a height graph, and a round cluster of a sleeve may go all the way around it. Here a vertex is the point (x / r, w n) in six
+dimensions, with r the radius of a disc of the clusters' mean area and n its normal; the energy is ACVD's. A fine cut by pyacvd is merged to
+the number asked for, each time where the energy grows least (Ward 1963), and the boundaries then move to where it is lowest.
 """
 
 import heapq
@@ -22,9 +22,11 @@ SWEEPS = 100
 
 
 def clusters(points, normals, area, faces, edges, count):
-    """Labels 0 .. count - 1 (P,) of a connected mesh: points (P, 3) [m], unit normals (P, 3), area (P,) [m^2] around each, faces (F, 3), edges (E, 2).
+    """Labels 0 .. count - 1 (P,) of a connected mesh: points (P, 3) [m], unit normals (P, 3), area (P,) [m^2] around each, faces (F, 3),
+    edges (E, 2).
 
-    Every cluster is connected; there may be fewer than ``count``. Where clusters still fold over, the normals get more weight, as long as that helps.
+    Every cluster is connected; there may be fewer than ``count``. Where clusters still fold over, the normals get more weight, as long as
+    that helps.
     """
     radius = np.sqrt(area.sum() / (np.pi * count))
     fine = max(count, min(FINE * count, len(points) // FINE_VERTICES))
@@ -73,7 +75,8 @@ def _merged(label, feature, area, edges, count):
 
     def offer(a, b):
         difference = total[a] / size[a] - total[b] / size[b]
-        heapq.heappush(heap, (size[a] * size[b] / (size[a] + size[b]) * (difference @ difference), min(a, b), max(a, b), stamp[a] + stamp[b]))
+        growth = size[a] * size[b] / (size[a] + size[b]) * (difference @ difference)
+        heapq.heappush(heap, (growth, min(a, b), max(a, b), stamp[a] + stamp[b]))
 
     stamp, parent = [0] * len(size), np.arange(len(size))
     for a in range(len(size)):
@@ -119,7 +122,8 @@ def _relaxed(label, feature, area, edges):
 
 
 def swept(label, edges, sweep, cost):
-    """Give, in place, vertices at the clusters' boundaries to that neighbouring cluster for which ``cost(vertices, own, to)`` (C,) is least, where it is negative.
+    """Give, in place, vertices at the clusters' boundaries to that neighbouring cluster for which ``cost(vertices, own, to)`` (C,) is
+    least, where it is negative.
 
     Each sweep looks at every other vertex, so that neighbours seldom move together. Returns how many of those looked at moved, as a share.
     """

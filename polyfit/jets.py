@@ -1,10 +1,9 @@
 """n-jets: heights z(u, v) = sum_i sum_j alpha_{i-j,j} u^(i-j) v^j and their closed-form geometry (paper, section "PolyFit").
 
-``alpha`` (..., A) has A = (n+1)(n+2)/2 entries, in the paper's order: i = 0..n, and j = 0..i within each i, that is
-1, u, v, u^2, uv, v^2, u^3, ... ``uv`` (..., P, 2) are P chart coordinates of each jet; leading dimensions broadcast, so that
-one jet (A,) takes (P, 2) and a batch (B, A) takes (B, P, 2). All lengths are in the canonical unit
-(:class:`polyfit.frames.CanonicalFrame`), curvatures in its inverse. Everything is differentiable in ``alpha`` and ``uv``.
-The same functions stand in Dr.Jit in ``polysft_mi.jet``, by the same names.
+``alpha`` (..., A) has A = (n+1)(n+2)/2 entries, in the paper's order: i = 0..n, and j = 0..i within each i, that is 1, u, v, u^2, uv, v^2,
+u^3, ... ``uv`` (..., P, 2) are P chart coordinates of each jet; leading dimensions broadcast, so that one jet (A,) takes (P, 2) and a batch
+(B, A) takes (B, P, 2). All lengths are in the canonical unit (:class:`polyfit.frames.CanonicalFrame`), curvatures in its inverse.
+Everything is differentiable in ``alpha`` and ``uv``. The same functions stand in Dr.Jit in ``polysft_mi.jet``, by the same names.
 """
 
 from dataclasses import dataclass
@@ -143,7 +142,8 @@ def principal_curvatures(alpha, uv):
 
 
 def nearest(alpha, x, steps=4):
-    """Chart coordinates uv (..., P, 2) of the jets' points nearest to points x (..., P, 3) of their charts, found from the points' own (u, v) by Gauss and Newton.
+    """Chart coordinates uv (..., P, 2) of the jets' points nearest to points x (..., P, 3) of their charts, found from the points' own (u,
+    v) by Gauss and Newton.
 
     A step that does not bring the point nearer is not taken. Without gradient.
     """

@@ -48,8 +48,8 @@ class LeastSquares(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad, _):
-        # At the minimum sum w (z - c.b) b = 0 holds for the points' basis values b. Differentiated: dc = G^-1 d(sum w (z - c.b) b) at fixed c,
-        # and the gradient contracts it with y = G^-1 grad, a jet like c itself.
+        # At the minimum sum w (z - c.b) b = 0 holds for the points' basis values b. Differentiated: dc = G^-1 d(sum w (z - c.b) b) at fixed
+        # c, and the gradient contracts it with y = G^-1 grad, a jet like c itself.
         points, weights, alpha, factor, kept, total = ctx.saved_tensors
         right = ctx.box.to_monomials_transposed(grad.to(torch.float64), ctx.order) * kept
         y = ctx.box.to_monomials(torch.cholesky_solve(right[..., None], factor)[..., 0] * kept, ctx.order)
@@ -103,7 +103,8 @@ class _Box:
 
 @lru_cache
 def _chebyshev_in_powers(order, device):
-    """Chebyshev polynomials in powers of x; and of (x - c)^m, for each power x^i, the binomial coefficient and the power of -c: (n+1, n+1) each."""
+    """Chebyshev polynomials in powers of x; and of (x - c)^m, for each power x^i, the binomial coefficient and the power of -c: (n+1, n+1)
+    each."""
     rows = np.zeros((order + 1, order + 1))
     for k in range(order + 1):
         rows[k, : k + 1] = chebyshev.cheb2poly(np.eye(order + 1)[k])[: k + 1]

@@ -50,7 +50,8 @@ def areas(V, F):
 
 
 def edges_of(F):
-    """Edges of the faces, each once and the smaller vertex first, (E, 2); and of which edge the side from corner k to the next is, (F, 3)."""
+    """Edges of the faces, each once and the smaller vertex first, (E, 2); and of which edge the side from corner k to the next is, (F,
+    3)."""
     side = np.stack([F, np.roll(F, -1, axis=1)], axis=-1)
     side.sort(axis=-1)
     size = int(F.max()) + 1
@@ -107,8 +108,8 @@ def components(count, pairs):
 def subdivided(F):
     """Every face cut in four at the middles of its sides: ``(faces (4 F, 3), edges (E, 2))``.
 
-    The middle of ``edges[e]`` is the vertex n + e, n the number of vertices of F. The children of face f are the rows 4 f + k: k = 0, 1, 2 at corner k and
-    3 in the middle, each with its corners in the order of the parent's (the middle one: opposite to them).
+    The middle of ``edges[e]`` is the vertex n + e, n the number of vertices of F. The children of face f are the rows 4 f + k: k = 0, 1, 2
+    at corner k and 3 in the middle, each with its corners in the order of the parent's (the middle one: opposite to them).
     """
     edges, side = edges_of(F)
     (a, b, c), (ab, bc, ca) = F.T, (side + int(F.max()) + 1).T
@@ -129,8 +130,8 @@ def child(face, barycentric, levels):
 
 
 def refined(F, parts):
-    """The faces with every side cut in ``parts``: ``(faces (parts^2 F, 3), face (N',), barycentric (N', 3))``, where the new vertex k lies at
-    ``barycentric[k]`` on the face ``face[k]`` of F. The vertices of F come first, in their order; neighbours share the new ones.
+    """The faces with every side cut in ``parts``: ``(faces (parts^2 F, 3), face (N',), barycentric (N', 3))``, where the new vertex k lies
+    at ``barycentric[k]`` on the face ``face[k]`` of F. The vertices of F come first, in their order; neighbours share the new ones.
     """
     grid = np.array([(i, j, parts - i - j) for i in range(parts, -1, -1) for j in range(parts - i, -1, -1)])
     count, edges, side = int(F.max()) + 1, *edges_of(F)

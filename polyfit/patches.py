@@ -9,7 +9,8 @@ from . import mesh
 from .clusters import clusters, halved
 from .errors import InputError
 
-# Vertices that a mesh should have before it is cut, for each patch and altogether: enough for the patches' outlines and for their jets' fit.
+# Vertices that a mesh should have before it is cut, for each patch and altogether: enough for the patches' outlines and for their jets'
+# fit.
 DENSITY = 100
 LEAST = 10_000
 
@@ -23,10 +24,10 @@ def patch_count(area):
 class Patches:
     """A mesh and its cut.
 
-    The cut is made on the mesh after ``levels`` subdivisions, ``vertices`` (M, 3) float64 [m] and ``faces`` (G, 3); the first N vertices are
-    those given, the ``given`` faces (F, 3) become the rows 4^levels f onwards. ``sheets`` (G, 3) are the same faces on vertices that are split where the
-    surface is no manifold (:func:`polyfit.mesh.sheets`), S of them, and ``label`` (S,) is the patch of each. ``side`` (G,) is -1 where a face is wound
-    against most of its part, else 1.
+    The cut is made on the mesh after ``levels`` subdivisions, ``vertices`` (M, 3) float64 [m] and ``faces`` (G, 3); the first N vertices
+    are those given, the ``given`` faces (F, 3) become the rows 4^levels f onwards. ``sheets`` (G, 3) are the same faces on vertices that
+    are split where the surface is no manifold (:func:`polyfit.mesh.sheets`), S of them, and ``label`` (S,) is the patch of each. ``side``
+    (G,) is -1 where a face is wound against most of its part, else 1.
 
     A patch's *chart* holds all vertices of the faces that touch the patch, so that the charts of neighbours overlap by one row
     of faces. One vertex in one chart is an *entry*: ``entry_patch`` (E,), rising, and ``entry_vertex`` (E,).
@@ -52,9 +53,9 @@ class Patches:
     def cut(cls, vertices, faces, count=None, *, density=DENSITY, where="mesh"):
         """Cut the mesh (N, 3) [m], (F, 3) into ``count`` connected patches; by default :func:`patch_count` of them.
 
-        The mesh is subdivided until it has about ``density`` vertices a patch, and 10,000. Separate components, and sheets that meet in
-        an edge of three or more faces, share no patch: each has at least one, and the default count is raised where that needs more. Raises InputError
-        for a mesh that :func:`polyfit.mesh.checked` refuses, and for a count that its components or its vertices do not allow.
+        The mesh is subdivided until it has about ``density`` vertices a patch, and 10,000. Separate components, and sheets that meet in an
+        edge of three or more faces, share no patch: each has at least one, and the default count is raised where that needs more. Raises
+        InputError for a mesh that :func:`polyfit.mesh.checked` refuses, and for a count that its components or its vertices do not allow.
         """
         V, given = mesh.checked(vertices, faces, where)
         split = mesh.sheets(given)
@@ -159,7 +160,8 @@ def _components_of_faces(F):
 
 
 def _levels(vertices, area, count, density):
-    """Subdivisions until there are vertices enough, and no face is larger than a tenth of a patch (or until there are some million faces)."""
+    """Subdivisions until there are vertices enough, and no face is larger than a tenth of a patch (or until there are some million
+    faces)."""
     few = np.log(max(density * count, LEAST) / vertices) / np.log(4)
     large = np.log(10 * count * area.max() / area.sum()) / np.log(4)
     most = np.log(4e6 / len(area)) / np.log(4)
@@ -167,11 +169,13 @@ def _levels(vertices, area, count, density):
 
 
 def _cluster(V, F, split, part, side, count):
-    """The patch of each vertex of ``split`` (G, 3): clusters of each part of the surface, ``part`` (G,), as many as its share of the area."""
+    """The patch of each vertex of ``split`` (G, 3): clusters of each part of the surface, ``part`` (G,), as many as its share of the
+    area."""
     size = int(split.max()) + 1
     points, of_vertex = np.empty((size, 3)), np.empty(size, dtype=np.int64)
     points[split], of_vertex[split] = V[F], part[:, None]
-    normals = np.stack([np.bincount(split.ravel(), np.repeat(side * x, 3), minlength=size) for x in mesh.face_vectors(points, split).T], axis=1)
+    vectors = side[:, None] * mesh.face_vectors(points, split)
+    normals = np.stack([np.bincount(split.ravel(), np.repeat(x, 3), minlength=size) for x in vectors.T], axis=1)
     area = np.bincount(split.ravel(), np.repeat(mesh.areas(points, split) / 3, 3), minlength=size)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
     area = np.maximum(area, 1e-9 * area.mean())

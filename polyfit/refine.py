@@ -5,7 +5,8 @@ import torch
 
 from . import clusters, mesh
 
-# Weight of a vertex's squared distance from its patch's centroid against its squared distance from the jet, each divided by its mean: keeps patches compact.
+# Weight of a vertex's squared distance from its patch's centroid against its squared distance from the jet, each divided by its mean: keeps
+# patches compact.
 COMPACTNESS = 1.0
 # Sweeps over the boundaries between two fits.
 SWEEPS = 4

@@ -16,11 +16,11 @@ from .patches import Patches
 class PatchedSurface:
     """S_k = {O_k, phi_k(u, v)}, k = 1..K: patches, their orientations, their jets, and the chart of every vertex.
 
-    ``patches``: the :class:`polyfit.patches.Patches` of the mesh; ``frame``: the orientations, (K,); ``alpha`` (K, A): the
-    coefficients, in charts whose z points to the side of the faces' normals; ``order`` (K,): the order fitted; ``uv`` (E, 2): chart coordinates of
-    the entries, those of the jet's point nearest to the vertex.
-    ``dataclasses.replace`` with another ``alpha`` or ``frame`` gives the deformed surface on the same charts; all that follows
-    from them is differentiable. Charts overlap at the patches' boundaries, where :meth:`at` blends them.
+    ``patches``: the :class:`polyfit.patches.Patches` of the mesh; ``frame``: the orientations, (K,); ``alpha`` (K, A): the coefficients, in
+    charts whose z points to the side of the faces' normals; ``order`` (K,): the order fitted; ``uv`` (E, 2): chart coordinates of the
+    entries, those of the jet's point nearest to the vertex. ``dataclasses.replace`` with another ``alpha`` or ``frame`` gives the deformed
+    surface on the same charts; all that follows from them is differentiable. Charts overlap at the patches' boundaries, where :meth:`at`
+    blends them.
     """
 
     patches: Patches
@@ -83,7 +83,8 @@ class PatchedSurface:
         return self._turned(patch, torch.cat([uv, z[..., None]], -1)) * self.frame.s[patch][..., None] + self.frame.T[patch]
 
     def distance(self, patch, points):
-        """Distances (...,) [m] of points (..., 3) [m] from the jets of the patches ``patch`` (...,), to first order: along z, divided by the slope."""
+        """Distances (...,) [m] of points (..., 3) [m] from the jets of the patches ``patch`` (...,), to first order: along z, divided by
+        the slope."""
         frame = self.frame[patch]
         x = frame.to_chart(points[..., None, :])
         z, zu, zv = (d.squeeze(-1) for d in jets.derivatives(self.alpha[patch], x[..., :2], (0, 0), (1, 0), (0, 1)))
@@ -133,8 +134,8 @@ class PatchedSurface:
     def at(self, face, barycentric, what="points"):
         """The surface at points of the given mesh, by face (P,) and barycentric coordinates (P, 3): (P, 3) [m].
 
-        ``what``: "points" or "normals" (unit). Where a point's face (of ``patches.faces``) touches several patches, theirs are blended in proportion to the point's
-        nearness to their corners; so neighbouring patches join without a gap.
+        ``what``: "points" or "normals" (unit). Where a point's face (of ``patches.faces``) touches several patches, theirs are blended in
+        proportion to the point's nearness to their corners; so neighbouring patches join without a gap.
         """
         face, barycentric = self.patches.locate(np.asarray(face), np.asarray(barycentric))
         return self._blended(face, barycentric, what)
@@ -148,7 +149,8 @@ class PatchedSurface:
         return tuple(self._blended(face, barycentric, w) for w in what)
 
     def resampled(self, parts=4, smoothing=0):
-        """A mesh of the surface with every side of the given mesh's faces cut in ``parts``: ``(vertices (N', 3) [m], faces (parts^2 F, 3) int64)``.
+        """A mesh of the surface with every side of the given mesh's faces cut in ``parts``: ``(vertices (N', 3) [m], faces (parts^2 F, 3)
+        int64)``.
 
         The given mesh's vertices come first. ``smoothing``: how often :meth:`smoothed` is applied.
         """
@@ -203,7 +205,8 @@ class PatchedSurface:
 
 
 def smoothed(vertices, faces, where, times=1):
-    """Vertices (N, 3) with those of ``where`` (N,) bool moved ``times`` times halfway to the mean of their neighbours (Laplacian smoothing).
+    """Vertices (N, 3) with those of ``where`` (N,) bool moved ``times`` times halfway to the mean of their neighbours (Laplacian
+    smoothing).
 
     Vertices at the mesh's own boundary only feel their neighbours along it, so that the outline does not shrink. Differentiable.
     """

@@ -1,7 +1,8 @@
 """Where torch and Dr.Jit meet: PolyFit sets up the Dr.Jit template, and gradients cross both ways (``dr.wrap``).
 
     torch   points -> PolyFit -> alpha, O -> vertices -> loss
-                                                  \\-> :func:`rendering` -> image -> loss          a rendering loss reaches PolyFit's network
+                                                  \\-> :func:`rendering` -> image -> loss          a rendering loss reaches PolyFit's
+                                                  network
     Dr.Jit  alpha -> surface -> image -> loss
                  \\-> :func:`in_torch` -> any torch function -> loss                              a torch loss reaches Dr.Jit's alpha
 
@@ -33,7 +34,8 @@ def template(polyfit, vertices, faces, uv, **options):
 
 
 def surface(polyfit, points):
-    """The points (..., P, 3) [m] of patches, put onto the patches' jets along the frames' z; differentiable to the weights of ``polyfit``."""
+    """The points (..., P, 3) [m] of patches, put onto the patches' jets along the frames' z; differentiable to the weights of
+    ``polyfit``."""
     found = polyfit(points)
     chart = found.frame.to_chart(points)
     return found.frame.from_chart(jets.point(found.jet.alpha, chart[..., :2]))
@@ -50,7 +52,8 @@ def in_torch(function):
 
 
 def rendering(problem, seed=0):
-    """The rendering of a :class:`polysft_mi.problem.Problem` as a torch function: vertices (N, 3) [m, camera frame] -> (rgb (H, W, 3) linear, alpha (H, W))."""
+    """The rendering of a :class:`polysft_mi.problem.Problem` as a torch function: vertices (N, 3) [m, camera frame] -> (rgb (H, W, 3)
+    linear, alpha (H, W))."""
 
     @in_drjit
     def render(vertices):
@@ -61,7 +64,8 @@ def rendering(problem, seed=0):
 
 
 def deformed(patch):
-    """The surface of a :class:`polysft_mi.patch.JetPatch` as a torch function of the unknowns: delta_alpha (A,), delta_u (N,), delta_v (N,),
+    """The surface of a :class:`polysft_mi.patch.JetPatch` as a torch function of the unknowns: delta_alpha (A,), delta_u (N,), delta_v
+    (N,),
     rotation (4,), translation (3,) -> vertices (N, 3) [m, camera frame]."""
 
     @in_drjit

@@ -55,8 +55,8 @@ class Template:
     def fit(cls, vertices, faces, uv, order, *, frame=None, tolerance=0.05, where="template"):
         """Fit a jet of ``order`` to the mesh, in ``frame``, a :class:`polyfit.frames.CanonicalFrame` in float64, or else in its PCA frame.
 
-        Raises InputError where the order is too high for the vertices, where the surface folds over in its chart (a closed surface does), or
-        where the largest residual exceeds ``tolerance`` times the scale s.
+        Raises InputError where the order is too high for the vertices, where the surface folds over in its chart (a closed surface does),
+        or where the largest residual exceeds ``tolerance`` times the scale s.
         """
         points = torch.as_tensor(np.asarray(vertices, dtype=np.float64))
         frame = frame or CanonicalFrame.from_points(points)
@@ -64,7 +64,8 @@ class Template:
         fitted = jets.fit(x, order)
         if fitted.order < order:
             wanted = f"a jet of order {order} has {jets.size_of(order)} coefficients"
-            raise InputError(f"{where}: order = {order} is too high: {wanted}, and the {len(points)} vertices determine no more than order {int(fitted.order)}")
+            found = f"the {len(points)} vertices determine no more than order {int(fitted.order)}"
+            raise InputError(f"{where}: order = {order} is too high: {wanted}, and {found}")
         alpha = fitted.alpha
         residual = (x[:, 2] - jets.height(alpha, x[:, :2])).numpy() * float(frame.s)
         template = cls(

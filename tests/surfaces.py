@@ -36,7 +36,8 @@ def joined(*meshes):
 
 
 def with_fin(n=11):
-    """A sheet with a second one standing on its middle row: an edge of three faces along it. Some of the fin's faces are wound the other way."""
+    """A sheet with a second one standing on its middle row: an edge of three faces along it. Some of the fin's faces are wound the other
+    way."""
     V, F = sheet(n=n)
     row = np.arange(n) + n * (n // 2)
     fin = np.concatenate([row] + [np.arange(n) + len(V) + n * k for k in range(4)])

@@ -27,7 +27,8 @@ def test_refined_mesh_is_the_same_surface(parts):
 def test_points_are_found_on_the_subdivided_mesh():
     V, F = surfaces.tube()
     rng = np.random.default_rng(0)
-    face, barycentric = rng.integers(len(F), size=500), np.concatenate([rng.dirichlet((1, 1, 1), 400), np.repeat(np.eye(3), [40, 30, 30], axis=0)])
+    face = rng.integers(len(F), size=500)
+    barycentric = np.concatenate([rng.dirichlet((1, 1, 1), 400), np.repeat(np.eye(3), [40, 30, 30], axis=0)])
     W, G = V, F
     for levels in range(1, 4):
         G, edges = mesh.subdivided(G)
