@@ -1,10 +1,8 @@
-"""PolyFit: surfaces as jets in a canonical frame (paper, section "PolyFit"), in torch.
-
-This version holds what a single patch needs: its canonical frame and its least-squares jet.
-"""
+"""PolyFit: surfaces as patches, each a jet in a canonical frame (paper, section "PolyFit"), in torch."""
 
 _EXPORTS = {
     "CanonicalFrame": "frames",
+    "rotation_matrix": "frames",
     "exponents": "jets",
     "height": "jets",
     "height_derivatives": "jets",
@@ -12,7 +10,20 @@ _EXPORTS = {
     "tangents": "jets",
     "normal": "jets",
     "metric": "jets",
+    "second_fundamental_form": "jets",
+    "principal_curvatures": "jets",
+    "turned_over": "jets",
     "fit": "jets",
+    "JetFit": "jets",
+    "Patches": "patches",
+    "patch_count": "patches",
+    "PatchedSurface": "surface",
+    "smoothed": "surface",
+    "read_mesh": "meshio",
+    "write_ply": "meshio",
+    "InputError": "errors",
+    "PolyFit": "stn",
+    "SpatialTransformer": "stn",
 }
 
 __all__ = sorted(_EXPORTS)

@@ -1,116 +1,210 @@
 """n-jets: heights z(u, v) = sum_i sum_j alpha_{i-j,j} u^(i-j) v^j and their closed-form geometry (paper, section "PolyFit").
 
-``alpha`` has A = (n+1)(n+2)/2 entries, in the paper's order: i = 0..n, and j = 0..i within each i, that is
-1, u, v, u^2, uv, v^2, u^3, ... All lengths are in the canonical unit (:class:`polyfit.frames.CanonicalFrame`).
-The same functions stand in Dr.Jit in ``polysft_mi.jet``, by the same names.
+``alpha`` (..., A) has A = (n+1)(n+2)/2 entries, in the paper's order: i = 0..n, and j = 0..i within each i, that is 1, u, v, u^2, uv, v^2,
+u^3, ... ``uv`` (..., P, 2) are P chart coordinates of each jet; leading dimensions broadcast, so that one jet (A,) takes (P, 2) and a batch
+(B, A) takes (B, P, 2). All lengths are in the canonical unit (:class:`polyfit.frames.CanonicalFrame`), curvatures in its inverse.
+Everything is differentiable in ``alpha`` and ``uv``. The same functions stand in Dr.Jit in ``polysft_mi.jet``, by the same names.
 """
+
+from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
 
+from .errors import InputError
 
+
+@lru_cache
 def exponents(order):
-    """Exponents (of u, of v) of the coefficients, shape (A, 2)."""
+    """Exponents (of u, of v) of the coefficients, shape (A, 2); the same array each time, not to be written to."""
     return np.array([(i - j, j) for i in range(order + 1) for j in range(i + 1)], dtype=np.int64)
+
+
+def size_of(order):
+    """Number of coefficients A of a jet of ``order``."""
+    return (order + 1) * (order + 2) // 2
 
 
 def order_of(size):
     """Order n of a jet with ``size`` coefficients. Raises ValueError where there is none."""
     order = int((np.sqrt(8 * size + 1) - 3) / 2 + 0.5)
-    if (order + 1) * (order + 2) // 2 != size:
+    if size_of(order) != size:
         raise ValueError(f"{size} is not the number of coefficients of a jet")
     return order
 
 
-def _powers(x, order):
-    """x^0 .. x^n, (..., n+1)."""
-    out = [torch.ones_like(x)]
-    for _ in range(order):
-        out.append(out[-1] * x)
+def matrix(alpha):
+    """alpha (..., A) as the matrix m (..., n+1, n+1) of z = sum_ab m_ab u^a v^b; zero where a + b > n."""
+    order = order_of(alpha.shape[-1])
+    out = alpha.new_zeros(*alpha.shape[:-1], (order + 1) ** 2)
+    out[..., _places(order, alpha.device)] = alpha
+    return out.unflatten(-1, (order + 1, order + 1))
+
+
+@lru_cache
+def _places(order, device):
+    """Where the coefficients stand in the flattened matrix, (A,)."""
+    return torch.as_tensor(exponents(order) @ (order + 1, 1), device=device)
+
+
+def from_matrix(m):
+    """The coefficients (..., A) of a matrix (..., n+1, n+1)."""
+    return m.flatten(-2)[..., _places(m.shape[-1] - 1, m.device)]
+
+
+def powers(x, order, derivative=0):
+    """The derivatives of x^0 .. x^n, (..., n+1)."""
+    out = [torch.zeros_like(x)] * min(derivative, order + 1)
+    power = torch.ones_like(x)
+    for k in range(derivative, order + 1):
+        out.append(power * float(np.prod(np.arange(k - derivative + 1, k + 1))))
+        power = power * x
     return torch.stack(out, -1)
 
 
 def basis(uv, order, du=0, dv=0):
     """The monomials' derivatives d^(du+dv) / du^du dv^dv at uv (..., 2): (..., A)."""
     e = exponents(order)
-    columns = []
-    for axis, d in ((0, du), (1, dv)):
-        p = _powers(uv[..., axis], order)
-        k = e[:, axis]
-        factor = np.prod([k - m for m in range(d)], axis=0) if d else np.ones(len(k))
-        factor = torch.as_tensor(np.where(k >= d, factor, 0), dtype=uv.dtype, device=uv.device)
-        columns.append(factor * p[..., np.maximum(k - d, 0)])
-    return columns[0] * columns[1]
+    return powers(uv[..., 0], order, du)[..., e[:, 0]] * powers(uv[..., 1], order, dv)[..., e[:, 1]]
+
+
+def derivatives(alpha, uv, *which):
+    """For each (du, dv) in ``which`` the derivative d^(du+dv) z / du^du dv^dv at uv, (..., P)."""
+    m, order = matrix(alpha), order_of(alpha.shape[-1])
+    along_v = {du: powers(uv[..., 0], order, du) @ m for du in {du for du, _ in which}}
+    of_v = {dv: powers(uv[..., 1], order, dv) for dv in {dv for _, dv in which}}
+    return tuple((along_v[du] * of_v[dv]).sum(-1) for du, dv in which)
 
 
 def height(alpha, uv):
-    """z, (...,), of the jets alpha (..., A) at uv (..., 2)."""
-    return (basis(uv, order_of(alpha.shape[-1])) * alpha).sum(-1)
+    """z, (..., P)."""
+    return derivatives(alpha, uv, (0, 0))[0]
 
 
 def height_derivatives(alpha, uv):
-    """(z_u, z_v), each (...,)."""
-    n = order_of(alpha.shape[-1])
-    return (basis(uv, n, 1, 0) * alpha).sum(-1), (basis(uv, n, 0, 1) * alpha).sum(-1)
+    """(z_u, z_v), each (..., P)."""
+    return derivatives(alpha, uv, (1, 0), (0, 1))
 
 
 def point(alpha, uv):
-    """phi(u, v) = (u, v, z(u, v)), (..., 3)."""
-    return torch.cat([uv, height(alpha, uv)[..., None]], -1)
+    """phi(u, v) = (u, v, z(u, v)), (..., P, 3)."""
+    z = height(alpha, uv)
+    return torch.cat([uv.expand(*z.shape, 2), z[..., None]], -1)
 
 
 def tangents(alpha, uv):
-    """phi_u = (1, 0, z_u) and phi_v = (0, 1, z_v), each (..., 3)."""
+    """phi_u = (1, 0, z_u) and phi_v = (0, 1, z_v), each (..., P, 3)."""
     zu, zv = height_derivatives(alpha, uv)
     one, zero = torch.ones_like(zu), torch.zeros_like(zu)
     return torch.stack([one, zero, zu], -1), torch.stack([zero, one, zv], -1)
 
 
 def normal(alpha, uv):
-    """Unit normal (-z_u, -z_v, 1) / |.|, (..., 3)."""
+    """Unit normal (-z_u, -z_v, 1) / |.|, (..., P, 3)."""
     zu, zv = height_derivatives(alpha, uv)
     return torch.nn.functional.normalize(torch.stack([-zu, -zv, torch.ones_like(zu)], -1), dim=-1)
 
 
 def metric(alpha, uv):
-    """First fundamental form J^T J, (..., 2, 2)."""
+    """First fundamental form J^T J, (..., P, 2, 2)."""
     zu, zv = height_derivatives(alpha, uv)
-    f = zu * zv
-    return torch.stack([torch.stack([1 + zu * zu, f], -1), torch.stack([f, 1 + zv * zv], -1)], -2)
+    return _symmetric(1 + zu * zu, zu * zv, 1 + zv * zv)
 
 
-def _legendre(order):
-    """Coefficients of the Legendre polynomials P_0..P_n in powers of x, (n+1, n+1)."""
-    from numpy.polynomial import legendre
-
-    rows = np.zeros((order + 1, order + 1))
-    for i in range(order + 1):
-        c = legendre.leg2poly(np.eye(order + 1)[i])
-        rows[i, : len(c)] = c
-    return rows
+def turned_over(alpha):
+    """The jets alpha (..., A) in charts with v and z pointing the other way: z'(u, v) = -z(u, -v)."""
+    odd = torch.as_tensor(exponents(order_of(alpha.shape[-1]))[:, 1] % 2, device=alpha.device)
+    return torch.where(odd == 1, alpha, -alpha)
 
 
-def fit(points, order):
-    """Least-squares jet through points (P, 3) of a chart with |u|, |v| <= 1: alpha (A,), float64.
+def second_fundamental_form(alpha, uv):
+    """(z_uu, z_uv, z_vv) / sqrt(1 + z_u^2 + z_v^2) as a matrix, (..., P, 2, 2); positive where the surface bends towards +z."""
+    zu, zv, zuu, zuv, zvv = derivatives(alpha, uv, (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
+    n = (1 + zu * zu + zv * zv).sqrt()
+    return _symmetric(zuu / n, zuv / n, zvv / n)
 
-    Solved in the basis P_{i-j}(u) P_j(v) of Legendre polynomials, which spans the same polynomials and keeps the system
-    well conditioned up to order 10, and turned into the paper's monomials at the end. Raises ValueError where the points are fewer than
-    the coefficients or do not determine them.
+
+def principal_curvatures(alpha, uv):
+    """Eigenvalues of the shape operator, the smaller first, (..., P, 2); positive where the surface bends towards +z.
+
+    At an umbilic, where both are equal and not differentiable, each has the gradient of the mean curvature.
     """
-    e = exponents(order)
-    points = points.to(torch.float64)
-    if len(points) < len(e):
-        raise ValueError(f"a jet of order {order} has {len(e)} coefficients, more than the {len(points)} points")
-    leg = torch.as_tensor(_legendre(order), device=points.device)
-    pu, pv = (_powers(points[:, k], order) @ leg.T for k in (0, 1))
-    system = pu[:, e[:, 0]] * pv[:, e[:, 1]]
-    solution, _, rank, _ = torch.linalg.lstsq(system, points[:, 2:], rcond=1e-10, driver="gelsd")
-    if int(rank) < len(e):
-        raise ValueError(f"the points determine only {int(rank)} of the {len(e)} coefficients of a jet of order {order}")
-    to_monomials = torch.zeros(len(e), len(e), dtype=torch.float64, device=points.device)
-    at = {tuple(x): k for k, x in enumerate(e)}
-    for k, (a, b) in enumerate(e):
-        for i in range(a + 1):
-            for j in range(b + 1):
-                to_monomials[at[i, j], k] += leg[a, i] * leg[b, j]
-    return to_monomials @ solution[:, 0]
+    g, h = metric(alpha, uv), second_fundamental_form(alpha, uv)
+    E, F, G = g[..., 0, 0], g[..., 0, 1], g[..., 1, 1]
+    L, M, N = h[..., 0, 0], h[..., 0, 1], h[..., 1, 1]
+    det = E * G - F * F
+    mean = (E * N - 2 * F * M + G * L) / (2 * det)
+    squared = mean * mean - (L * N - M * M) / det
+    apart = squared > torch.finfo(squared.dtype).eps * mean.detach() ** 2
+    half = torch.where(apart, torch.where(apart, squared, 1).sqrt(), 0)
+    return torch.stack([mean - half, mean + half], -1)
+
+
+def nearest(alpha, x, steps=4):
+    """Chart coordinates uv (..., P, 2) of the jets' points nearest to points x (..., P, 3) of their charts, found from the points' own (u,
+    v) by Gauss and Newton.
+
+    A step that does not bring the point nearer is not taken. Without gradient.
+    """
+    with torch.no_grad():
+        uv = x[..., :2].clone()
+        z, zu, zv = derivatives(alpha, uv, (0, 0), (1, 0), (0, 1))
+        for _ in range(steps):
+            r = torch.stack([uv[..., 0] - x[..., 0], uv[..., 1] - x[..., 1], z - x[..., 2]], -1)
+            a, b = r[..., 0] + zu * r[..., 2], r[..., 1] + zv * r[..., 2]
+            det = 1 + zu * zu + zv * zv
+            step = torch.stack([(1 + zv * zv) * a - zu * zv * b, (1 + zu * zu) * b - zu * zv * a], -1) / det[..., None]
+            tried = uv - step
+            found = derivatives(alpha, tried, (0, 0), (1, 0), (0, 1))
+            nearer = ((tried - x[..., :2]) ** 2).sum(-1) + (found[0] - x[..., 2]) ** 2 < (r * r).sum(-1)
+            uv = torch.where(nearer[..., None], tried, uv)
+            z, zu, zv = (torch.where(nearer, new, old) for new, old in zip(found, (z, zu, zv)))
+        return uv
+
+
+def _symmetric(a, b, c):
+    return torch.stack([torch.stack([a, b], -1), torch.stack([b, c], -1)], -2)
+
+
+@dataclass(frozen=True)
+class JetFit:
+    """``alpha`` (..., A): the coefficients, zero beyond the order fitted. ``order`` (...,) int64: the order that the points
+    determine, at most the one asked for; 0 is a constant."""
+
+    alpha: torch.Tensor
+    order: torch.Tensor
+
+
+def fit(points, order, *, weights=None, mask=None):
+    """Least-squares n-jets through ``points`` (..., P, 3), in charts with |u|, |v| of about 1: a :class:`JetFit`.
+
+    ``weights`` (..., P) not negative; ``mask`` (..., P) bool: the points that exist, the others are padding of any value.
+    Where the points are too few for ``order``, or lie such (on a line, on a small grid) that they do not determine it, the
+    patch is fitted by the highest order that they do determine. Differentiable once in points and weights, at the cost of
+    evaluating two jets. Raises InputError where a patch has no points or weight, or where numbers are not finite.
+    """
+    from .least_squares import LeastSquares
+
+    if not 1 <= order <= 10:
+        raise InputError(f"order = {order}; the order of a jet is 1 to 10")
+    if points.ndim < 2 or points.shape[-1] != 3:
+        raise InputError(f"points of shape {tuple(points.shape)}; (..., points, 3) is needed")
+    shape = points.shape[:-1]
+    if shape[-1] == 0:
+        raise InputError("patch 0 has no points")
+    flat = points.reshape(-1, *points.shape[-2:])
+    if mask is not None:
+        mask = mask.expand(shape).reshape(flat.shape[:2])
+    if weights is None:
+        weights = flat.new_ones(1, 1) if mask is None else mask.to(flat.dtype)
+        weights = weights.expand(flat.shape[:2])
+    else:
+        weights = weights.expand(shape).reshape(flat.shape[:2])
+        if mask is not None:
+            weights = torch.where(mask, weights, 0)
+    if mask is not None:  # padding is moved onto a point of the patch, where it changes neither box nor sums
+        first = mask.to(torch.uint8).argmax(1)
+        flat = torch.where(mask[..., None], flat, flat[torch.arange(len(flat), device=flat.device), first][:, None])
+    alpha, fitted = LeastSquares.apply(flat, weights, order)
+    return JetFit(alpha.reshape(*shape[:-1], -1), fitted.reshape(shape[:-1]))

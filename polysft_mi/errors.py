@@ -1,35 +1,5 @@
-"""The one exception for a user's mistake, and how a command line ends on it."""
+"""The exception for a user's mistake, and how a command line ends on it: those of :mod:`polyfit.errors`, by the same names."""
 
-import sys
+from polyfit.errors import InputError, cli
 
-
-class InputError(ValueError):
-    """A file, flag, scene or value that a user gave and that cannot be used.
-
-    The message is one line: it names the file or property, its value, and what would be accepted.
-    """
-
-
-def cli(main):
-    """Run ``main()`` as a process: its return value is the exit status.
-
-    An :class:`InputError` or an ``OSError`` that names a file ends in one line on stderr and exit status 2, Ctrl-C in 130.
-    """
-    try:
-        status = main()
-    except InputError as error:
-        status = _fail(str(error))
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        status = 130
-    except OSError as error:
-        if error.filename is None and error.strerror is None:
-            raise
-        where = f"{error.filename}: " if error.filename is not None else ""
-        status = _fail(f"{where}{error.strerror or error}")
-    sys.exit(status)
-
-
-def _fail(message):
-    print("error: " + " ".join(message.split()), file=sys.stderr)
-    return 2
+__all__ = ["InputError", "cli"]

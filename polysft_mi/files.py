@@ -1,40 +1,5 @@
-"""Files that are either whole or not there: written aside, then renamed."""
+"""Files that are either whole or not there: those of :mod:`polyfit.files`, by the same names."""
 
-import contextlib
-import errno
-import os
+from polyfit.files import FULL, aside, naming
 
-FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # numbers of the OSErrors that say that no more can be written
-
-
-@contextlib.contextmanager
-def naming(path):
-    """An OSError of the block that names no file, as a full disk's does where a file is flushed, names ``path``."""
-    try:
-        yield
-    except OSError as error:
-        if error.errno is not None and error.filename is None:
-            error.filename = os.fspath(path)
-        raise
-
-
-@contextlib.contextmanager
-def aside(path):
-    """``with aside(path) as temporary:`` write the file ``temporary``; it becomes ``path`` at the end of the block.
-
-    The name keeps its extension, because writers choose the format by it. On any exception (Ctrl-C included) what was written is
-    removed and what stood at ``path`` before stays. An OSError of the write names ``path``.
-    """
-    folder, name = os.path.split(os.fspath(path))
-    temporary = os.path.join(folder, f".{os.getpid()}.partial.{name}")
-    try:
-        yield temporary
-        with open(temporary, "rb+") as file:  # a full disk shows here at the latest, before the rename
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException as error:
-        with contextlib.suppress(OSError):
-            os.remove(temporary)
-        if isinstance(error, OSError) and error.errno is not None and error.filename in (None, temporary):
-            error.filename = os.fspath(path)  # the name that the user knows; a full disk comes with none
-        raise
+__all__ = ["FULL", "aside", "naming"]

@@ -53,19 +53,22 @@ class Template:
         return float(np.abs(self.residual).max())
 
     @classmethod
-    def fit(cls, vertices, faces, uv, order, *, capacity=None, tolerance=0.05, where="template"):
-        """Fit a jet of ``order`` to the mesh; it has the coefficients of order ``capacity`` (default: the same), the others zero.
+    def fit(cls, vertices, faces, uv, order, *, capacity=None, frame=None, tolerance=0.05, where="template"):
+        """Fit a jet of ``order`` to the mesh, in ``frame``, a :class:`polyfit.frames.CanonicalFrame` in float64, or else in its PCA frame; it has the
+        coefficients of order ``capacity`` (default: the same), those beyond ``order`` zero.
 
-        Raises InputError where the order is too high for the vertices, where the surface folds over in its chart (a closed surface does), or
-        where the largest residual exceeds ``tolerance`` times the scale s.
+        Raises InputError where the order is too high for the vertices, where the surface folds over in its chart (a closed surface does),
+        or where the largest residual exceeds ``tolerance`` times the scale s.
         """
         points = torch.as_tensor(np.asarray(vertices, dtype=np.float64))
-        frame = CanonicalFrame.from_points(points)
+        frame = frame or CanonicalFrame.from_points(points)
         x = frame.to_chart(points)
-        try:
-            alpha = jets.fit(x, order)
-        except ValueError as error:
-            raise InputError(f"{where}: order = {order} is too high: {error}") from None
+        fitted = jets.fit(x, order)
+        if fitted.order < order:
+            wanted = f"a jet of order {order} has {jets.size_of(order)} coefficients"
+            found = f"the {len(points)} vertices determine no more than order {int(fitted.order)}"
+            raise InputError(f"{where}: order = {order} is too high: {wanted}, and {found}")
+        alpha = fitted.alpha
         residual = (x[:, 2] - jets.height(alpha, x[:, :2])).numpy() * float(frame.s)
         template = cls(
             np.asarray(vertices, dtype=np.float64),
@@ -75,7 +78,7 @@ class Template:
             frame.R.numpy(),
             frame.T.numpy(),
             x[:, :2].numpy(),
-            np.pad(alpha.numpy(), (0, len(jets.exponents(max(order, capacity or order))) - len(alpha))),
+            np.pad(alpha.numpy(), (0, jets.size_of(max(order, capacity or order)) - len(alpha))),
             residual,
         )
         measured = (

@@ -207,7 +207,7 @@ def test_bad_value(sheet, setting, words):
 def test_order_too_high_for_the_vertices(tmp_path):
     truth = synthetic.cloth(tmp_path / "sheet", frames=1, size=SIZE, rows=4, columns=5)
     prepare.prepare(str(truth.folder))
-    has(refused(truth.folder / "scene.xml", "-D", "order=10"), "template.obj: order = 10 is too high", "66 coefficients, more than the 20 points")
+    has(refused(truth.folder / "scene.xml", "-D", "order=10"), "template.obj: order = 10 is too high", "66 coefficients, and the 20 vertices determine no more than order 3")
 
 
 @pytest.mark.parametrize("options", [["--fps", "0"], ["--fps", "nan"], ["--exr", "-1"], ["--exr", "some"]])

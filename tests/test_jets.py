@@ -1,4 +1,4 @@
-"""Jets in torch and in Dr.Jit, canonical frames, and the deforming patch."""
+"""Jets in torch and in Dr.Jit, and the deforming patch."""
 
 import drjit as dr
 import mitsuba as mi
@@ -8,7 +8,6 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from polyfit import jets
-from polyfit.frames import CanonicalFrame
 
 RNG = np.random.default_rng(7)
 
@@ -30,32 +29,6 @@ def test_coefficients_are_in_the_papers_order():
     assert jets.height(alpha, uv).item() == 12
 
 
-@pytest.mark.parametrize("order", range(1, 11))
-def test_fit_recovers_a_jet_of_its_order(order):
-    uv, alpha = chart(), random_alpha(order)
-    z = jets.height(alpha, uv)
-    found = jets.fit(torch.cat([uv, z[:, None]], 1), order)
-    assert (jets.height(found, uv) - z).abs().max() < 1e-9 * z.abs().max()
-    assert (found - alpha).abs().max() < 1e-6 * alpha.abs().max()
-
-
-def test_fit_is_the_least_squares_solution():
-    uv = chart()
-    z = torch.sin(3 * uv[:, 0]) * torch.cos(2 * uv[:, 1])
-    alpha = jets.fit(torch.cat([uv, z[:, None]], 1), 4)
-    reference = np.linalg.lstsq(jets.basis(uv, 4).numpy(), z.numpy(), rcond=None)[0]
-    assert np.abs(alpha.numpy() - reference).max() < 1e-8
-
-
-def test_fit_refuses_what_does_not_determine_the_jet():
-    uv = chart(14)
-    with pytest.raises(ValueError, match="15 coefficients, more than the 14 points"):
-        jets.fit(torch.cat([uv, uv[:, :1]], 1), 4)
-    line = torch.stack([torch.linspace(-1, 1, 50, dtype=torch.float64)] * 3, 1)
-    with pytest.raises(ValueError, match="determine only"):
-        jets.fit(line, 2)
-
-
 def test_derivatives_against_finite_differences():
     uv, alpha, h = chart(), random_alpha(5), 1e-6
     zu, zv = jets.height_derivatives(alpha, uv)
@@ -74,15 +47,70 @@ def test_tangents_normal_and_metric_belong_together():
     assert (J.transpose(-1, -2) @ J - g).abs().max() < 1e-12
 
 
-def test_canonical_frame_moves_with_the_points():
-    points = torch.as_tensor(RNG.normal(size=(300, 3)) * (1.0, 0.6, 0.1) + RNG.random((300, 3)) ** 2)
-    frame = CanonicalFrame.from_points(points)
-    R, s, t = torch.as_tensor(Rotation.random(random_state=3).as_matrix()), 2.7, torch.tensor([0.3, -1.0, 4.0], dtype=torch.float64)
-    moved = CanonicalFrame.from_points(s * points @ R.T + t)
-    assert (frame.to_chart(points) - moved.to_chart(s * points @ R.T + t)).abs().max() < 1e-9
-    assert (frame.from_chart(frame.to_chart(points)) - points).abs().max() < 1e-12
-    assert torch.linalg.det(frame.R).item() == pytest.approx(1)
-    assert frame.to_chart(points).norm(dim=1).max().item() == pytest.approx(1)
+def test_second_derivatives_against_finite_differences():
+    uv, alpha, h = chart(50), random_alpha(5), 1e-5
+    zu, zv = jets.height_derivatives(alpha, uv)
+    n = (1 + zu * zu + zv * zv).sqrt()
+    form = jets.second_fundamental_form(alpha, uv)
+    for k, step in enumerate((torch.tensor([h, 0.0]), torch.tensor([0.0, h]))):
+        ends = [jets.height_derivatives(alpha, uv + sign * step) for sign in (1, -1)]
+        for m in (0, 1):
+            numeric = (ends[0][m] - ends[1][m]) / (2 * h) / n
+            assert (form[:, k, m] - numeric).abs().max() < 1e-6 * numeric.abs().max()
+
+
+def test_a_batch_of_jets_is_its_jets():
+    uv = torch.stack([chart(30) for _ in range(6)]).reshape(2, 3, 30, 2)
+    alpha = torch.stack([random_alpha(4) for _ in range(6)]).reshape(2, 3, 15)
+    for function in (jets.height, jets.point, jets.normal, jets.metric, jets.second_fundamental_form, jets.principal_curvatures):
+        together = function(alpha, uv)
+        for k in np.ndindex(2, 3):
+            assert (together[k] - function(alpha[k], uv[k])).abs().max() < 1e-12
+    assert (jets.height(alpha, uv[0, 0]) - (jets.basis(uv[0, 0], 4) * alpha[..., None, :]).sum(-1)).abs().max() < 1e-12
+
+
+def fitted(height, extent=0.3, order=8):
+    x, y = np.meshgrid(*[np.linspace(-extent, extent, 40)] * 2)
+    points = torch.as_tensor(np.stack([x, y, height(x, y)], -1).reshape(-1, 3))
+    return jets.fit(points, order).alpha, points[:, :2] * 0.7
+
+
+def test_curvatures_of_a_sphere_a_cylinder_and_a_saddle():
+    alpha, uv = fitted(lambda x, y: 2 - np.sqrt(4 - x**2 - y**2))
+    assert (jets.principal_curvatures(alpha, uv) - 0.5).abs().max() < 1e-5
+    alpha, uv = fitted(lambda x, y: np.sqrt(2.25 - (0.8 * x + 0.6 * y) ** 2))
+    assert (jets.principal_curvatures(alpha, uv) - torch.tensor([-1 / 1.5, 0])).abs().max() < 1e-5
+    alpha, uv = fitted(lambda x, y: x * y)
+    n = (1 + (uv**2).sum(-1)).sqrt()  # of z = u v: E G - F^2 = n^2, mean -u v / n^3, Gauss -1 / n^4
+    found, mean = jets.principal_curvatures(alpha, uv), -uv.prod(-1) / n**3
+    assert (found.mean(-1) - mean).abs().max() < 1e-9
+    assert (found.prod(-1) + n**-4).abs().max() < 1e-9
+    assert (found[:, 0] <= found[:, 1]).all()
+
+
+def test_gradient_of_curvatures():
+    alpha, uv = random_alpha(4).requires_grad_(), chart(5).requires_grad_()
+    assert torch.autograd.gradcheck(jets.principal_curvatures, (alpha, uv))
+    flat = torch.zeros(15, dtype=torch.float64, requires_grad=True)
+    jets.principal_curvatures(flat, uv).sum().backward()
+    assert flat.grad.isfinite().all() and flat.grad[3] == pytest.approx(2 * 5)  # of the mean curvature, at an umbilic
+
+
+def test_nearest_points_are_feet_of_normals():
+    alpha, uv = 0.2 * random_alpha(4), chart(100)
+    x = jets.point(alpha, uv) + 0.05 * torch.as_tensor(RNG.normal(size=(100, 1))) * jets.normal(alpha, uv)
+    found = jets.nearest(alpha, x, steps=30)
+    off = x - jets.point(alpha, found)
+    assert (torch.linalg.cross(off, jets.normal(alpha, found)).norm(dim=-1) < 1e-6).all()
+    before = (x[:, 2] - jets.height(alpha, x[:, :2])).abs()
+    assert (off.norm(dim=-1) <= before + 1e-12).all()
+    assert (jets.nearest(alpha, jets.point(alpha, uv)) - uv).abs().max() < 1e-12
+
+
+def test_a_jet_turned_over_is_the_same_surface():
+    alpha, uv = random_alpha(5), chart(20)
+    over = jets.point(jets.turned_over(alpha), uv * torch.tensor([1, -1])) * torch.tensor([1, -1, -1])
+    assert (over - jets.point(alpha, uv)).abs().max() < 1e-12
 
 
 @pytest.mark.parametrize("order", [1, 4, 10])

@@ -56,7 +56,7 @@ def test_rough_surface_is_refused_with_the_residual():
 
 
 def test_order_too_high_for_the_vertices():
-    with pytest.raises(InputError, match="order = 10 is too high: .*66 coefficients, more than the 20 points"):
+    with pytest.raises(InputError, match="order = 10 is too high: .*66 coefficients, and the 20 vertices determine no more than order 3"):
         Template.fit(*grid(5, 4), 10)
 
 

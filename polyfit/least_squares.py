@@ -1,0 +1,177 @@
+"""The solve behind :func:`polyfit.jets.fit`: weighted least squares for batches of patches (Cazals & Pouget 2003).
+
+Each patch is fitted in the box of its own points, in a basis of products of Chebyshev polynomials, whose Gram matrix follows
+from the products' moments: T_a T_c = (T_{a+c} + T_{|a-c|}) / 2. So no matrix of points times coefficients is ever made, and
+the systems stay well conditioned up to order 10. Sums and solves are in float64, whatever the points are in.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import torch
+from numpy.polynomial import chebyshev
+from scipy.special import binom
+
+from . import jets
+from .errors import InputError
+
+# A coefficient counts as determined where its basis function, over the weighted points, keeps this RMS beyond those before it.
+DETERMINED = 1e-5
+# A box is taken to be at least this share of its longer side wide, so that rounding across a straight line is not stretched into a patch.
+NARROWEST = 1e-2
+
+
+class LeastSquares(torch.autograd.Function):
+    """points (B, P, 3), weights (B, P), order -> alpha (B, A), order (B,)."""
+
+    @staticmethod
+    def forward(ctx, points, weights, order):
+        x = points.movedim(-1, 0).to(torch.float64, memory_format=torch.contiguous_format, copy=True)  # (3, B, P)
+        box = _Box.of(x[:2])
+        w, total = _normalised(weights, points)
+        tx, ty = _chebyshev(box.normalised(x[:2]), 2 * order).permute(1, 2, 0, 3)  # (B, 2n+1, P) of u and of v, each row contiguous
+        wty = ty if w is None else w[:, None] * ty
+        scale = 1 / points.shape[1] if w is None else 1
+        gram = _gram(tx @ wty.mT * scale, order)
+        right = (tx[:, : order + 1] * x[2, :, None]) @ wty[:, : order + 1].mT * scale
+        right = jets.from_matrix(right)
+        _check(box, right)
+        factor, fitted, kept = _factorise(gram, order)
+        solution = torch.cholesky_solve((right * kept)[..., None], factor)[..., 0]
+        alpha = box.to_monomials(solution, order)
+        ctx.save_for_backward(points, weights, alpha, factor, kept, total)
+        ctx.box, ctx.order = box, order
+        ctx.mark_non_differentiable(fitted)
+        return alpha.to(points.dtype), fitted
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, grad, _):
+        # At the minimum sum w (z - c.b) b = 0 holds for the points' basis values b. Differentiated: dc = G^-1 d(sum w (z - c.b) b) at fixed
+        # c, and the gradient contracts it with y = G^-1 grad, a jet like c itself.
+        points, weights, alpha, factor, kept, total = ctx.saved_tensors
+        right = ctx.box.to_monomials_transposed(grad.to(torch.float64), ctx.order) * kept
+        y = ctx.box.to_monomials(torch.cholesky_solve(right[..., None], factor)[..., 0] * kept, ctx.order)
+        dtype, uv = points.dtype, points[..., :2]
+        which = (0, 0), (1, 0), (0, 1)
+        c, cu, cv = jets.derivatives(alpha.to(dtype), uv, *which)
+        y, yu, yv = jets.derivatives(y.to(dtype), uv, *which)
+        residual = points[..., 2] - c
+        w = weights / total.to(dtype)
+        to_points = torch.stack([w * (residual * yu - cu * y), w * (residual * yv - cv * y), w * y], -1)
+        to_weights = residual * y / total.to(dtype) if ctx.needs_input_grad[1] else None
+        return to_points, to_weights, None
+
+
+@dataclass(frozen=True)
+class _Box:
+    """Centre and half extent (B, 2) of the points' u and v, float64."""
+
+    centre: torch.Tensor
+    half: torch.Tensor
+
+    @classmethod
+    def of(cls, uv):
+        """Of coordinates (2, B, P)."""
+        low, high = torch.aminmax(uv, dim=2)
+        half = ((high - low) / 2).T
+        half = torch.maximum(half, NARROWEST * half.amax(1, keepdim=True))
+        return cls(((low + high) / 2).T, torch.where(half > 0, half, 1))
+
+    def normalised(self, uv):
+        """The coordinates (2, B, P) in the box, from -1 to 1."""
+        return (uv - self.centre.T[..., None]) * (1 / self.half.T[..., None])
+
+    def to_monomials(self, coefficients, order):
+        """Coefficients (B, A) of T_a(x) T_b(y) turned into those of u^a v^b."""
+        U, V = self._axes(order)
+        return jets.from_matrix(U.mT @ jets.matrix(coefficients) @ V)
+
+    def to_monomials_transposed(self, coefficients, order):
+        """The transposed map of :meth:`to_monomials`, for gradients."""
+        U, V = self._axes(order)
+        return jets.from_matrix(U @ jets.matrix(coefficients) @ V.mT)
+
+    def _axes(self, order):
+        """For u and for v (B, n+1, n+1): row a holds T_a((u - centre) / half) in powers of u."""
+        chebyshev, binomial, power = _chebyshev_in_powers(order, self.centre.device)
+        shifted = jets.powers(-self.centre.T, order)[..., power] * binomial
+        scaled = shifted * jets.powers(1 / self.half.T, order)[..., None]
+        return chebyshev @ scaled
+
+
+@lru_cache
+def _chebyshev_in_powers(order, device):
+    """Chebyshev polynomials in powers of x; and of (x - c)^m, for each power x^i, the binomial coefficient and the power of -c: (n+1, n+1)
+    each."""
+    rows = np.zeros((order + 1, order + 1))
+    for k in range(order + 1):
+        rows[k, : k + 1] = chebyshev.cheb2poly(np.eye(order + 1)[k])[: k + 1]
+    m, i = np.indices(rows.shape)
+    power = np.maximum(m - i, 0)
+    return tuple(torch.as_tensor(x, device=device) for x in (rows, binom(m, i), power))
+
+
+def _chebyshev(x, order):
+    """T_0 .. T_n of x (...): (n+1, ...)."""
+    out = x.new_empty(order + 1, *x.shape)
+    out[0], out[1] = 1, x
+    twice = 2 * x
+    for k in range(2, order + 1):
+        torch.mul(twice, out[k - 1], out=out[k]).sub_(out[k - 2])
+    return out
+
+
+def _normalised(weights, points):
+    """The weights divided by their sum, float64, or None where all are 1; and the sum, (B, 1)."""
+    if weights.stride() == (0, 0) and weights.numel():
+        return None, weights.new_full((len(points), 1), points.shape[1], dtype=torch.float64)
+    weights = weights.to(torch.float64)
+    total = weights.sum(1, keepdim=True)
+    bad = ~((total > 0) & total.isfinite() & (weights >= 0).all(1, keepdim=True))
+    if bad.any():
+        k = int(bad[:, 0].to(torch.uint8).argmax())
+        what = "no points" if not weights[k].abs().sum() > 0 else "weights that are negative or not finite"
+        raise InputError(f"patch {k} has {what}")
+    return weights / total, total
+
+
+def _check(box, right):
+    good = box.centre.isfinite().all(1) & box.half.isfinite().all(1) & right.isfinite().all(1)
+    if not good.all():
+        raise InputError(f"patch {int((~good).to(torch.uint8).argmax())} has points that are not finite")
+
+
+@lru_cache
+def _products(order, device):
+    """Indices (4, A^2) into the flat moments (2n+1)^2, whose mean are the moments of the products of two basis functions."""
+    e = jets.exponents(order)
+    a, b = e[:, None, :], e[None, :, :]
+    n = 2 * order + 1
+    index = [p[..., 0] * n + q[..., 1] for p in (a + b, np.abs(a - b)) for q in (a + b, np.abs(a - b))]
+    return torch.as_tensor(np.stack(index).reshape(4, -1), device=device)
+
+
+def _gram(moments, order):
+    """Gram matrices (B, A, A) of the products T_a(x) T_b(y), from the moments (B, 2n+1, 2n+1)."""
+    flat = moments.flatten(1).T.contiguous()  # whole rows of a moment each are gathered
+    total = sum(flat.index_select(0, index) for index in _products(order, moments.device)) / 4
+    return total.T.unflatten(1, (jets.size_of(order),) * 2)
+
+
+def _factorise(gram, order):
+    """Cholesky factors (B, A, A) of the leading blocks that the points determine, the orders (B,), and the coefficients kept (B, A)."""
+    degree = torch.as_tensor(jets.exponents(order).sum(1), device=gram.device)
+    fitted = torch.full((len(gram),), order, device=gram.device)
+    eye = torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)
+    factor, info = torch.linalg.cholesky_ex(gram)
+    while True:
+        short = (factor.diagonal(dim1=1, dim2=2) < DETERMINED) | (torch.arange(1, len(degree) + 1, device=gram.device) == info[:, None])
+        low = torch.where(short, degree, order + 1).amin(1) - 1
+        again = (low < fitted).nonzero()[:, 0]
+        if not len(again):
+            return factor, fitted, degree <= fitted[:, None]
+        fitted[again] = low[again]
+        kept = degree <= fitted[again, None]
+        factor[again], info[again] = torch.linalg.cholesky_ex(torch.where(kept[:, :, None] & kept[:, None, :], gram[again], eye))

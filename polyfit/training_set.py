@@ -1,0 +1,96 @@
+"""What is trained on: patches in the charts of their PCA frames, and how well a jet fits each of them from every side.
+
+A transformer that follows the gradient of a fit's error from the PCA frame finds the valley next to it, not the right one: across a fold
+the error first rises. So the height discrepancy is tabulated once for every patch, on axes all over the half sphere, and training reads the
+table, smoothed over directions (:meth:`TrainingSet.at`). The table is the loss itself, the jets' own fits; the smoothing narrows as
+training goes on.
+"""
+
+from dataclasses import dataclass, fields
+
+import torch
+
+from . import families, jets
+from .frames import CanonicalFrame
+from .garments import GarmentPatches
+from .losses import discrepancy
+
+CHUNK = 500  # patches made, and fitted, at a time
+AXES = 65
+GARMENT_SHARE = 0.75  # of the patches, where there are garments; the analytic families are the rest
+NORMALS = 0.1  # weight of 1 - cosine of the normals against RMS of height
+
+
+@dataclass(frozen=True)
+class TrainingSet:
+    """``points`` and ``normals`` (N, P, 3) in the charts of the PCA frames; ``height`` and ``loss`` (N, D): RMS of height, and that plus
+    ``NORMALS`` (1 - cosine) between the normals, of the jets fitted with z along each of :func:`axes`. float32."""
+
+    points: torch.Tensor
+    normals: torch.Tensor
+    height: torch.Tensor
+    loss: torch.Tensor
+
+    def __len__(self):
+        return len(self.points)
+
+    def to(self, device):
+        return TrainingSet(*(getattr(self, f.name).to(device) for f in fields(self)))
+
+    def at(self, index, z, sharpness):
+        """Height and loss, each (B, H), of patches ``index`` (B,) fitted along unit axes z (B, H, 3): means over the table, weighted by
+        exp(``sharpness`` cos^2).
+        """
+        weight = torch.softmax(sharpness * (z @ axes(z.device).T) ** 2, -1)
+        return (weight * self.height[index][:, None]).sum(-1), (weight * self.loss[index][:, None]).sum(-1)
+
+
+def axes(device=None):
+    """Unit vectors (AXES, 3) evenly over the half sphere z > 0, the pole first."""
+    k = torch.arange(AXES - 1, device=device) + 0.5
+    z, turn = 1 - k / (AXES - 1), k * torch.pi * (3 - 5**0.5)
+    r = (1 - z * z).sqrt()
+    return torch.cat([z.new_tensor([[0.0, 0.0, 1.0]]), torch.stack([r * turn.cos(), r * turn.sin(), z], -1)])
+
+
+def rotations_to(z):
+    """Rotations (..., 3, 3) whose third columns are the unit vectors z (..., 3)."""
+    helper = torch.nn.functional.one_hot(z.abs().argmin(-1), 3).to(z.dtype)
+    u = torch.nn.functional.normalize(torch.linalg.cross(helper, z), dim=-1)
+    return torch.stack([u, torch.linalg.cross(z, u), z], -1)
+
+
+def build(count, points, order, seed, *, garments=None, names=families.FAMILIES, device="cpu", advance=lambda done: None):
+    """:class:`TrainingSet` of ``count`` patches of ``points`` points each, for jets of ``order``.
+
+    ``garments`` (:class:`GarmentPatches` or None) are deformed at random; ``names`` are the analytic families that are summed, or empty.
+    ``advance`` is told how many patches there are so far.
+    """
+    parts = []
+    turns = rotations_to(axes())
+    for first in range(0, count, CHUNK):
+        size = min(CHUNK, count - first)
+        generator = torch.Generator().manual_seed(seed * 1_000_003 + first)
+        deformed = 0 if garments is None else size if not names else round(GARMENT_SHARE * size)
+        made = []
+        if deformed:
+            made.append(garments.deformed(deformed, generator))
+        if size > deformed:
+            samples = points if garments is None else garments.points.shape[1]
+            made.append(GarmentPatches(*(t.float() for t in families.sample(size - deformed, samples, generator, names))))
+        made = GarmentPatches.join(made)
+        parts.append(_tabulated(made.points[:, :points].to(device), made.normals[:, :points].to(device), turns.to(device), order))
+        advance(first + size)
+    return TrainingSet(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(TrainingSet)))
+
+
+def _tabulated(points, normals, turns, order):
+    frame = CanonicalFrame.from_points(points)
+    x, n = frame.to_chart(points), normals @ frame.R
+    height, loss = [], []
+    for turn in turns:
+        y = x @ turn
+        d = discrepancy(jets.fit(y, order).alpha, y, n @ turn)
+        height.append(d.height)
+        loss.append(d.height + NORMALS * (1 - d.cosine))
+    return TrainingSet(x, n, torch.stack(height, 1), torch.stack(loss, 1))

@@ -1,0 +1,82 @@
+"""Where torch and Dr.Jit meet: PolyFit sets up the Dr.Jit template, and gradients cross both ways (``dr.wrap``).
+
+    torch   points -> PolyFit -> alpha, O -> vertices -> loss
+                                                  \\-> :func:`rendering` -> image -> loss          a rendering loss reaches PolyFit's
+                                                  network
+    Dr.Jit  alpha -> surface -> image -> loss
+                 \\-> :func:`in_torch` -> any torch function -> loss                              a torch loss reaches Dr.Jit's alpha
+
+Import only after a Mitsuba variant is set.
+"""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import torch
+
+from polyfit import jets
+
+from .patch import Unknowns
+from .template import Template
+
+
+def template(polyfit, vertices, faces, uv, **options):
+    """The :class:`polysft_mi.template.Template` of the mesh in the frame, and of the order, of ``polyfit`` (:class:`polyfit.PolyFit`).
+
+    ``vertices`` (N, 3) [m], ``faces`` (F, 3), ``uv`` (N, 2); ``options`` and errors are those of ``Template.fit``.
+    """
+    points = torch.as_tensor(np.asarray(vertices))
+    with torch.no_grad():
+        frame = polyfit(points[None].float()).frame[0]
+    frame = frame.to(torch.float64)
+    left, _, right = torch.linalg.svd(frame.R)  # a rotation to the last digit again
+    return Template.fit(vertices, faces, uv, polyfit.order, frame=type(frame)(frame.s, left @ right, frame.T), **options)
+
+
+def surface(polyfit, points):
+    """The points (..., P, 3) [m] of patches, put onto the patches' jets along the frames' z; differentiable to the weights of
+    ``polyfit``."""
+    found = polyfit(points)
+    chart = found.frame.to_chart(points)
+    return found.frame.from_chart(jets.point(found.jet.alpha, chart[..., :2]))
+
+
+def in_drjit(function):
+    """A Dr.Jit ``function`` as a torch function: of tensors, on tensors, torch's autograd runs through it."""
+    return dr.wrap(source="torch", target="drjit")(function)
+
+
+def in_torch(function):
+    """A torch ``function`` as a Dr.Jit function: of Dr.Jit tensors and arrays, Dr.Jit's AD runs through it."""
+    return dr.wrap(source="drjit", target="torch")(function)
+
+
+def rendering(problem, seed=0):
+    """The rendering of a :class:`polysft_mi.problem.Problem` as a torch function: vertices (N, 3) [m, camera frame] -> (rgb (H, W, 3)
+    linear, alpha (H, W))."""
+
+    @in_drjit
+    def render(vertices):
+        rgb, alpha = problem.image(_points(vertices.array), seed)
+        return rgb, mi.TensorXf(alpha, (problem.height, problem.width))
+
+    return lambda vertices: render(vertices.to(torch.float32).contiguous())
+
+
+def deformed(patch):
+    """The surface of a :class:`polysft_mi.patch.JetPatch` as a torch function of the unknowns: delta_alpha (A,), delta_u (N,), delta_v
+    (N,),
+    rotation (4,), translation (3,) -> vertices (N, 3) [m, camera frame]."""
+
+    @in_drjit
+    def vertices(*unknowns):
+        points = patch.vertices(Unknowns(*(x.array for x in unknowns)))
+        return mi.TensorXf(dr.ravel(points), (dr.width(points), 3))
+
+    return lambda *unknowns: vertices(*(x.to(torch.float32).contiguous() for x in unknowns))
+
+
+def _points(flat):
+    """(3 N,) as a Point3f of N."""
+    index = 3 * dr.arange(mi.UInt32, dr.width(flat) // 3)
+    return mi.Point3f(*(dr.gather(mi.Float, flat, index + k) for k in range(3)))

@@ -1,0 +1,62 @@
+"""``python -m polyfit`` and ``import polyfit`` from outside: what they write, what they refuse, what they load."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import surfaces
+
+from polyfit import InputError, read_mesh, write_ply
+from polyfit.__main__ import main
+
+
+def run(*args):
+    return subprocess.run([sys.executable, *args], capture_output=True, text=True)
+
+
+def test_the_surface_is_written(tmp_path, capsys):
+    V, F = surfaces.tube()
+    write_ply(tmp_path / "tube.ply", V, F)
+    main([str(tmp_path / "tube.ply"), "-o", str(tmp_path / "out.ply"), "--patches", "8", "--resolution", "2"])
+    W, G, _ = read_mesh(tmp_path / "out.ply")
+    assert len(G) == 4 * len(F)
+    assert np.abs(np.hypot(W[:, 0], W[:, 1]) - 0.05).max() < 2e-3
+    assert "8 patches, 176 numbers" in capsys.readouterr().out
+
+
+def test_bad_input_ends_in_one_line_and_writes_nothing(tmp_path):
+    V, F = surfaces.sheet(n=5)
+    write_ply(tmp_path / "sheet.ply", V, F)
+    write_ply(tmp_path / "points.ply", V, F[:0])
+    (tmp_path / "broken.obj").write_text("v 0 0 0\nv 1 0 zero\n")
+    before = sorted(tmp_path.iterdir())
+    for message, args in {
+        "broken.obj: line 2": ["broken.obj"],
+        "points.ply": ["points.ply"],
+        "missing.obj: no such file": ["missing.obj"],
+        "26 patches; 1 to 25, the number of its vertices": ["sheet.ply", "--patches", "26"],
+        "order = 11; the order of a jet is 1 to 10": ["sheet.ply", "--order", "11"],
+        "--resolution 0; at least 1 is needed": ["sheet.ply", "--resolution", "0"],
+    }.items():
+        with pytest.raises(InputError) as error:
+            main([str(tmp_path / args[0]), *args[1:], "-o", str(tmp_path / "out.ply")])
+        assert message in str(error.value) and "\n" not in str(error.value)
+    with pytest.raises(InputError, match="nowhere: no such folder"):
+        main([str(tmp_path / "sheet.ply"), "-o", str(tmp_path / "nowhere" / "out.ply")])
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_a_process_ends_in_status_2(tmp_path):
+    done = run("-m", "polyfit", str(tmp_path / "missing.obj"), "-o", str(tmp_path / "out.ply"))
+    assert done.returncode == 2 and done.stdout == ""
+    assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1
+
+
+def test_import_is_light():
+    for use, heavy in {
+        "dir(polyfit)": {"torch", "mitsuba", "drjit", "pyvista", "numpy"},
+        "polyfit.PatchedSurface, polyfit.PolyFit": {"mitsuba", "drjit", "polysft_mi", "onefit"},
+    }.items():
+        done = run("-c", f"import sys, polyfit; {use}; bad = {heavy} & set(sys.modules); assert not bad, bad")
+        assert done.returncode == 0, done.stderr

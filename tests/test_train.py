@@ -1,0 +1,200 @@
+"""``python -m polyfit.train``: the table that is trained on, resuming, several processes, what it refuses."""
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+import trimesh
+from safetensors.torch import load_file
+
+from polyfit import InputError, PolyFit, jets, train, training_set
+from polyfit.baselines.atlasnet import AtlasNet
+from polyfit.baselines.regressors import DGCNN, PointNet
+from polyfit.losses import discrepancy
+
+ROOT = Path(__file__).resolve().parent.parent
+SMALL = train.Settings(families=("gaussian", "jet"), patches=120, points=40, reads=30, steps=8, batch=16, order=2)
+FLAGS = "--families gaussian jet --patches 120 --points 40 --reads 30 --steps 8 --batch 16 --order 2".split()
+
+
+@pytest.fixture(scope="module")
+def table():
+    return training_set.build(60, 50, 3, 0)
+
+
+@pytest.fixture
+def mesh(tmp_path):
+    tube = trimesh.creation.cylinder(0.1, 0.4, sections=24).subdivide().subdivide()
+    tube.export(tmp_path / "tube.ply")
+    return str(tmp_path / "tube.ply")
+
+
+def test_table_is_the_loss_of_jets_fitted_along_each_axis(table):
+    axes = training_set.axes()
+    for patch, k in ((0, 0), (7, 13), (41, 64)):
+        z = axes[k]
+        u = torch.linalg.cross(z, torch.tensor([0.3, -0.5, 0.9]))  # any axes across z will do
+        u = u / u.norm()
+        turn = torch.stack([u, torch.linalg.cross(z, u), z], 1)
+        x, n = table.points[patch] @ turn, table.normals[patch] @ turn
+        d = discrepancy(jets.fit(x, 3).alpha[None], x[None], n[None])
+        assert table.height[patch, k].item() == pytest.approx(d.height.item(), rel=1e-3)
+        assert table.loss[patch, k].item() == pytest.approx((d.height + training_set.NORMALS * (1 - d.cosine)).item(), rel=1e-3)
+
+
+def test_table_is_read_sharply_or_smoothly(table):
+    index, axes = torch.tensor([3, 8]), training_set.axes()
+    height, loss = table.at(index, axes[[20, 30]].expand(2, 2, 3), 1e5)
+    assert torch.equal(height, table.height[index][:, [20, 30]]) and torch.equal(loss, table.loss[index][:, [20, 30]])
+    below, _ = table.at(index, -axes[[20, 30]].expand(2, 2, 3), 1e5)  # a jet seen from below is a jet
+    assert torch.equal(below, height)
+    smooth, _ = table.at(index, axes[None, :2].expand(2, 2, 3), 0.0)
+    assert smooth.numpy() == pytest.approx(table.height[index].mean(1, keepdim=True).expand(2, 2).numpy(), rel=1e-5)
+
+
+def test_axes_cover_the_half_sphere():
+    axes = training_set.axes()
+    assert axes.norm(dim=1).numpy() == pytest.approx(1, abs=1e-6) and (axes[:, 2] > 0).all()
+    anywhere = torch.nn.functional.normalize(torch.randn(2000, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    assert torch.rad2deg(torch.arccos((anywhere @ axes.T).abs().amax(1))).max() < 15
+
+
+def test_training_lowers_the_loss(tmp_path):
+    settings = replace(SMALL, steps=60, batch=64)
+    data = train._Patches(training_set.build(300, 40, 2, 0, names=("gaussian", "jet")))
+    training = train.Training(settings, data, train._Processes("cpu"))
+
+    def loss():
+        with torch.no_grad():
+            return data.loss(training.network, settings, 0.0, torch.Generator().manual_seed(1), training.processes).item()
+
+    before = loss()
+    for _ in range(60):
+        training.step()
+    assert loss() < 0.97 * before
+
+
+def test_command_leaves_weights_their_making_and_a_log(tmp_path, capsys):
+    train.main([*FLAGS, "-o", str(tmp_path / "out")])
+    assert str(tmp_path / "out" / "weights.safetensors") in capsys.readouterr().out
+    model = PolyFit.load(tmp_path / "out" / "weights.safetensors", 2)
+    assert model(torch.rand(3, 30, 3)).jet.alpha.shape == (3, 6)
+    about = json.loads((tmp_path / "out" / "weights.json").read_text())
+    assert about["command"] == "python -m polyfit.train " + " ".join([*FLAGS, "-o", str(tmp_path / "out")])
+    assert (about["steps"], about["seed"], about["processes"]) == (8, 0, 1)
+    lines = [json.loads(line) for line in (tmp_path / "out" / "log.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines] == [8] and 0 < lines[0]["loss"] < 1
+    assert not list((tmp_path / "out").glob(".*"))
+
+
+@pytest.mark.parametrize("model", ["polyfit", "pointnet", "dgcnn"])
+def test_resumed_training_ends_where_an_uninterrupted_one_does(tmp_path, model):
+    settings = replace(SMALL, model=model)
+    whole = train.train(settings, tmp_path / "whole")
+    assert train.train(settings, tmp_path / "parts", until=3) is None
+    assert not (tmp_path / "parts" / "weights.safetensors").exists()
+    resumed = train.train(settings, tmp_path / "parts", resume=True)
+    a, b = load_file(whole), load_file(resumed)
+    assert a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a)
+    short = train.train(replace(settings, steps=3), tmp_path / "short")
+    assert any((load_file(short)[k] - a[k]).abs().max() > 1e-5 for k in a)  # the later steps did something
+
+
+def test_ctrl_c_leaves_a_checkpoint(tmp_path, monkeypatch):
+    step = train.Training.step
+
+    def interrupted(self):
+        if self.done == 4:
+            raise KeyboardInterrupt
+        return step(self)
+
+    monkeypatch.setattr(train.Training, "step", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        train.train(SMALL, tmp_path)
+    monkeypatch.undo()
+    resumed = load_file(train.train(SMALL, tmp_path, resume=True))
+    whole = load_file(train.train(SMALL, tmp_path / "whole"))
+    assert all(torch.equal(resumed[k], whole[k]) for k in whole)
+
+
+def test_two_processes_of_torchrun_do_what_one_does(tmp_path):
+    command = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", "--master-port", "29731", "-m", "polyfit.train"]
+    command += [*FLAGS, "-o", str(tmp_path / "two")]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, env=os.environ | {"OMP_NUM_THREADS": "1"})
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert json.loads((tmp_path / "two" / "weights.json").read_text())["processes"] == 2
+    two, one = load_file(tmp_path / "two" / "weights.safetensors"), load_file(train.train(SMALL, tmp_path / "one"))
+    fresh = train.Training(SMALL, None, train._Processes("cpu")).network.state_dict()
+    for k in one:
+        assert (two[k] - one[k]).abs().max() <= 1e-4, k
+    assert max((one[k] - fresh[k]).abs().max() for k in one) > 1e-3
+
+
+def test_networks_of_others_train_on_the_same_patches(tmp_path, mesh):
+    settings = replace(SMALL, meshes=(mesh,), cuts=(4, 8), families=())
+    for model, kind in (("pointnet", PointNet), ("dgcnn", DGCNN)):
+        path = train.train(replace(settings, model=model, steps=2), tmp_path / model)
+        assert kind.load(path, 2)(torch.rand(2, 30, 3)).jet.alpha.shape == (2, 6)
+        with pytest.raises(InputError, match=f"weights of {model}, not of polyfit"):
+            PolyFit.load(path)
+    sets = [load_file(tmp_path / model / "set.safetensors") for model in ("pointnet", "dgcnn")]
+    assert all(torch.equal(sets[0][k], sets[1][k]) for k in sets[0])
+    path = train.train(replace(settings, model="atlasnet", charts=3, steps=2, batch=2), tmp_path / "atlasnet")
+    assert AtlasNet.load(path).charts == 3
+
+
+class TestRefused:
+    def run(self, *flags):
+        return subprocess.run([sys.executable, "-m", "polyfit.train", *flags], cwd=ROOT, capture_output=True, text=True)
+
+    def test_on_the_command_line_in_one_line(self, tmp_path):
+        done = self.run("none.obj", "-o", str(tmp_path / "out"))
+        assert done.returncode == 2
+        assert done.stderr.strip().splitlines()[-1].startswith("error: none.obj: no such file")
+        assert "Traceback" not in done.stderr
+        assert not (tmp_path / "out" / "weights.safetensors").exists()
+
+    @pytest.mark.parametrize(
+        "change, message",
+        [
+            (dict(model="resnet"), "model resnet: choose among polyfit"),
+            (dict(families=("sine",)), "families sine: choose among jet"),
+            (dict(order=0), "order = 0"),
+            (dict(steps=0), "steps = 0: 1 at least"),
+            (dict(lr=0.0), "lr = 0.0: more than 0"),
+            (dict(reads=300), "reads 300"),
+            (dict(families=()), "nothing to train on"),
+            (dict(model="atlasnet"), "nothing to train on: give meshes"),
+        ],
+    )
+    def test_settings(self, change, message):
+        with pytest.raises(InputError, match=message):
+            replace(SMALL, **change)
+
+    def test_checkpoints_of_other_settings_and_none(self, tmp_path):
+        with pytest.raises(InputError, match="nothing to resume"):
+            train.train(SMALL, tmp_path, resume=True)
+        train.train(SMALL, tmp_path, until=1)
+        with pytest.raises(InputError, match="checkpoint of other settings"):
+            train.train(replace(SMALL, seed=1), tmp_path, resume=True)
+        (tmp_path / "checkpoint.safetensors").write_bytes(b"half of it")
+        with pytest.raises(InputError, match="checkpoint.safetensors: not a file of weights"):
+            train.train(SMALL, tmp_path, resume=True)
+
+    def test_folders_that_hold_a_result(self, tmp_path):
+        train.train(replace(SMALL, steps=1), tmp_path)
+        before = (tmp_path / "weights.safetensors").read_bytes()
+        with pytest.raises(InputError, match="exists; give another -o, or --resume"):
+            train.train(SMALL, tmp_path)
+        assert (tmp_path / "weights.safetensors").read_bytes() == before
+
+    def test_a_loss_that_is_not_finite(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(train._Patches, "loss", lambda self, network, *_: next(network.parameters()).sum() * torch.nan)
+        with pytest.raises(InputError, match="the loss is nan at step 1"):
+            train.train(SMALL, tmp_path)
+        assert not (tmp_path / "weights.safetensors").exists()
