@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import LinAlgError
+from threadpoolctl import ThreadpoolController
 
 from ..errors import InputError
 from ..normal_equations import Blocks, Chart, Pattern, Reduced, State, assemble
@@ -63,6 +64,7 @@ class GaussNewton:
         if settings.brightness == "gain":
             raise InputError("setting brightness = 'gain' with solver = gauss-newton; auto, local or none is needed")
         self._problem = None
+        self._blas = ThreadpoolController()  # its own threads cost more than they bring on blocks this small, and wait for Dr.Jit's
         self._scales, self._fitting = {}, {}
         self._hold = 0.0  # weight of the difference to the anchor, motion included, where a frame is solved again
 
@@ -71,6 +73,10 @@ class GaussNewton:
 
         ``window``: its Unknowns, in a list; ``past``: of the frames before it, oldest first, (arrays of ``Unknowns.to_numpy``, terms and facts).
         """
+        with self._blas.limit(limits=1, user_api="blas"):
+            return self._solve(problem, window, frames, report, past)
+
+    def _solve(self, problem, window, frames, report, past):
         if problem is not self._problem:
             self._prepare(problem)
         self._report, self._count = report, 0
