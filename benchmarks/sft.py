@@ -213,7 +213,7 @@ def _standing_in(template, V, axes):
     y = (V - template.origin) @ template.rotation / template.scale
     turn = template.rotation.T @ axes
     x = (y - y.mean(0)) @ turn
-    alpha = jets.fit(torch.as_tensor(x), template.order).numpy()
+    alpha = jets.fit(torch.as_tensor(x), template.order).alpha.numpy()
     return {
         "delta_alpha": alpha - template.alpha,
         "delta_u": x[:, 0] - template.chart[:, 0],

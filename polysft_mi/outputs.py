@@ -9,6 +9,8 @@ import platform
 import sys
 import time
 import xml.etree.ElementTree as ET
+from collections import deque
+from concurrent.futures import ThreadPoolExecutor
 
 import drjit as dr
 import mitsuba as mi
@@ -19,11 +21,11 @@ from .defaults import located
 from .exr import write_exr
 from .files import aside
 from .patch import Unknowns
-from .problem import TERMS
 from .raster import RasterIntegrator
 from .video import write_video
 
 RUN = "run.json"
+_DRAWING = 2  # threads that draw and write a frame's pictures
 
 
 def srgb(linear):
@@ -158,21 +160,36 @@ def write(problem, track, out, *, exr_frames, fps, command, say=None):
     masked = sequence.mask(0) is not None
     exr = set(chosen(count, exr_frames))
     sheet, per_frame = set(chosen(count, 5)), []
-    rows, view = [], figures.View.around(vertices)
+    rows, view, known = [], figures.View.around(vertices), versions()
+
+    def drawn(k, layers):
+        """Figures of a frame, its part of the contact sheet (or None) and its picture in the video."""
+        found = {"frame": int(indices[k]), **_image_figures(layers, masked)}
+        if k in exr:
+            metadata = {"frame": int(indices[k]), "scene": os.path.abspath(problem.experiment.path), **known}
+            write_exr(os.path.join(out, "comparison", f"{indices[k]:03d}.exr"), layers, metadata)
+        target, render, error = (_panel(layers[n]) for n in ("target", "render", "error"))
+        target, render = (np.round(255 * srgb(x)).astype(np.uint8) for x in (target, render))
+        surface = figures.shade_surface(vertices[k], template.faces, view, uv=template.uv, size=target.shape[1::-1])
+        row = {"target": target, "render": render, "error": error, "surface": surface, "label": f"frame {indices[k]}"} if k in sheet else None
+        return found, row, np.concatenate([target, render, _heat(error), surface], axis=1)
 
     def video_frames():
-        for k, u in enumerate(unknowns):
-            layers = pictures(u, k)
-            per_frame.append({"frame": int(indices[k]), **_image_figures(layers, masked)})
-            if k in exr:
-                metadata = {"frame": int(indices[k]), "scene": os.path.abspath(problem.experiment.path), **versions()}
-                write_exr(os.path.join(out, "comparison", f"{indices[k]:03d}.exr"), layers, metadata)
-            target, render, error = (_panel(layers[n]) for n in ("target", "render", "error"))
-            target, render = (np.round(255 * srgb(x)).astype(np.uint8) for x in (target, render))
-            surface = figures.shade_surface(vertices[k], template.faces, view, uv=template.uv, size=target.shape[1::-1])
-            if k in sheet:
-                rows.append({"target": target, "render": render, "error": error, "surface": surface, "label": f"frame {indices[k]}"})
-            yield np.concatenate([target, render, _heat(error), surface], axis=1)
+        waiting = deque()
+
+        def finished():
+            found, row, picture = waiting.popleft().result()
+            per_frame.append(found)
+            rows.extend([row] if row else [])
+            return picture
+
+        with ThreadPoolExecutor(_DRAWING) as pool:  # the next frames are rendered meanwhile
+            for k, u in enumerate(unknowns):
+                waiting.append(pool.submit(drawn, k, pictures(u, k)))
+                if len(waiting) > 2 * _DRAWING:
+                    yield finished()
+            while waiting:
+                yield finished()
 
     video = write_video(os.path.join(out, "comparison.mp4"), video_frames(), fps)
     figures.contact_sheet(os.path.join(out, "comparison.png"), rows)

@@ -269,10 +269,13 @@ def test_gradients_against_finite_differences(tmp_path, kind):
         dr.backward(loss(unknowns))
         for name in DIRECTIONS:
             direction = direction_of(name, len(sheet.arrays[name]))
-            ad = float(np.array(dr.grad(getattr(unknowns, name))) @ direction)
-            h = 2e-3
-            fd = (loss(sheet.step(name, direction, h))[0] - loss(sheet.step(name, direction, -h))[0]) / (2 * h)
-            assert abs(ad - fd) <= 0.05 * max(abs(fd), 2.0), f"{kind}, channels {channels}, {name}: AD {ad:.4g}, finite differences {fd:.4g}"
+            gradient = np.array(dr.grad(getattr(unknowns, name)))
+            ad = float(gradient @ direction)
+            # the median over steps, for single pixels jump where triangles are seen edge-on
+            slopes = [(loss(sheet.step(name, direction, h))[0] - loss(sheet.step(name, direction, -h))[0]) / (2 * h) for h in (2.5e-4, 5e-4, 1e-3, 2e-3)]
+            fd = float(np.median(slopes))
+            # of a direction across the gradient, what its length would give
+            assert abs(ad - fd) <= 0.05 * max(abs(fd), 0.25 * np.linalg.norm(gradient) * np.linalg.norm(direction), 2.0), f"{kind}, channels {channels}, {name}: AD {ad:.4g}, finite differences {fd:.4g}"
 
 
 def test_self_occlusion_is_there(tmp_path):
