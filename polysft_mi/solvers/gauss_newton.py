@@ -19,7 +19,7 @@ from . import Solution
 _SHEET = 225.0  # width [pixels] of the sheet that the stages' blurs are given for; they grow with the sheet in the image
 _WINDOW = 8.0  # standard deviation of the window of the local statistics, likewise
 _FIRST_SCALE, _SCALES = 0.3, (0.2, 1.0)  # robust scale at the start of a frame, and its bounds, in local standard deviations
-_SMALL = 3e-4  # share of the objective that a step must promise for another one to follow
+_SMALL = 2e-3  # share of the objective that a step must promise for another one to follow
 _SUSPECT, _SUSPECT_MARGIN, _MEMORY = 1.25, 0.03, 5  # a misfit above this many times the median of the frames before (plus the margin) is suspect
 _PATIENT = 18  # iterations a stage where a frame is suspect
 _RAISE = 0.02  # share of the objective by which more coefficients must lower it to be taken
