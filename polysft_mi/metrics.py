@@ -204,7 +204,32 @@ def score(surface, truth_path):
             summary[f"{name}_worst"] = float(np.max(values))
     if "depth_rmse_mm" in columns:
         summary["per_frame_mm"] = {str(k): round(v, 2) for k, v in zip(columns["frame"], columns["depth_rmse_mm"])}
+    if not os.path.isdir(truth_path):
+        summary |= confidence(surface, load_npz(truth_path))
     return summary
+
+
+def confidence(surface, truth):
+    """How ``sigma`` (T, N) [m] of a surface relates to its errors along the rays, where the truth has the same vertices (S, N, 3); {} where it cannot be told.
+
+    ``sigma_factor``: what sigma has to be multiplied by for 68 % of the errors to lie within it; ``sigma_two``: the share that then lies within twice
+    as much (95 % were they Gaussian); ``sigma_rank``: rank correlation of sigma and error. The first frame, where the template stands in its place, is left out.
+    """
+    if "sigma" not in surface or "vertices" not in truth or truth["vertices"].shape[1:] != surface["vertices"].shape[1:]:
+        return {}
+    known = [i for i, k in enumerate(surface["frames"]) if 0 < k < len(truth["vertices"])]
+    found = np.asarray(surface["vertices"], dtype=np.float64)[known]
+    ray = found / np.linalg.norm(found, axis=2, keepdims=True)
+    missing = found - truth["vertices"][np.asarray(surface["frames"])[known]]
+    error, sigma = np.abs((missing * ray).sum(2)).ravel(), np.asarray(surface["sigma"], dtype=np.float64)[known].ravel()
+    usable = np.isfinite(sigma) & (sigma > 0)
+    if usable.sum() < 2:
+        return {}
+    error, sigma = error[usable], sigma[usable]
+    ratio = error / sigma
+    factor = float(np.quantile(ratio, 0.68))
+    ranks = [np.argsort(np.argsort(x)) for x in (error, sigma)]
+    return {"sigma_factor": factor, "sigma_two": float((ratio <= 2 * factor).mean()), "sigma_rank": float(np.corrcoef(*ranks)[0, 1])}
 
 
 _WORST = ("rmse_mm", "depth_rmse_mm", "chamfer_1e4")

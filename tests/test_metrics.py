@@ -204,3 +204,16 @@ def test_score_refuses_what_cannot_be_compared(tmp_path):
             metrics.score(surface, str(tmp_path / name))
     with pytest.raises(InputError, match="not finite"):
         metrics.score({**surface, "vertices": surface["vertices"] * np.nan}, str(tmp_path / "short.npz"))
+
+
+def test_confidence_says_how_far_sigma_is_off():
+    rng = np.random.default_rng(0)
+    truth = np.tile([0.1, -0.05, 1.0], (4, 500, 1)) + 0.05 * rng.normal(size=(1, 500, 3))
+    sigma = np.tile(10 ** rng.uniform(-4, -2, (1, 500)), (4, 1))
+    ray = truth / np.linalg.norm(truth, axis=2, keepdims=True)
+    found = truth + (3 * sigma * rng.normal(size=(4, 500)))[..., None] * ray
+    surface = {"vertices": found, "frames": np.arange(4), "sigma": sigma}
+    figures = metrics.confidence(surface, {"vertices": truth})
+    assert abs(figures["sigma_factor"] - 3) < 0.2 and abs(figures["sigma_two"] - 0.954) < 0.02 and figures["sigma_rank"] > 0.7
+    assert metrics.confidence({**surface, "sigma": np.full((4, 500), np.nan)}, {"vertices": truth}) == {}
+    assert metrics.confidence({k: v for k, v in surface.items() if k != "sigma"}, {"vertices": truth}) == {}
