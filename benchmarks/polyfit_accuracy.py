@@ -46,7 +46,7 @@ from polyfit.baselines.atlasnet import AtlasNet, normalised
 from polyfit.baselines.regressors import DGCNN, PointNet
 from polyfit.errors import InputError, cli
 from polyfit.files import aside
-from polyfit.frames import CanonicalFrame, rotation_matrix
+from polyfit.frames import CanonicalFrame
 from polyfit.losses import behind, discrepancy
 from polyfit.meshio import read_mesh
 from polyfit.patches import Patches

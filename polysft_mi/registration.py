@@ -236,6 +236,11 @@ class Registration:
             dr.eval(squared, weight)
             return np.array(squared)[np.array(weight) > 0]
 
+    def misfit(self, vertices, frame, level):
+        """The mean of r^2 / (r^2 + c^2) over the pixels that are compared, 0 to 1, with a fixed c: 1 where there are none. vertices (N, 3) [m, world]."""
+        squared = self.residuals(vertices, frame, level)
+        return float((squared / (squared + _MISFIT**2)).mean()) if len(squared) else 1.0
+
     def evaluate(self, vertices, frame, level, scale):
         """:class:`Evaluation` of the surface with vertices (N, 3) [m, world] against a frame, at a level, under the robust ``scale``."""
         s = self.problem.settings

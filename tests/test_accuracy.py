@@ -1,24 +1,21 @@
 """The benchmark of PolyFit's accuracy: that it chooses and measures what it says. Its figures are no part of the tests."""
 
-import importlib.util
 import json
 import math
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import trimesh
+from scripts import load
 
 from polyfit import InputError, PolyFit
 from polyfit.garments import GarmentPatches
 from polyfit.stn import SpatialTransformer
 
 ROOT = Path(__file__).resolve().parent.parent
-spec = importlib.util.spec_from_file_location("benchmark_polyfit_accuracy", ROOT / "benchmarks" / "polyfit_accuracy.py")
-accuracy = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(accuracy)
+accuracy = load("benchmarks/polyfit_accuracy.py")
 
 
 def arcs(angle, length=0.5, points=400):

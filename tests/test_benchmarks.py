@@ -1,27 +1,18 @@
 """The benchmarks at tiny sizes: that they measure what they say. Their times are no part of the tests."""
 
-import importlib.util
 import json
 from pathlib import Path
 
 import drjit as dr
 import numpy as np
 import pytest
+from scripts import load
 
 from polysft_mi import metrics, plugins
 
 ROOT = Path(__file__).resolve().parent.parent
 SIZE, POINTS = (64, 48), 9
-
-
-def load(name):
-    spec = importlib.util.spec_from_file_location(f"benchmark_{name}", ROOT / "benchmarks" / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-raster, stability = load("raster"), load("stability")
+raster, stability = load("benchmarks/raster.py"), load("benchmarks/stability.py")
 
 
 @pytest.fixture(autouse=True)

@@ -1,19 +1,17 @@
 """The benchmark of reconstruction: that its measures measure what they say, on surfaces whose distance is known."""
 
-import importlib.util
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 import surfaces
+from scripts import load
 
 from polyfit import write_ply
 
 ROOT = Path(__file__).resolve().parent.parent
-spec = importlib.util.spec_from_file_location("polyfit_reconstruction", ROOT / "benchmarks" / "polyfit_reconstruction.py")
-benchmark = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(benchmark)
+benchmark = load("benchmarks/polyfit_reconstruction.py")
 
 
 def test_distance_and_angle_between_surfaces():

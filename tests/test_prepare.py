@@ -1,7 +1,6 @@
 """Scene files for the three forms of folders: recognised, complete, geometrically right, and refused in one line where they cannot be."""
 
 import dataclasses
-import importlib.util
 import json
 import os
 import subprocess
@@ -14,6 +13,7 @@ import numpy as np
 import pytest
 
 import synthetic
+from scripts import load
 from polysft_mi import meshio
 from polysft_mi.errors import InputError
 from polysft_mi.kinect_paper import template as kinect_paper_template
@@ -23,9 +23,7 @@ from polysft_mi.settings import Settings
 
 ROOT = Path(__file__).resolve().parent.parent
 FORMS = {"cloth": synthetic.cloth, "phi-SfT": synthetic.phi_sft, "Kinect-Paper": synthetic.kinect_paper}
-_spec = importlib.util.spec_from_file_location("write_scenes", ROOT / "scenes" / "write_scenes.py")
-write_scenes = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(write_scenes)
+write_scenes = load("scenes/write_scenes.py")
 
 
 def refused(*arguments, **options):

@@ -1,6 +1,5 @@
 """The comparison of solvers at tiny sizes: the baseline descends towards the truth; results are kept, shown and not made twice."""
 
-import importlib.util
 import json
 import shutil
 from pathlib import Path
@@ -8,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import synthetic
+from scripts import load
 from scipy.spatial.transform import Rotation
 
 from polysft_mi import evaluate, metrics, prepare
@@ -16,14 +16,7 @@ from polysft_mi.errors import InputError
 ROOT = Path(__file__).resolve().parent.parent
 
 
-def load(name):
-    spec = importlib.util.spec_from_file_location(f"benchmark_{name}", ROOT / "benchmarks" / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-sft, per_vertex = load("sft"), load("per_vertex")
+sft, per_vertex = load("benchmarks/sft.py"), load("benchmarks/per_vertex.py")
 SETUP = {"frames": None, "threads": None, "define": [], "mode": None, "iterations": None}
 
 

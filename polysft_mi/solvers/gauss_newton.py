@@ -92,6 +92,10 @@ class GaussNewton:
         ``before``, ``after``: arrays of ``Unknowns.to_numpy`` of the frames on either side; ``terms``: of the frame so far; ``weight``: of the
         squared difference to the middle.
         """
+        with self._blas.limit(limits=1, user_api="blas"):
+            return self._revisit(problem, frame, before, after, terms, weight)
+
+    def _revisit(self, problem, frame, before, after, terms, weight):
         if problem is not self._problem:
             self._prepare(problem)
         self._report, self._count = None, 0
@@ -138,8 +142,7 @@ class GaussNewton:
         rest = chart.state(self._problem.patch.rest().to_numpy())
         self._expect(0)
         vertices = chart.surface(rest, 0).vertices
-        squared = reg.residuals(vertices, 0, self.levels[STAGES[-1]])
-        before = (squared / (squared + 0.25)).mean() if len(squared) else 0.0
+        before = reg.misfit(vertices, 0, self.levels[STAGES[-1]])
         if before < _TEXTURE_MISFIT:
             return
         state = rest
@@ -150,8 +153,7 @@ class GaussNewton:
                     state = State(rest.alpha, state.uv + Reduced(self.blocks, normal, 1e-3).slide(), rest.rotation, rest.translation)
                 except (BadFrame, LinAlgError):
                     return
-        squared = reg.residuals(chart.surface(state, 0).vertices, 0, self.levels[STAGES[-1]])
-        after = (squared / (squared + 0.25)).mean() if len(squared) else 1.0
+        after = reg.misfit(chart.surface(state, 0).vertices, 0, self.levels[STAGES[-1]])
         if after < _TEXTURE_GAIN * before and np.abs(state.uv).max() < _TEXTURE_FARTHEST:
             reg.shift_texture(chart.template.chart, chart.template.chart + state.uv)
 
@@ -187,12 +189,7 @@ class GaussNewton:
         """The start that explains the frame best."""
         if len(starts) == 1:
             return starts[0]
-
-        def misfit(state):
-            squared = self.registration.residuals(self.chart.surface(state, 0).vertices, frame, self.levels[stage])
-            return (squared / (squared + 0.25)).mean() if len(squared) else 1.0
-
-        return min(starts, key=misfit)
+        return min(starts, key=lambda state: self.registration.misfit(self.chart.surface(state, 0).vertices, frame, self.levels[stage]))
 
     def _relocate(self, frame):
         """The flat template in the pose that its features have in the frame; None where too few are found."""
@@ -292,7 +289,7 @@ class GaussNewton:
     # -- order --------------------------------------------------------------
 
     def _adapt_order(self, state, terms, anchor, frame):
-        """Raise the order where the model says that it pays, and go on; else lower it where that costs nothing."""
+        """Raise the order where the model says that it pays, and go on from there: (state, terms)."""
         s, order = self.settings, int(terms["order"])
         stage = STAGES[-1]
         top = min(order + _ORDER_STEP, s.capacity)
