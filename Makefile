@@ -20,7 +20,8 @@ $(INSTALLED): pyproject.toml constraints.txt
 	@if $(PYTHON) -c 'import ensurepip' 2>/dev/null; then $(PYTHON) -m venv .venv; else \
 	    $(PYTHON) -m venv --without-pip .venv && $(PYTHON) -m pip --python $(PY) install -q pip || \
 	    { rm -rf .venv; echo 'error: no virtual environment can be made: install python3-venv (Debian, Ubuntu: apt-get install python3-venv)' >&2; exit 2; }; fi
-	PYTHONWARNINGS=ignore $(PY) -m pip install --disable-pip-version-check -c constraints.txt -e '.[test]'
+	@echo 'installing into .venv: a minute or so, more where the network is slow'
+	@PYTHONWARNINGS=ignore $(PY) -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[test]'
 	@touch $@
 
 # Rendering on the CPU needs a libLLVM, which no Python package brings.
