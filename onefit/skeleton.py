@@ -47,6 +47,28 @@ def standard_rest_pose():
     return pose
 
 
+# Joints of the standard body in the T-pose [m], the right side mirrored. Generated motions are made for them, and the size of others is
+# told by them.
+_STANDARD_JOINTS = {
+    "pelvis": (0.0, -0.0108, 0.0504), "spine1": (0.0, 0.0223, 0.1178), "spine2": (0.0, 0.0076, 0.2612), "spine3": (0.0, 0.0319, 0.3939),
+    "neck": (0.0, -0.0075, 0.5597), "head": (0.0, -0.0419, 0.6567), "hip": (0.1019, -0.0079, 0.0389), "knee": (0.1019, -0.0402, -0.3515),
+    "ankle": (0.1019, -0.0039, -0.7522), "foot": (0.1132, -0.1361, -0.7981), "collar": (0.0220, -0.0256, 0.4930),
+    "shoulder": (0.1616, -0.0171, 0.4675), "elbow": (0.4141, -0.0171, 0.4675), "wrist": (0.6412, -0.0171, 0.4675),
+    "hand": (0.7375, -0.0171, 0.4675),
+}  # fmt: skip
+
+
+def standard_joints():
+    """Joints (24, 3) [m] of the standard body in the T-pose."""
+    sides = {"left": 1.0, "right": -1.0}
+    places = []
+    for name in JOINTS:
+        side, _, part = name.partition("_")
+        x, y, z = _STANDARD_JOINTS[part or side]
+        places.append((x * sides.get(side, 1.0), y, z))
+    return torch.tensor(places)
+
+
 def chained(rotations):
     """Rotations (..., 24, 3, 3) relative to the parent, to rotations (..., 24, 3, 3) relative to the world."""
     done = [None] * len(PARENTS)

@@ -10,17 +10,18 @@ def transforms(body, poses, translation):
 
     ``poses`` (T, 24, 3) [rad] as in :mod:`onefit.skeleton`; ``translation`` (T, 3) [m] is added to the rest position of the root joint.
     Joint j turns by G_j(pose) G_j(rest_pose)^T, G_j the product of rotations from the root to j, about its own place, which follows from its
-    parent's map. With ``poses`` equal to ``body.rest_pose`` and no translation, all maps are the identity.
+    parent's map. A body for each frame has ``joints`` and ``rest_pose`` (T, 24, 3). With ``poses`` equal to ``body.rest_pose`` and no translation, all maps are the identity.
     """
     import roma
 
     rest = skeleton.chained(roma.rotvec_to_rotmat(body.rest_pose.to(poses.dtype)))
     R = skeleton.chained(roma.rotvec_to_rotmat(poses)) @ rest.mT
     joints = body.joints.to(poses.dtype)
-    places = [joints[0] + translation]
+    offsets = joints - joints[..., [max(p, 0) for p in skeleton.PARENTS], :]
+    places = [joints[..., 0, :] + translation]
     for j in range(1, len(skeleton.PARENTS)):
         p = skeleton.PARENTS[j]
-        places.append(places[p] + R[..., p, :, :] @ (joints[j] - joints[p]))
+        places.append(places[p] + (R[..., p, :, :] @ offsets[..., j, :, None])[..., 0])
     t = torch.stack(places, -2) - (R @ joints[..., None])[..., 0]
     return torch.cat([R, t[..., None]], -1)
 

@@ -12,16 +12,12 @@ MESH are garments (.obj, .ply), cut into patches and deformed at random; without
 """
 
 import argparse
-import contextlib
 import json
 import math
 import os
-import platform
 import shlex
 import sys
-import time
 from dataclasses import asdict, dataclass, fields
-from pathlib import Path
 
 import torch
 
@@ -29,13 +25,13 @@ from . import families, garments, training_set
 from .baselines.atlasnet import AtlasNet, chamfer, normalised
 from .baselines.regressors import DGCNN, PointNet
 from .errors import InputError, cli
-from .files import aside
 from .losses import discrepancy
 from .meshio import read_mesh
 from .stn import PolyFit, SpatialTransformer
-from .weights import load_into, read_weights, write_weights
+from .training import Processes, Training, device_of, progress_bar, started
+from .weights import read_weights, write_weights
 
-VERSION = 1  # of the checkpoints
+VERSION = 1  # of the training sets
 MODELS = ("polyfit", "pointnet", "dgcnn", "atlasnet")
 SAMPLES = 256  # points that are made of each patch
 CHOICE = 0.01  # height [s] by which one turn must be better than another to be chosen e times as likely, in training
@@ -87,82 +83,25 @@ class Settings:
         return {"pointnet": PointNet, "dgcnn": DGCNN}[self.model](self.order) if self.model != "atlasnet" else AtlasNet(self.charts)
 
 
-class _Processes:
-    """This process among those of ``torchrun``; alone without it."""
-
-    def __init__(self, device):
-        self.count, self.rank = int(os.environ.get("WORLD_SIZE", 1)), int(os.environ.get("RANK", 0))
-        self.device = torch.device(f"cuda:{os.environ.get('LOCAL_RANK', 0)}" if device == "cuda" and self.count > 1 else device)
-        if self.count > 1:
-            torch.distributed.init_process_group("nccl" if device == "cuda" else "gloo")
-
-    def wait(self):
-        if self.count > 1:
-            torch.distributed.barrier()
-
-    def close(self):
-        if self.count > 1:
-            torch.distributed.destroy_process_group()
-
-
-class Training:
-    """One training: its network, its optimiser, how many steps are done.
-
-    A step's random numbers come from (seed, step) alone, and every process of several takes its share of one and the same batch. So a
-    resumed training, and one on several processes, do what one process does without interruption.
-    """
+class PolyFitTraining(Training):
+    """Adam with a rate that falls as a cosine, on the batches of ``data``."""
 
     def __init__(self, settings, data, processes):
-        self.settings, self.data, self.processes = settings, data, processes
+        self.given, self.data = settings, data
         torch.manual_seed(settings.seed)
-        self.network = settings.network().to(processes.device)
-        self.done, self.seconds = 0, 0.0
-        self.optimiser = torch.optim.Adam(self.network.parameters(), settings.lr)
+        network = settings.network().to(processes.device)
+        super().__init__(network, torch.optim.Adam(network.parameters(), settings.lr), _plain(settings), processes)
 
-    def _generator(self):
-        return torch.Generator().manual_seed(self.settings.seed * 1_000_003 + 7919 * self.done + 1)
-
-    def step(self):
-        """One step of Adam; returns the loss of this process's share of the batch."""
-        start = time.perf_counter()
-        s, share = self.settings, self.done / self.settings.steps
+    def update(self):
+        s, share = self.given, self.done / self.given.steps
         for group in self.optimiser.param_groups:
             group["lr"] = s.lr * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * share)))
-        generator = self._generator()
-        loss = self.data.loss(self.network, s, share, generator, self.processes)
+        loss = self.data.loss(self.network, s, share, self.generator(), self.processes)
         self.optimiser.zero_grad()
         loss.backward()
-        if self.processes.count > 1:
-            flat = torch.cat([p.grad.flatten() for p in self.network.parameters()])
-            torch.distributed.all_reduce(flat)
-            for p, g in zip(self.network.parameters(), (flat / self.processes.count).split([p.numel() for p in self.network.parameters()])):
-                p.grad.copy_(g.view_as(p))
+        self.processes.average(self.network)
         self.optimiser.step()
-        self.done += 1
-        self.seconds += time.perf_counter() - start
-        return loss.item()
-
-    def save(self, path):
-        tensors = {f"network.{k}": v for k, v in self.network.state_dict().items()}
-        for k, state in self.optimiser.state_dict()["state"].items():
-            tensors |= {f"adam.{k}.{name}": value for name, value in state.items()}
-        progress = dict(done=self.done, seconds=self.seconds)
-        write_weights(path, tensors, dict(model="checkpoint", version=VERSION, settings=_plain(self.settings), **progress))
-
-    def restore(self, path):
-        """Goes on from a checkpoint. Raises InputError where it was made with other settings."""
-        tensors, about = read_weights(path, "checkpoint", VERSION)
-        other = [f"{k} {about['settings'].get(k)}" for k, v in _plain(self.settings).items() if about["settings"].get(k) != v]
-        if other:
-            raise InputError(f"{path}: a checkpoint of other settings ({', '.join(other)}); give the same, or another -o")
-        load_into(self.network, {k[8:]: v for k, v in tensors.items() if k.startswith("network.")}, path)
-        state = {}
-        for k, v in tensors.items():
-            if k.startswith("adam."):
-                _, index, name = k.split(".")
-                state.setdefault(int(index), {})[name] = v
-        self.optimiser.load_state_dict(self.optimiser.state_dict() | {"state": state})
-        self.done, self.seconds = about["done"], about["seconds"]
+        return dict(loss=loss.item())
 
 
 class _Patches:
@@ -254,76 +193,27 @@ def train(settings, folder, *, device="cpu", resume=False, until=None, every=120
     """Trains and leaves weights in ``folder``; returns their path. ``until`` (steps) ends early, with a checkpoint and no weights (None);
     ``every`` [s] checkpoints.
     """
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    folder = Path(folder)
-    checkpoint, weights = folder / "checkpoint.safetensors", folder / "weights.safetensors"
-    if resume and not checkpoint.exists():
-        raise InputError(f"{checkpoint}: no such file, nothing to resume")
-    if not resume and weights.exists():
-        raise InputError(f"{weights}: exists; give another -o, or --resume")
-    folder.mkdir(parents=True, exist_ok=True)
-    processes = _Processes(device)
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    folder = started(folder, resume)
+    weights = folder / "weights.safetensors"
+    processes = Processes(device)
     try:
-        with Progress(*columns, disable=processes.rank > 0) as progress:
+        with progress_bar(processes) as progress:
             data = _prepare(settings, folder, processes, progress)
-            training = Training(settings, data, processes)
+            training = PolyFitTraining(settings, data, processes)
             if resume:
-                training.restore(checkpoint)
+                training.restore(folder / "checkpoint.safetensors")
             task = progress.add_task("steps", total=settings.steps, completed=training.done)
             end = min(until or settings.steps, settings.steps)
-            _run(training, checkpoint, folder / "log.jsonl", end, every, lambda: progress.update(task, completed=training.done))
+            training.run(folder, end, every, lambda: progress.update(task, completed=training.done))
         if training.done < settings.steps:
             return None
         if processes.rank == 0:
-            _finish(training, weights, command)
+            training.network.save(weights)
+            training.write_about(weights.with_suffix(".json"), command)
         processes.wait()
         return weights
     finally:
         processes.close()
-
-
-def _run(training, checkpoint, log, end, every, advance):
-    """Steps up to ``end``, with a checkpoint every so many seconds, at the end, and at Ctrl-C."""
-    first = training.processes.rank == 0
-    saved, losses = time.monotonic(), []
-    with contextlib.ExitStack() as stack:
-        file = stack.enter_context(open(log, "a", encoding="utf-8")) if first else None
-        try:
-            while training.done < end:
-                losses.append(training.step())
-                advance()
-                if not math.isfinite(losses[-1]):
-                    raise InputError(f"the loss is {losses[-1]} at step {training.done}; a lower --lr may help")
-                if first and (training.done % 50 == 0 or training.done == end):
-                    line = dict(step=training.done, loss=sum(losses) / len(losses), lr=training.optimiser.param_groups[0]["lr"])
-                    file.write(json.dumps(line | dict(seconds=round(training.seconds, 2))) + "\n")
-                    file.flush()
-                    losses.clear()
-                if first and time.monotonic() - saved > every:
-                    training.save(checkpoint)
-                    saved = time.monotonic()
-        except KeyboardInterrupt:
-            if first:
-                training.save(checkpoint)
-            raise
-        if first:
-            training.save(checkpoint)
-
-
-def _finish(training, weights, command):
-    """The trained network, and the JSON file that says what made it."""
-    s = training.settings
-    about = dict(
-        command=command, **_plain(s), processes=training.processes.count, minutes=round(training.seconds / 60, 2),
-        machine=f"{platform.machine()}, {training.processes.device.type}, {torch.get_num_threads()} thread(s) a process", torch=torch.__version__,
-        date=time.strftime("%Y-%m-%d"), parameters=sum(p.numel() for p in training.network.parameters()),
-    )  # fmt: skip
-    training.network.save(weights)
-    with aside(weights.with_suffix(".json")) as temporary, open(temporary, "w", encoding="utf-8") as file:
-        json.dump(about, file, indent=2)
-        file.write("\n")
 
 
 def parser():
@@ -347,11 +237,9 @@ def main(argv=None):
     args = parser().parse_args(argv)
     values = {f.name: getattr(args, f.name) for f in fields(Settings)}
     settings = Settings(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
-    if args.device == "cuda" and not torch.cuda.is_available():
-        raise InputError("--device cuda: this torch sees no CUDA device")
     names = [os.path.basename(a) if a in args.meshes else a for a in (sys.argv[1:] if argv is None else argv)]
     command = "python -m polyfit.train " + shlex.join(names)
-    path = train(settings, args.output, device=args.device, resume=args.resume, every=args.checkpoint_every, command=command)
+    path = train(settings, args.output, device=device_of(args.device), resume=args.resume, every=args.checkpoint_every, command=command)
     if path and int(os.environ.get("RANK", 0)) == 0:
         print(path)
 
