@@ -30,11 +30,11 @@ def read_weights(path, model, version):
     except (SafetensorError, OSError, ValueError) as error:
         raise InputError(f"{path}: not a file of weights in safetensors ({error})") from None
     if not isinstance(about, dict) or "model" not in about:
-        raise InputError(f"{path}: no weights of polyfit (the file does not say what they are for)")
+        raise InputError(f"{path}: no weights (the file does not say what they are for)")
     if about["model"] != model:
         raise InputError(f"{path}: weights of {about['model']}, not of {model}")
     if about.get("version") != version:
-        this = f"and this is version {version}; python -m polyfit.train makes new ones"
+        this = f"and this is version {version}; training again makes new ones"
         raise InputError(f"{path}: weights of version {about.get('version')}, {this}")
     return weights, about
 

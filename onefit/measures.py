@@ -1,0 +1,69 @@
+"""Figures of a drape: collisions, changes of lengths and areas, jitter, physical energy (paper, section "Experiments", OneFit)."""
+
+from dataclasses import asdict, dataclass
+
+import torch
+
+from polyfit import mesh
+
+from . import losses
+
+
+@dataclass(frozen=True)
+class Measures:
+    """``collision``: % of the vertices inside the body (the paper's epsilon_c); ``edge``, ``area``: mean % by which edges and faces change
+    (epsilon_e, epsilon_a), against the garment graded to the body; ``energy``: stretching, gravity and inertia [J], a mean over frames;
+    ``jitter``: mean length of the vertices' second differences in time [mm]."""
+
+    collision: float
+    edge: float
+    area: float
+    energy: float
+    jitter: float
+
+    def as_dict(self):
+        return asdict(self)
+
+
+def areas(vertices, faces):
+    """Areas (T, F) of the faces (F, 3) of vertices (T, N, 3)."""
+    a, b, c = (vertices[:, faces[:, k]] for k in range(3))
+    return torch.linalg.cross(b - a, c - a).norm(dim=-1) / 2
+
+
+def lengths(vertices, edges):
+    """Lengths (T, E) of the edges (E, 2) of vertices (T, N, 3)."""
+    return (vertices[:, edges[:, 0]] - vertices[:, edges[:, 1]]).norm(dim=-1)
+
+
+def physical_energy(vertices, rest, faces, root, dt, k_mi=losses.Weights.k_mi):
+    """Stretching, gravity and inertia [J], each (T - 2,), of vertices (T, N, 3) of a garment that rests at ``rest`` (N, 3).
+
+    They are the terms of the training's objective, frame by frame: k_mi sum of squared changes of edge lengths; m g (z - z of the ``root``
+    (T, 3)); m |second difference|^2 / (2 dt^2).
+    """
+    edges = torch.as_tensor(mesh.edges_of(faces.numpy())[0])
+    stretch = k_mi * (lengths(vertices[2:], edges) - lengths(rest[None], edges)).square().sum(1)
+    face_area = areas(rest[None], faces)[0]
+    mass = losses.DENSITY * torch.zeros(len(rest)).index_add(0, faces.flatten(), (face_area / 3).repeat_interleave(3))
+    gravity = losses.GRAVITY * ((vertices[2:, :, 2] - root[2:, None, 2]) * mass).sum(1)
+    second = vertices[2:] - 2 * vertices[1:-1] + vertices[:-2]
+    inertia = (second.square().sum(-1) * mass).sum(1) / (2 * dt * dt)
+    return stretch, gravity, inertia
+
+
+def measure(vertices, faces, rest, body_vertices, collider, root, fps):
+    """:class:`Measures` of the vertices (T, N, 3) [m] of a garment with ``faces`` (F, 3), at ``rest`` (N, 3), on bodies (T, V, 3) whose roots
+    are at ``root`` (T, 3), in at least three frames."""
+    edges = torch.as_tensor(mesh.edges_of(faces.numpy())[0])
+    inside = torch.stack([collider.distance(v[None], b[None])[0] < 0 for v, b in zip(vertices, body_vertices)]).float().mean()
+    change = lambda now, then: ((now - then).abs() / then).mean()
+    energy = sum(physical_energy(vertices, rest, faces, root, 1 / fps)).mean()
+    second = (vertices[2:] - 2 * vertices[1:-1] + vertices[:-2]).norm(dim=-1).mean()
+    return Measures(
+        100 * float(inside),
+        100 * float(change(lengths(vertices, edges), lengths(rest[None], edges))),
+        100 * float(change(areas(vertices, faces), areas(rest[None], faces))),
+        float(energy),
+        1e3 * float(second),
+    )

@@ -1,0 +1,216 @@
+"""Trains OneFit: without any data but garments and motions, by physics (paper, section "OneFit").
+
+    python -m onefit.train [GARMENT ...] -o OUT [--motions FILE ...] [--from WEIGHTS] [--resume]
+    torchrun --nproc-per-node 2 -m onefit.train ...
+
+GARMENT are names of the package's templates (tshirt, dress, ...) or meshes (.obj, .ply); without any, the six templates of the paper. OUT receives
+
+    weights.safetensors     the trained network, for ``onefit.load``, and weights.json: what made it
+    log.jsonl               a line every 50 steps: the loss and each of its terms
+    checkpoint.safetensors  every few minutes and at Ctrl-C; --resume goes on from it and ends where an uninterrupted run would have
+"""
+
+import argparse
+import json
+import os
+import shlex
+import sys
+from dataclasses import asdict, dataclass, field, fields
+
+import torch
+
+from polyfit.errors import InputError, cli
+from polyfit.training import Processes, Training, device_of, progress_bar, started
+
+from .losses import Weights
+from .weights import load, save
+
+STANDARD = ("tshirt", "dress", "trousers", "shorts", "long_sleeve_top", "tank")
+CLIP = 1.0  # of the gradient's norm
+BAD = 20  # steps in a row without a finite loss, after which a training is given up
+HIDDEN = 0.1  # standard deviation of the encoder's memory at the start of a window
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What decides the result. ``batch``: patches of a step, all frames together (the paper's 20,000); ``lr`` for the first ``lr_epochs``
+    epochs, a tenth of it for the rest; an epoch has ``epoch_steps`` steps (0: as many as show each window of the motions once).
+    """
+
+    garments: tuple = STANDARD
+    motions: tuple = ()
+    start: str = ""
+    order: int = 4
+    batch: int = 20_000
+    epochs: int = 30
+    lr_epochs: int = 10
+    epoch_steps: int = 0
+    lr: float = 1e-3
+    seeds: int = 4
+    shapes: int = 48
+    seed: int = 0
+    weights: Weights = field(default_factory=Weights)
+
+    def __post_init__(self):
+        for name in ("batch", "epochs", "seeds"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name} = {getattr(self, name)}: 1 at least")
+        for name in ("epoch_steps", "lr_epochs", "shapes"):
+            if getattr(self, name) < 0:
+                raise InputError(f"{name} = {getattr(self, name)}: 0 at least")
+        if not 2 <= self.order <= 10:
+            raise InputError(f"order = {self.order}; the order of OneFit's jets is 2 to 10")
+        if not self.lr > 0:
+            raise InputError(f"lr = {self.lr}: more than 0")
+
+
+class OneFitTraining(Training):
+    """Adam on one garment after the other, in windows of motions drawn at random."""
+
+    def __init__(self, settings, data, processes):
+        self.given, self.data, self.bad, self.last = settings, data, 0, 0.0
+        torch.manual_seed(settings.seed)
+        network = load(settings.start).network if settings.start else _network(settings, data)
+        plain = json.loads(json.dumps(asdict(settings)))
+        network = network.to(processes.device).train()
+        super().__init__(network, torch.optim.Adam(network.parameters(), settings.lr), plain, processes)
+        windows = min(self._windows(garment) for garment, _ in data.garments)
+        self.epoch_steps = settings.epoch_steps or -(-len(data) // windows)
+        self.steps = settings.epochs * self.epoch_steps
+
+    def _windows(self, garment):
+        """Windows of a step, so that it has about ``batch`` patches, and each process the same number of windows."""
+        from .training_data import FRAMES
+
+        count = self.processes.count
+        return max(1, round(self.given.batch / len(garment) / FRAMES / count)) * count
+
+    def loss(self, generator, garment=None):
+        """The objective's terms on a batch of the random numbers of ``generator``: this process's share of it."""
+        from . import objective
+        from .training_data import FRAMES
+
+        garment, rest = self.data.garments[self.done % len(self.data.garments) if garment is None else garment]
+        windows = self.data.windows(self._windows(garment), generator)
+        count = len(windows.number)
+        hidden = HIDDEN * torch.randn(1, count, 512, generator=generator).to(self.processes.device)
+        mine = slice(self.processes.rank, None, self.processes.count)
+        windows = type(windows)(*(getattr(windows, f.name)[mine] for f in fields(windows)))
+        hidden = hidden[:, mine].contiguous()
+        deformation, _ = self.network(
+            garment.features, self.data.standard.joints, windows.poses, windows.translation, windows.shape, hidden=hidden,
+            frames=slice(-FRAMES, None),
+        )  # fmt: skip
+        scene = self.data.scene(windows, rest)
+        return objective.evaluate(garment, deformation, scene, self.given.weights, self.done // self.epoch_steps, generator)[0]
+
+    def update(self):
+        epoch = self.done // self.epoch_steps
+        for group in self.optimiser.param_groups:
+            group["lr"] = self.given.lr * (1.0 if epoch < self.given.lr_epochs else 0.1)
+        terms = self.loss(self.generator())
+        total = sum(terms.values())
+        self.optimiser.zero_grad()
+        total.backward()
+        self.processes.average(self.network)
+        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), CLIP)
+        if not (total.isfinite() and norm.isfinite()):
+            return self._stepped_over(terms)
+        self.bad, self.last = 0, total.item()
+        self.optimiser.step()
+        return dict(loss=self.last, **{name: value.item() for name, value in terms.items()})
+
+    def _stepped_over(self, terms):
+        self.bad += 1
+        wrong = [name for name, value in terms.items() if not value.isfinite()] or ["the gradient"]
+        print(f"step {self.done}: {', '.join(wrong)} not finite, stepped over", file=sys.stderr)
+        if self.bad >= BAD:
+            raise InputError(f"{self.bad} steps in a row were not finite; a lower --lr may help")
+        return dict(loss=self.last, stepped_over=1.0)
+
+
+def _network(settings, data):
+    from .network import OneFit
+
+    return OneFit(settings.order, len(data.standard.joints), data.shapes.shape[1])
+
+
+def _data(settings, progress):
+    from .garment import TEMPLATES, Garment
+    from .motion import Motion
+    from .training_data import TrainingData
+
+    task = progress.add_task("garments", total=len(settings.garments))
+    garments = [Garment.template(name) if name in TEMPLATES else Garment.read(name) for name in settings.garments]
+    motions = [Motion.read(path) for path in settings.motions] or None
+    return TrainingData(
+        garments, motions=motions, seeds=settings.seeds, shapes=settings.shapes, order=settings.order, seed=settings.seed,
+        advance=lambda: progress.advance(task),
+    )  # fmt: skip
+
+
+def train(settings, folder, *, device="cpu", resume=False, until=None, every=120.0, command=None):
+    """Trains and leaves weights in ``folder``; returns their path. ``until`` (steps) ends early, with a checkpoint and no weights (None);
+    ``every`` [s] checkpoints.
+    """
+    folder = started(folder, resume)
+    weights = folder / "weights.safetensors"
+    processes = Processes(device)
+    try:
+        with progress_bar(processes) as progress:
+            data = _data(settings, progress).to(processes.device)
+            training = OneFitTraining(settings, data, processes)
+            if resume:
+                training.restore(folder / "checkpoint.safetensors")
+            task = progress.add_task("steps", total=training.steps, completed=training.done)
+            end = min(until or training.steps, training.steps)
+            training.run(folder, end, every, lambda: progress.update(task, completed=training.done))
+        if training.done < training.steps:
+            return None
+        if processes.rank == 0:
+            save(weights, training.network, data.model, settings.garments)
+            training.write_about(weights.with_suffix(".json"), command, steps=training.steps)
+        processes.wait()
+        return weights
+    finally:
+        processes.close()
+
+
+def parser():
+    p = argparse.ArgumentParser(prog="python -m onefit.train", description=__doc__.splitlines()[0])
+    default = Settings()
+    p.add_argument("garments", nargs="*", metavar="GARMENT", help="templates or meshes (default: the paper's six templates)")
+    p.add_argument("-o", "--output", required=True, metavar="OUT", help="folder of the results")
+    p.add_argument("--motions", nargs="+", default=[], metavar="FILE", help="AMASS, NCS or BVH files (default: generated ones)")
+    p.add_argument("--from", dest="start", default="", metavar="WEIGHTS", help="weights to fine-tune, a file or a name of the package's")
+    for name, text in {
+        "order": "of the jets", "batch": "patches of a step, all frames together", "epochs": "", "lr-epochs": "epochs with the full rate, a tenth of it after",
+        "epoch-steps": "steps of an epoch, 0: each window of the motions once", "seeds": "generated motions of each kind",
+        "shapes": "random bodies beside the standard one", "seed": "",
+    }.items():  # fmt: skip
+        value = getattr(default, name.replace("-", "_"))
+        p.add_argument(f"--{name}", type=int, default=value, help=f"{text} (default: {value})".strip())
+    p.add_argument("--lr", type=float, default=default.lr, help=f"of Adam (default: {default.lr})")
+    group = p.add_argument_group("the losses' weights (0 switches one off)")
+    for f in fields(Weights):
+        group.add_argument(f"--{f.name.replace('_', '-')}", type=float, default=f.default, help=f"(default: {f.default})")
+    p.add_argument("--checkpoint-every", type=float, default=120.0, metavar="SECONDS")
+    p.add_argument("--resume", action="store_true", help="go on from OUT/checkpoint.safetensors")
+    p.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu", help="cpu or cuda")
+    return p
+
+
+def main(argv=None):
+    args = parser().parse_args(argv)
+    weights = Weights(**{f.name: getattr(args, f.name) for f in fields(Weights)})
+    values = {f.name: getattr(args, f.name) for f in fields(Settings) if f.name != "weights"}
+    values |= dict(garments=tuple(args.garments) or STANDARD, motions=tuple(args.motions))
+    command = "python -m onefit.train " + shlex.join(sys.argv[1:] if argv is None else argv)
+    settings = Settings(**values, weights=weights)
+    path = train(settings, args.output, device=device_of(args.device), resume=args.resume, every=args.checkpoint_every, command=command)
+    if path and int(os.environ.get("RANK", 0)) == 0:
+        print(path)
+
+
+if __name__ == "__main__":
+    cli(main)

@@ -1,0 +1,166 @@
+"""What every training here does: steps that can be interrupted, resumed and shared by several processes, a log, and what made the weights."""
+
+import contextlib
+import json
+import math
+import os
+import platform
+import time
+from pathlib import Path
+
+import torch
+
+from .errors import InputError
+from .files import aside
+from .weights import load_into, read_weights, write_weights
+
+VERSION = 1  # of the checkpoints
+LINE = 50  # steps that a line of the log sums up
+
+
+class Processes:
+    """This process among those of ``torchrun``; alone without it."""
+
+    def __init__(self, device):
+        self.count, self.rank = int(os.environ.get("WORLD_SIZE", 1)), int(os.environ.get("RANK", 0))
+        self.device = torch.device(f"cuda:{os.environ.get('LOCAL_RANK', 0)}" if device == "cuda" and self.count > 1 else device)
+        if self.count > 1:
+            torch.distributed.init_process_group("nccl" if device == "cuda" else "gloo")
+
+    def wait(self):
+        if self.count > 1:
+            torch.distributed.barrier()
+
+    def average(self, network):
+        """The mean of all processes' gradients of ``network``."""
+        if self.count > 1:
+            flat = torch.cat([p.grad.flatten() for p in network.parameters()])
+            torch.distributed.all_reduce(flat)
+            for p, g in zip(network.parameters(), (flat / self.count).split([p.numel() for p in network.parameters()])):
+                p.grad.copy_(g.view_as(p))
+
+    def close(self):
+        if self.count > 1:
+            torch.distributed.destroy_process_group()
+
+
+class Training:
+    """One training: its ``network``, its ``optimiser``, how many steps are ``done``. ``settings``: all that decides the result, as JSON gives it
+    back. Subclasses have :meth:`update`, whose random numbers come from :meth:`generator` alone, and take of each batch the share of their
+    process. So a resumed training, and one on several processes, do what one process does without interruption.
+    """
+
+    def __init__(self, network, optimiser, settings, processes):
+        self.network, self.optimiser, self.settings, self.processes = network, optimiser, settings, processes
+        self.done, self.seconds = 0, 0.0
+
+    def update(self):
+        """One step of the optimiser; what it lowered, as a dict of numbers with the sum as ``loss``."""
+        raise NotImplementedError
+
+    def generator(self):
+        """The random numbers of this step."""
+        return torch.Generator().manual_seed(self.settings["seed"] * 1_000_003 + 7919 * self.done + 1)
+
+    def step(self):
+        start = time.perf_counter()
+        figures = self.update()
+        self.done += 1
+        self.seconds += time.perf_counter() - start
+        return figures
+
+    # ---- checkpoints --------------------------------------------------------------------------------------------------
+
+    def save(self, path):
+        tensors = {f"network.{k}": v for k, v in self.network.state_dict().items()}
+        for k, state in self.optimiser.state_dict()["state"].items():
+            tensors |= {f"adam.{k}.{name}": value for name, value in state.items()}
+        progress = dict(done=self.done, seconds=self.seconds)
+        write_weights(path, tensors, dict(model="checkpoint", version=VERSION, settings=self.settings, **progress))
+
+    def restore(self, path):
+        """Goes on from a checkpoint. Raises InputError where it was made with other settings."""
+        tensors, about = read_weights(path, "checkpoint", VERSION)
+        other = [f"{k} {about['settings'].get(k)}" for k, v in self.settings.items() if about["settings"].get(k) != v]
+        if other:
+            raise InputError(f"{path}: a checkpoint of other settings ({', '.join(other)}); give the same, or another -o")
+        load_into(self.network, {k[8:]: v for k, v in tensors.items() if k.startswith("network.")}, path)
+        state = {}
+        for k, v in tensors.items():
+            if k.startswith("adam."):
+                _, index, name = k.split(".")
+                state.setdefault(int(index), {})[name] = v
+        self.optimiser.load_state_dict(self.optimiser.state_dict() | {"state": state})
+        self.done, self.seconds = about["done"], about["seconds"]
+
+    # ---- the loop -----------------------------------------------------------------------------------------------------
+
+    def run(self, folder, end, every, advance):
+        """Steps up to ``end``, with a line of ``folder``/log.jsonl every LINE of them and a checkpoint every so many seconds, at the end, and at
+        Ctrl-C. ``advance()`` is called after each step. Raises InputError where the loss is not finite."""
+        checkpoint, first = folder / "checkpoint.safetensors", self.processes.rank == 0
+        saved, lines = time.monotonic(), []
+        with contextlib.ExitStack() as stack:
+            file = stack.enter_context(open(folder / "log.jsonl", "a", encoding="utf-8")) if first else None
+            try:
+                while self.done < end:
+                    lines.append(self.step())
+                    advance()
+                    if not math.isfinite(lines[-1]["loss"]):
+                        raise InputError(f"the loss is {lines[-1]['loss']} at step {self.done}; a lower --lr may help")
+                    if first and (self.done % LINE == 0 or self.done == end):
+                        file.write(json.dumps(self._line(lines)) + "\n")
+                        file.flush()
+                        lines.clear()
+                    if first and time.monotonic() - saved > every:
+                        self.save(checkpoint)
+                        saved = time.monotonic()
+            except KeyboardInterrupt:
+                if first:
+                    self.save(checkpoint)
+                raise
+            if first:
+                self.save(checkpoint)
+
+    def _line(self, lines):
+        names = list(dict.fromkeys(name for line in lines for name in line))
+        means = {name: sum(found) / len(found) for name in names if (found := [line[name] for line in lines if name in line])}
+        return dict(step=self.done, **means, lr=self.optimiser.param_groups[0]["lr"], seconds=round(self.seconds, 2))
+
+    def write_about(self, path, command, **more):
+        """The JSON file that says what made the weights."""
+        device = self.processes.device.type
+        about = dict(
+            command=command, **self.settings, processes=self.processes.count, minutes=round(self.seconds / 60, 2),
+            machine=f"{platform.machine()}, {device}, {torch.get_num_threads()} thread(s) a process", torch=torch.__version__,
+            date=time.strftime("%Y-%m-%d"), parameters=sum(p.numel() for p in self.network.parameters()), **more,
+        )  # fmt: skip
+        with aside(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
+            json.dump(about, file, indent=2)
+            file.write("\n")
+
+
+def started(folder, resume):
+    """The folder of a training that is about to begin, or to go on from its checkpoint. Raises InputError where that cannot be."""
+    folder = Path(folder)
+    checkpoint, weights = folder / "checkpoint.safetensors", folder / "weights.safetensors"
+    if resume and not checkpoint.exists():
+        raise InputError(f"{checkpoint}: no such file, nothing to resume")
+    if not resume and weights.exists():
+        raise InputError(f"{weights}: exists; give another -o, or --resume")
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def progress_bar(processes):
+    """A rich.progress.Progress, shown by the first process."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    return Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), disable=processes.rank > 0)
+
+
+def device_of(name):
+    """``name``, checked. Raises InputError for a CUDA device that torch does not see."""
+    if name == "cuda" and not torch.cuda.is_available():
+        raise InputError("--device cuda: this torch sees no CUDA device")
+    return name
