@@ -1,0 +1,84 @@
+"""A surface with the same shape and loops at another number of vertices. NumPy; ``vertices`` (N, 3) [m], ``faces`` (F, 3)."""
+
+import warnings
+
+import numpy as np
+from scipy.sparse import coo_matrix
+
+from polyfit import mesh
+
+from .nearest import ClosestSurface
+
+
+def boundary_edges(F):
+    """Directed edges (B, 2) that have one face only, as the face walks them."""
+    edges, side = mesh.edges_of(F)
+    once = np.bincount(side.ravel(), minlength=len(edges))[side] == 1
+    return np.stack([F, np.roll(F, -1, axis=1)], axis=-1)[once]
+
+
+def loops(F):
+    """The boundary of a manifold mesh as a list of vertex indices, in the order in which their faces walk them; the longest first."""
+    after = dict(boundary_edges(F).tolist())
+    found = []
+    while after:
+        loop = [next(iter(after))]
+        while (following := after.pop(loop[-1], None)) is not None and following != loop[0]:
+            loop.append(following)
+        found.append(np.array(loop))
+    return sorted(found, key=len, reverse=True)
+
+
+def neighbour_mean(F, count, boundary_apart=False):
+    """Sparse (count, count) matrix that takes the mean of each vertex's neighbours; with ``boundary_apart`` boundary vertices have those
+    along their loop only.
+    """
+    e = mesh.edges_of(F)[0]
+    if boundary_apart:
+        b = boundary_edges(F)
+        on = np.zeros(count, dtype=bool)
+        on[b] = True
+        pairs = np.concatenate([e[~on[e[:, 0]]], e[~on[e[:, 1]]][:, ::-1], b, b[:, ::-1]])
+    else:
+        pairs = np.concatenate([e, e[:, ::-1]])
+    weight = 1 / np.bincount(pairs[:, 0], minlength=count)[pairs[:, 0]]
+    return coo_matrix((weight, (pairs[:, 0], pairs[:, 1])), shape=(count, count)).tocsr()
+
+
+def nearest_on_segments(points, a, b):
+    """Of points (N, 3) the nearest point (N, 3) on any of the segments from a (S, 3) to b (S, 3)."""
+    d = b - a
+    t = np.einsum("nsd,sd->ns", points[:, None] - a, d) / np.maximum((d * d).sum(axis=1), 1e-300)
+    at = a + np.clip(t, 0, 1)[..., None] * d
+    best = ((points[:, None] - at) ** 2).sum(axis=2).argmin(axis=1)
+    return at[np.arange(len(points)), best]
+
+
+def remeshed(V, F, count, steps=40):
+    """``(vertices, faces)`` with about ``count`` vertices, evenly spread over the surface, the boundary's on its loops.
+
+    Clusters of equal area (ACVD) give the triangles; then vertices slide on the surface towards the mean of their neighbours, those of a loop
+    along it. A mesh of fewer than 20 vertices for each new one is cut finer first.
+    """
+    import pyacvd
+    import pyvista
+
+    fine, G = np.asarray(V, dtype=np.float64), np.asarray(F, dtype=np.int64)
+    while len(fine) < 20 * count:
+        G, edges = mesh.subdivided(G)
+        fine = np.concatenate([fine, fine[edges].mean(axis=1)])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # pyacvd uses what pyvista has renamed
+        clusters = pyacvd.Clustering(pyvista.PolyData.from_regular_faces(fine, G))
+        clusters.cluster(int(count))
+        made = clusters.create_mesh()
+    x, f = np.array(made.points, dtype=np.float64), made.regular_faces.astype(np.int64)
+    surface, rim = ClosestSurface(V, F), boundary_edges(np.asarray(F))
+    own = np.unique(boundary_edges(f))
+    mean = neighbour_mean(f, len(x), boundary_apart=True)
+    for _ in range(steps):
+        y = mean @ x
+        x = np.array(surface(0.5 * (x + y)).point, dtype=np.float64)
+        if len(own):
+            x[own] = nearest_on_segments(0.5 * (x + y)[own], V[rim[:, 0]], V[rim[:, 1]])
+    return x, f
