@@ -30,9 +30,9 @@ CHANNELS = {
 STAND = {"left_arm": (0.0, 0.2, 0.1, 0.3), "right_arm": (0.0, 0.2, 0.1, 0.3), "left_foot_turn": (0.0, 0.1, 0.0), "right_foot_turn": (0.0, 0.1, 0.0)}
 
 _J = {name: place for name, place in zip(skeleton.JOINTS, skeleton.standard_joints().double().numpy(), strict=True)}
+BALL = _J["left_foot"]  # where the ball of the left foot is in the upright stand [m]
 _THIGH = _J["left_knee"] - _J["left_hip"]
 _SHIN = _J["left_ankle"] - _J["left_knee"]
-BALL = _J["left_foot"]  # where the ball of the left foot is in the upright stand [m]
 _BALL = _J["left_foot"] - _J["left_ankle"]  # from the ankle to the ball
 _HEEL = 0.19  # from the ball back to the heel's edge, about which toes are lifted [m]
 REACH = float(np.linalg.norm(_THIGH + _SHIN))  # of a leg in the T-pose: longer it never gets [m]
@@ -75,6 +75,9 @@ def _about(axis, angle):
     return Rotation.from_rotvec(np.asarray(angle)[..., None] * np.eye(3)[axis])
 
 
+_HANGING = _about(1, np.pi / 2)  # turns the T-pose's left arm down
+
+
 def _turned(angles):
     """Rotation from angles (T, 3): forward about x, to the left about y, twisted left about z, the twist first."""
     return Rotation.from_euler("ZXY", angles[:, [2, 0, 1]])
@@ -83,17 +86,65 @@ def _turned(angles):
 def _arm(arm, hand):
     """Rotations of a left arm's joints, relative to the chest and along the chain."""
     flexion, abduction, inwards, elbow = arm.T
-    hanging = _about(1, np.pi / 2)  # the T-pose's arm, let down
-    upper = Rotation.from_euler("XYZ", np.stack([-flexion, -abduction, -inwards], -1)) * hanging
-    # a collar takes a fifth of what the arm is lifted above the hanging, more above the shoulder, and goes forward with it
+    upper = Rotation.from_euler("XYZ", np.stack([-flexion, -abduction, -inwards], -1)) * _HANGING
+    # a collar follows the arm: more the higher it is, and to the front
     direction = upper.apply([1.0, 0.0, 0.0])
     lifted = np.arcsin(np.clip(direction[:, 2], -1, 1)) + np.pi / 2
     forward = np.arctan2(-direction[:, 1], 0.5 + np.abs(direction[:, 0]))
     collar = Rotation.from_euler("ZY", np.stack([-0.12 * forward, -0.16 * lifted**2 / np.pi], -1))
-    bend = _about(2, -elbow)
-    roll = _about(0, -0.5 * hand[:, 1])
-    wrist = Rotation.from_euler("XY", np.stack([-0.5 * hand[:, 1], hand[:, 0]], -1))
-    return {"collar": collar, "shoulder": collar.inv() * upper, "elbow": bend * roll, "wrist": wrist}
+    roll = -0.5 * hand[:, 1]
+    wrist = Rotation.from_euler("XY", np.stack([roll, hand[:, 0]], -1))
+    return {"collar": collar, "shoulder": collar.inv() * upper, "elbow": _about(2, -elbow) * _about(0, roll), "wrist": wrist}
+
+
+def arm_to(side, wrist, pole=(0.35, 0.5, -1.0)):
+    """An arm's channel (4,) that brings the wrist to the place ``wrist`` (3,) [m] of the standard body standing upright.
+
+    The elbow goes to the side of ``pole`` (3,), given for the left arm. Where the place is out of reach, the arm points at it.
+    """
+    sign = np.array([1.0 if side == "left" else -1.0, 1.0, 1.0])
+    wanted = np.asarray(wrist) * sign
+    aim = wanted.copy()
+    for _ in range(8):  # the collar's part moves the shoulder
+        arm = _two_bones(aim - _J["left_shoulder"], np.asarray(pole, dtype=np.float64))
+        aim = aim + wanted - _wrist(arm)
+    return arm
+
+
+def _two_bones(to, pole):
+    """The arm (4,) whose wrist is at ``to`` (3,) from the shoulder, or in that direction."""
+    a, b = (np.linalg.norm(_J[end] - _J[start]) for start, end in (("left_shoulder", "left_elbow"), ("left_elbow", "left_wrist")))
+    distance = np.clip(np.linalg.norm(to), abs(a - b) + 0.05, 0.999 * (a + b))
+    u = to / np.linalg.norm(to)
+    p = pole - (pole @ u) * u
+    p /= np.linalg.norm(p)
+    along = (a * a + distance**2 - b * b) / (2 * a * distance)
+    upper = along * u + np.sqrt(max(0.0, 1 - along**2)) * p
+    fore = (distance * u - a * upper) / b
+    hinge = np.cross(upper, fore)
+    hinge /= np.linalg.norm(hinge)
+    turned = Rotation.from_matrix(np.stack([upper, np.cross(upper, hinge), -hinge], -1)) * _HANGING.inv()
+    angles = -turned.as_euler("XYZ")
+    # the same rotation has two sets of angles: the one with the smaller turn of the arm about itself interpolates well
+    other = np.array([angles[0] + np.pi, np.pi - angles[1], angles[2] + np.pi])
+    angles = min((_wrapped(angles), _wrapped(other)), key=lambda a: abs(a[2]) + 0.1 * abs(a[0]))
+    return np.append(angles, np.arccos(np.clip(upper @ fore, -1, 1)))
+
+
+def _wrapped(angles):
+    """Flexion and abduction from -π/2 to 3π/2, rotation inwards from -π to π."""
+    low = np.array([-np.pi / 2, -np.pi / 2, -np.pi])
+    return (angles - low) % (2 * np.pi) + low
+
+
+def _wrist(arm):
+    """Where a left arm (4,) has its wrist, (3,) [m], the chest upright."""
+    joints = {name: rotation[0] for name, rotation in _arm(arm[None], np.zeros((1, 2))).items()}
+    place, rotation = _J["left_collar"], Rotation.identity()
+    for joint, end in (("collar", "left_shoulder"), ("shoulder", "left_elbow"), ("elbow", "left_wrist")):
+        rotation = rotation * joints[joint]
+        place = place + rotation.apply(_J[end] - _J["left_" + joint])
+    return place
 
 
 def _side(c, side):
