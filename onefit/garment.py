@@ -100,36 +100,17 @@ class Binding:
         self.distance, self.face, self.barycentric = found.distance, found.face, found.barycentric.astype(np.float64)
         self._rest = body.vertices.numpy().astype(np.float64)
         self._body_faces = body.faces.numpy()
-        self._turn_to_own_side(found)
+        facing = (found.normal * self.normals).sum(axis=1)  # below zero where the nearest point is on the other side of an armpit, on the other leg
         self.corners = self._body_faces[self.face]
         self.area, self.stiffness = _cotangent_laplacian(V, F)
-
-    def _turn_to_own_side(self, found):
-        """Vertices whose nearest point faces away from them (across the armpit, the other leg) hang on the nearest body vertex that does
-        not.
-        """
-        from scipy.spatial import cKDTree
-
-        wrong = np.flatnonzero((found.normal * self.normals).sum(axis=1) < 0)
-        if not len(wrong):
-            return
-        normals = vertex_normals(self._rest, self._body_faces)
-        distance, candidates = cKDTree(self._rest).query(self.V[wrong], k=400)
-        agree = np.einsum("nkd,nd->nk", normals[candidates], self.normals[wrong]) > 0
-        first = agree.argmax(axis=1)
-        usable = agree.any(axis=1) & (distance[np.arange(len(wrong)), first] < np.abs(self.distance[wrong]) + 0.10)
-        of_vertex = np.empty(len(self._rest), dtype=np.int64)
-        of_vertex[self._body_faces.ravel()] = np.arange(self._body_faces.size)
-        corner = of_vertex[candidates[np.arange(len(wrong)), first]][usable]
-        self.face[wrong[usable]] = corner // 3
-        self.barycentric[wrong[usable]] = np.eye(3)[corner % 3]
+        self._trust = self.area * np.clip(facing, 1e-3, 1) / (1 + (self.distance / NEAR) ** 2)
 
     def _on_body(self, values):
         """Values (V, C) of the body's vertices where this mesh's hang (N, C)."""
         return np.einsum("nk,nkc->nc", self.barycentric, values[self.corners])
 
     def _smoother(self, length):
-        trust = self.area / (1 + (self.distance / NEAR) ** 2)
+        trust = self._trust
         solver = splu((diags(trust) + length**2 * self.stiffness).tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
         return lambda values: solver.solve(trust[:, None] * values)
 

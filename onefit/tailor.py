@@ -82,7 +82,7 @@ class Block:
         """Level set as ``(vertices [m], faces)``, wound away from where the field is lower."""
         from skimage.measure import marching_cubes
 
-        V, F, _, _ = marching_cubes(field, level, spacing=(SPACING,) * 3, gradient_direction="ascent", allow_degenerate=False)
+        V, F, _, _ = marching_cubes(field, level, spacing=(SPACING,) * 3, gradient_direction="descent", allow_degenerate=False)
         return V + LOW, F.astype(np.int64)
 
     def _distance(self, surface, reach):
