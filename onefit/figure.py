@@ -31,6 +31,7 @@ STAND = {"left_arm": (0.0, 0.2, 0.1, 0.3), "right_arm": (0.0, 0.2, 0.1, 0.3), "l
 
 _J = {name: place for name, place in zip(skeleton.JOINTS, skeleton.standard_joints().double().numpy(), strict=True)}
 BALL = _J["left_foot"]  # where the ball of the left foot is in the upright stand [m]
+_SPINE = (("spine1", 0.3), ("spine2", 0.4), ("spine3", 0.3))  # the parts that the joints have in the spine's angles
 _THIGH = _J["left_knee"] - _J["left_hip"]
 _SHIN = _J["left_ankle"] - _J["left_knee"]
 _BALL = _J["left_foot"] - _J["left_ankle"]  # from the ankle to the ball
@@ -51,7 +52,7 @@ def motion(channels, fps, name):
     c = {**stand(len(next(iter(channels.values())))), **channels}
     c["pelvis"] = _lowered(c, fps)
     local = {"pelvis": _turned(c["turn"])}
-    for joint, part in (("spine1", 0.3), ("spine2", 0.4), ("spine3", 0.3)):
+    for joint, part in _SPINE:
         local[joint] = _turned(c["spine"] * part)
     for joint, part in (("neck", 0.5), ("head", 0.5)):
         local[joint] = _turned(c["head"] * part)
@@ -80,7 +81,7 @@ _HANGING = _about(1, np.pi / 2)  # turns the T-pose's left arm down
 
 def _turned(angles):
     """Rotation from angles (T, 3): forward about x, to the left about y, twisted left about z, the twist first."""
-    return Rotation.from_euler("ZXY", angles[:, [2, 0, 1]])
+    return Rotation.from_euler("ZXY", angles[..., [2, 0, 1]])
 
 
 def _arm(arm, hand):
@@ -109,6 +110,18 @@ def arm_to(side, wrist, pole=(0.35, 0.5, -1.0)):
         arm = _two_bones(aim - _J["left_shoulder"], np.asarray(pole, dtype=np.float64))
         aim = aim + wanted - _wrist(arm)
     return arm
+
+
+def in_chest(place, pelvis, turn, spine):
+    """Where ``place`` (3,) [m] in the world is as seen from the chest of a figure with these channels (3,), in the upright stand's axes:
+    the place to give to :func:`arm_to`.
+    """
+    rotation = _turned(np.asarray(turn, dtype=np.float64))
+    at, before = _J["pelvis"] + pelvis, "pelvis"
+    for joint, part in _SPINE:
+        at = at + rotation.apply(_J[joint] - _J[before])
+        rotation, before = rotation * _turned(np.asarray(spine, dtype=np.float64) * part), joint
+    return rotation.inv().apply(place - at) + _J[before]
 
 
 def _two_bones(to, pole):

@@ -48,7 +48,7 @@ def walk(t, rng):
     push = rng.uniform(0.85, 1.05) * min(1.0, 0.55 + 0.35 * speed)
     c, phase = _gait(
         t, rng, stride=stride, rate=speed / stride, stance=0.62, sway=rng.uniform(0.015, 0.03), bob=0.008 + 0.005 * speed,
-        lift=[(0.0, 0.0), (0.6, 0.0), (0.72, 0.05), (0.85, 0.02), (0.97, 0.005)], narrow=rng.uniform(0.02, 0.05), behind=0.05 + 0.02 * speed,
+        lift=[(0.0, 0.0), (0.59, 0.0), (0.71, 0.06 + 0.04 * speed), (0.84, 0.035), (0.97, 0.005)], narrow=rng.uniform(0.02, 0.05), behind=0.05 + 0.02 * speed,
         heel=[(0.0, -0.25), (0.1, 0.0), (0.3, 0.0), (0.5, 0.45 * push), (0.62, push), (0.7, 0.8 * push), (0.86, -0.1), (0.96, -0.3)],
         curvature=rng.uniform(-0.25, 0.25),
     )  # fmt: skip

@@ -7,7 +7,6 @@ from . import figure
 from .script import Script, bump, cycle, ease, wander
 
 G = 9.81
-_LEFT, _RIGHT = (0, 0.1, 0), (0, 0.1, 0)
 
 
 def _sides(rng):
@@ -124,11 +123,11 @@ def arms_crossed(t, rng):
         one, other, sign = _sides(rng)
         low, pace = rng.uniform(-0.02, 0.04), rng.uniform(0.9, 1.5)
         inner = figure.arm_to(one, (0.02 * sign, -0.215, 0.265 + low), pole=(0.7, 0.2, -1.0))
-        outer = figure.arm_to(other, (-0.03 * sign, -0.315, 0.245 + low), pole=(0.9, -0.1, -1.0))
+        outer = figure.arm_to(other, (-0.03 * sign, -0.295, 0.245 + low), pole=(0.9, -0.1, -1.0))
         before = (0.75, 0.25, 0.3, 1.3)
         s.move(0.7 * pace, **{f"{one}_arm": (0.6, 0.2, 0.4, 1.5), f"{other}_arm": before}, spine=(0.03, 0, 0))
         s.move(0.6 * pace, **{f"{one}_arm": inner, f"{other}_arm": (0.85, 0.2, 0.5, 1.5)}, after=0.35 * pace)
-        s.move(0.6 * pace, **{f"{other}_arm": outer, f"{one}_hand": (0.1, 0), f"{other}_hand": (0.3, 0)})
+        s.move(0.6 * pace, **{f"{other}_arm": outer, f"{one}_hand": (0.1, 0), f"{other}_hand": (0.35, 0)})
         for _ in range(rng.integers(1, 4)):
             s.move(
                 rng.uniform(0.7, 1.4), turn=(0, 0, rng.uniform(-0.2, 0.2)), spine=(rng.uniform(-0.1, 0.15), rng.uniform(-0.1, 0.1), rng.uniform(-0.3, 0.3)),
@@ -170,21 +169,27 @@ def sit(t, rng):
     while s.clock < t[-1] + 1:
         deep, pace = rng.uniform(0.31, 0.38), rng.uniform(0.8, 1.2)
         apart = rng.uniform(0.0, 0.3)
-        arm = [(0.35, 0.25, 0.25, 0.9), (0.0, 0.35, 0.1, 0.3), (0.7, 0.2, 0.3, 0.9)][rng.choice(3)]
+        seat, on_thighs, far = (0.0, 0.4, -deep), rng.random() < 0.7, rng.uniform(0.16, 0.3)
+
+        def posture(spine, seat=seat, on_thighs=on_thighs, far=far, apart=apart):
+            turn = (-0.12, 0, 0)
+            arms = {"left": (0.0, 0.4, 0.1, 0.35), "right": (0.0, 0.4, 0.1, 0.35)}
+            if on_thighs:
+                for side, sign in (("left", 1.0), ("right", -1.0)):
+                    place = np.array([sign * (0.13 + 0.5 * apart * far), seat[1] - far, seat[2] + 0.19])
+                    arms[side] = figure.arm_to(side, figure.in_chest(place, seat, turn, spine), pole=(1.0, 0.6, -0.6))
+            return {"pelvis": seat, "turn": turn, "spine": spine, "left_arm": arms["left"], "right_arm": arms["right"]}
+
         s.move(
-            pace, pelvis=(0, 0.33, -0.75 * deep), turn=(0.55, 0, 0), spine=(0.25, 0, 0), head=(-0.4, 0, 0), left_arm=(0.6, 0.25, 0.1, 0.6),
-            right_arm=(0.6, 0.25, 0.1, 0.6), left_foot_turn=(0, 0.1, apart), right_foot_turn=(0, 0.1, apart), after=0.7 * pace,
+            pace, pelvis=(0, 0.33, -0.75 * deep), turn=(0.55, 0, 0), spine=(0.25, 0, 0), head=(-0.4, 0, 0), left_arm=(0.7, 0.35, 0.1, 0.6),
+            right_arm=(0.7, 0.35, 0.1, 0.6), left_foot_turn=(0, 0.1, apart), right_foot_turn=(0, 0.1, apart), after=0.7 * pace,
         )  # fmt: skip
-        s.move(pace, pelvis=(0, 0.4, -deep), turn=(-0.12, 0, 0), spine=(0.12, 0, 0), head=(0, 0, 0), left_arm=arm, right_arm=arm)
+        s.move(pace, head=(0, 0, 0), **posture((0.12, 0, 0)))
         for _ in range(rng.integers(1, 4)):
-            s.move(
-                rng.uniform(0.8, 1.6), spine=(rng.uniform(-0.05, 0.4), rng.uniform(-0.15, 0.15), rng.uniform(-0.35, 0.35)),
-                head=(rng.uniform(-0.3, 0.2), 0, rng.uniform(-0.6, 0.6)),
-            )  # fmt: skip
-        s.move(
-            0.8 * pace, pelvis=(0, 0.3, -0.75 * deep), turn=(0.6, 0, 0), spine=(0.25, 0, 0), head=(-0.4, 0, 0), left_arm=(0.6, 0.25, 0.1, 0.6),
-            right_arm=(0.6, 0.25, 0.1, 0.6), after=0.55 * pace,
-        )  # fmt: skip
+            spine = (rng.uniform(-0.05, 0.35), rng.uniform(-0.12, 0.12), rng.uniform(-0.3, 0.3))
+            s.move(rng.uniform(0.8, 1.6), head=(rng.uniform(-0.3, 0.2), 0, rng.uniform(-0.6, 0.6)), **posture(spine))
+        s.move(0.5 * pace, left_arm=(0.7, 0.45, 0.1, 0.8), right_arm=(0.7, 0.45, 0.1, 0.8), after=0.2 * pace)
+        s.move(0.8 * pace, pelvis=(0, 0.3, -0.75 * deep), turn=(0.6, 0, 0), spine=(0.25, 0, 0), head=(-0.4, 0, 0), after=0.55 * pace)
         s.move(pace, pelvis=(0, 0, 0), turn=(0, 0, 0), spine=(0, 0, 0), head=(0, 0, 0), left_arm=_down(rng), right_arm=_down(rng))
         s.hold(rng.uniform(0.1, 0.6))
     return s.channels(t)
@@ -198,7 +203,7 @@ def turn(t, rng):
         direction = rng.choice([-1.0, 1.0])
         first, second = ("left", "right") if direction > 0 else ("right", "left")
         step, pace = rng.uniform(0.5, 0.85), rng.uniform(0.38, 0.6)
-        arms = rng.uniform(0.2, 0.7)
+        arms = rng.uniform(0.32, 0.7)
         for k in range(rng.integers(2, 7)):
             yaw += direction * step
             swing = (-1) ** k * 0.25
@@ -270,22 +275,22 @@ def bend(t, rng):
         pace = rng.uniform(1.0, 1.6)
         if rng.random() < 0.55:
             lean, curl = rng.uniform(0.5, 1.1), rng.uniform(0.4, 0.9)
-            arm = (lean + curl + rng.uniform(-0.2, 0.2), 0.15, 0.1, 0.15)
+            arm = (lean + curl + rng.uniform(-0.1, 0.3), 0.15, 0.1, 0.15)
+            s.move(0.8 * pace, left_arm=arm, right_arm=arm, after=0.05)  # arms first, clear of the thighs
             s.move(
                 pace, pelvis=(0, 0.11 * lean, -0.03 - 0.05 * rng.random()), turn=(lean, 0, 0), spine=(curl, 0, rng.uniform(-0.2, 0.2)),
-                head=(rng.uniform(-0.2, 0.4), 0, 0), left_arm=arm, right_arm=arm,
+                head=(rng.uniform(-0.2, 0.4), 0, 0),
             )  # fmt: skip
         else:
             one, other, sign = _sides(rng)
             far = rng.uniform(0.3, 0.6)
             s.move(
                 pace, pelvis=(0.05 * sign, 0, -0.01), turn=(0, -0.25 * sign * far, 0), spine=(0, -sign * far, 0), head=(0, -0.4 * sign * far, 0),
-                **{f"{one}_arm": (0.1, rng.uniform(2.4, 2.8), 0.0, 0.5), f"{other}_arm": (0.0, 0.35, 0.1, 0.3)},
+                **{f"{one}_arm": (0.1, rng.uniform(2.4, 2.8), 0.0, 0.5), f"{other}_arm": (0.15, 0.3 + 1.2 * far, 0.1, 0.2)},
             )  # fmt: skip
         s.hold(rng.uniform(0.1, 0.6))
-        s.move(
-            pace, pelvis=(0, 0, -0.01), turn=(0, 0, 0), spine=(0, 0, 0), head=(0, 0, 0), left_arm=_down(rng), right_arm=_down(rng),
-        )  # fmt: skip
+        s.move(pace, pelvis=(0, 0, -0.01), turn=(0, 0, 0), spine=(0, 0, 0), head=(0, 0, 0), after=0.55 * pace)
+        s.move(0.8 * pace, left_arm=_down(rng), right_arm=_down(rng))
         s.hold(rng.uniform(0.0, 0.4))
     return s.channels(t)
 
@@ -405,18 +410,20 @@ def jumping_jack(t, rng):
     phase = rate * t + rng.uniform(0, 1)
     c = figure.stand(len(t))
     wide, high = rng.uniform(0.15, 0.28), rng.uniform(2.3, 2.75)
-    out = cycle(phase, [(0.0, 0.0), (0.15, 0.0), (0.42, 1.0), (0.62, 1.0), (0.9, 0.0)], 0.04)
-    hop = cycle(phase, [(0.0, 0.0), (0.16, 0.0), (0.28, 1.0), (0.4, 0.0), (0.63, 0.0), (0.76, 1.0), (0.88, 0.0)], 0.03)
-    c["pelvis"][:, 2] = 0.09 * hop - 0.06 - 0.05 * out
+    p = phase % 1.0
+    out = ease((p - 0.17) / 0.22) - ease((p - 0.64) / 0.22)  # feet and arms move while in the air
+    hop = bump((p - 0.13) / 0.3) + bump((p - 0.6) / 0.3)
+    arms = cycle(phase, [(0.0, 0.0), (0.05, 0.0), (0.45, 1.0), (0.55, 1.0), (0.95, 0.0)], 0.05)
+    c["pelvis"][:, 2] = 0.08 * hop - 0.035
     c["turn"][:, 0] = 0.06
     c["spine"][:, 0] = 0.05 - 0.1 * out
     bent = rng.uniform(0.2, 0.5)
     zero = np.zeros(len(t))
     for side, sign in (("left", 1.0), ("right", -1.0)):
-        c[f"{side}_arm"] = np.stack([0.12 + zero, 0.25 + (high - 0.25) * out, 0.1 - 0.1 * out, bent + zero], -1)
+        c[f"{side}_arm"] = np.stack([0.12 + zero, 0.25 + (high - 0.25) * arms, 0.1 - 0.1 * arms, bent + zero], -1)
         c[f"{side}_foot"][:, 0] = sign * wide * out
         c[f"{side}_foot"][:, 2] = 0.06 * hop
-        c[f"{side}_foot_turn"] = np.stack([0.2 + 0.5 * hop, 0.1 + 0.15 * out, zero], -1)
+        c[f"{side}_foot_turn"] = np.stack([0.12 + 0.55 * hop, 0.1 + 0.15 * out, zero], -1)
     return c
 
 
@@ -463,18 +470,22 @@ def wave(t, rng):
 def pick_up(t, rng):
     """Picking something up from the floor with both hands, lifting it overhead, putting it down."""
     s = Script(rng)
-    s.move(0.5, **_step("left", 0.0, apart=0.08), after=0.4)
-    s.move(0.5, **_step("right", 0.0, apart=0.08))
+    apart = rng.uniform(0.08, 0.13)
+    for foot, sign in (("left", 1.0), ("right", -1.0)):
+        s.move(0.5, **{f"{foot}_foot": (sign * apart, 0, 0), f"{foot}_foot_turn": (0, 0.45, 0.2)}, after=0.45)
+    chest = {
+        "pelvis": (0, 0, -0.02), "turn": (0, 0, 0), "spine": (-0.02, 0, 0), "head": (0, 0, 0), "left_arm": (0.75, 0.2, 0.25, 1.5),
+        "right_arm": (0.75, 0.2, 0.25, 1.5),
+    }  # fmt: skip
     while s.clock < t[-1] + 1:
-        deep, pace, aside = rng.uniform(0.3, 0.42), rng.uniform(1.0, 1.5), rng.uniform(-0.3, 0.3)
-        floor = {
-            "pelvis": (0, 0.14, -deep), "turn": (0.75, 0, 0.3 * aside), "spine": (0.55, 0, 0.6 * aside), "head": (-0.2, 0, 0),
-            "left_arm": (1.15, 0.1, 0.1, 0.2), "right_arm": (1.15, 0.1, 0.1, 0.2),
-        }  # fmt: skip
-        chest = {
-            "pelvis": (0, 0, -0.02), "turn": (0, 0, 0), "spine": (-0.02, 0, 0), "head": (0, 0, 0), "left_arm": (0.75, 0.2, 0.25, 1.5),
-            "right_arm": (0.75, 0.2, 0.25, 1.5),
-        }  # fmt: skip
+        deep, pace, aside = rng.uniform(0.3, 0.4), rng.uniform(1.0, 1.5), rng.uniform(-0.06, 0.06)
+        pelvis, turn, spine = (0, 0.16, -deep), (0.8, 0, 0), (0.5, 0, 3 * aside)
+        arms = {}
+        for side, sign in (("left", 1.0), ("right", -1.0)):
+            place = np.array([sign * 0.09 + aside, -0.33, -0.64])
+            arms[f"{side}_arm"] = figure.arm_to(side, figure.in_chest(place, pelvis, turn, spine), pole=(1.0, 0.3, 0.2))
+        floor = {"pelvis": pelvis, "turn": turn, "spine": spine, "head": (-0.2, 0, 0), **arms}
+        s.move(0.6 * pace, left_arm=(0.9, 0.05, 0.1, 0.5), right_arm=(0.9, 0.05, 0.1, 0.5), after=0.3 * pace)
         s.move(pace, **floor)
         s.hold(rng.uniform(0.1, 0.3))
         s.move(pace, **chest)
@@ -483,7 +494,9 @@ def pick_up(t, rng):
             s.hold(0.3)
             s.move(0.9, **chest)
         s.move(pace, **floor)
-        s.move(pace, pelvis=(0, 0, -0.01), turn=(0, 0, 0), spine=(0, 0, 0), head=(0, 0, 0), left_arm=_down(rng), right_arm=_down(rng))
+        s.move(0.7, left_arm=(1.2, 0.15, 0.1, 0.4), right_arm=(1.2, 0.15, 0.1, 0.4), after=0.1)
+        s.move(0.9 * pace, pelvis=(0, 0, -0.01), turn=(0, 0, 0), spine=(0, 0, 0), head=(0, 0, 0), after=0.6 * pace)
+        s.move(0.8 * pace, left_arm=_down(rng), right_arm=_down(rng))
         s.hold(rng.uniform(0.0, 0.5))
     return s.channels(t)
 
@@ -503,10 +516,9 @@ def dance(t, rng):
     for k, (side, sign) in enumerate((("left", 1.0), ("right", -1.0))):
         lift = 1.0 + 0.45 * np.tanh(slow[:, k]) + 0.35 * sign * np.sin(2 * np.pi * phase + 0.4)
         c[f"{side}_arm"] = np.stack([0.5 + 0.3 * np.cos(2 * np.pi * phase + k), lift, 0.2 + zero, 1.1 + 0.4 * sign * np.cos(2 * np.pi * phase)], -1)
-        near = cycle(phase, [(0.0, 0.0), (0.1, 0.0), (0.35, 1.0), (0.6, 1.0), (0.85, 0.0)], 0.03)
-        near = near if side == "right" else cycle(phase + 0.5, [(0.0, 0.0), (0.1, 0.0), (0.35, 1.0), (0.6, 1.0), (0.85, 0.0)], 0.03)
-        at = (phase + (0.5 if side == "left" else 0.0)) % 1.0
+        p = (phase + (0.5 if side == "left" else 0.0)) % 1.0
+        near = ease((p - 0.1) / 0.24) - ease((p - 0.6) / 0.24)  # the foot that comes in touches, then steps out again
         c[f"{side}_foot"][:, 0] = sign * (0.16 - 0.17 * near)
-        c[f"{side}_foot"][:, 2] = 0.06 * (bump((at - 0.1) / 0.25) + bump((at - 0.6) / 0.25))
+        c[f"{side}_foot"][:, 2] = 0.05 * (bump((p - 0.06) / 0.32) + bump((p - 0.56) / 0.32))
         c[f"{side}_foot_turn"] = np.stack([0.45 * near, 0.15 + zero, zero], -1)
     return c

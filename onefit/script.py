@@ -68,9 +68,11 @@ class Script:
         total = {name: np.tile(self._start[name], (len(t), 1)) for name in CHANNELS}
         for name, start, seconds, change in self._moves:
             x = (t - start) / seconds
-            total[name] += ease(x)[:, None] * change
-            if name.endswith("foot"):
-                far = np.linalg.norm(change[:2])
-                if far > 0.01 and abs(change[2]) < 0.05:
-                    total[name][:, 2] += bump(x) * (0.03 + 0.12 * far)
+            if not name.endswith("foot"):
+                total[name] += ease(x)[:, None] * change
+                continue
+            total[name] += ease((x - 0.1) / 0.8)[:, None] * change  # up first, then along
+            far = np.linalg.norm(change[:2])
+            if far > 0.01 and abs(change[2]) < 0.05:
+                total[name][:, 2] += bump(x) * (0.04 + 0.12 * far)
         return total
