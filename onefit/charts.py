@@ -158,7 +158,7 @@ class PatchedGarment:
     def _blend(self, p, vertices):
         """The sparse matrix (N, K A) from changes of the C_k to displacements of the vertices: a partition of unity of the charts."""
         count, A = len(vertices), self.alpha.shape[1]
-        own = p.vertex_patch[:count]
+        own = self.vertex_patch = p.vertex_patch[:count]  # (N,): the patch of each vertex
         near = sp.coo_matrix((np.ones(len(p.neighbours)), p.neighbours.T), (len(self), len(self))).tocsr()
         near = ((near + near.T + sp.identity(len(self))) > 0).tocsr()
         candidates = near[own].tocoo()  # (N, K): own patch and those that it meets

@@ -473,10 +473,10 @@ def pick_up(t, rng):
     apart = rng.uniform(0.08, 0.13)
     for foot, sign in (("left", 1.0), ("right", -1.0)):
         s.move(0.5, **{f"{foot}_foot": (sign * apart, 0, 0), f"{foot}_foot_turn": (0, 0.45, 0.2)}, after=0.45)
-    chest = {
-        "pelvis": (0, 0, -0.02), "turn": (0, 0, 0), "spine": (-0.02, 0, 0), "head": (0, 0, 0), "left_arm": (0.75, 0.2, 0.25, 1.5),
-        "right_arm": (0.75, 0.2, 0.25, 1.5),
-    }  # fmt: skip
+    upright = {"pelvis": (0, 0, -0.02), "turn": (0, 0, 0), "spine": (-0.02, 0, 0), "head": (0, 0, 0)}
+    before, chest = (
+        {"left_arm": arm, "right_arm": arm} for arm in ((1.35, 0.0, 0.1, 0.4), (0.75, 0.2, 0.25, 1.5))
+    )  # arms go ahead of the trunk, clear of the thighs
     while s.clock < t[-1] + 1:
         deep, pace, aside = rng.uniform(0.3, 0.4), rng.uniform(1.0, 1.5), rng.uniform(-0.06, 0.06)
         pelvis, turn, spine = (0, 0.16, -deep), (0.8, 0, 0), (0.5, 0, 3 * aside)
@@ -485,17 +485,20 @@ def pick_up(t, rng):
             place = np.array([sign * 0.09 + aside, -0.33, -0.64])
             arms[f"{side}_arm"] = figure.arm_to(side, figure.in_chest(place, pelvis, turn, spine), pole=(1.0, 0.3, 0.2))
         floor = {"pelvis": pelvis, "turn": turn, "spine": spine, "head": (-0.2, 0, 0), **arms}
-        s.move(0.6 * pace, left_arm=(0.9, 0.05, 0.1, 0.5), right_arm=(0.9, 0.05, 0.1, 0.5), after=0.3 * pace)
+        s.move(0.6 * pace, **before, after=0.3 * pace)
         s.move(pace, **floor)
         s.hold(rng.uniform(0.1, 0.3))
-        s.move(pace, **chest)
+        s.move(0.8 * pace, **before, after=0.25 * pace)
+        s.move(pace, **upright, after=0.6 * pace)
+        s.move(0.8 * pace, **chest)
         if rng.random() < 0.6:
             s.move(0.9, left_arm=(2.7, 0.1, 0.0, 0.4), right_arm=(2.7, 0.1, 0.0, 0.4), spine=(-0.1, 0, 0), head=(-0.4, 0, 0))
             s.hold(0.3)
-            s.move(0.9, **chest)
+            s.move(0.9, **chest, spine=(-0.02, 0, 0), head=(0, 0, 0))
+        s.move(0.6 * pace, **before, after=0.3 * pace)
         s.move(pace, **floor)
-        s.move(0.7, left_arm=(1.2, 0.15, 0.1, 0.4), right_arm=(1.2, 0.15, 0.1, 0.4), after=0.1)
-        s.move(0.9 * pace, pelvis=(0, 0, -0.01), turn=(0, 0, 0), spine=(0, 0, 0), head=(0, 0, 0), after=0.6 * pace)
+        s.move(0.8 * pace, **before, after=0.25 * pace)
+        s.move(pace, **upright, after=0.8 * pace)
         s.move(0.8 * pace, left_arm=_down(rng), right_arm=_down(rng))
         s.hold(rng.uniform(0.0, 0.5))
     return s.channels(t)
