@@ -128,7 +128,8 @@ class Decoder(nn.Module):
 
 
 class OneFit(nn.Module):
-    """One network for any garment. ``order`` of the jets, ``joints`` and ``shape``: how many of both the body has."""
+    """One network for any garment: ``patches``, ``body`` and ``decoder``. ``order`` of the jets, ``joints`` and ``shape``: how many of both
+    the body has."""
 
     def __init__(self, order=4, joints=24, shape=6):
         super().__init__()
@@ -137,9 +138,3 @@ class OneFit(nn.Module):
         self.patches = PatchEncoder(order, joints)
         self.body = BodyEncoder(joints, shape)
         self.decoder = Decoder(order)
-
-    def forward(self, features, joints, poses, translation, shape, fps=30.0, hidden=None, frames=slice(None)):
-        """The :class:`Deformation` of K patches (``features`` as :attr:`PatchedGarment.features`) in the ``frames`` (a slice) of windows of B
-        motions, T = B L' frames of them; and the memory."""
-        Z_B, memory = self.body(poses, translation, shape, fps, hidden)
-        return self.decoder(self.patches(*features, joints), Z_B[:, frames].flatten(0, 1)), memory

@@ -11,15 +11,15 @@ RANDOM_POINTS = 1000  # vertices drawn for the collision, beside those nearest t
 
 @dataclass(frozen=True)
 class Scene:
-    """T frames of bodies, as three consecutive ones each of T/3 windows: ``transforms`` (T, J, 3, 4); ``body`` (T, V, 3) [m], the posed
-    surface; ``collider``, the :class:`onefit.collision.Collider` of its triangles; ``rest`` (N, T, 3) [m], the garment's vertices in the rest
-    space, graded to each frame's shape; ``dt`` [s] between frames."""
+    """T frames of bodies, each on its own: ``transforms`` (T, J, 3, 4); ``body`` (T, V, 3) [m], the posed surface; ``collider``, the
+    :class:`onefit.collision.Collider` of its triangles; ``rest`` (N, T, 3) [m], the garment's vertices in the rest space, graded to each
+    frame's shape, and ``field`` (3 P, T, 3), what :attr:`onefit.charts.PatchedGarment.field` makes of them."""
 
     transforms: torch.Tensor
     body: torch.Tensor
     collider: object
     rest: torch.Tensor
-    dt: float
+    field: torch.Tensor
 
 
 def posed(points, weights, transforms):
@@ -29,20 +29,25 @@ def posed(points, weights, transforms):
     return (maps[..., :3] @ points[..., None])[..., 0] + maps[..., 3]
 
 
-def evaluate(garment, deformation, scene, weights, epoch=100, generator=None):
+def vertices(garment, changes, rest, transforms):
+    """The garment's vertices (N, T, 3) [m], of :meth:`onefit.charts.PatchedGarment.changes`, rest (N, T, 3) [m] and transforms (T, J, 3, 4)."""
+    return posed(rest + garment.displacement(changes), garment.garment.blend_weights, transforms)
+
+
+def evaluate(garment, deformation, scene, weights, epoch=100, past=None, dt=1 / 30, generator=None):
     """The terms of the objective, a dict of tensors in which the weights are in force, and the posed vertices (N, T, 3) [m].
 
-    ``garment``: a :class:`onefit.charts.PatchedGarment`; ``deformation``: its :class:`onefit.charts.Deformation` in the T frames. A term whose
-    weight is 0 is left out.
+    ``garment``: a :class:`onefit.charts.PatchedGarment`; ``deformation``: its :class:`onefit.charts.Deformation` in the T frames; ``past``: the
+    vertices one and two frames, of ``dt`` [s], before each of them, (N, T, 3) [m] each; None leaves inertia out. A term whose weight is 0
+    is left out too.
     """
     changes = garment.changes(deformation)
-    x = posed(scene.rest + garment.displacement(changes), garment.garment.blend_weights, scene.transforms)
-    device = x.device
+    x = vertices(garment, changes, scene.rest, scene.transforms)
     area = garment.vertex_area
     terms = {}
-    k_ext = torch.ones((), device=device)
+    k_ext = torch.ones((), device=x.device)
     if weights.k_c:
-        drawn = torch.randint(len(x), (RANDOM_POINTS,), generator=generator).to(device)
+        drawn = torch.randint(len(x), (RANDOM_POINTS,), generator=generator).to(x.device)
         chosen = torch.cat([garment.metric_vertex, drawn])
         distance = scene.collider.distance(x[chosen].transpose(0, 1), scene.body).T
         share = area.sum() / len(chosen)
@@ -63,15 +68,13 @@ def evaluate(garment, deformation, scene, weights, epoch=100, generator=None):
     mass = losses.DENSITY * area
     if weights.k_g:
         terms["gravity"] = weights.k_g * losses.gravity(x[..., 2] - scene.transforms[:, 0, 2, 3], mass)
-    if weights.k_in:
-        earlier, before, now = x.unflatten(1, (-1, 3)).unbind(2)
-        terms["inertia"] = weights.k_in * losses.inertia(now, before, earlier, mass, scene.dt)
+    if weights.k_in and past is not None:
+        terms["inertia"] = weights.k_in * losses.inertia(x, *past, mass, dt)
     return terms, x
 
 
 def _metric_term(garment, changes, scene, k_ext):
-    rest = garment.field @ scene.rest  # (3 P, T, 3): the template's points and tangents, graded
-    points, *tangents = rest.unflatten(0, (-1, 3)).unbind(1)
+    points, *tangents = scene.field.unflatten(0, (-1, 3)).unbind(1)
     moved = garment.at_metric(changes).unbind(1)
     deformed = [t + d for t, d in zip(tangents, moved[1:])]
     skinned = losses.skinned_tangents(points + moved[0], deformed, garment.metric_weights, scene.transforms)

@@ -74,35 +74,35 @@ class OneFitTraining(Training):
         plain = json.loads(json.dumps(asdict(settings)))
         network = network.to(processes.device).train()
         super().__init__(network, torch.optim.Adam(network.parameters(), settings.lr), plain, processes)
-        windows = min(self._windows(garment) for garment, _ in data.garments)
+        windows = min(self._windows(garment) for garment, *_ in data.garments)
         self.epoch_steps = settings.epoch_steps or -(-len(data) // windows)
         self.steps = settings.epochs * self.epoch_steps
 
     def _windows(self, garment):
         """Windows of a step, so that it has about ``batch`` patches, and each process the same number of windows."""
-        from .training_data import FRAMES
-
         count = self.processes.count
-        return max(1, round(self.given.batch / len(garment) / FRAMES / count)) * count
+        return max(1, round(self.given.batch / len(garment) / count)) * count
 
     def loss(self, generator, garment=None):
         """The objective's terms on a batch of the random numbers of ``generator``: this process's share of it."""
         from . import objective
-        from .training_data import FRAMES
+        from .training_data import FPS
 
-        garment, rest = self.data.garments[self.done % len(self.data.garments) if garment is None else garment]
+        garment, rest, field = self.data.garments[self.done % len(self.data.garments) if garment is None else garment]
         windows = self.data.windows(self._windows(garment), generator)
-        count = len(windows.number)
-        hidden = HIDDEN * torch.randn(1, count, 512, generator=generator).to(self.processes.device)
+        hidden = HIDDEN * torch.randn(1, len(windows.number), self.network.body.memory.hidden_size, generator=generator)
         mine = slice(self.processes.rank, None, self.processes.count)
         windows = type(windows)(*(getattr(windows, f.name)[mine] for f in fields(windows)))
-        hidden = hidden[:, mine].contiguous()
-        deformation, _ = self.network(
-            garment.features, self.data.standard.joints, windows.poses, windows.translation, windows.shape, hidden=hidden,
-            frames=slice(-FRAMES, None),
-        )  # fmt: skip
-        scene = self.data.scene(windows, rest)
-        return objective.evaluate(garment, deformation, scene, self.given.weights, self.done // self.epoch_steps, generator)[0]
+        hidden = hidden.to(self.processes.device)[:, mine].contiguous()
+        Z_T = self.network.patches(*garment.features, self.data.standard.joints)
+        Z_B, _ = self.network.body(windows.poses, windows.translation, windows.shape, FPS, hidden)
+        scene, before = self.data.scene(windows, rest, field)
+        with torch.no_grad():  # the past is given
+            changes = [garment.changes(self.network.decoder(Z_T, Z_B[:, -k])) for k in (2, 3)]
+            past = [objective.vertices(garment, c, scene.rest, transforms) for c, transforms in zip(changes, before)]
+        deformation = self.network.decoder(Z_T, Z_B[:, -1])
+        epoch = self.done // self.epoch_steps
+        return objective.evaluate(garment, deformation, scene, self.given.weights, epoch, past, 1 / FPS, generator)[0]
 
     def update(self):
         epoch = self.done // self.epoch_steps

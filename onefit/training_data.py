@@ -12,7 +12,6 @@ from .collision import Collider
 from .motion import Motion
 
 LENGTH = 10  # frames of a window that the body's encoder sees
-FRAMES = 3  # the last of them, which the garment is draped in: inertia needs three
 FPS = 30.0
 
 
@@ -47,7 +46,8 @@ class TrainingData:
         self.garments = []
         for garment in garments:
             patched = PatchedGarment(garment, self.standard, patches=patches, order=order)
-            self.garments.append((patched, torch.stack([garment.graded(b) for b in bodies], 1)))  # (N, S, 3)
+            rest = torch.stack([garment.graded(b) for b in bodies], 1)
+            self.garments.append((patched, rest, patched.field @ rest))  # (N, S, 3) and (3 P, S, 3)
             advance()
         self.collider = Collider(self.standard.faces, self.standard.vertices)
 
@@ -59,7 +59,7 @@ class TrainingData:
         for name in ("shapes", "vertices", "joints", "rest_poses"):
             setattr(self, name, getattr(self, name).to(device))
         self.standard = self.standard.to(device)
-        self.garments = [(g.to(device), rest.to(device)) for g, rest in self.garments]
+        self.garments = [tuple(x.to(device) for x in entry) for entry in self.garments]
         self.collider = Collider(self.standard.faces, self.standard.vertices)
         return self
 
@@ -76,12 +76,11 @@ class TrainingData:
         shape = self.shapes[number] - self.model.standard_shape.to(device)
         return Windows(torch.stack(poses).to(device), torch.stack(translation).to(device), shape, number)
 
-    def scene(self, windows, rest):
-        """The :class:`onefit.objective.Scene` of the windows' last frames, of a garment whose graded vertices are ``rest`` (N, S, 3)."""
-        frame = slice(-FRAMES, None)
-        number = windows.number.repeat_interleave(FRAMES)
+    def scene(self, windows, rest, field):
+        """The :class:`onefit.objective.Scene` of the windows' last frames, and the transforms (B, J, 3, 4) one and two frames before; of a garment
+        whose graded vertices are ``rest`` (N, S, 3), with the ``field`` (3 P, S, 3) of them."""
+        number = windows.number
         body = replace(self.standard, joints=self.joints[number], rest_pose=self.rest_poses[number])
-        poses, translation = windows.poses[:, frame].flatten(0, 1), windows.translation[:, frame].flatten(0, 1)
-        transforms = skinning.transforms(body, poses, translation)
-        posed = skinning.skin(self.vertices[number], self.standard.blend_weights, transforms)
-        return objective.Scene(transforms, posed, self.collider, rest[:, number], 1 / FPS)
+        now, *past = (skinning.transforms(body, windows.poses[:, -k], windows.translation[:, -k]) for k in (1, 2, 3))
+        posed = skinning.skin(self.vertices[number], self.standard.blend_weights, now)
+        return objective.Scene(now, posed, self.collider, rest[:, number], field[:, number]), past

@@ -1,0 +1,212 @@
+import numpy as np
+import pytest
+import torch
+from polyfit import jets
+
+from onefit import losses, objective, skinning
+from onefit.body import AnnyBody
+from onefit.charts import Deformation, PatchedGarment, SparseMatrix
+from onefit.collision import FAR, Collider
+from onefit.garment import Garment
+
+T = 6
+
+
+@pytest.fixture(scope="module")
+def body():
+    return AnnyBody().body()
+
+
+@pytest.fixture(scope="module")
+def garment():
+    return Garment.template("tank")
+
+
+@pytest.fixture(scope="module")
+def patched(garment, body):
+    return PatchedGarment(garment, body)
+
+
+def deformation(patched, size=1.0, frames=T, seed=0):
+    g = torch.Generator().manual_seed(seed)
+    K, A = patched.alpha.shape
+    random = lambda *shape: size * torch.randn(*shape, generator=g)
+    return Deformation(0.05 * random(frames, K, A), 0.1 * random(frames, K, 3), 0.1 * random(frames, K))
+
+
+def points_of(patched, d, t, uv, patch):
+    """Points of deformed jets by their definition: p = s' R (u, v, z'(u, v)) + T'."""
+    frame = patched.frame.to(torch.float32)[patch]
+    alpha = patched.alpha.float()[patch] + d.alpha[t][patch]
+    s = frame.s * d.scale[t][patch].exp()
+    z = jets.height(alpha, uv[:, None])[:, 0]
+    x = s[:, None] * torch.cat([uv, z[:, None]], 1) + frame.s[:, None] * d.translation[t][patch]
+    return (frame.R @ x[..., None])[..., 0] + frame.T
+
+
+def test_a_sparse_matrix_multiplies_and_differentiates_as_a_dense_one():
+    g = torch.Generator().manual_seed(0)
+    dense = torch.randn(7, 5, generator=g) * (torch.rand(7, 5, generator=g) > 0.5)
+    x = torch.randn(5, 2, 3, generator=g, requires_grad=True)
+    sparse, full = SparseMatrix(dense.numpy()) @ x, torch.einsum("nm,mab->nab", dense, x)
+    assert torch.allclose(sparse, full, atol=1e-6)
+    weights = torch.randn(7, 2, 3, generator=g)
+    a, b = (torch.autograd.grad((y * weights).sum(), x, retain_graph=True)[0] for y in (sparse, full))
+    assert torch.allclose(a, b, atol=1e-6)
+    assert torch.allclose(SparseMatrix(dense.numpy()) @ x[:, 0, 0], full[:, 0, 0], atol=1e-6)
+
+
+def test_no_deformation_moves_nothing(patched):
+    zero = deformation(patched, 0.0)
+    assert patched.displacement(patched.changes(zero)).abs().max() == 0
+
+
+def test_changes_are_those_of_the_deformed_jets(patched):
+    d = deformation(patched)
+    at = patched.at_metric(patched.changes(d)).unflatten(0, (len(patched), -1))  # (K, M, 3, T, 3)
+    patch = torch.arange(len(patched)).repeat_interleave(at.shape[1])
+    uv = patched.metric_uv.flatten(0, 1)
+    rest = points_of(patched, deformation(patched, 0.0), 0, uv, patch)
+    for t in (0, T - 1):
+        moved = points_of(patched, d, t, uv, patch) - rest
+        assert torch.allclose(at[:, :, 0, t].flatten(0, 1), moved, atol=1e-6)
+        step = 1e-2  # of a polynomial of degree 4 in float32: central differences of the right size
+        for k, axis in enumerate(torch.eye(2)):
+            ahead, behind = (points_of(patched, d, t, uv + sign * step * axis, patch) for sign in (1, -1))
+            ahead0, behind0 = (points_of(patched, deformation(patched, 0.0), 0, uv + sign * step * axis, patch) for sign in (1, -1))
+            slope = ((ahead - behind) - (ahead0 - behind0)) / (2 * step)
+            assert torch.allclose(at[:, :, 1 + k, t].flatten(0, 1), slope, atol=2e-4)
+
+
+def test_blending_keeps_a_common_motion(patched):
+    # every patch moved by the same vector of the rest space: so is every vertex, whatever charts it is blended from
+    move = torch.tensor([0.03, -0.02, 0.05])
+    local = (patched.frame.R.float().mT @ move) / patched.frame.s.float()[:, None]
+    zero = deformation(patched, 0.0, 1)
+    moved = patched.displacement(patched.changes(Deformation(zero.alpha, local[None], zero.scale)))
+    assert torch.allclose(moved[:, 0], move.expand(len(moved), 3), atol=1e-6)
+
+
+def test_seams_are_not_torn(patched, garment):
+    # the charts disagree at random; an edge across a seam jumps far less than if each vertex had its own patch's displacement alone
+    d = deformation(patched, 0.2)
+    moved = patched.displacement(patched.changes(d))[:, 0]
+    own = torch.as_tensor(patched.vertex_patch)
+    frame = patched.frame.to(torch.float32)[own]
+    uv = ((garment.vertices - frame.T)[:, None] @ frame.R)[:, 0, :2] / frame.s[:, None]
+    alone = points_of(patched, d, 0, uv, own) - points_of(patched, deformation(patched, 0.0), 0, uv, own)
+    a, b = patched.edges[(own[patched.edges[:, 0]] != own[patched.edges[:, 1]])].T
+    assert len(a) > 200
+    jump = lambda x: (x[a] - x[b]).norm(dim=-1).median()
+    assert jump(moved) < 0.35 * jump(alone)
+
+
+def test_fields_of_the_vertices_and_their_derivatives(patched, garment):
+    # the positions themselves are such a field: its derivatives are the template's tangents
+    value, du, dv = (patched.field @ garment.vertices).unflatten(0, (-1, 3)).unbind(1)
+    patch = torch.arange(len(patched)).repeat_interleave(patched.metric_uv.shape[1])
+    uv = patched.metric_uv.flatten(0, 1)
+    points = points_of(patched, deformation(patched, 0.0), 0, uv, patch)
+    assert (value - points).norm(dim=-1).median() < 2e-4
+    slope = jets.height_derivatives(patched.alpha.float()[patch], uv[:, None])
+    s, R = patched.frame.s.float()[patch], patched.frame.R.float()[patch]
+    u = torch.stack([torch.ones(len(uv)), torch.zeros(len(uv)), slope[0][:, 0]], -1)
+    u = s[:, None] * (R @ u[..., None])[..., 0]
+    assert ((du - u).norm(dim=-1) / u.norm(dim=-1)).median() < 0.02
+    assert torch.allclose(patched.metric_weights[:, 0].sum(1), torch.ones(len(uv)), atol=1e-3)
+
+
+def test_frames_lie_along_the_bones_and_outwards(patched, garment, body):
+    R = patched.frame.R
+    assert torch.allclose(R.mT @ R, torch.eye(3, dtype=R.dtype).expand_as(R), atol=1e-9)
+    assert torch.allclose(torch.linalg.det(R), torch.ones(len(R), dtype=R.dtype))
+    outwards = patched.frame.T - body.joints[[0, 3, 6, 9]].double().mean(0)
+    side = patched.frame.T[:, :2].norm(dim=1) > 0.08  # not the shoulders
+    assert ((R[:, :2, 2] * outwards[:, :2]).sum(1)[side] > 0).double().mean() > 0.95
+    # a tank hangs from the spine: v is upwards
+    assert (R[:, 2, 1] > 0.5).double().mean() > 0.8
+
+
+def test_signed_distances(body):
+    collider = Collider(body.faces, body.vertices)
+    g = torch.Generator().manual_seed(1)
+    face = torch.randint(len(body.faces), (200,), generator=g)
+    corners = body.vertices[body.faces[face]]
+    normal = torch.nn.functional.normalize(torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), dim=-1)
+    for away in (0.002, -0.002):
+        found = collider.distance((corners.mean(1) + away * normal)[None], body.vertices[None])[0]
+        assert (found - away).abs().median() < 1e-5
+        assert (found * away > 0).float().mean() > 0.97  # thin places: lips, fingers
+    # moved bodies move their distances; the far is far
+    shift = torch.tensor([0.5, 0, 0])
+    x = corners.mean(1) + 0.01 * normal
+    both = collider.distance(torch.stack([x, x + shift]), torch.stack([body.vertices, body.vertices + shift]))
+    assert torch.allclose(both[0], both[1], atol=1e-5)
+    assert collider.distance(torch.full((1, 1, 3), 9.0), body.vertices[None]).item() == pytest.approx(FAR)
+
+
+def test_gradient_of_the_signed_distance(body):
+    collider = Collider(body.faces, body.vertices)
+    x = (body.vertices[::400] + 0.02 * torch.tensor([0.3, -0.8, 0.4]))[None].requires_grad_()
+    distance = collider.distance(x, body.vertices[None])
+    (gradient,) = torch.autograd.grad(distance.sum(), x)
+    step = 1e-3
+    for k, axis in enumerate(torch.eye(3)):
+        ends = [collider.distance((x + sign * step * axis).detach(), body.vertices[None]) for sign in (1, -1)]
+        slope = (ends[0] - ends[1]) / (2 * step)
+        assert (gradient[..., k] - slope).abs().median() < 1e-2
+    assert torch.allclose(gradient.norm(dim=-1), torch.ones(1), atol=1e-4)
+
+
+def scene(body, patched, frames=T, seed=2):
+    g = torch.Generator().manual_seed(seed)
+    poses = body.rest_pose + 0.15 * torch.randn(frames, 24, 3, generator=g)
+    transforms = skinning.transforms(body, poses, 0.02 * torch.randn(frames, 3, generator=g))
+    posed = skinning.skin(body.vertices, body.blend_weights, transforms)
+    rest = patched.garment.vertices[:, None].expand(-1, frames, -1)
+    return objective.Scene(transforms, posed, Collider(body.faces, body.vertices), rest, patched.field @ rest)
+
+
+def test_without_deformation_the_objective_is_plain_skinning(patched, garment, body):
+    s = scene(body, patched)
+    _, x = objective.evaluate(patched, deformation(patched, 0.0), s, losses.Weights(), generator=torch.Generator().manual_seed(0))
+    expected = skinning.skin(garment.vertices, garment.blend_weights, s.transforms)
+    assert torch.allclose(x.transpose(0, 1), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["collision", "inextensibility", "mesh_inextensibility", "boundary", "gravity", "inertia"])
+def test_gradient_of_the_whole_objective(patched, body, name):
+    s, d = scene(body, patched), deformation(patched, 0.3)
+    past = [objective.vertices(patched, patched.changes(deformation(patched, 0.3, seed=k)), s.rest, s.transforms) for k in (1, 2)]
+    switches = dict(collision="k_c", inextensibility="k_i", mesh_inextensibility="k_mi", boundary="k_b", gravity="k_g", inertia="k_in")
+    off = {k: 0.0 for k in ("k_c", "k_i", "k_b", "k_bn", "k_mi", "k_g", "k_in")}
+    on = {switches[name]: 1.0} | ({"k_bn": 1.0} if name == "boundary" else {})
+    weights = losses.Weights(**off | on)
+
+    def value(alpha, translation, scale):
+        generator = torch.Generator().manual_seed(5)
+        terms, _ = objective.evaluate(patched, Deformation(alpha, translation, scale), s, weights, past=past, generator=generator)
+        assert list(terms) == [name]
+        return terms[name]
+
+    inputs = [x.clone().requires_grad_() for x in (d.alpha, d.translation, d.scale)]
+    gradients = torch.autograd.grad(value(*inputs), inputs)
+    g = torch.Generator().manual_seed(7)
+    # directions in which the value changes: random ones, leaning towards the gradient, for float32 shows nothing else
+    for x, gradient in zip(range(3), gradients):
+        direction = gradient / gradient.norm() + 0.3 * torch.nn.functional.normalize(torch.randn(gradient.shape, generator=g).flatten(), dim=0).view_as(gradient)
+        step = (1e-2 if name == "gravity" else 3e-4) / direction.abs().max().item()
+        ends = []
+        for sign in (1, -1):
+            moved = [i.detach() for i in inputs]
+            moved[x] = moved[x] + sign * step * direction
+            ends.append(float(value(*moved)))
+        slope = (ends[0] - ends[1]) / (2 * step)
+        assert float((gradient * direction).sum()) == pytest.approx(slope, rel=0.03), ("alpha", "translation", "scale")[x]
+
+
+def test_metric_points_lie_on_their_vertices(patched, garment):
+    value = (patched.field @ garment.vertices).unflatten(0, (-1, 3))[:, 0]
+    apart = (value - garment.vertices[patched.metric_vertex]).norm(dim=-1)
+    edge = (garment.vertices[patched.edges[:, 0]] - garment.vertices[patched.edges[:, 1]]).norm(dim=-1)
+    assert apart.max() < 2 * np.float64(edge.max())
