@@ -90,7 +90,7 @@ class AnnyBody(BodyModel):
         model = self._anny = anny.Anny(skinning_method="lbs")
         bones, joint_of_bone = model.bone_labels, self.joint_of_bone()
         faces = model.get_triangular_faces()
-        kept = _largest_component(len(model.template_vertices), faces)
+        kept = largest_component(len(model.template_vertices), faces)
         number = torch.cumsum(kept, 0) - 1
         self._faces = number[faces[kept[faces].all(1)]]
 
@@ -144,7 +144,7 @@ class AnnyBody(BodyModel):
         return torch.from_numpy(rng.uniform(low, high)).float()
 
 
-def _largest_component(count, faces):
+def largest_component(count, faces):
     """Whether each of ``count`` vertices is in the component of ``faces`` (F, 3) with the most vertices: (count,) bool."""
     import numpy as np
     from polyfit.mesh import components

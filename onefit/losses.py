@@ -13,6 +13,7 @@ from polyfit.errors import InputError
 
 GRAVITY = 9.81  # [m/s^2], along -z
 DENSITY = 0.2  # [kg/m^2], a light cotton jersey
+METRIC = 0.1  # what a change of the metric by the square of the patch's radius counts for
 POINT = 1e-5  # [m^2] that a point of a sum stands for
 
 
@@ -72,10 +73,10 @@ def skinned_tangents(points, tangents, weights, transforms):
 
 
 def inextensibility(rest, posed, k_ext, s):
-    """Mean over points of |k_ext g_T - g_P|, both metrics (P, T, 3) as :func:`metric` gives them, in units of the patches' radius ``s``
-    (P,) [m]. The off-diagonal entry counts twice, as it stands twice in the matrix."""
+    """METRIC times the mean over points of |k_ext g_T - g_P|, both metrics (P, T, 3) as :func:`metric` gives them, in units of the patches'
+    radius ``s`` (P,) [m]. The off-diagonal entry counts twice, as it stands twice in the matrix."""
     difference = (k_ext[..., None] * rest - posed) / s[:, None, None].square()
-    return (difference.abs() * difference.new_tensor([1, 2, 1])).sum(-1).mean()
+    return METRIC * (difference.abs() * difference.new_tensor([1, 2, 1])).sum(-1).mean()
 
 
 def mesh_inextensibility(lengths, rest):

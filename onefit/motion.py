@@ -50,6 +50,18 @@ class Motion:
         return replace(self, poses=self.poses.to(device), translation=self.translation.to(device))
 
     @classmethod
+    def read(cls, path, fps=None, up=None):
+        """A motion from a file: AMASS's ``.npz`` (``poses``, ``trans``, ``mocap_framerate``; z up), Neural Cloth Simulation's (``fps``; y up), or BVH.
+
+        ``fps`` and ``up`` ("y" or "z") take the place of what the file says. SMPL's rotations are taken over joint by joint, in OneFit's axes
+        (:mod:`onefit.motionfiles`); a BVH skeleton is retargeted (:mod:`onefit.bvh`). The motion starts at x = y = 0 with its lowest foot on
+        the standard body's ground. Raises InputError for what cannot be used: not finite, another number of joints, no frame rate, another unit.
+        """
+        from .motionfiles import read
+
+        return read(path, fps, up)
+
+    @classmethod
     def generate(cls, name, seconds=10.0, seed=0, fps=30.0):
         """A generated motion of the kind ``name``, one of :data:`onefit.generate.KINDS`; see :mod:`onefit.generate`."""
         from .generate import generate

@@ -17,8 +17,8 @@ from .charts import Deformation
 GRAVITY = (0.0, 0.0, -1.0)  # unit, world
 SLOPE = 0.1  # of the leaky ReLUs
 # Deformations that a unit of the decoder's output stands for: coefficients and translation in units of the patch's radius, scale as a
-# logarithm. Small, so that the first steps of a training stay near plain skinning.
-UNIT = {"alpha": 0.1, "translation": 0.1, "scale": 0.03}
+# logarithm.
+UNIT = {"alpha": 0.2, "translation": 0.3, "scale": 0.05}
 
 
 def layers(widths, bias=True, last=True):

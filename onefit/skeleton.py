@@ -81,6 +81,13 @@ def chained(rotations):
     return torch.stack(done, -3)
 
 
+def chained_rotations(poses):
+    """Rotations (..., 24, 3, 3) of the joints in the world, from poses (..., 24, 3) [rad]."""
+    import roma
+
+    return chained(roma.rotvec_to_rotmat(poses))
+
+
 def rest_pose(joints):
     """The pose (24, 3) [rad] that takes the T-pose to the stand in which a body has its joints at ``joints`` (24, 3) [m].
 

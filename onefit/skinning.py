@@ -12,18 +12,24 @@ def transforms(body, poses, translation):
     Joint j turns by G_j(pose) G_j(rest_pose)^T, G_j the product of rotations from the root to j, about its own place, which follows from its
     parent's map. A body for each frame has ``joints`` and ``rest_pose`` (T, 24, 3). With ``poses`` equal to ``body.rest_pose`` and no translation, all maps are the identity.
     """
-    import roma
-
-    rest = skeleton.chained(roma.rotvec_to_rotmat(body.rest_pose.to(poses.dtype)))
-    R = skeleton.chained(roma.rotvec_to_rotmat(poses)) @ rest.mT
+    R = skeleton.chained_rotations(poses) @ skeleton.chained_rotations(body.rest_pose.to(poses.dtype)).mT
     joints = body.joints.to(poses.dtype)
-    offsets = joints - joints[..., [max(p, 0) for p in skeleton.PARENTS], :]
-    places = [joints[..., 0, :] + translation]
+    t = _chained_places(joints, R, translation) - (R @ joints[..., None])[..., 0]
+    return torch.cat([R, t[..., None]], -1)
+
+
+def joint_places(joints, poses, translation):
+    """Positions (T, 24, 3) [m] of the joints whose places in the T-pose are ``joints`` (24, 3) [m]."""
+    return _chained_places(joints, skeleton.chained_rotations(poses), translation)
+
+
+def _chained_places(joints, R, translation):
+    """Places (T, 24, 3) of joints that are at ``joints`` (24, 3) before they turn by R (T, 24, 3, 3) in the world."""
+    places = [joints[0] + translation]
     for j in range(1, len(skeleton.PARENTS)):
         p = skeleton.PARENTS[j]
-        places.append(places[p] + (R[..., p, :, :] @ offsets[..., j, :, None])[..., 0])
-    t = torch.stack(places, -2) - (R @ joints[..., None])[..., 0]
-    return torch.cat([R, t[..., None]], -1)
+        places.append(places[p] + R[..., p, :, :] @ (joints[j] - joints[p]))
+    return torch.stack(places, -2)
 
 
 def skin(points, blend_weights, transforms):
