@@ -6,9 +6,9 @@
 """
 
 _EXPORTS = {
-    "load": "drape",
-    "Draper": "drape",
-    "Drape": "drape",
+    "load": "draper",
+    "Draper": "draper",
+    "Drape": "draper",
     "pretrained": "weights",
     "Garment": "garment",
     "TEMPLATES": "garment",

@@ -1,172 +1,163 @@
-"""Draping: a trained network, a garment, a motion and a shape make moving cloth; :func:`onefit.load` is the way in."""
+"""Drapes a garment on a moving body, and writes the arrays, an animation and a rendering of it.
 
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from functools import cached_property
+    python -m onefit.drape dress walk -o OUT                         # a template, a generated motion
+    python -m onefit.drape shirt.obj motion.npz -o OUT --post        # a mesh, a motion of AMASS, NCS or BVH
+    python -m onefit.drape tshirt dance -o OUT --shape weight=0.7 height=0.6 --skip render
 
-import torch
+OUT receives
 
-from polyfit import mesh
-from polyfit.errors import InputError
+    drape.npz               vertices (T, N, 3) [m, z up], faces, rest, the body's vertices and faces, fps, and figures.json beside it
+    garment.usd, body.usd   animations that Blender and usdview open
+    frames/NNN.png, drape.mp4   path-traced by Mitsuba
+    meshes/NNN.obj          one mesh a frame, with --meshes obj (or ply)
+"""
 
-from . import skinning
-from .body import AnnyBody
-from .charts import PatchedGarment
-from .collision import Collider
-from .garment import TEMPLATES, Garment
-from .motion import Motion
-from .objective import posed
-from .weights import Trained
-from .weights import load as load_weights
+import argparse
+import json
+import shutil
+import time
+from pathlib import Path
 
-FPS = 30.0  # that the networks know
-WARM_UP = 10  # frames in which the first pose is held, for the network's memory to settle
-CLEARANCE = 0.003  # [m] from the body that post-processing leaves
-POINTS = 400_000  # vertices times frames that are draped at once
+import numpy as np
 
+from polyfit.errors import InputError, cli
+from polyfit.files import aside
 
-@dataclass(frozen=True)
-class Drape:
-    """A draped garment: ``vertices`` (T, N, 3) [m] in the world, ``faces`` (F, 3), ``rest`` (N, 3) [m], the garment graded to the shape; the
-    ``body``'s vertices (T, V, 3) [m], its ``body_faces`` and the root's place ``root`` (T, 3) [m]; ``fps`` frames a second."""
-
-    vertices: torch.Tensor
-    faces: torch.Tensor
-    rest: torch.Tensor
-    body: torch.Tensor
-    body_faces: torch.Tensor
-    root: torch.Tensor
-    fps: float
-
-    def measures(self):
-        """The :class:`onefit.measures.Measures` of this drape."""
-        from .measures import measure
-
-        return measure(self.vertices, self.faces, self.rest, self.body, Collider(self.body_faces, self.body[0]), self.root, self.fps)
+GARMENT, BODY = (0.08, 0.19, 0.42), (0.5, 0.48, 0.46)  # colours, linear RGB
 
 
-class Draper:
-    """A trained network with its body, ready to drape any garment. Made by :func:`onefit.load`.
-
-    Garments are cut into patches once and kept; frames go through in batches. ``device``: where it runs.
-    """
-
-    def __init__(self, trained: Trained, model=None, device="cpu"):
-        self.trained, self.device = trained, torch.device(device)
-        self.network = trained.network.to(self.device).eval()
-        self.model = model or AnnyBody()
-        if self.model.kind != trained.body:
-            size = len(self.model.standard_shape)
-            if size != self.network.shape["shape"]:
-                raise InputError(
-                    f"weights trained on the body {trained.body} ({self.network.shape['shape']} shape parameters), not on {self.model.kind} ({size}); "
-                    f"train on it: python -m onefit.train --body"
-                )
-        self._patched = {}
-
-    @cached_property
-    def standard(self):
-        """The standard body."""
-        return self.model.body()
-
-    def garment(self, garment):
-        """A :class:`Garment` of one, of a template's name, or of a mesh file."""
-        if isinstance(garment, Garment):
-            return garment
-        return Garment.template(garment) if garment in TEMPLATES else Garment.read(garment)
-
-    def patched(self, garment):
-        """The :class:`onefit.charts.PatchedGarment` of a garment, cut once."""
-        key = id(garment)
-        if key not in self._patched:
-            self._patched[key] = PatchedGarment(garment, self.standard, order=self.network.order).to(self.device)
-        return self._patched[key]
-
-    def drape(self, garment, motion, shape=None, *, post=False, skinning_only=False):
-        """A :class:`Drape`: ``garment`` (as :meth:`garment` takes it) on the body of ``shape`` (S,) in each frame of ``motion`` (a
-        :class:`Motion` or a file of one), at 30 frames a second.
-
-        ``post``: vertices are pushed out of the body and the pushes are smoothed. ``skinning_only``: plain skinning of the template, what
-        OneFit is held against. Raises InputError for a garment, motion or shape that cannot be used.
-        """
-        garment = self.garment(garment)
-        motion = (motion if isinstance(motion, Motion) else Motion.read(motion)).resampled(FPS).to(self.device)
-        body = self.model.body(shape)
-        rest = garment.graded(body).to(self.device)
-        patched = None if skinning_only else self.patched(garment)
-        body = body.to(self.device)
-        weights = garment.blend_weights.to(self.device)
-        transforms = skinning.transforms(body, motion.poses, motion.translation)
-        with torch.inference_mode():
-            embedding = None if skinning_only else self._embedding(motion, body)
-            step = max(1, POINTS // len(rest))
-            parts, bodies = [], []
-            for first in range(0, len(motion.poses), step):
-                frames = slice(first, first + step)
-                points = rest[:, None]
-                if not skinning_only:
-                    points = points + patched.displacement(patched.changes(self.network.decoder(self._codes(patched), embedding[frames])))
-                parts.append(posed(points, weights, transforms[frames]).transpose(0, 1))
-            bodies = torch.cat([skinning.skin(body.vertices, body.blend_weights, part) for part in transforms.split(64)])
-            vertices = torch.cat(parts)
-        root = skinning.posed_joints(body, transforms)[:, 0]
-        if post:
-            vertices = pushed_out(vertices, garment.faces.to(self.device), bodies, body.faces)
-        return Drape(*(x.cpu() for x in (vertices, garment.faces, rest, bodies, body.faces, root)), FPS)
-
-    def _codes(self, patched):
-        if not hasattr(patched, "codes"):
-            patched.codes = self.network.patches(*patched.features, self.standard.joints.to(self.device))
-        return patched.codes
-
-    def _embedding(self, motion, body):
-        """Z_B (T, width) of the motion, after the first pose was held for a while."""
-        hold = lambda x: torch.cat([x[:1].expand(WARM_UP, *x.shape[1:]), x])[None]
-        shape = (body.shape - self.model.standard_shape.to(self.device))[None]
-        return self.network.body(hold(motion.poses), hold(motion.translation), shape, FPS)[0][0, WARM_UP:]
+def _shape(model, pairs):
+    shape = model.standard_shape.clone()
+    for pair in pairs:
+        name, _, value = pair.partition("=")
+        if name not in model.shape_names:
+            raise InputError(f"--shape {pair}: choose among {', '.join(model.shape_names)}, as in weight=0.6")
+        try:
+            shape[model.shape_names.index(name)] = float(value)
+        except ValueError:
+            raise InputError(f"--shape {pair}: a number is needed, as in {name}=0.6") from None
+    return shape
 
 
-def load(name="six-garments", *, model=None, device="cpu"):
-    """The :class:`Draper` of a network: ``name`` of one that comes with the package (:func:`onefit.pretrained`), or a file of weights.
+def _motion(name, seconds, seed):
+    from .generate import KINDS
+    from .motion import Motion
 
-    ``model``: a body model, by default :class:`onefit.AnnyBody`. Raises InputError."""
-    return Draper(load_weights(name), model, device)
+    if name in KINDS:
+        return Motion.generate(name, seconds=seconds, seed=seed)
+    if not Path(name).exists():
+        raise InputError(f"motion {name}: no such file, and no kind of motion; there are {', '.join(KINDS)}")
+    return Motion.read(name)
 
 
-def pushed_out(vertices, faces, bodies, body_faces, clearance=CLEARANCE, rounds=3, smoothing=4):
-    """Vertices (T, N, 3) [m] moved out of the bodies (T, V, 3), to ``clearance`` [m] from them; faces (F, 3), body_faces (B, 3).
+def _model(name):
+    from .body import AnnyBody, PlainBody, SmplBody
 
-    The pushes, not the surface, are smoothed over the mesh, ``smoothing`` times, so that no fold is lost and none made; what that leaves
-    inside is pushed again, in at most ``rounds`` rounds.
-    """
-    edges = torch.as_tensor(mesh.edges_of(faces.cpu().numpy())[0], device=vertices.device)
-    both = torch.cat([edges, edges.flip(1)])
-    count = torch.bincount(both[:, 0], minlength=vertices.shape[1])[:, None].clamp(min=1)
+    if name == "anny":
+        return AnnyBody()
+    with_blend_weights = Path(name).suffix == ".npz" and "blend_weights" in np.load(name).files
+    return PlainBody(name) if with_blend_weights else SmplBody(name)
 
-    def spread(push):
-        for _ in range(smoothing):
-            mean = torch.zeros_like(push).index_add(0, both[:, 0], push[both[:, 1]]) / count
-            push = torch.where(push.norm(dim=-1, keepdim=True) > mean.norm(dim=-1, keepdim=True), push, mean)
-        return push
 
-    def one(part):
-        collider = Collider(body_faces, bodies[0])
-        out = vertices[part].clone()
-        for x, body in zip(out, bodies[part]):
-            chosen = torch.arange(len(x), device=x.device)
-            for turn in range(rounds):
-                nearest, normal = collider.nearest(x[chosen][None], body[None])
-                d = ((x[chosen] - nearest[0]) * normal[0]).sum(-1)
-                push = torch.zeros_like(x)
-                push[chosen] = (clearance - d).clamp(min=0)[:, None] * normal[0]
-                moved = push.abs().sum(-1) > 0
-                if not moved.any():
-                    break
-                x += spread(push) if turn + 1 < rounds else push
-                chosen = moved.nonzero()[:, 0] if turn else chosen
-        return out
+def _render(drape, folder, size, spp, advance):
+    """PNG frames and a video; Mitsuba is loaded here alone."""
+    from polysft_mi.backend import set_variant
 
-    workers = min(torch.get_num_threads(), len(vertices)) if not vertices.is_cuda else 1
-    parts = [slice(k * len(vertices) // workers, (k + 1) * len(vertices) // workers) for k in range(workers)]
-    with ThreadPoolExecutor(workers) as pool:
-        return torch.cat(list(pool.map(one, parts)))
+    set_variant()
+    import cv2
+
+    from polysft_mi import stage
+    from polysft_mi.video import write_video
+
+    parts = [(drape.body.numpy(), drape.body_faces.numpy(), BODY), (drape.vertices.numpy(), drape.faces.numpy(), GARMENT)]
+    frames = folder / "frames"
+    frames.mkdir()
+
+    def pictures():
+        for k, image in enumerate(stage.render(parts, size=size, spp=spp)):
+            cv2.imwrite(str(frames / f"{k:03d}.png"), image[..., ::-1])
+            advance()
+            yield image
+
+    write_video(folder / "drape.mp4", pictures(), drape.fps)
+
+
+def write(drape, folder, *, skip=(), meshes=None, size=(480, 360), spp=32, advance=lambda: None):
+    """The files of a :class:`onefit.Drape` in the new or empty ``folder``; ``skip``: any of "usd", "render"."""
+    from polyfit.animation import write_frames, write_usd
+
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    arrays = {name: getattr(drape, name).numpy() for name in ("vertices", "faces", "rest", "body", "body_faces", "root")}
+    with aside(folder / "drape.npz") as temporary:
+        np.savez_compressed(temporary, fps=drape.fps, **arrays)
+    if "usd" not in skip:
+        write_usd(folder / "garment.usd", arrays["vertices"], arrays["faces"], fps=drape.fps, up="z", name="garment")
+        write_usd(folder / "body.usd", arrays["body"], arrays["body_faces"], fps=drape.fps, up="z", name="body")
+    if meshes:
+        write_frames(folder / "meshes", meshes, arrays["vertices"], arrays["faces"], up="z")
+    if "render" not in skip:
+        _render(drape, folder, size, spp, advance)
+
+
+def parser():
+    p = argparse.ArgumentParser(prog="python -m onefit.drape", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument("garment", metavar="GARMENT", help="a template's name, or a mesh (.obj, .ply) around the standard body")
+    p.add_argument("motion", metavar="MOTION", help="a file (AMASS or NCS .npz, .bvh), or a generated kind: walk, run, dance, ...")
+    p.add_argument("-o", "--output", required=True, metavar="OUT", help="folder of the results; must be empty or new, or --overwrite")
+    p.add_argument("--weights", default="six-garments", help="a network of the package, or a file (default: six-garments)")
+    p.add_argument("--body", default="anny", help="anny, or a file: SMPL (.npz, .pkl) or plain (body.npz) (default: anny)")
+    p.add_argument("--shape", nargs="*", default=[], metavar="NAME=VALUE", help="the body's shape, e.g. weight=0.7; what is not named is standard")
+    p.add_argument("--seconds", type=float, default=3.0, help="of a generated motion (default: 3)")
+    p.add_argument("--seed", type=int, default=0, help="of a generated motion (default: 0)")
+    p.add_argument("--post", action="store_true", help="push vertices out of the body afterwards")
+    p.add_argument("--skip", nargs="*", default=[], choices=("usd", "render"), help="what not to write")
+    p.add_argument("--meshes", choices=("obj", "ply"), help="also one mesh a frame")
+    p.add_argument("--size", nargs=2, type=int, default=(480, 360), metavar=("HEIGHT", "WIDTH"), help="of the rendering (default: 480 360)")
+    p.add_argument("--spp", type=int, default=32, help="samples a pixel (default: 32)")
+    p.add_argument("--device", default="cpu", help="cpu or cuda, for the network (default: cpu)")
+    p.add_argument("--overwrite", action="store_true", help="replace what a previous drape left in OUT")
+    return p
+
+
+def main(argv=None):
+    args = parser().parse_args(argv)
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from polyfit.training import device_of
+
+    from .draper import load
+
+    folder = Path(args.output)
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        if not args.overwrite:
+            raise InputError(f"{folder}: not empty; give another -o, or --overwrite")
+        if not (folder / "drape.npz").exists():
+            raise InputError(f"{folder}: holds no drape; --overwrite replaces nothing else")
+    draper = load(args.weights, model=_model(args.body), device=device_of(args.device))
+    garment = draper.garment(args.garment)
+    motion = _motion(args.motion, args.seconds, args.seed)
+    shape = _shape(draper.model, args.shape)
+    console = Console(stderr=True)
+    for repair in garment.repairs:
+        console.print(f"{args.garment}: {repair}")
+    start = time.perf_counter()
+    drape = draper.drape(garment, motion, shape, post=args.post)
+    seconds = time.perf_counter() - start
+    figures = drape.measures().as_dict()
+    T, N = drape.vertices.shape[:2]
+    console.print(f"{N} vertices in {T} frames: {1e3 * seconds / T:.1f} ms a frame, {figures['collision']:.2f} % of the vertices inside the body")
+    if folder.exists():
+        shutil.rmtree(folder)
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    with Progress(*columns, console=console) as progress:
+        task = progress.add_task("rendering", total=T, visible="render" not in args.skip)
+        write(drape, folder, skip=args.skip, meshes=args.meshes, size=args.size, spp=args.spp, advance=lambda: progress.advance(task))
+    about = dict(garment=args.garment, motion=motion.name, weights=args.weights, shape=shape.tolist(), post=args.post, vertices=N, frames=T, **figures)
+    (folder / "figures.json").write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
+    print(folder)
+
+
+if __name__ == "__main__":
+    cli(main)

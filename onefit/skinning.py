@@ -10,7 +10,8 @@ def transforms(body, poses, translation):
 
     ``poses`` (T, 24, 3) [rad] as in :mod:`onefit.skeleton`; ``translation`` (T, 3) [m] is added to the rest position of the root joint.
     Joint j turns by G_j(pose) G_j(rest_pose)^T, G_j the product of rotations from the root to j, about its own place, which follows from its
-    parent's map. A body for each frame has ``joints`` and ``rest_pose`` (T, 24, 3). With ``poses`` equal to ``body.rest_pose`` and no translation, all maps are the identity.
+    parent's map. With ``poses`` equal to ``body.rest_pose`` and no translation, all maps are the identity. ``body`` may be one for each
+    frame, with ``joints`` and ``rest_pose`` (T, 24, 3).
     """
     R = skeleton.chained_rotations(poses) @ skeleton.chained_rotations(body.rest_pose.to(poses.dtype)).mT
     joints = body.joints.to(poses.dtype)
@@ -24,11 +25,12 @@ def joint_places(joints, poses, translation):
 
 
 def _chained_places(joints, R, translation):
-    """Places (T, 24, 3) of joints that are at ``joints`` (24, 3) before they turn by R (T, 24, 3, 3) in the world."""
-    places = [joints[0] + translation]
+    """Places (T, 24, 3) of joints that are at ``joints``, (24, 3) or (T, 24, 3), before they turn by R (T, 24, 3, 3) in the world."""
+    offsets = joints - joints[..., [max(p, 0) for p in skeleton.PARENTS], :]
+    places = [joints[..., 0, :] + translation]
     for j in range(1, len(skeleton.PARENTS)):
         p = skeleton.PARENTS[j]
-        places.append(places[p] + R[..., p, :, :] @ (joints[j] - joints[p]))
+        places.append(places[p] + (R[..., p, :, :] @ offsets[..., j, :, None])[..., 0])
     return torch.stack(places, -2)
 
 

@@ -210,3 +210,16 @@ def test_metric_points_lie_on_their_vertices(patched, garment):
     apart = (value - garment.vertices[patched.metric_vertex]).norm(dim=-1)
     edge = (garment.vertices[patched.edges[:, 0]] - garment.vertices[patched.edges[:, 1]]).norm(dim=-1)
     assert apart.max() < 2 * np.float64(edge.max())
+
+
+def test_transforms_of_a_body_for_each_frame():
+    from dataclasses import replace
+
+    model = AnnyBody()
+    bodies = [model.body(), model.body(torch.tensor([0.9, 0.7, 0.5, 0.6, 0.7, 0.4]))]
+    g = torch.Generator().manual_seed(4)
+    poses, translation = 0.3 * torch.randn(2, 24, 3, generator=g), torch.randn(2, 3, generator=g)
+    both = replace(bodies[0], **{name: torch.stack([getattr(b, name) for b in bodies]) for name in ("joints", "rest_pose")})
+    together = skinning.transforms(both, poses, translation)
+    for k, body in enumerate(bodies):
+        assert torch.allclose(together[k], skinning.transforms(body, poses[k : k + 1], translation[k : k + 1])[0], atol=1e-6)

@@ -1,0 +1,131 @@
+"""Draping: a trained network, a garment, a motion and a shape make moving cloth; :func:`onefit.load` is the way in."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+
+from polyfit.errors import InputError
+
+from . import skinning
+from .body import AnnyBody
+from .charts import PatchedGarment
+from .collision import Collider
+from .garment import TEMPLATES, Garment
+from .motion import Motion
+from .objective import posed
+from .post import pushed_out
+from .weights import Trained
+from .weights import load as load_weights
+
+FPS = 30.0  # that the networks know
+WARM_UP = 10  # frames in which the first pose is held, for the network's memory to settle
+POINTS = 400_000  # vertices times frames that are draped at once
+
+
+@dataclass(frozen=True)
+class Drape:
+    """A draped garment: ``vertices`` (T, N, 3) [m] in the world, ``faces`` (F, 3), ``rest`` (N, 3) [m], the garment graded to the shape; the
+    ``body``'s vertices (T, V, 3) [m], its ``body_faces`` and the root's place ``root`` (T, 3) [m]; ``fps`` frames a second."""
+
+    vertices: torch.Tensor
+    faces: torch.Tensor
+    rest: torch.Tensor
+    body: torch.Tensor
+    body_faces: torch.Tensor
+    root: torch.Tensor
+    fps: float
+
+    def measures(self):
+        """The :class:`onefit.measures.Measures` of this drape."""
+        from .measures import measure
+
+        return measure(self.vertices, self.faces, self.rest, self.body, Collider(self.body_faces, self.body[0]), self.root, self.fps)
+
+
+class Draper:
+    """A trained network with its body, ready to drape any garment. Made by :func:`onefit.load`.
+
+    Garments are cut into patches once and kept; frames go through in batches. ``device``: where it runs.
+    """
+
+    def __init__(self, trained: Trained, model=None, device="cpu"):
+        self.trained, self.device = trained, torch.device(device)
+        self.network = trained.network.to(self.device).eval()
+        self.model = model or AnnyBody()
+        if self.model.kind != trained.body:
+            size = len(self.model.standard_shape)
+            if size != self.network.shape["shape"]:
+                raise InputError(
+                    f"weights trained on the body {trained.body} ({self.network.shape['shape']} shape parameters), not on {self.model.kind} ({size}); "
+                    f"train on it: python -m onefit.train --body"
+                )
+        self._patched = {}
+
+    @cached_property
+    def standard(self):
+        """The standard body."""
+        return self.model.body()
+
+    def garment(self, garment):
+        """A :class:`Garment` of one, of a template's name, or of a mesh file."""
+        if isinstance(garment, Garment):
+            return garment
+        return Garment.template(garment) if garment in TEMPLATES else Garment.read(garment)
+
+    def patched(self, garment):
+        """The :class:`onefit.charts.PatchedGarment` of a garment, cut once."""
+        key = id(garment)
+        if key not in self._patched:
+            self._patched[key] = PatchedGarment(garment, self.standard, order=self.network.order).to(self.device)
+        return self._patched[key]
+
+    def drape(self, garment, motion, shape=None, *, post=False, skinning_only=False):
+        """A :class:`Drape`: ``garment`` (as :meth:`garment` takes it) on the body of ``shape`` (S,) in each frame of ``motion`` (a
+        :class:`Motion` or a file of one), at 30 frames a second.
+
+        ``post``: vertices are pushed out of the body and the pushes are smoothed. ``skinning_only``: plain skinning of the template, what
+        OneFit is held against. Raises InputError for a garment, motion or shape that cannot be used.
+        """
+        garment = self.garment(garment)
+        motion = (motion if isinstance(motion, Motion) else Motion.read(motion)).resampled(FPS).to(self.device)
+        body = self.model.body(shape)
+        rest = garment.graded(body).to(self.device)
+        patched = None if skinning_only else self.patched(garment)
+        body = body.to(self.device)
+        weights = garment.blend_weights.to(self.device)
+        transforms = skinning.transforms(body, motion.poses, motion.translation)
+        with torch.inference_mode():
+            embedding = None if skinning_only else self._embedding(motion, body)
+            step = max(1, POINTS // len(rest))
+            parts, bodies = [], []
+            for first in range(0, len(motion.poses), step):
+                frames = slice(first, first + step)
+                points = rest[:, None]
+                if not skinning_only:
+                    points = points + patched.displacement(patched.changes(self.network.decoder(self._codes(patched), embedding[frames])))
+                parts.append(posed(points, weights, transforms[frames]).transpose(0, 1))
+            bodies = torch.cat([skinning.skin(body.vertices, body.blend_weights, part) for part in transforms.split(64)])
+            vertices = torch.cat(parts)
+        root = skinning.posed_joints(body, transforms)[:, 0]
+        if post:
+            vertices = pushed_out(vertices, garment.faces.to(self.device), bodies, body.faces)
+        return Drape(*(x.cpu() for x in (vertices, garment.faces, rest, bodies, body.faces, root)), FPS)
+
+    def _codes(self, patched):
+        if not hasattr(patched, "codes"):
+            patched.codes = self.network.patches(*patched.features, self.standard.joints.to(self.device))
+        return patched.codes
+
+    def _embedding(self, motion, body):
+        """Z_B (T, width) of the motion, after the first pose was held for a while."""
+        hold = lambda x: torch.cat([x[:1].expand(WARM_UP, *x.shape[1:]), x])[None]
+        shape = (body.shape - self.model.standard_shape.to(self.device))[None]
+        return self.network.body(hold(motion.poses), hold(motion.translation), shape, FPS)[0][0, WARM_UP:]
+
+
+def load(name="six-garments", *, model=None, device="cpu"):
+    """The :class:`Draper` of a network: ``name`` of one that comes with the package (:func:`onefit.pretrained`), or a file of weights.
+
+    ``model``: a body model, by default :class:`onefit.AnnyBody`. Raises InputError."""
+    return Draper(load_weights(name), model, device)
