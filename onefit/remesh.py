@@ -73,6 +73,7 @@ def remeshed(V, F, count, steps=40):
         clusters.cluster(int(count))
         made = clusters.create_mesh()
     x, f = np.array(made.points, dtype=np.float64), made.regular_faces.astype(np.int64)
+    f = np.where(mesh.winding(f)[:, None] < 0, f[:, ::-1], f)
     surface, rim = ClosestSurface(V, F), boundary_edges(np.asarray(F))
     own = np.unique(boundary_edges(f))
     mean = neighbour_mean(f, len(x), boundary_apart=True)

@@ -1,0 +1,194 @@
+"""Meshes of garments made clean, or refused: one layer of cloth, at most two faces an edge, wound alike, with openings. NumPy.
+
+The rules, in this order; whatever is changed is told in a sentence:
+
+1. Faces whose corners coincide, faces that repeat others, and vertices in no face are dropped.
+2. Vertices of the boundary that lie on one another (a seam of the texture, a soup of triangles) are merged, unless more than two faces would
+   meet at an edge.
+3. At an edge of three or more faces the two that continue each other straightest stay joined; parts that touch in a point come apart.
+4. Of separate parts, those below 5 % of the area (buttons, labels, pockets) are dropped; the others stay, each for itself.
+5. A part without an opening is refused: a solid, or cloth with a thickness. So is one with a single side (a Moebius strip).
+6. Faces wound against the others of their part are turned.
+7. Holes of less than 10 cm around are filled.
+"""
+
+import numpy as np
+
+from polyfit import mesh
+from polyfit.errors import InputError
+
+from .remesh import loops
+
+COINCIDENT = 2e-5  # vertices closer than this lie on one another [m]
+SMALL_PART = 0.05  # of the area
+SMALL_HOLE = 0.10  # around [m]
+
+
+def mended(V, F, where="garment"):
+    """``(vertices (N', 3), faces (F', 3), sentences)`` of a mesh in metres. Raises InputError, in one line that starts with ``where``."""
+    V, F = np.asarray(V, dtype=np.float64), np.asarray(F, dtype=np.int64)
+    if len(V) == 0 or len(F) == 0:
+        raise InputError(f"{where}: no faces; a garment is a mesh of triangles or quads")
+    bad = ~np.isfinite(V).all(axis=1)
+    bad[np.setdiff1d(np.arange(len(V)), F)] = False
+    if bad.any():
+        raise InputError(f"{where}: {bad.sum()} vertices have coordinates that are not finite (the first is vertex {bad.argmax()}, counted from 0)")
+    told = []
+    V, F = _without_slivers(V, F, where, told)
+    V, F = _sewn(V, F, told)
+    V, F = _cut_apart(V, F, told)
+    V, F = _large_parts(V, F, where, told)
+    F = _wound_alike(V, F, where, told)
+    V, F = _filled(V, F, told)
+    return V, F, tuple(told)
+
+
+def parts(F):
+    """The number of the connected part that each face is in (F,)."""
+    return mesh.components(int(F.max()) + 1, np.concatenate([F[:, :2], F[:, 1:]]))[F[:, 0]]
+
+
+def _used(V, F):
+    used = np.unique(F)
+    index = np.full(len(V), -1)
+    index[used] = np.arange(len(used))
+    return V[used], index[F]
+
+
+def _without_slivers(V, F, where, told):
+    loose = len(V) - len(np.unique(F))
+    if loose:
+        told.append(f"dropped {loose} vertices that are in no face")
+    V, F = _used(V, F)
+    e = mesh.edges_of(F)[0]
+    short = e[np.linalg.norm(V[e[:, 0]] - V[e[:, 1]], axis=1) < COINCIDENT]
+    V, G = _merged(V, F, short)
+    whole = (G != np.roll(G, 1, axis=1)).all(axis=1)
+    _, first = np.unique(np.sort(G, axis=1), axis=0, return_index=True)
+    once = np.zeros(len(G), dtype=bool)
+    once[first] = True
+    if (~whole).any():
+        told.append(f"dropped {(~whole).sum()} faces without area")
+    if (whole & ~once).any():
+        told.append(f"dropped {(whole & ~once).sum()} faces that repeat others")
+    G = G[whole & once]
+    if not len(G) or not mesh.areas(V, G).sum() > 1e-8:
+        raise InputError(f"{where}: its faces have no area")
+    return _used(V, G)
+
+
+def _merged(V, F, pairs):
+    """The mesh with the vertices of each of ``pairs`` (P, 2) made one, the one that comes first."""
+    label = mesh.components(len(V), pairs)
+    _, first, label = np.unique(label, return_index=True, return_inverse=True)
+    return V[first], label[F]
+
+
+def _uses(F):
+    edges, side = mesh.edges_of(F)
+    return edges, np.bincount(side.ravel(), minlength=len(edges))
+
+
+def _sewn(V, F, told):
+    from scipy.spatial import cKDTree
+
+    edges, uses = _uses(F)
+    rim = np.unique(edges[uses == 1])
+    pairs = rim[cKDTree(V[rim]).query_pairs(COINCIDENT, output_type="ndarray")] if len(rim) else np.empty((0, 2), dtype=np.int64)
+    crowded = set(map(tuple, edges[uses > 2].tolist()))
+    while len(pairs):
+        label = mesh.components(len(V), pairs)
+        W, G = _merged(V, F, pairs)
+        whole = (G != np.roll(G, 1, axis=1)).all(axis=1)
+        number = np.unique(label, return_inverse=True)[1]
+        new_edges, new_uses = _uses(G[whole])
+        was = {tuple(sorted((number[a], number[b]))) for a, b in crowded}
+        wrong = {v for e, u in zip(new_edges.tolist(), new_uses) if u > 2 and tuple(e) not in was for v in e}
+        keep = ~np.isin(number[pairs[:, 0]], list(wrong))
+        if keep.all() and whole.all():
+            told.append(f"merged {len(V) - len(W)} vertices of the boundary with others that lie on them")
+            return W, G
+        if keep.all():  # a face would lose its area: leave its corners apart
+            keep = ~np.isin(number[pairs[:, 0]], G[~whole])
+        pairs = pairs[keep]
+    return V, F
+
+
+def _cut_apart(V, F, told):
+    edges, side = mesh.edges_of(F)
+    uses = np.bincount(side.ravel(), minlength=len(edges))
+    order = np.argsort(side.ravel(), kind="stable")
+    start = np.cumsum(uses) - uses
+    two = start[uses == 2]
+    pairs = [np.stack([order[two], order[two + 1]], axis=1)]
+    for s, u in zip(start[uses > 2], uses[uses > 2]):
+        corner = order[s : s + u]
+        a, b, c = (V[F[corner // 3, (corner + k) % 3]] for k in range(3))
+        along = (b - a) / np.linalg.norm(b - a, axis=1, keepdims=True)
+        inward = (c - a) - ((c - a) * along).sum(axis=1, keepdims=True) * along
+        inward /= np.maximum(np.linalg.norm(inward, axis=1, keepdims=True), 1e-300)
+        i, j = np.unravel_index(np.argmin(inward @ inward.T + 3 * np.eye(u)), (u, u))
+        pairs.append(corner[None, [i, j]])
+    one, two = np.concatenate(pairs).T
+    after = lambda corner: corner - corner % 3 + (corner + 1) % 3
+    alike = F.ravel()[one] == F.ravel()[two]
+    joined = [(one, np.where(alike, two, after(two))), (after(one), np.where(alike, after(two), two))]
+    label = mesh.components(F.size, np.concatenate([np.stack(p, axis=1) for p in joined]))
+    if (uses > 2).any():
+        told.append(f"cut apart at {(uses > 2).sum()} edges where more than two faces meet")
+    count = label.max() + 1
+    if count > len(V) and not (uses > 2).any():
+        told.append(f"cut apart at {count - len(V)} vertices where parts touch in a point")
+    if count == len(V):
+        return V, F
+    W = np.empty((count, 3))
+    W[label] = V[F.ravel()]
+    return W, label.reshape(-1, 3)
+
+
+def _large_parts(V, F, where, told):
+    part, area = parts(F), mesh.areas(V, F)
+    share = np.bincount(part, area) / area.sum()
+    keep = share >= min(SMALL_PART, share.max())
+    if not keep.all():
+        few = "a part" if (~keep).sum() == 1 else f"{(~keep).sum()} parts"
+        told.append(f"dropped {few} of {(~keep[part]).sum()} faces, {100 * share[~keep].sum():.2g} % of the area")
+    if keep.sum() > 1:
+        told.append(f"has {keep.sum()} separate parts, which move each for itself")
+    V, F = _used(V, F[keep[part]])
+    edges, uses = _uses(F)
+    part = parts(F)
+    open_parts = np.unique(part[np.isin(F, edges[uses == 1]).any(axis=1)])
+    if len(open_parts) < part.max() + 1:
+        raise InputError(f"{where}: a closed surface without openings (a solid, or cloth with a thickness); a single layer of cloth is needed")
+    return V, F
+
+
+def _wound_alike(V, F, where, told):
+    turned = mesh.winding(F) < 0
+    F = np.where(turned[:, None], F[:, ::-1], F)
+    walks = np.stack([F, np.roll(F, -1, axis=1)], axis=-1).reshape(-1, 2)
+    if len(np.unique(walks, axis=0)) < len(walks):
+        raise InputError(f"{where}: a surface with one side only (a Moebius strip); cloth with two sides is needed")
+    if turned.any():
+        told.append(f"turned {turned.sum()} faces that were wound against their neighbours")
+    return F
+
+
+def _filled(V, F, told):
+    extra, faces, filled = [], [F], 0
+    for loop in loops(F):
+        following = np.roll(loop, -1)
+        if np.linalg.norm(V[following] - V[loop], axis=1).sum() >= SMALL_HOLE:
+            continue
+        filled += 1
+        if len(loop) == 3:
+            faces.append(loop[None, ::-1])
+            continue
+        centre = len(V) + len(extra)
+        extra.append(V[loop].mean(axis=0))
+        faces.append(np.stack([following, loop, np.full(len(loop), centre)], axis=1))
+    if not filled:
+        return V, F
+    told.append(f"filled {filled} hole{'s' if filled > 1 else ''} of less than {100 * SMALL_HOLE:.0f} cm around")
+    return np.concatenate([V, *[x[None] for x in extra]]), np.concatenate(faces)
