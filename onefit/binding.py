@@ -13,6 +13,7 @@ from .nearest import ClosestSurface
 # Lengths over which the weights and the displacements of a shape are smoothed where the garment touches the body [m]; they grow with the
 # distance from it, doubled at 1.7 times this one.
 WEIGHTS_LENGTH, SHAPE_LENGTH, NEAR = 0.025, 0.015, 0.02
+CLEARANCE = 0.003  # that grading leaves between body and cloth [m]
 
 
 @lru_cache(maxsize=1)
@@ -50,6 +51,8 @@ class Binding:
         self.barycentric = found.barycentric.astype(np.float64)  # (N, 3)
         self.corners = surface.faces[found.face]  # (N, 3) vertices of the body
         facing = (found.normal * vertex_normals(V, F)).sum(axis=1)
+        self._touching = np.flatnonzero((np.abs(self.distance) < 0.01) & (facing > 0.3))
+        self._above = self._above_body(V, surface.vertices.astype(np.float64))[0]
         area, self._stiffness = cotangent_laplacian(V, F)
         self._trust = area * np.clip(facing, 1e-3, 1) / (1 + (self.distance / NEAR) ** 2)
 
@@ -73,6 +76,25 @@ class Binding:
     def displacement(self, of_body):
         """(N, 3) [m] of that of the body's vertices (V, 3)."""
         return self._smooth_shape(self.on_body(of_body))
+
+    def moved(self, V, before, after):
+        """Vertices ``V`` (N, 3) [m] displaced with those of the body from ``before`` to ``after`` (V, 3). Where the cloth touches the body, it
+        stays as far above the plane at its point there as it was, or CLEARANCE if that is less.
+        """
+        moved = V + self.displacement(after - before)
+        above, normal = self._above_body(moved, after)
+        moved[self._touching] += np.maximum(np.minimum(self._above, CLEARANCE) - above, 0)[:, None] * normal
+        return moved
+
+    def _above_body(self, V, body):
+        """How far the vertices that touch the body lie above the planes of the body's faces on which they hang (K,) [m], and their normals (K,
+        3).
+        """
+        corners = body[self.corners[self._touching]]
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+        point = np.einsum("nk,nkd->nd", self.barycentric[self._touching], corners)
+        return ((V[self._touching] - point) * normal).sum(axis=1), normal
 
 
 def smoother(trust, stiffness, length):

@@ -91,8 +91,9 @@ class Garment:
         """Rest vertices (N, 3) [m] moved with the shape of ``body``: a Body in the standard stand. The standard shape leaves them where
         they are.
         """
-        moved = fitting.standard_on(body) - standard_body().vertices.double().numpy()
-        return self.vertices + torch.as_tensor(self._binding.displacement(moved), dtype=torch.float32, device=self.vertices.device)
+        rest = self.vertices.cpu().double().numpy()
+        moved = self._binding.moved(rest, standard_body().vertices.double().numpy(), fitting.standard_on(body))
+        return torch.as_tensor(moved, dtype=torch.float32, device=self.vertices.device)
 
     def remeshed(self, count):
         """The same garment with about ``count`` vertices: of even triangles (ACVD)."""
