@@ -135,7 +135,7 @@ class AnnyBody(BodyModel):
 
     # Ranges that random_shape draws from, uniformly: bodies from 1.4 to 1.95 m. Beyond them Anny has children, giants and the very old.
     RANGES = {
-        "gender": (0.0, 1.0), "age": (0.5, 0.8), "muscle": (0.3, 0.7), "weight": (0.3, 0.75), "height": (0.3, 0.55), "proportions": (0.25, 0.75),
+        "gender": (0.0, 1.0), "age": (0.5, 0.8), "muscle": (0.3, 0.7), "weight": (0.25, 0.85), "height": (0.3, 0.55), "proportions": (0.25, 0.75),
     }  # fmt: skip
 
     def random_shape(self, rng):

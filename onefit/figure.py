@@ -32,9 +32,11 @@ STAND = {"left_arm": (0.0, 0.2, 0.1, 0.3), "right_arm": (0.0, 0.2, 0.1, 0.3), "l
 _J = {name: place for name, place in zip(skeleton.JOINTS, skeleton.standard_joints().double().numpy(), strict=True)}
 BALL = _J["left_foot"]  # where the ball of the left foot is in the upright stand [m]
 _SPINE = (("spine1", 0.3), ("spine2", 0.4), ("spine3", 0.3))  # the parts that the joints have in the spine's angles
+HIP = _J["left_hip"]  # and the left hip [m]
 _THIGH = _J["left_knee"] - _J["left_hip"]
 _SHIN = _J["left_ankle"] - _J["left_knee"]
 _BALL = _J["left_foot"] - _J["left_ankle"]  # from the ankle to the ball
+_SOFT = 0.003  # how softly a leg that is almost straight gives in [m]
 _HEEL = 0.19  # from the ball back to the heel's edge, about which toes are lifted [m]
 REACH = float(np.linalg.norm(_THIGH + _SHIN))  # of a leg in the T-pose: longer it never gets [m]
 
@@ -88,11 +90,11 @@ def _arm(arm, hand):
     """Rotations of a left arm's joints, relative to the chest and along the chain."""
     flexion, abduction, inwards, elbow = arm.T
     upper = Rotation.from_euler("XYZ", np.stack([-flexion, -abduction, -inwards], -1)) * _HANGING
-    # a collar follows the arm: more the higher it is, and to the front
-    direction = upper.apply([1.0, 0.0, 0.0])
-    lifted = np.arcsin(np.clip(direction[:, 2], -1, 1)) + np.pi / 2
-    forward = np.arctan2(-direction[:, 1], 0.5 + np.abs(direction[:, 0]))
-    collar = Rotation.from_euler("ZY", np.stack([-0.12 * forward, -0.16 * lifted**2 / np.pi], -1))
+    # a collar follows the arm: up by 7° where it is level and by 29° overhead, and to the front
+    x, y, z = upper.apply([1.0, 0.0, 0.0]).T
+    lifted = 0.5 + 0.5 * z
+    forward = np.arctan2(-y, 0.5 + np.sqrt(x * x + 0.04))
+    collar = Rotation.from_euler("ZY", np.stack([-0.12 * forward, -0.5 * lifted**2], -1))
     roll = -0.5 * hand[:, 1]
     wrist = Rotation.from_euler("XY", np.stack([roll, hand[:, 0]], -1))
     return {"collar": collar, "shoulder": collar.inv() * upper, "elbow": _about(2, -elbow) * _about(0, roll), "wrist": wrist}
@@ -185,9 +187,11 @@ def _leg(c, side):
     """Rotations of a leg's joints, as of a left leg: the ankle where the foot wants it, the knee bent as the distance asks."""
     ankle, foot, pelvis, hip, knee_yaw = _side(c, side)
     to = ankle - hip
-    distance = np.linalg.norm(to, axis=1)
+    # never quite straight: there the knee's bend goes with the root of what is missing, and would jerk
+    most = 0.9985 * REACH
+    distance = most - _SOFT * np.logaddexp(0.0, (most - np.linalg.norm(to, axis=1)) / _SOFT)
+    distance = np.maximum(distance, 0.35 * REACH)
     # law of cosines in the thigh's frame: |thigh + Rx(k) shin| = distance, with thigh and shin in the plane x = 0
-    distance = np.clip(distance, 0.35 * REACH, REACH)
     a, b = np.linalg.norm(_THIGH), np.linalg.norm(_SHIN)
     rest = np.arctan2(_SHIN[1], -_SHIN[2]) - np.arctan2(_THIGH[1], -_THIGH[2])  # the T-pose's own soft bend
     bend = np.arccos(np.clip((distance**2 - a * a - b * b) / (2 * a * b), -1, 1)) - rest
@@ -224,7 +228,7 @@ def _lowered(c, fps):
         for side in ("left", "right"):
             ankle, _, _, hip, _ = _side(c | {"pelvis": pelvis}, side)
             across = np.linalg.norm((ankle - hip)[:, :2], axis=1)
-            highest = ankle[:, 2] + np.sqrt(np.clip((0.998 * REACH) ** 2 - across**2, 0.01, None))
+            highest = ankle[:, 2] + np.sqrt(np.clip((0.996 * REACH) ** 2 - across**2, 0.01, None))
             excess = np.maximum(excess, hip[:, 2] - highest)
         if not (excess > 0).any():
             break

@@ -141,26 +141,34 @@ def arms_crossed(t, rng):
 
 
 def kick(t, rng):
-    """High kicks to the front, after a step back with the kicking leg."""
-    s = Script(rng)
+    """High kicks to the front with a nearly straight leg that swings from behind."""
+    s = Script(rng, left_swing=2, right_swing=2)  # the leg's angle, and how far the foot is off the ground
     guard = (0.5, 0.4, 0.3, 1.4)
     s.move(0.5, left_arm=guard, right_arm=guard, pelvis=(0, 0, -0.03))
     while s.clock < t[-1] + 1:
         one, other, sign = _sides(rng)
-        high, out, pace = rng.uniform(0.6, 1.15), rng.uniform(-0.1, 0.15), rng.uniform(0.4, 0.6)
-        foot, turn = f"{one}_foot", f"{one}_foot_turn"
-        s.move(pace, pelvis=(-0.05 * sign, 0.05, -0.05), **{foot: (0, 0.35, 0), turn: (0.5, 0.15, 0)})
+        high, pace = rng.uniform(1.1, 1.9), rng.uniform(0.45, 0.65)
+        turn = f"{one}_foot_turn"
+        s.move(0.5 * pace, **{f"{one}_swing": (0.0, 0.06), turn: (0.2, 0.1, 0)}, after=0.25 * pace)
+        s.move(pace, pelvis=(-0.06 * sign, -0.03, -0.05), **{f"{one}_swing": (-0.5, 0.06), turn: (0.7, 0.1, 0)})
         s.move(
-            pace, pelvis=(-0.085 * sign, 0.0, -0.02), turn=(-0.12 - 0.25 * high, -0.1 * sign, -0.15 * sign), spine=(0.1, 0, 0.2 * sign),
-            **{foot: (out * sign, -0.35 - 0.28 * high, high), turn: (0.6 - 1.3 * high, 0.05, 0)},
+            1.2 * pace, pelvis=(-0.085 * sign, 0.0, -0.02), turn=(-0.1 - 0.15 * high, -0.08 * sign, -0.15 * sign), spine=(0.2, 0, 0.2 * sign),
+            head=(0.15, 0, 0), **{f"{one}_swing": (high, 0.06), turn: (0.5 - high, 0.05, 0)},
             **{f"{other}_arm": (1.3, 0.4, 0.2, 0.8), f"{one}_arm": (-0.4, 0.7, 0.1, 0.5)},
         )  # fmt: skip
         s.move(
-            1.2 * pace, pelvis=(0, 0, -0.03), turn=(0, 0, 0), spine=(0.05, 0, 0), left_arm=guard, right_arm=guard,
-            **{foot: (0, 0, 0), turn: (0, 0.1, 0)},
+            1.3 * pace, pelvis=(0, 0, -0.03), turn=(0, 0, 0), spine=(0.05, 0, 0), head=(0, 0, 0), left_arm=guard, right_arm=guard,
+            after=1.1 * pace, **{f"{one}_swing": (0.0, 0.06), turn: (0, 0.1, 0)},
         )  # fmt: skip
+        s.move(0.5 * pace, **{f"{one}_swing": (0.0, 0.0)})
         s.hold(rng.uniform(0.1, 0.5))
-    return s.channels(t)
+    c = s.channels(t)
+    for side in ("left", "right"):  # about the hip
+        swing, lift = c.pop(f"{side}_swing").T
+        _, y, z = figure.BALL - figure.HIP
+        y, z = z * np.sin(swing) + y * np.cos(swing) - y, z * np.cos(swing) - y * np.sin(swing) - z
+        c[f"{side}_foot"] += np.stack([0 * y, y, z + lift], -1)
+    return c
 
 
 def sit(t, rng):
@@ -389,7 +397,7 @@ def jump(t, rng):
     fine, free = _flights(t, *zip(*flights, strict=True))
     feet = np.interp(t, fine, _smoothed(free, 480 * 0.03))
     c["pelvis"][:, 2] = height
-    c["pelvis"][:, 1] = -0.3 * np.minimum(height, 0)
+    c["pelvis"][:, 1] = 0.3 * np.logaddexp(0.0, -height / 0.03) * 0.03  # the seat goes back as it goes down
     for side in ("left", "right"):
         c[f"{side}_foot"][:, 2] += feet
     return c
@@ -474,16 +482,17 @@ def pick_up(t, rng):
     for foot, sign in (("left", 1.0), ("right", -1.0)):
         s.move(0.5, **{f"{foot}_foot": (sign * apart, 0, 0), f"{foot}_foot_turn": (0, 0.45, 0.2)}, after=0.45)
     upright = {"pelvis": (0, 0, -0.02), "turn": (0, 0, 0), "spine": (-0.02, 0, 0), "head": (0, 0, 0)}
-    before, chest = (
-        {"left_arm": arm, "right_arm": arm} for arm in ((1.35, 0.0, 0.1, 0.4), (0.75, 0.2, 0.25, 1.5))
-    )  # arms go ahead of the trunk, clear of the thighs
+    pole = (0.6, 0.3, -0.6)
+    chest = {"left_arm": (0.75, 0.2, 0.25, 1.5), "right_arm": (0.75, 0.2, 0.25, 1.5)}
+    # arms go ahead of the trunk, clear of the thighs
+    before = {f"{side}_arm": figure.arm_to(side, (sign * 0.12, -0.42, 0.36), pole) for side, sign in (("left", 1.0), ("right", -1.0))}
     while s.clock < t[-1] + 1:
         deep, pace, aside = rng.uniform(0.3, 0.4), rng.uniform(1.0, 1.5), rng.uniform(-0.06, 0.06)
         pelvis, turn, spine = (0, 0.16, -deep), (0.8, 0, 0), (0.5, 0, 3 * aside)
         arms = {}
         for side, sign in (("left", 1.0), ("right", -1.0)):
             place = np.array([sign * 0.09 + aside, -0.33, -0.64])
-            arms[f"{side}_arm"] = figure.arm_to(side, figure.in_chest(place, pelvis, turn, spine), pole=(1.0, 0.3, 0.2))
+            arms[f"{side}_arm"] = figure.arm_to(side, figure.in_chest(place, pelvis, turn, spine), pole)
         floor = {"pelvis": pelvis, "turn": turn, "spine": spine, "head": (-0.2, 0, 0), **arms}
         s.move(0.6 * pace, **before, after=0.3 * pace)
         s.move(pace, **floor)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from .figure import CHANNELS, stand
+from .figure import stand
 
 
 def ease(x):
@@ -41,13 +41,14 @@ class Script:
     """A course of movements from posture to posture, each eased in and out; movements may overlap, because they add up.
 
     ``move(0.8, spine=(0.3, 0, 0), pelvis=...)`` takes 0.8 s to bring channels of :mod:`onefit.figure` to new values, the others stay. A foot
-    that goes elsewhere is lifted on its way. ``channels(t)`` gives the figure's channels at times t.
+    that goes elsewhere is lifted on its way. ``channels(t)`` gives the figure's channels at times t, and those of ``others`` (sizes by names),
+    which start at zero.
     """
 
-    def __init__(self, rng):
+    def __init__(self, rng, **others):
         self.rng = rng
         self.clock = 0.0
-        self.now = {name: values[0] for name, values in stand(1).items()}
+        self.now = {name: values[0] for name, values in stand(1).items()} | {name: np.zeros(size) for name, size in others.items()}
         self._start = dict(self.now)
         self._moves = []
 
@@ -59,13 +60,13 @@ class Script:
         for name, value in changes.items():
             value = np.asarray(value, dtype=np.float64)
             # limbs do not start all at once: the trunk leads, arms and head follow
-            lag = 0.0 if name.endswith(("foot", "turn")) or name == "pelvis" else self.rng.uniform(0.0, 0.12) * seconds
+            lag = 0.0 if name.endswith(("foot", "turn", "swing")) or name == "pelvis" else self.rng.uniform(0.0, 0.12) * seconds
             self._moves.append((name, self.clock + lag, seconds, value - self.now[name]))
             self.now[name] = value
         self.clock += seconds if after is None else after
 
     def channels(self, t):
-        total = {name: np.tile(self._start[name], (len(t), 1)) for name in CHANNELS}
+        total = {name: np.tile(self._start[name], (len(t), 1)) for name in self._start}
         for name, start, seconds, change in self._moves:
             x = (t - start) / seconds
             if not name.endswith("foot"):

@@ -210,6 +210,7 @@ class _Arrays(pickle.Unpickler):
     _NUMPY = {"_reconstruct", "scalar", "ndarray", "dtype", "_frombuffer"}
 
     def find_class(self, module, name):
+        module = {"copy_reg": "copyreg", "__builtin__": "builtins"}.get(module, module)  # Python 2's names
         top = module.partition(".")[0]
         if top == "numpy" and name in self._NUMPY:
             return super().find_class(module.replace("numpy.core", "numpy._core") if hasattr(np, "_core") else module, name)
