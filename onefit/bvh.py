@@ -172,9 +172,9 @@ def _places(parents, offsets):
 def _axes(path, places, joint_of, up):
     """The rotation (3, 3) from the file's axes to OneFit's, its axes along the file's, told from the zero pose."""
     head = places[joint_of.get("head", joint_of.get("neck", joint_of["left_shoulder"]))]
-    feet = 0.5 * (places[joint_of["left_ankle"]] + places[joint_of["right_ankle"]])
+    hips = 0.5 * (places[joint_of["left_hip"]] + places[joint_of["right_hip"]])
     nearest = lambda v: np.sign(v[np.abs(v).argmax()]) * np.eye(3)[np.abs(v).argmax()]
-    z = nearest(head - feet) if up is None else np.eye(3)["xyz".index(up)]
+    z = nearest(head - hips) if up is None else np.eye(3)["xyz".index(up)]
     x = places[joint_of["left_hip"]] - places[joint_of["right_hip"]]
     x = nearest(x - (x @ z) * z)
     return np.stack([x, np.cross(z, x), z])
@@ -190,10 +190,10 @@ def _standing(path, rest, joint_of):
             joints[j] = rest[joint_of[name]]
         else:  # beyond what the file has: on, the way the bone before it goes
             joints[j] = joints[parent] + 0.3 * (joints[parent] - joints[skeleton.PARENTS[parent]] if parent > 0 else 0.0)
-    tall = joints[skeleton.INDEX["head"], 2] - joints[[skeleton.INDEX["left_ankle"], skeleton.INDEX["right_ankle"]], 2].mean()
+    trunk = joints[skeleton.INDEX["head"]] - joints[0]
     down = [joints[skeleton.INDEX[f"{s}_hip"], 2] - joints[skeleton.INDEX[f"{s}_ankle"], 2] for s in ("left", "right")]
-    if not (tall > 0 and min(down) > 0.8 * _legs(joints)):
-        raise InputError(f"{path}: its zero pose is no stand with the legs down; export the motion with a T-pose as rest pose")
+    if not (trunk[2] > 0.8 * np.linalg.norm(trunk) and min(down) > 0.8 * _legs(joints)):
+        raise InputError(f"{path}: its zero pose is no upright stand with the legs down; export the motion with a T-pose as rest pose")
     return torch.as_tensor(joints)
 
 

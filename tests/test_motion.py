@@ -301,7 +301,7 @@ def test_bvh_files_that_cannot_be_used(tmp_path):
         "3 frames are announced, 2 are there": "\n".join(rows[:-1]),
         "frames are not finite in 1 of 3 frames, the first is frame 1": "\n".join([*rows[:-2], "nan " + rows[-2].split(" ", 1)[1], rows[-1]]),
         "a frame time of 0.0; say the rate": good.replace("Frame Time: 0.0333333", "Frame Time: 0"),
-        "its zero pose is no stand": (tmp_path / "sat.bvh").read_text(),
+        "its zero pose is no upright stand": (tmp_path / "sat.bvh").read_text(),
     }
     for message, text in cases.items():
         (tmp_path / "bad.bvh").write_text(text)
