@@ -51,7 +51,8 @@ def _motion(name, seconds, seed):
 
 
 def _model(name):
-    from .body import AnnyBody, PlainBody, SmplBody
+    from .body import AnnyBody
+    from .smpl import PlainBody, SmplBody
 
     if name == "anny":
         return AnnyBody()

@@ -60,7 +60,7 @@ class Draper:
                     f"weights trained on the body {trained.body} ({self.network.shape['shape']} shape parameters), not on {self.model.kind} ({size}); "
                     f"train on it: python -m onefit.train --body"
                 )
-        self._patched = {}
+        self._garments, self._patched = {}, {}
 
     @cached_property
     def standard(self):
@@ -68,10 +68,12 @@ class Draper:
         return self.model.body()
 
     def garment(self, garment):
-        """A :class:`Garment` of one, of a template's name, or of a mesh file."""
+        """A :class:`Garment` of one, of a template's name, or of a mesh file; names and files are read once."""
         if isinstance(garment, Garment):
             return garment
-        return Garment.template(garment) if garment in TEMPLATES else Garment.read(garment)
+        if str(garment) not in self._garments:
+            self._garments[str(garment)] = Garment.template(garment) if garment in TEMPLATES else Garment.read(garment)
+        return self._garments[str(garment)]
 
     def patched(self, garment):
         """The :class:`onefit.charts.PatchedGarment` of a garment, cut once."""

@@ -11,11 +11,11 @@ from .collision import Collider
 CLEARANCE = 0.003  # [m] from the body
 
 
-def pushed_out(vertices, faces, bodies, body_faces, clearance=CLEARANCE, rounds=3, smoothing=4):
+def pushed_out(vertices, faces, bodies, body_faces, clearance=CLEARANCE, rounds=5, smoothing=4):
     """Vertices (T, N, 3) [m] moved out of the bodies (T, V, 3), to ``clearance`` [m] from them; faces (F, 3), body_faces (B, 3).
 
     The pushes, not the surface, are smoothed over the mesh, ``smoothing`` times, so that no fold is lost and none made; what that leaves
-    inside is pushed again, in at most ``rounds`` rounds.
+    inside is pushed again, unsmoothed from the third of at most ``rounds`` rounds on.
     """
     edges = torch.as_tensor(mesh.edges_of(faces.cpu().numpy())[0], device=vertices.device)
     both = torch.cat([edges, edges.flip(1)])
@@ -40,7 +40,7 @@ def pushed_out(vertices, faces, bodies, body_faces, clearance=CLEARANCE, rounds=
                 moved = push.abs().sum(-1) > 0
                 if not moved.any():
                     break
-                x += spread(push) if turn + 1 < rounds else push
+                x += spread(push) if turn < 2 else push
                 chosen = moved.nonzero()[:, 0] if turn else chosen
         return out
 

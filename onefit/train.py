@@ -12,6 +12,7 @@ GARMENT are names of the package's templates (tshirt, dress, ...) or meshes (.ob
 
 import argparse
 import json
+import math
 import os
 import shlex
 import sys
@@ -112,17 +113,18 @@ class OneFitTraining(Training):
         total = sum(terms.values())
         self.optimiser.zero_grad()
         total.backward()
+        figures = self.processes.mean({"loss": total.item(), **{name: value.item() for name, value in terms.items()}})
         self.processes.average(self.network)
         norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), CLIP)
-        if not (total.isfinite() and norm.isfinite()):
-            return self._stepped_over(terms)
-        self.bad, self.last = 0, total.item()
+        if not (math.isfinite(figures["loss"]) and norm.isfinite()):
+            return self._stepped_over(figures)
+        self.bad, self.last = 0, figures["loss"]
         self.optimiser.step()
-        return dict(loss=self.last, **{name: value.item() for name, value in terms.items()})
+        return figures
 
-    def _stepped_over(self, terms):
+    def _stepped_over(self, figures):
         self.bad += 1
-        wrong = [name for name, value in terms.items() if not value.isfinite()] or ["the gradient"]
+        wrong = [name for name, value in figures.items() if name != "loss" and not math.isfinite(value)] or ["the gradient"]
         print(f"step {self.done}: {', '.join(wrong)} not finite, stepped over", file=sys.stderr)
         if self.bad >= BAD:
             raise InputError(f"{self.bad} steps in a row were not finite; a lower --lr may help")

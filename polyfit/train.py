@@ -101,7 +101,7 @@ class PolyFitTraining(Training):
         loss.backward()
         self.processes.average(self.network)
         self.optimiser.step()
-        return dict(loss=loss.item())
+        return self.processes.mean(dict(loss=loss.item()))
 
 
 class _Patches:

@@ -39,6 +39,14 @@ class Processes:
             for p, g in zip(network.parameters(), (flat / self.count).split([p.numel() for p in network.parameters()])):
                 p.grad.copy_(g.view_as(p))
 
+    def mean(self, figures):
+        """The mean over all processes of each number of a dict; all have the same names."""
+        if self.count == 1:
+            return figures
+        values = torch.tensor(list(figures.values()), dtype=torch.float64, device=self.device)
+        torch.distributed.all_reduce(values)
+        return dict(zip(figures, (values / self.count).tolist()))
+
     def close(self):
         if self.count > 1:
             torch.distributed.destroy_process_group()

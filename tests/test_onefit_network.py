@@ -1,0 +1,211 @@
+import dataclasses
+
+import pytest
+import torch
+from polyfit.errors import InputError
+
+import onefit
+from onefit import weights
+from onefit.body import AnnyBody
+from onefit.charts import PatchedGarment
+from onefit.collision import Collider
+from onefit.draper import Draper
+from onefit.garment import Garment
+from onefit.motion import Motion
+from onefit.network import SLOPE, Decoder, OneFit, descriptors, encoded
+from onefit.post import pushed_out
+
+
+@pytest.fixture(scope="module")
+def model():
+    return AnnyBody()
+
+
+def perturbed(seed=0, size=0.1):
+    """A network whose heads say something, as a trained one's do."""
+    torch.manual_seed(seed)
+    network = OneFit()
+    with torch.no_grad():
+        for head in network.decoder.heads.values():
+            head[-1].weight.normal_(0, size)
+    return network.eval()
+
+
+@pytest.fixture(scope="module")
+def draper(model):
+    return Draper(weights.Trained(perturbed(), "anny", ("tank",)), model)
+
+
+@pytest.fixture(scope="module")
+def walk():
+    return Motion.generate("walk", seconds=0.7, seed=3)
+
+
+def test_positional_encoding():
+    x = torch.tensor([[0.25, 0.0]])
+    assert encoded(x, 2).tolist()[0] == pytest.approx([0.25, 0, 0.5**0.5, 1, 0, 0, 0.5**0.5, 0, 1, 1], abs=1e-6)
+
+
+def test_descriptors_are_rotations_and_gravity_seen_from_the_joints():
+    g = torch.Generator().manual_seed(0)
+    poses = 0.5 * torch.randn(2, 3, 24, 3, generator=g)
+    found = descriptors(poses)
+    assert found.shape == (2, 3, 24, 9)
+    a, b, down = found.split(3, -1)
+    for x in (a, b, down):
+        assert torch.allclose(x.norm(dim=-1), torch.ones(1), atol=1e-5)
+    assert (a * b).sum(-1).abs().max() < 1e-5
+    # standing: gravity points down in every joint; turning about the vertical does not change what a joint feels of it
+    upright = torch.zeros(1, 24, 3)
+    assert torch.allclose(descriptors(upright)[0, :, 6:], torch.tensor([0.0, 0, -1]).expand(24, 3))
+    turned = upright.clone()
+    turned[0, 0] = torch.tensor([0, 0, 1.3])
+    assert torch.allclose(descriptors(turned)[0, :, 6:], torch.tensor([0.0, 0, -1]).expand(24, 3), atol=1e-6)
+    # on its face, a body feels gravity towards its front, -y
+    face = upright.clone()
+    face[0, 0] = torch.tensor([torch.pi / 2, 0, 0])
+    assert torch.allclose(descriptors(face)[0, 0, 6:], torch.tensor([0.0, -1, 0]), atol=1e-6)
+
+
+def test_the_decoder_is_that_of_the_concatenation():
+    torch.manual_seed(1)
+    decoder = perturbed().decoder
+    Z_T, Z_B = torch.randn(5, 128), torch.randn(3, 256)
+    out = decoder(Z_T, Z_B)
+    weight = torch.cat([decoder.of_patch.weight, decoder.of_body.weight], 1)
+    both = torch.cat([Z_T[None].expand(3, 5, 128), Z_B[:, None].expand(3, 5, 256)], -1)
+    x = torch.nn.functional.leaky_relu(both @ weight.T + decoder.of_patch.bias, SLOPE)
+    expected = decoder.heads["translation"](decoder.trunk(x))
+    assert torch.allclose(out.translation, expected * 0.3, atol=1e-5)
+    assert out.alpha.shape == (3, 5, 15) and out.scale.shape == (3, 5)
+
+
+def test_layers_are_those_of_the_paper():
+    network = OneFit()
+    widths = lambda layers: [(m.in_features, m.out_features) for m in layers if isinstance(m, torch.nn.Linear)]
+    assert widths(network.body.static) == [(216, 64), (64, 128), (128, 256), (256, 512)]
+    assert widths(network.body.local) == [(9, 32), (32, 32)] and widths(network.body.moving) == [(768, 512), (512, 512)]
+    assert network.body.memory.hidden_size == 512
+    assert not any("bias" in name for part in (network.body.local, network.body.moving, network.body.memory) for name, _ in part.named_parameters())
+    assert [b for _, b in widths(network.body.join)][:4] == [256] * 4 and len(widths(network.body.join)) == 5
+    assert widths(network.decoder.trunk) == [(512, 512), (512, 512), (512, 256)]
+    assert all([b for _, b in widths(head)][:2] == [128, 64] for head in network.decoder.heads.values())
+
+
+def test_a_body_at_rest_leaves_the_dynamic_encoding_at_zero():
+    body = perturbed().body
+    poses = 0.3 * torch.randn(1, 1, 24, 3, generator=torch.Generator().manual_seed(2)).expand(1, 12, 24, 3)
+    _, memory = body(poses, torch.zeros(1, 12, 3), torch.zeros(1, 6), 30.0)
+    assert memory.abs().max() == 0
+    _, moving = body(poses * torch.linspace(0, 1, 12)[:, None, None], torch.zeros(1, 12, 3), torch.zeros(1, 6), 30.0)
+    assert moving.abs().max() > 1e-3
+    # a memory that was anything fades while the body stands still
+    noise = torch.randn(1, 1, 512, generator=torch.Generator().manual_seed(3))
+    _, faded = body(poses, torch.zeros(1, 12, 3), torch.zeros(1, 6), 30.0, noise)
+    assert faded.norm() < 0.05 * noise.norm()
+
+
+def test_the_memory_goes_on_where_it_stopped():
+    body = perturbed().body
+    g = torch.Generator().manual_seed(4)
+    poses, translation = 0.3 * torch.randn(1, 8, 24, 3, generator=g), torch.zeros(1, 8, 3)
+    whole, _ = body(poses, translation, torch.zeros(1, 6), 30.0)
+    again, _ = body(poses, translation, torch.zeros(1, 6), 30.0)
+    assert torch.equal(whole, again)
+    shape, _ = body(poses, translation, 0.2 * torch.ones(1, 6), 30.0)
+    moved, _ = body(poses, translation + torch.arange(8)[None, :, None] * 0.05, torch.zeros(1, 6), 30.0)
+    assert (whole - shape).abs().max() > 1e-4 and (whole - moved).abs().max() > 1e-4
+    elsewhere, _ = body(poses, translation + 3.0, torch.zeros(1, 6), 30.0)
+    assert torch.allclose(whole, elsewhere, atol=1e-4)  # where the body stands does not matter
+
+
+def test_an_untrained_network_is_plain_skinning(model, walk):
+    torch.manual_seed(0)
+    fresh = Draper(weights.Trained(OneFit().eval(), "anny", ()), model)
+    assert torch.equal(fresh.drape("tank", walk).vertices, fresh.drape("tank", walk, skinning_only=True).vertices)
+
+
+def test_draping_in_batches_is_draping_at_once(draper, walk, monkeypatch):
+    whole = draper.drape("tank", walk).vertices
+    assert whole.shape == (len(walk), len(Garment.template("tank")), 3)
+    monkeypatch.setattr(onefit.draper, "POINTS", 5 * whole.shape[1])
+    assert torch.allclose(draper.drape("tank", walk).vertices, whole, atol=1e-5)
+    assert (whole - draper.drape("tank", walk, skinning_only=True).vertices).abs().max() > 1e-3
+
+
+def test_place_and_direction_of_a_motion_only_move_the_drape(draper, walk):
+    # turned about the vertical and set elsewhere: the cloth turns and goes with it
+    import roma
+
+    turn = roma.rotvec_to_rotmat(torch.tensor([0.0, 0, 0.8]))
+    root = roma.rotmat_to_rotvec(turn @ roma.rotvec_to_rotmat(walk.poses[:, 0]))
+    poses = torch.cat([root[:, None], walk.poses[:, 1:]], 1)
+    place = draper.standard.joints[0]
+    other = dataclasses.replace(walk, poses=poses, translation=(walk.translation + place) @ turn.T - place + torch.tensor([1.0, 2.0, 0]))
+    a, b = draper.drape("tank", walk), draper.drape("tank", other)
+    expected = a.vertices @ turn.T + torch.tensor([1.0, 2.0, 0])
+    # the root's descriptor says where the body faces, so the network may see a little of it
+    plain = draper.drape("tank", other, skinning_only=True).vertices
+    assert torch.allclose(draper.drape("tank", walk, skinning_only=True).vertices @ turn.T + torch.tensor([1.0, 2.0, 0]), plain, atol=1e-4)
+    assert (b.vertices - expected).norm(dim=-1).mean() < (b.vertices - plain).norm(dim=-1).mean()
+
+
+def test_post_processing_leaves_nothing_inside(draper, walk):
+    raw = draper.drape("tank", walk)
+    out = draper.drape("tank", walk, post=True)
+    assert raw.measures().collision > 1
+    assert out.measures().collision < 0.1
+    # what was outside, and far from what was not, stays where it was
+    still = (raw.vertices - out.vertices).norm(dim=-1) == 0
+    assert 0.1 < still.float().mean() < 1
+
+
+def test_pushing_out_of_a_sphere():
+    import trimesh
+
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.1)
+    body, faces = torch.as_tensor(ball.vertices, dtype=torch.float32)[None], torch.as_tensor(ball.faces)
+    cloth = trimesh.creation.icosphere(subdivisions=3, radius=0.1)
+    x = torch.as_tensor(cloth.vertices, dtype=torch.float32)[None].clone()
+    x[:, ::7] *= 0.95
+    out = pushed_out(x, torch.as_tensor(cloth.faces), body, faces, clearance=0.003)
+    distance = Collider(faces, body[0]).distance(out, body)
+    assert distance.min() > 0.0025 and distance.max() < 0.02
+
+
+def test_weights_in_eight_bits_drape_alike(draper, model, walk, tmp_path):
+    path = tmp_path / "weights.safetensors"
+    weights.save(path, draper.network, model, ("tank",))
+    assert path.stat().st_size < 1.1 * sum(p.numel() for p in draper.network.parameters())
+    loaded = onefit.load(path, model=model)
+    assert loaded.trained.garments == ("tank",)
+    a, b, c = draper.drape("tank", walk), loaded.drape("tank", walk), draper.drape("tank", walk, skinning_only=True)
+    # eight bits cost a few per cent of the deformation
+    assert (a.vertices - b.vertices).norm(dim=-1).mean() < 0.05 * (a.vertices - c.vertices).norm(dim=-1).mean()
+
+
+def test_patches_are_cut_once_for_a_garment(draper, walk):
+    garment = Garment.template("shorts")
+    assert draper.patched(garment) is draper.patched(garment)
+    assert isinstance(draper.patched(garment), PatchedGarment)
+
+
+def test_refused_weights(tmp_path, model, draper):
+    with pytest.raises(InputError, match="no such file, nor one of the package's"):
+        onefit.load("nothing")
+    bad = tmp_path / "bad.safetensors"
+    bad.write_bytes(b"no weights")
+    with pytest.raises(InputError, match="not a file of weights"):
+        onefit.load(bad)
+    path = tmp_path / "old.safetensors"
+    version, weights.VERSION = weights.VERSION, 0
+    try:
+        weights.save(path, draper.network, model, ())
+    finally:
+        weights.VERSION = version
+    with pytest.raises(InputError, match="weights of version 0"):
+        onefit.load(path)
+
+
+def test_decoder_of_another_order():
+    assert Decoder(3)(torch.zeros(2, 128), torch.zeros(1, 256)).alpha.shape == (1, 2, 10)

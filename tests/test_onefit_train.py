@@ -1,0 +1,179 @@
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from polyfit.errors import InputError
+from polyfit.training import Processes
+from safetensors.torch import load_file
+
+import onefit
+from onefit import train
+from onefit.losses import Weights
+from onefit.training_data import LENGTH
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture(scope="module")
+def motion(tmp_path_factory):
+    """A file in the form of AMASS: arms that swing, knees that bend, half a second at 60 frames a second."""
+    t = np.linspace(0, 1, 31)
+    poses = np.zeros((31, 156))
+    poses[:, 3 * 16 + 2], poses[:, 3 * 17 + 2] = -0.9 + 0.4 * t, 0.9 - 0.4 * t
+    poses[:, 3 * 4], poses[:, 3 * 1] = 0.5 * t, -0.4 * t
+    poses[:, 0] = np.pi / 2  # z up
+    trans = np.stack([0 * t, -0.3 * t, 0.9 + 0 * t], 1)
+    path = tmp_path_factory.mktemp("motions") / "swing.npz"
+    np.savez(path, poses=poses, trans=trans, mocap_framerate=60.0, betas=np.zeros(16))
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def small(motion):
+    return train.Settings(garments=("shorts",), motions=(motion,), batch=600, epochs=2, lr_epochs=1, epoch_steps=4, shapes=1)
+
+
+@pytest.fixture(scope="module")
+def data(small):
+    from onefit.garment import Garment
+    from onefit.motion import Motion
+    from onefit.training_data import TrainingData
+
+    return TrainingData([Garment.template("shorts")], motions=[Motion.read(small.motions[0])], shapes=1)
+
+
+def test_windows_are_of_consecutive_frames_at_30_a_second(data):
+    windows = data.windows(5, torch.Generator().manual_seed(0))
+    assert windows.poses.shape == (5, LENGTH, 24, 3) and windows.translation.shape == (5, LENGTH, 3)
+    step = windows.translation.diff(dim=1)[..., 1]
+    assert torch.allclose(step, torch.full_like(step, -0.3 / 0.5 / 30), atol=1e-4)
+    assert set(windows.number.tolist()) <= {0, 1}
+    assert windows.shape[windows.number == 0].abs().sum() == 0
+
+
+def test_training_lowers_the_loss(small, data):
+    training = train.OneFitTraining(replace(small, epochs=1, epoch_steps=60), data, Processes("cpu"))
+
+    def loss():
+        with torch.no_grad():
+            return sum(sum(training.loss(torch.Generator().manual_seed(k)).values()).item() for k in range(3)) / 3
+
+    before = loss()
+    for _ in range(25):
+        training.step()
+    assert loss() < before - 0.005
+
+
+def test_each_loss_has_a_switch(small, data):
+    names = dict(k_c="collision", k_i="inextensibility", k_mi="mesh_inextensibility", k_g="gravity", k_in="inertia")
+    for switch, name in names.items():
+        training = train.OneFitTraining(replace(small, weights=Weights(**{switch: 0.0})), data, Processes("cpu"))
+        with torch.no_grad():
+            terms = training.loss(torch.Generator().manual_seed(0))
+        assert set(terms) == (set(names.values()) | {"boundary"}) - {name}
+    training = train.OneFitTraining(replace(small, weights=Weights(k_b=0.0, k_bn=0.0)), data, Processes("cpu"))
+    with torch.no_grad():
+        assert "boundary" not in training.loss(torch.Generator().manual_seed(0))
+
+
+def test_the_rate_falls_to_a_tenth(small, data):
+    training = train.OneFitTraining(small, data, Processes("cpu"))
+    rates = []
+    for _ in range(5):
+        training.step()
+        rates.append(training.optimiser.param_groups[0]["lr"])
+    assert rates == pytest.approx([1e-3] * 4 + [1e-4])
+
+
+def test_a_step_that_is_not_finite_is_stepped_over(small, data, monkeypatch, capsys):
+    training = train.OneFitTraining(small, data, Processes("cpu"))
+    training.step()
+    before = {k: v.clone() for k, v in training.network.state_dict().items()}
+    loss = train.OneFitTraining.loss
+    monkeypatch.setattr(train.OneFitTraining, "loss", lambda self, g: {k: v * float("nan") if k == "gravity" else v for k, v in loss(self, g).items()})
+    figures = training.step()
+    assert figures["stepped_over"] == 1 and np.isfinite(figures["loss"])
+    assert "step 1: gravity not finite, stepped over" in capsys.readouterr().err
+    assert all(torch.equal(v, before[k]) for k, v in training.network.state_dict().items())
+    monkeypatch.setattr(train, "BAD", 2)
+    with pytest.raises(InputError, match="2 steps in a row were not finite"):
+        training.step()
+
+
+def test_a_resumed_training_ends_where_an_uninterrupted_one_does(small, tmp_path):
+    whole = train.train(small, tmp_path / "whole", command="python -m onefit.train ...")
+    assert train.train(small, tmp_path / "parts", until=3) is None
+    resumed = train.train(small, tmp_path / "parts", resume=True)
+    a, b = load_file(whole), load_file(resumed)
+    assert a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a)
+    about = json.loads(whole.with_suffix(".json").read_text())
+    assert about["command"] == "python -m onefit.train ..." and about["steps"] == 8 and about["garments"] == ["shorts"] and about["weights"]["k_b"] == 5e3
+    lines = [json.loads(line) for line in (tmp_path / "whole" / "log.jsonl").read_text().splitlines()]
+    assert lines[-1]["step"] == 8 and {"loss", "collision", "inertia", "lr"} <= set(lines[-1])
+    with pytest.raises(InputError, match="a checkpoint of other settings"):
+        train.train(replace(small, seed=5), tmp_path / "parts", resume=True)
+    # and it can be gone on from, with another garment
+    tuned = train.train(replace(small, garments=("tank",), start=str(whole), epochs=1, epoch_steps=1), tmp_path / "tuned")
+    assert onefit.load(tuned).trained.garments == ("tank",)
+    first, then = onefit.load(whole).network.state_dict(), onefit.load(tuned).network.state_dict()
+    changes = [float((first[k] - then[k]).abs().max()) for k in first]
+    assert 0 < max(changes) < 0.01
+
+
+def test_two_processes_of_torchrun_have_the_curve_of_one(small, tmp_path):
+    flags = ["shorts", "--motions", small.motions[0], "--batch", "600", "--epochs", "1", "--epoch-steps", "3", "--shapes", "1"]
+    command = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", "--master-port", "29741", "-m", "onefit.train", *flags]
+    done = subprocess.run(
+        [*command, "-o", str(tmp_path / "two")], cwd=ROOT, capture_output=True, text=True, timeout=300, env=os.environ | {"OMP_NUM_THREADS": "1"}
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    train.main([*flags, "-o", str(tmp_path / "one")])
+    two, one = (load_file(tmp_path / name / "checkpoint.safetensors") for name in ("two", "one"))
+    assert json.loads((tmp_path / "two" / "weights.json").read_text())["processes"] == 2
+    curves = [[json.loads(line) for line in (tmp_path / name / "log.jsonl").read_text().splitlines()] for name in ("two", "one")]
+    for a, b in zip(*curves):
+        assert {k: a[k] for k in a if k != "seconds"} == pytest.approx({k: b[k] for k in b if k != "seconds"}, rel=1e-3)
+    # three steps of 1e-3 at most; where a gradient is nearly zero, Adam makes much of its rounding
+    apart = torch.cat([(two[k] - one[k]).abs().flatten() for k in one if k.startswith("network.")])
+    assert apart.max() < 1e-3 and apart.mean() < 1e-5
+    fresh = train.OneFitTraining(replace(small, epochs=1, epoch_steps=3), _Nothing(), Processes("cpu")).network.state_dict()
+    moved = torch.cat([(one[f"network.{k}"] - v).abs().flatten() for k, v in fresh.items()])
+    assert moved.mean() > 10 * apart.mean()
+
+
+class _Nothing:
+    """Just enough of the data for a fresh network."""
+
+    garments = [(range(100),)]
+    standard = type("Body", (), {"joints": range(24)})
+    shapes = torch.zeros(1, 6)
+
+    def __len__(self):
+        return 1
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (dict(batch=0), "batch = 0: 1 at least"),
+        (dict(order=1), "order = 1"),
+        (dict(lr=0.0), "lr = 0.0: more than 0"),
+        (dict(epoch_steps=-1), "epoch_steps = -1"),
+    ],
+)
+def test_settings_are_checked(change, message):
+    with pytest.raises(InputError, match=message):
+        train.Settings(**change)
+
+
+def test_a_wrong_name_ends_in_one_line(tmp_path):
+    done = subprocess.run([sys.executable, "-m", "onefit.train", "tuxedo.obj", "-o", str(tmp_path / "out")], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert done.stderr.strip().splitlines()[-1].startswith("error: tuxedo.obj: no such file")
+    assert "Traceback" not in done.stderr
