@@ -62,7 +62,7 @@ def walk(t, rng):
     bent = rng.uniform(0.15, 0.6)
     for side, sign in (("left", -1.0), ("right", 1.0)):
         forward = sign * np.cos(2 * np.pi * (phase - 0.03))
-        c[f"{side}_arm"] = np.stack([swing * forward, 0.2 + zero, 0.15 + zero, bent + 0.5 * swing * (1 + forward)], -1)
+        c[f"{side}_arm"] = np.stack([swing * forward, 0.23 + zero, 0.15 + zero, bent + 0.5 * swing * (1 + forward)], -1)
     return c
 
 

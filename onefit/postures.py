@@ -122,11 +122,11 @@ def arms_crossed(t, rng):
     while s.clock < t[-1] + 1:
         one, other, sign = _sides(rng)
         low, pace = rng.uniform(-0.02, 0.04), rng.uniform(0.9, 1.5)
-        inner = figure.arm_to(one, (0.02 * sign, -0.215, 0.265 + low), pole=(0.7, 0.2, -1.0))
-        outer = figure.arm_to(other, (-0.03 * sign, -0.295, 0.245 + low), pole=(0.9, -0.1, -1.0))
+        inner = figure.arm_to(one, (0.03 * sign, -0.222, 0.2 + low), pole=(0.7, 0.2, -1.0))
+        outer = figure.arm_to(other, (-0.03 * sign, -0.272, 0.33 + low), pole=(1.2, 0.0, -0.6))
         before = (0.75, 0.25, 0.3, 1.3)
         s.move(0.7 * pace, **{f"{one}_arm": (0.6, 0.2, 0.4, 1.5), f"{other}_arm": before}, spine=(0.03, 0, 0))
-        s.move(0.6 * pace, **{f"{one}_arm": inner, f"{other}_arm": (0.85, 0.2, 0.5, 1.5)}, after=0.35 * pace)
+        s.move(0.6 * pace, **{f"{one}_arm": inner, f"{other}_arm": (0.95, 0.15, 0.5, 1.4)}, after=0.45 * pace)
         s.move(0.6 * pace, **{f"{other}_arm": outer, f"{one}_hand": (0.1, 0), f"{other}_hand": (0.35, 0)})
         for _ in range(rng.integers(1, 4)):
             s.move(
