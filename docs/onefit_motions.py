@@ -1,6 +1,6 @@
 """Draw ``docs/onefit_motions.png``: every kind of generated motion, eight moments of each from left to right.
 
-    python docs/onefit_motions.py        (a minute)
+python docs/onefit_motions.py        (a minute)
 """
 
 import os
@@ -11,10 +11,11 @@ sys.path.insert(0, os.path.dirname(HERE))
 
 import numpy as np  # noqa: E402
 import pyvista  # noqa: E402
+from PIL import Image, ImageDraw  # noqa: E402
+
 from onefit import generate, skinning  # noqa: E402
 from onefit.body import AnnyBody  # noqa: E402
 from onefit.motion import Motion  # noqa: E402
-from PIL import Image, ImageDraw  # noqa: E402
 from polyfit.files import aside  # noqa: E402
 
 MOMENTS, SECONDS, SEED, COLUMNS = 8, 5.0, 3, 2

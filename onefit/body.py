@@ -3,6 +3,7 @@
 from dataclasses import dataclass, fields, replace
 
 import torch
+
 from polyfit.errors import InputError
 
 from . import skeleton
@@ -12,9 +13,9 @@ from . import skeleton
 class Body:
     """One shape of a body at rest: a closed surface, z up, facing -y, in the stand that ``rest_pose`` says.
 
-    ``vertices`` (V, 3) [m]; ``faces`` (F, 3) int64, wound outwards; ``blend_weights`` (V, 24), rows that sum to one; ``joints`` (24, 3) [m];
-    ``rest_pose`` (24, 3) [rad], the pose that takes the T-pose to this stand; ``shape`` (S,), the parameters that made it; ``kind``, the
-    model's name; ``parents``, those of :mod:`onefit.skeleton`.
+    ``vertices`` (V, 3) [m]; ``faces`` (F, 3) int64, wound outwards; ``blend_weights`` (V, 24), rows that sum to one; ``joints`` (24, 3)
+    [m]; ``rest_pose`` (24, 3) [rad], the pose that takes the T-pose to this stand; ``shape`` (S,), the parameters that made it; ``kind``,
+    the model's name; ``parents``, those of :mod:`onefit.skeleton`.
     """
 
     vertices: torch.Tensor
@@ -74,9 +75,9 @@ class AnnyBody(BodyModel):
     """The body of the package ``anny`` (Apache 2.0, its data CC0), reduced to the 24 joints; needs no licence and no download.
 
     The shape is Anny's phenotype: gender (0 male, 1 female), age (child 1/3, young adult 2/3, old 1), muscle, weight, height, proportions,
-    each from 0 to 1; the standard shape has 0.5 everywhere (a teenager, 1.63 m). The surface is Anny's main component (13,348 vertices, closed:
-    no eyes, no tongue), the rest stand its own A-pose. A joint lies at the first of the bones that move with it (hand and foot: in the
-    middle of their fingers' and toes' first joints). A pose moves the body as Anny itself would with its bones turned in these groups.
+    each from 0 to 1; the standard shape has 0.5 everywhere (a teenager, 1.63 m). The surface is Anny's main component (13,348 vertices,
+    closed: no eyes, no tongue), the rest stand its own A-pose. A joint lies at the first of the bones that move with it (hand and foot: in
+    the middle of their fingers' and toes' first joints). A pose moves the body as Anny itself would with its bones turned in these groups.
     """
 
     kind = "anny"
@@ -135,7 +136,8 @@ class AnnyBody(BodyModel):
 
     # Ranges that random_shape draws from, uniformly: bodies from 1.4 to 1.95 m. Beyond them Anny has children, giants and the very old.
     RANGES = {
-        "gender": (0.0, 1.0), "age": (0.5, 0.8), "muscle": (0.3, 0.7), "weight": (0.25, 0.85), "height": (0.3, 0.55), "proportions": (0.25, 0.75),
+        "gender": (0.0, 1.0), "age": (0.5, 0.8), "muscle": (0.3, 0.7), "weight": (0.25, 0.85), "height": (0.3, 0.55),
+        "proportions": (0.25, 0.75),
     }  # fmt: skip
 
     def random_shape(self, rng):
@@ -147,6 +149,7 @@ class AnnyBody(BodyModel):
 def largest_component(count, faces):
     """Whether each of ``count`` vertices is in the component of ``faces`` (F, 3) with the most vertices: (count,) bool."""
     import numpy as np
+
     from polyfit.mesh import components
 
     F = faces.numpy()

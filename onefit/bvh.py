@@ -3,14 +3,16 @@
 import re
 
 import numpy as np
-from polyfit.errors import InputError
 from scipy.spatial.transform import Rotation
+
+from polyfit.errors import InputError
 
 from . import skeleton
 from .motionfiles import _finite, placed
 
-# Names of bones, without case, separators, prefixes as in "mixamorig:", and sides, for each joint: the first that a file has counts. Mixamo,
-# CMU and MotionBuilder; Blender's Rigify; Poser and Daz; Unreal; others. The spine, the neck and what lies between are found by their place.
+# Names of bones, without case, separators, prefixes as in "mixamorig:", and sides, for each joint: the first that a file has counts.
+# Mixamo, CMU and MotionBuilder; Blender's Rigify; Poser and Daz; Unreal; others. The spine, the neck and what lies between are found by
+# their place.
 _NAMES = {
     "hip": ("upleg", "thigh", "upperleg", "hip", "femur"),
     "knee": ("leg", "shin", "calf", "lowerleg", "lowleg", "knee", "tibia"),
@@ -28,9 +30,10 @@ def read_bvh(path, name, fps=None, up=None):
     """The :class:`~onefit.motion.Motion` of a BVH file.
 
     The file's zero pose has to be a stand (T-pose, A-pose, arms down): how it is turned from the T-pose is found as for bodies
-    (:func:`onefit.skeleton.rest_pose`), and rotations are counted from the T-pose from then on. Lengths are scaled by the legs', so that any
-    unit will do. A rotation of a bone that the 24 joints do not have goes to the next joint outwards; fingers and faces are left out; up is
-    where the head is in the zero pose. Raises InputError where the file cannot be read, a limb is not found, or the zero pose is no stand.
+    (:func:`onefit.skeleton.rest_pose`), and rotations are counted from the T-pose from then on. Lengths are scaled by the legs', so that
+    any unit will do. A rotation of a bone that the 24 joints do not have goes to the next joint outwards; fingers and faces are left out;
+    up is where the head is in the zero pose. Raises InputError where the file cannot be read, a limb is not found, or the zero pose is no
+    stand.
     """
     names, parents, offsets, channels, frames, period = _parse(path)
     joint_of = _joints(path, names, parents, offsets)
@@ -155,7 +158,13 @@ def _side(name):
         return None, ""
     base = name.rpartition(":")[2]
     for side, letter in (("left", "l"), ("right", "r")):
-        for pattern in (rf"(?i){side}", rf"^(?i:{letter})[._\- ]+", rf"[._\- ]+(?i:{letter})(?=$|[._\- ])", rf"^{letter}(?=[A-Z])", rf"^{letter.upper()}(?=[A-Z][a-z])"):
+        for pattern in (
+            rf"(?i){side}",
+            rf"^(?i:{letter})[._\- ]+",
+            rf"[._\- ]+(?i:{letter})(?=$|[._\- ])",
+            rf"^{letter}(?=[A-Z])",
+            rf"^{letter.upper()}(?=[A-Z][a-z])",
+        ):
             rest, count = re.subn(pattern, "", base, count=1)
             if count:
                 return side, re.sub(r"[^a-z]|^(def|org)[._\-]", "", re.sub(r"(?i)^(def|org|bip\d*|character\d*)[._\- ]+", "", rest).lower())

@@ -10,7 +10,8 @@ Everything is an array over the frames, in float64. Angles are in radians and an
 - ``left_hand``, ``right_hand`` (T, 2): the wrist bent towards the palm, and the forearm turned palm up;
 - ``left_foot``, ``right_foot`` (T, 3): where the ball of the foot is, from its place in the upright stand [m], in the world: the leg
   follows, bent at the knee as it has to be;
-- ``left_foot_turn``, ``right_foot_turn`` (T, 3): the foot's heel lifted (toes, where negative), the foot turned outwards, and the knee outwards
+- ``left_foot_turn``, ``right_foot_turn`` (T, 3): the foot's heel lifted (toes, where negative), the foot turned outwards, and the knee
+outwards
   from the foot.
 """
 
@@ -27,7 +28,12 @@ CHANNELS = {
     "left_foot": 3, "right_foot": 3, "left_foot_turn": 3, "right_foot_turn": 3,
 }  # fmt: skip
 # hanging arms, a hand's breadth from the hips, elbows soft
-STAND = {"left_arm": (0.0, 0.2, 0.1, 0.3), "right_arm": (0.0, 0.2, 0.1, 0.3), "left_foot_turn": (0.0, 0.1, 0.0), "right_foot_turn": (0.0, 0.1, 0.0)}
+STAND = {
+    "left_arm": (0.0, 0.2, 0.1, 0.3),
+    "right_arm": (0.0, 0.2, 0.1, 0.3),
+    "left_foot_turn": (0.0, 0.1, 0.0),
+    "right_foot_turn": (0.0, 0.1, 0.0),
+}
 
 _J = {name: place for name, place in zip(skeleton.JOINTS, skeleton.standard_joints().double().numpy(), strict=True)}
 BALL = _J["left_foot"]  # where the ball of the left foot is in the upright stand [m]
@@ -163,7 +169,8 @@ def _wrist(arm):
 
 
 def _side(c, side):
-    """What the leg of a side needs, mirrored to a left leg: ankles (T, 3), rotations of foot and pelvis, hip (T, 3), the knee's yaw (T,)."""
+    """What the leg of a side needs, mirrored to a left leg: ankles (T, 3), rotations of foot and pelvis, hip (T, 3), the knee's yaw
+    (T,)."""
     sign = np.array([1.0 if side == "left" else -1.0, 1.0, 1.0])
     pelvis = _turned(c["turn"])
     if side == "right":

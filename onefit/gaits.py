@@ -14,13 +14,13 @@ def _along(path, side, curvature):
     return np.stack([x + side * np.cos(yaw), y + side * np.sin(yaw)], -1), yaw
 
 
-def _gait(t, rng, *, stride, rate, stance, lift, heel, sway, bob, narrow, behind, curvature):
+def gait(t, rng, *, stride, rate, stance, lift, heel, sway, bob, narrow, behind, curvature):
     """(channels of pelvis and feet, phase (T,)) of a gait. A print stays where it is; at phase 0 the left foot touches the ground.
 
     ``stride`` [m] from print to print of one foot, ``rate`` strides a second, ``stance`` the part of the time that a foot is on the ground;
-    ``lift`` and ``heel`` courses of (phase, height of the ball [m]) and (phase, pitch of the foot [rad]); ``sway`` and ``bob`` of the pelvis
-    [m]; ``narrow``, how much closer to the middle than in standing the feet are put [m]; ``behind``, how far behind the hips a print is at
-    mid-stance [m]; ``curvature`` of the way [1/m].
+    ``lift`` and ``heel`` courses of (phase, height of the ball [m]) and (phase, pitch of the foot [rad]); ``sway`` and ``bob`` of the
+    pelvis [m]; ``narrow``, how much closer to the middle than in standing the feet are put [m]; ``behind``, how far behind the hips a print
+    is at mid-stance [m]; ``curvature`` of the way [1/m].
     """
     phase = rate * t + rng.uniform(0, 1)
     c = figure.stand(len(t))
@@ -46,9 +46,10 @@ def walk(t, rng):
     speed = rng.uniform(0.7, 1.6)
     stride = (0.25 + 0.85 * speed**0.5) * rng.uniform(0.95, 1.05)
     push = rng.uniform(0.85, 1.05) * min(1.0, 0.55 + 0.35 * speed)
-    c, phase = _gait(
+    c, phase = gait(
         t, rng, stride=stride, rate=speed / stride, stance=0.62, sway=rng.uniform(0.015, 0.03), bob=0.008 + 0.005 * speed,
-        lift=[(0.0, 0.0), (0.59, 0.0), (0.71, 0.06 + 0.04 * speed), (0.84, 0.035), (0.97, 0.005)], narrow=rng.uniform(0.02, 0.05), behind=0.05 + 0.02 * speed,
+        lift=[(0.0, 0.0), (0.59, 0.0), (0.71, 0.06 + 0.04 * speed), (0.84, 0.035), (0.97, 0.005)], narrow=rng.uniform(0.02, 0.05),
+        behind=0.05 + 0.02 * speed,
         heel=[(0.0, -0.25), (0.1, 0.0), (0.3, 0.0), (0.5, 0.45 * push), (0.62, push), (0.7, 0.8 * push), (0.86, -0.1), (0.96, -0.3)],
         curvature=rng.uniform(-0.25, 0.25),
     )  # fmt: skip
@@ -70,7 +71,7 @@ def run(t, rng):
     """Running at 2 to 3.6 m/s, straight on or in a wide bend."""
     speed = rng.uniform(2.0, 3.6)
     rate = rng.uniform(1.35, 1.5)
-    c, phase = _gait(
+    c, phase = gait(
         t, rng, stride=speed / rate, rate=rate, stance=0.3, sway=0.01, bob=-0.03, narrow=0.06, behind=0.04 + 0.02 * speed,
         lift=[(0.0, 0.0), (0.3, 0.0), (0.42, 0.16), (0.55, 0.16 + 0.07 * speed), (0.7, 0.28), (0.9, 0.07)],
         heel=[(0.0, -0.1), (0.06, 0.0), (0.14, 0.1), (0.32, 0.9), (0.52, 1.4), (0.7, 0.5), (0.9, -0.1)], curvature=rng.uniform(-0.08, 0.08),
@@ -85,26 +86,4 @@ def run(t, rng):
     for side, sign in (("left", -1.0), ("right", 1.0)):
         forward = sign * np.cos(2 * np.pi * (phase - 0.02))
         c[f"{side}_arm"] = np.stack([swing * forward - 0.1, 0.33 + zero, 0.25 + 0.2 * forward, bent + 0.25 * forward], -1)
-    return c
-
-
-def sneak(t, rng):
-    """Going slowly with bent knees, on tiptoe, arms held up in front."""
-    speed = rng.uniform(0.35, 0.6)
-    rate = rng.uniform(0.45, 0.6)
-    c, phase = _gait(
-        t, rng, stride=speed / rate, rate=rate, stance=0.62, sway=0.05, bob=0.02, narrow=0.03, behind=0.02, curvature=rng.uniform(-0.3, 0.3),
-        lift=[(0.0, 0.0), (0.6, 0.0), (0.78, 0.22), (0.9, 0.12)], heel=[(0.0, 0.45), (0.1, 0.2), (0.4, 0.1), (0.62, 0.8), (0.8, 0.5)],
-    )  # fmt: skip
-    wave = np.cos(2 * np.pi * phase)
-    zero = np.zeros(len(t))
-    c["pelvis"][:, 2] -= rng.uniform(0.08, 0.18)
-    c["pelvis"][:, 1] += 0.08
-    c["turn"] += np.stack([0.25 + zero, 0 * wave, -0.15 * wave], -1)
-    c["spine"] = np.stack([rng.uniform(0.2, 0.45) + zero, 0.06 * wave, 0.2 * wave], -1)
-    c["head"] = np.stack([-0.4 + zero, zero, 0.5 * np.sin(np.pi * phase)], -1)
-    lift, bent = rng.uniform(0.6, 1.1), rng.uniform(1.2, 1.7)
-    for side, sign in (("left", -1.0), ("right", 1.0)):
-        c[f"{side}_arm"] = np.stack([lift + 0.25 * sign * wave, 0.35 + zero, 0.1 + zero, bent - 0.15 * sign * wave], -1)
-        c[f"{side}_hand"] = np.stack([0.5 + zero, zero], -1)
     return c

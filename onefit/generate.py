@@ -7,9 +7,10 @@ tests only: no network of ours is trained on them, nor on seeds from :data:`HELD
 import zlib
 
 import numpy as np
+
 from polyfit.errors import InputError
 
-from . import figure, gaits, postures
+from . import figure, gaits, heldout, postures
 from .script import wander
 
 HELD_OUT_SEEDS = 1_000_000  # seeds from here up are never trained on
@@ -26,7 +27,7 @@ def generate(name, seconds=10.0, seed=0, fps=30.0):
         raise InputError(f"a motion of {seconds} s at {fps} frames a second; at least one frame, at most a million are needed")
     rng = np.random.default_rng([zlib.crc32(name.encode()), seed])
     flipped = rng.random() < 0.5
-    t = np.arange(int(round(seconds * fps))) / fps
+    t = np.arange(round(seconds * fps)) / fps
     channels = KINDS[name](t, rng)
     alive = np.random.default_rng([zlib.crc32(name.encode()), seed, 1])
     channels = _alive(channels, t, alive)
@@ -46,10 +47,11 @@ def _alive(channels, t, rng):
 
 
 _TRAINING = (
-    postures.idle, gaits.walk, gaits.run, postures.squat, postures.reach, postures.twist, postures.arms_up, postures.arms_crossed, postures.kick,
+    postures.idle, gaits.walk, gaits.run, postures.squat, postures.reach, postures.twist, postures.arms_up, postures.arms_crossed,
+    postures.kick,
     postures.sit, postures.turn, postures.side_step, postures.lunge, postures.bend, postures.stretch, postures.jump, postures.improvise,
 )  # fmt: skip
-_HELD_OUT = (postures.jumping_jack, postures.box, gaits.sneak, postures.wave, postures.pick_up, postures.dance)
+_HELD_OUT = (heldout.jumping_jack, heldout.box, heldout.sneak, heldout.wave, heldout.pick_up, heldout.dance)
 TRAINING = tuple(kind.__name__ for kind in _TRAINING)
 HELD_OUT = tuple(kind.__name__ for kind in _HELD_OUT)
 KINDS = {kind.__name__: kind for kind in _TRAINING + _HELD_OUT}

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import torch
+
 from polyfit.errors import InputError
 
 from . import skeleton
@@ -12,9 +13,9 @@ from . import skeleton
 class Motion:
     """A sequence of poses of the 24 joints, in OneFit's world (metres, z up, facing -y).
 
-    ``poses`` (T, 24, 3) axis-angle vectors [rad], each joint relative to its parent and counted from the T-pose; ``translation`` (T, 3) [m],
-    added to the rest position of the root joint; ``fps`` frames a second; ``name``. Raises InputError where shapes do not fit or a number is
-    not finite.
+    ``poses`` (T, 24, 3) axis-angle vectors [rad], each joint relative to its parent and counted from the T-pose; ``translation`` (T, 3)
+    [m], added to the rest position of the root joint; ``fps`` frames a second; ``name``. Raises InputError where shapes do not fit or a
+    number is not finite.
     """
 
     poses: torch.Tensor
@@ -51,11 +52,13 @@ class Motion:
 
     @classmethod
     def read(cls, path, fps=None, up=None):
-        """A motion from a file: AMASS's ``.npz`` (``poses``, ``trans``, ``mocap_framerate``; z up), Neural Cloth Simulation's (``fps``; y up), or BVH.
+        """A motion from a file: AMASS's ``.npz`` (``poses``, ``trans``, ``mocap_framerate``; z up), Neural Cloth Simulation's (``fps``; y
+        up), or BVH.
 
-        ``fps`` and ``up`` ("y" or "z") take the place of what the file says. SMPL's rotations are taken over joint by joint, in OneFit's axes
-        (:mod:`onefit.motionfiles`); a BVH skeleton is retargeted (:mod:`onefit.bvh`). The motion starts at x = y = 0 with its lowest foot on
-        the standard body's ground. Raises InputError for what cannot be used: not finite, another number of joints, no frame rate, another unit.
+        ``fps`` and ``up`` ("y" or "z") take the place of what the file says. SMPL's rotations are taken over joint by joint, in OneFit's
+        axes (:mod:`onefit.motionfiles`); a BVH skeleton is retargeted (:mod:`onefit.bvh`). The motion starts at x = y = 0 with its lowest
+        foot on the standard body's ground. Raises InputError for what cannot be used: not finite, another number of joints, no frame rate,
+        another unit.
         """
         from .motionfiles import read
 
@@ -97,7 +100,9 @@ class Motion:
         step = (before.inv() * after).as_rotvec() * np.repeat(part, poses.shape[1], 0)
         new = (before * Rotation.from_rotvec(step)).as_rotvec().reshape(count, -1, 3)
         place = places[first] * (1 - part) + places[first + 1] * part
-        return replace(self, poses=torch.as_tensor(new).to(self.poses), translation=torch.as_tensor(place).to(self.translation), fps=float(fps))
+        return replace(
+            self, poses=torch.as_tensor(new).to(self.poses), translation=torch.as_tensor(place).to(self.translation), fps=float(fps)
+        )
 
 
 def _other_side(name):

@@ -11,8 +11,9 @@ import zipfile
 
 import numpy as np
 import torch
-from polyfit.errors import InputError
 from scipy.spatial.transform import Rotation
+
+from polyfit.errors import InputError
 
 from . import skeleton, skinning
 from .motion import Motion
@@ -86,9 +87,8 @@ def _finite(path, **arrays):
     for key, array in arrays.items():
         bad = ~np.isfinite(array).reshape(len(array), -1).all(1)
         if bad.any():
-            raise InputError(
-                f"{path}: {key} are not finite in {bad.sum()} of {len(bad)} frames, the first is frame {bad.argmax()}; cut them out or fill them in"
-            )
+            where = f"{bad.sum()} of {len(bad)} frames, the first is frame {bad.argmax()}"
+            raise InputError(f"{path}: {key} are not finite in {where}; cut them out or fill them in")
 
 
 def _upright(path, root, up):
@@ -105,5 +105,9 @@ def placed(poses, translation, fps, name):
     at = skeleton.INDEX["left_foot"], skeleton.INDEX["right_foot"]
     poses = torch.as_tensor(poses, dtype=torch.float32)
     feet = skinning.joint_places(skeleton.standard_joints(), poses, torch.zeros(len(poses), 3))[:, at, 2].amin(1).double().numpy()
-    translation = translation - [translation[0, 0], translation[0, 1], (feet + translation[:, 2]).min() - skeleton.standard_joints()[at[0], 2].item()]
+    translation = translation - [
+        translation[0, 0],
+        translation[0, 1],
+        (feet + translation[:, 2]).min() - skeleton.standard_joints()[at[0], 2].item(),
+    ]
     return Motion(poses, torch.as_tensor(translation, dtype=torch.float32), float(fps), name)

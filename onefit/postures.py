@@ -4,31 +4,22 @@ import numpy as np
 from scipy.interpolate import BPoly
 
 from . import figure
-from .script import Script, bump, cycle, ease, wander
+from .script import Script, hanging, sides, step
 
 G = 9.81
-
-
-def _sides(rng):
-    """The sides in a random order, with the first one's sign (left is 1)."""
-    return ("left", "right", 1.0) if rng.random() < 0.5 else ("right", "left", -1.0)
-
-
-def _down(rng):
-    """An arm hanging, (4,), a bit different every time."""
-    return rng.uniform((-0.1, 0.18, 0.0, 0.15), (0.2, 0.3, 0.2, 0.5))
 
 
 def idle(t, rng):
     """Standing, weight from one leg to the other, a look around, an arm that moves."""
     s = Script(rng)
     while s.clock < t[-1] + 1:
-        one, other, _ = _sides(rng)
+        one, other, _ = sides(rng)
         lean = rng.uniform(-0.055, 0.055)
         s.move(
-            rng.uniform(1.2, 2.5), pelvis=(lean, rng.uniform(-0.02, 0.02), -0.2 * abs(lean)), turn=(0, -1.2 * lean, rng.uniform(-0.15, 0.15)),
+            rng.uniform(1.2, 2.5), pelvis=(lean, rng.uniform(-0.02, 0.02), -0.2 * abs(lean)), turn=(0, -1.2 * lean, rng.uniform(-0.15,
+            0.15)),
             spine=(rng.uniform(-0.03, 0.1), 1.6 * lean, rng.uniform(-0.15, 0.15)), head=(rng.uniform(-0.2, 0.3), 0, rng.uniform(-0.8, 0.8)),
-            **{f"{one}_arm": rng.uniform((-0.3, 0.2, 0, 0.1), (0.5, 0.5, 0.3, 1.2)), f"{other}_arm": _down(rng)},
+            **{f"{one}_arm": rng.uniform((-0.3, 0.2, 0, 0.1), (0.5, 0.5, 0.3, 1.2)), f"{other}_arm": hanging(rng)},
         )  # fmt: skip
         s.hold(rng.uniform(0.0, 1.2))
     return s.channels(t)
@@ -50,7 +41,7 @@ def squat(t, rng):
         s.hold(rng.uniform(0.0, 0.5))
         s.move(
             pace * rng.uniform(0.8, 1.1), pelvis=(0, 0, -0.02), turn=(0, 0, 0), spine=(0, 0, 0), head=(0, 0, 0),
-            left_arm=_down(rng), right_arm=_down(rng),
+            left_arm=hanging(rng), right_arm=hanging(rng),
         )  # fmt: skip
         s.hold(rng.uniform(0.0, 0.5))
     return s.channels(t)
@@ -60,7 +51,7 @@ def reach(t, rng):
     """Reaching up, to the front, to the side and across with one hand or both."""
     s = Script(rng)
     while s.clock < t[-1] + 1:
-        one, other, sign = _sides(rng)
+        one, other, sign = sides(rng)
         both = rng.random() < 0.35
         height = rng.uniform(0.9, 2.8)
         aside = rng.uniform(-0.35, 0.9) if height < 2.2 else rng.uniform(0.0, 0.4)
@@ -72,13 +63,14 @@ def reach(t, rng):
             turn=(0.1 * (height < 1.6), 0, -0.4 * sign * turned), head=(-0.35 * high, 0, sign * 0.3 * aside),
             **{
                 f"{one}_arm": arm, f"{other}_arm": arm if both else rng.uniform((-0.4, 0.25, 0, 0.2), (0.1, 0.45, 0.2, 0.6)),
-                f"{one}_foot_turn": (0.5 * high, 0.1, 0), f"{other}_foot_turn": (0.5 * high * both, 0.1, 0), f"{one}_hand": (-0.3 * high, 0),
+                f"{one}_foot_turn": (0.5 * high, 0.1, 0), f"{other}_foot_turn": (0.5 * high * both, 0.1, 0), f"{one}_hand": (-0.3 * high,
+                0),
             },
         )  # fmt: skip
         s.hold(rng.uniform(0.1, 0.6))
         if rng.random() < 0.6:
             s.move(
-                rng.uniform(0.8, 1.3), left_arm=_down(rng), right_arm=_down(rng), spine=(0, 0, 0), pelvis=(0, 0, -0.01), turn=(0, 0, 0),
+                rng.uniform(0.8, 1.3), left_arm=hanging(rng), right_arm=hanging(rng), spine=(0, 0, 0), pelvis=(0, 0, -0.01), turn=(0, 0, 0),
                 head=(0, 0, 0), left_foot_turn=(0, 0.1, 0), right_foot_turn=(0, 0.1, 0), left_hand=(0, 0), right_hand=(0, 0),
             )  # fmt: skip
             s.hold(rng.uniform(0.0, 0.4))
@@ -89,7 +81,7 @@ def twist(t, rng):
     """The trunk turned from side to side, arms swinging out, raised or on their way."""
     s = Script(rng)
     wide = rng.uniform(0.0, 0.1)
-    one, other, sign = _sides(rng)
+    one, other, sign = sides(rng)
     s.move(0.6, left_foot=(wide, 0, 0), pelvis=(-0.03, 0, -0.02), left_arm=(0.1, 0.6, 0.1, 0.6), right_arm=(0.1, 0.6, 0.1, 0.6), after=0.5)
     s.move(0.6, right_foot=(-wide, 0, 0), pelvis=(0, 0, -0.03))
     while s.clock < t[-1] + 1:
@@ -111,7 +103,7 @@ def arms_up(t, rng):
         up = (high, 0.2, 0.0, bent) if rng.random() < 0.5 else (0.15, high, 0.0, bent)
         s.move(pace, left_arm=up, right_arm=up, spine=(-0.15, rng.uniform(-0.2, 0.2), 0), head=(-0.3, 0, 0), pelvis=(0, -0.02, 0))
         s.hold(rng.uniform(0.1, 0.8))
-        s.move(pace, left_arm=_down(rng), right_arm=_down(rng), spine=(0.05, 0, 0), head=(0, 0, 0), pelvis=(0, 0, -0.01))
+        s.move(pace, left_arm=hanging(rng), right_arm=hanging(rng), spine=(0.05, 0, 0), head=(0, 0, 0), pelvis=(0, 0, -0.01))
         s.hold(rng.uniform(0.0, 0.5))
     return s.channels(t)
 
@@ -120,7 +112,7 @@ def arms_crossed(t, rng):
     """Arms folded in front of the chest, one over the other, and opened again."""
     s = Script(rng)
     while s.clock < t[-1] + 1:
-        one, other, sign = _sides(rng)
+        one, other, sign = sides(rng)
         low, pace = rng.uniform(-0.02, 0.04), rng.uniform(0.9, 1.5)
         inner = figure.arm_to(one, (0.03 * sign, -0.222, 0.2 + low), pole=(0.7, 0.2, -1.0))
         outer = figure.arm_to(other, (-0.03 * sign, -0.272, 0.33 + low), pole=(1.2, 0.0, -0.6))
@@ -130,12 +122,13 @@ def arms_crossed(t, rng):
         s.move(0.6 * pace, **{f"{other}_arm": outer, f"{one}_hand": (0.1, 0), f"{other}_hand": (0.35, 0)})
         for _ in range(rng.integers(1, 4)):
             s.move(
-                rng.uniform(0.7, 1.4), turn=(0, 0, rng.uniform(-0.2, 0.2)), spine=(rng.uniform(-0.1, 0.15), rng.uniform(-0.1, 0.1), rng.uniform(-0.3, 0.3)),
+                rng.uniform(0.7, 1.4), turn=(0, 0, rng.uniform(-0.2, 0.2)), spine=(rng.uniform(-0.1, 0.15), rng.uniform(-0.1, 0.1),
+                rng.uniform(-0.3, 0.3)),
                 head=(rng.uniform(-0.2, 0.2), 0, rng.uniform(-0.5, 0.5)), pelvis=(rng.uniform(-0.04, 0.04), 0, -0.01),
             )  # fmt: skip
         s.move(0.6 * pace, **{f"{other}_arm": before, f"{other}_hand": (0, 0)}, after=0.3 * pace)
         s.move(0.8 * pace, **{f"{one}_arm": (0.6, 0.3, 0.2, 1.2), f"{one}_hand": (0, 0)}, after=0.6 * pace)
-        s.move(pace, left_arm=_down(rng), right_arm=_down(rng), turn=(0, 0, 0), spine=(0, 0, 0), head=(0, 0, 0))
+        s.move(pace, left_arm=hanging(rng), right_arm=hanging(rng), turn=(0, 0, 0), spine=(0, 0, 0), head=(0, 0, 0))
         s.hold(rng.uniform(0.0, 0.5))
     return s.channels(t)
 
@@ -146,13 +139,14 @@ def kick(t, rng):
     guard = (0.5, 0.4, 0.3, 1.4)
     s.move(0.5, left_arm=guard, right_arm=guard, pelvis=(0, 0, -0.03))
     while s.clock < t[-1] + 1:
-        one, other, sign = _sides(rng)
+        one, other, sign = sides(rng)
         high, pace = rng.uniform(1.1, 1.9), rng.uniform(0.45, 0.65)
         turn = f"{one}_foot_turn"
         s.move(0.5 * pace, **{f"{one}_swing": (0.0, 0.06), turn: (0.2, 0.1, 0)}, after=0.25 * pace)
         s.move(pace, pelvis=(-0.06 * sign, -0.03, -0.05), **{f"{one}_swing": (-0.5, 0.06), turn: (0.7, 0.1, 0)})
         s.move(
-            1.2 * pace, pelvis=(-0.085 * sign, 0.0, -0.02), turn=(-0.1 - 0.15 * high, -0.08 * sign, -0.15 * sign), spine=(0.2, 0, 0.2 * sign),
+            1.2 * pace, pelvis=(-0.085 * sign, 0.0, -0.02), turn=(-0.1 - 0.15 * high, -0.08 * sign, -0.15 * sign), spine=(0.2, 0,
+            0.2 * sign),
             head=(0.15, 0, 0), **{f"{one}_swing": (high, 0.06), turn: (0.5 - high, 0.05, 0)},
             **{f"{other}_arm": (1.3, 0.4, 0.2, 0.8), f"{one}_arm": (-0.4, 0.7, 0.1, 0.5)},
         )  # fmt: skip
@@ -198,7 +192,7 @@ def sit(t, rng):
             s.move(rng.uniform(0.8, 1.6), head=(rng.uniform(-0.3, 0.2), 0, rng.uniform(-0.6, 0.6)), **posture(spine))
         s.move(0.5 * pace, left_arm=(0.7, 0.45, 0.1, 0.8), right_arm=(0.7, 0.45, 0.1, 0.8), after=0.2 * pace)
         s.move(0.8 * pace, pelvis=(0, 0.3, -0.75 * deep), turn=(0.6, 0, 0), spine=(0.25, 0, 0), head=(-0.4, 0, 0), after=0.55 * pace)
-        s.move(pace, pelvis=(0, 0, 0), turn=(0, 0, 0), spine=(0, 0, 0), head=(0, 0, 0), left_arm=_down(rng), right_arm=_down(rng))
+        s.move(pace, pelvis=(0, 0, 0), turn=(0, 0, 0), spine=(0, 0, 0), head=(0, 0, 0), left_arm=hanging(rng), right_arm=hanging(rng))
         s.hold(rng.uniform(0.1, 0.6))
     return s.channels(t)
 
@@ -210,29 +204,21 @@ def turn(t, rng):
     while s.clock < t[-1] + 1:
         direction = rng.choice([-1.0, 1.0])
         first, second = ("left", "right") if direction > 0 else ("right", "left")
-        step, pace = rng.uniform(0.5, 0.85), rng.uniform(0.38, 0.6)
+        part, pace = rng.uniform(0.5, 0.85), rng.uniform(0.38, 0.6)
         arms = rng.uniform(0.32, 0.7)
         for k in range(rng.integers(2, 7)):
-            yaw += direction * step
+            yaw += direction * part
             swing = (-1) ** k * 0.25
             s.move(
-                0.9 * pace, turn=(0.03, 0, yaw - 0.3 * direction * step), head=(0.05, 0, 0.35 * direction), spine=(0.03, 0, 0.2 * direction),
+                0.9 * pace, turn=(0.03, 0, yaw - 0.3 * direction * part), head=(0.05, 0, 0.35 * direction), spine=(0.03, 0,
+                0.2 * direction),
                 left_arm=(swing, arms, 0.1, 0.5), right_arm=(-swing, arms, 0.1, 0.5), after=0.05, pelvis=(0, 0, -0.03),
             )  # fmt: skip
             for foot in (first, second):
-                s.move(0.85 * pace, **_step(foot, yaw), after=0.75 * pace)
-        s.move(0.7, turn=(0, 0, yaw), head=(0, 0, 0), spine=(0, 0, 0), pelvis=(0, 0, -0.01), left_arm=_down(rng), right_arm=_down(rng))
+                s.move(0.85 * pace, **step(foot, yaw), after=0.75 * pace)
+        s.move(0.7, turn=(0, 0, yaw), head=(0, 0, 0), spine=(0, 0, 0), pelvis=(0, 0, -0.01), left_arm=hanging(rng), right_arm=hanging(rng))
         s.hold(rng.uniform(0.0, 0.8))
     return s.channels(t)
-
-
-def _step(foot, yaw, place=(0.0, 0.0), apart=0.0):
-    """Changes that put a foot where it belongs for a body at ``place`` (2,) [m] that faces ``yaw``, its feet ``apart`` [m] farther out."""
-    sign = 1.0 if foot == "left" else -1.0
-    x, y = sign * (figure.BALL[0] + apart), figure.BALL[1]
-    c, w = np.cos(yaw), np.sin(yaw)
-    to = (c * x - w * y + place[0] - sign * figure.BALL[0], w * x + c * y + place[1] - figure.BALL[1], 0.0)
-    return {f"{foot}_foot": to, f"{foot}_foot_turn": (0, 0.1 + sign * yaw, 0)}
 
 
 def side_step(t, rng):
@@ -240,17 +226,19 @@ def side_step(t, rng):
     s = Script(rng)
     x = 0.0
     while s.clock < t[-1] + 1:
-        one, other, sign = _sides(rng)
+        one, other, sign = sides(rng)
         far, pace, lift, low = rng.uniform(0.25, 0.45), rng.uniform(0.35, 0.6), rng.uniform(0.3, 1.2), rng.uniform(0.03, 0.12)
         for _ in range(rng.integers(1, 4)):
             x += sign * far
             s.move(
-                pace, pelvis=(x - 0.5 * sign * far, 0.03, -low), turn=(0.1, 0.05 * sign, 0), spine=(0.06, -0.1 * sign, 0), left_arm=(0.1, lift, 0.1, 0.4),
-                right_arm=(0.1, lift, 0.1, 0.4), **_step(one, 0.0, (x, 0.0)),
+                pace, pelvis=(x - 0.5 * sign * far, 0.03, -low), turn=(0.1, 0.05 * sign, 0), spine=(0.06, -0.1 * sign, 0), left_arm=(0.1,
+                lift, 0.1, 0.4),
+                right_arm=(0.1, lift, 0.1, 0.4), **step(one, 0.0, (x, 0.0)),
             )  # fmt: skip
             s.move(
-                pace, pelvis=(x, 0, -0.02), turn=(0.03, 0, 0), spine=(0.02, 0, 0), left_arm=(0.3, 0.3, 0.2, 0.8), right_arm=(0.3, 0.3, 0.2, 0.8),
-                **_step(other, 0.0, (x, 0.0)),
+                pace, pelvis=(x, 0, -0.02), turn=(0.03, 0, 0), spine=(0.02, 0, 0), left_arm=(0.3, 0.3, 0.2, 0.8), right_arm=(0.3, 0.3,
+                0.2, 0.8),
+                **step(other, 0.0, (x, 0.0)),
             )  # fmt: skip
         s.hold(rng.uniform(0.0, 0.4))
     return s.channels(t)
@@ -260,16 +248,17 @@ def lunge(t, rng):
     """Long steps forward into a deep lunge and back, hands at the sides, overhead or on the way."""
     s = Script(rng)
     while s.clock < t[-1] + 1:
-        one, other, sign = _sides(rng)
+        one, other, _ = sides(rng)
         far, deep, pace = rng.uniform(0.5, 0.8), rng.uniform(0.18, 0.34), rng.uniform(0.7, 1.1)
         arm = [(0.1, 0.35, 0.1, 0.3), (rng.uniform(2.5, 2.9), 0.15, 0.0, 0.2), (0.2, 1.4, 0.0, 0.2), (1.3, 0.2, 0.2, 0.3)][rng.choice(4)]
         s.move(
-            pace, pelvis=(0, -0.48 * far, -deep), turn=(0.1, 0, rng.uniform(-0.1, 0.1)), spine=(0.02, 0, rng.uniform(-0.3, 0.3)), left_arm=arm,
+            pace, pelvis=(0, -0.48 * far, -deep), turn=(0.1, 0, rng.uniform(-0.1, 0.1)), spine=(0.02, 0, rng.uniform(-0.3, 0.3)),
+            left_arm=arm,
             right_arm=arm, **{f"{one}_foot": (0, -far, 0), f"{other}_foot_turn": (rng.uniform(0.6, 0.9), 0.02, 0)},
         )  # fmt: skip
         s.hold(rng.uniform(0.1, 0.6))
         s.move(
-            pace, pelvis=(0, 0, -0.01), turn=(0, 0, 0), spine=(0, 0, 0), left_arm=_down(rng), right_arm=_down(rng),
+            pace, pelvis=(0, 0, -0.01), turn=(0, 0, 0), spine=(0, 0, 0), left_arm=hanging(rng), right_arm=hanging(rng),
             **{f"{one}_foot": (0, 0, 0), f"{other}_foot_turn": (0, 0.1, 0)},
         )  # fmt: skip
         s.hold(rng.uniform(0.0, 0.4))
@@ -290,15 +279,16 @@ def bend(t, rng):
                 head=(rng.uniform(-0.2, 0.4), 0, 0),
             )  # fmt: skip
         else:
-            one, other, sign = _sides(rng)
+            one, other, sign = sides(rng)
             far = rng.uniform(0.3, 0.6)
             s.move(
-                pace, pelvis=(0.05 * sign, 0, -0.01), turn=(0, -0.25 * sign * far, 0), spine=(0, -sign * far, 0), head=(0, -0.4 * sign * far, 0),
+                pace, pelvis=(0.05 * sign, 0, -0.01), turn=(0, -0.25 * sign * far, 0), spine=(0, -sign * far, 0), head=(0,
+                -0.4 * sign * far, 0),
                 **{f"{one}_arm": (0.1, rng.uniform(2.4, 2.8), 0.0, 0.5), f"{other}_arm": (0.15, 0.3 + 1.2 * far, 0.1, 0.2)},
             )  # fmt: skip
         s.hold(rng.uniform(0.1, 0.6))
         s.move(pace, pelvis=(0, 0, -0.01), turn=(0, 0, 0), spine=(0, 0, 0), head=(0, 0, 0), after=0.55 * pace)
-        s.move(0.8 * pace, left_arm=_down(rng), right_arm=_down(rng))
+        s.move(0.8 * pace, left_arm=hanging(rng), right_arm=hanging(rng))
         s.hold(rng.uniform(0.0, 0.4))
     return s.channels(t)
 
@@ -308,7 +298,7 @@ def stretch(t, rng):
     s = Script(rng)
     while s.clock < t[-1] + 1:
         pace = rng.uniform(0.8, 1.5)
-        one, other, sign = _sides(rng)
+        one, other, sign = sides(rng)
         style = rng.choice(3)
         if style == 0:  # open wide, then close in front
             for _ in range(rng.integers(1, 4)):
@@ -325,7 +315,7 @@ def stretch(t, rng):
             s.move(pace, left_arm=arm, right_arm=arm, spine=(0.05, 0, 0))
             for _ in range(rng.integers(1, 4)):
                 s.move(0.6 * pace, spine=(0.05, 0, rng.uniform(-0.5, 0.5)), left_arm=arm, right_arm=arm)
-        s.move(pace, left_arm=_down(rng), right_arm=_down(rng), spine=(0, 0, 0), head=(0, 0, 0))
+        s.move(pace, left_arm=hanging(rng), right_arm=hanging(rng), spine=(0, 0, 0), head=(0, 0, 0))
         s.hold(rng.uniform(0.0, 0.4))
     return s.channels(t)
 
@@ -345,12 +335,15 @@ def improvise(t, rng):
         low = rng.uniform(0.0, 0.14)
         s.move(
             rng.uniform(0.6, 1.3), after=rng.uniform(0.5, 1.1), pelvis=(rng.uniform(-0.08, 0.08), rng.uniform(-0.04, 0.06), -low),
-            turn=(rng.uniform(-0.05, 0.25), rng.uniform(-0.12, 0.12), rng.uniform(-0.3, 0.3)), head=rng.uniform((-0.3, -0.2, -0.6), (0.3, 0.2, 0.6)),
+            turn=(rng.uniform(-0.05, 0.25), rng.uniform(-0.12, 0.12), rng.uniform(-0.3, 0.3)), head=rng.uniform((-0.3, -0.2, -0.6), (0.3,
+            0.2, 0.6)),
             spine=rng.uniform((-0.15, -0.25, -0.4), (0.4, 0.25, 0.4)), **changes,
         )  # fmt: skip
         if rng.random() < 0.5:
             foot = rng.choice(["left", "right"])
-            s.move(0.5, **_step(foot, rng.uniform(-0.25, 0.25), rng.uniform((-0.05, -0.15), (0.05, 0.1)), apart=rng.uniform(0, 0.15)), after=0.3)
+            s.move(
+                0.5, **step(foot, rng.uniform(-0.25, 0.25), rng.uniform((-0.05, -0.15), (0.05, 0.1)), apart=rng.uniform(0, 0.15)), after=0.3
+            )
     return s.channels(t)
 
 
@@ -380,9 +373,17 @@ def jump(t, rng):
         keys += [start, start + load, lift, lift + half, lift + 2 * half, lift + 2 * half + soak, lift + 2 * half + soak + 0.8]
         values += [[-0.01, 0, 0], [-deep, 0, 0], [0.07, v, -G], [0.07 + height, 0, -G], [0.07, -v, -G], [-0.8 * deep, 0, 0], [-0.01, 0, 0]]
         flights.append((lift, height))
-        s.move(load, turn=(1.5 * deep, 0, 0), spine=(0.3, 0, 0), head=(-0.3, 0, 0), left_arm=(-0.7, 0.25, 0, 0.2), right_arm=(-0.7, 0.25, 0, 0.2))
         s.move(
-            push + 0.5 * half, turn=(0, 0, 0), spine=(-0.05, 0, 0), head=(0, 0, 0), left_arm=up, right_arm=up, left_foot_turn=(0.75, 0.1, 0),
+            load,
+            turn=(1.5 * deep, 0, 0),
+            spine=(0.3, 0, 0),
+            head=(-0.3, 0, 0),
+            left_arm=(-0.7, 0.25, 0, 0.2),
+            right_arm=(-0.7, 0.25, 0, 0.2),
+        )
+        s.move(
+            push + 0.5 * half, turn=(0, 0, 0), spine=(-0.05, 0, 0), head=(0, 0, 0), left_arm=up, right_arm=up, left_foot_turn=(0.75, 0.1,
+            0),
             right_foot_turn=(0.75, 0.1, 0),
         )  # fmt: skip
         s.hold(0.5 * half)
@@ -407,130 +408,3 @@ def _smoothed(values, width):
     from scipy.ndimage import gaussian_filter1d
 
     return gaussian_filter1d(values, width)
-
-
-# --- held out ----------------------------------------------------------------------------------------------------------------------------
-
-
-def jumping_jack(t, rng):
-    """Small hops from feet together to feet apart and back, arms up by the sides and down."""
-    rate = rng.uniform(0.75, 1.1)
-    phase = rate * t + rng.uniform(0, 1)
-    c = figure.stand(len(t))
-    wide, high = rng.uniform(0.15, 0.28), rng.uniform(2.3, 2.75)
-    p = phase % 1.0
-    out = ease((p - 0.17) / 0.22) - ease((p - 0.64) / 0.22)  # feet and arms move while in the air
-    hop = bump((p - 0.13) / 0.3) + bump((p - 0.6) / 0.3)
-    arms = cycle(phase, [(0.0, 0.0), (0.05, 0.0), (0.45, 1.0), (0.55, 1.0), (0.95, 0.0)], 0.05)
-    c["pelvis"][:, 2] = 0.08 * hop - 0.035
-    c["turn"][:, 0] = 0.06
-    c["spine"][:, 0] = 0.05 - 0.1 * out
-    bent = rng.uniform(0.2, 0.5)
-    zero = np.zeros(len(t))
-    for side, sign in (("left", 1.0), ("right", -1.0)):
-        c[f"{side}_arm"] = np.stack([0.12 + zero, 0.25 + (high - 0.25) * arms, 0.1 - 0.1 * arms, bent + zero], -1)
-        c[f"{side}_foot"][:, 0] = sign * wide * out
-        c[f"{side}_foot"][:, 2] = 0.06 * hop
-        c[f"{side}_foot_turn"] = np.stack([0.12 + 0.55 * hop, 0.1 + 0.15 * out, zero], -1)
-    return c
-
-
-def box(t, rng):
-    """Boxing: guard, jabs and hooks with either hand, the trunk behind them, small steps."""
-    s = Script(rng)
-    guards = {"left": figure.arm_to("left", (0.12, -0.3, 0.5)), "right": figure.arm_to("right", (-0.12, -0.24, 0.48))}
-    s.move(0.6, pelvis=(0, 0.02, -0.06), turn=(0.08, 0, -0.25), **{f"{side}_arm": arm for side, arm in guards.items()})
-    s.move(0.5, **_step("right", -0.5, (0.0, 0.18), apart=0.04))
-    while s.clock < t[-1] + 1:
-        one, other, sign = _sides(rng)
-        fast, hook = rng.uniform(0.22, 0.35), rng.random() < 0.35
-        arm = (1.35, 0.75, 0.25, 1.4) if hook else (rng.uniform(1.4, 1.75), -0.08, 0.3, 0.15)
-        s.move(
-            fast, pelvis=(0, -0.05, -0.07), turn=(0.12, 0, -0.25 - 0.3 * sign), spine=(0.08, 0, -0.3 * sign), head=(0.05, 0, 0.45 * sign + 0.2),
-            **{f"{one}_arm": arm, f"{one}_hand": (0, 0)},
-        )  # fmt: skip
-        s.move(
-            1.3 * fast, pelvis=(0, 0.02, -0.06), turn=(0.08, 0, -0.25), spine=(0.05, 0, 0), head=(0, 0, 0.2), **{f"{one}_arm": guards[one]},
-        )  # fmt: skip
-        s.hold(rng.choice([0.0, 0.1, 0.5, 0.9]))
-    return s.channels(t)
-
-
-def wave(t, rng):
-    """An arm waved overhead, the other one hanging or on the way up too."""
-    s = Script(rng)
-    while s.clock < t[-1] + 1:
-        one, other, sign = _sides(rng)
-        both = rng.random() < 0.3
-        up = np.array([0.25, rng.uniform(1.9, 2.3), -0.2, 0.9])
-        pace = rng.uniform(0.8, 1.1)
-        rest = {f"{other}_arm": up} if both else {}
-        s.move(pace, spine=(-0.05, -0.08 * sign, 0), head=(-0.1, 0, 0.2 * sign), **{f"{one}_arm": up, f"{one}_hand": (0, 0.4)}, **rest)
-        beat = rng.uniform(0.3, 0.45)
-        for k in range(rng.integers(3, 8)):
-            to = up + np.array([0, 0.2, 0, -0.5]) * (1 if k % 2 else -1)
-            s.move(beat, spine=(-0.05, -0.08 * sign + 0.04 * (-1) ** k, 0), **{f"{one}_arm": to}, **({f"{other}_arm": to} if both else {}))
-        s.move(pace, left_arm=_down(rng), right_arm=_down(rng), spine=(0, 0, 0), head=(0, 0, 0), **{f"{one}_hand": (0, 0)})
-        s.hold(rng.uniform(0.0, 0.6))
-    return s.channels(t)
-
-
-def pick_up(t, rng):
-    """Picking something up from the floor with both hands, lifting it overhead, putting it down."""
-    s = Script(rng)
-    apart = rng.uniform(0.08, 0.13)
-    for foot, sign in (("left", 1.0), ("right", -1.0)):
-        s.move(0.5, **{f"{foot}_foot": (sign * apart, 0, 0), f"{foot}_foot_turn": (0, 0.45, 0.2)}, after=0.45)
-    upright = {"pelvis": (0, 0, -0.02), "turn": (0, 0, 0), "spine": (-0.02, 0, 0), "head": (0, 0, 0)}
-    pole = (0.6, 0.3, -0.6)
-    chest = {"left_arm": (0.75, 0.2, 0.25, 1.5), "right_arm": (0.75, 0.2, 0.25, 1.5)}
-    # arms go ahead of the trunk, clear of the thighs
-    before = {f"{side}_arm": figure.arm_to(side, (sign * 0.12, -0.42, 0.36), pole) for side, sign in (("left", 1.0), ("right", -1.0))}
-    while s.clock < t[-1] + 1:
-        deep, pace, aside = rng.uniform(0.3, 0.4), rng.uniform(1.0, 1.5), rng.uniform(-0.06, 0.06)
-        pelvis, turn, spine = (0, 0.16, -deep), (0.8, 0, 0), (0.5, 0, 3 * aside)
-        arms = {}
-        for side, sign in (("left", 1.0), ("right", -1.0)):
-            place = np.array([sign * 0.09 + aside, -0.33, -0.64])
-            arms[f"{side}_arm"] = figure.arm_to(side, figure.in_chest(place, pelvis, turn, spine), pole)
-        floor = {"pelvis": pelvis, "turn": turn, "spine": spine, "head": (-0.2, 0, 0), **arms}
-        s.move(0.6 * pace, **before, after=0.3 * pace)
-        s.move(pace, **floor)
-        s.hold(rng.uniform(0.1, 0.3))
-        s.move(0.8 * pace, **before, after=0.25 * pace)
-        s.move(pace, **upright, after=0.6 * pace)
-        s.move(0.8 * pace, **chest)
-        if rng.random() < 0.6:
-            s.move(0.9, left_arm=(2.7, 0.1, 0.0, 0.4), right_arm=(2.7, 0.1, 0.0, 0.4), spine=(-0.1, 0, 0), head=(-0.4, 0, 0))
-            s.hold(0.3)
-            s.move(0.9, **chest, spine=(-0.02, 0, 0), head=(0, 0, 0))
-        s.move(0.6 * pace, **before, after=0.3 * pace)
-        s.move(pace, **floor)
-        s.move(0.8 * pace, **before, after=0.25 * pace)
-        s.move(pace, **upright, after=0.8 * pace)
-        s.move(0.8 * pace, left_arm=_down(rng), right_arm=_down(rng))
-        s.hold(rng.uniform(0.0, 0.5))
-    return s.channels(t)
-
-
-def dance(t, rng):
-    """Step and touch from side to side on a beat, hips and shoulders swinging, arms in waves."""
-    beat = rng.uniform(0.75, 1.0)
-    phase = beat * t + rng.uniform(0, 1)
-    c = figure.stand(len(t))
-    zero = np.zeros(len(t))
-    swing = np.sin(2 * np.pi * phase)
-    c["pelvis"] = np.stack([0.13 * swing, 0.02 * np.cos(2 * np.pi * phase), -0.06 + 0.025 * np.cos(4 * np.pi * phase)], -1)
-    c["turn"] = np.stack([0.05 + zero, -0.12 * swing, 0.25 * np.sin(2 * np.pi * phase + 0.8)], -1)
-    c["spine"] = np.stack([0.05 + 0.06 * np.cos(4 * np.pi * phase), 0.25 * swing, -0.4 * np.sin(2 * np.pi * phase + 0.5)], -1)
-    c["head"] = np.stack([0.06 * np.cos(4 * np.pi * phase), -0.1 * swing, 0.2 * swing], -1)
-    slow = wander(t, rng, (1.0, 1.0), 7.0)
-    for k, (side, sign) in enumerate((("left", 1.0), ("right", -1.0))):
-        lift = 1.0 + 0.45 * np.tanh(slow[:, k]) + 0.35 * sign * np.sin(2 * np.pi * phase + 0.4)
-        c[f"{side}_arm"] = np.stack([0.5 + 0.3 * np.cos(2 * np.pi * phase + k), lift, 0.2 + zero, 1.1 + 0.4 * sign * np.cos(2 * np.pi * phase)], -1)
-        p = (phase + (0.5 if side == "left" else 0.0)) % 1.0
-        near = ease((p - 0.1) / 0.24) - ease((p - 0.6) / 0.24)  # the foot that comes in touches, then steps out again
-        c[f"{side}_foot"][:, 0] = sign * (0.16 - 0.17 * near)
-        c[f"{side}_foot"][:, 2] = 0.05 * (bump((p - 0.06) / 0.32) + bump((p - 0.56) / 0.32))
-        c[f"{side}_foot_turn"] = np.stack([0.45 * near, 0.15 + zero, zero], -1)
-    return c

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from .figure import stand
+from .figure import BALL, stand
 
 
 def ease(x):
@@ -27,7 +27,8 @@ def wander(t, rng, size, period):
 
 
 def cycle(phase, keys, width=0.04):
-    """A periodic course through ``keys``, pairs (phase from 0 to 1, value): straight between them, then smoothed by a Gaussian of ``width``."""
+    """A periodic course through ``keys``, pairs (phase from 0 to 1, value): straight between them, then smoothed by a Gaussian of
+    ``width``."""
     at, values = zip(*keys, strict=True)
     count = 512
     samples = np.interp(np.arange(count) / count, at, values, period=1.0)
@@ -40,8 +41,10 @@ def cycle(phase, keys, width=0.04):
 class Script:
     """A course of movements from posture to posture, each eased in and out; movements may overlap, because they add up.
 
-    ``move(0.8, spine=(0.3, 0, 0), pelvis=...)`` takes 0.8 s to bring channels of :mod:`onefit.figure` to new values, the others stay. A foot
-    that goes elsewhere is lifted on its way. ``channels(t)`` gives the figure's channels at times t, and those of ``others`` (sizes by names),
+    ``move(0.8, spine=(0.3, 0, 0), pelvis=...)`` takes 0.8 s to bring channels of :mod:`onefit.figure` to new values,
+    the others stay. A foot
+    that goes elsewhere is lifted on its way. ``channels(t)`` gives the figure's channels at times t,
+    and those of ``others`` (sizes by names),
     which start at zero.
     """
 
@@ -56,7 +59,8 @@ class Script:
         self.clock += seconds
 
     def move(self, seconds, after=None, **changes):
-        """Reach ``changes`` in ``seconds``; the next movement starts then, or ``after`` seconds from this one's start where that is given."""
+        """Reach ``changes`` in ``seconds``; the next movement starts then, or ``after`` seconds from this one's start where that is
+        given."""
         for name, value in changes.items():
             value = np.asarray(value, dtype=np.float64)
             # limbs do not start all at once: the trunk leads, arms and head follow
@@ -77,3 +81,22 @@ class Script:
             if far > 0.01 and abs(change[2]) < 0.05:
                 total[name][:, 2] += bump(x) * (0.04 + 0.12 * far)
         return total
+
+
+def sides(rng):
+    """The sides in a random order, with the first one's sign (left is 1)."""
+    return ("left", "right", 1.0) if rng.random() < 0.5 else ("right", "left", -1.0)
+
+
+def hanging(rng):
+    """An arm hanging, (4,), a bit different every time."""
+    return rng.uniform((-0.1, 0.18, 0.0, 0.15), (0.2, 0.3, 0.2, 0.5))
+
+
+def step(foot, yaw, place=(0.0, 0.0), apart=0.0):
+    """Changes that put a foot where it belongs for a body at ``place`` (2,) [m] that faces ``yaw``, its feet ``apart`` [m] farther out."""
+    sign = 1.0 if foot == "left" else -1.0
+    x, y = sign * (BALL[0] + apart), BALL[1]
+    c, w = np.cos(yaw), np.sin(yaw)
+    to = (c * x - w * y + place[0] - sign * BALL[0], w * x + c * y + place[1] - BALL[1], 0.0)
+    return {f"{foot}_foot": to, f"{foot}_foot_turn": (0, 0.1 + sign * yaw, 0)}

@@ -1,7 +1,7 @@
 """The one skeleton of OneFit: SMPL's 24 joints, the T-pose that angles count from, and the A-pose in which bodies rest.
 
-World: metres, z up; the body faces -y and its left is +x. A pose (24, 3) holds each joint's rotation relative to its parent as an axis-angle
-vector [rad] in these axes, counted from the T-pose: arms stretched out along x, palms down, legs straight down.
+World: metres, z up; the body faces -y and its left is +x. A pose (24, 3) holds each joint's rotation relative to its parent as an
+axis-angle vector [rad] in these axes, counted from the T-pose: arms stretched out along x, palms down, legs straight down.
 """
 
 import math

@@ -9,8 +9,8 @@ def transforms(body, poses, translation):
     """The affine maps (T, 24, 3, 4) that take points of the body's rest space [m] to the world [m], one for each joint.
 
     ``poses`` (T, 24, 3) [rad] as in :mod:`onefit.skeleton`; ``translation`` (T, 3) [m] is added to the rest position of the root joint.
-    Joint j turns by G_j(pose) G_j(rest_pose)^T, G_j the product of rotations from the root to j, about its own place, which follows from its
-    parent's map. With ``poses`` equal to ``body.rest_pose`` and no translation, all maps are the identity. ``body`` may be one for each
+    Joint j turns by G_j(pose) G_j(rest_pose)^T, G_j the product of rotations from the root to j, about its own place, which follows from
+    its parent's map. With ``poses`` equal to ``body.rest_pose`` and no translation, all maps are the identity. ``body`` may be one for each
     frame, with ``joints`` and ``rest_pose`` (T, 24, 3).
     """
     R = skeleton.chained_rotations(poses) @ skeleton.chained_rotations(body.rest_pose.to(poses.dtype)).mT

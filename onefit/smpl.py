@@ -8,6 +8,7 @@ import zipfile
 
 import numpy as np
 import torch
+
 from polyfit.errors import InputError
 from polyfit.mesh import checked
 
@@ -16,12 +17,14 @@ from .body import Body, BodyModel, largest_component
 
 # from SMPL's axes (y up, facing +z) to OneFit's (z up, facing -y); x is the left in both
 FROM_SMPL = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+_UNPICKLING = (pickle.UnpicklingError, AttributeError, IndexError, KeyError, TypeError)  # what reading a broken pickle may end in
 _THUMBS = {52: (34, 49), 55: (37, 52)}  # first joint of the left and right thumb, for 52 and 55 joints
 _HANDS = {52: (22, 37), 55: (25, 40)}  # first joint of the left and right hand
 
 
 def _reduction(count):
-    """(joint (count,) that each of 24, 52 (SMPL-H) or 55 (SMPL-X) joints moves with; places (24, count), weights of joints in a joint's place).
+    """(joint (count,) that each of 24, 52 (SMPL-H) or 55 (SMPL-X) joints moves with; places (24, count), weights of joints in a joint's
+    place).
 
     Fingers move with the hand, whose place is the middle of their first joints; thumbs with the wrist; jaw and eyes with the head.
     """
@@ -53,7 +56,8 @@ def _reduced(path, weights, joints, parents):
 
 
 def _rested(path, vertices, faces, weights, joints, rest_pose, shape, kind):
-    """The :class:`~onefit.body.Body` of arrays in OneFit's axes, brought from the stand ``rest_pose`` to the standard A-pose by skinning."""
+    """The :class:`~onefit.body.Body` of arrays in OneFit's axes, brought from the stand ``rest_pose`` to the standard A-pose by
+    skinning."""
     tall = np.ptp(vertices[:, 2])
     if not 0.4 < tall < 2.8:
         unit = next((f"; in {name}? then divide by {per}" for name, per in (("cm", 100), ("mm", 1000)) if 0.4 < tall / per < 2.8), "")
@@ -63,7 +67,13 @@ def _rested(path, vertices, faces, weights, joints, rest_pose, shape, kind):
         raise InputError(f"{path}: blend weights that are negative, not finite, or zero for a whole vertex")
     tensor = lambda a: torch.as_tensor(np.ascontiguousarray(a), dtype=torch.float32)
     body = Body(
-        tensor(vertices), torch.as_tensor(faces.astype(np.int64)), tensor(weights / sums[:, None]), tensor(joints), tensor(rest_pose), shape, kind
+        tensor(vertices),
+        torch.as_tensor(faces.astype(np.int64)),
+        tensor(weights / sums[:, None]),
+        tensor(joints),
+        tensor(rest_pose),
+        shape,
+        kind,
     )
     target = skeleton.standard_rest_pose()
     place = skeleton.standard_joints()[0] - body.joints[0]
@@ -77,8 +87,8 @@ class SmplBody(BodyModel):
 
     Read are ``v_template``, ``f``, ``weights``, ``J_regressor``, ``kintree_table`` and ``shapedirs``; the shape is its first ten betas (or
     as many as there are). ``posedirs`` are left out: OneFit skins linearly. SMPL's zero pose is OneFit's T-pose; from there the surface is
-    brought to the standard A-pose by skinning, which flattens it a little at the armpits, as SMPL without its pose blend shapes does. Raises
-    InputError for a file that cannot be read, misses a key, or whose shapes do not fit.
+    brought to the standard A-pose by skinning, which flattens it a little at the armpits, as SMPL without its pose blend shapes does.
+    Raises InputError for a file that cannot be read, misses a key, or whose shapes do not fit.
     """
 
     def __init__(self, path):
@@ -96,8 +106,9 @@ class SmplBody(BodyModel):
         kept = largest_component(len(V), torch.as_tensor(F)).numpy()
         self.kind, self._path = "smpl", path
         self._basis = shapedirs[:, :, :10].astype(np.float64)
-        self._vertices, self._weights, self._regressor = V.astype(np.float64), data["weights"].astype(np.float64), regressor.astype(np.float64)
-        self._parents = np.where(data["kintree_table"][0].astype(np.int64) < len(self._regressor), data["kintree_table"][0].astype(np.int64), -1)
+        self._vertices, self._weights, self._regressor = (a.astype(np.float64) for a in (V, data["weights"], regressor))
+        parents = data["kintree_table"][0].astype(np.int64)
+        self._parents = np.where(parents < len(self._regressor), parents, -1)
         self._kept, self._faces = kept, (np.cumsum(kept) - 1)[F[kept[F].all(1)]]
         self.shape_names = tuple(f"beta{k}" for k in range(self._basis.shape[2]))
         self.standard_shape = torch.zeros(len(self.shape_names))
@@ -143,7 +154,9 @@ class PlainBody(BodyModel):
         if up.argmax() == 1:
             V, places, rest = (a @ FROM_SMPL.double().numpy().T for a in (V, places, rest))
         elif up.argmax() != 2 or up[2] < 0.8 * np.linalg.norm(up):
-            raise InputError(f"{path}: its head is at {np.round(up, 2).tolist()} from its pelvis; a body that stands along y or z is needed")
+            raise InputError(
+                f"{path}: its head is at {np.round(up, 2).tolist()} from its pelvis; a body that stands along y or z is needed"
+            )
         if places[skeleton.INDEX["left_hip"], 0] < places[skeleton.INDEX["right_hip"], 0]:
             raise InputError(f"{path}: its left is at -x; a body whose left is at +x is needed")
         kept = largest_component(len(V), torch.as_tensor(F)).numpy()
@@ -180,9 +193,9 @@ def _read(path, keys):
             raise InputError(f"{path}: a body is read from .npz or .pkl")
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
-    except (ValueError, EOFError, OSError, zipfile.BadZipFile, pickle.UnpicklingError, AttributeError, IndexError, KeyError, TypeError) as error:
-        if isinstance(error, InputError):
-            raise
+    except InputError:
+        raise
+    except (ValueError, EOFError, OSError, zipfile.BadZipFile, *_UNPICKLING) as error:
         raise InputError(f"{path}: cannot be read as a body ({' '.join(str(error).split())[:200]})") from None
     missing = [key for key in keys if key not in data]
     if missing:

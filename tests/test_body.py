@@ -8,6 +8,7 @@ import types
 import numpy as np
 import pytest
 import torch
+
 from onefit import skeleton, skinning
 from onefit.body import AnnyBody
 from onefit.skeleton import INDEX
@@ -120,7 +121,8 @@ def test_known_poses(standard):
 
 
 def test_moves_as_anny_does_with_its_bones_turned_in_groups(model, standard):
-    """Against Anny's own forward pass. Exact where a joint's bones share one pivot: everywhere but at toes and fingers, which stay straight."""
+    """Against Anny's own forward pass. Exact where a joint's bones share one pivot: everywhere but at toes and fingers, which stay
+    straight."""
     anny = model._anny
     pose = random_poses(3, size=0.4).double()
     for name in ("left_foot", "right_foot", "left_hand", "right_hand"):
@@ -157,7 +159,7 @@ def test_shapes(model):
 
 
 def test_making_a_body_says_nothing_and_compiles_nothing():
-    code = "import sys; from onefit.body import AnnyBody; AnnyBody().body(); print(sorted(m for m in sys.modules if m == 'warp' or m == 'mitsuba'))"
+    code = "import sys; from onefit.body import AnnyBody; AnnyBody().body(); print([m for m in ('warp', 'mitsuba') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert (done.stdout, done.stderr) == ("[]\n", "")
 
@@ -225,8 +227,8 @@ def smpl(standard):
     parents[0] = 2**32 - 1
     shapedirs = np.stack([0.05 * V, 0.05 * V * [1, 0, 0]], -1)
     return {
-        "v_template": V, "f": standard.faces.numpy().astype(np.uint32), "weights": standard.blend_weights.double().numpy(), "J_regressor": regressor,
-        "kintree_table": np.stack([parents.astype(np.uint32), np.arange(24, dtype=np.uint32)]), "shapedirs": shapedirs,
+        "v_template": V, "f": standard.faces.numpy().astype(np.uint32), "weights": standard.blend_weights.double().numpy(), "J_regressor":
+        regressor, "kintree_table": np.stack([parents.astype(np.uint32), np.arange(24, dtype=np.uint32)]), "shapedirs": shapedirs,
     }  # fmt: skip
 
 
@@ -289,7 +291,11 @@ def test_pickles_cannot_run_code(smpl, tmp_path):
 
 
 def test_fingers_and_face_of_larger_skeletons_are_folded_into_24_joints(smpl, tmp_path):
-    parents = [*skeleton.PARENTS[:22], *(20 if k % 3 == 0 else 21 + k for k in range(15)), *(21 if k % 3 == 0 else 36 + k for k in range(15))]
+    parents = [
+        *skeleton.PARENTS[:22],
+        *(20 if k % 3 == 0 else 21 + k for k in range(15)),
+        *(21 if k % 3 == 0 else 36 + k for k in range(15)),
+    ]
     W, R = smpl["weights"], smpl["J_regressor"]
     weights, regressor = np.zeros((len(W), 52)), np.zeros((52, R.shape[1]))
     weights[:, :22], regressor[:22] = W[:, :22], R[:22]
@@ -346,7 +352,10 @@ def test_plain_body_with_y_up_in_the_t_pose(standard, smpl, tmp_path):
 
 def test_plain_files_that_cannot_be_used(standard, tmp_path):
     cases = [
-        ({"vertices": standard.vertices.numpy() * 100, "joints": standard.joints.numpy() * 100}, "a body 162.6 units tall; metres are needed; in cm"),
+        (
+            {"vertices": standard.vertices.numpy() * 100, "joints": standard.joints.numpy() * 100},
+            "a body 162.6 units tall; metres are needed; in cm",
+        ),
         ({"joints": np.zeros((65, 3)), "rest_pose": np.zeros((65, 4))}, "65 joints; 24"),
         ({"rest_pose": np.zeros((24, 4))}, "axis-angle vectors"),
         ({"vertices": standard.vertices.numpy() * [-1, 1, 1], "joints": standard.joints.numpy() * [-1, 1, 1]}, "its left is at -x"),

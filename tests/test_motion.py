@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
+
 from onefit import generate, skeleton, skinning
 from onefit.body import AnnyBody
 from onefit.motion import Motion
 from onefit.skeleton import INDEX
 from polyfit.errors import InputError
-from scipy.spatial.transform import Rotation
 
 T_POSE = skeleton.standard_joints()
 FROM_SMPL = Rotation.from_euler("x", 90, degrees=True)
@@ -102,7 +103,9 @@ def test_amass_puts_joints_where_smpl_does(tmp_path):
     local, trans = smpl_poses()
     model = T_POSE.double().numpy() @ FROM_SMPL.as_matrix()  # the standard skeleton in SMPL's axes
     expected = smpl_places(local, trans, model)
-    np.savez(tmp_path / "a.npz", poses=np.concatenate([local[:, :22].reshape(12, -1), np.ones((12, 90))], 1), trans=trans, mocap_framerate=120.0)
+    np.savez(
+        tmp_path / "a.npz", poses=np.concatenate([local[:, :22].reshape(12, -1), np.ones((12, 90))], 1), trans=trans, mocap_framerate=120.0
+    )
     motion = Motion.read(tmp_path / "a.npz")
     J = places(motion)
     assert motion.fps == 120 and motion.name == "a"
@@ -190,17 +193,21 @@ def test_motion_files_that_cannot_be_used(tmp_path):
 
 PARTS = ("hip", "knee", "ankle", "foot", "collar", "shoulder", "elbow", "wrist")
 STYLES = {  # names of pelvis, spine, neck and head, and of a side's bones; Euler order; axes; units a metre
-    "mixamo": (["Hips", "Spine", "Spine1", "Spine2", "Neck", "Head"], ["{S}UpLeg", "{S}Leg", "{S}Foot", "{S}ToeBase", "{S}Shoulder", "{S}Arm",
+    "mixamo": (["Hips", "Spine", "Spine1", "Spine2", "Neck", "Head"], ["{S}UpLeg", "{S}Leg", "{S}Foot", "{S}ToeBase", "{S}Shoulder",
+    "{S}Arm",
                "{S}ForeArm", "{S}Hand"], "mixamorig:", "ZXY", "y", 100.0),
-    "cmu": (["Hips", "LowerBack", "Spine", "Spine1", "Neck", "Head"], ["{S}UpLeg", "{S}Leg", "{S}Foot", "{S}ToeBase", "{S}Shoulder", "{S}Arm",
+    "cmu": (["Hips", "LowerBack", "Spine", "Spine1", "Neck", "Head"], ["{S}UpLeg", "{S}Leg", "{S}Foot", "{S}ToeBase", "{S}Shoulder",
+    "{S}Arm",
             "{S}ForeArm", "{S}Hand"], "", "ZYX", "y", 17.7),
-    "rigify": (["spine", "spine.001", "spine.002", "spine.003", "spine.004", "head"], ["thigh.{s}", "shin.{s}", "foot.{s}", "toe.{s}", "shoulder.{s}",
+    "rigify": (["spine", "spine.001", "spine.002", "spine.003", "spine.004", "head"], ["thigh.{s}", "shin.{s}", "foot.{s}", "toe.{s}",
+    "shoulder.{s}",
                "upper_arm.{s}", "forearm.{s}", "hand.{s}"], "", "XYZ", "z", 1.0),
     "poser": (["hip", "abdomen", "chest", "chest2", "neck", "head"], ["{l}Thigh", "{l}Shin", "{l}Foot", "{l}Toe", "{l}Collar", "{l}Shldr",
               "{l}ForeArm", "{l}Hand"], "", "YZX", "y", 40.0),
     "mocap": (["Hips", "Chest", "Chest2", "Chest3", "Neck", "Head"], ["{S}Hip", "{S}Knee", "{S}Ankle", "{S}Toe", "{S}Collar", "{S}Shoulder",
               "{S}Elbow", "{S}Wrist"], "", "ZXY", "y", 100.0),
-    "unreal": (["pelvis", "spine_01", "spine_02", "spine_03", "neck_01", "head"], ["thigh_{l}", "calf_{l}", "foot_{l}", "ball_{l}", "clavicle_{l}",
+    "unreal": (["pelvis", "spine_01", "spine_02", "spine_03", "neck_01", "head"], ["thigh_{l}", "calf_{l}", "foot_{l}", "ball_{l}",
+    "clavicle_{l}",
                "upperarm_{l}", "lowerarm_{l}", "hand_{l}"], "", "ZYX", "z", 100.0),
 }  # fmt: skip
 
@@ -299,7 +306,9 @@ def test_bvh_files_that_cannot_be_used(tmp_path):
         "no left knee among its bones": good.replace("LeftLeg", "LeftThing"),
         "numbers for 69 channels": "\n".join(rows[:-1] + [rows[-1].rsplit(" ", 1)[0]]),
         "3 frames are announced, 2 are there": "\n".join(rows[:-1]),
-        "frames are not finite in 1 of 3 frames, the first is frame 1": "\n".join([*rows[:-2], "nan " + rows[-2].split(" ", 1)[1], rows[-1]]),
+        "frames are not finite in 1 of 3 frames, the first is frame 1": "\n".join(
+            [*rows[:-2], "nan " + rows[-2].split(" ", 1)[1], rows[-1]]
+        ),
         "a frame time of 0.0; say the rate": good.replace("Frame Time: 0.0333333", "Frame Time: 0"),
         "its zero pose is no upright stand": (tmp_path / "sat.bvh").read_text(),
     }
@@ -340,7 +349,15 @@ def test_generated_motions_are_smooth_and_within_joints_limits(kind):
         for side, x in ((0, 1.0), (1, -1.0)):  # a forearm never bends backwards
             assert Rotation.from_rotvec(elbow[:, side].numpy()).apply([x, 0, 0])[:, 1].max() < 0.01
         assert elbow.norm(dim=-1).max() < 2.6
-        for joint, most in (("spine1", 0.5), ("spine2", 0.65), ("spine3", 0.5), ("neck", 0.75), ("head", 0.75), ("left_ankle", 1.25), ("left_collar", 0.75)):
+        for joint, most in (
+            ("spine1", 0.5),
+            ("spine2", 0.65),
+            ("spine3", 0.5),
+            ("neck", 0.75),
+            ("head", 0.75),
+            ("left_ankle", 1.25),
+            ("left_collar", 0.75),
+        ):
             assert motion.poses[:, INDEX[joint]].norm(dim=-1).max() < most, joint
 
 
@@ -413,7 +430,9 @@ def test_arms_do_not_pass_through_the_body():
     assert enclosed(np.concatenate([V, [V[ring].mean(0) for ring in rings]]), faces, V[fore]).sum() > 50
     for kind in KINDS:
         motion = Motion.generate(kind, seconds=8, seed=11)[::35]
-        posed = skinning.skin(body.vertices, body.blend_weights, skinning.transforms(body, motion.poses, motion.translation)).double().numpy()
+        posed = (
+            skinning.skin(body.vertices, body.blend_weights, skinning.transforms(body, motion.poses, motion.translation)).double().numpy()
+        )
         for V in posed:
             inside = enclosed(np.concatenate([V, [V[ring].mean(0) for ring in rings]]), faces, V[fore])
             if inside.any():
