@@ -1,14 +1,17 @@
-# make demo, make test: each installs what is missing into .venv (seconds where nothing is) and runs.
+# make demo, make drape, make test: each installs what is missing into .venv (seconds where nothing is) and runs.
 # PYTHON=python3.12 takes another Python for a new .venv.
 
 PYTHON ?= python3
 PY := .venv/bin/python
 INSTALLED := .venv/installed
 
-.PHONY: demo test venv llvm clean
+.PHONY: demo drape test venv llvm clean
 
 demo: venv
 	$(PY) -m polysft_mi.run scenes/demo.xml -o out/demo --overwrite
+
+drape: venv
+	$(PY) -m onefit.drape dress dance -o out/drape --seconds 2 --overwrite
 
 test: venv
 	$(PY) -m pytest -q

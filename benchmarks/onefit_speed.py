@@ -1,0 +1,85 @@
+"""How long OneFit takes to drape: a frame, its parts, and the same garment at four resolutions.
+
+    python benchmarks/onefit_speed.py [--weights six-garments] [--device cuda]
+
+Milliseconds a frame, the median of repeated drapes of a motion of 90 frames in batches, without rendering: all of ``Draper.drape``, the network
+alone, and post-processing; then the T-shirt at about 1,000, 4,000, 16,000 and 64,000 vertices. Cutting a garment into patches comes once and
+stands apart. The clock shows what else the machine does; the least of the repetitions is given beside the median.
+"""
+
+import argparse
+import json
+import statistics
+import subprocess
+import sys
+import time
+
+import torch
+
+import onefit
+from onefit.draper import FPS
+from onefit.post import pushed_out
+from polyfit.errors import cli
+
+FRAMES = 90
+
+
+def timed(function, device, repeats=9):
+    """Median and least milliseconds of ``function()``."""
+    found = []
+    for k in range(repeats + 2):
+        start = time.perf_counter()
+        function()
+        if device.startswith("cuda"):
+            torch.cuda.synchronize()
+        if k >= 2:
+            found.append(1e3 * (time.perf_counter() - start))
+    return statistics.median(found), min(found)
+
+
+def network_alone(draper, patched, motion):
+    """The embedding of the motion and the decoding of every patch in every frame, no vertex among it."""
+    body = draper.model.body().to(draper.device)
+    with torch.inference_mode():
+        embedding = draper._embedding(motion, body)
+        for part in embedding.split(32):
+            patched.changes(draper.network.decoder(draper._codes(patched), part))
+
+
+def main(argv=None):
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--weights", default="six-garments")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--counts", type=int, nargs="+", default=[1000, 4000, 16_000, 64_000])
+    parser.add_argument("-o", "--output", help="a JSON file of the figures")
+    args = parser.parse_args(argv)
+    start = time.perf_counter()
+    subprocess.run([sys.executable, "-c", "import onefit"], check=True)
+    seconds = time.perf_counter() - start
+    print(f"{torch.get_num_threads()} threads, {args.device}; a process that imports onefit and ends: {seconds:.2f} s\n")
+    draper = onefit.load(args.weights, device=args.device)
+    motion = onefit.Motion.generate("walk", seconds=FRAMES / FPS, seed=1).to(draper.device)
+    shirt = draper.garment("tshirt")
+    print("| vertices | patches | cut, once [s] | drape [ms a frame] | network alone | post-processing |\n|---|---|---|---|---|---|")
+    rows = []
+    for count in args.counts:
+        garment = shirt if count == len(shirt) else shirt.remeshed(count)
+        start = time.perf_counter()
+        patched = draper.patched(garment)
+        cut = time.perf_counter() - start
+        T = len(motion.poses)
+        whole = [x / T for x in timed(lambda: draper.drape(garment, motion), args.device)]
+        network = [x / T for x in timed(lambda: network_alone(draper, patched, motion), args.device)]
+        drape = draper.drape(garment, motion)
+        post = [x / T for x in timed(lambda: pushed_out(drape.vertices, drape.faces, drape.body, drape.body_faces), args.device, 3)]
+        cells = [f"{len(garment)}", f"{len(patched)}", f"{cut:.1f}"] + [f"{a:.2f} ({b:.2f})" for a, b in (whole, network, post)]
+        print("| " + " | ".join(cells) + " |", flush=True)
+        rows.append(dict(vertices=len(garment), patches=len(patched), cut=cut, drape=whole, network=network, post=post))
+    if args.output:
+        with open(args.output, "w", encoding="utf-8") as file:
+            json.dump(dict(import_seconds=seconds, rows=rows), file, indent=2)
+    return 0
+
+
+if __name__ == "__main__":
+    cli(main)
