@@ -16,7 +16,7 @@ from .shading import View, shade_surface
 __all__ = ["View", "contact_sheet", "frame_plot", "loss_plot", "shade_surface"]
 
 TERMS = {"loss": "total", "rgb": "photometric", "silhouette": "silhouette", "inextensibility": "inextensibility", "temporal": "temporal"}
-_COLOURS = {"loss": "#222222", "rgb": "#c4572e", "silhouette": "#3b6ea5", "inextensibility": "#4b8b3b", "temporal": "#8d5aa0"}
+COLOURS = {"loss": "#222222", "rgb": "#c4572e", "silhouette": "#3b6ea5", "inextensibility": "#4b8b3b", "temporal": "#8d5aa0"}
 
 
 def _kept_safe(draw):
@@ -58,17 +58,11 @@ def loss_plot(path, log_records):
     ``log_records``: dicts with ``frame``, ``iteration``, ``loss`` and any of the terms in ``TERMS``, in the order of the run; records
     without a loss are passed over.
     """
-    records = [r for r in log_records if "loss" in r and "frame" in r]
-    if not records:
-        raise ValueError("no record holds a loss")
+    records, step, curves = loss_curves(log_records)
     figure = _figure(9, 4, layout="constrained")
     axes = figure.add_subplot()
-    step = np.cumsum([_advance(a, b) for a, b in zip([None] + records, records)])
-    for term, label in TERMS.items():
-        values = np.array([_number(r.get(term)) for r in records])
-        values[~(values > 0)] = np.nan  # a logarithmic axis has no place for them
-        if np.isfinite(values).any():
-            axes.plot(step, values, color=_COLOURS[term], label=label, linewidth=1.4 if term == "loss" else 0.9)
+    for term, values in curves.items():
+        axes.plot(step, values, color=COLOURS[term], label=TERMS[term], linewidth=1.4 if term == "loss" else 0.9)
     axes.set_yscale("log")
     axes.set_xlabel("iteration, all frames one after the other")
     axes.set_ylabel("loss")
@@ -85,6 +79,23 @@ def loss_plot(path, log_records):
     if axes.get_legend_handles_labels()[0]:
         figure.legend(frameon=False, fontsize=8, ncols=len(TERMS), loc="outside lower center")
     return figure
+
+
+def loss_curves(log_records):
+    """``(records, step, curves)``: the records with a loss, the iteration (R,) of each counted over all frames, and each term of ``TERMS`` that has one as its
+    values (R,), NaN where they are not positive. Raises ValueError where no record holds a loss.
+    """
+    records = [r for r in log_records if "loss" in r and "frame" in r]
+    if not records:
+        raise ValueError("no record holds a loss")
+    step = np.cumsum([_advance(a, b) for a, b in zip([None] + records, records)])
+    curves = {}
+    for term in TERMS:
+        values = np.array([_number(r.get(term)) for r in records])
+        values[~(values > 0)] = np.nan  # a logarithmic axis has no place for them
+        if np.isfinite(values).any():
+            curves[term] = values
+    return records, step, curves
 
 
 def _advance(before, record):
