@@ -310,7 +310,7 @@ def _scalars(run, shown, errors, distance):
         out.append(_scalar("distance to the truth", "Distance of each vertex from the true one.", "mm", distance[shown], "viridis"))
     if errors is not None:
         meaning = "Root mean square over the channels of rendering minus image, in linear colour, where each vertex is seen."
-        out.append(_scalar("error", meaning, "linear colour", errors, "inferno", high=PEAK))
+        out.append(_scalar("error", meaning, "linear colour", errors, "inferno"))
     curvature = run.mean_curvature()[shown]
     meaning = "Mean curvature of the jet: positive (red) where the surface bulges towards the camera in the first frame, negative (blue) where it is hollow."
     out.append(_scalar("curvature", meaning, "1/m", curvature, "RdBu_r", signed=True))
@@ -320,12 +320,12 @@ def _scalars(run, shown, errors, distance):
     return out
 
 
-def _scalar(label, meaning, unit, values, colours, *, high=None, signed=False):
+def _scalar(label, meaning, unit, values, colours, *, signed=False):
     import matplotlib
     from matplotlib.colors import to_hex
 
     known = np.isfinite(values)
-    top = high or float(np.quantile(np.abs(values[known]), 0.99) if known.any() else 1) or 1.0
+    top = float(np.quantile(np.abs(values[known]), 0.99) if known.any() else 1) or 1.0
     low = -top if signed else 0.0
     raw = np.round(np.clip((np.where(known, values, 0) - low) / (top - low), 0, 1) * 254).astype(np.uint8)
     scale = [to_hex(c) for c in matplotlib.colormaps[colours](np.linspace(0, 1, 17))]
