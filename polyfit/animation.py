@@ -7,13 +7,12 @@ counterclockwise as seen from outside; ``uv`` (N, 2) texture coordinates, v up, 
 
 import io
 import os
-import shutil
 import tempfile
 
 import numpy as np
 
 from .errors import InputError
-from .files import aside
+from .files import aside, folder_aside
 from .mesh import face_vectors
 from .meshio import write_ply
 
@@ -246,38 +245,21 @@ def write_frames(folder, kind, vertices, faces, uv=None, texture=None, *, labels
     ``labels`` (T,): the frames' numbers in the file names, by default 0 to T - 1. A folder that holds nothing but such files is replaced.
     """
     vertices, faces, uv = _checked(vertices, faces, uv, 1)
-    folder = os.path.normpath(os.fspath(folder))
-    if os.path.lexists(folder) and not _replaceable(folder, kind):
-        raise InputError(f"{folder}: holds other files; a new or empty folder is needed")
-    partial = os.path.join(os.path.dirname(folder), f".{os.getpid()}.partial.{os.path.basename(folder)}")
-    os.makedirs(partial)
-    try:
-        data, image = encoded(texture) if kind == "obj" and texture is not None and uv is not None else (None, None)
+    ours = lambda name: name in ("surface.mtl", "texture.png", "texture.jpg") or name.endswith(f".{kind}") and name[: -len(kind) - 1].isdigit()
+    data, image = encoded(texture) if kind == "obj" and texture is not None and uv is not None else (None, None)
+    with folder_aside(folder, ours) as place:
         if data:
-            with open(os.path.join(partial, f"texture.{image}"), "wb") as file:
+            with open(os.path.join(place, f"texture.{image}"), "wb") as file:
                 file.write(data)
         if kind == "obj":
-            with open(os.path.join(partial, "surface.mtl"), "w", encoding="ascii") as file:
+            with open(os.path.join(place, "surface.mtl"), "w", encoding="ascii") as file:
                 file.write("newmtl surface\nKd 1 1 1\nKs 0 0 0\nillum 1\n" + (f"map_Kd texture.{image}\n" if data else ""))
         for label, V in zip(range(len(vertices)) if labels is None else labels, vertices):
-            place = os.path.join(partial, f"{int(label):03d}.{kind}")
+            name = os.path.join(place, f"{int(label):03d}.{kind}")
             if kind == "ply":
-                write_ply(place, V, faces, uv)
+                write_ply(name, V, faces, uv)
             else:
-                _write_obj(place, V, faces, uv, up)
-        if os.path.isdir(folder):
-            shutil.rmtree(folder)
-        os.rename(partial, folder)
-    except BaseException:
-        shutil.rmtree(partial, ignore_errors=True)
-        raise
-
-
-def _replaceable(folder, kind):
-    if not os.path.isdir(folder):
-        return False
-    ours = lambda name: name in ("surface.mtl", "texture.png", "texture.jpg") or name.endswith(f".{kind}") and name[: -len(kind) - 1].isdigit()
-    return all(map(ours, os.listdir(folder)))
+                _write_obj(name, V, faces, uv, up)
 
 
 def _write_obj(path, V, F, uv, up):

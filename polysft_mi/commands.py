@@ -3,6 +3,8 @@
 import argparse
 import sys
 
+from .errors import InputError
+
 # name: what it is for, in a line of `polysft --help`
 COMMANDS = {
     "prepare": "make a scene of a video or of a sequence's folder",
@@ -15,11 +17,15 @@ COMMANDS = {
 }
 
 
+class Parser(argparse.ArgumentParser):
+    """An ``argparse`` parser whose complaints are one line, as all others are."""
+
+    def error(self, message):
+        raise InputError(f"{message}; {self.prog} --help shows what is taken")
+
+
 def parser(name, description, examples):
-    """An ``argparse`` parser of the command ``name``, called as the user called it; ``examples`` is a list of its arguments with what they do."""
+    """The parser of the command ``name``, called as the user called it; ``examples`` are pairs of its arguments and what they do."""
     prog = sys.argv[0] if sys.argv[0] == f"polysft {name}" else f"python -m polysft_mi.{name}"
-    width = max(len(e) for e, _ in examples)
-    lines = [f"  {prog} {arguments:{width}s}  {what}".rstrip() for arguments, what in examples]
-    return argparse.ArgumentParser(
-        prog=prog, description=description, epilog="examples:\n" + "\n".join(lines), formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    lines = [f"  {prog} {arguments}\n      {what}" for arguments, what in examples]
+    return Parser(prog=prog, description=description, epilog="examples:\n" + "\n".join(lines), formatter_class=argparse.RawDescriptionHelpFormatter)

@@ -111,10 +111,11 @@ def _number(value):
 
 
 @_kept_safe
-def frame_plot(path, per_frame):
-    """One small plot over the frames for each figure: ``per_frame`` is a dict of equally long lists, one of them ``frame``."""
+def frame_plot(path, per_frame, labels=None):
+    """One small plot over the frames for each figure: ``per_frame`` is a dict of equally long lists, one of them ``frame``; ``labels`` names them."""
     from .evaluate import LABELS
 
+    labels = labels or LABELS
     names = [k for k in per_frame if k != "frame"]
     figure = _figure(9, 1.7 * len(names) + 0.6, layout="constrained")
     frames = np.asarray(per_frame["frame"])
@@ -127,7 +128,7 @@ def frame_plot(path, per_frame):
             axes.axhline(finite.mean(), color="0.55", linewidth=0.8, linestyle="--")
             if finite.min() >= 0:
                 axes.set_ylim(0, 1.1 * finite.max() or 1)
-            axes.set_title(f"{LABELS.get(name, name)}: mean {finite.mean():.4g}", fontsize=9, loc="left")
+            axes.set_title(f"{labels.get(name, name)}: mean {finite.mean():.4g}", fontsize=9, loc="left")
         _plain(axes)
         axes.tick_params(labelsize=8, labelbottom=k == len(names) - 1)
     axes.set_xlabel("frame")
@@ -170,6 +171,48 @@ def contact_sheet(path, rows):
     if heat is not None:
         figure.colorbar(heat, ax=grid[:, columns.index("error")], location="bottom", shrink=0.8, aspect=30, pad=0.01).ax.tick_params(labelsize=7)
     return figure
+
+
+_MAPS = {"distance": ("distance of A from B [mm]", "viridis", 0), "depth_difference": ("depth of A minus B [mm]", "RdBu_r", -1)}
+
+
+def false_colour(name, values, scale):
+    """The difference ``name``, values (H, W) [mm], as linear RGB (H, W, 3): in the colours of :func:`false_colours`, black where it is not known."""
+    import matplotlib
+
+    _, colours, low = _MAPS[name]
+    x = np.clip((values / scale - low) / (1 - low), 0, 1)
+    rgb = matplotlib.colormaps[colours](np.nan_to_num(x))[..., :3]
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    return np.where(np.isfinite(values)[..., None], linear, 0)
+
+
+def false_colours(path, title, images, maps, scale):
+    """Pictures side by side, and differences in false colours with their scale: ``images`` are (title, (h, w, 3) uint8), ``maps`` (name, (H, W) [mm], NaN where
+    unknown), the name one of "distance" and "depth_difference"; colours end at ``scale`` [mm]. Raises OSError where it cannot be written.
+    """
+    height, width = images[0][1].shape[:2]
+    columns, wide = len(images) + len(maps), 3.2
+    figure = _figure(wide * columns, wide * height / width + 0.75, layout="constrained")
+    figure.get_layout_engine().set(w_pad=0.03, h_pad=0.03, wspace=0, hspace=0)
+    grid = figure.subplots(1, columns, squeeze=False)[0]
+    for axes, (label, image) in zip(grid, images):
+        axes.imshow(image)
+        axes.set_title(label, fontsize=9)
+    for axes, (name, values) in zip(grid[len(images) :], maps):
+        label, colours, low = _MAPS[name]
+        axes.set_facecolor("0.93")
+        shown = axes.imshow(values, cmap=colours, vmin=low * scale, vmax=scale, interpolation="nearest")
+        axes.set_title(label, fontsize=9)
+        figure.colorbar(shown, ax=axes, location="bottom", shrink=0.9, aspect=30, pad=0.02, extend="max" if low == 0 else "both").ax.tick_params(labelsize=7)
+    for axes in grid:
+        axes.set_anchor("N")
+        axes.set_xticks([]), axes.set_yticks([])
+        for spine in axes.spines.values():
+            spine.set_visible(False)
+    figure.suptitle(title, fontsize=10)
+    with aside(path) as temporary:
+        figure.savefig(temporary, facecolor="white")
 
 
 _SHEET = {"target": "target", "render": "render", "error": "error", "surface": "surface from the side"}
