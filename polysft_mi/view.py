@@ -1,5 +1,6 @@
 """``python -m polysft_mi.view OUT``: a run in polyscope's window, to turn, play and colour."""
 
+import ctypes
 import os
 import sys
 
@@ -33,7 +34,6 @@ class Viewer:
         if run.texture and os.path.isfile(run.texture):
             self._texture()
         self.show(0)
-        ps.set_view_from_json(ps.get_view_as_json())
 
     def _texture(self):
         import cv2
@@ -74,22 +74,37 @@ class Viewer:
             self.show((self.frame + 1) % len(self.vertices))
 
 
+_INSTEAD = "report.html in the run's folder needs none, and --screenshot FILE writes a picture"
+
+
+def _display():
+    """Whether a window could be opened, found out without polyscope, which ends untidily where it cannot."""
+    if not sys.platform.startswith("linux") or os.environ.get("WAYLAND_DISPLAY"):
+        return True
+    try:
+        x11 = ctypes.CDLL("libX11.so.6")
+    except OSError:
+        return False
+    x11.XOpenDisplay.restype = ctypes.c_void_p
+    return bool(os.environ.get("DISPLAY")) and bool(x11.XOpenDisplay(None))
+
+
 def _polyscope(screenshot):
     """polyscope, started. Raises InputError where it is not installed or finds no display."""
+    if not screenshot and not _display():
+        raise InputError(f"view: no display (DISPLAY={os.environ.get('DISPLAY', '')}); {_INSTEAD}")
     try:
         import polyscope as ps
     except ImportError:
         raise InputError("view: polyscope is not installed: python -m pip install 'polysft-mi[view]'") from None
-    if not screenshot and sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise InputError("view: there is no display (DISPLAY is not set); report.html in the run's folder needs none, and --screenshot FILE writes a picture")
     ps.set_program_name("polysft")
     ps.set_verbosity(0)
     ps.set_use_prefs_file(False)
     ps.set_allow_headless_backends(screenshot)
     try:
         ps.init()
-    except RuntimeError as error:
-        raise InputError(f"view: no window can be opened ({' '.join(str(error).split())}); report.html in the run's folder needs none") from None
+    except RuntimeError:
+        raise InputError(f"view: no window can be opened here, for want of OpenGL or of a display; {_INSTEAD}") from None
     return ps
 
 
