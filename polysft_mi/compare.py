@@ -24,6 +24,7 @@ _EXAMPLES = [
 
 _OWN = {"psnr_mask": "PSNR inside the surface [dB]", "ssim_mask": "SSIM inside the surface", "seconds_per_frame": "seconds a frame", "order": "order of the jet"}
 LABELS = {**evaluate.LABELS, "depth_difference_mm": "difference in depth, RMS [mm]", "shared": "vertices of B whose ray meets A"}
+LABELS |= {f"{name}_worst": label.replace(" [", ", worst frame [") for name, label in LABELS.items() if f"{name}_worst" not in LABELS}
 
 
 class Other:
@@ -101,6 +102,17 @@ def _splatted(points, camera):
     return np.where(np.isfinite(depth), depth, np.nan).reshape(camera.height, camera.width)
 
 
+def _dots(values, share=0.05):
+    """An image (H, W) of values at few pixels, NaN elsewhere, as dots that can be seen; as it is where more than ``share`` of the pixels have one."""
+    from scipy.ndimage import distance_transform_edt
+
+    missing = np.isnan(values)
+    if missing.all() or (~missing).mean() > share:
+        return values
+    far, (row, column) = distance_transform_edt(missing, return_indices=True)
+    return np.where(far <= max(2, values.shape[1] / 160), values[row, column], np.nan)
+
+
 def compare(a, b):
     """Figures of the run ``a`` (a folder) against ``b``, a run or ground truth as :mod:`polysft_mi.evaluate` takes it: ``(figures, Other)``.
 
@@ -140,13 +152,15 @@ def write(figures, other, out, *, count=20, scale=None):
         values = np.concatenate([np.abs(m[name][np.isfinite(m[name])]) for m in maps.values() for name in ("distance", "depth_difference") if name in m])
         scale = 1e3 * float(np.quantile(values, 0.98)) if values.size else 1.0
     scale = max(scale, 1e-3)
-    panels = [{int(k): p for k, p in zip(run.frames, run.panels())} if run else {} for run in (other.run, other.other)]
+    panels = [_pictures(run, set(shown)) if run else {} for run in (other.run, other.other)]
     ours = lambda name: name in ("compare.json", "figures.png") or re.fullmatch(r"\d{3,}\.(png|exr)", name) is not None
     names = "   ".join(f"{side}: {os.path.basename(os.path.normpath(figures[side.lower()]))}" for side in "AB")
     with folder_aside(out, ours) as folder:
         for k in shown:
             images = [("frame", panels[0][k][0]), ("A", panels[0][k][1])] + ([("B", panels[1][k][1])] if k in panels[1] else [])
             drawn = [(name, 1e3 * maps[k][name]) for name in ("distance", "depth_difference") if name in maps[k]]
+            if other.kind == "points":
+                drawn = [(name, _dots(values)) for name, values in drawn]
             pictures.false_colours(os.path.join(folder, f"{k:03d}.png"), f"frame {k}      {names}", images, drawn, scale)
             layers = _layers(other, k, camera) | maps[k]
             layers["false_colour"] = pictures.false_colour(*drawn[0], scale)
@@ -158,6 +172,11 @@ def write(figures, other, out, *, count=20, scale=None):
             json.dump({**figures, "false_colour_mm": scale}, file, indent=1)
             file.write("\n")
     return len(shown)
+
+
+def _pictures(run, shown):
+    """The pictures of :meth:`polysft_mi.results.Run.panels` of the frames ``shown``, by their index."""
+    return {int(k): [panel.copy() for panel in panels] for k, panels in zip(run.frames, run.panels()) if int(k) in shown}
 
 
 def _layers(other, k, camera):
@@ -175,7 +194,7 @@ def _layers(other, k, camera):
     return layers
 
 
-def main(arguments=None):
+def parser():
     p = commands.parser("compare", "Compare a run with another run, or with ground truth. Differences are A minus B.", _EXAMPLES)
     p.add_argument("a", metavar="A", help="folder of a run")
     p.add_argument("b", metavar="B", help="folder of another run, or ground truth as evaluate takes it")
@@ -184,7 +203,11 @@ def main(arguments=None):
     p.add_argument("--scale", type=float, metavar="MM", help="difference at which the false colours end (default: that which 98 %% of the pixels lie below)")
     p.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
     p.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
-    options = p.parse_args(arguments)
+    return p
+
+
+def main(arguments=None):
+    options = parser().parse_args(arguments)
     if options.frames < 1 or options.scale is not None and not (np.isfinite(options.scale) and options.scale > 0):
         raise InputError(f"--frames {options.frames} --scale {options.scale}: at least one frame and a positive number of millimetres are needed")
     if options.output is not None and not os.path.isdir(os.path.dirname(os.path.abspath(options.output))):

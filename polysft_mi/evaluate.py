@@ -128,12 +128,16 @@ def print_table(figures, title, labels=LABELS):
     Console().print(table)
 
 
+def parser():
+    p = commands.parser("evaluate", "Figures of a reconstruction against ground truth.", _EXAMPLES)
+    p.add_argument("out", metavar="OUT", help="folder of a run, or a surface.npz")
+    p.add_argument("truth", metavar="TRUTH", help="gt.npz, an .npz of depth points, a folder of cloud_*.npz, or a sequence's folder")
+    p.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+    return p
+
+
 def main(arguments=None):
-    parser = commands.parser("evaluate", "Figures of a reconstruction against ground truth.", _EXAMPLES)
-    parser.add_argument("out", metavar="OUT", help="folder of a run, or a surface.npz")
-    parser.add_argument("truth", metavar="TRUTH", help="gt.npz, an .npz of depth points, a folder of cloud_*.npz, or a sequence's folder")
-    parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
-    options = parser.parse_args(arguments)
+    options = parser().parse_args(arguments)
     figures = evaluate(options.out, options.truth)
     if options.json:
         print(json.dumps(figures))

@@ -81,7 +81,7 @@ def _texture(run, given):
     return path
 
 
-def main(arguments=None):
+def parser():
     p = commands.parser("export", "Write the moving surface of a run for other programs: metres, y up unless asked otherwise, textured.", _EXAMPLES)
     p.add_argument("out", metavar="OUT", help="folder of a run")
     p.add_argument("--format", choices=("usd", "glb", "obj", "ply", "npz"), required=True, help="what to write")
@@ -90,7 +90,11 @@ def main(arguments=None):
     p.add_argument("--fps", type=float, help="frames a second (default: that of the run)")
     p.add_argument("--texture", metavar="IMAGE", help="another image than the one that the scene names")
     p.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
-    options = p.parse_args(arguments)
+    return p
+
+
+def main(arguments=None):
+    options = parser().parse_args(arguments)
     run = Run.open(options.out)
     path = export(run, options.format, options.output, up=options.up, fps=options.fps, texture=options.texture)
     if not options.quiet:

@@ -1,6 +1,7 @@
 """``python -m polysft_mi.report OUT``: one page, in one file, that shows a run in any browser and without a network."""
 
 import base64
+import io
 import json
 import os
 from collections import deque
@@ -215,6 +216,7 @@ def _loss(records):
 def _images(run, shown):
     """The pictures as base64 by name, and the error (S, N) at each vertex of the frames shown, or None where the camera is not known."""
     import cv2
+    from PIL import Image
 
     wanted, budget = set(shown), _IMAGES / len(shown)
     size = None
@@ -223,13 +225,12 @@ def _images(run, shown):
     def encode(panels, width, quality):
         out = []
         for panel in panels:
-            panel = np.ascontiguousarray(panel[..., ::-1])
+            panel = np.ascontiguousarray(panel)
             if width < panel.shape[1]:
                 panel = cv2.resize(panel, (width, max(1, round(panel.shape[0] * width / panel.shape[1]))), interpolation=cv2.INTER_AREA)
-            done, data = cv2.imencode(".webp", panel, [cv2.IMWRITE_WEBP_QUALITY, quality])
-            if not done:
-                raise InputError(f"{run.folder}: a picture of {panel.shape[1]}x{panel.shape[0]} cannot be encoded as WebP")
-            out.append(data.tobytes())
+            data = io.BytesIO()
+            Image.fromarray(panel).save(data, "WEBP", quality=quality, method=2)  # half the time of the default for 3 % more bytes
+            out.append(data.getvalue())
         return out
 
     with ThreadPoolExecutor(_WORKERS) as pool:
@@ -332,14 +333,18 @@ def _scalar(label, meaning, unit, values, colours, *, signed=False):
     return {"label": label, "meaning": meaning, "unit": unit, "low": low, "high": top, "scale": scale, "values": _base64(np.where(known, raw, 255).astype(np.uint8))}
 
 
-def main(arguments=None):
+def parser():
     p = commands.parser("report", "Write one page, in one file, that shows a run in any browser and without a network.", _EXAMPLES)
     p.add_argument("out", metavar="OUT", help="folder of a run")
     p.add_argument("-o", "--output", metavar="FILE", help="file to write (default: report.html in OUT)")
     p.add_argument("--truth", metavar="TRUTH", help="ground truth, as evaluate takes it")
     p.add_argument("--frames", type=int, default=200, metavar="N", help="show at most N frames, spread over the video (default: 200)")
     p.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
-    options = p.parse_args(arguments)
+    return p
+
+
+def main(arguments=None):
+    options = parser().parse_args(arguments)
     if options.frames < 1:
         raise InputError(f"--frames {options.frames}; at least 1 is needed")
     path = write(options.out, options.output, truth=options.truth, frames=options.frames)

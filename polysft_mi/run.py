@@ -148,8 +148,8 @@ def _report(out, progress):
     progress.stage("report")
     try:
         return report.write(out)
-    except InputError as error:
-        print(f"no report: {error}", file=sys.stderr)
+    except Exception as error:  # whatever it is, the results stand without the page
+        print(f"no report: {type(error).__name__}: {error}", file=sys.stderr)
         return None
 
 

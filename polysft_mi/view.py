@@ -108,12 +108,16 @@ def _polyscope(screenshot):
     return ps
 
 
-def main(arguments=None):
+def parser():
     p = commands.parser("view", "Look at a run in an interactive viewer (polyscope, of the optional extra 'view').", _EXAMPLES)
     p.add_argument("out", metavar="OUT", help="folder of a run")
     p.add_argument("--frame", type=int, metavar="K", help="frame to begin with, by its index (default: the first)")
     p.add_argument("--screenshot", metavar="FILE", help="write a .png of that frame instead of opening a window")
-    options = p.parse_args(arguments)
+    return p
+
+
+def main(arguments=None):
+    options = parser().parse_args(arguments)
     run = Run.open(options.out)
     at = {int(k): n for n, k in enumerate(run.frames)}
     if options.frame is not None and options.frame not in at:
