@@ -153,7 +153,6 @@ def _figures(run, truth):
     cards += [(label, form.format(metric[name])) for name, (label, form) in wanted.items() if name in metric]
     if "sigma_mm" in columns:
         cards.append(("sigma along the ray, median", f"{np.median([s for s in columns['sigma_mm'] if s is not None] or [np.nan]):.2f} mm"))
-    cards.append(("frames", str(len(run.frames))))
     lost = metric.get("lost", {})
     cards.append(("lost frames", str(len(lost))))
     return columns, cards, distance

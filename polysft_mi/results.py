@@ -14,6 +14,7 @@ from .defaults import known_defaults, located
 from .errors import InputError
 from .evaluate import read_surface
 from .metrics import load_npz
+from .video import read_video
 
 PEAK = 0.25  # the error that is white in the pictures of a run
 
@@ -125,14 +126,13 @@ class Run:
             width = picture.shape[1] // 4
             yield tuple(picture[:, k * width : (k + 1) * width] for k in range(3))
             count += 1
-            if count == len(self.frames):
-                return
-        raise InputError(f"{self.path('comparison.mp4')}: shows {count} frames; the run has {len(self.frames)}")
+        if count != len(self.frames):
+            raise InputError(f"{self.path('comparison.mp4')}: shows {count} frames; the run has {len(self.frames)}")
 
     def _comparison(self):
         path = self.path("comparison.mp4")
         if os.path.isfile(path):
-            yield from _decoded(path)
+            yield from read_video(path)
             return
         names = [self.path("comparison", f"{k:03d}.png") for k in range(len(self.frames))]
         if not os.path.isfile(names[0]):
@@ -144,21 +144,6 @@ class Run:
             if image is None:
                 raise InputError(f"{name}: not a readable image")
             yield image[..., ::-1]
-
-
-def _decoded(path):
-    """The pictures of a video, (H, W, 3) uint8 RGB."""
-    import imageio_ffmpeg
-
-    frames = imageio_ffmpeg.read_frames(path)
-    try:
-        width, height = next(frames)["size"]
-        for data in frames:
-            yield np.frombuffer(data, np.uint8).reshape(height, width, 3)
-    except (OSError, RuntimeError, StopIteration) as error:
-        raise InputError(f"{path}: not a readable video ({' '.join(str(error).split())[:200]})") from None
-    finally:
-        frames.close()
 
 
 def read_json(path):
