@@ -165,7 +165,7 @@ def write(figures, other, out, *, count=20, scale=None):
             layers = _layers(other, k, camera) | maps[k]
             layers["false_colour"] = pictures.false_colour(*drawn[0], scale)
             versions = other.run.about.get("versions", {})
-            metadata = {"frame": k, "a": figures["a"], "b": figures["b"], "false_colour_mm": scale, "scene": other.run.about.get("command", ""), **versions}
+            metadata = {"frame": k, "a": figures["a"], "b": figures["b"], "false_colour_mm": scale, "scene": os.path.abspath(other.run.path("scene.xml")), **versions}
             exr.write_exr(os.path.join(folder, f"{k:03d}.exr"), layers, metadata, plain="false_colour")
         pictures.frame_plot(os.path.join(folder, "figures.png"), {n: v for n, v in figures["per_frame"].items() if n != "shared"}, LABELS)
         with open(os.path.join(folder, "compare.json"), "w", encoding="utf-8") as file:
