@@ -154,7 +154,7 @@ def write(figures, other, out, *, count=20, scale=None):
     scale = max(scale, 1e-3)
     panels = [_pictures(run, set(shown)) if run else {} for run in (other.run, other.other)]
     ours = lambda name: name in ("compare.json", "figures.png") or re.fullmatch(r"\d{3,}\.(png|exr)", name) is not None
-    names = "   ".join(f"{side}: {os.path.basename(os.path.normpath(figures[side.lower()]))}" for side in "AB")
+    names = "   ".join(f"{side}: {'/'.join(os.path.normpath(figures[side.lower()]).split(os.sep)[-2:])}" for side in "AB")
     with folder_aside(out, ours) as folder:
         for k in shown:
             images = [("frame", panels[0][k][0]), ("A", panels[0][k][1])] + ([("B", panels[1][k][1])] if k in panels[1] else [])

@@ -21,7 +21,7 @@ _EXAMPLES = [
     ("out/demo -o page.html --frames 50", "elsewhere, and smaller: 50 frames spread over the video"),
 ]
 
-_NUMBERS = 1_000_000  # vertices of all frames together that a page may hold; fewer frames are shown where there are more
+_NUMBERS = 450_000  # vertices of all frames together that a page may hold; fewer frames are shown where there are more
 _IMAGES = 9_000_000  # bytes of all pictures together, before base64
 _SIZES = ((640, 80), (640, 70), (480, 75), (480, 60), (360, 60), (240, 50))  # width and quality, the first that fits
 _FINE = 24_000  # triangles that a page may draw
