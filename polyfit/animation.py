@@ -1,8 +1,9 @@
 """A textured mesh that moves, as files that other programs play: USD, glTF, one OBJ or PLY a frame, or arrays.
 
-Everywhere: ``vertices`` (T, N, 3) [m] of T frames, in the axes of the file (right-handed, ``up`` says which way is up), ``faces`` (F, 3),
-counterclockwise as seen from outside; ``uv`` (N, 2) texture coordinates, v up, or None; ``texture`` the path of an image, or None;
-``fps`` frames a second, the first at time 0. Files are written aside and renamed; InputError and OSError are raised for what cannot be used or written.
+Everywhere: ``vertices`` (T, N, 3) [m] of T frames, in the axes of the file (right-handed, ``up`` says which way is up), ``faces`` (F,
+3), counterclockwise as seen from outside; ``uv`` (N, 2) texture coordinates, v up, or None; ``texture`` the path of an image, or None;
+``fps`` frames a second, the first at time 0. Files are written aside and renamed; InputError and OSError are raised for what cannot be
+used or written.
 """
 
 import io
@@ -20,9 +21,11 @@ UP = {"y": np.diag([1.0, -1.0, -1.0]), "z": np.array([[1.0, 0, 0], [0, 0, 1], [0
 
 
 def from_camera(points, up="y"):
-    """Points (..., 3) of an OpenCV camera frame (x right, y down, z forward) in a frame with y up, (x, -y, -z), or with z up, (x, z, -y).
+    """Points (..., 3) of an OpenCV camera frame (x right, y down, z forward) in a frame with y up, (x, -y, -z), or with z up, (x, z,
+    -y).
 
-    Both are rotations about x: nothing is mirrored. The camera stays at the origin; with y up it looks along -z, as the cameras of glTF and USD do.
+    Both are rotations about x: nothing is mirrored. The camera stays at the origin; with y up it looks along -z, as the cameras of glTF
+    and USD do.
     """
     return np.asarray(points) @ UP[up].T.astype(np.asarray(points).dtype)
 
@@ -76,11 +79,11 @@ def encoded(texture):
 
 
 def write_usd(path, vertices, faces, uv=None, texture=None, *, fps=24.0, up="y", name="surface"):
-    """Write a USD scene, its format by the extension: ``.usdz`` (one file with the texture in it), ``.usdc``, ``.usda``, or ``.usd``, for which the texture is
-    written beside as NAME_texture.png or .jpg.
+    """Write a USD scene, its format by the extension: ``.usdz`` (one file with the texture in it), ``.usdc``, ``.usda``, or ``.usd``,
+    for which the texture is written beside as NAME_texture.png or .jpg.
 
-    A Mesh ``/name/mesh`` with ``points``, ``normals`` and ``extent`` at the time codes 0 to T - 1, ``fps`` time codes a second, metersPerUnit 1, no
-    subdivision, and a UsdPreviewSurface with the texture. Needs usd-core.
+    A Mesh ``/name/mesh`` with ``points``, ``normals`` and ``extent`` at the time codes 0 to T - 1, ``fps`` time codes a second,
+    metersPerUnit 1, no subdivision, and a UsdPreviewSurface with the texture. Needs usd-core.
     """
     vertices, faces, uv = _checked(vertices, faces, uv, fps)
     stem, extension = os.path.splitext(os.fspath(path))
@@ -170,8 +173,8 @@ def _stage(vertices, faces, uv, image, fps, up, name):
 
 
 def write_glb(path, vertices, faces, uv=None, texture=None, *, fps=24.0, name="surface"):
-    """Write binary glTF 2.0 (``.glb``): the first frame as the mesh, a morph target for each later one, and an animation of their weights, which blends each frame
-    into the next. ``vertices`` have y up, as glTF has it. Needs pygltflib.
+    """Write binary glTF 2.0 (``.glb``): the first frame as the mesh, a morph target for each later one, and an animation of their
+    weights, which blends each frame into the next. ``vertices`` have y up, as glTF has it. Needs pygltflib.
     """
     import pygltflib as gltf
 
@@ -197,7 +200,8 @@ def write_glb(path, vertices, faces, uv=None, texture=None, *, fps=24.0, name="s
 
     def geometry(positions, directions):
         return gltf.Attributes(
-            POSITION=accessor(positions, gltf.VEC3, gltf.ARRAY_BUFFER, bounds=True), NORMAL=accessor(directions, gltf.VEC3, gltf.ARRAY_BUFFER)
+            POSITION=accessor(positions, gltf.VEC3, gltf.ARRAY_BUFFER, bounds=True),
+            NORMAL=accessor(directions, gltf.VEC3, gltf.ARRAY_BUFFER),
         )
 
     n = normals(vertices, faces)
@@ -207,7 +211,10 @@ def write_glb(path, vertices, faces, uv=None, texture=None, *, fps=24.0, name="s
     targets = [geometry(V - vertices[0], d - n[0]) for V, d in zip(vertices[1:], n[1:])]
     wide = vertices.shape[1] > 65535
     index = accessor(
-        faces.ravel().astype(np.uint32 if wide else np.uint16), gltf.SCALAR, gltf.ELEMENT_ARRAY_BUFFER, gltf.UNSIGNED_INT if wide else gltf.UNSIGNED_SHORT
+        faces.ravel().astype(np.uint32 if wide else np.uint16),
+        gltf.SCALAR,
+        gltf.ELEMENT_ARRAY_BUFFER,
+        gltf.UNSIGNED_INT if wide else gltf.UNSIGNED_SHORT,
     )
     paint = gltf.PbrMetallicRoughness(metallicFactor=0.0, roughnessFactor=0.9)
     if data:
@@ -240,12 +247,16 @@ def write_glb(path, vertices, faces, uv=None, texture=None, *, fps=24.0, name="s
 
 
 def write_frames(folder, kind, vertices, faces, uv=None, texture=None, *, labels=None, up="y"):
-    """Write one mesh a frame into a new or empty ``folder``: ``kind`` "obj", with a material file and the texture, or "ply", with uv as ``s``, ``t``.
+    """Write one mesh a frame into a new or empty ``folder``: ``kind`` "obj", with a material file and the texture, or "ply", with uv as
+    ``s``, ``t``.
 
-    ``labels`` (T,): the frames' numbers in the file names, by default 0 to T - 1. A folder that holds nothing but such files is replaced.
+    ``labels`` (T,): the frames' numbers in the file names, by default 0 to T - 1. A folder that holds nothing but such files is
+    replaced.
     """
     vertices, faces, uv = _checked(vertices, faces, uv, 1)
-    ours = lambda name: name in ("surface.mtl", "texture.png", "texture.jpg") or name.endswith(f".{kind}") and name[: -len(kind) - 1].isdigit()
+    ours = lambda name: (
+        name in ("surface.mtl", "texture.png", "texture.jpg") or name.endswith(f".{kind}") and name[: -len(kind) - 1].isdigit()
+    )
     data, image = encoded(texture) if kind == "obj" and texture is not None and uv is not None else (None, None)
     with folder_aside(folder, ours) as place:
         if data:

@@ -23,8 +23,9 @@ examples:
   polysft export out/demo --format glb           for browsers and Blender
   polysft COMMAND --help                         the options of a command, with examples
 
-Each command is also a module: python -m polysft_mi.run ... Exit status: 0 done, 2 a mistake in what was given (one line on stderr says which),
-130 interrupted. Colours only on a terminal, and not where NO_COLOR is set.
+Each command is also a module: python -m polysft_mi.run ...
+Exit status: 0 done, 2 a mistake in what was given (one line on stderr says which), 130 interrupted.
+Colours only on a terminal, and not where NO_COLOR is set.
 """
 
 

@@ -22,13 +22,20 @@ _EXAMPLES = [
     ("out/a out/b --json", "one JSON object on stdout"),
 ]
 
-_OWN = {"psnr_mask": "PSNR inside the surface [dB]", "ssim_mask": "SSIM inside the surface", "seconds_per_frame": "seconds a frame", "order": "order of the jet"}
+_OWN = {
+    "psnr_mask": "PSNR inside the surface [dB]",
+    "ssim_mask": "SSIM inside the surface",
+    "seconds_per_frame": "seconds a frame",
+    "order": "order of the jet",
+}
 LABELS = {**evaluate.LABELS, "depth_difference_mm": "difference in depth, RMS [mm]", "shared": "vertices of B whose ray meets A"}
 LABELS |= {f"{name}_worst": label.replace(" [", ", worst frame [") for name, label in LABELS.items() if f"{name}_worst" not in LABELS}
 
 
 class Other:
-    """What A is compared with: ``rows()`` the figures of each frame, ``frames`` those that both have, ``maps(k)`` the differences in frame ``k`` [m]."""
+    """What A is compared with: ``per_frame()`` the figures of each frame, ``frames`` those that both have, ``maps(k)`` the differences in
+    frame ``k`` [m].
+    """
 
     def __init__(self, run, path):
         self.run, self.path = run, path
@@ -56,7 +63,11 @@ class Other:
         if "points" in truth and "frames" in truth:
             self.kind, self.truth = "points", {int(k): p.astype(np.float64) for k, p in zip(truth["frames"], truth["points"])}
         elif "vertices" in truth and "faces" in truth:
-            self.kind, self.truth, self.truth_faces = "mesh", dict(enumerate(truth["vertices"].astype(np.float64))), truth["faces"].astype(np.int64)
+            self.kind, self.truth, self.truth_faces = (
+                "mesh",
+                dict(enumerate(truth["vertices"].astype(np.float64))),
+                truth["faces"].astype(np.int64),
+            )
         else:
             raise InputError(f"{where}: holds {', '.join(truth)}; vertices and faces, or points and frames, are needed")
 
@@ -64,14 +75,18 @@ class Other:
         """Equally long lists by name, ``frame`` among them."""
         if self.other is None:
             return metrics.per_frame({"vertices": self.run.vertices, "faces": self.run.faces, "frames": self.run.frames}, self.where)
-        rows = list(metrics.against_meshes(self.at, self.truth, self.faces, self.path)) if self.same else [{"frame": k} for k in self.frames]
+        rows = (
+            list(metrics.against_meshes(self.at, self.truth, self.faces, self.path)) if self.same else [{"frame": k} for k in self.frames]
+        )
         for row in rows:
             error, share = metrics.depth_rmse(self.at[row["frame"]], self.faces, self.truth[row["frame"]])
             row |= {"depth_difference_mm": 1e3 * error, "shared": share}
         return {name: [row[name] for row in rows] for name in rows[0]}
 
     def maps(self, k, camera):
-        """Images (H, W) of the frame ``k``, NaN where there is none: ``distance`` and ``depth_difference`` [m], depths [m], as far as they can be told."""
+        """Images (H, W) of the frame ``k``, NaN where there is none: ``distance`` and ``depth_difference`` [m], depths [m], as far as
+        they can be told.
+        """
         V, other = self.at[k], self.truth[k]
         if self.kind == "cloud":
             from scipy.spatial import cKDTree
@@ -82,12 +97,12 @@ class Other:
             depth, distance = seen(V, self.faces, camera, [cKDTree(points).query(V)[0]])
             return {"depth_a": depth, "distance": distance}
         if self.kind == "points":
-            depth_a, = seen(V, self.faces, camera)
+            (depth_a,) = seen(V, self.faces, camera)
             depth_b = _splatted(other, camera)
             return {"depth_a": depth_a, "depth_b": depth_b, "depth_difference": depth_a - depth_b}
         values = [np.linalg.norm(V - other, axis=1)] if self.same else []
         depth_a, *distance = seen(V, self.faces, camera, values)
-        depth_b, = seen(other, self.truth_faces, camera)
+        (depth_b,) = seen(other, self.truth_faces, camera)
         maps = {"depth_a": depth_a, "depth_b": depth_b, "depth_difference": depth_a - depth_b}
         return {**maps, "distance": distance[0]} if distance else maps
 
@@ -103,7 +118,9 @@ def _splatted(points, camera):
 
 
 def _dots(values, share=0.05):
-    """An image (H, W) of values at few pixels, NaN elsewhere, as dots that can be seen; as it is where more than ``share`` of the pixels have one."""
+    """An image (H, W) of values at few pixels, NaN elsewhere, as dots that can be seen; as it is where more than ``share`` of the
+    pixels have one.
+    """
     from scipy.ndimage import distance_transform_edt
 
     missing = np.isnan(values)
@@ -114,10 +131,11 @@ def _dots(values, share=0.05):
 
 
 def compare(a, b):
-    """Figures of the run ``a`` (a folder) against ``b``, a run or ground truth as :mod:`polysft_mi.evaluate` takes it: ``(figures, Other)``.
+    """Figures of the run ``a`` (a folder) against ``b``, a run or ground truth as :mod:`polysft_mi.evaluate` takes it: ``(figures,
+    Other)``.
 
-    ``figures``: ``a``, ``b``, ``frames``, ``difference`` (name to mean, and to the worst frame's as NAME_worst), ``own`` (name to [a, b], of two runs), ``per_frame``.
-    Raises InputError.
+    ``figures``: ``a``, ``b``, ``frames``, ``difference`` (name to mean, and to the worst frame's as NAME_worst), ``own`` (name to [a,
+    b], of two runs), ``per_frame``. Raises InputError.
     """
     run = Run.open(a)
     other = Other(run, b)
@@ -136,7 +154,8 @@ def compare(a, b):
 
 
 def write(figures, other, out, *, count=20, scale=None):
-    """Write compare.json, figures.png and, for at most ``count`` frames, NNN.png and NNN.exr with the differences in false colours into the folder ``out``.
+    """Write compare.json, figures.png and, for at most ``count`` frames, NNN.png and NNN.exr with the differences in false colours into
+    the folder ``out``.
 
     ``scale``: the difference [mm] at which the colours end, by default what 98 % of the pixels lie below.
     """
@@ -149,7 +168,9 @@ def write(figures, other, out, *, count=20, scale=None):
     shown = [other.frames[i] for i in spread(len(other.frames), count)]
     maps = {k: other.maps(k, camera) for k in shown}
     if scale is None:
-        values = np.concatenate([np.abs(m[name][np.isfinite(m[name])]) for m in maps.values() for name in ("distance", "depth_difference") if name in m])
+        values = np.concatenate(
+            [np.abs(m[name][np.isfinite(m[name])]) for m in maps.values() for name in ("distance", "depth_difference") if name in m]
+        )
         scale = 1e3 * float(np.quantile(values, 0.98)) if values.size else 1.0
     scale = max(scale, 1e-3)
     panels = [_pictures(run, set(shown)) if run else {} for run in (other.run, other.other)]
@@ -165,7 +186,14 @@ def write(figures, other, out, *, count=20, scale=None):
             layers = _layers(other, k, camera) | maps[k]
             layers["false_colour"] = pictures.false_colour(*drawn[0], scale)
             versions = other.run.about.get("versions", {})
-            metadata = {"frame": k, "a": figures["a"], "b": figures["b"], "false_colour_mm": scale, "scene": os.path.abspath(other.run.path("scene.xml")), **versions}
+            metadata = {
+                "frame": k,
+                "a": figures["a"],
+                "b": figures["b"],
+                "false_colour_mm": scale,
+                "scene": os.path.abspath(other.run.path("scene.xml")),
+                **versions,
+            }
             exr.write_exr(os.path.join(folder, f"{k:03d}.exr"), layers, metadata, plain="false_colour")
         pictures.frame_plot(os.path.join(folder, "figures.png"), {n: v for n, v in figures["per_frame"].items() if n != "shared"}, LABELS)
         with open(os.path.join(folder, "compare.json"), "w", encoding="utf-8") as file:
@@ -180,7 +208,9 @@ def _pictures(run, shown):
 
 
 def _layers(other, k, camera):
-    """The images of both runs in the frame ``k`` that their own EXR files hold, as the layers ``target``, ``a``, ``b`` and ``difference``."""
+    """The images of both runs in the frame ``k`` that their own EXR files hold, as the layers ``target``, ``a``, ``b`` and
+    ``difference``.
+    """
     layers = {}
     for name, run in (("a", other.run), ("b", other.other)):
         path = run.path("comparison", f"{k:03d}.exr") if run else ""
@@ -198,9 +228,19 @@ def parser():
     p = commands.parser("compare", "Compare a run with another run, or with ground truth. Differences are A minus B.", _EXAMPLES)
     p.add_argument("a", metavar="A", help="folder of a run")
     p.add_argument("b", metavar="B", help="folder of another run, or ground truth as evaluate takes it")
-    p.add_argument("-o", "--output", metavar="OUT", help="folder for compare.json, figures.png, and a PNG and an EXR a frame with the differences in false colours")
+    p.add_argument(
+        "-o",
+        "--output",
+        metavar="OUT",
+        help="folder for compare.json, figures.png, and a PNG and an EXR a frame with the differences in false colours",
+    )
     p.add_argument("--frames", type=int, default=20, metavar="N", help="pictures of at most N frames, spread evenly (default: 20)")
-    p.add_argument("--scale", type=float, metavar="MM", help="difference at which the false colours end (default: that which 98 %% of the pixels lie below)")
+    p.add_argument(
+        "--scale",
+        type=float,
+        metavar="MM",
+        help="difference at which the false colours end (default: that which 98 %% of the pixels lie below)",
+    )
     p.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
     p.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
     return p
@@ -209,7 +249,9 @@ def parser():
 def main(arguments=None):
     options = parser().parse_args(arguments)
     if options.frames < 1 or options.scale is not None and not (np.isfinite(options.scale) and options.scale > 0):
-        raise InputError(f"--frames {options.frames} --scale {options.scale}: at least one frame and a positive number of millimetres are needed")
+        raise InputError(
+            f"--frames {options.frames} --scale {options.scale}: at least one frame and a positive number of millimetres are needed"
+        )
     if options.output is not None and not os.path.isdir(os.path.dirname(os.path.abspath(options.output))):
         raise InputError(f"-o {options.output}: no such folder: {os.path.dirname(os.path.abspath(options.output))}")
     figures, other = compare(options.a, options.b)

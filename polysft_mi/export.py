@@ -17,15 +17,20 @@ _EXAMPLES = [
     ("out/demo --format npz --up camera", "arrays, in the camera frame"),
 ]
 
-EXTENSIONS = {"usd": (".usdz", ".usdc", ".usda", ".usd"), "glb": (".glb",), "npz": (".npz",)}  # the first is the default; the others are folders
+EXTENSIONS = {
+    "usd": (".usdz", ".usdc", ".usda", ".usd"),
+    "glb": (".glb",),
+    "npz": (".npz",),
+}  # the first is the default; the others are folders
 _PACKAGES = {"usd": ("pxr", "usd-core"), "glb": ("pygltflib", "pygltflib")}
 
 
 def export(run, kind, path=None, *, up="y", fps=None, texture=None):
     """Write the surface of a :class:`polysft_mi.results.Run` in the format ``kind``; returns the path written.
 
-    ``path``: the file, for "obj" and "ply" the folder, by default in the run's ``export`` folder. ``up``: "y", "z", or "camera" for the OpenCV camera frame as
-    it is (which USD and glTF do not have); ``fps``: frames a second, by default the run's; ``texture``: another image than the scene's. Raises InputError.
+    ``path``: the file, for "obj" and "ply" the folder, by default in the run's ``export`` folder. ``up``: "y", "z", or "camera" for the
+    OpenCV camera frame as it is (which USD and glTF do not have); ``fps``: frames a second, by default the run's; ``texture``: another
+    image than the scene's. Raises InputError.
     """
     from polyfit import animation
 
@@ -33,7 +38,9 @@ def export(run, kind, path=None, *, up="y", fps=None, texture=None):
     if not (np.isfinite(fps) and 0 < fps <= 1000):
         raise InputError(f"--fps {fps:g}: a rate above 0, at most 1000, is needed")
     if kind == "glb" and up != "y" or kind == "usd" and up == "camera":
-        raise InputError(f"--up {up}: {'glTF has y up' if kind == 'glb' else 'USD has y or z up'}; leave it out{' or give z' if kind == 'usd' else ''}")
+        raise InputError(
+            f"--up {up}: {'glTF has y up' if kind == 'glb' else 'USD has y or z up'}; leave it out{' or give z' if kind == 'usd' else ''}"
+        )
     if kind in _PACKAGES:
         module, package = _PACKAGES[kind]
         try:
@@ -82,11 +89,18 @@ def _texture(run, given):
 
 
 def parser():
-    p = commands.parser("export", "Write the moving surface of a run for other programs: metres, y up unless asked otherwise, textured.", _EXAMPLES)
+    p = commands.parser(
+        "export", "Write the moving surface of a run for other programs: metres, y up unless asked otherwise, textured.", _EXAMPLES
+    )
     p.add_argument("out", metavar="OUT", help="folder of a run")
     p.add_argument("--format", choices=("usd", "glb", "obj", "ply", "npz"), required=True, help="what to write")
     p.add_argument("-o", "--output", metavar="FILE", help="file to write, for obj and ply a folder (default: in OUT/export)")
-    p.add_argument("--up", choices=("y", "z", "camera"), default="y", help="which way is up; camera: x right, y down, z forward, as in surface.npz (default: y)")
+    p.add_argument(
+        "--up",
+        choices=("y", "z", "camera"),
+        default="y",
+        help="which way is up; camera: x right, y down, z forward, as in surface.npz (default: y)",
+    )
     p.add_argument("--fps", type=float, help="frames a second (default: that of the run)")
     p.add_argument("--texture", metavar="IMAGE", help="another image than the one that the scene names")
     p.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")

@@ -82,8 +82,8 @@ def loss_plot(path, log_records):
 
 
 def loss_curves(log_records):
-    """``(records, step, curves)``: the records with a loss, the iteration (R,) of each counted over all frames, and each term of ``TERMS`` that has one as its
-    values (R,), NaN where they are not positive. Raises ValueError where no record holds a loss.
+    """``(records, step, curves)``: the records with a loss, the iteration (R,) of each counted over all frames, and each term of
+    ``TERMS`` that has one as its values (R,), NaN where they are not positive. Raises ValueError where no record holds a loss.
     """
     records = [r for r in log_records if "loss" in r and "frame" in r]
     if not records:
@@ -112,7 +112,9 @@ def _number(value):
 
 @_kept_safe
 def frame_plot(path, per_frame, labels=None):
-    """One small plot over the frames for each figure: ``per_frame`` is a dict of equally long lists, one of them ``frame``; ``labels`` names them."""
+    """One small plot over the frames for each figure: ``per_frame`` is a dict of equally long lists, one of them ``frame``; ``labels``
+    names them.
+    """
     from .evaluate import LABELS
 
     labels = labels or LABELS
@@ -177,7 +179,9 @@ _MAPS = {"distance": ("distance of A from B [mm]", "viridis", 0), "depth_differe
 
 
 def false_colour(name, values, scale):
-    """The difference ``name``, values (H, W) [mm], as linear RGB (H, W, 3): in the colours of :func:`false_colours`, black where it is not known."""
+    """The difference ``name``, values (H, W) [mm], as linear RGB (H, W, 3): in the colours of :func:`false_colours`, black where it is
+    not known.
+    """
     import matplotlib
 
     _, colours, low = _MAPS[name]
@@ -188,8 +192,9 @@ def false_colour(name, values, scale):
 
 
 def false_colours(path, title, images, maps, scale):
-    """Pictures side by side, and differences in false colours with their scale: ``images`` are (title, (h, w, 3) uint8), ``maps`` (name, (H, W) [mm], NaN where
-    unknown), the name one of "distance" and "depth_difference"; colours end at ``scale`` [mm]. Raises OSError where it cannot be written.
+    """Pictures side by side, and differences in false colours with their scale: ``images`` are (title, (h, w, 3) uint8), ``maps``
+    (name, (H, W) [mm], NaN where unknown), the name one of "distance" and "depth_difference"; colours end at ``scale`` [mm]. Raises
+    OSError where it cannot be written.
     """
     height, width = images[0][1].shape[:2]
     columns, wide = len(images) + len(maps), 3.2
@@ -204,7 +209,8 @@ def false_colours(path, title, images, maps, scale):
         axes.set_facecolor("0.93")
         shown = axes.imshow(values, cmap=colours, vmin=low * scale, vmax=scale, interpolation="nearest")
         axes.set_title(label, fontsize=9)
-        figure.colorbar(shown, ax=axes, location="bottom", shrink=0.9, aspect=30, pad=0.02, extend="max" if low == 0 else "both").ax.tick_params(labelsize=7)
+        ends = "max" if low == 0 else "both"
+        figure.colorbar(shown, ax=axes, location="bottom", shrink=0.9, aspect=30, pad=0.02, extend=ends).ax.tick_params(labelsize=7)
     for axes in grid:
         axes.set_anchor("N")
         axes.set_xticks([]), axes.set_yticks([])

@@ -30,7 +30,8 @@ _WORKERS = 2
 
 
 def write(out, path=None, *, truth=None, frames=200):
-    """Write the report of the run in the folder ``out`` to ``path`` (default: ``report.html`` in it), at most ``frames`` frames spread evenly; returns the path.
+    """Write the report of the run in the folder ``out`` to ``path`` (default: ``report.html`` in it), at most ``frames`` frames spread
+    evenly; returns the path.
 
     ``truth``: ground truth as :mod:`polysft_mi.evaluate` takes it. Raises InputError.
     """
@@ -118,7 +119,9 @@ _LABELS = {
 
 
 def _figures(run, truth):
-    """``(columns, cards, distance)``: lists by frame, pairs of label and value for the top, and (T, N) [mm] to a truth of the same vertices or None."""
+    """``(columns, cards, distance)``: lists by frame, pairs of label and value for the top, and (T, N) [mm] to a truth of the same
+    vertices or None.
+    """
     from . import evaluate, metrics
 
     at = {int(k): n for n, k in enumerate(run.frames)}
@@ -149,7 +152,11 @@ def _figures(run, truth):
     add(("rgb", "inextensibility", "iterations", "seconds", "order"), metric.get("windows", []))
     if len(set(columns.get("order", []))) == 1:
         del columns["order"]
-    wanted = {"psnr_mask": ("PSNR inside the surface", "{:.2f} dB"), "ssim_mask": ("SSIM inside the surface", "{:.3f}"), "seconds_per_frame": ("seconds a frame", "{:.2f}")}
+    wanted = {
+        "psnr_mask": ("PSNR inside the surface", "{:.2f} dB"),
+        "ssim_mask": ("SSIM inside the surface", "{:.3f}"),
+        "seconds_per_frame": ("seconds a frame", "{:.2f}"),
+    }
     cards += [(label, form.format(metric[name])) for name, (label, form) in wanted.items() if name in metric]
     if "sigma_mm" in columns:
         cards.append(("sigma along the ray, median", f"{np.median([s for s in columns['sigma_mm'] if s is not None] or [np.nan]):.2f} mm"))
@@ -176,7 +183,8 @@ def _subtitle(run, shown):
     camera, metric = run.camera, run.metrics
     count = f"{len(run.frames)} frames" + (f" ({len(shown)} shown)" if len(shown) < len(run.frames) else "")
     size = f" of {camera.width}×{camera.height}" if camera else ""
-    return f"{count}{size}, {run.vertices.shape[1]} vertices, jet of order {metric.get('order', '?')}, solver {metric.get('solver', '?')}, {run.about.get('started', '')}"
+    how = f"jet of order {metric.get('order', '?')}, solver {metric.get('solver', '?')}, {run.about.get('started', '')}"
+    return f"{count}{size}, {run.vertices.shape[1]} vertices, {how}"
 
 
 def _warning(run):
@@ -189,7 +197,14 @@ def _warning(run):
 def _about(run):
     about, metric = run.about, run.metrics
     rows = [["started", about.get("started", "")]]
-    rows += [[label, f"{metric[name]:.3g}"] for name, label in (("template_residual_rms_mm", "template against its jet, RMS [mm]"), ("template_residual_max_mm", "at most [mm]")) if name in metric]
+    rows += [
+        [label, f"{metric[name]:.3g}"]
+        for name, label in (
+            ("template_residual_rms_mm", "template against its jet, RMS [mm]"),
+            ("template_residual_max_mm", "at most [mm]"),
+        )
+        if name in metric
+    ]
     rows += [["texture", run.texture or "none"]]
     if run.camera:
         c = run.camera
@@ -238,19 +253,25 @@ def _images(run, shown):
             if k not in wanted:
                 continue
             if size is None or encoded and len(encoded) == 1:  # by the first frames: how large pictures may be
-                size = next((s for s in _SIZES[_SIZES.index(size) if size else 0 :] if sum(map(len, encode(panels, *s))) <= budget), _SIZES[-1])
+                size = next(
+                    (s for s in _SIZES[_SIZES.index(size) if size else 0 :] if sum(map(len, encode(panels, *s))) <= budget), _SIZES[-1]
+                )
             if run.camera is not None:
                 errors.append(_error_at_vertices(run.camera, run.vertices[k], panels[2]))
             waiting.append(pool.submit(encode, panels, *size))
             if len(waiting) > 2 * _WORKERS:
                 encoded.append(waiting.popleft().result())
         encoded += [w.result() for w in waiting]
-    named = {name: [base64.b64encode(images[c]).decode("ascii") for images in encoded] for c, name in enumerate(("target", "render", "error"))}
+    named = {
+        name: [base64.b64encode(images[c]).decode("ascii") for images in encoded] for c, name in enumerate(("target", "render", "error"))
+    }
     return {"kind": "webp", **named}, np.stack(errors) if errors else None
 
 
 def _error_at_vertices(camera, vertices, panel):
-    """The error (N,) where each vertex is seen, read off the picture of the error (a mean over 3x3 of its pixels); NaN outside the image."""
+    """The error (N,) where each vertex is seen, read off the picture of the error (a mean over 3x3 of its pixels); NaN outside the
+    image.
+    """
     import cv2
 
     error = cv2.blur(panel.sum(axis=2, dtype=np.float32) * (PEAK / 765), (3, 3))
@@ -266,7 +287,9 @@ def _error_at_vertices(camera, vertices, panel):
 
 
 def _mesh(run, shown):
-    """The surface for the page: coarse positions, z up, as 16 bit numbers, and a finer mesh on it whose vertices have the texture's colours."""
+    """The surface for the page: coarse positions, z up, as 16 bit numbers, and a finer mesh on it whose vertices have the texture's
+    colours.
+    """
     from polyfit.animation import from_camera
     from polyfit.mesh import refined
 
@@ -278,8 +301,9 @@ def _mesh(run, shown):
     fine, face, weights = refined(faces, parts)
     corners = faces[face]
     mesh = {
-        "vertices": run.vertices.shape[1], "low": low.tolist(), "high": np.maximum(high, low + 1e-9).tolist(), "positions": _base64(positions),
-        "corners": _base64(corners.astype("<u4")), "weights": _base64(weights.astype("<f4")), "faces": _base64(fine.astype("<u4")),
+        "vertices": run.vertices.shape[1], "low": low.tolist(), "high": np.maximum(high, low + 1e-9).tolist(),
+        "positions": _base64(positions), "corners": _base64(corners.astype("<u4")),
+        "weights": _base64(weights.astype("<f4")), "faces": _base64(fine.astype("<u4")),
     }  # fmt: skip
     colours = _texture_colours(run.texture, np.einsum("nk,nkc->nc", weights, run.uv[corners].astype(np.float64)), run.uv, fine)
     return mesh if colours is None else {**mesh, "colours": _base64(colours)}
@@ -299,12 +323,16 @@ def _texture_colours(path, uv, coarse_uv, fine):
         image = cv2.resize(image, smaller, interpolation=cv2.INTER_AREA)
     height, width = image.shape[:2]
     x, y = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
-    sampled = cv2.remap(image, x.astype(np.float32)[:, None], y.astype(np.float32)[:, None], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    sampled = cv2.remap(
+        image, x.astype(np.float32)[:, None], y.astype(np.float32)[:, None], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
     return sampled.reshape(-1, 3)[:, ::-1]
 
 
 def _scalars(run, shown, errors, distance):
-    """What the surface may be coloured by: for each its texts, its range and scale, and the values (S, N) as bytes, 255 for what is not known."""
+    """What the surface may be coloured by: for each its texts, its range and scale, and the values (S, N) as bytes, 255 for what is not
+    known.
+    """
     out = []
     if distance is not None:
         out.append(_scalar("distance to the truth", "Distance of each vertex from the true one.", "mm", distance[shown], "viridis"))
@@ -312,7 +340,7 @@ def _scalars(run, shown, errors, distance):
         meaning = "Root mean square over the channels of rendering minus image, in linear colour, where each vertex is seen."
         out.append(_scalar("error", meaning, "linear colour", errors, "inferno"))
     curvature = run.mean_curvature()[shown]
-    meaning = "Mean curvature of the jet: positive (red) where the surface bulges towards the camera in the first frame, negative (blue) where it is hollow."
+    meaning = "Mean curvature of the jet: red where the surface bulges towards the first frame's camera, blue where it is hollow."
     out.append(_scalar("curvature", meaning, "1/m", curvature, "RdBu_r", signed=True))
     if run.sigma is not None and np.isfinite(run.sigma[shown]).any():
         meaning = "Standard deviation of each vertex along its ray, as the solver estimates it; grey where it is not known."
@@ -329,7 +357,15 @@ def _scalar(label, meaning, unit, values, colours, *, signed=False):
     low = -top if signed else 0.0
     raw = np.round(np.clip((np.where(known, values, 0) - low) / (top - low), 0, 1) * 254).astype(np.uint8)
     scale = [to_hex(c) for c in matplotlib.colormaps[colours](np.linspace(0, 1, 17))]
-    return {"label": label, "meaning": meaning, "unit": unit, "low": low, "high": top, "scale": scale, "values": _base64(np.where(known, raw, 255).astype(np.uint8))}
+    return {
+        "label": label,
+        "meaning": meaning,
+        "unit": unit,
+        "low": low,
+        "high": top,
+        "scale": scale,
+        "values": _base64(np.where(known, raw, 255).astype(np.uint8)),
+    }
 
 
 def parser():

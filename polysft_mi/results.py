@@ -21,8 +21,8 @@ PEAK = 0.25  # the error that is white in the pictures of a run
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run: ``folder``; ``vertices`` (T, N, 3) float32 [m, camera frame], ``faces`` (F, 3), ``uv`` (N, 2) v up, ``frames`` (T,) the index of each,
-    ``sigma`` (T, N) [m] or None; ``metrics`` and ``about``: its metrics.json and run.json.
+    """A finished run: ``folder``; ``vertices`` (T, N, 3) float32 [m, camera frame], ``faces`` (F, 3), ``uv`` (N, 2) v up, ``frames``
+    (T,) the index of each, ``sigma`` (T, N) [m] or None; ``metrics`` and ``about``: its metrics.json and run.json.
     """
 
     folder: str
@@ -104,7 +104,9 @@ class Run:
                 raise InputError(f"{path}: not JSON lines ({error})") from None
 
     def mean_curvature(self):
-        """Mean curvature (T, N) [1/m] of the jets at the vertices, positive where the surface bulges towards the camera (by its pose in the first frame)."""
+        """Mean curvature (T, N) [1/m] of the jets at the vertices, positive where the surface bulges towards the camera (by its pose in
+        the first frame).
+        """
         import torch
         from scipy.spatial.transform import Rotation
 
@@ -119,7 +121,8 @@ class Run:
     def panels(self):
         """For each frame in turn the pictures of the comparison video: target, rendering and error, each (h, w, 3) uint8 RGB.
 
-        The error picture runs from black (0) through red and yellow to white (:data:`PEAK`); the sum of its channels is proportional to the error.
+        The error picture runs from black (0) through red and yellow to white (:data:`PEAK`); the sum of its channels is proportional to
+        the error.
         """
         count = 0
         for picture in self._comparison():

@@ -171,7 +171,8 @@ def _print_end(out, summary, page, seconds):
         f"({summary['iterations_per_window']:.0f} iterations a window); inside the surface PSNR {summary.get('psnr_mask', float('nan')):.2f} dB, "
         f"SSIM {summary.get('ssim_mask', float('nan')):.3f}"
     )
-    print(f"surfaces: {os.path.join(out, 'surface.npz')}, {os.path.join(out, 'meshes')}; look at {page or summary['video']} and {os.path.join(out, 'comparison.png')}")
+    look = f"{page or summary['video']} and {os.path.join(out, 'comparison.png')}"
+    print(f"surfaces: {os.path.join(out, 'surface.npz')}, {os.path.join(out, 'meshes')}; look at {look}")
 
 
 class Progress:

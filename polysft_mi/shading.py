@@ -1,4 +1,6 @@
-"""Pictures of a surface in NumPy alone: shaded, from a viewpoint of one's choice; or its depth and values at its vertices, as the camera sees them."""
+"""Pictures of a surface in NumPy alone: shaded, from a viewpoint of one's choice; or its depth and values at its vertices, as the
+camera sees them.
+"""
 
 from dataclasses import dataclass
 
@@ -90,10 +92,11 @@ def shade_surface(vertices, faces, view=None, uv=None, size=(480, 480)):
 
 
 def seen(vertices, faces, camera, values=()):
-    """What a camera sees of a mesh: depth (H, W) [m], NaN beyond the mesh, and an image (H, W) of each of ``values`` (N,), given at the vertices.
+    """What a camera sees of a mesh: depth (H, W) [m], NaN beyond the mesh, and an image (H, W) of each of ``values`` (N,), given at the
+    vertices.
 
-    ``vertices`` (N, 3) [m, camera frame]; ``camera``: :class:`polysft_mi.camera.Intrinsics`. Interpolation is perspective, at the pixels' centres; triangles that reach
-    behind the camera are left out.
+    ``vertices`` (N, 3) [m, camera frame]; ``camera``: :class:`polysft_mi.camera.Intrinsics`. Interpolation is perspective, at the
+    pixels' centres; triangles that reach behind the camera are left out.
     """
     V, F = np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64)
     F = F[(V[F, 2] > 1e-9).all(axis=1)]

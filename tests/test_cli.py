@@ -21,7 +21,9 @@ OWN = [name for name in commands.COMMANDS if name != "prepare"]
 
 
 def command(*arguments, **options):
-    return subprocess.run([sys.executable, "-m", "polysft_mi", *map(str, arguments)], capture_output=True, text=True, cwd=ROOT, timeout=120, **options)
+    return subprocess.run(
+        [sys.executable, "-m", "polysft_mi", *map(str, arguments)], capture_output=True, text=True, cwd=ROOT, timeout=120, **options
+    )
 
 
 def test_installed_command_is_ours():
@@ -36,7 +38,8 @@ def test_help_lists_every_command_and_loads_nothing_heavy(capsys):
     assert [name for name in listed if name in commands.COMMANDS] == list(commands.COMMANDS)
     for name in commands.COMMANDS:
         assert callable(importlib.import_module(f"polysft_mi.{name}").main)
-    code = "import sys, polysft_mi.__main__ as m; m.main(['--help']); print([x for x in ('numpy', 'torch', 'mitsuba', 'plotly', 'pxr') if x in sys.modules])"
+    heavy = ("numpy", "torch", "mitsuba", "plotly", "pxr")
+    code = f"import sys, polysft_mi.__main__ as m; m.main(['--help']); print([x for x in {heavy} if x in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
     assert done.stdout.splitlines()[-1] == "[]", done.stdout + done.stderr
 
@@ -63,7 +66,17 @@ def test_no_command_and_a_wrong_one(capsys):
     assert polysft.main(["--version"]) == 0 and capsys.readouterr().out.splitlines()[-1].startswith("polysft ")
 
 
-@pytest.mark.parametrize("arguments", [["wrong"], ["export"], ["export", "out", "--format", "fbx"], ["report", "{tmp}"], ["compare", "{tmp}", "{tmp}"], ["evaluate", "{tmp}"]])
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["wrong"],
+        ["export"],
+        ["export", "out", "--format", "fbx"],
+        ["report", "{tmp}"],
+        ["compare", "{tmp}", "{tmp}"],
+        ["evaluate", "{tmp}"],
+    ],
+)
 def test_mistakes_end_in_one_line_and_status_2(arguments, tmp_path):
     done = command(*[a.replace("{tmp}", str(tmp_path)) for a in arguments])
     assert done.returncode == 2 and done.stdout == ""

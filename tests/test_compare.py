@@ -64,7 +64,9 @@ def test_two_runs(finished_run, moved, tmp_path, capsys):
     out, b = finished_run[1], moved[0]
     assert compare.main([str(out), str(b), "-o", str(tmp_path / "pictures"), "--frames", "2", "--scale", "4", "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
-    assert printed["difference"]["rmse_mm"] == pytest.approx(2, abs=1e-3) and printed["difference"]["depth_difference_mm"] == pytest.approx(2, rel=0.1)
+    assert printed["difference"]["rmse_mm"] == pytest.approx(2, abs=1e-3) and printed["difference"]["depth_difference_mm"] == pytest.approx(
+        2, rel=0.1
+    )
     assert printed["own"]["psnr_mask"] == [Run.open(out).metrics["psnr_mask"]] * 2
     folder = tmp_path / "pictures"
     assert sorted(p.name for p in folder.iterdir()) == ["000.exr", "000.png", "003.exr", "003.png", "compare.json", "figures.png"]
@@ -85,9 +87,23 @@ def test_two_runs(finished_run, moved, tmp_path, capsys):
     assert own.mean() > 0.1 and np.abs(run_layers["depth"] - layers["depth_a"])[own].max() < 1e-4  # Mitsuba's depth is ours
     with OpenEXR.File(str(folder / "003.exr"), separate_channels=True) as file:
         names = set(file.channels())
-    assert {"target.R", "a.R", "b.R", "difference.R", "distance.Y", "depth_a.Z", "depth_difference.Z", "false_colour.R", "R", "G", "B"} <= names
+    assert {
+        "target.R",
+        "a.R",
+        "b.R",
+        "difference.R",
+        "distance.Y",
+        "depth_a.Z",
+        "depth_difference.Z",
+        "false_colour.R",
+        "R",
+        "G",
+        "B",
+    } <= names
     colour = layers["false_colour"][np.isfinite(distance)]
-    np.testing.assert_allclose(colour, np.broadcast_to(figures.false_colour("distance", np.full((1, 1), 2.0), 4.0)[0, 0], colour.shape), atol=6e-3)  # half, and a colour map of 256 steps
+    np.testing.assert_allclose(
+        colour, np.broadcast_to(figures.false_colour("distance", np.full((1, 1), 2.0), 4.0)[0, 0], colour.shape), atol=6e-3
+    )  # half, and a colour map of 256 steps
     image = cv2.imread(str(folder / "003.png"))
     viridis = np.array([140, 145, 33])  # B, G, R at the middle of the scale
     assert (np.abs(image.astype(int) - viridis).max(-1) < 12).sum() > 1000
@@ -110,7 +126,9 @@ def test_against_points_and_clouds(finished_run, tmp_path):
     ours, other = compare.compare(run.folder, str(tmp_path / "points.npz"))
     assert ours["difference"]["depth_rmse_mm"] == pytest.approx(1e3 * np.sqrt(((0.01 * run.vertices[2, ::5, 2]) ** 2).mean()), rel=0.05)
     map_ = other.maps(2, run.camera)["depth_difference"]
-    assert 5 < np.isfinite(map_).sum() <= points.shape[1] and np.nanmedian(map_) == pytest.approx(-0.01 * np.median(run.vertices[2, :, 2]), rel=0.2)
+    assert 5 < np.isfinite(map_).sum() <= points.shape[1] and np.nanmedian(map_) == pytest.approx(
+        -0.01 * np.median(run.vertices[2, :, 2]), rel=0.2
+    )
     dots = compare._dots(map_)
     assert np.isfinite(dots).sum() > 3 * np.isfinite(map_).sum() and set(dots[np.isfinite(dots)]) <= set(map_[np.isfinite(map_)])
     compare.write(ours, other, tmp_path / "p")

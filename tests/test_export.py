@@ -50,7 +50,9 @@ def read_glb(path):
         view = scene["bufferViews"][a["bufferView"]]
         columns = {"SCALAR": 1, "VEC2": 2, "VEC3": 3}[a["type"]]
         dtype = {5126: "<f4", 5123: "<u2", 5125: "<u4"}[a["componentType"]]
-        out = np.frombuffer(data, dtype, a["count"] * columns, start + view.get("byteOffset", 0) + a.get("byteOffset", 0)).reshape(-1, columns)
+        out = np.frombuffer(data, dtype, a["count"] * columns, start + view.get("byteOffset", 0) + a.get("byteOffset", 0)).reshape(
+            -1, columns
+        )
         if "min" in a:
             assert np.allclose(out.min(0), a["min"], atol=1e-7) and np.allclose(out.max(0), a["max"], atol=1e-7)
         return out
@@ -200,7 +202,9 @@ class TestRefusals:
         before = sorted(shutil.os.listdir(run.folder))
         with pytest.raises(InputError, match=words):
             export.main([run.folder, *arguments])
-        assert list(tmp_path.iterdir()) == [] and sorted(set(shutil.os.listdir(run.folder)) - {"export"}) == sorted(set(before) - {"export"})
+        assert list(tmp_path.iterdir()) == [] and sorted(set(shutil.os.listdir(run.folder)) - {"export"}) == sorted(
+            set(before) - {"export"}
+        )
 
     def test_in_the_folder(self, run, tmp_path):
         with pytest.raises(InputError, match="no such folder"):

@@ -6,7 +6,6 @@ import json
 import re
 import shutil
 import subprocess
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -73,7 +72,9 @@ def test_surface_and_pictures_are_those_of_the_run(finished_run, page):
     uv = np.einsum("nk,nkc->nc", weights, run.uv[corners])
     at = np.clip((np.stack([1 - uv[:, 1], uv[:, 0]], 1) * texture.shape[:2]).astype(int), 0, np.array(texture.shape[:2]) - 1)
     assert np.abs(colours - texture[at[:, 0], at[:, 1]]).mean() < 12  # one end of the texture differs from the other by 150
-    target, render, error = (np.asarray(Image.open(io.BytesIO(base64.b64decode(data["images"][n][2])))) for n in ("target", "render", "error"))
+    target, render, error = (
+        np.asarray(Image.open(io.BytesIO(base64.b64decode(data["images"][n][2])))) for n in ("target", "render", "error")
+    )
     expected = np.asarray(Image.open(finished_run[0].folder / "frames" / "002.png").convert("RGB")).astype(float)
     assert np.abs(target.astype(float) - expected).mean() < 6
     assert render.shape == error.shape == target.shape and len(data["images"]["error"]) == 4
@@ -98,7 +99,9 @@ def test_figures_and_colours(finished_run, page):
 
 
 def test_curvature_is_that_of_the_meshes(finished_run):
-    """The true sheet is a cylinder whose middle bulges towards the camera: half the curvature of its middle row of vertices, by circles through three of them."""
+    """The true sheet is a cylinder whose middle bulges towards the camera: half the curvature of its middle row of vertices, by circles
+    through three of them.
+    """
     run = Run.open(finished_run[1])
     row = run.vertices[-1].reshape(9, 11, 3)[4].astype(float)
     before, after, chord = row[1:-1] - row[:-2], row[2:] - row[1:-1], row[2:] - row[:-2]
@@ -160,12 +163,16 @@ console.error = (...a) => problems.push(a.join(" "));
 _ACT = """<script>
 (async () => {
   const wait = () => new Promise(done => setTimeout(done, 300)), seen = {};
-  const note = name => { seen[name] = {now, target: $("target").src.length, label: $("now").textContent, drawn: $("target").naturalWidth, row: document.querySelector("tr.now").rowIndex,
-                                       z: $("surface").data[0].z.reduce((a, b) => a + b, 0), kind: Object.keys($("surface").data[0]).includes("intensity")}; };
+  const note = name => { seen[name] = {now, target: $("target").src.length, label: $("now").textContent,
+                                       drawn: $("target").naturalWidth, row: document.querySelector("tr.now").rowIndex,
+                                       z: $("surface").data[0].z.reduce((a, b) => a + b, 0),
+                                       kind: Object.keys($("surface").data[0]).includes("intensity")}; };
   await wait(); note("start");
   STEPS
-  const boxes = ["target", "surface"].map(id => { const b = $(id).getBoundingClientRect(); return [b.top, Math.min(b.bottom, innerHeight), b.left, b.right].map(Math.round); });
-  console.log("SEEN " + JSON.stringify({...seen, problems, boxes, fetched: performance.getEntriesByType("resource").filter(r => !r.name.startsWith("data:") && !r.name.startsWith("blob:")).map(r => r.name)}));
+  const boxes = ["target", "surface"].map(id => $(id).getBoundingClientRect()).map(
+    b => [b.top, Math.min(b.bottom, innerHeight), b.left, b.right].map(Math.round));
+  const fetched = performance.getEntriesByType("resource").map(r => r.name).filter(name => !/^(data|blob):/.test(name));
+  console.log("SEEN " + JSON.stringify({...seen, problems, boxes, fetched}));
 })();
 </script></body>"""
 _STEPS = """
@@ -182,8 +189,21 @@ def browse(page, tmp_path, steps):
     before, _, after = text.rpartition("</body>")
     copy, picture = tmp_path / "page.html", tmp_path / "page.png"
     copy.write_text(before + _ACT.replace("STEPS", steps) + after, encoding="utf-8")
-    flags = ["--headless", "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage"]
-    flags += ["--disable-background-networking", "--disable-component-update", "--disable-sync", "--no-first-run", f"--user-data-dir={tmp_path / 'profile'}"]
+    flags = [
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--use-angle=swiftshader",
+        "--enable-unsafe-swiftshader",
+        "--disable-dev-shm-usage",
+    ]
+    flags += [
+        "--disable-background-networking",
+        "--disable-component-update",
+        "--disable-sync",
+        "--no-first-run",
+        f"--user-data-dir={tmp_path / 'profile'}",
+    ]
     flags += ["--window-size=1300,1500", "--virtual-time-budget=6000", "--enable-logging=stderr", f"--screenshot={picture}"]
     done = subprocess.run([BROWSER, *flags, copy.as_uri()], capture_output=True, text=True, timeout=120)
     seen = re.search(r'"SEEN (\{.*\})"', done.stderr)
