@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from polysft_mi import report
+from polysft_mi import report, video
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError
 from polysft_mi.results import PEAK, Run
@@ -130,6 +130,22 @@ def test_fewer_frames_and_odd_names(finished_run, tmp_path):
     assert data["command"] == "</script><!-- x" and data["title"] == out.name
     assert "<title>a &lt;b> &amp; 'ü'</title>" in (out / "report.html").read_text(encoding="utf-8")
     assert report.spread(5, 3) == [0, 2, 4] and report.spread(2, 9) == [0, 1] and report.spread(9, 1) == [0]
+
+
+def test_pngs_stand_in_for_the_video(finished_run, tmp_path):
+    """As a run leaves them where no video can be encoded."""
+    out = tmp_path / "run"
+    shutil.copytree(finished_run[1], out)
+    for k, frame in enumerate(video.read_video(out / "comparison.mp4")):
+        Image.fromarray(frame).save(out / "comparison" / f"{k:03d}.png")
+    (out / "comparison.mp4").unlink()
+    report.write(out)
+    assert data_of(out / "report.html")["images"] == data_of(finished_run[1] / "report.html")["images"]
+    metrics = json.loads((out / "metrics.json").read_text())
+    lost = {"frames_wanted": 9, "lost": {"2": "left the image"}}
+    (out / "metrics.json").write_text(json.dumps({**metrics, **lost}))
+    report.write(out)
+    assert data_of(out / "report.html")["warning"] == "Interrupted: 4 of 9 frames. Frame 2: left the image."
 
 
 def test_refusals_leave_nothing(finished_run, tmp_path):
