@@ -20,11 +20,12 @@ import numpy as np
 ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 sys.path.insert(0, ROOT)
 
-from polysft_mi import kinect_paper
+from polysft_mi import kinect_paper, meshio
 from polysft_mi.capture.images import read_rgb
 from polysft_mi.capture.masks import iou
 from polysft_mi.errors import InputError, cli
 from polysft_mi.evaluate import evaluate
+from polysft_mi.prepare import write_obj
 from polysft_mi.sequence import drop_stray_components, list_images
 from polysft_mi.video import write_video
 
@@ -88,27 +89,31 @@ def measure_pose(data, out):
     return result
 
 
+def upright(folder, out):
+    """Texture and template of phi_sft_R1 with the texture upright: the sequence has it, and v, upside down, which is a mirror image of what the camera saw."""
+    photo, template = os.path.join(out, "phi_texture.png"), os.path.join(out, "phi_template.obj")
+    cv2.imwrite(photo, cv2.imread(os.path.join(folder, "texture.png"))[::-1])
+    vertices, faces, uv = meshio.read_template(os.path.join(folder, "0_R1_quad.obj"))
+    write_obj(template, vertices, faces, np.column_stack([uv[:, 0], 1 - uv[:, 1]]))
+    return photo, template
+
+
 def measure_masks(data, out):
     result = {}
-    for name, options in MASKS.items():
+    for name in ("cloth/flag", "phi_sft_R1"):
         folder = os.path.join(data, name)
+        frames = os.path.join(folder, "frames" if name == "cloth/flag" else "rgbs")
+        photo, template = (os.path.join(folder, n) for n in ("texture.png", "template.obj")) if name == "cloth/flag" else upright(folder, out)
         target = os.path.join(out, "masks_" + os.path.basename(name))
-        given = list_images(os.path.join(folder, "masks"))
-        options = [o.replace("DATA", folder) for o in options]
-        seconds = python("-m", "polysft_mi.prepare", *options, "--camera", f"{folder}/camera.json", "-o", target, "--overwrite")
+        camera = os.path.join(folder, "camera.json")
+        seconds = python("-m", "polysft_mi.prepare", frames, "--texture", photo, "--template", template, "--camera", camera, "-o", target, "--overwrite")
         if not os.path.isdir(f"{target}/masks"):
             raise InputError(f"{name}: no masks were found that could be believed")
-        found = list_images(f"{target}/masks")
-        values = [iou(read_rgb(a)[..., 0], drop_stray_components(read_rgb(b).max(axis=2))) for a, b in zip(found, given, strict=True)]
+        pairs = zip(list_images(f"{target}/masks"), list_images(os.path.join(folder, "masks")), strict=True)
+        values = [iou(read_rgb(a)[..., 0], drop_stray_components(read_rgb(b).max(axis=2))) for a, b in pairs]
         result[name] = {"iou_mean": float(np.mean(values)), "iou_worst": float(np.min(values)), "frames": len(values), "seconds": seconds}
         print(name, json.dumps(result[name]))
     return result
-
-
-MASKS = {
-    "cloth/flag": ["DATA/frames", "--texture", "DATA/texture.png", "--template", "DATA/template.obj"],
-    "phi_sft_R1": ["DATA/rgbs", "--texture", "DATA/texture.png", "--template", "DATA/0_R1_quad.obj"],
-}
 
 
 def measure_time(data, out):

@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -163,14 +164,23 @@ def _pose(mesh, photo, texture, frame, view, straight, corners, taken, out, firs
         with contextlib.suppress(OSError):
             os.makedirs(os.path.dirname(out) or ".", exist_ok=True)
             _write_png(picture, pictures.matches(photo, frame, matches))
-        raise InputError(
-            f"{texture}: not found in frame {first}: {int(matches.agree.sum())} of {len(matches.agree)} matches agree on a pose, {LEAST} are needed; {picture} shows them. "
-            "Start where the sheet is seen whole and sharp (--first N), or say where it is (--corners x,y x,y x,y x,y)"
-        )
+        raise InputError(f"{texture}: not found in frame {first}: {_why_not(photo, frame, matches, mesh, view)}; {picture} shows them")
     residual = float(np.sqrt((pose.residual**2).mean()))
     found["pose"] = {"by": "features", "matches": len(matches.agree), "agree": int(matches.agree.sum()), "residual_px": residual}
     say(f"pose: {int(matches.agree.sum())} of {len(matches.agree)} matches agree, missed by {residual:.2f} pixels RMS")
     return pose, matches
+
+
+def _why_not(photo, frame, matches, mesh, view):
+    """In words, why no pose was found."""
+    agree = int(matches.agree.sum())
+    mirrored = replace(mesh, uv=mesh.uv * (-1, 1) + (1, 0))
+    if from_matches(match(np.ascontiguousarray(photo[:, ::-1]), frame), mirrored, view)[1].agree.sum() >= max(2 * agree, 2 * LEAST):
+        return "its mirror image is; flip the photo, or the video (cameras for selfies mirror)"
+    advice = "start where the sheet is seen whole and sharp (--first N), or say where it is (--corners x,y x,y x,y x,y)"
+    if agree < LEAST:
+        return f"{agree} of {len(matches.agree)} matches agree on a pose, {LEAST} are needed; {advice}"
+    return f"the {agree} matches that agree, of {len(matches.agree)}, put the sheet behind the camera or on its back; {advice}"
 
 
 def _write_frames(folder, index, frame, stream, straight, masks, expected, found, say, progress):

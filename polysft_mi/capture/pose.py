@@ -12,7 +12,7 @@ from polysft_mi.errors import InputError
 LEAST = 10  # matches that must agree: four fix a plane's pose, and some agree by chance
 _RATIO = 0.8  # of the distances to the best and the second match, above which a match counts as ambiguous
 _FEATURES = 5000
-_PHOTO_SIDE = 1400  # pixels to which a photo is shrunk before its features are sought
+_PHOTO_SIDE = 2000  # pixels to which a photo is shrunk before its features are sought
 _TOLERANCE = 0.012  # of the frame's diagonal, by which a rigid pose may miss a match: the sheet may be bent
 _SOFT = 1.5  # pixels at which a residual starts to count less
 _SMALLEST = 2e-4  # share of the frame that a sheet must cover
