@@ -30,6 +30,7 @@ _FRAME, _MASK = "frames/{:05d}.png", "masks/{:05d}.png"
 _IN_VIEW = 0.3  # share of the vertices that must be seen in the first frame
 _ASPECT = 1.06  # ratio of the aspects of photo and size that is said
 _ALIKE = 0.85  # IoU of the first mask and the template's silhouette, below which masks are not believed
+_STRANGE = 0.75  # of their colours, likewise
 _JUMP = 1.5  # ratio of the areas of two masks in a row, likewise
 _SHARPEST = 2048  # pixels of a texture's longer side; what is finer no frame shows
 
@@ -54,6 +55,8 @@ def capture(
         raise InputError("give either --size WIDTH HEIGHT, of a flat sheet, or --template mesh.obj")
     inputs = [x for x in (video, texture, template, camera, calibrate, masks) if isinstance(x, str) and x != FIRST_FRAME]
     out = _target(video, out, inputs, overwrite)
+    if isinstance(masks, str):
+        list_images(masks, "masks")  # that they are there is known before the work
     found = {"video": video, "command": command}
 
     stream = read_frames(video, first, last, stride)
@@ -188,7 +191,7 @@ def _write_frames(folder, index, frame, stream, straight, masks, expected, found
     tracked = Masks(expected.shape[::-1]) if masks is True else None
     if masks:
         os.makedirs(os.path.join(folder, "masks"))
-    indices, areas, first_iou = [], [], None
+    indices, areas, strange, first_iou = [], [], [], None
     with ThreadPoolExecutor(2) as pool:
         pending = []
 
@@ -204,6 +207,7 @@ def _write_frames(folder, index, frame, stream, straight, masks, expected, found
                 mask = tracked.next(frame) if k else tracked.first(frame, expected)
                 first_iou = iou(mask, expected) if k == 0 else first_iou
                 areas.append(int((mask > 0).sum()))
+                strange.append(tracked.strangeness)
                 write(_MASK.format(k), mask)
             indices.append(index)
             progress(len(indices))
@@ -218,8 +222,8 @@ def _write_frames(folder, index, frame, stream, straight, masks, expected, found
         _given_masks(folder, masks, indices, straight)
         say(f"masks: those of {masks}")
     elif tracked:
-        used, why = _believable(first_iou, areas, indices)
-        found["masks"] = {"first_iou": first_iou, "used": used, **({"why": why} if why else {})}
+        used, why = _believable(first_iou, areas, strange, indices)
+        found["masks"] = {"first_iou": first_iou, "strangeness": max(strange), "used": used, **({"why": why} if why else {})}
         say(f"masks: by GrabCut, the first overlaps with the template by {100 * first_iou:.0f} %" if used else f"masks: not used, for {why}; prepare/masks.png shows them")
     _show(folder, indices, bool(masks))
     if masks and not used:
@@ -237,13 +241,16 @@ def _show(folder, indices, masked):
         _write_png(os.path.join(folder, REPORT, "masks.png"), pictures.contact_sheet(cells))
 
 
-def _believable(first_iou, areas, indices):
+def _believable(first_iou, areas, strange, indices):
     """(whether masks can be used, why not)."""
     if first_iou < _ALIKE:
         return False, f"in the first frame they overlap with the template by {100 * first_iou:.0f} % only: the sheet does not stand out from what is behind it"
     for before, after, index in zip(areas, areas[1:], indices[1:]):
         if after == 0 or max(before / after, after / before) > _JUMP:
             return False, f"in frame {index} their area jumps from {before} to {after} pixels"
+    for index, value in zip(indices, strange):
+        if value > _STRANGE:
+            return False, f"what is inside in frame {index} has other colours than the sheet in the first"
     return True, None
 
 

@@ -54,7 +54,8 @@ def focal_length(path):
     if not is_video(path):
         image = list_images(path, "frames")[0]
         return focal_35mm(image), image
-    av = _av()
+    import av  # its log stays off: turned on, it is known to dead-lock with threads
+
     try:
         with av.open(_name(path)) as container:
             tags = [container.metadata, *(stream.metadata for stream in container.streams.video)]
@@ -80,7 +81,8 @@ def _sources(path):
 
 
 def _decoded(path):
-    av = _av()
+    import av
+
     count = 0
     try:
         with av.open(_name(path)) as container:
@@ -106,10 +108,3 @@ def _upright(frame):
 def _name(path):
     """The path as FFmpeg must be given it: a colon in a name is not the end of a protocol's."""
     return "file:" + os.fspath(path)
-
-
-def _av():
-    import av
-
-    av.logging.set_level(av.logging.PANIC)
-    return av

@@ -1,5 +1,7 @@
 """Single images as people have them: any orientation, bit depth and alpha, read as 8-bit sRGB."""
 
+import os
+
 import numpy as np
 
 from polysft_mi.errors import InputError
@@ -16,6 +18,9 @@ def read_rgb(path):
     Turned as its Exif orientation says; 16 bits become 8, float pixels are taken as linear, grey becomes RGB; what is transparent becomes white. Raises InputError
     where it is not a readable image.
     """
+    if os.fspath(path).lower().endswith((".heic", ".heif", ".avif")):
+        raise InputError(f"{path}: HEIC and AVIF are not read; export it as JPEG or PNG")
+    path = os.fspath(path)
     image_size(path)  # by Pillow, whose words on a broken file are clear
     pixels = read_pixels(path)
     if pixels.ndim == 2:

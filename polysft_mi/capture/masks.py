@@ -19,6 +19,8 @@ class Masks:
         self._flow = cv2.DISOpticalFlow_create(cv2.DISOpticalFlow_PRESET_FAST)
         self._grey = self._mask = None
         self._models = np.zeros((1, 65)), np.zeros((1, 65))
+        self._colours = None
+        self.strangeness = 0.0  # of the last mask: 0 where its colours are those of the first, 1 where they share none (Bhattacharyya)
 
     def first(self, image, silhouette):
         """From the template's silhouette (H, W), 0 or 255."""
@@ -26,7 +28,8 @@ class Masks:
         self._grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
         expected = (self._reduced(silhouette) > 127).astype(np.uint8)
         self._mask = self._cut(small, expected, _FIRST_ITERATIONS)
-        return self._enlarged(image)
+        self._colours = _histogram(small, self._mask)
+        return self._enlarged()
 
     def next(self, image):
         small = self._reduced(image)
@@ -35,7 +38,8 @@ class Masks:
         y, x = np.mgrid[: grey.shape[0], : grey.shape[1]].astype(np.float32)
         moved = cv2.remap(255 * self._mask, x + flow[..., 0], y + flow[..., 1], cv2.INTER_LINEAR)
         self._grey, self._mask = grey, self._cut(small, (moved > 127).astype(np.uint8), _ITERATIONS)
-        return self._enlarged(image)
+        self.strangeness = cv2.compareHist(_histogram(small, self._mask), self._colours, cv2.HISTCMP_BHATTACHARYYA)
+        return self._enlarged()
 
     def _cut(self, image, expected, iterations):
         if not expected.any():
@@ -57,11 +61,16 @@ class Masks:
     def _reduced(self, image):
         return image if self._small == self._size else cv2.resize(image, self._small, interpolation=cv2.INTER_AREA)
 
-    def _enlarged(self, image):
+    def _enlarged(self):
         if self._small == self._size:
             return 255 * self._mask
         soft = cv2.resize(self._mask.astype(np.float32), self._size, interpolation=cv2.INTER_CUBIC)
         return np.where(soft > 0.5, 255, 0).astype(np.uint8)
+
+
+def _histogram(image, mask):
+    counts = cv2.calcHist([image], [0, 1, 2], mask, [8, 8, 8], [0, 256] * 3)
+    return cv2.GaussianBlur(counts.reshape(8, -1), (3, 3), 0) / max(counts.sum(), 1)
 
 
 def _connected(mask, core):

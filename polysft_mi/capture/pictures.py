@@ -68,12 +68,16 @@ def matches(photo, frame, found):
 def pose(frame, photo, sheet, placed, camera):
     """Two pictures of the first frame: the template's mesh and border drawn on it; and the photo laid on it where the template is."""
     wired, scale = shrunk(frame)
-    x = camera.project(placed)
-    draw = lambda edges, colour, width: [
-        cv2.line(wired, *(tuple(int(round(v)) for v in np.clip(x[k] * scale, -1e4, 1e4)) for k in edge), colour, width, cv2.LINE_AA) for edge in edges
-    ]
+    plain, x = wired.copy(), camera.project(placed)
+
+    def draw(edges, colour, width):
+        for edge in edges:
+            a, b = (tuple(int(round(v)) for v in np.clip(x[k] * scale, -1e4, 1e4)) for k in edge)
+            cv2.line(wired, a, b, colour, width, cv2.LINE_AA)
+
     edges = np.sort(np.concatenate([sheet.faces[:, [0, 1]], sheet.faces[:, [1, 2]], sheet.faces[:, [2, 0]]]), axis=1)
     draw(np.unique(edges, axis=0), GREEN, 1)
+    wired = cv2.addWeighted(plain, 0.7, wired, 0.3, 0)  # what is printed shows through
     draw(sheet.border(), YELLOW, 2)
     label(wired, "the template in the first frame")
     laid, _ = shrunk(_laid(frame, photo, sheet, x))
