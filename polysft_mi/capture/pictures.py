@@ -6,14 +6,21 @@ import numpy as np
 GREEN, RED, YELLOW, WHITE = (60, 220, 90), (235, 70, 60), (255, 210, 40), (255, 255, 255)
 _CELL = 320  # pixels of a contact sheet's picture
 _COLUMNS = 4
-_LINES = 150  # drawn of each kind of match
+_LINES = 60  # drawn of each kind of match
 _SIDE = 900  # pixels to which larger pictures are shrunk
+_HEIGHT = 480  # pixels of a picture that is drawn on
 
 
 def shrunk(image, side=_SIDE):
     """(image no larger than ``side``, what it was scaled by)."""
     scale = min(1.0, side / max(image.shape[:2]))
     return (cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else image.copy()), scale
+
+
+def _canvas(image):
+    """(image of _HEIGHT rows, enlarged where it has fewer, what it was scaled by)."""
+    scale = _HEIGHT / image.shape[0]
+    return cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC), scale
 
 
 def contact_sheet(cells):
@@ -47,11 +54,8 @@ def masked(image, mask):
 
 def matches(photo, frame, found):
     """Photo and frame side by side, :class:`polysft_mi.capture.pose.Matches` as lines: green where they agree, red where not."""
-    (left, a), (right, b) = shrunk(photo, 700), shrunk(frame)
-    height = max(left.shape[0], right.shape[0])
-    canvas = np.full((height, left.shape[1] + right.shape[1] + 8, 3), 255, np.uint8)
-    canvas[: left.shape[0], : left.shape[1]] = left // 2 + 64
-    canvas[: right.shape[0], left.shape[1] + 8 :] = right // 2 + 64
+    (left, _), (right, b) = _canvas(photo), _canvas(frame)
+    canvas = np.hstack([left // 2 + 64, np.full((_HEIGHT, 8, 3), 255, np.uint8), right // 2 + 64])
     at = np.column_stack([found.photo[:, 0], 1 - found.photo[:, 1]]) * left.shape[1::-1]
     to = found.frame * b + (left.shape[1] + 8, 0)
     for agree, colour in ((False, RED), (True, GREEN)):
@@ -67,7 +71,7 @@ def matches(photo, frame, found):
 
 def pose(frame, photo, sheet, placed, camera):
     """Two pictures of the first frame: the template's mesh and border drawn on it; and the photo laid on it where the template is."""
-    wired, scale = shrunk(frame)
+    wired, scale = _canvas(frame)
     plain, x = wired.copy(), camera.project(placed)
 
     def draw(edges, colour, width):
@@ -80,7 +84,7 @@ def pose(frame, photo, sheet, placed, camera):
     wired = cv2.addWeighted(plain, 0.7, wired, 0.3, 0)  # what is printed shows through
     draw(sheet.border(), YELLOW, 2)
     label(wired, "the template in the first frame")
-    laid, _ = shrunk(_laid(frame, photo, sheet, x))
+    laid, _ = _canvas(_laid(frame, photo, sheet, x))
     label(laid, "the photo, laid where the template is")
     return np.hstack([wired, np.full((wired.shape[0], 4, 3), 255, np.uint8), laid])
 
