@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
+from scripts import load
+
 from polysft_mi import meshio, prepare
 from polysft_mi.camera import Intrinsics
 from polysft_mi.capture import calibration, frames, images, lens, masks, pose, sheet
@@ -200,12 +202,18 @@ def test_command_line(clip, tmp_path):
     assert f"python -m polysft_mi.run '{tmp_path / 'o ut' / 'scene.xml'}'" in done.stdout
     again = command(*words)
     assert again.returncode == 2 and again.stderr.startswith("error: ") and again.stderr.count("\n") == 1 and "--overwrite" in again.stderr
-    replaced = command(*words, "--overwrite", "--json")
-    assert replaced.returncode == 0 and json.loads(replaced.stdout)["frames"] == 2
-    (tmp_path / "o ut" / "prepare" / "prepare.json").unlink()
-    assert "not replaced" in command(*words, "--overwrite").stderr and (tmp_path / "o ut" / "scene.xml").exists()
-    shown = command("--help").stdout
-    assert "python -m polysft_mi.prepare clip.mp4 --texture photo.jpg" in shown
+    assert "python -m polysft_mi.prepare clip.mp4 --texture photo.jpg" in prepare.parser().format_help()
+
+
+def test_replacing_a_folder(clip, tmp_path, capsys):
+    words = [clip[0], "--texture", clip[1], "--size", "A4", "--camera", clip[2], "-o", str(tmp_path / "out"), "--no-masks"]
+    prepare.main([*words, "--last", "0", "-q"])
+    assert capsys.readouterr().out == ""
+    prepare.main([*words, "--last", "1", "--overwrite", "--json"])
+    assert json.loads(capsys.readouterr().out)["frames"] == 2 and len(os.listdir(tmp_path / "out" / "frames")) == 2
+    assert os.listdir(tmp_path) == ["out"]
+    (tmp_path / "out" / "prepare" / "prepare.json").unlink()
+    assert "not replaced" in refused(prepare.main, [*words, "--overwrite"]) and (tmp_path / "out" / "scene.xml").exists()
 
 
 # ---- frames and images ----------------------------------------------------------------------------------------------------------
@@ -340,11 +348,19 @@ def test_calibration(kind, board, tmp_path):
     assert found.camera.fx == pytest.approx(640, rel=0.01) and found.camera.fy == pytest.approx(640, rel=0.01)
     assert (found.camera.cx, found.camera.cy) == pytest.approx((330, 235), abs=4)
     assert found.distortion[0] == pytest.approx(DISTORTION[0], abs=0.05) and picture.ndim == 3
+    for k in range(2, len(turns)):
+        (tmp_path / "boards" / f"{k}.png").unlink()
     assert "found in 0 frames" in refused(calibration.calibrate, str(tmp_path / "boards"), "14x11")
     assert "charuco:" in refused(calibration.calibrate, str(tmp_path / "boards"), "big")
-    for k in range(3, len(turns)):
-        (tmp_path / "boards" / f"{k}.png").unlink()
-    assert "at least 4" in refused(calibration.calibrate, str(tmp_path / "boards"), board)
+
+
+def test_views_of_a_board_that_tell_nothing(tmp_path):
+    image = cv2.copyMakeBorder(board_image("charuco")[0], 30, 30, 30, 30, cv2.BORDER_CONSTANT, value=255)
+    for k in range(5):  # from the front, from one distance
+        write_png(tmp_path / f"{k}.png", np.roll(image, 4 * k, axis=1))
+        if k == 2:
+            assert "at least 4" in refused(calibration.calibrate, str(tmp_path), "charuco:7x5:4X4_50:0.75")
+    assert "focal length open" in refused(calibration.calibrate, str(tmp_path), "charuco:7x5:4X4_50:0.75")
 
 
 # ---- sizes ----------------------------------------------------------------------------------------------------------------------
@@ -496,3 +512,12 @@ def test_words_of_the_command_line(words, said, clip):
 
 def test_options_for_videos_are_refused_for_folders(tmp_path):
     assert "--fov" in refused(prepare.main, [str(DEMO), "--fov", "60"])
+
+
+def test_print_that_the_benchmark_rectifies(tmp_path):
+    import synthetic
+
+    truth = synthetic.kinect_paper(tmp_path / "data", frames=1, size=(320, 240))
+    got = load("benchmarks/prepare.py").rectified_print(str(truth.folder))
+    wanted = cv2.flip(synthetic.texture_image(), 0)  # there the template's first row is the print's highest, in Kinect-Paper its lowest
+    assert np.abs(cv2.resize(got, (64, 64), interpolation=cv2.INTER_AREA).astype(int) - wanted)[2:-2, 2:-2].mean() < 6

@@ -16,6 +16,8 @@ _LOOKED_AT = 60  # frames of a video
 _USED = 25  # of those where the board is found
 _LEAST = 4
 _CORNERS = 8  # of a ChArUco board, in a frame
+_NOISE = 0.1  # pixels that a corner is off, at best
+_TILT = 15.0  # degrees between two views of the board, at least
 _SURE = 0.02  # standard deviation of the focal length, of itself, above which a calibration is refused
 _MISSED = 3.0  # pixels, likewise, RMS
 
@@ -84,16 +86,22 @@ def calibrate(path, board="9x6"):
     views = _different(views)
     start = np.array([[max(size), 0, size[0] / 2 - 0.5], [0, max(size), size[1] / 2 - 0.5], [0, 0, 1]], dtype=np.float64)
     try:
-        missed, K, distortion, _, _, deviations, _, _ = cv2.calibrateCameraExtended(
+        missed, K, distortion, turns, _, deviations, _, _ = cv2.calibrateCameraExtended(
             [v[2] for v in views], [v[3] for v in views], size, start, np.zeros(5), flags=cv2.CALIB_USE_INTRINSIC_GUESS
         )
     except cv2.error as error:
         raise InputError(f"{path}: the boards do not tell the camera ({error.err}); views from different sides are needed") from None
-    f, unsure = K[0, 0], float(np.max(np.ravel(deviations)[:2])) / K[0, 0]
+    f = K[0, 0]
+    unsure = float(np.max(np.ravel(deviations)[:2])) / f * max(1.0, _NOISE / missed)  # corners that fit better than they are seen promise too much
     if not np.isfinite(K).all() or not np.isfinite(missed) or missed > _MISSED:
         raise InputError(f"{path}: the camera that fits best misses the board's corners by {missed:.2g} pixels; a flat board, sharp images and one zoom are needed")
-    if unsure > _SURE:
-        raise InputError(f"{path}: the views leave the focal length open by {100 * unsure:.1f} %; tilt the board, 30 degrees and more, to different sides")
+    normals = np.stack([cv2.Rodrigues(turn)[0][:, 2] for turn in turns])
+    tilt = float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1)).max()))
+    if unsure > _SURE or tilt < _TILT:
+        raise InputError(
+            f"{path}: the views leave the focal length open: the board is tilted by {tilt:.0f} degrees between them, and it is known to {100 * unsure:.1f} %; "
+            "tilt the board by 30 degrees and more, to different sides"
+        )
     camera = Intrinsics(f, K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5, *size)
     source = f"{path}, {detect.name} in {len(views)} views, missed by {missed:.2f} pixels, focal length ±{100 * unsure:.1f} %"
     return Lens(camera, tuple(np.ravel(distortion)[:5].tolist()), source), _picture(views)
