@@ -2,9 +2,10 @@
 
     python benchmarks/prepare.py [--data FOLDER] [--only pose masks time] [-o out/benchmarks/prepare]
 
-``pose``: Kinect-Paper's frames 1 to 60, encoded as a video, prepared by the rectified print of frame 1 and K, without masks, and run; beside it the run from the given pose.
-Figures are those of ``python -m polysft_mi.evaluate`` on the ground-truth frames among them. ``masks``: intersection over union of found and given masks. ``time``: seconds to
-prepare 200 frames of 640x480, start-up included. Prints one line a figure, and writes ``prepare.json``.
+``pose``: Kinect-Paper's frames 1 to 60, encoded as a video, prepared by the rectified print of frame 1 and K, without masks, and run;
+beside it the run from the given pose. Figures are those of ``python -m polysft_mi.evaluate`` on the ground-truth frames among them.
+``masks``: intersection over union of found and given masks. ``time``: seconds to prepare 200 frames of 640x480, start-up included. Prints
+one line a figure, and writes ``prepare.json``.
 """
 
 import argparse
@@ -50,7 +51,9 @@ def rectified_print(folder):
     vertices, _, _ = kinect_paper.template(folder, 2)
     corners = kinect_paper.camera(folder).project(vertices)[[2, 3, 1, 0]]  # the template's first row is the print's lowest
     width, height = (round(DENSITY * side) for side in PRINT)
-    H = cv2.getPerspectiveTransform(np.float32(corners - 0.5), np.float32([(0, 0), (width, 0), (width, height), (0, height)]) - np.float32(0.5))
+    H = cv2.getPerspectiveTransform(
+        np.float32(corners - 0.5), np.float32([(0, 0), (width, 0), (width, height), (0, height)]) - np.float32(0.5)
+    )
     return cv2.warpPerspective(read_rgb(kinect_paper.images(folder)[0]), H, (width, height), flags=cv2.INTER_CUBIC)
 
 
@@ -62,7 +65,8 @@ def write_camera(folder, path):
 
 
 def kinect_inputs(data, out, count):
-    """(video, photo, camera file) of ``count`` frames of Kinect-Paper, forwards and backwards again where it has fewer; the video as H.264."""
+    """(video, photo, camera file) of ``count`` frames of Kinect-Paper, forwards and backwards again where it has fewer; the video as
+    H.264."""
     folder = os.path.join(data, "kinect_paper")
     paths = kinect_paper.images(folder)
     paths = (paths + paths[::-1])[:count]
@@ -76,11 +80,37 @@ def kinect_inputs(data, out, count):
 def measure_pose(data, out):
     video, photo, camera = kinect_inputs(data, out, FRAMES)
     size = [f"{side:g}" for side in PRINT]
-    python("-m", "polysft_mi.prepare", video, "--texture", photo, "--size", *size, "--camera", camera, "--no-masks", "-o", f"{out}/kinect", "--overwrite")
+    python(
+        "-m",
+        "polysft_mi.prepare",
+        video,
+        "--texture",
+        photo,
+        "--size",
+        *size,
+        "--camera",
+        camera,
+        "--no-masks",
+        "-o",
+        f"{out}/kinect",
+        "--overwrite",
+    )
     python("-m", "polysft_mi.run", f"{out}/kinect/scene.xml", "-o", f"{out}/kinect_run", "--overwrite", "-q")
     given = os.path.join(ROOT, "scenes", "kinect_paper.xml")
     folder = os.path.join(data, "kinect_paper")
-    python("-m", "polysft_mi.run", given, "-D", f"data={os.path.abspath(folder)}", "-D", f"last={FRAMES - 1}", "-o", f"{out}/kinect_given", "--overwrite", "-q")
+    python(
+        "-m",
+        "polysft_mi.run",
+        given,
+        "-D",
+        f"data={os.path.abspath(folder)}",
+        "-D",
+        f"last={FRAMES - 1}",
+        "-o",
+        f"{out}/kinect_given",
+        "--overwrite",
+        "-q",
+    )
     result = {}
     for name in ("kinect_run", "kinect_given"):
         figures = evaluate(f"{out}/{name}", folder)
@@ -90,7 +120,8 @@ def measure_pose(data, out):
 
 
 def upright(folder, out):
-    """Texture and template of phi_sft_R1 with the texture upright: the sequence has it, and v, upside down, which is a mirror image of what the camera saw."""
+    """Texture and template of phi_sft_R1 with the texture upright: the sequence has it, and v, upside down, which is a mirror image of what
+    the camera saw."""
     photo, template = os.path.join(out, "phi_texture.png"), os.path.join(out, "phi_template.obj")
     cv2.imwrite(photo, cv2.imread(os.path.join(folder, "texture.png"))[::-1])
     vertices, faces, uv = meshio.read_template(os.path.join(folder, "0_R1_quad.obj"))
@@ -103,10 +134,14 @@ def measure_masks(data, out):
     for name in ("cloth/flag", "phi_sft_R1"):
         folder = os.path.join(data, name)
         frames = os.path.join(folder, "frames" if name == "cloth/flag" else "rgbs")
-        photo, template = (os.path.join(folder, n) for n in ("texture.png", "template.obj")) if name == "cloth/flag" else upright(folder, out)
+        photo, template = (
+            (os.path.join(folder, n) for n in ("texture.png", "template.obj")) if name == "cloth/flag" else upright(folder, out)
+        )
         target = os.path.join(out, "masks_" + os.path.basename(name))
         camera = os.path.join(folder, "camera.json")
-        seconds = python("-m", "polysft_mi.prepare", frames, "--texture", photo, "--template", template, "--camera", camera, "-o", target, "--overwrite")
+        seconds = python(
+            "-m", "polysft_mi.prepare", frames, "--texture", photo, "--template", template, "--camera", camera, "-o", target, "--overwrite"
+        )
         if not os.path.isdir(f"{target}/masks"):
             raise InputError(f"{name}: no masks were found that could be believed")
         pairs = zip(list_images(f"{target}/masks"), list_images(os.path.join(folder, "masks")), strict=True)
@@ -118,7 +153,20 @@ def measure_masks(data, out):
 
 def measure_time(data, out):
     video, photo, camera = kinect_inputs(data, out, TIMED)
-    seconds = python("-m", "polysft_mi.prepare", video, "--texture", photo, "--size", *map(str, PRINT), "--camera", camera, "-o", f"{out}/timed", "--overwrite")
+    seconds = python(
+        "-m",
+        "polysft_mi.prepare",
+        video,
+        "--texture",
+        photo,
+        "--size",
+        *map(str, PRINT),
+        "--camera",
+        camera,
+        "-o",
+        f"{out}/timed",
+        "--overwrite",
+    )
     print(f"time: {TIMED} frames of 640x480, with masks: {seconds:.1f} s")
     return {"frames": TIMED, "seconds": seconds}
 
@@ -126,8 +174,12 @@ def measure_time(data, out):
 def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", default=DATA, help="folder with kinect_paper, phi_sft_R1 and cloth")
-    parser.add_argument("--only", nargs="+", choices=("pose", "masks", "time"), default=("pose", "masks", "time"), help="what to measure (default: all)")
-    parser.add_argument("-o", "--output", default=os.path.join(ROOT, "out", "benchmarks", "prepare"), help="where videos, folders and runs go")
+    parser.add_argument(
+        "--only", nargs="+", choices=("pose", "masks", "time"), default=("pose", "masks", "time"), help="what to measure (default: all)"
+    )
+    parser.add_argument(
+        "-o", "--output", default=os.path.join(ROOT, "out", "benchmarks", "prepare"), help="where videos, folders and runs go"
+    )
     args = parser.parse_args(argv)
     os.makedirs(args.output, exist_ok=True)
     measures = {"pose": measure_pose, "masks": measure_masks, "time": measure_time}

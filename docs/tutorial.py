@@ -1,6 +1,7 @@
 """Make the pictures of ``docs/tutorial.md``: ``python docs/tutorial.py`` (a minute or two).
 
-The demo's frames become a video, which is prepared and run by the tutorial's own commands, into ``out/tutorial``; the pictures go into ``docs``.
+The demo's frames become a video, which is prepared and run by the tutorial's own commands, into ``out/tutorial``; the pictures go into
+``docs``.
 """
 
 import os
@@ -65,7 +66,11 @@ def main():
     for source, (name, width) in PICTURES.items():
         image = cv2.imread(source)
         scale = min(1.0, width / image.shape[1])
-        cv2.imwrite(os.path.join(HERE, name), cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), [cv2.IMWRITE_JPEG_QUALITY, 85])
+        cv2.imwrite(
+            os.path.join(HERE, name),
+            cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA),
+            [cv2.IMWRITE_JPEG_QUALITY, 85],
+        )
     e = errors()
     print(f"half of its vertices lie within {np.median(e):.1f} mm of it, nine tenths within {np.quantile(e, 0.9):.1f} mm")
 

@@ -1,7 +1,8 @@
-"""``python -m polysft_mi.prepare``: the scene file of a sequence's folder, whose form is recognised by the files in it; or the whole folder from a video.
+"""``python -m polysft_mi.prepare``: the scene file of a sequence's folder, whose form is recognised by the files in it; or the whole folder
+from a video.
 
-Three forms are known (:data:`FORMS`). Names of OBJ files and images, numbers and sizes of frames are the folder's own. What makes a folder from a video is
-:mod:`polysft_mi.capture`.
+Three forms are known (:data:`FORMS`). Names of OBJ files and images, numbers and sizes of frames are the folder's own. What makes a folder
+from a video is :mod:`polysft_mi.capture`.
 """
 
 import argparse
@@ -212,15 +213,21 @@ def prepare(folder, out=None, resolution=33, overwrite=False):
                 os.rmdir(target)
         hint = "; give a folder that can be written by -o DIR" if here else ""
         raise InputError(f"{target}: {error.strerror or error}{hint}") from None
-    return scene, (
-        f"{folder}: a sequence in the form {layout.form}, {len(sequence)} frames of {camera.width}x{camera.height}, "
-        f"{'with' if masks else 'without'} masks, template of {len(vertices)} vertices ({layout.obj or f'subdivided to {resolution}x{resolution}'})"
+    return (
+        scene,
+        (
+            f"{folder}: a sequence in the form {layout.form}, {len(sequence)} frames of {camera.width}x{camera.height},"
+            f" {'with' if masks else 'without'} masks, template of {len(vertices)} vertices"
+            f" ({layout.obj or f'subdivided to {resolution}x{resolution}'})"
+        ),
     )
 
 
 def _check_view(vertices, camera, where):
     if vertices[:, 2].min() <= 0:
-        raise InputError(f"{where}: the template lies behind the camera (z down to {vertices[:, 2].min():.3g} m); z must be positive in the camera frame")
+        raise InputError(
+            f"{where}: the template lies behind the camera (z down to {vertices[:, 2].min():.3g} m); z must be positive in the camera frame"
+        )
     x = camera.project(vertices)
     if not ((x > 0) & (x < (camera.width, camera.height))).all(axis=1).any():
         raise InputError(f"{where}: the template is out of view: no vertex lies in the {camera.width}x{camera.height} image")
@@ -252,87 +259,53 @@ then look at OUT/prepare/*.png, and:
 
 def parser():
     """The command line's parser."""
+    from .capture.command import add_arguments
+
     p = argparse.ArgumentParser(
         prog="python -m polysft_mi.prepare",
-        description="Make a sequence's folder, with its scene file, from a video and a photo of the sheet; or write the scene file of a folder in one of "
-        f"the forms {FORMS}.",
+        description=(
+            "Make a sequence's folder, with its scene file, from a video and a photo of the sheet; or write the scene file of a folder in"
+            f" one of the forms {FORMS}."
+        ),
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     p.add_argument("folder", metavar="FOLDER|VIDEO", help="a sequence's folder; or a video, a folder of images, or a pattern of images")
-    p.add_argument("-o", "--output", metavar="DIR", help="what to write into (default: FOLDER; for a video, its name without the extension)")
+    p.add_argument(
+        "-o", "--output", metavar="DIR", help="what to write into (default: FOLDER; for a video, its name without the extension)"
+    )
     p.add_argument("--overwrite", action="store_true", help="replace what is there")
-    p.add_argument("--resolution", type=int, default=33, metavar="N", help="vertices along the longer side of a flat template; of Kinect-Paper's, along both (default: 33)")
+    p.add_argument(
+        "--resolution",
+        type=int,
+        default=33,
+        metavar="N",
+        help="vertices along the longer side of a flat template; of Kinect-Paper's, along both (default: 33)",
+    )
     p.add_argument("-q", "--quiet", action="store_true", help="no progress, only errors")
     p.add_argument("--json", action="store_true", help="print what was found as JSON")
 
-    video = p.add_argument_group("from a video")
-    video.add_argument("--texture", metavar="PHOTO", help="a straight photo of the sheet, from edge to edge; or first-frame, with --corners")
-    video.add_argument("--size", nargs="+", metavar="LENGTH", help="width and height as the photo shows them: 0.297 0.210 (metres), 297mm 210mm, or A4")
-    video.add_argument("--template", metavar="OBJ", help="a template that is not flat, instead of --size: metres, with the photo's uv")
-    video.add_argument("--corners", nargs="+", metavar="X,Y", help="the sheet's corners in the first frame [pixels]: top left, top right, bottom right, bottom left of the print; "
-                       "instead of looking for the photo. Or: frame, where the sheet fills the picture")  # fmt: skip
-    video.add_argument("--texture-corners", nargs=4, metavar="X,Y", help="the sheet's corners in the photo [pixels], where it shows more than the sheet")
-    video.add_argument("--first", type=int, default=0, metavar="N", help="first frame to use, counted from 0; the template is placed in it (default: 0)")
-    video.add_argument("--last", type=int, default=-1, metavar="N", help="last frame to use, inclusive (default: the end)")
-    video.add_argument("--stride", type=int, default=1, metavar="N", help="use every N-th frame (default: 1)")
-    video.add_argument("--scale", type=float, default=1.0, metavar="S", help="scale the frames by S (default: 1)")
-    masks = video.add_mutually_exclusive_group()
-    masks.add_argument("--masks", metavar="FOLDER", help="masks that are there, one a frame, instead of finding them")
-    masks.add_argument("--no-masks", action="store_true", help="go without")
-    camera = p.add_argument_group("the camera of a video (default: what the video or the photo says of itself)").add_mutually_exclusive_group()
-    camera.add_argument("--fov", type=float, metavar="DEG", help="horizontal field of view [degrees]")
-    camera.add_argument("--camera", metavar="JSON", help="fx, fy, cx, cy, width, height [pixels], and distortion (OpenCV's coefficients) or none")
-    camera.add_argument("--calibrate", metavar="VIDEO", help="a video, or images, of a chessboard or ChArUco board by the same camera")
-    p.add_argument("--board", default="9x6", metavar="BOARD", help="its inner corners (default: 9x6), or charuco:7x5:4X4_50:0.75 (squares, dictionary, marker by square)")
+    add_arguments(p)
     return p
 
 
-def _points(words, option):
-    """Pixels (N, 2) of words such as ``212,80``."""
-    try:
-        points = [[float(x) for x in word.split(",")] for word in words]
-    except ValueError:
-        points = []
-    if len(points) != 4 or any(len(p) != 2 for p in points) or not np.isfinite(points).all():
-        raise InputError(f"{option} {' '.join(words)}: four points x,y in pixels are needed: top left, top right, bottom right, bottom left")
-    return points
-
-
-def _from_video(args, command):
-    from .capture.folder import capture
-
-    if args.texture is None:
-        raise InputError(f"{args.folder}: a video needs --texture photo.jpg, a straight photo of the sheet (or --texture first-frame, with --corners), and --size")
-    corners = args.corners if args.corners in (None, ["frame"]) else _points(args.corners, "--corners")
-    quiet = args.quiet or args.json
-    with _progress(quiet) as progress:
-        return capture(
-            args.folder, args.output, texture=args.texture, size=args.size, template=args.template, resolution=args.resolution, camera=args.camera, fov=args.fov,
-            calibrate=args.calibrate, board=args.board, corners="frame" if corners == ["frame"] else corners,
-            texture_corners=args.texture_corners and _points(args.texture_corners, "--texture-corners"),
-            masks=args.masks or not args.no_masks, first=args.first, last=args.last, stride=args.stride, scale=args.scale, overwrite=args.overwrite,
-            say=(lambda line: None) if quiet else print, progress=progress, command=command,
-        )  # fmt: skip
-
-
-@contextlib.contextmanager
-def _progress(quiet):
-    """A function that shows how many frames are done, on a terminal."""
-    if quiet or not sys.stderr.isatty():
-        yield lambda count: None
-        return
-    from rich.console import Console
-
-    with Console(stderr=True).status("reading") as status:
-        yield lambda count: status.update(f"{count} frames")
-
-
 def main(argv=None):
+    from .capture.command import from_video
+
     args = parser().parse_args(argv)
-    given = [o for o, value in (("--size", args.size), ("--template", args.template), ("--corners", args.corners), ("--fov", args.fov), ("--camera", args.camera)) if value is not None]
+    given = [
+        o
+        for o, value in (
+            ("--size", args.size),
+            ("--template", args.template),
+            ("--corners", args.corners),
+            ("--fov", args.fov),
+            ("--camera", args.camera),
+        )
+        if value is not None
+    ]
     if args.texture is not None or os.path.isfile(args.folder):
-        scene, found = _from_video(args, shlex.join(["python", "-m", "polysft_mi.prepare", *(sys.argv[1:] if argv is None else argv)]))
+        scene, found = from_video(args, shlex.join(["python", "-m", "polysft_mi.prepare", *(sys.argv[1:] if argv is None else argv)]))
         line = None
     elif given:
         raise InputError(f"{args.folder}: {given[0]} is for a video, or a folder of images, which also needs --texture")

@@ -43,7 +43,11 @@ def photo(seed=1, size=(594, 420)):
         centre, radius = rng.integers(0, size), int(rng.integers(6, 26))
         colour = tuple(int(c) for c in rng.integers(90, 250, 3))
         corner = tuple(int(c) for c in centre + rng.integers(5, 40, 2))
-        cv2.circle(image, tuple(int(c) for c in centre), radius, colour, -1) if rng.random() < 0.5 else cv2.rectangle(image, tuple(int(c) for c in centre), corner, colour, -1)
+        (
+            cv2.circle(image, tuple(int(c) for c in centre), radius, colour, -1)
+            if rng.random() < 0.5
+            else cv2.rectangle(image, tuple(int(c) for c in centre), corner, colour, -1)
+        )
     return image
 
 
@@ -134,7 +138,9 @@ def test_folder_of_a_video(clip, tmp_path):
 def test_demo_is_found_by_its_texture(tmp_path):
     """The demo's first frame is curved: its own mesh as the template."""
     write_video(tmp_path / "demo.mp4", [images.read_rgb(p) for p in sorted((DEMO / "frames").glob("*.jpg"))[:3]])
-    capture(str(tmp_path / "demo.mp4"), texture=str(DEMO / "texture.jpg"), template=str(DEMO / "template.obj"), camera=str(DEMO / "camera.json"))
+    capture(
+        str(tmp_path / "demo.mp4"), texture=str(DEMO / "texture.jpg"), template=str(DEMO / "template.obj"), camera=str(DEMO / "camera.json")
+    )
     vertices, _, _ = meshio.read_template(tmp_path / "demo" / "template.obj")
     truth, _, _ = meshio.read_template(DEMO / "template.obj")
     assert np.linalg.norm(vertices - truth, axis=1).max() < 3e-3
@@ -147,7 +153,17 @@ def test_corners_and_the_first_frame_as_texture(clip, tmp_path):
     R, t = placed(2 / 11)
     corners = CAMERA.project(np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]) * (WIDTH / 2, HEIGHT / 2, 0) @ R.T + t)
     _, found = capture(
-        clip[0], str(tmp_path / "out"), texture="first-frame", size=["A4"], camera=clip[2], corners=corners.tolist(), first=2, last=8, stride=3, scale=0.5, masks=False
+        clip[0],
+        str(tmp_path / "out"),
+        texture="first-frame",
+        size=["A4"],
+        camera=clip[2],
+        corners=corners.tolist(),
+        first=2,
+        last=8,
+        stride=3,
+        scale=0.5,
+        masks=False,
     )
     assert found["indices"] == [2, 5, 8]
     vertices, _, uv = meshio.read_template(tmp_path / "out" / "template.obj")
@@ -158,12 +174,27 @@ def test_corners_and_the_first_frame_as_texture(clip, tmp_path):
     assert not (tmp_path / "out" / "masks").exists() and images.read_rgb(tmp_path / "out" / "texture.png").shape == (120, 160, 3)
 
 
+def test_sheet_that_fills_the_picture(clip, tmp_path):
+    words = ["--texture", "first-frame", "--size", "40cm", "30cm", "--fov", "50", "--corners", "frame", "--no-masks", "--last", "1", "-q"]
+    prepare.main([clip[0], *words, "-o", str(tmp_path / "out")])
+    vertices, _, uv = meshio.read_template(tmp_path / "out" / "template.obj")
+    assert (uv.min(), uv.max()) == pytest.approx((0, 1), abs=1e-3)
+    assert np.ptp(vertices, axis=0) == pytest.approx((0.4, 0.3, 0), abs=1e-3)
+    assert vertices[:, 2].mean() == pytest.approx(0.2 / np.tan(np.radians(25)), rel=1e-3)
+
+
 def test_photo_that_shows_more_than_the_sheet(clip, tmp_path):
     straight = images.read_rgb(clip[1])
     corners = np.float32([(70, 60), (690, 95), (660, 520), (50, 480)])
     H = cv2.getPerspectiveTransform(np.float32([(0, 0), (594, 0), (594, 420), (0, 420)]), corners)
     wider = cv2.warpPerspective(straight, H, (760, 600), borderValue=(60, 60, 60))
-    capture(clip[0], str(tmp_path / "out"), last=1, **given(clip, texture=write_png(tmp_path / "wider.png", wider), size=["A4"]), texture_corners=corners)
+    capture(
+        clip[0],
+        str(tmp_path / "out"),
+        last=1,
+        **given(clip, texture=write_png(tmp_path / "wider.png", wider), size=["A4"]),
+        texture_corners=corners,
+    )
     texture = images.read_rgb(tmp_path / "out" / "texture.png")
     assert abs(texture.shape[1] / texture.shape[0] - WIDTH / HEIGHT) < 0.01
     assert np.abs(cv2.resize(texture, (594, 420)).astype(int) - straight).mean() < 12
@@ -227,7 +258,19 @@ def test_frames_are_upright_and_in_their_colours(tmp_path):
     assert len(got) == 3 and all(np.abs(x[8:40:31, 8:50:41].astype(int) - image[8:40:31, 8:50:41]).max() < 6 for x in got)
     import imageio_ffmpeg
 
-    turned = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-nostdin", "-display_rotation", "90", "-i", tmp_path / "a.mp4", "-c", "copy", tmp_path / "b.mp4"]
+    turned = [
+        imageio_ffmpeg.get_ffmpeg_exe(),
+        "-v",
+        "error",
+        "-nostdin",
+        "-display_rotation",
+        "90",
+        "-i",
+        tmp_path / "a.mp4",
+        "-c",
+        "copy",
+        tmp_path / "b.mp4",
+    ]
     subprocess.run([str(x) for x in turned], check=True, timeout=60)
     _, got = next(frames.read_frames(tmp_path / "b.mp4"))
     assert got.shape == (64, 48, 3) and np.abs(got.astype(int) - np.rot90(image)).mean() < 6
@@ -369,8 +412,10 @@ def test_views_of_a_board_that_tell_nothing(tmp_path):
 @pytest.mark.parametrize(
     "words, size",
     [
-        (["0.297", "0.210"], (0.297, 0.21)), (["297mm", "210mm"], (0.297, 0.21)), (["297", "210mm"], (0.297, 0.21)), (["29.7cm", "21cm"], (0.297, 0.21)),
-        (["297x210mm"], (0.297, 0.21)), (["A4"], (0.297, 0.21)), (["a3"], (0.42, 0.297)), (["11in", "8.5in"], (0.2794, 0.2159)), (["30cm"], (0.3, 0.3)), (["2", "1.5"], (2, 1.5)),
+        (["0.297", "0.210"], (0.297, 0.21)), (["297mm", "210mm"], (0.297, 0.21)), (["297", "210mm"], (0.297, 0.21)), (["29.7cm", "21cm"],
+        (0.297, 0.21)),
+        (["297x210mm"], (0.297, 0.21)), (["A4"], (0.297, 0.21)), (["a3"], (0.42, 0.297)), (["11in", "8.5in"], (0.2794, 0.2159)),
+        (["30cm"], (0.3, 0.3)), (["2", "1.5"], (2, 1.5)),
     ],
 )  # fmt: skip
 def test_sizes(words, size):
@@ -384,8 +429,10 @@ def test_size_of_a_standing_sheet():
 @pytest.mark.parametrize(
     "words, said",
     [
-        (["297", "210"], "297mm 210mm"), (["29.7", "21"], "29.7cm 21cm"), (["11", "8.5"], "11in 8.5in"), (["297m", "210m"], "20 m"), (["0.1mm", "1m"], "5 mm"), (["0", "1"], "positive"),
-        (["-1", "1"], "not a length"), (["A9"], "not a length"), (["1", "2", "3"], "3 lengths"), (["297px", "210px"], "'297px'"), (["nan", "1"], "not a length"), (["inf"], "not a length"),
+        (["297", "210"], "297mm 210mm"), (["29.7", "21"], "29.7cm 21cm"), (["11", "8.5"], "11in 8.5in"), (["297m", "210m"], "20 m"),
+        (["0.1mm", "1m"], "5 mm"), (["0", "1"], "positive"),
+        (["-1", "1"], "not a length"), (["A9"], "not a length"), (["1", "2", "3"], "3 lengths"), (["297px", "210px"], "'297px'"), (["nan",
+        "1"], "not a length"), (["inf"], "not a length"),
     ],
 )  # fmt: skip
 def test_sizes_that_no_sheet_has(words, said):

@@ -111,7 +111,8 @@ def test_options_of_the_command_are_described():
 
 
 def test_pages_build_without_a_warning(tmp_path):
-    done = subprocess.run([sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html", ROOT / "docs", tmp_path / "html"], capture_output=True, text=True)
+    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html", ROOT / "docs", tmp_path / "html"]
+    done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     index = (tmp_path / "html" / "index.html").read_text(encoding="utf-8")
     assert [p.stem for p in (ROOT / "docs").glob("*.md") if p.stem != "index" and f'href="{p.stem}.html"' not in index] == []
@@ -119,7 +120,8 @@ def test_pages_build_without_a_warning(tmp_path):
 
 def test_options_of_prepare_are_described():
     text = (ROOT / "docs" / "prepare.md").read_text(encoding="utf-8")
-    options = [o for action in prepare_parser()._actions for o in action.option_strings if o not in ("-h", "--help", "-o", "--output", "--quiet")]
+    known = ("-h", "--help", "-o", "--output", "--quiet")
+    options = [o for action in prepare_parser()._actions for o in action.option_strings if o not in known]
     assert [o for o in options if f"`{o}" not in text and f"[{o} " not in text and f"| {o} " not in text] == []
 
 

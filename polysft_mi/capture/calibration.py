@@ -1,4 +1,5 @@
-"""The camera from a video, or images, of a chessboard or a ChArUco board that is moved before it: focal lengths, principal point, distortion."""
+"""The camera from a video, or images, of a chessboard or a ChArUco board that is moved before it: focal lengths, principal point,
+distortion."""
 
 import re
 
@@ -33,7 +34,10 @@ def parse_board(text):
     board = re.fullmatch(r"charuco:(\d+)x(\d+):(\w+):(0?\.\d+)", text)
     dictionary = board and getattr(cv2.aruco, "DICT_" + board[3].upper().removeprefix("DICT_"), None)
     if not board or dictionary is None or min(int(board[1]), int(board[2])) < 3:
-        raise InputError(f"--board {text}: give the inner corners of a chessboard, as in 9x6, or a ChArUco board, as in charuco:7x5:4X4_50:0.75 (squares, dictionary, marker by square)")
+        raise InputError(
+            f"--board {text}: give the inner corners of a chessboard, as in 9x6, or a ChArUco board, as in charuco:7x5:4X4_50:0.75"
+            " (squares, dictionary, marker by square)"
+        )
     return _Charuco(int(board[1]), int(board[2]), dictionary, float(board[4]))
 
 
@@ -69,8 +73,8 @@ class _Charuco:
 def calibrate(path, board="9x6"):
     """(:class:`polysft_mi.capture.lens.Lens`, a picture of the boards that were found) from a video, a folder of images or a pattern.
 
-    Five distortion coefficients, by OpenCV's calibration over at most 25 views that differ. Raises InputError where the board is found in too few, or where the
-    views do not tell the focal length.
+    Four distortion coefficients (k1, k2, p1, p2; k3, which few views tell, is 0), by OpenCV's calibration over at most 25 views that
+    differ. Raises InputError where the board is found in too few, or where the views do not tell the focal length.
     """
     detect = parse_board(board)
     views, size = [], None
@@ -82,29 +86,36 @@ def calibrate(path, board="9x6"):
             views.append((index, image if len(views) < 200 else None, *found))
     if len(views) < _LEAST:
         hint = "; --board says which board it is" if not views else ""
-        raise InputError(f"{path}: {detect.name} is found in {len(views)} frames; at least {_LEAST}, from different sides, are needed{hint}")
+        raise InputError(
+            f"{path}: {detect.name} is found in {len(views)} frames; at least {_LEAST}, from different sides, are needed{hint}"
+        )
     views = _different(views)
     start = np.array([[max(size), 0, size[0] / 2 - 0.5], [0, max(size), size[1] / 2 - 0.5], [0, 0, 1]], dtype=np.float64)
     try:
         missed, K, distortion, turns, _, deviations, _, _ = cv2.calibrateCameraExtended(
-            [v[2] for v in views], [v[3] for v in views], size, start, np.zeros(5), flags=cv2.CALIB_USE_INTRINSIC_GUESS
+            [v[2] for v in views], [v[3] for v in views], size, start, np.zeros(5), flags=cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_K3
         )
     except cv2.error as error:
         raise InputError(f"{path}: the boards do not tell the camera ({error.err}); views from different sides are needed") from None
-    f = K[0, 0]
-    unsure = float(np.max(np.ravel(deviations)[:2])) / f * max(1.0, _NOISE / missed)  # corners that fit better than they are seen promise too much
+    f = float(K[0, 0])
+    unsure = (
+        float(np.max(np.ravel(deviations)[:2])) / f * max(1.0, _NOISE / missed)
+    )  # corners that fit better than they are seen promise too much
     if not np.isfinite(K).all() or not np.isfinite(missed) or missed > _MISSED:
-        raise InputError(f"{path}: the camera that fits best misses the board's corners by {missed:.2g} pixels; a flat board, sharp images and one zoom are needed")
+        raise InputError(
+            f"{path}: the camera that fits best misses the board's corners by {missed:.2g} pixels; a flat board, sharp images and one zoom"
+            " are needed"
+        )
     normals = np.stack([cv2.Rodrigues(turn)[0][:, 2] for turn in turns])
     tilt = float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1)).max()))
     if unsure > _SURE or tilt < _TILT:
         raise InputError(
-            f"{path}: the views leave the focal length open: the board is tilted by {tilt:.0f} degrees between them, and it is known to {100 * unsure:.1f} %; "
-            "tilt the board by 30 degrees and more, to different sides"
+            f"{path}: the views leave the focal length open: the board is tilted by {tilt:.0f} degrees between them, and it is known to"
+            f" {100 * unsure:.1f} %; tilt the board by 30 degrees and more, to different sides"
         )
-    camera = Intrinsics(f, K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5, *size)
+    camera = Intrinsics(f, float(K[1, 1]), float(K[0, 2]) + 0.5, float(K[1, 2]) + 0.5, *size)
     source = f"{path}, {detect.name} in {len(views)} views, missed by {missed:.2f} pixels, focal length ±{100 * unsure:.1f} %"
-    return Lens(camera, tuple(np.ravel(distortion)[:5].tolist()), source), _picture(views)
+    return Lens(camera, tuple(np.ravel(distortion)[:4].tolist()), source), _picture(views)
 
 
 def _different(views):
@@ -123,6 +134,6 @@ def _picture(views):
         index, image, _, pixels = views[k]
         shown = image.copy()
         for x in pixels:
-            cv2.circle(shown, tuple(int(v) for v in x), max(3, image.shape[1] // 160), pictures.GREEN, -1)
+            cv2.circle(shown, tuple(int(v) for v in x), max(3, image.shape[1] // 100), pictures.GREEN, -1)
         cells.append((f"frame {index}", shown))
     return pictures.contact_sheet(cells)

@@ -36,18 +36,21 @@ _SHARPEST = 2048  # pixels of a texture's longer side; what is finer no frame sh
 
 
 def capture(
-    video, out=None, *, texture, size=None, template=None, resolution=33, camera=None, fov=None, calibrate=None, board="9x6", corners=None, texture_corners=None,
+    video, out=None, *, texture, size=None, template=None, resolution=33, camera=None, fov=None, calibrate=None, board="9x6",
+    corners=None, texture_corners=None,
     masks=True, first=0, last=-1, stride=1, scale=1.0, overwrite=False, say=lambda line: None, progress=lambda count: None, command="",
 ):  # fmt: skip
-    """Make the folder ``out`` of a sequence from ``video`` (a file, a folder of images, a pattern): frames, masks, template, texture, camera, ``scene.xml``.
+    """Make the folder ``out`` of a sequence from ``video`` (a file, a folder of images, a pattern): frames, masks, template, texture,
+    camera, ``scene.xml``.
 
-    ``texture``: the photo, or "first-frame"; ``size``: words as :func:`polysft_mi.capture.size.parse_size` takes them, or ``template``, an OBJ; the camera by one of
-    ``camera`` (a file), ``fov`` [degrees] and ``calibrate`` (a video of a ``board``), else by what the video says; ``corners`` (4, 2): pixels of the sheet's corners in
-    the frame ``first`` as it was taken, or "frame" for the picture's own; ``texture_corners`` (4, 2): likewise in the photo, whose rest is cut off; ``masks``:
-    True to find them, a folder of them, or False for none; ``say`` is given one line for each step, ``progress`` the number of frames done.
+    ``texture``: the photo, or "first-frame"; ``size``: words as :func:`polysft_mi.capture.size.parse_size` takes them, or ``template``, an
+    OBJ; the camera by one of ``camera`` (a file), ``fov`` [degrees] and ``calibrate`` (a video of a ``board``), else by what the video
+    says; ``corners`` (4, 2): pixels of the sheet's corners in the frame ``first`` as it was taken, or "frame" for the picture's own;
+    ``texture_corners`` (4, 2): likewise in the photo, whose rest is cut off; ``masks``: True to find them, a folder of them, or False for
+    none; ``say`` is given one line for each step, ``progress`` the number of frames done.
 
-    Returns (path of the scene, a dict of what was found: what ``prepare/prepare.json`` holds). Raises InputError; then nothing is written, but where the sheet is not
-    found in the first frame, a picture of the matches, which the message names.
+    Returns (path of the scene, a dict of what was found: what ``prepare/prepare.json`` holds). Raises InputError; then nothing is written,
+    but where the sheet is not found in the first frame, a picture of the matches, which the message names.
     """
     if sum(x is not None for x in (camera, fov, calibrate)) > 1:
         raise InputError("--camera, --fov and --calibrate: one of them is needed, not several")
@@ -67,7 +70,10 @@ def capture(
     view = straight.camera
     frame = straight.image(frame)
     found["camera"] = {**lens.as_json(), "from": lens.source}
-    say(f"camera: {view.fx:.1f} pixels focal length, {view.width}x{view.height}, {'undistorted, ' if any(lens.distortion) else ''}from {lens.source}")
+    say(
+        f"camera: {view.fx:.1f} pixels focal length, {view.width}x{view.height}, {'undistorted, ' if any(lens.distortion) else ''}from"
+        f" {lens.source}"
+    )
 
     photo = None if texture == FIRST_FRAME else read_rgb(texture)
     if texture_corners is not None:
@@ -80,7 +86,10 @@ def capture(
     placed = pose(mesh.vertices)
     seen = _seen(placed, view)
     if seen < _IN_VIEW:
-        raise InputError(f"{video}, frame {index}: {100 * seen:.0f} % of the sheet is in view; at least {100 * _IN_VIEW:.0f} % must be: start later, by --first")
+        raise InputError(
+            f"{video}, frame {index}: {100 * seen:.0f} % of the sheet is in view; at least {100 * _IN_VIEW:.0f} % must be: start later, by"
+            " --first"
+        )
     if photo is None:
         photo, uv = frame, view.project(placed) / (view.width, view.height)
         uv[:, 1] = 1 - uv[:, 1]
@@ -99,7 +108,18 @@ def capture(
         if matches is not None:
             save("matches.png", pictures.matches(photo, frame, matches))
         save("pose.png", pictures.pose(frame, photo, mesh, placed, view))
-        used = _write_frames(partial, index, frame, stream, straight, masks, silhouette(view.project(placed), mesh.faces, frame.shape[1::-1]), found, say, progress)
+        used = _write_frames(
+            partial,
+            index,
+            frame,
+            stream,
+            straight,
+            masks,
+            silhouette(view.project(placed), mesh.faces, frame.shape[1::-1]),
+            found,
+            say,
+            progress,
+        )
         _write_png(os.path.join(partial, "texture.png"), pictures.shrunk(photo, _SHARPEST)[0])
         write_obj(os.path.join(partial, "template.obj"), placed, mesh.faces, mesh.uv)
         _write_json(os.path.join(partial, "camera.json"), Lens(view).as_json())
@@ -132,7 +152,10 @@ def _lens(video, texture, camera, fov, calibrate, board, size):
     if focal is None and texture != FIRST_FRAME:
         focal, where = focal_35mm(texture), f"{texture}, taken for the same camera and zoom"
     if focal is None:
-        raise InputError(f"{video}: does not say its camera; give --fov DEGREES (across the picture), --camera camera.json, or --calibrate VIDEO of a chessboard")
+        raise InputError(
+            f"{video}: does not say its camera; give --fov DEGREES (across the picture), --camera camera.json, or --calibrate VIDEO of a"
+            " chessboard"
+        )
     return Lens.from_focal_35mm(focal, *size, where), None
 
 
@@ -144,9 +167,15 @@ def _sheet(size, template, resolution, photo, texture, say):
     if aspect is not None:
         ratio, turned = aspect / (width / height), aspect / (height / width)
         if max(ratio, 1 / ratio) > _ASPECT and max(turned, 1 / turned) < max(ratio, 1 / ratio) / 1.2:
-            raise InputError(f"{texture}: {photo.shape[1]}x{photo.shape[0]} pixels, for a sheet {width:g} m wide and {height:g} m high; give --size {height:g} {width:g}?")
+            raise InputError(
+                f"{texture}: {photo.shape[1]}x{photo.shape[0]} pixels, for a sheet {width:g} m wide and {height:g} m high; give --size"
+                f" {height:g} {width:g}?"
+            )
         if max(ratio, 1 / ratio) > _ASPECT:
-            say(f"note: the photo is {aspect:.3g} times as wide as high, the sheet {width / height:.3g} times; does it show the sheet from edge to edge (--texture-corners)?")
+            say(
+                f"note: the photo is {aspect:.3g} times as wide as high, the sheet {width / height:.3g} times; does it show the sheet from"
+                " edge to edge (--texture-corners)?"
+            )
     return sheet.grid(width, height, resolution)
 
 
@@ -159,7 +188,10 @@ def _pose(mesh, photo, texture, frame, view, straight, corners, taken, out, firs
         say(f"pose: by its corners, missed by {found['pose']['residual_px']:.2f} pixels")
         return pose, None
     if photo is None:
-        raise InputError("--texture first-frame: --corners x,y x,y x,y x,y must say where the sheet lies in it (top left, top right, bottom right, bottom left), or --corners frame")
+        raise InputError(
+            "--texture first-frame: --corners x,y x,y x,y x,y must say where the sheet lies in it (top left, top right, bottom right,"
+            " bottom left), or --corners frame"
+        )
     matches = match(photo, frame)
     pose, matches = from_matches(matches, mesh, view)
     if pose is None:
@@ -224,7 +256,11 @@ def _write_frames(folder, index, frame, stream, straight, masks, expected, found
     elif tracked:
         used, why = _believable(first_iou, areas, strange, indices)
         found["masks"] = {"first_iou": first_iou, "strangeness": max(strange), "used": used, **({"why": why} if why else {})}
-        say(f"masks: by GrabCut, the first overlaps with the template by {100 * first_iou:.0f} %" if used else f"masks: not used, for {why}; prepare/masks.png shows them")
+        say(
+            f"masks: by GrabCut, the first overlaps with the template by {100 * first_iou:.0f} %"
+            if used
+            else f"masks: not used, for {why}; prepare/masks.png shows them"
+        )
     _show(folder, indices, bool(masks))
     if masks and not used:
         shutil.rmtree(os.path.join(folder, "masks"))
@@ -244,7 +280,13 @@ def _show(folder, indices, masked):
 def _believable(first_iou, areas, strange, indices):
     """(whether masks can be used, why not)."""
     if first_iou < _ALIKE:
-        return False, f"in the first frame they overlap with the template by {100 * first_iou:.0f} % only: the sheet does not stand out from what is behind it"
+        return (
+            False,
+            (
+                f"in the first frame they overlap with the template by {100 * first_iou:.0f} % only: the sheet does not stand out from what"
+                " is behind it"
+            ),
+        )
     for before, after, index in zip(areas, areas[1:], indices[1:]):
         if after == 0 or max(before / after, after / before) > _JUMP:
             return False, f"in frame {index} their area jumps from {before} to {after} pixels"
@@ -257,7 +299,9 @@ def _believable(first_iou, areas, strange, indices):
 def _given_masks(folder, masks, indices, straight):
     paths = list_images(masks, "masks")
     if len(paths) != len(indices) and len(paths) <= indices[-1]:
-        raise InputError(f"{masks}: {len(paths)} masks for {len(indices)} frames, the last of them frame {indices[-1]}; one a frame is needed")
+        raise InputError(
+            f"{masks}: {len(paths)} masks for {len(indices)} frames, the last of them frame {indices[-1]}; one a frame is needed"
+        )
     paths = paths if len(paths) == len(indices) else [paths[k] for k in indices]
     for k, path in enumerate(paths):
         mask = read_rgb(path).max(axis=2)

@@ -16,11 +16,13 @@ _MOST = 16384  # pixels a side
 def read_frames(path, first=0, last=-1, stride=1):
     """Yield (index, image (H, W, 3) uint8 sRGB) of the frames ``first`` to ``last`` (inclusive, -1 for the end) in steps of ``stride``.
 
-    ``path``: a video file, a folder of images or a glob pattern. Raises InputError: for a file that is not a video or breaks off, for no frames, for frames of
-    several sizes, and where ``first`` or ``last`` lies beyond the end.
+    ``path``: a video file, a folder of images or a glob pattern. Raises InputError: for a file that is not a video or breaks off, for no
+    frames, for frames of several sizes, and where ``first`` or ``last`` lies beyond the end.
     """
     if first < 0 or last < -1 or (last != -1 and last < first) or stride < 1:
-        raise InputError(f"first = {first}, last = {last}, stride = {stride}; 0 <= first <= last (or last = -1 for the end) and stride >= 1 are needed")
+        raise InputError(
+            f"first = {first}, last = {last}, stride = {stride}; 0 <= first <= last (or last = -1 for the end) and stride >= 1 are needed"
+        )
     seen, size = 0, None
     for index, (where, load) in enumerate(_sources(path)):
         seen = index + 1
@@ -32,7 +34,9 @@ def read_frames(path, first=0, last=-1, stride=1):
         here = image.shape[1::-1]
         size = size or here
         if here != size:
-            raise InputError(f"{where}: {here[0]}x{here[1]} pixels, and those before have {size[0]}x{size[1]}; all frames must be of one size")
+            raise InputError(
+                f"{where}: {here[0]}x{here[1]} pixels, and those before have {size[0]}x{size[1]}; all frames must be of one size"
+            )
         if min(here) < 16 or max(here) > _MOST:
             raise InputError(f"{where}: {here[0]}x{here[1]} pixels; 16 to {_MOST} a side are needed")
         yield index, image
@@ -50,7 +54,8 @@ def is_video(path):
 
 
 def focal_length(path):
-    """(the focal length for film of 36x24 mm [mm], where it is written), or (None, None). A video has it where the telephone wrote it there, images in Exif data."""
+    """(the focal length for film of 36x24 mm [mm], where it is written), or (None, None). A video has it where the telephone wrote it
+    there, images in Exif data."""
     if not is_video(path):
         image = list_images(path, "frames")[0]
         return focal_35mm(image), image
@@ -87,7 +92,9 @@ def _decoded(path):
     try:
         with av.open(_name(path)) as container:
             if not container.streams.video:
-                raise InputError(f"{path}: holds no pictures (streams: {', '.join(s.type for s in container.streams) or 'none'}); a video is needed")
+                raise InputError(
+                    f"{path}: holds no pictures (streams: {', '.join(s.type for s in container.streams) or 'none'}); a video is needed"
+                )
             stream = container.streams.video[0]
             stream.thread_type = "AUTO"
             for frame in container.decode(stream):

@@ -15,8 +15,8 @@ _FOCAL_35MM = 0xA405
 def read_rgb(path):
     """The image (H, W, 3), uint8 sRGB, upright.
 
-    Turned as its Exif orientation says; 16 bits become 8, float pixels are taken as linear, grey becomes RGB; what is transparent becomes white. Raises InputError
-    where it is not a readable image.
+    Turned as its Exif orientation says; 16 bits become 8, float pixels are taken as linear, grey becomes RGB; what is transparent becomes
+    white. Raises InputError where it is not a readable image.
     """
     if os.fspath(path).lower().endswith((".heic", ".heif", ".avif")):
         raise InputError(f"{path}: HEIC and AVIF are not read; export it as JPEG or PNG")
@@ -74,5 +74,7 @@ def _encoded(linear):
     """Linear colours as 8-bit sRGB (IEC 61966-2-1); alpha, the fourth channel, as it is."""
     x = np.clip(linear, 0, 1)
     colours = x[..., :3] if x.shape[2] >= 3 else x[..., :1]
-    x = np.concatenate([np.where(colours <= 0.0031308, 12.92 * colours, 1.055 * colours ** (1 / 2.4) - 0.055), x[..., colours.shape[2] :]], axis=2)
+    x = np.concatenate(
+        [np.where(colours <= 0.0031308, 12.92 * colours, 1.055 * colours ** (1 / 2.4) - 0.055), x[..., colours.shape[2] :]], axis=2
+    )
     return np.round(255 * x).astype(np.uint8)

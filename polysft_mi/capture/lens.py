@@ -1,4 +1,5 @@
-"""The camera that took the frames: focal length, principal point, and the lens's distortion, which is removed before anything else looks at a frame."""
+"""The camera that took the frames: focal length, principal point, and the lens's distortion, which is removed before anything else looks at
+a frame."""
 
 import json
 import math
@@ -19,8 +20,8 @@ _ALIKE = 0.01  # relative difference of two aspect ratios that rounding the size
 class Lens:
     """A pinhole and what keeps the lens from being one.
 
-    ``camera``: :class:`polysft_mi.camera.Intrinsics` of the frames as they were taken; ``distortion``: OpenCV's coefficients (k1, k2, p1, p2, k3, ...), in normalised
-    image coordinates; ``source``: how they are known, in words.
+    ``camera``: :class:`polysft_mi.camera.Intrinsics` of the frames as they were taken; ``distortion``: OpenCV's coefficients (k1, k2, p1,
+    p2, k3, ...), in normalised image coordinates; ``source``: how they are known, in words.
     """
 
     camera: Intrinsics
@@ -29,7 +30,10 @@ class Lens:
 
     def __post_init__(self):
         if len(self.distortion) not in _COEFFICIENTS or not np.isfinite(self.distortion).all():
-            raise InputError(f"{self.source}: {len(self.distortion)} distortion coefficients; 4, 5, 8, 12 or 14 finite numbers, in OpenCV's order, are needed")
+            raise InputError(
+                f"{self.source}: {len(self.distortion)} distortion coefficients; 4, 5, 8, 12 or 14 finite numbers, in OpenCV's order, are"
+                " needed"
+            )
 
     @classmethod
     def from_fov(cls, fov, width, height, source="--fov"):
@@ -47,14 +51,17 @@ class Lens:
 
     @classmethod
     def from_json(cls, path, width, height):
-        """From a camera file (fx, fy, cx, cy, width, height, and ``distortion``, a list, or none), for frames of this size. Raises InputError."""
+        """From a camera file (fx, fy, cx, cy, width, height, and ``distortion``, a list, or none), for frames of this size. Raises
+        InputError."""
         camera = Intrinsics.from_json(path)
         with open(path, encoding="utf-8") as file:
             distortion = json.load(file).get("distortion") or ()
         try:
             distortion = tuple(float(x) for x in distortion)
         except (TypeError, ValueError):
-            raise InputError(f"{path}: distortion = {distortion!r}; a list of 4, 5, 8, 12 or 14 numbers, in OpenCV's order, is needed") from None
+            raise InputError(
+                f"{path}: distortion = {distortion!r}; a list of 4, 5, 8, 12 or 14 numbers, in OpenCV's order, is needed"
+            ) from None
         return cls(camera, distortion, str(path)).resized(width, height)
 
     def resized(self, width, height):
@@ -64,7 +71,9 @@ class Lens:
             return self
         x, y = width / c.width, height / c.height
         if abs(x / y - 1) > _ALIKE:
-            raise InputError(f"{self.source}: for pictures of {c.width}x{c.height}; the frames have {width}x{height}, which is no scaled version of them")
+            raise InputError(
+                f"{self.source}: for pictures of {c.width}x{c.height}; the frames have {width}x{height}, which is no scaled version of them"
+            )
         return Lens(Intrinsics(c.fx * x, c.fy * y, c.cx * x, c.cy * y, width, height), self.distortion, self.source)
 
     def as_json(self):
@@ -90,7 +99,9 @@ class Undistortion:
             raise InputError(f"--scale {scale:g}: makes frames of {size[0]}x{size[1]} pixels; at least 16 a side are needed")
         self.camera = lens.resized(*size).camera if abs(size[0] * c.height / (size[1] * c.width) - 1) < _ALIKE else None
         if self.camera is None:
-            raise InputError(f"--scale {scale:g}: makes frames of {size[0]}x{size[1]} pixels, too small to keep the shape of {c.width}x{c.height}")
+            raise InputError(
+                f"--scale {scale:g}: makes frames of {size[0]}x{size[1]} pixels, too small to keep the shape of {c.width}x{c.height}"
+            )
         self._distortion = np.array(lens.distortion) if any(lens.distortion) else None
         self._K = c.matrix()
         self._K[:2, 2] -= 0.5  # OpenCV counts from the centre of the first pixel

@@ -1,4 +1,5 @@
-"""The sheet's silhouette in every frame: GrabCut around the template's projection in the first, then around where the optical flow carries the frame before's."""
+"""The sheet's silhouette in every frame: GrabCut around the template's projection in the first, then around where the optical flow carries
+the frame before's."""
 
 import cv2
 import numpy as np
@@ -48,7 +49,9 @@ class Masks:
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * r + 1, 2 * r + 1))
         inner = cv2.erode(expected, disc, borderValue=1)
         outer = cv2.dilate(expected, disc)
-        trimap = np.where(inner > 0, cv2.GC_FGD, np.where(outer > 0, np.where(expected > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD), cv2.GC_BGD)).astype(np.uint8)
+        trimap = np.where(
+            inner > 0, cv2.GC_FGD, np.where(outer > 0, np.where(expected > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD), cv2.GC_BGD)
+        ).astype(np.uint8)
         x, y, w, h = cv2.boundingRect(outer)
         window = np.s_[max(0, y - 4 * r) : y + h + 4 * r, max(0, x - 4 * r) : x + w + 4 * r]
         part = np.ascontiguousarray(trimap[window])
@@ -83,7 +86,8 @@ def _connected(mask, core):
 
 
 def silhouette(pixels, faces, size):
-    """The projection of a mesh: mask (H, W) uint8, 0 or 255, of triangles ``faces`` (F, 3) between ``pixels`` (N, 2), (0.5, 0.5) the first pixel's centre."""
+    """The projection of a mesh: mask (H, W) uint8, 0 or 255, of triangles ``faces`` (F, 3) between ``pixels`` (N, 2), (0.5, 0.5) the first
+    pixel's centre."""
     mask = np.zeros(size[::-1], np.uint8)
     shift = 4  # binary places of the fixed-point coordinates that OpenCV takes; it counts from the first pixel's centre
     corners = np.round((np.clip(pixels, -1e5, 1e5) - 0.5) * 2**shift).astype(np.int32)

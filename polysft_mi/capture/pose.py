@@ -20,7 +20,8 @@ _SMALLEST = 2e-4  # share of the frame that a sheet must cover
 
 @dataclass(frozen=True)
 class Matches:
-    """Features found in both: ``photo`` (K, 2) uv on the photo (v up), ``frame`` (K, 2) pixels, ``agree`` (K,) bool: those that one motion explains."""
+    """Features found in both: ``photo`` (K, 2) uv on the photo (v up), ``frame`` (K, 2) pixels, ``agree`` (K,) bool: those that one motion
+    explains."""
 
     photo: np.ndarray
     frame: np.ndarray
@@ -29,7 +30,8 @@ class Matches:
 
 @dataclass(frozen=True)
 class Pose:
-    """p -> ``rotation`` p + ``translation`` [m] from the template's frame to the camera's; ``residual`` (K,): pixels by which it misses what it was found by."""
+    """p -> ``rotation`` p + ``translation`` [m] from the template's frame to the camera's; ``residual`` (K,): pixels by which it misses
+    what it was found by."""
 
     rotation: np.ndarray
     translation: np.ndarray
@@ -41,7 +43,8 @@ class Pose:
 
 
 def match(photo, frame):
-    """:class:`Matches` of SIFT features of two images (H, W, 3) uint8, each of the photo's best in the frame, both ways; none agrees yet."""
+    """:class:`Matches` of SIFT features of two images (H, W, 3) uint8, each of the photo's best in the frame, both ways; none agrees
+    yet."""
     shrink = min(1.0, _PHOTO_SIDE / max(photo.shape[:2]))
     if shrink < 1:
         photo = cv2.resize(photo, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
@@ -61,8 +64,8 @@ def match(photo, frame):
 def from_matches(matches, sheet, camera):
     """(:class:`Pose`, the matches with those that agree) of a :class:`polysft_mi.capture.sheet.Sheet`.
 
-    A plane by a RANSAC homography and the two poses that it allows, other templates by RANSAC over poses; then robust least squares over what agrees. Where
-    it is not found, the pose is None.
+    A plane by a RANSAC homography and the two poses that it allows, other templates by RANSAC over poses; then robust least squares over
+    what agrees. Where it is not found, the pose is None.
     """
     points = sheet.at(matches.photo)
     on = np.isfinite(points).all(axis=1)
@@ -80,14 +83,17 @@ def from_matches(matches, sheet, camera):
 
 
 def from_corners(corners, sheet, camera):
-    """The :class:`Pose` by the pixels (4, 2) of the template's corners: top left, top right, bottom right, bottom left of its photo. Raises InputError."""
+    """The :class:`Pose` by the pixels (4, 2) of the template's corners: top left, top right, bottom right, bottom left of its photo. Raises
+    InputError."""
     corners = np.asarray(corners, dtype=np.float64)
     sides = np.roll(corners, -1, axis=0) - corners
     turns = sides[:, 0] * np.roll(sides, -1, axis=0)[:, 1] - sides[:, 1] * np.roll(sides, -1, axis=0)[:, 0]
     if (turns < 0).all():
         raise InputError("--corners: they run against the clock; top left, top right, bottom right, bottom left of the print are needed")
     if not (turns > 0).all():
-        raise InputError("--corners: they make no convex quadrangle; top left, top right, bottom right, bottom left of the print are needed")
+        raise InputError(
+            "--corners: they make no convex quadrangle; top left, top right, bottom right, bottom left of the print are needed"
+        )
     points = sheet.corners()
     starts, _ = _starts(points, None, corners, sheet.flat, camera, np.inf)
     pose = _refined(starts, points, corners, camera) if starts else None
@@ -97,14 +103,22 @@ def from_corners(corners, sheet, camera):
 
 
 def _starts(points, photo, pixels, flat, camera, tolerance):
-    """Poses (R, t) to start from, and which of the K pairs agree with one motion (indices); ``photo`` (K, 2): their uv, where ``tolerance`` [pixels] is finite."""
+    """Poses (R, t) to start from, and which of the K pairs agree with one motion (indices); ``photo`` (K, 2): their uv, where ``tolerance``
+    [pixels] is finite."""
     rays = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
     if not flat:
         if len(points) < 6:
             found, turn, shift = cv2.solvePnP(points, rays, np.eye(3), None, flags=cv2.SOLVEPNP_SQPNP)
             return ([(turn, shift)] if found else []), np.arange(len(points))
         found, turn, shift, inliers = cv2.solvePnPRansac(
-            points, rays, np.eye(3), None, reprojectionError=min(tolerance, 1e4) / camera.fx, iterationsCount=2000, confidence=0.9999, flags=cv2.SOLVEPNP_EPNP
+            points,
+            rays,
+            np.eye(3),
+            None,
+            reprojectionError=min(tolerance, 1e4) / camera.fx,
+            iterationsCount=2000,
+            confidence=0.9999,
+            flags=cv2.SOLVEPNP_EPNP,
         )
         return ([(turn, shift)], inliers.ravel()) if found and inliers is not None else ([], np.empty(0, int))
     origin, axes = _plane(points)
@@ -112,7 +126,9 @@ def _starts(points, photo, pixels, flat, camera, tolerance):
     inliers = np.arange(len(points))
     if np.isfinite(tolerance):
         cv2.setRNGSeed(0)
-        if _cross(*(np.linalg.lstsq(plane[:, :2], photo - photo.mean(0), rcond=None)[0][:, None]))[0] > 0:  # RANSAC takes no mirror images: v goes up, y down
+        if (
+            _cross(*(np.linalg.lstsq(plane[:, :2], photo - photo.mean(0), rcond=None)[0][:, None]))[0] > 0
+        ):  # RANSAC takes no mirror images: v goes up, y down
             axes = axes * np.array([[1.0], [-1.0], [-1.0]])
             plane = (points - origin) @ axes.T
         unit = camera.width / max(np.ptp(plane[:, :2], axis=0).max(), 1e-12)  # RANSAC's checks are for coordinates of the size of pixels

@@ -13,8 +13,8 @@ _SMALLEST, _LARGEST = 0.005, 20.0  # m
 
 @dataclass(frozen=True)
 class Sheet:
-    """A template in a frame of its own (x right, y down, z away from who looks at its print): ``vertices`` (N, 3) [m], ``faces`` (F, 3), ``uv`` (N, 2) of
-    its photo, v up; ``name``: what it is, in words."""
+    """A template in a frame of its own (x right, y down, z away from who looks at its print): ``vertices`` (N, 3) [m], ``faces`` (F, 3),
+    ``uv`` (N, 2) of its photo, v up; ``name``: what it is, in words."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -34,7 +34,9 @@ class Sheet:
         try:
             finder = Triangulation(*self.uv.T, triangles=self.faces).get_trifinder()
         except (RuntimeError, ValueError):
-            raise InputError(f"{self.name}: its texture coordinates overlap; each place of the photo may lie on one place of the template only") from None
+            raise InputError(
+                f"{self.name}: its texture coordinates overlap; each place of the photo may lie on one place of the template only"
+            ) from None
         face = finder(*np.asarray(uv, dtype=float).T)
         found = self.faces[face]
         a, b, c = (self.uv[found[:, k]] for k in range(3))
@@ -58,7 +60,8 @@ class Sheet:
 
 
 def grid(width, height, resolution=33):
-    """The :class:`Sheet` of a flat rectangle of ``width`` x ``height`` [m], ``resolution`` vertices along its longer side, its cells about square."""
+    """The :class:`Sheet` of a flat rectangle of ``width`` x ``height`` [m], ``resolution`` vertices along its longer side, its cells about
+    square."""
     if not 2 <= resolution <= 400:
         raise InputError(f"--resolution {resolution}: 2 to 400 vertices along the longer side can be used")
     longer = max(width, height)
@@ -68,7 +71,12 @@ def grid(width, height, resolution=33):
     k = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = (corner.ravel() for corner in (k[:-1, :-1], k[:-1, 1:], k[1:, :-1], k[1:, 1:]))
     faces = np.stack([a, b, c, b, d, c], axis=1).reshape(-1, 3)
-    return Sheet(vertices, faces, np.stack([x, 1 - y], axis=-1).reshape(-1, 2), f"a sheet of {1e3 * width:.4g} x {1e3 * height:.4g} mm, {columns}x{rows} vertices")
+    return Sheet(
+        vertices,
+        faces,
+        np.stack([x, 1 - y], axis=-1).reshape(-1, 2),
+        f"a sheet of {1e3 * width:.4g} x {1e3 * height:.4g} mm, {columns}x{rows} vertices",
+    )
 
 
 def from_obj(path):

@@ -6,7 +6,8 @@ from polysft_mi.errors import InputError
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}
 SHEETS = {
-    "A0": (1.189, 0.841), "A1": (0.841, 0.594), "A2": (0.594, 0.420), "A3": (0.420, 0.297), "A4": (0.297, 0.210), "A5": (0.210, 0.148), "A6": (0.148, 0.105),
+    "A0": (1.189, 0.841), "A1": (0.841, 0.594), "A2": (0.594, 0.420), "A3": (0.420, 0.297), "A4": (0.297, 0.210), "A5": (0.210, 0.148),
+    "A6": (0.148, 0.105),
     "LETTER": (0.2794, 0.2159), "LEGAL": (0.3556, 0.2159), "TABLOID": (0.4318, 0.2794),
 }  # fmt: skip
 _SMALLEST, _LARGEST = 0.005, 20.0  # m
@@ -17,8 +18,8 @@ _FORMS = "give --size WIDTH HEIGHT, as in 0.297 0.210 (metres), 297mm 210mm, or 
 def parse_size(words, aspect=None):
     """(width, height) [m] of a sheet, from the words behind ``--size``.
 
-    Two lengths, one (of a square), or the name of a sheet of paper, which lies as the photo does, whose width / height is ``aspect``. Raises InputError for what is
-    none of these, and for sizes that no sheet has.
+    Two lengths, one (of a square), or the name of a sheet of paper, which lies as the photo does, whose width / height is ``aspect``.
+    Raises InputError for what is none of these, and for sizes that no sheet has.
     """
     words = [part for word in words for part in re.split(r"[x×](?=\s*\d)|\s+", str(word).strip()) if part]
     if len(words) == 1 and words[0].upper() in SHEETS:
@@ -33,7 +34,9 @@ def parse_size(words, aspect=None):
     if any(n <= 0 for n in size):
         raise InputError(f"--size {' '.join(words)}: a length must be positive")
     if unit is None and max(size) > _LARGEST_BARE:
-        raise InputError(f"--size {' '.join(words)}: metres, as numbers without a unit are, make a sheet of {_text(size)}; {_suggestion(numbers)}")
+        raise InputError(
+            f"--size {' '.join(words)}: metres, as numbers without a unit are, make a sheet of {_text(size)}; {_suggestion(numbers)}"
+        )
     if not (_SMALLEST <= min(size) and max(size) <= _LARGEST):
         raise InputError(f"--size {' '.join(words)}: a sheet of {_text(size)}; {1e3 * _SMALLEST:g} mm to {_LARGEST:g} m a side can be used")
     return size if len(size) == 2 else size * 2
