@@ -14,7 +14,7 @@ from scripts import load
 
 from polysft_mi import meshio, prepare
 from polysft_mi.camera import Intrinsics
-from polysft_mi.capture import calibration, frames, images, lens, masks, pose, sheet
+from polysft_mi.capture import calibration, folder, frames, images, lens, masks, pose, sheet
 from polysft_mi.capture.folder import capture
 from polysft_mi.capture.size import parse_size
 from polysft_mi.errors import InputError
@@ -568,3 +568,19 @@ def test_print_that_the_benchmark_rectifies(tmp_path):
     got = load("benchmarks/prepare.py").rectified_print(str(truth.folder))
     wanted = cv2.flip(synthetic.texture_image(), 0)  # there the template's first row is the print's highest, in Kinect-Paper its lowest
     assert np.abs(cv2.resize(got, (64, 64), interpolation=cv2.INTER_AREA).astype(int) - wanted)[2:-2, 2:-2].mean() < 6
+
+
+def test_bent_first_frame_is_said(tmp_path):
+    """Matches of a sheet that is a cylinder, against the flat one."""
+    flat = sheet.grid(WIDTH, HEIGHT, 33)
+    x = flat.vertices[:, 0]
+    lines = []
+    for k, curvature in enumerate((0.3, 5.0)):  # 1/m
+        bent = np.column_stack([np.sin(curvature * x) / curvature, flat.vertices[:, 1], (1 - np.cos(curvature * x)) / curvature])
+        R, t = placed()
+        pixels = CAMERA.project(bent @ R.T + t)
+        found, after = pose.from_matches(pose.Matches(flat.uv.clip(1e-6, 1 - 1e-6), pixels, np.zeros(len(x), bool)), flat, CAMERA)
+        missed = np.sqrt((found.residual**2).mean()) / np.hypot(320, 240)
+        lines.append(missed > folder._BENT)
+        assert after.agree.sum() >= pose.LEAST
+    assert lines == [False, True]

@@ -30,6 +30,7 @@ _FRAME, _MASK = "frames/{:05d}.png", "masks/{:05d}.png"
 _IN_VIEW = 0.3  # share of the vertices that must be seen in the first frame
 _ASPECT = 1.06  # ratio of the aspects of photo and size that is said
 _ALIKE = 0.85  # IoU of the first mask and the template's silhouette, below which masks are not believed
+_BENT = 0.005  # of the frame's diagonal, by which a rigid pose misses matches, from which it is said
 _STRANGE = 0.75  # of their colours, likewise
 _JUMP = 1.5  # ratio of the areas of two masks in a row, likewise
 _SHARPEST = 2048  # pixels of a texture's longer side; what is finer no frame shows
@@ -203,6 +204,11 @@ def _pose(mesh, photo, texture, frame, view, straight, corners, taken, out, firs
     residual = float(np.sqrt((pose.residual**2).mean()))
     found["pose"] = {"by": "features", "matches": len(matches.agree), "agree": int(matches.agree.sum()), "residual_px": residual}
     say(f"pose: {int(matches.agree.sum())} of {len(matches.agree)} matches agree, missed by {residual:.2f} pixels RMS")
+    if residual > _BENT * np.hypot(view.width, view.height):
+        say(
+            f"note: the sheet is bent in frame {first}, and the template is not; a run may start wrongly there: see pose.png, or choose"
+            " another --first"
+        )
     return pose, matches
 
 
