@@ -1,17 +1,21 @@
-# make demo, make test: each installs what is missing into .venv (seconds where nothing is) and runs.
+# make demo, make test, make docs: each installs what is missing into .venv (seconds where nothing is) and runs.
 # PYTHON=python3.12 takes another Python for a new .venv.
 
 PYTHON ?= python3
 PY := .venv/bin/python
 INSTALLED := .venv/installed
 
-.PHONY: demo test venv llvm clean
+.PHONY: demo test docs venv llvm clean
 
 demo: venv
 	$(PY) -m polysft_mi.run scenes/demo.xml -o out/demo --overwrite
 
 test: venv
 	$(PY) -m pytest -q
+
+# The pages of docs/ as HTML, in out/docs; a warning is an error
+docs: $(INSTALLED)
+	$(PY) -m sphinx -W --keep-going -q -b html docs out/docs
 
 venv: $(INSTALLED) llvm
 
@@ -21,7 +25,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	    $(PYTHON) -m venv --without-pip .venv && $(PYTHON) -m pip --python $(PY) install -q pip || \
 	    { rm -rf .venv; echo 'error: no virtual environment can be made: install python3-venv (Debian, Ubuntu: apt-get install python3-venv)' >&2; exit 2; }; fi
 	@echo 'installing into .venv: a minute or so, more where the network is slow'
-	@PYTHONWARNINGS=ignore $(PY) -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[test]'
+	@PYTHONWARNINGS=ignore $(PY) -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[test,docs]'
 	@touch $@
 
 # Rendering on the CPU needs a libLLVM, which no Python package brings.
