@@ -5,7 +5,6 @@ Three forms are known (:data:`FORMS`). Names of OBJ files and images, numbers an
 from a video is :mod:`polysft_mi.capture`.
 """
 
-import argparse
 import contextlib
 import json
 import os
@@ -241,34 +240,34 @@ def write_obj(path, vertices, faces, uv):
         file.writelines("f {0}/{0} {1}/{1} {2}/{2}\n".format(*f) for f in np.asarray(faces) + 1)
 
 
-_EXAMPLES = """\
-examples:
-  a folder in a form that is known:
-    python -m polysft_mi.prepare FOLDER
-  a video of a printed sheet, and a straight photo of it that shows nothing else:
-    python -m polysft_mi.prepare clip.mp4 --texture photo.jpg --size 297mm 210mm --fov 65 -o OUT
-    python -m polysft_mi.prepare clip.mp4 --texture photo.jpg --size A4 --calibrate chessboard.mp4 --board 9x6 -o OUT
-  no photo: the first frame is the texture, and the sheet's corners in it are given:
-    python -m polysft_mi.prepare clip.mp4 --texture first-frame --corners 212,80 431,95 420,260 200,241 --size A4 --fov 65 -o OUT
-  a part of a video, at half its size, and without masks:
-    python -m polysft_mi.prepare clip.mp4 --texture photo.jpg --size A4 --fov 65 --first 30 --last 229 --scale 0.5 --no-masks -o OUT
-then look at OUT/prepare/*.png, and:
-    python -m polysft_mi.run OUT/scene.xml -o RESULT
-"""
+_EXAMPLES = [
+    ("FOLDER", "a folder in a form that is known: writes FOLDER/scene.xml"),
+    (
+        "clip.mp4 --texture photo.jpg --size 297mm 210mm --fov 65 -o OUT",
+        "a video of a printed sheet, and a straight photo of it that shows nothing else; then look at OUT/prepare, and: polysft run OUT/scene.xml",
+    ),
+    ("clip.mp4 --texture photo.jpg --size A4 --calibrate chessboard.mp4 --board 9x6 -o OUT", "the camera from a video of a chessboard"),
+    (
+        "clip.mp4 --texture first-frame --corners 212,80 431,95 420,260 200,241 --size A4 --fov 65 -o OUT",
+        "no photo: the first frame is the texture, and the sheet's corners in it are given",
+    ),
+    (
+        "clip.mp4 --texture photo.jpg --size A4 --fov 65 --first 30 --last 229 --scale 0.5 --no-masks -o OUT",
+        "a part of a video, at half its size, and without masks",
+    ),
+]
 
 
 def parser():
     """The command line's parser."""
+    from . import commands
     from .capture.command import add_arguments
 
-    p = argparse.ArgumentParser(
-        prog="python -m polysft_mi.prepare",
-        description=(
-            "Make a sequence's folder, with its scene file, from a video and a photo of the sheet; or write the scene file of a folder in"
-            f" one of the forms {FORMS}."
-        ),
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    p = commands.parser(
+        "prepare",
+        "Make a sequence's folder, with its scene file, from a video and a photo of the sheet; or write the scene file of a folder in"
+        f" one of the forms {FORMS}.",
+        _EXAMPLES,
     )
     p.add_argument("folder", metavar="FOLDER|VIDEO", help="a sequence's folder; or a video, a folder of images, or a pattern of images")
     p.add_argument(
