@@ -1,11 +1,11 @@
-# make demo, make drape, make test: each installs what is missing into .venv (seconds where nothing is) and runs.
+# make demo, make drape, make test, make docs: each installs what is missing into .venv (seconds where nothing is) and runs.
 # PYTHON=python3.12 takes another Python for a new .venv.
 
 PYTHON ?= python3
 PY := .venv/bin/python
 INSTALLED := .venv/installed
 
-.PHONY: demo drape test venv llvm clean
+.PHONY: demo drape test docs venv llvm clean
 
 demo: venv
 	$(PY) -m polysft_mi.run scenes/demo.xml -o out/demo --overwrite
@@ -16,6 +16,10 @@ drape: venv
 test: venv
 	$(PY) -m pytest -q
 
+# The pages of docs/ as HTML, in out/docs; a warning is an error
+docs: $(INSTALLED)
+	$(PY) -m sphinx -W --keep-going -q -b html docs out/docs
+
 venv: $(INSTALLED) llvm
 
 # Debian keeps venv's own pip in a package of its own (python3-venv); without it the system's pip puts one into the environment.
@@ -24,7 +28,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	    $(PYTHON) -m venv --without-pip .venv && $(PYTHON) -m pip --python $(PY) install -q pip || \
 	    { rm -rf .venv; echo 'error: no virtual environment can be made: install python3-venv (Debian, Ubuntu: apt-get install python3-venv)' >&2; exit 2; }; fi
 	@echo 'installing into .venv: a minute or so, more where the network is slow'
-	@PYTHONWARNINGS=ignore $(PY) -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[test]'
+	@PYTHONWARNINGS=ignore $(PY) -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[test,docs]'
 	@touch $@
 
 # Rendering on the CPU needs a libLLVM, which no Python package brings.

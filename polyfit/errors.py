@@ -1,5 +1,6 @@
 """The one exception for a user's mistake, and how a command line ends on it."""
 
+import os
 import sys
 
 
@@ -31,5 +32,6 @@ def cli(main):
 
 
 def _fail(message):
-    print("error: " + " ".join(message.split()), file=sys.stderr)
+    coloured = sys.stderr.isatty() and not os.environ.get("NO_COLOR")
+    print(("\033[1;31merror:\033[0m " if coloured else "error: ") + " ".join(message.split()), file=sys.stderr)
     return 2

@@ -3,6 +3,9 @@
 import contextlib
 import errno
 import os
+import shutil
+
+from .errors import InputError
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # numbers of the OSErrors that say that no more can be written
 
@@ -37,4 +40,25 @@ def aside(path):
             os.remove(temporary)
         if isinstance(error, OSError) and error.errno is not None and error.filename in (None, temporary):
             error.filename = os.fspath(path)  # the name that the user knows; a full disk comes with none
+        raise
+
+
+@contextlib.contextmanager
+def folder_aside(path, ours):
+    """``with folder_aside(path, ours) as temporary:`` fill the folder ``temporary``; it becomes ``path`` at the end of the block, or is removed on any exception.
+
+    What stands at ``path`` is replaced where it is a folder in which ``ours(name)`` is true of every name, and else refused by an InputError.
+    """
+    path = os.path.abspath(path)
+    if os.path.lexists(path) and not (os.path.isdir(path) and all(map(ours, os.listdir(path)))):
+        raise InputError(f"{path}: {'holds other files' if os.path.isdir(path) else 'is a file'}; a new or empty folder is needed")
+    temporary = os.path.join(os.path.dirname(path), f".{os.getpid()}.partial.{os.path.basename(path)}")
+    os.mkdir(temporary)
+    try:
+        yield temporary
+        if os.path.isdir(path):
+            shutil.rmtree(path)
+        os.rename(temporary, path)
+    except BaseException:
+        shutil.rmtree(temporary, ignore_errors=True)
         raise

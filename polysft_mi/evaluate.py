@@ -4,7 +4,6 @@ OUT is a run's folder (with ``surface.npz``) or a ``surface.npz``. TRUTH is ``gt
 points, a folder of ``cloud_*.npz``, or a sequence's folder that holds one of them. :func:`polysft_mi.metrics.score` says what the figures are.
 """
 
-import argparse
 import glob
 import json
 import os
@@ -12,8 +11,14 @@ import sys
 
 import numpy as np
 
+from . import commands
 from .errors import InputError, cli
 from .metrics import load_npz, score
+
+_EXAMPLES = [
+    ("out/demo scenes/demo", "a run against the truth in its sequence's folder"),
+    ("out/flag/surface.npz /data/flag/gt.npz --json", "files alone; one JSON object on stdout"),
+]
 
 LABELS = {
     "frames": "frames compared",
@@ -103,9 +108,9 @@ def _format(value):
     return str(value) if isinstance(value, int) else f"{value:.5g}"
 
 
-def print_table(figures, title):
+def print_table(figures, title, labels=LABELS):
     """The figures as a table: by rich on a terminal, as aligned plain text elsewhere."""
-    rows = [(LABELS.get(k, k), _format(v)) for k, v in figures.items() if not isinstance(v, dict)]
+    rows = [(labels.get(k, k), _format(v)) for k, v in figures.items() if not isinstance(v, dict)]
     if not sys.stdout.isatty():
         width = max(len(label) for label, _ in rows)
         for label, value in rows:
@@ -123,14 +128,16 @@ def print_table(figures, title):
     Console().print(table)
 
 
+def parser():
+    p = commands.parser("evaluate", "Figures of a reconstruction against ground truth.", _EXAMPLES)
+    p.add_argument("out", metavar="OUT", help="folder of a run, or a surface.npz")
+    p.add_argument("truth", metavar="TRUTH", help="gt.npz, an .npz of depth points, a folder of cloud_*.npz, or a sequence's folder")
+    p.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+    return p
+
+
 def main(arguments=None):
-    parser = argparse.ArgumentParser(
-        prog="python -m polysft_mi.evaluate", description="Figures of a reconstruction against ground truth."
-    )
-    parser.add_argument("out", metavar="OUT", help="folder of a run, or a surface.npz")
-    parser.add_argument("truth", metavar="TRUTH", help="gt.npz, an .npz of depth points, a folder of cloud_*.npz, or a sequence's folder")
-    parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
-    options = parser.parse_args(arguments)
+    options = parser().parse_args(arguments)
     figures = evaluate(options.out, options.truth)
     if options.json:
         print(json.dumps(figures))

@@ -11,7 +11,8 @@ import numpy as np
 
 from .files import aside
 
-_KINDS = {"depth": "Z", "normal": "XYZ", "uv": "UV"}  # by the layer's name, and float32; the others by their count, and half
+# by the layer's name, and float32; the others by their count, and half
+_KINDS = {"depth": "Z", "normal": "XYZ", "uv": "UV", "depth_a": "Z", "depth_b": "Z", "depth_difference": "Z", "distance": "Y"}
 _COLOURS = {1: "Y", 3: "RGB", 4: "RGBA"}
 _REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 DEFAULT_LAYER = "render"
@@ -28,10 +29,10 @@ def channel_names(layer, count):
     return [f"{layer}.{s}" for s in suffixes]
 
 
-def write_exr(path, layers, metadata=None):
-    """Write ``layers`` (name -> (H, W) or (H, W, C)) to the EXR file ``path``, ZIP-compressed.
+def write_exr(path, layers, metadata=None, plain=DEFAULT_LAYER):
+    """Write ``layers`` (name -> (H, W) or (H, W, C)) to the EXR file ``path``, ZIP-compressed; the layer ``plain`` once more as plain R, G, B.
 
-    Colours, errors and masks are linear values (Rec.709 primaries) and are stored as half; ``depth`` [m], ``normal``
+    Colours, errors and masks are linear values (Rec.709 primaries) and are stored as half; ``depth`` and its kin [m], ``normal``
     (camera frame) and ``uv`` as float32. ``metadata`` (name -> str, int, float, or anything that JSON holds, as a string)
     goes into the header. Raises ValueError for layers of different sizes and OSError where the file cannot be written.
     """
@@ -52,7 +53,7 @@ def write_exr(path, layers, metadata=None):
         for k, name in enumerate(names):
             plane = np.ascontiguousarray(image[..., k])
             channels[name] = OpenEXR.Channel(plane)
-            if layer == DEFAULT_LAYER and name[-1] in "RGBA":
+            if layer == plain and name[-1] in "RGBA":
                 channels[name[-1]] = OpenEXR.Channel(plane)
     if not channels:
         raise ValueError("no layers; at least one is needed")

@@ -16,7 +16,7 @@ from .shading import View, shade_surface
 __all__ = ["View", "contact_sheet", "frame_plot", "loss_plot", "shade_surface"]
 
 TERMS = {"loss": "total", "rgb": "photometric", "silhouette": "silhouette", "inextensibility": "inextensibility", "temporal": "temporal"}
-_COLOURS = {"loss": "#222222", "rgb": "#c4572e", "silhouette": "#3b6ea5", "inextensibility": "#4b8b3b", "temporal": "#8d5aa0"}
+COLOURS = {"loss": "#222222", "rgb": "#c4572e", "silhouette": "#3b6ea5", "inextensibility": "#4b8b3b", "temporal": "#8d5aa0"}
 
 
 def _kept_safe(draw):
@@ -58,17 +58,11 @@ def loss_plot(path, log_records):
     ``log_records``: dicts with ``frame``, ``iteration``, ``loss`` and any of the terms in ``TERMS``, in the order of the run; records
     without a loss are passed over.
     """
-    records = [r for r in log_records if "loss" in r and "frame" in r]
-    if not records:
-        raise ValueError("no record holds a loss")
+    records, step, curves = loss_curves(log_records)
     figure = _figure(9, 4, layout="constrained")
     axes = figure.add_subplot()
-    step = np.cumsum([_advance(a, b) for a, b in zip([None] + records, records)])
-    for term, label in TERMS.items():
-        values = np.array([_number(r.get(term)) for r in records])
-        values[~(values > 0)] = np.nan  # a logarithmic axis has no place for them
-        if np.isfinite(values).any():
-            axes.plot(step, values, color=_COLOURS[term], label=label, linewidth=1.4 if term == "loss" else 0.9)
+    for term, values in curves.items():
+        axes.plot(step, values, color=COLOURS[term], label=TERMS[term], linewidth=1.4 if term == "loss" else 0.9)
     axes.set_yscale("log")
     axes.set_xlabel("iteration, all frames one after the other")
     axes.set_ylabel("loss")
@@ -87,6 +81,23 @@ def loss_plot(path, log_records):
     return figure
 
 
+def loss_curves(log_records):
+    """``(records, step, curves)``: the records with a loss, the iteration (R,) of each counted over all frames, and each term of
+    ``TERMS`` that has one as its values (R,), NaN where they are not positive. Raises ValueError where no record holds a loss.
+    """
+    records = [r for r in log_records if "loss" in r and "frame" in r]
+    if not records:
+        raise ValueError("no record holds a loss")
+    step = np.cumsum([_advance(a, b) for a, b in zip([None] + records, records)])
+    curves = {}
+    for term in TERMS:
+        values = np.array([_number(r.get(term)) for r in records])
+        values[~(values > 0)] = np.nan  # a logarithmic axis has no place for them
+        if np.isfinite(values).any():
+            curves[term] = values
+    return records, step, curves
+
+
 def _advance(before, record):
     """Iterations from one record to the next, so that records logged now and then keep their place."""
     iteration = _number(record.get("iteration"))
@@ -100,10 +111,13 @@ def _number(value):
 
 
 @_kept_safe
-def frame_plot(path, per_frame):
-    """One small plot over the frames for each figure: ``per_frame`` is a dict of equally long lists, one of them ``frame``."""
+def frame_plot(path, per_frame, labels=None):
+    """One small plot over the frames for each figure: ``per_frame`` is a dict of equally long lists, one of them ``frame``; ``labels``
+    names them.
+    """
     from .evaluate import LABELS
 
+    labels = labels or LABELS
     names = [k for k in per_frame if k != "frame"]
     figure = _figure(9, 1.7 * len(names) + 0.6, layout="constrained")
     frames = np.asarray(per_frame["frame"])
@@ -116,7 +130,7 @@ def frame_plot(path, per_frame):
             axes.axhline(finite.mean(), color="0.55", linewidth=0.8, linestyle="--")
             if finite.min() >= 0:
                 axes.set_ylim(0, 1.1 * finite.max() or 1)
-            axes.set_title(f"{LABELS.get(name, name)}: mean {finite.mean():.4g}", fontsize=9, loc="left")
+            axes.set_title(f"{labels.get(name, name)}: mean {finite.mean():.4g}", fontsize=9, loc="left")
         _plain(axes)
         axes.tick_params(labelsize=8, labelbottom=k == len(names) - 1)
     axes.set_xlabel("frame")
@@ -159,6 +173,52 @@ def contact_sheet(path, rows):
     if heat is not None:
         figure.colorbar(heat, ax=grid[:, columns.index("error")], location="bottom", shrink=0.8, aspect=30, pad=0.01).ax.tick_params(labelsize=7)
     return figure
+
+
+_MAPS = {"distance": ("distance of A from B [mm]", "viridis", 0), "depth_difference": ("depth of A minus B [mm]", "RdBu_r", -1)}
+
+
+def false_colour(name, values, scale):
+    """The difference ``name``, values (H, W) [mm], as linear RGB (H, W, 3): in the colours of :func:`false_colours`, black where it is
+    not known.
+    """
+    import matplotlib
+
+    _, colours, low = _MAPS[name]
+    x = np.clip((values / scale - low) / (1 - low), 0, 1)
+    rgb = matplotlib.colormaps[colours](np.nan_to_num(x))[..., :3]
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    return np.where(np.isfinite(values)[..., None], linear, 0)
+
+
+def false_colours(path, title, images, maps, scale):
+    """Pictures side by side, and differences in false colours with their scale: ``images`` are (title, (h, w, 3) uint8), ``maps``
+    (name, (H, W) [mm], NaN where unknown), the name one of "distance" and "depth_difference"; colours end at ``scale`` [mm]. Raises
+    OSError where it cannot be written.
+    """
+    height, width = images[0][1].shape[:2]
+    columns, wide = len(images) + len(maps), 3.2
+    figure = _figure(wide * columns, wide * height / width + 0.75, layout="constrained")
+    figure.get_layout_engine().set(w_pad=0.03, h_pad=0.03, wspace=0, hspace=0)
+    grid = figure.subplots(1, columns, squeeze=False)[0]
+    for axes, (label, image) in zip(grid, images):
+        axes.imshow(image)
+        axes.set_title(label, fontsize=9)
+    for axes, (name, values) in zip(grid[len(images) :], maps):
+        label, colours, low = _MAPS[name]
+        axes.set_facecolor("0.93")
+        shown = axes.imshow(values, cmap=colours, vmin=low * scale, vmax=scale, interpolation="nearest")
+        axes.set_title(label, fontsize=9)
+        ends = "max" if low == 0 else "both"
+        figure.colorbar(shown, ax=axes, location="bottom", shrink=0.9, aspect=30, pad=0.02, extend=ends).ax.tick_params(labelsize=7)
+    for axes in grid:
+        axes.set_anchor("N")
+        axes.set_xticks([]), axes.set_yticks([])
+        for spine in axes.spines.values():
+            spine.set_visible(False)
+    figure.suptitle(title, fontsize=10)
+    with aside(path) as temporary:
+        figure.savefig(temporary, facecolor="white")
 
 
 _SHEET = {"target": "target", "render": "render", "error": "error", "surface": "surface from the side"}

@@ -249,7 +249,7 @@ def per_frame(surface, truth_path):
         if "points" in truth and "frames" in truth:
             rows = _against_points(at, faces, truth)
         elif "vertices" in truth and "faces" in truth:
-            rows = _against_meshes(at, truth, truth_path)
+            rows = against_meshes(at, dict(enumerate(truth["vertices"])), truth["faces"], truth_path)
         else:
             raise InputError(f"{truth_path}: holds {', '.join(truth)}; vertices and faces, or points and frames, are needed")
     rows = list(rows)
@@ -258,12 +258,12 @@ def per_frame(surface, truth_path):
     return {name: [row[name] for row in rows] for name in rows[0]}
 
 
-def _against_meshes(at, truth, where):
-    faces = truth["faces"]
+def against_meshes(at, truth, faces, where):
+    """Figures of each frame that both have: ``at`` and ``truth`` map frames to vertices (N, 3) [m], ``faces`` (F, 3) are those of both."""
     for k in sorted(at):
-        if k >= len(truth["vertices"]):
+        if k not in truth:
             continue
-        V, G = at[k], truth["vertices"][k].astype(np.float64)
+        V, G = at[k], truth[k].astype(np.float64)
         if len(V) != len(G):
             raise InputError(f"surface has {len(V)} vertices, {where} has {len(G)}; the template's own vertices are needed")
         moved = align_similarity(V, G)

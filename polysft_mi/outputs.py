@@ -3,9 +3,11 @@
 Import only after a Mitsuba variant is set.
 """
 
+import dataclasses
 import json
 import os
 import platform
+import shlex
 import sys
 import time
 import xml.etree.ElementTree as ET
@@ -22,6 +24,7 @@ from .exr import write_exr
 from .files import aside
 from .patch import Unknowns
 from .raster import RasterIntegrator
+from .results import PEAK
 from .video import write_video
 
 RUN = "run.json"
@@ -227,18 +230,20 @@ def _panel(image, width=640):
     return image if scale >= 1 else cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
 
 
-def _heat(error, peak=0.25):
+def _heat(error, peak=PEAK):
     """An error (H, W) in [0, peak] as a picture, black to white through red and yellow."""
     x = np.clip(np.nan_to_num(error) / peak, 0, 1)[..., None]
     return np.round(255 * np.clip(x * 3 - np.array([0, 1, 2]), 0, 1)).astype(np.uint8)
 
 
-def write_beginning(out, scene, command):
-    """What stands in the folder from the first second: the resolved scene (text), and what the run is."""
+def write_beginning(out, scene, camera, command, fps):
+    """What stands in the folder from the first second: the resolved scene (text), the :class:`polysft_mi.pinhole.Pinhole`, and what the run is."""
     with aside(os.path.join(out, "scene.xml")) as temporary, open(temporary, "w", encoding="utf-8") as file:
         file.write(scene)
-    write_json(os.path.join(out, RUN), {"command": command, "started": time.strftime("%Y-%m-%dT%H:%M:%S"), "versions": versions()})
+    write_json(os.path.join(out, "camera.json"), dataclasses.asdict(camera.intrinsics()))
+    about = {"command": command, "started": time.strftime("%Y-%m-%dT%H:%M:%S"), "fps": fps, "versions": versions()}
+    write_json(os.path.join(out, RUN), about)
 
 
 def command_line():
-    return " ".join(["python -m polysft_mi.run", *sys.argv[1:]])
+    return f"python -m polysft_mi.run {shlex.join(sys.argv[1:])}"

@@ -4,6 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .camera import Intrinsics
 from .errors import InputError
 
 NEAR = 1e-6  # depth [m] up to which a point counts as behind the camera
@@ -45,6 +46,11 @@ class Pinhole:
         x = (np.asarray(points, dtype=np.float64) - self.origin) @ self.inverse.T
         before = x[:, 2] > NEAR
         return x[:, :2] / np.where(before, x[:, 2], 1)[:, None], before
+
+    def intrinsics(self):
+        """The same camera as :class:`polysft_mi.camera.Intrinsics`, for points in the OpenCV camera frame."""
+        K = self.inverse @ self.axes.T
+        return Intrinsics(*(float(K[i, j] / K[2, 2]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))), self.width, self.height)
 
     def to_camera(self, points):
         """World points (..., 3) in the OpenCV camera frame."""

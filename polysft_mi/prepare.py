@@ -1,11 +1,15 @@
-"""``python -m polysft_mi.prepare FOLDER``: the scene file of a sequence's folder, whose form is recognised by the files in it.
+"""``python -m polysft_mi.prepare``: the scene file of a sequence's folder, whose form is recognised by the files in it; or the whole folder
+from a video.
 
-Three forms are known (:data:`FORMS`). Names of OBJ files and images, numbers and sizes of frames are the folder's own.
+Three forms are known (:data:`FORMS`). Names of OBJ files and images, numbers and sizes of frames are the folder's own. What makes a folder
+from a video is :mod:`polysft_mi.capture`.
 """
 
-import argparse
 import contextlib
+import json
 import os
+import shlex
+import sys
 from dataclasses import dataclass, field
 from xml.sax.saxutils import escape, quoteattr
 
@@ -208,15 +212,21 @@ def prepare(folder, out=None, resolution=33, overwrite=False):
                 os.rmdir(target)
         hint = "; give a folder that can be written by -o DIR" if here else ""
         raise InputError(f"{target}: {error.strerror or error}{hint}") from None
-    return scene, (
-        f"{folder}: a sequence in the form {layout.form}, {len(sequence)} frames of {camera.width}x{camera.height}, "
-        f"{'with' if masks else 'without'} masks, template of {len(vertices)} vertices ({layout.obj or f'subdivided to {resolution}x{resolution}'})"
+    return (
+        scene,
+        (
+            f"{folder}: a sequence in the form {layout.form}, {len(sequence)} frames of {camera.width}x{camera.height},"
+            f" {'with' if masks else 'without'} masks, template of {len(vertices)} vertices"
+            f" ({layout.obj or f'subdivided to {resolution}x{resolution}'})"
+        ),
     )
 
 
 def _check_view(vertices, camera, where):
     if vertices[:, 2].min() <= 0:
-        raise InputError(f"{where}: the template lies behind the camera (z down to {vertices[:, 2].min():.3g} m); z must be positive in the camera frame")
+        raise InputError(
+            f"{where}: the template lies behind the camera (z down to {vertices[:, 2].min():.3g} m); z must be positive in the camera frame"
+        )
     x = camera.project(vertices)
     if not ((x > 0) & (x < (camera.width, camera.height))).all(axis=1).any():
         raise InputError(f"{where}: the template is out of view: no vertex lies in the {camera.width}x{camera.height} image")
@@ -230,16 +240,81 @@ def write_obj(path, vertices, faces, uv):
         file.writelines("f {0}/{0} {1}/{1} {2}/{2}\n".format(*f) for f in np.asarray(faces) + 1)
 
 
+_EXAMPLES = [
+    ("FOLDER", "a folder in a form that is known: writes FOLDER/scene.xml"),
+    (
+        "clip.mp4 --texture photo.jpg --size 297mm 210mm --fov 65 -o OUT",
+        "a video of a printed sheet, and a straight photo of it that shows nothing else; then look at OUT/prepare, and: polysft run OUT/scene.xml",
+    ),
+    ("clip.mp4 --texture photo.jpg --size A4 --calibrate chessboard.mp4 --board 9x6 -o OUT", "the camera from a video of a chessboard"),
+    (
+        "clip.mp4 --texture first-frame --corners 212,80 431,95 420,260 200,241 --size A4 --fov 65 -o OUT",
+        "no photo: the first frame is the texture, and the sheet's corners in it are given",
+    ),
+    (
+        "clip.mp4 --texture photo.jpg --size A4 --fov 65 --first 30 --last 229 --scale 0.5 --no-masks -o OUT",
+        "a part of a video, at half its size, and without masks",
+    ),
+]
+
+
+def parser():
+    """The command line's parser."""
+    from . import commands
+    from .capture.command import add_arguments
+
+    p = commands.parser(
+        "prepare",
+        "Make a sequence's folder, with its scene file, from a video and a photo of the sheet; or write the scene file of a folder in"
+        f" one of the forms {FORMS}.",
+        _EXAMPLES,
+    )
+    p.add_argument("folder", metavar="FOLDER|VIDEO", help="a sequence's folder; or a video, a folder of images, or a pattern of images")
+    p.add_argument(
+        "-o", "--output", metavar="DIR", help="what to write into (default: FOLDER; for a video, its name without the extension)"
+    )
+    p.add_argument("--overwrite", action="store_true", help="replace what is there")
+    p.add_argument(
+        "--resolution",
+        type=int,
+        default=33,
+        metavar="N",
+        help="vertices along the longer side of a flat template; of Kinect-Paper's, along both (default: 33)",
+    )
+    p.add_argument("-q", "--quiet", action="store_true", help="no progress, only errors")
+    p.add_argument("--json", action="store_true", help="print what was found as JSON")
+
+    add_arguments(p)
+    return p
+
+
 def main(argv=None):
-    parser = argparse.ArgumentParser(prog="python -m polysft_mi.prepare", description=f"Write the scene file of a sequence in one of the forms {FORMS}.")
-    parser.add_argument("folder", metavar="FOLDER", help="the sequence")
-    parser.add_argument("-o", "--output", metavar="DIR", help="where scene.xml goes (default: FOLDER)")
-    parser.add_argument("--resolution", type=int, default=33, metavar="N", help="vertices a side of the subdivided Kinect-Paper template (default: 33)")
-    parser.add_argument("--overwrite", action="store_true", help="replace a scene.xml that is there")
-    args = parser.parse_args(argv)
-    scene, line = prepare(args.folder, args.output, args.resolution, args.overwrite)
-    print(line)
-    print(f"next: python -m polysft_mi.run {scene} -o OUT")
+    from .capture.command import from_video
+
+    args = parser().parse_args(argv)
+    given = [
+        o
+        for o, value in (
+            ("--size", args.size),
+            ("--template", args.template),
+            ("--corners", args.corners),
+            ("--fov", args.fov),
+            ("--camera", args.camera),
+        )
+        if value is not None
+    ]
+    if args.texture is not None or os.path.isfile(args.folder):
+        scene, found = from_video(args, shlex.join(["python", "-m", "polysft_mi.prepare", *(sys.argv[1:] if argv is None else argv)]))
+        line = None
+    elif given:
+        raise InputError(f"{args.folder}: {given[0]} is for a video, or a folder of images, which also needs --texture")
+    else:
+        scene, line = prepare(args.folder, args.output, args.resolution, args.overwrite)
+        found = {"folder": args.folder}
+    if args.json:
+        print(json.dumps({"scene": scene, **found}, ensure_ascii=False))
+    elif not args.quiet:
+        print(*filter(None, [line]), f"next: python -m polysft_mi.run {shlex.quote(scene)} -o OUT", sep="\n")
 
 
 if __name__ == "__main__":

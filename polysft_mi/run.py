@@ -1,30 +1,30 @@
 """``python -m polysft_mi.run scene.xml -o OUT``: the template's surface in every frame of a video."""
 
-import argparse
+import json
 import os
 import shutil
 import sys
 import time
 
+from . import commands
 from .errors import InputError, cli
 
-_DESCRIPTION = """\
-Reconstruct the surface of a textured template in every frame of a video.
+_EXAMPLES = [
+    ("scenes/demo.xml -o out/demo", "the demo; then open out/demo/report.html"),
+    ("scenes/flag.xml -D data=/data/flag -o out/flag -D order=6 -D last=19", "another place of the data, other settings, 20 frames"),
+    ("scenes/flag.xml -D data=/data/flag -o out/flag --resume", "go on after an interruption"),
+    ("scenes/demo.xml -o out/demo --overwrite -q --json", "for scripts: one JSON object on stdout"),
+]
 
-  python -m polysft_mi.run scenes/demo.xml -o out/demo
-  python -m polysft_mi.run scenes/flag.xml -D data=/data/flag -o out/flag -D order=6 -D last=19
-  python -m polysft_mi.run scenes/flag.xml -D data=/data/flag -o out/flag --resume
-"""
-
-_OURS = ("scene.xml", "run.json", "checkpoint.npz", "log.jsonl", "surface.npz", "params.npz", "metrics.json")
-_PICTURES = ("loss.png", "comparison.png", "comparison.mp4")
+_OURS = ("scene.xml", "camera.json", "run.json", "checkpoint.npz", "log.jsonl", "surface.npz", "params.npz", "metrics.json")
+_PICTURES = ("loss.png", "comparison.png", "comparison.mp4", "report.html")
 _FOLDERS = ("meshes", "comparison")
 
 
 def parser():
     from .backend import add_mode_argument
 
-    p = argparse.ArgumentParser(prog="python -m polysft_mi.run", description=_DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = commands.parser("run", "Reconstruct the surface of a textured template in every frame of a video.", _EXAMPLES)
     p.add_argument("scene", metavar="scene.xml", help="Mitsuba scene with a polysft integrator (docs/scene.md)")
     p.add_argument("-o", "--output", metavar="OUT", required=True, help="folder for the results")
     p.add_argument("-D", dest="define", metavar="NAME=VALUE", action="append", default=[], help="override a <default> of the scene; may be repeated")
@@ -34,7 +34,9 @@ def parser():
     again.add_argument("--resume", action="store_true", help="go on with the run that OUT holds")
     p.add_argument("--exr", metavar="N", default="20", help="comparison EXRs for at most N frames, or 'all' (default: 20)")
     p.add_argument("--fps", type=float, default=15, help="frames a second of comparison.mp4 (default: 15)")
+    p.add_argument("--no-report", action="store_true", help="do not write report.html at the end")
     p.add_argument("-q", "--quiet", action="store_true", help="no progress, only the result")
+    p.add_argument("--json", action="store_true", help="the result as one JSON object on stdout")
     return p
 
 
@@ -87,7 +89,7 @@ def _clear(out):
     for name in (*_OURS, *_PICTURES):
         if os.path.exists(os.path.join(out, name)):
             os.remove(os.path.join(out, name))
-    for name in (*_FOLDERS, "comparison.mp4"):
+    for name in (*_FOLDERS, "comparison.mp4", "export"):
         shutil.rmtree(os.path.join(out, name), ignore_errors=True)
 
 
@@ -110,7 +112,7 @@ def _run(options, overrides, out, exr_frames):
     os.makedirs(out, exist_ok=True)
     command = outputs.command_line()
     if not options.resume:
-        outputs.write_beginning(out, text, command)
+        outputs.write_beginning(out, text, problem.camera, command, options.fps)
 
     count = len(sequence.indices)
     began, status = time.perf_counter(), 0
@@ -128,10 +130,27 @@ def _run(options, overrides, out, exr_frames):
         if not done.states:
             return status
         summary = outputs.write(problem, done, out, exr_frames=exr_frames, fps=options.fps, command=command, say=progress.stage)
+        page = None if options.no_report else _report(out, progress)
     for frame, reason in summary["lost"].items():
         print(f"frame {frame}: {reason}; it keeps the state of the frame before", file=sys.stderr)
-    _print_end(out, summary, time.perf_counter() - began)
+    seconds = time.perf_counter() - began
+    if options.json:
+        print(json.dumps({"out": out, "seconds": seconds, "report": page, **summary}, default=float))
+    else:
+        _print_end(out, summary, page, seconds)
     return status
+
+
+def _report(out, progress):
+    """The path of the report, or None after a warning: a finished run must not be lost to its page."""
+    from . import report
+
+    progress.stage("report")
+    try:
+        return report.write(out)
+    except Exception as error:  # whatever it is, the results stand without the page
+        print(f"no report: {type(error).__name__}: {error}", file=sys.stderr)
+        return None
 
 
 def _check_same(out, text):
@@ -146,13 +165,14 @@ def _check_same(out, text):
         raise InputError(f"{out}: was run with another scene or other settings (see {path}); resume with those, or give --overwrite")
 
 
-def _print_end(out, summary, seconds):
+def _print_end(out, summary, page, seconds):
     print(
         f"{summary['frames']} of {summary['frames_wanted']} frames in {seconds:.0f} s, {summary['seconds_per_frame']:.2f} s a frame "
         f"({summary['iterations_per_window']:.0f} iterations a window); inside the surface PSNR {summary.get('psnr_mask', float('nan')):.2f} dB, "
         f"SSIM {summary.get('ssim_mask', float('nan')):.3f}"
     )
-    print(f"surfaces: {os.path.join(out, 'surface.npz')}, {os.path.join(out, 'meshes')}; look at {summary['video']} and {os.path.join(out, 'comparison.png')}")
+    look = f"{page or summary['video']} and {os.path.join(out, 'comparison.png')}"
+    print(f"surfaces: {os.path.join(out, 'surface.npz')}, {os.path.join(out, 'meshes')}; look at {look}")
 
 
 class Progress:

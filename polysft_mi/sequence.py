@@ -71,7 +71,7 @@ class Sequence:
 
         8 and 16 bit images are taken as sRGB and decoded; float images (EXR, HDR, TIFF) as linear. Grey becomes RGB, alpha is ignored.
         """
-        image = _read(self.files[i])
+        image = read_pixels(self.files[i])
         if image.ndim == 2:
             image = image[..., None]
         image = image[..., :3] if image.shape[2] >= 3 else image[..., :1]
@@ -88,7 +88,7 @@ class Sequence:
         if self.mask_files is None:
             return None
         path = self.mask_files[i]
-        image = _read(path)
+        image = read_pixels(path)
         if image.ndim == 3:
             image = image[..., :3].max(axis=2) if image.shape[2] >= 3 else image[..., 0]
         scale = 1 if image.dtype.kind == "f" or image.max() <= 1 else np.iinfo(image.dtype).max
@@ -149,12 +149,12 @@ def _checked_size(path, decode=True):
                 image.load()
             return image.size
     except UnidentifiedImageError:  # of another kind than Pillow knows, EXR among them
-        return _read(path).shape[1::-1]
+        return read_pixels(path).shape[1::-1]
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise InputError(f"{path}: not a readable image ({getattr(error, 'strerror', None) or error})") from None
 
 
-def _read(path):
+def read_pixels(path):
     """Pixels as the file has them: (H, W) or (H, W, C) in OpenCV's channel order, uint8, uint16 or float32."""
     import cv2
 

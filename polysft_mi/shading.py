@@ -1,4 +1,6 @@
-"""A shaded picture of a surface from a viewpoint of one's choice, in NumPy alone."""
+"""Pictures of a surface in NumPy alone: shaded, from a viewpoint of one's choice; or its depth and values at its vertices, as the
+camera sees them.
+"""
 
 from dataclasses import dataclass
 
@@ -87,6 +89,36 @@ def shade_surface(vertices, faces, view=None, uv=None, size=(480, 480)):
     image = image.reshape(size[1], _SUPERSAMPLE, size[0], _SUPERSAMPLE, 3)
     image = sum(image[:, i, :, j] for i in range(_SUPERSAMPLE) for j in range(_SUPERSAMPLE)) / _SUPERSAMPLE**2
     return _SRGB[(np.clip(image, 0, 1) * (len(_SRGB) - 1)).astype(np.int64)]
+
+
+def seen(vertices, faces, camera, values=()):
+    """What a camera sees of a mesh: depth (H, W) [m], NaN beyond the mesh, and an image (H, W) of each of ``values`` (N,), given at the
+    vertices.
+
+    ``vertices`` (N, 3) [m, camera frame]; ``camera``: :class:`polysft_mi.camera.Intrinsics`. Interpolation is perspective, at the
+    pixels' centres; triangles that reach behind the camera are left out.
+    """
+    V, F = np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64)
+    F = F[(V[F, 2] > 1e-9).all(axis=1)]
+    corners, near = camera.project(np.where(V[:, 2:] > 1e-9, V, 1.0))[F], 1 / np.where(V[:, 2] > 1e-9, V[:, 2], 1.0)
+    edge1, edge2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    triangle, x, y = _covered_pixels(corners, camera.width, camera.height)
+    right, down = x + 0.5 - corners[triangle, 0, 0], y + 0.5 - corners[triangle, 0, 1]
+    area = (edge1[:, 0] * edge2[:, 1] - edge1[:, 1] * edge2[:, 0])[triangle]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        b1 = (right * edge2[triangle, 1] - down * edge2[triangle, 0]) / area
+        b2 = (down * edge1[triangle, 0] - right * edge1[triangle, 1]) / area
+    weights = np.stack([1 - b1 - b2, b1, b2], axis=1) * near[F][triangle]  # those of the surface, times 1/z
+    inverse = weights.sum(axis=1)
+    pixel = y * camera.width + x
+    nearest = np.zeros(camera.height * camera.width)
+    np.maximum.at(nearest, pixel, inverse)
+    front = np.flatnonzero(inverse == nearest[pixel])
+    images = np.full((1 + len(values), len(nearest)), np.nan)
+    images[0, pixel[front]] = 1 / inverse[front]
+    for image, value in zip(images[1:], values):
+        image[pixel[front]] = (weights[front] * np.asarray(value, dtype=np.float64)[F][triangle[front]]).sum(axis=1) / inverse[front]
+    return tuple(images.reshape(-1, camera.height, camera.width))
 
 
 def _light(normals):

@@ -1,4 +1,4 @@
-"""Videos that browsers play (H.264), and numbered PNGs where no encoder is."""
+"""Videos that browsers play (H.264), written and read back, and numbered PNGs where no encoder is."""
 
 import functools
 import os
@@ -7,6 +7,7 @@ import subprocess
 
 import numpy as np
 
+from .errors import InputError
 from .files import aside
 
 # Rec.709, converted and marked: what is not marked, players take for Rec.601 or 709 by its size
@@ -96,3 +97,23 @@ def _write_pngs(folder, frames):
         if number and int(number[1]) >= count:
             os.remove(os.path.join(folder, name))
     return folder
+
+
+def read_video(path):
+    """The frames of a video that :func:`write_video` wrote, one after the other, (H, W, 3) uint8 sRGB. Raises InputError where it cannot be read."""
+    if encoder() is None:
+        raise InputError(f"{path}: cannot be read without ffmpeg (the Python package imageio-ffmpeg)")
+    command = [encoder(), "-v", "error", "-i", os.fspath(path), "-f", "image2pipe", "-c:v", "ppm", "-"]
+    with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        try:
+            while process.stdout.readline() == b"P6\n":
+                width, height = map(int, process.stdout.readline().split())
+                process.stdout.readline()  # the largest value, 255
+                data = process.stdout.read(3 * width * height)
+                if len(data) == 3 * width * height:
+                    yield np.frombuffer(data, np.uint8).reshape(height, width, 3)
+        finally:
+            process.kill()  # where the caller stops before the end
+        message = process.stderr.read().decode(errors="replace").strip().split("\n")[0]
+    if message:
+        raise InputError(f"{path}: not a readable video ({message[:200]})")

@@ -54,3 +54,17 @@ def shared_data():
     if not folder.is_dir():
         pytest.skip(f"the sequences are not at {folder} (POLYSFT_DATA names another folder)")
     return folder
+
+
+@pytest.fixture(scope="session")
+def finished_run(tmp_path_factory):
+    """``(truth, out)``: a short run as the command leaves it, and the true surface; to be read, not changed."""
+    import synthetic
+
+    from polysft_mi import prepare, run
+
+    truth = synthetic.cloth(tmp_path_factory.mktemp("finished") / "sheet", frames=4, bend=2.5, turn=0.1)
+    prepare.main([str(truth.folder)])
+    out = tmp_path_factory.mktemp("finished") / "out"
+    assert run.main([str(truth.folder / "scene.xml"), "-o", str(out), "-q", "--exr", "all"]) == 0
+    return truth, out

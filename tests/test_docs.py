@@ -2,12 +2,17 @@
 
 import importlib.util
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from scripts import load
+
 from polysft_mi import plugins, scene, settings
+from polysft_mi.prepare import parser as prepare_parser
 from polysft_mi.problem import Problem
 from polysft_mi.sequence import Sequence
 
@@ -103,3 +108,28 @@ def test_options_of_the_command_are_described():
 
     options = [o for action in run.parser()._actions for o in action.option_strings if o not in ("-h", "--help", "-o", "--output")]
     assert [o for o in options if f"`{o}" not in SCENE] == []
+
+
+def test_pages_build_without_a_warning(tmp_path):
+    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html", ROOT / "docs", tmp_path / "html"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    index = (tmp_path / "html" / "index.html").read_text(encoding="utf-8")
+    assert [p.stem for p in (ROOT / "docs").glob("*.md") if p.stem != "index" and f'href="{p.stem}.html"' not in index] == []
+
+
+def test_options_of_prepare_are_described():
+    text = (ROOT / "docs" / "prepare.md").read_text(encoding="utf-8")
+    known = ("-h", "--help", "-o", "--output", "--quiet")
+    options = [o for action in prepare_parser()._actions for o in action.option_strings if o not in known]
+    assert [o for o in options if f"`{o}" not in text and f"[{o} " not in text and f"| {o} " not in text] == []
+
+
+def test_commands_of_the_tutorial_are_those_that_its_pictures_come_from():
+    tutorial = load("docs/tutorial.py")
+    lines = tutorial.commands()
+    assert [words[2] for words in lines] == ["polysft_mi.prepare", "polysft_mi.run"]
+    arguments = prepare_parser().parse_args(lines[0][3:])
+    assert (arguments.folder, arguments.texture) == (f"{tutorial.OUT}/clip.mp4", f"{tutorial.OUT}/photo.jpg")
+    text = (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")
+    assert [name for name, _ in tutorial.PICTURES.values() if f"({name})" not in text or not (ROOT / "docs" / name).exists()] == []

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from polysft_mi import video
+from polysft_mi.errors import InputError
 
 needs_encoder = pytest.mark.skipif(video.encoder() is None, reason="no ffmpeg with an H.264 encoder here")
 
@@ -33,6 +34,12 @@ def test_decodes_to_the_same_frames(tmp_path):
     for want, got in zip(frames(), decoded):
         assert np.abs(got[4:40, 4:25].reshape(-1, 3).mean(0) - want[10, 10]).max() < 6
         assert np.abs(got[4:40, 40:60].reshape(-1, 3).mean(0) - 128).max() < 6
+    ours = list(video.read_video(path))
+    assert len(ours) == 7 and all(np.abs(a.astype(int) - b).max() <= 2 for a, b in zip(ours, decoded))
+    next(video.read_video(path))  # the rest is left unread
+    (tmp_path / "broken.mp4").write_bytes(path.read_bytes()[:400])
+    with pytest.raises(InputError, match="broken.mp4: not a readable video"):
+        list(video.read_video(tmp_path / "broken.mp4"))
 
 
 @needs_encoder

@@ -1,0 +1,55 @@
+"""``polysft``, or ``python -m polysft_mi``: every command of the package under one name."""
+
+import difflib
+import importlib
+import sys
+
+from . import __version__
+from .commands import COMMANDS
+from .errors import InputError, cli
+
+_HELP = """\
+usage: polysft COMMAND ...
+
+The surface of a textured template in every frame of a video.
+
+commands:
+{commands}
+
+examples:
+  polysft run scenes/demo.xml -o out/demo        reconstruct; then open out/demo/report.html
+  polysft evaluate out/demo scenes/demo          how far the surface is from the truth
+  polysft compare out/demo scenes/demo -o errors   and where, in false colours
+  polysft export out/demo --format glb           for browsers and Blender
+  polysft COMMAND --help                         the options of a command, with examples
+
+Each command is also a module: python -m polysft_mi.run ...
+Exit status: 0 done, 2 a mistake in what was given (one line on stderr says which), 130 interrupted.
+Colours only on a terminal, and not where NO_COLOR is set.
+"""
+
+
+def main(arguments=None):
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
+        width = max(map(len, COMMANDS))
+        print(_HELP.format(commands="\n".join(f"  {name:{width}s}  {what}" for name, what in COMMANDS.items())), end="")
+        return 0 if arguments else 2
+    if arguments[0] in ("-V", "--version"):
+        print(f"polysft {__version__}")
+        return 0
+    name, rest = arguments[0], arguments[1:]
+    if name not in COMMANDS:
+        near = difflib.get_close_matches(name, COMMANDS, 1)
+        raise InputError(f"polysft {name}: no such command{f', did you mean {near[0]}?' if near else ';'} there are {', '.join(COMMANDS)}")
+    sys.argv = [f"polysft {name}", *rest]  # what the command's help and the record of a run name
+    return importlib.import_module(f"{__package__}.{name}").main(rest)
+
+
+def entry():
+    """The installed command."""
+    cli(main)
+
+
+if __name__ == "__main__":
+    cli(main)

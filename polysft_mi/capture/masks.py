@@ -1,0 +1,103 @@
+"""The sheet's silhouette in every frame: GrabCut around the template's projection in the first, then around where the optical flow carries
+the frame before's."""
+
+import cv2
+import numpy as np
+
+_SIDE = 480  # pixels of the longer side at which the work is done
+_BAND = 0.035  # of the silhouette's size: how far its border may lie from where it is expected
+_FIRST_ITERATIONS = 5
+_ITERATIONS = 2
+
+
+class Masks:
+    """``first(image, silhouette)``, then ``next(image)`` for each frame: masks (H, W) uint8, 0 or 255, of images (H, W, 3) uint8 RGB."""
+
+    def __init__(self, size):
+        """``size``: (width, height) of the frames [pixels]."""
+        self._size = size
+        self._small = tuple(max(1, round(n * min(1.0, _SIDE / max(size)))) for n in size)
+        self._flow = cv2.DISOpticalFlow_create(cv2.DISOpticalFlow_PRESET_FAST)
+        self._grey = self._mask = None
+        self._models = np.zeros((1, 65)), np.zeros((1, 65))
+        self._colours = None
+        self.strangeness = 0.0  # of the last mask: 0 where its colours are those of the first, 1 where they share none (Bhattacharyya)
+
+    def first(self, image, silhouette):
+        """From the template's silhouette (H, W), 0 or 255."""
+        small = self._reduced(image)
+        self._grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
+        expected = (self._reduced(silhouette) > 127).astype(np.uint8)
+        self._mask = self._cut(small, expected, _FIRST_ITERATIONS)
+        self._colours = _histogram(small, self._mask)
+        return self._enlarged()
+
+    def next(self, image):
+        small = self._reduced(image)
+        grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
+        flow = self._flow.calc(grey, self._grey, None)
+        y, x = np.mgrid[: grey.shape[0], : grey.shape[1]].astype(np.float32)
+        moved = cv2.remap(255 * self._mask, x + flow[..., 0], y + flow[..., 1], cv2.INTER_LINEAR)
+        self._grey, self._mask = grey, self._cut(small, (moved > 127).astype(np.uint8), _ITERATIONS)
+        self.strangeness = cv2.compareHist(_histogram(small, self._mask), self._colours, cv2.HISTCMP_BHATTACHARYYA)
+        return self._enlarged()
+
+    def _cut(self, image, expected, iterations):
+        if not expected.any():
+            return expected
+        r = max(2, round(_BAND * np.sqrt(expected.sum())))
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * r + 1, 2 * r + 1))
+        inner = cv2.erode(expected, disc, borderValue=1)
+        outer = cv2.dilate(expected, disc)
+        trimap = np.where(
+            inner > 0, cv2.GC_FGD, np.where(outer > 0, np.where(expected > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD), cv2.GC_BGD)
+        ).astype(np.uint8)
+        x, y, w, h = cv2.boundingRect(outer)
+        window = np.s_[max(0, y - 4 * r) : y + h + 4 * r, max(0, x - 4 * r) : x + w + 4 * r]
+        part = np.ascontiguousarray(trimap[window])
+        cv2.setRNGSeed(0)
+        cv2.grabCut(np.ascontiguousarray(image[window]), part, None, *self._models, iterations, cv2.GC_INIT_WITH_MASK)
+        cut = np.zeros_like(expected)
+        cut[window] = (part == cv2.GC_FGD) | (part == cv2.GC_PR_FGD)
+        return _connected(cut, inner)
+
+    def _reduced(self, image):
+        return image if self._small == self._size else cv2.resize(image, self._small, interpolation=cv2.INTER_AREA)
+
+    def _enlarged(self):
+        if self._small == self._size:
+            return 255 * self._mask
+        soft = cv2.resize(self._mask.astype(np.float32), self._size, interpolation=cv2.INTER_CUBIC)
+        return np.where(soft > 0.5, 255, 0).astype(np.uint8)
+
+
+def _histogram(image, mask):
+    counts = cv2.calcHist([image], [0, 1, 2], mask, [8, 8, 8], [0, 256] * 3)
+    return cv2.GaussianBlur(counts.reshape(8, -1), (3, 3), 0) / max(counts.sum(), 1)
+
+
+def _connected(mask, core):
+    """The components of a mask that meet ``core``; all of it where there is no core."""
+    if not core.any():
+        return mask
+    _, labels = cv2.connectedComponents(mask, connectivity=8)
+    keep = np.unique(labels[core > 0])
+    return (np.isin(labels, keep[keep > 0])).astype(np.uint8)
+
+
+def silhouette(pixels, faces, size):
+    """The projection of a mesh: mask (H, W) uint8, 0 or 255, of triangles ``faces`` (F, 3) between ``pixels`` (N, 2), (0.5, 0.5) the first
+    pixel's centre."""
+    mask = np.zeros(size[::-1], np.uint8)
+    shift = 4  # binary places of the fixed-point coordinates that OpenCV takes; it counts from the first pixel's centre
+    corners = np.round((np.clip(pixels, -1e5, 1e5) - 0.5) * 2**shift).astype(np.int32)
+    for face in corners[faces]:
+        cv2.fillConvexPoly(mask, face, 255, cv2.LINE_8, shift)
+    return mask
+
+
+def iou(a, b):
+    """Intersection over union of two masks, above half their largest value each; 1 where both are empty."""
+    a, b = (np.asarray(m) > 0.5 * max(np.max(m), 1e-9) for m in (a, b))
+    union = (a | b).sum()
+    return float((a & b).sum() / union) if union else 1.0

@@ -1,0 +1,124 @@
+"""Pictures of what each step of the preparation found, for a person to look at: (H, W, 3) uint8 RGB images."""
+
+import cv2
+import numpy as np
+
+GREEN, RED, YELLOW, WHITE = (60, 220, 90), (235, 70, 60), (255, 210, 40), (255, 255, 255)
+_CELL = 320  # pixels of a contact sheet's picture
+_COLUMNS = 4
+_LINES = 60  # drawn of each kind of match
+_SIDE = 900  # pixels to which larger pictures are shrunk
+_HEIGHT = 480  # pixels of a picture that is drawn on
+
+
+def shrunk(image, side=_SIDE):
+    """(image no larger than ``side``, what it was scaled by)."""
+    scale = min(1.0, side / max(image.shape[:2]))
+    return (cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else image.copy()), scale
+
+
+def _canvas(image):
+    """(image of _HEIGHT rows, enlarged where it has fewer, what it was scaled by)."""
+    scale = _HEIGHT / image.shape[0]
+    return cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC), scale
+
+
+def contact_sheet(cells):
+    """Pictures in rows of four, each with its caption: ``cells`` are (caption, image)."""
+    drawn = []
+    for caption, image in cells:
+        cell, _ = shrunk(image, _CELL)
+        label(cell, caption)
+        drawn.append(cell)
+    height, width = (max(cell.shape[k] for cell in drawn) for k in (0, 1))
+    columns = min(_COLUMNS, len(drawn))
+    rows = -(-len(drawn) // columns)
+    sheet = np.full((rows * (height + 4) - 4, columns * (width + 4) - 4, 3), 255, np.uint8)
+    for k, cell in enumerate(drawn):
+        y, x = k // columns * (height + 4), k % columns * (width + 4)
+        sheet[y : y + cell.shape[0], x : x + cell.shape[1]] = cell
+    return sheet
+
+
+def chosen(count, most=12):
+    """Indices of at most ``most`` of ``count`` things, evenly spread, the first and the last among them."""
+    return sorted({round(k) for k in np.linspace(0, count - 1, min(count, most))})
+
+
+def masked(image, mask):
+    """An image whose part outside of the mask is dark, the border drawn."""
+    shown = np.where(mask[..., None] > 127, image, image // 3)
+    outline, _ = cv2.findContours((mask > 127).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    return cv2.drawContours(np.ascontiguousarray(shown), outline, -1, YELLOW, max(1, round(max(image.shape[:2]) / 320)))
+
+
+def matches(photo, frame, found):
+    """Photo and frame side by side, :class:`polysft_mi.capture.pose.Matches` as lines: green where they agree, red where not."""
+    (left, _), (right, b) = _canvas(photo), _canvas(frame)
+    canvas = np.hstack([left // 2 + 64, np.full((_HEIGHT, 8, 3), 255, np.uint8), right // 2 + 64])
+    at = np.column_stack([found.photo[:, 0], 1 - found.photo[:, 1]]) * left.shape[1::-1]
+    to = found.frame * b + (left.shape[1] + 8, 0)
+    for agree, colour in ((False, RED), (True, GREEN)):
+        lines = np.flatnonzero(found.agree == agree)
+        for k in lines[:: max(1, len(lines) // _LINES)]:
+            p, q = (tuple(int(round(v)) for v in x) for x in (at[k], to[k]))
+            cv2.line(canvas, p, q, colour, 1, cv2.LINE_AA)
+            for x in (p, q):
+                cv2.circle(canvas, x, 3, colour, 1, cv2.LINE_AA)
+    label(canvas, f"{len(found.agree)} features of the photo found in the frame, {int(found.agree.sum())} agree on one pose (green)")
+    return canvas
+
+
+def pose(frame, photo, sheet, placed, camera):
+    """Two pictures of the first frame: the template's mesh and border drawn on it; and the photo laid on it where the template is."""
+    wired, scale = _canvas(frame)
+    plain, x = wired.copy(), camera.project(placed)
+
+    def draw(edges, colour, width):
+        for edge in edges:
+            a, b = (tuple(int(round(v)) for v in np.clip(x[k] * scale, -1e4, 1e4)) for k in edge)
+            cv2.line(wired, a, b, colour, width, cv2.LINE_AA)
+
+    edges = np.sort(np.concatenate([sheet.faces[:, [0, 1]], sheet.faces[:, [1, 2]], sheet.faces[:, [2, 0]]]), axis=1)
+    draw(np.unique(edges, axis=0), GREEN, 1)
+    wired = cv2.addWeighted(plain, 0.7, wired, 0.3, 0)  # what is printed shows through
+    draw(sheet.border(), YELLOW, 2)
+    label(wired, "the template in the first frame")
+    laid, _ = _canvas(_laid(frame, photo, sheet, x))
+    label(laid, "the photo, laid where the template is")
+    return np.hstack([wired, np.full((wired.shape[0], 4, 3), 255, np.uint8), laid])
+
+
+def _laid(frame, photo, sheet, x):
+    from matplotlib.tri import Triangulation
+
+    try:
+        finder = Triangulation(*x.T, triangles=sheet.faces).get_trifinder()
+    except (RuntimeError, ValueError):  # a template that hides a part of itself
+        return frame
+    columns, rows = np.meshgrid(np.arange(frame.shape[1]) + 0.5, np.arange(frame.shape[0]) + 0.5)
+    face = finder(columns, rows)
+    seen = face >= 0
+    corners = sheet.faces[face[seen]]
+    a, b, c = (x[corners[:, k]] for k in range(3))
+    p = np.column_stack([columns[seen], rows[seen]])
+    t = np.linalg.solve(np.stack([b - a, c - a], axis=2), (p - a)[..., None])[..., 0]
+    u, v, w = (sheet.uv[corners[:, k]] for k in range(3))
+    uv = u + t[:, :1] * (v - u) + t[:, 1:] * (w - u)
+    side = max(1.0, max(photo.shape[:2]) / max(np.ptp(p, axis=0).max() if len(p) else 1, 1))
+    photo = cv2.resize(photo, None, fx=1 / side, fy=1 / side, interpolation=cv2.INTER_AREA) if side > 1 else photo
+    maps = np.stack([uv[:, 0] * photo.shape[1] - 0.5, (1 - uv[:, 1]) * photo.shape[0] - 0.5], axis=-1).astype(np.float32)
+    whole = np.full((*frame.shape[:2], 2), -1, np.float32)
+    whole[seen] = maps
+    colours = cv2.remap(photo, whole[..., 0], whole[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    laid = frame.copy()
+    laid[seen] = colours[seen]
+    return laid
+
+
+def label(image, text):
+    """Write a line at the top left, in place."""
+    scale = 0.45 if image.shape[1] < 500 else 0.6
+    (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
+    cv2.rectangle(image, (0, 0), (width + 8, height + 10), (0, 0, 0), -1)
+    cv2.putText(image, text, (4, height + 5), cv2.FONT_HERSHEY_SIMPLEX, scale, WHITE, 1, cv2.LINE_AA)

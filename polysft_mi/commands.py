@@ -1,0 +1,33 @@
+"""What the commands have in common: their names, and parsers that teach by examples."""
+
+import argparse
+import sys
+
+from .errors import InputError
+
+# name: what it is for, in a line of `polysft --help`
+COMMANDS = {
+    "prepare": "make a scene of a video or of a sequence's folder",
+    "run": "reconstruct the surface in every frame",
+    "evaluate": "figures against ground truth",
+    "report": "one page that shows a run: video, errors, surface in 3D, figures",
+    "export": "the moving surface as USD, glTF, OBJ, PLY or arrays",
+    "compare": "two runs, or a run and its ground truth: figures and pictures",
+    "view": "look at a run in an interactive viewer",
+}
+
+
+class Parser(argparse.ArgumentParser):
+    """An ``argparse`` parser whose complaints are one line, as all others are."""
+
+    def error(self, message):
+        raise InputError(f"{message}; {self.prog} --help shows what is taken")
+
+
+def parser(name, description, examples):
+    """The parser of the command ``name``, called as the user called it; ``examples`` are pairs of its arguments and what they do."""
+    prog = sys.argv[0] if sys.argv[0] == f"polysft {name}" else f"python -m polysft_mi.{name}"
+    lines = [f"  {prog} {arguments}\n      {what}" for arguments, what in examples]
+    return Parser(
+        prog=prog, description=description, epilog="examples:\n" + "\n".join(lines), formatter_class=argparse.RawDescriptionHelpFormatter
+    )

@@ -1,0 +1,117 @@
+"""The commands as one: their names, help, examples, exit status, and what goes to which stream."""
+
+import importlib
+import json
+import os
+import pty
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from polysft_mi import __main__ as polysft
+from polysft_mi import commands
+from polysft_mi.errors import InputError
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def command(*arguments, **options):
+    return subprocess.run(
+        [sys.executable, "-m", "polysft_mi", *map(str, arguments)], capture_output=True, text=True, cwd=ROOT, timeout=120, **options
+    )
+
+
+def test_installed_command_is_ours():
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    module, function = re.search(r'^polysft = "([\w.]+):(\w+)"', text, re.M).groups()
+    assert getattr(importlib.import_module(module), function) is polysft.entry
+
+
+def test_help_lists_every_command_and_loads_nothing_heavy(capsys):
+    assert polysft.main(["--help"]) == 0
+    listed = re.findall(r"^  (\w+)  ", capsys.readouterr().out, re.M)
+    assert [name for name in listed if name in commands.COMMANDS] == list(commands.COMMANDS)
+    for name in commands.COMMANDS:
+        assert callable(importlib.import_module(f"polysft_mi.{name}").main)
+    heavy = ("numpy", "torch", "mitsuba", "plotly", "pxr")
+    code = f"import sys, polysft_mi.__main__ as m; m.main(['--help']); print([x for x in {heavy} if x in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert done.stdout.splitlines()[-1] == "[]", done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("name", commands.COMMANDS)
+def test_help_of_a_command_teaches_by_examples_that_parse(name, capsys, monkeypatch):
+    monkeypatch.setattr(sys, "argv", [f"polysft {name}"])
+    module = importlib.import_module(f"polysft_mi.{name}")
+    with pytest.raises(SystemExit) as ended:
+        module.main(["--help"])
+    text = capsys.readouterr().out
+    assert ended.value.code == 0 and text.startswith(f"usage: polysft {name} ")
+    for arguments, _ in module._EXAMPLES:
+        assert f"  polysft {name} {arguments}\n" in text
+        module.parser().parse_args(shlex.split(arguments))
+    monkeypatch.setattr(sys, "argv", ["whatever"])
+    assert module.parser().prog == f"python -m polysft_mi.{name}"
+
+
+def test_no_command_and_a_wrong_one(capsys):
+    assert polysft.main([]) == 2
+    with pytest.raises(InputError, match="exprot: no such command, did you mean export"):
+        polysft.main(["exprot"])
+    assert polysft.main(["--version"]) == 0 and capsys.readouterr().out.splitlines()[-1].startswith("polysft ")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["wrong"],
+        ["export"],
+        ["export", "out", "--format", "fbx"],
+        ["report", "{tmp}"],
+        ["compare", "{tmp}", "{tmp}"],
+        ["evaluate", "{tmp}"],
+    ],
+)
+def test_mistakes_end_in_one_line_and_status_2(arguments, tmp_path):
+    done = command(*[a.replace("{tmp}", str(tmp_path)) for a in arguments])
+    assert done.returncode == 2 and done.stdout == ""
+    assert re.fullmatch(r"error: .+\n", done.stderr), done.stderr
+
+
+def test_json_is_all_that_stdout_holds(finished_run, tmp_path, capsys, monkeypatch):
+    truth, out = finished_run
+    monkeypatch.setattr(sys, "argv", sys.argv)
+
+    def printed(*arguments):
+        assert polysft.main([str(a) for a in arguments]) == 0
+        seen = capsys.readouterr()
+        assert seen.err == ""
+        return seen.out
+
+    evaluated = json.loads(printed("evaluate", out, truth.folder, "--json"))
+    compared = json.loads(printed("compare", out, truth.folder, "--json"))
+    assert evaluated["rmse_mm"] == pytest.approx(compared["difference"]["rmse_mm"])
+    new = tmp_path / "a folder"
+    figures = json.loads(printed("run", truth.folder / "scene.xml", "-o", new, "-D", "last=1", "-q", "--json", "--no-report"))
+    assert (figures["frames"], figures["report"], figures["out"]) == (2, None, str(new)) and not (new / "report.html").exists()
+    recorded = json.loads((new / "run.json").read_text())["command"]
+    assert shlex.split(recorded)[:3] == ["python", "-m", "polysft_mi.run"] and str(new) in shlex.split(recorded)
+    assert printed("export", new, "--format", "npz", "-q") == "" and (new / "export" / "surface.npz").exists()
+
+
+@pytest.mark.parametrize("plain", [False, True])
+def test_colours_only_on_a_terminal_that_wants_them(plain):
+    environment = {**os.environ, "TERM": "xterm"} | ({"NO_COLOR": "1"} if plain else {})
+    if not plain:
+        environment.pop("NO_COLOR", None)
+    parent, child = pty.openpty()
+    subprocess.run([sys.executable, "-m", "polysft_mi", "wrong"], stderr=child, cwd=ROOT, env=environment)
+    os.close(child)
+    shown = os.read(parent, 4096).decode()
+    os.close(parent)
+    assert ("\033[" in shown) is not plain and "error:" in shown
+    assert "\033[" not in command("wrong").stderr

@@ -1,0 +1,249 @@
+"""The page of a run: what it says is what the run left, and in a browser it shows it."""
+
+import base64
+import io
+import json
+import re
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from polysft_mi import report, video
+from polysft_mi.camera import Intrinsics
+from polysft_mi.errors import InputError
+from polysft_mi.results import PEAK, Run
+
+BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None)
+needs_browser = pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed (Debian, Ubuntu: apt-get install chromium)")
+
+
+@pytest.fixture(scope="module")
+def page(finished_run, tmp_path_factory):
+    """The report with the truth in it, as a file outside the run's folder."""
+    truth, out = finished_run
+    path = tmp_path_factory.mktemp("page") / "report.html"
+    assert report.main([str(out), "--truth", str(truth.folder), "-o", str(path), "-q"]) == 0
+    return path
+
+
+def data_of(path):
+    return json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', path.read_text(encoding="utf-8"), re.S)[1])
+
+
+def array(text, dtype):
+    return np.frombuffer(base64.b64decode(text), dtype)
+
+
+def scalar(data, label, shape):
+    (found,) = [s for s in data["scalars"] if s["label"] == label]
+    raw = array(found["values"], np.uint8).reshape(shape)
+    return np.where(raw == 255, np.nan, found["low"] + raw / 254 * (found["high"] - found["low"])), found
+
+
+def test_a_run_leaves_its_report(finished_run):
+    _, out = finished_run
+    assert data_of(out / "report.html")["columns"]["frame"] == [0, 1, 2, 3]
+
+
+def test_page_needs_nothing_else(page):
+    text = page.read_text(encoding="utf-8")
+    own = text.replace(re.search(r"<script>(.{100000,}?)</script>", text, re.S)[1], "")  # without plotly itself
+    assert not re.search(r"""(src|href)\s*=\s*["']?(https?:)?//|@import|url\(""", own)
+    assert "{{" not in own
+
+
+def test_surface_and_pictures_are_those_of_the_run(finished_run, page):
+    run, data = Run.open(finished_run[1]), data_of(page)
+    mesh = data["mesh"]
+    low, high = np.array(mesh["low"]), np.array(mesh["high"])
+    V = low + array(mesh["positions"], "<u2").reshape(run.vertices.shape) / 65535 * (high - low)
+    x, y, z = np.moveaxis(run.vertices, -1, 0)
+    np.testing.assert_allclose(V, np.stack([x, z, -y], -1), atol=1e-5)
+    corners, weights = array(mesh["corners"], "<u4").reshape(-1, 3), array(mesh["weights"], "<f4").reshape(-1, 3)
+    fine = np.einsum("nk,nkc->nc", weights, V[0][corners])
+    F = array(mesh["faces"], "<u4").reshape(-1, 3)
+    area = lambda V, F: 0.5 * np.linalg.norm(np.cross(V[F[:, 1]] - V[F[:, 0]], V[F[:, 2]] - V[F[:, 0]]), axis=1).sum()
+    assert area(fine, F) == pytest.approx(area(V[0], run.faces), rel=1e-6)
+    texture = np.asarray(Image.open(run.texture).convert("RGB")).astype(float)
+    colours = array(mesh["colours"], np.uint8).reshape(-1, 3)
+    uv = np.einsum("nk,nkc->nc", weights, run.uv[corners])
+    at = np.clip((np.stack([1 - uv[:, 1], uv[:, 0]], 1) * texture.shape[:2]).astype(int), 0, np.array(texture.shape[:2]) - 1)
+    assert np.abs(colours - texture[at[:, 0], at[:, 1]]).mean() < 12  # one end of the texture differs from the other by 150
+    target, render, error = (
+        np.asarray(Image.open(io.BytesIO(base64.b64decode(data["images"][n][2])))) for n in ("target", "render", "error")
+    )
+    expected = np.asarray(Image.open(finished_run[0].folder / "frames" / "002.png").convert("RGB")).astype(float)
+    assert np.abs(target.astype(float) - expected).mean() < 6
+    assert render.shape == error.shape == target.shape and len(data["images"]["error"]) == 4
+
+
+def test_figures_and_colours(finished_run, page):
+    truth, out = finished_run
+    run, data = Run.open(out), data_of(page)
+    shape = run.vertices.shape[:2]
+    true_distance = 1e3 * np.linalg.norm(run.vertices - truth.vertices, axis=2)
+    np.testing.assert_allclose(data["columns"]["rmse_mm"], np.sqrt((true_distance**2).mean(1)), rtol=1e-4)
+    assert data["columns"]["psnr_mask"] == [row["psnr_mask"] for row in run.metrics["per_frame"]]
+    distance, found = scalar(data, "distance to the truth", shape)
+    assert np.abs(distance - np.clip(true_distance, 0, found["high"])).max() <= 0.6 * found["high"] / 254
+    error, _ = scalar(data, "error", shape)
+    assert np.isfinite(error).all() and 0 < error.mean() < 0.1
+    sigma, found = scalar(data, "sigma", shape)
+    known = np.isfinite(run.sigma)
+    assert np.array_equal(np.isfinite(sigma), known)
+    assert np.abs(sigma - np.clip(1e3 * run.sigma, 0, found["high"]))[known].max() <= 0.6 * found["high"] / 254
+    assert [label for label, _ in data["cards"]].count("lost frames") == 1
+
+
+def test_curvature_is_that_of_the_meshes(finished_run):
+    """The true sheet is a cylinder whose middle bulges towards the camera: half the curvature of its middle row of vertices, by circles
+    through three of them.
+    """
+    run = Run.open(finished_run[1])
+    row = run.vertices[-1].reshape(9, 11, 3)[4].astype(float)
+    before, after, chord = row[1:-1] - row[:-2], row[2:] - row[1:-1], row[2:] - row[:-2]
+    length = np.linalg.norm([before, after, chord], axis=2)
+    bent = 2 * np.linalg.norm(np.cross(before, after), axis=1) / length.prod(0)
+    np.testing.assert_allclose(run.mean_curvature()[-1].reshape(9, 11)[4, 1:-1], bent / 2, rtol=0.05)
+
+
+def test_error_where_each_vertex_is_seen():
+    camera = Intrinsics(100, 100, 20, 20, 40, 40)
+    heat = np.zeros((80, 80, 3), np.uint8)  # the picture has twice the size of the film
+    heat[:, 40:, 0] = 255  # a third of the way from black to white, right of the middle
+    vertices = np.array([[-0.1, 0, 1], [0.1, 0, 1], [0.5, 0, 1], [0.1, 0, -1]])
+    error = report._error_at_vertices(camera, vertices, heat)
+    np.testing.assert_allclose(error, [0, PEAK / 3, np.nan, np.nan], atol=1e-6)
+
+
+def test_fewer_frames_and_odd_names(finished_run, tmp_path):
+    out = tmp_path / "a <b> & 'ü'"
+    shutil.copytree(finished_run[1], out)
+    about = json.loads((out / "run.json").read_text())
+    (out / "run.json").write_text(json.dumps({**about, "command": "</script><!-- x"}))
+    report.write(out, frames=2)
+    data = data_of(out / "report.html")
+    assert data["shown"] == [0, 3] and len(data["images"]["target"]) == 2 and len(data["columns"]["frame"]) == 4
+    assert data["command"] == "</script><!-- x" and data["title"] == out.name
+    assert "<title>a &lt;b> &amp; 'ü'</title>" in (out / "report.html").read_text(encoding="utf-8")
+    assert report.spread(5, 3) == [0, 2, 4] and report.spread(2, 9) == [0, 1] and report.spread(9, 1) == [0]
+
+
+def test_pngs_stand_in_for_the_video(finished_run, tmp_path):
+    """As a run leaves them where no video can be encoded."""
+    out = tmp_path / "run"
+    shutil.copytree(finished_run[1], out)
+    for k, frame in enumerate(video.read_video(out / "comparison.mp4")):
+        Image.fromarray(frame).save(out / "comparison" / f"{k:03d}.png")
+    (out / "comparison.mp4").unlink()
+    report.write(out)
+    assert data_of(out / "report.html")["images"] == data_of(finished_run[1] / "report.html")["images"]
+    metrics = json.loads((out / "metrics.json").read_text())
+    lost = {"frames_wanted": 9, "lost": {"2": "left the image"}}
+    (out / "metrics.json").write_text(json.dumps({**metrics, **lost}))
+    report.write(out)
+    assert data_of(out / "report.html")["warning"] == "Interrupted: 4 of 9 frames. Frame 2: left the image."
+
+
+def test_refusals_leave_nothing(finished_run, tmp_path):
+    out = tmp_path / "run"
+    shutil.copytree(finished_run[1], out)
+    (out / "report.html").unlink()
+    (out / "comparison.mp4").write_bytes(b"no video")
+    with pytest.raises(InputError, match="comparison.mp4: not a readable video"):
+        report.write(out)
+    (out / "comparison.mp4").unlink()
+    with pytest.raises(InputError, match="pictures are needed"):
+        report.write(out)
+    shutil.copy(finished_run[1] / "comparison.mp4", out)
+    with pytest.raises(InputError, match="holds no ground truth"):
+        report.write(out, truth=tmp_path)
+    with pytest.raises(InputError, match="not a file in a folder"):
+        report.write(out, tmp_path / "nowhere" / "a.html")
+    with pytest.raises(InputError, match="--frames 0"):
+        report.main([str(out), "--frames", "0"])
+    assert not (out / "report.html").exists() and [p for p in out.iterdir() if "partial" in p.name] == []
+
+
+# ---- in a browser ------------------------------------------------------------------------------------------------------------
+
+_WATCH = """<script>
+const problems = [];
+addEventListener("error", e => problems.push(String(e.message)));
+addEventListener("unhandledrejection", e => problems.push(String(e.reason)));
+console.error = (...a) => problems.push(a.join(" "));
+</script>"""
+_ACT = """<script>
+(async () => {
+  const wait = () => new Promise(done => setTimeout(done, 300)), seen = {};
+  const note = name => { seen[name] = {now, target: $("target").src.length, label: $("now").textContent,
+                                       drawn: $("target").naturalWidth, row: document.querySelector("tr.now").rowIndex,
+                                       z: $("surface").data[0].z.reduce((a, b) => a + b, 0),
+                                       kind: Object.keys($("surface").data[0]).includes("intensity")}; };
+  await wait(); note("start");
+  STEPS
+  const boxes = ["target", "surface"].map(id => $(id).getBoundingClientRect()).map(
+    b => [b.top, Math.min(b.bottom, innerHeight), b.left, b.right].map(Math.round));
+  const fetched = performance.getEntriesByType("resource").map(r => r.name).filter(name => !/^(data|blob):/.test(name));
+  console.log("SEEN " + JSON.stringify({...seen, problems, boxes, fetched}));
+})();
+</script></body>"""
+_STEPS = """
+  $("time").value = 2; $("time").dispatchEvent(new Event("input")); await wait(); note("slid");
+  const key = k => document.dispatchEvent(new KeyboardEvent("keydown", {key: k, bubbles: true}));
+  key("ArrowRight"); await wait(); note("right"); key("Home"); await wait(); note("home"); key("End"); await wait(); note("end");
+  [...$("choices").children].find(b => b.textContent === "curvature").click(); await wait(); note("curvature");
+"""
+
+
+def browse(page, tmp_path, steps):
+    """The page opened in a browser, with steps done in it: what it noted, and a screenshot (H, W, 3) from the page's top."""
+    text = page.read_text(encoding="utf-8").replace("<head>", "<head>" + _WATCH, 1)
+    before, _, after = text.rpartition("</body>")
+    copy, picture = tmp_path / "page.html", tmp_path / "page.png"
+    copy.write_text(before + _ACT.replace("STEPS", steps) + after, encoding="utf-8")
+    flags = [
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--use-angle=swiftshader",
+        "--enable-unsafe-swiftshader",
+        "--disable-dev-shm-usage",
+    ]
+    flags += [
+        "--disable-background-networking",
+        "--disable-component-update",
+        "--disable-sync",
+        "--no-first-run",
+        f"--user-data-dir={tmp_path / 'profile'}",
+    ]
+    flags += ["--window-size=1300,1500", "--virtual-time-budget=6000", "--enable-logging=stderr", f"--screenshot={picture}"]
+    done = subprocess.run([BROWSER, *flags, copy.as_uri()], capture_output=True, text=True, timeout=120)
+    seen = re.search(r'"SEEN (\{.*\})"', done.stderr)
+    assert seen, done.stderr[-2000:]
+    return json.loads(seen[1]), np.asarray(Image.open(picture).convert("RGB")).astype(int)
+
+
+def part(picture, box):
+    top, bottom, left, right = box
+    return picture[top:bottom, left:right]
+
+
+@needs_browser
+def test_browser_shows_it(page, tmp_path):
+    (tmp_path / "still").mkdir(), (tmp_path / "moved").mkdir()
+    still, first = browse(page, tmp_path / "still", "")
+    seen, last = browse(page, tmp_path / "moved", _STEPS)
+    assert seen["problems"] == still["problems"] == [] and seen["fetched"] == []
+    assert [seen[n]["now"] for n in ("start", "slid", "right", "home", "end")] == [0, 2, 3, 0, 3]
+    assert seen["slid"]["label"].startswith("frame 2") and seen["slid"]["row"] == 3 and seen["start"]["drawn"] > 50
+    assert seen["slid"]["z"] != seen["start"]["z"] == seen["home"]["z"]
+    assert (seen["start"]["kind"], seen["curvature"]["kind"]) == (False, True)
+    (before, surface), (after, same) = ([part(p, box) for box in seen["boxes"]] for p in (first, last))
+    assert np.abs(before - after).max(2).mean() > 5  # the slider changed the picture
+    for picture in (surface, same):
+        assert (np.ptp(picture, axis=2) > 60).mean() > 0.05, "the surface in 3D is blank"
+    assert (np.abs(surface - same).max(2) > 40).mean() > 0.05
