@@ -3,6 +3,7 @@
 import re
 
 import numpy as np
+import torch
 from scipy.spatial.transform import Rotation
 
 from polyfit.errors import InputError
@@ -58,7 +59,7 @@ def read_bvh(path, name, fps=None, up=None):
         else:
             target[j] = C * world[bone] * C.inv() * Rotation.from_matrix(stand[j])
     poses = np.stack([(r if p < 0 else target[p].inv() * r).as_rotvec() for r, p in zip(target, skeleton.PARENTS, strict=True)], 1)
-    scale = _legs(skeleton.standard_joints().double().numpy()) / _legs(joints.numpy())
+    scale = skeleton.leg_length(skeleton.standard_joints()) / skeleton.leg_length(joints)
     return placed(poses, root @ turn.T * scale, fps, name)
 
 
@@ -191,26 +192,17 @@ def _axes(path, places, joint_of, up):
 
 def _standing(path, rest, joint_of):
     """Joints (24, 3) of the zero pose, in OneFit's axes. Raises InputError where it is no stand."""
-    import torch
-
-    joints = np.zeros((24, 3))
+    joints = torch.zeros(24, 3, dtype=torch.float64)
     for j, (name, parent) in enumerate(zip(skeleton.JOINTS, skeleton.PARENTS, strict=True)):
         if name in joint_of:
-            joints[j] = rest[joint_of[name]]
+            joints[j] = torch.as_tensor(rest[joint_of[name]])
         else:  # beyond what the file has: on, the way the bone before it goes
             joints[j] = joints[parent] + 0.3 * (joints[parent] - joints[skeleton.PARENTS[parent]] if parent > 0 else 0.0)
     trunk = joints[skeleton.INDEX["head"]] - joints[0]
     down = [joints[skeleton.INDEX[f"{s}_hip"], 2] - joints[skeleton.INDEX[f"{s}_ankle"], 2] for s in ("left", "right")]
-    if not (trunk[2] > 0.8 * np.linalg.norm(trunk) and min(down) > 0.8 * _legs(joints)):
+    if not (trunk[2] > 0.8 * trunk.norm() and min(down) > 0.8 * skeleton.leg_length(joints)):
         raise InputError(f"{path}: its zero pose is no upright stand with the legs down; export the motion with a T-pose as rest pose")
-    return torch.as_tensor(joints)
-
-
-def _legs(joints):
-    """Length [the joints' unit] of a leg from hip to ankle, mean of both."""
-    at = skeleton.INDEX
-    bones = [(f"{s}_{a}", f"{s}_{b}") for s in ("left", "right") for a, b in (("hip", "knee"), ("knee", "ankle"))]
-    return sum(float(np.linalg.norm(joints[at[b]] - joints[at[a]])) for a, b in bones) / 2
+    return joints
 
 
 def _posed(path, parents, channels, frames):

@@ -71,6 +71,14 @@ class Motion:
 
         return generate(name, seconds=seconds, seed=seed, fps=fps)
 
+    def fitted(self, body):
+        """The motion for a :class:`~onefit.body.Body` with longer or shorter legs than the standard body's: its way is scaled by their
+        length, so that feet which stood still on the standard body nearly do on this one.
+        """
+        return replace(
+            self, translation=self.translation * (skeleton.leg_length(body.joints) / skeleton.leg_length(skeleton.standard_joints()))
+        )
+
     def mirrored(self):
         """The motion seen in a mirror: left is right, and x is -x."""
         other = [skeleton.INDEX[_other_side(name)] for name in skeleton.JOINTS]

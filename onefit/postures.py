@@ -323,13 +323,14 @@ def stretch(t, rng):
 def improvise(t, rng):
     """One posture after another at random: hands anywhere before and beside the body, trunk and hips moving, small steps."""
     s = Script(rng)
+    s.move(0.5, left_arm=(0.1, 0.6, 0.1, 0.4), right_arm=(0.1, 0.6, 0.1, 0.4), after=0.2)
     while s.clock < t[-1] + 1:
         changes = {}
         for side, sign in (("left", 1.0), ("right", -1.0)):
             if rng.random() < 0.75:
-                place = rng.uniform((0.12, -0.6, 0.05), (0.6, -0.25, 0.95))
+                place = rng.uniform((0.12, -0.6, 0.22), (0.6, -0.28, 0.95))
                 if rng.random() < 0.35:
-                    place = rng.uniform((0.4, -0.4, 0.0), (0.65, 0.05, 0.9))
+                    place = rng.uniform((0.42, -0.4, 0.05), (0.65, 0.05, 0.9))
                 changes[f"{side}_arm"] = figure.arm_to(side, place * [sign, 1, 1], pole=(rng.uniform(0.4, 1.2), 0.4, -1.0))
                 changes[f"{side}_hand"] = rng.uniform((-0.4, -0.3), (0.4, 0.8))
         low = rng.uniform(0.0, 0.14)

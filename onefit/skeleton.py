@@ -69,6 +69,12 @@ def standard_joints():
     return torch.tensor(places)
 
 
+def leg_length(joints):
+    """Length of a leg from hip to ankle, mean of both, in the unit of ``joints`` (24, 3)."""
+    bones = [(f"{side}_{a}", f"{side}_{b}") for side in ("left", "right") for a, b in (("hip", "knee"), ("knee", "ankle"))]
+    return sum(float((joints[INDEX[b]] - joints[INDEX[a]]).norm()) for a, b in bones) / 2
+
+
 def chained(rotations):
     """Rotations (..., 24, 3, 3) relative to the parent, to rotations (..., 24, 3, 3) relative to the world."""
     done = [None] * len(PARENTS)

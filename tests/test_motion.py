@@ -372,6 +372,20 @@ def test_feet_stand_still_on_the_ground(kind):
     assert down.any() and np.percentile(speed[down], 98) < 0.08  # m/s
 
 
+def test_feet_stand_still_on_other_bodies_when_the_way_is_fitted():
+    body = AnnyBody().body((0.3, 0.75, 0.5, 0.5, 0.5, 0.5))
+    motion = Motion.generate("walk", seconds=6, seed=1, fps=60.0)
+
+    def slides(motion):
+        feet = skinning.posed_joints(body, skinning.transforms(body, motion.poses, motion.translation))[:, [10, 11]].numpy()
+        down = feet[1:, :, 2] < feet[..., 2].min() + 0.006
+        return np.median(np.linalg.norm(np.diff(feet[..., :2], axis=0), axis=-1)[down]) * 60
+
+    assert slides(motion.fitted(body)) < 0.03 < 0.1 < slides(motion)  # m/s
+    standard = AnnyBody().body()
+    assert torch.allclose(motion.fitted(standard).translation, motion.translation, atol=1e-3)
+
+
 def test_walking_and_running_get_somewhere():
     for kind, low, high in (("walk", 0.6, 1.7), ("run", 1.9, 3.7)):
         for seed in range(5):
