@@ -7,6 +7,8 @@ import numpy as np
 
 from polyfit import mesh
 
+from .quietwarp import warp
+
 
 @dataclass(frozen=True)
 class Nearest:
@@ -23,10 +25,7 @@ class Nearest:
 
 @lru_cache(maxsize=1)
 def _warp():
-    import warp as wp
-
-    wp.config.quiet = True
-    wp.init()
+    wp = warp()
 
     @wp.kernel
     def nearest(mesh: wp.uint64, points: wp.array(dtype=wp.vec3), reach: float, face: wp.array(dtype=int), uv: wp.array(dtype=wp.vec2)):
