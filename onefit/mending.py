@@ -27,12 +27,7 @@ SMALL_HOLE = 0.10  # around [m]
 def mended(V, F, where="garment"):
     """``(vertices (N', 3), faces (F', 3), sentences)`` of a mesh in metres. Raises InputError, in one line that starts with ``where``."""
     V, F = np.asarray(V, dtype=np.float64), np.asarray(F, dtype=np.int64)
-    if len(V) == 0 or len(F) == 0:
-        raise InputError(f"{where}: no faces; a garment is a mesh of triangles or quads")
-    bad = ~np.isfinite(V).all(axis=1)
-    bad[np.setdiff1d(np.arange(len(V)), F)] = False
-    if bad.any():
-        raise InputError(f"{where}: {bad.sum()} vertices have coordinates that are not finite (the first is vertex {bad.argmax()}, counted from 0)")
+    check(V, F, where)
     told = []
     V, F = _without_slivers(V, F, where, told)
     V, F = _sewn(V, F, told)
@@ -41,6 +36,18 @@ def mended(V, F, where="garment"):
     F = _wound_alike(V, F, where, told)
     V, F = _filled(V, F, told)
     return V, F, tuple(told)
+
+
+def check(V, F, where="garment"):
+    """Raises InputError where there are no faces, or vertices of theirs that are not finite or all in one place."""
+    if len(V) == 0 or len(F) == 0:
+        raise InputError(f"{where}: no faces; a garment is a mesh of triangles or quads")
+    used = np.unique(F)
+    if not (finite := np.isfinite(V[used]).all(axis=1)).all():
+        first = used[finite.argmin()]
+        raise InputError(f"{where}: {(~finite).sum()} vertices have coordinates that are not finite (the first is vertex {first}, counted from 0)")
+    if not np.ptp(V[used], axis=0).max() > 0:
+        raise InputError(f"{where}: its faces have no area")
 
 
 def parts(F):

@@ -54,11 +54,40 @@ def nearest_on_segments(points, a, b):
     return at[np.arange(len(points)), best]
 
 
+def delaunay(V, F):
+    """Faces (F, 3) with the edges flipped whose two opposite angles together are more than 180 degrees, as long as there are any."""
+    F = F.copy()
+    for _ in range(20):
+        edges, side = mesh.edges_of(F)
+        order, uses = np.argsort(side.ravel(), kind="stable"), np.bincount(side.ravel())
+        start = (np.cumsum(uses) - uses)[uses == 2]
+        one, two = order[start], order[start + 1]  # corners from which the edge is walked, 3 face + k
+        to_next = V[np.roll(F, -1, axis=1)] - V[F]
+        to_next /= np.maximum(np.linalg.norm(to_next, axis=2, keepdims=True), 1e-300)
+        angle = np.arccos(np.clip(-(np.roll(to_next, -1, axis=1) * np.roll(to_next, 1, axis=1)).sum(axis=2), -1, 1)).ravel()  # opposite to side k
+        total = angle[one] + angle[two]
+        there, touched, flips = set(map(tuple, edges.tolist())), set(), 0
+        for k in np.argsort(-total, kind="stable")[: (total > np.pi + 1e-3).sum()]:
+            f, g = one[k] // 3, two[k] // 3
+            a, b, c = (F[f, (one[k] + i) % 3] for i in range(3))
+            d = F[g, (two[k] + 2) % 3]
+            new = (min(c, d), max(c, d))
+            if f in touched or g in touched or new in there:
+                continue
+            touched |= {f, g}
+            there.add(new)
+            F[f], F[g] = (c, a, d), (d, b, c)
+            flips += 1
+        if not flips:
+            break
+    return F
+
+
 def remeshed(V, F, count, steps=40):
     """``(vertices, faces)`` with about ``count`` vertices, evenly spread over the surface, the boundary's on its loops.
 
     Clusters of equal area (ACVD) give the triangles; then vertices slide on the surface towards the mean of their neighbours, those of a loop
-    along it. A mesh of fewer than 20 vertices for each new one is cut finer first.
+    along it, and edges are flipped to the Delaunay triangulation. A mesh of fewer than 20 vertices for each new one is cut finer first.
     """
     import pyacvd
     import pyvista
@@ -76,10 +105,12 @@ def remeshed(V, F, count, steps=40):
     f = np.where(mesh.winding(f)[:, None] < 0, f[:, ::-1], f)
     surface, rim = ClosestSurface(V, F), boundary_edges(np.asarray(F))
     own = np.unique(boundary_edges(f))
-    mean = neighbour_mean(f, len(x), boundary_apart=True)
-    for _ in range(steps):
+    for step in range(steps):
+        if step % 10 == 0:
+            f = delaunay(x, f)
+            mean = neighbour_mean(f, len(x), boundary_apart=True)
         y = mean @ x
         x = np.array(surface(0.5 * (x + y)).point, dtype=np.float64)
         if len(own):
             x[own] = nearest_on_segments(0.5 * (x + y)[own], V[rim[:, 0]], V[rim[:, 1]])
-    return x, f
+    return x, delaunay(x, f)
