@@ -178,7 +178,7 @@ def sit(t, rng):
             arms = {"left": (0.0, 0.4, 0.1, 0.35), "right": (0.0, 0.4, 0.1, 0.35)}
             if on_thighs:
                 for side, sign in (("left", 1.0), ("right", -1.0)):
-                    place = np.array([sign * (0.13 + 0.5 * apart * far), seat[1] - far, seat[2] + 0.19])
+                    place = np.array([sign * (0.13 + 0.5 * apart * far), seat[1] - far, seat[2] + 0.21])
                     arms[side] = figure.arm_to(side, figure.in_chest(place, seat, turn, spine), pole=(1.0, 0.6, -0.6))
             return {"pelvis": seat, "turn": turn, "spine": spine, "left_arm": arms["left"], "right_arm": arms["right"]}
 

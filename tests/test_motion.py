@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from scripts import load
 
 from onefit import generate, skeleton, skinning
 from onefit.body import AnnyBody
@@ -398,62 +399,17 @@ def test_walking_and_running_get_somewhere():
     assert (running.min(1) > T_POSE[10, 2].item() + 0.02).mean() > 0.1  # both feet off the ground
 
 
-def enclosed(vertices, faces, points):
-    """Which of ``points`` (P, 3) are inside the closed surface of ``vertices`` and ``faces``: (P,) bool."""
-    import pyvista
-    from vtkmodules.vtkFiltersModeling import vtkSelectEnclosedPoints
-
-    surface = pyvista.PolyData(vertices, np.concatenate([np.full((len(faces), 1), 3), faces], 1))
-    select = vtkSelectEnclosedPoints()
-    select.SetSurfaceData(surface)
-    select.SetInputData(pyvista.PolyData(points))
-    select.Update()
-    return np.asarray(pyvista.wrap(select.GetOutput()).point_data["SelectedPoints"]) > 0
-
-
-def closed_part(body, kept):
-    """Faces of the part of a body whose vertices are ``kept`` (V,) bool, and the rings where it was cut; ring k is closed by a fan to a
-    vertex V + k in its middle."""
-    faces = body.faces.numpy()
-    faces = faces[kept[faces].all(1)]
-    after = {(int(a), int(b)) for f in faces for a, b in ((f[0], f[1]), (f[1], f[2]), (f[2], f[0]))}
-    following = {b: a for a, b in after if (b, a) not in after}
-    rings = []
-    while following:
-        start, at = following.popitem()
-        rings.append([start])
-        while at != start:
-            rings[-1].append(at)
-            at = following.pop(at)
-    fans = [(a, b, len(kept) + k) for k, ring in enumerate(rings) for a, b in zip(ring, ring[1:] + ring[:1], strict=True)]
-    return np.concatenate([faces, np.array(fans)]), rings
-
-
 def test_arms_do_not_pass_through_the_body():
     body = AnnyBody().body()
-    of = body.blend_weights.argmax(1).numpy()
-    numbers = lambda *parts: [INDEX[f"{side}_{part}"] for side in ("left", "right") for part in parts]
-    core = ~np.isin(of, numbers("shoulder", "elbow", "wrist", "hand"))
-    faces, rings = closed_part(body, core)
-    assert len(rings) == 2  # at the shoulders
-    fore = np.flatnonzero(np.isin(of, numbers("elbow", "wrist", "hand")))[::4]
-    deep = 0
+    script = load("benchmarks/onefit_motions.py")
+    core = script.Core(body)
+    assert len(core.rings) == 2  # cut at the shoulders
     through = torch.zeros(1, 24, 3)
-    through[:, INDEX["left_shoulder"], 1] = np.pi / 2 + 0.6  # it can tell: an arm let down into the hip
-    V = skinning.skin(body.vertices, body.blend_weights, skinning.transforms(body, through, torch.zeros(1, 3)))[0].double().numpy()
-    assert enclosed(np.concatenate([V, [V[ring].mean(0) for ring in rings]]), faces, V[fore]).sum() > 50
+    through[:, INDEX["left_shoulder"], 1] = np.pi / 2 + 0.6  # an arm let down into the hip
+    assert core.depth(script.posed(body, Motion(through, torch.zeros(1, 3), 30.0))[0]) > 0.03
     for kind in KINDS:
-        motion = Motion.generate(kind, seconds=8, seed=11)[::35]
-        posed = (
-            skinning.skin(body.vertices, body.blend_weights, skinning.transforms(body, motion.poses, motion.translation)).double().numpy()
-        )
-        for V in posed:
-            inside = enclosed(np.concatenate([V, [V[ring].mean(0) for ring in rings]]), faces, V[fore])
-            if inside.any():
-                depth = np.linalg.norm(V[fore][inside][:, None] - V[core][None, ::3], axis=-1).min(1)
-                assert depth.max() < 0.035, kind
-                deep += depth.max() > 0.012
-    assert deep <= 3
+        depths = [core.depth(V) for V in script.posed(body, Motion.generate(kind, seconds=8, seed=11)[::35])]
+        assert max(depths) < (0.03 if kind == "pick_up" else 0.015), kind
 
 
 def test_the_same_at_any_rate_and_length():
