@@ -9,6 +9,8 @@ from polyfit import mesh
 
 from .quietwarp import warp
 
+from .quietwarp import warp
+
 
 @dataclass(frozen=True)
 class Nearest:

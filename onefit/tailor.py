@@ -1,4 +1,7 @@
-"""The seven garment templates, made around Anny's standard rest body: ``python -m onefit.tailor``.
+"""The seven garment templates, made around Anny's standard rest body.
+
+    python -m onefit.tailor                       # all seven, a minute
+    python -m onefit.tailor --body body.ply       # the body that they are made around
 
 Each garment is a level set: the body's signed distance with its hollows closed by a rolling ball (cloth spans the gap between the breasts and
 that of the spine), torso, arms, legs and a flared skirt joined by a smooth union, less the ease that the garment has there. It is cut open at
@@ -6,14 +9,19 @@ neck, hem and cuffs by smooth functions, remeshed by clusters (ACVD), and its tr
 loops. Everything is deterministic. Metres, OneFit's axes.
 """
 
+import argparse
+import os
 from functools import cached_property
 
 import numpy as np
 
 from polyfit import mesh
-from polyfit.errors import cli
+from polyfit.errors import InputError, cli
 from polyfit.files import aside
+from polyfit.meshio import write_ply
 
+from .binding import standard_body
+from .garment import FOLDER
 from .nearest import ClosestSurface
 from .remesh import loops, remeshed
 
@@ -229,21 +237,34 @@ def _clipped(V, F, inside):
     return np.array(part.points, dtype=np.float64), part.regular_faces.astype(np.int64)
 
 
-def write(names=tuple(PATTERNS)):
-    """Sew the named templates into ``onefit/data/garments``."""
-    from .body import AnnyBody
-    from .garment import FOLDER
-
-    body = AnnyBody().body()
+def write(names, folder):
+    """Sew the named templates into ``folder``."""
+    body = standard_body()
     block = Block(body.vertices.numpy(), body.faces.numpy())
-    FOLDER.mkdir(parents=True, exist_ok=True)
+    os.makedirs(folder, exist_ok=True)
     for name in names:
         V, F = sewn(block, name)
-        path = FOLDER / f"{name}.npz"
+        path = os.path.join(folder, f"{name}.npz")
         with aside(path) as temporary:
             np.savez_compressed(temporary, vertices=V.astype(np.float32), faces=F.astype(np.int32))
         print(f"{path}: {len(V)} vertices, {len(F)} faces, {mesh.areas(V, F).sum():.3f} m^2, {len(loops(F))} loops")
 
 
+def main():
+    parser = argparse.ArgumentParser(prog="python -m onefit.tailor", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"templates to sew (default: all): {', '.join(PATTERNS)}")
+    parser.add_argument("-o", "--output", default=FOLDER, metavar="FOLDER", help="where the .npz files go (default: the package's own folder)")
+    parser.add_argument("--body", metavar="FILE.ply", help="write the standard body, to make garments around, and sew nothing")
+    args = parser.parse_args()
+    if unknown := [n for n in args.names if n not in PATTERNS]:
+        raise InputError(f"{unknown[0]}: no such template; there are {', '.join(PATTERNS)}")
+    if args.body:
+        body = standard_body()
+        write_ply(args.body, body.vertices.numpy(), body.faces.numpy())
+        print(f"written: {args.body}")
+    else:
+        write(args.names or PATTERNS, args.output)
+
+
 if __name__ == "__main__":
-    cli(write)
+    cli(main)
