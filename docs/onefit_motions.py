@@ -32,7 +32,7 @@ def row(plotter, body, faces, kind):
     images = []
     for vertices, place in zip(posed.double().numpy(), motion.translation.double().numpy(), strict=True):
         plotter.clear_actors()
-        plotter.add_mesh(pyvista.PolyData(vertices - place * [1, 1, 0], faces), color="#d9b48f", smooth_shading=True, ambient=0.25)
+        plotter.add_mesh(pyvista.PolyData(vertices - place * [1, 1, 0], faces), color="#b9bcc4", smooth_shading=True, ambient=0.25)
         plotter.add_mesh(pyvista.Plane(center=(0, 0, FLOOR), i_size=2.4, j_size=2.4), color="#dfe3ea", lighting=False)
         plotter.camera_position = [(2.2, -3.9, 0.9), (0, 0, 0.02), (0, 0, 1)]
         plotter.camera.view_angle = 27

@@ -16,6 +16,7 @@ import argparse
 import json
 import shutil
 import time
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -56,8 +57,10 @@ def _model(name):
 
     if name == "anny":
         return AnnyBody()
-    with_blend_weights = Path(name).suffix == ".npz" and "blend_weights" in np.load(name).files
-    return PlainBody(name) if with_blend_weights else SmplBody(name)
+    if not Path(name).exists():
+        raise InputError(f"--body {name}: no such file; anny needs none")
+    plain = zipfile.is_zipfile(name) and "blend_weights.npy" in zipfile.ZipFile(name).namelist()
+    return PlainBody(name) if plain else SmplBody(name)
 
 
 def _render(drape, folder, size, spp, advance):

@@ -84,7 +84,7 @@ class Draper:
 
     def drape(self, garment, motion, shape=None, *, post=False, skinning_only=False):
         """A :class:`Drape`: ``garment`` (as :meth:`garment` takes it) on the body of ``shape`` (S,) in each frame of ``motion`` (a
-        :class:`Motion` or a file of one), at 30 frames a second.
+        :class:`Motion` or a file of one), at 30 frames a second. With a shape, the way is scaled by the length of its legs.
 
         ``post``: vertices are pushed out of the body and the pushes are smoothed. ``skinning_only``: plain skinning of the template, what
         OneFit is held against. Raises InputError for a garment, motion or shape that cannot be used.
@@ -92,6 +92,7 @@ class Draper:
         garment = self.garment(garment)
         motion = (motion if isinstance(motion, Motion) else Motion.read(motion)).resampled(FPS).to(self.device)
         body = self.model.body(shape)
+        motion = motion if shape is None else motion.fitted(body.to(self.device))
         rest = garment.graded(body).to(self.device)
         patched = None if skinning_only else self.patched(garment)
         body = body.to(self.device)

@@ -1,0 +1,103 @@
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from polyfit.errors import InputError
+
+from onefit import drape, weights
+from onefit.body import AnnyBody
+from onefit.network import OneFit
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture(scope="module")
+def network(tmp_path_factory):
+    torch.manual_seed(0)
+    path = tmp_path_factory.mktemp("weights") / "w.safetensors"
+    weights.save(path, OneFit(), AnnyBody(), ("shorts",))
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def out(network, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("drapes") / "out"
+    drape.main([
+        "shorts", "walk", "-o", str(folder), "--weights", network, "--seconds", "0.1", "--size", "90", "60", "--spp", "4",
+        "--meshes", "ply", "--shape", "height=0.6", "weight=0.4",
+    ])  # fmt: skip
+    return folder
+
+
+def test_arrays_and_figures(out):
+    with np.load(out / "drape.npz") as file:
+        T, N, _ = file["vertices"].shape
+        assert T == 3 and file["rest"].shape == (N, 3) and file["body"].shape[0] == T and float(file["fps"]) == 30
+        assert file["faces"].max() == N - 1 and file["body_faces"].max() == file["body"].shape[1] - 1
+    about = json.loads((out / "figures.json").read_text())
+    assert about["garment"] == "shorts" and about["frames"] == T and about["vertices"] == N
+    assert about["shape"] == pytest.approx([0.5, 0.5, 0.5, 0.4, 0.6, 0.5])
+    assert {"collision", "edge", "area", "energy", "jitter"} <= set(about)
+
+
+def test_animations_hold_the_arrays(out):
+    from pxr import Usd, UsdGeom
+
+    with np.load(out / "drape.npz") as file:
+        for name, vertices in (("garment", file["vertices"]), ("body", file["body"])):
+            stage = Usd.Stage.Open(str(out / f"{name}.usd"))
+            assert UsdGeom.GetStageUpAxis(stage) == "Z" and UsdGeom.GetStageMetersPerUnit(stage) == 1 and stage.GetTimeCodesPerSecond() == 30
+            points = UsdGeom.Mesh(stage.GetPrimAtPath(f"/{name}/mesh")).GetPointsAttr()
+            for t in range(len(vertices)):
+                assert np.abs(np.array(points.Get(t)) - vertices[t]).max() < 1e-5
+        meshes = sorted((out / "meshes").glob("*.ply"))
+        assert len(meshes) == len(file["vertices"])
+
+
+def test_pictures_show_body_and_garment(out):
+    frames = sorted((out / "frames").glob("*.png"))
+    assert len(frames) == 3 and (out / "drape.mp4").stat().st_size > 1000
+    image = cv2.imread(str(frames[0])).astype(int)
+    assert image.shape == (90, 60, 3)
+    blue = image[..., 0] - image[..., 2]
+    assert 20 < (blue > 40).sum() < 1500  # the shorts
+    assert image.std() > 10
+
+
+def test_what_is_there_is_not_lost(out, network):
+    with pytest.raises(InputError, match="not empty; give another -o, or --overwrite"):
+        drape.main(["shorts", "walk", "-o", str(out), "--weights", network])
+    with pytest.raises(InputError, match="holds no drape"):
+        drape.main(["shorts", "walk", "-o", str(ROOT / "tests"), "--weights", network, "--overwrite"])
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (("shorts", "tango"), "motion tango: no such file, and no kind of motion; there are idle, walk"),
+        (("tuxedo.obj", "walk"), "tuxedo.obj: no such file"),
+        (("shorts", "walk", "--shape", "girth=3"), "--shape girth=3: choose among gender, age"),
+        (("shorts", "walk", "--shape", "weight=heavy"), "--shape weight=heavy: a number is needed"),
+        (("shorts", "walk", "--shape", "weight=2"), "weight = 2; phenotypes go from 0 to 1"),
+        (("shorts", "walk", "--body", "nobody.npz"), "--body nobody.npz: no such file"),
+    ],
+)
+def test_refused_in_one_line(arguments, message, network, tmp_path):
+    with pytest.raises(InputError) as caught:
+        drape.main([*arguments, "-o", str(tmp_path / "out"), "--weights", network])
+    assert message in str(caught.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_importing_onefit_is_quick_and_loads_nothing_heavy():
+    code = "import sys, onefit; print([x for x in ('torch', 'numpy', 'mitsuba', 'drjit', 'warp', 'anny') if x in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert done.stdout.strip() == "[]"
+    code = "import sys, onefit; onefit.load, onefit.Garment, onefit.AnnyBody, onefit.Motion, onefit.SmplBody; print('mitsuba' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert done.stdout.strip() == "False", done.stderr
