@@ -2,8 +2,8 @@
 
     python benchmarks/onefit_ablation.py -o RUNS [--garment tank] [--epoch-steps 30]
 
-Each training has twelve epochs, ten at the full rate; a run that RUNS holds already is not made again. Measured as by onefit_accuracy.py, without
-post-processing.
+Each training has twelve epochs, ten at the full rate; a run that RUNS holds already is not made again. Measured as by onefit_accuracy.py,
+without post-processing.
 """
 
 import argparse

@@ -5,11 +5,11 @@
 For the seven templates, and for the garment files given, it prints
 
 - the mesh: vertices, faces, openings, area, median edge, smallest angle, distance from the standard body;
-- weights: the longest stretch of an edge when a left shoulder and hip turn by 40 degrees, for weights smoothed and as they are at the nearest point;
+- stretch: the longest of an edge when the left shoulder and hip turn by 40 degrees, with weights smoothed (as they are);
 - skinned: vertices inside the body, %, in four frames of each kind of motion that networks are trained on, plain skinning;
 - graded: vertices inside the body, %, over random shapes, the deepest [mm], and milliseconds for each;
-- back: the distance [mm], mean and largest, from where a template was, when it is graded to random shapes, put into the T-pose and read back
-  with ``made_for``;
+- back: the distance [mm], mean and largest, from where a template was, when it is graded to random shapes, put into the T-pose and read
+  back with ``made_for``;
 
 and the grading to a body of another topology against that of the same body. Writes ``onefit_garments.json``.
 """
@@ -51,8 +51,8 @@ def mesh_figures(garment):
     angle = np.degrees(np.arccos(np.clip(-(side * np.roll(side, 1, axis=1)).sum(axis=2) / length / np.roll(length, 1, axis=1), -1, 1)))
     d = 1e3 * standard_surface()(V).distance
     return {
-        "vertices": len(V), "faces": len(F), "openings": len(loops(F)), "area": mesh.areas(V, F).sum(), "edge_mm": 1e3 * np.median(lengths(V, F)),
-        "angle": angle.min(), "distance_mm": (d.min(), np.median(d), d.max()),
+        "vertices": len(V), "faces": len(F), "openings": len(loops(F)), "area": mesh.areas(V, F).sum(),
+        "edge_mm": 1e3 * np.median(lengths(V, F)), "angle": angle.min(), "distance_mm": (d.min(), np.median(d), d.max()),
     }  # fmt: skip
 
 
@@ -87,7 +87,7 @@ def posed_bodies():
 def inside(surfaces, vertices):
     """Share of vertices inside [%], mean over the bodies, and the deepest [mm]."""
     d = [s(v).distance for s, v in zip(surfaces, vertices)]
-    return 100 * np.mean([(x < 0).mean() for x in d]), -1e3 * min(0, min(x.min() for x in d))
+    return 100 * np.mean([(x < 0).mean() for x in d]), 1e3 * max(0.0, -min(x.min() for x in d))
 
 
 def back(garment, bodies):
@@ -127,8 +127,8 @@ def main():
         figures["graded_ms"] = 1e3 * (time.perf_counter() - start) / len(bodies)
         figures["graded_inside"], figures["graded_deepest_mm"] = inside(surfaces, graded)
         text = "{vertices} / {faces}, {openings} openings, {area:.2f} m2, edge {edge_mm:.0f} mm, angle {angle:.0f}; stretch {stretch:.1f}"
-        text += " ({stretch_unsmoothed:.1f}); skinned {skinned_inside:.2f} % inside; graded {graded_inside:.3f} % inside, {graded_deepest_mm:.1f} mm"
-        text += ", {graded_ms:.1f} ms"
+        text += " ({stretch_unsmoothed:.1f}); skinned {skinned_inside:.2f} % inside"
+        text += "; graded {graded_inside:.3f} % inside, {graded_deepest_mm:.1f} mm, {graded_ms:.1f} ms"
         if garment.name in TEMPLATES:
             figures["back_mm"] = back(garment, bodies[:3])
             other = [garment.graded(other_topology(b)) - torch.as_tensor(g) for b, g in zip(bodies[:2], graded)]

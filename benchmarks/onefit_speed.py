@@ -2,9 +2,9 @@
 
     python benchmarks/onefit_speed.py [--weights six-garments] [--device cuda]
 
-Milliseconds a frame, the median of repeated drapes of a motion of 90 frames in batches, without rendering: all of ``Draper.drape``, the network
-alone, and post-processing; then the T-shirt at about 1,000, 4,000, 16,000 and 64,000 vertices. Cutting a garment into patches comes once and
-stands apart. The clock shows what else the machine does; the least of the repetitions is given beside the median.
+Milliseconds a frame, the median of repeated drapes of a motion of 90 frames in batches, without rendering: all of ``Draper.drape``, the
+network alone, and post-processing; then the T-shirt at about 1,000, 4,000, 16,000 and 64,000 vertices. Cutting a garment into patches
+comes once and stands apart. The clock shows what else the machine does; the least of the repetitions is given beside the median.
 """
 
 import argparse
@@ -37,13 +37,13 @@ def timed(function, device, repeats=9):
     return statistics.median(found), min(found)
 
 
-def network_alone(draper, patched, motion):
+def network_alone(draper, garment, motion):
     """The embedding of the motion and the decoding of every patch in every frame, no vertex among it."""
     body = draper.model.body().to(draper.device)
     with torch.inference_mode():
-        embedding = draper._embedding(motion, body)
+        embedding = draper.embedding(motion, body)
         for part in embedding.split(32):
-            patched.changes(draper.network.decoder(draper._codes(patched), part))
+            draper.patched(garment).changes(draper.network.decoder(draper.codes(garment), part))
 
 
 def main(argv=None):
@@ -69,7 +69,7 @@ def main(argv=None):
         cut = time.perf_counter() - start
         T = len(motion.poses)
         whole = [x / T for x in timed(lambda: draper.drape(garment, motion), args.device)]
-        network = [x / T for x in timed(lambda: network_alone(draper, patched, motion), args.device)]
+        network = [x / T for x in timed(lambda: network_alone(draper, garment, motion), args.device)]
         drape = draper.drape(garment, motion)
         post = [x / T for x in timed(lambda: pushed_out(drape.vertices, drape.faces, drape.body, drape.body_faces), args.device, 3)]
         cells = [f"{len(garment)}", f"{len(patched)}", f"{cut:.1f}"] + [f"{a:.2f} ({b:.2f})" for a, b in (whole, network, post)]

@@ -27,7 +27,8 @@ def picture(parts, direction):
     plotter = pyvista.Plotter(off_screen=True, window_size=(ZOOM * WIDTH, ZOOM * HEIGHT), lighting="none")
     plotter.set_background("white")
     for V, F, colour in parts:
-        plotter.add_mesh(pyvista.PolyData.from_regular_faces(V, F), color=colour, smooth_shading=True, ambient=0.25, diffuse=0.8, specular=0.05)
+        part = pyvista.PolyData.from_regular_faces(V, F)
+        plotter.add_mesh(part, color=colour, smooth_shading=True, ambient=0.25, diffuse=0.8, specular=0.05)
     right = np.cross([0, 0, 1], direction)
     for light, strength in ((direction - 0.9 * right + [0, 0, 0.9], 0.75), (direction + 1.5 * right + [0, 0, 0.2], 0.3)):
         plotter.add_light(pyvista.Light(position=10 * light, focal_point=(0, 0, 0), intensity=strength, light_type="scene light"))

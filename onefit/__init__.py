@@ -1,8 +1,8 @@
 """OneFit: one network that drapes any garment on a moving body (paper, section "OneFit"), in torch, on PolyFit's patches.
 
-    import onefit
-    drape = onefit.load("six-garments").drape("shirt.obj", onefit.Motion.generate("walk"))
-    drape.vertices  # (T, N, 3), metres
+import onefit
+drape = onefit.load("six-garments").drape("shirt.obj", onefit.Motion.generate("walk"))
+drape.vertices  # (T, N, 3), metres
 """
 
 _EXPORTS = {

@@ -12,7 +12,7 @@ from .nearest import ClosestSurface
 
 # Lengths over which the weights and the displacements of a shape are smoothed where the garment touches the body [m]; they grow with the
 # distance from it, doubled at 1.7 times this one.
-WEIGHTS_LENGTH, SHAPE_LENGTH, NEAR = 0.025, 0.015, 0.02
+WEIGHTS_LENGTH, SHAPE_LENGTH, NEAR = 0.010, 0.008, 0.007
 CLEARANCE = 0.003  # that grading leaves between body and cloth [m]
 
 
@@ -35,12 +35,13 @@ def surface_of(body):
 
 
 class Binding:
-    """Where each vertex of a mesh ``V`` (N, 3) [m], ``F`` (F, 3) wound outwards, hangs on a body's ``surface``, and smoothing over the mesh.
+    """Where each vertex of a mesh ``V`` (N, 3) [m], ``F`` (F, 3) wound outwards, hangs on a body's ``surface``, and smoothing over the
+    mesh.
 
     The nearest points of the body tell a weight or a displacement of each vertex. They jump where the nearest point does, between arm and
-    chest or from leg to leg, and mean less the farther away the body is; so they are smoothed: x minimises
-    sum_i m_i c_i |x_i - y_i|^2 + l^2 sum_ij w_ij |x_i - x_j|^2, with the areas m, the cotangent weights w (above zero, so that x stays within
-    the range of y), and the trust c = n / (1 + (distance / NEAR)^2), where n is the cosine between the normals of garment and body (at least
+    chest or from leg to leg, and mean less the farther away the body is; so they are smoothed: x minimises sum_i m_i c_i |x_i - y_i|^2 +
+    l^2 sum_ij w_ij |x_i - x_j|^2, with the areas m, the cotangent weights w (above zero, so that x stays within the range of y), and the
+    trust c = n / (1 + (distance / NEAR)^2), where n is the cosine between the normals of garment and body (at least
     0.001: the other side of an armpit, the other leg tell nothing). Independent of the mesh's resolution.
     """
 
@@ -78,8 +79,8 @@ class Binding:
         return self._smooth_shape(self.on_body(of_body))
 
     def moved(self, V, before, after):
-        """Vertices ``V`` (N, 3) [m] displaced with those of the body from ``before`` to ``after`` (V, 3). Where the cloth touches the body, it
-        stays as far above the plane at its point there as it was, or CLEARANCE if that is less.
+        """Vertices ``V`` (N, 3) [m] displaced with those of the body from ``before`` to ``after`` (V, 3). Where the cloth touches the
+        body, it stays as far above the plane at its point there as it was, or CLEARANCE if that is less.
         """
         moved = V + self.displacement(after - before)
         above, normal = self._above_body(moved, after)
@@ -87,8 +88,8 @@ class Binding:
         return moved
 
     def _above_body(self, V, body):
-        """How far the vertices that touch the body lie above the planes of the body's faces on which they hang (K,) [m], and their normals (K,
-        3).
+        """How far the vertices that touch the body lie above the planes of the body's faces on which they hang (K,) [m], and their
+        normals (K, 3).
         """
         corners = body[self.corners[self._touching]]
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

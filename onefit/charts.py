@@ -1,8 +1,9 @@
 """A garment cut into patches, and what follows from its patches' deformation: positions and tangents, linear in the jets' coefficients.
 
 In the chart of patch k a deformed jet is p(u, v) = s' R (u, v, sum_b alpha'_b m_b(u, v)) + T', m_b the monomials. Since u, v and 1 are
-monomials too, p is linear in them: p = C_k m(u, v), with a matrix C_k (3, A) for each patch. So the displacement of the whole garment, at any
-resolution, is one sparse matrix, made once, times the changes of the C_k (:attr:`PatchedGarment.blend`). No jet is evaluated frame by frame.
+monomials too, p is linear in them: p = C_k m(u, v), with a matrix C_k (3, A) for each patch. So the displacement of the whole garment, at
+any resolution, is one sparse matrix, made once, times the changes of the C_k (:attr:`PatchedGarment.blend`). No jet is evaluated frame by
+frame.
 """
 
 import copy
@@ -47,7 +48,11 @@ class SparseMatrix:
     def __matmul__(self, dense):
         """(columns, ...) -> (rows, ...)."""
         flat = dense.reshape(len(dense), -1).contiguous()
-        return _Product.apply(flat, self._forward, self._backward).unflatten(1, dense.shape[1:]) if dense.ndim > 1 else (self @ dense[:, None])[:, 0]
+        return (
+            _Product.apply(flat, self._forward, self._backward).unflatten(1, dense.shape[1:])
+            if dense.ndim > 1
+            else (self @ dense[:, None])[:, 0]
+        )
 
     def to(self, device):
         moved = object.__new__(SparseMatrix)
@@ -137,9 +142,7 @@ class PatchedGarment:
             columns.append(np.tile(p.entry_vertex[e], 3 * METRIC_POINTS))
             values.append(stack.reshape(-1))
         points = np.stack(points)  # (K, M)
-        field = sp.csr_matrix(
-            (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), (3 * points.size, len(p.vertices))
-        )
+        field = sp.csr_matrix((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), (3 * points.size, len(p.vertices)))
         #: (3 P, N): value and derivatives along u and v, at the points of the metric, of a field given at the vertices
         self._field = (field @ self._refinement).tocsr()
         self.metric_uv = torch.as_tensor(uv[points], dtype=torch.float32)
@@ -163,9 +166,14 @@ class PatchedGarment:
         near = ((near + near.T + sp.identity(len(self))) > 0).tocsr()
         candidates = near[own].tocoo()  # (N, K): own patch and those that it meets
         row, patch = candidates.row, candidates.col
-        x = np.einsum("ei,eij->ej", vertices[row] - self.frame.T.numpy()[patch], self.frame.R.numpy()[patch]) / self.frame.s.numpy()[patch, None]
+        x = (
+            np.einsum("ei,eij->ej", vertices[row] - self.frame.T.numpy()[patch], self.frame.R.numpy()[patch])
+            / self.frame.s.numpy()[patch, None]
+        )
         r = np.linalg.norm(x[:, :2], axis=1) / REACH
-        weight = np.where(patch == own[row], np.maximum(1 - r**2, 0.02), np.maximum(1 - r**2 - np.maximum(np.abs(x[:, 2]) - 0.5, 0), 0)) ** 3
+        weight = (
+            np.where(patch == own[row], np.maximum(1 - r**2, 0.02), np.maximum(1 - r**2 - np.maximum(np.abs(x[:, 2]) - 0.5, 0), 0)) ** 3
+        )
         keep = _largest(row, weight, MEET) & (weight > 0)
         row, patch, weight, x = row[keep], patch[keep], weight[keep], x[keep]
         weight /= np.bincount(row, weight, minlength=count)[row]
@@ -241,7 +249,8 @@ class PatchedGarment:
 
     @cached_property
     def features(self):
-        """What the network reads of each patch: ``alpha`` (K, A), ``orientation`` (K, 7) (log s / 5 cm, two axes of R), ``centre`` (K, 3)."""
+        """What the network reads of each patch: ``alpha`` (K, A), ``orientation`` (K, 7) (log s / 5 cm, two axes of R), ``centre`` (K, 3).
+        """
         R = self.frame.R.float()
         orientation = torch.cat([(self.frame.s.float() / 0.05).log()[:, None], R[:, :, 2], R[:, :, 1]], 1)
         return self.alpha.float(), orientation, self.frame.T.float()

@@ -17,7 +17,9 @@ def _warp():
     wp = warp()
 
     @wp.kernel
-    def query(mesh: wp.uint64, points: wp.array(dtype=wp.vec3), far: float, nearest: wp.array(dtype=wp.vec3), normal: wp.array(dtype=wp.vec3)):
+    def query(
+        mesh: wp.uint64, points: wp.array(dtype=wp.vec3), far: float, nearest: wp.array(dtype=wp.vec3), normal: wp.array(dtype=wp.vec3)
+    ):
         i = wp.tid()
         found = wp.mesh_query_point_sign_normal(mesh, points[i], far)
         if found.result:
@@ -37,7 +39,9 @@ def _warp():
 
 
 class Collider:
-    """The surface of a body that moves: its triangles (F, 3), which are closed and wound outwards, and a hierarchy that follows its vertices."""
+    """The surface of a body that moves: its triangles (F, 3), which are closed and wound outwards, and a hierarchy that follows its
+    vertices.
+    """
 
     def __init__(self, faces, rest):
         """``rest`` (V, 3) [m]: vertices that the hierarchy is built on."""
@@ -48,8 +52,8 @@ class Collider:
         self._mesh = wp.Mesh(points=self._vertices, indices=indices)
 
     def nearest(self, points, vertices):
-        """Of points (T, P, 3) [m] with the body's vertices at (T, V, 3): the nearest points of its surface (T, P, 3), and unit vectors (T, P,
-        3) from there to the point where that lies outside, from the point where it lies inside. Zero for points farther than FAR.
+        """Of points (T, P, 3) [m] with the body's vertices at (T, V, 3): the nearest points of its surface (T, P, 3), and unit vectors (T,
+        P, 3) from there to the point where that lies outside, from the point where it lies inside. Zero for points farther than FAR.
         Without gradient."""
         wp = self._wp
         points, vertices = (x.detach().float().contiguous() for x in (points, vertices))

@@ -8,7 +8,7 @@ OUT receives
 
     drape.npz               vertices (T, N, 3) [m, z up], faces, rest, the body's vertices and faces, fps, and figures.json beside it
     garment.usd, body.usd   animations that Blender and usdview open
-    frames/NNN.png, drape.mp4   path-traced by Mitsuba
+    frames/NNN.png          path-traced by Mitsuba; drape.mp4 is their video
     meshes/NNN.obj          one mesh a frame, with --meshes obj (or ply)
 """
 
@@ -111,7 +111,9 @@ def parser():
     p.add_argument("-o", "--output", required=True, metavar="OUT", help="folder of the results; must be empty or new, or --overwrite")
     p.add_argument("--weights", default="six-garments", help="a network of the package, or a file (default: six-garments)")
     p.add_argument("--body", default="anny", help="anny, or a file: SMPL (.npz, .pkl) or plain (body.npz) (default: anny)")
-    p.add_argument("--shape", nargs="*", default=[], metavar="NAME=VALUE", help="the body's shape, e.g. weight=0.7; what is not named is standard")
+    p.add_argument(
+        "--shape", nargs="*", default=[], metavar="NAME=VALUE", help="the body's shape, e.g. weight=0.7; what is not named is standard"
+    )
     p.add_argument("--seconds", type=float, default=3.0, help="of a generated motion (default: 3)")
     p.add_argument("--seed", type=int, default=0, help="of a generated motion (default: 0)")
     p.add_argument("--post", action="store_true", help="push vertices out of the body afterwards")
@@ -152,14 +154,25 @@ def main(argv=None):
     seconds = time.perf_counter() - start
     figures = drape.measures().as_dict()
     T, N = drape.vertices.shape[:2]
-    console.print(f"{N} vertices in {T} frames: {1e3 * seconds / T:.1f} ms a frame, {figures['collision']:.2f} % of the vertices inside the body")
+    console.print(
+        f"{N} vertices in {T} frames: {1e3 * seconds / T:.1f} ms a frame, {figures['collision']:.2f} % of the vertices inside the body"
+    )
     if folder.exists():
         shutil.rmtree(folder)
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     with Progress(*columns, console=console) as progress:
         task = progress.add_task("rendering", total=T, visible="render" not in args.skip)
         write(drape, folder, skip=args.skip, meshes=args.meshes, size=args.size, spp=args.spp, advance=lambda: progress.advance(task))
-    about = dict(garment=args.garment, motion=motion.name, weights=args.weights, shape=shape.tolist(), post=args.post, vertices=N, frames=T, **figures)
+    about = dict(
+        garment=args.garment,
+        motion=motion.name,
+        weights=args.weights,
+        shape=shape.tolist(),
+        post=args.post,
+        vertices=N,
+        frames=T,
+        **figures,
+    )
     (folder / "figures.json").write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
     print(folder)
 

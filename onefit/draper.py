@@ -5,9 +5,9 @@ from functools import cached_property
 
 import torch
 
-from polyfit.errors import InputError
 
 from . import skinning
+from .binding import standard_body
 from .body import AnnyBody
 from .charts import PatchedGarment
 from .collision import Collider
@@ -25,8 +25,8 @@ POINTS = 400_000  # vertices times frames that are draped at once
 
 @dataclass(frozen=True)
 class Drape:
-    """A draped garment: ``vertices`` (T, N, 3) [m] in the world, ``faces`` (F, 3), ``rest`` (N, 3) [m], the garment graded to the shape; the
-    ``body``'s vertices (T, V, 3) [m], its ``body_faces`` and the root's place ``root`` (T, 3) [m]; ``fps`` frames a second."""
+    """A draped garment: ``vertices`` (T, N, 3) [m] in the world, ``faces`` (F, 3), ``rest`` (N, 3) [m], the garment graded to the shape;
+    the ``body``'s vertices (T, V, 3) [m], its ``body_faces`` and the root's place ``root`` (T, 3) [m]; ``fps`` frames a second."""
 
     vertices: torch.Tensor
     faces: torch.Tensor
@@ -44,28 +44,22 @@ class Drape:
 
 
 class Draper:
-    """A trained network with its body, ready to drape any garment. Made by :func:`onefit.load`.
+    """A trained network and a body model, ready to drape any garment. Made by :func:`onefit.load`.
 
-    Garments are cut into patches once and kept; frames go through in batches. ``device``: where it runs.
+    Garments are cut into patches once and kept; frames go through in batches. ``device``: where it runs. On a body model of another kind than
+    the network was trained on, garments are graded to its shapes and the network is told the standard shape.
     """
 
     def __init__(self, trained: Trained, model=None, device="cpu"):
         self.trained, self.device = trained, torch.device(device)
         self.network = trained.network.to(self.device).eval()
         self.model = model or AnnyBody()
-        if self.model.kind != trained.body:
-            size = len(self.model.standard_shape)
-            if size != self.network.shape["shape"]:
-                raise InputError(
-                    f"weights trained on the body {trained.body} ({self.network.shape['shape']} shape parameters), not on {self.model.kind} ({size}); "
-                    f"train on it: python -m onefit.train --body"
-                )
-        self._garments, self._patched = {}, {}
+        self._garments, self._patched, self._codes = {}, {}, {}
 
     @cached_property
     def standard(self):
-        """The standard body."""
-        return self.model.body()
+        """The standard body, which garments are made around."""
+        return standard_body()
 
     def garment(self, garment):
         """A :class:`Garment` of one, of a template's name, or of a mesh file; names and files are read once."""
@@ -99,14 +93,14 @@ class Draper:
         weights = garment.blend_weights.to(self.device)
         transforms = skinning.transforms(body, motion.poses, motion.translation)
         with torch.inference_mode():
-            embedding = None if skinning_only else self._embedding(motion, body)
+            embedding = None if skinning_only else self.embedding(motion, body)
             step = max(1, POINTS // len(rest))
             parts, bodies = [], []
             for first in range(0, len(motion.poses), step):
                 frames = slice(first, first + step)
                 points = rest[:, None]
                 if not skinning_only:
-                    points = points + patched.displacement(patched.changes(self.network.decoder(self._codes(patched), embedding[frames])))
+                    points = points + patched.displacement(patched.changes(self.network.decoder(self.codes(garment), embedding[frames])))
                 parts.append(posed(points, weights, transforms[frames]).transpose(0, 1))
             bodies = torch.cat([skinning.skin(body.vertices, body.blend_weights, part) for part in transforms.split(64)])
             vertices = torch.cat(parts)
@@ -115,16 +109,24 @@ class Draper:
             vertices = pushed_out(vertices, garment.faces.to(self.device), bodies, body.faces)
         return Drape(*(x.cpu() for x in (vertices, garment.faces, rest, bodies, body.faces, root)), FPS)
 
-    def _codes(self, patched):
-        if not hasattr(patched, "codes"):
-            patched.codes = self.network.patches(*patched.features, self.standard.joints.to(self.device))
-        return patched.codes
+    def codes(self, garment):
+        """Z_T (K, width) of the garment's patches, found once."""
+        key = id(garment)
+        if key not in self._codes:
+            with torch.no_grad():
+                self._codes[key] = self.network.patches(*self.patched(garment).features, self.standard.joints.to(self.device))
+        return self._codes[key]
 
-    def _embedding(self, motion, body):
+    def embedding(self, motion, body):
         """Z_B (T, width) of the motion, after the first pose was held for a while."""
         hold = lambda x: torch.cat([x[:1].expand(WARM_UP, *x.shape[1:]), x])[None]
-        shape = (body.shape - self.model.standard_shape.to(self.device))[None]
-        return self.network.body(hold(motion.poses), hold(motion.translation), shape, FPS)[0][0, WARM_UP:]
+        known = body.kind == self.trained.body
+        shape = (
+            body.shape - self.model.standard_shape.to(self.device)
+            if known
+            else torch.zeros(self.network.shape["shape"], device=self.device)
+        )
+        return self.network.body(hold(motion.poses), hold(motion.translation), shape[None], FPS)[0][0, WARM_UP:]
 
 
 def load(name="six-garments", *, model=None, device="cpu"):

@@ -74,14 +74,16 @@ def check_place(V, surface, where, tell_pose=True):
     if lies and tell_pose:
         other = misfit(_t_surface(), seen)
         if other < 0.87 * own and own - other > 0.005:
-            raise InputError(f"{where}: looks made for the T-pose ({_mm(other)} from it, {_mm(own)} from the stand with lowered arms): give made_for='{T_POSE}'")
+            fits = f"{_mm(other)} from it, {_mm(own)} from the stand with lowered arms"
+            raise InputError(f"{where}: looks made for the T-pose ({fits}): give made_for='{T_POSE}'")
     if lies and own < 0.04:
         return
     best = _best_place(seen, surface, [1.0] if lies else list(UNITS), tell_pose)
     if lies and not (best and best[0] < 0.5 * own):
         return
     size = " x ".join(f"{s:.3g}" for s in np.ptp(V, axis=0))
-    found = f"{where}: does not lie on the body: {_mm(np.abs(d).mean())} from it on average, {100 * (d < -DEEP).mean():.0f} % of the vertices deep inside"
+    deep = 100 * (d < -DEEP).mean()
+    found = f"{where}: does not lie on the body: {_mm(np.abs(d).mean())} from it on average, {deep:.0f} % of the vertices deep inside"
     if best is None:
         raise InputError(f"{found}; it spans {size} m; the body is 1.63 m tall (z from -0.82 to 0.81), z up, and faces -y")
     raise InputError(f"{found}; it looks like {best[1]}: give {best[2]}")
@@ -150,10 +152,10 @@ def _offset(V, surface):
 def to_standard(V, F, made_for, loose=False):
     """Vertices (N, 3) [m] of a garment made on the body ``made_for``, in the stand and shape of the standard body.
 
-    The paper displaces each vertex by the difference of its nearest body vertex between the two bodies. That shears sleeves where the stand
-    differs, so the stand is changed by skinning with the garment's smoothed blend weights, and the rest, the difference in shape, by the
-    displacement (smoothed too); one step of Laplacian smoothing follows. Of ``loose`` garments, which do not follow the legs, the legs' pose
-    is left as it is.
+    The paper displaces each vertex by the difference of its nearest body vertex between the two bodies. That shears sleeves where the
+    stand differs, so the stand is changed by skinning with the garment's smoothed blend weights, and the rest, the difference in shape,
+    by the displacement (smoothed too); one step of Laplacian smoothing follows. Of ``loose`` garments, which do not follow the legs, the
+    legs' pose is left as it is.
     """
     standard = standard_body()
     pose = standard.rest_pose.clone()
@@ -194,8 +196,8 @@ def counterpart(source, target):
 
 
 def pushed_out(V, F, where="garment"):
-    """``(vertices (N, 3), sentences)``: vertices up to 3 cm inside the standard body are taken out of it, with the faces that it pokes through
-    and their neighbours. Raises InputError for more than 2 % deeper ones.
+    """``(vertices (N, 3), sentences)``: vertices up to 3 cm inside the standard body are taken out of it, with the faces that it pokes
+    through and their neighbours. Raises InputError for more than 2 % deeper ones.
     """
     surface = standard_surface()
     d = surface(V).distance
@@ -213,8 +215,9 @@ def pushed_out(V, F, where="garment"):
             break
         move[F[poked].ravel()] += np.repeat((CLEARANCE - middle.distance[poked])[:, None] * middle.normal[poked], 3, axis=0) / 2
         out = out + smoother(area * np.where(move.any(axis=1), 1.0, 0.1), stiffness, SPREAD)(move)
-    found = surface(out)
-    out = np.where((found.distance < CLEARANCE / 4)[:, None], found.point + CLEARANCE * found.normal, out)
+    for _ in range(8):
+        found = surface(out)
+        out = np.where((found.distance < CLEARANCE / 4)[:, None], found.point + CLEARANCE * found.normal, out)
     return out, (f"pushed {(d < 0).sum()} vertices out of the body, by up to {-1000 * d.min():.1f} mm",)
 
 

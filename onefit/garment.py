@@ -23,8 +23,8 @@ FOLDER = Path(__file__).parent / "data" / "garments"
 class Garment:
     """A garment at rest on the standard body.
 
-    ``name``; ``vertices`` (N, 3) float32 [m], in OneFit's axes; ``faces`` (F, 3) int64, wound outwards; ``blend_weights`` (N, 24), rows that
-    sum to one; ``repairs``, sentences on what was changed when it was read.
+    ``name``; ``vertices`` (N, 3) float32 [m], in OneFit's axes; ``faces`` (F, 3) int64, wound outwards; ``blend_weights`` (N, 24), rows
+    that sum to one; ``repairs``, sentences on what was changed when it was read.
     """
 
     name: str
@@ -46,10 +46,11 @@ class Garment:
     def read(cls, path, *, name=None, made_for=None, loose=False, scale=1.0, up="z", turn=0.0, offset=(0.0, 0.0, 0.0)):
         """The garment of an OBJ or PLY file of triangles or quads, repaired by the rules of :mod:`onefit.mending`.
 
-        ``scale``, ``up``, ``turn`` [degrees], ``offset`` [m]: as in :func:`onefit.fitting.placed`, from the file's units and axes to metres and
-        OneFit's. ``made_for``: the :class:`~onefit.body.Body` on which it lies, if that is not the standard body, or "T-pose" for the
-        standard body in the T-pose; the garment is brought to the standard body as :func:`onefit.fitting.to_standard` says, and ``loose``
-        (skirts, dresses) leaves the legs' pose out. Raises InputError, in one line, for a mesh that is no garment or does not lie on the body.
+        ``scale``, ``up``, ``turn`` [degrees], ``offset`` [m]: as in :func:`onefit.fitting.placed`, from the file's units and axes to
+        metres and OneFit's. ``made_for``: the :class:`~onefit.body.Body` on which it lies, if that is not the standard body, or "T-pose"
+        for the standard body in the T-pose; the garment is brought to the standard body as :func:`onefit.fitting.to_standard` says, and
+        ``loose`` (skirts, dresses) leaves the legs' pose out. Raises InputError, in one line, for a mesh that is no garment or does not
+        lie on the body.
         """
         V, F, _ = read_mesh(path, "garment")
         return cls.of_mesh(

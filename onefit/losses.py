@@ -1,8 +1,8 @@
 """The losses of OneFit (paper, section "OneFit"), each a function of tensors and differentiable in those that the network moves.
 
 Points stand first and frames second, (N, T, 3), as :mod:`onefit.charts` makes them. Every loss is a mean over frames. The paper leaves the
-normalisations open. Here all is in SI units; a sum over points has ten points for each square centimetre, whatever the mesh's own resolution, so
-that the paper's weights mean the same for all garments. docs/onefit.md lists every choice.
+normalisations open. Here all is in SI units; a sum over points has ten points for each square centimetre, whatever the mesh's own
+resolution, so that the paper's weights mean the same for all garments. docs/onefit.md lists every choice.
 """
 
 from dataclasses import dataclass
@@ -61,9 +61,9 @@ def metric(tangents):
 def skinned_tangents(points, tangents, weights, transforms):
     """Tangents J_psi J_phi (2 of (P, T, 3)) of a skinned surface.
 
-    ``points`` (P, T, 3) and ``tangents`` (2 of (P, T, 3)) in the rest space; ``weights`` (P, 3, J): blend weights and their derivatives along
-    u and v; ``transforms`` (T, J, 3, 4). The weights change along the surface, so that J_psi is not the blended rotation alone:
-    d psi = (sum_j w_j R_j) d phi + sum_j dw_j (R_j x + t_j).
+    ``points`` (P, T, 3) and ``tangents`` (2 of (P, T, 3)) in the rest space; ``weights`` (P, 3, J): blend weights and their derivatives
+    along u and v; ``transforms`` (T, J, 3, 4). The weights change along the surface, so that J_psi is not the blended rotation alone: d
+    psi = (sum_j w_j R_j) d phi + sum_j dw_j (R_j x + t_j).
     """
     T, J = transforms.shape[:2]
     flat = transforms.transpose(0, 1).reshape(J, T * 12)
@@ -80,8 +80,8 @@ def inextensibility(rest, posed, k_ext, s):
 
 
 def mesh_inextensibility(lengths, rest):
-    """Sum over edges of squared changes of length [m^2], of ``lengths`` and ``rest`` (E, T) [m]. It depends on strain and area alone, not on
-    how fine the mesh is, for the squared lengths of a mesh's edges add up to about 3.5 times its area."""
+    """Sum over edges of squared changes of length [m^2], of ``lengths`` and ``rest`` (E, T) [m]. It depends on strain and area alone, not
+    on how fine the mesh is, for the squared lengths of a mesh's edges add up to about 3.5 times its area."""
     return (lengths - rest).square().sum(0).mean()
 
 
@@ -103,7 +103,7 @@ def gravity(height, mass):
 
 
 def inertia(x, before, earlier, mass, dt):
-    """sum m / (2 dt^2) |x - x' - dt v'|^2 [J], v' = (x' - x'') / dt, of points (N, T, 3) [m] now, one and two frames ago (Santesteban et al.
-    2022). The past is given: no gradient reaches it."""
+    """sum m / (2 dt^2) |x - x' - dt v'|^2 [J], v' = (x' - x'') / dt, of points (N, T, 3) [m] now, one and two frames ago (Santesteban et
+    al. 2022). The past is given: no gradient reaches it."""
     before, earlier = before.detach(), earlier.detach()
     return ((x - 2 * before + earlier).square().sum(-1) * mass[:, None]).sum(0).mean() / (2 * dt * dt)

@@ -3,10 +3,10 @@
 The rules, in this order; whatever is changed is told in a sentence:
 
 1. Faces whose corners coincide, faces that repeat others, and vertices in no face are dropped.
-2. Vertices of the boundary that lie on one another (a seam of the texture, a soup of triangles) are merged, unless more than two faces would
-   meet at an edge.
+2. Where edges of the boundary lie on one another (a seam of the texture, a soup of triangles), their vertices are merged.
 3. At an edge of three or more faces the two that continue each other straightest stay joined; parts that touch in a point come apart.
-4. Of separate parts, those below 5 % of the area (buttons, labels, pockets) are dropped; the others stay, each for itself.
+4. Of separate parts, those below 5 % of the area (buttons, labels, pockets) are dropped; the others stay, each for itself. Refused if
+   less than 80 % of the area would be left.
 5. A part without an opening is refused: a solid, or cloth with a thickness. So is one with a single side (a Moebius strip).
 6. Faces wound against the others of their part are turned.
 7. Holes of less than 10 cm around are filled.
@@ -20,7 +20,7 @@ from polyfit.errors import InputError
 from .remesh import loops
 
 COINCIDENT = 2e-5  # vertices closer than this lie on one another [m]
-SMALL_PART = 0.05  # of the area
+SMALL_PART, MOST = 0.05, 0.80  # of the area: parts that are dropped, and what has to be left
 SMALL_HOLE = 0.10  # around [m]
 
 
@@ -31,6 +31,7 @@ def mended(V, F, where="garment"):
     told = []
     V, F = _without_slivers(V, F, where, told)
     V, F = _sewn(V, F, told)
+    V, F = _without_slivers(V, F, where, told)
     V, F = _cut_apart(V, F, told)
     V, F = _large_parts(V, F, where, told)
     F = _wound_alike(V, F, where, told)
@@ -45,7 +46,8 @@ def check(V, F, where="garment"):
     used = np.unique(F)
     if not (finite := np.isfinite(V[used]).all(axis=1)).all():
         first = used[finite.argmin()]
-        raise InputError(f"{where}: {(~finite).sum()} vertices have coordinates that are not finite (the first is vertex {first}, counted from 0)")
+        count = f"{(~finite).sum()} vertices have coordinates that are not finite"
+        raise InputError(f"{where}: {count} (the first is vertex {first}, counted from 0)")
     if not np.ptp(V[used], axis=0).max() > 0:
         raise InputError(f"{where}: its faces have no area")
 
@@ -100,25 +102,20 @@ def _sewn(V, F, told):
     from scipy.spatial import cKDTree
 
     edges, uses = _uses(F)
-    rim = np.unique(edges[uses == 1])
+    rim_edges = edges[uses == 1]
+    rim = np.unique(rim_edges)
     pairs = rim[cKDTree(V[rim]).query_pairs(COINCIDENT, output_type="ndarray")] if len(rim) else np.empty((0, 2), dtype=np.int64)
-    crowded = set(map(tuple, edges[uses > 2].tolist()))
-    while len(pairs):
-        label = mesh.components(len(V), pairs)
-        W, G = _merged(V, F, pairs)
-        whole = (G != np.roll(G, 1, axis=1)).all(axis=1)
-        number = np.unique(label, return_inverse=True)[1]
-        new_edges, new_uses = _uses(G[whole])
-        was = {tuple(sorted((number[a], number[b]))) for a, b in crowded}
-        wrong = {v for e, u in zip(new_edges.tolist(), new_uses) if u > 2 and tuple(e) not in was for v in e}
-        keep = ~np.isin(number[pairs[:, 0]], list(wrong))
-        if keep.all() and whole.all():
-            told.append(f"merged {len(V) - len(W)} vertices of the boundary with others that lie on them")
-            return W, G
-        if keep.all():  # a face would lose its area: leave its corners apart
-            keep = ~np.isin(number[pairs[:, 0]], G[~whole])
-        pairs = pairs[keep]
-    return V, F
+    if not len(pairs):
+        return V, F
+    # only where two edges of the boundary coincide: parts that touch in a point stay apart
+    place = mesh.components(len(V), pairs)
+    _, which, times = np.unique(np.sort(place[rim_edges], axis=1), axis=0, return_inverse=True, return_counts=True)
+    seam = np.unique(rim_edges[(times > 1)[which.ravel()]])
+    pairs = pairs[np.isin(pairs, seam).all(axis=1)]
+    W, G = _merged(V, F, pairs)
+    if len(W) < len(V):
+        told.append(f"merged {len(V) - len(W)} vertices of the boundary with others that lie on them")
+    return W, G
 
 
 def _cut_apart(V, F, told):
@@ -156,7 +153,10 @@ def _cut_apart(V, F, told):
 def _large_parts(V, F, where, told):
     part, area = parts(F), mesh.areas(V, F)
     share = np.bincount(part, area) / area.sum()
-    keep = share >= min(SMALL_PART, share.max())
+    keep = share >= SMALL_PART
+    if share[keep].sum() < MOST:
+        found = f"falls apart into {len(share)} parts, {100 * share[~keep].sum():.0f} % of its area in small ones"
+        raise InputError(f"{where}: {found}; faces joined by common vertices are needed")
     if not keep.all():
         few = "a part" if (~keep).sum() == 1 else f"{(~keep).sum()} parts"
         told.append(f"dropped {few} of {(~keep[part]).sum()} faces, {100 * share[~keep].sum():.2g} % of the area")
@@ -167,7 +167,8 @@ def _large_parts(V, F, where, told):
     part = parts(F)
     open_parts = np.unique(part[np.isin(F, edges[uses == 1]).any(axis=1)])
     if len(open_parts) < part.max() + 1:
-        raise InputError(f"{where}: a closed surface without openings (a solid, or cloth with a thickness); a single layer of cloth is needed")
+        found = "a closed surface without openings (a solid, or cloth with a thickness)"
+        raise InputError(f"{where}: {found}; a single layer of cloth is needed")
     return V, F
 
 

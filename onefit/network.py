@@ -1,7 +1,7 @@
 """The network: patches and the body's motion in, the patches' deformation out (paper, section "OneFit", and supplement).
 
-    jets, orientations, places of the patches ─► PatchEncoder ─► Z_T ─┐
-    poses, shape, root velocity ─► BodyEncoder ─────────────────► Z_B ┴─► Decoder ─► Deformation
+jets, orientations, places of the patches ─► PatchEncoder ─► Z_T ─┐
+poses, shape, root velocity ─► BodyEncoder ─────────────────► Z_B ┴─► Decoder ─► Deformation
 """
 
 import math
@@ -36,15 +36,15 @@ def layers(widths, bias=True, last=True):
 
 
 def encoded(x, octaves):
-    """Positional encoding (Mildenhall et al. 2020) of x (..., D) [m]: x and its sines and cosines at wavelengths of 2 m / 2^i, (..., D (1 + 2
-    octaves))."""
+    """Positional encoding (Mildenhall et al. 2020) of x (..., D) [m]: x and its sines and cosines at wavelengths of 2 m / 2^i, (..., D (1
+    + 2 octaves))."""
     waves = x[..., None] * (math.pi * 2.0 ** torch.arange(octaves, dtype=x.dtype, device=x.device))
     return torch.cat([x, waves.sin().flatten(-2), waves.cos().flatten(-2)], -1)
 
 
 class PatchEncoder(nn.Module):
-    """Z_T (K, width) of patches: an MLP, with skip connections, of the jet, the orientation, the encoded centre and its encoded offsets from
-    the joints."""
+    """Z_T (K, width) of patches: an MLP, with skip connections, of the jet, the orientation, the encoded centre and its encoded offsets
+    from the joints."""
 
     def __init__(self, order, joints, width=128, hidden=256, octaves=(6, 3)):
         super().__init__()

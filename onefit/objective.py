@@ -1,4 +1,6 @@
-"""The whole objective of a garment's deformation in a few frames (paper, section "OneFit"): what training lowers, and what a drape is measured by."""
+"""The whole objective of a garment's deformation in a few frames (paper, section "OneFit"): what training lowers, and what a drape is
+measured by.
+"""
 
 from dataclasses import dataclass
 
@@ -30,16 +32,18 @@ def posed(points, weights, transforms):
 
 
 def vertices(garment, changes, rest, transforms):
-    """The garment's vertices (N, T, 3) [m], of :meth:`onefit.charts.PatchedGarment.changes`, rest (N, T, 3) [m] and transforms (T, J, 3, 4)."""
+    """The garment's vertices (N, T, 3) [m], of :meth:`onefit.charts.PatchedGarment.changes`, rest (N, T, 3) [m] and transforms (T, J, 3,
+    4).
+    """
     return posed(rest + garment.displacement(changes), garment.garment.blend_weights, transforms)
 
 
 def evaluate(garment, deformation, scene, weights, epoch=100, past=None, dt=1 / 30, generator=None):
     """The terms of the objective, a dict of tensors in which the weights are in force, and the posed vertices (N, T, 3) [m].
 
-    ``garment``: a :class:`onefit.charts.PatchedGarment`; ``deformation``: its :class:`onefit.charts.Deformation` in the T frames; ``past``: the
-    vertices one and two frames, of ``dt`` [s], before each of them, (N, T, 3) [m] each; None leaves inertia out. A term whose weight is 0
-    is left out too.
+    ``garment``: a :class:`onefit.charts.PatchedGarment`; ``deformation``: its :class:`onefit.charts.Deformation` in the T frames;
+    ``past``: the vertices one and two frames, of ``dt`` [s], before each of them, (N, T, 3) [m] each; None leaves inertia out. A term
+    whose weight is 0 is left out too.
     """
     changes = garment.changes(deformation)
     x = vertices(garment, changes, scene.rest, scene.transforms)

@@ -64,7 +64,8 @@ def delaunay(V, F):
         one, two = order[start], order[start + 1]  # corners from which the edge is walked, 3 face + k
         to_next = V[np.roll(F, -1, axis=1)] - V[F]
         to_next /= np.maximum(np.linalg.norm(to_next, axis=2, keepdims=True), 1e-300)
-        angle = np.arccos(np.clip(-(np.roll(to_next, -1, axis=1) * np.roll(to_next, 1, axis=1)).sum(axis=2), -1, 1)).ravel()  # opposite to side k
+        cosine = -(np.roll(to_next, -1, axis=1) * np.roll(to_next, 1, axis=1)).sum(axis=2)
+        angle = np.arccos(np.clip(cosine, -1, 1)).ravel()  # opposite to the side from corner k
         total = angle[one] + angle[two]
         there, touched, flips = set(map(tuple, edges.tolist())), set(), 0
         for k in np.argsort(-total, kind="stable")[: (total > np.pi + 1e-3).sum()]:
@@ -86,8 +87,9 @@ def delaunay(V, F):
 def remeshed(V, F, count, steps=40):
     """``(vertices, faces)`` with about ``count`` vertices, evenly spread over the surface, the boundary's on its loops.
 
-    Clusters of equal area (ACVD) give the triangles; then vertices slide on the surface towards the mean of their neighbours, those of a loop
-    along it, and edges are flipped to the Delaunay triangulation. A mesh of fewer than 20 vertices for each new one is cut finer first.
+    Clusters of equal area (ACVD) give the triangles; then vertices slide on the surface towards the mean of their neighbours, those of a
+    loop along it, and edges are flipped to the Delaunay triangulation. A mesh of fewer than 20 vertices for each new one is cut finer
+    first.
     """
     import pyacvd
     import pyvista

@@ -3,10 +3,10 @@
     python -m onefit.tailor                       # all seven, a minute
     python -m onefit.tailor --body body.ply       # the body that they are made around
 
-Each garment is a level set: the body's signed distance with its hollows closed by a rolling ball (cloth spans the gap between the breasts and
-that of the spine), torso, arms, legs and a flared skirt joined by a smooth union, less the ease that the garment has there. It is cut open at
-neck, hem and cuffs by smooth functions, remeshed by clusters (ACVD), and its triangles are evened out by sliding along the surface and along the
-loops. Everything is deterministic. Metres, OneFit's axes.
+Each garment is a level set: the body's signed distance with its hollows closed by a rolling ball (cloth spans the gap between the breasts
+and that of the spine), torso, arms, legs and a flared skirt joined by a smooth union, less the ease that the garment has there. It is cut
+open at neck, hem and cuffs by smooth functions, remeshed by clusters (ACVD), and its triangles are evened out by sliding along the
+surface and along the loops. Everything is deterministic. Metres, OneFit's axes.
 """
 
 import argparse
@@ -45,9 +45,10 @@ def ramp(x, start, end):
 class Block:
     """The signed distances that garments are made of, on one grid around the standard body [m]."""
 
-    def __init__(self, vertices, faces):
-        shape = np.round((HIGH - LOW) / SPACING).astype(int) + 1
-        axes = [(LOW[k] + SPACING * np.arange(shape[k])).astype(np.float32) for k in range(3)]
+    def __init__(self, vertices, faces, spacing=SPACING):
+        self.spacing = spacing
+        shape = np.round((HIGH - LOW) / spacing).astype(int) + 1
+        axes = [(LOW[k] + spacing * np.arange(shape[k])).astype(np.float32) for k in range(3)]
         self.x, self.y, self.z = np.meshgrid(*axes, indexing="ij", sparse=True)
         self.side = np.abs(self.x)
         self.points = np.stack(np.broadcast_arrays(self.x, self.y, self.z), axis=-1)
@@ -90,7 +91,7 @@ class Block:
         """Level set as ``(vertices [m], faces)``, wound away from where the field is lower."""
         from skimage.measure import marching_cubes
 
-        V, F, _, _ = marching_cubes(field, level, spacing=(SPACING,) * 3, gradient_direction="descent", allow_degenerate=False)
+        V, F, _, _ = marching_cubes(field, level, spacing=(self.spacing,) * 3, gradient_direction="descent", allow_degenerate=False)
         return V + LOW, F.astype(np.int64)
 
     def _distance(self, surface, reach):
@@ -119,8 +120,8 @@ def along_arm(x, y, z):
 
 
 def below_neckline(x, y, z, front, back, narrow):
-    """Positive below a neckline that lies ``front`` high at y = -0.09 and ``back`` high at y = 0.05 [m]; ``narrow`` [1/m] bends it up at the
-    sides.
+    """Positive below a neckline that lies ``front`` high at y = -0.09 and ``back`` high at y = 0.05 [m]; ``narrow`` [1/m] bends it up at
+    the sides.
     """
     return front + (back - front) * (y + 0.09) / 0.14 + narrow * x * x - z
 
@@ -233,7 +234,8 @@ def _clipped(V, F, inside):
 
     surface = pyvista.PolyData.from_regular_faces(V, F)
     surface["inside"] = inside(*V.T)
-    part = surface.clip_scalar(scalars="inside", value=0.0, invert=False).triangulate().clean(tolerance=1e-6, absolute=True).extract_largest()
+    part = surface.clip_scalar(scalars="inside", value=0.0, invert=False).triangulate()
+    part = part.clean(tolerance=1e-6, absolute=True).extract_largest()
     return np.array(part.points, dtype=np.float64), part.regular_faces.astype(np.int64)
 
 
@@ -251,9 +253,10 @@ def write(names, folder):
 
 
 def main():
-    parser = argparse.ArgumentParser(prog="python -m onefit.tailor", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(prog="python -m onefit.tailor", description=__doc__, formatter_class=raw)
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"templates to sew (default: all): {', '.join(PATTERNS)}")
-    parser.add_argument("-o", "--output", default=FOLDER, metavar="FOLDER", help="where the .npz files go (default: the package's own folder)")
+    parser.add_argument("-o", "--output", default=FOLDER, metavar="FOLDER", help="of the .npz files (default: the package's own)")
     parser.add_argument("--body", metavar="FILE.ply", help="write the standard body, to make garments around, and sew nothing")
     args = parser.parse_args()
     if unknown := [n for n in args.names if n not in PATTERNS]:

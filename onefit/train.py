@@ -3,7 +3,8 @@
     python -m onefit.train [GARMENT ...] -o OUT [--motions FILE ...] [--from WEIGHTS] [--resume]
     torchrun --nproc-per-node 2 -m onefit.train ...
 
-GARMENT are names of the package's templates (tshirt, dress, ...) or meshes (.obj, .ply); without any, the six templates of the paper. OUT receives
+GARMENT are names of the package's templates (tshirt, dress, ...) or meshes (.obj, .ply); without any, the six templates of the paper. OUT
+receives
 
     weights.safetensors     the trained network, for ``onefit.load``, and weights.json: what made it
     log.jsonl               a line every 50 steps: the loss and each of its terms
@@ -21,7 +22,7 @@ from dataclasses import asdict, dataclass, field, fields
 import torch
 
 from polyfit.errors import InputError, cli
-from polyfit.training import Processes, Training, device_of, progress_bar, started
+from polyfit.training import Training, conduct, device_of
 
 from .losses import Weights
 from .weights import load, save
@@ -74,14 +75,16 @@ class OneFitTraining(Training):
         network = load(settings.start).network if settings.start else _network(settings, data)
         plain = json.loads(json.dumps(asdict(settings)))
         network = network.to(processes.device).train()
-        super().__init__(network, torch.optim.Adam(network.parameters(), settings.lr), plain, processes)
-        windows = min(self._windows(garment) for garment, *_ in data.garments)
+        windows = min(self._windows(garment, processes) for garment, *_ in data.garments)
         self.epoch_steps = settings.epoch_steps or -(-len(data) // windows)
-        self.steps = settings.epochs * self.epoch_steps
+        super().__init__(network, torch.optim.Adam(network.parameters(), settings.lr), plain, processes, settings.epochs * self.epoch_steps)
 
-    def _windows(self, garment):
+    def write_weights(self, path):
+        save(path, self.network, self.data.model, self.given.garments)
+
+    def _windows(self, garment, processes):
         """Windows of a step, so that it has about ``batch`` patches, and each process the same number of windows."""
-        count = self.processes.count
+        count = processes.count
         return max(1, round(self.given.batch / len(garment) / count)) * count
 
     def loss(self, generator, garment=None):
@@ -90,7 +93,7 @@ class OneFitTraining(Training):
         from .training_data import FPS
 
         garment, rest, field = self.data.garments[self.done % len(self.data.garments) if garment is None else garment]
-        windows = self.data.windows(self._windows(garment), generator)
+        windows = self.data.windows(self._windows(garment, self.processes), generator)
         hidden = HIDDEN * torch.randn(1, len(windows.number), self.network.body.memory.hidden_size, generator=generator)
         mine = slice(self.processes.rank, None, self.processes.count)
         windows = type(windows)(*(getattr(windows, f.name)[mine] for f in fields(windows)))
@@ -155,27 +158,11 @@ def train(settings, folder, *, device="cpu", resume=False, until=None, every=120
     """Trains and leaves weights in ``folder``; returns their path. ``until`` (steps) ends early, with a checkpoint and no weights (None);
     ``every`` [s] checkpoints.
     """
-    folder = started(folder, resume)
-    weights = folder / "weights.safetensors"
-    processes = Processes(device)
-    try:
-        with progress_bar(processes) as progress:
-            data = _data(settings, progress).to(processes.device)
-            training = OneFitTraining(settings, data, processes)
-            if resume:
-                training.restore(folder / "checkpoint.safetensors")
-            task = progress.add_task("steps", total=training.steps, completed=training.done)
-            end = min(until or training.steps, training.steps)
-            training.run(folder, end, every, lambda: progress.update(task, completed=training.done))
-        if training.done < training.steps:
-            return None
-        if processes.rank == 0:
-            save(weights, training.network, data.model, settings.garments)
-            training.write_about(weights.with_suffix(".json"), command, steps=training.steps)
-        processes.wait()
-        return weights
-    finally:
-        processes.close()
+
+    def make(folder, processes, progress):
+        return OneFitTraining(settings, _data(settings, progress).to(processes.device), processes)
+
+    return conduct(make, folder, device=device, resume=resume, until=until, every=every, command=command)
 
 
 def parser():
@@ -186,7 +173,8 @@ def parser():
     p.add_argument("--motions", nargs="+", default=[], metavar="FILE", help="AMASS, NCS or BVH files (default: generated ones)")
     p.add_argument("--from", dest="start", default="", metavar="WEIGHTS", help="weights to fine-tune, a file or a name of the package's")
     for name, text in {
-        "order": "of the jets", "batch": "patches of a step, all frames together", "epochs": "", "lr-epochs": "epochs with the full rate, a tenth of it after",
+        "order": "of the jets", "batch": "patches of a step, all frames together", "epochs": "",
+        "lr-epochs": "epochs with the full rate, a tenth of it after",
         "epoch-steps": "steps of an epoch, 0: each window of the motions once", "seeds": "generated motions of each kind",
         "shapes": "random bodies beside the standard one", "seed": "",
     }.items():  # fmt: skip

@@ -27,17 +27,21 @@ class Windows:
 
 
 class TrainingData:
-    """``garments``: names of templates or :class:`onefit.garment.Garment`; ``motions``: those to draw from, by default every training kind of
-    :mod:`onefit.generate` with the seeds 0 .. ``seeds`` - 1; ``shapes``: how many random bodies beside the standard one.
+    """``garments``: names of templates or :class:`onefit.garment.Garment`; ``motions``: those to draw from, by default every training kind
+    of :mod:`onefit.generate` with the seeds 0 .. ``seeds`` - 1; ``shapes``: how many random bodies beside the standard one.
     """
 
-    def __init__(self, garments, *, model=None, motions=None, seeds=4, seconds=6.0, shapes=48, patches=None, order=4, seed=0, advance=lambda: None):
+    def __init__(
+        self, garments, *, model=None, motions=None, seeds=4, seconds=6.0, shapes=48, patches=None, order=4, seed=0, advance=lambda: None
+    ):
         self.model = model or AnnyBody()
         rng = np.random.default_rng(seed)
         self.shapes = torch.stack([self.model.standard_shape] + [self.model.random_shape(rng) for _ in range(shapes)])
         bodies = [self.model.body(shape) for shape in self.shapes]
         self.standard = bodies[0]
-        self.vertices, self.joints, self.rest_poses = (torch.stack([getattr(b, name) for b in bodies]) for name in ("vertices", "joints", "rest_pose"))
+        self.vertices, self.joints, self.rest_poses = (
+            torch.stack([getattr(b, name) for b in bodies]) for name in ("vertices", "joints", "rest_pose")
+        )
         if motions is None:
             motions = [Motion.generate(name, seconds=seconds, seed=k) for name in generate.TRAINING for k in range(seeds)]
         self.motions = [m.resampled(FPS) for m in motions]
@@ -77,8 +81,8 @@ class TrainingData:
         return Windows(torch.stack(poses).to(device), torch.stack(translation).to(device), shape, number)
 
     def scene(self, windows, rest, field):
-        """The :class:`onefit.objective.Scene` of the windows' last frames, and the transforms (B, J, 3, 4) one and two frames before; of a garment
-        whose graded vertices are ``rest`` (N, S, 3), with the ``field`` (3 P, S, 3) of them."""
+        """The :class:`onefit.objective.Scene` of the windows' last frames, and the transforms (B, J, 3, 4) one and two frames before; of a
+        garment whose graded vertices are ``rest`` (N, S, 3), with the ``field`` (3 P, S, 3) of them."""
         number = windows.number
         body = replace(self.standard, joints=self.joints[number], rest_pose=self.rest_poses[number])
         now, *past = (skinning.transforms(body, windows.poses[:, -k], windows.translation[:, -k]) for k in (1, 2, 3))

@@ -20,7 +20,8 @@ def pretrained():
 
 @dataclass(frozen=True)
 class Trained:
-    """A ``network`` (:class:`onefit.network.OneFit`), the ``body`` model's kind that it was trained on, and the names of its ``garments``."""
+    """A ``network`` (:class:`onefit.network.OneFit`), the ``body`` model's kind that it was trained on, and the names of its ``garments``.
+    """
 
     network: object
     body: str
@@ -28,8 +29,8 @@ class Trained:
 
 
 def save(path, network, model, garments):
-    """The weights of ``network``, matrices in eight bits a number and a scale for each row, with what is needed to use them: ``model``, the body
-    model, and ``garments``, names."""
+    """The weights of ``network``, matrices in eight bits a number and a scale for each row, with what is needed to use them: ``model``,
+    the body model, and ``garments``, names."""
     about = dict(model="onefit", version=VERSION, shape=network.shape, body=model.kind, garments=list(garments))
     tensors = {}
     for name, tensor in network.state_dict().items():

@@ -28,7 +28,7 @@ from .errors import InputError, cli
 from .losses import discrepancy
 from .meshio import read_mesh
 from .stn import PolyFit, SpatialTransformer
-from .training import Processes, Training, device_of, progress_bar, started
+from .training import Training, conduct, device_of
 from .weights import read_weights, write_weights
 
 VERSION = 1  # of the training sets
@@ -90,7 +90,10 @@ class PolyFitTraining(Training):
         self.given, self.data = settings, data
         torch.manual_seed(settings.seed)
         network = settings.network().to(processes.device)
-        super().__init__(network, torch.optim.Adam(network.parameters(), settings.lr), _plain(settings), processes)
+        super().__init__(network, torch.optim.Adam(network.parameters(), settings.lr), _plain(settings), processes, settings.steps)
+
+    def write_weights(self, path):
+        self.network.save(path)
 
     def update(self):
         s, share = self.given, self.done / self.given.steps
@@ -193,27 +196,11 @@ def train(settings, folder, *, device="cpu", resume=False, until=None, every=120
     """Trains and leaves weights in ``folder``; returns their path. ``until`` (steps) ends early, with a checkpoint and no weights (None);
     ``every`` [s] checkpoints.
     """
-    folder = started(folder, resume)
-    weights = folder / "weights.safetensors"
-    processes = Processes(device)
-    try:
-        with progress_bar(processes) as progress:
-            data = _prepare(settings, folder, processes, progress)
-            training = PolyFitTraining(settings, data, processes)
-            if resume:
-                training.restore(folder / "checkpoint.safetensors")
-            task = progress.add_task("steps", total=settings.steps, completed=training.done)
-            end = min(until or settings.steps, settings.steps)
-            training.run(folder, end, every, lambda: progress.update(task, completed=training.done))
-        if training.done < settings.steps:
-            return None
-        if processes.rank == 0:
-            training.network.save(weights)
-            training.write_about(weights.with_suffix(".json"), command)
-        processes.wait()
-        return weights
-    finally:
-        processes.close()
+
+    def make(folder, processes, progress):
+        return PolyFitTraining(settings, _prepare(settings, folder, processes, progress), processes)
+
+    return conduct(make, folder, device=device, resume=resume, until=until, every=every, command=command)
 
 
 def parser():

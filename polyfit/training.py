@@ -1,4 +1,5 @@
-"""What every training here does: steps that can be interrupted, resumed and shared by several processes, a log, and what made the weights."""
+"""What every training here does: steps that can be interrupted, resumed and shared by several processes, a log, and what made the weights.
+"""
 
 import contextlib
 import json
@@ -53,17 +54,21 @@ class Processes:
 
 
 class Training:
-    """One training: its ``network``, its ``optimiser``, how many steps are ``done``. ``settings``: all that decides the result, as JSON gives it
-    back. Subclasses have :meth:`update`, whose random numbers come from :meth:`generator` alone, and take of each batch the share of their
-    process. So a resumed training, and one on several processes, do what one process does without interruption.
+    """One training: its ``network``, its ``optimiser``, how many of its ``steps`` are ``done``. ``settings``: all that decides the result,
+    as JSON gives it back. Subclasses have :meth:`update`, whose random numbers come from :meth:`generator` alone, and take of each batch
+    the share of their process. So a resumed training, and one on several processes, do what one process does without interruption.
     """
 
-    def __init__(self, network, optimiser, settings, processes):
+    def __init__(self, network, optimiser, settings, processes, steps):
         self.network, self.optimiser, self.settings, self.processes = network, optimiser, settings, processes
-        self.done, self.seconds = 0, 0.0
+        self.steps, self.done, self.seconds = steps, 0, 0.0
 
     def update(self):
         """One step of the optimiser; what it lowered, as a dict of numbers with the sum as ``loss``."""
+        raise NotImplementedError
+
+    def write_weights(self, path):
+        """The trained network as a file."""
         raise NotImplementedError
 
     def generator(self):
@@ -104,8 +109,8 @@ class Training:
     # ---- the loop -----------------------------------------------------------------------------------------------------
 
     def run(self, folder, end, every, advance):
-        """Steps up to ``end``, with a line of ``folder``/log.jsonl every LINE of them and a checkpoint every so many seconds, at the end, and at
-        Ctrl-C. ``advance()`` is called after each step. Raises InputError where the loss is not finite."""
+        """Steps up to ``end``, with a line of ``folder``/log.jsonl every LINE of them and a checkpoint every so many seconds, at the end,
+        and at Ctrl-C. ``advance()`` is called after each step. Raises InputError where the loss is not finite."""
         checkpoint, first = folder / "checkpoint.safetensors", self.processes.rank == 0
         saved, lines = time.monotonic(), []
         with contextlib.ExitStack() as stack:
@@ -135,21 +140,28 @@ class Training:
         means = {name: sum(found) / len(found) for name in names if (found := [line[name] for line in lines if name in line])}
         return dict(step=self.done, **means, lr=self.optimiser.param_groups[0]["lr"], seconds=round(self.seconds, 2))
 
-    def write_about(self, path, command, **more):
+    def write_about(self, path, command):
         """The JSON file that says what made the weights."""
         device = self.processes.device.type
         about = dict(
-            command=command, **self.settings, processes=self.processes.count, minutes=round(self.seconds / 60, 2),
+            command=command, **{"steps": self.steps} | self.settings, processes=self.processes.count, minutes=round(self.seconds / 60, 2),
             machine=f"{platform.machine()}, {device}, {torch.get_num_threads()} thread(s) a process", torch=torch.__version__,
-            date=time.strftime("%Y-%m-%d"), parameters=sum(p.numel() for p in self.network.parameters()), **more,
+            date=time.strftime("%Y-%m-%d"), parameters=sum(p.numel() for p in self.network.parameters()),
         )  # fmt: skip
         with aside(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
             json.dump(about, file, indent=2)
             file.write("\n")
 
 
-def started(folder, resume):
-    """The folder of a training that is about to begin, or to go on from its checkpoint. Raises InputError where that cannot be."""
+def conduct(make, folder, *, device="cpu", resume=False, until=None, every=120.0, command=None):
+    """Trains what ``make(folder, processes, progress)`` gives, a :class:`Training`, and leaves its weights in ``folder``; returns their
+    path.
+
+    ``until`` (steps) ends early, with a checkpoint and no weights (None); ``every`` [s] checkpoints; ``progress`` is a
+    rich.progress.Progress. Raises InputError for a folder that holds weights already, or nothing to ``resume``.
+    """
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
     folder = Path(folder)
     checkpoint, weights = folder / "checkpoint.safetensors", folder / "weights.safetensors"
     if resume and not checkpoint.exists():
@@ -157,14 +169,25 @@ def started(folder, resume):
     if not resume and weights.exists():
         raise InputError(f"{weights}: exists; give another -o, or --resume")
     folder.mkdir(parents=True, exist_ok=True)
-    return folder
-
-
-def progress_bar(processes):
-    """A rich.progress.Progress, shown by the first process."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    return Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), disable=processes.rank > 0)
+    processes = Processes(device)
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    try:
+        with Progress(*columns, disable=processes.rank > 0) as progress:
+            training = make(folder, processes, progress)
+            if resume:
+                training.restore(checkpoint)
+            task = progress.add_task("steps", total=training.steps, completed=training.done)
+            end = min(until or training.steps, training.steps)
+            training.run(folder, end, every, lambda: progress.update(task, completed=training.done))
+        if training.done < training.steps:
+            return None
+        if processes.rank == 0:
+            training.write_weights(weights)
+            training.write_about(weights.with_suffix(".json"), command)
+        processes.wait()
+        return weights
+    finally:
+        processes.close()
 
 
 def device_of(name):

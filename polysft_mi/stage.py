@@ -15,9 +15,9 @@ FOV = 28.0  # degrees, of the picture's height
 def render(parts, *, size=(640, 480), spp=24, azimuth=25.0, elevation=8.0, follow=False):
     """Images (H, W, 3) uint8 sRGB, one a frame, of moving meshes on a floor.
 
-    ``parts``: of each mesh its vertices (T, N, 3) [m, z up], its faces (F, 3) and its colour, linear RGB. ``size``: (height, width) [pixels];
-    ``azimuth`` [degrees] to the side of the -y axis that the camera stands on, ``elevation`` above the floor. The camera keeps all in
-    the picture; with ``follow`` it goes along with what moves.
+    ``parts``: of each mesh its vertices (T, N, 3) [m, z up], its faces (F, 3) and its colour, linear RGB. ``size``: (height, width)
+    [pixels]; ``azimuth`` [degrees] to the side of the -y axis that the camera stands on, ``elevation`` above the floor. The camera keeps
+    all in the picture; with ``follow`` it goes along with what moves.
     """
     height, width = size
     everything = np.concatenate([np.asarray(v, np.float32) for v, _, _ in parts], axis=1)
@@ -64,7 +64,10 @@ def _scene(parts, floor):
 
 
 def _mesh(name, vertices, faces, colour):
-    bsdf = {"type": "twosided", "bsdf": {"type": "principled", "base_color": {"type": "rgb", "value": list(colour)}, "roughness": 0.7, "specular": 0.2}}
+    bsdf = {
+        "type": "twosided",
+        "bsdf": {"type": "principled", "base_color": {"type": "rgb", "value": list(colour)}, "roughness": 0.7, "specular": 0.2},
+    }
     props = mi.Properties()
     props["bsdf"] = mi.load_dict(bsdf)
     mesh = mi.Mesh(name, len(vertices), len(faces), has_vertex_normals=True, props=props)

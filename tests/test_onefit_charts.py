@@ -1,13 +1,13 @@
 import numpy as np
 import pytest
 import torch
-from polyfit import jets
 
 from onefit import losses, objective, skinning
 from onefit.body import AnnyBody
 from onefit.charts import Deformation, PatchedGarment, SparseMatrix
 from onefit.collision import FAR, Collider
 from onefit.garment import Garment
+from polyfit import jets
 
 T = 6
 
@@ -194,7 +194,9 @@ def test_gradient_of_the_whole_objective(patched, body, name):
     g = torch.Generator().manual_seed(7)
     # directions in which the value changes: random ones, leaning towards the gradient, for float32 shows nothing else
     for x, gradient in zip(range(3), gradients):
-        direction = gradient / gradient.norm() + 0.3 * torch.nn.functional.normalize(torch.randn(gradient.shape, generator=g).flatten(), dim=0).view_as(gradient)
+        direction = gradient / gradient.norm() + 0.3 * torch.nn.functional.normalize(
+            torch.randn(gradient.shape, generator=g).flatten(), dim=0
+        ).view_as(gradient)
         step = (1e-2 if name == "gravity" else 3e-4) / direction.abs().max().item()
         ends = []
         for sign in (1, -1):

@@ -7,11 +7,11 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from polyfit.errors import InputError
 
 from onefit import drape, weights
 from onefit.body import AnnyBody
 from onefit.network import OneFit
+from polyfit.errors import InputError
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -51,7 +51,9 @@ def test_animations_hold_the_arrays(out):
     with np.load(out / "drape.npz") as file:
         for name, vertices in (("garment", file["vertices"]), ("body", file["body"])):
             stage = Usd.Stage.Open(str(out / f"{name}.usd"))
-            assert UsdGeom.GetStageUpAxis(stage) == "Z" and UsdGeom.GetStageMetersPerUnit(stage) == 1 and stage.GetTimeCodesPerSecond() == 30
+            assert (
+                UsdGeom.GetStageUpAxis(stage) == "Z" and UsdGeom.GetStageMetersPerUnit(stage) == 1 and stage.GetTimeCodesPerSecond() == 30
+            )
             points = UsdGeom.Mesh(stage.GetPrimAtPath(f"/{name}/mesh")).GetPointsAttr()
             for t in range(len(vertices)):
                 assert np.abs(np.array(points.Get(t)) - vertices[t]).max() < 1e-5
@@ -98,6 +100,8 @@ def test_importing_onefit_is_quick_and_loads_nothing_heavy():
     code = "import sys, onefit; print([x for x in ('torch', 'numpy', 'mitsuba', 'drjit', 'warp', 'anny') if x in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
     assert done.stdout.strip() == "[]"
-    code = "import sys, onefit; onefit.load, onefit.Garment, onefit.AnnyBody, onefit.Motion, onefit.SmplBody; print('mitsuba' in sys.modules)"
+    code = (
+        "import sys, onefit; onefit.load, onefit.Garment, onefit.AnnyBody, onefit.Motion, onefit.SmplBody; print('mitsuba' in sys.modules)"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
     assert done.stdout.strip() == "False", done.stderr

@@ -1,9 +1,9 @@
 import pytest
 import torch
-from polyfit.errors import InputError
 
 from onefit import losses
 from onefit.losses import Weights
+from polyfit.errors import InputError
 
 G = torch.Generator().manual_seed(3)
 
@@ -55,14 +55,19 @@ def test_inextensibility_of_an_isometry_and_of_a_stretch():
     # 10 % along u: E from 1 to 1.21
     assert float(losses.inextensibility(rest, losses.metric((1.1 * u, v)), one, s)) == pytest.approx(losses.METRIC * (0.21), rel=1e-4)
     # shear: F from 0 to 0.2, and it stands twice in the matrix
-    assert float(losses.inextensibility(rest, losses.metric((u, v + 0.2 * u)), one, s)) == pytest.approx(losses.METRIC * (0.4 + 0.04), rel=1e-4)
+    assert float(losses.inextensibility(rest, losses.metric((u, v + 0.2 * u)), one, s)) == pytest.approx(
+        losses.METRIC * (0.4 + 0.04), rel=1e-4
+    )
     # where the metric may be larger by k_ext, that much costs nothing
     assert float(losses.inextensibility(rest, 1.3 * rest, 1.3 * one, s)) == pytest.approx(0, abs=1e-6)
-    assert float(losses.inextensibility(rest, losses.metric((1.1 * u, v)), one, 2 * s)) == pytest.approx(losses.METRIC * (0.21 / 4), rel=1e-4)
+    assert float(losses.inextensibility(rest, losses.metric((1.1 * u, v)), one, 2 * s)) == pytest.approx(
+        losses.METRIC * (0.21 / 4), rel=1e-4
+    )
     T = losses.metric((random(4, 2, 3), random(4, 2, 3)))
     weights = random(4, 2).abs() + 1
     gradient_agrees(
-        lambda x: losses.inextensibility(T, losses.metric(x.unbind(0)), weights, torch.full((4,), 0.7, dtype=torch.float64)), random(2, 4, 2, 3)
+        lambda x: losses.inextensibility(T, losses.metric(x.unbind(0)), weights, torch.full((4,), 0.7, dtype=torch.float64)),
+        random(2, 4, 2, 3),
     )
 
 

@@ -2,7 +2,6 @@ import dataclasses
 
 import pytest
 import torch
-from polyfit.errors import InputError
 
 import onefit
 from onefit import weights
@@ -14,6 +13,7 @@ from onefit.garment import Garment
 from onefit.motion import Motion
 from onefit.network import SLOPE, Decoder, OneFit, descriptors, encoded
 from onefit.post import pushed_out
+from polyfit.errors import InputError
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +86,9 @@ def test_layers_are_those_of_the_paper():
     assert widths(network.body.static) == [(216, 64), (64, 128), (128, 256), (256, 512)]
     assert widths(network.body.local) == [(9, 32), (32, 32)] and widths(network.body.moving) == [(768, 512), (512, 512)]
     assert network.body.memory.hidden_size == 512
-    assert not any("bias" in name for part in (network.body.local, network.body.moving, network.body.memory) for name, _ in part.named_parameters())
+    assert not any(
+        "bias" in name for part in (network.body.local, network.body.moving, network.body.memory) for name, _ in part.named_parameters()
+    )
     assert [b for _, b in widths(network.body.join)][:4] == [256] * 4 and len(widths(network.body.join)) == 5
     assert widths(network.decoder.trunk) == [(512, 512), (512, 512), (512, 256)]
     assert all([b for _, b in widths(head)][:2] == [128, 64] for head in network.decoder.heads.values())
@@ -209,3 +211,19 @@ def test_refused_weights(tmp_path, model, draper):
 
 def test_decoder_of_another_order():
     assert Decoder(3)(torch.zeros(2, 128), torch.zeros(1, 256)).alpha.shape == (1, 2, 10)
+
+
+def test_a_body_of_another_kind_is_draped_too(draper, walk, tmp_path):
+    # Anny's own surface as a plain file is another kind: the network is told the standard shape, and the drape is that of the standard body
+    import numpy as np
+
+    body = draper.standard
+    path = tmp_path / "body.npz"
+    np.savez(
+        path,
+        **{name: getattr(body, name).numpy() for name in ("vertices", "faces", "blend_weights", "joints", "rest_pose")},
+        parents=np.array(body.parents),
+    )
+    other = Draper(draper.trained, onefit.PlainBody(path))
+    a, b = draper.drape("tank", walk), other.drape("tank", walk)
+    assert (a.vertices - b.vertices).norm(dim=-1).max() < 0.005

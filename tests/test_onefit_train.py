@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from polyfit.errors import InputError
-from polyfit.training import Processes
 from safetensors.torch import load_file
 
 import onefit
 from onefit import train
 from onefit.losses import Weights
 from onefit.training_data import LENGTH
+from polyfit.errors import InputError
+from polyfit.training import Processes
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -96,7 +96,9 @@ def test_a_step_that_is_not_finite_is_stepped_over(small, data, monkeypatch, cap
     training.step()
     before = {k: v.clone() for k, v in training.network.state_dict().items()}
     loss = train.OneFitTraining.loss
-    monkeypatch.setattr(train.OneFitTraining, "loss", lambda self, g: {k: v * float("nan") if k == "gravity" else v for k, v in loss(self, g).items()})
+    monkeypatch.setattr(
+        train.OneFitTraining, "loss", lambda self, g: {k: v * float("nan") if k == "gravity" else v for k, v in loss(self, g).items()}
+    )
     figures = training.step()
     assert figures["stepped_over"] == 1 and np.isfinite(figures["loss"])
     assert "step 1: gravity not finite, stepped over" in capsys.readouterr().err
@@ -113,7 +115,12 @@ def test_a_resumed_training_ends_where_an_uninterrupted_one_does(small, tmp_path
     a, b = load_file(whole), load_file(resumed)
     assert a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a)
     about = json.loads(whole.with_suffix(".json").read_text())
-    assert about["command"] == "python -m onefit.train ..." and about["steps"] == 8 and about["garments"] == ["shorts"] and about["weights"]["k_b"] == 5e3
+    assert (
+        about["command"] == "python -m onefit.train ..."
+        and about["steps"] == 8
+        and about["garments"] == ["shorts"]
+        and about["weights"]["k_b"] == 5e3
+    )
     lines = [json.loads(line) for line in (tmp_path / "whole" / "log.jsonl").read_text().splitlines()]
     assert lines[-1]["step"] == 8 and {"loss", "collision", "inertia", "lr"} <= set(lines[-1])
     with pytest.raises(InputError, match="a checkpoint of other settings"):
@@ -128,9 +135,25 @@ def test_a_resumed_training_ends_where_an_uninterrupted_one_does(small, tmp_path
 
 def test_two_processes_of_torchrun_have_the_curve_of_one(small, tmp_path):
     flags = ["shorts", "--motions", small.motions[0], "--batch", "600", "--epochs", "1", "--epoch-steps", "3", "--shapes", "1"]
-    command = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", "--master-port", "29741", "-m", "onefit.train", *flags]
+    command = [
+        sys.executable,
+        "-m",
+        "torch.distributed.run",
+        "--nproc-per-node",
+        "2",
+        "--master-port",
+        "29741",
+        "-m",
+        "onefit.train",
+        *flags,
+    ]
     done = subprocess.run(
-        [*command, "-o", str(tmp_path / "two")], cwd=ROOT, capture_output=True, text=True, timeout=300, env=os.environ | {"OMP_NUM_THREADS": "1"}
+        [*command, "-o", str(tmp_path / "two")],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
     )
     assert done.returncode == 0, done.stderr[-2000:]
     train.main([*flags, "-o", str(tmp_path / "one")])
@@ -173,7 +196,9 @@ def test_settings_are_checked(change, message):
 
 
 def test_a_wrong_name_ends_in_one_line(tmp_path):
-    done = subprocess.run([sys.executable, "-m", "onefit.train", "tuxedo.obj", "-o", str(tmp_path / "out")], cwd=ROOT, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-m", "onefit.train", "tuxedo.obj", "-o", str(tmp_path / "out")], cwd=ROOT, capture_output=True, text=True
+    )
     assert done.returncode == 2
     assert done.stderr.strip().splitlines()[-1].startswith("error: tuxedo.obj: no such file")
     assert "Traceback" not in done.stderr

@@ -16,6 +16,7 @@ from polyfit import InputError, PolyFit, jets, train, training_set
 from polyfit.baselines.atlasnet import AtlasNet
 from polyfit.baselines.regressors import DGCNN, PointNet
 from polyfit.losses import discrepancy
+from polyfit.training import Processes
 
 ROOT = Path(__file__).resolve().parent.parent
 SMALL = train.Settings(families=("gaussian", "jet"), patches=120, points=40, reads=30, steps=8, batch=16, order=2)
@@ -67,7 +68,7 @@ def test_axes_cover_the_half_sphere():
 def test_training_lowers_the_loss(tmp_path):
     settings = replace(SMALL, steps=60, batch=64)
     data = train._Patches(training_set.build(300, 40, 2, 0, names=("gaussian", "jet")))
-    training = train.PolyFitTraining(settings, data, train.Processes("cpu"))
+    training = train.PolyFitTraining(settings, data, Processes("cpu"))
 
     def loss():
         with torch.no_grad():
@@ -129,7 +130,7 @@ def test_two_processes_of_torchrun_do_what_one_does(tmp_path):
     assert done.returncode == 0, done.stderr[-2000:]
     assert json.loads((tmp_path / "two" / "weights.json").read_text())["processes"] == 2
     two, one = load_file(tmp_path / "two" / "weights.safetensors"), load_file(train.train(SMALL, tmp_path / "one"))
-    fresh = train.PolyFitTraining(SMALL, None, train.Processes("cpu")).network.state_dict()
+    fresh = train.PolyFitTraining(SMALL, None, Processes("cpu")).network.state_dict()
     for k in one:
         assert (two[k] - one[k]).abs().max() <= 1e-4, k
     assert max((one[k] - fresh[k]).abs().max() for k in one) > 1e-3
