@@ -63,6 +63,16 @@ def _model(name):
     return PlainBody(name) if plain else SmplBody(name)
 
 
+def _garment(args):
+    from .garment import TEMPLATES, Garment
+
+    if args.garment in TEMPLATES:
+        return Garment.template(args.garment)
+    return Garment.read(
+        args.garment, made_for=args.made_for, loose=args.loose, scale=args.scale, up=args.up, turn=args.turn, offset=tuple(args.offset)
+    )
+
+
 def _render(drape, folder, size, spp, advance):
     """PNG frames and a video; Mitsuba is loaded here alone."""
     from polysft_mi.backend import set_variant
@@ -114,6 +124,13 @@ def parser():
     p.add_argument(
         "--shape", nargs="*", default=[], metavar="NAME=VALUE", help="the body's shape, e.g. weight=0.7; what is not named is standard"
     )
+    group = p.add_argument_group("a garment's mesh that is not in metres around the standard body")
+    group.add_argument("--scale", type=float, default=1.0, help="to metres: 0.01 for centimetres (default: 1)")
+    group.add_argument("--up", default="z", choices=("z", "y"), help="the axis that points up (default: z)")
+    group.add_argument("--turn", type=float, default=0.0, help="about the vertical [degrees] (default: 0)")
+    group.add_argument("--offset", nargs=3, type=float, default=(0.0, 0.0, 0.0), metavar=("X", "Y", "Z"), help="to move it by [m]")
+    group.add_argument("--made-for", choices=("T-pose",), help="T-pose: the standard body with its arms stretched out")
+    group.add_argument("--loose", action="store_true", help="a skirt or dress: the legs' pose is not followed")
     p.add_argument("--seconds", type=float, default=3.0, help="of a generated motion (default: 3)")
     p.add_argument("--seed", type=int, default=0, help="of a generated motion (default: 0)")
     p.add_argument("--post", action="store_true", help="push vertices out of the body afterwards")
@@ -142,7 +159,7 @@ def main(argv=None):
         if not (folder / "drape.npz").exists():
             raise InputError(f"{folder}: holds no drape; --overwrite replaces nothing else")
     draper = load(args.weights, model=_model(args.body), device=device_of(args.device))
-    garment = draper.garment(args.garment)
+    garment = _garment(args)
     motion = _motion(args.motion, args.seconds, args.seed)
     shape = _shape(draper.model, args.shape)
     console = Console(stderr=True)

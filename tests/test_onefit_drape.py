@@ -105,3 +105,19 @@ def test_importing_onefit_is_quick_and_loads_nothing_heavy():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
     assert done.stdout.strip() == "False", done.stderr
+
+
+def test_a_mesh_in_centimetres_with_y_up(network, tmp_path):
+    from onefit.garment import Garment
+    from polyfit.meshio import write_ply
+
+    shorts = Garment.template("shorts")
+    x, y, z = 100 * shorts.vertices.double().numpy().T
+    write_ply(tmp_path / "shorts.ply", np.stack([x, z, -y], 1), shorts.faces.numpy())
+    arguments = [str(tmp_path / "shorts.ply"), "walk", "--weights", network, "--seconds", "0.1", "--skip", "usd", "render"]
+    with pytest.raises(InputError, match="it looks like .*y up"):
+        drape.main([*arguments, "-o", str(tmp_path / "wrong")])
+    drape.main([*arguments, "-o", str(tmp_path / "right"), "--scale", "0.01", "--up", "y"])
+    with np.load(tmp_path / "right" / "drape.npz") as file:
+        assert np.abs(file["rest"] - shorts.vertices.numpy()).max() < 1e-3
+    assert sorted(p.name for p in (tmp_path / "right").iterdir()) == ["drape.npz", "figures.json"]
