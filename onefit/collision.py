@@ -10,6 +10,7 @@ import torch
 from .quietwarp import warp
 
 FAR = 0.15  # [m]; points farther from the body than this are not asked about, and pass for this far
+DEEP = 0.005  # [m] inside, from where on a sign is asked of the nearest triangle too
 
 
 @lru_cache
@@ -27,8 +28,12 @@ def _warp():
             away = points[i] - at
             length = wp.length(away)
             nearest[i] = at
+            sign = found.sign
+            # between the legs, where two points of the body are equally near, Warp's sign takes the mean of both normals and can be wrong
+            if sign < 0.0 and length > DEEP and wp.dot(away, wp.mesh_eval_face_normal(mesh, found.face)) > 0.0:
+                sign = 1.0
             if length > 1.0e-5:
-                normal[i] = away * (found.sign / length)
+                normal[i] = away * (sign / length)
             else:
                 normal[i] = wp.mesh_eval_face_normal(mesh, found.face)
         else:

@@ -145,6 +145,18 @@ def test_signed_distances(body):
     assert collider.distance(torch.full((1, 1, 3), 9.0), body.vertices[None]).item() == pytest.approx(FAR)
 
 
+def test_points_between_the_legs_are_outside(body):
+    # on the plane of symmetry both legs are equally near
+    from onefit.nearest import ClosestSurface
+
+    g = torch.Generator().manual_seed(0)
+    x = torch.rand(20_000, 3, generator=g) * torch.tensor([0.0, 0.3, 0.75]) + torch.tensor([0.0, -0.15, -0.8])
+    found = Collider(body.faces, body.vertices).distance(x[None], body.vertices[None])[0]
+    expected = torch.as_tensor(ClosestSurface(body.vertices.numpy(), body.faces.numpy())(x.numpy()).distance).clamp(max=FAR)
+    assert (expected > 0).float().mean() > 0.9
+    assert torch.allclose(found, expected.float(), atol=1e-5)
+
+
 def test_gradient_of_the_signed_distance(body):
     collider = Collider(body.faces, body.vertices)
     x = (body.vertices[::400] + 0.02 * torch.tensor([0.3, -0.8, 0.4]))[None].requires_grad_()
