@@ -1,6 +1,6 @@
-"""Draws docs/onefit.png: garments draped by a network of the package, in held-out motions, path-traced.
+"""Draws docs/onefit.jpg: garments draped by a network of the package, in held-out motions, path-traced.
 
-python docs/drapes.py [OUT.png] [--weights six-garments]
+python docs/drapes.py [OUT.jpg] [--weights six-garments]
 """
 
 import argparse
@@ -21,7 +21,7 @@ from polysft_mi import stage  # noqa: E402
 ROWS = [  # garment, motion, shape, colour
     ("dress", "dance", None, (0.35, 0.03, 0.06)),
     ("long_sleeve_top", "box", (0.1, 0.6, 0.6, 0.6, 0.6, 0.5), (0.06, 0.16, 0.35)),
-    ("trousers", "sneak", (0.9, 0.65, 0.5, 0.45, 0.5, 0.5), (0.05, 0.09, 0.07)),
+    ("trousers", "sneak", (0.0, 0.65, 0.5, 0.45, 0.5, 0.5), (0.05, 0.09, 0.07)),
 ]
 FRAMES, SIZE = 6, (380, 300)
 BODY = (0.5, 0.48, 0.46)
@@ -29,7 +29,7 @@ BODY = (0.5, 0.48, 0.46)
 
 def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("output", nargs="?", default=str(Path(__file__).parent / "onefit.png"))
+    parser.add_argument("output", nargs="?", default=str(Path(__file__).parent / "onefit.jpg"))
     parser.add_argument("--weights", default="six-garments")
     args = parser.parse_args(argv)
     draper, rows = onefit.load(args.weights), []
@@ -41,7 +41,7 @@ def main(argv=None):
             (drape.vertices[chosen].numpy(), drape.faces.numpy(), colour),
         ]
         rows.append(np.concatenate(list(stage.render(parts, size=SIZE, spp=96, follow=True)), axis=1))
-    cv2.imwrite(args.output, np.concatenate(rows)[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    cv2.imwrite(args.output, np.concatenate(rows)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
 
 
 if __name__ == "__main__":
