@@ -36,7 +36,8 @@ HIDDEN = 0.1  # standard deviation of the encoder's memory at the start of a win
 @dataclass(frozen=True)
 class Settings:
     """What decides the result. ``batch``: patches of a step, all frames together (the paper's 20,000); ``lr`` for the first ``lr_epochs``
-    epochs, a tenth of it for the rest; an epoch has ``epoch_steps`` steps (0: as many as show each window of the motions once).
+    epochs, a tenth of it for the rest; an epoch has ``epoch_steps`` steps (0: as many as show each window of the motions once); ``tight``: the
+    share of :meth:`onefit.garment.Garment.tightened` for a second copy of each garment, 0 for none.
     """
 
     garments: tuple = STANDARD
@@ -50,6 +51,7 @@ class Settings:
     lr: float = 1e-3
     seeds: int = 4
     shapes: int = 48
+    tight: float = 0.0
     seed: int = 0
     weights: Weights = field(default_factory=Weights)
 
@@ -62,6 +64,8 @@ class Settings:
                 raise InputError(f"{name} = {getattr(self, name)}: 0 at least")
         if not 2 <= self.order <= 10:
             raise InputError(f"order = {self.order}; the order of OneFit's jets is 2 to 10")
+        if not 0 <= self.tight < 1:
+            raise InputError(f"tight = {self.tight}: 0, or a share of the distance from the body, less than 1")
         if not self.lr > 0:
             raise InputError(f"lr = {self.lr}: more than 0")
 
@@ -147,6 +151,8 @@ def _data(settings, progress):
 
     task = progress.add_task("garments", total=len(settings.garments))
     garments = [Garment.template(name) if name in TEMPLATES else Garment.read(name) for name in settings.garments]
+    if settings.tight:
+        garments += [garment.tightened(settings.tight) for garment in garments]
     motions = [Motion.read(path) for path in settings.motions] or None
     return TrainingData(
         garments, motions=motions, seeds=settings.seeds, shapes=settings.shapes, order=settings.order, seed=settings.seed,
@@ -180,6 +186,8 @@ def parser():
     }.items():  # fmt: skip
         value = getattr(default, name.replace("-", "_"))
         p.add_argument(f"--{name}", type=int, default=value, help=f"{text} (default: {value})".strip())
+    text = "beside each garment a tighter copy, drawn to this share of its distance from the body; 0: none (default: 0)"
+    p.add_argument("--tight", type=float, default=default.tight, metavar="SHARE", help=text)
     p.add_argument("--lr", type=float, default=default.lr, help=f"of Adam (default: {default.lr})")
     group = p.add_argument_group("the losses' weights (0 switches one off)")
     for f in fields(Weights):
