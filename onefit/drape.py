@@ -14,7 +14,6 @@ OUT receives
 
 import argparse
 import json
-import shutil
 import time
 import zipfile
 from pathlib import Path
@@ -22,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from polyfit.errors import InputError, cli
-from polyfit.files import aside
+from polyfit.files import aside, folder_aside
 
 GARMENT, BODY = (0.08, 0.19, 0.42), (0.5, 0.48, 0.46)  # colours, linear RGB
 
@@ -97,11 +96,10 @@ def _render(drape, folder, size, spp, advance):
 
 
 def write(drape, folder, *, skip=(), meshes=None, size=(480, 360), spp=32, advance=lambda: None):
-    """The files of a :class:`onefit.Drape` in the new or empty ``folder``; ``skip``: any of "usd", "render"."""
+    """The files of a :class:`onefit.Drape` in the empty ``folder``; ``skip``: any of "usd", "render"."""
     from polyfit.animation import write_frames, write_usd
 
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     arrays = {name: getattr(drape, name).numpy() for name in ("vertices", "faces", "rest", "body", "body_faces", "root")}
     with aside(folder / "drape.npz") as temporary:
         np.savez_compressed(temporary, fps=drape.fps, **arrays)
@@ -174,23 +172,13 @@ def main(argv=None):
     console.print(
         f"{N} vertices in {T} frames: {1e3 * seconds / T:.1f} ms a frame, {figures['collision']:.2f} % of the vertices inside the body"
     )
-    if folder.exists():
-        shutil.rmtree(folder)
+    about = dict(garment=args.garment, motion=motion.name, weights=args.weights, shape=shape.tolist(), post=args.post, vertices=N, frames=T)
+    folder.parent.mkdir(parents=True, exist_ok=True)
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=console) as progress:
+    with Progress(*columns, console=console) as progress, folder_aside(folder, lambda name: True) as temporary:
         task = progress.add_task("rendering", total=T, visible="render" not in args.skip)
-        write(drape, folder, skip=args.skip, meshes=args.meshes, size=args.size, spp=args.spp, advance=lambda: progress.advance(task))
-    about = dict(
-        garment=args.garment,
-        motion=motion.name,
-        weights=args.weights,
-        shape=shape.tolist(),
-        post=args.post,
-        vertices=N,
-        frames=T,
-        **figures,
-    )
-    (folder / "figures.json").write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
+        write(drape, temporary, skip=args.skip, meshes=args.meshes, size=args.size, spp=args.spp, advance=lambda: progress.advance(task))
+        (Path(temporary) / "figures.json").write_text(json.dumps(about | figures, indent=2) + "\n", encoding="utf-8")
     print(folder)
 
 
