@@ -56,9 +56,9 @@ class Collider:
         indices = wp.from_torch(faces.detach().to(rest.device, torch.int32).flatten().contiguous())
         self._mesh = wp.Mesh(points=self._vertices, indices=indices)
 
-    def nearest(self, points, vertices):
+    def nearest(self, points, vertices, reach=FAR):
         """Of points (T, P, 3) [m] with the body's vertices at (T, V, 3): the nearest points of its surface (T, P, 3), and unit vectors (T,
-        P, 3) from there to the point where that lies outside, from the point where it lies inside. Zero for points farther than FAR.
+        P, 3) from there to the point where that lies outside, from the point where it lies inside. Zero for points farther than ``reach`` [m].
         Without gradient."""
         wp = self._wp
         points, vertices = (x.detach().float().contiguous() for x in (points, vertices))
@@ -67,7 +67,7 @@ class Collider:
             wp.copy(self._vertices, wp.from_torch(v, dtype=wp.vec3))
             self._mesh.refit()
             arrays = [wp.from_torch(x, dtype=wp.vec3) for x in (p, n, d)]
-            wp.launch(self._query, len(p), inputs=[self._mesh.id, arrays[0], FAR, *arrays[1:]], device=self.device)
+            wp.launch(self._query, len(p), inputs=[self._mesh.id, arrays[0], reach, *arrays[1:]], device=self.device)
         return nearest, normal
 
     def distance(self, points, vertices):

@@ -9,6 +9,7 @@ from polyfit import mesh
 from .collision import Collider
 
 CLEARANCE = 0.003  # [m] from the body
+REACH = 0.08  # [m]; vertices deeper in the body than this stay there
 
 
 def pushed_out(vertices, faces, bodies, body_faces, clearance=CLEARANCE, rounds=5, smoothing=4):
@@ -33,15 +34,16 @@ def pushed_out(vertices, faces, bodies, body_faces, clearance=CLEARANCE, rounds=
         for x, body in zip(out, bodies[part]):
             chosen = torch.arange(len(x), device=x.device)
             for turn in range(rounds):
-                nearest, normal = collider.nearest(x[chosen][None], body[None])
+                nearest, normal = collider.nearest(x[chosen][None], body[None], REACH)
                 d = ((x[chosen] - nearest[0]) * normal[0]).sum(-1)
-                push = torch.zeros_like(x)
-                push[chosen] = (clearance - d).clamp(min=0)[:, None] * normal[0]
-                moved = push.abs().sum(-1) > 0
-                if not moved.any():
+                near = (d < clearance) & (normal[0] != 0).any(-1)
+                if not near.any():
                     break
-                x += spread(push) if turn < 2 else push
-                chosen = moved.nonzero()[:, 0] if turn else chosen
+                push = torch.zeros_like(x)
+                push[chosen[near]] = (clearance - d[near])[:, None] * normal[0][near]
+                push = spread(push) if turn < 2 else push
+                x += push
+                chosen = (push != 0).any(-1).nonzero()[:, 0]  # the others are clear, and stay where they are
         return out
 
     workers = min(torch.get_num_threads(), len(vertices)) if not vertices.is_cuda else 1

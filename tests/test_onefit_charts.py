@@ -170,9 +170,9 @@ def test_gradient_of_the_signed_distance(body):
     assert torch.allclose(gradient.norm(dim=-1), torch.ones(1), atol=1e-4)
 
 
-def scene(body, patched, frames=T, seed=2):
+def scene(body, patched, frames=T, seed=2, bend=0.15):
     g = torch.Generator().manual_seed(seed)
-    poses = body.rest_pose + 0.15 * torch.randn(frames, 24, 3, generator=g)
+    poses = body.rest_pose + bend * torch.randn(frames, 24, 3, generator=g)
     transforms = skinning.transforms(body, poses, 0.02 * torch.randn(frames, 3, generator=g))
     posed = skinning.skin(body.vertices, body.blend_weights, transforms)
     rest = patched.garment.vertices[:, None].expand(-1, frames, -1)
@@ -188,7 +188,8 @@ def test_without_deformation_the_objective_is_plain_skinning(patched, garment, b
 
 @pytest.mark.parametrize("name", ["collision", "inextensibility", "mesh_inextensibility", "boundary", "gravity", "inertia"])
 def test_gradient_of_the_whole_objective(patched, body, name):
-    s, d = scene(body, patched), deformation(patched, 0.3)
+    # little for the collision: its distance jumps where a point in the body has another part of it for its nearest
+    s, d = scene(body, patched, bend=0.02 if name == "collision" else 0.15), deformation(patched, 0.2 if name == "collision" else 0.3)
     past = [objective.vertices(patched, patched.changes(deformation(patched, 0.3, seed=k)), s.rest, s.transforms) for k in (1, 2)]
     switches = dict(collision="k_c", inextensibility="k_i", mesh_inextensibility="k_mi", boundary="k_b", gravity="k_g", inertia="k_in")
     off = {k: 0.0 for k in ("k_c", "k_i", "k_b", "k_bn", "k_mi", "k_g", "k_in")}
