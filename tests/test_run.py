@@ -157,6 +157,7 @@ def test_ctrl_c_leaves_a_valid_shorter_result(sequence, tmp_path):
     process = subprocess.Popen(
         command(sequence.folder / "scene.xml", "-o", out, *QUICK, "-D", "patience=100000", "-D", "period=60"),
         cwd=ROOT, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a shell's background jobs inherit that it is ignored
     )  # fmt: skip
     checkpoint = out / "checkpoint.npz"
     deadline = time.time() + 120
