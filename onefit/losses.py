@@ -53,7 +53,7 @@ def extension(distance, epoch, epsilon):
 
 
 def metric(tangents):
-    """First fundamental forms (..., 3): E, F, G of tangents (..., 2, 3)-like stacks: a pair of (..., 3)."""
+    """First fundamental forms (..., 3) [m^2], the entries E, F, G, of the pair ``tangents`` along u and v, (..., 3) [m] each."""
     u, v = tangents
     return torch.stack([(u * u).sum(-1), (u * v).sum(-1), (v * v).sum(-1)], -1)
 
@@ -62,8 +62,8 @@ def skinned_tangents(points, tangents, weights, transforms):
     """Tangents J_psi J_phi (2 of (P, T, 3)) of a skinned surface.
 
     ``points`` (P, T, 3) and ``tangents`` (2 of (P, T, 3)) in the rest space; ``weights`` (P, 3, J): blend weights and their derivatives
-    along u and v; ``transforms`` (T, J, 3, 4). The weights change along the surface, so that J_psi is not the blended rotation alone: d
-    psi = (sum_j w_j R_j) d phi + sum_j dw_j (R_j x + t_j).
+    along u and v; ``transforms`` (T, J, 3, 4). The weights change along the surface, so that J_psi is not the blended rotation alone:
+    d psi = (sum_j w_j R_j) d phi + sum_j dw_j (R_j x + t_j).
     """
     T, J = transforms.shape[:2]
     flat = transforms.transpose(0, 1).reshape(J, T * 12)
@@ -93,7 +93,7 @@ def boundary(displacement, normals, k_b, k_bn):
 
 
 def normals(tangents):
-    """Unit normals (..., 3) of a pair of tangents."""
+    """Unit normals (..., 3) of the pair ``tangents`` along u and v, (..., 3) [m] each."""
     return torch.nn.functional.normalize(torch.linalg.cross(*tangents), dim=-1)
 
 

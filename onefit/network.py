@@ -73,6 +73,7 @@ def descriptors(poses):
 
 
 def _matrices(rotvec):
+    """Rotations (..., 3, 3) of axis-angle vectors (..., 3) [rad]."""
     import roma
 
     return roma.rotvec_to_rotmat(rotvec)
