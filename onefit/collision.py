@@ -56,22 +56,27 @@ class Collider:
         indices = wp.from_torch(faces.detach().to(rest.device, torch.int32).flatten().contiguous())
         self._mesh = wp.Mesh(points=self._vertices, indices=indices)
 
-    def nearest(self, points, vertices, reach=FAR):
-        """Of points (T, P, 3) [m] with the body's vertices at (T, V, 3): the nearest points of its surface (T, P, 3), and unit vectors (T,
-        P, 3) from there to the point where that lies outside, from the point where it lies inside. Zero for points farther than ``reach`` [m].
-        Without gradient."""
-        wp = self._wp
-        points, vertices = (x.detach().float().contiguous() for x in (points, vertices))
+    def follow(self, vertices):
+        """The body's vertices are at (V, 3) [m] from now on."""
+        self._wp.copy(self._vertices, self._wp.from_torch(vertices.detach().float().contiguous(), dtype=self._wp.vec3))
+        self._mesh.refit()
+
+    def nearest(self, points, reach=FAR):
+        """Of points (P, 3) [m]: the nearest points of the body's surface (P, 3), and unit vectors (P, 3) from there to the point where that
+        lies outside, from the point where it lies inside. Zero for points farther than ``reach`` [m]. Without gradient."""
+        points = points.detach().float().contiguous()
         nearest, normal = torch.empty_like(points), torch.empty_like(points)
-        for p, v, n, d in zip(points, vertices, nearest, normal):
-            wp.copy(self._vertices, wp.from_torch(v, dtype=wp.vec3))
-            self._mesh.refit()
-            arrays = [wp.from_torch(x, dtype=wp.vec3) for x in (p, n, d)]
-            wp.launch(self._query, len(p), inputs=[self._mesh.id, arrays[0], reach, *arrays[1:]], device=self.device)
+        points, *found = (self._wp.from_torch(x, dtype=self._wp.vec3) for x in (points, nearest, normal))
+        self._wp.launch(self._query, len(points), inputs=[self._mesh.id, points, reach, *found], device=self.device)
         return nearest, normal
 
     def distance(self, points, vertices):
-        """Signed distances (T, P) [m], negative inside; differentiable in ``points`` (T, P, 3). Points farther than FAR have FAR."""
-        nearest, normal = self.nearest(points, vertices)
+        """Signed distances (T, P) [m], negative inside, of points (T, P, 3) [m] from the body with its vertices at (T, V, 3); differentiable
+        in ``points``. Points farther than FAR have FAR."""
+        found = []
+        for p, v in zip(points, vertices):
+            self.follow(v)
+            found.append(self.nearest(p))
+        nearest, normal = (torch.stack(x) for x in zip(*found))
         d = ((points - nearest) * normal).sum(-1)
         return torch.where((normal == 0).all(-1), FAR, d)
