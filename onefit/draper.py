@@ -10,9 +10,9 @@ from . import skinning
 from .binding import standard_body
 from .body import AnnyBody
 from .charts import PatchedGarment
-from .collision import Collider
 from .garment import TEMPLATES, Garment
 from .motion import Motion
+from .nearest import ClosestSurface
 from .objective import posed
 from .post import pushed_out
 from .weights import Trained
@@ -40,7 +40,7 @@ class Drape:
         """The :class:`onefit.measures.Measures` of this drape."""
         from .measures import measure
 
-        return measure(self.vertices, self.faces, self.rest, self.body, Collider(self.body_faces, self.body[0]), self.root, self.fps)
+        return measure(self.vertices, self.faces, self.rest, self.body, ClosestSurface(self.body[0], self.body_faces), self.root, self.fps)
 
 
 class Draper:

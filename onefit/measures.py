@@ -56,7 +56,7 @@ def measure(vertices, faces, rest, body_vertices, collider, root, fps):
     """:class:`Measures` of the vertices (T, N, 3) [m] of a garment with ``faces`` (F, 3), at ``rest`` (N, 3), on bodies (T, V, 3) whose
     roots are at ``root`` (T, 3), in at least three frames."""
     edges = torch.as_tensor(mesh.edges_of(faces.numpy())[0])
-    inside = torch.stack([collider.distance(v[None], b[None])[0] < 0 for v, b in zip(vertices, body_vertices)]).float().mean()
+    inside = torch.stack([collider.distances(v[None], b[None])[0] < 0 for v, b in zip(vertices, body_vertices)]).float().mean()
     change = lambda now, then: ((now - then).abs() / then).mean()
     energy = sum(physical_energy(vertices, rest, faces, root, 1 / fps)).mean()
     second = (vertices[2:] - 2 * vertices[1:-1] + vertices[:-2]).norm(dim=-1).mean()

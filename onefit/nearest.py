@@ -1,89 +1,144 @@
-"""The nearest point of a closed triangle mesh, and on which side of it a point lies. Warp's bounding volume hierarchy, NumPy in and out."""
+"""The nearest point of a closed triangle mesh, still or moving, and on which side of it a point lies: Warp's bounding volume hierarchy.
+
+The side is that of the pseudonormal at the nearest point (Baerentzen and Aanaes 2005): of the face, of the two faces of an edge, or of
+all around a vertex, weighted by their angles. It is summed up where it is asked for, so that nothing but the hierarchy follows a motion.
+"""
 
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-
-from polyfit import mesh
-
-from .quietwarp import warp
+import torch
 
 from .quietwarp import warp
+
+FAR = 0.15  # [m]; how far :meth:`ClosestSurface.distances` looks
+ON = 1e-5  # barycentric coordinates below it are on an edge; points nearer than this [m] are on the surface
 
 
 @dataclass(frozen=True)
 class Nearest:
     """``face`` (N,) int64, ``barycentric`` (N, 3), ``point`` (N, 3) [m] on the mesh, ``distance`` (N,) [m]: negative inside the mesh,
-    ``normal`` (N, 3): the unit pseudonormal there, that of the face, of the edge or of the vertex on which the point lies.
+    ``normal`` (N, 3): the unit pseudonormal there, that of the face, of the edge or of the vertex on which the point lies. Arrays of
+    points that were an array, tensors otherwise.
     """
 
-    face: np.ndarray
-    barycentric: np.ndarray
-    point: np.ndarray
-    distance: np.ndarray
-    normal: np.ndarray
+    face: np.ndarray | torch.Tensor
+    barycentric: np.ndarray | torch.Tensor
+    point: np.ndarray | torch.Tensor
+    distance: np.ndarray | torch.Tensor
+    normal: np.ndarray | torch.Tensor
 
 
 @lru_cache(maxsize=1)
 def _warp():
     wp = warp()
+    row = wp.types.vector(length=10, dtype=float)  # barycentric coordinates, point, distance, normal
+    ON_EDGE = wp.constant(ON)
+
+    @wp.func
+    def pseudonormal(mesh: wp.uint64, face: int, b: wp.vec3, first: wp.array(dtype=int), around: wp.array(dtype=int)):
+        most = int(0)
+        for k in range(3):
+            if b[k] > b[most]:
+                most = k
+        one, two = (most + 1) % 3, (most + 2) % 3
+        normal = wp.mesh_eval_face_normal(mesh, face)
+        if wp.min(b[one], b[two]) < ON_EDGE:
+            on_vertex = wp.max(b[one], b[two]) < ON_EDGE
+            v = wp.mesh_get_index(mesh, 3 * face + most)
+            other = wp.mesh_get_index(mesh, 3 * face + wp.where(b[one] > b[two], one, two))
+            points = wp.mesh_get(mesh).points
+            normal = wp.vec3(0.0, 0.0, 0.0)
+            for j in range(first[v], first[v + 1]):
+                f, k = around[j] // 3, around[j] % 3
+                p, q = wp.mesh_get_index(mesh, 3 * f + (k + 1) % 3), wp.mesh_get_index(mesh, 3 * f + (k + 2) % 3)
+                weight = float(0.0)
+                if on_vertex:
+                    weight = wp.acos(wp.dot(wp.normalize(points[p] - points[v]), wp.normalize(points[q] - points[v])))
+                elif p == other or q == other:
+                    weight = 1.0
+                normal += weight * wp.mesh_eval_face_normal(mesh, f)
+        return wp.normalize(normal)
 
     @wp.kernel
-    def nearest(mesh: wp.uint64, points: wp.array(dtype=wp.vec3), reach: float, face: wp.array(dtype=int), uv: wp.array(dtype=wp.vec2)):
+    def nearest(
+        mesh: wp.uint64,
+        first: wp.array(dtype=int),
+        around: wp.array(dtype=int),
+        points: wp.array(dtype=wp.vec3),
+        reach: float,
+        face: wp.array(dtype=int),
+        found: wp.array(dtype=row),
+    ):
         i = wp.tid()
         query = wp.mesh_query_point_no_sign(mesh, points[i], reach)
+        face[i] = -1
+        found[i][6] = reach
         if query.result:
+            b = wp.vec3(query.u, query.v, 1.0 - query.u - query.v)
+            at = wp.mesh_eval_position(mesh, query.face, query.u, query.v)
+            normal = pseudonormal(mesh, query.face, b, first, around)
+            away = points[i] - at
             face[i] = query.face
-            uv[i] = wp.vec2(query.u, query.v)
+            for k in range(3):
+                found[i][k] = b[k]
+                found[i][3 + k] = at[k]
+                found[i][7 + k] = normal[k]
+            found[i][6] = wp.length(away) * wp.where(wp.dot(away, normal) < 0.0, -1.0, 1.0)
 
-    return wp, nearest
+    return wp, nearest, row
 
 
 class ClosestSurface:
-    """Queries of one closed mesh, ``vertices`` (V, 3) [m] and ``faces`` (F, 3) wound outward."""
+    """Queries of one closed mesh, ``vertices`` (V, 3) [m] and ``faces`` (F, 3) wound outward, arrays or tensors; on the vertices' device.
+    """
 
     def __init__(self, vertices, faces):
-        self._wp, self._nearest = _warp()
-        wp = self._wp
-        self.vertices = np.ascontiguousarray(vertices, dtype=np.float32)
-        self.faces = np.ascontiguousarray(faces, dtype=np.int64)
-        corners = wp.array(self.faces.ravel().astype(np.int32), dtype=int, device="cpu")
-        self._mesh = wp.Mesh(wp.array(self.vertices, dtype=wp.vec3, device="cpu"), corners)
-        self._normals = _pseudonormals(np.asarray(vertices, dtype=np.float64), self.faces).astype(np.float32)
+        self._wp, self._nearest, self._row = _warp()
+        vertices, faces = torch.as_tensor(vertices).detach(), torch.as_tensor(faces)
+        self.faces = np.ascontiguousarray(faces.cpu().numpy(), dtype=np.int64)
+        self._device = self._wp.device_from_torch(vertices.device)
+        self._vertices = vertices.float().clone().contiguous()
+        on_device = lambda x: self._wp.array(x.astype(np.int32), dtype=int, device=self._device)
+        self._mesh = self._wp.Mesh(self._wp.from_torch(self._vertices, dtype=self._wp.vec3), on_device(self.faces.ravel()))
+        counts = np.bincount(self.faces.ravel(), minlength=len(vertices))
+        # the corners of faces at vertex v are around[first[v]:first[v + 1]]
+        self._corners = on_device(np.concatenate([[0], np.cumsum(counts)])), on_device(np.argsort(self.faces.ravel(), kind="stable"))
+
+    @property
+    def vertices(self):
+        """Where the mesh's vertices are now, (V, 3) float32 [m], an array."""
+        return self._vertices.cpu().numpy()
+
+    def follow(self, vertices):
+        """The mesh moves: its vertices are at the tensor (V, 3) [m] from now on."""
+        self._vertices.copy_(vertices.detach())
+        self._mesh.refit()
 
     def __call__(self, points, reach=10.0):
-        """:class:`Nearest` of points (N, 3) [m]. Those farther than ``reach`` [m] get the distance ``reach``, the face -1 and NaN."""
+        """:class:`Nearest` of points (N, 3) [m], an array or a tensor on the mesh's device. Those farther than ``reach`` [m] get the
+        distance ``reach``, the face -1 and NaN. Without gradient.
+        """
         wp = self._wp
-        x = np.ascontiguousarray(points, dtype=np.float32)
-        face, uv = wp.full(len(x), -1, dtype=int, device="cpu"), wp.zeros(len(x), dtype=wp.vec2, device="cpu")
-        wp.launch(self._nearest, len(x), [self._mesh.id, wp.array(x, dtype=wp.vec3, device="cpu"), float(reach), face, uv], device="cpu")
-        face, uv = face.numpy().astype(np.int64), uv.numpy()
-        b = np.column_stack([uv, 1 - uv.sum(axis=1)])
-        point = np.einsum("nk,nkd->nd", b, self.vertices[self.faces[face]])
-        zero = b < 1e-5
-        on_edge, on_vertex = zero.sum(axis=1) == 1, zero.sum(axis=1) == 2
-        part = np.where(on_vertex, 4 + b.argmax(axis=1), np.where(on_edge, 1 + zero.argmax(axis=1), 0))
-        normal = self._normals[face, part]
-        distance = np.copysign(np.linalg.norm(x - point, axis=1), np.einsum("nd,nd->n", x - point, normal))
-        missed = face < 0
-        b[missed], point[missed], normal[missed], distance[missed] = np.nan, np.nan, np.nan, reach
-        return Nearest(face, b, point, distance, normal)
+        x = torch.as_tensor(points, device=self._vertices.device).detach().float().contiguous()
+        face, found = x.new_empty(len(x), dtype=torch.int32), x.new_full((len(x), 10), torch.nan)
+        arrays = wp.from_torch(x, dtype=wp.vec3), float(reach), wp.from_torch(face), wp.from_torch(found, dtype=self._row)
+        wp.launch(self._nearest, len(x), [self._mesh.id, *self._corners, *arrays], device=self._device)
+        parts = face.long(), found[:, :3], found[:, 3:6], found[:, 6], found[:, 7:]
+        return Nearest(*parts if torch.is_tensor(points) else (p.cpu().numpy() for p in parts))
 
-
-def _pseudonormals(V, F):
-    """Unit normals (F, 7, 3): of the face, of its edges opposite to the corners 0, 1, 2, of its corners (weighted by the angles there).
-
-    With them the side of the surface on which a point lies is found from its nearest point alone (Baerentzen and Aanaes 2005).
-    """
-    face = mesh.face_vectors(V, F)
-    face /= np.maximum(np.linalg.norm(face, axis=1, keepdims=True), 1e-300)
-    edges, side = mesh.edges_of(F)  # sides run from corner k to the next: side k is opposite to corner k + 2
-    sums = lambda index, count, values: np.stack([np.bincount(index, x, minlength=count) for x in values.T], axis=1)
-    of_edge = sums(side.ravel(), len(edges), np.repeat(face, 3, axis=0))
-    to_next = V[np.roll(F, -1, axis=1)] - V[F]
-    to_next /= np.maximum(np.linalg.norm(to_next, axis=2, keepdims=True), 1e-300)
-    angle = np.arccos(np.clip(-(to_next * np.roll(to_next, 1, axis=1)).sum(axis=2), -1, 1))
-    of_vertex = sums(F.ravel(), len(V), (angle[..., None] * face[:, None]).reshape(-1, 3))
-    out = np.concatenate([face[:, None], of_edge[np.roll(side, -1, axis=1)], of_vertex[F]], axis=1)
-    return out / np.maximum(np.linalg.norm(out, axis=2, keepdims=True), 1e-300)
+    def distances(self, points, vertices):
+        """Signed distances (T, P) [m], negative inside, of points (T, P, 3) [m] from the mesh with its vertices at (T, V, 3);
+        differentiable in ``points``. Points farther than FAR have FAR.
+        """
+        found = []
+        for x, at in zip(points, vertices):
+            self.follow(at)
+            found.append(self(x, FAR))
+        face, point, distance, normal = (torch.stack([getattr(n, k) for n in found]) for k in ("face", "point", "distance", "normal"))
+        away = (points.detach() - point) / distance[..., None]
+        away = torch.where(distance[..., None].abs() > ON, away, normal)  # the gradient of the distance
+        missed = (face < 0)[..., None]
+        d = ((points - point.masked_fill(missed, 0)) * away.masked_fill(missed, 0)).sum(-1)
+        return torch.where(face < 0, FAR, d)

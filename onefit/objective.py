@@ -14,8 +14,8 @@ RANDOM_POINTS = 1000  # vertices drawn for the collision, beside those nearest t
 @dataclass(frozen=True)
 class Scene:
     """T frames of bodies, each on its own: ``transforms`` (T, J, 3, 4); ``body`` (T, V, 3) [m], the posed surface; ``collider``, the
-    :class:`onefit.collision.Collider` of its triangles; ``rest`` (N, T, 3) [m], the garment's vertices in the rest space, graded to each
-    frame's shape, and ``field`` (3 P, T, 3), what :attr:`onefit.charts.PatchedGarment.field` makes of them."""
+    :class:`onefit.nearest.ClosestSurface` of its triangles; ``rest`` (N, T, 3) [m], the garment's vertices in the rest space, graded to
+    each frame's shape, and ``field`` (3 P, T, 3), what :attr:`onefit.charts.PatchedGarment.field` makes of them."""
 
     transforms: torch.Tensor
     body: torch.Tensor
@@ -53,7 +53,7 @@ def evaluate(garment, deformation, scene, weights, epoch=100, past=None, dt=1 / 
     if weights.k_c:
         drawn = torch.randint(len(x), (RANDOM_POINTS,), generator=generator).to(x.device)
         chosen = torch.cat([garment.metric_vertex, drawn])
-        distance = scene.collider.distance(x[chosen].transpose(0, 1), scene.body).T
+        distance = scene.collider.distances(x[chosen].transpose(0, 1), scene.body).T
         share = area.sum() / len(chosen)
         terms["collision"] = weights.k_c * losses.collision(distance, share.expand(len(chosen)), weights.epsilon)
         k_ext = losses.extension(distance[: len(garment.metric_vertex)], epoch, weights.epsilon)

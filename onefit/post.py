@@ -2,25 +2,45 @@
 
 from concurrent.futures import ThreadPoolExecutor
 
+import numpy as np
 import torch
 
 from .charts import SparseMatrix
-from .collision import Collider
+from .nearest import ClosestSurface
 from .remesh import neighbour_mean
 
 CLEARANCE = 0.003  # [m] from the body
-SKIN = 0.006  # [m]; farther from the body's surface no vertex is looked for but around those that were pushed
 REACH = 0.08  # [m]; vertices deeper in the body than this stay there
 
 
-def pushed_out(vertices, faces, bodies, body_faces, clearance=CLEARANCE, rounds=5, smoothing=4):
-    """Vertices (T, N, 3) [m] moved out of the bodies (T, V, 3), to ``clearance`` [m] from them; faces (F, 3), body_faces (B, 3).
+def pushed_out(vertices, faces, bodies, body_faces, rounds=5, smoothing=4):
+    """Vertices (T, N, 3) [m] moved out of the bodies (T, V, 3), to CLEARANCE from them; faces (F, 3), body_faces (B, 3).
 
     The pushes, not the surface, are smoothed over the mesh, ``smoothing`` times, so that no fold is lost and none made; what that leaves
-    inside is pushed again, unsmoothed from the third of at most ``rounds`` rounds on. Most vertices are far from the body, and to learn no
-    more than that is quick: the first round looks for those near its surface, the others, among those that were pushed, for deep ones.
+    inside is pushed again, unsmoothed from the third of at most ``rounds`` rounds on. That a vertex is not within CLEARANCE of the body's
+    surface is quickly told; only beside those found inside, and among those that were pushed, deeper ones are looked for.
     """
-    mean = SparseMatrix(neighbour_mean(faces.cpu().numpy(), vertices.shape[1]), vertices.device)
+    adjacency = neighbour_mean(faces.cpu().numpy(), vertices.shape[1])
+    mean = SparseMatrix(adjacency, vertices.device)
+    beside = lambda chosen: torch.as_tensor(np.unique(adjacency[chosen.cpu().numpy()].indices), device=vertices.device).long()
+
+    def pushes(x, surface, chosen=None):
+        """(N, 3) [m]: to CLEARANCE, of those among all vertices that are nearer; or of those chosen that are nearer than half of it."""
+        push, known = torch.zeros_like(x), torch.zeros(len(x), dtype=torch.bool, device=x.device)
+        first, reach = chosen is None, CLEARANCE if chosen is None else REACH
+        chosen = torch.arange(len(x), device=x.device) if first else chosen
+        while len(chosen):
+            found = surface(x[chosen], reach)
+            near = (found.distance < (CLEARANCE if first else CLEARANCE / 2)).nonzero()[:, 0]
+            at = chosen[near]
+            push[at] = found.point[near] + CLEARANCE * found.normal[near] - x[at]
+            known[at] = True
+            inside = at[found.distance[near] < 0]
+            if not first or not len(inside):
+                break
+            chosen, reach = beside(inside), REACH
+            chosen = chosen[~known[chosen]]
+        return push
 
     def spread(push):
         for _ in range(smoothing):
@@ -29,22 +49,18 @@ def pushed_out(vertices, faces, bodies, body_faces, clearance=CLEARANCE, rounds=
         return push
 
     def one(part):
-        collider = Collider(body_faces, bodies[0])
+        surface = ClosestSurface(bodies[0], body_faces)
         out = vertices[part].clone()
         for x, body in zip(out, bodies[part]):
-            collider.follow(body)
-            chosen = torch.arange(len(x), device=x.device)
+            surface.follow(body)
+            chosen = None
             for turn in range(rounds):
-                nearest, normal = collider.nearest(x[chosen], REACH if turn else SKIN)
-                d = ((x[chosen] - nearest) * normal).sum(-1)
-                near = (d < (clearance / 2 if turn else clearance)) & (normal != 0).any(-1)
-                if not near.any():
+                push = pushes(x, surface, chosen)
+                if not push.any():
                     break
-                push = torch.zeros_like(x)
-                push[chosen[near]] = (clearance - d[near])[:, None] * normal[near]
                 push = spread(push) if turn < 2 else push
                 x += push
-                chosen = (push != 0).any(-1).nonzero()[:, 0]  # the others are clear, and stay where they are
+                chosen = push.any(-1).nonzero()[:, 0]  # the others are clear, and stay where they are
         return out
 
     workers = min(torch.get_num_threads(), len(vertices)) if not vertices.is_cuda else 1

@@ -8,8 +8,8 @@ import torch
 from . import generate, objective, skinning
 from .body import AnnyBody
 from .charts import PatchedGarment
-from .collision import Collider
 from .motion import Motion
+from .nearest import ClosestSurface
 
 LENGTH = 10  # frames of a window that the body's encoder sees
 FPS = 30.0
@@ -53,7 +53,7 @@ class TrainingData:
             rest = torch.stack([garment.graded(b) for b in bodies], 1)
             self.garments.append((patched, rest, patched.field @ rest))  # (N, S, 3) and (3 P, S, 3)
             advance()
-        self.collider = Collider(self.standard.faces, self.standard.vertices)
+        self.collider = ClosestSurface(self.standard.vertices, self.standard.faces)
 
     def __len__(self):
         """How many windows there are."""
@@ -64,7 +64,7 @@ class TrainingData:
             setattr(self, name, getattr(self, name).to(device))
         self.standard = self.standard.to(device)
         self.garments = [tuple(x.to(device) for x in entry) for entry in self.garments]
-        self.collider = Collider(self.standard.faces, self.standard.vertices)
+        self.collider = ClosestSurface(self.standard.vertices, self.standard.faces)
         return self
 
     def windows(self, count, generator):

@@ -190,6 +190,33 @@ def test_nearest_points_and_sides():
     assert np.allclose(np.einsum("nk,nkd->nd", got.barycentric, V[F[got.face]]), got.point, atol=1e-6)
     missed = ClosestSurface(V, F)(np.array([[3.0, 0, 0]]), reach=1.0)
     assert missed.face[0] == -1 and missed.distance[0] == 1.0 and np.isnan(missed.point).all()
+    # a mesh that moves there, and tensors
+    surface = ClosestSurface(V @ [[0.5, 0, 0], [0, 2, 0], [0.3, 0, 1]], F)
+    surface.follow(torch.as_tensor(V))
+    assert np.array_equal(surface.vertices, V.astype(np.float32))
+    moved = surface(torch.as_tensor(x))
+    assert torch.allclose(moved.distance, torch.as_tensor(got.distance), atol=1e-6)
+
+
+def test_pseudonormals_of_a_cube():
+    # whatever way its sides are cut in two
+    import trimesh
+
+    cube = trimesh.creation.box((2, 2, 2))
+    edge, half = np.array([[1, 1, 0], [0, -1, 1], [-1, 0, -1.0]]), 0.3 * np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]])
+    x = np.concatenate([cube.vertices, edge + half, [[1, 0.2, 0.1], [0.1, -1, 0.4]]])
+    expected = np.concatenate([cube.vertices, edge, [[1, 0, 0], [0, -1, 0]]])
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    found = ClosestSurface(cube.vertices, cube.faces)(x + 0.2 * expected)
+    assert np.allclose(found.distance, 0.2, atol=1e-6) and np.allclose(found.normal, expected, atol=1e-5)
+
+
+def test_points_between_the_legs_are_outside():
+    # on the plane of symmetry both legs are equally near
+    surface = standard_surface()
+    x = np.random.default_rng(0).uniform([0, -0.15, -0.8], [0, 0.15, -0.05], (100, 3))
+    inside = winding_number(x, surface.vertices.astype(np.float64)[surface.faces]) > 0.5
+    assert np.array_equal(surface(x).distance < 0, inside) and inside.mean() < 0.1
 
 
 def distance_to_triangles(p, T):

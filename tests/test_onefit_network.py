@@ -4,13 +4,14 @@ import pytest
 import torch
 
 import onefit
+import onefit.post
 from onefit import weights
 from onefit.body import AnnyBody
 from onefit.charts import PatchedGarment
-from onefit.collision import Collider
 from onefit.draper import Draper
 from onefit.garment import Garment
 from onefit.motion import Motion
+from onefit.nearest import ClosestSurface
 from onefit.network import SLOPE, Decoder, OneFit, descriptors, encoded
 from onefit.post import pushed_out
 from polyfit.errors import InputError
@@ -170,9 +171,27 @@ def test_pushing_out_of_a_sphere():
     cloth = trimesh.creation.icosphere(subdivisions=3, radius=0.1)
     x = torch.as_tensor(cloth.vertices, dtype=torch.float32)[None].clone()
     x[:, ::7] *= 0.95
-    out = pushed_out(x, torch.as_tensor(cloth.faces), body, faces, clearance=0.003)
-    distance = Collider(faces, body[0]).distance(out, body)
+    out = pushed_out(x, torch.as_tensor(cloth.faces), body, faces)
+    distance = ClosestSurface(body[0], faces).distances(out, body)
     assert distance.min() > 0.0025 and distance.max() < 0.02
+
+
+def test_pushing_out_finds_deep_vertices_from_their_neighbours(monkeypatch):
+    import trimesh
+
+    ball, cloth = (trimesh.creation.icosphere(subdivisions=k, radius=r) for k, r in ((4, 0.1), (5, 0.103)))
+    body, faces = torch.as_tensor(ball.vertices, dtype=torch.float32)[None], torch.as_tensor(ball.faces)
+    x = torch.as_tensor(cloth.vertices, dtype=torch.float32)[None]
+    x = x - 0.4 * x * torch.exp(-((x / 0.103 - torch.tensor([0, 0, 1.0])).square().sum(-1, keepdim=True) / 0.5**2))
+    surface = ClosestSurface(body[0], faces)
+    before = surface.distances(x, body)
+    assert before.min() < -0.03
+    out = pushed_out(x, torch.as_tensor(cloth.faces), body, faces)
+    assert surface.distances(out, body).min() > 0
+    # as when every vertex is asked how deep it is
+    query = ClosestSurface.__call__
+    monkeypatch.setattr(ClosestSurface, "__call__", lambda self, points, reach: query(self, points, onefit.post.REACH))
+    assert torch.allclose(pushed_out(x, torch.as_tensor(cloth.faces), body, faces), out, atol=1e-5)
 
 
 def test_weights_in_eight_bits_drape_alike(draper, model, walk, tmp_path):
