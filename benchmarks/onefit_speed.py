@@ -4,7 +4,8 @@
 
 Milliseconds a frame, the median of repeated drapes of a motion of 90 frames in batches, without rendering: all of ``Draper.drape``, the
 network alone, and post-processing; then the T-shirt at about 1,000, 4,000, 16,000 and 64,000 vertices. Cutting a garment into patches
-comes once and stands apart. The clock shows what else the machine does; the least of the repetitions is given beside the median.
+comes once and stands apart. The clock shows what else the machine does; the least of the repetitions is given beside the median, and the
+processor's time, of all threads together.
 """
 
 import argparse
@@ -25,16 +26,17 @@ FRAMES = 90
 
 
 def timed(function, device, repeats=9):
-    """Median and least milliseconds of ``function()``."""
-    found = []
+    """Median and least milliseconds of ``function()`` by the clock, and the median of the processor's."""
+    found, busy = [], []
     for k in range(repeats + 2):
-        start = time.perf_counter()
+        start, used = time.perf_counter(), time.process_time()
         function()
         if device.startswith("cuda"):
             torch.cuda.synchronize()
         if k >= 2:
             found.append(1e3 * (time.perf_counter() - start))
-    return statistics.median(found), min(found)
+            busy.append(1e3 * (time.process_time() - used))
+    return statistics.median(found), min(found), statistics.median(busy)
 
 
 def network_alone(draper, garment, motion):
@@ -72,7 +74,7 @@ def main(argv=None):
         network = [x / T for x in timed(lambda: network_alone(draper, garment, motion), args.device)]
         drape = draper.drape(garment, motion)
         post = [x / T for x in timed(lambda: pushed_out(drape.vertices, drape.faces, drape.body, drape.body_faces), args.device, 3)]
-        cells = [f"{len(garment)}", f"{len(patched)}", f"{cut:.1f}"] + [f"{a:.2f} ({b:.2f})" for a, b in (whole, network, post)]
+        cells = [f"{len(garment)}", f"{len(patched)}", f"{cut:.1f}"] + [f"{a:.2f} ({b:.2f}; {c:.2f})" for a, b, c in (whole, network, post)]
         print("| " + " | ".join(cells) + " |", flush=True)
         rows.append(dict(vertices=len(garment), patches=len(patched), cut=cut, drape=whole, network=network, post=post))
     if args.output:
