@@ -8,6 +8,7 @@ import math
 from collections import OrderedDict
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import drjit as dr
@@ -17,7 +18,7 @@ from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import cKDTree
 
 from .problem import BadFrame
-from .pyramid import compared, level_image
+from .pyramid import FARTHEST, compared, level_image
 
 _TEXELS = 1.5  # texels of the baked texture to a pixel of the first frame
 _PIXEL_BLUR = 0.29  # standard deviation of a pixel's own square [pixels]
@@ -25,7 +26,6 @@ _CORNERS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 _SUMS = 18 + 9 + 4  # of second derivatives, of first ones and of figures, a triangle
 _SILHOUETTE = 0.1  # of k_silhouette: robust, normalised residuals are smaller than colours, and masks are ragged
 _MISFIT = 0.5  # residual, in local standard deviations, that counts half a misfit
-_FARTHEST = 30.0  # pixels of the grid beyond which a silhouette is pulled no harder
 _CACHED_FRAMES = 4
 
 
@@ -67,6 +67,8 @@ class Registration:
         self._bake(mesh, faces)
         self._textures, self._frames = {}, OrderedDict()
         self._reader = ThreadPoolExecutor(1)
+        sequence = problem.sequence
+        self._decoded = lru_cache(2)(lambda frame: (sequence.frame(frame), sequence.mask(frame)))  # all levels are made of one decoding
         self.levels = ()
         self.normalise = problem.settings.lighting == "local"
 
@@ -155,8 +157,7 @@ class Registration:
             self._frames.popitem(last=False)
 
     def _read(self, frame, level):
-        sequence = self.problem.sequence
-        return level_image(sequence.frame(frame), sequence.mask(frame), level, self.normalise)
+        return level_image(*self._decoded(frame), level, self.normalise)
 
     def _frame_level(self, frame, level):
         """The frame at a level, on the device: packed colour and weight; the mask or None; the :class:`LevelImage`; its area [pixels of the grid]."""
@@ -215,16 +216,23 @@ class Registration:
         by_x = ((t10 - t00) * (1 - fy) + (t11 - t01) * fy) * self._texel[0].x
         by_y = (bottom - top) * self._texel[0].y
 
-        x0, y0, width, w, h = view.region
-        local = dr.arange(mi.UInt32, w * h)
-        ly = local // width
-        pixel = (ly + y0) * dr.opaque(mi.UInt32, image.colour.shape[1]) + (local - ly * width + x0)
-        target = dr.gather(mi.Vector4f, packed, pixel, hit)
+        pixel, known = self._at(view, image)
+        target = dr.gather(mi.Vector4f, packed, pixel, hit & known)
         seen = top + (bottom - top) * fy
         weight = dr.select(hit & (seen.w > 0.5), target.w, 0)
         seen.w, target.w = 0, 0
         residual = dr.select(weight > 0, seen - target, 0)
         return residual, weight, triangle, (b1, b2), (p0, e1, e2), (c1 - c0, c2 - c0), (by_x, by_y)
+
+    @staticmethod
+    def _at(view, image):
+        """Indices of the region's pixels in the arrays of a :class:`LevelImage`, and whether they lie there."""
+        x0, y0, width, w, h = view.region
+        local = dr.arange(mi.UInt32, w * h)
+        ly = local // width
+        (rows, columns), corner = (dr.opaque(mi.Int32, int(k)) for k in image.inside.shape), (dr.opaque(mi.Int32, int(k)) for k in image.corner)
+        x, y = (mi.Int32(a) - b for a, b in zip((local - ly * width + x0, ly + y0), corner))
+        return mi.UInt32(y * columns + x), (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
 
     def residuals(self, vertices, frame, level):
         """Squared residuals r^2 = |T - I|^2 / 3 of the pixels that are compared, (P,) float32; vertices (N, 3) [m, world]."""
@@ -326,12 +334,9 @@ class Registration:
         _, mask, image, _ = self._frame_level(frame, level)
         if mask is None:
             return None
-        x0, y0, width, w, h = view.region
-        local = dr.arange(mi.UInt32, w * h)
-        ly = local // width
-        pixel = (ly + y0) * dr.opaque(mi.UInt32, image.mask.shape[1]) + (local - ly * width + x0)
+        pixel, known = self._at(view, image)
         alpha = dr.select(view.hit, mi.Float(1), 0)
-        wanted = dr.gather(mi.Float, mask, pixel)
+        wanted = dr.gather(mi.Float, mask, pixel, known)
         total = float((image.mask.astype(np.float64) ** 2).sum())  # of the whole frame, less the region's, which alpha is subtracted from
         crossings = self.raster.crossings(view)
         if crossings is None:
@@ -350,14 +355,15 @@ class Registration:
         alpha = mi.Float(alpha)
         error = dr.sum(dr.square(alpha - wanted) - dr.square(wanted))
         excess = dr.gather(mi.Float, alpha - wanted, to)
-        at = dr.gather(mi.UInt32, pixel, to)
+        at = dr.select(dr.gather(mi.Bool, known, to), mi.Int32(dr.gather(mi.UInt32, pixel, to)), -1)
         dr.eval(va, vb, da, db, step, excess, at, error)
         kept = np.array(step) != 0  # where a sheet passes before the sheet itself, alpha does not change
         at = np.array(at)[kept]
+        distance = np.where(at >= 0, image.distance.ravel()[at], FARTHEST)
         step = np.array(step)[kept][:, None]
         ends = [self.corner[np.array(i)[kept]] for i in (va, vb)]
         by = [np.array(d).T[kept].astype(np.float64) * step for d in (da, db)]
-        return total + float(error[0]), (*ends, *by, np.array(excess)[kept].astype(np.float64), image.distance.ravel()[at])
+        return total + float(error[0]), (*ends, *by, np.array(excess)[kept].astype(np.float64), distance)
 
     def _pull(self, vertices, pairs, frame, level, weight):
         """Energy, rows and gradient (N, 3) of the silhouette term.
@@ -371,7 +377,7 @@ class Registration:
             return weight * energy, None, gradient
         i, j, ci, cj, excess, distance = found
         slope = np.linalg.norm(ci + cj, axis=1)  # as the edge moves as a whole
-        curvature = 2 * weight / np.maximum(1.0, slope * np.minimum(distance, _FARTHEST))
+        curvature = 2 * weight / np.maximum(1.0, slope * np.minimum(distance, FARTHEST))
         scale = 1 / level.stride
         jacobian = self.projection(vertices)
         for k, c in ((i, ci), (j, cj)):

@@ -242,14 +242,17 @@ def test_photometric_gradient_is_that_of_autodiff_through_raster(problem, twin, 
     flat, rgb, alpha = attached(reference, vertices)
     interior = np.array(objective.interior(alpha)).reshape(problem.height, problem.width)
     image = level_image(problem.sequence.frame(2), problem.sequence.mask(2), level, False)
-    image.inside = image.inside * interior  # where raster blends no silhouette into the colour
+    part = tuple(slice(k, k + n) for k, n in zip(image.corner[::-1], image.inside.shape))
+    image.inside = image.inside * interior[part]  # where raster blends no silhouette into the colour
     first._frames[2, level] = _Ready(image)
     mine = first.evaluate(vertices, 2, level, scale)
-    weight, area = mi.Float(image.inside.ravel()), float(image.mask.sum())
+    whole = np.zeros((problem.height, problem.width, 4), np.float32)
+    whole[part] = np.concatenate([image.colour, image.inside[..., None]], -1)
+    weight, area = mi.Float(whole[..., 3].ravel()), float(image.mask.sum())
     squared = 0
     for c in range(3):
         k = dr.arange(mi.UInt32, problem.pixels) * 3 + c
-        squared += dr.square(dr.gather(mi.Float, rgb.array, k) - mi.Float(image.colour[..., c].ravel())) / 3
+        squared += dr.square(dr.gather(mi.Float, rgb.array, k) - mi.Float(whole[..., c].ravel())) / 3
     energy = dr.sum(weight * scale**2 * dr.log(1 + squared / scale**2)) / area
     dr.backward(energy)
     expected = np.array(dr.grad(flat)).reshape(-1, 3)
