@@ -58,7 +58,7 @@ def _around(mask, level):
     rows, columns = (np.flatnonzero(mask.any(axis=k)) for k in (1, 0)) if mask is not None else ((), ())
     if len(rows) == 0:
         return (0, 0), (slice(None), slice(None))
-    margin = int((FARTHEST + 2) * level.stride + 4 * max(level.sigma, level.window))
+    margin = int(max((FARTHEST + 2) * level.stride, 4 * level.sigma, 4 * level.window))
     step = math.lcm(level.stride, _POOL)  # so that the grids of the part are those of the whole
     at = [(max(0, int(x[0]) - margin) // step * step, (int(x[-1]) + margin) // step * step + step) for x in (rows, columns)]
     return (at[0][0], at[1][0]), tuple(slice(*x) for x in at)

@@ -11,12 +11,12 @@ import synthetic
 from scipy.spatial.transform import Rotation
 
 from polyfit import jets
-from polysft_mi import objective, prepare, registration, scene, solvers
+from polysft_mi import objective, prepare, pyramid, registration, scene, solvers
 from polysft_mi.errors import InputError
 from polysft_mi.normal_equations import Blocks, Chart, Normal, Pattern, Reduced, State, assemble
 from polysft_mi.patch import Unknowns
 from polysft_mi.problem import Problem
-from polysft_mi.pyramid import Level, level_image
+from polysft_mi.pyramid import FARTHEST, Level, level_image
 from polysft_mi.registration import Registration
 from polysft_mi.relocate import Relocator
 from polysft_mi.sequence import Sequence
@@ -274,6 +274,45 @@ class _Ready:
 
 def _silhouette_gradient(first, vertices, level):
     return first.evaluate(vertices, 2, level, 1e-6).gradient  # at this scale no residual pulls
+
+
+def test_sums_over_each_triangles_pixels(problem):
+    first, count = Registration(problem), 500
+    faces = len(first.faces)
+    triangle = RNG.integers(-1, faces // 3, count).astype(np.int32)  # many see none of the later triangles
+    found = RNG.random((3, count, 4)).astype(np.float32)
+    table = first._by_triangle(mi.Int32(triangle), [mi.Vector4f(np.ascontiguousarray(x.T)) for x in found])
+    expected = np.zeros((faces, 31))
+    for t, second, slope, figures in zip(triangle, *found.astype(np.float64)):
+        if t >= 0:
+            corner = 1 - second[3] - slope[3], second[3], slope[3]
+            expected[t, :18] += np.concatenate([corner[a] * corner[b] * second[:3] for a, b in registration._CORNERS])
+            expected[t, 18:] += np.concatenate([*(b * slope[:3] for b in corner), figures])
+    assert np.abs(table - expected).max() < 1e-5 * np.abs(expected).max()
+    assert np.array_equal(table, first._by_triangle(mi.Int32(triangle), [mi.Vector4f(np.ascontiguousarray(x.T)) for x in found]))
+
+
+@pytest.mark.parametrize("level", [Level(0.0), Level(2.5, 2), Level(3.8, 3, 10.0)])
+def test_a_masked_image_is_that_of_the_whole_where_the_mask_has_a_say(monkeypatch, level):
+    image = cv2.GaussianBlur(RNG.random((360, 480, 3)).astype(np.float32), (0, 0), 2)
+    mask = np.zeros((360, 480), np.float32)
+    cv2.ellipse(mask, (320, 200), (30, 20), 20, 0, 360, 1, -1)
+    part = level_image(image, mask, level)
+    monkeypatch.setattr(pyramid, "_around", lambda mask, level: ((0, 0), (slice(None), slice(None))))
+    whole = level_image(image, mask, level)
+    (rows, columns), (x, y) = part.inside.shape, part.corner
+    assert part.inside.size < 0.8 * whole.inside.size and (x > 0 or y > 0)
+    here = np.s_[y : y + rows, x : x + columns]
+    for name in ("inside", "mask"):
+        assert np.array_equal(getattr(part, name), getattr(whole, name)[here])
+        outside = getattr(whole, name).copy()
+        outside[here] = 0
+        assert not outside.any()
+    assert np.abs(part.colour - whole.colour[here])[part.inside > 0].max() < 1e-5
+    near = whole.distance < FARTHEST
+    assert np.abs(part.distance - whole.distance[here])[near[here]].max() < 1e-5
+    near[here] = False
+    assert not near.any()
 
 
 @pytest.mark.parametrize("amount", [0.5, 1.0])
