@@ -258,16 +258,16 @@ class Blocks:
             d, y = inside[k].T[:n, :n], x[k * size : k * size + n]
             if k:
                 w = coupling[-1]
-                d = d - w.T @ w
+                d = blas.dsyrk(-1.0, w, beta=1.0, c=d, trans=1, lower=1, overwrite_c=1)  # in place, here and below, but for the last block
                 y = y - w.T @ parts[-1]
-            factor, bad = lapack.dpotrf(d, lower=1, clean=1)
+            factor, bad = lapack.dpotrf(d, lower=1, clean=1, overwrite_a=1)
             if bad:
                 raise LinAlgError("the uv block is not positive definite")
             factors.append(factor)
             parts.append(blas.dtrsm(1.0, factor, y, lower=1))
             if k + 1 < self.count:
                 following = min(size, rest - (k + 1) * size)
-                coupling.append(blas.dtrsm(1.0, factor, below[k].T[:n, :following], lower=1))
+                coupling.append(blas.dtrsm(1.0, factor, below[k].T[:n, :following], lower=1, overwrite_b=1))
         return Elimination(self, factors, coupling, parts)
 
 

@@ -14,7 +14,6 @@ import cv2
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import cKDTree
 
 from .problem import BadFrame
@@ -106,6 +105,8 @@ class Registration:
 
     def on_template(self, texels):
         """Points (K, 3) [m, world] of the undeformed template at pixels (K, 2) of ``texture`` (OpenCV's, whole at their centres); NaN beyond it."""
+        from scipy.interpolate import LinearNDInterpolator  # a tenth of the start, and seldom needed
+
         coordinates = np.array(self._texcoord, dtype=np.float64).reshape(-1, 2) * np.array(self._texel[0]).ravel() + np.array(self._texel[1]).ravel()
         return LinearNDInterpolator(coordinates, self.problem.template.vertices[self.corner])(texels)
 
@@ -127,6 +128,8 @@ class Registration:
 
     def shift_texture(self, chart, displaced):
         """Move the texture on the template: what lies at ``chart`` (N, 2) is shown at ``displaced`` (N, 2) instead. Whether that could be done."""
+        from scipy.interpolate import LinearNDInterpolator
+
         coordinates = np.array(self._texcoord, dtype=np.float64).reshape(-1, 2)
         shown = np.empty((len(chart), 2))
         shown[self.corner] = coordinates
