@@ -2,10 +2,11 @@
 
     python benchmarks/scaling.py [--grids 33 50 71 100] [--sizes 640x480 1280x720 1920x1080] [--frames 8] [--docs docs] [-m llvm_ad_rgb]
 
-A textured sheet that covers a third of the image bends and turns (its edges keep their lengths); ``raster`` renders it, with its masks, 16 samples a pixel. The template is the sheet in
-the first frame, of so many vertices a side. Each case is tracked by default settings in a process of its own, which has rendered nothing before. A case's seconds are medians over its frames
-but the first, for which kernels are compiled: of all the process's threads together, so that what else the machine does counts little (those of the clock are printed too). Its memory is the
-process's peak; ``started`` is what a process holds before it loads a scene.
+A textured sheet that covers a third of the image bends and turns (its edges keep their lengths); ``raster`` renders it, with its masks, 16 samples
+a pixel. The template is the sheet in the first frame, of so many vertices a side. Each case is tracked by default settings in a process of its own,
+which has rendered nothing before. A case's seconds are medians over its frames but the first, for which kernels are compiled: of all the process's
+threads together, so that what else the machine does counts little (those of the clock are printed too). Its memory is the process's peak; ``started``
+is what a process holds before it loads a scene.
 
 Writes ``scaling.md`` and ``scaling.png`` into ``docs`` (``--docs FOLDER`` for another).
 """
@@ -68,7 +69,7 @@ def make(folder, points, size, frames):
     import cv2
     import mitsuba as mi
 
-    from polysft_mi import prepare, scene
+    from polysft_mi import outputs, prepare, scene
     from polysft_mi.problem import Problem
     from polysft_mi.sequence import Sequence
 
@@ -97,7 +98,7 @@ def make(folder, points, size, frames):
         rgb, alpha = problem.image(mi.Point3f(np.ascontiguousarray(vertices.T, dtype=np.float32)))
         alpha = np.array(alpha).reshape(size[1], size[0])
         linear = np.array(rgb) + 0.05 * (1 - alpha[..., None])
-        write("frames", k, np.round(255 * np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)).astype(np.uint8))
+        write("frames", k, np.round(255 * outputs.srgb(linear)).astype(np.uint8))
         write("masks", k, np.round(255 * alpha).astype(np.uint8))
 
 
@@ -125,7 +126,8 @@ def measure(folder):
         error = 1e3 * np.sqrt(((found - truth["vertices"]) ** 2).sum(2).mean(1))
     order = max(t["order"] for t in done.totals)
     cpu = np.diff(list(ticks.values())).tolist()
-    return {"seconds": done.seconds[1:], "cpu": cpu, "evaluations": done.iterations[1:], "started_mb": started, "peak_mb": peak, "rmse_mm": error.tolist(), "order": order}
+    figures = {"seconds": done.seconds[1:], "cpu": cpu, "evaluations": done.iterations[1:], "rmse_mm": error.tolist(), "order": order}
+    return {**figures, "started_mb": started, "peak_mb": peak}
 
 
 def worker(job):
@@ -150,7 +152,8 @@ def run_case(points, size, frames, mode):
             command = [sys.executable, os.path.abspath(__file__), "--worker", json.dumps(job)]
             done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
             if done.returncode:
-                raise InputError(f"{points * points} vertices at {size}: {task} ended with status {done.returncode}: {done.stderr.strip()[-500:]}")
+                why = done.stderr.strip()[-500:]
+                raise InputError(f"{points * points} vertices at {size}: {task} ended with status {done.returncode}: {why}")
     return summarise(points, size, json.loads(done.stdout.splitlines()[-1]))
 
 
@@ -172,28 +175,28 @@ def report(cases, docs, frames):
     """Write scaling.md and scaling.png for cases that are done; the text."""
     v = cases[0]["versions"]
     rows = [
-        f"| {c['vertices']:,} | {c['size'].replace('x', '×')} | {c['cpu']:.2f} | {c['evaluations']:.0f} | {c['order']} | {c['peak_mb']:.0f} | {c['rmse_mm']:.2f} |" for c in cases
+        f"| {c['vertices']:,} | {c['size'].replace('x', '×')} | {c['cpu']:.2f} | {c['evaluations']:.0f} | {c['order']} "
+        f"| {c['peak_mb']:.0f} | {c['rmse_mm']:.2f} |"
+        for c in cases
     ]
     started = np.median([c["started_mb"] for c in cases])
-    text = "\n".join(
-        [
-            "# How the tracker scales",
-            "",
-            "`python benchmarks/scaling.py` makes this page: a sheet that covers a third of the image bends and turns in front of the camera, rendered with its masks, tracked by default settings.",
-            f"Seconds a frame are the tracker's (median of {frames - 1} frames), without start-up and pictures, of all its threads together: on idle cores it takes less, for reading the next frame and the kernels",
-            f"run beside the rest. Memory is the process's peak, of which {started:.0f} MB are Python, Mitsuba, PyTorch and LLVM. Evaluations are those of the objective with its derivatives. {v['variant']}, {v['machine']}.",
-            "",
-            "| vertices | image | seconds a frame | evaluations a frame | highest order | memory [MB] | RMS distance from the truth [mm] |",
-            "|---:|---|---:|---:|---:|---:|---:|",
-            *rows,
-            "",
-            "![Seconds a frame and memory over the number of vertices, and over the number of pixels](scaling.png)",
-            "",
-            "With the image grow decoding, rays and residuals; only the finest of the three stages works on every pixel that sees the sheet. With the template grows above all the elimination of each",
-            "vertex's (Δu, Δv): a sheet's block tridiagonal matrix is as wide as the sheet, so that its factorisation grows with the square of the number of vertices (half of the time at 10,000).",
-            "",
-        ]
-    )
+    text = f"""# How the tracker scales
+
+`python benchmarks/scaling.py` makes this page: a sheet that covers a third of the image bends and turns in front of the camera, rendered with its
+masks, tracked by default settings. Seconds a frame are the tracker's (median of {frames - 1} frames), without start-up and pictures, of all its
+threads together: on idle cores it takes less, for reading the next frame and the kernels run beside the rest. Memory is the process's peak, of which
+{started:.0f} MB are Python, Mitsuba, PyTorch and LLVM. Evaluations are those of the objective with its derivatives. {v['variant']}, {v['machine']}.
+
+| vertices | image | seconds a frame | evaluations a frame | highest order | memory [MB] | RMS distance from the truth [mm] |
+|---:|---|---:|---:|---:|---:|---:|
+{chr(10).join(rows)}
+
+![Seconds a frame and memory over the number of vertices, and over the number of pixels](scaling.png)
+
+With the image grow decoding, rays and residuals; only the finest of the three stages works on every pixel that sees the sheet. With the template
+grows above all the elimination of each vertex's (Δu, Δv): a sheet's block tridiagonal matrix is as wide as the sheet, so that its factorisation grows
+with the square of the number of vertices (half of the time at 10,000).
+"""
     with aside(os.path.join(docs, "scaling.md")) as temporary, open(temporary, "w", encoding="utf-8") as file:
         file.write(text)
     plot(os.path.join(docs, "scaling.png"), cases)
@@ -206,7 +209,8 @@ def plot(path, cases):
     figure = Figure(figsize=(7.2, 4.6), dpi=90, layout="constrained")
     axes = figure.subplots(2, 2, sharex="col", sharey="row")
     pixels = lambda c: np.prod(parse_size(c["size"]))
-    sizes, counts = sorted({c["size"] for c in cases}, key=lambda s: np.prod(parse_size(s))), sorted({c["vertices"] for c in cases})
+    sizes = sorted({c["size"] for c in cases}, key=lambda s: np.prod(parse_size(s)))
+    counts = sorted({c["vertices"] for c in cases})
     shades = lambda n: [(0.77, 0.34, 0.18, 1 - 0.7 * k / max(n - 1, 1)) for k in reversed(range(n))]
     for row, (name, label) in enumerate((("cpu", "seconds a frame"), ("peak_mb", "memory [MB]"))):
         for column, (groups, key, across) in enumerate(((sizes, "size", lambda c: c["vertices"]), (counts, "vertices", pixels))):
@@ -241,7 +245,8 @@ def parse_size(text):
 
 def parser():
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument("--grids", nargs="+", type=int, metavar="N", default=GRIDS, help=f"vertices a side of the templates (default: {' '.join(map(str, GRIDS))})")
+    grids = " ".join(map(str, GRIDS))
+    p.add_argument("--grids", nargs="+", type=int, metavar="N", default=GRIDS, help=f"vertices a side of the templates (default: {grids})")
     p.add_argument("--sizes", nargs="+", metavar="WxH", default=SIZES, help=f"image sizes (default: {' '.join(SIZES)})")
     p.add_argument("--frames", type=int, default=FRAMES, help=f"frames of a case (default: {FRAMES})")
     p.add_argument("--docs", metavar="FOLDER", default=os.path.join(ROOT, "docs"), help="for scaling.md and scaling.png (default: docs)")
@@ -257,13 +262,15 @@ def main(arguments=None):
     for size in options.sizes:
         parse_size(size)
     if min(options.grids) < 4 or options.frames < 2 or not os.path.isdir(options.docs):
-        raise InputError(f"--grids {options.grids} --frames {options.frames} --docs {options.docs}: at least 4 vertices a side, 2 frames and a folder are needed")
+        given = f"--grids {options.grids} --frames {options.frames} --docs {options.docs}"
+        raise InputError(f"{given}: at least 4 vertices a side, 2 frames and a folder are needed")
     began, cases = time.perf_counter(), []
     for size in options.sizes:
         for points in options.grids:
             cases.append(run_case(points, size, options.frames, options.mode))
             c = cases[-1]
-            print(f"{time.perf_counter() - began:4.0f} s  {c['vertices']} vertices, {size}: {c['seconds']:.2f} s a frame ({c['cpu']:.2f} of all threads), {c['peak_mb']:.0f} MB", file=sys.stderr)
+            figures = f"{c['seconds']:.2f} s a frame ({c['cpu']:.2f} of all threads), {c['peak_mb']:.0f} MB"
+            print(f"{time.perf_counter() - began:4.0f} s  {c['vertices']} vertices, {size}: {figures}", file=sys.stderr)
     print(report(cases, options.docs, options.frames))
 
 
