@@ -192,6 +192,9 @@ class Pattern:
         corners = np.repeat(np.arange(3), 3), np.tile(np.arange(3), 3)
         at = self.find(faces[:, corners[0]], faces[:, corners[1]])
         self.from_faces = sp.csr_matrix((np.ones(at.size), (at.ravel(), np.arange(at.size))), shape=(len(self._keys), at.size))
+        ends = np.concatenate([a, b])
+        self.from_ends = sp.csr_matrix((np.ones(len(ends)), (ends, np.arange(len(ends)))), shape=(count, len(ends)))  # sums over edges' ends
+        self.across = self.find(a, b), self.find(b, a)
         graph = sp.csr_matrix((np.ones(len(self._keys)), (self.row, self.column)), shape=(count, count))
         order = reverse_cuthill_mckee(graph, symmetric_mode=True)
         self.place = np.empty(count, dtype=np.int64)  # of each vertex in the narrow ordering
@@ -255,16 +258,16 @@ class Blocks:
             d, y = inside[k].T[:n, :n], x[k * size : k * size + n]
             if k:
                 w = coupling[-1]
-                d = d - w.T @ w
+                d = blas.dsyrk(-1.0, w, beta=1.0, c=d, trans=1, lower=1, overwrite_c=1)  # in place, here and below, but for the last block
                 y = y - w.T @ parts[-1]
-            factor, bad = lapack.dpotrf(d, lower=1, clean=1)
+            factor, bad = lapack.dpotrf(d, lower=1, clean=1, overwrite_a=1)
             if bad:
                 raise LinAlgError("the uv block is not positive definite")
             factors.append(factor)
             parts.append(blas.dtrsm(1.0, factor, y, lower=1))
             if k + 1 < self.count:
                 following = min(size, rest - (k + 1) * size)
-                coupling.append(blas.dtrsm(1.0, factor, below[k].T[:n, :following], lower=1))
+                coupling.append(blas.dtrsm(1.0, factor, below[k].T[:n, :following], lower=1, overwrite_b=1))
         return Elimination(self, factors, coupling, parts)
 
 
@@ -326,36 +329,43 @@ def assemble(pattern, surface, projection, evaluation, lengths, stiffness):
     """
     a, b = pattern.edges.T
     edge = surface.vertices[a] - surface.vertices[b]
-    length = np.linalg.norm(edge, axis=1)
+    length = np.sqrt(np.einsum("ek,ek->e", edge, edge))
     direction = edge / length[:, None]
     excess = length - lengths
-    gradient = evaluation.gradient.copy()
     pull = (2 * stiffness * excess)[:, None] * direction
-    for axis in range(3):
-        gradient[:, axis] += np.bincount(a, pull[:, axis], len(gradient)) - np.bincount(b, pull[:, axis], len(gradient))
+    gradient = evaluation.gradient + pattern.from_ends @ np.concatenate([pull, -pull])
 
     # Each vertex moves by its own (u, v), by the height that all coefficients make there, and by the motion: blocks of the first three are
     # sparse like the mesh, and the coefficients follow by the basis.
     local = np.concatenate([surface.by_uv, np.broadcast_to(surface.up[:, None], (pattern.count, 3, 1))], 2)
     screen, screen_motion = projection @ local, projection @ surface.by_motion  # (N, 2, 3), (N, 2, 6)
     blocks = (pattern.from_faces @ evaluation.second.reshape(-1, 4)).reshape(-1, 2, 2)
+    if evaluation.rows is not None:
+        i, j, ci, cj, h = evaluation.rows
+        hi, hj = ci * h[:, None], cj * h[:, None]
+        across = ci[:, :, None] * hj[:, None]
+        at = np.concatenate([pattern.diagonal[i], pattern.diagonal[j], pattern.find(i, j), pattern.find(j, i)])
+        pattern.add(blocks, at, np.concatenate([ci[:, :, None] * hi[:, None], cj[:, :, None] * hj[:, None], across, across.transpose(0, 2, 1)]))
     total = screen[pattern.row].transpose(0, 2, 1) @ (blocks @ screen[pattern.column])  # (B, 3, 3)
     matrix = sp.bsr_matrix((blocks, pattern.column, pattern.start), shape=2 * (2 * pattern.count,))
     moved = (matrix @ screen_motion.reshape(-1, 6)).reshape(-1, 2, 6)
     local_motion = screen.transpose(0, 2, 1) @ moved  # (N, 3, 6)
     motion = screen_motion.reshape(-1, 6).T @ moved.reshape(-1, 6)
 
-    # edges and silhouettes: residuals of two vertices each
-    world = (a, b, direction, -direction, np.full(len(a), 2 * stiffness)), local, surface.by_motion
-    for (i, j, ci, cj, h), by_local, by_motion in [world] + ([(evaluation.rows, screen, screen_motion)] if evaluation.rows is not None else []):
-        ri, rj = (ci[:, None] @ by_local[i])[:, 0], (cj[:, None] @ by_local[j])[:, 0]
-        m = (ci[:, None] @ by_motion[i])[:, 0] + (cj[:, None] @ by_motion[j])[:, 0]
-        hi, hj, hm = ri * h[:, None], rj * h[:, None], m * h[:, None]
-        across = ri[:, :, None] * hj[:, None]
-        at = np.concatenate([pattern.find(i, i), pattern.find(j, j), pattern.find(i, j), pattern.find(j, i)])
-        pattern.add(total, at, np.concatenate([ri[:, :, None] * hi[:, None], rj[:, :, None] * hj[:, None], across, across.transpose(0, 2, 1)]))
-        pattern.add(local_motion, np.concatenate([i, j]), np.concatenate([ri[:, :, None] * hm[:, None], rj[:, :, None] * hm[:, None]]))
-        motion += m.T @ hm
+    # edges: residuals of two vertices each
+    ends = np.concatenate([a, b])
+    outward = np.concatenate([direction, -direction])
+    by_local = np.einsum("ek,ekm->em", outward, local[ends])
+    by_motion = np.einsum("ek,ekm->em", direction, surface.by_motion[a] - surface.by_motion[b])
+    heavy = 2 * stiffness * by_local
+    both = np.concatenate([by_local, np.tile(by_motion, (2, 1))], 1)
+    sums = pattern.from_ends @ (heavy[:, :, None] * both[:, None]).reshape(len(ends), 27)
+    total[pattern.diagonal] += sums.reshape(-1, 3, 9)[:, :, :3]
+    local_motion += sums.reshape(-1, 3, 9)[:, :, 3:]
+    across = heavy[: len(a), :, None] * by_local[len(a) :, None]
+    total[pattern.across[0]] += across
+    total[pattern.across[1]] += across.transpose(0, 2, 1)
+    motion += 2 * stiffness * by_motion.T @ by_motion
 
     basis = surface.basis
     size = basis.shape[1]

@@ -79,42 +79,50 @@ class Pictures:
         self.problem = problem
         # geometry comes from the rasteriser whatever renders the colours
         self._raster = RasterIntegrator(mi.Properties("raster"))
-        self._raster.aovs = ["depth", "normal", "uv"]
+        self._raster.aovs, self._raster.antialias = ["depth", "normal", "uv"], False
 
-    def __call__(self, unknowns, frame):
+    def __call__(self, unknowns, frame, geometry=True):
         """Layers (H, W[, C]) float32: ``target``, ``render`` (linear RGB), ``error`` (root mean square over channels), ``mask_target``,
-        ``mask_render``, ``depth`` [m], ``normal`` (camera frame, towards the camera), ``uv`` (texture coordinates, v up); 0 beyond the surface.
+        ``mask_render``; with ``geometry`` also ``depth`` [m], ``normal`` (camera frame, towards the camera), ``uv`` (texture coordinates, v up);
+        0 beyond the surface.
         """
         problem = self.problem
         with dr.suspend_grad():
             vertices = problem.patch.vertices(unknowns)
             rgb, alpha = problem.image(vertices)
-            geometry = np.array(self._raster.render(problem.experiment.scene, problem.experiment.sensor, spp=1))[..., -6:]
-        render = np.array(rgb)
+            render = np.array(rgb)
+            more = self._geometry() if geometry else {}
         mask_render = np.array(alpha).reshape(render.shape[:2])
         image, mask = problem.sequence.frame(frame), problem.sequence.mask(frame)
         target = image * mask[..., None] if mask is not None else image
         inside = np.ones_like(mask_render) if mask is not None else mask_render > 0.999
-        error = np.sqrt(((render - target) ** 2).mean(-1)) * inside
-        hit = geometry[..., :1] > 0
-        normal = geometry[..., 1:4] @ problem.camera.axes.T
-        uv = np.where(hit, np.stack([geometry[..., 4], 1 - geometry[..., 5]], -1), 0)
+        difference = render - target
+        error = np.sqrt(np.einsum("hwc,hwc->hw", difference, difference) / 3) * inside
         return {
-            "target": image.astype(np.float32),
+            "target": image,
             "render": render,
-            "error": error.astype(np.float32),
+            "error": error,
             "mask_target": mask if mask is not None else np.ones_like(mask_render),
             "mask_render": mask_render,
-            "depth": geometry[..., 0],
-            "normal": normal.astype(np.float32),
-            "uv": uv.astype(np.float32),
+            **more,
         }
+
+    def _geometry(self):
+        """The layers ``depth``, ``normal`` and ``uv`` of the surface that was rendered last."""
+        geometry = np.array(self._raster.image(self.problem.experiment.scene, self.problem.experiment.sensor, spp=1))[..., -6:]
+        normal = geometry[..., 1:4] @ self.problem.camera.axes.T.astype(np.float32)
+        uv = np.where(geometry[..., :1] > 0, np.stack([geometry[..., 4], 1 - geometry[..., 5]], -1), 0)
+        return {"depth": geometry[..., 0], "normal": normal, "uv": uv}
 
 
 def _image_figures(layers, masked):
     """PSNR and SSIM of the rendering, in sRGB, inside the surface (the target's mask, else the rendered interior)."""
     inside = layers["mask_target"] > 0.5 if masked else layers["mask_render"] > 0.999
-    a, b = srgb(layers["render"]), srgb(layers["target"])
+    rows, columns = (np.flatnonzero(inside.any(axis=k)) for k in (1, 0))
+    if not len(rows):
+        return {"psnr_mask": float("nan"), "ssim_mask": float("nan")}
+    near = slice(max(0, rows[0] - 5), rows[-1] + 6), slice(max(0, columns[0] - 5), columns[-1] + 6)  # with the margin of SSIM's window
+    a, b, inside = srgb(layers["render"][near]), srgb(layers["target"][near]), inside[near]
     return {"psnr_mask": metrics.psnr(a, b, inside), "ssim_mask": metrics.ssim(a, b, inside)}
 
 
@@ -188,7 +196,7 @@ def write(problem, track, out, *, exr_frames, fps, command, say=None):
 
         with ThreadPoolExecutor(_DRAWING) as pool:  # the next frames are rendered meanwhile
             for k, u in enumerate(unknowns):
-                waiting.append(pool.submit(drawn, k, pictures(u, k)))
+                waiting.append(pool.submit(drawn, k, pictures(u, k, geometry=k in exr)))
                 if len(waiting) > 2 * _DRAWING:
                     yield finished()
             while waiting:

@@ -105,7 +105,7 @@ class Problem:
         self.place(vertices)
         scene, sensor, spp = self.experiment.scene, self.experiment.sensor, self.settings.spp
         if self._raster:
-            image = self.experiment.renderer.render(scene, sensor, spp=spp, seed=seed)
+            image = self.experiment.renderer.image(scene, sensor, seed, spp)
             alpha = None
         else:
             image = mi.render(scene, self._params, sensor=sensor, integrator=self.experiment.renderer, spp=spp, seed=seed)

@@ -1,12 +1,14 @@
 """Levels of an image: blurred, freed from lighting by local normalisation, on a coarser grid; of the video's frames and of the template's texture
 alike. NumPy and OpenCV only."""
 
+import math
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 _POOL = 4  # local statistics are taken on an image this many times smaller
+FARTHEST = 30.0  # pixels of the grid beyond which a silhouette is pulled no harder
 _FLOOR = 0.02  # local standard deviation below which an area counts as flat: it is not blown up to the contrast of the rest
 
 
@@ -23,16 +25,21 @@ class Level:
 @dataclass
 class LevelImage:
     """A frame at a level: ``colour`` (h, w, 3) float32; ``inside`` (h, w), 1 where the sheet may be compared; with a mask, ``mask`` (h, w) in
-    [0, 1], and ``distance`` (h, w), pixels of this grid from the mask's contour, of either side."""
+    [0, 1], and ``distance`` (h, w), pixels of this grid from the mask's contour, of either side. ``corner`` (x, y) [pixels of this grid]: where
+    these arrays begin; with a mask they end where it does, and everything that it takes part in: what lies beyond is not of the sheet, and farther than
+    ``FARTHEST`` from the contour."""
 
     colour: np.ndarray
     inside: np.ndarray
     mask: np.ndarray = None
     distance: np.ndarray = None
+    corner: tuple = (0, 0)
 
 
 def level_image(image, mask, level, normalise=True):
     """A frame (H, W, 3), linear, with its mask (H, W) or None, at a :class:`Level`."""
+    (y, x), near = _around(mask, level)
+    image, mask = image[near], mask[near] if mask is not None else None
     colour = compared(image, mask, level.sigma, level.window, normalise)
     inside = np.ones(image.shape[:2], np.float32) if mask is None else (mask > 0.5).astype(np.float32)
     if level.stride > 1:
@@ -43,7 +50,18 @@ def level_image(image, mask, level, normalise=True):
     small = _shrink(mask, level.stride)
     on = (small > 0.5).astype(np.uint8)
     distance = sum(cv2.distanceTransform(x, cv2.DIST_L2, 3) for x in (on, 1 - on))
-    return LevelImage(colour, inside, small, distance)
+    return LevelImage(colour, inside, small, distance, (x // level.stride, y // level.stride))
+
+
+def _around(mask, level):
+    """(y, x) where the part of an image begins that a mask (H, W) has a say in at a level, and its slices: everything without a mask."""
+    rows, columns = (np.flatnonzero(mask.any(axis=k)) for k in (1, 0)) if mask is not None else ((), ())
+    if len(rows) == 0:
+        return (0, 0), (slice(None), slice(None))
+    margin = int(max((FARTHEST + 2) * level.stride, 4 * level.sigma, 4 * level.window))
+    step = math.lcm(level.stride, _POOL)  # so that the grids of the part are those of the whole
+    at = [(max(0, int(x[0]) - margin) // step * step, (int(x[-1]) + margin) // step * step + step) for x in (rows, columns)]
+    return (at[0][0], at[1][0]), tuple(slice(*x) for x in at)
 
 
 def compared(image, weight, sigma, window, normalise):

@@ -112,7 +112,7 @@ class RasterIntegrator(mi.SamplingIntegrator):
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         """Image tensor (H, W, C) of the crop window, attached to whatever the scene is attached to."""
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-        image = self._image(scene, sensor, int(seed) if not dr.is_array_v(seed) else seed, spp)
+        image = self.image(scene, sensor, int(seed) if not dr.is_array_v(seed) else seed, spp)
         film = sensor.film()
         if not dr.grad_enabled(image):  # let the film have it too, for whoever develops or writes that
             film.prepare(self.aov_names())
@@ -201,7 +201,8 @@ class RasterIntegrator(mi.SamplingIntegrator):
             dr.eval(pi, triangle, depth)  # once: everything below reads it, and the scene may change before it is evaluated
         return View((x0_, y0_, w_, w, h), basis, origin, positions, screen, ray, length, hit, triangle, depth, pi)
 
-    def _image(self, scene, sensor, seed, spp):
+    def image(self, scene, sensor, seed=0, spp=0):
+        """What :meth:`render` returns, without a copy of it in the sensor's film."""
         spp = spp or sensor.sampler().sample_count()
         scale = math.isqrt(spp)
         if scale * scale != spp:

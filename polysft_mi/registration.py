@@ -8,24 +8,23 @@ import math
 from collections import OrderedDict
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import cKDTree
 
 from .problem import BadFrame
-from .pyramid import compared, level_image
+from .pyramid import FARTHEST, compared, level_image
 
 _TEXELS = 1.5  # texels of the baked texture to a pixel of the first frame
 _PIXEL_BLUR = 0.29  # standard deviation of a pixel's own square [pixels]
 _CORNERS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-_PACKETS = 8  # 18 sums of second, 9 of first derivatives and 4 of figures a triangle, in packets of 4
+_SUMS = 18 + 9 + 4  # of second derivatives, of first ones and of figures, a triangle
 _SILHOUETTE = 0.1  # of k_silhouette: robust, normalised residuals are smaller than colours, and masks are ragged
 _MISFIT = 0.5  # residual, in local standard deviations, that counts half a misfit
-_FARTHEST = 30.0  # pixels of the grid beyond which a silhouette is pulled no harder
 _CACHED_FRAMES = 4
 
 
@@ -67,6 +66,8 @@ class Registration:
         self._bake(mesh, faces)
         self._textures, self._frames = {}, OrderedDict()
         self._reader = ThreadPoolExecutor(1)
+        sequence = problem.sequence
+        self._decoded = lru_cache(2)(lambda frame: (sequence.frame(frame), sequence.mask(frame)))  # all levels are made of one decoding
         self.levels = ()
         self.normalise = problem.settings.lighting == "local"
 
@@ -104,6 +105,8 @@ class Registration:
 
     def on_template(self, texels):
         """Points (K, 3) [m, world] of the undeformed template at pixels (K, 2) of ``texture`` (OpenCV's, whole at their centres); NaN beyond it."""
+        from scipy.interpolate import LinearNDInterpolator  # a tenth of the start, and seldom needed
+
         coordinates = np.array(self._texcoord, dtype=np.float64).reshape(-1, 2) * np.array(self._texel[0]).ravel() + np.array(self._texel[1]).ravel()
         return LinearNDInterpolator(coordinates, self.problem.template.vertices[self.corner])(texels)
 
@@ -125,6 +128,8 @@ class Registration:
 
     def shift_texture(self, chart, displaced):
         """Move the texture on the template: what lies at ``chart`` (N, 2) is shown at ``displaced`` (N, 2) instead. Whether that could be done."""
+        from scipy.interpolate import LinearNDInterpolator
+
         coordinates = np.array(self._texcoord, dtype=np.float64).reshape(-1, 2)
         shown = np.empty((len(chart), 2))
         shown[self.corner] = coordinates
@@ -155,8 +160,7 @@ class Registration:
             self._frames.popitem(last=False)
 
     def _read(self, frame, level):
-        sequence = self.problem.sequence
-        return level_image(sequence.frame(frame), sequence.mask(frame), level, self.normalise)
+        return level_image(*self._decoded(frame), level, self.normalise)
 
     def _frame_level(self, frame, level):
         """The frame at a level, on the device: packed colour and weight; the mask or None; the :class:`LevelImage`; its area [pixels of the grid]."""
@@ -215,16 +219,23 @@ class Registration:
         by_x = ((t10 - t00) * (1 - fy) + (t11 - t01) * fy) * self._texel[0].x
         by_y = (bottom - top) * self._texel[0].y
 
-        x0, y0, width, w, h = view.region
-        local = dr.arange(mi.UInt32, w * h)
-        ly = local // width
-        pixel = (ly + y0) * dr.opaque(mi.UInt32, image.colour.shape[1]) + (local - ly * width + x0)
-        target = dr.gather(mi.Vector4f, packed, pixel, hit)
+        pixel, known = self._at(view, image)
+        target = dr.gather(mi.Vector4f, packed, pixel, hit & known)
         seen = top + (bottom - top) * fy
         weight = dr.select(hit & (seen.w > 0.5), target.w, 0)
         seen.w, target.w = 0, 0
         residual = dr.select(weight > 0, seen - target, 0)
         return residual, weight, triangle, (b1, b2), (p0, e1, e2), (c1 - c0, c2 - c0), (by_x, by_y)
+
+    @staticmethod
+    def _at(view, image):
+        """Indices of the region's pixels in the arrays of a :class:`LevelImage`, and whether they lie there."""
+        x0, y0, width, w, h = view.region
+        local = dr.arange(mi.UInt32, w * h)
+        ly = local // width
+        (rows, columns), corner = (dr.opaque(mi.Int32, int(k)) for k in image.inside.shape), (dr.opaque(mi.Int32, int(k)) for k in image.corner)
+        x, y = (mi.Int32(a) - b for a, b in zip((local - ly * width + x0, ly + y0), corner))
+        return mi.UInt32(y * columns + x), (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
 
     def residuals(self, vertices, frame, level):
         """Squared residuals r^2 = |T - I|^2 / 3 of the pixels that are compared, (P,) float32; vertices (N, 3) [m, world]."""
@@ -270,24 +281,10 @@ class Registration:
                 xx, xy, yy = xx + a * a, xy + a * b, yy + b * b
             first *= robust
             xx, xy, yy = (robust * x for x in (xx, xy, yy))
-            corner = (1 - b1 - b2, b1, b2)
-            sums = []
-            for a, b in _CORNERS:
-                m = corner[a] * corner[b]
-                sums += [m * xx, m * xy, m * yy]
-            for b in corner:
-                sums += [b * first.x, b * first.y, b * first.z]
-            sums += [weight * c2 * dr.log(1 + squared / c2), weight, weight * squared / (squared + c2), weight * squared / (squared + _MISFIT**2), mi.Float(0)]
-            active = view.hit & (weight > 0)
-            faces = len(self.faces)
-            out = dr.zeros(mi.Float64, 4 * _PACKETS * faces)
-            packet = dr.replace_type_t(mi.Vector4f, dr.VarType.Float64)
-            for k in range(_PACKETS):
-                dr.scatter_add(out, packet(*sums[4 * k : 4 * k + 4]), triangle * _PACKETS + k, active, mode=dr.ReduceMode.Local)
-            dr.eval(out)
+            figures = weight * c2 * dr.log(1 + squared / c2), weight, weight * squared / (squared + c2), weight * squared / (squared + _MISFIT**2)
+            found = mi.Vector4f(xx, xy, yy, b1), mi.Vector4f(first.x, first.y, first.z, b2), mi.Vector4f(*figures)
+            table = self._by_triangle(view.triangle, found)
             pairs = self._silhouette(view, frame, level) if s.k_silhouette > 0 else None
-        # rounded, so that the order in which threads added does not show
-        table = np.array(out).astype(np.float32).astype(np.float64).reshape(faces, 4 * _PACKETS)
         *_, area = self._frame_level(frame, level)
         energy, pixels, outlying, misfit = table[:, 27:31].sum(0).tolist()
         weight = s.k_rgb / (area or max(pixels, 1.0))
@@ -306,6 +303,32 @@ class Registration:
             weight * energy, silhouette, share * outlying, share * misfit, gradient, second, rows, pixels * level.stride**2
         )
 
+    def _by_triangle(self, triangle, found):
+        """Sums over the pixels that see each triangle (F, 31) float64: 18 of curvature, 9 of slope and 4 figures.
+
+        ``triangle``: of each pixel, -1 for none; ``found``: (xx, xy, yy, b1), (slope, b2) and the figures of each, where b1 and b2 are its
+        barycentric coordinates. A thread a triangle adds its pixels up in their order: in a fraction of the time of atomic additions by the pixels,
+        and always alike.
+        """
+        buffers = [dr.ravel(x) for x in found]
+        dr.eval(buffers)
+        seen, faces = np.array(triangle), len(self.faces)
+        order = np.argsort((seen + 1).astype(np.uint16) if faces < 2**16 - 1 else seen, kind="stable")  # of 16 bits NumPy sorts by radix
+        ends = np.cumsum(np.bincount(seen + 1, minlength=faces + 1))
+        order, start, end = (mi.UInt32(x.astype(np.uint32)) for x in (order, ends[:-1], ends[1:]))
+
+        def add(k, *sums):
+            pixel = dr.gather(mi.UInt32, order, k)
+            second, slope, figures = (dr.gather(mi.Vector4f, x, pixel) for x in buffers)
+            corner = 1 - second.w - slope.w, second.w, slope.w
+            new = [corner[a] * corner[b] * x for a, b in _CORNERS for x in (second.x, second.y, second.z)]
+            new += [b * x for b in corner for x in (slope.x, slope.y, slope.z)] + list(figures)
+            return k + 1, *(a + b for a, b in zip(sums, new))
+
+        sums = dr.while_loop((start, *(dr.zeros(mi.Float, faces) for _ in range(_SUMS))), lambda k, *_: k < end, add, label="sums")[1:]
+        dr.eval(sums)
+        return np.stack([np.array(x) for x in sums], 1).astype(np.float64)
+
     # -- silhouettes --------------------------------------------------------
 
     def _silhouette(self, view, frame, level):
@@ -314,12 +337,9 @@ class Registration:
         _, mask, image, _ = self._frame_level(frame, level)
         if mask is None:
             return None
-        x0, y0, width, w, h = view.region
-        local = dr.arange(mi.UInt32, w * h)
-        ly = local // width
-        pixel = (ly + y0) * dr.opaque(mi.UInt32, image.mask.shape[1]) + (local - ly * width + x0)
+        pixel, known = self._at(view, image)
         alpha = dr.select(view.hit, mi.Float(1), 0)
-        wanted = dr.gather(mi.Float, mask, pixel)
+        wanted = dr.gather(mi.Float, mask, pixel, known)
         total = float((image.mask.astype(np.float64) ** 2).sum())  # of the whole frame, less the region's, which alpha is subtracted from
         crossings = self.raster.crossings(view)
         if crossings is None:
@@ -338,14 +358,15 @@ class Registration:
         alpha = mi.Float(alpha)
         error = dr.sum(dr.square(alpha - wanted) - dr.square(wanted))
         excess = dr.gather(mi.Float, alpha - wanted, to)
-        at = dr.gather(mi.UInt32, pixel, to)
+        at = dr.select(dr.gather(mi.Bool, known, to), mi.Int32(dr.gather(mi.UInt32, pixel, to)), -1)
         dr.eval(va, vb, da, db, step, excess, at, error)
         kept = np.array(step) != 0  # where a sheet passes before the sheet itself, alpha does not change
         at = np.array(at)[kept]
+        distance = np.where(at >= 0, image.distance.ravel()[at], FARTHEST)
         step = np.array(step)[kept][:, None]
         ends = [self.corner[np.array(i)[kept]] for i in (va, vb)]
         by = [np.array(d).T[kept].astype(np.float64) * step for d in (da, db)]
-        return total + float(error[0]), (*ends, *by, np.array(excess)[kept].astype(np.float64), image.distance.ravel()[at])
+        return total + float(error[0]), (*ends, *by, np.array(excess)[kept].astype(np.float64), distance)
 
     def _pull(self, vertices, pairs, frame, level, weight):
         """Energy, rows and gradient (N, 3) of the silhouette term.
@@ -359,7 +380,7 @@ class Registration:
             return weight * energy, None, gradient
         i, j, ci, cj, excess, distance = found
         slope = np.linalg.norm(ci + cj, axis=1)  # as the edge moves as a whole
-        curvature = 2 * weight / np.maximum(1.0, slope * np.minimum(distance, _FARTHEST))
+        curvature = 2 * weight / np.maximum(1.0, slope * np.minimum(distance, FARTHEST))
         scale = 1 / level.stride
         jacobian = self.projection(vertices)
         for k, c in ((i, ci), (j, cj)):

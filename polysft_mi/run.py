@@ -1,5 +1,6 @@
 """``python -m polysft_mi.run scene.xml -o OUT``: the template's surface in every frame of a video."""
 
+import gc
 import json
 import os
 import shutil
@@ -114,6 +115,7 @@ def _run(options, overrides, out, exr_frames):
     if not options.resume:
         outputs.write_beginning(out, text, problem.camera, command, options.fps)
 
+    gc.freeze()  # what is loaded by now stays: the collector need not go through it again and again
     count = len(sequence.indices)
     began, status = time.perf_counter(), 0
     with Progress(count, s, options.quiet) as progress:

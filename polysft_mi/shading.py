@@ -66,29 +66,37 @@ def shade_surface(vertices, faces, view=None, uv=None, size=(480, 480)):
         values += [*np.moveaxis(((uv - uv.min(axis=0)) / np.maximum(np.ptp(uv, axis=0), 1e-12) * 10)[F], 2, 0)]
 
     triangle, x, y = _covered_pixels(corners, width, height)
-    right, down = x + 0.5 - corners[triangle, 0, 0], y + 0.5 - corners[triangle, 0, 1]
-
-    def inside(value, at):
-        """A value (F, 3), given at the corners, at the covered pixels ``at``: affine, because the view is orthographic."""
-        d1, d2 = value[:, 1] - value[:, 0], value[:, 2] - value[:, 0]
-        slope_x, slope_y = (d1 * edge2[:, 1] - d2 * edge1[:, 1]) / area, (d2 * edge1[:, 0] - d1 * edge2[:, 0]) / area
-        t = triangle[at]
-        return value[t, 0] + slope_x[t] * right[at] + slope_y[t] * down[at]
-
+    # values are affine in a triangle, because the view is orthographic: its constant, and slopes to the right and down
     with np.errstate(divide="ignore", invalid="ignore"):  # triangles seen edge-on cover nothing
-        pixel, depth = y * width + x, inside(values[0], slice(None))
-        nearest = np.full(height * width, np.inf)
-        np.minimum.at(nearest, pixel, depth)
-        front = np.flatnonzero(depth == nearest[pixel])
-        light = np.clip(inside(values[1], front), 0, 2)
-        for value in values[2:]:
-            at = inside(value, front)
-            light *= 1 - 0.17 * np.clip(2 - np.abs(at - np.round(at)) / 0.03, 0, 1)
-    image = np.full((height * width, 3), _BACKGROUND)
-    image[pixel[front]] = np.where(away[triangle[front], None], _BACK, _FRONT) * light[:, None]
-    image = image.reshape(size[1], _SUPERSAMPLE, size[0], _SUPERSAMPLE, 3)
-    image = sum(image[:, i, :, j] for i in range(_SUPERSAMPLE) for j in range(_SUPERSAMPLE)) / _SUPERSAMPLE**2
-    return _SRGB[(np.clip(image, 0, 1) * (len(_SRGB) - 1)).astype(np.int64)]
+        affine = []
+        for value in values:
+            d1, d2 = value[:, 1] - value[:, 0], value[:, 2] - value[:, 0]
+            slopes = (d1 * edge2[:, 1] - d2 * edge1[:, 1]) / area, (d2 * edge1[:, 0] - d1 * edge2[:, 0]) / area
+            at_origin = value[:, 0] - slopes[0] * (corners[:, 0, 0] - 0.5) - slopes[1] * (corners[:, 0, 1] - 0.5)  # the origin's pixel
+            affine.append((at_origin, *slopes))
+
+    def inside(value, t, x, y):
+        return value[0].take(t) + value[1].take(t) * x + value[2].take(t) * y
+
+    pixel, depth = y * width + x, inside(affine[0], triangle, x, y)
+    nearest = np.full(height * width, np.inf)
+    np.minimum.at(nearest, pixel, depth)
+    front = np.flatnonzero(depth == nearest[pixel])
+    triangle, x, y = triangle[front], x[front], y[front]
+    light = np.clip(inside(affine[1], triangle, x, y), 0, 2)
+    for value in affine[2:]:
+        at = inside(value, triangle, x, y)
+        light *= 1 - 0.17 * np.clip(2 - np.abs(at - np.round(at)) / 0.03, 0, 1)
+
+    # a pixel is the mean of its samples: of either side's light, and of the background
+    at, back = y // _SUPERSAMPLE * size[0] + x // _SUPERSAMPLE, away[triangle]
+    shares = [np.bincount(at, weights, size[0] * size[1]) / _SUPERSAMPLE**2 for weights in (light * back, light * ~back, None)]
+    covered = np.flatnonzero(shares[2])
+    of_back, of_front, sheet = (share[covered, None] for share in shares)
+    colour = np.clip(of_back * _BACK + of_front * _FRONT + (1 - sheet) * _BACKGROUND, 0, 1)
+    image = np.full((size[0] * size[1], 3), _SRGB[int(_BACKGROUND * (len(_SRGB) - 1))])
+    image[covered] = _SRGB[(colour * (len(_SRGB) - 1)).astype(np.int64)]
+    return image.reshape(size[1], size[0], 3)
 
 
 def seen(vertices, faces, camera, values=()):
@@ -149,7 +157,7 @@ def _covered_pixels(corners, width, height):
 
 def _ranges(start, stop, limit):
     """The whole numbers from start to stop - 1, within 0 to limit - 1, for each pair: (index of the pair, number)."""
-    start = np.clip(start, 0, limit).astype(np.int64)
-    count = np.maximum(np.clip(stop, 0, limit).astype(np.int64) - start, 0)
-    index = np.repeat(np.arange(len(count)), count)
-    return index, np.arange(len(index)) - np.repeat(np.cumsum(count) - count - start, count)
+    start = np.clip(start, 0, limit).astype(np.int32)  # half the memory of what NumPy would take, and so half the time
+    count = np.maximum(np.clip(stop, 0, limit).astype(np.int32) - start, 0)
+    index = np.repeat(np.arange(len(count), dtype=np.int32), count)
+    return index, np.arange(len(index), dtype=np.int32) - np.repeat(np.cumsum(count, dtype=np.int32) - count - start, count)

@@ -15,7 +15,7 @@ _MARKS = "range=tv:colorspace=bt709:color_primaries=bt709:color_trc=bt709"
 _WIDEST = 3840  # beyond it, browsers and graphics cards give up
 _SIZE = rf"w=min(iw\,{_WIDEST}):h=-2:flags=area"
 _FILTER = ["-vf", f"scale={_SIZE}:out_color_matrix=bt709:out_range=tv,format=yuv420p,setparams={_MARKS}"]
-_CODEC = ["-c:v", "libx264", "-preset", "medium", "-crf", "18", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
+_CODEC = ["-c:v", "libx264", "-preset", "veryfast", "-crf", "18", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
 
 
 @functools.lru_cache(maxsize=None)

@@ -12,7 +12,7 @@ from polysft_mi import metrics, plugins
 
 ROOT = Path(__file__).resolve().parent.parent
 SIZE, POINTS = (64, 48), 9
-raster, stability = load("benchmarks/raster.py"), load("benchmarks/stability.py")
+raster, scaling, stability = (load(f"benchmarks/{name}.py") for name in ("raster", "scaling", "stability"))
 
 
 @pytest.fixture(autouse=True)
@@ -87,3 +87,19 @@ def test_stability_writes_figures_and_picture(tmp_path, capsys):
     assert report["counts"]["2"]["rmse_mm"] == pytest.approx(1e3 * np.linalg.norm(truth) / np.sqrt(len(truth)) * report["counts"]["2"]["e3d"], rel=1e-5)
     assert (tmp_path / "stability.png").read_bytes().startswith(b"\x89PNG")
     assert "stability.json" in capsys.readouterr().out
+
+
+def test_scaling_tracks_the_sheet_that_it_makes(tmp_path):
+    scaling.make(str(tmp_path), POINTS, (160, 120), 3)
+    with np.load(tmp_path / "gt.npz") as truth:
+        vertices, faces = truth["vertices"], truth["faces"]
+    a, b = vertices[:, faces], np.roll(vertices[:, faces], -1, axis=2)
+    lengths = np.linalg.norm(a - b, axis=3)
+    assert np.abs(lengths / lengths[0] - 1).max() < 0.01  # chords of a cylinder
+    found = scaling.measure(str(tmp_path))
+    assert len(found["seconds"]) == len(found["cpu"]) == len(found["evaluations"]) == 2
+    moved = 1e3 * np.linalg.norm(vertices[-1] - vertices[0], axis=1).mean()
+    assert 0 < found["rmse_mm"][-1] < 0.1 * moved and found["peak_mb"] >= found["started_mb"]
+    case = scaling.summarise(POINTS, "160x120", {**found, "versions": {"variant": "v", "machine": "m"}})
+    text = scaling.report([case, {**case, "vertices": 4}], str(tmp_path), 3)
+    assert "| 81 | 160×120 |" in text and (tmp_path / "scaling.md").read_text(encoding="utf-8") == text and (tmp_path / "scaling.png").exists()

@@ -11,12 +11,12 @@ import synthetic
 from scipy.spatial.transform import Rotation
 
 from polyfit import jets
-from polysft_mi import objective, prepare, registration, scene, solvers
+from polysft_mi import objective, prepare, pyramid, registration, scene, solvers
 from polysft_mi.errors import InputError
 from polysft_mi.normal_equations import Blocks, Chart, Normal, Pattern, Reduced, State, assemble
 from polysft_mi.patch import Unknowns
 from polysft_mi.problem import Problem
-from polysft_mi.pyramid import Level, level_image
+from polysft_mi.pyramid import FARTHEST, Level, level_image
 from polysft_mi.registration import Registration
 from polysft_mi.relocate import Relocator
 from polysft_mi.sequence import Sequence
@@ -242,14 +242,17 @@ def test_photometric_gradient_is_that_of_autodiff_through_raster(problem, twin, 
     flat, rgb, alpha = attached(reference, vertices)
     interior = np.array(objective.interior(alpha)).reshape(problem.height, problem.width)
     image = level_image(problem.sequence.frame(2), problem.sequence.mask(2), level, False)
-    image.inside = image.inside * interior  # where raster blends no silhouette into the colour
+    part = tuple(slice(k, k + n) for k, n in zip(image.corner[::-1], image.inside.shape))
+    image.inside = image.inside * interior[part]  # where raster blends no silhouette into the colour
     first._frames[2, level] = _Ready(image)
     mine = first.evaluate(vertices, 2, level, scale)
-    weight, area = mi.Float(image.inside.ravel()), float(image.mask.sum())
+    whole = np.zeros((problem.height, problem.width, 4), np.float32)
+    whole[part] = np.concatenate([image.colour, image.inside[..., None]], -1)
+    weight, area = mi.Float(whole[..., 3].ravel()), float(image.mask.sum())
     squared = 0
     for c in range(3):
         k = dr.arange(mi.UInt32, problem.pixels) * 3 + c
-        squared += dr.square(dr.gather(mi.Float, rgb.array, k) - mi.Float(image.colour[..., c].ravel())) / 3
+        squared += dr.square(dr.gather(mi.Float, rgb.array, k) - mi.Float(whole[..., c].ravel())) / 3
     energy = dr.sum(weight * scale**2 * dr.log(1 + squared / scale**2)) / area
     dr.backward(energy)
     expected = np.array(dr.grad(flat)).reshape(-1, 3)
@@ -271,6 +274,45 @@ class _Ready:
 
 def _silhouette_gradient(first, vertices, level):
     return first.evaluate(vertices, 2, level, 1e-6).gradient  # at this scale no residual pulls
+
+
+def test_sums_over_each_triangles_pixels(problem):
+    first, count = Registration(problem), 500
+    faces = len(first.faces)
+    triangle = RNG.integers(-1, faces // 3, count).astype(np.int32)  # many see none of the later triangles
+    found = RNG.random((3, count, 4)).astype(np.float32)
+    table = first._by_triangle(mi.Int32(triangle), [mi.Vector4f(np.ascontiguousarray(x.T)) for x in found])
+    expected = np.zeros((faces, 31))
+    for t, second, slope, figures in zip(triangle, *found.astype(np.float64)):
+        if t >= 0:
+            corner = 1 - second[3] - slope[3], second[3], slope[3]
+            expected[t, :18] += np.concatenate([corner[a] * corner[b] * second[:3] for a, b in registration._CORNERS])
+            expected[t, 18:] += np.concatenate([*(b * slope[:3] for b in corner), figures])
+    assert np.abs(table - expected).max() < 1e-5 * np.abs(expected).max()
+    assert np.array_equal(table, first._by_triangle(mi.Int32(triangle), [mi.Vector4f(np.ascontiguousarray(x.T)) for x in found]))
+
+
+@pytest.mark.parametrize("level", [Level(0.0), Level(2.5, 2), Level(3.8, 3, 10.0)])
+def test_a_masked_image_is_that_of_the_whole_where_the_mask_has_a_say(monkeypatch, level):
+    image = cv2.GaussianBlur(RNG.random((360, 480, 3)).astype(np.float32), (0, 0), 2)
+    mask = np.zeros((360, 480), np.float32)
+    cv2.ellipse(mask, (320, 200), (30, 20), 20, 0, 360, 1, -1)
+    part = level_image(image, mask, level)
+    monkeypatch.setattr(pyramid, "_around", lambda mask, level: ((0, 0), (slice(None), slice(None))))
+    whole = level_image(image, mask, level)
+    (rows, columns), (x, y) = part.inside.shape, part.corner
+    assert part.inside.size < 0.8 * whole.inside.size and (x > 0 or y > 0)
+    here = np.s_[y : y + rows, x : x + columns]
+    for name in ("inside", "mask"):
+        assert np.array_equal(getattr(part, name), getattr(whole, name)[here])
+        outside = getattr(whole, name).copy()
+        outside[here] = 0
+        assert not outside.any()
+    assert np.abs(part.colour - whole.colour[here])[part.inside > 0].max() < 1e-5
+    near = whole.distance < FARTHEST
+    assert np.abs(part.distance - whole.distance[here])[near[here]].max() < 1e-5
+    near[here] = False
+    assert not near.any()
 
 
 @pytest.mark.parametrize("amount", [0.5, 1.0])

@@ -1,0 +1,278 @@
+"""How time a frame and memory of the second-order tracker grow with the template and with the image.
+
+    python benchmarks/scaling.py [--grids 33 50 71 100] [--sizes 640x480 1280x720 1920x1080] [--frames 8] [--docs docs] [-m llvm_ad_rgb]
+
+A textured sheet that covers a third of the image bends and turns (its edges keep their lengths); ``raster`` renders it, with its masks, 16 samples
+a pixel. The template is the sheet in the first frame, of so many vertices a side. Each case is tracked by default settings in a process of its own,
+which has rendered nothing before. A case's seconds are medians over its frames but the first, for which kernels are compiled: of all the process's
+threads together, so that what else the machine does counts little (those of the clock are printed too). Its memory is the process's peak; ``started``
+is what a process holds before it loads a scene.
+
+Writes ``scaling.md`` and ``scaling.png`` into ``docs`` (``--docs FOLDER`` for another).
+"""
+
+import argparse
+import json
+import os
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+
+import numpy as np
+
+ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+sys.path.insert(0, ROOT)
+
+from polysft_mi.backend import add_mode_argument, set_variant
+from polysft_mi.camera import Intrinsics
+from polysft_mi.errors import InputError, cli
+from polysft_mi.files import aside
+
+GRIDS, SIZES, FRAMES = (33, 50, 71, 100), ("640x480", "1280x720", "1920x1080"), 8
+SHARE, SAMPLES = 1 / 3, 16  # of the image that the sheet covers; a pixel
+
+
+# ---- in a worker's process ------------------------------------------------------------------------------------------------
+
+
+def camera(size):
+    width, height = size
+    return Intrinsics(1.1 * width, 1.1 * width, width / 2, height / 2, width, height)
+
+
+def sheet(points, size, t):
+    """The sheet at the time t in [0, 1]: vertices (N, 3) [m, camera frame] of a flat sheet at 0, of a cylinder around a slanting axis later."""
+    x, y = (a.ravel() for a in np.meshgrid(*2 * [np.linspace(-0.5, 0.5, points)]))
+    extent = np.sqrt(SHARE) * np.array(size) / camera(size).fx
+    x, y = x * extent[0], y * extent[1]
+    c, s = np.cos(0.4), np.sin(0.4)
+    along, across = c * x + s * y, c * y - s * x
+    curvature = max(1.5 * t, 1e-9) / extent[0]
+    bent, z = np.sin(curvature * along) / curvature, (1 - np.cos(curvature * along)) / curvature
+    x, y = c * bent - s * across, s * bent + c * across
+    c, s = np.cos(0.2 * t), np.sin(0.2 * t)
+    return np.stack([c * x - s * y + 0.02 * t, s * x + c * y, 1 + z], axis=1)
+
+
+def faces_and_uv(points):
+    k = np.arange(points * points).reshape(points, points)
+    a, b, d, e = (q.ravel() for q in (k[:-1, :-1], k[:-1, 1:], k[1:, :-1], k[1:, 1:]))
+    u, v = (x.ravel() for x in np.meshgrid(*2 * [np.linspace(0, 1, points)]))
+    return np.stack([a, d, b, b, d, e], axis=1).reshape(-1, 3), np.stack([u, 1 - v], axis=1)
+
+
+def make(folder, points, size, frames):
+    """A sequence's folder: frames and masks, template.obj, texture and camera.json, and the true surfaces in gt.npz."""
+    import cv2
+    import mitsuba as mi
+
+    from polysft_mi import outputs, prepare, scene
+    from polysft_mi.problem import Problem
+    from polysft_mi.sequence import Sequence
+
+    faces, uv = faces_and_uv(points)
+    truth = np.stack([sheet(points, size, k / max(frames - 1, 1)) for k in range(frames)])
+    shutil.copy(os.path.join(ROOT, "scenes", "demo", "texture.jpg"), folder)
+    lines = ["v {:.8f} {:.8f} {:.8f}".format(*p) for p in truth[0]] + ["vt {:.8f} {:.8f}".format(*t) for t in uv]
+    lines += ["f " + " ".join(f"{k}/{k}" for k in face) for face in faces + 1]
+    with open(os.path.join(folder, "template.obj"), "w") as file:
+        file.write("\n".join(lines) + "\n")
+    c = camera(size)
+    with open(os.path.join(folder, "camera.json"), "w") as file:
+        json.dump({k: getattr(c, k) for k in ("fx", "fy", "cx", "cy", "width", "height")}, file)
+    np.savez(os.path.join(folder, "gt.npz"), vertices=truth.astype(np.float32), faces=faces)
+
+    def write(name, k, values):
+        os.makedirs(os.path.join(folder, name), exist_ok=True)
+        cv2.imwrite(os.path.join(folder, name, f"{k:03d}.png"), values[..., ::-1] if values.ndim == 3 else values)
+
+    blank = np.full((size[1], size[0], 3), 255, np.uint8)
+    write("frames", 0, blank), write("masks", 0, blank[..., 0])  # so that there is a scene to render with
+    prepare.main([folder])
+    experiment = scene.load(os.path.join(folder, "scene.xml"), {"spp": str(SAMPLES)})
+    problem = Problem(experiment, Sequence.open(experiment.frames, experiment.masks))
+    for k, vertices in enumerate(truth):
+        rgb, alpha = problem.image(mi.Point3f(np.ascontiguousarray(vertices.T, dtype=np.float32)))
+        alpha = np.array(alpha).reshape(size[1], size[0])
+        linear = np.array(rgb) + 0.05 * (1 - alpha[..., None])
+        write("frames", k, np.round(255 * outputs.srgb(linear)).astype(np.uint8))
+        write("masks", k, np.round(255 * alpha).astype(np.uint8))
+
+
+def measure(folder):
+    """Seconds (of the clock, of all threads) and evaluations of each frame, memory [MB] before the scene and at most, and distances from the truth [mm]."""
+    from polysft_mi import scene, solvers
+    from polysft_mi.patch import Unknowns
+    from polysft_mi.problem import Problem
+    from polysft_mi.sequence import Sequence
+    from polysft_mi.tracker import track
+
+    with open("/proc/self/statm") as file:
+        started = int(file.read().split()[1]) * resource.getpagesize() / 1e6
+    experiment = scene.load(os.path.join(folder, "scene.xml"), {})
+    problem = Problem(experiment, Sequence.open(experiment.frames, experiment.masks))
+    ticks = {}
+
+    def tick(frame, *_):
+        ticks[frame] = time.process_time()  # after the last evaluation of a frame
+
+    done = track(problem, solvers.create(experiment.settings), len(problem.sequence), folder, progress=tick)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
+    with np.load(os.path.join(folder, "gt.npz")) as truth:
+        found = np.stack([problem.surface(Unknowns.from_numpy(s)) for s in done.states])
+        error = 1e3 * np.sqrt(((found - truth["vertices"]) ** 2).sum(2).mean(1))
+    order = max(t["order"] for t in done.totals)
+    cpu = np.diff(list(ticks.values())).tolist()
+    figures = {"seconds": done.seconds[1:], "cpu": cpu, "evaluations": done.iterations[1:], "rmse_mm": error.tolist(), "order": order}
+    return {**figures, "started_mb": started, "peak_mb": peak}
+
+
+def worker(job):
+    set_variant(job["mode"])
+    from polysft_mi import outputs, plugins
+
+    plugins.register()
+    if job["task"] == "make":
+        make(job["folder"], job["points"], parse_size(job["size"]), job["frames"])
+    else:
+        print(json.dumps({**measure(job["folder"]), "versions": outputs.versions()}))
+
+
+# ---- in the benchmark's own process ---------------------------------------------------------------------------------------
+
+
+def run_case(points, size, frames, mode):
+    """The figures of a case (dict)."""
+    with tempfile.TemporaryDirectory() as folder:
+        for task in ("make", "measure"):
+            job = {"task": task, "folder": folder, "points": points, "size": size, "frames": frames, "mode": mode}
+            command = [sys.executable, os.path.abspath(__file__), "--worker", json.dumps(job)]
+            done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+            if done.returncode:
+                why = done.stderr.strip()[-500:]
+                raise InputError(f"{points * points} vertices at {size}: {task} ended with status {done.returncode}: {why}")
+    return summarise(points, size, json.loads(done.stdout.splitlines()[-1]))
+
+
+def summarise(points, size, found):
+    return {
+        "vertices": points * points,
+        "size": size,
+        **{name: float(np.median(found[name])) for name in ("seconds", "cpu")},
+        "evaluations": float(np.mean(found["evaluations"])),
+        "order": found["order"],
+        "peak_mb": found["peak_mb"],
+        "started_mb": found["started_mb"],
+        "rmse_mm": float(np.mean(found["rmse_mm"][1:])),
+        "versions": found["versions"],
+    }
+
+
+def report(cases, docs, frames):
+    """Write scaling.md and scaling.png for cases that are done; the text."""
+    v = cases[0]["versions"]
+    rows = [
+        f"| {c['vertices']:,} | {c['size'].replace('x', '×')} | {c['cpu']:.2f} | {c['evaluations']:.0f} | {c['order']} "
+        f"| {c['peak_mb']:.0f} | {c['rmse_mm']:.2f} |"
+        for c in cases
+    ]
+    started = np.median([c["started_mb"] for c in cases])
+    text = f"""# How the tracker scales
+
+`python benchmarks/scaling.py` makes this page: a sheet that covers a third of the image bends and turns in front of the camera, rendered with its
+masks, tracked by default settings. Seconds a frame are the tracker's (median of {frames - 1} frames), without start-up and pictures, of all its
+threads together: on idle cores it takes less, for reading the next frame and the kernels run beside the rest. Memory is the process's peak, of which
+{started:.0f} MB are Python, Mitsuba, PyTorch and LLVM. Evaluations are those of the objective with its derivatives. {v['variant']}, {v['machine']}.
+
+| vertices | image | seconds a frame | evaluations a frame | highest order | memory [MB] | RMS distance from the truth [mm] |
+|---:|---|---:|---:|---:|---:|---:|
+{chr(10).join(rows)}
+
+![Seconds a frame and memory over the number of vertices, and over the number of pixels](scaling.png)
+
+With the image grow decoding, rays and residuals; only the finest of the three stages works on every pixel that sees the sheet. With the template
+grows above all the elimination of each vertex's (Δu, Δv): a sheet's block tridiagonal matrix is as wide as the sheet, so that its factorisation grows
+with the square of the number of vertices (half of the time at 10,000).
+"""
+    with aside(os.path.join(docs, "scaling.md")) as temporary, open(temporary, "w", encoding="utf-8") as file:
+        file.write(text)
+    plot(os.path.join(docs, "scaling.png"), cases)
+    return text
+
+
+def plot(path, cases):
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.2, 4.6), dpi=90, layout="constrained")
+    axes = figure.subplots(2, 2, sharex="col", sharey="row")
+    pixels = lambda c: np.prod(parse_size(c["size"]))
+    sizes = sorted({c["size"] for c in cases}, key=lambda s: np.prod(parse_size(s)))
+    counts = sorted({c["vertices"] for c in cases})
+    shades = lambda n: [(0.77, 0.34, 0.18, 1 - 0.7 * k / max(n - 1, 1)) for k in reversed(range(n))]
+    for row, (name, label) in enumerate((("cpu", "seconds a frame"), ("peak_mb", "memory [MB]"))):
+        for column, (groups, key, across) in enumerate(((sizes, "size", lambda c: c["vertices"]), (counts, "vertices", pixels))):
+            a = axes[row, column]
+            for group, colour in zip(groups, shades(len(groups))):
+                chosen = sorted((c for c in cases if c[key] == group), key=across)
+                text = group.replace("x", "×") if key == "size" else f"{group:,} vertices"
+                a.plot([across(c) for c in chosen], [c[name] for c in chosen], color=colour, marker="o", markersize=3.5, label=text)
+            a.grid(True, color="0.9", linewidth=0.6)
+            a.spines[["top", "right"]].set_visible(False)
+            a.set_ylim(bottom=0)
+            if column == 0:
+                a.set_ylabel(label)
+            if row == 1:  # under the curves, which begin with what a process holds
+                a.legend(frameon=False, fontsize=8, loc="lower right")
+    axes[1, 0].set_xlabel("vertices")
+    axes[1, 1].set_xlabel("pixels")
+    axes[1, 1].set_xticks([np.prod(parse_size(s)) for s in sizes], [s.replace("x", "×") for s in sizes], fontsize=8)
+    with aside(path) as temporary:
+        figure.savefig(temporary, format="png", facecolor="white")
+
+
+def parse_size(text):
+    try:
+        width, height = (int(x) for x in text.lower().split("x"))
+        if min(width, height) < 48:
+            raise ValueError
+    except ValueError:
+        raise InputError(f"--sizes {text}: WIDTHxHEIGHT is needed, at least 48x48, such as 640x480") from None
+    return width, height
+
+
+def parser():
+    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    grids = " ".join(map(str, GRIDS))
+    p.add_argument("--grids", nargs="+", type=int, metavar="N", default=GRIDS, help=f"vertices a side of the templates (default: {grids})")
+    p.add_argument("--sizes", nargs="+", metavar="WxH", default=SIZES, help=f"image sizes (default: {' '.join(SIZES)})")
+    p.add_argument("--frames", type=int, default=FRAMES, help=f"frames of a case (default: {FRAMES})")
+    p.add_argument("--docs", metavar="FOLDER", default=os.path.join(ROOT, "docs"), help="for scaling.md and scaling.png (default: docs)")
+    add_mode_argument(p)
+    p.add_argument("--worker", help=argparse.SUPPRESS)
+    return p
+
+
+def main(arguments=None):
+    options = parser().parse_args(arguments)
+    if options.worker:
+        return worker(json.loads(options.worker))
+    for size in options.sizes:
+        parse_size(size)
+    if min(options.grids) < 4 or options.frames < 2 or not os.path.isdir(options.docs):
+        given = f"--grids {options.grids} --frames {options.frames} --docs {options.docs}"
+        raise InputError(f"{given}: at least 4 vertices a side, 2 frames and a folder are needed")
+    began, cases = time.perf_counter(), []
+    for size in options.sizes:
+        for points in options.grids:
+            cases.append(run_case(points, size, options.frames, options.mode))
+            c = cases[-1]
+            figures = f"{c['seconds']:.2f} s a frame ({c['cpu']:.2f} of all threads), {c['peak_mb']:.0f} MB"
+            print(f"{time.perf_counter() - began:4.0f} s  {c['vertices']} vertices, {size}: {figures}", file=sys.stderr)
+    print(report(cases, options.docs, options.frames))
+
+
+if __name__ == "__main__":
+    cli(main)
