@@ -321,18 +321,21 @@ class Normal:
     gradient: np.ndarray
 
 
-def assemble(pattern, surface, projection, evaluation, lengths, stiffness):
+def assemble(pattern, surface, projection, evaluation, lengths, stiffness, slack=np.inf):
     """:class:`Normal` of the images and the edges, and the edges' energy.
 
     ``projection`` (N, 2, 3): of the vertices; ``evaluation``: :class:`polysft_mi.registration.Evaluation`; ``lengths`` (E,) [m]: of the template's
-    edges; ``stiffness`` [1/m^2]: weight of the squared differences to them.
+    edges; ``stiffness`` [1/m^2]: weight of the squared differences x to them. An edge that is shorter counts c^2 log(1 + x^2/c^2) instead of x^2,
+    with c = ``slack`` [m].
     """
     a, b = pattern.edges.T
     edge = surface.vertices[a] - surface.vertices[b]
     length = np.sqrt(np.einsum("ek,ek->e", edge, edge))
     direction = edge / length[:, None]
     excess = length - lengths
-    pull = (2 * stiffness * excess)[:, None] * direction
+    beyond = np.maximum((np.minimum(excess, 0) / slack) ** 2, 1e-12)
+    hold = 2 * stiffness / (1 + beyond)
+    pull = (hold * excess)[:, None] * direction
     gradient = evaluation.gradient + pattern.from_ends @ np.concatenate([pull, -pull])
 
     # Each vertex moves by its own (u, v), by the height that all coefficients make there, and by the motion: blocks of the first three are
@@ -357,7 +360,7 @@ def assemble(pattern, surface, projection, evaluation, lengths, stiffness):
     outward = np.concatenate([direction, -direction])
     by_local = np.einsum("ek,ekm->em", outward, local[ends])
     by_motion = np.einsum("ek,ekm->em", direction, surface.by_motion[a] - surface.by_motion[b])
-    heavy = 2 * stiffness * by_local
+    heavy = np.tile(hold, 2)[:, None] * by_local
     both = np.concatenate([by_local, np.tile(by_motion, (2, 1))], 1)
     sums = pattern.from_ends @ (heavy[:, :, None] * both[:, None]).reshape(len(ends), 27)
     total[pattern.diagonal] += sums.reshape(-1, 3, 9)[:, :, :3]
@@ -365,7 +368,7 @@ def assemble(pattern, surface, projection, evaluation, lengths, stiffness):
     across = heavy[: len(a), :, None] * by_local[len(a) :, None]
     total[pattern.across[0]] += across
     total[pattern.across[1]] += across.transpose(0, 2, 1)
-    motion += 2 * stiffness * by_motion.T @ by_motion
+    motion += by_motion.T @ (hold[:, None] * by_motion)
 
     basis = surface.basis
     size = basis.shape[1]
@@ -378,7 +381,7 @@ def assemble(pattern, surface, projection, evaluation, lengths, stiffness):
     cross = np.concatenate([np.stack(lifted[:2], 1), local_motion[:, :2]], 2).reshape(-1, size + 6)
     along = np.concatenate([basis.T @ (gradient @ surface.up), np.einsum("nk,nkm->m", gradient, surface.by_motion)])
     normal = Normal(total[:, :2, :2].copy(), cross, glob, np.einsum("nk,nka->na", gradient, surface.by_uv), along)
-    return normal, stiffness * float((excess**2).sum())
+    return normal, stiffness * float((excess**2 * np.log1p(beyond) / beyond).sum())
 
 
 class Reduced:
@@ -404,9 +407,17 @@ class Reduced:
     def step(self):
         """The step (global (G,), uv (N, 2)), and the decrease that the model promises. Raises LinAlgError where what remains is not positive definite."""
         g = -cho_solve(cho_factor(self.schur, check_finite=False), self.right, check_finite=False)
+        step = g, self.following(g)
+        return step, self.promised(step)
+
+    def following(self, g):
+        """The step (N, 2) of the uv displacements that goes with a step (G,) of the global unknowns."""
         y = self.elimination.columns
-        uv = -self.elimination.back(y[:, -1] + y[:, :-1] @ g).reshape(-1, 2)
-        return (g, uv), -0.5 * float(g @ self.normal.gradient + (uv * self.normal.uv_gradient).sum())
+        return -self.elimination.back(y[:, -1] + y[:, :-1] @ g).reshape(-1, 2)
+
+    def promised(self, step):
+        """The decrease that the model promises of a step that minimises it."""
+        return -0.5 * float(step[0] @ self.normal.gradient + (step[1] * self.normal.uv_gradient).sum())
 
     def slide(self):
         """The step (N, 2) of the uv displacements alone."""
@@ -417,6 +428,17 @@ class Reduced:
         keep = np.r_[np.arange(size), np.arange(len(self.right) - 6, len(self.right))]
         b, y = self.right[keep], self.elimination.columns[:, -1]
         return 0.5 * float(b @ cho_solve(cho_factor(self.schur[np.ix_(keep, keep)], check_finite=False), b, check_finite=False) + y @ y)
+
+    def without(self, size, alpha):
+        """The step (G,) that takes the coefficients from ``size`` on, whose values are ``alpha`` (A,), to zero, the others following, and the
+        increase that the model expects of it at a minimum."""
+        high = np.arange(size, len(self.right) - 6)
+        rest = np.r_[np.arange(size), np.arange(len(self.right) - 6, len(self.right))]
+        g = np.zeros(len(self.right))
+        g[high] = -alpha[high]
+        pull = self.schur[np.ix_(rest, high)] @ g[high]
+        g[rest] = -cho_solve(cho_factor(self.schur[np.ix_(rest, rest)], check_finite=False), pull, check_finite=False)
+        return g, 0.5 * float(g @ self.schur @ g)
 
     def variance(self, by_uv, by_global):
         """The diagonal of J H^-1 J^T (N,), where row i of J has the derivatives ``by_uv`` (N, 2) by the vertex's own (u, v) and ``by_global`` (N, G)."""

@@ -30,6 +30,9 @@ class Settings:
     k_rgb: float = _setting(1.0, "weight of the photometric loss", low=0)
     k_silhouette: float = _setting(1.0, "weight of the silhouette loss (needs masks)", low=0)
     k_mi: float = _setting(0.1, "weight of mesh inextensibility", low=0)
+    slack: float = _setting(
+        0.0, "share of its length by which an edge may shorten before shortening more gets cheap, for folds finer than the jet (gauss-newton); 0: none", low=0
+    )
     k_tc: float = _setting(0.05, "weight of temporal consistency", low=0)
     k_bend: float = _setting(1e-6, "weight of the jet's mean squared second derivatives (gauss-newton)", low=0)
     k_uv: float = _setting(1e-4, "weight of the differences of neighbours' uv displacements (gauss-newton)", low=0)
@@ -45,7 +48,7 @@ class Settings:
     spp: int = _setting(1, "samples a pixel; raster takes square numbers (1, 4, 9, ...)", low=1)
     seed: int = _setting(0, "seed of the renderer's random numbers (path replay)", low=0)
     solver: str = _setting("gauss-newton", "solver of each window", choices=("gauss-newton", "adam"))
-    window: int = _setting(3, "frames W in the sliding window of adam", low=1)
+    window: int = _setting(0, "frames W that are solved together in the sliding window; 0: 1 for gauss-newton, 3 for adam", low=0)
     smooth: float = _setting(0.0, "weight that holds each frame to the middle of its neighbours in a last pass over the video, both ways (gauss-newton); 0 for none", low=0)
     patience: int = _setting(100, "iterations of adam without improvement after which the window moves on", low=1)
     period: int = _setting(500, "largest number of iterations of adam in a window", low=1)
@@ -56,7 +59,7 @@ class Settings:
     @property
     def width(self):
         """Frames that are solved together."""
-        return self.window if self.solver == "adam" else 1
+        return self.window or {"gauss-newton": 1, "adam": 3}[self.solver]
 
     @property
     def lighting(self):

@@ -146,7 +146,8 @@ def _advance(problem, solver, done, start, width, log, progress):
     while usable := [k for k in members if k not in done.unusable]:
         before = [Unknowns.from_numpy(done.states[k]) for k in usable]
         try:
-            past = [(done.states[k], done.totals[k - width + 1]) for k in range(max(width - 1, members[-1] - _PAST), members[-1])]
+            earlier = range(max(0, members[-1] - _PAST), members[-1]) if start else []
+            past = [(done.states[k], done.totals[k - width + 1] if k >= width - 1 else {}) for k in earlier]
             solution = solver.solve(problem, before, usable, report, past)
             solved, terms, facts, latest[0] = dict(zip(usable, solution.window)), solution.terms, solution.facts, solution.iterations
             sigma = dict(zip(usable, solution.sigma or []))

@@ -8,6 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import synthetic
+from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from polyfit import jets
@@ -182,6 +183,15 @@ def test_step_and_variance_are_those_of_the_dense_system(rows, columns):
     keep = np.r_[np.arange(n), n, n + 1, np.arange(n + 3, n + 9)]
     assert reduced.restricted(2) == pytest.approx(0.5 * g[keep] @ np.linalg.solve(h[np.ix_(keep, keep)], g[keep]), rel=1e-5)
     assert np.allclose(reduced.slide().ravel(), -np.linalg.solve(h[:n, :n], g[:n]), rtol=1e-5, atol=1e-7)
+    # coefficients 2 (of 3) to zero: the rest minimises the quadratic around a point where the gradient is zero
+    alpha = RNG.normal(size=3)
+    step, increase = reduced.without(2, alpha)
+    rest = -np.linalg.solve(h[np.ix_(keep, keep)], -alpha[2] * h[keep, n + 2])
+    whole = np.zeros(len(h))
+    whole[keep], whole[n + 2] = rest, -alpha[2]
+    assert np.allclose(step, whole[n:], rtol=1e-5, atol=1e-7)
+    assert np.allclose((reduced.following(step) - reduced.slide()).ravel(), whole[:n], rtol=1e-5, atol=1e-6)
+    assert increase == pytest.approx(0.5 * whole @ h @ whole, rel=1e-5)
 
 
 def test_a_disconnected_and_irregular_mesh_is_factorised():
@@ -351,6 +361,32 @@ def test_inextensibility_gradient_is_that_of_autodiff(problem):
     assert np.abs(normal.gradient[-3:] - by_shift).max() < 1e-3 * np.abs(by_uv).max()
 
 
+def test_slack_lets_edges_shorten_but_not_stretch(problem):
+    chart = Chart(problem.template)
+    first = Registration(problem)
+    pattern = Pattern(first.faces, problem.template.edges, len(problem.template.vertices))
+    rest = np.array(problem.edge_lengths, dtype=np.float64)
+    state = some_state(chart, 0.02)
+    none = registration.Evaluation(0, 0, 0, 0, np.zeros((len(problem.template.vertices), 3)), np.zeros((len(first.faces), 9, 2, 2)), None, 1.0)
+
+    def model(at, lengths, slack):
+        surface = chart.surface(at)
+        return assemble(pattern, surface, first.projection(surface.vertices), none, lengths, 3.0, slack)
+
+    slack = 0.002 * rest.mean()
+    normal, energy = model(state, rest, slack)
+    step = RNG.normal(size=len(normal.gradient)) * 1e-6, RNG.normal(size=state.uv.shape) * 1e-6
+    slope = (model(state.moved(step), rest, slack)[1] - model(state.moved(step, -1), rest, slack)[1]) / 2
+    assert step[0] @ normal.gradient + (step[1] * normal.uv_gradient).sum() == pytest.approx(slope, rel=1e-4)
+    a, b = pattern.edges.T
+    length = np.linalg.norm(chart.surface(state).vertices[a] - chart.surface(state).vertices[b], axis=1)
+    for factor in (0.9, 1.1):  # all stretched, all shortened
+        x = length - factor * length
+        plain, robust = (model(state, factor * length, c)[1] for c in (np.inf, slack))
+        assert plain == pytest.approx(3 * (x**2).sum(), rel=1e-6)
+        assert robust == pytest.approx(plain if factor < 1 else 3 * (slack**2 * np.log1p((x / slack) ** 2)).sum(), rel=1e-6)
+
+
 def test_whole_gradient_against_finite_differences(problem):
     solver = gauss_newton.GaussNewton(dataclasses.replace(problem.settings, solver="gauss-newton", brightness="local", k_tc=50.0, k_bend=1e-3, k_uv=1e-2))
     solver._prepare(problem)
@@ -434,7 +470,71 @@ def test_order_rises_with_the_data_and_stays_within_bounds(tmp_path):
     assert {t["order"] for t in done.totals} <= {2, 3}
 
 
+def test_order_falls_where_the_data_ask_for_less(tmp_path):
+    flat = synthetic.cloth(tmp_path / "flat", frames=2, size=(160, 120), rows=9, columns=12, bend=0.0, shift=0.01, turn=0.02)
+    problem = problem_of(flat.folder, order=2, order_max=4)
+    rest = problem.patch.rest()
+    before = [(rest.to_numpy(), {"order": 4, "misfit": 0.0})]
+    solution = solvers.create(problem.settings).solve(problem, [rest], [1], None, before)
+    assert solution.facts["order"] == 2
+    error = np.linalg.norm(problem.surface(solution.window[0]) - flat.vertices[1], axis=1)
+    assert error.mean() < 0.002
+
+
+# -- windows -----------------------------------------------------------------
+
+
+def test_a_windows_step_against_finite_differences_and_the_dense_system(truth):
+    """Without the image, which jumps, differences are sharp: of the whole window's objective; the step is that of all unknowns of all frames together."""
+    problem = problem_of(truth.folder, k_rgb=0.0, k_silhouette=0.0, k_tc=500.0, k_bend=1e-2, window=3, texture_fit="none")
+    settings = problem.settings
+    solver = gauss_newton.GaussNewton(settings)
+    solver._prepare(problem)
+    chart, frames, orders = solver.chart, [0, 1, 2], [3, 4, 4]
+    before, *states = [some_state(chart, 0.01) for _ in range(4)]
+
+    def total(at):
+        return sum(terms["total"] for _, terms in solver._window(at, before, frames, orders))
+
+    models = solver._window(states, before, frames, orders)
+    steps = [(RNG.normal(size=len(n.gradient)) * 1e-6, RNG.normal(size=s.uv.shape) * 1e-6) for (n, _), s in zip(models, states)]
+    slope = (total([s.moved(d) for s, d in zip(states, steps)]) - total([s.moved(d, -1) for s, d in zip(states, steps)])) / 2
+    mine = sum(g @ n.gradient + (uv * n.uv_gradient).sum() for (g, uv), (n, _) in zip(steps, models))
+    assert mine == pytest.approx(slope, rel=1e-4)
+
+    damping, found = 1e-4, solver._window_step(models, 1e-4)
+    parts, right, sizes = zip(*[(*dense(solver.pattern, n), len(n.gradient)) for n, _ in models])
+    n, start = 2 * solver.pattern.count, np.cumsum([0] + [len(h) for h in parts])
+    floor = [np.where(np.arange(len(h)) < n, 0, 1e-9 * np.diag(h)[n:].mean()) for h in parts]  # no edge holds a translation
+    whole = block_diag(*[h + np.diag(np.diag(h) * damping + x) for h, x in zip(parts, floor)])
+    for k in range(2):
+        both = np.arange(chart.size(orders[k]))
+        i, j = start[k] + n + both, start[k + 1] + n + both
+        whole[i, j] = whole[j, i] = -2 * settings.k_tc * gauss_newton._TEMPORAL
+    expected = np.split(-np.linalg.solve(whole, np.concatenate(right)), start[1:-1])
+    for (g, uv), x in zip(found[0], expected):
+        assert np.allclose(np.concatenate([uv.ravel(), g]), x, rtol=1e-3, atol=1e-4 * np.abs(x).max())
+
+
+@pytest.mark.parametrize("k_tc", [0.05, 1000.0])
+def test_a_window_follows_the_sheet_and_couples_its_frames(truth, tmp_path, k_tc):
+    """More coupling means less motion between frames; the default follows the truth as single frames do."""
+    problem = problem_of(truth.folder, window=3, k_tc=k_tc)
+    done = track(problem, solvers.create(problem.settings), 4, str(tmp_path))
+    assert len(done.states) == 4 and len(done.totals) == 2 and set(done.sigma) == {0, 1, 2, 3}
+    error = [np.linalg.norm(problem.surface(Unknowns.from_numpy(s)) - t, axis=1).mean() for s, t in zip(done.states, truth.vertices)]
+    if k_tc < 1:
+        assert max(error) < 0.003
+        return
+    single = problem_of(truth.folder, window=1, k_tc=0.05)
+    loose = track(single, solvers.create(single.settings), 4, str(tmp_path / ".."))
+    moved = [sum(((b["delta_u"] - a["delta_u"]) ** 2).sum() for a, b in zip(x.states, x.states[1:])) for x in (done, loose)]
+    assert moved[0] < 0.5 * moved[1]
+
+
 def test_settings_that_do_not_go_together():
+    with pytest.raises(InputError, match="one of them looks both ways"):
+        solvers.create(Settings(window=3, smooth=0.1))
     with pytest.raises(InputError, match="gain"):
         solvers.create(Settings(brightness="gain"))
     assert Settings().width == 1 and Settings(solver="adam").width == 3

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import LinAlgError
+from scipy.linalg import LinAlgError, block_diag, cho_factor, cho_solve
 from threadpoolctl import ThreadpoolController
 
 from ..errors import InputError
@@ -23,10 +23,13 @@ _SMALL = 2e-3  # share of the objective that a step must promise for another one
 _SUSPECT, _SUSPECT_MARGIN, _MEMORY = 1.25, 0.03, 5  # a misfit above this many times the median of the frames before (plus the margin) is suspect
 _PATIENT = 18  # iterations a stage where a frame is suspect
 _RAISE = 0.02  # share of the objective by which more coefficients must lower it to be taken
+_LOWER = 2.0  # the highest coefficients are kept where they are worth this many times what they would make of noise alone
+_JOINT = 3  # iterations of a whole window, each of whose frames has been solved
 _ORDER_STEP = 2
 # fitting the texture to the first frame: only above this misfit, if it falls by this factor, and no farther than this [chart units]
 _TEXTURE_MISFIT, _TEXTURE_GAIN, _TEXTURE_FARTHEST = 0.15, 0.6, 0.08
 _TEXTURE_ITERATIONS, _TEXTURE_STIFFNESS = 6, 1.0
+_FACTS = "misfit", "outlying", "order"
 _TEMPORAL = 1e-3  # of k_tc: it holds a frame to the one before, in a stiffer basis than the monomials of the paper's window
 
 
@@ -52,26 +55,30 @@ FAR = Stage(6.0, 1e2, 6)  # before the others where the sheet has moved far
 
 
 class GaussNewton:
-    """Second-order descent, frame by frame: Gauss-Newton curvatures of all terms, damped after Levenberg and Marquardt.
+    """Second-order descent: Gauss-Newton curvatures of all terms, damped after Levenberg and Marquardt.
 
-    The window is the frame itself; ``revisit`` looks both ways. A frame starts from the one before or from where its motion leads, whichever explains the image better. Where it ends with a misfit far above that of
-    the frames before, other starts are tried: farther motion, and the rigid pose of the flat template by features. The order of the jet rises from
-    ``order`` to at most ``order_max`` where the objective asks for it, and falls where it does not.
+    A frame starts from the one before or from where its motion leads, whichever explains the image better. Where it ends with a misfit far above
+    that of the frames before, other starts are tried: farther motion, and the rigid pose of the flat template by features. The order of the jet
+    rises from ``order`` to at most ``order_max`` where the objective asks for it, and falls where it does not. In a window of several frames the
+    newest is solved so, and then all together; ``revisit`` looks both ways from one frame.
     """
 
     def __init__(self, settings):
         self.settings = settings
         if settings.brightness == "gain":
             raise InputError("setting brightness = 'gain' with solver = gauss-newton; auto, local or none is needed")
+        if settings.smooth > 0 and settings.width > 1:
+            raise InputError(f"setting smooth = {settings.smooth:g} with window = {settings.width}; one of them looks both ways: window = 1, or smooth = 0, is needed")
         self._problem = None
         self._blas = ThreadpoolController()  # its own threads cost more than they bring on blocks this small, and wait for Dr.Jit's
         self._scales, self._fitting = {}, {}
         self._hold = 0.0  # weight of the difference to the anchor, motion included, where a frame is solved again
 
     def solve(self, problem, window, frames, report=None, past=()):
-        """Minimise over the only one of ``frames``: :class:`Solution`.
+        """Minimise over the last of ``frames``, then over all of them: :class:`Solution`.
 
-        ``window``: its Unknowns, in a list; ``past``: of the frames before it, oldest first, (arrays of ``Unknowns.to_numpy``, terms and facts).
+        ``window``: their Unknowns, in a list; ``past``: of all frames before the last, oldest first, (arrays of ``Unknowns.to_numpy``, terms and
+        facts); without it every frame of the window is new.
         """
         with self._blas.limit(limits=1, user_api="blas"):
             return self._solve(problem, window, frames, report, past)
@@ -80,11 +87,20 @@ class GaussNewton:
         if problem is not self._problem:
             self._prepare(problem)
         self._report, self._count = report, 0
-        self._expect(frames[-1])
-        self._scales, self._fitting = self._scales_of(past[-1][1] if past else {}), {}
-        history = [self.chart.state(arrays) for arrays, _ in past[-2:]]
-        newest = self._newest(self.chart.state(window[-1].to_numpy()), frames[-1], history, [terms for _, terms in past])
-        return self._solution(*newest)
+        states = [self.chart.state(unknowns.to_numpy()) for unknowns in window]
+        known = [terms for _, terms in past]
+        before = [self.chart.state(arrays) for arrays, _ in past[: max(0, len(past) + 1 - len(frames))][-2:]]
+        self._fitting = self._scales_of(known[-1] if past else {})
+        for k in range(len(frames) - 1 if past else 0, len(frames)):
+            self._expect(frames[k])
+            self._scales, self._fitting = self._fitting, {}
+            start = states[k] if past or k == 0 else states[k - 1]
+            states[k], found = self._newest(start, frames[k], (before + states[:k])[-2:], known)
+            known.append(found)
+        if len(frames) == 1:
+            return self._solution(states, [found], found)
+        orders = [int(terms.get("order") or found["order"]) for terms in known[-len(frames) :]]
+        return self._solution(*self._joint(states, before[-1] if before else None, frames, orders), found)
 
     def revisit(self, problem, frame, before, after, terms, weight):
         """Solve a frame again, held to the middle of its neighbours: :class:`Solution`.
@@ -108,7 +124,7 @@ class GaussNewton:
             state, found = self._descend(middle, middle, frame, order, STAGES)
         finally:
             self._hold = 0.0
-        return self._solution(state, found)
+        return self._solution([state], [found], found)
 
     # -- preparation --------------------------------------------------------
 
@@ -120,6 +136,7 @@ class GaussNewton:
         self.pattern = Pattern(self.registration.faces, template.edges, len(template.vertices))
         self.blocks = Blocks(self.pattern)
         self.lengths = np.array(problem.edge_lengths, dtype=np.float64)
+        self.slack = problem.settings.slack * self.lengths.mean() or np.inf
         position, _ = problem.camera.project(template.vertices)
         corner = position[self.registration.faces]
         a, b = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
@@ -232,6 +249,73 @@ class GaussNewton:
         self._fitting[stage] = self._robust_scale(terms["outlying"], scale)
         return state, terms
 
+    # -- a window -----------------------------------------------------------
+
+    def _joint(self, states, before, frames, orders):
+        """Levenberg-Marquardt on all frames of a window together, at the last stage: (states, terms of each).
+
+        ``before``: the state of the frame before the window, which stays, or None; ``orders``: of the frames' jets.
+        """
+        states, damping = list(states), 1e-4
+        models = self._window(states, before, frames, orders)
+        total = sum(terms["total"] for _, terms in models)
+        for _ in range(_JOINT):
+            try:
+                steps, promised = self._window_step(models, damping)
+            except LinAlgError:
+                damping = max(10 * damping, 1e-4)
+                continue
+            trial = [state.moved(step) for state, step in zip(states, steps)]
+            if promised < _SMALL * total:
+                states, models = trial, self._window(trial, before, frames, orders)
+                break
+            found = self._window(trial, before, frames, orders)
+            now = sum(terms["total"] for _, terms in found)
+            if now < total:
+                states, models, total, damping = trial, found, now, max(damping / 5, 1e-7)
+            else:
+                damping *= 10
+        return states, [terms for _, terms in models]
+
+    def _window(self, states, before, frames, orders):
+        """(Normal, terms) of every frame: the whole gradient of the window, of its curvature what lies within a frame.
+
+        What couples two frames counts among the terms of the later one, and pulls both.
+        """
+        stage = STAGES[-1]
+        scale = self._scales.get(stage, _FIRST_SCALE)
+        anchors = [before if before is not None else states[0], *states[:-1]]
+        models = [self._linearise(s, a, f, n, stage, scale) for s, a, f, n in zip(states, anchors, frames, orders)]
+        temporal = 2 * self.settings.k_tc * _TEMPORAL
+        diagonal = self.pattern.diagonal
+        for (earlier, _), (later, _), a, b, n in zip(models, models[1:], states, states[1:], orders):
+            size = self.chart.size(n)
+            earlier.gradient[:size] -= temporal * (b.alpha - a.alpha)[:size]
+            earlier.glob[:size, :size] += temporal * np.eye(size)
+            earlier.uv_gradient -= temporal * (b.uv - a.uv)
+            # the displacements' coupling, weak beside the image, by its bound |a - b|^2 <= 2 |a|^2 + 2 |b|^2: the uv blocks stay apart
+            for k in (0, 1):
+                earlier.uv[diagonal, k, k] += 2 * temporal
+                later.uv[diagonal, k, k] += temporal
+        return models
+
+    def _window_step(self, models, damping):
+        """The steps of all frames, and the decrease that they promise. The global unknowns are coupled from frame to frame: a block-banded system."""
+        reduced = [Reduced(self.blocks, normal, damping) for normal, _ in models]
+        start = np.cumsum([0] + [len(r.right) for r in reduced])
+        matrix = block_diag(*(r.schur for r in reduced))
+        temporal = 2 * self.settings.k_tc * _TEMPORAL
+        for k in range(len(reduced) - 1):
+            both = np.arange(min(len(reduced[k].right), len(reduced[k + 1].right)) - 6)
+            matrix[start[k] + both, start[k + 1] + both] -= temporal
+            matrix[start[k + 1] + both, start[k] + both] -= temporal
+        g = -cho_solve(cho_factor(matrix, check_finite=False), np.concatenate([r.right for r in reduced]), check_finite=False)
+        parts = np.split(g, start[1:-1])
+        steps = [(part, r.following(part)) for part, r in zip(parts, reduced)]
+        return steps, sum(r.promised(step) for r, step in zip(reduced, steps))
+
+    # -- one stage ----------------------------------------------------------
+
     @staticmethod
     def _scales_of(terms):
         """The robust scale of each stage that a frame left behind."""
@@ -250,7 +334,7 @@ class GaussNewton:
         evaluation = self.registration.evaluate(surface.vertices, frame, self.levels[stage], scale)
         stiffness = s.k_mi * (stage.stiffness if stiffness is None else stiffness) / chart.template.scale**2
         projection = self.registration.projection(surface.vertices)
-        normal, inextensibility = assemble(self.pattern, surface, projection, evaluation, self.lengths, stiffness)
+        normal, inextensibility = assemble(self.pattern, surface, projection, evaluation, self.lengths, stiffness, self.slack)
         a = self.chart.size(order)
         bend = 2 * s.k_bend * chart.bending
         moved, slid = state.alpha - anchor.alpha, state.uv - anchor.uv
@@ -289,32 +373,56 @@ class GaussNewton:
     # -- order --------------------------------------------------------------
 
     def _adapt_order(self, state, terms, anchor, frame):
-        """Raise the order where the model says that it pays, and go on from there: (state, terms)."""
+        """Raise the order where the model says that it pays, lower it where it does not, and go on from there: (state, terms)."""
         s, order = self.settings, int(terms["order"])
-        stage = STAGES[-1]
-        top = min(order + _ORDER_STEP, s.capacity)
-        if top > order:
-            wide, there = self._linearise(state, anchor, frame, top, stage, self._scales.get(stage, _FIRST_SCALE))
-            try:
-                reduced = Reduced(self.blocks, wide, 1e-6)
-                promised = reduced.step()[1] - reduced.restricted(self.chart.size(order))
-            except LinAlgError:
-                promised = 0.0
-            if promised > _RAISE * there["total"]:
-                found = self._descend(state, anchor, frame, top, STAGES[1:])
-                if found[1]["total"] < (1 - 0.5 * _RAISE) * there["total"]:
-                    return found
-        return state, terms
+        return (
+            (order < s.capacity and self._raised(state, anchor, frame, order))
+            or (order > s.order and self._lowered(state, terms, anchor, frame, order))
+            or (state, terms)
+        )
+
+    def _raised(self, state, anchor, frame, order):
+        """(state, terms) with more coefficients; None where they do not pay."""
+        stage, top = STAGES[-1], min(order + _ORDER_STEP, self.settings.capacity)
+        wide, there = self._linearise(state, anchor, frame, top, stage, self._scales.get(stage, _FIRST_SCALE))
+        try:
+            reduced = Reduced(self.blocks, wide, 1e-6)
+            promised = reduced.step()[1] - reduced.restricted(self.chart.size(order))
+        except LinAlgError:
+            return None
+        if promised <= _RAISE * there["total"]:
+            return None
+        found = self._descend(state, anchor, frame, top, STAGES[1:])
+        return found if found[1]["total"] < (1 - 0.5 * _RAISE) * there["total"] else None
+
+    def _lowered(self, state, terms, anchor, frame, order):
+        """(state, terms) without the highest coefficients; None where they are worth their place."""
+        lower = max(order - _ORDER_STEP, self.settings.order)
+        size = self.chart.size(lower)
+        normal, _, noise = terms["model"]
+        worth = _LOWER * noise * (self.chart.size(order) - size)
+        try:
+            reduced = Reduced(self.blocks, normal, 1e-6)
+            g, expected = reduced.without(size, state.alpha)
+        except LinAlgError:
+            return None
+        if expected > worth:
+            return None
+        state = state.moved((g, reduced.following(g) - reduced.slide()))
+        state.alpha[size:] = 0.0
+        found = self._stage(state, anchor, frame, lower, STAGES[-1], STAGES[-1].iterations)
+        return found if found[1]["total"] < terms["total"] + worth else None
 
     # -- results ------------------------------------------------------------
 
-    def _solution(self, state, terms):
-        terms = dict(terms)
-        model = terms.pop("model")
-        facts = {name: terms.pop(name) for name in ("misfit", "outlying", "order")}
+    def _solution(self, states, found, newest):
+        """:class:`Solution` of a window: its states, the terms of each, and those of its newest frame when it was solved."""
+        names = [name for name in found[0] if name not in (*_FACTS, "model", "total")]
+        terms = {name: float(np.mean([f[name] for f in found])) for name in names}
+        facts = {name: newest[name] for name in _FACTS}
         facts |= {f"scale_{k}": self._fitting.get(stage, _FIRST_SCALE) for k, stage in enumerate((FAR, *STAGES))}
-        window = [Unknowns.from_numpy(self.chart.arrays(state))]
-        return Solution(window, terms.pop("total"), terms, self._count, facts, [self._sigma(*model)])
+        window = [Unknowns.from_numpy(self.chart.arrays(state)) for state in states]
+        return Solution(window, sum(terms.values()), terms, self._count, facts, [self._sigma(*f["model"]) for f in found])
 
     def _sigma(self, normal, surface, noise):
         """Standard deviation (N,) [m, float32] of each vertex along its ray, from the curvatures of the whole objective: NaN where they are singular."""
