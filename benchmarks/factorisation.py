@@ -1,7 +1,7 @@
 """``python benchmarks/factorisation.py``: ways to factorise the tracker's sparse uv block with all its right-hand sides, in milliseconds.
 
-The matrix is that of a sheet's grid (``--grid`` vertices a side) with the tracker's own pattern: residuals between neighbours, 2 unknowns a vertex, and
-``--columns`` right-hand sides (the global unknowns and the gradient). Libraries that are not installed are left out.
+The matrix is that of a sheet's grid (``--grid`` vertices a side) with the tracker's own pattern: residuals between neighbours, 2 unknowns
+a vertex, and ``--columns`` right-hand sides (the global unknowns and the gradient). Libraries that are not installed are left out.
 """
 
 import argparse

@@ -263,8 +263,9 @@ def measure(data, runs):
 
 
 def cloud(path):
-    """Points (2, 10,000, 3) of one of SNUG's garments, uniform in area, in the unit sphere about the centre of its box: one cloud to encode, one to
-    compare with. SNUG's y is up, and z to the front; as the garments that were trained on, they have z up here, and y to the back."""
+    """Points (2, 10,000, 3) of one of SNUG's garments, uniform in area, in the unit sphere about the centre of its box: one cloud to
+    encode, one to compare with. SNUG's y is up, and z to the front; as the garments that were trained on, they have z up here, and y to
+    the back."""
     vertices, faces = read_mesh(path)[:2]
     vertices = vertices[:, [0, 2, 1]] * (1, -1, 1)
     generator, area = np.random.default_rng(0), mesh.areas(vertices, faces)

@@ -2,20 +2,22 @@
 
     python benchmarks/raster.py [--sizes 160x120 640x480 ...] [--grids 33 72 225] [-o out/benchmarks] [-m llvm_ad_rgb]
 
-The scene is a gently bent, textured sheet that fills half of the image, under a constant emitter of radiance 1; the loss is the squared difference to
-the picture of the sheet a little further bent. The contenders:
+The scene is a gently bent, textured sheet that fills half of the image, under a constant emitter of radiance 1; the loss is the squared
+difference to the picture of the sheet a little further bent. The contenders:
 
     raster          ``render()`` under Dr.Jit's AD, as the solver calls it: RGB and alpha, unlit
     raster, mi      the same through ``mi.render``, which renders once more for the backward pass
     prb_projective  through ``mi.render``, 1 sample a pixel, depth 2, ``sppi = 0``: RGB alone
 
-Depth 2 is one bounce, the emitter's light off the sheet, which is the texture's own colour wherever the sheet does not shadow itself: what raster shows (depth 1
-would be black). ``sppi = 0`` leaves out the edges of shadows, which this scene does not have. That is in path replay's favour: by default it looks for them with
-512 samples a pixel in every backward pass, and took 500 times as long as raster at 160x120.
+Depth 2 is one bounce, the emitter's light off the sheet, which is the texture's own colour wherever the sheet does not shadow itself: what
+raster shows (depth 1 would be black). ``sppi = 0`` leaves out the edges of shadows, which this scene does not have. That is in path
+replay's favour: by default it looks for them with 512 samples a pixel in every backward pass, and took 500 times as long as raster at
+160x120.
 
-All of a case's contenders run in one process, turn by turn; times are medians after a warm-up, ratios medians of the ratios within a turn, so that what else the
-machine does meanwhile falls on both. Moving the sheet (``params.update()``, which rebuilds what rays are traced with) is timed apart, for it is no part of
-either. Peak memory is measured in a process of its own for each contender and case; growth and compilation over many iterations too.
+All of a case's contenders run in one process, turn by turn; times are medians after a warm-up, ratios medians of the ratios within a turn,
+so that what else the machine does meanwhile falls on both. Moving the sheet (``params.update()``, which rebuilds what rays are traced
+with) is timed apart, for it is no part of either. Peak memory is measured in a process of its own for each contender and case; growth and
+compilation over many iterations too.
 
 Writes ``raster.json`` and ``raster.png``, anew after every case, so that an interrupted run leaves the cases that it reached.
 """
@@ -182,7 +184,9 @@ def measure_times(size, points, folder, seconds):
 
 
 def compare_pictures(raster, path_replay):
-    """That both show the same: share of the image that the sheet covers, mean colour on it, and mean difference of the two (of a 16-sample picture)."""
+    """That both show the same: share of the image that the sheet covers, mean colour on it, and mean difference of the two (of a 16-sample
+    picture).
+    """
     import mitsuba as mi
 
     for contender in (raster, path_replay):
@@ -221,7 +225,9 @@ def measure_growth(size, points, folder, iterations):
 
 
 def measure_kernels(size, points, folder, iterations):
-    """Kernels that each iteration of raster launched, and those that it did not find in Dr.Jit's memory: compiled, or read from its cache on the disk."""
+    """Kernels that each iteration of raster launched, and those that it did not find in Dr.Jit's memory: compiled, or read from its cache
+    on the disk.
+    """
     import drjit as dr
 
     dr.set_flag(dr.JitFlag.KernelHistory, True)

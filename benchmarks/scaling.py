@@ -2,11 +2,11 @@
 
     python benchmarks/scaling.py [--grids 33 50 71 100] [--sizes 640x480 1280x720 1920x1080] [--frames 8] [--docs docs] [-m llvm_ad_rgb]
 
-A textured sheet that covers a third of the image bends and turns (its edges keep their lengths); ``raster`` renders it, with its masks, 16 samples
-a pixel. The template is the sheet in the first frame, of so many vertices a side. Each case is tracked by default settings in a process of its own,
-which has rendered nothing before. A case's seconds are medians over its frames but the first, for which kernels are compiled: of all the process's
-threads together, so that what else the machine does counts little (those of the clock are printed too). Its memory is the process's peak; ``started``
-is what a process holds before it loads a scene.
+A textured sheet that covers a third of the image bends and turns (its edges keep their lengths); ``raster`` renders it, with its masks, 16
+samples a pixel. The template is the sheet in the first frame, of so many vertices a side. Each case is tracked by default settings in a
+process of its own, which has rendered nothing before. A case's seconds are medians over its frames but the first, for which kernels are
+compiled: of all the process's threads together, so that what else the machine does counts little (those of the clock are printed too). Its
+memory is the process's peak; ``started`` is what a process holds before it loads a scene.
 
 Writes ``scaling.md`` and ``scaling.png`` into ``docs`` (``--docs FOLDER`` for another).
 """
@@ -44,7 +44,9 @@ def camera(size):
 
 
 def sheet(points, size, t):
-    """The sheet at the time t in [0, 1]: vertices (N, 3) [m, camera frame] of a flat sheet at 0, of a cylinder around a slanting axis later."""
+    """The sheet at the time t in [0, 1]: vertices (N, 3) [m, camera frame] of a flat sheet at 0, of a cylinder around a slanting axis
+    later.
+    """
     x, y = (a.ravel() for a in np.meshgrid(*2 * [np.linspace(-0.5, 0.5, points)]))
     extent = np.sqrt(SHARE) * np.array(size) / camera(size).fx
     x, y = x * extent[0], y * extent[1]
@@ -103,7 +105,9 @@ def make(folder, points, size, frames):
 
 
 def measure(folder):
-    """Seconds (of the clock, of all threads) and evaluations of each frame, memory [MB] before the scene and at most, and distances from the truth [mm]."""
+    """Seconds (of the clock, of all threads) and evaluations of each frame, memory [MB] before the scene and at most, and distances from
+    the truth [mm].
+    """
     from polysft_mi import scene, solvers
     from polysft_mi.patch import Unknowns
     from polysft_mi.problem import Problem

@@ -2,9 +2,10 @@
 
     python benchmarks/stability.py [scenes/demo.xml] [-D name=value ...] [--counts 50 300 1000 5000] [-o out/benchmarks] [-m llvm_ad_rgb]
 
-The video is reconstructed as usual up to the frame before the last. The last window is then solved once, from where that leaves it, with patience off, and what
-the solver would return after each of the counts is kept: the best unknowns so far. Beside it stands the solver's latest step, which shows how much it wanders.
-Figures are those of the window's newest frame; a shorter video (``-D last=20``) tests another.
+The video is reconstructed as usual up to the frame before the last. The last window is then solved once, from where that leaves it, with
+patience off, and what the solver would return after each of the counts is kept: the best unknowns so far. Beside it stands the solver's
+latest step, which shows how much it wanders. Figures are those of the window's newest frame; a shorter video (``-D last=20``) tests
+another.
 
 Writes ``stability.json`` and ``stability.png``.
 """
@@ -33,8 +34,8 @@ CURVE = 25  # iterations between points of the curves
 class Watched:
     """A problem whose solver is watched: what it has found, and where it is, after some numbers of evaluations.
 
-    Solvers see a problem only through its methods, so this works for any. ``found`` and ``latest`` map a count to the unknowns of the newest frame: the best
-    of so many evaluations, and those of the last one. ``losses`` maps it to (best, last).
+    Solvers see a problem only through its methods, so this works for any. ``found`` and ``latest`` map a count to the unknowns of the
+    newest frame: the best of so many evaluations, and those of the last one. ``losses`` maps it to (best, last).
     """
 
     def __init__(self, problem, counts):
@@ -59,8 +60,9 @@ class Watched:
 def run(scene, overrides, counts, folder, say=print):
     """Solve the last window for as many iterations as the largest count.
 
-    Returns (problem, frame, surfaces, wandering, losses): the newest frame, counted in the selection; the surfaces found and the solver's latest, count to vertices
-    (N, 3) [m, camera frame]; count to (best, latest) loss. ``folder``, which exists, takes the checkpoints of the run up to there.
+    Returns (problem, frame, surfaces, wandering, losses): the newest frame, counted in the selection; the surfaces found and the solver's
+    latest, count to vertices (N, 3) [m, camera frame]; count to (best, latest) loss. ``folder``, which exists, takes the checkpoints of
+    the run up to there.
     """
     from polysft_mi import scene as scenes
     from polysft_mi import solvers

@@ -46,8 +46,8 @@ class Drape:
 class Draper:
     """A trained network and a body model, ready to drape any garment. Made by :func:`onefit.load`.
 
-    Garments are cut into patches once and kept; frames go through in batches. ``device``: where it runs. On a body model of another kind than
-    the network was trained on, garments are graded to its shapes and the network is told the standard shape.
+    Garments are cut into patches once and kept; frames go through in batches. ``device``: where it runs. On a body model of another kind
+    than the network was trained on, garments are graded to its shapes and the network is told the standard shape.
     """
 
     def __init__(self, trained: Trained, model=None, device="cpu"):

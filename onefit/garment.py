@@ -99,8 +99,8 @@ class Garment:
         return torch.as_tensor(moved, dtype=torch.float32, device=self.vertices.device)
 
     def tightened(self, share):
-        """The same garment cut tighter: cloth within TIGHT of the standard body is drawn to ``share`` of its distance from it, farther cloth
-        less and less of the way. Networks learn from it what cloth on the skin is like.
+        """The same garment cut tighter: cloth within TIGHT of the standard body is drawn to ``share`` of its distance from it, farther
+        cloth less and less of the way. Networks learn from it what cloth on the skin is like.
         """
         V, F = self.vertices.cpu().double().numpy(), self.faces.cpu().numpy()
         found = standard_surface()(V)

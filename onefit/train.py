@@ -36,8 +36,8 @@ HIDDEN = 0.1  # standard deviation of the encoder's memory at the start of a win
 @dataclass(frozen=True)
 class Settings:
     """What decides the result. ``batch``: patches of a step, all frames together (the paper's 20,000); ``lr`` for the first ``lr_epochs``
-    epochs, a tenth of it for the rest; an epoch has ``epoch_steps`` steps (0: as many as show each window of the motions once); ``tight``: the
-    share of :meth:`onefit.garment.Garment.tightened` for a second copy of each garment, 0 for none.
+    epochs, a tenth of it for the rest; an epoch has ``epoch_steps`` steps (0: as many as show each window of the motions once); ``tight``:
+    the share of :meth:`onefit.garment.Garment.tightened` for a second copy of each garment, 0 for none.
     """
 
     garments: tuple = STANDARD

@@ -45,9 +45,11 @@ def aside(path):
 
 @contextlib.contextmanager
 def folder_aside(path, ours):
-    """``with folder_aside(path, ours) as temporary:`` fill the folder ``temporary``; it becomes ``path`` at the end of the block, or is removed on any exception.
+    """``with folder_aside(path, ours) as temporary:`` fill the folder ``temporary``; it becomes ``path`` at the end of the block, or is
+    removed on any exception.
 
-    What stands at ``path`` is replaced where it is a folder in which ``ours(name)`` is true of every name, and else refused by an InputError.
+    What stands at ``path`` is replaced where it is a folder in which ``ours(name)`` is true of every name, and else refused by an
+    InputError.
     """
     path = os.path.abspath(path)
     if os.path.lexists(path) and not (os.path.isdir(path) and all(map(ours, os.listdir(path)))):

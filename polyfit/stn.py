@@ -120,7 +120,8 @@ class PolyFit(torch.nn.Module):
         self.stn = stn
 
     def frame(self, points, mask=None, *, weights=None):
-        """The :class:`CanonicalFrame` of patches ``points`` (B, P, 3), of which ``mask`` (B, P) counts; ``weights`` (B, P) for mean and spread.
+        """The :class:`CanonicalFrame` of patches ``points`` (B, P, 3), of which ``mask`` (B, P) counts; ``weights`` (B, P) for mean and
+        spread.
 
         Differentiable with respect to the network's weights, through the turn that was kept. Raises InputError as
         :meth:`CanonicalFrame.from_points` does.

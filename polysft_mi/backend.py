@@ -1,9 +1,9 @@
 """What Mitsuba computes on: the variant, and the LLVM library that the CPU variants need.
 
-Dr.Jit compiles its CPU kernels with a libLLVM that it loads at run time, and takes the first one that it finds. LLVM 14 is refused, and LLVM 15 and
-16 end the process in the middle of a render, past any ``try`` (x86-64: "Cannot select: fminimum"); so the library is chosen here, before Dr.Jit starts.
-Command lines, tests and library users all call :func:`set_variant`. Importing this module has no side effect and needs the standard library alone;
-``python -m polysft_mi.backend`` prints the library that would be used.
+Dr.Jit compiles its CPU kernels with a libLLVM that it loads at run time, and takes the first one that it finds. LLVM 14 is refused, and
+LLVM 15 and 16 end the process in the middle of a render, past any ``try`` (x86-64: "Cannot select: fminimum"); so the library is chosen
+here, before Dr.Jit starts. Command lines, tests and library users all call :func:`set_variant`. Importing this module has no side effect
+and needs the standard library alone; ``python -m polysft_mi.backend`` prints the library that would be used.
 """
 
 import ctypes
@@ -69,8 +69,8 @@ def find_libllvm(folders=None):
     """The newest libLLVM that Dr.Jit can use.
 
     ``DRJIT_LIBLLVM_PATH`` goes before everything, and must then hold; else the files of ``folders`` (by default: the environment's, the
-    system's usual ones, and what ``ldconfig`` knows) are each asked for their version. One that is not in ``PROVEN_LLVM`` must compile and run a
-    kernel first. Asking and trying happen in processes of their own.
+    system's usual ones, and what ``ldconfig`` knows) are each asked for their version. One that is not in ``PROVEN_LLVM`` must compile and
+    run a kernel first. Asking and trying happen in processes of their own.
 
     Returns (path, version): the file's real path, and its version as a tuple of three ints.
     Raises :class:`InputError` where ``DRJIT_LIBLLVM_PATH`` names what cannot be used, or where nothing is found.
@@ -97,12 +97,14 @@ def find_libllvm(folders=None):
 
 
 def set_variant(mode=None):
-    """Set Mitsuba's variant; a second call with the same mode does nothing. Best called before ``import mitsuba``, which makes Dr.Jit choose an LLVM.
+    """Set Mitsuba's variant; a second call with the same mode does nothing. Best called before ``import mitsuba``, which makes Dr.Jit
+    choose an LLVM.
 
     ``mode``: a variant that ends in ``_ad_rgb``. None takes one that is already set and fits, else ``cuda_ad_rgb`` where a GPU
     really works, else ``llvm_ad_rgb``.
 
-    Returns the variant's name. Raises :class:`InputError` where the mode is unknown or does not fit, a GPU is asked for and none works, or LLVM is missing.
+    Returns the variant's name. Raises :class:`InputError` where the mode is unknown or does not fit, a GPU is asked for and none works, or
+    LLVM is missing.
     """
     mitsuba = sys.modules.get("mitsuba")
     current = mitsuba and mitsuba.variant()
@@ -145,7 +147,8 @@ def gpu_works():
 
 
 def variant_works(mode, library=None, timeout=120.0):
-    """Whether a variant traces a ray and takes a derivative, in a process of its own so that a broken driver or compiler cannot end this one.
+    """Whether a variant traces a ray and takes a derivative, in a process of its own so that a broken driver or compiler cannot end this
+    one.
 
     ``library``: the libLLVM to do it with (default: what Dr.Jit takes). ``timeout``: seconds after which it counts as not working.
     """
@@ -221,7 +224,9 @@ def _named_version(path):
 
 
 def _version(path):
-    """A library's version as a tuple of ints, told by its name if that is too old to be loaded, else by itself; None where it does not load or does not tell."""
+    """A library's version as a tuple of ints, told by its name if that is too old to be loaded, else by itself; None where it does not
+    load or does not tell.
+    """
     named = _named_version(path)
     if named and named[0] < OLDEST_LLVM:
         return named

@@ -20,8 +20,8 @@ def known_defaults(path):
 
 
 def resolved_defaults(path, overrides):
-    """The defaults of a scene file with ``overrides`` (name to text) in force. Raises InputError for a name that the file does not have, and for
-    a value that its setting does not take (Mitsuba reads an empty number as 0)."""
+    """The defaults of a scene file with ``overrides`` (name to text) in force. Raises InputError for a name that the file does not have,
+    and for a value that its setting does not take (Mitsuba reads an empty number as 0)."""
     known = known_defaults(path)
     for name in overrides:
         if name not in known:

@@ -1,7 +1,7 @@
 """``python -m polysft_mi.evaluate OUT TRUTH``: the figures of a run against ground truth, as a table or as JSON.
 
-OUT is a run's folder (with ``surface.npz``) or a ``surface.npz``. TRUTH is ``gt.npz`` (vertices of every frame), an .npz of depth
-points, a folder of ``cloud_*.npz``, or a sequence's folder that holds one of them. :func:`polysft_mi.metrics.score` says what the figures are.
+OUT is a run's folder (with ``surface.npz``) or a ``surface.npz``. TRUTH is ``gt.npz`` (vertices of every frame), an .npz of depth points,
+a folder of ``cloud_*.npz``, or a sequence's folder that holds one of them. :func:`polysft_mi.metrics.score` says what the figures are.
 """
 
 import glob

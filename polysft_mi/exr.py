@@ -30,7 +30,8 @@ def channel_names(layer, count):
 
 
 def write_exr(path, layers, metadata=None, plain=DEFAULT_LAYER):
-    """Write ``layers`` (name -> (H, W) or (H, W, C)) to the EXR file ``path``, ZIP-compressed; the layer ``plain`` once more as plain R, G, B.
+    """Write ``layers`` (name -> (H, W) or (H, W, C)) to the EXR file ``path``, ZIP-compressed; the layer ``plain`` once more as plain R,
+    G, B.
 
     Colours, errors and masks are linear values (Rec.709 primaries) and are stored as half; ``depth`` and its kin [m], ``normal``
     (camera frame) and ``uv`` as float32. ``metadata`` (name -> str, int, float, or anything that JSON holds, as a string)

@@ -218,10 +218,12 @@ def score(surface, truth_path):
 
 
 def confidence(surface, truth):
-    """How ``sigma`` (T, N) [m] of a surface relates to its errors along the rays, where the truth has the same vertices (S, N, 3); {} where it cannot be told.
+    """How ``sigma`` (T, N) [m] of a surface relates to its errors along the rays, where the truth has the same vertices (S, N, 3); {}
+    where it cannot be told.
 
-    ``sigma_factor``: what sigma has to be multiplied by for 68 % of the errors to lie within it; ``sigma_two``: the share that then lies within twice
-    as much (95 % were they Gaussian); ``sigma_rank``: rank correlation of sigma and error. The first frame, where the template stands in its place, is left out.
+    ``sigma_factor``: what sigma has to be multiplied by for 68 % of the errors to lie within it; ``sigma_two``: the share that then lies
+    within twice as much (95 % were they Gaussian); ``sigma_rank``: rank correlation of sigma and error. The first frame, where the
+    template stands in its place, is left out.
     """
     if "sigma" not in surface or "vertices" not in truth or truth["vertices"].shape[1:] != surface["vertices"].shape[1:]:
         return {}

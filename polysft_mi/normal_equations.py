@@ -1,7 +1,9 @@
-"""From second-order models at the vertices to a step in the unknowns of the jet patch: normal equations, and their elimination. NumPy and SciPy only.
+"""From second-order models at the vertices to a step in the unknowns of the jet patch: normal equations, and their elimination. NumPy and
+SciPy only.
 
-Unknowns of a frame: the 2N displacements (Δu, Δv), sparse like the mesh, and G = A + 6 global ones: the coefficients in an orthogonal basis, a rotation
-increment (axis times angle, before the rotation) and the translation T_c. The first are eliminated, what is left is small and dense.
+Unknowns of a frame: the 2N displacements (Δu, Δv), sparse like the mesh, and G = A + 6 global ones: the coefficients in an orthogonal
+basis, a rotation increment (axis times angle, before the rotation) and the translation T_c. The first are eliminated, what is left is
+small and dense.
 """
 
 from dataclasses import dataclass
@@ -18,8 +20,8 @@ from polyfit import jets
 
 @dataclass
 class State:
-    """Unknowns of a frame on the host, float64: ``alpha`` (A,), the offset of the coefficients in the basis of :class:`Chart`; ``uv`` (N, 2), (Δu, Δv);
-    ``rotation``: R_c; ``translation`` (3,): T_c, in the chart's unit."""
+    """Unknowns of a frame on the host, float64: ``alpha`` (A,), the offset of the coefficients in the basis of :class:`Chart`; ``uv`` (N,
+    2), (Δu, Δv); ``rotation``: R_c; ``translation`` (3,): T_c, in the chart's unit."""
 
     alpha: np.ndarray
     uv: np.ndarray
@@ -220,7 +222,8 @@ class Pattern:
 class Blocks:
     """A symmetric matrix with the pattern's 2x2 blocks, factorised as block tridiagonal in the narrow ordering, by LAPACK.
 
-    On these narrow meshes that is faster than general sparse Cholesky, above all with many right-hand sides (``benchmarks/factorisation.py``).
+    On these narrow meshes that is faster than general sparse Cholesky, above all with many right-hand sides
+    (``benchmarks/factorisation.py``).
     """
 
     def __init__(self, pattern):
@@ -242,7 +245,9 @@ class Blocks:
         self.size = size
 
     def eliminate(self, blocks, columns):
-        """Factorise (B, 2, 2) = L L^T: returns an :class:`Elimination` with L^-1 columns for columns (2N, C). Raises LinAlgError where it is not positive."""
+        """Factorise (B, 2, 2) = L L^T: returns an :class:`Elimination` with L^-1 columns for columns (2N, C). Raises LinAlgError where it
+        is not positive.
+        """
         size, rest = self.size, 2 * self.pattern.count
         values = blocks.ravel()
         inside = np.zeros(self.count * size * size)
@@ -312,7 +317,9 @@ class Elimination:
 
 @dataclass
 class Normal:
-    """Normal equations of a frame: ``uv`` (B, 2, 2), ``cross`` (2N, G), ``glob`` (G, G) and the gradient ``uv_gradient`` (N, 2), ``gradient`` (G,)."""
+    """Normal equations of a frame: ``uv`` (B, 2, 2), ``cross`` (2N, G), ``glob`` (G, G) and the gradient ``uv_gradient`` (N, 2),
+    ``gradient`` (G,).
+    """
 
     uv: np.ndarray
     cross: np.ndarray
@@ -324,9 +331,9 @@ class Normal:
 def assemble(pattern, surface, projection, evaluation, lengths, stiffness, slack=np.inf):
     """:class:`Normal` of the images and the edges, and the edges' energy.
 
-    ``projection`` (N, 2, 3): of the vertices; ``evaluation``: :class:`polysft_mi.registration.Evaluation`; ``lengths`` (E,) [m]: of the template's
-    edges; ``stiffness`` [1/m^2]: weight of the squared differences x to them. An edge that is shorter counts c^2 log(1 + x^2/c^2) instead of x^2,
-    with c = ``slack`` [m].
+    ``projection`` (N, 2, 3): of the vertices; ``evaluation``: :class:`polysft_mi.registration.Evaluation`; ``lengths`` (E,) [m]: of the
+    template's edges; ``stiffness`` [1/m^2]: weight of the squared differences x to them. An edge that is shorter counts c^2 log(1 +
+    x^2/c^2) instead of x^2, with c = ``slack`` [m].
     """
     a, b = pattern.edges.T
     edge = surface.vertices[a] - surface.vertices[b]
@@ -405,7 +412,9 @@ class Reduced:
         self.right = normal.gradient - whole[:-1, -1]
 
     def step(self):
-        """The step (global (G,), uv (N, 2)), and the decrease that the model promises. Raises LinAlgError where what remains is not positive definite."""
+        """The step (global (G,), uv (N, 2)), and the decrease that the model promises. Raises LinAlgError where what remains is not
+        positive definite.
+        """
         g = -cho_solve(cho_factor(self.schur, check_finite=False), self.right, check_finite=False)
         step = g, self.following(g)
         return step, self.promised(step)
@@ -430,8 +439,8 @@ class Reduced:
         return 0.5 * float(b @ cho_solve(cho_factor(self.schur[np.ix_(keep, keep)], check_finite=False), b, check_finite=False) + y @ y)
 
     def without(self, size, alpha):
-        """The step (G,) that takes the coefficients from ``size`` on, whose values are ``alpha`` (A,), to zero, the others following, and the
-        increase that the model expects of it at a minimum."""
+        """The step (G,) that takes the coefficients from ``size`` on, whose values are ``alpha`` (A,), to zero, the others following, and
+        the increase that the model expects of it at a minimum."""
         high = np.arange(size, len(self.right) - 6)
         rest = np.r_[np.arange(size), np.arange(len(self.right) - 6, len(self.right))]
         g = np.zeros(len(self.right))
@@ -441,7 +450,9 @@ class Reduced:
         return g, 0.5 * float(g @ self.schur @ g)
 
     def variance(self, by_uv, by_global):
-        """The diagonal of J H^-1 J^T (N,), where row i of J has the derivatives ``by_uv`` (N, 2) by the vertex's own (u, v) and ``by_global`` (N, G)."""
+        """The diagonal of J H^-1 J^T (N,), where row i of J has the derivatives ``by_uv`` (N, 2) by the vertex's own (u, v) and
+        ``by_global`` (N, G).
+        """
         solved = self.elimination.back(self.elimination.columns[:, :-1]).reshape(len(by_uv), 2, -1)
         rows = by_global - np.einsum("na,nag->ng", by_uv, solved)
         half = solve_triangular(np.linalg.cholesky(self.schur), rows.T, lower=True, check_finite=False)

@@ -21,7 +21,8 @@ _INTERIOR = 0.999  # alpha above which a pixel counts as filled by the surface
 
 
 def robust(squared, norm, scale):
-    """rho of squared residuals r^2: r^2 (``l2``), |r| (``l1``), or scale^2 (sqrt(1 + r^2/scale^2) - 1) * 2 (``charbonnier``, r^2 near 0)."""
+    """rho of squared residuals r^2: r^2 (``l2``), |r| (``l1``), or scale^2 (sqrt(1 + r^2/scale^2) - 1) * 2 (``charbonnier``, r^2 near 0).
+    """
     if norm == "l2":
         return squared
     if norm == "l1":

@@ -83,8 +83,8 @@ class Pictures:
 
     def __call__(self, unknowns, frame, geometry=True):
         """Layers (H, W[, C]) float32: ``target``, ``render`` (linear RGB), ``error`` (root mean square over channels), ``mask_target``,
-        ``mask_render``; with ``geometry`` also ``depth`` [m], ``normal`` (camera frame, towards the camera), ``uv`` (texture coordinates, v up);
-        0 beyond the surface.
+        ``mask_render``; with ``geometry`` also ``depth`` [m], ``normal`` (camera frame, towards the camera), ``uv`` (texture coordinates,
+        v up); 0 beyond the surface.
         """
         problem = self.problem
         with dr.suspend_grad():
@@ -245,7 +245,9 @@ def _heat(error, peak=PEAK):
 
 
 def write_beginning(out, scene, camera, command, fps):
-    """What stands in the folder from the first second: the resolved scene (text), the :class:`polysft_mi.pinhole.Pinhole`, and what the run is."""
+    """What stands in the folder from the first second: the resolved scene (text), the :class:`polysft_mi.pinhole.Pinhole`, and what the
+    run is.
+    """
     with aside(os.path.join(out, "scene.xml")) as temporary, open(temporary, "w", encoding="utf-8") as file:
         file.write(scene)
     write_json(os.path.join(out, "camera.json"), dataclasses.asdict(camera.intrinsics()))

@@ -18,8 +18,8 @@ from . import jet
 class Unknowns:
     """The unknowns of one frame, in the chart's unit.
 
-    ``delta_alpha`` Float of A; ``delta_u``, ``delta_v`` Floats of N; ``rotation`` Float of 4, the quaternion (x, y, z, w) of R_c, normalised
-    where it is used; ``translation`` Float of 3, T_c.
+    ``delta_alpha`` Float of A; ``delta_u``, ``delta_v`` Floats of N; ``rotation`` Float of 4, the quaternion (x, y, z, w) of R_c,
+    normalised where it is used; ``translation`` Float of 3, T_c.
     """
 
     delta_alpha: mi.Float

@@ -57,7 +57,9 @@ class Pinhole:
         return (np.asarray(points) - self.origin) @ self.axes.T
 
     def device(self, scale=1):
-        """The map as opaque Dr.Jit values (so that no number of it is baked into a kernel); ``scale`` samples a pixel and axis (a fraction: a coarser grid)."""
+        """The map as opaque Dr.Jit values (so that no number of it is baked into a kernel); ``scale`` samples a pixel and axis (a
+        fraction: a coarser grid).
+        """
         if scale not in self._device:
             basis, inverse = self.basis.copy(), self.inverse.copy()
             basis[:, :2] /= scale

@@ -22,7 +22,8 @@ _CACHED_FRAMES = 8
 
 
 def _positions_key(params, mesh):
-    """The key of the mesh's vertex positions among a scene's parameters. (Mitsuba names meshes by id, or by address where they have none.)"""
+    """The key of the mesh's vertex positions among a scene's parameters. (Mitsuba names meshes by id, or by address where they have none.)
+    """
     keys = [k for k in params.keys() if k.endswith("vertex_positions")]
     for key in keys:
         if len(keys) == 1 or key.split(".")[0] == mesh.id():
@@ -32,7 +33,8 @@ def _positions_key(params, mesh):
 
 @dataclass
 class Target:
-    """One image on the device: ``rgb`` (H, W, 3), cut out by the mask where there is one; ``mask`` Float of P or None; ``area`` [pixels]."""
+    """One image on the device: ``rgb`` (H, W, 3), cut out by the mask where there is one; ``mask`` Float of P or None; ``area`` [pixels].
+    """
 
     rgb: mi.TensorXf
     mask: mi.Float

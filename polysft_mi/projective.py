@@ -16,8 +16,8 @@ class SilhouetteProjective(PSIntegrator):
      * - (none of its own)
 
     Renders 1 where a ray meets a surface and 0 where it does not, in every colour channel, with the gradient of that step by projective
-    sampling (Zhang et al. 2023, "Projective Sampling for Differentiable Rendering of Geometry"). The objective uses it for the mask where the
-    images come from ``prb_projective``. Noisy: 16 samples a pixel are usable.
+    sampling (Zhang et al. 2023, "Projective Sampling for Differentiable Rendering of Geometry"). The objective uses it for the mask where
+    the images come from ``prb_projective``. Noisy: 16 samples a pixel are usable.
     """
 
     def __init__(self, props):

@@ -1,5 +1,5 @@
-"""Levels of an image: blurred, freed from lighting by local normalisation, on a coarser grid; of the video's frames and of the template's texture
-alike. NumPy and OpenCV only."""
+"""Levels of an image: blurred, freed from lighting by local normalisation, on a coarser grid; of the video's frames and of the template's
+texture alike. NumPy and OpenCV only."""
 
 import math
 from dataclasses import dataclass
@@ -14,8 +14,8 @@ _FLOOR = 0.02  # local standard deviation below which an area counts as flat: it
 
 @dataclass(frozen=True)
 class Level:
-    """How images are compared: blurred by ``sigma``, freed from lighting under a window of ``window`` (standard deviations, pixels of the video), on a grid
-    of every ``stride``-th pixel."""
+    """How images are compared: blurred by ``sigma``, freed from lighting under a window of ``window`` (standard deviations, pixels of the
+    video), on a grid of every ``stride``-th pixel."""
 
     sigma: float
     stride: int = 1
@@ -24,10 +24,10 @@ class Level:
 
 @dataclass
 class LevelImage:
-    """A frame at a level: ``colour`` (h, w, 3) float32; ``inside`` (h, w), 1 where the sheet may be compared; with a mask, ``mask`` (h, w) in
-    [0, 1], and ``distance`` (h, w), pixels of this grid from the mask's contour, of either side. ``corner`` (x, y) [pixels of this grid]: where
-    these arrays begin; with a mask they end where it does, and everything that it takes part in: what lies beyond is not of the sheet, and farther than
-    ``FARTHEST`` from the contour."""
+    """A frame at a level: ``colour`` (h, w, 3) float32; ``inside`` (h, w), 1 where the sheet may be compared; with a mask, ``mask`` (h, w)
+    in [0, 1], and ``distance`` (h, w), pixels of this grid from the mask's contour, of either side. ``corner`` (x, y) [pixels of this
+    grid]: where these arrays begin; with a mask they end where it does, and everything that it takes part in: what lies beyond is not of
+    the sheet, and farther than ``FARTHEST`` from the contour."""
 
     colour: np.ndarray
     inside: np.ndarray
@@ -65,8 +65,8 @@ def _around(mask, level):
 
 
 def compared(image, weight, sigma, window, normalise):
-    """The image as it is compared: blurred by ``sigma`` and, with ``normalise``, freed from lighting under ``window`` [pixels]; only what is inside
-    ``weight`` (H, W) counts."""
+    """The image as it is compared: blurred by ``sigma`` and, with ``normalise``, freed from lighting under ``window`` [pixels]; only what
+    is inside ``weight`` (H, W) counts."""
     image = blur(image, sigma, weight)
     return normalised(image, window, weight) if normalise else image
 

@@ -34,9 +34,10 @@ def _cross2(a, b):
 class View:
     """What the pixels of a region see, detached but for ``positions`` and ``screen``; region pixels run row by row.
 
-    ``region``: (x0, y0, width) opaque UInt32 and (width, height) ints; ``basis``, ``origin``: the camera as :meth:`Pinhole.device` gives it;
-    ``positions`` Float64 of 3V [m], ``screen`` Point3d of V (x, y [pixels], depth [m]): the vertices; ``ray``, and the ``length`` of its direction
-    before it was normalised (depth = t / length); ``hit``, ``triangle`` (-1 for none), ``depth``, and Mitsuba's preliminary intersection.
+    ``region``: (x0, y0, width) opaque UInt32 and (width, height) ints; ``basis``, ``origin``: the camera as :meth:`Pinhole.device` gives
+    it; ``positions`` Float64 of 3V [m], ``screen`` Point3d of V (x, y [pixels], depth [m]): the vertices; ``ray``, and the ``length`` of
+    its direction before it was normalised (depth = t / length); ``hit``, ``triangle`` (-1 for none), ``depth``, and Mitsuba's preliminary
+    intersection.
     """
 
     region: tuple
@@ -292,8 +293,8 @@ class RasterIntegrator(mi.SamplingIntegrator):
         return [mi.Float(triangle)]
 
     def crossings(self, view):
-        """The silhouette edges that run between neighbouring pixel centres of a :class:`View`: detached (va, vb, near, far, horizontal), None where
-        there are none.
+        """The silhouette edges that run between neighbouring pixel centres of a :class:`View`: detached (va, vb, near, far, horizontal),
+        None where there are none.
 
         Vertices of each edge, the region's pixel whose sheet ends there, the other pixel, and whether the two lie side by side.
         """
@@ -327,7 +328,8 @@ class RasterIntegrator(mi.SamplingIntegrator):
             return va, vb, near, far, dr.gather(mi.Bool, horizontal, kept)
 
     def blend(self, view, ea, eb, near, far, horizontal):
-        """How an edge between two pixel centres blends them: (pixel that changes, pixel whose colour comes in, its weight, where the edge crosses).
+        """How an edge between two pixel centres blends them: (pixel that changes, pixel whose colour comes in, its weight, where the edge
+        crosses).
 
         ``ea``, ``eb``: the edge's ends [pixels], attached; the weight and the place are.
         """
@@ -446,7 +448,8 @@ class RasterIntegrator(mi.SamplingIntegrator):
         return found, va, vb, last
 
     def _assemble(self, rgba, aovs, region, camera, scale, alpha):
-        """Put the region into the full image and shape it (H, W, C): colours averaged over the samples of a pixel, AOVs of its middle one."""
+        """Put the region into the full image and shape it (H, W, C): colours averaged over the samples of a pixel, AOVs of its middle one.
+        """
         x0, y0, w_, w, h = region
         width, height = camera.width, camera.height
         colours = 4 if alpha else 3
@@ -474,7 +477,9 @@ class RasterIntegrator(mi.SamplingIntegrator):
 
 
 def _margin(box, width, height):
-    """(x, y, width, height) of the pixels around a box (x, y, x, y) within the image, with a margin for the neighbours that antialiasing blends with."""
+    """(x, y, width, height) of the pixels around a box (x, y, x, y) within the image, with a margin for the neighbours that antialiasing
+    blends with.
+    """
     xa, ya, xb, yb = box
     xa, ya = max(0, math.floor(min(xa, width)) - 1), max(0, math.floor(min(ya, height)) - 1)
     xb, yb = min(width, math.ceil(max(xb, 0)) + 1), min(height, math.ceil(max(yb, 0)) + 1)

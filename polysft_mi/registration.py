@@ -1,7 +1,7 @@
 """The images' part of the objective to second order: how well a surface explains a frame, and how that changes with each vertex.
 
-Visibility comes from Mitsuba (one ray a pixel, :meth:`RasterIntegrator.look`), the texture from the template's BSDF, blurred like the frame; residuals
-and their derivatives are closed forms, summed on the device per triangle. Import only after a Mitsuba variant is set.
+Visibility comes from Mitsuba (one ray a pixel, :meth:`RasterIntegrator.look`), the texture from the template's BSDF, blurred like the
+frame; residuals and their derivatives are closed forms, summed on the device per triangle. Import only after a Mitsuba variant is set.
 """
 
 import math
@@ -32,10 +32,11 @@ _CACHED_FRAMES = 4
 class Evaluation:
     """A frame's images against a surface. Energies are weighted like the objective; a pixel is one of the level's grid.
 
-    ``photometric``, ``silhouette``: energies; ``gradient`` (N, 3) of both [1/m]; ``second`` (F, 9, 2, 2): the photometric term's Gauss-Newton
-    blocks of each triangle's corner pairs (row by row) with respect to the corners' projections [1/pixel^2]; ``rows``: the silhouette's
-    residuals as (i, j, ci, cj, h), each with derivative ci (K, 2) and cj by the projections of the vertices i and j and curvature h (K,);
-    ``pixels``: how many were compared; ``outlying``: the mean of r^2 / (r^2 + scale^2) over them, and ``misfit`` with a fixed scale.
+    ``photometric``, ``silhouette``: energies; ``gradient`` (N, 3) of both [1/m]; ``second`` (F, 9, 2, 2): the photometric term's
+    Gauss-Newton blocks of each triangle's corner pairs (row by row) with respect to the corners' projections [1/pixel^2]; ``rows``: the
+    silhouette's residuals as (i, j, ci, cj, h), each with derivative ci (K, 2) and cj by the projections of the vertices i and j and
+    curvature h (K,); ``pixels``: how many were compared; ``outlying``: the mean of r^2 / (r^2 + scale^2) over them, and ``misfit`` with a
+    fixed scale.
     """
 
     photometric: float
@@ -104,7 +105,9 @@ class Registration:
         dr.make_opaque(self._texel)
 
     def on_template(self, texels):
-        """Points (K, 3) [m, world] of the undeformed template at pixels (K, 2) of ``texture`` (OpenCV's, whole at their centres); NaN beyond it."""
+        """Points (K, 3) [m, world] of the undeformed template at pixels (K, 2) of ``texture`` (OpenCV's, whole at their centres); NaN
+        beyond it.
+        """
         from scipy.interpolate import LinearNDInterpolator  # a tenth of the start, and seldom needed
 
         coordinates = np.array(self._texcoord, dtype=np.float64).reshape(-1, 2) * np.array(self._texel[0]).ravel() + np.array(self._texel[1]).ravel()
@@ -127,7 +130,9 @@ class Registration:
         return self._textures[level]
 
     def shift_texture(self, chart, displaced):
-        """Move the texture on the template: what lies at ``chart`` (N, 2) is shown at ``displaced`` (N, 2) instead. Whether that could be done."""
+        """Move the texture on the template: what lies at ``chart`` (N, 2) is shown at ``displaced`` (N, 2) instead. Whether that could be
+        done.
+        """
         from scipy.interpolate import LinearNDInterpolator
 
         coordinates = np.array(self._texcoord, dtype=np.float64).reshape(-1, 2)
@@ -163,7 +168,9 @@ class Registration:
         return level_image(*self._decoded(frame), level, self.normalise)
 
     def _frame_level(self, frame, level):
-        """The frame at a level, on the device: packed colour and weight; the mask or None; the :class:`LevelImage`; its area [pixels of the grid]."""
+        """The frame at a level, on the device: packed colour and weight; the mask or None; the :class:`LevelImage`; its area [pixels of
+        the grid].
+        """
         key = (frame, level)
         if key not in self._frames:
             self.expect([frame], [level])
@@ -248,7 +255,9 @@ class Registration:
             return np.array(squared)[np.array(weight) > 0]
 
     def misfit(self, vertices, frame, level):
-        """The mean of r^2 / (r^2 + c^2) over the pixels that are compared, 0 to 1, with a fixed c: 1 where there are none. vertices (N, 3) [m, world]."""
+        """The mean of r^2 / (r^2 + c^2) over the pixels that are compared, 0 to 1, with a fixed c: 1 where there are none. vertices (N, 3)
+        [m, world].
+        """
         squared = self.residuals(vertices, frame, level)
         return float((squared / (squared + _MISFIT**2)).mean()) if len(squared) else 1.0
 
@@ -307,8 +316,8 @@ class Registration:
         """Sums over the pixels that see each triangle (F, 31) float64: 18 of curvature, 9 of slope and 4 figures.
 
         ``triangle``: of each pixel, -1 for none; ``found``: (xx, xy, yy, b1), (slope, b2) and the figures of each, where b1 and b2 are its
-        barycentric coordinates. A thread a triangle adds its pixels up in their order: in a fraction of the time of atomic additions by the pixels,
-        and always alike.
+        barycentric coordinates. A thread a triangle adds its pixels up in their order: in a fraction of the time of atomic additions by
+        the pixels, and always alike.
         """
         buffers = [dr.ravel(x) for x in found]
         dr.eval(buffers)
@@ -332,8 +341,8 @@ class Registration:
     # -- silhouettes --------------------------------------------------------
 
     def _silhouette(self, view, frame, level):
-        """The rendered silhouette against the mask: (energy without its weight, per pair of pixels: va, vb, derivative of the pixel's alpha by the
-        edge's ends (K, 2) each, alpha less mask, distance to the mask's contour); None without masks."""
+        """The rendered silhouette against the mask: (energy without its weight, per pair of pixels: va, vb, derivative of the pixel's
+        alpha by the edge's ends (K, 2) each, alpha less mask, distance to the mask's contour); None without masks."""
         _, mask, image, _ = self._frame_level(frame, level)
         if mask is None:
             return None
@@ -371,8 +380,8 @@ class Registration:
     def _pull(self, vertices, pairs, frame, level, weight):
         """Energy, rows and gradient (N, 3) of the silhouette term.
 
-        The curvature is that of the quadratic which has the term's slope here and its minimum at the mask's contour: a step then goes all the way,
-        where plain Gauss-Newton, whose residuals are pixels, would go one pixel.
+        The curvature is that of the quadratic which has the term's slope here and its minimum at the mask's contour: a step then goes all
+        the way, where plain Gauss-Newton, whose residuals are pixels, would go one pixel.
         """
         energy, found = pairs
         gradient = np.zeros((len(vertices), 3))

@@ -29,8 +29,8 @@ class Relocator:
         self._descriptors = self._descriptors[known] if self._descriptors is not None else None
 
     def pose(self, image):
-        """The motion (Rotation, translation (3,) [m]), p -> R p + t in the world, from the template to a linear image (H, W, 3); None where too few
-        features agree."""
+        """The motion (Rotation, translation (3,) [m]), p -> R p + t in the world, from the template to a linear image (H, W, 3); None
+        where too few features agree."""
         keys, descriptors = self._detector.detectAndCompute(grey(image), None)
         if descriptors is None or self._descriptors is None or len(keys) < _INLIERS or len(self._points) < _INLIERS:
             return None

@@ -91,7 +91,9 @@ def _told(error, path):
 
 
 def _check_nodes(path, overrides):
-    """Parse the file, check its integrator, its sensor and that the files it names are there; return the properties of the template's shape (or None)."""
+    """Parse the file, check its integrator, its sensor and that the files it names are there; return the properties of the template's
+    shape (or None).
+    """
     config = mi.parser.ParserConfig(mi.variant())
     try:
         state = mi.parser.parse_file(config, path, **overrides)

@@ -80,8 +80,8 @@ class Sequence:
     def mask(self, i):
         """Silhouette i, (H, W) float32 in [0, 1]; None without masks.
 
-        The largest of the colour channels, in parts of the type's maximum (an 8 or 16 bit mask with no value above 1 is taken as it is). With
-        ``drop_stray``, blobs away from the sheet are removed (:func:`drop_stray_components`).
+        The largest of the colour channels, in parts of the type's maximum (an 8 or 16 bit mask with no value above 1 is taken as it is).
+        With ``drop_stray``, blobs away from the sheet are removed (:func:`drop_stray_components`).
         """
         if self.mask_files is None:
             return None
@@ -138,7 +138,9 @@ def image_size(path):
 
 
 def _checked_size(path, decode=True):
-    """(width, height); reads the whole file by Pillow, which, other than OpenCV, reports one that breaks off: the pixels of most kinds, the checksums of PNG."""
+    """(width, height); reads the whole file by Pillow, which, other than OpenCV, reports one that breaks off: the pixels of most kinds,
+    the checksums of PNG.
+    """
     from PIL import Image, UnidentifiedImageError
 
     try:

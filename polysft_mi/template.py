@@ -15,10 +15,10 @@ from .errors import InputError
 class Template:
     """A surface S = {O, phi(u, v)}: mesh, orientation, chart and coefficients, float64.
 
-    ``vertices`` (N, 3) [m, camera frame] and ``faces`` (F, 3) as in the file; ``uv`` (N, 2) texture coordinates, v up;
-    ``scale`` [m], ``rotation`` (3, 3), ``origin`` (3,) [m]: the orientation O = (s, R, T), p = s R x + T;
-    ``chart`` (N, 2): (u, v) of each vertex, at most 1 in norm; ``alpha`` (A,): the jet, in the chart's unit, zero beyond the order that was fitted;
-    ``residual`` (N,) [m]: signed distance along the chart's normal that the jet leaves.
+    ``vertices`` (N, 3) [m, camera frame] and ``faces`` (F, 3) as in the file; ``uv`` (N, 2) texture coordinates, v up; ``scale`` [m],
+    ``rotation`` (3, 3), ``origin`` (3,) [m]: the orientation O = (s, R, T), p = s R x + T; ``chart`` (N, 2): (u, v) of each vertex, at
+    most 1 in norm; ``alpha`` (A,): the jet, in the chart's unit, zero beyond the order that was fitted; ``residual`` (N,) [m]: signed
+    distance along the chart's normal that the jet leaves.
     """
 
     vertices: np.ndarray
@@ -54,8 +54,8 @@ class Template:
 
     @classmethod
     def fit(cls, vertices, faces, uv, order, *, capacity=None, frame=None, tolerance=0.05, where="template"):
-        """Fit a jet of ``order`` to the mesh, in ``frame``, a :class:`polyfit.frames.CanonicalFrame` in float64, or else in its PCA frame; it has the
-        coefficients of order ``capacity`` (default: the same), those beyond ``order`` zero.
+        """Fit a jet of ``order`` to the mesh, in ``frame``, a :class:`polyfit.frames.CanonicalFrame` in float64, or else in its PCA frame;
+        it has the coefficients of order ``capacity`` (default: the same), those beyond ``order`` zero.
 
         Raises InputError where the order is too high for the vertices, where the surface folds over in its chart (a closed surface does),
         or where the largest residual exceeds ``tolerance`` times the scale s.

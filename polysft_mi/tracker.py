@@ -72,9 +72,9 @@ class Track:
 def track(problem, solver, frames, out, *, resume=False, progress=None):
     """Solve window after window; checkpoints and the log go to the folder ``out``. Returns the :class:`Track`.
 
-    ``frames``: number of frames. ``progress(frame, iteration, total, terms)`` is called after each evaluation. Where the objective stops being
-    finite, or the surface leaves the image, the new frame keeps the state of the one before, and the run goes on. KeyboardInterrupt passes
-    through; the checkpoint on disk is then that of the last whole window.
+    ``frames``: number of frames. ``progress(frame, iteration, total, terms)`` is called after each evaluation. Where the objective stops
+    being finite, or the surface leaves the image, the new frame keeps the state of the one before, and the run goes on. KeyboardInterrupt
+    passes through; the checkpoint on disk is then that of the last whole window.
     """
     width = min(problem.settings.width, frames)
     checkpoint, log_path = os.path.join(out, CHECKPOINT), os.path.join(out, LOG)
@@ -93,7 +93,9 @@ def track(problem, solver, frames, out, *, resume=False, progress=None):
 
 
 def _look_back(problem, solver, done):
-    """Solve again, now that both neighbours are known: the frames that explain their image far worse than those around them; with ``smooth``, all."""
+    """Solve again, now that both neighbours are known: the frames that explain their image far worse than those around them; with
+    ``smooth``, all.
+    """
     misfit = np.array([t.get("misfit") or math.nan for t in done.totals])
     count, smooth = len(misfit), problem.settings.smooth
     suspect = []

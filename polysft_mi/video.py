@@ -36,9 +36,9 @@ def encoder():
 def write_video(path, frames, fps=25):
     """Write ``frames``, an iterable of (H, W, 3) uint8 sRGB images of one size, to ``path`` (.mp4), ``fps`` frames a second.
 
-    Sizes are padded to even numbers by repeating the last row or column, and shrunk to 3840 columns where there are more. Where no encoder is, the frames become
-    ``000.png``, ``001.png``, ... in the folder that has ``path``'s name without its extension. Returns the path of what was
-    written. Raises ValueError for no frames or frames of another form, OSError where they cannot be written.
+    Sizes are padded to even numbers by repeating the last row or column, and shrunk to 3840 columns where there are more. Where no encoder
+    is, the frames become ``000.png``, ``001.png``, ... in the folder that has ``path``'s name without its extension. Returns the path of
+    what was written. Raises ValueError for no frames or frames of another form, OSError where they cannot be written.
     """
     frames = _checked(frames)
     if encoder() is None:
@@ -100,7 +100,9 @@ def _write_pngs(folder, frames):
 
 
 def read_video(path):
-    """The frames of a video that :func:`write_video` wrote, one after the other, (H, W, 3) uint8 sRGB. Raises InputError where it cannot be read."""
+    """The frames of a video that :func:`write_video` wrote, one after the other, (H, W, 3) uint8 sRGB. Raises InputError where it cannot
+    be read.
+    """
     if encoder() is None:
         raise InputError(f"{path}: cannot be read without ffmpeg (the Python package imageio-ffmpeg)")
     command = [encoder(), "-v", "error", "-i", os.fspath(path), "-f", "image2pipe", "-c:v", "ppm", "-"]

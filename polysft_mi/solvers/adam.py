@@ -11,8 +11,8 @@ from . import Solution
 class Adam:
     """First-order descent on the objective of a window, until it stops improving.
 
-    ``patience`` iterations without a new minimum, or ``period`` iterations, end it (supplement, "Adaptive Window Optimization"). The best unknowns seen are
-    kept. Moments start at zero in every window, so that a window depends on nothing but its start.
+    ``patience`` iterations without a new minimum, or ``period`` iterations, end it (supplement, "Adaptive Window Optimization"). The best
+    unknowns seen are kept. Moments start at zero in every window, so that a window depends on nothing but its start.
     """
 
     def __init__(self, settings):

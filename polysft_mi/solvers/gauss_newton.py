@@ -57,10 +57,10 @@ FAR = Stage(6.0, 1e2, 6)  # before the others where the sheet has moved far
 class GaussNewton:
     """Second-order descent: Gauss-Newton curvatures of all terms, damped after Levenberg and Marquardt.
 
-    A frame starts from the one before or from where its motion leads, whichever explains the image better. Where it ends with a misfit far above
-    that of the frames before, other starts are tried: farther motion, and the rigid pose of the flat template by features. The order of the jet
-    rises from ``order`` to at most ``order_max`` where the objective asks for it, and falls where it does not. In a window of several frames the
-    newest is solved so, and then all together; ``revisit`` looks both ways from one frame.
+    A frame starts from the one before or from where its motion leads, whichever explains the image better. Where it ends with a misfit far
+    above that of the frames before, other starts are tried: farther motion, and the rigid pose of the flat template by features. The order
+    of the jet rises from ``order`` to at most ``order_max`` where the objective asks for it, and falls where it does not. In a window of
+    several frames the newest is solved so, and then all together; ``revisit`` looks both ways from one frame.
     """
 
     def __init__(self, settings):
@@ -77,8 +77,8 @@ class GaussNewton:
     def solve(self, problem, window, frames, report=None, past=()):
         """Minimise over the last of ``frames``, then over all of them: :class:`Solution`.
 
-        ``window``: their Unknowns, in a list; ``past``: of all frames before the last, oldest first, (arrays of ``Unknowns.to_numpy``, terms and
-        facts); without it every frame of the window is new.
+        ``window``: their Unknowns, in a list; ``past``: of all frames before the last, oldest first, (arrays of ``Unknowns.to_numpy``,
+        terms and facts); without it every frame of the window is new.
         """
         with self._blas.limit(limits=1, user_api="blas"):
             return self._solve(problem, window, frames, report, past)
@@ -105,8 +105,8 @@ class GaussNewton:
     def revisit(self, problem, frame, before, after, terms, weight):
         """Solve a frame again, held to the middle of its neighbours: :class:`Solution`.
 
-        ``before``, ``after``: arrays of ``Unknowns.to_numpy`` of the frames on either side; ``terms``: of the frame so far; ``weight``: of the
-        squared difference to the middle.
+        ``before``, ``after``: arrays of ``Unknowns.to_numpy`` of the frames on either side; ``terms``: of the frame so far; ``weight``: of
+        the squared difference to the middle.
         """
         with self._blas.limit(limits=1, user_api="blas"):
             return self._revisit(problem, frame, before, after, terms, weight)
@@ -300,7 +300,9 @@ class GaussNewton:
         return models
 
     def _window_step(self, models, damping):
-        """The steps of all frames, and the decrease that they promise. The global unknowns are coupled from frame to frame: a block-banded system."""
+        """The steps of all frames, and the decrease that they promise. The global unknowns are coupled from frame to frame: a block-banded
+        system.
+        """
         reduced = [Reduced(self.blocks, normal, damping) for normal, _ in models]
         start = np.cumsum([0] + [len(r.right) for r in reduced])
         matrix = block_diag(*(r.schur for r in reduced))
@@ -425,7 +427,9 @@ class GaussNewton:
         return Solution(window, sum(terms.values()), terms, self._count, facts, [self._sigma(*f["model"]) for f in found])
 
     def _sigma(self, normal, surface, noise):
-        """Standard deviation (N,) [m, float32] of each vertex along its ray, from the curvatures of the whole objective: NaN where they are singular."""
+        """Standard deviation (N,) [m, float32] of each vertex along its ray, from the curvatures of the whole objective: NaN where they
+        are singular.
+        """
         ray = surface.vertices - self._problem.camera.origin
         ray /= np.linalg.norm(ray, axis=1, keepdims=True)
         by_global = np.column_stack([(ray @ surface.up)[:, None] * surface.basis, np.einsum("nk,nkm->nm", ray, surface.by_motion)])
