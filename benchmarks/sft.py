@@ -305,7 +305,7 @@ def table(results):
         if not rows:
             continue
         head = ["sequence", "method", "order", "frames", *(LABELS[name] for name in names), "seconds a frame", "iterations a window"]
-        lines = [f"### {title}", "", _row(head), _row(["---"] * 4 + ["---:"] * (len(head) - 4))]
+        lines = [f"## {title}", "", _row(head), _row(["---"] * 4 + ["---:"] * (len(head) - 4))]
         for r in rows:
             method = "*best jet*" if r["method"] == JET else f"`{r['method']}`"
             orders = "–" if not r.get("orders") else "–".join(map(str, dict.fromkeys(r["orders"])))
@@ -317,7 +317,7 @@ def table(results):
     for key, title in (("error", "Failed"), ("unscored", "Without figures")):
         lines = [f"- {r['sequence']}, `{r['method']}`: {r[key]}" for r in ordered if key in r]
         if lines:
-            parts.append("\n".join([f"### {title}", "", *lines]))
+            parts.append("\n".join([f"## {title}", "", *lines]))
     return "\n\n".join(parts)
 
 

@@ -94,7 +94,7 @@ def test_table_shows_each_kind_of_truth_apart():
         result("corner", "adam", figures={}, error="error: it broke"),
     ]
     meshes, points, failed = sft.table(rows).split("\n\n### ")
-    assert meshes.startswith("### True vertices")
+    assert meshes.startswith("## True vertices")
     cells = [[x.strip() for x in line.strip("|").split("|")] for line in meshes.splitlines()[2:]]
     assert {len(row) for row in cells} == {9}
     assert cells[2] == ["flag", "`adam`", "4", "45", "0.0123", "7.5", "0.02", "5.25", "150"]
