@@ -93,7 +93,7 @@ def test_table_shows_each_kind_of_truth_apart():
         result(),
         result("corner", "adam", figures={}, error="error: it broke"),
     ]
-    meshes, points, failed = sft.table(rows).split("\n\n### ")
+    meshes, points, failed = sft.table(rows).split("\n\n## ")
     assert meshes.startswith("## True vertices")
     cells = [[x.strip() for x in line.strip("|").split("|")] for line in meshes.splitlines()[2:]]
     assert {len(row) for row in cells} == {9}
@@ -115,7 +115,7 @@ def test_what_has_no_truth_is_said(sheet, tmp_path, monkeypatch):
     r = sft.run("flag", "adam", str(data), str(tmp_path / "out"), {**SETUP, "frames": 1, "define": ["period=2"], "mode": "llvm_ad_rgb"})
     assert r["seconds_a_frame"] > 0 and r["figures"] == {} and "no frame in common" in r["unscored"]
     assert r["unscored"].startswith("flag/gt_points.npz")
-    assert "### Without figures" in sft.table([r]) and "no frame in common" in sft.table([r])
+    assert "## Without figures" in sft.table([r]) and "no frame in common" in sft.table([r])
 
 
 def test_report_writes_page_and_plot(tmp_path):
