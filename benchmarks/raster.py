@@ -36,6 +36,7 @@ import numpy as np
 ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 sys.path.insert(0, ROOT)
 
+from benchmarks.cases import add_case_arguments, parse_size
 from polysft_mi.backend import add_mode_argument, set_variant
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError, cli
@@ -267,16 +268,6 @@ def in_process(measure, size, grid, mode, **options):
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def parse_size(text):
-    try:
-        width, height = (int(x) for x in text.lower().split("x"))
-        if min(width, height) < 16:
-            raise ValueError
-    except ValueError:
-        raise InputError(f"--sizes {text}: WIDTHxHEIGHT is needed, at least 16x16, such as 640x480") from None
-    return width, height
-
-
 def summarise(size, grid, times, memory):
     """The figures of a case: medians, quartiles, ratios."""
     passes = {name: np.array(values) for name, values in times["passes"].items()}
@@ -365,8 +356,7 @@ def judge_long_run(growth, kernels):
 
 def parser():
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument("--sizes", nargs="+", metavar="WxH", default=SIZES, help=f"image sizes (default: {' '.join(SIZES)})")
-    p.add_argument("--grids", nargs="+", type=int, metavar="N", default=GRIDS, help="vertices a side of the templates (default: 33 72 225)")
+    add_case_arguments(p, SIZES, GRIDS)
     p.add_argument("--seconds", type=float, default=5, help=f"time for the turns of a case, of which there are at least {LEAST_TURNS} (default: 5)")
     p.add_argument("--iterations", type=int, default=300, help="length of the run that must not grow or compile (default: 300)")
     p.add_argument("-o", "--out", metavar="FOLDER", default="out/benchmarks", help="for raster.json and raster.png (default: out/benchmarks)")

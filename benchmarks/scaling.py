@@ -26,6 +26,7 @@ import numpy as np
 ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 sys.path.insert(0, ROOT)
 
+from benchmarks.cases import add_case_arguments, parse_size
 from polysft_mi.backend import add_mode_argument, set_variant
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError, cli
@@ -237,21 +238,9 @@ def plot(path, cases):
         figure.savefig(temporary, format="png", facecolor="white")
 
 
-def parse_size(text):
-    try:
-        width, height = (int(x) for x in text.lower().split("x"))
-        if min(width, height) < 48:
-            raise ValueError
-    except ValueError:
-        raise InputError(f"--sizes {text}: WIDTHxHEIGHT is needed, at least 48x48, such as 640x480") from None
-    return width, height
-
-
 def parser():
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    grids = " ".join(map(str, GRIDS))
-    p.add_argument("--grids", nargs="+", type=int, metavar="N", default=GRIDS, help=f"vertices a side of the templates (default: {grids})")
-    p.add_argument("--sizes", nargs="+", metavar="WxH", default=SIZES, help=f"image sizes (default: {' '.join(SIZES)})")
+    add_case_arguments(p, SIZES, GRIDS)
     p.add_argument("--frames", type=int, default=FRAMES, help=f"frames of a case (default: {FRAMES})")
     p.add_argument("--docs", metavar="FOLDER", default=os.path.join(ROOT, "docs"), help="for scaling.md and scaling.png (default: docs)")
     add_mode_argument(p)
@@ -264,7 +253,7 @@ def main(arguments=None):
     if options.worker:
         return worker(json.loads(options.worker))
     for size in options.sizes:
-        parse_size(size)
+        parse_size(size, least=48)
     if min(options.grids) < 4 or options.frames < 2 or not os.path.isdir(options.docs):
         given = f"--grids {options.grids} --frames {options.frames} --docs {options.docs}"
         raise InputError(f"{given}: at least 4 vertices a side, 2 frames and a folder are needed")

@@ -339,15 +339,23 @@ def test_silhouette_gradient_is_that_of_autodiff_through_raster(problem, amount)
     assert np.abs(mine.gradient - expected).max() < 1e-3 * np.abs(expected).max()
 
 
-def test_inextensibility_gradient_is_that_of_autodiff(problem):
-    chart = Chart(problem.template)
-    first = Registration(problem)
+def edges_of(problem):
+    """(Chart, Pattern, the edges' lengths, and what makes the normal equations of a state by the edges alone)."""
+    chart, first = Chart(problem.template), Registration(problem)
     pattern = Pattern(first.faces, problem.template.edges, len(problem.template.vertices))
-    lengths = np.array(problem.edge_lengths, dtype=np.float64)
+
+    def edges_alone(state, lengths, *weights):
+        surface = chart.surface(state)
+        none = registration.Evaluation(0, 0, 0, 0, np.zeros_like(surface.vertices), np.zeros((len(first.faces), 9, 2, 2)), None, 1.0)
+        return assemble(pattern, surface, first.projection(surface.vertices), none, lengths, *weights)
+
+    return chart, pattern, np.array(problem.edge_lengths, dtype=np.float64), edges_alone
+
+
+def test_inextensibility_gradient_is_that_of_autodiff(problem):
+    chart, _, lengths, edges_alone = edges_of(problem)
     state = some_state(chart, 0.02)
-    surface = chart.surface(state)
-    none = registration.Evaluation(0, 0, 0, 0, np.zeros_like(surface.vertices), np.zeros((len(first.faces), 9, 2, 2)), None, 1.0)
-    normal, energy = assemble(pattern, surface, first.projection(surface.vertices), none, lengths, 0.1 / problem.template.scale**2)
+    normal, energy = edges_alone(state, lengths, 0.1 / problem.template.scale**2)
     unknowns = Unknowns.from_numpy(chart.arrays(state))
     dr.enable_grad(unknowns)
     value = 0.1 * objective.inextensibility(problem.patch.vertices(unknowns), problem.edges, problem.edge_lengths, problem.patch.scale)
@@ -362,16 +370,11 @@ def test_inextensibility_gradient_is_that_of_autodiff(problem):
 
 
 def test_slack_lets_edges_shorten_but_not_stretch(problem):
-    chart = Chart(problem.template)
-    first = Registration(problem)
-    pattern = Pattern(first.faces, problem.template.edges, len(problem.template.vertices))
-    rest = np.array(problem.edge_lengths, dtype=np.float64)
+    chart, pattern, rest, edges_alone = edges_of(problem)
     state = some_state(chart, 0.02)
-    none = registration.Evaluation(0, 0, 0, 0, np.zeros((len(problem.template.vertices), 3)), np.zeros((len(first.faces), 9, 2, 2)), None, 1.0)
 
     def model(at, lengths, slack):
-        surface = chart.surface(at)
-        return assemble(pattern, surface, first.projection(surface.vertices), none, lengths, 3.0, slack)
+        return edges_alone(at, lengths, 3.0, slack)
 
     slack = 0.002 * rest.mean()
     normal, energy = model(state, rest, slack)
