@@ -105,6 +105,7 @@ def _run(options, overrides, out, exr_frames):
     sequence = Sequence.open(experiment.frames, experiment.masks, first=s.first, last=s.last, stride=s.stride, size=experiment.size)
     problem = Problem(experiment, sequence)
     problem.check_start()
+    solver = solvers.create(s)
     text = outputs.resolved_scene(experiment)
     if options.resume:
         _check_same(out, text)
@@ -124,7 +125,7 @@ def _run(options, overrides, out, exr_frames):
             f"{count} frames of {experiment.size[0]}x{experiment.size[1]}, masks: {'yes' if experiment.masks else 'no'}"
         )
         try:
-            done = track(problem, solvers.create(s), count, out, resume=options.resume, progress=progress)
+            done = track(problem, solver, count, out, resume=options.resume, progress=progress)
         except KeyboardInterrupt:
             path = os.path.join(out, "checkpoint.npz")
             done, status = (Track.load(path) if os.path.exists(path) else Track()), 130

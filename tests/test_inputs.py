@@ -204,6 +204,17 @@ def test_bad_value(sheet, setting, words):
     has(refused(sheet / "scene.xml", "-D", setting), words)
 
 
+@pytest.mark.parametrize(
+    "settings, words",
+    [
+        (["window=3", "smooth=1"], "window = 1, or smooth = 0, is needed"),
+        (["brightness=gain"], "brightness = 'gain' with solver = gauss-newton; auto, local or none is needed"),
+    ],
+)
+def test_values_that_do_not_go_together(sheet, settings, words):
+    has(refused(sheet / "scene.xml", *(part for text in settings for part in ("-D", text))), words)
+
+
 def test_order_too_high_for_the_vertices(tmp_path):
     truth = synthetic.cloth(tmp_path / "sheet", frames=1, size=SIZE, rows=4, columns=5)
     prepare.prepare(str(truth.folder))
