@@ -63,7 +63,7 @@ class Surface:
 
 
 class Chart:
-    """The template's jet on the host, in a basis of products of Legendre polynomials, which stays well conditioned to order 10."""
+    """The template's jet on the host, in a basis of products of Legendre polynomials, which stays well conditioned to order 14."""
 
     def __init__(self, template):
         self.template = template
@@ -146,7 +146,6 @@ class Chart:
             pu[:, self._u[:size]] * pv[:, self._v[:size]],
             by_motion,
         )
-
 
     def fitted(self, state, vertices, iterations=8, bending=1e-6):
         """The state, from ``state`` on, whose vertices come closest to ``vertices`` (N, 3) [m, world], in the least-squares sense.
@@ -295,7 +294,6 @@ class Elimination:
         out = np.empty_like(flat)
         out[self.blocks._order] = np.concatenate(x)
         return out.reshape(y.shape)
-
 
     def inverse_diagonal(self):
         """The 2x2 blocks on the diagonal of the inverse, (N, 2, 2)."""

@@ -23,7 +23,7 @@ class Settings:
     last: int = _setting(-1, "last image to use, inclusive; -1 for the end of the video", low=-1)
     stride: int = _setting(1, "use every stride-th image", low=1)
     order: int = _setting(4, "order n of the jet; gauss-newton starts with it", low=1, high=10)
-    order_max: int = _setting(10, "order up to which gauss-newton may raise the jet; at least ``order``", low=1, high=10)
+    order_max: int = _setting(14, "order up to which gauss-newton may raise the jet; at least ``order``", low=1, high=14)
     fit_tolerance: float = _setting(
         0.05, "largest distance of the template from its jet, as a share of the template's radius, before it is refused", above=0
     )

@@ -61,7 +61,7 @@ def some_state(chart, size=0.05):
 # -- the chart ---------------------------------------------------------------
 
 
-@pytest.mark.parametrize("order", [1, 4, 7, 10])
+@pytest.mark.parametrize("order", [1, 4, 7, 14])
 def test_chart_is_the_jet_of_polyfit(order):
     template = grid_template(13, 14, order=min(order, 6), capacity=order)
     chart = Chart(template)
@@ -82,10 +82,10 @@ def test_chart_agrees_with_the_device(problem):
     chart = Chart(problem.template)
     state = some_state(chart)
     device = problem.surface(Unknowns.from_numpy(chart.arrays(state)))
-    assert np.abs(device - chart.surface(state).vertices).max() < 2e-6
+    assert np.abs(device - chart.surface(state).vertices).max() < 1e-5  # m; what single precision leaves of monomials of order 14
 
 
-@pytest.mark.parametrize("order", [4, 10])
+@pytest.mark.parametrize("order", [4, 14])
 def test_derivatives_of_the_surface(order):
     chart = Chart(grid_template(13, 14, order=4, capacity=order))
     state = some_state(chart)
@@ -542,4 +542,4 @@ def test_settings_that_do_not_go_together():
         solvers.create(Settings(brightness="gain"))
     assert Settings().width == 1 and Settings(solver="adam").width == 3
     assert Settings().lighting == "local" and Settings(solver="adam").lighting == "none"
-    assert Settings(order=4).capacity == 10 and Settings(solver="adam").capacity == 4
+    assert Settings(order=4).capacity == 14 and Settings(solver="adam").capacity == 4

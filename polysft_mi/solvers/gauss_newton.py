@@ -50,7 +50,7 @@ class Stage:
 
 # Soft edges first, so that the texture coordinates register to the image before lengths are enforced: in a stiff flat sheet that is compressed
 # in the image, height has no first-order effect, and it would drift in depth instead of bending.
-STAGES = Stage(2.5, 1e2, 6), Stage(1.5, 1e3, 5), Stage(1.0, 1e4, 4)
+STAGES = Stage(2.5, 1e2, 6), Stage(1.5, 3e2, 5), Stage(1.0, 1e3, 4)
 FAR = Stage(6.0, 1e2, 6)  # before the others where the sheet has moved far
 
 
