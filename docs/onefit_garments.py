@@ -1,11 +1,13 @@
 """Draw ``docs/onefit_garments.png``: the seven templates on the standard body, from the front and from behind.
 
-    python docs/onefit_garments.py            (half a minute)
+    python docs/onefit_garments.py                                        (half a minute)
+    python docs/onefit_garments.py --cuts 14 -o docs/onefit_cuts.jpg      (two minutes: random cuts, as training draws them)
 """
 
 import argparse
 import os
 import sys
+import tempfile
 
 HERE = os.path.dirname(os.path.abspath(__file__))
 sys.path.insert(0, os.path.dirname(HERE))
@@ -16,6 +18,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 
 from onefit.binding import standard_body  # noqa: E402
+from onefit.cuts import cuts  # noqa: E402
 from onefit.garment import TEMPLATES, Garment  # noqa: E402
 
 WIDTH, HEIGHT, ZOOM = 300, 460, 3
@@ -42,19 +45,29 @@ def picture(parts, direction):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cuts", type=int, metavar="N", help="N random cuts instead of the templates")
     parser.add_argument("-o", "--output", default=os.path.join(HERE, "onefit_garments.png"))
     args = parser.parse_args()
+    if args.cuts:
+        with tempfile.TemporaryDirectory() as folder:
+            garments = cuts(args.cuts, folder)
+    else:
+        garments = [Garment.template(name) for name in TEMPLATES]
     body = standard_body()
     skin = (body.vertices.numpy(), body.faces.numpy(), SKIN)
-    columns, rows, title = len(TEMPLATES), 2, 40
-    out = Figure(figsize=(columns * WIDTH / 150, (rows * HEIGHT + title) / 150), dpi=150)
+    columns, title = min(len(garments), len(TEMPLATES)), 40
+    band = 2 * HEIGHT + title  # a row of garments, seen from the front and from behind
+    tall = -(-len(garments) // columns) * band
+    out = Figure(figsize=(columns * WIDTH / 150, tall / 150), dpi=150)
     FigureCanvasAgg(out)
-    tall = rows * HEIGHT + title
-    for k, name in enumerate(TEMPLATES):
-        garment = Garment.template(name)
-        out.text((k + 0.5) / columns, 1 - 0.5 * title / tall, f"{name}: {len(garment):,} vertices", ha="center", va="center", fontsize=9)
-        for row, side in enumerate((np.array([-0.35, -1, 0.12]), np.array([0.35, 1, 0.12]))):
-            axes = out.add_axes((k / columns, (1 - row) * HEIGHT / tall, 1 / columns, HEIGHT / tall))
+    for k, garment in enumerate(garments):
+        row, column = divmod(k, columns)
+        text = f"{garment.name}: {len(garment):,} vertices"
+        at = (column + 0.5) / columns, 1 - (row * band + 0.5 * title) / tall
+        out.text(*at, text, ha="center", va="center", fontsize=7 if args.cuts else 9)
+        for behind, side in enumerate((np.array([-0.35, -1, 0.12]), np.array([0.35, 1, 0.12]))):
+            below = tall - row * band - title - (behind + 1) * HEIGHT
+            axes = out.add_axes((column / columns, below / tall, 1 / columns, HEIGHT / tall))
             axes.imshow(picture([skin, (garment.vertices.numpy(), garment.faces.numpy(), CLOTH)], side / np.linalg.norm(side)))
             axes.axis("off")
     out.savefig(args.output)

@@ -22,6 +22,10 @@ from polyfit.surface import PatchedSurface
 # Charts reach this far beyond the patch, in units of its radius, where they fade into their neighbours'; at most so many meet in a point.
 REACH = 1.3
 MEET = 4
+# How much jets are held to the chart's plane where the patch has no points, see _steady_jets.
+STEADY = 1e-3
+# A patch that fills less of its chart's disc is a strip (a hem turned in), of which networks know little: its neighbours have more say.
+STRIP = 0.2
 # Points of each patch at which the metric is held, and boundary points for each pair of patches that meet.
 METRIC_POINTS = 16
 BOUNDARY_POINTS = 6
@@ -171,9 +175,9 @@ class PatchedGarment:
             / self.frame.s.numpy()[patch, None]
         )
         r = np.linalg.norm(x[:, :2], axis=1) / REACH
-        weight = (
-            np.where(patch == own[row], np.maximum(1 - r**2, 0.02), np.maximum(1 - r**2 - np.maximum(np.abs(x[:, 2]) - 0.5, 0), 0)) ** 3
-        )
+        near = np.where(patch == own[row], np.maximum(1 - r**2, 0.02), np.maximum(1 - r**2 - np.maximum(np.abs(x[:, 2]) - 0.5, 0), 0))
+        area = np.bincount(p.entry_patch, p.entry_weight) / (np.pi * self.frame.s.numpy() ** 2)  # as a share of the chart's disc
+        weight = (near * np.minimum(area / STRIP, 1)[patch]) ** 3
         keep = _largest(row, weight, MEET) & (weight > 0)
         row, patch, weight, x = row[keep], patch[keep], weight[keep], x[keep]
         weight /= np.bincount(row, weight, minlength=count)[row]
@@ -284,21 +288,39 @@ def _refinement(count, given, levels):
 
 
 def _along_bones(surface, weights, body):
-    """Frames turned about z until v lies along the bone of the joint that ``weights`` (K, J) give most: (frame, alpha, uv (E, 2) NumPy)."""
+    """Frames turned about z until v lies along the bone of the joint that ``weights`` (K, J) give most, and the jets there: (frame, alpha,
+    uv (E, 2) NumPy).
+    """
+    p = surface.patches
     bones = _bones(body)[torch.as_tensor(weights).argmax(1)]
-    order = jets.order_of(surface.alpha.shape[1])
     along = (surface.frame.R.mT @ bones[..., None])[..., 0]
     angle = torch.atan2(-along[:, 0], along[:, 1])
     cos, sin, zero, one = angle.cos(), angle.sin(), 0 * angle, 1 + 0 * angle
     turn = torch.stack([torch.stack(row, -1) for row in [(cos, -sin, zero), (sin, cos, zero), (zero, zero, one)]], -2)
     frame = CanonicalFrame(surface.frame.s, surface.frame.R @ turn, surface.frame.T)
-    grid = torch.linspace(-1, 1, order + 2, dtype=torch.float64)
-    at = torch.cartesian_prod(grid, grid)
-    old = at @ turn[:, :2, :2].mT  # the grid of the new chart, in the old one
-    z = jets.height(surface.alpha, old)
-    alpha = jets.fit(torch.cat([at.expand(len(z), -1, -1), z[..., None]], -1), order).alpha
-    uv = (turn[:, :2, :2].mT[surface.patches.entry_patch] @ surface.uv[..., None])[..., 0]
-    return frame, alpha, uv.numpy()
+    patch = torch.as_tensor(p.entry_patch)
+    points = torch.as_tensor(p.vertices[p.entry_vertex]) - frame.T[patch]
+    x = (frame.R[patch].mT @ points[..., None])[..., 0] / frame.s[patch, None]
+    alpha = _steady_jets(x, patch, torch.as_tensor(p.entry_weight), len(weights), jets.order_of(surface.alpha.shape[1]))
+    return frame, alpha, jets.nearest(alpha[patch], x[:, None])[:, 0].numpy()
+
+
+def _steady_jets(x, patch, weight, count, order):
+    """Jets (K, A) of the points ``x`` (E, 3) of the charts ``patch`` (E,): least squares, held by STEADY times the mean square of the jet
+    over the chart's unit disc.
+
+    A strip of cloth (a hem turned in, a waistband) does not determine a jet across it: coefficients a hundred times those of other patches
+    fit it a little better, and a network that reads them answers with nonsense.
+    """
+    b = jets.basis(x[:, :2], order)
+    share = (weight / torch.zeros(count, dtype=x.dtype).index_add(0, patch, weight)[patch])[:, None]
+    A = b.shape[1]
+    gram = x.new_zeros(count, A * A).index_add(0, patch, ((share * b)[:, :, None] * b[:, None]).flatten(1)).unflatten(1, (A, A))
+    right = x.new_zeros(count, A).index_add(0, patch, share * b * x[:, 2:])
+    ring = torch.linspace(0, 2 * np.pi, 33, dtype=x.dtype)[1:]
+    radius = torch.linspace(0, 1, 33, dtype=x.dtype)[1:].sqrt()  # rings of equal area
+    disc = jets.basis(torch.stack([torch.outer(radius, ring.cos()), torch.outer(radius, ring.sin())], -1).flatten(0, 1), order)
+    return torch.linalg.solve(gram + STEADY * disc.T @ disc / len(disc), right)
 
 
 def _bones(body):

@@ -16,7 +16,6 @@ from .body import Body
 from .mending import check, mended, parts
 
 TEMPLATES = ("tshirt", "dress", "tank", "long_sleeve_top", "shorts", "trousers", "jumpsuit")
-TIGHT = 0.03  # [m]
 FOLDER = Path(__file__).parent / "data" / "garments"
 
 
@@ -97,20 +96,6 @@ class Garment:
         rest = self.vertices.cpu().double().numpy()
         moved = self._binding.moved(rest, standard_body().vertices.double().numpy(), fitting.standard_on(body))
         return torch.as_tensor(moved, dtype=torch.float32, device=self.vertices.device)
-
-    def tightened(self, share):
-        """The same garment cut tighter: cloth within TIGHT of the standard body is drawn to ``share`` of its distance from it, farther
-        cloth less and less of the way. Networks learn from it what cloth on the skin is like.
-        """
-        V, F = self.vertices.cpu().double().numpy(), self.faces.cpu().numpy()
-        found = standard_surface()(V)
-        kept = share + (1 - share) * np.clip(found.distance / TIGHT - 1, 0, 1)
-        move = ((kept - 1) * np.maximum(found.distance, 0))[:, None] * found.normal
-        mean = remesh.neighbour_mean(F, len(V))
-        for _ in range(10):
-            move = 0.5 * (move + mean @ move)
-        V, pushed = fitting.pushed_out(V + move, F, self.name)
-        return type(self).bound(f"{self.name}, tight", V, F, pushed)
 
     def remeshed(self, count):
         """The same garment with about ``count`` vertices: every face is cut in four as often as is needed for 0.7 times as many; where

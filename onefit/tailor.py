@@ -152,56 +152,65 @@ def upper_arm_to(length):
     return lambda x, y, z: np.where(armhole(x, z) > 0, length - along_arm(x, y, z)[0], 1)
 
 
-def sleeved_top(b):
-    return smooth_union(smooth_union(b.torso, b.arms, 0.04), b.skin, 0.01)
+def sleeved_top(b, snug=0):
+    """``snug``, 0 to 1: how far the cloth follows the skin, instead of spanning the body's hollows."""
+    loose = smooth_union(smooth_union(b.torso, b.arms, 0.04), b.skin, 0.01)
+    return loose + snug * (b.skin - loose)
 
 
-def sleeveless_top(b):
-    return smooth_union(b.torso, b.trunk, 0.01)
+def sleeveless_top(b, snug=0):
+    loose = smooth_union(b.torso, b.trunk, 0.01)
+    return loose + snug * (b.trunk - loose)
 
 
-def lower(b):
-    return smooth_union(smooth_union(b.hips, b.legs, 0.02), b.body, 0.01)
+def lower(b, snug=0):
+    loose = smooth_union(smooth_union(b.hips, b.legs, 0.02), b.body, 0.01)
+    return loose + snug * (np.maximum(b.body, b.armhole) - loose)
 
 
-def tshirt(b):
+def tshirt(b, snug=0, ease=0.008, waist_ease=0.010, sleeve_ease=0.012, sleeve=0.165, hem=-0.02, front=0.47, back=0.53, narrow=6):
     s, _ = along_arm(b.x, b.y, b.z)
-    ease = 0.008 + 0.010 * ramp(b.z, 0.35, -0.05) + 0.012 * ramp(s, 0.0, 0.17) * ramp(b.armhole, -0.02, 0.06)
-    sleeve = upper_arm_to(0.165)
-    return sleeved_top(b) - ease, lambda *p: minimum(below_neckline(*p, 0.47, 0.53, 6), p[2] + 0.02, sleeve(*p))
+    ease = ease + waist_ease * ramp(b.z, 0.35, -0.05) + sleeve_ease * ramp(s, 0.0, 0.17) * ramp(b.armhole, -0.02, 0.06)
+    sleeve = upper_arm_to(sleeve)
+    return sleeved_top(b, snug) - ease, lambda *p: minimum(below_neckline(*p, front, back, narrow), p[2] - hem, sleeve(*p))
 
 
-def long_sleeve_top(b):
+def long_sleeve_top(b, snug=0, ease=0.007, waist_ease=0.009, sleeve_ease=0.004, sleeve=0.195, hem=-0.04, front=0.475, back=0.535, narrow=6):
     _, t = along_arm(b.x, b.y, b.z)
-    ease = 0.007 + 0.009 * ramp(b.z, 0.35, -0.05) + 0.004 * ramp(t, 0.0, 0.2) * ramp(b.armhole, -0.02, 0.06)
+    ease = ease + waist_ease * ramp(b.z, 0.35, -0.05) + sleeve_ease * ramp(t, 0.0, 0.2) * ramp(b.armhole, -0.02, 0.06)
 
     def inside(x, y, z):
-        sleeve = np.where(armhole(x, z) > 0, 0.195 - along_arm(x, y, z)[1], 1)
-        return minimum(below_neckline(x, y, z, 0.475, 0.535, 6), z + 0.04, sleeve)
+        reach = np.where(armhole(x, z) > 0, sleeve - along_arm(x, y, z)[1], 1)
+        return minimum(below_neckline(x, y, z, front, back, narrow), z - hem, reach)
 
-    return sleeved_top(b) - ease, inside
-
-
-def tank(b):
-    ease = 0.006 + 0.012 * ramp(b.z, 0.35, 0.0)
-    return sleeveless_top(b) - ease, lambda *p: minimum(below_neckline(*p, 0.425, 0.50, 8), arm_hole(*p), p[2] - 0.01)
+    return sleeved_top(b, snug) - ease, inside
 
 
-def dress(b):
-    flare = skirt(b.x, b.y, b.z, (0.20, 0.135, 0.09, -0.035), (-0.34, 0.31, 0.26, -0.03))
-    body = sleeveless_top(b) - 0.006
-    field = smooth_union(np.where(b.z > -0.12, body, np.maximum(body, -0.12 - b.z)), flare, 0.06)
-    return field, lambda *p: minimum(below_neckline(*p, 0.435, 0.51, 8), arm_hole(*p), p[2] + 0.34)
+def tank(b, snug=0, ease=0.006, waist_ease=0.012, hem=0.01, front=0.425, back=0.50, narrow=8):
+    ease = ease + waist_ease * ramp(b.z, 0.35, 0.0)
+    return sleeveless_top(b, snug) - ease, lambda *p: minimum(below_neckline(*p, front, back, narrow), arm_hole(*p), p[2] - hem)
 
 
-def trousers(b):
-    ease = 0.005 + 0.007 * ramp(b.z, 0.12, 0.0) + 0.012 * ramp(b.z, -0.05, -0.45)
-    return lower(b) - ease, lambda x, y, z: minimum(0.14 - z, z + 0.70)
+def dress(
+    b, snug=0, ease=0.006, waist=(0.135, 0.09), flare=(0.31, 0.26), hem=-0.34, fitted=-0.12, top=np.inf, front=0.435, back=0.51, narrow=8
+):
+    """Half widths and depths of the cone at the ``waist`` and, ``flare``, at its ``hem``; fitted to the body down to ``fitted``; ``top``:
+    the upper rim of a skirt.
+    """
+    cone = skirt(b.x, b.y, b.z, (0.20, *waist, -0.035), (hem, *flare, -0.03))
+    body = sleeveless_top(b, snug) - ease
+    field = smooth_union(np.where(b.z > fitted, body, np.maximum(body, fitted - b.z)), cone, 0.06)
+    return field, lambda *p: minimum(below_neckline(*p, front, back, narrow), arm_hole(*p), p[2] - hem, top - p[2])
 
 
-def shorts(b):
-    ease = 0.005 + 0.009 * ramp(b.z, 0.12, 0.0) + 0.015 * ramp(b.z, -0.05, -0.27)
-    return lower(b) - ease, lambda x, y, z: minimum(0.14 - z, z + 0.27)
+def trousers(b, snug=0, ease=0.005, hip_ease=0.007, leg_ease=0.012, waist=0.14, hem=-0.70):
+    ease = ease + hip_ease * ramp(b.z, 0.12, 0.0) + leg_ease * ramp(b.z, -0.05, -0.45)
+    return lower(b, snug) - ease, lambda x, y, z: minimum(waist - z, z - hem)
+
+
+def shorts(b, snug=0, ease=0.005, hip_ease=0.009, leg_ease=0.015, waist=0.14, hem=-0.27):
+    ease = ease + hip_ease * ramp(b.z, 0.12, 0.0) + leg_ease * ramp(b.z, -0.05, -0.27)
+    return lower(b, snug) - ease, lambda x, y, z: minimum(waist - z, z - hem)
 
 
 def jumpsuit(b):
@@ -213,19 +222,24 @@ def jumpsuit(b):
     return body - ease, lambda *p: minimum(below_neckline(*p, 0.465, 0.53, 6), p[2] + 0.69, sleeve(*p))
 
 
-# The pattern of each template, and how many vertices it is sewn with
+# The pattern of each template, whose arguments are its measures [m], and how many vertices it is sewn with
 PATTERNS = {
     "tshirt": (tshirt, 4000), "dress": (dress, 6000), "tank": (tank, 3000), "long_sleeve_top": (long_sleeve_top, 5000),
     "shorts": (shorts, 2500), "trousers": (trousers, 5000), "jumpsuit": (jumpsuit, 7500),
 }  # fmt: skip
 
 
-def sewn(block, name):
-    """``(vertices (N, 3), faces (F, 3))`` of the pattern ``name``."""
-    pattern, count = PATTERNS[name]
-    field, inside = pattern(block)
-    V, F = _clipped(*block.mesh(field), inside)
-    return remeshed(V, F, count)
+def sewn(block, name, count=None, bumps=0.0, stretch=(1.0, 1.0, 1.0), **measures):
+    """``(vertices (N, 3), faces (F, 3))`` of the pattern ``name``, with its own measures [m] but for those given.
+
+    ``count`` of the vertices; ``bumps``: a field [m] on the block's grid that is added to the ease; ``stretch`` (3,): triangles are even
+    in a space stretched so.
+    """
+    pattern, own = PATTERNS[name]
+    field, inside = pattern(block, **measures)
+    V, F = _clipped(*block.mesh(field - bumps), inside)
+    V, F = remeshed(V * stretch, F, count or own)
+    return V / stretch, F
 
 
 def _clipped(V, F, inside):

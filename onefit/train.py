@@ -8,6 +8,7 @@ receives
 
     weights.safetensors     the trained network, for ``onefit.load``, and weights.json: what made it
     log.jsonl               a line every 50 steps: the loss and each of its terms
+    cuts/                   with --cuts: what was sewn, a file each
     checkpoint.safetensors  every few minutes and at Ctrl-C; --resume goes on from it and ends where an uninterrupted run would have
 """
 
@@ -18,6 +19,7 @@ import os
 import shlex
 import sys
 from dataclasses import asdict, dataclass, field, fields
+from functools import partial
 
 import torch
 
@@ -36,8 +38,8 @@ HIDDEN = 0.1  # standard deviation of the encoder's memory at the start of a win
 @dataclass(frozen=True)
 class Settings:
     """What decides the result. ``batch``: patches of a step, all frames together (the paper's 20,000); ``lr`` for the first ``lr_epochs``
-    epochs, a tenth of it for the rest; an epoch has ``epoch_steps`` steps (0: as many as show each window of the motions once); ``tight``:
-    the share of :meth:`onefit.garment.Garment.tightened` for a second copy of each garment, 0 for none.
+    epochs, a tenth of it for the rest; an epoch has ``epoch_steps`` steps (0: as many as show each window of the motions once); ``cuts``:
+    how many random cuts (:mod:`onefit.cuts`) are trained on beside the garments.
     """
 
     garments: tuple = STANDARD
@@ -51,7 +53,7 @@ class Settings:
     lr: float = 1e-3
     seeds: int = 4
     shapes: int = 48
-    tight: float = 0.0
+    cuts: int = 0
     seed: int = 0
     weights: Weights = field(default_factory=Weights)
 
@@ -59,13 +61,11 @@ class Settings:
         for name in ("batch", "epochs", "seeds"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} = {getattr(self, name)}: 1 at least")
-        for name in ("epoch_steps", "lr_epochs", "shapes"):
+        for name in ("epoch_steps", "lr_epochs", "shapes", "cuts"):
             if getattr(self, name) < 0:
                 raise InputError(f"{name} = {getattr(self, name)}: 0 at least")
         if not 2 <= self.order <= 10:
             raise InputError(f"order = {self.order}; the order of OneFit's jets is 2 to 10")
-        if not 0 <= self.tight < 1:
-            raise InputError(f"tight = {self.tight}: 0, or a share of the distance from the body, less than 1")
         if not self.lr > 0:
             raise InputError(f"lr = {self.lr}: more than 0")
 
@@ -144,19 +144,21 @@ def _network(settings, data):
     return OneFit(settings.order, len(data.standard.joints), data.shapes.shape[1])
 
 
-def _data(settings, progress):
+def _data(settings, folder, progress):
+    from .cuts import cuts
     from .garment import TEMPLATES, Garment
     from .motion import Motion
     from .training_data import TrainingData
 
-    task = progress.add_task("garments", total=len(settings.garments))
     garments = [Garment.template(name) if name in TEMPLATES else Garment.read(name) for name in settings.garments]
-    if settings.tight:
-        garments += [garment.tightened(settings.tight) for garment in garments]
+    if settings.cuts:
+        task = progress.add_task("cuts sewn", total=settings.cuts)
+        garments += cuts(settings.cuts, os.path.join(folder, "cuts"), settings.seed, partial(progress.advance, task))
+    task = progress.add_task("garments", total=len(garments))
     motions = [Motion.read(path) for path in settings.motions] or None
     return TrainingData(
         garments, motions=motions, seeds=settings.seeds, shapes=settings.shapes, order=settings.order, seed=settings.seed,
-        advance=lambda: progress.advance(task),
+        advance=partial(progress.advance, task),
     )  # fmt: skip
 
 
@@ -166,7 +168,7 @@ def train(settings, folder, *, device="cpu", resume=False, until=None, every=120
     """
 
     def make(folder, processes, progress):
-        return OneFitTraining(settings, _data(settings, progress).to(processes.device), processes)
+        return OneFitTraining(settings, _data(settings, folder, progress).to(processes.device), processes)
 
     return conduct(make, folder, device=device, resume=resume, until=until, every=every, command=command)
 
@@ -182,12 +184,11 @@ def parser():
         "order": "of the jets", "batch": "patches of a step, all frames together", "epochs": "",
         "lr-epochs": "epochs with the full rate, a tenth of it after",
         "epoch-steps": "steps of an epoch, 0: each window of the motions once", "seeds": "generated motions of each kind",
-        "shapes": "random bodies beside the standard one", "seed": "",
+        "shapes": "random bodies beside the standard one",
+        "cuts": "random cuts of the templates' patterns to train on beside the garments", "seed": "",
     }.items():  # fmt: skip
         value = getattr(default, name.replace("-", "_"))
         p.add_argument(f"--{name}", type=int, default=value, help=f"{text} (default: {value})".strip())
-    text = "beside each garment a tighter copy, drawn to this share of its distance from the body; 0: none (default: 0)"
-    p.add_argument("--tight", type=float, default=default.tight, metavar="SHARE", help=text)
     p.add_argument("--lr", type=float, default=default.lr, help=f"of Adam (default: {default.lr})")
     group = p.add_argument_group("the losses' weights (0 switches one off)")
     for f in fields(Weights):

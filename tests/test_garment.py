@@ -464,18 +464,3 @@ def test_garments_in_another_pose_and_axes(shared_data):
         given = eval(f"dict({str(error.value).partition('give ')[2]})")
         g = Garment.read(path, **{"made_for": "T-pose", **given})
         assert standard_surface()(g.vertices.numpy()).distance.min() > 0
-
-
-def test_a_tighter_copy_lies_nearer_to_the_body_and_not_inside():
-    from onefit.binding import standard_surface
-
-    for name in ("trousers", "dress"):
-        garment = Garment.template(name)
-        tight = garment.tightened(0.25)
-        a, b = (standard_surface()(g.vertices.numpy()).distance for g in (garment, tight))
-        near = a < 0.02
-        assert (b > 0).all()
-        assert np.median(b[near] / a[near]) < 0.45
-        far = a > 0.08
-        assert np.abs(b[far] - a[far]).max(initial=0) < 1e-3
-        assert torch.equal(tight.faces, garment.faces) and len(tight) == len(garment)

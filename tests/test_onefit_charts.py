@@ -4,9 +4,10 @@ import torch
 
 from onefit import losses, objective, skinning
 from onefit.body import AnnyBody
-from onefit.charts import Deformation, PatchedGarment, SparseMatrix
+from onefit.charts import Deformation, PatchedGarment, SparseMatrix, _steady_jets
 from onefit.garment import Garment
 from onefit.nearest import FAR, ClosestSurface
+from onefit.remesh import loops
 from polyfit import jets
 
 T = 6
@@ -101,6 +102,31 @@ def test_seams_are_not_torn(patched, garment):
     assert jump(moved) < 0.35 * jump(alone)
 
 
+def test_a_strip_follows_its_neighbours(body):
+    # a hem turned in: where the strip's own chart alone is moved, the strip follows little of it; a patch on the outside follows it
+    garment = Garment.template("shorts")
+    V, F = garment.vertices.double().numpy(), garment.faces.numpy()
+    rim = max(loops(F), key=lambda loop: V[loop, 2].mean())  # the waist
+    inner = V[rim] - [0, 0, 0.012] + 0.004 * (V[rim].mean(0) - V[rim]) / np.linalg.norm(V[rim].mean(0) - V[rim], axis=1, keepdims=True)
+    new, after = len(V) + np.arange(len(rim)), np.roll(np.arange(len(rim)), -1)
+    turned_in = np.concatenate([np.stack([rim[after], rim, new], 1), np.stack([rim[after], new, new[after]], 1)])
+    hemmed = PatchedGarment(Garment.bound("hemmed", np.concatenate([V, inner]), np.concatenate([F, turned_in])), body)
+    own = torch.as_tensor(hemmed.vertex_patch)
+    area = torch.zeros(len(hemmed)).index_add(0, own, hemmed.vertex_area) / (np.pi * hemmed.frame.s.float() ** 2)
+    zero = deformation(hemmed, 0.0, 1)
+
+    def followed(k):
+        """How much of its chart's motion along z the patch k follows, in the mean."""
+        move = torch.zeros(1, len(hemmed), 3)
+        move[0, k, 2] = 1.0
+        moved = hemmed.displacement(hemmed.changes(Deformation(zero.alpha, move, zero.scale)))[own == k, 0]
+        return float(moved.norm(dim=1).mean() / hemmed.frame.s[k])
+
+    strips, others = torch.nonzero(area < 0.12)[:, 0], torch.nonzero(area > 0.4)[:, 0]
+    assert len(strips) > 0
+    assert max(followed(k) for k in strips) < 0.15 and min(followed(k) for k in others) > 0.35
+
+
 def test_fields_of_the_vertices_and_their_derivatives(patched, garment):
     # the positions themselves are such a field: its derivatives are the template's tangents
     value, du, dv = (patched.field @ garment.vertices).unflatten(0, (-1, 3)).unbind(1)
@@ -125,6 +151,23 @@ def test_frames_lie_along_the_bones_and_outwards(patched, garment, body):
     assert ((R[:, :2, 2] * outwards[:, :2]).sum(1)[side] > 0).double().mean() > 0.95
     # a tank hangs from the spine: v is upwards
     assert (R[:, 2, 1] > 0.5).double().mean() > 0.8
+
+
+def test_jets_of_strips_stay_within_reason():
+    # a strip 20 times as long as wide with 0.5 mm of noise: least squares alone would have coefficients of hundreds
+    g = torch.Generator().manual_seed(0)
+    uv = (torch.rand(200, 2, generator=g, dtype=torch.float64) * 2 - 1) * torch.tensor([0.05, 1.0])
+    z = 0.1 * uv[:, 1] ** 2 + 0.01 * torch.randn(200, generator=g, dtype=torch.float64)
+    disc = torch.rand(200, 2, generator=g, dtype=torch.float64) * 1.6 - 0.8
+    shape = torch.tensor([0.02, 0, 0.1, -0.2, 0.1, 0.3, 0, 0.1, 0, -0.1, 0.1, 0, 0.2, 0, 0], dtype=torch.float64)
+    x = torch.cat([torch.cat([uv, z[:, None]], 1), torch.cat([disc, jets.height(shape, disc)[:, None]], 1)])
+    patch = torch.arange(2).repeat_interleave(200)
+    alone = jets.fit(x[:200], 4).alpha
+    strip, whole = _steady_jets(x, patch, torch.ones(400, dtype=torch.float64), 2, 4)
+    assert alone.abs().max() > 10 > 1 > strip.abs().max()
+    assert (jets.height(strip, uv) - z).square().mean().sqrt() < 0.012
+    # cloth on all of the chart is fitted as it is
+    assert (jets.height(whole, disc) - x[200:, 2]).abs().max() < 0.01
 
 
 def test_signed_distances(body):
