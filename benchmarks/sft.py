@@ -34,6 +34,7 @@ DATA = os.environ.get("POLYSFT_DATA") or os.path.join(os.path.dirname(ROOT), "sh
 SEQUENCES = ("flag", "bend", "paper", "curtain", "corner", "kinect_paper", "phi_sft_R1")
 METHODS = ("gauss-newton", "adam", "per-vertex")
 JET = "best jet"
+FITTED = 10  # the highest order of a template's own jet; it has coefficients of zero above
 KINDS = (  # of ground truth: title, figures in the table
     ("True vertices", ("e3d_proc", "en_deg", "e3d")),
     ("Depth points", ("depth_rmse_mm", "depth_rmse_mm_worst", "depth_rmse_allpix_mm")),
@@ -163,7 +164,7 @@ def best_jets(template, truth):
 
     orders = [*range(2, template.order, 2), template.order]
     parts = (template.vertices, template.faces, template.uv)
-    charts = [Chart(template if n == template.order else Template.fit(*parts, n, tolerance=np.inf)) for n in orders]
+    charts = [Chart(template if n == template.order else Template.fit(*parts, min(n, FITTED), capacity=n, tolerance=np.inf)) for n in orders]
     previous, surfaces = None, []
     for V in np.asarray(truth, dtype=np.float64):
         over = _rotation_onto(template.vertices, V) @ template.rotation
@@ -254,7 +255,7 @@ def jet_result(sequence, folder, order, setup):
     if "vertices" not in truth:
         return None
     vertices, faces, uv = meshio.read_template(obj)
-    template = Template.fit(vertices, faces, uv, order, tolerance=np.inf, where=obj)
+    template = Template.fit(vertices, faces, uv, min(order, FITTED), capacity=order, tolerance=np.inf, where=obj)
     meshes = truth["vertices"][: setup["frames"] or None]
     surface = {"vertices": best_jets(template, meshes), "faces": template.faces, "frames": np.arange(len(meshes))}
     figures = metrics.score(surface, truth_path)
