@@ -99,15 +99,23 @@ def test_figures_and_colours(finished_run, page):
 
 
 def test_curvature_is_that_of_the_meshes(finished_run):
-    """The true sheet is a cylinder whose middle bulges towards the camera: half the curvature of its middle row of vertices, by circles
-    through three of them.
+    """On the middle row of the grid, whose rows and columns stay at right angles: half the sum of the normal curvatures along both, by
+    differences of the mesh's own edges.
     """
     run = Run.open(finished_run[1])
-    row = run.vertices[-1].reshape(9, 11, 3)[4].astype(float)
-    before, after, chord = row[1:-1] - row[:-2], row[2:] - row[1:-1], row[2:] - row[:-2]
-    length = np.linalg.norm([before, after, chord], axis=2)
-    bent = 2 * np.linalg.norm(np.cross(before, after), axis=1) / length.prod(0)
-    np.testing.assert_allclose(run.mean_curvature()[-1].reshape(9, 11)[4, 1:-1], bent / 2, rtol=0.05)
+    grid = run.vertices[-1].reshape(9, 11, 3).astype(float)
+    row = [grid[4, :-2], grid[4, 1:-1], grid[4, 2:]]
+    column = [grid[3, 1:-1], grid[4, 1:-1], grid[5, 1:-1]]
+    normal = np.cross(row[2] - row[0], column[2] - column[0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    bent = sum(_turning(*points, normal) for points in (row, column)) / 2
+    np.testing.assert_allclose(run.mean_curvature()[-1].reshape(9, 11)[4, 1:-1], np.abs(bent), rtol=0.03)
+
+
+def _turning(a, b, c, normal):
+    """Normal curvature (N,) [1/m] of the polylines a, b, c (N, 3) [m] at b."""
+    before, after = (np.linalg.norm(d, axis=1, keepdims=True) for d in (b - a, c - b))
+    return (((c - b) / after - (b - a) / before) / ((before + after) / 2) * normal).sum(1)
 
 
 def test_error_where_each_vertex_is_seen():
