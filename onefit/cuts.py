@@ -39,7 +39,7 @@ CUTS = {
 }  # fmt: skip
 EASE = 0.001, 0.020  # of all [m], drawn evenly in its logarithm: half of the cuts lie on the skin
 COUNT = 500, 5000  # vertices, likewise
-WRINKLES = 0.004  # the greatest height [m], for half of the cuts
+WRINKLES = 0.004  # the greatest amplitude [m] of four waves, halved in their sum, for half of the cuts
 WAVES = 0.05, 0.15  # their lengths [m]
 STRETCH = 0.4  # of the triangles: the logarithm of the greatest
 SHORTEST = 2e-4  # edge [m]: at a rim, vertices may slide onto each other
@@ -47,7 +47,7 @@ TRIES = 20
 
 
 def drawn(name, rng):
-    """The arguments of :func:`onefit.tailor.sewn` for a cut ``name`` of :data:`CUTS`, but for its ``bumps``."""
+    """The arguments of :func:`onefit.tailor.sewn` for a cut ``name`` of :data:`CUTS`, but for its ``bumps``: a dict, lengths in metres."""
     measures = {"snug": rng.uniform(), "ease": _log_uniform(rng, *EASE)}
     for key, (first, last) in CUTS[name][2].items():
         measures[key] = first + (last - first) * rng.uniform() ** 2
@@ -59,7 +59,7 @@ def drawn(name, rng):
 
 
 def wrinkles(block, rng):
-    """A sum of plane waves on the grid of ``block`` [m], or 0."""
+    """Four plane waves, summed, on the grid (X, Y, Z) of ``block`` [m], at most twice :data:`WRINKLES` high; or 0."""
     if rng.random() < 0.5:
         return 0.0
     height = rng.uniform(0, WRINKLES)
