@@ -36,7 +36,7 @@ class Evaluation:
     Gauss-Newton blocks of each triangle's corner pairs (row by row) with respect to the corners' projections [1/pixel^2]; ``rows``: the
     silhouette's residuals as (i, j, ci, cj, h), each with derivative ci (K, 2) and cj by the projections of the vertices i and j and
     curvature h (K,); ``pixels``: how many were compared; ``outlying``: the mean of r^2 / (r^2 + scale^2) over them, and ``misfit`` with a
-    fixed scale.
+    fixed scale; both 1 where no pixel is compared.
     """
 
     photometric: float
@@ -307,10 +307,8 @@ class Registration:
         if pairs is not None:
             silhouette, rows, pull = self._pull(vertices, pairs, frame, level, _SILHOUETTE * s.k_silhouette / area)
             gradient += pull
-        share = 1 / max(pixels, 1.0)
-        return Evaluation(
-            weight * energy, silhouette, share * outlying, share * misfit, gradient, second, rows, pixels * level.stride**2
-        )
+        outlying, misfit = (outlying / pixels, misfit / pixels) if pixels else (1.0, 1.0)
+        return Evaluation(weight * energy, silhouette, outlying, misfit, gradient, second, rows, pixels * level.stride**2)
 
     def _by_triangle(self, triangle, found):
         """Sums over the pixels that see each triangle (F, 31) float64: 18 of curvature, 9 of slope and 4 figures.

@@ -12,7 +12,7 @@ from .errors import InputError, cli
 
 _EXAMPLES = [
     ("scenes/demo.xml -o out/demo", "the demo; then open out/demo/report.html"),
-    ("scenes/flag.xml -D data=/data/flag -o out/flag -D order=6 -D last=19", "another place of the data, other settings, 20 frames"),
+    ("scenes/flag.xml -D data=/data/flag -o out/flag -D order_max=10 -D last=19", "another place of the data, other settings, 20 frames"),
     ("scenes/flag.xml -D data=/data/flag -o out/flag --resume", "go on after an interruption"),
     ("scenes/demo.xml -o out/demo --overwrite -q --json", "for scripts: one JSON object on stdout"),
 ]

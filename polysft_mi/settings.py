@@ -22,7 +22,10 @@ class Settings:
     first: int = _setting(0, "first image to use, counted from 0 in the sorted list", low=0)
     last: int = _setting(-1, "last image to use, inclusive; -1 for the end of the video", low=-1)
     stride: int = _setting(1, "use every stride-th image", low=1)
-    order: int = _setting(4, "order n of the jet; gauss-newton starts with it", low=1, high=10)
+    order: int = _setting(4, "order n of the template's jet, and with adam of the frames'", low=1, high=10)
+    order_min: int = _setting(
+        8, "lowest order of a frame's jet (gauss-newton), as far as ``order_max`` and the template's vertices allow, and at least ``order``", low=1, high=14
+    )
     order_max: int = _setting(14, "order up to which gauss-newton may raise the jet; at least ``order``", low=1, high=14)
     fit_tolerance: float = _setting(
         0.05, "largest distance of the template from its jet, as a share of the template's radius, before it is refused", above=0

@@ -1,6 +1,7 @@
 """The second-order solver: its derivatives against autodiff through the renderer, its algebra against dense matrices, its frames against the truth."""
 
 import dataclasses
+import shutil
 
 import cv2
 import drjit as dr
@@ -8,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import synthetic
-from scipy.linalg import block_diag
+from scipy.linalg import LinAlgError, block_diag
 from scipy.spatial.transform import Rotation
 
 from polyfit import jets
@@ -464,18 +465,61 @@ def test_a_sheet_that_jumps_is_found_again(tmp_path, monkeypatch):
     assert found.pose(np.zeros((240, 320, 3), np.float32)) is None
 
 
+def test_a_sheet_that_matches_nothing_stays_in_view(truth, tmp_path):
+    """Images of something else: what no pixel sees costs nothing, and the sheet must not flee there, nor the solver fail."""
+    folder = tmp_path / "other"
+    shutil.copytree(truth.folder, folder)
+    for k, path in enumerate(sorted((folder / "frames").iterdir())[1:]):
+        noise = np.random.default_rng(k).integers(0, 256, (30, 40, 3)).astype(np.uint8)
+        cv2.imwrite(str(path), cv2.resize(noise, (160, 120), interpolation=cv2.INTER_CUBIC))
+    problem = problem_of(folder)
+    done = track(problem, solvers.create(problem.settings), 4, str(tmp_path))
+    for state in done.states:
+        vertices = problem.surface(Unknowns.from_numpy(state))
+        assert np.isfinite(vertices).all() and np.linalg.norm(vertices - truth.vertices[0], axis=1).max() < 1.0
+        assert problem.visible_share(Unknowns.from_numpy(state)) > 0.5
+    assert not done.lost
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0, -3.0), (5.0, 0.0, 0.0)])
+def test_a_sheet_out_of_view_explains_nothing(problem, shift):
+    """Behind the camera, or beside the image: no pixel is compared, which must not look like a perfect match."""
+    vertices = problem.template.vertices + shift
+    found = Registration(problem).evaluate(vertices, 1, Level(1.0, 1, 8.0), 0.3)
+    assert (found.misfit, found.outlying, found.pixels, found.photometric) == (1, 1, 0, 0)
+
+
+def test_steps_that_lead_nowhere_are_refused():
+    uv, g = np.zeros((5, 2)), np.zeros(10)
+    gauss_newton._check((g, uv))
+    g[0] = 100.0  # of the coefficients: no bound
+    gauss_newton._check((g, uv))
+    for bad in ((g + np.eye(10)[9] * 3, uv), (g, uv - 3), (g * np.nan, uv)):
+        with pytest.raises(LinAlgError):
+            gauss_newton._check(bad)
+
+
 def test_order_rises_with_the_data_and_stays_within_bounds(tmp_path):
     waves = synthetic.cloth(tmp_path / "waves", frames=3, size=(160, 120), rows=13, columns=17, bend=0.5, shift=0.0, turn=0.0)
-    problem = problem_of(waves.folder, order=2, order_max=3)
+    problem = problem_of(waves.folder, order=2, order_min=2, order_max=3)
     solver = solvers.create(problem.settings)
     assert problem.template.order == 3
     done = track(problem, solver, 3, str(tmp_path))
     assert {t["order"] for t in done.totals} <= {2, 3}
 
 
+@pytest.mark.parametrize("rows, columns, asked, first", [(9, 12, {}, 8), (9, 12, dict(order_max=6), 6), (9, 12, dict(order_min=2), 4), (5, 6, {}, 6)])
+def test_order_of_the_first_frame(tmp_path, rows, columns, asked, first):
+    """The least order, as far as the settings allow and the vertices determine it (28 coefficients of 30 vertices)."""
+    still = synthetic.cloth(tmp_path / "still", frames=1, size=(160, 120), rows=rows, columns=columns, bend=0.0)
+    problem = problem_of(still.folder, **asked)
+    solution = solvers.create(problem.settings).solve(problem, [problem.patch.rest()], [0])
+    assert solution.facts["order"] == first
+
+
 def test_order_falls_where_the_data_ask_for_less(tmp_path):
     flat = synthetic.cloth(tmp_path / "flat", frames=2, size=(160, 120), rows=9, columns=12, bend=0.0, shift=0.01, turn=0.02)
-    problem = problem_of(flat.folder, order=2, order_max=4)
+    problem = problem_of(flat.folder, order=2, order_min=2, order_max=4)
     rest = problem.patch.rest()
     before = [(rest.to_numpy(), {"order": 4, "misfit": 0.0})]
     solution = solvers.create(problem.settings).solve(problem, [rest], [1], None, before)

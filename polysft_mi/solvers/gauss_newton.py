@@ -29,6 +29,8 @@ _ORDER_STEP = 2
 # fitting the texture to the first frame: only above this misfit, if it falls by this factor, and no farther than this [chart units]
 _TEXTURE_MISFIT, _TEXTURE_GAIN, _TEXTURE_FARTHEST = 0.15, 0.6, 0.08
 _TEXTURE_ITERATIONS, _TEXTURE_STIFFNESS = 6, 1.0
+_SHOWN = 0.7  # share of the pixels that see the sheet below which neither a stage nor another start may go: what none sees costs nothing
+_FARTHEST_STEP = 2.0  # rotation [rad], translation and uv displacements [chart units]
 _FACTS = "misfit", "outlying", "order"
 _TEMPORAL = 1e-3  # of k_tc: it holds a frame to the one before, in a stiffer basis than the monomials of the paper's window
 
@@ -37,6 +39,13 @@ def _cost(found):
     """What starts are compared by: unlike the objective, free of the robust scale."""
     terms = found[1]
     return terms["misfit"] + terms["inextensibility"] + terms["smoothness"]
+
+
+def _check(step):
+    """Raises LinAlgError where a step is not finite, or goes farther than any model is good for."""
+    g, uv = step
+    if not max(np.abs(g[-6:]).max(), np.abs(uv).max()) < _FARTHEST_STEP:
+        raise LinAlgError("the step is not finite, or too long")
 
 
 @dataclass(frozen=True)
@@ -118,7 +127,7 @@ class GaussNewton:
         self._scales, self._fitting = self._scales_of(terms), {}
         a, b = self.chart.state(before), self.chart.state(after)
         middle = a.towards(b, -0.5)
-        order = int(terms.get("order") or self.settings.order)
+        order = int(terms.get("order") or self.least)
         self._hold = weight
         try:
             state, found = self._descend(middle, middle, frame, order, STAGES)
@@ -135,6 +144,9 @@ class GaussNewton:
         self.chart = Chart(template)
         self.pattern = Pattern(self.registration.faces, template.edges, len(template.vertices))
         self.blocks = Blocks(self.pattern)
+        s = self.settings
+        orders = range(s.order, min(s.order_min, s.capacity) + 1)
+        self.least = max((n for n in orders if self.chart.size(n) <= len(template.vertices)), default=s.order)
         self.lengths = np.array(problem.edge_lengths, dtype=np.float64)
         self.slack = problem.settings.slack * self.lengths.mean() or np.inf
         position, _ = problem.camera.project(template.vertices)
@@ -166,7 +178,7 @@ class GaussNewton:
         for stage in STAGES[:2]:
             for _ in range(_TEXTURE_ITERATIONS):
                 try:
-                    normal, terms = self._linearise(state, rest, 0, self.settings.order, stage, _FIRST_SCALE, stiffness=_TEXTURE_STIFFNESS)
+                    normal, terms = self._linearise(state, rest, 0, self.least, stage, _FIRST_SCALE, stiffness=_TEXTURE_STIFFNESS)
                     state = State(rest.alpha, state.uv + Reduced(self.blocks, normal, 1e-3).slide(), rest.rotation, rest.translation)
                 except (BadFrame, LinAlgError):
                     return
@@ -189,7 +201,7 @@ class GaussNewton:
         if len(history) > 1:
             starts += [history[-2].towards(history[-1], f) for f in (0.5, 1.0)]
         orders = [t["order"] for t in past if t.get("order") is not None]
-        order = int(orders[-1]) if orders else self.settings.order
+        order = int(orders[-1]) if orders else self.least
         best = self._descend(self._nearest(starts, frame, STAGES[0]), anchor, frame, order, STAGES)
         usual = [t["misfit"] for t in past[-_MEMORY:] if t.get("misfit") is not None]
         limit = _SUSPECT * np.median(usual) + _SUSPECT_MARGIN if len(usual) >= 3 else math.inf
@@ -197,7 +209,9 @@ class GaussNewton:
             self.registration.expect([frame], [self.levels[FAR]])
             for other in (lambda: self._nearest(starts, frame, FAR), lambda: self._relocate(frame)):
                 if (other := other()) is not None:
-                    best = min(best, self._descend(other, anchor, frame, order, (FAR, *STAGES), _PATIENT), key=_cost)
+                    found = self._descend(other, anchor, frame, order, (FAR, *STAGES), _PATIENT)
+                    if found[1]["pixels"] > _SHOWN * best[1]["pixels"]:
+                        best = min(best, found, key=_cost)
                 if best[1]["misfit"] <= limit:
                     break
         return self._adapt_order(*best, anchor, frame)
@@ -228,10 +242,11 @@ class GaussNewton:
         """Levenberg-Marquardt at one stage: (state, terms). Its robust scale is the one that fitted the frame before."""
         scale = self._scales.get(stage, _FIRST_SCALE)
         normal, terms = self._linearise(state, anchor, frame, order, stage, scale)
-        damping = 1e-4
+        damping, least = 1e-4, _SHOWN * terms["pixels"]
         for _ in range(iterations):
             try:
                 step, promised = Reduced(self.blocks, normal, damping).step()
+                _check(step)
             except LinAlgError:
                 damping = max(10 * damping, 1e-4)
                 continue
@@ -240,7 +255,7 @@ class GaussNewton:
                 break
             trial = state.moved(step)
             found = self._linearise(trial, anchor, frame, order, stage, scale)
-            if found[1]["total"] < terms["total"]:
+            if found[1]["total"] < terms["total"] and found[1]["pixels"] > least:
                 if terms["total"] - found[1]["total"] > 0.5 * promised:
                     damping = max(damping / 5, 1e-7)
                 state, (normal, terms) = trial, found
@@ -314,6 +329,8 @@ class GaussNewton:
         g = -cho_solve(cho_factor(matrix, check_finite=False), np.concatenate([r.right for r in reduced]), check_finite=False)
         parts = np.split(g, start[1:-1])
         steps = [(part, r.following(part)) for part, r in zip(parts, reduced)]
+        for step in steps:
+            _check(step)
         return steps, sum(r.promised(step) for r, step in zip(reduced, steps))
 
     # -- one stage ----------------------------------------------------------
@@ -369,7 +386,8 @@ class GaussNewton:
         # what the residuals' own size says of their noise; pixels closer than the blur are no evidence of their own
         level = self.levels[stage]
         noise = 2 * evaluation.photometric / (3 * max(evaluation.pixels, 1.0)) * max(1.0, 4 * math.pi * level.sigma**2)
-        facts = {"misfit": evaluation.misfit, "outlying": evaluation.outlying, "order": order, "model": (normal, surface, noise)}
+        facts = {"misfit": evaluation.misfit, "outlying": evaluation.outlying, "pixels": evaluation.pixels, "order": order}
+        facts["model"] = normal, surface, noise
         return normal, {**terms, "total": total, **facts}
 
     # -- order --------------------------------------------------------------
@@ -379,7 +397,7 @@ class GaussNewton:
         s, order = self.settings, int(terms["order"])
         return (
             (order < s.capacity and self._raised(state, anchor, frame, order))
-            or (order > s.order and self._lowered(state, terms, anchor, frame, order))
+            or (order > self.least and self._lowered(state, terms, anchor, frame, order))
             or (state, terms)
         )
 
@@ -399,7 +417,7 @@ class GaussNewton:
 
     def _lowered(self, state, terms, anchor, frame, order):
         """(state, terms) without the highest coefficients; None where they are worth their place."""
-        lower = max(order - _ORDER_STEP, self.settings.order)
+        lower = max(order - _ORDER_STEP, self.least)
         size = self.chart.size(lower)
         normal, _, noise = terms["model"]
         worth = _LOWER * noise * (self.chart.size(order) - size)
@@ -419,7 +437,7 @@ class GaussNewton:
 
     def _solution(self, states, found, newest):
         """:class:`Solution` of a window: its states, the terms of each, and those of its newest frame when it was solved."""
-        names = [name for name in found[0] if name not in (*_FACTS, "model", "total")]
+        names = [name for name in found[0] if name not in (*_FACTS, "pixels", "model", "total")]
         terms = {name: float(np.mean([f[name] for f in found])) for name in names}
         facts = {name: newest[name] for name in _FACTS}
         facts |= {f"scale_{k}": self._fitting.get(stage, _FIRST_SCALE) for k, stage in enumerate((FAR, *STAGES))}
