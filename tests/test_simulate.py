@@ -1,0 +1,98 @@
+"""Simulated sequences: what they show is what their truth says, in the form that the scenes expect. The simulator itself need not be installed."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scripts import load
+
+from polysft_mi import scene
+from polysft_mi.problem import Problem
+from polysft_mi.registration import Registration
+from polysft_mi.sequence import Sequence
+
+simulate = load("benchmarks/simulate.py")
+ROOT = Path(__file__).resolve().parent.parent
+KIND = simulate.KINDS["bend"]
+
+
+@pytest.fixture(scope="module")
+def bent(tmp_path_factory):
+    """Two frames: the flat sheet, and half a wave of it, as long as before, turned a little."""
+    folder = tmp_path_factory.mktemp("simulated") / "bend"
+    flat, uv = simulate.sheet(KIND)
+    angle = 0.8 * (uv[:, 0] - 0.5)
+    x = flat.copy()
+    x[:, 0], x[:, 2] = KIND.size[0] / 0.8 * np.sin(angle), simulate.DEPTH + KIND.size[0] / 0.8 * (1 - np.cos(angle))
+    nx, ny = KIND.cells
+    a = (np.arange(ny)[:, None] * (nx + 1) + np.arange(nx)).ravel()
+    faces = np.concatenate([np.stack([a, a + 1, a + nx + 2], 1), np.stack([a, a + nx + 2, a + nx + 1], 1)])
+    simulate.render(str(folder), np.stack([flat, x]), faces, uv, np.random.default_rng(2))
+    return folder, np.stack([flat, x])
+
+
+def test_masks_are_where_the_vertices_are(bent):
+    folder, vertices = bent
+    for t, x in enumerate(vertices):
+        mask = cv2.imread(str(folder / "masks" / f"{t:03d}.png"), cv2.IMREAD_GRAYSCALE) > 0
+        pixel = simulate.FOCAL * x[:, :2] / x[:, 2:] + np.array(simulate.SIZE) / 2
+        rows, columns = np.nonzero(mask)
+        low, high = np.array([columns.min(), rows.min()]), np.array([columns.max(), rows.max()]) + 1
+        assert np.abs(low - pixel.min(0)).max() < 1.5 and np.abs(high - pixel.max(0)).max() < 1.5
+        assert mask[rows.min() + 3 : rows.max() - 3, columns.min() + 5 : columns.max() - 5].mean() > 0.97
+
+
+def test_frames_show_the_texture_on_the_true_surface(bent):
+    """The solver's own misfit of the truth is small, and large where the texture is turned over or the surface is off by six pixels."""
+    folder, vertices = bent
+    experiment = scene.load(str(ROOT / "scenes" / "bend.xml"), {"data": str(folder)})
+    problem = Problem(experiment, Sequence.open(experiment.frames, experiment.masks, size=experiment.size))
+    registration = Registration(problem)
+    level = simulate_level(problem)
+    for t, x in enumerate(vertices):
+        assert registration.misfit(x, t, level) < 0.08
+        assert registration.misfit(x + [0.007, 0, 0], t, level) > 0.15
+        assert registration.misfit((x - x.mean(0)) * [1, -1, 1] + x.mean(0), t, level) > 0.3
+
+
+def simulate_level(problem):
+    from polysft_mi.solvers import gauss_newton
+
+    solver = gauss_newton.GaussNewton(problem.settings)
+    solver._prepare(problem)
+    return solver.levels[gauss_newton.STAGES[-1]]
+
+
+def test_drag_pushes_along_the_normal_and_not_in_still_air():
+    flat, _ = simulate.sheet(KIND)
+    nx = KIND.cells[0]
+    faces = np.array([[0, 1, nx + 2]])
+    still = simulate.drag(flat, np.zeros_like(flat), faces, np.zeros((1, 3)))
+    gust = simulate.drag(flat, np.zeros_like(flat), faces, np.array([[3.0, 0.0, 2.0]]))
+    assert not still.any()
+    area = 0.5 * KIND.size[0] / nx * KIND.size[1] / KIND.cells[1]
+    assert gust.sum(0) == pytest.approx([0, 0, 0.5 * simulate.AIR * area * 2.0 * np.hypot(3, 2)])
+    with_the_wind = simulate.drag(flat, np.tile([3.0, 0.0, 2.0], (len(flat), 1)), faces, np.array([[3.0, 0.0, 2.0]]))
+    assert np.abs(with_the_wind).max() < 1e-12
+
+
+def test_pinned_points_come_together_by_the_share_that_is_said():
+    for name, kind in simulate.KINDS.items():
+        rng = np.random.default_rng(0)
+        rest, uv = simulate.sheet(kind)
+        held = simulate.pinned(name, kind, rng)
+        weather = simulate.Weather(name, kind, rest, held, rng)
+        assert np.allclose(weather.points(0.0), rest[held]) and not weather.wind(rest, 0.0).any()
+        end = weather.points(simulate.FRAMES / simulate.FPS)
+        assert np.ptp(end[:, 0]) == pytest.approx((1 - kind.pressed) * np.ptp(rest[held, 0]))
+        assert uv.min() == 0 and uv.max() == 1 and uv[0].tolist() == [0, 1]  # the image's upper left corner
+
+
+def test_a_folder_that_exists_is_refused(tmp_path):
+    (tmp_path / "flag").mkdir()
+    line = [sys.executable, str(ROOT / "benchmarks" / "simulate.py"), str(tmp_path), "--only", "flag"]
+    done = subprocess.run(line, capture_output=True, text=True)
+    assert done.returncode == 2 and done.stderr.strip().endswith("exists already; another OUT is needed") and len(done.stderr.strip().splitlines()) == 1
