@@ -121,7 +121,7 @@ def _run(options, overrides, out, exr_frames):
     began, status = time.perf_counter(), 0
     with Progress(count, s, options.quiet) as progress:
         progress.say(
-            f"template: {len(problem.template.vertices)} vertices, order {s.order}, residual {1e3 * problem.template.residual_rms:.3g} mm RMS; "
+            f"template: {len(problem.template.vertices)} vertices, order {problem.template.fitted}, residual {1e3 * problem.template.residual_rms:.3g} mm RMS; "
             f"{count} frames of {experiment.size[0]}x{experiment.size[1]}, masks: {'yes' if experiment.masks else 'no'}"
         )
         try:

@@ -153,6 +153,6 @@ def _template(mesh, source, settings):
     uv[:, 1] = 1 - uv[:, 1]  # Mitsuba's v runs down, a file's up
     meshio.check_template(vertices, faces, uv, where)
     template = Template.fit(
-        vertices, faces, uv, settings.order, capacity=settings.capacity, tolerance=settings.fit_tolerance, where=where
+        vertices, faces, uv, settings.least, capacity=settings.capacity, exact=settings.order > 0, tolerance=settings.fit_tolerance, where=where
     )
     return template, corner

@@ -22,9 +22,8 @@ class Settings:
     first: int = _setting(0, "first image to use, counted from 0 in the sorted list", low=0)
     last: int = _setting(-1, "last image to use, inclusive; -1 for the end of the video", low=-1)
     stride: int = _setting(1, "use every stride-th image", low=1)
-    order: int = _setting(4, "order n of the template's jet, and with adam of the frames'", low=1, high=10)
-    order_min: int = _setting(
-        8, "lowest order of a frame's jet (gauss-newton), as far as ``order_max`` and the template's vertices allow, and at least ``order``", low=1, high=14
+    order: int = _setting(
+        0, "order n of the jet, the lowest for gauss-newton; 0: 8 for gauss-newton, 4 (the paper's) for adam, or less where the template's vertices determine no more", low=0, high=10
     )
     order_max: int = _setting(14, "order up to which gauss-newton may raise the jet; at least ``order``", low=1, high=14)
     fit_tolerance: float = _setting(
@@ -70,9 +69,14 @@ class Settings:
         return self.brightness if self.brightness != "auto" else {"gauss-newton": "local", "adam": "none"}[self.solver]
 
     @property
+    def least(self):
+        """The order of the template's jet, and the lowest of a frame's."""
+        return self.order or {"gauss-newton": min(8, self.order_max), "adam": 4}[self.solver]
+
+    @property
     def capacity(self):
         """The highest order that the solver may use."""
-        return max(self.order, self.order_max) if self.solver == "gauss-newton" else self.order
+        return max(self.least, self.order_max) if self.solver == "gauss-newton" else self.least
 
     def __post_init__(self):
         for f in dataclasses.fields(self):

@@ -18,7 +18,7 @@ class Template:
     ``vertices`` (N, 3) [m, camera frame] and ``faces`` (F, 3) as in the file; ``uv`` (N, 2) texture coordinates, v up; ``scale`` [m],
     ``rotation`` (3, 3), ``origin`` (3,) [m]: the orientation O = (s, R, T), p = s R x + T; ``chart`` (N, 2): (u, v) of each vertex, at
     most 1 in norm; ``alpha`` (A,): the jet, in the chart's unit, zero beyond the order that was fitted; ``residual`` (N,) [m]: signed
-    distance along the chart's normal that the jet leaves.
+    distance along the chart's normal that the jet leaves; ``fitted``: the order that was fitted.
     """
 
     vertices: np.ndarray
@@ -30,6 +30,7 @@ class Template:
     chart: np.ndarray
     alpha: np.ndarray
     residual: np.ndarray
+    fitted: int
 
     @property
     def order(self):
@@ -53,18 +54,19 @@ class Template:
         return float(np.abs(self.residual).max())
 
     @classmethod
-    def fit(cls, vertices, faces, uv, order, *, capacity=None, frame=None, tolerance=0.05, where="template"):
+    def fit(cls, vertices, faces, uv, order, *, capacity=None, exact=True, frame=None, tolerance=0.05, where="template"):
         """Fit a jet of ``order`` to the mesh, in ``frame``, a :class:`polyfit.frames.CanonicalFrame` in float64, or else in its PCA frame;
-        it has the coefficients of order ``capacity`` (default: the same), those beyond ``order`` zero.
+        it has the coefficients of order ``capacity`` (default: the same), those beyond ``order`` zero. Where not ``exact``, vertices that
+        determine less get the highest order that they do.
 
-        Raises InputError where the order is too high for the vertices, where the surface folds over in its chart (a closed surface does),
+        Raises InputError where the order is too high for the vertices (if ``exact``), where the surface folds over in its chart (a closed surface does),
         or where the largest residual exceeds ``tolerance`` times the scale s.
         """
         points = torch.as_tensor(np.asarray(vertices, dtype=np.float64))
         frame = frame or CanonicalFrame.from_points(points)
         x = frame.to_chart(points)
         fitted = jets.fit(x, order)
-        if fitted.order < order:
+        if fitted.order < order and exact:
             wanted = f"a jet of order {order} has {jets.size_of(order)} coefficients"
             found = f"the {len(points)} vertices determine no more than order {int(fitted.order)}"
             raise InputError(f"{where}: order = {order} is too high: {wanted}, and {found}")
@@ -80,9 +82,10 @@ class Template:
             x[:, :2].numpy(),
             np.pad(alpha.numpy(), (0, jets.size_of(max(order, capacity or order)) - len(alpha))),
             residual,
+            int(fitted.order),
         )
         measured = (
-            f"the residual of the {order}-jet is {1e3 * template.residual_rms:.3g} mm RMS, {1e3 * template.residual_max:.3g} mm at most, "
+            f"the residual of the {template.fitted}-jet is {1e3 * template.residual_rms:.3g} mm RMS, {1e3 * template.residual_max:.3g} mm at most, "
             f"of a radius of {1e3 * template.scale:.3g} mm"
         )
         flipped = _flipped(template.chart, template.faces)

@@ -501,25 +501,25 @@ def test_steps_that_lead_nowhere_are_refused():
 
 def test_order_rises_with_the_data_and_stays_within_bounds(tmp_path):
     waves = synthetic.cloth(tmp_path / "waves", frames=3, size=(160, 120), rows=13, columns=17, bend=0.5, shift=0.0, turn=0.0)
-    problem = problem_of(waves.folder, order=2, order_min=2, order_max=3)
+    problem = problem_of(waves.folder, order=2, order_max=3)
     solver = solvers.create(problem.settings)
     assert problem.template.order == 3
     done = track(problem, solver, 3, str(tmp_path))
     assert {t["order"] for t in done.totals} <= {2, 3}
 
 
-@pytest.mark.parametrize("rows, columns, asked, first", [(9, 12, {}, 8), (9, 12, dict(order_max=6), 6), (9, 12, dict(order_min=2), 4), (5, 6, {}, 6)])
+@pytest.mark.parametrize("rows, columns, asked, first", [(9, 12, {}, 8), (9, 12, dict(order_max=6), 6), (9, 12, dict(order=3), 3), (5, 6, {}, 4)])
 def test_order_of_the_first_frame(tmp_path, rows, columns, asked, first):
-    """The least order, as far as the settings allow and the vertices determine it (28 coefficients of 30 vertices)."""
+    """Eight, as far as the settings allow and the vertices determine it; the template has it too."""
     still = synthetic.cloth(tmp_path / "still", frames=1, size=(160, 120), rows=rows, columns=columns, bend=0.0)
     problem = problem_of(still.folder, **asked)
     solution = solvers.create(problem.settings).solve(problem, [problem.patch.rest()], [0])
-    assert solution.facts["order"] == first
+    assert solution.facts["order"] == problem.template.fitted == first
 
 
 def test_order_falls_where_the_data_ask_for_less(tmp_path):
     flat = synthetic.cloth(tmp_path / "flat", frames=2, size=(160, 120), rows=9, columns=12, bend=0.0, shift=0.01, turn=0.02)
-    problem = problem_of(flat.folder, order=2, order_min=2, order_max=4)
+    problem = problem_of(flat.folder, order=2, order_max=4)
     rest = problem.patch.rest()
     before = [(rest.to_numpy(), {"order": 4, "misfit": 0.0})]
     solution = solvers.create(problem.settings).solve(problem, [rest], [1], None, before)
@@ -587,3 +587,4 @@ def test_settings_that_do_not_go_together():
     assert Settings().width == 1 and Settings(solver="adam").width == 3
     assert Settings().lighting == "local" and Settings(solver="adam").lighting == "none"
     assert Settings(order=4).capacity == 14 and Settings(solver="adam").capacity == 4
+    assert [s.least for s in (Settings(), Settings(solver="adam"), Settings(order=5), Settings(order_max=6))] == [8, 4, 5, 6]

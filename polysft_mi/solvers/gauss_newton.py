@@ -68,7 +68,7 @@ class GaussNewton:
 
     A frame starts from the one before or from where its motion leads, whichever explains the image better. Where it ends with a misfit far
     above that of the frames before, other starts are tried: farther motion, and the rigid pose of the flat template by features. The order
-    of the jet rises from ``order`` to at most ``order_max`` where the objective asks for it, and falls where it does not. In a window of
+    of the jet rises from the template's to at most ``order_max`` where the objective asks for it, and falls where it does not. In a window of
     several frames the newest is solved so, and then all together; ``revisit`` looks both ways from one frame.
     """
 
@@ -141,12 +141,9 @@ class GaussNewton:
         self._problem = problem
         template = problem.template
         self.registration = Registration(problem)
-        self.chart = Chart(template)
+        self.chart, self.least = Chart(template), template.fitted
         self.pattern = Pattern(self.registration.faces, template.edges, len(template.vertices))
         self.blocks = Blocks(self.pattern)
-        s = self.settings
-        orders = range(s.order, min(s.order_min, s.capacity) + 1)
-        self.least = max((n for n in orders if self.chart.size(n) <= len(template.vertices)), default=s.order)
         self.lengths = np.array(problem.edge_lengths, dtype=np.float64)
         self.slack = problem.settings.slack * self.lengths.mean() or np.inf
         position, _ = problem.camera.project(template.vertices)
