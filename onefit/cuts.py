@@ -27,7 +27,7 @@ CUTS = {
     )),
     "trousers": ("trousers", 3, dict(hip_ease=(0, 0.02), leg_ease=(0, 0.03), waist=(0.22, 0.04), hem=(-0.715, -0.35))),
     "long_sleeve_top": ("long_sleeve_top", 4, dict(
-        waist_ease=(0, 0.03), sleeve_ease=(0, 0.02), sleeve=(0.26, 0.0),
+        waist_ease=(0, 0.03), sleeve_ease=(0, 0.02), sleeve=(0.24, 0.0),
         hem=(-0.15, 0.08), front=(0.49, 0.42), back=(0.545, 0.49), narrow=(8, 3)
     )),
     "dress": ("dress", 4, dict(
@@ -35,7 +35,6 @@ CUTS = {
     )),
     "shorts": ("shorts", 3, dict(hip_ease=(0, 0.02), leg_ease=(0, 0.03), waist=(0.04, 0.20), hem=(-0.10, -0.40))),
     "tank": ("tank", 4, dict(waist_ease=(0, 0.03), hem=(-0.12, 0.15), front=(0.46, 0.37), back=(0.52, 0.44), narrow=(10, 4))),
-    "long_trousers": ("trousers", 3, dict(hip_ease=(0, 0.02), leg_ease=(0.01, 0.05), waist=(0.22, 0.04), hem=(-0.77, -0.70))),
     "skirt": ("dress", 2, dict(hem=(-0.14, -0.62), waist=(0.11, 0.14), flare=(0.20, 0.38), top=(0.06, 0.16))),
 }  # fmt: skip
 EASE = 0.001, 0.020  # of all [m], drawn evenly in its logarithm: half of the cuts lie on the skin

@@ -82,11 +82,9 @@ class Block:
 
     @cached_property
     def legs(self):
-        """Each leg by itself, from the hip to the ankle, and straight on below it."""
+        """Each leg by itself, from the hip to the ankle."""
         left = np.maximum(np.maximum(self.body, self.z - 0.03), np.maximum(-0.72 - self.z, 0.01 - self.x))
         left = self._closed(left, 0.15)
-        ankle = np.searchsorted(self.z.ravel(), -0.705)
-        left[:, :, :ankle] = left[:, :, ankle : ankle + 1]
         return np.minimum(left, left[::-1])
 
     def mesh(self, field, level=0.0):
