@@ -29,6 +29,12 @@ def test_residual_is_what_the_jet_leaves():
     assert 1e-3 < t.residual_rms < 4e-3 < 1.5 * t.residual_max
 
 
+def test_vertices_that_determine_less_get_less():
+    t = Template.fit(*grid(5, 4), 8, capacity=10, exact=False)
+    assert t.fitted == 3 and t.order == 10 and t.residual_max < 1e-12
+    assert Template.fit(*grid(), 8).fitted == 8
+
+
 def test_polynomial_surface_leaves_nothing():
     t = Template.fit(*grid(height=lambda x, y: x**2 - 3 * x * y + 20 * y**4), 4)
     # the chart is tilted against x, y, so a polynomial in one is not quite one in the other
