@@ -25,9 +25,10 @@ import numpy as np
 ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 sys.path.insert(0, ROOT)
 
+from polyfit.mesh import edges_of  # noqa: E402
 from polysft_mi.backend import set_variant  # noqa: E402
 from polysft_mi.errors import InputError, cli  # noqa: E402
-from polysft_mi.files import aside  # noqa: E402
+from polysft_mi.prepare import write_obj  # noqa: E402
 
 FRAMES, FPS = 45, 60.0
 SUBSTEPS, ITERATIONS = 10, 40  # of a frame, and of Newton's vertex block descent in each
@@ -112,7 +113,8 @@ class Weather:
 
 
 def drag(x, v, faces, wind):
-    """Force of the air on each vertex (N, 3) [N], normal to the triangles."""
+    """Force of the air on each vertex (N, 3) [N], normal to the triangles ``faces`` (F, 3), of positions ``x`` (N, 3) [m], velocities ``v``
+    (N, 3) [m/s] and the air's velocity ``wind`` (F, 3) [m/s]."""
     corner = x[faces]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     double = np.linalg.norm(normal, axis=1, keepdims=True)
@@ -202,15 +204,10 @@ def texture(rng, aspect, height=512):
     return (255 * np.clip(image, 0.02, 0.98)).astype(np.uint8)
 
 
-def write_obj(path, vertices, uv, faces):
-    rows = ["v %.6f %.6f %.6f" % tuple(p) for p in vertices] + ["vt %.6f %.6f" % tuple(p) for p in uv]
-    rows += ["f %d/%d %d/%d %d/%d" % tuple(np.repeat(f, 2)) for f in faces + 1]
-    with aside(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
-        file.write("\n".join(rows) + "\n")
-
-
 def render(folder, vertices, faces, uv, rng):
-    """Write texture, template, camera, frames and masks of vertices (T, N, 3) [m, camera frame] into ``folder``."""
+    """Write texture, template, camera, frames and masks of vertices (T, N, 3) [m, camera frame], faces (F, 3) and texture coordinates
+    (N, 2) into ``folder``; ``rng`` draws texture, light and noise.
+    """
     import mitsuba as mi
 
     for name in ("frames", "masks"):
@@ -218,7 +215,7 @@ def render(folder, vertices, faces, uv, rng):
     at = lambda *names: os.path.join(folder, *names)
     image = texture(rng, np.ptp(uv[:, 0]) * np.ptp(vertices[0, :, 0]) / np.ptp(vertices[0, :, 1]))
     cv2.imwrite(at("texture.png"), image[..., ::-1])
-    write_obj(at("template.obj"), vertices[0], uv, faces)
+    write_obj(at("template.obj"), vertices[0], faces, uv)
     width, height = SIZE
     with open(at("camera.json"), "w", encoding="utf-8") as file:
         json.dump(dict(width=width, height=height, fx=FOCAL, fy=FOCAL, cx=width / 2, cy=height / 2), file, indent=1)
@@ -270,8 +267,8 @@ def main(argv=None):
         vertices, faces = simulate(name, args.seed)
         render(folder, vertices, faces, sheet(KINDS[name])[1], np.random.default_rng([args.seed, list(KINDS).index(name), 1]))
         np.savez_compressed(os.path.join(folder, "gt.npz"), vertices=vertices.astype(np.float32), faces=faces.astype(np.int32))
-        edges = np.unique(np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1), axis=0)
-        length = np.linalg.norm(vertices[:, edges[:, 0]] - vertices[:, edges[:, 1]], axis=-1)
+        a, b = edges_of(faces)[0].T
+        length = np.linalg.norm(vertices[:, a] - vertices[:, b], axis=-1)
         strain = 100 * np.abs(length / length[0] - 1).mean()
         print(f"{folder}: {len(vertices)} frames, moved by {1e3 * np.linalg.norm(vertices - vertices[0], axis=-1).mean():.0f} mm, lengths change by {strain:.2f} %")
 

@@ -491,12 +491,12 @@ def test_a_sheet_out_of_view_explains_nothing(problem, shift):
 
 def test_steps_that_lead_nowhere_are_refused():
     uv, g = np.zeros((5, 2)), np.zeros(10)
-    gauss_newton._check((g, uv))
+    gauss_newton._check_step((g, uv))
     g[0] = 100.0  # of the coefficients: no bound
-    gauss_newton._check((g, uv))
+    gauss_newton._check_step((g, uv))
     for bad in ((g + np.eye(10)[9] * 3, uv), (g, uv - 3), (g * np.nan, uv)):
         with pytest.raises(LinAlgError):
-            gauss_newton._check(bad)
+            gauss_newton._check_step(bad)
 
 
 def test_order_rises_with_the_data_and_stays_within_bounds(tmp_path):

@@ -51,14 +51,14 @@ def test_frames_show_the_texture_on_the_true_surface(bent):
     experiment = scene.load(str(ROOT / "scenes" / "bend.xml"), {"data": str(folder)})
     problem = Problem(experiment, Sequence.open(experiment.frames, experiment.masks, size=experiment.size))
     registration = Registration(problem)
-    level = simulate_level(problem)
+    level = finest_level(problem)
     for t, x in enumerate(vertices):
         assert registration.misfit(x, t, level) < 0.08
         assert registration.misfit(x + [0.007, 0, 0], t, level) > 0.15
         assert registration.misfit((x - x.mean(0)) * [1, -1, 1] + x.mean(0), t, level) > 0.3
 
 
-def simulate_level(problem):
+def finest_level(problem):
     from polysft_mi.solvers import gauss_newton
 
     solver = gauss_newton.GaussNewton(problem.settings)

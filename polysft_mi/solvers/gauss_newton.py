@@ -41,8 +41,8 @@ def _cost(found):
     return terms["misfit"] + terms["inextensibility"] + terms["smoothness"]
 
 
-def _check(step):
-    """Raises LinAlgError where a step is not finite, or goes farther than any model is good for."""
+def _check_step(step):
+    """Raises LinAlgError where a step (global (G,), uv (N, 2)) is not finite, or goes farther than any model is good for."""
     g, uv = step
     if not max(np.abs(g[-6:]).max(), np.abs(uv).max()) < _FARTHEST_STEP:
         raise LinAlgError("the step is not finite, or too long")
@@ -243,7 +243,7 @@ class GaussNewton:
         for _ in range(iterations):
             try:
                 step, promised = Reduced(self.blocks, normal, damping).step()
-                _check(step)
+                _check_step(step)
             except LinAlgError:
                 damping = max(10 * damping, 1e-4)
                 continue
@@ -327,7 +327,7 @@ class GaussNewton:
         parts = np.split(g, start[1:-1])
         steps = [(part, r.following(part)) for part, r in zip(parts, reduced)]
         for step in steps:
-            _check(step)
+            _check_step(step)
         return steps, sum(r.promised(step) for r, step in zip(reduced, steps))
 
     # -- one stage ----------------------------------------------------------
