@@ -5,8 +5,7 @@ from functools import cached_property
 
 import torch
 
-
-from . import skinning
+from . import ease, skinning
 from .binding import standard_body
 from .body import AnnyBody
 from .charts import PatchedGarment
@@ -54,7 +53,7 @@ class Draper:
         self.trained, self.device = trained, torch.device(device)
         self.network = trained.network.to(self.device).eval()
         self.model = model or AnnyBody()
-        self._garments, self._patched, self._codes = {}, {}, {}
+        self._garments, self._patched, self._codes, self._ease = {}, {}, {}, {}
 
     @cached_property
     def standard(self):
@@ -88,19 +87,19 @@ class Draper:
         body = self.model.body(shape)
         motion = motion if shape is None else motion.fitted(body.to(self.device))
         rest = garment.graded(body).to(self.device)
-        patched = None if skinning_only else self.patched(garment)
+        offset = 0 if skinning_only else self.ease(garment)
         body = body.to(self.device)
         weights = garment.blend_weights.to(self.device)
         transforms = skinning.transforms(body, motion.poses, motion.translation)
         with torch.inference_mode():
             embedding = None if skinning_only else self.embedding(motion, body)
             step = max(1, POINTS // len(rest))
-            parts, bodies = [], []
+            parts = []
             for first in range(0, len(motion.poses), step):
                 frames = slice(first, first + step)
-                points = rest[:, None]
+                points = (rest + offset)[:, None]
                 if not skinning_only:
-                    points = points + patched.displacement(patched.changes(self.network.decoder(self.codes(garment), embedding[frames])))
+                    points = points + self._displacement(garment, embedding[frames])
                 parts.append(posed(points, weights, transforms[frames]).transpose(0, 1))
             bodies = torch.cat([skinning.skin(body.vertices, body.blend_weights, part) for part in transforms.split(64)])
             vertices = torch.cat(parts)
@@ -117,10 +116,34 @@ class Draper:
                 self._codes[key] = self.network.patches(*self.patched(garment).features, self.standard.joints.to(self.device))
         return self._codes[key]
 
+    def _displacement(self, garment, embedding):
+        """Displacements of the vertices in the rest space, (N, T, 3) [m], for embeddings (T, width)."""
+        patched = self.patched(garment)
+        return patched.displacement(patched.changes(self.network.decoder(self.codes(garment), embedding)))
+
+    def ease(self, garment):
+        """The offset of the garment's vertices in the rest space, (N, 3) [m], found once: :func:`onefit.ease.ease`."""
+        key = id(garment)
+        if key not in self._ease:
+            with torch.no_grad():
+                rest, faces, body = garment.vertices.to(self.device), garment.faces, self.standard.to(self.device)
+                self._ease[key] = ease.ease(rest, faces, body, self._trial(garment, rest, body))
+        return self._ease[key]
+
+    def _trial(self, garment, rest, body):
+        """The frames that :func:`onefit.ease.ease` looks at."""
+        weights = garment.blend_weights.to(self.device)
+        for kind in ease.MOTIONS:
+            motion = Motion.generate(kind, seconds=ease.SECONDS, fps=FPS).to(self.device)
+            transforms = skinning.transforms(body, motion.poses, motion.translation)[:: ease.EVERY]
+            displacement = self._displacement(garment, self.embedding(motion, body)[:: ease.EVERY])
+            draped, skinned = (posed(x, weights, transforms).transpose(0, 1) for x in (rest[:, None] + displacement, rest[:, None]))
+            yield from zip(draped, skinned, skinning.skin(body.vertices, body.blend_weights, transforms))
+
     def embedding(self, motion, body):
         """Z_B (T, width) of the motion, after the first pose was held for a while."""
         hold = lambda x: torch.cat([x[:1].expand(WARM_UP, *x.shape[1:]), x])[None]
-        known = body.kind == self.trained.body
+        known = body.kind == self.trained.body == self.model.kind
         shape = (
             body.shape - self.model.standard_shape.to(self.device)
             if known

@@ -10,13 +10,23 @@ from .nearest import ClosestSurface
 from .remesh import neighbour_mean
 
 CLEARANCE = 0.003  # [m] from the body
+SMOOTHING = 4  # times that pushes are smoothed
 REACH = 0.08  # [m]; vertices deeper in the body than this stay there
 
 
-def pushed_out(vertices, faces, bodies, body_faces, rounds=5, smoothing=4):
+def spread(push, mean):
+    """Pushes (N, 3) [m] smoothed over the mesh by ``mean``, which takes the mean of each vertex' neighbours: none becomes shorter.
+    """
+    for _ in range(SMOOTHING):
+        around = mean @ push
+        push = torch.where(push.norm(dim=-1, keepdim=True) > around.norm(dim=-1, keepdim=True), push, around)
+    return push
+
+
+def pushed_out(vertices, faces, bodies, body_faces, rounds=5):
     """Vertices (T, N, 3) [m] moved out of the bodies (T, V, 3), to CLEARANCE from them; faces (F, 3), body_faces (B, 3).
 
-    The pushes, not the surface, are smoothed over the mesh, ``smoothing`` times, so that no fold is lost and none made; what that leaves
+    The pushes, not the surface, are smoothed over the mesh, so that no fold is lost and none made; what that leaves
     inside is pushed again, unsmoothed from the third of at most ``rounds`` rounds on. That a vertex is not within CLEARANCE of the body's
     surface is quickly told; only beside those found inside, and among those that were pushed, deeper ones are looked for.
     """
@@ -42,12 +52,6 @@ def pushed_out(vertices, faces, bodies, body_faces, rounds=5, smoothing=4):
             chosen = chosen[~known[chosen]]
         return push
 
-    def spread(push):
-        for _ in range(smoothing):
-            around = mean @ push
-            push = torch.where(push.norm(dim=-1, keepdim=True) > around.norm(dim=-1, keepdim=True), push, around)
-        return push
-
     def one(part):
         surface = ClosestSurface(bodies[0], body_faces)
         out = vertices[part].clone()
@@ -58,7 +62,7 @@ def pushed_out(vertices, faces, bodies, body_faces, rounds=5, smoothing=4):
                 push = pushes(x, surface, chosen)
                 if not push.any():
                     break
-                push = spread(push) if turn < 2 else push
+                push = spread(push, mean) if turn < 2 else push
                 x += push
                 chosen = push.any(-1).nonzero()[:, 0]  # the others are clear, and stay where they are
         return out
