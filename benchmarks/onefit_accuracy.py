@@ -56,6 +56,7 @@ def main(argv=None):
     parser.add_argument("--seconds", type=float, default=3.0, help="of each motion (default: 3)")
     parser.add_argument("--shapes", type=int, default=4, help="random bodies beside the standard one (default: 4)")
     parser.add_argument("--no-post", action="store_true", help="without the column of post-processing, which takes most of the time")
+    parser.add_argument("--no-ease", action="store_true", help="what the networks alone make, without the garments' ease")
     parser.add_argument("-o", "--output", help="a JSON file of the figures")
     args = parser.parse_args(argv)
     drapers = {name: onefit.load(name) for name in args.weights}
@@ -64,7 +65,7 @@ def main(argv=None):
     for name in args.garments:
         first = next(iter(drapers.values()))
         garment = first.garment(name)
-        rows = [("skinning", first, dict(skinning_only=True))] + [(key, draper, {}) for key, draper in drapers.items()]
+        rows = [("skinning", first, dict(skinning_only=True))] + [(key, draper, dict(eased=not args.no_ease)) for key, draper in drapers.items()]
         for network, draper, options in rows:
             plain = row(draper, garment, args.seconds, args.shapes, **options)
             post = None if args.no_post else row(draper, garment, args.seconds, args.shapes, post=True, **options)

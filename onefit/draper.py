@@ -75,11 +75,12 @@ class Draper:
             self._patched[key] = PatchedGarment(garment, self.standard, order=self.network.order).to(self.device)
         return self._patched[key]
 
-    def drape(self, garment, motion, shape=None, *, post=False, skinning_only=False):
+    def drape(self, garment, motion, shape=None, *, post=False, eased=True, skinning_only=False):
         """A :class:`Drape`: ``garment`` (as :meth:`garment` takes it) on the body of ``shape`` (S,) in each frame of ``motion`` (a
         :class:`Motion` or a file of one), at 30 frames a second. With a shape, the way is scaled by the length of its legs.
 
-        ``post``: vertices are pushed out of the body and the pushes are smoothed. ``skinning_only``: plain skinning of the template, what
+        ``post``: vertices are pushed out of the body and the pushes are smoothed. ``eased``: with the garment's :meth:`ease`, which costs
+        a second or two once, and nothing a frame; without it a drape is what the network alone makes. ``skinning_only``: plain skinning of the template, what
         OneFit is held against. Raises InputError for a garment, motion or shape that cannot be used.
         """
         garment = self.garment(garment)
@@ -87,7 +88,7 @@ class Draper:
         body = self.model.body(shape)
         motion = motion if shape is None else motion.fitted(body.to(self.device))
         rest = garment.graded(body).to(self.device)
-        offset = 0 if skinning_only else self.ease(garment)
+        offset = self.ease(garment) if eased and not skinning_only else 0
         body = body.to(self.device)
         weights = garment.blend_weights.to(self.device)
         transforms = skinning.transforms(body, motion.poses, motion.translation)
