@@ -5,6 +5,7 @@ deep, whatever the arm does. A few frames of motions like those of training show
 frame costs anything for it.
 """
 
+import numpy as np
 import torch
 
 from .charts import SparseMatrix
@@ -14,7 +15,7 @@ from .remesh import neighbour_mean
 
 MOTIONS = "idle", "walk", "run", "squat", "reach", "twist", "arms_up", "arms_crossed"  # of the kinds that networks are trained on
 SECONDS, EVERY = 1.0, 6  # of each motion; one frame in so many is looked at
-SHARE = 0.8  # of those frames in which a vertex is to be clear
+SHARE = 0.8  # of those frames in which a vertex is to lie far enough out
 
 
 def ease(rest, faces, body, frames):
@@ -23,7 +24,7 @@ def ease(rest, faces, body, frames):
 
     ``frames``: for each frame, the vertices as the network drapes them and as plain skinning does (N, 3), and the body's (V, 3). A vertex
     should lie as far out of the body as in the rest pose and under plain skinning, whichever is less, or CLEARANCE where both are more.
-    What it misses in SHARE of the frames, it is moved along the body's normal at rest; its neighbours go along.
+    It is moved along the body's normal at rest, so far that this holds in SHARE of the frames, and its neighbours go along.
     """
     surface = ClosestSurface(body.vertices, body.faces)
     at_rest = surface(rest, REACH)
@@ -32,7 +33,7 @@ def ease(rest, faces, body, frames):
         surface.follow(vertices)
         wanted = torch.minimum(at_rest.distance, surface(skinned, REACH).distance).clamp(max=CLEARANCE)
         missing.append((wanted - surface(draped, REACH).distance).clamp(min=0))
-    missing = torch.stack(missing).quantile(SHARE, dim=0)[:, None]
+    missing = torch.as_tensor(np.quantile(torch.stack(missing).cpu().numpy(), SHARE, axis=0)).to(rest)[:, None]  # torch's has a largest size
     moved = (missing > 0) & (at_rest.face >= 0)[:, None]
     mean = SparseMatrix(neighbour_mean(faces.cpu().numpy(), len(rest)), rest.device)
     return spread(torch.where(moved, missing * at_rest.normal, 0.0), mean)
