@@ -3,6 +3,8 @@
 
 PYTHON ?= python3
 PY := .venv/bin/python
+SHELL := /bin/bash
+.SHELLFLAGS := -o pipefail -c
 INSTALLED := .venv/installed
 
 .PHONY: demo drape test docs venv llvm clean
@@ -27,8 +29,9 @@ $(INSTALLED): pyproject.toml constraints.txt
 	@if $(PYTHON) -c 'import ensurepip' 2>/dev/null; then $(PYTHON) -m venv .venv; else \
 	    $(PYTHON) -m venv --without-pip .venv && $(PYTHON) -m pip --python $(PY) install -q pip || \
 	    { rm -rf .venv; echo 'error: no virtual environment can be made: install python3-venv (Debian, Ubuntu: apt-get install python3-venv)' >&2; exit 2; }; fi
-	@echo 'installing into .venv: a minute or so, more where the network is slow'
-	@PYTHONWARNINGS=ignore $(PY) -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[test,docs]'
+	@printf 'installing into .venv, a minute or so, more where the network is slow: '
+	@PYTHONWARNINGS=ignore PYTHONUNBUFFERED=1 $(PY) -m pip install --progress-bar off --disable-pip-version-check -c constraints.txt -e '.[test,docs]' \
+	    | awk '/^Collecting/ { printf "."; fflush() } /^Installing/ { printf " unpacking"; fflush() } END { print "" }'
 	@touch $@
 
 # Rendering on the CPU needs a libLLVM, which no Python package brings.
