@@ -163,7 +163,7 @@ def main(argv=None):
     console = Console(stderr=True)
     for repair in garment.repairs:
         console.print(f"{args.garment}: {repair}")
-    draper.patched(garment)  # once for all motions, so it does not count
+    draper.ease(garment)  # cut and tried on once for all motions, so it does not count
     start = time.perf_counter()
     drape = draper.drape(garment, motion, shape, post=args.post)
     seconds = time.perf_counter() - start

@@ -80,8 +80,8 @@ class Draper:
         :class:`Motion` or a file of one), at 30 frames a second. With a shape, the way is scaled by the length of its legs.
 
         ``post``: vertices are pushed out of the body and the pushes are smoothed. ``eased``: with the garment's :meth:`ease`, which costs
-        seconds once, and nothing a frame; without it a drape is what the network alone makes. ``skinning_only``: plain skinning of the template, what
-        OneFit is held against. Raises InputError for a garment, motion or shape that cannot be used.
+        seconds once, and nothing a frame; without it a drape is what the network alone makes. ``skinning_only``: plain skinning of the
+        template, what OneFit is held against. Raises InputError for a garment, motion or shape that cannot be used.
         """
         garment = self.garment(garment)
         motion = (motion if isinstance(motion, Motion) else Motion.read(motion)).resampled(FPS).to(self.device)
