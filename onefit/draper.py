@@ -132,7 +132,8 @@ class Draper:
         return self._ease[key]
 
     def _trial(self, garment, rest, body):
-        """The frames that :func:`onefit.ease.ease` looks at."""
+        """The frames that :func:`onefit.ease.ease` looks at, of ``rest`` (N, 3) [m] on the standard ``body``: vertices as the network
+        drapes them and as plain skinning does (N, 3), and the body's (V, 3) [m]."""
         weights = garment.blend_weights.to(self.device)
         for kind in ease.MOTIONS:
             motion = Motion.generate(kind, seconds=ease.SECONDS, fps=FPS).to(self.device)

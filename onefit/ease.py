@@ -22,7 +22,7 @@ def ease(rest, faces, body, frames):
     """Offsets (N, 3) [m] of a garment's vertices ``rest`` (N, 3), with ``faces`` (F, 3), around the standard ``body``
     (:class:`onefit.body.Body`).
 
-    ``frames``: for each frame, the vertices as the network drapes them and as plain skinning does (N, 3), and the body's (V, 3). A vertex
+    ``frames``: for each frame, the vertices as the network drapes them and as plain skinning does (N, 3), and the body's (V, 3) [m]. A vertex
     should lie as far out of the body as in the rest pose and under plain skinning, whichever is less, or CLEARANCE where both are more.
     It is moved along the body's normal at rest, so far that this holds in SHARE of the frames, and its neighbours go along.
     """

@@ -15,8 +15,8 @@ REACH = 0.08  # [m]; vertices deeper in the body than this stay there
 
 
 def spread(push, mean):
-    """Pushes (N, 3) [m] smoothed over the mesh by ``mean``, which takes the mean of each vertex' neighbours: none becomes shorter.
-    """
+    """Pushes (N, 3) [m], smoothed over the mesh; none becomes shorter. ``mean``: a matrix (N, N) that takes the mean of each vertex's
+    neighbours (:func:`onefit.remesh.neighbour_mean`)."""
     for _ in range(SMOOTHING):
         around = mean @ push
         push = torch.where(push.norm(dim=-1, keepdim=True) > around.norm(dim=-1, keepdim=True), push, around)
