@@ -219,6 +219,7 @@ def _standing_in(template, V, axes):
         "delta_alpha": alpha - template.alpha,
         "delta_u": x[:, 0] - template.chart[:, 0],
         "delta_v": x[:, 1] - template.chart[:, 1],
+        "delta_w": np.zeros(len(x)),
         "rotation": Rotation.from_matrix(turn).as_quat(),
         "translation": y.mean(0),
     }

@@ -64,9 +64,8 @@ def rendering(problem, seed=0):
 
 
 def deformed(patch):
-    """The surface of a :class:`polysft_mi.patch.JetPatch` as a torch function of the unknowns: delta_alpha (A,), delta_u (N,), delta_v
-    (N,),
-    rotation (4,), translation (3,) -> vertices (N, 3) [m, camera frame]."""
+    """The surface of a :class:`polysft_mi.patch.JetPatch` as a torch function of the unknowns: delta_alpha (A,), delta_u, delta_v,
+    delta_w (N,), rotation (4,), translation (3,) -> vertices (N, 3) [m, camera frame]."""
 
     @in_drjit
     def vertices(*unknowns):

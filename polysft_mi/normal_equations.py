@@ -1,9 +1,9 @@
 """From second-order models at the vertices to a step in the unknowns of the jet patch: normal equations, and their elimination. NumPy and
 SciPy only.
 
-Unknowns of a frame: the 2N displacements (Δu, Δv), sparse like the mesh, and G = A + 6 global ones: the coefficients in an orthogonal
-basis, a rotation increment (axis times angle, before the rotation) and the translation T_c. The first are eliminated, what is left is
-small and dense.
+Unknowns of a frame: local ones, the displacements (Δu, Δv) of each of the N vertices or, with its relief, (Δu, Δv, Δw), d = 2 or 3 of
+them, sparse like the mesh; and G = A + 6 global ones: the coefficients in an orthogonal basis, a rotation increment (axis times angle,
+before the rotation) and the translation T_c. The first are eliminated, what is left is small and dense.
 """
 
 from dataclasses import dataclass
@@ -20,29 +20,28 @@ from polyfit import jets
 
 @dataclass
 class State:
-    """Unknowns of a frame on the host, float64: ``alpha`` (A,), the offset of the coefficients in the basis of :class:`Chart`; ``uv`` (N,
-    2), (Δu, Δv); ``rotation``: R_c; ``translation`` (3,): T_c, in the chart's unit."""
+    """Unknowns of a frame on the host, float64: ``alpha`` (A,), the offset of the coefficients in the basis of :class:`Chart`; ``offset``
+    (N, 3), (Δu, Δv, Δw); ``rotation``: R_c; ``translation`` (3,): T_c, in the chart's unit."""
 
     alpha: np.ndarray
-    uv: np.ndarray
+    offset: np.ndarray
     rotation: Rotation
     translation: np.ndarray
 
     def moved(self, step, factor=1.0):
-        """The state after a step (global (G,), uv (N, 2)); coefficients beyond those of the step stay."""
-        g, uv = step
-        alpha = self.alpha.copy()
+        """The state after a step (global (G,), local (N, d)); coefficients beyond those of the step stay, and with d = 2 the relief."""
+        g, local = step
+        alpha, offset = self.alpha.copy(), self.offset.copy()
         alpha[: len(g) - 6] += factor * g[:-6]
-        return State(
-            alpha, self.uv + factor * uv, Rotation.from_rotvec(factor * g[-6:-3]) * self.rotation, self.translation + factor * g[-3:]
-        )
+        offset[:, : local.shape[1]] += factor * local
+        return State(alpha, offset, Rotation.from_rotvec(factor * g[-6:-3]) * self.rotation, self.translation + factor * g[-3:])
 
     def towards(self, other, factor):
         """The state that goes on from this one past ``other``: other + factor (other - self)."""
         turn = (other.rotation * self.rotation.inv()).as_rotvec()
         return State(
             other.alpha + factor * (other.alpha - self.alpha),
-            other.uv + factor * (other.uv - self.uv),
+            other.offset + factor * (other.offset - self.offset),
             Rotation.from_rotvec(factor * turn) * other.rotation,
             other.translation + factor * (other.translation - self.translation),
         )
@@ -52,11 +51,12 @@ class State:
 class Surface:
     """The vertices (N, 3) [m, world] that a :class:`State` makes, with derivatives.
 
-    ``by_uv`` (N, 3, 2); by the coefficients: ``up`` (3,) times ``basis`` (N, A); by rotation and translation: ``by_motion`` (N, 3, 6).
+    ``by_offset`` (N, 3, 3): by (Δu, Δv, Δw), of which the last, ``up`` (3,), is the same everywhere; by the coefficients: ``up`` times
+    ``basis`` (N, A); by rotation and translation: ``by_motion`` (N, 3, 6).
     """
 
     vertices: np.ndarray
-    by_uv: np.ndarray
+    by_offset: np.ndarray
     up: np.ndarray
     basis: np.ndarray
     by_motion: np.ndarray
@@ -100,7 +100,10 @@ class Chart:
         """A :class:`State` from the arrays of ``Unknowns.to_numpy``."""
         a = {name: np.asarray(x, dtype=np.float64) for name, x in arrays.items()}
         return State(
-            self._from_monomials @ a["delta_alpha"], np.stack([a["delta_u"], a["delta_v"]], 1), Rotation.from_quat(a["rotation"]), a["translation"]
+            self._from_monomials @ a["delta_alpha"],
+            np.stack([a["delta_u"], a["delta_v"], a["delta_w"]], 1),
+            Rotation.from_quat(a["rotation"]),
+            a["translation"],
         )
 
     def rigid(self, rotation, translation):
@@ -113,8 +116,9 @@ class Chart:
         """The reverse of :meth:`state`."""
         return {
             "delta_alpha": self.to_monomials @ state.alpha,
-            "delta_u": state.uv[:, 0],
-            "delta_v": state.uv[:, 1],
+            "delta_u": state.offset[:, 0],
+            "delta_v": state.offset[:, 1],
+            "delta_w": state.offset[:, 2],
             "rotation": state.rotation.as_quat(),
             "translation": state.translation,
         }
@@ -122,13 +126,13 @@ class Chart:
     def surface(self, state, order=None):
         """The :class:`Surface` of a state; its derivatives by the coefficients up to ``order`` (default: all)."""
         t = self.template
-        uv = t.chart + state.uv
+        uv = t.chart + state.offset[:, :2]
         alpha = self._alpha + state.alpha
         matrix = np.zeros((self.order + 1, self.order + 1))
         matrix[self._u, self._v] = alpha
         pu, pv = (legendre.legvander(uv[:, k], self.order) for k in (0, 1))
         along = pu @ matrix
-        height = (along * pv).sum(1)
+        height = (along * pv).sum(1) + state.offset[:, 2]
         slope = np.stack([((pu @ (self._derivative @ matrix)) * pv).sum(1), (along * (pv @ self._derivative)).sum(1)], 1)
         rotation = state.rotation.as_matrix()
         turn = self._axes @ rotation
@@ -139,9 +143,11 @@ class Chart:
         x = y @ rotation.T
         for k, (a, b) in enumerate(((1, 2), (2, 0), (0, 1))):  # axis k of the chart crossed with the point
             by_motion[:, :, k] = x[:, a, None] * self._axes[:, b] - x[:, b, None] * self._axes[:, a]
+        by_offset = np.tile(turn, (len(y), 1, 1))
+        by_offset[:, :, :2] += turn[None, :, 2:] * slope[:, None, :]
         return Surface(
             y @ turn.T + (t.origin + self._axes @ state.translation),
-            turn[None, :, :2] + turn[None, :, 2:] * slope[:, None, :],
+            by_offset,
             turn[:, 2],
             pu[:, self._u[:size]] * pv[:, self._v[:size]],
             by_motion,
@@ -150,7 +156,8 @@ class Chart:
     def fitted(self, state, vertices, iterations=8, bending=1e-6):
         """The state, from ``state`` on, whose vertices come closest to ``vertices`` (N, 3) [m, world], in the least-squares sense.
 
-        Each vertex slides freely in its tangent plane, so that only distances along the normals count for the other unknowns.
+        Each vertex slides freely in its tangent plane, so that only distances along the normals count for the other unknowns. The relief
+        stays as it is.
         """
         size = len(state.alpha)
         prior = np.zeros((size + 6, size + 6))
@@ -158,7 +165,8 @@ class Chart:
         for _ in range(iterations):
             surface = self.surface(state)
             missing = vertices - surface.vertices
-            normal = np.cross(surface.by_uv[:, :, 0], surface.by_uv[:, :, 1])
+            tangents = surface.by_offset[:, :, :2]
+            normal = np.cross(tangents[:, :, 0], tangents[:, :, 1])
             normal /= np.linalg.norm(normal, axis=1, keepdims=True)
             rows = np.column_stack([(normal @ surface.up)[:, None] * surface.basis, np.einsum("nk,nkm->nm", normal, surface.by_motion)])
             # sliding makes rotations in the plane and shifts along it free: a little damping holds them
@@ -166,10 +174,21 @@ class Chart:
             right = rows.T @ np.einsum("nk,nk->n", normal, missing) - prior[:, :size] @ state.alpha
             g = np.linalg.solve(square + 1e-6 * np.trace(square) / len(square) * np.eye(len(square)), right)
             rest = missing - (surface.basis @ g[:size])[:, None] * surface.up - surface.by_motion @ g[size:]
-            square = surface.by_uv.transpose(0, 2, 1) @ surface.by_uv
-            uv = np.linalg.solve(square, np.einsum("nka,nk->na", surface.by_uv, rest)[:, :, None])[:, :, 0]
+            square = tangents.transpose(0, 2, 1) @ tangents
+            uv = np.linalg.solve(square, np.einsum("nka,nk->na", tangents, rest)[:, :, None])[:, :, 0]
             state = state.moved((g, uv))
         return state
+
+    def absorbed(self, state, order, ridge=1e-6):
+        """The same surface with as much of the relief as a jet of ``order`` can hold in the coefficients instead."""
+        size, relief = self.size(order), state.offset[:, 2]
+        basis = self.surface(state, order).basis
+        held = ridge * len(relief) * (self.bending[:size, :size] + np.eye(size))
+        alpha, offset = state.alpha.copy(), state.offset.copy()
+        part = np.linalg.solve(basis.T @ basis + held, basis.T @ relief)
+        alpha[:size] += part
+        offset[:, 2] -= basis @ part
+        return State(alpha, offset, state.rotation, state.translation)
 
 
 def _legendre_to_monomials(order):
@@ -180,16 +199,19 @@ def _legendre_to_monomials(order):
 
 
 class Pattern:
-    """Which vertices of the mesh share an edge: the blocks of every matrix here, in the order of (row, column), and a narrow ordering."""
+    """Which vertices of the mesh share an edge, or are one of the ``further`` pairs (P, 2): the blocks of every matrix here, in the order
+    of (row, column), and a narrow ordering.
+    """
 
-    def __init__(self, faces, edges, count):
+    def __init__(self, faces, edges, count, further=None):
         self.count, self.edges = count, edges
-        a, b = edges.T
+        a, b = (edges if further is None else np.concatenate([edges, further])).T
         each = np.arange(count)
         self._keys = np.sort(np.concatenate([each * count + each, a * count + b, b * count + a]))
         self.row, self.column = np.divmod(self._keys, count)
         self.start = np.searchsorted(self.row, np.arange(count + 1))
         self.diagonal = self.find(each, each)
+        a, b = edges.T
         corners = np.repeat(np.arange(3), 3), np.tile(np.arange(3), 3)
         at = self.find(faces[:, corners[0]], faces[:, corners[1]])
         self.from_faces = sp.csr_matrix((np.ones(at.size), (at.ravel(), np.arange(at.size))), shape=(len(self._keys), at.size))
@@ -201,10 +223,16 @@ class Pattern:
         self.place = np.empty(count, dtype=np.int64)  # of each vertex in the narrow ordering
         self.place[order] = each
         self.order = order
-        self.laplacian = np.zeros(len(self._keys))  # sum over edges of (x_a - x_b)^2
-        np.add.at(self.laplacian, self.find(a, a), 1)
-        np.add.at(self.laplacian, self.find(b, b), 1)
-        self.laplacian[self.find(a, b)] = self.laplacian[self.find(b, a)] = -1
+        difference = sp.csr_matrix(
+            (np.tile([1.0, -1.0], len(edges)), (np.repeat(np.arange(len(edges)), 2), edges.ravel())), shape=(len(edges), count)
+        )
+        self.laplacian = self.blocks_of(difference.T @ difference)  # sum over edges of (x_a - x_b)^2
+
+    def blocks_of(self, matrix):
+        """A sparse matrix (N, N) within the pattern as one number a block."""
+        matrix, out = matrix.tocoo(), np.zeros(len(self._keys))
+        out[self.find(matrix.row, matrix.col)] = matrix.data
+        return out
 
     def find(self, i, j):
         """Indices of the blocks (i, j)."""
@@ -219,35 +247,36 @@ class Pattern:
 
 
 class Blocks:
-    """A symmetric matrix with the pattern's 2x2 blocks, factorised as block tridiagonal in the narrow ordering, by LAPACK.
+    """A symmetric matrix with the pattern's d x d blocks, factorised as block tridiagonal in the narrow ordering, by LAPACK.
 
     On these narrow meshes that is faster than general sparse Cholesky, above all with many right-hand sides
     (``benchmarks/factorisation.py``).
     """
 
-    def __init__(self, pattern):
-        self.pattern = pattern
+    def __init__(self, pattern, d=2):
+        self.pattern, self.d = pattern, d
         row, column = pattern.place[pattern.row], pattern.place[pattern.column]
         width = max(8, int(np.abs(row - column).max()))  # vertices a block
         self.count = -(-pattern.count // width)
         self.width = width
-        at = 2 * row[:, None, None] + np.arange(2)[None, :, None], 2 * column[:, None, None] + np.arange(2)[None, None, :]
-        r, c = (np.broadcast_to(x, (len(row), 2, 2)) for x in at)
-        size = 2 * width
+        each = np.arange(d)
+        at = d * row[:, None, None] + each[None, :, None], d * column[:, None, None] + each[None, None, :]
+        r, c = (np.broadcast_to(x, (len(row), d, d)) for x in at)
+        size = d * width
         part, down = r // size, c // size
         self._inside = (part == down).ravel()
         self._below = (part == down + 1).ravel()
         # Fortran order inside each block, which LAPACK takes without a copy
         self._at_inside = ((part * size + c % size) * size + r % size).ravel()[self._inside]
         self._at_below = ((down * size + r % size) * size + c % size).ravel()[self._below]  # transposed: the block above
-        self._order = (2 * pattern.order[:, None] + np.arange(2)).ravel()
+        self._order = (d * pattern.order[:, None] + each).ravel()
         self.size = size
 
     def eliminate(self, blocks, columns):
-        """Factorise (B, 2, 2) = L L^T: returns an :class:`Elimination` with L^-1 columns for columns (2N, C). Raises LinAlgError where it
+        """Factorise (B, d, d) = L L^T: returns an :class:`Elimination` with L^-1 columns for columns (dN, C). Raises LinAlgError where it
         is not positive.
         """
-        size, rest = self.size, 2 * self.pattern.count
+        size, rest = self.size, self.d * self.pattern.count
         values = blocks.ravel()
         inside = np.zeros(self.count * size * size)
         below = np.zeros(self.count * size * size)
@@ -266,7 +295,7 @@ class Blocks:
                 y = y - w.T @ parts[-1]
             factor, bad = lapack.dpotrf(d, lower=1, clean=1, overwrite_a=1)
             if bad:
-                raise LinAlgError("the uv block is not positive definite")
+                raise LinAlgError("the local block is not positive definite")
             factors.append(factor)
             parts.append(blas.dtrsm(1.0, factor, y, lower=1))
             if k + 1 < self.count:
@@ -283,7 +312,7 @@ class Elimination:
         self.columns = np.concatenate(parts)
 
     def back(self, y):
-        """L^-T y, (2N,) or (2N, C), in the order of the vertices."""
+        """L^-T y, (dN,) or (dN, C), in the order of the vertices."""
         size, x = self.blocks.size, [None] * len(self.factors)
         flat = y[:, None] if y.ndim == 1 else y
         for k in reversed(range(len(x))):
@@ -296,7 +325,7 @@ class Elimination:
         return out.reshape(y.shape)
 
     def inverse_diagonal(self):
-        """The 2x2 blocks on the diagonal of the inverse, (N, 2, 2)."""
+        """The blocks on the diagonal of the inverse, (N, d, d)."""
         size, blocks = self.blocks.size, [None] * len(self.factors)
         for k in reversed(range(len(blocks))):
             inverse = lapack.dpotri(self.factors[k], lower=1)[0]
@@ -305,47 +334,46 @@ class Elimination:
                 w = blas.dtrsm(1.0, self.factors[k], self.coupling[k], lower=1, trans_a=1)
                 inverse = inverse + w @ blocks[k + 1] @ w.T
             blocks[k] = inverse
-        part, at = np.divmod(2 * self.blocks.pattern.place, size)
+        part, at = np.divmod(self.blocks.d * self.blocks.pattern.place, size)
         padded = np.zeros((len(blocks), size, size))
         for k, block in enumerate(blocks):
             padded[k, : len(block), : len(block)] = block
-        two = np.arange(2)
-        return padded[part[:, None, None], at[:, None, None] + two[:, None], at[:, None, None] + two]
+        each = np.arange(self.blocks.d)
+        return padded[part[:, None, None], at[:, None, None] + each[:, None], at[:, None, None] + each]
 
 
 @dataclass
 class Normal:
-    """Normal equations of a frame: ``uv`` (B, 2, 2), ``cross`` (2N, G), ``glob`` (G, G) and the gradient ``uv_gradient`` (N, 2),
+    """Normal equations of a frame: ``local`` (B, d, d), ``cross`` (dN, G), ``glob`` (G, G) and the gradient ``local_gradient`` (N, d),
     ``gradient`` (G,).
     """
 
-    uv: np.ndarray
+    local: np.ndarray
     cross: np.ndarray
     glob: np.ndarray
-    uv_gradient: np.ndarray
+    local_gradient: np.ndarray
     gradient: np.ndarray
 
 
-def assemble(pattern, surface, projection, evaluation, lengths, stiffness, slack=np.inf):
+def assemble(pattern, surface, projection, evaluation, lengths, stiffness, wide=None):
     """:class:`Normal` of the images and the edges, and the edges' energy.
 
     ``projection`` (N, 2, 3): of the vertices; ``evaluation``: :class:`polysft_mi.registration.Evaluation`; ``lengths`` (E,) [m]: of the
-    template's edges; ``stiffness`` [1/m^2]: weight of the squared differences x to them. An edge that is shorter counts c^2 log(1 +
-    x^2/c^2) instead of x^2, with c = ``slack`` [m].
+    template's edges; ``stiffness`` [1/m^2]: weight of the squared differences to them; ``wide``: a :class:`Pattern` that holds
+    this one, where the relief is an unknown too (d = 3) and the local block is to have that pattern.
     """
+    d = 2 if wide is None else 3
     a, b = pattern.edges.T
     edge = surface.vertices[a] - surface.vertices[b]
-    length = np.sqrt(np.einsum("ek,ek->e", edge, edge))
+    length = np.maximum(np.sqrt(np.einsum("ek,ek->e", edge, edge)), 1e-9)
     direction = edge / length[:, None]
     excess = length - lengths
-    beyond = np.maximum((np.minimum(excess, 0) / slack) ** 2, 1e-12)
-    hold = 2 * stiffness / (1 + beyond)
-    pull = (hold * excess)[:, None] * direction
+    pull = (2 * stiffness * excess)[:, None] * direction
     gradient = evaluation.gradient + pattern.from_ends @ np.concatenate([pull, -pull])
 
-    # Each vertex moves by its own (u, v), by the height that all coefficients make there, and by the motion: blocks of the first three are
-    # sparse like the mesh, and the coefficients follow by the basis.
-    local = np.concatenate([surface.by_uv, np.broadcast_to(surface.up[:, None], (pattern.count, 3, 1))], 2)
+    # Each vertex moves by its own (u, v), by a height, which is its own and that of all coefficients there, and by the motion: blocks of the
+    # first three are sparse like the mesh, and the coefficients follow by the basis.
+    local = surface.by_offset
     screen, screen_motion = projection @ local, projection @ surface.by_motion  # (N, 2, 3), (N, 2, 6)
     blocks = (pattern.from_faces @ evaluation.second.reshape(-1, 4)).reshape(-1, 2, 2)
     if evaluation.rows is not None:
@@ -365,7 +393,7 @@ def assemble(pattern, surface, projection, evaluation, lengths, stiffness, slack
     outward = np.concatenate([direction, -direction])
     by_local = np.einsum("ek,ekm->em", outward, local[ends])
     by_motion = np.einsum("ek,ekm->em", direction, surface.by_motion[a] - surface.by_motion[b])
-    heavy = np.tile(hold, 2)[:, None] * by_local
+    heavy = 2 * stiffness * by_local
     both = np.concatenate([by_local, np.tile(by_motion, (2, 1))], 1)
     sums = pattern.from_ends @ (heavy[:, :, None] * both[:, None]).reshape(len(ends), 27)
     total[pattern.diagonal] += sums.reshape(-1, 3, 9)[:, :, :3]
@@ -373,7 +401,7 @@ def assemble(pattern, surface, projection, evaluation, lengths, stiffness, slack
     across = heavy[: len(a), :, None] * by_local[len(a) :, None]
     total[pattern.across[0]] += across
     total[pattern.across[1]] += across.transpose(0, 2, 1)
-    motion += by_motion.T @ (hold[:, None] * by_motion)
+    motion += 2 * stiffness * by_motion.T @ by_motion
 
     basis = surface.basis
     size = basis.shape[1]
@@ -383,26 +411,31 @@ def assemble(pattern, surface, projection, evaluation, lengths, stiffness, slack
     glob[:size, size:] = basis.T @ local_motion[:, 2]
     glob[size:, :size] = glob[:size, size:].T
     glob[size:, size:] = motion
-    cross = np.concatenate([np.stack(lifted[:2], 1), local_motion[:, :2]], 2).reshape(-1, size + 6)
+    cross = np.concatenate([np.stack(lifted[:d], 1), local_motion[:, :d]], 2).reshape(-1, size + 6)
     along = np.concatenate([basis.T @ (gradient @ surface.up), np.einsum("nk,nkm->m", gradient, surface.by_motion)])
-    normal = Normal(total[:, :2, :2].copy(), cross, glob, np.einsum("nk,nka->na", gradient, surface.by_uv), along)
-    return normal, stiffness * float((excess**2 * np.log1p(beyond) / beyond).sum())
+    if wide is None:
+        blocks = total[:, :2, :2].copy()
+    else:
+        blocks = np.zeros((len(wide.row), 3, 3))
+        blocks[wide.find(pattern.row, pattern.column)] = total
+    normal = Normal(blocks, cross, glob, np.einsum("nk,nka->na", gradient, local[:, :, :d]), along)
+    return normal, stiffness * float((excess**2).sum())
 
 
 class Reduced:
-    """Normal equations with the uv block eliminated under Levenberg-Marquardt's ``damping``: ``schur`` (G, G) and ``right`` (G,) remain.
+    """Normal equations with the local block eliminated under Levenberg-Marquardt's ``damping``: ``schur`` (G, G) and ``right`` (G,) remain.
 
-    Raises LinAlgError where the damped uv block is not positive definite.
+    Raises LinAlgError where the damped local block is not positive definite.
     """
 
     def __init__(self, blocks, normal, damping):
         self.normal, self.blocks = normal, blocks
         diagonal = blocks.pattern.diagonal
-        uv = normal.uv.copy()
-        for k in (0, 1):
-            d = uv[diagonal, k, k]
-            uv[diagonal, k, k] = d * (1 + damping) + 1e-9 * d.mean()
-        self.elimination = blocks.eliminate(uv, np.column_stack([normal.cross, normal.uv_gradient.ravel()]))
+        local = normal.local.copy()
+        for k in range(blocks.d):
+            main = local[diagonal, k, k]
+            local[diagonal, k, k] = main * (1 + damping) + 1e-9 * main.mean()
+        self.elimination = blocks.eliminate(local, np.column_stack([normal.cross, normal.local_gradient.ravel()]))
         y = self.elimination.columns
         whole = y.T @ y
         main = np.diag(normal.glob)
@@ -410,7 +443,7 @@ class Reduced:
         self.right = normal.gradient - whole[:-1, -1]
 
     def step(self):
-        """The step (global (G,), uv (N, 2)), and the decrease that the model promises. Raises LinAlgError where what remains is not
+        """The step (global (G,), local (N, d)), and the decrease that the model promises. Raises LinAlgError where what remains is not
         positive definite.
         """
         g = -cho_solve(cho_factor(self.schur, check_finite=False), self.right, check_finite=False)
@@ -418,20 +451,20 @@ class Reduced:
         return step, self.promised(step)
 
     def following(self, g):
-        """The step (N, 2) of the uv displacements that goes with a step (G,) of the global unknowns."""
+        """The step (N, d) of the local unknowns that goes with a step (G,) of the global ones."""
         y = self.elimination.columns
-        return -self.elimination.back(y[:, -1] + y[:, :-1] @ g).reshape(-1, 2)
+        return -self.elimination.back(y[:, -1] + y[:, :-1] @ g).reshape(-1, self.blocks.d)
 
     def promised(self, step):
         """The decrease that the model promises of a step that minimises it."""
-        return -0.5 * float(step[0] @ self.normal.gradient + (step[1] * self.normal.uv_gradient).sum())
+        return -0.5 * float(step[0] @ self.normal.gradient + (step[1] * self.normal.local_gradient).sum())
 
     def slide(self):
-        """The step (N, 2) of the uv displacements alone."""
-        return -self.elimination.back(self.elimination.columns[:, -1]).reshape(-1, 2)
+        """The step (N, d) of the local unknowns alone."""
+        return -self.elimination.back(self.elimination.columns[:, -1]).reshape(-1, self.blocks.d)
 
     def restricted(self, size):
-        """The decrease that the model promises where only the first ``size`` coefficients, the motion and the uv displacements may move."""
+        """The decrease that the model promises where only the first ``size`` coefficients, the motion and the local unknowns may move."""
         keep = np.r_[np.arange(size), np.arange(len(self.right) - 6, len(self.right))]
         b, y = self.right[keep], self.elimination.columns[:, -1]
         return 0.5 * float(b @ cho_solve(cho_factor(self.schur[np.ix_(keep, keep)], check_finite=False), b, check_finite=False) + y @ y)
@@ -447,11 +480,39 @@ class Reduced:
         g[rest] = -cho_solve(cho_factor(self.schur[np.ix_(rest, rest)], check_finite=False), pull, check_finite=False)
         return g, 0.5 * float(g @ self.schur @ g)
 
-    def variance(self, by_uv, by_global):
-        """The diagonal of J H^-1 J^T (N,), where row i of J has the derivatives ``by_uv`` (N, 2) by the vertex's own (u, v) and
+    def variance(self, by_local, by_global):
+        """The diagonal of J H^-1 J^T (N,), where row i of J has the derivatives ``by_local`` (N, d) by the vertex's own unknowns and
         ``by_global`` (N, G).
         """
-        solved = self.elimination.back(self.elimination.columns[:, :-1]).reshape(len(by_uv), 2, -1)
-        rows = by_global - np.einsum("na,nag->ng", by_uv, solved)
+        solved = self.elimination.back(self.elimination.columns[:, :-1]).reshape(*by_local.shape, -1)
+        rows = by_global - np.einsum("na,nag->ng", by_local, solved)
         half = solve_triangular(np.linalg.cholesky(self.schur), rows.T, lower=True, check_finite=False)
-        return (half * half).sum(0) + np.einsum("na,nab,nb->n", by_uv, self.elimination.inverse_diagonal(), by_uv)
+        return (half * half).sum(0) + np.einsum("na,nab,nb->n", by_local, self.elimination.inverse_diagonal(), by_local)
+
+
+def hinges(chart, faces):
+    """What a height over the chart (N, 2) bends at the mesh's inner edges: the pairs (H, 2) of vertices that lie across each, and the
+    sparse J (H, N) that makes the bends. The sum of their squares is the integral of the squared curvature of a roll along the mesh's rows,
+    up to three times that of others; no plane has any.
+
+    After Bergou et al., "A Quadratic Bending Model for Inextensible Surfaces" (SGP 2006).
+    """
+    start, end, apex = (np.concatenate([faces[:, (k + j) % 3] for k in range(3)]) for j in range(3))
+    low, high = np.minimum(start, end), np.maximum(start, end)
+    order = np.lexsort((high, low))
+    low, high, apex = low[order], high[order], apex[order]
+    first = np.flatnonzero((low[1:] == low[:-1]) & (high[1:] == high[:-1]))
+    quads = np.stack([low[first], high[first], apex[first], apex[first + 1]], 1)
+    x = chart[quads]
+
+    def across(i, j, k):  # sine and cosine, times the lengths, of the angle at i
+        a, b = x[:, j] - x[:, i], x[:, k] - x[:, i]
+        return np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), (a * b).sum(1)
+
+    (s2, c2), (s3, c3), (t2, d2), (t3, d3) = across(0, 1, 2), across(0, 1, 3), across(1, 0, 2), across(1, 0, 3)
+    area = np.maximum(0.5 * (s2 + s3), 1e-12)
+    from_0, from_1 = ([c / np.maximum(s, 1e-12) for s, c in pair] for pair in (((s2, c2), (s3, c3)), ((t2, d2), (t3, d3))))
+    rows = np.stack([from_1[0] + from_1[1], from_0[0] + from_0[1], -from_0[0] - from_1[0], -from_0[1] - from_1[1]], 1)
+    rows /= np.sqrt(area)[:, None]
+    matrix = sp.csr_matrix((rows.ravel(), (np.repeat(np.arange(len(quads)), 4), quads.ravel())), shape=(len(quads), len(chart)))
+    return quads[:, 2:], matrix

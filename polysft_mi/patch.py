@@ -1,6 +1,8 @@
 """The deforming jet patch in Dr.Jit: unknowns of a frame, and the surface they make (paper, section "PolySfT").
 
-    vertices = O( R_c phi(u + Δu, v + Δv; alpha + Δalpha) + T_c ),   O(x) = s R x + T
+    vertices = O( R_c (phi(u + Δu, v + Δv; alpha + Δalpha) + (0, 0, Δw)) + T_c ),   O(x) = s R x + T
+
+The paper has no Δw; it is zero but for the second-order solver.
 
 Import only after a Mitsuba variant is set.
 """
@@ -18,13 +20,14 @@ from . import jet
 class Unknowns:
     """The unknowns of one frame, in the chart's unit.
 
-    ``delta_alpha`` Float of A; ``delta_u``, ``delta_v`` Floats of N; ``rotation`` Float of 4, the quaternion (x, y, z, w) of R_c,
-    normalised where it is used; ``translation`` Float of 3, T_c.
+    ``delta_alpha`` Float of A; ``delta_u``, ``delta_v``, ``delta_w`` Floats of N, the last the relief, a height over the jet; ``rotation``
+    Float of 4, the quaternion (x, y, z, w) of R_c, normalised where it is used; ``translation`` Float of 3, T_c.
     """
 
     delta_alpha: mi.Float
     delta_u: mi.Float
     delta_v: mi.Float
+    delta_w: mi.Float
     rotation: mi.Float
     translation: mi.Float
 
@@ -32,17 +35,19 @@ class Unknowns:
         "delta_alpha": mi.Float,
         "delta_u": mi.Float,
         "delta_v": mi.Float,
+        "delta_w": mi.Float,
         "rotation": mi.Float,
         "translation": mi.Float,
     }
 
-    NAMES = ("delta_alpha", "delta_u", "delta_v", "rotation", "translation")
+    NAMES = ("delta_alpha", "delta_u", "delta_v", "delta_w", "rotation", "translation")
 
     @classmethod
     def zero(cls, coefficients, vertices):
         """The template itself: no deformation, no motion."""
         return cls(
             dr.zeros(mi.Float, coefficients),
+            dr.zeros(mi.Float, vertices),
             dr.zeros(mi.Float, vertices),
             dr.zeros(mi.Float, vertices),
             mi.Float([0, 0, 0, 1]),
@@ -98,17 +103,18 @@ class JetPatch:
     def vertices(self, unknowns):
         """Positions of the vertices, Point3f of N [m, camera frame]."""
         x = mi.Vector3f(jet.point(*self._chart(unknowns)))
+        x.z += unknowns.delta_w
         t = mi.Vector3f(*(dr.gather(mi.Float, unknowns.translation, k) for k in range(3)))
         return self.origin + self._to_camera(x, unknowns) + self.scale * (self.rotation @ t)
 
     def tangents(self, unknowns):
-        """Derivatives of the position along u and along v at the vertices, Vector3f of N each [m per chart unit, camera frame]."""
+        """Derivatives of the jet, without relief, along u and along v at the vertices, Vector3f of N each [m per chart unit, camera frame]."""
         return tuple(self._to_camera(t, unknowns) for t in jet.tangents(*self._chart(unknowns)))
 
     def normals(self, unknowns):
-        """Unit normals at the vertices, Normal3f of N [camera frame]."""
+        """Unit normals of the jet, without relief, at the vertices, Normal3f of N [camera frame]."""
         return mi.Normal3f(self._to_camera(mi.Vector3f(jet.normal(*self._chart(unknowns))), unknowns) / self.scale)
 
     def metric(self, unknowns):
-        """First fundamental form (E, F, G) with respect to (u, v) at the vertices, Floats of N [m^2 per chart unit squared]."""
+        """First fundamental form (E, F, G) of the jet, without relief, with respect to (u, v) at the vertices, Floats of N [m^2 per chart unit squared]."""
         return tuple(self.scale * self.scale * g for g in jet.metric(*self._chart(unknowns)))

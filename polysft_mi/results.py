@@ -104,7 +104,7 @@ class Run:
                 raise InputError(f"{path}: not JSON lines ({error})") from None
 
     def mean_curvature(self):
-        """Mean curvature (T, N) [1/m] of the jets at the vertices, positive where the surface bulges towards the camera (by its pose in
+        """Mean curvature (T, N) [1/m] of the jets, without relief, at the vertices, positive where the surface bulges towards the camera (by its pose in
         the first frame).
         """
         import torch

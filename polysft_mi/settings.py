@@ -32,12 +32,12 @@ class Settings:
     k_rgb: float = _setting(1.0, "weight of the photometric loss", low=0)
     k_silhouette: float = _setting(1.0, "weight of the silhouette loss (needs masks)", low=0)
     k_mi: float = _setting(0.1, "weight of mesh inextensibility", low=0)
-    slack: float = _setting(
-        0.0, "share of its length by which an edge may shorten before shortening more gets cheap, for folds finer than the jet (gauss-newton); 0: none", low=0
-    )
     k_tc: float = _setting(0.05, "weight of temporal consistency", low=0)
     k_bend: float = _setting(1e-6, "weight of the jet's mean squared second derivatives (gauss-newton)", low=0)
     k_uv: float = _setting(1e-4, "weight of the differences of neighbours' uv displacements (gauss-newton)", low=0)
+    k_relief: float = _setting(
+        1e-3, "weight of the slopes of the relief, heights of the vertices over the jet, and a few thousandths of it of its bends (gauss-newton); 0: no relief", low=0
+    )
     rgb_norm: str = _setting("l1", "norm of the photometric residual", choices=("l1", "l2", "charbonnier"))
     rgb_scale: float = _setting(0.1, "residual at which the Charbonnier norm turns from quadratic to linear", above=0)
     brightness: str = _setting(

@@ -132,8 +132,8 @@ def test_gradient_of_the_deformed_patch_in_torch(bent, network):
     problem, points = bent
     patch = JetPatch(bridge.template(network, points.numpy(), problem.template.faces, problem.template.uv))
     vertices, N = bridge.deformed(patch), len(points)
-    unknowns = [0.05 * torch.randn(n, generator=torch.Generator().manual_seed(k)) for k, n in enumerate((15, N, N, 4, 3))]
-    unknowns[3] = unknowns[3] + torch.tensor([0, 0, 0, 1.0])
+    unknowns = [0.05 * torch.randn(n, generator=torch.Generator().manual_seed(k)) for k, n in enumerate((15, N, N, N, 4, 3))]
+    unknowns[4] = unknowns[4] + torch.tensor([0, 0, 0, 1.0])
     weight = torch.as_tensor(RNG.normal(size=(N, 3)), dtype=torch.float32)
     unknowns = [x.requires_grad_() for x in unknowns]
     (weight * vertices(*unknowns)).sum().backward()

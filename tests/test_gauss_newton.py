@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from polyfit import jets
 from polysft_mi import objective, prepare, pyramid, registration, scene, solvers
 from polysft_mi.errors import InputError
-from polysft_mi.normal_equations import Blocks, Chart, Normal, Pattern, Reduced, State, assemble
+from polysft_mi.normal_equations import Blocks, Chart, Normal, Pattern, Reduced, State, assemble, hinges
 from polysft_mi.patch import Unknowns
 from polysft_mi.problem import Problem
 from polysft_mi.pyramid import FARTHEST, Level, level_image
@@ -56,7 +56,7 @@ def grid_template(rows=6, columns=7, order=4, capacity=None, bend=4.0):
 def some_state(chart, size=0.05):
     n, a = len(chart.template.chart), len(chart.degree)
     turn = Rotation.from_rotvec(RNG.normal(size=3) * size)
-    return State(RNG.normal(size=a) * size, RNG.normal(size=(n, 2)) * size, turn, RNG.normal(size=3) * size)
+    return State(RNG.normal(size=a) * size, RNG.normal(size=(n, 3)) * size, turn, RNG.normal(size=3) * size)
 
 
 # -- the chart ---------------------------------------------------------------
@@ -68,15 +68,16 @@ def test_chart_is_the_jet_of_polyfit(order):
     chart = Chart(template)
     state = some_state(chart)
     arrays = chart.arrays(state)
-    uv = template.chart + state.uv
+    uv = template.chart + state.offset[:, :2]
     import torch
 
     z = jets.height(torch.as_tensor(template.alpha + arrays["delta_alpha"]), torch.as_tensor(uv)).numpy()
-    local = np.column_stack([uv, z]) @ state.rotation.as_matrix().T + state.translation
+    local = np.column_stack([uv, z + state.offset[:, 2]]) @ state.rotation.as_matrix().T + state.translation
     expected = template.scale * local @ template.rotation.T + template.origin
     assert np.abs(chart.surface(state).vertices - expected).max() < 1e-9
     back = chart.state(arrays)
-    assert np.abs(back.alpha - state.alpha).max() < 1e-9 and (back.rotation * state.rotation.inv()).magnitude() < 1e-7
+    assert np.abs(back.alpha - state.alpha).max() < 1e-9 and np.array_equal(back.offset, state.offset)
+    assert (back.rotation * state.rotation.inv()).magnitude() < 1e-7
 
 
 def test_chart_agrees_with_the_device(problem):
@@ -90,10 +91,10 @@ def test_chart_agrees_with_the_device(problem):
 def test_derivatives_of_the_surface(order):
     chart = Chart(grid_template(13, 14, order=4, capacity=order))
     state = some_state(chart)
-    step = RNG.normal(size=len(chart.degree) + 6) * 1e-5, RNG.normal(size=state.uv.shape) * 1e-5
+    step = RNG.normal(size=len(chart.degree) + 6) * 1e-5, RNG.normal(size=state.offset.shape) * 1e-5
     s = chart.surface(state)
     a = len(chart.degree)
-    linear = (s.basis @ step[0][:a])[:, None] * s.up + s.by_motion @ step[0][a:] + np.einsum("nka,na->nk", s.by_uv, step[1])
+    linear = (s.basis @ step[0][:a])[:, None] * s.up + s.by_motion @ step[0][a:] + np.einsum("nka,na->nk", s.by_offset, step[1])
     numeric = (chart.surface(state.moved(step)).vertices - chart.surface(state.moved(step, -1)).vertices) / 2
     assert np.abs(linear - numeric).max() < 1e-6 * np.abs(numeric).max()
 
@@ -108,79 +109,114 @@ def test_lower_order_is_the_first_columns():
     chart = Chart(grid_template(9, 9, order=4, capacity=8))
     state = some_state(chart)
     assert np.array_equal(chart.surface(state, 5).basis, chart.surface(state).basis[:, :21])
-    moved = state.moved((np.ones(21 + 6) * 0.1, np.zeros_like(state.uv)))
+    moved = state.moved((np.ones(21 + 6) * 0.1, np.full((81, 2), 0.2)))
+    assert np.allclose(moved.offset - state.offset, [0.2, 0.2, 0])
     assert np.allclose(moved.alpha[:21] - state.alpha[:21], 0.1) and np.array_equal(moved.alpha[21:], state.alpha[21:])
 
 
 def test_towards_goes_on_with_the_motion():
     chart = Chart(grid_template())
     a, b = some_state(chart), some_state(chart)
-    assert np.allclose(a.towards(b, 0).alpha, b.alpha) and np.allclose(a.towards(b, -1).uv, a.uv)
+    assert np.allclose(a.towards(b, 0).alpha, b.alpha) and np.allclose(a.towards(b, -1).offset, a.offset)
     c = a.towards(b, 1)
     assert (c.rotation * b.rotation.inv() * (b.rotation * a.rotation.inv()).inv()).magnitude() < 1e-12
 
 
 def test_rigid_motion_moves_the_template():
     chart = Chart(grid_template())
-    rest = State(np.zeros(15), np.zeros((42, 2)), Rotation.identity(), np.zeros(3))
+    rest = State(np.zeros(15), np.zeros((42, 3)), Rotation.identity(), np.zeros(3))
     turn, shift = Rotation.from_rotvec([0.2, -0.1, 0.3]), np.array([0.02, -0.01, 0.05])
-    state = State(rest.alpha, rest.uv, *chart.rigid(turn, shift))
+    state = State(rest.alpha, rest.offset, *chart.rigid(turn, shift))
     assert np.allclose(chart.surface(state).vertices, turn.apply(chart.surface(rest).vertices) + shift)
 
 
 def test_fitted_finds_the_state_of_given_vertices():
     chart = Chart(grid_template(11, 11))
-    rest = State(np.zeros(15), np.zeros((121, 2)), Rotation.identity(), np.zeros(3))
-    goal = chart.surface(some_state(chart, 0.03)).vertices
+    rest = State(np.zeros(15), np.zeros((121, 3)), Rotation.identity(), np.zeros(3))
+    smooth = some_state(chart, 0.03)
+    smooth.offset[:, 2] = 0
+    goal = chart.surface(smooth).vertices
     found = chart.fitted(rest, goal, 20)
     assert np.abs(chart.surface(found).vertices - goal).max() < 2e-4
+
+
+def test_absorbed_leaves_the_surface_and_as_little_relief_as_the_order_can():
+    chart = Chart(grid_template(13, 14, order=4, capacity=6))
+    state = some_state(chart)
+    fine = state.offset[:, 2] + chart.surface(state).basis @ RNG.normal(size=len(chart.degree)) * 0.1
+    state = dataclasses.replace(state, offset=np.column_stack([state.offset[:, :2], fine]))
+    found = chart.absorbed(state, 4, ridge=1e-12)
+    assert np.allclose(chart.surface(found).vertices, chart.surface(state).vertices, atol=1e-12)
+    basis = chart.surface(state, 4).basis
+    assert np.abs(basis.T @ fine).max() > 0.1 and np.abs(basis.T @ found.offset[:, 2]).max() < 1e-6
+    assert np.array_equal(found.alpha[15:], state.alpha[15:])
+
+
+def test_hinges_measure_bending_and_no_plane_bends():
+    """The sum of squares is the integral of a roll's squared curvature, on an irregular mesh too."""
+    n = 41
+    v, u = np.meshgrid(*2 * [np.linspace(-1, 1, n)], indexing="ij")
+    chart = np.stack([u, v], -1).reshape(-1, 2)
+    inner = np.abs(chart).max(1) < 0.99
+    chart[inner] += RNG.uniform(-0.1, 0.1, (inner.sum(), 2)) * 2 / n
+    faces = synthetic.grid_faces(n, n)
+    across, bends = hinges(chart, faces)
+    assert len(across) == bends.shape[0] == 3 * (n - 1) ** 2 - 2 * (n - 1)  # inner edges
+    assert np.abs(bends @ (0.3 + chart @ [1.5, -0.7])).max() < 1e-9
+    for k in (0, 1):
+        assert ((bends @ (0.5 * chart[:, k] ** 2)) ** 2).sum() == pytest.approx(4.0, rel=0.1)  # 1 on an area of 4
+    # the pairs are the corners that an inner edge separates
+    a, b = (set(map(frozenset, x)) for x in (across, [(f[k], f[k - 1]) for f in faces for k in range(3)]))
+    assert not a & b
 
 
 # -- the normal equations ----------------------------------------------------
 
 
 def dense(pattern, normal):
-    n = 2 * pattern.count
+    d = normal.local.shape[-1]
+    n = d * pattern.count
     h = np.zeros((n, n))
-    for i, j, block in zip(pattern.row, pattern.column, normal.uv):
-        h[2 * i : 2 * i + 2, 2 * j : 2 * j + 2] = block
-    return np.block([[h, normal.cross], [normal.cross.T, normal.glob]]), np.concatenate([normal.uv_gradient.ravel(), normal.gradient])
+    for i, j, block in zip(pattern.row, pattern.column, normal.local):
+        h[d * i : d * i + d, d * j : d * j + d] = block
+    return np.block([[h, normal.cross], [normal.cross.T, normal.glob]]), np.concatenate([normal.local_gradient.ravel(), normal.gradient])
 
 
-def random_normal(pattern, size=9):
+def random_normal(pattern, size=9, d=2):
     """Positive normal equations of the pattern: J^T J of residuals that each see one triangle and the global unknowns."""
-    n, blocks = 2 * pattern.count, np.zeros((len(pattern.row), 2, 2))
+    n, blocks = d * pattern.count, np.zeros((len(pattern.row), d, d))
     cross, glob = np.zeros((n, size)), np.eye(size) * 0.1
-    for a, b in pattern.edges:
-        for _ in range(3):
-            ja, jb, g = RNG.normal(size=2), RNG.normal(size=2), RNG.normal(size=size)
+    for a, b in np.stack([pattern.row, pattern.column], 1)[pattern.row < pattern.column]:
+        for _ in range(d + 1):
+            ja, jb, g = RNG.normal(size=d), RNG.normal(size=d), RNG.normal(size=size)
             for i, j, x in ((a, a, np.outer(ja, ja)), (b, b, np.outer(jb, jb)), (a, b, np.outer(ja, jb)), (b, a, np.outer(jb, ja))):
                 blocks[pattern.find(i, j)] += x
-            cross[2 * a : 2 * a + 2] += np.outer(ja, g)
-            cross[2 * b : 2 * b + 2] += np.outer(jb, g)
+            cross[d * a : d * a + d] += np.outer(ja, g)
+            cross[d * b : d * b + d] += np.outer(jb, g)
             glob += np.outer(g, g)
-    return Normal(blocks, cross, glob, RNG.normal(size=(pattern.count, 2)), RNG.normal(size=size))
+    return Normal(blocks, cross, glob, RNG.normal(size=(pattern.count, d)), RNG.normal(size=size))
 
 
-@pytest.mark.parametrize("rows, columns", [(2, 2), (3, 9), (8, 7)])
-def test_step_and_variance_are_those_of_the_dense_system(rows, columns):
+@pytest.mark.parametrize("rows, columns, d", [(2, 2, 2), (3, 9, 2), (8, 7, 2), (2, 2, 3), (8, 7, 3)])
+def test_step_and_variance_are_those_of_the_dense_system(rows, columns, d):
     template = grid_template(rows, columns, order=1)
-    pattern = Pattern(template.faces, template.edges, rows * columns)
-    normal = random_normal(pattern)
+    further = hinges(template.chart, template.faces)[0] if d == 3 else None
+    pattern = Pattern(template.faces, template.edges, rows * columns, further)
+    normal = random_normal(pattern, d=d)
     h, g = dense(pattern, normal)
-    n, damping = 2 * pattern.count, 1e-3
+    n, damping = d * pattern.count, 1e-3
     h += np.diag(np.diag(h)) * damping
-    reduced = Reduced(Blocks(pattern), normal, damping)
+    reduced = Reduced(Blocks(pattern, d), normal, damping)
     (glob, uv), decrease = reduced.step()
     expected = -np.linalg.solve(h, g)
     assert np.allclose(np.concatenate([uv.ravel(), glob]), expected, rtol=1e-5, atol=1e-7)
     assert decrease == pytest.approx(-0.5 * expected @ g, rel=1e-5)
-    by_uv, by_global = RNG.normal(size=(pattern.count, 2)), RNG.normal(size=(pattern.count, 9))
+    by_local, by_global = RNG.normal(size=(pattern.count, d)), RNG.normal(size=(pattern.count, 9))
     j = np.zeros((pattern.count, len(h)))
     j[:, n:] = by_global
     for k in range(pattern.count):
-        j[k, 2 * k : 2 * k + 2] = by_uv[k]
-    assert np.allclose(reduced.variance(by_uv, by_global), np.einsum("ij,ji->i", j, np.linalg.solve(h, j.T)), rtol=1e-5)
+        j[k, d * k : d * k + d] = by_local[k]
+    assert np.allclose(reduced.variance(by_local, by_global), np.einsum("ij,ji->i", j, np.linalg.solve(h, j.T)), rtol=1e-5)
     keep = np.r_[np.arange(n), n, n + 1, np.arange(n + 3, n + 9)]
     assert reduced.restricted(2) == pytest.approx(0.5 * g[keep] @ np.linalg.solve(h[np.ix_(keep, keep)], g[keep]), rel=1e-5)
     assert np.allclose(reduced.slide().ravel(), -np.linalg.solve(h[:n, :n], g[:n]), rtol=1e-5, atol=1e-7)
@@ -345,10 +381,10 @@ def edges_of(problem):
     chart, first = Chart(problem.template), Registration(problem)
     pattern = Pattern(first.faces, problem.template.edges, len(problem.template.vertices))
 
-    def edges_alone(state, lengths, *weights):
+    def edges_alone(state, lengths, stiffness):
         surface = chart.surface(state)
         none = registration.Evaluation(0, 0, 0, 0, np.zeros_like(surface.vertices), np.zeros((len(first.faces), 9, 2, 2)), None, 1.0)
-        return assemble(pattern, surface, first.projection(surface.vertices), none, lengths, *weights)
+        return assemble(pattern, surface, first.projection(surface.vertices), none, lengths, stiffness, wide=pattern)
 
     return chart, pattern, np.array(problem.edge_lengths, dtype=np.float64), edges_alone
 
@@ -364,37 +400,18 @@ def test_inextensibility_gradient_is_that_of_autodiff(problem):
     assert energy == pytest.approx(value[0], rel=1e-4)
     by_alpha = chart.to_monomials.T @ np.array(dr.grad(unknowns.delta_alpha))
     assert np.abs(normal.gradient[: len(by_alpha)] - by_alpha).max() < 1e-3 * np.abs(by_alpha).max()
-    by_uv = np.stack([np.array(dr.grad(unknowns.delta_u)), np.array(dr.grad(unknowns.delta_v))], 1)
-    assert np.abs(normal.uv_gradient - by_uv).max() < 1e-3 * np.abs(by_uv).max()
+    by_offset = np.stack([np.array(dr.grad(x)) for x in (unknowns.delta_u, unknowns.delta_v, unknowns.delta_w)], 1)
+    assert np.abs(normal.local_gradient - by_offset).max() < 1e-3 * np.abs(by_offset).max()
     by_shift = np.array(dr.grad(unknowns.translation))
-    assert np.abs(normal.gradient[-3:] - by_shift).max() < 1e-3 * np.abs(by_uv).max()
+    assert np.abs(normal.gradient[-3:] - by_shift).max() < 1e-3 * np.abs(by_offset).max()
 
 
-def test_slack_lets_edges_shorten_but_not_stretch(problem):
-    chart, pattern, rest, edges_alone = edges_of(problem)
-    state = some_state(chart, 0.02)
-
-    def model(at, lengths, slack):
-        return edges_alone(at, lengths, 3.0, slack)
-
-    slack = 0.002 * rest.mean()
-    normal, energy = model(state, rest, slack)
-    step = RNG.normal(size=len(normal.gradient)) * 1e-6, RNG.normal(size=state.uv.shape) * 1e-6
-    slope = (model(state.moved(step), rest, slack)[1] - model(state.moved(step, -1), rest, slack)[1]) / 2
-    assert step[0] @ normal.gradient + (step[1] * normal.uv_gradient).sum() == pytest.approx(slope, rel=1e-4)
-    a, b = pattern.edges.T
-    length = np.linalg.norm(chart.surface(state).vertices[a] - chart.surface(state).vertices[b], axis=1)
-    for factor in (0.9, 1.1):  # all stretched, all shortened
-        x = length - factor * length
-        plain, robust = (model(state, factor * length, c)[1] for c in (np.inf, slack))
-        assert plain == pytest.approx(3 * (x**2).sum(), rel=1e-6)
-        assert robust == pytest.approx(plain if factor < 1 else 3 * (slack**2 * np.log1p((x / slack) ** 2)).sum(), rel=1e-6)
-
-
-def test_whole_gradient_against_finite_differences(problem):
-    solver = gauss_newton.GaussNewton(dataclasses.replace(problem.settings, solver="gauss-newton", brightness="local", k_tc=50.0, k_bend=1e-3, k_uv=1e-2))
+@pytest.mark.parametrize("stage", gauss_newton.STAGES[::2])  # without and with the relief
+def test_whole_gradient_against_finite_differences(problem, stage):
+    settings = dataclasses.replace(problem.settings, solver="gauss-newton", brightness="local", k_tc=50.0, k_bend=1e-3, k_uv=1e-2)
+    solver = gauss_newton.GaussNewton(settings)
     solver._prepare(problem)
-    stage = gauss_newton.STAGES[0]
+    solver._before = 0.07
     chart = solver.chart
     rest = chart.state(problem.patch.rest().to_numpy())
     anchor, state = some_state(chart, 0.01), dataclasses.replace(some_state(chart, 0.004), translation=np.array([0.01, -0.008, 0.02]))
@@ -405,12 +422,12 @@ def test_whole_gradient_against_finite_differences(problem):
 
     normal, _ = linearise(state)
     for _ in range(3):
-        step = np.zeros(len(normal.gradient)), RNG.normal(size=state.uv.shape) * 3e-4
+        step = np.zeros(len(normal.gradient)), RNG.normal(size=normal.local_gradient.shape) * 3e-4
         step[0][:15] = RNG.normal(size=15) * 3e-4
         step[0][15:] = RNG.normal(size=6) * 3e-4
         slope = (linearise(state.moved(step))[1]["total"] - linearise(state.moved(step, -1))[1]["total"]) / 2
-        mine = step[0] @ normal.gradient + (step[1] * normal.uv_gradient).sum()
-        scale = np.linalg.norm(step[0]) * np.linalg.norm(normal.gradient) + np.linalg.norm(step[1]) * np.linalg.norm(normal.uv_gradient)
+        mine = step[0] @ normal.gradient + (step[1] * normal.local_gradient).sum()
+        scale = np.linalg.norm(step[0]) * np.linalg.norm(normal.gradient) + np.linalg.norm(step[1]) * np.linalg.norm(normal.local_gradient)
         assert abs(mine - slope) < 0.02 * scale  # a pixel's sight of the sheet jumps; the autodiff tests are the sharp ones
 
 
@@ -499,6 +516,41 @@ def test_steps_that_lead_nowhere_are_refused():
             gauss_newton._check_step(bad)
 
 
+def test_gradient_and_curvature_of_what_holds_the_relief(truth):
+    """Without the image, which jumps, differences are sharp; these terms are quadratic in the displacements, so that their curvature is exact."""
+    problem = problem_of(truth.folder, k_rgb=0.0, k_silhouette=0.0, k_mi=0.0, k_tc=5.0, k_relief=0.7, texture_fit="none")
+    solver = gauss_newton.GaussNewton(problem.settings)
+    solver._prepare(problem)
+    solver._before = 0.07
+    rest = solver.chart.state(problem.patch.rest().to_numpy())
+    state = some_state(solver.chart, 0.01)
+
+    def linearise(x):
+        return solver._linearise(x, rest, 1, 4, gauss_newton.STAGES[-1], 0.5)
+
+    normal, terms = linearise(state)
+    assert normal.local.shape[-1] == 3
+    h = dense(solver.systems[3].pattern, normal)[0][: 3 * len(state.offset), : 3 * len(state.offset)]
+    for _ in range(3):
+        step = np.zeros(len(normal.gradient)), RNG.normal(size=state.offset.shape) * 1e-2
+        change = linearise(state.moved(step))[1]["total"] - terms["total"]
+        promised = (step[1] * normal.local_gradient).sum() + 0.5 * step[1].ravel() @ h @ step[1].ravel()
+        assert change == pytest.approx(promised, rel=1e-6)
+
+
+def test_relief_moves_only_where_it_may(truth, tmp_path):
+    """Not in the first frame, nor where its weight is zero; else the more it weighs, the less there is of it, and it holds what no jet of the order can."""
+    found = {}
+    for weight in (0.0, 1e-3, 10.0):
+        problem = problem_of(truth.folder, k_relief=weight)
+        out = tmp_path / str(weight)
+        out.mkdir()
+        done = track(problem, solvers.create(problem.settings), 4, str(out))
+        assert not done.states[0]["delta_w"].any()
+        found[weight] = np.abs(done.states[-1]["delta_w"]).mean()
+    assert found[0.0] == 0 < found[10.0] < 0.1 * found[1e-3]
+
+
 def test_order_rises_with_the_data_and_stays_within_bounds(tmp_path):
     waves = synthetic.cloth(tmp_path / "waves", frames=3, size=(160, 120), rows=13, columns=17, bend=0.5, shift=0.0, turn=0.0)
     problem = problem_of(waves.folder, order=2, order_max=3)
@@ -544,9 +596,9 @@ def test_a_windows_step_against_finite_differences_and_the_dense_system(truth):
         return sum(terms["total"] for _, terms in solver._window(at, before, frames, orders))
 
     models = solver._window(states, before, frames, orders)
-    steps = [(RNG.normal(size=len(n.gradient)) * 1e-6, RNG.normal(size=s.uv.shape) * 1e-6) for (n, _), s in zip(models, states)]
+    steps = [(RNG.normal(size=len(n.gradient)) * 1e-6, RNG.normal(size=n.local_gradient.shape) * 1e-6) for (n, _), s in zip(models, states)]
     slope = (total([s.moved(d) for s, d in zip(states, steps)]) - total([s.moved(d, -1) for s, d in zip(states, steps)])) / 2
-    mine = sum(g @ n.gradient + (uv * n.uv_gradient).sum() for (g, uv), (n, _) in zip(steps, models))
+    mine = sum(g @ n.gradient + (uv * n.local_gradient).sum() for (g, uv), (n, _) in zip(steps, models))
     assert mine == pytest.approx(slope, rel=1e-4)
 
     damping, found = 1e-4, solver._window_step(models, 1e-4)

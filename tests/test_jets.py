@@ -151,6 +151,7 @@ def patch():
         "delta_alpha": 0.1 * RNG.normal(size=15),
         "delta_u": 0.02 * RNG.normal(size=63),
         "delta_v": 0.02 * RNG.normal(size=63),
+        "delta_w": 0.02 * RNG.normal(size=63),
         "rotation": np.array([0.1, -0.2, 0.3, 0.9]),
         "translation": 0.1 * RNG.normal(size=3),
     }
@@ -168,6 +169,7 @@ def test_patch_against_plain_numpy(patch):
     t = patch.template
     uv = torch.as_tensor(t.chart + np.stack([x["delta_u"], x["delta_v"]], 1))
     canonical = jets.point(torch.as_tensor(t.alpha + x["delta_alpha"]), uv).numpy()
+    canonical[:, 2] += x["delta_w"]
     R = Rotation.from_quat(x["rotation"]).as_matrix()
     expected = t.scale * (canonical @ R.T + x["translation"]) @ t.rotation.T + t.origin
     assert np.abs(np.array(patch.vertices(unknowns)).T - expected).max() < 1e-6

@@ -229,12 +229,12 @@ class Sheet:
         return Unknowns.from_numpy({**self.arrays, name: self.arrays[name] + h * direction})
 
 
-DIRECTIONS = ["delta_alpha", "delta_u", "delta_v", "rotation", "translation"]
+DIRECTIONS = ["delta_alpha", "delta_u", "delta_v", "delta_w", "rotation", "translation"]
 
 
 def direction_of(name, size):
     rng = np.random.default_rng(11)
-    if name in ("delta_u", "delta_v"):  # a smooth field over the sheet, as a deformation is
+    if name in ("delta_u", "delta_v", "delta_w"):  # a smooth field over the sheet, as a deformation is
         return np.sin(np.linspace(0, 4, size) + 0.5).astype(np.float32)
     out = rng.normal(size=size).astype(np.float32)
     if name == "rotation":

@@ -74,6 +74,7 @@ def test_unknowns_make_the_surface(result):
     for k, expected in enumerate(surface(result)["vertices"]):
         uv = p["chart"] + np.stack([p["delta_u"][k], p["delta_v"][k]], 1)
         x = jets.point(torch.as_tensor(p["alpha"] + p["delta_alpha"][k]), torch.as_tensor(uv)).numpy()
+        x[:, 2] += p["delta_w"][k]
         x = x @ Rotation.from_quat(p["rotation"][k]).as_matrix().T + p["translation"][k]
         assert np.abs(p["scale"] * x @ p["frame_rotation"].T + p["frame_origin"] - expected).max() < 1e-5
 

@@ -230,7 +230,7 @@ def test_a_jet_that_was_turned_is_found_again(sheet):
 
     template, rng = template_of(sheet, 4), np.random.default_rng(0)
     chart = Chart(template)
-    arrays = {"delta_alpha": 0.1 * rng.standard_normal(15), "delta_u": np.zeros(99), "delta_v": np.zeros(99)}
+    arrays = {"delta_alpha": 0.1 * rng.standard_normal(15), **{name: np.zeros(99) for name in ("delta_u", "delta_v", "delta_w")}}
     turn = Rotation.from_euler("xyz", [0.3, -0.4, 0.2]).as_quat()
     truth = chart.surface(chart.state({**arrays, "rotation": turn, "translation": [0.1, 0, 0.2]})).vertices
     found = sft.best_jets(template, truth[None])

@@ -1,10 +1,10 @@
 """Adam with the paper's step sizes (section "Experiments", PolySfT). Import only after a Mitsuba variant is set."""
 
+import dataclasses
 import math
 
 import mitsuba as mi
 
-from ..patch import Unknowns
 from . import Solution
 
 
@@ -33,13 +33,13 @@ class Adam:
             "translation": s.lr_rigid,
         }
         for k, unknowns in enumerate(window):
-            for name, value in unknowns.items():
-                optimizer[f"{k}.{name}"] = mi.Float(value)
+            for name in steps:  # the paper has no relief: it stays as it is
+                optimizer[f"{k}.{name}"] = mi.Float(getattr(unknowns, name))
         optimizer.set_learning_rate({f"{k}.{name}": steps[name] for k in range(len(window)) for name in steps})
 
         best, best_total, best_terms, since, iteration = [w.copy() for w in window], math.inf, {}, 0, 0
         while True:
-            current = [Unknowns(**{n: optimizer[f"{k}.{n}"] for n in Unknowns.NAMES}) for k in range(len(window))]
+            current = [dataclasses.replace(unknowns, **{n: optimizer[f"{k}.{n}"] for n in steps}) for k, unknowns in enumerate(window)]
             total, terms = problem.evaluate(current, frames, backward=True, seed=(s.seed + 7919 * iteration) % 2**31)
             if total < best_total:
                 best, best_total, best_terms, since = [w.copy() for w in current], total, terms, 0

@@ -8,7 +8,7 @@ from scipy.linalg import LinAlgError, block_diag, cho_factor, cho_solve
 from threadpoolctl import ThreadpoolController
 
 from ..errors import InputError
-from ..normal_equations import Blocks, Chart, Pattern, Reduced, State, assemble
+from ..normal_equations import Blocks, Chart, Pattern, Reduced, State, assemble, hinges
 from ..patch import Unknowns
 from ..problem import BadFrame
 from ..pyramid import Level
@@ -30,8 +30,10 @@ _ORDER_STEP = 2
 _TEXTURE_MISFIT, _TEXTURE_GAIN, _TEXTURE_FARTHEST = 0.15, 0.6, 0.08
 _TEXTURE_ITERATIONS, _TEXTURE_STIFFNESS = 6, 1.0
 _SHOWN = 0.7  # share of the pixels that see the sheet below which neither a stage nor another start may go: what none sees costs nothing
-_FARTHEST_STEP = 2.0  # rotation [rad], translation and uv displacements [chart units]
+_FARTHEST_STEP = 2.0  # rotation [rad], translation and displacements [chart units]
 _FACTS = "misfit", "outlying", "order"
+_RELIEF_BEND = 3e-3  # of the relief's weight, for its bending
+_RELIEF_MISFIT = 0.045  # of the frame before, at which the relief's weight has doubled; with the fourth power: noise must not become ripples, which use up length
 _TEMPORAL = 1e-3  # of k_tc: it holds a frame to the one before, in a stiffer basis than the monomials of the paper's window
 
 
@@ -42,24 +44,26 @@ def _cost(found):
 
 
 def _check_step(step):
-    """Raises LinAlgError where a step (global (G,), uv (N, 2)) is not finite, or goes farther than any model is good for."""
-    g, uv = step
-    if not max(np.abs(g[-6:]).max(), np.abs(uv).max()) < _FARTHEST_STEP:
+    """Raises LinAlgError where a step (global (G,), local (N, d)) is not finite, or goes farther than any model is good for."""
+    g, local = step
+    if not max(np.abs(g[-6:]).max(), np.abs(local).max()) < _FARTHEST_STEP:
         raise LinAlgError("the step is not finite, or too long")
 
 
 @dataclass(frozen=True)
 class Stage:
-    """``blur`` [pixels at a sheet of _SHEET], ``stiffness`` (the factor of k_mi), and the most ``iterations``."""
+    """``blur`` [pixels at a sheet of _SHEET], ``stiffness`` (the factor of k_mi), the most ``iterations``, and the misfit of the frame before
+    below which the ``relief`` moves."""
 
     blur: float
     stiffness: float
     iterations: int
+    relief: float = 0.0
 
 
 # Soft edges first, so that the texture coordinates register to the image before lengths are enforced: in a stiff flat sheet that is compressed
 # in the image, height has no first-order effect, and it would drift in depth instead of bending.
-STAGES = Stage(2.5, 1e2, 6), Stage(1.5, 3e2, 5), Stage(1.0, 1e3, 4)
+STAGES = Stage(2.5, 1e2, 6), Stage(1.5, 3e2, 5, 0.08), Stage(1.0, 1e3, 4, math.inf)
 FAR = Stage(6.0, 1e2, 6)  # before the others where the sheet has moved far
 
 
@@ -68,7 +72,8 @@ class GaussNewton:
 
     A frame starts from the one before or from where its motion leads, whichever explains the image better. Where it ends with a misfit far
     above that of the frames before, other starts are tried: farther motion, and the rigid pose of the flat template by features. The order
-    of the jet rises from the template's to at most ``order_max`` where the objective asks for it, and falls where it does not. In a window of
+    of the jet rises from the template's to at most ``order_max`` where the objective asks for it, and falls where it does not; a relief over
+    the jet, a height of each vertex, holds folds that no jet can. In a window of
     several frames the newest is solved so, and then all together; ``revisit`` looks both ways from one frame.
     """
 
@@ -81,6 +86,7 @@ class GaussNewton:
         self._problem = None
         self._blas = ThreadpoolController()  # its own threads cost more than they bring on blocks this small, and wait for Dr.Jit's
         self._scales, self._fitting = {}, {}
+        self._before = math.nan  # misfit of the frame before the one at work; NaN in the first, where the template has its shape
         self._hold = 0.0  # weight of the difference to the anchor, motion included, where a frame is solved again
 
     def solve(self, problem, window, frames, report=None, past=()):
@@ -103,6 +109,7 @@ class GaussNewton:
         for k in range(len(frames) - 1 if past else 0, len(frames)):
             self._expect(frames[k])
             self._scales, self._fitting = self._fitting, {}
+            self._before = next((t["misfit"] for t in reversed(known) if t.get("misfit") is not None), math.nan)
             start = states[k] if past or k == 0 else states[k - 1]
             states[k], found = self._newest(start, frames[k], (before + states[:k])[-2:], known)
             known.append(found)
@@ -125,6 +132,7 @@ class GaussNewton:
             self._prepare(problem)
         self._report, self._count = None, 0
         self._scales, self._fitting = self._scales_of(terms), {}
+        self._before = terms.get("misfit") or math.nan
         a, b = self.chart.state(before), self.chart.state(after)
         middle = a.towards(b, -0.5)
         order = int(terms.get("order") or self.least)
@@ -142,10 +150,13 @@ class GaussNewton:
         template = problem.template
         self.registration = Registration(problem)
         self.chart, self.least = Chart(template), template.fitted
-        self.pattern = Pattern(self.registration.faces, template.edges, len(template.vertices))
-        self.blocks = Blocks(self.pattern)
+        faces, count = self.registration.faces, len(template.vertices)
+        across, bends = hinges(template.chart, faces)
+        self.pattern, wide = Pattern(faces, template.edges, count), Pattern(faces, template.edges, count, across)
+        self.systems = {2: Blocks(self.pattern), 3: Blocks(wide, 3)}  # by the local unknowns of a vertex
+        self.bends = bends
+        self._relief_blocks = wide.laplacian + _RELIEF_BEND * wide.blocks_of(bends.T @ bends)
         self.lengths = np.array(problem.edge_lengths, dtype=np.float64)
-        self.slack = problem.settings.slack * self.lengths.mean() or np.inf
         position, _ = problem.camera.project(template.vertices)
         corner = position[self.registration.faces]
         a, b = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
@@ -156,6 +167,7 @@ class GaussNewton:
             self.levels[stage] = Level(sigma, max(1, int(0.8 * sigma)), max(_WINDOW * unit, 3 * sigma))
         self._relocator = None
         self._report, self._count = None, 0
+        self._before = math.nan
         if self.settings.texture_fit == "auto":
             self._fit_texture()
 
@@ -176,12 +188,12 @@ class GaussNewton:
             for _ in range(_TEXTURE_ITERATIONS):
                 try:
                     normal, terms = self._linearise(state, rest, 0, self.least, stage, _FIRST_SCALE, stiffness=_TEXTURE_STIFFNESS)
-                    state = State(rest.alpha, state.uv + Reduced(self.blocks, normal, 1e-3).slide(), rest.rotation, rest.translation)
+                    state = state.moved((np.zeros(len(normal.gradient)), self._reduced(normal, 1e-3).slide()))
                 except (BadFrame, LinAlgError):
                     return
         after = reg.misfit(chart.surface(state, 0).vertices, 0, self.levels[STAGES[-1]])
-        if after < _TEXTURE_GAIN * before and np.abs(state.uv).max() < _TEXTURE_FARTHEST:
-            reg.shift_texture(chart.template.chart, chart.template.chart + state.uv)
+        if after < _TEXTURE_GAIN * before and np.abs(state.offset).max() < _TEXTURE_FARTHEST:
+            reg.shift_texture(chart.template.chart, chart.template.chart + state.offset[:, :2])
 
     def _expect(self, frame):
         """Have this frame and the next one read in a second thread."""
@@ -211,7 +223,11 @@ class GaussNewton:
                         best = min(best, found, key=_cost)
                 if best[1]["misfit"] <= limit:
                     break
-        return self._adapt_order(*best, anchor, frame)
+        state, terms = self._adapt_order(*best, anchor, frame)
+        return self.chart.absorbed(state, self.least), terms
+
+    def _reduced(self, normal, damping):
+        return Reduced(self.systems[normal.local.shape[-1]], normal, damping)
 
     def _nearest(self, starts, frame, stage):
         """The start that explains the frame best."""
@@ -227,7 +243,7 @@ class GaussNewton:
         if motion is None:
             return None
         rest = self.chart.state(self._problem.patch.rest().to_numpy())
-        return State(rest.alpha, rest.uv, *self.chart.rigid(*motion))
+        return State(rest.alpha, rest.offset, *self.chart.rigid(*motion))
 
     def _descend(self, state, anchor, frame, order, stages, iterations=None):
         """Stage after stage, each of at most its own or so many ``iterations``: (state, terms)."""
@@ -242,7 +258,7 @@ class GaussNewton:
         damping, least = 1e-4, _SHOWN * terms["pixels"]
         for _ in range(iterations):
             try:
-                step, promised = Reduced(self.blocks, normal, damping).step()
+                step, promised = self._reduced(normal, damping).step()
                 _check_step(step)
             except LinAlgError:
                 damping = max(10 * damping, 1e-4)
@@ -299,23 +315,24 @@ class GaussNewton:
         anchors = [before if before is not None else states[0], *states[:-1]]
         models = [self._linearise(s, a, f, n, stage, scale) for s, a, f, n in zip(states, anchors, frames, orders)]
         temporal = 2 * self.settings.k_tc * _TEMPORAL
-        diagonal = self.pattern.diagonal
         for (earlier, _), (later, _), a, b, n in zip(models, models[1:], states, states[1:], orders):
             size = self.chart.size(n)
             earlier.gradient[:size] -= temporal * (b.alpha - a.alpha)[:size]
             earlier.glob[:size, :size] += temporal * np.eye(size)
-            earlier.uv_gradient -= temporal * (b.uv - a.uv)
-            # the displacements' coupling, weak beside the image, by its bound |a - b|^2 <= 2 |a|^2 + 2 |b|^2: the uv blocks stay apart
-            for k in (0, 1):
-                earlier.uv[diagonal, k, k] += 2 * temporal
-                later.uv[diagonal, k, k] += temporal
+            d = earlier.local.shape[-1]
+            earlier.local_gradient -= temporal * (b.offset - a.offset)[:, :d]
+            # the displacements' coupling, weak beside the image, by its bound |a - b|^2 <= 2 |a|^2 + 2 |b|^2: the local blocks stay apart
+            diagonal = self.systems[d].pattern.diagonal
+            for k in range(d):
+                earlier.local[diagonal, k, k] += 2 * temporal
+                later.local[diagonal, k, k] += temporal
         return models
 
     def _window_step(self, models, damping):
         """The steps of all frames, and the decrease that they promise. The global unknowns are coupled from frame to frame: a block-banded
         system.
         """
-        reduced = [Reduced(self.blocks, normal, damping) for normal, _ in models]
+        reduced = [self._reduced(normal, damping) for normal, _ in models]
         start = np.cumsum([0] + [len(r.right) for r in reduced])
         matrix = block_diag(*(r.schur for r in reduced))
         temporal = 2 * self.settings.k_tc * _TEMPORAL
@@ -350,29 +367,36 @@ class GaussNewton:
         evaluation = self.registration.evaluate(surface.vertices, frame, self.levels[stage], scale)
         stiffness = s.k_mi * (stage.stiffness if stiffness is None else stiffness) / chart.template.scale**2
         projection = self.registration.projection(surface.vertices)
-        normal, inextensibility = assemble(self.pattern, surface, projection, evaluation, self.lengths, stiffness, self.slack)
+        d = 3 if s.k_relief > 0 and self._before < stage.relief else 2
+        relief = s.k_relief * (1 + (np.nan_to_num(self._before) / _RELIEF_MISFIT) ** 4)
+        pattern = self.systems[d].pattern
+        normal, inextensibility = assemble(self.pattern, surface, projection, evaluation, self.lengths, stiffness, pattern if d == 3 else None)
         a = self.chart.size(order)
         bend = 2 * s.k_bend * chart.bending
-        moved, slid = state.alpha - anchor.alpha, state.uv - anchor.uv
+        moved, slid = state.alpha - anchor.alpha, state.offset - anchor.offset
         temporal = s.k_tc * _TEMPORAL + self._hold
         normal.glob[:a, :a] += bend[:a, :a] + 2 * temporal * np.eye(a)
         normal.gradient[:a] += (bend @ state.alpha + 2 * temporal * moved)[:a]
         motion = np.concatenate([(state.rotation * anchor.rotation.inv()).as_rotvec(), state.translation - anchor.translation])
         normal.glob[a:, a:] += 2 * self._hold * np.eye(6)
         normal.gradient[a:] += 2 * self._hold * motion
-        i, j = self.pattern.edges.T
-        apart = state.uv[i] - state.uv[j]
-        pull = np.stack([np.bincount(i, apart[:, k], len(slid)) - np.bincount(j, apart[:, k], len(slid)) for k in (0, 1)], 1)
-        normal.uv_gradient += 2 * s.k_uv * pull + 2 * s.k_tc * _TEMPORAL * slid
-        for k in (0, 1):
-            normal.uv[:, k, k] += 2 * s.k_uv * self.pattern.laplacian
-            normal.uv[self.pattern.diagonal, k, k] += 2 * s.k_tc * _TEMPORAL
+        # neighbours' differences, of the relief its bends too
+        i, j = pattern.edges.T
+        apart, bent = state.offset[i] - state.offset[j], self.bends @ state.offset[:, 2]
+        weights = np.array([s.k_uv, s.k_uv, relief])
+        pull = weights * (pattern.from_ends @ np.concatenate([apart, -apart]))
+        pull[:, 2] += relief * _RELIEF_BEND * (self.bends.T @ bent)
+        normal.local_gradient += 2 * (pull + s.k_tc * _TEMPORAL * slid)[:, :d]
+        for k, blocks in enumerate((pattern.laplacian, pattern.laplacian, self._relief_blocks)[:d]):
+            normal.local[:, k, k] += 2 * weights[k] * blocks
+            normal.local[pattern.diagonal, k, k] += 2 * s.k_tc * _TEMPORAL
         terms = {
             "rgb": evaluation.photometric,
             "silhouette": evaluation.silhouette,
             "inextensibility": inextensibility,
             "temporal": temporal * float((moved**2).sum()) + s.k_tc * _TEMPORAL * float((slid**2).sum()) + self._hold * float((motion**2).sum()),
-            "smoothness": s.k_bend * float(state.alpha @ chart.bending @ state.alpha) + s.k_uv * float((apart**2).sum()),
+            "smoothness": s.k_bend * float(state.alpha @ chart.bending @ state.alpha)
+            + float((weights * apart**2).sum() + relief * _RELIEF_BEND * (bent**2).sum()),
         }
         total = sum(terms.values())
         if not math.isfinite(total):
@@ -403,7 +427,7 @@ class GaussNewton:
         stage, top = STAGES[-1], min(order + _ORDER_STEP, self.settings.capacity)
         wide, there = self._linearise(state, anchor, frame, top, stage, self._scales.get(stage, _FIRST_SCALE))
         try:
-            reduced = Reduced(self.blocks, wide, 1e-6)
+            reduced = self._reduced(wide, 1e-6)
             promised = reduced.step()[1] - reduced.restricted(self.chart.size(order))
         except LinAlgError:
             return None
@@ -419,7 +443,7 @@ class GaussNewton:
         normal, _, noise = terms["model"]
         worth = _LOWER * noise * (self.chart.size(order) - size)
         try:
-            reduced = Reduced(self.blocks, normal, 1e-6)
+            reduced = self._reduced(normal, 1e-6)
             g, expected = reduced.without(size, state.alpha)
         except LinAlgError:
             return None
@@ -449,7 +473,8 @@ class GaussNewton:
         ray /= np.linalg.norm(ray, axis=1, keepdims=True)
         by_global = np.column_stack([(ray @ surface.up)[:, None] * surface.basis, np.einsum("nk,nkm->nm", ray, surface.by_motion)])
         try:
-            variance = Reduced(self.blocks, normal, 1e-9).variance(np.einsum("nk,nka->na", ray, surface.by_uv), by_global)
+            by_local = np.einsum("nk,nka->na", ray, surface.by_offset)[:, : normal.local.shape[-1]]
+            variance = self._reduced(normal, 1e-9).variance(by_local, by_global)
         except (LinAlgError, np.linalg.LinAlgError):
             variance = np.full(len(ray), np.nan)
         return np.sqrt(noise * variance).astype(np.float32)
