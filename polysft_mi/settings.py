@@ -36,7 +36,7 @@ class Settings:
     k_bend: float = _setting(1e-6, "weight of the jet's mean squared second derivatives (gauss-newton)", low=0)
     k_uv: float = _setting(1e-4, "weight of the differences of neighbours' uv displacements (gauss-newton)", low=0)
     k_relief: float = _setting(
-        1e-3, "weight of the slopes of the relief, heights of the vertices over the jet, and a few thousandths of it of its bends (gauss-newton); 0: no relief", low=0
+        1e-3, "weight of the slopes of the relief, heights of the vertices over the jet, and a few thousandths of it of its bends (gauss-newton, templates of at most 3,000 vertices); 0: no relief", low=0
     )
     rgb_norm: str = _setting("l1", "norm of the photometric residual", choices=("l1", "l2", "charbonnier"))
     rgb_scale: float = _setting(0.1, "residual at which the Charbonnier norm turns from quadratic to linear", above=0)

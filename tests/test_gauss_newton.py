@@ -538,8 +538,15 @@ def test_gradient_and_curvature_of_what_holds_the_relief(truth):
         assert change == pytest.approx(promised, rel=1e-6)
 
 
+def test_large_templates_have_no_relief(truth, tmp_path, monkeypatch):
+    problem = problem_of(truth.folder)
+    monkeypatch.setattr(gauss_newton, "_RELIEF_VERTICES", len(problem.template.vertices) - 1)
+    done = track(problem, solvers.create(problem.settings), 3, str(tmp_path))
+    assert not done.states[-1]["delta_w"].any()
+
+
 def test_relief_moves_only_where_it_may(truth, tmp_path):
-    """Not in the first frame, nor where its weight is zero; else the more it weighs, the less there is of it, and it holds what no jet of the order can."""
+    """Not in the first frame, nor where its weight is zero; else the more it weighs, the less there is of it."""
     found = {}
     for weight in (0.0, 1e-3, 10.0):
         problem = problem_of(truth.folder, k_relief=weight)

@@ -32,6 +32,7 @@ _TEXTURE_ITERATIONS, _TEXTURE_STIFFNESS = 6, 1.0
 _SHOWN = 0.7  # share of the pixels that see the sheet below which neither a stage nor another start may go: what none sees costs nothing
 _FARTHEST_STEP = 2.0  # rotation [rad], translation and displacements [chart units]
 _FACTS = "misfit", "outlying", "order"
+_RELIEF_VERTICES = 3000  # of the template, above which there is no relief: its wide system takes a second an iteration at 10,000
 _RELIEF_BEND = 3e-3  # of the relief's weight, for its bending
 _RELIEF_MISFIT = 0.045  # of the frame before, at which the relief's weight has doubled; with the fourth power: noise must not become ripples, which use up length
 _TEMPORAL = 1e-3  # of k_tc: it holds a frame to the one before, in a stiffer basis than the monomials of the paper's window
@@ -367,7 +368,7 @@ class GaussNewton:
         evaluation = self.registration.evaluate(surface.vertices, frame, self.levels[stage], scale)
         stiffness = s.k_mi * (stage.stiffness if stiffness is None else stiffness) / chart.template.scale**2
         projection = self.registration.projection(surface.vertices)
-        d = 3 if s.k_relief > 0 and self._before < stage.relief else 2
+        d = 3 if s.k_relief > 0 and len(state.offset) <= _RELIEF_VERTICES and self._before < stage.relief else 2
         relief = s.k_relief * (1 + (np.nan_to_num(self._before) / _RELIEF_MISFIT) ** 4)
         pattern = self.systems[d].pattern
         normal, inextensibility = assemble(self.pattern, surface, projection, evaluation, self.lengths, stiffness, pattern if d == 3 else None)
