@@ -340,7 +340,7 @@ def _scalars(run, shown, errors, distance):
         meaning = "Root mean square over the channels of rendering minus image, in linear colour, where each vertex is seen."
         out.append(_scalar("error", meaning, "linear colour", errors, "inferno"))
     curvature = run.mean_curvature()[shown]
-    meaning = "Mean curvature of the jet: red where the surface bulges towards the first frame's camera, blue where it is hollow."
+    meaning = "Mean curvature of the jet, without its relief: red where the surface bulges towards the first frame's camera, blue where it is hollow."
     out.append(_scalar("curvature", meaning, "1/m", curvature, "RdBu_r", signed=True))
     if run.sigma is not None and np.isfinite(run.sigma[shown]).any():
         meaning = "Standard deviation of each vertex along its ray, as the solver estimates it; grey where it is not known."

@@ -78,7 +78,10 @@ def test_glb_plays_the_frames(run, expected, tmp_path):
     np.testing.assert_allclose(times, np.arange(len(expected)) / FPS, atol=1e-6)
     np.testing.assert_allclose(base + np.einsum("tk,knc->tnc", weights, targets), expected, atol=1e-6)
     normals = accessor(primitive["attributes"]["NORMAL"]) + accessor(primitive["targets"][-1]["NORMAL"])
-    np.testing.assert_allclose(normals, trimesh.Trimesh(expected[-1], run.faces, process=False).vertex_normals, atol=0.02)
+    of_faces = np.cross(*(expected[-1][run.faces[:, k]] - expected[-1][run.faces[:, 0]] for k in (1, 2)))
+    by_area = np.zeros_like(expected[-1])
+    np.add.at(by_area, run.faces, of_faces[:, None])
+    np.testing.assert_allclose(normals, by_area / np.linalg.norm(by_area, axis=1, keepdims=True), atol=1e-3)
     assert image(0) == open(run.texture, "rb").read()
 
 

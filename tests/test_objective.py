@@ -82,7 +82,7 @@ def test_isometries_are_free():
 
 def window_of(values):
     rows = values.reshape(3, 7)
-    return [Unknowns(floats(r[:3]), floats(r[3:5]), floats(r[5:7]), floats([0, 0, 0, 1]), floats([0, 0, 0])) for r in rows]
+    return [Unknowns(floats(r[:3]), floats(r[3:5]), floats(r[5:7]), floats([0, 0]), floats([0, 0, 0, 1]), floats([0, 0, 0])) for r in rows]
 
 
 def test_temporal_value_and_gradient():
@@ -94,9 +94,9 @@ def test_temporal_value_and_gradient():
 
     def f(v):
         rows = [dr.gather(mi.Float, v, 7 * k + index) for k in range(3)]
-        zero = floats([0, 0, 0])
+        zero = floats([0, 0, 0])  # relief, rotation and translation do not count
         part = lambda r, a, n: dr.gather(mi.Float, r, a + dr.arange(mi.UInt32, n))
-        return objective.temporal([Unknowns(part(r, 0, 3), part(r, 3, 2), part(r, 5, 2), zero, zero) for r in rows])
+        return objective.temporal([Unknowns(part(r, 0, 3), part(r, 3, 2), part(r, 5, 2), zero, zero, zero) for r in rows])
 
     check_gradient(f, x)
 
