@@ -180,7 +180,8 @@ class Chart:
         return state
 
     def absorbed(self, state, order, ridge=1e-6):
-        """The same surface with as much of the relief as a jet of ``order`` can hold in the coefficients instead."""
+        """The state of the same surface with as much of the relief as a jet of ``order`` can hold in the coefficients instead; ``ridge``
+        holds those that the vertices do not determine."""
         size, relief = self.size(order), state.offset[:, 2]
         basis = self.surface(state, order).basis
         held = ridge * len(relief) * (self.bending[:size, :size] + np.eye(size))
@@ -229,7 +230,7 @@ class Pattern:
         self.laplacian = self.blocks_of(difference.T @ difference)  # sum over edges of (x_a - x_b)^2
 
     def blocks_of(self, matrix):
-        """A sparse matrix (N, N) within the pattern as one number a block."""
+        """A sparse matrix (N, N) within the pattern as one number a block, (B,)."""
         matrix, out = matrix.tocoo(), np.zeros(len(self._keys))
         out[self.find(matrix.row, matrix.col)] = matrix.data
         return out
@@ -491,8 +492,8 @@ class Reduced:
 
 
 def hinges(chart, faces):
-    """What a height over the chart (N, 2) bends at the mesh's inner edges: the pairs (H, 2) of vertices that lie across each, and the
-    sparse J (H, N) that makes the bends. The sum of their squares is the integral of the squared curvature of a roll along the mesh's rows,
+    """What a height over the chart (N, 2), both in the chart's unit, bends at the H inner edges of the mesh with ``faces`` (F, 3): the
+    pairs (H, 2) of vertices that lie across each, and the sparse J (H, N) that makes the bends. The sum of their squares is the integral of the squared curvature of a roll along the mesh's rows,
     up to three times that of others; no plane has any.
 
     After Bergou et al., "A Quadratic Bending Model for Inextensible Surfaces" (SGP 2006).

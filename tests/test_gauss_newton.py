@@ -411,7 +411,7 @@ def test_whole_gradient_against_finite_differences(problem, stage):
     settings = dataclasses.replace(problem.settings, solver="gauss-newton", brightness="local", k_tc=50.0, k_bend=1e-3, k_uv=1e-2)
     solver = gauss_newton.GaussNewton(settings)
     solver._prepare(problem)
-    solver._before = 0.07
+    solver._misfit_before = 0.07
     chart = solver.chart
     rest = chart.state(problem.patch.rest().to_numpy())
     anchor, state = some_state(chart, 0.01), dataclasses.replace(some_state(chart, 0.004), translation=np.array([0.01, -0.008, 0.02]))
@@ -521,7 +521,7 @@ def test_gradient_and_curvature_of_what_holds_the_relief(truth):
     problem = problem_of(truth.folder, k_rgb=0.0, k_silhouette=0.0, k_mi=0.0, k_tc=5.0, k_relief=0.7, texture_fit="none")
     solver = gauss_newton.GaussNewton(problem.settings)
     solver._prepare(problem)
-    solver._before = 0.07
+    solver._misfit_before = 0.07
     rest = solver.chart.state(problem.patch.rest().to_numpy())
     state = some_state(solver.chart, 0.01)
 

@@ -87,7 +87,7 @@ class GaussNewton:
         self._problem = None
         self._blas = ThreadpoolController()  # its own threads cost more than they bring on blocks this small, and wait for Dr.Jit's
         self._scales, self._fitting = {}, {}
-        self._before = math.nan  # misfit of the frame before the one at work; NaN in the first, where the template has its shape
+        self._misfit_before = math.nan  # of the frame at work; NaN in the first, where the template has its shape
         self._hold = 0.0  # weight of the difference to the anchor, motion included, where a frame is solved again
 
     def solve(self, problem, window, frames, report=None, past=()):
@@ -110,7 +110,7 @@ class GaussNewton:
         for k in range(len(frames) - 1 if past else 0, len(frames)):
             self._expect(frames[k])
             self._scales, self._fitting = self._fitting, {}
-            self._before = next((t["misfit"] for t in reversed(known) if t.get("misfit") is not None), math.nan)
+            self._misfit_before = next((t["misfit"] for t in reversed(known) if t.get("misfit") is not None), math.nan)
             start = states[k] if past or k == 0 else states[k - 1]
             states[k], found = self._newest(start, frames[k], (before + states[:k])[-2:], known)
             known.append(found)
@@ -133,7 +133,7 @@ class GaussNewton:
             self._prepare(problem)
         self._report, self._count = None, 0
         self._scales, self._fitting = self._scales_of(terms), {}
-        self._before = terms.get("misfit") or math.nan
+        self._misfit_before = terms.get("misfit") or math.nan
         a, b = self.chart.state(before), self.chart.state(after)
         middle = a.towards(b, -0.5)
         order = int(terms.get("order") or self.least)
@@ -168,7 +168,7 @@ class GaussNewton:
             self.levels[stage] = Level(sigma, max(1, int(0.8 * sigma)), max(_WINDOW * unit, 3 * sigma))
         self._relocator = None
         self._report, self._count = None, 0
-        self._before = math.nan
+        self._misfit_before = math.nan
         if self.settings.texture_fit == "auto":
             self._fit_texture()
 
@@ -368,8 +368,8 @@ class GaussNewton:
         evaluation = self.registration.evaluate(surface.vertices, frame, self.levels[stage], scale)
         stiffness = s.k_mi * (stage.stiffness if stiffness is None else stiffness) / chart.template.scale**2
         projection = self.registration.projection(surface.vertices)
-        d = 3 if s.k_relief > 0 and len(state.offset) <= _RELIEF_VERTICES and self._before < stage.relief else 2
-        relief = s.k_relief * (1 + (np.nan_to_num(self._before) / _RELIEF_MISFIT) ** 4)
+        d = 3 if s.k_relief > 0 and len(state.offset) <= _RELIEF_VERTICES and self._misfit_before < stage.relief else 2
+        relief = s.k_relief * (1 + (np.nan_to_num(self._misfit_before) / _RELIEF_MISFIT) ** 4)
         pattern = self.systems[d].pattern
         normal, inextensibility = assemble(self.pattern, surface, projection, evaluation, self.lengths, stiffness, pattern if d == 3 else None)
         a = self.chart.size(order)
