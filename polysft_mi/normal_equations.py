@@ -200,16 +200,19 @@ def _legendre_to_monomials(order):
 
 
 class Pattern:
-    """Which vertices of the mesh share an edge: the blocks of every matrix here, in the order of (row, column), and a narrow ordering."""
+    """Which vertices of the mesh share an edge, or are one of the ``further`` pairs (P, 2): the blocks of every matrix here, in the order
+    of (row, column), and a narrow ordering.
+    """
 
-    def __init__(self, faces, edges, count):
+    def __init__(self, faces, edges, count, further=None):
         self.count, self.edges = count, edges
-        a, b = edges.T
+        a, b = (edges if further is None else np.concatenate([edges, further])).T
         each = np.arange(count)
         self._keys = np.sort(np.concatenate([each * count + each, a * count + b, b * count + a]))
         self.row, self.column = np.divmod(self._keys, count)
         self.start = np.searchsorted(self.row, np.arange(count + 1))
         self.diagonal = self.find(each, each)
+        a, b = edges.T
         corners = np.repeat(np.arange(3), 3), np.tile(np.arange(3), 3)
         at = self.find(faces[:, corners[0]], faces[:, corners[1]])
         self.from_faces = sp.csr_matrix((np.ones(at.size), (at.ravel(), np.arange(at.size))), shape=(len(self._keys), at.size))
@@ -224,18 +227,12 @@ class Pattern:
         difference = sp.csr_matrix(
             (np.tile([1.0, -1.0], len(edges)), (np.repeat(np.arange(len(edges)), 2), edges.ravel())), shape=(len(edges), count)
         )
-        self.laplacian = self.bound(difference.T @ difference)  # sum over edges of (x_a - x_b)^2
+        self.laplacian = self.blocks_of(difference.T @ difference)  # sum over edges of (x_a - x_b)^2
 
-    def bound(self, matrix):
-        """A sparse symmetric matrix (N, N) as one number a block, (B,): itself where it lies within the pattern, else the least above it
-        that does, by 2 |x_i x_j| <= x_i^2 + x_j^2 for the pairs beyond.
-        """
-        matrix = matrix.tocoo()
-        key = matrix.row.astype(np.int64) * self.count + matrix.col
-        inside = np.isin(key, self._keys)
-        out = np.zeros(len(self._keys))
-        np.add.at(out, np.searchsorted(self._keys, key[inside]), matrix.data[inside])
-        out[self.diagonal] += np.bincount(matrix.row[~inside], np.abs(matrix.data[~inside]), self.count)
+    def blocks_of(self, matrix):
+        """A sparse matrix (N, N) within the pattern as one number a block, (B,)."""
+        matrix, out = matrix.tocoo(), np.zeros(len(self._keys))
+        out[self.find(matrix.row, matrix.col)] = matrix.data
         return out
 
     def find(self, i, j):
@@ -359,13 +356,14 @@ class Normal:
     gradient: np.ndarray
 
 
-def assemble(pattern, surface, projection, evaluation, lengths, stiffness, d=2):
+def assemble(pattern, surface, projection, evaluation, lengths, stiffness, wide=None):
     """:class:`Normal` of the images and the edges, and the edges' energy.
 
     ``projection`` (N, 2, 3): of the vertices; ``evaluation``: :class:`polysft_mi.registration.Evaluation`; ``lengths`` (E,) [m]: of the
-    template's edges; ``stiffness`` [1/m^2]: weight of the squared differences to them; ``d``: the local unknowns of a vertex, 3 with
-    the relief.
+    template's edges; ``stiffness`` [1/m^2]: weight of the squared differences to them; ``wide``: a :class:`Pattern` that holds
+    this one, where the relief is an unknown too (d = 3) and the local block is to have that pattern.
     """
+    d = 2 if wide is None else 3
     a, b = pattern.edges.T
     edge = surface.vertices[a] - surface.vertices[b]
     length = np.maximum(np.sqrt(np.einsum("ek,ek->e", edge, edge)), 1e-9)
@@ -416,7 +414,12 @@ def assemble(pattern, surface, projection, evaluation, lengths, stiffness, d=2):
     glob[size:, size:] = motion
     cross = np.concatenate([np.stack(lifted[:d], 1), local_motion[:, :d]], 2).reshape(-1, size + 6)
     along = np.concatenate([basis.T @ (gradient @ surface.up), np.einsum("nk,nkm->m", gradient, surface.by_motion)])
-    normal = Normal(total[:, :d, :d].copy(), cross, glob, np.einsum("nk,nka->na", gradient, local[:, :, :d]), along)
+    if wide is None:
+        blocks = total[:, :2, :2].copy()
+    else:
+        blocks = np.zeros((len(wide.row), 3, 3))
+        blocks[wide.find(pattern.row, pattern.column)] = total
+    normal = Normal(blocks, cross, glob, np.einsum("nk,nka->na", gradient, local[:, :, :d]), along)
     return normal, stiffness * float((excess**2).sum())
 
 
@@ -490,8 +493,8 @@ class Reduced:
 
 def hinges(chart, faces):
     """What a height over the chart (N, 2), both in the chart's unit, bends at the H inner edges of the mesh with ``faces`` (F, 3): the
-    sparse J (H, N) that makes the bends. The sum of their squares is the integral of the squared curvature of a roll along the mesh's
-    rows, up to three times that of others; no plane has any.
+    pairs (H, 2) of vertices that lie across each, and the sparse J (H, N) that makes the bends. The sum of their squares is the integral of the squared curvature of a roll along the mesh's rows,
+    up to three times that of others; no plane has any.
 
     After Bergou et al., "A Quadratic Bending Model for Inextensible Surfaces" (SGP 2006).
     """
@@ -512,4 +515,5 @@ def hinges(chart, faces):
     from_0, from_1 = ([c / np.maximum(s, 1e-12) for s, c in pair] for pair in (((s2, c2), (s3, c3)), ((t2, d2), (t3, d3))))
     rows = np.stack([from_1[0] + from_1[1], from_0[0] + from_0[1], -from_0[0] - from_1[0], -from_0[1] - from_1[1]], 1)
     rows /= np.sqrt(area)[:, None]
-    return sp.csr_matrix((rows.ravel(), (np.repeat(np.arange(len(quads)), 4), quads.ravel())), shape=(len(quads), len(chart)))
+    matrix = sp.csr_matrix((rows.ravel(), (np.repeat(np.arange(len(quads)), 4), quads.ravel())), shape=(len(quads), len(chart)))
+    return quads[:, 2:], matrix

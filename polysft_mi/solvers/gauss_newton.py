@@ -32,7 +32,7 @@ _TEXTURE_ITERATIONS, _TEXTURE_STIFFNESS = 6, 1.0
 _SHOWN = 0.7  # share of the pixels that see the sheet below which neither a stage nor another start may go: what none sees costs nothing
 _FARTHEST_STEP = 2.0  # rotation [rad], translation and displacements [chart units]
 _FACTS = "misfit", "outlying", "order"
-_RELIEF_VERTICES = 3000  # of the template, above which there is no relief: its elimination takes a third of a second an iteration at 10,000
+_RELIEF_VERTICES = 3000  # of the template, above which there is no relief: its wide system takes a second an iteration at 10,000
 _RELIEF_BEND = 3e-3  # of the relief's weight, for its bending
 _RELIEF_MISFIT = 0.045  # of the frame before, at which the relief's weight has doubled; with the fourth power: noise must not become ripples, which use up length
 _TEMPORAL = 1e-3  # of k_tc: it holds a frame to the one before, in a stiffer basis than the monomials of the paper's window
@@ -152,10 +152,11 @@ class GaussNewton:
         self.registration = Registration(problem)
         self.chart, self.least = Chart(template), template.fitted
         faces, count = self.registration.faces, len(template.vertices)
-        self.pattern = Pattern(faces, template.edges, count)
-        self.systems = {d: Blocks(self.pattern, d) for d in (2, 3)}  # by the local unknowns of a vertex
-        self.bends = hinges(template.chart, faces)
-        self._relief_blocks = self.pattern.laplacian + _RELIEF_BEND * self.pattern.bound(self.bends.T @ self.bends)
+        across, bends = hinges(template.chart, faces)
+        self.pattern, wide = Pattern(faces, template.edges, count), Pattern(faces, template.edges, count, across)
+        self.systems = {2: Blocks(self.pattern), 3: Blocks(wide, 3)}  # by the local unknowns of a vertex
+        self.bends = bends
+        self._relief_blocks = wide.laplacian + _RELIEF_BEND * wide.blocks_of(bends.T @ bends)
         self.lengths = np.array(problem.edge_lengths, dtype=np.float64)
         position, _ = problem.camera.project(template.vertices)
         corner = position[self.registration.faces]
@@ -322,7 +323,7 @@ class GaussNewton:
             d = earlier.local.shape[-1]
             earlier.local_gradient -= temporal * (b.offset - a.offset)[:, :d]
             # the displacements' coupling, weak beside the image, by its bound |a - b|^2 <= 2 |a|^2 + 2 |b|^2: the local blocks stay apart
-            diagonal = self.pattern.diagonal
+            diagonal = self.systems[d].pattern.diagonal
             for k in range(d):
                 earlier.local[diagonal, k, k] += 2 * temporal
                 later.local[diagonal, k, k] += temporal
@@ -369,8 +370,8 @@ class GaussNewton:
         projection = self.registration.projection(surface.vertices)
         d = 3 if s.k_relief > 0 and len(state.offset) <= _RELIEF_VERTICES and self._misfit_before < stage.relief else 2
         relief = s.k_relief * (1 + (np.nan_to_num(self._misfit_before) / _RELIEF_MISFIT) ** 4)
-        pattern = self.pattern
-        normal, inextensibility = assemble(pattern, surface, projection, evaluation, self.lengths, stiffness, d)
+        pattern = self.systems[d].pattern
+        normal, inextensibility = assemble(self.pattern, surface, projection, evaluation, self.lengths, stiffness, pattern if d == 3 else None)
         a = self.chart.size(order)
         bend = 2 * s.k_bend * chart.bending
         moved, slid = state.alpha - anchor.alpha, state.offset - anchor.offset
