@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 from numpy.polynomial import legendre
-from scipy.linalg import LinAlgError, blas, cho_factor, cho_solve, lapack, solve_triangular
+from scipy.linalg import LinAlgError, cho_factor, cho_solve, get_blas_funcs, get_lapack_funcs, solve_triangular
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 from scipy.spatial.transform import Rotation
 
@@ -273,35 +273,36 @@ class Blocks:
         self._order = (d * pattern.order[:, None] + each).ravel()
         self.size = size
 
-    def eliminate(self, blocks, columns):
-        """Factorise (B, d, d) = L L^T: returns an :class:`Elimination` with L^-1 columns for columns (dN, C). Raises LinAlgError where it
-        is not positive.
+    def eliminate(self, blocks, columns, dtype=np.float64):
+        """Factorise (B, d, d) = L L^T: returns an :class:`Elimination` with L^-1 columns for columns (dN, C), in ``dtype``. Raises
+        LinAlgError where it is not positive.
         """
+        (potrf,), (syrk, trsm) = get_lapack_funcs(["potrf"], dtype=dtype), get_blas_funcs(["syrk", "trsm"], dtype=dtype)
         size, rest = self.size, self.d * self.pattern.count
         values = blocks.ravel()
-        inside = np.zeros(self.count * size * size)
-        below = np.zeros(self.count * size * size)
+        inside = np.zeros(self.count * size * size, dtype)
+        below = np.zeros(self.count * size * size, dtype)
         inside[self._at_inside] = values[self._inside]
         below[self._at_below] = values[self._below]
         inside = inside.reshape(self.count, size, size)
         below = below.reshape(self.count, size, size)
-        x = columns[self._order]
+        x = columns.astype(dtype)[self._order]
         factors, coupling, parts = [], [], []
         for k in range(self.count):
             n = min(size, rest - k * size)
             d, y = inside[k].T[:n, :n], x[k * size : k * size + n]
             if k:
                 w = coupling[-1]
-                d = blas.dsyrk(-1.0, w, beta=1.0, c=d, trans=1, lower=1, overwrite_c=1)  # in place, here and below, but for the last block
+                d = syrk(-1.0, w, beta=1.0, c=d, trans=1, lower=1, overwrite_c=1)  # in place, here and below, but for the last block
                 y = y - w.T @ parts[-1]
-            factor, bad = lapack.dpotrf(d, lower=1, clean=1, overwrite_a=1)
+            factor, bad = potrf(d, lower=1, clean=1, overwrite_a=1)
             if bad:
                 raise LinAlgError("the local block is not positive definite")
             factors.append(factor)
-            parts.append(blas.dtrsm(1.0, factor, y, lower=1))
+            parts.append(trsm(1.0, factor, y, lower=1))
             if k + 1 < self.count:
                 following = min(size, rest - (k + 1) * size)
-                coupling.append(blas.dtrsm(1.0, factor, below[k].T[:n, :following], lower=1, overwrite_b=1))
+                coupling.append(trsm(1.0, factor, below[k].T[:n, :following], lower=1, overwrite_b=1))
         return Elimination(self, factors, coupling, parts)
 
 
@@ -311,16 +312,17 @@ class Elimination:
     def __init__(self, blocks, factors, coupling, parts):
         self.blocks, self.factors, self.coupling = blocks, factors, coupling
         self.columns = np.concatenate(parts)
+        (self._trsm,) = get_blas_funcs(["trsm"], dtype=self.columns.dtype)
 
     def back(self, y):
         """L^-T y, (dN,) or (dN, C), in the order of the vertices."""
         size, x = self.blocks.size, [None] * len(self.factors)
-        flat = y[:, None] if y.ndim == 1 else y
+        flat = (y[:, None] if y.ndim == 1 else y).astype(self.columns.dtype, copy=False)
         for k in reversed(range(len(x))):
             part = flat[k * size : k * size + len(self.factors[k])]
             if k + 1 < len(x):
                 part = part - self.coupling[k] @ x[k + 1]
-            x[k] = blas.dtrsm(1.0, self.factors[k], part, lower=1, trans_a=1)
+            x[k] = self._trsm(1.0, self.factors[k], part, lower=1, trans_a=1)
         out = np.empty_like(flat)
         out[self.blocks._order] = np.concatenate(x)
         return out.reshape(y.shape)
@@ -328,11 +330,12 @@ class Elimination:
     def inverse_diagonal(self):
         """The blocks on the diagonal of the inverse, (N, d, d)."""
         size, blocks = self.blocks.size, [None] * len(self.factors)
+        (potri,) = get_lapack_funcs(["potri"], dtype=self.columns.dtype)
         for k in reversed(range(len(blocks))):
-            inverse = lapack.dpotri(self.factors[k], lower=1)[0]
+            inverse = potri(self.factors[k], lower=1)[0]
             inverse = np.tril(inverse) + np.tril(inverse, -1).T
             if k + 1 < len(blocks):
-                w = blas.dtrsm(1.0, self.factors[k], self.coupling[k], lower=1, trans_a=1)
+                w = self._trsm(1.0, self.factors[k], self.coupling[k], lower=1, trans_a=1)
                 inverse = inverse + w @ blocks[k + 1] @ w.T
             blocks[k] = inverse
         part, at = np.divmod(self.blocks.d * self.blocks.pattern.place, size)
@@ -426,19 +429,20 @@ def assemble(pattern, surface, projection, evaluation, lengths, stiffness, wide=
 class Reduced:
     """Normal equations with the local block eliminated under Levenberg-Marquardt's ``damping``: ``schur`` (G, G) and ``right`` (G,) remain.
 
-    Raises LinAlgError where the damped local block is not positive definite.
+    The elimination is in ``dtype``: single precision will do for a step, which is tried and then kept or not, in half the time. Raises
+    LinAlgError where the damped local block is not positive definite.
     """
 
-    def __init__(self, blocks, normal, damping):
+    def __init__(self, blocks, normal, damping, dtype=np.float64):
         self.normal, self.blocks = normal, blocks
         diagonal = blocks.pattern.diagonal
         local = normal.local.copy()
         for k in range(blocks.d):
             main = local[diagonal, k, k]
             local[diagonal, k, k] = main * (1 + damping) + 1e-9 * main.mean()
-        self.elimination = blocks.eliminate(local, np.column_stack([normal.cross, normal.local_gradient.ravel()]))
+        self.elimination = blocks.eliminate(local, np.column_stack([normal.cross, normal.local_gradient.ravel()]), dtype)
         y = self.elimination.columns
-        whole = y.T @ y
+        whole = (y.T @ y).astype(np.float64)
         main = np.diag(normal.glob)
         self.schur = normal.glob + np.diag(damping * main + 1e-9 * main.mean()) - whole[:-1, :-1]
         self.right = normal.gradient - whole[:-1, -1]

@@ -211,6 +211,9 @@ def test_step_and_variance_are_those_of_the_dense_system(rows, columns, d):
     expected = -np.linalg.solve(h, g)
     assert np.allclose(np.concatenate([uv.ravel(), glob]), expected, rtol=1e-5, atol=1e-7)
     assert decrease == pytest.approx(-0.5 * expected @ g, rel=1e-5)
+    (glob, uv), decrease = Reduced(Blocks(pattern, d), normal, damping, np.float32).step()
+    assert uv.dtype == np.float32 and np.allclose(np.concatenate([uv.ravel(), glob]), expected, atol=2e-4 * np.abs(expected).max())
+    assert decrease == pytest.approx(-0.5 * expected @ g, rel=1e-4)
     by_local, by_global = RNG.normal(size=(pattern.count, d)), RNG.normal(size=(pattern.count, 9))
     j = np.zeros((pattern.count, len(h)))
     j[:, n:] = by_global

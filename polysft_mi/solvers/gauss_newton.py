@@ -227,8 +227,8 @@ class GaussNewton:
         state, terms = self._adapt_order(*best, anchor, frame)
         return self.chart.absorbed(state, self.least), terms
 
-    def _reduced(self, normal, damping):
-        return Reduced(self.systems[normal.local.shape[-1]], normal, damping)
+    def _reduced(self, normal, damping, dtype=np.float64):
+        return Reduced(self.systems[normal.local.shape[-1]], normal, damping, dtype)
 
     def _nearest(self, starts, frame, stage):
         """The start that explains the frame best."""
@@ -259,7 +259,7 @@ class GaussNewton:
         damping, least = 1e-4, _SHOWN * terms["pixels"]
         for _ in range(iterations):
             try:
-                step, promised = self._reduced(normal, damping).step()
+                step, promised = self._reduced(normal, damping, np.float32).step()
                 _check_step(step)
             except LinAlgError:
                 damping = max(10 * damping, 1e-4)
