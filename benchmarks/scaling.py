@@ -72,7 +72,7 @@ def make(folder, points, size, frames):
     import cv2
     import mitsuba as mi
 
-    from polysft_mi import outputs, prepare, scene
+    from polysft_mi import pictures, prepare, scene
     from polysft_mi.problem import Problem
     from polysft_mi.sequence import Sequence
 
@@ -101,7 +101,7 @@ def make(folder, points, size, frames):
         rgb, alpha = problem.image(mi.Point3f(np.ascontiguousarray(vertices.T, dtype=np.float32)))
         alpha = np.array(alpha).reshape(size[1], size[0])
         linear = np.array(rgb) + 0.05 * (1 - alpha[..., None])
-        write("frames", k, np.round(255 * outputs.srgb(linear)).astype(np.uint8))
+        write("frames", k, np.round(255 * pictures.srgb(linear)).astype(np.uint8))
         write("masks", k, np.round(255 * alpha).astype(np.uint8))
 
 

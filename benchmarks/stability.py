@@ -135,7 +135,7 @@ def picture(path, problem, frame, surfaces, counts, rows, usual, truth):
     from matplotlib.figure import Figure
 
     from polysft_mi import shading
-    from polysft_mi.outputs import srgb
+    from polysft_mi.pictures import srgb
 
     template, image = problem.template, srgb(problem.sequence.frame(frame))
     shown = [(f"{n} iterations", surfaces[n]) for n in counts] + ([("truth", truth)] if truth is not None else [])

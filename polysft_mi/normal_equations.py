@@ -265,8 +265,8 @@ class Blocks:
         r, c = (np.broadcast_to(x, (len(row), d, d)) for x in at)
         size = d * width
         part, down = r // size, c // size
-        self._inside = (part == down).ravel()
-        self._below = (part == down + 1).ravel()
+        self._inside = np.flatnonzero((part == down) & (r >= c))  # LAPACK reads the lower triangle alone
+        self._below = np.flatnonzero(part == down + 1)
         # Fortran order inside each block, which LAPACK takes without a copy
         self._at_inside = ((part * size + c % size) * size + r % size).ravel()[self._inside]
         self._at_below = ((down * size + r % size) * size + c % size).ravel()[self._below]  # transposed: the block above
@@ -386,7 +386,7 @@ def assemble(pattern, surface, projection, evaluation, lengths, stiffness, wide=
         across = ci[:, :, None] * hj[:, None]
         at = np.concatenate([pattern.diagonal[i], pattern.diagonal[j], pattern.find(i, j), pattern.find(j, i)])
         pattern.add(blocks, at, np.concatenate([ci[:, :, None] * hi[:, None], cj[:, :, None] * hj[:, None], across, across.transpose(0, 2, 1)]))
-    total = screen[pattern.row].transpose(0, 2, 1) @ (blocks @ screen[pattern.column])  # (B, 3, 3)
+    total = _conjugated(blocks, screen, pattern)  # (B, 3, 3)
     matrix = sp.bsr_matrix((blocks, pattern.column, pattern.start), shape=2 * (2 * pattern.count,))
     moved = (matrix @ screen_motion.reshape(-1, 6)).reshape(-1, 2, 6)
     local_motion = screen.transpose(0, 2, 1) @ moved  # (N, 3, 6)
@@ -424,6 +424,20 @@ def assemble(pattern, surface, projection, evaluation, lengths, stiffness, wide=
         blocks[wide.find(pattern.row, pattern.column)] = total
     normal = Normal(blocks, cross, glob, np.einsum("nk,nka->na", gradient, local[:, :, :d]), along)
     return normal, stiffness * float((excess**2).sum())
+
+
+def _conjugated(blocks, s, pattern):
+    """s_i^T blocks_ij s_j of each block of the pattern, (B, 3, 3): ``blocks`` (B, 2, 2), ``s`` (N, 2, 3). By components: products of whole
+    arrays take a fifth of the time of many small matrix products.
+    """
+    i, j = (np.ascontiguousarray(s.reshape(-1, 6).T)[:, k] for k in (pattern.row, pattern.column))
+    k = np.ascontiguousarray(blocks.reshape(-1, 4).T)
+    out = np.empty((3, 3, len(blocks)))
+    for b in range(3):
+        right = k[0] * j[b] + k[1] * j[3 + b], k[2] * j[b] + k[3] * j[3 + b]
+        for a in range(3):
+            out[a, b] = i[a] * right[0] + i[3 + a] * right[1]
+    return np.ascontiguousarray(out.reshape(9, -1).T).reshape(-1, 3, 3)
 
 
 class Reduced:

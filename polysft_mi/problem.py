@@ -73,6 +73,7 @@ class Problem:
         self._params = mi.traverse(experiment.scene)
         self._key = _positions_key(self._params, experiment.mesh)
         self._targets = OrderedDict()
+        self.texcoords = None
         self.camera = Pinhole(experiment.sensor)
         self._setup_renderer()
 
@@ -97,7 +98,8 @@ class Problem:
         self._params.update()
 
     def set_texcoords(self, texcoords):
-        """Replace the template's texture coordinates (Float of 2V, in the order of the rendered mesh)."""
+        """Replace the template's texture coordinates (Float of 2V, in the order of the rendered mesh); ``texcoords`` (NumPy) tells them."""
+        self.texcoords = np.array(texcoords)
         key = self._key.removesuffix("positions") + "texcoords"
         self._params[key] = texcoords
         self._params.update()

@@ -333,8 +333,10 @@ class Registration:
             return k + 1, *(a + b for a, b in zip(sums, new))
 
         sums = dr.while_loop((start, *(dr.zeros(mi.Float, faces) for _ in range(_SUMS))), lambda k, *_: k < end, add, label="sums")[1:]
-        dr.eval(sums)
-        return np.stack([np.array(x) for x in sums], 1).astype(np.float64)
+        table, at = dr.empty(mi.Float, faces * _SUMS), dr.arange(mi.UInt32, faces) * _SUMS
+        for k, x in enumerate(sums):
+            dr.scatter(table, x, at + k, mode=dr.ReduceMode.Permute)
+        return np.array(table).reshape(faces, _SUMS).astype(np.float64)
 
     # -- silhouettes --------------------------------------------------------
 

@@ -96,6 +96,7 @@ def _clear(out):
 
 def _run(options, overrides, out, exr_frames):
     from . import outputs, scene, solvers
+    from .drawing import Drawing
     from .problem import Problem
     from .sequence import Sequence
     from .tracker import Track, track
@@ -119,20 +120,24 @@ def _run(options, overrides, out, exr_frames):
     gc.freeze()  # what is loaded by now stays: the collector need not go through it again and again
     count = len(sequence.indices)
     began, status = time.perf_counter(), 0
-    with Progress(count, s, options.quiet) as progress:
+    about = {"scene": os.path.abspath(experiment.path), **outputs.versions()}
+    with (
+        Progress(count, s, options.quiet) as progress,
+        Drawing(problem, overrides, out, exr_frames=exr_frames, about=about) as drawing,
+    ):
         progress.say(
             f"template: {len(problem.template.vertices)} vertices, order {problem.template.fitted}, residual {1e3 * problem.template.residual_rms:.3g} mm RMS; "
             f"{count} frames of {experiment.size[0]}x{experiment.size[1]}, masks: {'yes' if experiment.masks else 'no'}"
         )
         try:
-            done = track(problem, solver, count, out, resume=options.resume, progress=progress)
+            done = track(problem, solver, count, out, resume=options.resume, progress=progress, solved=drawing.frame)
         except KeyboardInterrupt:
             path = os.path.join(out, "checkpoint.npz")
             done, status = (Track.load(path) if os.path.exists(path) else Track()), 130
             progress.say(f"interrupted: {len(done.states)} of {count} frames are kept; --resume goes on")
         if not done.states:
             return status
-        summary = outputs.write(problem, done, out, exr_frames=exr_frames, fps=options.fps, command=command, say=progress.stage)
+        summary = outputs.write(problem, done, out, drawing, fps=options.fps, command=command, say=progress.stage)
         page = None if options.no_report else _report(out, progress)
     for frame, reason in summary["lost"].items():
         print(f"frame {frame}: {reason}; it keeps the state of the frame before", file=sys.stderr)

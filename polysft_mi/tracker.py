@@ -69,11 +69,12 @@ class Track:
         return cls(states=[{name: arrays[name][k] for name in arrays} for k in range(count)], sigma=sigma, **meta)
 
 
-def track(problem, solver, frames, out, *, resume=False, progress=None):
+def track(problem, solver, frames, out, *, resume=False, progress=None, solved=None):
     """Solve window after window; checkpoints and the log go to the folder ``out``. Returns the :class:`Track`.
 
-    ``frames``: number of frames. ``progress(frame, iteration, total, terms)`` is called after each evaluation. Where the objective stops
-    being finite, or the surface leaves the image, the new frame keeps the state of the one before, and the run goes on. KeyboardInterrupt
+    ``frames``: number of frames. ``progress(frame, iteration, total, terms)`` is called after each evaluation, ``solved(frame, vertices)``
+    with the surface (N, 3) [m, world] of each frame that no later window moves, as soon as it stands; the look back may still change some.
+    Where the objective stops being finite, or the surface leaves the image, the new frame keeps the state of the one before, and the run goes on. KeyboardInterrupt
     passes through; the checkpoint on disk is then that of the last whole window.
     """
     width = min(problem.settings.width, frames)
@@ -85,6 +86,8 @@ def track(problem, solver, frames, out, *, resume=False, progress=None):
             _advance(problem, solver, done, start, width, log, progress)
             log.flush()
             done.save(checkpoint)
+            if solved:
+                solved(start, problem.surface(Unknowns.from_numpy(done.states[start])))
     if hasattr(solver, "revisit") and len(done.totals) == frames and not done.finished:
         _look_back(problem, solver, done)
         done.finished = True

@@ -1,0 +1,152 @@
+"""A run's pictures, drawn while the tracker works on.
+
+A track leaves a second processor idle for the most part, and pictures need nothing of it but the surfaces. So a process of its own opens the
+scene once more and draws each frame as soon as it is solved (:class:`polysft_mi.pictures.Album`).
+"""
+
+import multiprocessing
+import os
+import shutil
+import signal
+import tempfile
+import threading
+from concurrent.futures import ProcessPoolExecutor
+
+import numpy as np
+
+_WORTH = 8  # frames from which on another process is worth its start
+_NICE = 5  # below the tracker in rank
+_album = None  # of the drawing process
+
+
+def _draw_in_background(variant, scene, overrides, sequence, album, calls):
+    """In the drawing process: make the album (by these arguments) where there is none yet, and call these of its methods. Returns what the
+    last one does.
+    """
+    global _album
+    if _album is None:
+        threading.Thread(target=_end_with_parent, args=[album[-1]], daemon=True).start()
+        if hasattr(os, "nice"):
+            os.nice(_NICE)
+        from .backend import set_variant
+
+        set_variant(variant)
+        import drjit as dr
+
+        from . import scene as scenes
+        from .pictures import Album
+        from .problem import Problem
+
+        dr.set_thread_count(1)
+        _album = Album(Problem(scenes.load(scene, overrides), sequence), *album)
+    result = None
+    for name, *arguments in calls:
+        result = getattr(_album, name)(*arguments)
+    return result
+
+
+def _end_with_parent(folder):
+    """A process pool's processes outlive a parent that is killed."""
+    multiprocessing.parent_process().join()
+    shutil.rmtree(folder, ignore_errors=True)
+    os._exit(1)
+
+
+class Drawing:
+    """The pictures of ``problem``'s run in the folder ``out``: hand over each frame when it is solved, and :meth:`finish`.
+
+    ``overrides``: of the scene's defaults; ``exr_frames``: how many comparison EXRs at most; ``about``: for their headers. Runs of a few
+    frames are drawn here, at the end, as is everything where the drawing process fails.
+    """
+
+    def __init__(self, problem, overrides, out, *, exr_frames, about):
+        self.problem, self.out, self.exr_frames = problem, out, exr_frames
+        self._folder = tempfile.TemporaryDirectory(prefix="polysft_mi-", ignore_cleanup_errors=True)
+        self._album = out, about, self._folder.name
+        self._given, self._jobs, self._pool = {}, [], None
+        self._exr = self._chosen(len(problem.sequence.indices))
+        if len(problem.sequence.indices) >= _WORTH:
+            import mitsuba as mi
+
+            self._first = mi.variant(), problem.experiment.path, overrides, problem.sequence, self._album
+            self._pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"))
+            self._submit(["prepare"])  # starts the process
+
+    def _chosen(self, count):
+        from .pictures import chosen
+
+        return set(chosen(count, self.exr_frames))
+
+    def _submit(self, *calls):
+        """Have the album's methods called; of no use where the process is gone, which :meth:`finish` tells."""
+        alone = threading.current_thread() is threading.main_thread()
+        kept = signal.signal(signal.SIGINT, signal.SIG_IGN) if alone else None  # Ctrl-C is for the tracker; the process inherits this
+        try:
+            self._jobs.append(self._pool.submit(_draw_in_background, *self._first, calls))
+        except RuntimeError:  # the pool is broken
+            pass
+        finally:
+            if alone:
+                signal.signal(signal.SIGINT, kept)
+
+    def frame(self, k, vertices):
+        """The surface of frame ``k`` has ``vertices`` (N, 3) [m, world]; later calls replace earlier ones."""
+        if self._pool is not None:
+            self._give(k, vertices)
+
+    def _give(self, k, vertices):
+        self._given[k] = vertices, k in self._exr
+        self._submit(self._call(k, vertices))
+
+    def _call(self, k, vertices):
+        return "draw", k, vertices, self.problem.texcoords, k in self._exr
+
+    def finish(self, vertices, surfaces, fps):
+        """Have the rest drawn and all bound: what :meth:`polysft_mi.pictures.Album.bind` returns, as a function to call for it.
+
+        ``vertices``, ``surfaces`` (T, N, 3) [m]: of all frames, in the world and in the camera frame.
+        """
+        self._exr = self._chosen(len(vertices))
+        self._remove_other_exrs()
+        template = self.problem.template
+        last = "bind", surfaces, template.faces, template.uv, fps
+        if self._pool is not None:
+            for k, v in enumerate(vertices):
+                before, exr = self._given.get(k, (None, False))
+                if not np.array_equal(before, v) or (k in self._exr and not exr):
+                    self._give(k, v)
+            self._submit(last)
+
+        def result():
+            try:
+                if self._pool is not None and self._jobs:
+                    return [job.result() for job in self._jobs][-1]
+            except Exception:  # killed, or out of memory, or what drawing it here will tell
+                pass
+            return self._here(vertices, last)
+
+        return result
+
+    def _here(self, vertices, last):
+        from .pictures import Album
+
+        album = Album(self.problem, *self._album)
+        for k, v in enumerate(vertices):
+            album.draw(*self._call(k, v)[1:])
+        return album.bind(*last[1:])
+
+    def _remove_other_exrs(self):
+        """Of frames that were chosen when more, or fewer, were to come."""
+        folder, indices = os.path.join(self.out, "comparison"), self.problem.sequence.indices
+        kept = {f"{indices[k]:03d}.exr" for k in self._exr}
+        for name in os.listdir(folder) if os.path.isdir(folder) else ():
+            if name.endswith(".exr") and name not in kept:
+                os.remove(os.path.join(folder, name))
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, kind, error, trace):
+        if self._pool is not None:
+            self._pool.shutdown(wait=False, cancel_futures=True)
+        self._folder.cleanup()

@@ -1,0 +1,169 @@
+"""The pictures of a run: each frame's rendering beside its image, as layers, EXRs, a video and a contact sheet.
+
+Import only after a Mitsuba variant is set. :mod:`polysft_mi.drawing` has this done by a process of its own.
+"""
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+
+import cv2
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from . import figures, metrics
+from .exr import write_exr
+from .raster import RasterIntegrator
+from .results import PEAK
+from .video import encoder, write_video
+
+_WIDTH = 640  # pixels across of a picture in the video, at most
+_ROWS = 5  # of the contact sheet
+_THREADS = 2  # that draw and write what has been rendered
+_WAITING = 4  # renderings that may wait for them
+
+
+def srgb(linear):
+    """Linear values (..., 3) as sRGB in [0, 1]."""
+    x = np.clip(np.nan_to_num(linear), 0, 1)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
+
+
+def chosen(count, limit):
+    """At most ``limit`` of ``count`` frames, spread evenly, first and last among them."""
+    if limit >= count:
+        return list(range(count))
+    return sorted(set(np.linspace(0, count - 1, limit).round().astype(int).tolist())) if limit > 0 else []
+
+
+class Renderings:
+    """Renderings of the surface of a frame beside its image, as arrays."""
+
+    def __init__(self, problem):
+        self.problem = problem
+        # geometry comes from the rasteriser whatever renders the colours
+        self._raster = RasterIntegrator(mi.Properties("raster"))
+        self._raster.aovs, self._raster.antialias = ["depth", "normal", "uv"], False
+
+    def __call__(self, vertices, frame, geometry=True):
+        """Layers (H, W[, C]) float32 of the surface with ``vertices`` (N, 3) [m, world]: ``target``, ``render`` (linear RGB), ``error``
+        (root mean square over channels), ``mask_target``, ``mask_render``; with ``geometry`` also ``depth`` [m], ``normal`` (camera frame,
+        towards the camera), ``uv`` (texture coordinates, v up); 0 beyond the surface.
+        """
+        problem = self.problem
+        with dr.suspend_grad():
+            rgb, alpha = problem.image(mi.Point3f(np.ascontiguousarray(vertices.T, dtype=np.float32)))
+            render = np.array(rgb)
+            more = self._geometry() if geometry else {}
+        mask_render = np.array(alpha).reshape(render.shape[:2])
+        image, mask = problem.sequence.frame(frame), problem.sequence.mask(frame)
+        target = image * mask[..., None] if mask is not None else image
+        inside = np.ones_like(mask_render) if mask is not None else mask_render > 0.999
+        difference = render - target
+        error = np.sqrt(np.einsum("hwc,hwc->hw", difference, difference) / 3) * inside
+        return {
+            "target": image,
+            "render": render,
+            "error": error,
+            "mask_target": mask if mask is not None else np.ones_like(mask_render),
+            "mask_render": mask_render,
+            **more,
+        }
+
+    def _geometry(self):
+        """The layers ``depth``, ``normal`` and ``uv`` of the surface that was rendered last."""
+        geometry = np.array(self._raster.image(self.problem.experiment.scene, self.problem.experiment.sensor, spp=1))[..., -6:]
+        normal = geometry[..., 1:4] @ self.problem.camera.axes.T.astype(np.float32)
+        uv = np.where(geometry[..., :1] > 0, np.stack([geometry[..., 4], 1 - geometry[..., 5]], -1), 0)
+        return {"depth": geometry[..., 0], "normal": normal, "uv": uv}
+
+
+class Album:
+    """The pictures of a run in the making: frames are drawn one by one, in any order and as often as need be, and bound at the end.
+
+    ``out``: folder of the run; ``about``: what the EXRs' headers say of it; ``folder``: where the frames' pictures lie until the end.
+    """
+
+    def __init__(self, problem, out, about, folder):
+        self.problem, self.out, self.about, self.folder = problem, out, about, folder
+        self._renderings, self._texcoords = Renderings(problem), None
+        self._masked = problem.sequence.mask(0) is not None
+        self._pool = ThreadPoolExecutor(_THREADS)
+        self._drawn = {}  # frame: future of its figures
+
+    def prepare(self):
+        """Load what binding needs, beforehand."""
+        import matplotlib.backends.backend_agg  # noqa: F401
+
+        encoder()
+
+    def draw(self, frame, vertices, texcoords=None, exr=False):
+        """Draw a frame whose surface has ``vertices`` (N, 3) [m, world], and ``texcoords`` (2V,) other than the template's own, if any."""
+        if texcoords is not None and not np.array_equal(texcoords, self._texcoords):
+            self._texcoords = texcoords
+            self.problem.set_texcoords(mi.Float(texcoords))
+        layers = self._renderings(vertices, frame, geometry=exr)
+        waiting = [f for f in self._drawn.values() if not f.done()]
+        if len(waiting) >= _WAITING:
+            waiting[0].result()
+        if frame in self._drawn:
+            self._drawn[frame].result()
+        self._drawn[frame] = self._pool.submit(self._draw, frame, layers, exr)
+
+    def _draw(self, frame, layers, exr):
+        index = self.problem.sequence.indices[frame]
+        if exr:
+            os.makedirs(os.path.join(self.out, "comparison"), exist_ok=True)
+            write_exr(os.path.join(self.out, "comparison", f"{index:03d}.exr"), layers, {"frame": int(index), **self.about})
+        target, render, error = (_panel(layers[n]) for n in ("target", "render", "error"))
+        target, render = (np.round(255 * srgb(x)).astype(np.uint8) for x in (target, render))
+        cv2.imwrite(self._place(frame), np.concatenate([target, render, _heat(error)], axis=1), [cv2.IMWRITE_PNG_COMPRESSION, 1])
+        return {"frame": int(index), **_figures(layers, self._masked)}
+
+    def _place(self, frame):
+        return os.path.join(self.folder, f"{frame}.png")
+
+    def bind(self, surfaces, faces, uv, fps):
+        """Write comparison.mp4 and comparison.png of the frames' ``surfaces`` (T, N, 3) [m, camera frame], all of which have been drawn:
+        (the video's path, figures of each frame).
+        """
+        found = [self._drawn[k].result() for k in range(len(surfaces))]
+        view, sheet, rows = figures.View.around(surfaces), set(chosen(len(surfaces), _ROWS)), []
+
+        def picture(k):
+            panels = cv2.imread(self._place(k))
+            width = panels.shape[1] // 3
+            surface = figures.shade_surface(surfaces[k], faces, view, uv=uv, size=(width, panels.shape[0]))
+            if k in sheet:
+                parts = [panels[:, j * width : (j + 1) * width] for j in range(3)]
+                error = parts[2].sum(axis=2, dtype=np.float32) * (PEAK / 765)
+                label = f"frame {found[k]['frame']}"
+                rows.append((k, {"target": parts[0], "render": parts[1], "error": error, "surface": surface, "label": label}))
+            return np.concatenate([panels, surface], axis=1)
+
+        video = write_video(os.path.join(self.out, "comparison.mp4"), self._pool.map(picture, range(len(surfaces))), fps)
+        figures.contact_sheet(os.path.join(self.out, "comparison.png"), [row for _, row in sorted(rows, key=lambda r: r[0])])
+        return video, found
+
+
+def _figures(layers, masked):
+    """PSNR and SSIM of the rendering, in sRGB, inside the surface (the target's mask, else the rendered interior)."""
+    inside = layers["mask_target"] > 0.5 if masked else layers["mask_render"] > 0.999
+    rows, columns = (np.flatnonzero(inside.any(axis=k)) for k in (1, 0))
+    if not len(rows):
+        return {"psnr_mask": float("nan"), "ssim_mask": float("nan")}
+    near = slice(max(0, rows[0] - 5), rows[-1] + 6), slice(max(0, columns[0] - 5), columns[-1] + 6)  # with the margin of SSIM's window
+    a, b, inside = srgb(layers["render"][near]), srgb(layers["target"][near]), inside[near]
+    return {"psnr_mask": metrics.psnr(a, b, inside), "ssim_mask": metrics.ssim(a, b, inside)}
+
+
+def _panel(image):
+    """An image shrunk to at most _WIDTH pixels across, for the video and the contact sheet."""
+    scale = _WIDTH / image.shape[1]
+    return image if scale >= 1 else cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+
+
+def _heat(error, peak=PEAK):
+    """An error (H, W) in [0, peak] as a picture, black to white through red and yellow."""
+    x = np.clip(np.nan_to_num(error) / peak, 0, 1)[..., None]
+    return np.round(255 * np.clip(x * 3 - np.array([0, 1, 2]), 0, 1)).astype(np.uint8)

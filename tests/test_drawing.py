@@ -1,0 +1,155 @@
+"""Pictures drawn by a process of their own are those drawn here, whatever happens to it."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import synthetic
+
+from polysft_mi import drawing, exr, prepare, scene, video
+from polysft_mi.drawing import Drawing
+from polysft_mi.problem import Problem
+from polysft_mi.sequence import Sequence
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture(scope="module")
+def sheet(tmp_path_factory):
+    truth = synthetic.cloth(tmp_path_factory.mktemp("drawing") / "sheet", frames=9, bend=2.5, turn=0.1)
+    prepare.main([str(truth.folder)])
+    return truth
+
+
+def problem_of(sheet):
+    experiment = scene.load(str(sheet.folder / "scene.xml"))
+    return Problem(experiment, Sequence.open(experiment.frames, experiment.masks, size=experiment.size))
+
+
+def drawn(sheet, out, during=lambda drawing: None, *, problem=None, frames=9, exr_frames=3):
+    """(figures of each frame, the video's frames, names of the EXRs): of the true surfaces."""
+    problem = problem or problem_of(sheet)
+    surfaces = sheet.vertices[:frames].astype(np.float32)
+    vertices = np.stack([problem.camera.origin + v @ problem.camera.axes for v in surfaces]).astype(np.float32)
+    assert np.allclose(problem.camera.to_camera(vertices), surfaces, atol=1e-6)
+    out.mkdir(exist_ok=True)
+    with Drawing(problem, {}, str(out), exr_frames=exr_frames, about={"scene": "sheet"}) as made:
+        for k, v in enumerate(vertices):
+            made.frame(k, v)
+        during(made)
+        path, figures = made.finish(vertices, surfaces, 15)()
+        folder = Path(made._folder.name)
+    assert not folder.exists() and (out / "comparison.png").exists()
+    return figures, np.stack(list(video.read_video(path))), sorted(p.name for p in (out / "comparison").glob("*.exr"))
+
+
+@pytest.fixture(scope="module")
+def here(sheet, tmp_path_factory):
+    """Drawn in this process."""
+    before, drawing._WORTH = drawing._WORTH, 10**6
+    try:
+        return drawn(sheet, tmp_path_factory.mktemp("here"))
+    finally:
+        drawing._WORTH = before
+
+
+def assert_same(a, b):
+    for x, y in zip(a[0], b[0], strict=True):
+        assert x == pytest.approx(y, rel=1e-4)
+    assert a[1].shape == b[1].shape and np.abs(a[1].astype(int) - b[1]).mean() < 0.05
+    assert a[2] == b[2]
+
+
+def test_another_process_draws_the_same(sheet, here, tmp_path):
+    found = drawn(sheet, tmp_path / "out", lambda made: [job.result() for job in made._jobs])
+    assert_same(found, here)
+    assert [f["frame"] for f in found[0]] == list(range(9)) and found[2] == ["000.exr", "004.exr", "008.exr"]
+    assert found[0][0]["psnr_mask"] > 30
+    assert np.isfinite(exr.read_exr(str(tmp_path / "out" / "comparison" / "004.exr"))[0]["depth"]).all()
+
+
+def test_frames_that_change_are_drawn_again(sheet, here, tmp_path):
+    def spoil(made):
+        made.frame(3, sheet.vertices[0].astype(np.float32) + 0.01)
+
+    assert_same(drawn(sheet, tmp_path / "out", spoil), here)
+
+
+def test_a_killed_process_costs_nothing_but_time(sheet, here, tmp_path):
+    def kill(made):
+        made._jobs[3].result()
+        for pid in made._pool._processes:
+            os.kill(pid, signal.SIGKILL)
+
+    assert_same(drawn(sheet, tmp_path / "out", kill), here)
+
+
+def test_texture_that_was_moved_is_moved_in_the_pictures(sheet, here, tmp_path):
+    problem = problem_of(sheet)
+    moved = np.array(problem.experiment.mesh.vertex_texcoords_buffer()) + 0.03
+    problem.set_texcoords(mi.Float(moved))
+    other = drawn(sheet, tmp_path / "out", problem=problem)
+    assert all(a["psnr_mask"] < b["psnr_mask"] - 3 for a, b in zip(other[0], here[0]))
+
+
+def test_fewer_frames_than_expected(sheet, here, tmp_path):
+    """As after Ctrl-C: the EXRs are spread over the frames that there are."""
+    found = drawn(sheet, tmp_path / "out", frames=5)
+    assert found[2] == ["000.exr", "002.exr", "004.exr"] and len(found[1]) == 5
+    for x, y in zip(found[0], here[0]):
+        assert x == pytest.approx(y, rel=1e-4)
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc"), reason="children are found in /proc")
+def test_the_process_ends_with_a_run_that_is_killed(sheet, tmp_path):
+    out = tmp_path / "out"
+    arguments = [sys.executable, "-m", "polysft_mi.run", str(sheet.folder / "scene.xml"), "-o", str(out), "-q"]
+    run = subprocess.Popen(arguments, cwd=ROOT, env={**os.environ, "TMPDIR": str(tmp_path)}, start_new_session=True)
+    try:
+        wait_for(lambda: list(out.glob("checkpoint.npz")))
+        ours = members(run.pid)
+        assert len(ours) > 1
+        run.kill()
+        run.wait()
+        wait_for(lambda: not members(run.pid))
+        assert not list(tmp_path.glob("polysft_mi-*"))
+    finally:
+        if members(run.pid):
+            os.killpg(run.pid, signal.SIGKILL)
+
+
+def members(session):
+    """Processes of a session, zombies aside."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            state, _, _, of = path.read_text().rpartition(")")[2].split()[:4]
+        except OSError:
+            continue
+        if int(of) == session and state != "Z":
+            found.append(int(path.parent.name))
+    return found
+
+
+def wait_for(condition, seconds=60):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def test_metrics_name_the_frames_in_order(sheet, tmp_path):
+    from polysft_mi import run
+
+    out = tmp_path / "out"
+    assert run.main([str(sheet.folder / "scene.xml"), "-o", str(out), "-q", "-D", "first=1", "--exr", "2"]) == 0
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert [f["frame"] for f in metrics["per_frame"]] == list(range(1, 9))
+    assert sorted(p.name for p in (out / "comparison").iterdir()) == ["001.exr", "008.exr"]
