@@ -3,7 +3,7 @@
 _EXPORTS = {
     "CanonicalFrame": "frames",
     "rotation_matrix": "frames",
-    "exponents": "jets",
+    "exponents": "monomials",
     "height": "jets",
     "height_derivatives": "jets",
     "point": "jets",

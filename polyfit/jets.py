@@ -13,25 +13,7 @@ import numpy as np
 import torch
 
 from .errors import InputError
-
-
-@lru_cache
-def exponents(order):
-    """Exponents (of u, of v) of the coefficients, shape (A, 2); the same array each time, not to be written to."""
-    return np.array([(i - j, j) for i in range(order + 1) for j in range(i + 1)], dtype=np.int64)
-
-
-def size_of(order):
-    """Number of coefficients A of a jet of ``order``."""
-    return (order + 1) * (order + 2) // 2
-
-
-def order_of(size):
-    """Order n of a jet with ``size`` coefficients. Raises ValueError where there is none."""
-    order = int((np.sqrt(8 * size + 1) - 3) / 2 + 0.5)
-    if size_of(order) != size:
-        raise ValueError(f"{size} is not the number of coefficients of a jet")
-    return order
+from .monomials import exponents, order_of, size_of
 
 
 def matrix(alpha):

@@ -11,6 +11,7 @@ import signal
 import tempfile
 import threading
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 
 import numpy as np
 
@@ -19,7 +20,7 @@ _NICE = 5  # below the tracker in rank
 _album = None  # of the drawing process
 
 
-def _draw_in_background(variant, scene, overrides, sequence, album, calls):
+def _draw_in_background(variant, scene, overrides, template, sequence, album, calls):
     """In the drawing process: make the album (by these arguments) where there is none yet, and call these of its methods. Returns what the
     last one does.
     """
@@ -38,7 +39,7 @@ def _draw_in_background(variant, scene, overrides, sequence, album, calls):
         from .problem import Problem
 
         dr.set_thread_count(1)
-        _album = Album(Problem(scenes.load(scene, overrides), sequence), *album)
+        _album = Album(Problem(scenes.load(scene, overrides, template), sequence), *album)
     result = None
     for name, *arguments in calls:
         result = getattr(_album, name)(*arguments)
@@ -68,9 +69,9 @@ class Drawing:
         if len(problem.sequence.indices) >= _WORTH:
             import mitsuba as mi
 
-            self._first = mi.variant(), problem.experiment.path, overrides, problem.sequence, self._album
+            self._first = mi.variant(), problem.experiment.path, overrides, problem.template, problem.sequence, self._album
             self._pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"))
-            self._submit(["prepare"])  # starts the process
+            self._submit()  # starts the process
 
     def _chosen(self, count):
         from .pictures import chosen
@@ -102,38 +103,45 @@ class Drawing:
         return "draw", k, vertices, self.problem.texcoords, k in self._exr
 
     def finish(self, vertices, surfaces, fps):
-        """Have the rest drawn and all bound: what :meth:`polysft_mi.pictures.Album.bind` returns, as a function to call for it.
+        """Have the rest drawn, and all bound: what :meth:`polysft_mi.pictures.Album.finish` and ``bind`` return, each as a function to call
+        for it, in this order.
 
         ``vertices``, ``surfaces`` (T, N, 3) [m]: of all frames, in the world and in the camera frame.
         """
         self._exr = self._chosen(len(vertices))
         self._remove_other_exrs()
-        template = self.problem.template
-        last = "bind", surfaces, template.faces, template.uv, fps
+        last = ("finish", surfaces), ("bind", len(surfaces), fps)
         if self._pool is not None:
             for k, v in enumerate(vertices):
                 before, exr = self._given.get(k, (None, False))
                 if not np.array_equal(before, v) or (k in self._exr and not exr):
                     self._give(k, v)
-            self._submit(last)
+            for call in last:
+                self._submit(call)
+        album = []  # here, where it must be
 
-        def result():
+        def result(k):
             try:
-                if self._pool is not None and self._jobs:
-                    return [job.result() for job in self._jobs][-1]
+                if self._pool is not None and len(self._jobs) > 2 and not album:
+                    return [job.result() for job in self._jobs[: len(self._jobs) - 1 + k]][-1]
             except Exception:  # killed, or out of memory, or what drawing it here will tell
                 pass
-            return self._here(vertices, last)
+            if not album:
+                album.append(self._here(vertices))
+                if k > 0:
+                    album[0].finish(surfaces)
+            name, *arguments = last[k]
+            return getattr(album[0], name)(*arguments)
 
-        return result
+        return partial(result, 0), partial(result, 1)
 
-    def _here(self, vertices, last):
+    def _here(self, vertices):
         from .pictures import Album
 
         album = Album(self.problem, *self._album)
         for k, v in enumerate(vertices):
             album.draw(*self._call(k, v)[1:])
-        return album.bind(*last[1:])
+        return album
 
     def _remove_other_exrs(self):
         """Of frames that were chosen when more, or fewer, were to come."""

@@ -150,13 +150,18 @@ def contact_sheet(path, rows):
     errors = [np.asarray(r["error"], dtype=np.float64) for r in rows if r.get("error") is not None]
     finite = np.concatenate([e[np.isfinite(e)] for e in errors]) if errors else np.zeros(0)
     peak = max(float(np.quantile(finite, 0.995)), 1e-6) if finite.size else 1.0
-    width, aspect = 2.6, first.shape[0] / first.shape[1]
-    figure = _figure(width * len(columns) + 0.5, width * aspect * len(rows) + 0.4, layout="constrained")
-    figure.get_layout_engine().set(w_pad=0.02, h_pad=0.02, wspace=0, hspace=0)
-    grid = figure.subplots(len(rows), len(columns), squeeze=False)
+    # places in inches, by hand: finding them takes matplotlib longer than all the rest
+    wide, high, left, top, bottom, gap = 2.6, 2.6 * first.shape[0] / first.shape[1], 0.25, 0.25, 0.45 if errors else 0.05, 0.04
+    whole = left + len(columns) * (wide + gap), bottom + top + len(rows) * (high + gap)
+    figure = _figure(*whole)
+
+    def axes_at(x, y, w, h):
+        return figure.add_axes((x / whole[0], y / whole[1], w / whole[0], h / whole[1]))
+
     heat = None
     for i, row in enumerate(rows):
-        for axes, name in zip(grid[i], columns):
+        for j, name in enumerate(columns):
+            axes = axes_at(left + j * (wide + gap), bottom + (len(rows) - 1 - i) * (high + gap), wide, high)
             axes.set_xticks([]), axes.set_yticks([])
             for spine in axes.spines.values():
                 spine.set_visible(False)
@@ -171,7 +176,8 @@ def contact_sheet(path, rows):
             if name == columns[0]:
                 axes.set_ylabel(row.get("label", ""), fontsize=9)
     if heat is not None:
-        figure.colorbar(heat, ax=grid[:, columns.index("error")], location="bottom", shrink=0.8, aspect=30, pad=0.01).ax.tick_params(labelsize=7)
+        below = axes_at(left + columns.index("error") * (wide + gap) + 0.1 * wide, bottom - 0.15, 0.8 * wide, 0.08)
+        figure.colorbar(heat, cax=below, orientation="horizontal").ax.tick_params(labelsize=7)
     return figure
 
 

@@ -15,7 +15,7 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve, get_blas_funcs, get
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 from scipy.spatial.transform import Rotation
 
-from polyfit import jets
+from polyfit.monomials import exponents
 
 
 @dataclass
@@ -68,9 +68,9 @@ class Chart:
     def __init__(self, template):
         self.template = template
         self.order = template.order
-        exponents = jets.exponents(self.order)
-        self.degree = exponents.sum(1)  # of each coefficient
-        self._u, self._v = exponents.T
+        powers = exponents(self.order)
+        self.degree = powers.sum(1)  # of each coefficient
+        self._u, self._v = powers.T
         self.to_monomials = _legendre_to_monomials(self.order)
         self._from_monomials = np.linalg.inv(self.to_monomials)
         self._alpha = self._from_monomials @ template.alpha
@@ -194,9 +194,9 @@ class Chart:
 
 def _legendre_to_monomials(order):
     """The matrix (A, A) that takes coefficients of P_{i-j}(u) P_j(v), products of Legendre polynomials, to those of the monomials."""
-    exponents = jets.exponents(order)
+    powers = exponents(order)
     leg = [np.pad(legendre.leg2poly(row), (0, order - k)) for k, row in enumerate(np.eye(k + 1)[k] for k in range(order + 1))]
-    return np.array([[leg[a][i] * leg[b][j] for a, b in exponents] for i, j in exponents])
+    return np.array([[leg[a][i] * leg[b][j] for a, b in powers] for i, j in powers])
 
 
 class Pattern:

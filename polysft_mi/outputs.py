@@ -70,7 +70,7 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
     indices = np.asarray(sequence.indices[:count], dtype=np.int64)
     world = np.stack([problem.surface(Unknowns.from_numpy(s)) for s in track.states])
     vertices = problem.camera.to_camera(world).astype(np.float32)
-    drawn = drawing.finish(world, vertices, fps)
+    drawn, bound = drawing.finish(world, vertices, fps)
 
     sigma = {}
     if track.sigma:
@@ -91,9 +91,9 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
     for index, v in zip(indices, vertices):
         meshio.write_ply(os.path.join(out, "meshes", f"{index:03d}.ply"), v, template.faces, template.uv)
     say("pictures")
-    with open(os.path.join(out, "log.jsonl"), encoding="utf-8") as file:
-        figures.loss_plot(os.path.join(out, "loss.png"), [json.loads(line) for line in file])
-    video, per_frame = drawn()
+    rows, per_frame = drawn()
+    figures.contact_sheet(os.path.join(out, "comparison.png"), rows)
+    video = bound()
 
     finite = {name: [p[name] for p in per_frame if np.isfinite(p[name])] for name in ("psnr_mask", "ssim_mask")}
     summary = {

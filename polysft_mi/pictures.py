@@ -1,8 +1,9 @@
-"""The pictures of a run: each frame's rendering beside its image, as layers, EXRs, a video and a contact sheet.
+"""The pictures of a run: each frame's rendering beside its image, as layers, EXRs and a video.
 
 Import only after a Mitsuba variant is set. :mod:`polysft_mi.drawing` has this done by a process of its own.
 """
 
+import json
 import os
 from concurrent.futures import ThreadPoolExecutor
 
@@ -15,10 +16,11 @@ from . import figures, metrics
 from .exr import write_exr
 from .raster import RasterIntegrator
 from .results import PEAK
-from .video import encoder, write_video
+from .video import write_video
 
 _WIDTH = 640  # pixels across of a picture in the video, at most
 _ROWS = 5  # of the contact sheet
+_MARGIN = 1.25  # of the view of the surface, for what may move
 _THREADS = 2  # that draw and write what has been rendered
 _WAITING = 4  # renderings that may wait for them
 
@@ -79,71 +81,86 @@ class Renderings:
 
 
 class Album:
-    """The pictures of a run in the making: frames are drawn one by one, in any order and as often as need be, and bound at the end.
+    """The pictures of a run in the making: frames are drawn one by one, in any order and as often as need be, and bound into a video at the
+    end.
 
     ``out``: folder of the run; ``about``: what the EXRs' headers say of it; ``folder``: where the frames' pictures lie until the end.
     """
 
     def __init__(self, problem, out, about, folder):
         self.problem, self.out, self.about, self.folder = problem, out, about, folder
-        self._renderings, self._texcoords = Renderings(problem), None
+        self._renderings, self._texcoords, self._view = Renderings(problem), None, None
         self._masked = problem.sequence.mask(0) is not None
         self._pool = ThreadPoolExecutor(_THREADS)
         self._drawn = {}  # frame: future of its figures
-
-    def prepare(self):
-        """Load what binding needs, beforehand."""
-        import matplotlib.backends.backend_agg  # noqa: F401
-
-        encoder()
 
     def draw(self, frame, vertices, texcoords=None, exr=False):
         """Draw a frame whose surface has ``vertices`` (N, 3) [m, world], and ``texcoords`` (2V,) other than the template's own, if any."""
         if texcoords is not None and not np.array_equal(texcoords, self._texcoords):
             self._texcoords = texcoords
             self.problem.set_texcoords(mi.Float(texcoords))
+        surface = self.problem.camera.to_camera(vertices)
+        if self._view is None:
+            self._view = figures.View.around(surface).wider(_MARGIN)
         layers = self._renderings(vertices, frame, geometry=exr)
         waiting = [f for f in self._drawn.values() if not f.done()]
         if len(waiting) >= _WAITING:
             waiting[0].result()
         if frame in self._drawn:
             self._drawn[frame].result()
-        self._drawn[frame] = self._pool.submit(self._draw, frame, layers, exr)
+        self._drawn[frame] = self._pool.submit(self._draw, frame, surface, layers, exr)
 
-    def _draw(self, frame, layers, exr):
+    def _draw(self, frame, surface, layers, exr):
         index = self.problem.sequence.indices[frame]
         if exr:
             os.makedirs(os.path.join(self.out, "comparison"), exist_ok=True)
             write_exr(os.path.join(self.out, "comparison", f"{index:03d}.exr"), layers, {"frame": int(index), **self.about})
         target, render, error = (_panel(layers[n]) for n in ("target", "render", "error"))
         target, render = (np.round(255 * srgb(x)).astype(np.uint8) for x in (target, render))
-        cv2.imwrite(self._place(frame), np.concatenate([target, render, _heat(error)], axis=1), [cv2.IMWRITE_PNG_COMPRESSION, 1])
+        self._write(frame, "images", np.concatenate([target, render, _heat(error)], axis=1))
+        self._write(frame, "surface", self._shaded(surface, target.shape))
         return {"frame": int(index), **_figures(layers, self._masked)}
 
-    def _place(self, frame):
-        return os.path.join(self.folder, f"{frame}.png")
+    def _shaded(self, surface, shape):
+        template = self.problem.template
+        return figures.shade_surface(surface, template.faces, self._view, uv=template.uv, size=(shape[1], shape[0]))
 
-    def bind(self, surfaces, faces, uv, fps):
-        """Write comparison.mp4 and comparison.png of the frames' ``surfaces`` (T, N, 3) [m, camera frame], all of which have been drawn:
-        (the video's path, figures of each frame).
+    def _place(self, frame, name):
+        return os.path.join(self.folder, f"{frame}-{name}.png")
+
+    def _write(self, frame, name, picture):
+        cv2.imwrite(self._place(frame, name), picture, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+
+    def _panels(self, frame):
+        """Target, rendering, error and surface of a frame, each (h, w, 3) uint8."""
+        images = cv2.imread(self._place(frame, "images"))
+        return [*np.split(images, 3, axis=1), cv2.imread(self._place(frame, "surface"))]
+
+    def finish(self, surfaces):
+        """Once all frames are drawn: the rows of a contact sheet (:func:`polysft_mi.figures.contact_sheet`), and the figures of each frame.
+
+        ``surfaces`` (T, N, 3) [m, camera frame]. Where some leave the view of the first one, all are shaded again in one that holds them.
         """
-        found = [self._drawn[k].result() for k in range(len(surfaces))]
-        view, sheet, rows = figures.View.around(surfaces), set(chosen(len(surfaces), _ROWS)), []
+        found, rows = [self._drawn[k].result() for k in range(len(surfaces))], []
+        if not self._view.holds(surfaces):
+            self._view = figures.View.around(surfaces)
+            shape = self._panels(0)[0].shape
+            list(self._pool.map(lambda k: self._write(k, "surface", self._shaded(surfaces[k], shape)), range(len(surfaces))))
+        for k in chosen(len(surfaces), _ROWS):
+            target, render, heat, surface = self._panels(k)
+            error = heat.sum(axis=2, dtype=np.float32) * (PEAK / 765)
+            rows.append({"target": target, "render": render, "error": error, "surface": surface, "label": f"frame {found[k]['frame']}"})
+        return rows, found
 
-        def picture(k):
-            panels = cv2.imread(self._place(k))
-            width = panels.shape[1] // 3
-            surface = figures.shade_surface(surfaces[k], faces, view, uv=uv, size=(width, panels.shape[0]))
-            if k in sheet:
-                parts = [panels[:, j * width : (j + 1) * width] for j in range(3)]
-                error = parts[2].sum(axis=2, dtype=np.float32) * (PEAK / 765)
-                label = f"frame {found[k]['frame']}"
-                rows.append((k, {"target": parts[0], "render": parts[1], "error": error, "surface": surface, "label": label}))
-            return np.concatenate([panels, surface], axis=1)
-
-        video = write_video(os.path.join(self.out, "comparison.mp4"), self._pool.map(picture, range(len(surfaces))), fps)
-        figures.contact_sheet(os.path.join(self.out, "comparison.png"), [row for _, row in sorted(rows, key=lambda r: r[0])])
-        return video, found
+    def bind(self, count, fps):
+        """Write comparison.mp4 of the first ``count`` frames, and loss.png of the log; returns the video's path, or its folder where no
+        encoder is.
+        """
+        pictures = self._pool.map(lambda k: np.concatenate(self._panels(k), axis=1), range(count))
+        video = write_video(os.path.join(self.out, "comparison.mp4"), pictures, fps)
+        with open(os.path.join(self.out, "log.jsonl"), encoding="utf-8") as file:
+            figures.loss_plot(os.path.join(self.out, "loss.png"), [json.loads(line) for line in file])
+        return video
 
 
 def _figures(layers, masked):

@@ -1,5 +1,6 @@
 """``python -m polysft_mi.run scene.xml -o OUT``: the template's surface in every frame of a video."""
 
+import contextlib
 import gc
 import json
 import os
@@ -122,6 +123,7 @@ def _run(options, overrides, out, exr_frames):
     began, status = time.perf_counter(), 0
     about = {"scene": os.path.abspath(experiment.path), **outputs.versions()}
     with (
+        _half_the_threads() if s.solver == "gauss-newton" else contextlib.nullcontext(),
         Progress(count, s, options.quiet) as progress,
         Drawing(problem, overrides, out, exr_frames=exr_frames, about=about) as drawing,
     ):
@@ -147,6 +149,19 @@ def _run(options, overrides, out, exr_frames):
     else:
         _print_end(out, summary, page, seconds)
     return status
+
+
+@contextlib.contextmanager
+def _half_the_threads():
+    """The second-order solver's kernels are short: with a thread a processor, threads mostly wait for each other, and none is left to draw."""
+    import drjit as dr
+
+    before = dr.thread_count()
+    dr.set_thread_count(max(1, (os.cpu_count() or 1) // 2))
+    try:
+        yield
+    finally:
+        dr.set_thread_count(before)
 
 
 def _report(out, progress):

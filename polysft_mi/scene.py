@@ -44,8 +44,9 @@ class Experiment:
         return tuple(int(x) for x in self.sensor.film().crop_size())
 
 
-def load(path, overrides=None):
-    """Load a scene file as an :class:`Experiment`; ``overrides`` maps names of its defaults to text.
+def load(path, overrides=None, template=None):
+    """Load a scene file as an :class:`Experiment`; ``overrides`` maps names of its defaults to text, ``template`` is the :class:`Template`
+    of the same scene where it is known already.
 
     Raises InputError for whatever a user can get wrong in it.
     """
@@ -70,7 +71,7 @@ def load(path, overrides=None):
         raise InputError(f"{path}: {len(meshes)} meshes; give the template's shape id=\"template\"")
     experiment, mesh = scene.integrator(), meshes[0]
     settings = experiment.settings
-    template, corner = _template(mesh, source, settings)
+    template, corner = _template(mesh, source, settings, template)
     return Experiment(
         path, scene, scene.sensors()[0], experiment.renderer, mesh, template, corner, experiment.frames, experiment.masks, settings, defaults
     )
@@ -134,8 +135,10 @@ def _source(props):
     return where, vertices, faces
 
 
-def _template(mesh, source, settings):
-    """The template that the mesh shows, in its file's own vertex order, and the map from rendered vertices to it."""
+def _template(mesh, source, settings, template):
+    """The template that the mesh shows, in its file's own vertex order (fitted, where it is not given), and the map from rendered vertices to
+    it.
+    """
     rendered = np.array(mesh.vertex_positions_buffer(), dtype=np.float64).reshape(-1, 3)
     faces = np.array(mesh.faces_buffer(), dtype=np.int64).reshape(-1, 3)
     where, vertices, faces = source or (f"template {mesh.id()!r}", rendered, faces)
@@ -145,6 +148,8 @@ def _template(mesh, source, settings):
     if not np.isfinite(rendered).all():
         raise InputError(f"{where}: positions are not finite (NaN)")
     distance, corner = cKDTree(vertices).query(rendered)
+    if template is not None:
+        return template, corner
     size = np.ptp(vertices, axis=0).max()
     if distance.max() > 1e-4 * size:
         raise InputError(f"{where}: its vertices are not those that Mitsuba loads (up to {distance.max():.3g} m apart)")

@@ -2,7 +2,7 @@
 camera sees them.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -42,6 +42,15 @@ class View:
         seen = points @ rotation.T
         low, high = seen.min(axis=0), seen.max(axis=0)
         return cls(rotation, (low + high) / 2 @ rotation, 0.55 * float(np.max((high - low)[:2])))
+
+    def wider(self, factor):
+        """The same view with ``factor`` times as much in it."""
+        return replace(self, radius=factor * self.radius)
+
+    def holds(self, points):
+        """Whether points (..., 3) [m] all lie in the picture, whatever its form."""
+        seen = (np.asarray(points, dtype=np.float64).reshape(-1, 3) - self.centre) @ self.rotation.T
+        return bool((np.abs(seen[:, :2]) <= self.radius).all())
 
 
 def shade_surface(vertices, faces, view=None, uv=None, size=(480, 480)):

@@ -1,12 +1,10 @@
-"""The template: a mesh held by one jet in its canonical frame (paper, sections "PolyFit" and "PolySfT"). NumPy and torch only."""
+"""The template: a mesh held by one jet in its canonical frame (paper, sections "PolyFit" and "PolySfT"). NumPy, and torch for the fit."""
 
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
-from polyfit import jets
-from polyfit.frames import CanonicalFrame
+from polyfit.monomials import order_of, size_of
 
 from .errors import InputError
 
@@ -35,7 +33,7 @@ class Template:
     @property
     def order(self):
         """The order that the coefficients are for."""
-        return jets.order_of(len(self.alpha))
+        return order_of(len(self.alpha))
 
     @property
     def edges(self):
@@ -62,12 +60,17 @@ class Template:
         Raises InputError where the order is too high for the vertices (if ``exact``), where the surface folds over in its chart (a closed surface does),
         or where the largest residual exceeds ``tolerance`` times the scale s.
         """
+        import torch  # takes longer than the rest of a start together
+
+        from polyfit import jets
+        from polyfit.frames import CanonicalFrame
+
         points = torch.as_tensor(np.asarray(vertices, dtype=np.float64))
         frame = frame or CanonicalFrame.from_points(points)
         x = frame.to_chart(points)
         fitted = jets.fit(x, order)
         if fitted.order < order and exact:
-            wanted = f"a jet of order {order} has {jets.size_of(order)} coefficients"
+            wanted = f"a jet of order {order} has {size_of(order)} coefficients"
             found = f"the {len(points)} vertices determine no more than order {int(fitted.order)}"
             raise InputError(f"{where}: order = {order} is too high: {wanted}, and {found}")
         alpha = fitted.alpha
@@ -80,7 +83,7 @@ class Template:
             frame.R.numpy(),
             frame.T.numpy(),
             x[:, :2].numpy(),
-            np.pad(alpha.numpy(), (0, jets.size_of(max(order, capacity or order)) - len(alpha))),
+            np.pad(alpha.numpy(), (0, size_of(max(order, capacity or order)) - len(alpha))),
             residual,
             int(fitted.order),
         )

@@ -15,6 +15,7 @@ import synthetic
 
 from polysft_mi import drawing, exr, prepare, scene, video
 from polysft_mi.drawing import Drawing
+from polysft_mi.pictures import Album, chosen
 from polysft_mi.problem import Problem
 from polysft_mi.sequence import Sequence
 
@@ -40,13 +41,17 @@ def drawn(sheet, out, during=lambda drawing: None, *, problem=None, frames=9, ex
     vertices = np.stack([problem.camera.origin + v @ problem.camera.axes for v in surfaces]).astype(np.float32)
     assert np.allclose(problem.camera.to_camera(vertices), surfaces, atol=1e-6)
     out.mkdir(exist_ok=True)
+    (out / "log.jsonl").write_text('{"frame": 0, "iteration": 0, "loss": 1.0}\n')
     with Drawing(problem, {}, str(out), exr_frames=exr_frames, about={"scene": "sheet"}) as made:
         for k, v in enumerate(vertices):
             made.frame(k, v)
         during(made)
-        path, figures = made.finish(vertices, surfaces, 15)()
+        for_sheet, bound = made.finish(vertices, surfaces, 15)
+        rows, figures = for_sheet()
+        path = bound()
         folder = Path(made._folder.name)
-    assert not folder.exists() and (out / "comparison.png").exists()
+    assert not folder.exists() and (out / "loss.png").exists()
+    assert [r["label"] for r in rows] == [f"frame {k}" for k in chosen(frames, 5)]
     return figures, np.stack(list(video.read_video(path))), sorted(p.name for p in (out / "comparison").glob("*.exr"))
 
 
@@ -105,6 +110,21 @@ def test_fewer_frames_than_expected(sheet, here, tmp_path):
     assert found[2] == ["000.exr", "002.exr", "004.exr"] and len(found[1]) == 5
     for x, y in zip(found[0], here[0]):
         assert x == pytest.approx(y, rel=1e-4)
+
+
+def test_a_surface_that_leaves_the_view_of_the_first_is_shown_whole(sheet, tmp_path):
+    problem = problem_of(sheet)
+    (tmp_path / "log.jsonl").write_text('{"frame": 0, "iteration": 0, "loss": 1.0}\n')
+    album = Album(problem, str(tmp_path), {}, str(tmp_path))
+    surfaces = sheet.vertices[:3] + np.array([0, 0.2, 0.4])[:, None, None] * np.array([1, 0.3, 0])
+    for k, v in enumerate(surfaces):
+        album.draw(k, problem.camera.origin + v @ problem.camera.axes)
+    rows, _ = album.finish(surfaces)
+    assert album._view.holds(surfaces)
+    for row in rows:
+        background = row["surface"][0, 0]
+        shown = (row["surface"] != background).any(-1)
+        assert shown.mean() > 0.02 and not shown[[0, -1]].any() and not shown[:, [0, -1]].any()
 
 
 @pytest.mark.skipif(not os.path.isdir("/proc"), reason="children are found in /proc")
