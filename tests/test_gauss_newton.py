@@ -1,6 +1,7 @@
 """The second-order solver: its derivatives against autodiff through the renderer, its algebra against dense matrices, its frames against the truth."""
 
 import dataclasses
+import math
 import shutil
 
 import cv2
@@ -414,7 +415,7 @@ def test_whole_gradient_against_finite_differences(problem, stage):
     settings = dataclasses.replace(problem.settings, solver="gauss-newton", brightness="local", k_tc=50.0, k_bend=1e-3, k_uv=1e-2)
     solver = gauss_newton.GaussNewton(settings)
     solver._prepare(problem)
-    solver._misfit_before = 0.07
+    solver._noise = 0.07
     chart = solver.chart
     rest = chart.state(problem.patch.rest().to_numpy())
     anchor, state = some_state(chart, 0.01), dataclasses.replace(some_state(chart, 0.004), translation=np.array([0.01, -0.008, 0.02]))
@@ -524,7 +525,7 @@ def test_gradient_and_curvature_of_what_holds_the_relief(truth):
     problem = problem_of(truth.folder, k_rgb=0.0, k_silhouette=0.0, k_mi=0.0, k_tc=5.0, k_relief=0.7, texture_fit="none")
     solver = gauss_newton.GaussNewton(problem.settings)
     solver._prepare(problem)
-    solver._misfit_before = 0.07
+    solver._noise = 0.07
     rest = solver.chart.state(problem.patch.rest().to_numpy())
     state = some_state(solver.chart, 0.01)
 
@@ -559,6 +560,39 @@ def test_relief_moves_only_where_it_may(truth, tmp_path):
         assert not done.states[0]["delta_w"].any()
         found[weight] = np.abs(done.states[-1]["delta_w"]).mean()
     assert found[0.0] == 0 < found[10.0] < 0.1 * found[1e-3]
+
+
+def test_noise_is_the_least_misfit_but_for_the_first_frame(problem):
+    """The first frame fits itself: the texture was taken from it. What lies far above the least later on is no noise."""
+    solver = gauss_newton.GaussNewton(problem.settings)
+    assert np.isnan(solver._remember([])) and np.isnan(solver._noise) and not solver._unexplained
+    first = {"misfit": 0.01, "least_misfit": None}  # as a checkpoint has it
+    assert np.isnan(solver._remember([first])) and solver._noise == 0.01
+    known = [first, {"misfit": 0.03, "least_misfit": 0.03}, {"misfit": 0.05, "least_misfit": 0.03}]
+    assert solver._remember(known) == 0.03 and solver._noise == 0.03 and not solver._unexplained
+    solver._remember([*known, {"misfit": 0.07, "least_misfit": 0.03}])
+    assert solver._noise == 0.03 and solver._unexplained
+    solver._remember([{"misfit": 0.015, "least_misfit": 0.002}])  # clean images are explained well enough
+    assert not solver._unexplained
+
+
+@pytest.mark.parametrize(
+    "noise, unexplained, moves", [(math.nan, False, [0, 0, 0]), (0.01, False, [0, 1, 1]), (0.01, True, [1, 1, 1]), (0.2, False, [0, 0, 1]), (0.2, True, [0, 0, 1])]
+)
+def test_stages_in_which_the_relief_moves(problem, noise, unexplained, moves):
+    solver = gauss_newton.GaussNewton(problem.settings)
+    solver._prepare(problem)
+    rest = solver.chart.state(problem.patch.rest().to_numpy())
+    solver._noise, solver._unexplained = noise, unexplained
+    found = [solver._linearise(rest, rest, 1, 4, stage, 0.5)[0].local.shape[-1] - 2 for stage in gauss_newton.STAGES]
+    assert found == moves
+
+
+def test_the_least_misfit_goes_from_frame_to_frame(truth, tmp_path):
+    problem = problem_of(truth.folder)
+    done = track(problem, solvers.create(problem.settings), 4, str(tmp_path))
+    misfit, least = ([t[name] for t in done.totals] for name in ("misfit", "least_misfit"))
+    assert least[0] is None and least[1:] == pytest.approx(np.minimum.accumulate(misfit[1:]).tolist())
 
 
 def test_order_rises_with_the_data_and_stays_within_bounds(tmp_path):

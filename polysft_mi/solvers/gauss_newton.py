@@ -31,10 +31,13 @@ _TEXTURE_MISFIT, _TEXTURE_GAIN, _TEXTURE_FARTHEST = 0.15, 0.6, 0.08
 _TEXTURE_ITERATIONS, _TEXTURE_STIFFNESS = 6, 1.0
 _SHOWN = 0.7  # share of the pixels that see the sheet below which neither a stage nor another start may go: what none sees costs nothing
 _FARTHEST_STEP = 2.0  # rotation [rad], translation and displacements [chart units]
-_FACTS = "misfit", "outlying", "order"
+_FACTS = "misfit", "outlying", "order", "least_misfit"
 _RELIEF_VERTICES = 3000  # of the template, above which there is no relief: its wide system takes a second an iteration at 10,000
 _RELIEF_BEND = 3e-3  # of the relief's weight, for its bending
-_RELIEF_MISFIT = 0.045  # of the frame before, at which the relief's weight has doubled; with the fourth power: noise must not become ripples, which use up length
+# Noise must not become ripples, which use up length. What noise there is, the least misfit of the frames so far tells, the first one aside,
+# which the texture was taken from: at this misfit the relief's weight has doubled, and it grows with that power of it.
+_RELIEF_MISFIT, _RELIEF_POWER = 0.05, 8
+_UNEXPLAINED, _UNEXPLAINED_FACTOR = 0.02, 2.0  # a misfit above this, and above so many times the least, is no noise: the jet does not follow
 _TEMPORAL = 1e-3  # of k_tc: it holds a frame to the one before, in a stiffer basis than the monomials of the paper's window
 
 
@@ -53,18 +56,18 @@ def _check_step(step):
 
 @dataclass(frozen=True)
 class Stage:
-    """``blur`` [pixels at a sheet of _SHEET], ``stiffness`` (the factor of k_mi), the most ``iterations``, and the misfit of the frame before
-    below which the ``relief`` moves."""
+    """``blur`` [pixels at a sheet of _SHEET], ``stiffness`` (the factor of k_mi), the most ``iterations``, and the least misfit so far
+    below which the ``relief`` moves: the first number everywhere, the second where the frame before was not explained."""
 
     blur: float
     stiffness: float
     iterations: int
-    relief: float = 0.0
+    relief: tuple = (0.0, 0.0)
 
 
 # Soft edges first, so that the texture coordinates register to the image before lengths are enforced: in a stiff flat sheet that is compressed
 # in the image, height has no first-order effect, and it would drift in depth instead of bending.
-STAGES = Stage(2.5, 1e2, 6), Stage(1.5, 3e2, 5, 0.08), Stage(1.0, 1e3, 4, math.inf)
+STAGES = Stage(2.5, 1e2, 6, (0.0, 0.08)), Stage(1.5, 3e2, 5, (0.08, 0.08)), Stage(1.0, 1e3, 4, (math.inf, math.inf))
 FAR = Stage(6.0, 1e2, 6)  # before the others where the sheet has moved far
 
 
@@ -87,7 +90,7 @@ class GaussNewton:
         self._problem = None
         self._blas = ThreadpoolController()  # its own threads cost more than they bring on blocks this small, and wait for Dr.Jit's
         self._scales, self._fitting = {}, {}
-        self._misfit_before = math.nan  # of the frame at work; NaN in the first, where the template has its shape
+        self._noise, self._unexplained = math.nan, False  # of the frame at work: the least misfit before it, NaN in the first, where the template has its shape
         self._hold = 0.0  # weight of the difference to the anchor, motion included, where a frame is solved again
 
     def solve(self, problem, window, frames, report=None, past=()):
@@ -110,9 +113,10 @@ class GaussNewton:
         for k in range(len(frames) - 1 if past else 0, len(frames)):
             self._expect(frames[k])
             self._scales, self._fitting = self._fitting, {}
-            self._misfit_before = next((t["misfit"] for t in reversed(known) if t.get("misfit") is not None), math.nan)
+            least = self._remember(known)
             start = states[k] if past or k == 0 else states[k - 1]
             states[k], found = self._newest(start, frames[k], (before + states[:k])[-2:], known)
+            found["least_misfit"] = float(np.fmin(least, found["misfit"])) if known else math.nan
             known.append(found)
         if len(frames) == 1:
             return self._solution(states, [found], found)
@@ -133,7 +137,7 @@ class GaussNewton:
             self._prepare(problem)
         self._report, self._count = None, 0
         self._scales, self._fitting = self._scales_of(terms), {}
-        self._misfit_before = terms.get("misfit") or math.nan
+        least = self._remember([terms])
         a, b = self.chart.state(before), self.chart.state(after)
         middle = a.towards(b, -0.5)
         order = int(terms.get("order") or self.least)
@@ -142,6 +146,7 @@ class GaussNewton:
             state, found = self._descend(middle, middle, frame, order, STAGES)
         finally:
             self._hold = 0.0
+        found["least_misfit"] = least
         return self._solution([state], [found], found)
 
     # -- preparation --------------------------------------------------------
@@ -168,7 +173,7 @@ class GaussNewton:
             self.levels[stage] = Level(sigma, max(1, int(0.8 * sigma)), max(_WINDOW * unit, 3 * sigma))
         self._relocator = None
         self._report, self._count = None, 0
-        self._misfit_before = math.nan
+        self._noise, self._unexplained = math.nan, False
         if self.settings.texture_fit == "auto":
             self._fit_texture()
 
@@ -195,6 +200,13 @@ class GaussNewton:
         after = reg.misfit(chart.surface(state, 0).vertices, 0, self.levels[STAGES[-1]])
         if after < _TEXTURE_GAIN * before and np.abs(state.offset).max() < _TEXTURE_FARTHEST:
             reg.shift_texture(chart.template.chart, chart.template.chart + state.offset[:, :2])
+
+    def _remember(self, known):
+        """What the frames before (their terms) say of the noise: sets it, and returns the least misfit, NaN where only the first is known."""
+        misfit, least = (next((t[name] for t in reversed(known) if t.get(name) is not None), math.nan) for name in ("misfit", "least_misfit"))
+        self._noise = misfit if math.isnan(least) else least
+        self._unexplained = misfit > max(_UNEXPLAINED, _UNEXPLAINED_FACTOR * self._noise)
+        return least
 
     def _expect(self, frame):
         """Have this frame and the next one read in a second thread."""
@@ -368,8 +380,8 @@ class GaussNewton:
         evaluation = self.registration.evaluate(surface.vertices, frame, self.levels[stage], scale)
         stiffness = s.k_mi * (stage.stiffness if stiffness is None else stiffness) / chart.template.scale**2
         projection = self.registration.projection(surface.vertices)
-        d = 3 if s.k_relief > 0 and len(state.offset) <= _RELIEF_VERTICES and self._misfit_before < stage.relief else 2
-        relief = s.k_relief * (1 + (np.nan_to_num(self._misfit_before) / _RELIEF_MISFIT) ** 4)
+        d = 3 if s.k_relief > 0 and len(state.offset) <= _RELIEF_VERTICES and self._noise < stage.relief[self._unexplained] else 2
+        relief = s.k_relief * (1 + (np.nan_to_num(self._noise) / _RELIEF_MISFIT) ** _RELIEF_POWER)
         pattern = self.systems[d].pattern
         normal, inextensibility = assemble(self.pattern, surface, projection, evaluation, self.lengths, stiffness, pattern if d == 3 else None)
         a = self.chart.size(order)
