@@ -570,7 +570,7 @@ def test_noise_is_the_least_misfit_but_for_the_first_frame(problem):
     assert np.isnan(solver._remember([first])) and solver._noise == 0.01
     known = [first, {"misfit": 0.03, "least_misfit": 0.03}, {"misfit": 0.05, "least_misfit": 0.03}]
     assert solver._remember(known) == 0.03 and solver._noise == 0.03 and not solver._unexplained
-    solver._remember([*known, {"misfit": 0.07, "least_misfit": 0.03}])
+    solver._remember([*known, {"misfit": 0.13, "least_misfit": 0.03}])
     assert solver._noise == 0.03 and solver._unexplained
     solver._remember([{"misfit": 0.015, "least_misfit": 0.002}])  # clean images are explained well enough
     assert not solver._unexplained
@@ -673,6 +673,20 @@ def test_a_window_follows_the_sheet_and_couples_its_frames(truth, tmp_path, k_tc
     loose = track(single, solvers.create(single.settings), 4, str(tmp_path / ".."))
     moved = [sum(((b["delta_u"] - a["delta_u"]) ** 2).sum() for a, b in zip(x.states, x.states[1:])) for x in (done, loose)]
     assert moved[0] < 0.5 * moved[1]
+
+
+def test_looking_back_smooths_and_keeps_what_frames_know(truth, tmp_path):
+    """``smooth`` holds every inner frame to the middle of its neighbours, and loses none of the facts that later frames go by."""
+    found = {}
+    for smooth in (0.0, 10.0):
+        problem = problem_of(truth.folder, smooth=smooth)
+        (tmp_path / str(smooth)).mkdir()
+        done = track(problem, solvers.create(problem.settings), 4, str(tmp_path / str(smooth)))
+        assert done.finished and len(done.totals) == len(done.sigma) == 4
+        assert all(t["least_misfit"] > 0 and t["order"] == 8 for t in done.totals[1:])
+        surfaces = np.stack([problem.surface(Unknowns.from_numpy(s)) for s in done.states])
+        found[smooth] = np.abs(np.diff(surfaces, n=2, axis=0)).mean()
+    assert found[10.0] < 0.85 * found[0.0]
 
 
 def test_settings_that_do_not_go_together():

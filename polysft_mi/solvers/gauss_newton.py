@@ -37,7 +37,7 @@ _RELIEF_BEND = 3e-3  # of the relief's weight, for its bending
 # Noise must not become ripples, which use up length. What noise there is, the least misfit of the frames so far tells, the first one aside,
 # which the texture was taken from: at this misfit the relief's weight has doubled, and it grows with that power of it.
 _RELIEF_MISFIT, _RELIEF_POWER = 0.05, 8
-_UNEXPLAINED, _UNEXPLAINED_FACTOR = 0.02, 2.0  # a misfit above this, and above so many times the least, is no noise: the jet does not follow
+_UNEXPLAINED, _UNEXPLAINED_FACTOR = 0.02, 4.0  # a misfit above this, and above so many times the least, is no noise: the jet does not follow
 _TEMPORAL = 1e-3  # of k_tc: it holds a frame to the one before, in a stiffer basis than the monomials of the paper's window
 
 
