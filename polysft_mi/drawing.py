@@ -79,13 +79,13 @@ class Drawing:
         return set(chosen(count, self.exr_frames))
 
     def _submit(self, *calls):
-        """Have the album's methods called; of no use where the process is gone, which :meth:`finish` tells."""
+        """Have the album's methods called: the future of the last one, None where the process is gone, which :meth:`finish` minds."""
         alone = threading.current_thread() is threading.main_thread()
         kept = signal.signal(signal.SIGINT, signal.SIG_IGN) if alone else None  # Ctrl-C is for the tracker; the process inherits this
         try:
-            self._jobs.append(self._pool.submit(_draw_in_background, *self._first, calls))
+            return self._pool.submit(_draw_in_background, *self._first, calls)
         except RuntimeError:  # the pool is broken
-            pass
+            return None
         finally:
             if alone:
                 signal.signal(signal.SIGINT, kept)
@@ -97,7 +97,7 @@ class Drawing:
 
     def _give(self, k, vertices):
         self._given[k] = vertices, k in self._exr
-        self._submit(self._call(k, vertices))
+        self._jobs.append(self._submit(self._call(k, vertices)))
 
     def _call(self, k, vertices):
         return "draw", k, vertices, self.problem.texcoords, k in self._exr
@@ -116,16 +116,15 @@ class Drawing:
                 before, exr = self._given.get(k, (None, False))
                 if not np.array_equal(before, v) or (k in self._exr and not exr):
                     self._give(k, v)
-            for call in last:
-                self._submit(call)
+            jobs = [self._submit(call) for call in last]
         album = []  # here, where it must be
 
         def result(k):
-            try:
-                if self._pool is not None and len(self._jobs) > 2 and not album:
-                    return [job.result() for job in self._jobs[: len(self._jobs) - 1 + k]][-1]
-            except Exception:  # killed, or out of memory, or what drawing it here will tell
-                pass
+            if self._pool is not None and not album:
+                try:
+                    return [job.result() for job in (*self._jobs, *jobs[: k + 1])][-1]
+                except Exception:  # killed, or out of memory, or what drawing it here will tell
+                    pass
             if not album:
                 album.append(self._here(vertices))
                 if k > 0:

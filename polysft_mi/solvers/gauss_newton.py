@@ -35,8 +35,8 @@ _FACTS = "misfit", "outlying", "order", "least_misfit"
 _RELIEF_VERTICES = 3000  # of the template, above which there is no relief: its wide system takes a second an iteration at 10,000
 _RELIEF_BEND = 3e-3  # of the relief's weight, for its bending
 # Noise must not become ripples, which use up length. What noise there is, the least misfit of the frames so far tells, the first one aside,
-# which the texture was taken from: at this misfit the relief's weight has doubled, and it grows with that power of it.
-_RELIEF_MISFIT, _RELIEF_POWER = 0.05, 8
+# which the texture was taken from: at this misfit the relief's weight has doubled, and it grows with that power of it, to so many times.
+_RELIEF_MISFIT, _RELIEF_POWER, _RELIEF_HEAVIEST = 0.05, 8, 1e3
 _UNEXPLAINED, _UNEXPLAINED_FACTOR = 0.02, 4.0  # a misfit above this, and above so many times the least, is no noise: the jet does not follow
 _TEMPORAL = 1e-3  # of k_tc: it holds a frame to the one before, in a stiffer basis than the monomials of the paper's window
 
@@ -381,7 +381,7 @@ class GaussNewton:
         stiffness = s.k_mi * (stage.stiffness if stiffness is None else stiffness) / chart.template.scale**2
         projection = self.registration.projection(surface.vertices)
         d = 3 if s.k_relief > 0 and len(state.offset) <= _RELIEF_VERTICES and self._noise < stage.relief[self._unexplained] else 2
-        relief = s.k_relief * (1 + (np.nan_to_num(self._noise) / _RELIEF_MISFIT) ** _RELIEF_POWER)
+        relief = s.k_relief * (1 + min((np.nan_to_num(self._noise) / _RELIEF_MISFIT) ** _RELIEF_POWER, _RELIEF_HEAVIEST))
         pattern = self.systems[d].pattern
         normal, inextensibility = assemble(self.pattern, surface, projection, evaluation, self.lengths, stiffness, pattern if d == 3 else None)
         a = self.chart.size(order)
