@@ -428,7 +428,7 @@ def assemble(pattern, surface, projection, evaluation, lengths, stiffness, wide=
 
 def _conjugated(blocks, s, pattern):
     """s_i^T blocks_ij s_j of each block of the pattern, (B, 3, 3): ``blocks`` (B, 2, 2), ``s`` (N, 2, 3). By components: products of whole
-    arrays take a fifth of the time of many small matrix products.
+    arrays are faster than many small matrix products.
     """
     i, j = (np.ascontiguousarray(s.reshape(-1, 6).T)[:, k] for k in (pattern.row, pattern.column))
     k = np.ascontiguousarray(blocks.reshape(-1, 4).T)
@@ -511,8 +511,8 @@ class Reduced:
 
 def hinges(chart, faces):
     """What a height over the chart (N, 2), both in the chart's unit, bends at the H inner edges of the mesh with ``faces`` (F, 3): the
-    pairs (H, 2) of vertices that lie across each, and the sparse J (H, N) that makes the bends. The sum of their squares is the integral of the squared curvature of a roll along the mesh's rows,
-    up to three times that of others; no plane has any.
+    pairs (H, 2) of vertices that lie across each, and the sparse J (H, N) that makes the bends. The sum of their squares is the integral of
+    the squared curvature of a roll along the mesh's rows, up to three times that of others; no plane has any.
 
     After Bergou et al., "A Quadratic Bending Model for Inextensible Surfaces" (SGP 2006).
     """

@@ -153,7 +153,7 @@ class Album:
         return rows, found
 
     def bind(self, count, fps):
-        """Write comparison.mp4 of the first ``count`` frames, and loss.png of the log; returns the video's path, or its folder where no
+        """Write comparison.mp4 of the first ``count`` frames, ``fps`` a second, and loss.png of the log; returns the video's path, or its folder where no
         encoder is.
         """
         pictures = self._pool.map(lambda k: np.concatenate(self._panels(k), axis=1), range(count))
