@@ -1,7 +1,7 @@
 """Draw ``docs/onefit_garments.png``: the seven templates on the standard body, from the front and from behind.
 
     python docs/onefit_garments.py                                        (half a minute)
-    python docs/onefit_garments.py --cuts 14 -o docs/onefit_cuts.jpg      (two minutes: random cuts, as training draws them)
+    python docs/onefit_garments.py --cuts 18 -o docs/onefit_cuts.jpg      (two minutes: random cuts, as training draws them)
 """
 
 import argparse
@@ -18,7 +18,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 
 from onefit.binding import standard_body  # noqa: E402
-from onefit.cuts import cuts  # noqa: E402
+from onefit.cuts import CUTS, cuts  # noqa: E402
 from onefit.garment import TEMPLATES, Garment  # noqa: E402
 
 WIDTH, HEIGHT, ZOOM = 300, 460, 3
@@ -55,7 +55,7 @@ def main():
         garments = [Garment.template(name) for name in TEMPLATES]
     body = standard_body()
     skin = (body.vertices.numpy(), body.faces.numpy(), SKIN)
-    columns, title = min(len(garments), len(TEMPLATES)), 40
+    columns, title = min(len(garments), len(CUTS if args.cuts else TEMPLATES)), 40
     band = 2 * HEIGHT + title  # a row of garments, seen from the front and from behind
     tall = -(-len(garments) // columns) * band
     out = Figure(figsize=(columns * WIDTH / 150, tall / 150), dpi=150)

@@ -19,6 +19,8 @@ from polyfit import jets, mesh
 from polyfit.frames import CanonicalFrame
 from polyfit.surface import PatchedSurface
 
+from .binding import surface_of
+
 # Charts reach this far beyond the patch, in units of its radius, where they fade into their neighbours'; at most so many meet in a point.
 REACH = 1.3
 MEET = 4
@@ -26,6 +28,10 @@ MEET = 4
 STEADY = 1e-3
 # A patch that fills less of its chart's disc is a strip (a hem turned in), of which networks know little: its neighbours have more say.
 STRIP = 0.2
+ROOM = 0.005, 0.1  # [m]
+AROUND = 1.0  # width of the Gaussian by which patches around share their drift, in distances of neighbours
+HELD = 1e-2  # how much the slopes of their plane are held to zero
+LOOSE = 0.005  # [m]; a patch much nearer to the body than this lies on it
 # Points of each patch at which the metric is held, and boundary points for each pair of patches that meet.
 METRIC_POINTS = 16
 BOUNDARY_POINTS = 6
@@ -34,11 +40,14 @@ BOUNDARY_POINTS = 6
 @dataclass(frozen=True)
 class Deformation:
     """What the network says of each patch in each frame: ``alpha`` (T, K, A) added to the coefficients, ``translation`` (T, K, 3) in the
-    chart and in units of s, ``scale`` (T, K), the logarithm of s'/s. Zeros leave the garment as it is."""
+    chart and in units of s, ``scale`` (T, K), the logarithm of s'/s, and ``drift`` (T, K, 3), a displacement along the rest space's axes, in
+    units of the patch's room, that the cloth around shares: each patch takes the plane through those of the patches around it, so that it
+    turns and stretches with them. Zeros leave the garment as it is."""
 
     alpha: torch.Tensor
     translation: torch.Tensor
     scale: torch.Tensor
+    drift: torch.Tensor
 
 
 class SparseMatrix:
@@ -111,6 +120,11 @@ class PatchedGarment:
         rng = np.random.default_rng(seed)
         self._entries(p, uv, rng)
         self._blend(p, vertices)
+        self.looseness = _looseness(p, body)
+        #: (K,) [m]: a patch's mean distance from the standard body, within ROOM
+        self.room = np.clip(LOOSE * np.sinh(self.looseness[:, 1].double().numpy()), *ROOM)
+        #: a SparseMatrix (3 K, K): the entries of 1, u and v [m] of the plane that drifts of the patches around make in each chart
+        self.planes = SparseMatrix(_planes(p.neighbours, self.frame) @ sp.diags(self.room))
 
     def __len__(self):
         """K, the number of patches."""
@@ -223,7 +237,9 @@ class PatchedGarment:
         wide = torch.nn.functional.pad((grown - 1), (1, A - 2)), torch.nn.functional.pad((grown - 1), (2, A - 3))
         C = torch.stack([wide[0], wide[1], height], -1)
         C = torch.cat([C[:, :, :1] + deformation.translation[:, :, None], C[:, :, 1:]], 2)
-        return torch.einsum("tkac,kdc->katd", C, s[:, None, None] * R)
+        change = torch.einsum("tkac,kdc->katd", C, s[:, None, None] * R)
+        plane = (self.planes @ deformation.drift.transpose(0, 1)).unflatten(0, (K, 3))
+        return change + torch.nn.functional.pad(plane, (0, 0, 0, 0, 0, A - 3))
 
     def displacement(self, changes):
         """Displacements of the vertices in the rest space, (N, T, 3) [m]."""
@@ -253,11 +269,13 @@ class PatchedGarment:
 
     @cached_property
     def features(self):
-        """What the network reads of each patch: ``alpha`` (K, A), ``orientation`` (K, 7) (log s / 5 cm, two axes of R), ``centre`` (K, 3).
+        """What the network reads of each patch: ``alpha`` (K, A), ``orientation`` (K, 7) (log s / 5 cm, two axes of R), ``centre`` (K, 3),
+        ``looseness`` (K, 3) (least, mean and greatest distance of its vertices from the standard body, as asinh(d / LOOSE)) and
+        ``blend_weights`` (K, J).
         """
         R = self.frame.R.float()
         orientation = torch.cat([(self.frame.s.float() / 0.05).log()[:, None], R[:, :, 2], R[:, :, 1]], 1)
-        return self.alpha.float(), orientation, self.frame.T.float()
+        return self.alpha.float(), orientation, self.frame.T.float(), self.looseness, torch.as_tensor(self.blend_weights).float()
 
     @cached_property
     def edges(self):
@@ -303,6 +321,38 @@ def _along_bones(surface, weights, body):
     x = (frame.R[patch].mT @ points[..., None])[..., 0] / frame.s[patch, None]
     alpha = _steady_jets(x, patch, torch.as_tensor(p.entry_weight), len(weights), jets.order_of(surface.alpha.shape[1]))
     return frame, alpha, jets.nearest(alpha[patch], x[:, None])[:, 0].numpy()
+
+
+def _planes(pairs, frame):
+    """The matrix (3 K, K) from values of the patches to the planes a + b u + c v of the charts: least squares over the patches around,
+    two rings of the ``pairs`` (B, 2) that meet, weighted by a Gaussian of their distance; slopes are held by a trace of a ridge.
+    """
+    R, s, T = (x.numpy() for x in (frame.R, frame.s, frame.T))
+    ring = sp.coo_matrix((np.ones(len(pairs)), pairs.T), (len(T), len(T))).tocsr()
+    ring = ring + ring.T + sp.identity(len(T))
+    near = (ring @ ring).tocsr()
+    length = np.median(np.linalg.norm(T[pairs[:, 0]] - T[pairs[:, 1]], axis=1)) if len(pairs) else 1.0
+    rows, columns, values = [], [], []
+    for k in range(len(T)):
+        around = near[k].indices
+        x = (T[around] - T[k]) @ R[k] / s[k]
+        b = np.column_stack([np.ones(len(around)), x[:, :2]])
+        w = np.exp(-((np.linalg.norm(T[around] - T[k], axis=1) / (AROUND * length)) ** 2))[:, None]
+        gram = (b * w).T @ b + np.diag([0, HELD, HELD]) * w.sum()
+        values.append(np.linalg.solve(gram, (b * w).T).ravel())
+        rows.append(np.repeat(3 * k + np.arange(3), len(around)))
+        columns.append(np.tile(around, 3))
+    return sp.csr_matrix((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), (3 * len(T), len(T)))
+
+
+def _looseness(p, body):
+    """Least, mean and greatest distance of each patch's vertices from the ``body``, as asinh(d / LOOSE): (K, 3)."""
+    distance = surface_of(body)(p.vertices).distance
+    order = np.argsort(p.vertex_patch, kind="stable")
+    count = np.bincount(p.vertex_patch)
+    first = np.cumsum(count) - count
+    least, total, greatest = (ufunc.reduceat(distance[order], first) for ufunc in (np.minimum, np.add, np.maximum))
+    return torch.as_tensor(np.arcsinh(np.stack([least, total / count, greatest], 1) / LOOSE), dtype=torch.float32)
 
 
 def _steady_jets(x, patch, weight, count, order):

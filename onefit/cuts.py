@@ -19,7 +19,7 @@ from .remesh import loops
 from .tailor import Block, sewn
 
 # The pattern, how many loops its boundary has, and its measures [m], from .. to, more of them near the first: little ease, to the ankles
-# and wrists, where the body is hardest to follow.
+# and wrists, where the body is hardest to follow. The wide ones are fitted to the hips only, and swing.
 CUTS = {
     "tshirt": ("tshirt", 4, dict(
         waist_ease=(0, 0.03), sleeve_ease=(0, 0.03), sleeve=(0.23, 0.07),
@@ -36,6 +36,10 @@ CUTS = {
     "shorts": ("shorts", 3, dict(hip_ease=(0, 0.02), leg_ease=(0, 0.03), waist=(0.04, 0.20), hem=(-0.10, -0.40))),
     "tank": ("tank", 4, dict(waist_ease=(0, 0.03), hem=(-0.12, 0.15), front=(0.46, 0.37), back=(0.52, 0.44), narrow=(10, 4))),
     "skirt": ("dress", 2, dict(hem=(-0.14, -0.62), waist=(0.11, 0.14), flare=(0.20, 0.38), top=(0.06, 0.16))),
+    "wide_dress": ("dress", 4, dict(
+        hem=(-0.30, -0.60), waist=(0.11, 0.14), flare=(0.27, 0.40), front=(0.47, 0.38), back=(0.52, 0.44), narrow=(10, 4)
+    )),
+    "wide_skirt": ("dress", 2, dict(hem=(-0.25, -0.60), waist=(0.11, 0.14), flare=(0.27, 0.42), top=(0.06, 0.16))),
 }  # fmt: skip
 EASE = 0.001, 0.020  # of all [m], drawn evenly in its logarithm: half of the cuts lie on the skin
 COUNT = 500, 5000  # vertices, likewise
@@ -54,7 +58,7 @@ def drawn(name, rng):
     if "flare" in measures:  # of the skirt: its depths, and how far it is fitted to the body; a narrow one has to hold the thighs
         measures["waist"] = measures["waist"], rng.uniform(0.55, 0.75) * measures["waist"]
         measures["flare"] = measures["flare"], rng.uniform(0.75, 0.95) * measures["flare"]
-        measures["fitted"] = rng.uniform(measures["hem"] - 0.02, -0.12)
+        measures["fitted"] = -0.12 if name.startswith("wide") else rng.uniform(measures["hem"] - 0.02, -0.12)
     return measures | dict(count=int(_log_uniform(rng, *COUNT)), stretch=np.exp(rng.uniform(-STRETCH, STRETCH, 3)))
 
 

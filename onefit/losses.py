@@ -104,6 +104,9 @@ def gravity(height, mass):
 
 def inertia(x, before, earlier, mass, dt):
     """sum m / (2 dt^2) |x - x' - dt v'|^2 [J], v' = (x' - x'') / dt, of points (N, T, 3) [m] now, one and two frames ago (Santesteban et
-    al. 2022). The past is given: no gradient reaches it."""
-    before, earlier = before.detach(), earlier.detach()
+    al. 2022).
+
+    The gradient reaches the past, too. With a past that is given, a swing of frequency w costs k - m w^2: cloth that swings more slowly by
+    itself than the body moves it is no minimum, and a network learns to swing more and more.
+    """
     return ((x - 2 * before + earlier).square().sum(-1) * mass[:, None]).sum(0).mean() / (2 * dt * dt)

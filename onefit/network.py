@@ -16,9 +16,10 @@ from .charts import Deformation
 
 GRAVITY = (0.0, 0.0, -1.0)  # unit, world
 SLOPE = 0.1  # of the leaky ReLUs
+LOOSENESS = 3  # numbers that tell how far a patch is from the body
 # Deformations that a unit of the decoder's output stands for: coefficients and translation in units of the patch's radius, scale as a
-# logarithm.
-UNIT = {"alpha": 0.2, "translation": 0.3, "scale": 0.05}
+# logarithm, drift in units of the patch's room.
+UNIT = {"alpha": 0.2, "translation": 0.3, "scale": 0.05, "drift": 1.0}
 
 
 def layers(widths, bias=True, last=True):
@@ -43,24 +44,28 @@ def encoded(x, octaves):
 
 
 class PatchEncoder(nn.Module):
-    """Z_T (K, width) of patches: an MLP, with skip connections, of the jet, the orientation, the encoded centre and its encoded offsets
-    from the joints."""
+    """Z_T (K, width) of a garment's patches: an MLP, with skip connections, of the jet, the orientation, the encoded centre and its encoded
+    offsets from the joints (the paper's), of how the patch hangs on the body, and of all patches together: a skirt is no trouser leg.
+    """
 
     def __init__(self, order, joints, width=128, hidden=256, octaves=(6, 3)):
         super().__init__()
         self.octaves = octaves
-        size = jets.size_of(order) + 7 + 3 * (1 + 2 * octaves[0]) + 3 * joints * (1 + 2 * octaves[1])
+        size = jets.size_of(order) + 7 + 3 * (1 + 2 * octaves[0]) + 3 * joints * (1 + 2 * octaves[1]) + LOOSENESS + joints
         self.first = layers([size, hidden, hidden])
         self.second = layers([size + hidden, hidden, hidden])
         self.last = layers([size + hidden, width], last=False)
+        self.whole = layers([hidden, hidden, width], last=False)
+        nn.init.zeros_(self.whole[-1].weight)
 
-    def forward(self, alpha, orientation, centre, joints):
-        """Of jets (K, A), orientations (K, 7), centres (K, 3) [m], joints (J, 3) [m] of the standard body."""
+    def forward(self, alpha, orientation, centre, looseness, blend_weights, joints):
+        """Of jets (K, A), orientations (K, 7), centres (K, 3) [m], looseness (K, 3), blend weights (K, J), as
+        :attr:`onefit.charts.PatchedGarment.features` has them, and joints (J, 3) [m] of the standard body."""
         offsets = centre[:, None] - joints
         places = encoded(centre, self.octaves[0]), encoded(offsets, self.octaves[1]).flatten(1)
-        x = torch.cat([alpha, orientation, *places], -1)
-        y = self.first(x)
-        return self.last(torch.cat([x, self.second(torch.cat([x, y], -1))], -1))
+        x = torch.cat([alpha, orientation, *places, looseness, blend_weights], -1)
+        y = self.second(torch.cat([x, self.first(x)], -1))
+        return self.last(torch.cat([x, y], -1)) + self.whole(y.mean(0))
 
 
 def descriptors(poses):
@@ -108,13 +113,13 @@ class BodyEncoder(nn.Module):
 
 
 class Decoder(nn.Module):
-    """Z_T and Z_B to a :class:`Deformation`: layers of 512, 512, 512 and 256, and three heads (128, 64)."""
+    """Z_T and Z_B to a :class:`Deformation`: layers of 512, 512, 512 and 256, and heads (128, 64)."""
 
     def __init__(self, order, patch=128, body=256):
         super().__init__()
         self.of_patch, self.of_body = nn.Linear(patch, 512), nn.Linear(body, 512, bias=False)
         self.trunk = layers([512, 512, 512, 256])
-        sizes = {"alpha": jets.size_of(order), "translation": 3, "scale": 1}
+        sizes = {"alpha": jets.size_of(order), "translation": 3, "scale": 1, "drift": 3}
         self.heads = nn.ModuleDict({name: layers([256, 128, 64, size], last=False) for name, size in sizes.items()})
         for head in self.heads.values():  # an untrained network is plain skinning
             nn.init.zeros_(head[-1].weight)
@@ -125,7 +130,7 @@ class Decoder(nn.Module):
         x = nn.functional.leaky_relu(self.of_patch(Z_T) + self.of_body(Z_B)[:, None], SLOPE)
         x = self.trunk(x)
         out = {name: head(x) * UNIT[name] for name, head in self.heads.items()}
-        return Deformation(out["alpha"], out["translation"], out["scale"][..., 0])
+        return Deformation(out["alpha"], out["translation"], out["scale"][..., 0], out["drift"])
 
 
 class OneFit(nn.Module):

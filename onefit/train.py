@@ -105,9 +105,8 @@ class OneFitTraining(Training):
         Z_T = self.network.patches(*garment.features, self.data.standard.joints)
         Z_B, _ = self.network.body(windows.poses, windows.translation, windows.shape, FPS, hidden)
         scene, before = self.data.scene(windows, rest, field)
-        with torch.no_grad():  # the past is given
-            changes = [garment.changes(self.network.decoder(Z_T, Z_B[:, -k])) for k in (2, 3)]
-            past = [objective.vertices(garment, c, scene.rest, transforms) for c, transforms in zip(changes, before)]
+        changes = [garment.changes(self.network.decoder(Z_T, Z_B[:, -k])) for k in (2, 3)]
+        past = [objective.vertices(garment, c, scene.rest, transforms) for c, transforms in zip(changes, before)]
         deformation = self.network.decoder(Z_T, Z_B[:, -1])
         epoch = self.done // self.epoch_steps
         return objective.evaluate(garment, deformation, scene, self.given.weights, epoch, past, 1 / FPS, generator)[0]

@@ -1,10 +1,13 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from onefit import losses, objective, skinning
 from onefit.body import AnnyBody
-from onefit.charts import Deformation, PatchedGarment, SparseMatrix, _steady_jets
+from onefit.binding import standard_surface
+from onefit.charts import AROUND, HELD, Deformation, PatchedGarment, SparseMatrix, _steady_jets
 from onefit.garment import Garment
 from onefit.nearest import FAR, ClosestSurface
 from onefit.remesh import loops
@@ -32,7 +35,7 @@ def deformation(patched, size=1.0, frames=T, seed=0):
     g = torch.Generator().manual_seed(seed)
     K, A = patched.alpha.shape
     random = lambda *shape: size * torch.randn(*shape, generator=g)
-    return Deformation(0.05 * random(frames, K, A), 0.1 * random(frames, K, 3), 0.1 * random(frames, K))
+    return Deformation(0.05 * random(frames, K, A), 0.1 * random(frames, K, 3), 0.1 * random(frames, K), 0.2 * random(frames, K, 3))
 
 
 def points_of(patched, d, t, uv, patch):
@@ -42,7 +45,30 @@ def points_of(patched, d, t, uv, patch):
     s = frame.s * d.scale[t][patch].exp()
     z = jets.height(alpha, uv[:, None])[:, 0]
     x = s[:, None] * torch.cat([uv, z[:, None]], 1) + frame.s[:, None] * d.translation[t][patch]
-    return (frame.R @ x[..., None])[..., 0] + frame.T
+    return (frame.R @ x[..., None])[..., 0] + frame.T + drifted(patched, d.drift[t], uv, patch)
+
+
+def room(patched):
+    return torch.as_tensor(patched.room, dtype=torch.float32)[:, None]
+
+
+def drifted(patched, drift, uv, patch):
+    """The plane, at points (P, 2) of the charts, that fits the drifts of the patches around by weighted least squares."""
+    T, s, R = patched.frame.T.float(), patched.frame.s.float(), patched.frame.R.float()
+    drift = drift * room(patched)
+    meet = torch.eye(len(T), dtype=torch.bool)
+    meet[tuple(patched.boundary_patch.T)] = meet[tuple(patched.boundary_patch.T.flip(0))] = True
+    i, j = (meet & ~torch.eye(len(T), dtype=torch.bool)).nonzero().T
+    length = np.median((T[i] - T[j]).norm(dim=1))
+    planes = []
+    for k in range(len(T)):
+        around = (meet[meet[k]].any(0)).nonzero()[:, 0]
+        away = T[around] - T[k]
+        w = (-(away.square().sum(1)) / (AROUND * length) ** 2 / 2).exp()  # the root of the weights
+        b = torch.cat([torch.ones(len(around), 1), (away @ R[k])[:, :2] / s[k]], 1)
+        held = torch.diag(torch.tensor([0.0, HELD, HELD]).sqrt()) * w.norm()
+        planes.append(torch.linalg.lstsq(torch.cat([w[:, None] * b, held]), torch.cat([w[:, None] * drift[around], torch.zeros(3, 3)])).solution)
+    return (torch.cat([torch.ones(len(uv), 1), uv], 1)[:, None] @ torch.stack(planes)[patch])[:, 0]
 
 
 def test_a_sparse_matrix_multiplies_and_differentiates_as_a_dense_one():
@@ -84,8 +110,39 @@ def test_blending_keeps_a_common_motion(patched):
     move = torch.tensor([0.03, -0.02, 0.05])
     local = (patched.frame.R.float().mT @ move) / patched.frame.s.float()[:, None]
     zero = deformation(patched, 0.0, 1)
-    moved = patched.displacement(patched.changes(Deformation(zero.alpha, local[None], zero.scale)))
-    assert torch.allclose(moved[:, 0], move.expand(len(moved), 3), atol=1e-6)
+    for common in (replace(zero, translation=local[None]), replace(zero, drift=(move / room(patched))[None])):
+        moved = patched.displacement(patched.changes(common))
+        assert torch.allclose(moved[:, 0], move.expand(len(moved), 3), atol=1e-6)
+
+
+def test_a_drift_turns_and_stretches_the_cloth_with_it(patched, garment):
+    # drifts that grow with the place: every chart moves by its part of the same field, so that no seam opens
+    slope = torch.tensor([[0.1, 0, 0.2], [0.05, -0.1, 0.3], [0, 0.1, 0.1]])
+    zero, field = deformation(patched, 0.0, 1), patched.frame.T.float() @ slope.T / room(patched)
+    moved = patched.displacement(patched.changes(replace(zero, drift=field[None])))[:, 0]
+    wanted = garment.vertices @ slope.T
+    inner = (garment.vertices[:, None] - patched.frame.T.float()).norm(dim=-1).topk(4, largest=False).values[:, 3] < 0.1  # not at the rims
+    assert (moved - wanted)[inner].norm(dim=1).median() < 0.04 * (wanted - wanted.mean(0)).norm(dim=1).median()
+    at = patched.at_boundary(patched.changes(replace(zero, drift=field[None])))[:, :, 0, 0]
+    alone = patched.at_boundary(patched.changes(replace(zero, translation=_in_charts(patched, slope)[None])))[:, :, 0, 0]
+    apart = lambda x: (x[0] - x[1]).norm(dim=1).median()
+    assert apart(at) < 0.2 * apart(alone)
+
+
+def _in_charts(patched, slope):
+    """Translations (K, 3), in the charts, of the patches' centres by the field of this slope."""
+    move = patched.frame.T.float() @ slope.T
+    return (patched.frame.R.float().mT @ move[..., None])[..., 0] / patched.frame.s.float()[:, None]
+
+
+def test_looseness_tells_how_far_patches_are_from_the_body(patched, garment):
+    distance = standard_surface()(garment.vertices.numpy()).distance
+    found = 5e-3 * torch.sinh(patched.looseness)
+    for k in (0, len(patched) // 2, len(patched) - 1):
+        own = distance[patched.vertex_patch == k]
+        least, mean, greatest = found[k].tolist()
+        assert least <= own.min() + 1e-6 and greatest >= own.max() - 1e-6  # the patches' own, finer vertices
+        assert mean == pytest.approx(own.mean(), abs=1.5e-3)
 
 
 def test_seams_are_not_torn(patched, garment):
@@ -119,7 +176,7 @@ def test_a_strip_follows_its_neighbours(body):
         """How much of its chart's motion along z the patch k follows, in the mean."""
         move = torch.zeros(1, len(hemmed), 3)
         move[0, k, 2] = 1.0
-        moved = hemmed.displacement(hemmed.changes(Deformation(zero.alpha, move, zero.scale)))[own == k, 0]
+        moved = hemmed.displacement(hemmed.changes(replace(zero, translation=move)))[own == k, 0]
         return float(moved.norm(dim=1).mean() / hemmed.frame.s[k])
 
     strips, others = torch.nonzero(area < 0.12)[:, 0], torch.nonzero(area > 0.4)[:, 0]
@@ -227,17 +284,17 @@ def test_gradient_of_the_whole_objective(patched, body, name):
     on = {switches[name]: 1.0} | ({"k_bn": 1.0} if name == "boundary" else {})
     weights = losses.Weights(**off | on)
 
-    def value(alpha, translation, scale):
+    def value(*parts):
         generator = torch.Generator().manual_seed(5)
-        terms, _ = objective.evaluate(patched, Deformation(alpha, translation, scale), s, weights, past=past, generator=generator)
+        terms, _ = objective.evaluate(patched, Deformation(*parts), s, weights, past=past, generator=generator)
         assert list(terms) == [name]
         return terms[name]
 
-    inputs = [x.clone().requires_grad_() for x in (d.alpha, d.translation, d.scale)]
+    inputs = [x.clone().requires_grad_() for x in (d.alpha, d.translation, d.scale, d.drift)]
     gradients = torch.autograd.grad(value(*inputs), inputs)
     g = torch.Generator().manual_seed(7)
     # directions in which the value changes: random ones, leaning towards the gradient, for float32 shows nothing else
-    for x, gradient in zip(range(3), gradients):
+    for x, gradient in zip(range(4), gradients):
         direction = gradient / gradient.norm() + 0.3 * torch.nn.functional.normalize(
             torch.randn(gradient.shape, generator=g).flatten(), dim=0
         ).view_as(gradient)
@@ -248,7 +305,7 @@ def test_gradient_of_the_whole_objective(patched, body, name):
             moved[x] = moved[x] + sign * step * direction
             ends.append(float(value(*moved)))
         slope = (ends[0] - ends[1]) / (2 * step)
-        assert float((gradient * direction).sum()) == pytest.approx(slope, rel=0.03), ("alpha", "translation", "scale")[x]
+        assert float((gradient * direction).sum()) == pytest.approx(slope, rel=0.03), ("alpha", "translation", "scale", "drift")[x]
 
 
 def test_metric_points_lie_on_their_vertices(patched, garment):

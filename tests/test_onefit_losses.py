@@ -124,11 +124,21 @@ def test_gravity_and_inertia():
     # at constant velocity there is none
     move = torch.tensor([0.1, 0.2, 0.3]).expand(2, 1, 3)
     assert float(losses.inertia(2 * move, move, 0 * move, mass, dt)) == pytest.approx(0, abs=1e-9)
-    past = random(3, 2, 3).requires_grad_()
-    now = random(3, 2, 3)
-    gradient_agrees(lambda x: losses.inertia(x, past, 0 * now, torch.ones(3, dtype=torch.float64), 0.5), now)
-    value = losses.inertia(now.clone().requires_grad_(), past, 0 * now, torch.ones(3, dtype=torch.float64), 0.5)
-    assert torch.autograd.grad(value, past, allow_unused=True)[0] is None
+    frames = [random(3, 2, 3) for _ in range(3)]
+    for k in range(3):  # of the frame itself, and of those before it
+        at = lambda x: losses.inertia(*frames[:k], x, *frames[k + 1 :], torch.ones(3, dtype=torch.float64), 0.5)
+        gradient_agrees(at, frames[k])
+
+
+def test_a_swing_does_not_grow_by_its_inertia():
+    # cloth with a stiffness of 40 per unit of mass, and so a swing of one a second, on a body that moves three times a second: whatever the
+    # phase, a larger response costs more
+    t = torch.arange(300, dtype=torch.float64) / 30
+    motion = (2 * torch.pi * 3 * t).sin()[:, None, None].expand(-1, 1, 3)
+    size = torch.tensor(0.2, dtype=torch.float64, requires_grad=True)
+    x = (size * motion).transpose(0, 1)  # (1, T, 3)
+    value = losses.inertia(x[:, 2:], x[:, 1:-1], x[:, :-2], torch.ones(1, dtype=torch.float64), 1 / 30)
+    assert float(torch.autograd.grad(value, size)[0]) > 0
 
 
 def test_weights_are_checked():

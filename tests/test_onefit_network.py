@@ -172,29 +172,30 @@ def ball(radius, subdivisions=4):
 
 
 def test_ease_takes_away_what_a_network_does_wrongly_in_most_frames():
-    (vertices, faces), (rest, triangles) = ball(0.1), ball(0.106, 3)
+    (vertices, faces), (rest, triangles) = ball(0.1), ball(0.11, 3)
     body = SimpleNamespace(vertices=vertices, faces=faces)
     surface = ClosestSurface(vertices, faces)
     deep, seldom = rest[:, 2] > 0.09, rest[:, 2] < -0.09
     frames = []
-    for k in range(10):
+    for k in range(40):
         move = torch.zeros(len(rest), 3)
-        move[deep] = -0.08 * rest[deep]  # 8.5 mm towards the middle, always
+        move[deep] = -0.08 * rest[deep]  # 9 mm towards the middle, always
         move[seldom] = -0.08 * rest[seldom] * (k == 0)
-        push = torch.tensor([0.3 * k, 0.0, 0.0])  # the body goes on, and the cloth with it
+        push = torch.tensor([0.1 * k, 0.0, 0.0])  # the body goes on, and the cloth with it
         frames.append((rest + move + push, rest + push, vertices + push))
     offset = ease.ease(rest, triangles, body, frames)
-    assert surface(frames[0][0] + offset, 1.0).distance[deep].min() > 0.9 * post.CLEARANCE
-    assert not offset[seldom].any()  # wrong in one frame of ten only
+    assert surface(frames[0][0] + offset, 1.0).distance[deep].min() > 0.9 * ease.CLEARANCE
+    assert not offset[seldom].any()  # wrong in one frame of forty only
     assert not offset[rest[:, 2] < 0].any()
     # where the cloth was made nearer than that, or skinning brings it nearer, it may be there
-    near = rest * (0.101 / 0.106)
+    near = rest * (0.101 / 0.11)
     offset = ease.ease(near, triangles, body, [(near * 0.98, near, vertices)] * 5)
     assert 0.0005 < surface(near * 0.98 + offset, 1.0).distance.min() < 0.0015
     assert not ease.ease(rest, triangles, body, [(rest * 0.92, rest * 0.92, vertices)] * 5).any()
 
 
-def test_ease_keeps_a_network_out_of_the_body(draper, walk):
+def test_ease_keeps_a_network_out_of_the_body(model, walk):
+    draper = Draper(weights.Trained(perturbed(1, 0.15), "anny", ("tank",)), model)  # ten times as much inside as skinning
     garment = draper.garment("tank")
     offset = draper.ease(garment)
     assert offset is draper.ease(garment) and offset.shape == garment.vertices.shape
