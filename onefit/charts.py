@@ -28,7 +28,7 @@ MEET = 4
 STEADY = 1e-3
 # A patch that fills less of its chart's disc is a strip (a hem turned in), of which networks know little: its neighbours have more say.
 STRIP = 0.2
-ROOM = 0.005, 0.1  # [m]
+ROOM = 0.005, 0.1  # [m]; how far a patch may be thought to go: its drift of one
 AROUND = 1.0  # width of the Gaussian by which patches around share their drift, in distances of neighbours
 HELD = 1e-2  # how much the slopes of their plane are held to zero
 LOOSE = 0.005  # [m]; a patch much nearer to the body than this lies on it
