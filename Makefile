@@ -13,7 +13,7 @@ demo: venv
 	$(PY) -m polysft_mi.run scenes/demo.xml -o out/demo --overwrite
 
 drape: venv
-	$(PY) -m onefit.drape dress dance -o out/drape --seconds 2 --overwrite
+	$(PY) -m onefit.drape dress dance --weights dress -o out/drape --seconds 2 --overwrite
 
 test: venv
 	$(PY) -m pytest -q
