@@ -316,8 +316,6 @@ def test_metric_points_lie_on_their_vertices(patched, garment):
 
 
 def test_transforms_of_a_body_for_each_frame():
-    from dataclasses import replace
-
     model = AnnyBody()
     bodies = [model.body(), model.body(torch.tensor([0.9, 0.7, 0.5, 0.6, 0.7, 0.4]))]
     g = torch.Generator().manual_seed(4)

@@ -131,8 +131,7 @@ def test_gravity_and_inertia():
 
 
 def test_a_swing_does_not_grow_by_its_inertia():
-    # cloth with a stiffness of 40 per unit of mass, and so a swing of one a second, on a body that moves three times a second: whatever the
-    # phase, a larger response costs more
+    # cloth that follows a body's motion of three a second by a fifth: following it further costs more, for the past moves along
     t = torch.arange(300, dtype=torch.float64) / 30
     motion = (2 * torch.pi * 3 * t).sin()[:, None, None].expand(-1, 1, 3)
     size = torch.tensor(0.2, dtype=torch.float64, requires_grad=True)
