@@ -14,6 +14,7 @@ from .defaults import known_defaults, located
 from .errors import InputError
 from .evaluate import read_surface
 from .metrics import load_npz
+from .template import matrix
 from .video import read_video
 
 PEAK = 0.25  # the error that is white in the pictures of a run
@@ -107,16 +108,18 @@ class Run:
         """Mean curvature (T, N) [1/m] of the jets, without relief, at the vertices, positive where the surface bulges towards the camera (by its pose in
         the first frame).
         """
-        import torch
+        from numpy.polynomial.polynomial import polyder, polyval2d
         from scipy.spatial.transform import Rotation
-
-        from polyfit import jets
 
         p = self.params
         up = p["frame_rotation"] @ Rotation.from_quat(p["rotation"][0]).as_matrix()[:, 2]  # the chart's z in the camera frame
-        uv = torch.as_tensor(p["chart"] + np.stack([p["delta_u"], p["delta_v"]], -1))
-        alpha = torch.as_tensor(p["alpha"] + p["delta_alpha"])
-        return np.sign(up[2]) * (jets.principal_curvatures(alpha, uv).mean(-1) / float(p["scale"])).numpy()
+        u, v = (p["chart"][:, k] + p[name] for k, name in enumerate(("delta_u", "delta_v")))
+        out = np.empty_like(u)
+        for t, alpha in enumerate(p["alpha"] + p["delta_alpha"]):
+            z = matrix(alpha)
+            zu, zv, zuu, zuv, zvv = (polyval2d(u[t], v[t], polyder(polyder(z, i), j, axis=1)) for i, j in ((1, 0), (0, 1), (2, 0), (1, 1), (0, 2)))
+            out[t] = ((1 + zv**2) * zuu - 2 * zu * zv * zuv + (1 + zu**2) * zvv) / (2 * (1 + zu**2 + zv**2) ** 1.5)
+        return np.sign(up[2]) * out / float(p["scale"])
 
     def panels(self):
         """For each frame in turn the pictures of the comparison video: target, rendering and error, each (h, w, 3) uint8 RGB.

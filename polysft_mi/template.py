@@ -1,12 +1,19 @@
-"""The template: a mesh held by one jet in its canonical frame (paper, sections "PolyFit" and "PolySfT"). NumPy, and torch for the fit."""
+"""The template: a mesh held by one jet in its canonical frame (paper, sections "PolyFit" and "PolySfT"). NumPy.
+
+The frame and the fit are those of :class:`polyfit.frames.CanonicalFrame` and :func:`polyfit.jets.fit`, for one patch: to load torch would take
+longer than the rest of a run's start.
+"""
 
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.polynomial import Chebyshev, Polynomial, chebyshev
 
-from polyfit.monomials import order_of, size_of
+from polyfit.monomials import exponents, order_of, size_of
 
 from .errors import InputError
+
+DETERMINED, NARROWEST = 1e-5, 1e-2  # as in polyfit.least_squares, with the same meaning
 
 
 @dataclass(frozen=True)
@@ -60,32 +67,26 @@ class Template:
         Raises InputError where the order is too high for the vertices (if ``exact``), where the surface folds over in its chart (a closed surface does),
         or where the largest residual exceeds ``tolerance`` times the scale s.
         """
-        import torch  # takes longer than the rest of a start together
-
-        from polyfit import jets
-        from polyfit.frames import CanonicalFrame
-
-        points = torch.as_tensor(np.asarray(vertices, dtype=np.float64))
-        frame = frame or CanonicalFrame.from_points(points)
-        x = frame.to_chart(points)
-        fitted = jets.fit(x, order)
-        if fitted.order < order and exact:
+        points = np.asarray(vertices, dtype=np.float64)
+        scale, rotation, origin = _principal_frame(points) if frame is None else (np.asarray(x) for x in (frame.s, frame.R, frame.T))
+        x = (points - origin) @ rotation / scale
+        alpha, fitted = _fitted(x, order)
+        if fitted < order and exact:
             wanted = f"a jet of order {order} has {size_of(order)} coefficients"
-            found = f"the {len(points)} vertices determine no more than order {int(fitted.order)}"
+            found = f"the {len(points)} vertices determine no more than order {fitted}"
             raise InputError(f"{where}: order = {order} is too high: {wanted}, and {found}")
-        alpha = fitted.alpha
-        residual = (x[:, 2] - jets.height(alpha, x[:, :2])).numpy() * float(frame.s)
+        height = np.polynomial.polynomial.polyval2d(*x[:, :2].T, matrix(alpha))
         template = cls(
-            np.asarray(vertices, dtype=np.float64),
+            points,
             np.asarray(faces, dtype=np.int64),
             np.asarray(uv, dtype=np.float64),
-            float(frame.s),
-            frame.R.numpy(),
-            frame.T.numpy(),
-            x[:, :2].numpy(),
-            np.pad(alpha.numpy(), (0, size_of(max(order, capacity or order)) - len(alpha))),
-            residual,
-            int(fitted.order),
+            float(scale),
+            rotation,
+            origin,
+            x[:, :2],
+            np.pad(alpha, (0, size_of(max(order, capacity or order)) - len(alpha))),
+            (x[:, 2] - height) * float(scale),
+            fitted,
         )
         measured = (
             f"the residual of the {template.fitted}-jet is {1e3 * template.residual_rms:.3g} mm RMS, {1e3 * template.residual_max:.3g} mm at most, "
@@ -110,3 +111,53 @@ def _flipped(chart, faces):
     area = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
     up = int((area > 0).sum())
     return min(up, len(faces) - up)
+
+
+def _principal_frame(points):
+    """(s, R, T) of points (P, 3) by their principal components, signs by the data, as ``CanonicalFrame.from_points`` has them."""
+    origin = points.mean(0)
+    centred = points - origin
+    scale = np.sqrt((centred**2).sum(1).max())
+    if not np.isfinite(scale) or not scale > 1e-12 * np.abs(points).max():
+        raise InputError(f"the template's {len(points)} vertices are not finite, or coincide")
+    x = centred / scale
+    _, axes = np.linalg.eigh(x.T @ x / len(x))
+    u, v = (axis * _side(x @ axis) for axis in (axes[:, 2], axes[:, 1]))
+    return scale, np.stack([u, v, np.cross(u, v)], 1), origin
+
+
+def _side(along):
+    """1 or -1: where the third moment of coordinates (P,) lies; of symmetric ones, where the first lies that is half as far out as the
+    farthest."""
+    skew = (along**3).mean()
+    far = np.abs(along) >= 0.5 * np.abs(along).max()
+    return -1.0 if (skew if abs(skew) > 1e-9 else along[far.argmax()]) < 0 else 1.0
+
+
+def _fitted(x, order):
+    """(coefficients (A,), order) of the least-squares jet of ``order`` through points x (P, 3) of a chart, or of the highest order that they
+    determine: products of Chebyshev polynomials in the points' box, turned into monomials."""
+    powers = exponents(order)
+    low, high = x[:, :2].min(0), x[:, :2].max(0)
+    centre, half = (low + high) / 2, (high - low) / 2
+    half = np.maximum(half, max(NARROWEST * half.max(), 1e-300))
+    values = [chebyshev.chebvander((x[:, k] - centre[k]) / half[k], order)[:, powers[:, k]] for k in (0, 1)]
+    basis = values[0] * values[1] / np.sqrt(len(x))
+    kept = np.zeros(len(powers))
+    diagonal = np.abs(np.diagonal(np.linalg.qr(basis, mode="r")))
+    kept[: len(diagonal)] = diagonal
+    fitted = int(min(powers.sum(1)[kept < DETERMINED], default=order + 1)) - 1
+    size = size_of(fitted)
+    solution = np.zeros(len(powers))
+    solution[:size] = np.linalg.lstsq(basis[:, :size], x[:, 2] / np.sqrt(len(x)), rcond=None)[0]
+    axes = [[Chebyshev.basis(n, domain=[c - h, c + h]).convert(kind=Polynomial).coef for n in range(order + 1)] for c, h in zip(centre, half)]
+    to_u, to_v = (np.stack([np.pad(row, (0, order + 1 - len(row))) for row in rows]) for rows in axes)
+    return (to_u.T @ matrix(solution) @ to_v)[tuple(powers.T)], fitted
+
+
+def matrix(alpha):
+    """Coefficients (A,) as a matrix over the powers of u and v."""
+    order = order_of(len(alpha))
+    out = np.zeros((order + 1, order + 1))
+    out[tuple(exponents(order).T)] = alpha
+    return out

@@ -1,9 +1,16 @@
 """What one jet can hold, and what is refused with the measured residual."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
+import torch
 import trimesh
+from scipy.spatial.transform import Rotation
 
+from polyfit import jets
+from polyfit.frames import CanonicalFrame
 from polysft_mi.errors import InputError
 from polysft_mi.template import Template
 
@@ -20,13 +27,48 @@ def grid(n=15, m=13, height=lambda x, y: 0 * x):
 def test_residual_is_what_the_jet_leaves():
     vertices, faces, uv = grid(height=lambda x, y: 0.004 * np.sin(60 * x))
     t = Template.fit(vertices, faces, uv, 4)
-    from polyfit import jets
-    import torch
-
     held = np.concatenate([t.chart, jets.height(torch.as_tensor(t.alpha), torch.as_tensor(t.chart)).numpy()[:, None]], 1)
     points = t.scale * held @ t.rotation.T + t.origin
     assert np.linalg.norm(points - vertices, axis=1) == pytest.approx(np.abs(t.residual), abs=1e-12)
     assert 1e-3 < t.residual_rms < 4e-3 < 1.5 * t.residual_max
+
+
+@pytest.mark.parametrize("narrow", [1.0, 0.03])
+def test_frame_and_jet_are_those_of_polyfit(narrow):
+    rng = np.random.default_rng(3)
+    turn = Rotation.from_rotvec([0.4, -0.7, 0.2]).as_matrix()
+    for order in range(1, 11):
+        vertices, faces, uv = grid(14, 12, height=lambda x, y: 0.02 * np.sin(15 * x + 1) * np.cos(20 * y / narrow))
+        vertices = (vertices * [1, narrow, narrow] + 1e-3 * narrow * rng.normal(size=vertices.shape)) @ turn.T
+        t = Template.fit(vertices, faces, uv, order, capacity=10, exact=False, tolerance=np.inf)
+        points = torch.as_tensor(vertices)
+        frame = CanonicalFrame.from_points(points)
+        x = frame.to_chart(points)
+        jet = jets.fit(x, order)
+        assert t.fitted == jet.order and t.scale == pytest.approx(float(frame.s), rel=1e-12)
+        np.testing.assert_allclose(t.rotation, frame.R, atol=1e-9)
+        np.testing.assert_allclose(t.origin, frame.T, atol=1e-12)
+        np.testing.assert_allclose(t.chart, x[:, :2], atol=1e-9)
+        np.testing.assert_allclose(t.residual, (x[:, 2] - jets.height(jet.alpha, x[:, :2])) * frame.s, atol=1e-9)
+        size = len(jet.alpha)
+        np.testing.assert_allclose(t.alpha[:size], jet.alpha, rtol=1e-5, atol=1e-9 + 1e-6 * np.abs(jet.alpha.numpy()).max())
+        assert not t.alpha[size:].any()
+    given = CanonicalFrame(frame.s * 1.1, frame.rotated(torch.tensor([0.0, 0, 0.3, 1], dtype=torch.float64)).R, frame.T + 0.01)
+    t = Template.fit(vertices, faces, uv, 3, frame=given, tolerance=np.inf)
+    np.testing.assert_allclose(t.chart, given.to_chart(points)[:, :2], atol=1e-12)
+
+
+def test_signs_of_the_frame_turn_with_a_symmetric_sheet():
+    vertices, faces, uv = grid()
+    for turn in Rotation.random(8, random_state=1).as_matrix():
+        t = Template.fit(vertices @ turn.T, faces, uv, 2)
+        np.testing.assert_allclose(t.chart, Template.fit(vertices, faces, uv, 2).chart, atol=1e-9)
+
+
+def test_vertices_that_coincide_are_refused():
+    for vertices in (np.ones((12, 3)), np.full((12, 3), np.nan)):
+        with pytest.raises(InputError, match="12 vertices are not finite, or coincide"):
+            Template.fit(vertices, grid(4, 3)[1], np.zeros((12, 2)), 1)
 
 
 def test_vertices_that_determine_less_get_less():
@@ -70,3 +112,17 @@ def test_edges_are_each_once():
     t = Template.fit(*grid(4, 3), 1)
     edges = {tuple(e) for e in t.edges}
     assert len(edges) == len(t.edges) == 4 * 2 + 3 * 3 + 6  # rows, columns, diagonals
+
+
+def test_a_run_does_without_torch():
+    code = """
+import sys, numpy as np
+from polysft_mi import backend; backend.set_variant("llvm_ad_rgb")
+import polysft_mi.run, polysft_mi.scene, polysft_mi.solvers, polysft_mi.problem, polysft_mi.report, polysft_mi.results
+from polysft_mi.template import Template
+x, y = (a.ravel() for a in np.meshgrid(np.linspace(0, 1, 4), np.linspace(0, 2, 4)))
+faces = np.array([[4 * r + c, 4 * r + c + 1, 4 * r + c + 4] for r in range(3) for c in range(3)])
+Template.fit(np.stack([x, y, 0 * x], 1), faces, np.stack([x, y], 1), 2)
+sys.exit("torch" in sys.modules)
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
