@@ -2,7 +2,7 @@
 
     python benchmarks/onefit_garments.py [more.obj ...] [--shapes 60] [-o out/benchmarks]        (two minutes)
 
-For the seven templates, and for the garment files given, it prints
+For the eight templates, and for the garment files given, it prints
 
 - the mesh: vertices, faces, openings, area, median edge, smallest angle, distance from the standard body;
 - stretch: the longest of an edge when the left shoulder and hip turn by 40 degrees, with weights smoothed (as they are);

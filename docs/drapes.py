@@ -20,6 +20,7 @@ from polysft_mi import stage  # noqa: E402
 
 ROWS = [  # garment, motion, shape, colour
     ("dress", "dance", None, (0.35, 0.03, 0.06)),
+    ("skirt", "jumping_jack", None, (0.24, 0.12, 0.02)),
     ("long_sleeve_top", "box", (0.1, 0.6, 0.6, 0.6, 0.6, 0.5), (0.06, 0.16, 0.35)),
     ("trousers", "sneak", (0.0, 0.65, 0.5, 0.45, 0.5, 0.5), (0.05, 0.09, 0.07)),
 ]

@@ -1,4 +1,4 @@
-"""Draw ``docs/onefit_garments.png``: the seven templates on the standard body, from the front and from behind.
+"""Draw ``docs/onefit_garments.png``: the eight templates on the standard body, from the front and from behind.
 
     python docs/onefit_garments.py                                        (half a minute)
     python docs/onefit_garments.py --cuts 18 -o docs/onefit_cuts.jpg      (two minutes: random cuts, as training draws them)

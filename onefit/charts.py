@@ -20,6 +20,7 @@ from polyfit.frames import CanonicalFrame
 from polyfit.surface import PatchedSurface
 
 from .binding import surface_of
+from .waistband import held
 
 # Charts reach this far beyond the patch, in units of its radius, where they fade into their neighbours'; at most so many meet in a point.
 REACH = 1.3
@@ -120,7 +121,9 @@ class PatchedGarment:
         rng = np.random.default_rng(seed)
         self._entries(p, uv, rng)
         self._blend(p, vertices)
-        self.looseness = _looseness(p, body)
+        surface = surface_of(body)
+        self._hold(p, vertices, held(vertices, faces, body.joints.cpu().double().numpy()), surface)
+        self.looseness = _looseness(p, surface)
         #: (K,) [m]: a patch's mean distance from the standard body, within ROOM
         self.room = np.clip(LOOSE * np.sinh(self.looseness[:, 1].double().numpy()), *ROOM)
         #: a SparseMatrix (3 K, K): the entries of 1, u and v [m] of the plane that drifts of the patches around make in each chart
@@ -200,6 +203,18 @@ class PatchedGarment:
         #: (N, K A), a SparseMatrix
         self.blend = SparseMatrix(sp.csr_matrix((b.ravel(), (np.repeat(row, A), columns.ravel())), (count, len(self) * A)))
 
+    def _hold(self, p, vertices, firmly, surface):
+        """The band where vertices are held ``firmly`` (N,) (:mod:`onefit.waistband`): they give way along the body's normal, but do not slide.
+        """
+        band = np.flatnonzero(firmly)
+        normal = surface(vertices[band]).normal.astype(np.float64) if len(band) else np.zeros((0, 3))
+        along = firmly[band, None, None] * (np.eye(3) - normal[:, :, None] * normal[:, None])
+        #: which vertices are held, (H,), and what is taken off their displacements, (H, 3, 3)
+        self.band = torch.as_tensor(band), torch.as_tensor(along, dtype=torch.float32)
+        share = np.bincount(p.vertex_patch, self._refinement @ firmly) / np.bincount(p.vertex_patch)
+        #: (K, 1): how much of each patch is held
+        self.held = torch.as_tensor(share[:, None], dtype=torch.float32)
+
     # ---- fields of the vertices at the metric's points ------------------------------------------------------------------------
 
     @cached_property
@@ -243,7 +258,9 @@ class PatchedGarment:
 
     def displacement(self, changes):
         """Displacements of the vertices in the rest space, (N, T, 3) [m]."""
-        return self.blend @ changes.flatten(0, 1)
+        moved = self.blend @ changes.flatten(0, 1)
+        band, along = self.band
+        return moved.index_add(0, band, moved[band] @ along, alpha=-1) if len(band) else moved
 
     def at_metric(self, changes):
         """Displacement at the metric's points and its derivatives along u and v, each patch by its own chart: (P, 3, T, 3) [m]."""
@@ -270,12 +287,12 @@ class PatchedGarment:
     @cached_property
     def features(self):
         """What the network reads of each patch: ``alpha`` (K, A), ``orientation`` (K, 7) (log s / 5 cm, two axes of R), ``centre`` (K, 3),
-        ``looseness`` (K, 3) (least, mean and greatest distance of its vertices from the standard body, as asinh(d / LOOSE)) and
-        ``blend_weights`` (K, J).
+        ``looseness`` (K, 3) (least, mean and greatest distance of its vertices from the standard body, as asinh(d / LOOSE)), ``held`` (K, 1)
+        and ``blend_weights`` (K, J).
         """
         R = self.frame.R.float()
         orientation = torch.cat([(self.frame.s.float() / 0.05).log()[:, None], R[:, :, 2], R[:, :, 1]], 1)
-        return self.alpha.float(), orientation, self.frame.T.float(), self.looseness, torch.as_tensor(self.blend_weights).float()
+        return self.alpha.float(), orientation, self.frame.T.float(), self.looseness, self.held, torch.as_tensor(self.blend_weights).float()
 
     @cached_property
     def edges(self):
@@ -345,9 +362,9 @@ def _planes(pairs, frame):
     return sp.csr_matrix((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), (3 * len(T), len(T)))
 
 
-def _looseness(p, body):
-    """Least, mean and greatest distance of each patch's vertices from the ``body``, as asinh(d / LOOSE): (K, 3)."""
-    distance = surface_of(body)(p.vertices).distance
+def _looseness(p, surface):
+    """Least, mean and greatest distance of each patch's vertices from the body's ``surface``, as asinh(d / LOOSE): (K, 3)."""
+    distance = surface(p.vertices).distance
     order = np.argsort(p.vertex_patch, kind="stable")
     count = np.bincount(p.vertex_patch)
     first = np.cumsum(count) - count

@@ -10,12 +10,13 @@ import torch
 
 from .charts import SparseMatrix
 from .nearest import ClosestSurface
-from .post import CLEARANCE, REACH, spread
+from .post import REACH, spread
 from .remesh import neighbour_mean
 
 MOTIONS = "idle", "walk", "run", "squat", "reach", "twist", "arms_up", "arms_crossed"  # of the kinds that networks are trained on
 SECONDS, EVERY = 1.0, 6  # of each motion; one frame in so many is looked at
-SHARE = 0.8  # of those frames in which a vertex is to lie far enough out
+SHARE = 0.95  # of those frames in which a vertex is to lie far enough out
+CLEARANCE = 0.007  # [m] from the body, where the garment was made with as much and skinning leaves as much
 
 
 def ease(rest, faces, body, frames):

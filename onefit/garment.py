@@ -15,7 +15,7 @@ from .binding import Binding, standard_body, standard_surface, vertex_normals
 from .body import Body
 from .mending import check, mended, parts
 
-TEMPLATES = ("tshirt", "dress", "tank", "long_sleeve_top", "shorts", "trousers", "jumpsuit")
+TEMPLATES = ("tshirt", "dress", "tank", "long_sleeve_top", "shorts", "trousers", "jumpsuit", "skirt")
 FOLDER = Path(__file__).parent / "data" / "garments"
 
 

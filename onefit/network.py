@@ -16,7 +16,7 @@ from .charts import Deformation
 
 GRAVITY = (0.0, 0.0, -1.0)  # unit, world
 SLOPE = 0.1  # of the leaky ReLUs
-LOOSENESS = 3  # numbers that tell how far a patch is from the body
+HANG = 4  # numbers that tell how a patch hangs: how far from the body, and how much of it is held
 # Deformations that a unit of the decoder's output stands for: coefficients and translation in units of the patch's radius, scale as a
 # logarithm, drift in units of the patch's room.
 UNIT = {"alpha": 0.2, "translation": 0.3, "scale": 0.05, "drift": 1.0}
@@ -51,19 +51,19 @@ class PatchEncoder(nn.Module):
     def __init__(self, order, joints, width=128, hidden=256, octaves=(6, 3)):
         super().__init__()
         self.octaves = octaves
-        size = jets.size_of(order) + 7 + 3 * (1 + 2 * octaves[0]) + 3 * joints * (1 + 2 * octaves[1]) + LOOSENESS + joints
+        size = jets.size_of(order) + 7 + 3 * (1 + 2 * octaves[0]) + 3 * joints * (1 + 2 * octaves[1]) + HANG + joints
         self.first = layers([size, hidden, hidden])
         self.second = layers([size + hidden, hidden, hidden])
         self.last = layers([size + hidden, width], last=False)
         self.whole = layers([hidden, hidden, width], last=False)
         nn.init.zeros_(self.whole[-1].weight)
 
-    def forward(self, alpha, orientation, centre, looseness, blend_weights, joints):
-        """Of jets (K, A), orientations (K, 7), centres (K, 3) [m], looseness (K, 3), blend weights (K, J), as
+    def forward(self, alpha, orientation, centre, looseness, held, blend_weights, joints):
+        """Of jets (K, A), orientations (K, 7), centres (K, 3) [m], looseness (K, 3), held (K, 1), blend weights (K, J), as
         :attr:`onefit.charts.PatchedGarment.features` has them, and joints (J, 3) [m] of the standard body."""
         offsets = centre[:, None] - joints
         places = encoded(centre, self.octaves[0]), encoded(offsets, self.octaves[1]).flatten(1)
-        x = torch.cat([alpha, orientation, *places, looseness, blend_weights], -1)
+        x = torch.cat([alpha, orientation, *places, looseness, held, blend_weights], -1)
         y = self.second(torch.cat([x, self.first(x)], -1))
         return self.last(torch.cat([x, y], -1)) + self.whole(y.mean(0))
 

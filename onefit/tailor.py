@@ -1,6 +1,6 @@
-"""The seven garment templates, made around Anny's standard rest body.
+"""The eight garment templates, made around Anny's standard rest body.
 
-    python -m onefit.tailor                       # all seven, a minute
+    python -m onefit.tailor                       # all eight, a minute
     python -m onefit.tailor --body body.ply       # the body that they are made around
 
 Each garment is a level set: the body's signed distance with its hollows closed by a rolling ball (cloth spans the gap between the breasts
@@ -132,7 +132,7 @@ def arm_hole(x, y, z, centre=(0.20, -0.02, 0.47), radii=(0.08, 0.10, 0.095)):
     return (np.sqrt(sum((v / r) ** 2 for v, r in zip(d, radii))) - 1) * min(radii)
 
 
-def skirt(x, y, z, waist, hem):
+def flared(x, y, z, waist, hem):
     """About the signed distance to an elliptic cone: ``waist`` and ``hem`` are (z, half width, half depth, centre's y) [m]."""
     t = (z - waist[0]) / (hem[0] - waist[0])
     a, b, c = (np.maximum(w + t * (h - w), 0.02 * (k < 2) - 1 * (k == 2)) for k, (w, h) in enumerate(zip(waist[1:], hem[1:])))
@@ -197,10 +197,14 @@ def dress(
     """Half widths and depths of the cone at the ``waist`` and, ``flare``, at its ``hem``; fitted to the body down to ``fitted``; ``top``:
     the upper rim of a skirt.
     """
-    cone = skirt(b.x, b.y, b.z, (0.20, *waist, -0.035), (hem, *flare, -0.03))
+    cone = flared(b.x, b.y, b.z, (0.20, *waist, -0.035), (hem, *flare, -0.03))
     body = sleeveless_top(b, snug) - ease
     field = smooth_union(np.where(b.z > fitted, body, np.maximum(body, fitted - b.z)), cone, 0.06)
     return field, lambda *p: minimum(below_neckline(*p, front, back, narrow), arm_hole(*p), p[2] - hem, top - p[2])
+
+
+def skirt(b):
+    return dress(b, snug=1, waist=(0.06, 0.03), flare=(0.33, 0.30), hem=-0.40, fitted=-0.06, top=0.14)
 
 
 def trousers(b, snug=0, ease=0.005, hip_ease=0.007, leg_ease=0.012, waist=0.14, hem=-0.70):
@@ -226,6 +230,7 @@ def jumpsuit(b):
 PATTERNS = {
     "tshirt": (tshirt, 4000), "dress": (dress, 6000), "tank": (tank, 3000), "long_sleeve_top": (long_sleeve_top, 5000),
     "shorts": (shorts, 2500), "trousers": (trousers, 5000), "jumpsuit": (jumpsuit, 7500),
+    "skirt": (skirt, 4000),
 }  # fmt: skip
 
 

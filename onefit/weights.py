@@ -8,7 +8,7 @@ import torch
 from polyfit.errors import InputError
 from polyfit.weights import load_into, read_weights, write_weights
 
-VERSION = 2  # of the network's shape and the meaning of its weights
+VERSION = 3  # of the network's shape and the meaning of its weights
 SCALE = ":scale"  # after the name of a matrix: its rows' scales
 FOLDER = Path(__file__).parent / "data" / "weights"
 

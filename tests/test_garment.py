@@ -17,8 +17,8 @@ from onefit.remesh import loops
 from polyfit import mesh, write_ply
 from polyfit.errors import InputError
 
-LOOPS = {"tshirt": 4, "dress": 4, "tank": 4, "long_sleeve_top": 4, "shorts": 3, "trousers": 3, "jumpsuit": 5}
-AREA = {"tshirt": 0.6, "dress": 1.0, "tank": 0.4, "long_sleeve_top": 0.75, "shorts": 0.45, "trousers": 0.85, "jumpsuit": 1.25}  # [m^2]
+LOOPS = {"tshirt": 4, "dress": 4, "tank": 4, "long_sleeve_top": 4, "shorts": 3, "trousers": 3, "jumpsuit": 5, "skirt": 2}
+AREA = {"tshirt": 0.6, "dress": 1.0, "tank": 0.4, "long_sleeve_top": 0.75, "shorts": 0.45, "trousers": 0.85, "jumpsuit": 1.25, "skirt": 0.8}  # [m^2]
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +77,7 @@ class TestTemplates:
         assert found.distance.min() > 0.004
         assert standard_surface()(V[F].mean(axis=1)).distance.min() > 0.003
         assert ((found.normal * vertex_normals(V, F)).sum(axis=1) > 0).mean() > 0.999
-        if garment.name != "dress":
+        if garment.name not in ("dress", "skirt"):
             assert found.distance.max() < 0.04
 
     def test_blend_weights_are_shares_and_no_edge_is_torn_by_a_turned_limb(self, garment):

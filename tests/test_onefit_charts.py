@@ -8,9 +8,10 @@ from onefit import losses, objective, skinning
 from onefit.body import AnnyBody
 from onefit.binding import standard_surface
 from onefit.charts import AROUND, HELD, Deformation, PatchedGarment, SparseMatrix, _steady_jets
-from onefit.garment import Garment
+from onefit.garment import TEMPLATES, Garment
 from onefit.nearest import FAR, ClosestSurface
 from onefit.remesh import loops
+from onefit.waistband import BAND, held
 from polyfit import jets
 
 T = 6
@@ -143,6 +144,58 @@ def test_looseness_tells_how_far_patches_are_from_the_body(patched, garment):
         least, mean, greatest = found[k].tolist()
         assert least <= own.min() + 1e-6 and greatest >= own.max() - 1e-6  # the patches' own, finer vertices
         assert mean == pytest.approx(own.mean(), abs=1.5e-3)
+
+
+def test_garments_are_held_at_the_waist_or_hang_from_the_shoulders(body):
+    joints = body.joints.double().numpy()
+    for name in TEMPLATES:
+        garment = Garment.template(name)
+        V, F = garment.vertices.double().numpy(), garment.faces.numpy()
+        found = held(V, F, joints)
+        if name not in ("trousers", "shorts", "skirt"):
+            assert not found.any()
+            continue
+        rim = V[next(loop for loop in loops(F) if V[loop, 2].min() > V[:, 2].max() - 0.001)]  # the waists are level
+        line = np.concatenate([(1 - t) * rim + t * np.roll(rim, -1, axis=0) for t in np.linspace(0, 1, 50)])
+        away = np.concatenate([np.linalg.norm(V[i : i + 500, None] - line, axis=2).min(1) for i in range(0, len(V), 500)])
+        x = np.clip((BAND[1] - away) / (BAND[1] - BAND[0]), 0, 1)
+        assert np.allclose(found, 3 * x**2 - 2 * x**3, atol=0.01)
+        assert (found == 1).sum() > 50
+    # the dress without what is above its waist is a skirt; a dress that ends below the shoulders is held, too
+    dress = Garment.template("dress")
+    V, F = dress.vertices.double().numpy(), dress.faces.numpy()
+    skirt = F[(V[F, 2] < 0.1).all(1)]
+    used, skirt = np.unique(skirt, return_inverse=True)
+    skirt = skirt.reshape(-1, 3)
+    found = held(V[used], skirt, joints)
+    assert found[V[used, 2] > 0.085].min() > 0.99 and not found[V[used, 2] < 0.02].any()
+    assert held(V, F, joints + [0, 0, 0.2]).any()
+    box = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, -1.0]]), np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]])
+    assert not held(*box, joints).any()  # no boundary at all
+
+
+def test_a_band_gives_way_but_does_not_slide(body):
+    shorts = PatchedGarment(Garment.template("shorts"), body)
+    V = shorts.garment.vertices
+    d = deformation(shorts)
+    d.drift.requires_grad_()
+    moved = shorts.displacement(shorts.changes(d))  # (N, T, 3)
+    free = shorts.blend @ shorts.changes(d).flatten(0, 1)
+    firmly = torch.as_tensor(held(V.double().numpy(), shorts.garment.faces.numpy(), body.joints.double().numpy())).float()
+    normal = torch.as_tensor(standard_surface()(V.numpy()).normal)
+    outwards = lambda x: torch.einsum("ntd,nd->nt", x, normal)
+    slid = lambda x: (x - outwards(x)[..., None] * normal[:, None]).norm(dim=-1)
+    assert torch.allclose(outwards(moved), outwards(free), atol=1e-6)
+    assert torch.allclose(slid(moved), (1 - firmly[:, None]) * slid(free), atol=1e-6)
+    assert (firmly == 1).sum() > 50 and slid(free)[firmly == 1].median() > 0.005
+    # what is held has no gradient along the body
+    (gradient,) = torch.autograd.grad((moved - outwards(moved)[..., None] * normal[:, None])[firmly == 1].sum(), d.drift)
+    assert gradient.abs().max() < 1e-5
+    # the network is told which patches are held
+    own = torch.as_tensor(shorts.vertex_patch)
+    share = torch.zeros(len(shorts)).index_add(0, own, firmly) / torch.bincount(own)
+    assert torch.allclose(shorts.features[4][:, 0], share, atol=0.1) and shorts.features[4].max() > 0.5
+    assert shorts.features[4][share == 0].median() == 0
 
 
 def test_seams_are_not_torn(patched, garment):

@@ -31,6 +31,15 @@ def test_what_is_compared():
     assert float(swing.compared(half, skinned, reference, turned, lowest)[2]) == pytest.approx(0.75, rel=1e-4)
 
 
+def test_what_has_slipped():
+    shorts = Garment.template("shorts")
+    skinned = torch.zeros(7, len(shorts), 3)
+    moved = skinned.clone()
+    moved[5:, shorts.vertices[:, 2] > shorts.vertices[:, 2].max() - 1e-3, 2] = -0.02  # the waist is level
+    moved[:5] = 1.0
+    assert float(swing.slipped(moved, skinned, shorts)) == pytest.approx(20)
+
+
 def test_the_least_is_less_than_skinning_and_keeps_out_of_the_body(monkeypatch):
     monkeypatch.setattr(swing, "STEPS", 5)
     draper, garment = onefit.load(), Garment.template("dress")
