@@ -69,6 +69,15 @@ def test_descriptors_are_rotations_and_gravity_seen_from_the_joints():
     assert torch.allclose(descriptors(face)[0, 0, 6:], torch.tensor([0.0, -1, 0]), atol=1e-6)
 
 
+def test_the_patch_encoder_reads_all_it_is_given():
+    encoder = perturbed().patches
+    g = torch.Generator().manual_seed(0)
+    inputs = [torch.randn(5, *size, generator=g) for size in ((15,), (7,), (3,), (3,), (1,), (24,))] + [torch.randn(24, 3, generator=g)]
+    codes = encoder(*inputs)
+    for k, x in enumerate(inputs):
+        assert (encoder(*inputs[:k], x + 0.1, *inputs[k + 1 :]) - codes).abs().max() > 1e-4
+
+
 def test_the_decoder_is_that_of_the_concatenation():
     torch.manual_seed(1)
     decoder = perturbed().decoder

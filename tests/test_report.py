@@ -6,12 +6,15 @@ import json
 import re
 import shutil
 import subprocess
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from scipy.spatial.transform import Rotation
 from PIL import Image
 
+from polyfit import jets
 from polysft_mi import report, video
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError
@@ -97,6 +100,15 @@ def test_figures_and_colours(finished_run, page):
     assert np.array_equal(np.isfinite(sigma), known)
     assert np.abs(sigma - np.clip(1e3 * run.sigma, 0, found["high"]))[known].max() <= 0.6 * found["high"] / 254
     assert [label for label, _ in data["cards"]].count("lost frames") == 1
+
+
+def test_curvature_is_the_mean_of_polyfits_principal_ones():
+    rng = np.random.default_rng(0)
+    p = {name: 0.3 * rng.normal(size=size) for name, size in dict(chart=(20, 2), delta_u=(3, 20), delta_v=(3, 20), alpha=15, delta_alpha=(3, 15)).items()}
+    p |= dict(scale=0.2, frame_rotation=np.eye(3), rotation=np.tile([0.1, 0.2, 0.3, 1.0], (3, 1)))
+    uv = torch.as_tensor(p["chart"] + np.stack([p["delta_u"], p["delta_v"]], -1))
+    wanted = jets.principal_curvatures(torch.as_tensor(p["alpha"] + p["delta_alpha"]), uv).mean(-1) / 0.2
+    np.testing.assert_allclose(Run.mean_curvature(SimpleNamespace(params=p)), wanted, rtol=1e-9)
 
 
 def test_curvature_is_that_of_the_jets(finished_run):

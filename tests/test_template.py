@@ -58,6 +58,15 @@ def test_frame_and_jet_are_those_of_polyfit(narrow):
     np.testing.assert_allclose(t.chart, given.to_chart(points)[:, :2], atol=1e-12)
 
 
+@pytest.mark.parametrize("jitter", [1e-8, 1e-4])
+def test_what_the_vertices_hardly_determine_is_as_in_polyfit(jitter):
+    vertices, faces, uv = grid(5, 4)
+    vertices = vertices + jitter * np.random.default_rng(0).normal(size=vertices.shape)
+    t = Template.fit(vertices, faces, uv, 5, exact=False, tolerance=np.inf)
+    points = torch.as_tensor(vertices)
+    assert t.fitted == jets.fit(CanonicalFrame.from_points(points).to_chart(points), 5).order == {1e-8: 3, 1e-4: 4}[jitter]
+
+
 def test_signs_of_the_frame_turn_with_a_symmetric_sheet():
     vertices, faces, uv = grid()
     for turn in Rotation.random(8, random_state=1).as_matrix():
