@@ -39,7 +39,7 @@ def _shape(model, pairs):
     return shape
 
 
-def _motion(name, seconds, seed):
+def _motion(name, seconds, seed, fps, up):
     from .generate import KINDS
     from .motion import Motion
 
@@ -47,7 +47,7 @@ def _motion(name, seconds, seed):
         return Motion.generate(name, seconds=seconds, seed=seed)
     if not Path(name).exists():
         raise InputError(f"motion {name}: no such file, and no kind of motion; there are {', '.join(KINDS)}")
-    return Motion.read(name)
+    return Motion.read(name, fps, up)
 
 
 def _model(name):
@@ -129,6 +129,8 @@ def parser():
     group.add_argument("--offset", nargs=3, type=float, default=(0.0, 0.0, 0.0), metavar=("X", "Y", "Z"), help="to move it by [m]")
     group.add_argument("--made-for", choices=("T-pose",), help="T-pose: the standard body with its arms stretched out")
     group.add_argument("--loose", action="store_true", help="a skirt or dress: the legs' pose is not followed")
+    p.add_argument("--fps", type=float, help="frames a second of a motion file, in place of what it says")
+    p.add_argument("--motion-up", choices=("y", "z"), help="the axis that points up in a motion file, in place of what its kind has")
     p.add_argument("--seconds", type=float, default=3.0, help="of a generated motion (default: 3)")
     p.add_argument("--seed", type=int, default=0, help="of a generated motion (default: 0)")
     p.add_argument("--post", action="store_true", help="push vertices out of the body afterwards")
@@ -158,7 +160,7 @@ def main(argv=None):
             raise InputError(f"{folder}: holds no drape; --overwrite replaces nothing else")
     draper = load(args.weights, model=_model(args.body), device=device_of(args.device))
     garment = _garment(args)
-    motion = _motion(args.motion, args.seconds, args.seed)
+    motion = _motion(args.motion, args.seconds, args.seed, args.fps, args.motion_up)
     shape = _shape(draper.model, args.shape)
     console = Console(stderr=True)
     for repair in garment.repairs:

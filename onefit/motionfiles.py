@@ -96,7 +96,7 @@ def _upright(path, root, up):
     mean = root.apply([0.0, 0.0, 1.0]).mean(0)
     if abs(mean[2]) < 0.3 and abs(mean[1]) > 0.85:
         other = "z" if up == "y" else "y"
-        raise InputError(f"{path}: its body lies down throughout if {up} is up; say that {other} is: up={other!r}, or --up {other}")
+        raise InputError(f"{path}: its body lies down throughout if {up} is up; say that {other} is: up={other!r}, or --motion-up {other}")
 
 
 def placed(poses, translation, fps, name):

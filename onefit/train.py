@@ -37,13 +37,16 @@ HIDDEN = 0.1  # standard deviation of the encoder's memory at the start of a win
 
 @dataclass(frozen=True)
 class Settings:
-    """What decides the result. ``batch``: patches of a step, all frames together (the paper's 20,000); ``lr`` for the first ``lr_epochs``
-    epochs, a tenth of it for the rest; an epoch has ``epoch_steps`` steps (0: as many as show each window of the motions once); ``cuts``:
-    how many random cuts (:mod:`onefit.cuts`) are trained on beside the garments.
+    """What decides the result. ``fps`` and ``motion_up``: of the files of ``motions``, as :meth:`onefit.motion.Motion.read` takes them;
+    ``batch``: patches of a step, all frames together (the paper's 20,000); ``lr`` for the first ``lr_epochs`` epochs, a tenth of it for the
+    rest; an epoch has ``epoch_steps`` steps (0: as many as show each window of the motions once); ``cuts``: how many random cuts
+    (:mod:`onefit.cuts`) are trained on beside the garments.
     """
 
     garments: tuple = STANDARD
     motions: tuple = ()
+    fps: float | None = None
+    motion_up: str | None = None
     start: str = ""
     order: int = 4
     batch: int = 20_000
@@ -154,7 +157,7 @@ def _data(settings, folder, progress):
         task = progress.add_task("cuts sewn", total=settings.cuts)
         garments += cuts(settings.cuts, os.path.join(folder, "cuts"), settings.seed, partial(progress.advance, task))
     task = progress.add_task("garments", total=len(garments))
-    motions = [Motion.read(path) for path in settings.motions] or None
+    motions = [Motion.read(path, settings.fps, settings.motion_up) for path in settings.motions] or None
     return TrainingData(
         garments, motions=motions, seeds=settings.seeds, shapes=settings.shapes, order=settings.order, seed=settings.seed,
         advance=partial(progress.advance, task),
@@ -178,6 +181,8 @@ def parser():
     p.add_argument("garments", nargs="*", metavar="GARMENT", help="templates or meshes (default: the paper's six templates)")
     p.add_argument("-o", "--output", required=True, metavar="OUT", help="folder of the results")
     p.add_argument("--motions", nargs="+", default=[], metavar="FILE", help="AMASS, NCS or BVH files (default: generated ones)")
+    p.add_argument("--fps", type=float, help="frames a second of the motion files, in place of what they say")
+    p.add_argument("--motion-up", choices=("y", "z"), help="the axis that points up in the motion files, in place of what their kind has")
     p.add_argument("--from", dest="start", default="", metavar="WEIGHTS", help="weights to fine-tune, a file or a name of the package's")
     for name, text in {
         "order": "of the jets", "batch": "patches of a step, all frames together", "epochs": "",

@@ -107,6 +107,18 @@ def test_importing_onefit_is_quick_and_loads_nothing_heavy():
     assert done.stdout.strip() == "False", done.stderr
 
 
+def test_what_a_motion_file_does_not_say_is_said_by_flags(network, tmp_path):
+    # the advice of the messages is taken word for word
+    np.savez(tmp_path / "still.npz", poses=np.zeros((9, 72)), trans=np.zeros((9, 3)))
+    arguments = ["shorts", str(tmp_path / "still.npz"), "--weights", network, "--skip", "usd", "render", "-o", str(tmp_path / "out")]
+    for flags, message in (([], "no frame rate .*say it: .* --fps 30$"), (["--fps", "60"], "lies down throughout .* --motion-up y$")):
+        with pytest.raises(InputError, match=message):
+            drape.main([*arguments, *flags])
+    drape.main([*arguments, "--fps", "60", "--motion-up", "y"])
+    with np.load(tmp_path / "out" / "drape.npz") as file:
+        assert len(file["vertices"]) == 5 and file["fps"] == 30  # 8 / 60 s
+
+
 def test_a_mesh_in_centimetres_with_y_up(network, tmp_path):
     from onefit.garment import Garment
     from polyfit.meshio import write_ply

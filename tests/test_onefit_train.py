@@ -57,6 +57,18 @@ def test_windows_are_of_consecutive_frames_at_30_a_second(data):
     assert windows.shape[windows.number == 0].abs().sum() == 0
 
 
+def test_motions_are_read_as_the_flags_say(motion, tmp_path):
+    from rich.progress import Progress
+
+    args = ["shorts", "--motions", motion, "--fps", "20", "--motion-up", "z", "--shapes", "1"]
+    args = train.parser().parse_args([*args, "-o", str(tmp_path)])
+    settings = train.Settings(garments=("shorts",), motions=(motion,), fps=args.fps, motion_up=args.motion_up, shapes=1)
+    (read,) = train._data(settings, str(tmp_path), Progress()).motions
+    assert len(read.poses) == 46  # 31 frames at 20 a second last 1.5 s
+    with pytest.raises(InputError, match="lies down throughout"):
+        train._data(replace(settings, motion_up="y"), str(tmp_path), Progress())
+
+
 def test_training_lowers_the_loss(small, data):
     training = train.OneFitTraining(replace(small, epochs=1, epoch_steps=60), data, Processes("cpu"))
 
