@@ -203,6 +203,17 @@ def test_ease_takes_away_what_a_network_does_wrongly_in_most_frames():
     assert not ease.ease(rest, triangles, body, [(rest * 0.92, rest * 0.92, vertices)] * 5).any()
 
 
+def test_ease_looks_at_the_centres_of_coarse_triangles():
+    (vertices, faces), (rest, triangles) = ball(0.1, 4), ball(0.125, 1)  # with sides of 7 cm: the centres are 7 mm nearer
+    body = SimpleNamespace(vertices=vertices, faces=faces)
+    surface = ClosestSurface(vertices, faces)
+    sunk = rest * (0.107 / 0.125)
+    distance = lambda x: surface(x, 1.0).distance.min()
+    assert distance(rest[triangles].mean(1)) > 0.01 and distance(sunk) > 0.0069 and distance(sunk[triangles].mean(1)) < 0.001
+    eased = sunk + ease.ease(rest, triangles, body, [(sunk, rest, vertices)] * 5)
+    assert distance(eased[triangles].mean(1)) > 0.004
+
+
 def test_ease_keeps_a_network_out_of_the_body(model, walk):
     draper = Draper(weights.Trained(perturbed(1, 0.15), "anny", ("tank",)), model)  # ten times as much inside as skinning
     garment = draper.garment("tank")
