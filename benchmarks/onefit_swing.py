@@ -16,7 +16,7 @@ import torch
 from rich.progress import Progress
 
 import onefit
-from onefit import losses, objective, remesh, skinning
+from onefit import losses, objective, skinning, waistband
 from onefit.charts import Deformation
 from onefit.measures import measure
 from onefit.nearest import ClosestSurface
@@ -69,7 +69,7 @@ def compared(vertices, skinned, reference, turned, lowest):
 
 def slipped(vertices, skinned, garment):
     """How far [mm] the highest rim of ``garment`` is from its place under plain skinning, in the mean, of vertices (T, N, 3) [m]."""
-    rim = max(remesh.loops(garment.faces.numpy()), key=lambda loop: garment.vertices[loop, 2].mean())
+    rim = waistband.highest_rim(garment.vertices.numpy(), garment.faces.numpy())
     return 1e3 * (vertices - skinned)[5:, rim].norm(dim=-1).mean()
 
 

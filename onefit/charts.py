@@ -31,7 +31,7 @@ STEADY = 1e-3
 STRIP = 0.2
 ROOM = 0.005, 0.1  # [m]; how far a patch may be thought to go: its drift of one
 AROUND = 1.0  # width of the Gaussian by which patches around share their drift, in distances of neighbours
-HELD = 1e-2  # how much the slopes of their plane are held to zero
+LEVEL = 1e-2  # how much the slopes of their plane are held to zero
 LOOSE = 0.005  # [m]; a patch much nearer to the body than this lies on it
 # Points of each patch at which the metric is held, and boundary points for each pair of patches that meet.
 METRIC_POINTS = 16
@@ -355,7 +355,7 @@ def _planes(pairs, frame):
         x = (T[around] - T[k]) @ R[k] / s[k]
         b = np.column_stack([np.ones(len(around)), x[:, :2]])
         w = np.exp(-((np.linalg.norm(T[around] - T[k], axis=1) / (AROUND * length)) ** 2))[:, None]
-        gram = (b * w).T @ b + np.diag([0, HELD, HELD]) * w.sum()
+        gram = (b * w).T @ b + np.diag([0, LEVEL, LEVEL]) * w.sum()
         values.append(np.linalg.solve(gram, (b * w).T).ravel())
         rows.append(np.repeat(3 * k + np.arange(3), len(around)))
         columns.append(np.tile(around, 3))

@@ -15,11 +15,7 @@ from scipy.special import binom
 
 from . import jets
 from .errors import InputError
-
-# A coefficient counts as determined where its basis function, over the weighted points, keeps this RMS beyond those before it.
-DETERMINED = 1e-5
-# A box is taken to be at least this share of its longer side wide, so that rounding across a straight line is not stretched into a patch.
-NARROWEST = 1e-2
+from .monomials import DETERMINED, NARROWEST
 
 
 class LeastSquares(torch.autograd.Function):

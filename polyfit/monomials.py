@@ -4,6 +4,12 @@ from functools import lru_cache
 
 import numpy as np
 
+# Of the least squares of jets, in polyfit.least_squares and for a tracker's template:
+# A coefficient counts as determined where its basis function, over the weighted points, keeps this RMS beyond those before it.
+DETERMINED = 1e-5
+# A box is taken to be at least this share of its longer side wide, so that rounding across a straight line is not stretched into a patch.
+NARROWEST = 1e-2
+
 
 @lru_cache
 def exponents(order):

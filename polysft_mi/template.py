@@ -9,11 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial import Chebyshev, Polynomial, chebyshev
 
-from polyfit.monomials import exponents, order_of, size_of
+from polyfit.monomials import DETERMINED, NARROWEST, exponents, order_of, size_of
 
 from .errors import InputError
-
-DETERMINED, NARROWEST = 1e-5, 1e-2  # as in polyfit.least_squares, with the same meaning
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import torch
 from onefit import losses, objective, skinning
 from onefit.body import AnnyBody
 from onefit.binding import standard_surface
-from onefit.charts import AROUND, HELD, Deformation, PatchedGarment, SparseMatrix, _steady_jets
+from onefit.charts import AROUND, LEVEL, Deformation, PatchedGarment, SparseMatrix, _steady_jets
 from onefit.garment import TEMPLATES, Garment
 from onefit.nearest import FAR, ClosestSurface
 from onefit.remesh import loops
@@ -67,7 +67,7 @@ def drifted(patched, drift, uv, patch):
         away = T[around] - T[k]
         w = (-(away.square().sum(1)) / (AROUND * length) ** 2 / 2).exp()  # the root of the weights
         b = torch.cat([torch.ones(len(around), 1), (away @ R[k])[:, :2] / s[k]], 1)
-        held = torch.diag(torch.tensor([0.0, HELD, HELD]).sqrt()) * w.norm()
+        held = torch.diag(torch.tensor([0.0, LEVEL, LEVEL]).sqrt()) * w.norm()
         planes.append(torch.linalg.lstsq(torch.cat([w[:, None] * b, held]), torch.cat([w[:, None] * drift[around], torch.zeros(3, 3)])).solution)
     return (torch.cat([torch.ones(len(uv), 1), uv], 1)[:, None] @ torch.stack(planes)[patch])[:, 0]
 
