@@ -359,12 +359,14 @@ class Normal:
     gradient: np.ndarray
 
 
-def assemble(pattern, surface, projection, evaluation, lengths, stiffness, wide=None):
+def assemble(pattern, surface, projection, evaluation, lengths, stiffness, wide=None, give=np.inf):
     """:class:`Normal` of the images and the edges, and the edges' energy.
 
     ``projection`` (N, 2, 3): of the vertices; ``evaluation``: :class:`polysft_mi.registration.Evaluation`; ``lengths`` (E,) [m]: of the
     template's edges; ``stiffness`` [1/m^2]: weight of the squared differences to them; ``wide``: a :class:`Pattern` that holds
-    this one, where the relief is an unknown too (d = 3) and the local block is to have that pattern.
+    this one, where the relief is an unknown too (d = 3) and the local block is to have that pattern; ``give``: the strain at which a
+    stretched edge pulls hardest. An excess e > 0 over the length L costs c^2 log(1 + e^2 / c^2), c = give L: cloth that hangs from a point
+    is stretched there by a tenth, and by squares that would turn the whole sheet. What is compressed buckles; its costs are squares.
     """
     d = 2 if wide is None else 3
     a, b = pattern.edges.T
@@ -372,7 +374,10 @@ def assemble(pattern, surface, projection, evaluation, lengths, stiffness, wide=
     length = np.maximum(np.sqrt(np.einsum("ek,ek->e", edge, edge)), 1e-9)
     direction = edge / length[:, None]
     excess = length - lengths
-    pull = (2 * stiffness * excess)[:, None] * direction
+    x = (np.maximum(excess, 0) / (give * lengths)) ** 2
+    energy = stiffness * float((excess**2 * np.divide(np.log1p(x), x, out=np.ones_like(x), where=x > 0)).sum())
+    heavy = 2 * stiffness / (1 + x)
+    pull = (heavy * excess)[:, None] * direction
     gradient = evaluation.gradient + pattern.from_ends @ np.concatenate([pull, -pull])
 
     # Each vertex moves by its own (u, v), by a height, which is its own and that of all coefficients there, and by the motion: blocks of the
@@ -397,15 +402,15 @@ def assemble(pattern, surface, projection, evaluation, lengths, stiffness, wide=
     outward = np.concatenate([direction, -direction])
     by_local = np.einsum("ek,ekm->em", outward, local[ends])
     by_motion = np.einsum("ek,ekm->em", direction, surface.by_motion[a] - surface.by_motion[b])
-    heavy = 2 * stiffness * by_local
+    pulled = np.tile(heavy, 2)[:, None] * by_local
     both = np.concatenate([by_local, np.tile(by_motion, (2, 1))], 1)
-    sums = pattern.from_ends @ (heavy[:, :, None] * both[:, None]).reshape(len(ends), 27)
+    sums = pattern.from_ends @ (pulled[:, :, None] * both[:, None]).reshape(len(ends), 27)
     total[pattern.diagonal] += sums.reshape(-1, 3, 9)[:, :, :3]
     local_motion += sums.reshape(-1, 3, 9)[:, :, 3:]
-    across = heavy[: len(a), :, None] * by_local[len(a) :, None]
+    across = pulled[: len(a), :, None] * by_local[len(a) :, None]
     total[pattern.across[0]] += across
     total[pattern.across[1]] += across.transpose(0, 2, 1)
-    motion += 2 * stiffness * by_motion.T @ by_motion
+    motion += (heavy[:, None] * by_motion).T @ by_motion
 
     basis = surface.basis
     size = basis.shape[1]
@@ -423,7 +428,7 @@ def assemble(pattern, surface, projection, evaluation, lengths, stiffness, wide=
         blocks = np.zeros((len(wide.row), 3, 3))
         blocks[wide.find(pattern.row, pattern.column)] = total
     normal = Normal(blocks, cross, glob, np.einsum("nk,nka->na", gradient, local[:, :, :d]), along)
-    return normal, stiffness * float((excess**2).sum())
+    return normal, energy
 
 
 def _conjugated(blocks, s, pattern):

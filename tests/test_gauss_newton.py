@@ -385,10 +385,10 @@ def edges_of(problem):
     chart, first = Chart(problem.template), Registration(problem)
     pattern = Pattern(first.faces, problem.template.edges, len(problem.template.vertices))
 
-    def edges_alone(state, lengths, stiffness):
+    def edges_alone(state, lengths, stiffness, **more):
         surface = chart.surface(state)
         none = registration.Evaluation(0, 0, 0, 0, np.zeros_like(surface.vertices), np.zeros((len(first.faces), 9, 2, 2)), None, 1.0)
-        return assemble(pattern, surface, first.projection(surface.vertices), none, lengths, stiffness, wide=pattern)
+        return assemble(pattern, surface, first.projection(surface.vertices), none, lengths, stiffness, wide=pattern, **more)
 
     return chart, pattern, np.array(problem.edge_lengths, dtype=np.float64), edges_alone
 
@@ -408,6 +408,28 @@ def test_inextensibility_gradient_is_that_of_autodiff(problem):
     assert np.abs(normal.local_gradient - by_offset).max() < 1e-3 * np.abs(by_offset).max()
     by_shift = np.array(dr.grad(unknowns.translation))
     assert np.abs(normal.gradient[-3:] - by_shift).max() < 1e-3 * np.abs(by_offset).max()
+
+
+def test_stretched_edges_give_and_compressed_ones_do_not(problem):
+    chart, pattern, lengths, edges_alone = edges_of(problem)
+    state, give = some_state(chart, 0.02), 0.03
+    normal, energy = edges_alone(state, lengths, 7.0, give=give)
+    points, (a, b) = chart.surface(state).vertices, pattern.edges.T
+    excess, c = np.linalg.norm(points[a] - points[b], axis=1) - lengths, give * lengths
+    assert (excess > 3 * c).any() and (excess < -3 * c).any()
+    assert energy == pytest.approx(7.0 * np.where(excess > 0, c**2 * np.log(1 + (excess / c) ** 2), excess**2).sum())
+    for _ in range(3):
+        step = RNG.normal(size=len(normal.gradient)) * 1e-6, RNG.normal(size=normal.local_gradient.shape) * 1e-6
+        slope = (edges_alone(state.moved(step), lengths, 7.0, give=give)[1] - edges_alone(state.moved(step, -1), lengths, 7.0, give=give)[1]) / 2
+        assert step[0] @ normal.gradient + (step[1] * normal.local_gradient).sum() == pytest.approx(slope, rel=1e-4)
+    # curvature: of squares whose weight is what is left of an edge's pull
+    weight = np.where(excess > 0, 1 / (1 + (excess / c) ** 2), 1.0)
+    step = RNG.normal(size=len(normal.gradient)) * 1e-6, RNG.normal(size=normal.local_gradient.shape) * 1e-6
+    ends = [chart.surface(state.moved(step, f)).vertices for f in (1, -1)]
+    change = np.subtract(*(np.linalg.norm(p[a] - p[b], axis=1) for p in ends)) / 2
+    h = dense(pattern, normal)[0]
+    whole = np.concatenate([step[1].ravel(), step[0]])
+    assert whole @ h @ whole == pytest.approx(2 * 7.0 * (weight * change**2).sum(), rel=1e-3)
 
 
 @pytest.mark.parametrize("stage", gauss_newton.STAGES[::2])  # without and with the relief
