@@ -432,6 +432,18 @@ def test_stretched_edges_give_and_compressed_ones_do_not(problem):
     assert whole @ h @ whole == pytest.approx(2 * 7.0 * (weight * change**2).sum(), rel=1e-3)
 
 
+@pytest.mark.parametrize(("noise", "low", "high"), [(math.nan, 0.0099, 0.0101), (0.007, 0.0099, 0.0101), (0.05, 0.019, 0.021), (0.124, 5, 11)])
+def test_strain_is_held_harder_where_it_may_be_noise(problem, monkeypatch, noise, low, high):
+    solver, given = gauss_newton.GaussNewton(problem.settings), []
+    solver._prepare(problem)
+    monkeypatch.setattr(gauss_newton, "assemble", lambda *arguments: given.append(arguments[7]) or assemble(*arguments))
+    solver._noise = noise
+    rest = solver.chart.state(problem.patch.rest().to_numpy())
+    solver._linearise(rest, rest, 1, 4, gauss_newton.STAGES[0], 0.5)
+    solver._linearise(rest, rest, 1, 4, gauss_newton.STAGES[0], 0.5, stiffness=1.0)  # where the texture is fitted: always
+    assert low <= given[0] <= high and given[1] == math.inf
+
+
 @pytest.mark.parametrize("stage", gauss_newton.STAGES[::2])  # without and with the relief
 def test_whole_gradient_against_finite_differences(problem, stage):
     settings = dataclasses.replace(problem.settings, solver="gauss-newton", brightness="local", k_tc=50.0, k_bend=1e-3, k_uv=1e-2)
