@@ -442,6 +442,10 @@ def test_strain_is_held_harder_where_it_may_be_noise(problem, monkeypatch, noise
     solver._linearise(rest, rest, 1, 4, gauss_newton.STAGES[0], 0.5)
     solver._linearise(rest, rest, 1, 4, gauss_newton.STAGES[0], 0.5, stiffness=1.0)  # where the texture is fitted: always
     assert low <= given[0] <= high and given[1] == math.inf
+    solver._moved = True
+    for stage in (gauss_newton.FAR, *gauss_newton.STAGES):
+        solver._linearise(rest, rest, 1, 4, stage, 0.5)
+    assert given[2] == given[3] == math.inf and given[4] == given[5] == given[0]
 
 
 @pytest.mark.parametrize("stage", gauss_newton.STAGES[::2])  # without and with the relief

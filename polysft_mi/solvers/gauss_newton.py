@@ -39,6 +39,7 @@ _RELIEF_BEND = 3e-3  # of the relief's weight, for its bending
 _RELIEF_MISFIT, _RELIEF_POWER, _RELIEF_HEAVIEST = 0.05, 8, 1e3
 _UNEXPLAINED, _UNEXPLAINED_FACTOR = 0.02, 4.0  # a misfit above this, and above so many times the least, is no noise: the jet does not follow
 _GIVE = 0.01  # strain at which a stretched edge pulls hardest, where images are clean; more in noise, as with the relief's weight
+_MOVED = 0.15  # misfit at a frame's start above which the sheet has moved far: lengths lead it there, and edges do not give in the coarse stages
 _TEMPORAL = 1e-3  # of k_tc: it holds a frame to the one before, in a stiffer basis than the monomials of the paper's window
 
 
@@ -92,6 +93,7 @@ class GaussNewton:
         self._blas = ThreadpoolController()  # its own threads cost more than they bring on blocks this small, and wait for Dr.Jit's
         self._scales, self._fitting = {}, {}
         self._noise, self._unexplained = math.nan, False  # of the frame at work: the least misfit before it, NaN in the first, where the template has its shape
+        self._moved = False  # whether the frame at work starts far from its image
         self._hold = 0.0  # weight of the difference to the anchor, motion included, where a frame is solved again
 
     def solve(self, problem, window, frames, report=None, past=()):
@@ -137,7 +139,7 @@ class GaussNewton:
         if problem is not self._problem:
             self._prepare(problem)
         self._report, self._count = None, 0
-        self._scales, self._fitting = self._scales_of(terms), {}
+        self._scales, self._fitting, self._moved = self._scales_of(terms), {}, False
         least = self._remember([terms])
         a, b = self.chart.state(before), self.chart.state(after)
         middle = a.towards(b, -0.5)
@@ -225,12 +227,15 @@ class GaussNewton:
             starts += [history[-2].towards(history[-1], f) for f in (0.5, 1.0)]
         orders = [t["order"] for t in past if t.get("order") is not None]
         order = int(orders[-1]) if orders else self.least
-        best = self._descend(self._nearest(starts, frame, STAGES[0]), anchor, frame, order, STAGES)
+        nearest, misfit = self._nearest(starts, frame, STAGES[0])
+        self._moved = misfit > _MOVED
+        best = self._descend(nearest, anchor, frame, order, STAGES)
         usual = [t["misfit"] for t in past[-_MEMORY:] if t.get("misfit") is not None]
         limit = _SUSPECT * np.median(usual) + _SUSPECT_MARGIN if len(usual) >= 3 else math.inf
         if best[1]["misfit"] > limit:
             self.registration.expect([frame], [self.levels[FAR]])
-            for other in (lambda: self._nearest(starts, frame, FAR), lambda: self._relocate(frame)):
+            self._moved = True
+            for other in (lambda: self._nearest(starts, frame, FAR)[0], lambda: self._relocate(frame)):
                 if (other := other()) is not None:
                     found = self._descend(other, anchor, frame, order, (FAR, *STAGES), _PATIENT)
                     if found[1]["pixels"] > _SHOWN * best[1]["pixels"]:
@@ -244,10 +249,10 @@ class GaussNewton:
         return Reduced(self.systems[normal.local.shape[-1]], normal, damping, dtype)
 
     def _nearest(self, starts, frame, stage):
-        """The start that explains the frame best."""
-        if len(starts) == 1:
-            return starts[0]
-        return min(starts, key=lambda state: self.registration.misfit(self.chart.surface(state, 0).vertices, frame, self.levels[stage]))
+        """The start that explains the frame best, and its misfit."""
+        misfits = [self.registration.misfit(self.chart.surface(state, 0).vertices, frame, self.levels[stage]) for state in starts]
+        k = int(np.argmin(misfits))
+        return starts[k], misfits[k]
 
     def _relocate(self, frame):
         """The flat template in the pose that its features have in the frame; None where too few are found."""
@@ -380,7 +385,7 @@ class GaussNewton:
         surface = chart.surface(state, order)
         evaluation = self.registration.evaluate(surface.vertices, frame, self.levels[stage], scale)
         noisy = 1 + min((np.nan_to_num(self._noise) / _RELIEF_MISFIT) ** _RELIEF_POWER, _RELIEF_HEAVIEST)
-        give = _GIVE * noisy if stiffness is None else math.inf
+        give = math.inf if stiffness is not None or (self._moved and stage in (FAR, STAGES[0])) else _GIVE * noisy
         stiffness = s.k_mi * (stage.stiffness if stiffness is None else stiffness) / chart.template.scale**2
         projection = self.registration.projection(surface.vertices)
         d = 3 if s.k_relief > 0 and len(state.offset) <= _RELIEF_VERTICES and self._noise < stage.relief[self._unexplained] else 2
