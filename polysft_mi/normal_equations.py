@@ -374,9 +374,9 @@ def assemble(pattern, surface, projection, evaluation, lengths, stiffness, wide=
     length = np.maximum(np.sqrt(np.einsum("ek,ek->e", edge, edge)), 1e-9)
     direction = edge / length[:, None]
     excess = length - lengths
-    x = (np.maximum(excess, 0) / (give * lengths)) ** 2
-    energy = stiffness * float((excess**2 * np.divide(np.log1p(x), x, out=np.ones_like(x), where=x > 0)).sum())
-    heavy = 2 * stiffness / (1 + x)
+    over = (np.maximum(excess, 0) / (give * lengths)) ** 2
+    energy = stiffness * float((excess**2 * np.divide(np.log1p(over), over, out=np.ones_like(over), where=over > 0)).sum())
+    heavy = 2 * stiffness / (1 + over)  # (E,): of each edge
     pull = (heavy * excess)[:, None] * direction
     gradient = evaluation.gradient + pattern.from_ends @ np.concatenate([pull, -pull])
 

@@ -35,10 +35,11 @@ _FACTS = "misfit", "outlying", "order", "least_misfit"
 _RELIEF_VERTICES = 3000  # of the template, above which there is no relief: its wide system takes a second an iteration at 10,000
 _RELIEF_BEND = 3e-3  # of the relief's weight, for its bending
 # Noise must not become ripples, which use up length. What noise there is, the least misfit of the frames so far tells, the first one aside,
-# which the texture was taken from: at this misfit the relief's weight has doubled, and it grows with that power of it, to so many times.
-_RELIEF_MISFIT, _RELIEF_POWER, _RELIEF_HEAVIEST = 0.05, 8, 1e3
+# which the texture was taken from: at this misfit the relief's weight, and the strain at which edges give, have doubled, and they grow with
+# that power of it, to so many times.
+_NOISE_MISFIT, _NOISE_POWER, _NOISE_MOST = 0.05, 8, 1e3
 _UNEXPLAINED, _UNEXPLAINED_FACTOR = 0.02, 4.0  # a misfit above this, and above so many times the least, is no noise: the jet does not follow
-_GIVE = 0.01  # strain at which a stretched edge pulls hardest, where images are clean; more in noise, as with the relief's weight
+_GIVE = 0.01  # strain at which a stretched edge pulls hardest, where images are clean
 _MOVED = 0.15  # misfit at a frame's start above which the sheet has moved far: lengths lead it there, and edges do not give in the coarse stages
 _TEMPORAL = 1e-3  # of k_tc: it holds a frame to the one before, in a stiffer basis than the monomials of the paper's window
 
@@ -384,14 +385,15 @@ class GaussNewton:
         s, chart = self.settings, self.chart
         surface = chart.surface(state, order)
         evaluation = self.registration.evaluate(surface.vertices, frame, self.levels[stage], scale)
-        noisy = 1 + min((np.nan_to_num(self._noise) / _RELIEF_MISFIT) ** _RELIEF_POWER, _RELIEF_HEAVIEST)
-        give = math.inf if stiffness is not None or (self._moved and stage in (FAR, STAGES[0])) else _GIVE * noisy
+        caution = 1 + min((np.nan_to_num(self._noise) / _NOISE_MISFIT) ** _NOISE_POWER, _NOISE_MOST)  # before what may be noise
+        give = math.inf if stiffness is not None or (self._moved and stage in (FAR, STAGES[0])) else _GIVE * caution
         stiffness = s.k_mi * (stage.stiffness if stiffness is None else stiffness) / chart.template.scale**2
         projection = self.registration.projection(surface.vertices)
         d = 3 if s.k_relief > 0 and len(state.offset) <= _RELIEF_VERTICES and self._noise < stage.relief[self._unexplained] else 2
-        relief = s.k_relief * noisy
+        relief = s.k_relief * caution
         pattern = self.systems[d].pattern
-        normal, inextensibility = assemble(self.pattern, surface, projection, evaluation, self.lengths, stiffness, pattern if d == 3 else None, give)
+        wide = pattern if d == 3 else None
+        normal, inextensibility = assemble(self.pattern, surface, projection, evaluation, self.lengths, stiffness, wide, give=give)
         a = self.chart.size(order)
         bend = 2 * s.k_bend * chart.bending
         moved, slid = state.alpha - anchor.alpha, state.offset - anchor.offset
