@@ -6,16 +6,20 @@ them, sparse like the mesh; and G = A + 6 global ones: the coefficients in an or
 before the rotation) and the translation T_c. The first are eliminated, what is left is small and dense.
 """
 
+from concurrent.futures import ThreadPoolExecutor
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
 from numpy.polynomial import legendre
-from scipy.linalg import LinAlgError, cho_factor, cho_solve, get_blas_funcs, get_lapack_funcs, solve_triangular
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 from scipy.spatial.transform import Rotation
 
 from polyfit.monomials import exponents
+
+from . import lapack
 
 
 @dataclass
@@ -247,11 +251,15 @@ class Pattern:
             flat[:, k] += np.bincount(at, values[:, k], len(flat))
 
 
+_ALONE = 100  # rows a block below which one thread is faster than two, which pass Python's lock to and fro
+_other = ThreadPoolExecutor(1, "elimination")
+
+
 class Blocks:
     """A symmetric matrix with the pattern's d x d blocks, factorised as block tridiagonal in the narrow ordering, by LAPACK.
 
     On these narrow meshes that is faster than general sparse Cholesky, above all with many right-hand sides
-    (``benchmarks/factorisation.py``).
+    (``benchmarks/factorisation.py``). It is done from both ends at once, by two threads, which meet in the middle.
     """
 
     def __init__(self, pattern, d=2):
@@ -260,90 +268,128 @@ class Blocks:
         width = max(8, int(np.abs(row - column).max()))  # vertices a block
         self.count = -(-pattern.count // width)
         self.width = width
+        self.size = size = d * width
+        self.middle = self.count // 2
+        self.chains = range(self.middle), range(self.count - 1, self.middle, -1)  # of blocks, towards the middle
         each = np.arange(d)
         at = d * row[:, None, None] + each[None, :, None], d * column[:, None, None] + each[None, None, :]
         r, c = (np.broadcast_to(x, (len(row), d, d)) for x in at)
-        size = d * width
         part, down = r // size, c // size
         self._inside = np.flatnonzero((part == down) & (r >= c))  # LAPACK reads the lower triangle alone
-        self._below = np.flatnonzero(part == down + 1)
-        # Fortran order inside each block, which LAPACK takes without a copy
+        self._beside = np.flatnonzero(part == down - np.sign(down - self.middle))  # rows of the next block towards the middle
+        # each block in Fortran order, those beside transposed
         self._at_inside = ((part * size + c % size) * size + r % size).ravel()[self._inside]
-        self._at_below = ((down * size + r % size) * size + c % size).ravel()[self._below]  # transposed: the block above
+        self._at_beside = ((down * size + r % size) * size + c % size).ravel()[self._beside]
         self._order = (d * pattern.order[:, None] + each).ravel()
-        self.size = size
+
+    def rows(self, k):
+        """The rows of block k, a slice; its size is the blocks' but for the last one's."""
+        return slice(k * self.size, min((k + 1) * self.size, self.d * self.pattern.count))
+
+    def both(self, run):
+        """Run either chain of blocks, the second in a thread of its own where blocks are large enough to be worth it."""
+        first, second = self.chains
+        if self.size < _ALONE:
+            run(first)
+            run(second)
+            return
+        other = _other.submit(run, second)
+        try:
+            run(first)
+        finally:
+            failed = other.exception()  # waits
+        if failed:
+            raise failed
 
     def eliminate(self, blocks, columns, dtype=np.float64):
         """Factorise (B, d, d) = L L^T: returns an :class:`Elimination` with L^-1 columns for columns (dN, C), in ``dtype``. Raises
         LinAlgError where it is not positive.
         """
-        (potrf,), (syrk, trsm) = get_lapack_funcs(["potrf"], dtype=dtype), get_blas_funcs(["syrk", "trsm"], dtype=dtype)
-        size, rest = self.size, self.d * self.pattern.count
-        values = blocks.ravel()
-        inside = np.zeros(self.count * size * size, dtype)
-        below = np.zeros(self.count * size * size, dtype)
-        inside[self._at_inside] = values[self._inside]
-        below[self._at_below] = values[self._below]
-        inside = inside.reshape(self.count, size, size)
-        below = below.reshape(self.count, size, size)
-        x = columns.astype(dtype)[self._order]
-        factors, coupling, parts = [], [], []
-        for k in range(self.count):
-            n = min(size, rest - k * size)
-            d, y = inside[k].T[:n, :n], x[k * size : k * size + n]
-            if k:
-                w = coupling[-1]
-                d = syrk(-1.0, w, beta=1.0, c=d, trans=1, lower=1, overwrite_c=1)  # in place, here and below, but for the last block
-                y = y - w.T @ parts[-1]
-            factor, bad = potrf(d, lower=1, clean=1, overwrite_a=1)
-            if bad:
-                raise LinAlgError("the local block is not positive definite")
-            factors.append(factor)
-            parts.append(trsm(1.0, factor, y, lower=1))
-            if k + 1 < self.count:
-                following = min(size, rest - (k + 1) * size)
-                coupling.append(trsm(1.0, factor, below[k].T[:n, :following], lower=1, overwrite_b=1))
-        return Elimination(self, factors, coupling, parts)
+        values, shape = blocks.ravel(), (self.count, self.size, self.size)
+        inside, beside = (np.zeros(shape, dtype) for _ in range(2))
+        inside.ravel()[self._at_inside] = values[self._inside]
+        beside.ravel()[self._at_beside] = values[self._beside]
+        parts = [self.rows(k) for k in range(self.count)]
+        sizes = [part.stop - part.start for part in parts]
+        factors = [block.T[:n, :n] for block, n in zip(inside, sizes)]
+        coupling = [None] * self.count
+        y = columns.astype(dtype)[self._order]
+
+        def run(chain):
+            for k in chain:
+                following = k + (1 if k < self.middle else -1)
+                lapack.cholesky(factors[k])
+                lapack.solve(factors[k], y[parts[k]].T, transposed=True, right=True)
+                coupling[k] = w = beside[k].T[: sizes[k], : sizes[following]]
+                lapack.solve(factors[k], w)
+                if following != self.middle:
+                    lapack.subtract_square(factors[following], w)
+                    y[parts[following]] -= w.T @ y[parts[k]]
+
+        self.both(run)
+        for k in (chain[-1] for chain in self.chains if chain):
+            lapack.subtract_square(factors[self.middle], coupling[k])
+            y[parts[self.middle]] -= coupling[k].T @ y[parts[k]]
+        lapack.cholesky(factors[self.middle])
+        lapack.solve(factors[self.middle], y[parts[self.middle]].T, transposed=True, right=True)
+        return Elimination(self, factors, coupling, y)
 
 
 class Elimination:
-    """L of a factorised block-tridiagonal matrix, and ``parts`` of L^-1 columns."""
+    """L of a factorised matrix, block by block: on the diagonal, and beside it towards the middle (transposed); and ``columns``, L^-1 times
+    those given."""
 
-    def __init__(self, blocks, factors, coupling, parts):
-        self.blocks, self.factors, self.coupling = blocks, factors, coupling
-        self.columns = np.concatenate(parts)
-        (self._trsm,) = get_blas_funcs(["trsm"], dtype=self.columns.dtype)
+    def __init__(self, blocks, factors, coupling, columns):
+        self.blocks, self.factors, self.coupling, self.columns = blocks, factors, coupling, columns
+
+    def only(self, chosen):
+        """The same with the columns ``chosen`` alone."""
+        return Elimination(self.blocks, self.factors, self.coupling, self.columns[:, chosen])
 
     def back(self, y):
         """L^-T y, (dN,) or (dN, C), in the order of the vertices."""
-        size, x = self.blocks.size, [None] * len(self.factors)
-        flat = (y[:, None] if y.ndim == 1 else y).astype(self.columns.dtype, copy=False)
-        for k in reversed(range(len(x))):
-            part = flat[k * size : k * size + len(self.factors[k])]
-            if k + 1 < len(x):
-                part = part - self.coupling[k] @ x[k + 1]
-            x[k] = self._trsm(1.0, self.factors[k], part, lower=1, trans_a=1)
-        out = np.empty_like(flat)
-        out[self.blocks._order] = np.concatenate(x)
+        blocks = self.blocks
+        x = np.array(y.reshape(len(y), -1), dtype=self.columns.dtype, order="C")
+
+        def solve(k):
+            lapack.solve(self.factors[k], x[blocks.rows(k)].T, right=True)
+
+        def run(chain):
+            for k in reversed(chain):
+                x[blocks.rows(k)] -= self.coupling[k] @ x[blocks.rows(k + (1 if k < blocks.middle else -1))]
+                solve(k)
+
+        solve(blocks.middle)
+        blocks.both(run)
+        out = np.empty_like(x)
+        out[blocks._order] = x
         return out.reshape(y.shape)
 
     def inverse_diagonal(self):
         """The blocks on the diagonal of the inverse, (N, d, d)."""
-        size, blocks = self.blocks.size, [None] * len(self.factors)
-        (potri,) = get_lapack_funcs(["potri"], dtype=self.columns.dtype)
-        for k in reversed(range(len(blocks))):
-            inverse = potri(self.factors[k], lower=1)[0]
-            inverse = np.tril(inverse) + np.tril(inverse, -1).T
-            if k + 1 < len(blocks):
-                w = self._trsm(1.0, self.factors[k], self.coupling[k], lower=1, trans_a=1)
-                inverse = inverse + w @ blocks[k + 1] @ w.T
-            blocks[k] = inverse
-        part, at = np.divmod(self.blocks.d * self.blocks.pattern.place, size)
-        padded = np.zeros((len(blocks), size, size))
-        for k, block in enumerate(blocks):
-            padded[k, : len(block), : len(block)] = block
-        each = np.arange(self.blocks.d)
-        return padded[part[:, None, None], at[:, None, None] + each[:, None], at[:, None, None] + each]
+        blocks, size = self.blocks, self.blocks.size
+        found = np.zeros((blocks.count, size, size), self.columns.dtype)
+
+        def fill(k, following=None):
+            factor = self.factors[k]
+            lower = factor.copy(order="F")
+            lapack.inverse(lower)
+            found[k, : len(lower), : len(lower)] = np.tril(lower) + np.tril(lower, -1).T
+            if following is not None:
+                w = self.coupling[k].copy(order="F")
+                lapack.solve(factor, w, transposed=True)
+                n = w.shape[1]
+                found[k, : len(w), : len(w)] += w @ found[following, :n, :n] @ w.T
+
+        def run(chain):
+            for k in reversed(chain):
+                fill(k, k + (1 if k < blocks.middle else -1))
+
+        fill(blocks.middle)
+        blocks.both(run)
+        part, at = np.divmod(blocks.d * blocks.pattern.place, size)
+        each = np.arange(blocks.d)
+        return found[part[:, None, None], at[:, None, None] + each[:, None], at[:, None, None] + each]
 
 
 @dataclass
@@ -453,7 +499,7 @@ class Reduced:
     """
 
     def __init__(self, blocks, normal, damping, dtype=np.float64):
-        self.normal, self.blocks = normal, blocks
+        self.blocks = blocks
         diagonal = blocks.pattern.diagonal
         local = normal.local.copy()
         for k in range(blocks.d):
@@ -470,28 +516,37 @@ class Reduced:
         """The step (global (G,), local (N, d)), and the decrease that the model promises. Raises LinAlgError where what remains is not
         positive definite.
         """
-        g = -cho_solve(cho_factor(self.schur, check_finite=False), self.right, check_finite=False)
-        step = g, self.following(g)
-        return step, self.promised(step)
+        g = self._least()
+        return (g, self.following(g)), self.promised(g)
+
+    def _least(self):
+        return -cho_solve(cho_factor(self.schur, check_finite=False), self.right, check_finite=False)
+
+    def promised(self, g):
+        """The decrease that the model promises of the step to its minimum, whose global unknowns are ``g`` (G,)."""
+        y = self.elimination.columns[:, -1]
+        return 0.5 * float(y @ y - g @ self.right)
 
     def following(self, g):
         """The step (N, d) of the local unknowns that goes with a step (G,) of the global ones."""
         y = self.elimination.columns
         return -self.elimination.back(y[:, -1] + y[:, :-1] @ g).reshape(-1, self.blocks.d)
 
-    def promised(self, step):
-        """The decrease that the model promises of a step that minimises it."""
-        return -0.5 * float(step[0] @ self.normal.gradient + (step[1] * self.normal.local_gradient).sum())
-
     def slide(self):
         """The step (N, d) of the local unknowns alone."""
         return -self.elimination.back(self.elimination.columns[:, -1]).reshape(-1, self.blocks.d)
 
-    def restricted(self, size):
-        """The decrease that the model promises where only the first ``size`` coefficients, the motion and the local unknowns may move."""
+    def decrease(self):
+        """The decrease that :meth:`step` promises, without the step. Raises LinAlgError like it."""
+        return self.promised(self._least())
+
+    def lower(self, size):
+        """The same where only the first ``size`` coefficients, the motion and the local unknowns may move."""
         keep = np.r_[np.arange(size), np.arange(len(self.right) - 6, len(self.right))]
-        b, y = self.right[keep], self.elimination.columns[:, -1]
-        return 0.5 * float(b @ cho_solve(cho_factor(self.schur[np.ix_(keep, keep)], check_finite=False), b, check_finite=False) + y @ y)
+        part = copy(self)
+        part.elimination = self.elimination.only(np.r_[keep, len(self.right)])
+        part.schur, part.right = self.schur[np.ix_(keep, keep)], self.right[keep]
+        return part
 
     def without(self, size, alpha):
         """The step (G,) that takes the coefficients from ``size`` on, whose values are ``alpha`` (A,), to zero, the others following, and

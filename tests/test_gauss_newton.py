@@ -222,7 +222,11 @@ def test_step_and_variance_are_those_of_the_dense_system(rows, columns, d):
         j[k, d * k : d * k + d] = by_local[k]
     assert np.allclose(reduced.variance(by_local, by_global), np.einsum("ij,ji->i", j, np.linalg.solve(h, j.T)), rtol=1e-5)
     keep = np.r_[np.arange(n), n, n + 1, np.arange(n + 3, n + 9)]
-    assert reduced.restricted(2) == pytest.approx(0.5 * g[keep] @ np.linalg.solve(h[np.ix_(keep, keep)], g[keep]), rel=1e-5)
+    lower = reduced.lower(2)
+    assert reduced.decrease() == pytest.approx(-0.5 * expected @ g, rel=1e-5)
+    assert lower.decrease() == pytest.approx(0.5 * g[keep] @ np.linalg.solve(h[np.ix_(keep, keep)], g[keep]), rel=1e-5)
+    small, fewer = h[np.ix_(keep, keep)], j[:, keep]
+    assert np.allclose(lower.variance(by_local, by_global[:, keep[n:] - n]), np.einsum("ij,ji->i", fewer, np.linalg.solve(small, fewer.T)), rtol=1e-5)
     assert np.allclose(reduced.slide().ravel(), -np.linalg.solve(h[:n, :n], g[:n]), rtol=1e-5, atol=1e-7)
     # coefficients 2 (of 3) to zero: the rest minimises the quadratic around a point where the gradient is zero
     alpha = RNG.normal(size=3)

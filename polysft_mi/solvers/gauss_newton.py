@@ -8,11 +8,11 @@ from scipy.linalg import LinAlgError, block_diag, cho_factor, cho_solve
 from threadpoolctl import ThreadpoolController
 
 from ..errors import InputError
-from ..normal_equations import Blocks, Chart, Pattern, Reduced, State, assemble, hinges
+from ..normal_equations import Blocks, Chart, Normal, Pattern, Reduced, State, Surface, assemble, hinges
 from ..patch import Unknowns
 from ..problem import BadFrame
 from ..pyramid import Level
-from ..registration import Registration
+from ..registration import Evaluation, Registration
 from ..relocate import Relocator
 from . import Solution
 
@@ -24,6 +24,7 @@ _SUSPECT, _SUSPECT_MARGIN, _MEMORY = 1.25, 0.03, 5  # a misfit above this many t
 _PATIENT = 18  # iterations a stage where a frame is suspect
 _RAISE = 0.02  # share of the objective by which more coefficients must lower it to be taken
 _LOWER = 2.0  # the highest coefficients are kept where they are worth this many times what they would make of noise alone
+_UNDAMPED = 1e-9  # damping where a model is asked about, not followed
 _JOINT = 3  # iterations of a whole window, each of whose frames has been solved
 _ORDER_STEP = 2
 # fitting the texture to the first frame: only above this misfit, if it falls by this factor, and no farther than this [chart units]
@@ -55,6 +56,19 @@ def _check_step(step):
     g, local = step
     if not max(np.abs(g[-6:]).max(), np.abs(local).max()) < _FARTHEST_STEP:
         raise LinAlgError("the step is not finite, or too long")
+
+
+@dataclass
+class Model:
+    """The objective to second order around a ``state`` whose vertices are of ``surface``: from the images' ``evaluation``, ``normal``. ``noise``: the
+    variance of a residual; ``reduced``: ``normal`` without damping, made when it is wanted."""
+
+    state: State
+    surface: Surface
+    evaluation: Evaluation
+    normal: Normal
+    noise: float
+    reduced: Reduced = None
 
 
 @dataclass(frozen=True)
@@ -365,7 +379,7 @@ class GaussNewton:
         steps = [(part, r.following(part)) for part, r in zip(parts, reduced)]
         for step in steps:
             _check_step(step)
-        return steps, sum(r.promised(step) for r, step in zip(reduced, steps))
+        return steps, sum(r.promised(part) for r, part in zip(reduced, parts))
 
     # -- one stage ----------------------------------------------------------
 
@@ -380,11 +394,13 @@ class GaussNewton:
         m = min(max(outlying, 0.02), 0.98)
         return float(np.clip(scale * math.sqrt(m / (1 - m) / 0.44), *_SCALES))
 
-    def _linearise(self, state, anchor, frame, order, stage, scale, stiffness=None):
-        """(Normal, terms) of the whole objective at a state. Raises BadFrame where it is not finite."""
+    def _linearise(self, state, anchor, frame, order, stage, scale, stiffness=None, evaluation=None):
+        """(Normal, terms) of the whole objective at a state, whose ``evaluation`` may be known. Raises BadFrame where it is not finite."""
         s, chart = self.settings, self.chart
         surface = chart.surface(state, order)
-        evaluation = self.registration.evaluate(surface.vertices, frame, self.levels[stage], scale)
+        known = evaluation is not None
+        if not known:
+            evaluation = self.registration.evaluate(surface.vertices, frame, self.levels[stage], scale)
         caution = 1 + min((np.nan_to_num(self._noise) / _NOISE_MISFIT) ** _NOISE_POWER, _NOISE_MOST)  # before what may be noise
         give = math.inf if stiffness is not None or (self._moved and stage in (FAR, STAGES[0])) else _GIVE * caution
         stiffness = s.k_mi * (stage.stiffness if stiffness is None else stiffness) / chart.template.scale**2
@@ -424,14 +440,15 @@ class GaussNewton:
         total = sum(terms.values())
         if not math.isfinite(total):
             raise BadFrame(frame, total)
-        if self._report:
-            self._report(self._count, total, terms)
-        self._count += 1
+        if not known:
+            if self._report:
+                self._report(self._count, total, terms)
+            self._count += 1
         # what the residuals' own size says of their noise; pixels closer than the blur are no evidence of their own
         level = self.levels[stage]
         noise = 2 * evaluation.photometric / (3 * max(evaluation.pixels, 1.0)) * max(1.0, 4 * math.pi * level.sigma**2)
         facts = {"misfit": evaluation.misfit, "outlying": evaluation.outlying, "pixels": evaluation.pixels, "order": order}
-        facts["model"] = normal, surface, noise
+        facts["model"] = Model(state, surface, evaluation, normal, noise)
         return normal, {**terms, "total": total, **facts}
 
     # -- order --------------------------------------------------------------
@@ -440,33 +457,33 @@ class GaussNewton:
         """Raise the order where the model says that it pays, lower it where it does not, and go on from there: (state, terms)."""
         s, order = self.settings, int(terms["order"])
         return (
-            (order < s.capacity and self._raised(state, anchor, frame, order))
+            (order < s.capacity and self._raised(state, terms, anchor, frame, order))
             or (order > self.least and self._lowered(state, terms, anchor, frame, order))
             or (state, terms)
         )
 
-    def _raised(self, state, anchor, frame, order):
+    def _raised(self, state, terms, anchor, frame, order):
         """(state, terms) with more coefficients; None where they do not pay."""
-        stage, top = STAGES[-1], min(order + _ORDER_STEP, self.settings.capacity)
-        wide, there = self._linearise(state, anchor, frame, top, stage, self._scales.get(stage, _FIRST_SCALE))
+        stage, model, top = STAGES[-1], terms["model"], min(order + _ORDER_STEP, self.settings.capacity)
+        wide, _ = self._linearise(model.state, anchor, frame, top, stage, self._scales.get(stage, _FIRST_SCALE), evaluation=model.evaluation)
         try:
-            reduced = self._reduced(wide, 1e-6)
-            promised = reduced.step()[1] - reduced.restricted(self.chart.size(order))
+            reduced = self._reduced(wide, _UNDAMPED)
+            model.reduced = reduced.lower(self.chart.size(order))
+            promised = reduced.decrease() - model.reduced.decrease()
         except LinAlgError:
             return None
-        if promised <= _RAISE * there["total"]:
+        if promised <= _RAISE * terms["total"]:
             return None
         found = self._descend(state, anchor, frame, top, STAGES[1:])
-        return found if found[1]["total"] < (1 - 0.5 * _RAISE) * there["total"] else None
+        return found if found[1]["total"] < (1 - 0.5 * _RAISE) * terms["total"] else None
 
     def _lowered(self, state, terms, anchor, frame, order):
         """(state, terms) without the highest coefficients; None where they are worth their place."""
         lower = max(order - _ORDER_STEP, self.least)
         size = self.chart.size(lower)
-        normal, _, noise = terms["model"]
-        worth = _LOWER * noise * (self.chart.size(order) - size)
+        worth = _LOWER * terms["model"].noise * (self.chart.size(order) - size)
         try:
-            reduced = self._reduced(normal, 1e-6)
+            reduced = self._undamped(terms["model"])
             g, expected = reduced.without(size, state.alpha)
         except LinAlgError:
             return None
@@ -477,6 +494,10 @@ class GaussNewton:
         found = self._stage(state, anchor, frame, lower, STAGES[-1], STAGES[-1].iterations)
         return found if found[1]["total"] < terms["total"] + worth else None
 
+    def _undamped(self, model):
+        model.reduced = model.reduced or self._reduced(model.normal, _UNDAMPED)
+        return model.reduced
+
     # -- results ------------------------------------------------------------
 
     def _solution(self, states, found, newest):
@@ -486,18 +507,19 @@ class GaussNewton:
         facts = {name: newest[name] for name in _FACTS}
         facts |= {f"scale_{k}": self._fitting.get(stage, _FIRST_SCALE) for k, stage in enumerate((FAR, *STAGES))}
         window = [Unknowns.from_numpy(self.chart.arrays(state)) for state in states]
-        return Solution(window, sum(terms.values()), terms, self._count, facts, [self._sigma(*f["model"]) for f in found])
+        return Solution(window, sum(terms.values()), terms, self._count, facts, [self._sigma(f["model"]) for f in found])
 
-    def _sigma(self, normal, surface, noise):
+    def _sigma(self, model):
         """Standard deviation (N,) [m, float32] of each vertex along its ray, from the curvatures of the whole objective: NaN where they
         are singular.
         """
+        surface = model.surface
         ray = surface.vertices - self._problem.camera.origin
         ray /= np.linalg.norm(ray, axis=1, keepdims=True)
         by_global = np.column_stack([(ray @ surface.up)[:, None] * surface.basis, np.einsum("nk,nkm->nm", ray, surface.by_motion)])
         try:
-            by_local = np.einsum("nk,nka->na", ray, surface.by_offset)[:, : normal.local.shape[-1]]
-            variance = self._reduced(normal, 1e-9).variance(by_local, by_global)
+            by_local = np.einsum("nk,nka->na", ray, surface.by_offset)[:, : model.normal.local.shape[-1]]
+            variance = self._undamped(model).variance(by_local, by_global)
         except (LinAlgError, np.linalg.LinAlgError):
             variance = np.full(len(ray), np.nan)
-        return np.sqrt(noise * variance).astype(np.float32)
+        return np.sqrt(model.noise * variance).astype(np.float32)
