@@ -93,6 +93,8 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
     say("pictures")
     rows, per_frame = drawn()
     figures.contact_sheet(os.path.join(out, "comparison.png"), rows)
+    with open(os.path.join(out, "log.jsonl"), encoding="utf-8") as file:
+        figures.loss_plot(os.path.join(out, "loss.png"), [json.loads(line) for line in file])
     video = bound()
 
     finite = {name: [p[name] for p in per_frame if np.isfinite(p[name])] for name in ("psnr_mask", "ssim_mask")}

@@ -3,7 +3,6 @@
 Import only after a Mitsuba variant is set. :mod:`polysft_mi.drawing` has this done by a process of its own.
 """
 
-import json
 import os
 from concurrent.futures import ThreadPoolExecutor
 
@@ -153,14 +152,9 @@ class Album:
         return rows, found
 
     def bind(self, count, fps):
-        """Write comparison.mp4 of the first ``count`` frames, ``fps`` a second, and loss.png of the log; returns the video's path, or its folder where no
-        encoder is.
-        """
+        """Write comparison.mp4 of the first ``count`` frames, ``fps`` a second; returns its path, or its folder where no encoder is."""
         pictures = self._pool.map(lambda k: np.concatenate(self._panels(k), axis=1), range(count))
-        video = write_video(os.path.join(self.out, "comparison.mp4"), pictures, fps)
-        with open(os.path.join(self.out, "log.jsonl"), encoding="utf-8") as file:
-            figures.loss_plot(os.path.join(self.out, "loss.png"), [json.loads(line) for line in file])
-        return video
+        return write_video(os.path.join(self.out, "comparison.mp4"), pictures, fps)
 
 
 def _figures(layers, masked):

@@ -41,7 +41,6 @@ def drawn(sheet, out, during=lambda drawing: None, *, problem=None, frames=9, ex
     vertices = np.stack([problem.camera.origin + v @ problem.camera.axes for v in surfaces]).astype(np.float32)
     assert np.allclose(problem.camera.to_camera(vertices), surfaces, atol=1e-6)
     out.mkdir(exist_ok=True)
-    (out / "log.jsonl").write_text('{"frame": 0, "iteration": 0, "loss": 1.0}\n')
     with Drawing(problem, {}, str(out), exr_frames=exr_frames, about={"scene": "sheet"}) as made:
         for k, v in enumerate(vertices):
             made.frame(k, v)
@@ -50,7 +49,7 @@ def drawn(sheet, out, during=lambda drawing: None, *, problem=None, frames=9, ex
         rows, figures = for_sheet()
         path = bound()
         folder = Path(made._folder.name)
-    assert not folder.exists() and (out / "loss.png").exists()
+    assert not folder.exists()
     assert [r["label"] for r in rows] == [f"frame {k}" for k in chosen(frames, 5)]
     return figures, np.stack(list(video.read_video(path))), sorted(p.name for p in (out / "comparison").glob("*.exr"))
 
