@@ -183,6 +183,16 @@ class Chart:
             state = state.moved((g, uv))
         return state
 
+    def through(self, state, vertices, order):
+        """The state with the motion of ``state`` whose vertices are ``vertices`` (N, 3) [m, world]: as much of their heights as a jet of
+        ``order`` can hold in the coefficients, the rest in the relief."""
+        t, turn = self.template, self._axes @ state.rotation.as_matrix()
+        y = np.linalg.solve(turn, (vertices - t.origin - self._axes @ state.translation).T).T
+        offset = np.column_stack([y[:, :2] - t.chart, y[:, 2]])
+        found = State(np.zeros_like(state.alpha), offset, state.rotation, state.translation)
+        offset[:, 2] -= self.surface(found).basis @ self._alpha
+        return self.absorbed(found, order)
+
     def absorbed(self, state, order, ridge=1e-6):
         """The state of the same surface with as much of the relief as a jet of ``order`` can hold in the coefficients instead; ``ridge``
         holds those that the vertices do not determine."""
@@ -410,9 +420,10 @@ def assemble(pattern, surface, projection, evaluation, lengths, stiffness, wide=
 
     ``projection`` (N, 2, 3): of the vertices; ``evaluation``: :class:`polysft_mi.registration.Evaluation`; ``lengths`` (E,) [m]: of the
     template's edges; ``stiffness`` [1/m^2]: weight of the squared differences to them; ``wide``: a :class:`Pattern` that holds
-    this one, where the relief is an unknown too (d = 3) and the local block is to have that pattern; ``give``: the strain at which a
-    stretched edge pulls hardest. An excess e > 0 over the length L costs c^2 log(1 + e^2 / c^2), c = give L: cloth that hangs from a point
-    is stretched there by a tenth, and by squares that would turn the whole sheet. What is compressed buckles; its costs are squares.
+    this one, where the relief is an unknown too (d = 3) and the local block is to have that pattern; ``give``: the strain from which on
+    a stretched edge hardly pulls harder. An excess e > 0 over the length L costs 2 c^2 ((1 + e^2 / c^2)^1/2 - 1), c = give L (Charbonnier):
+    cloth that hangs from a point is stretched there by a tenth, and by squares that would turn the whole sheet. What is compressed buckles;
+    its costs are squares.
     """
     d = 2 if wide is None else 3
     a, b = pattern.edges.T
@@ -421,8 +432,8 @@ def assemble(pattern, surface, projection, evaluation, lengths, stiffness, wide=
     direction = edge / length[:, None]
     excess = length - lengths
     over = (np.maximum(excess, 0) / (give * lengths)) ** 2
-    energy = stiffness * float((excess**2 * np.divide(np.log1p(over), over, out=np.ones_like(over), where=over > 0)).sum())
-    heavy = 2 * stiffness / (1 + over)  # (E,): of each edge
+    energy = stiffness * float((excess**2 * 2 / (1 + np.sqrt(1 + over))).sum())
+    heavy = 2 * stiffness / np.sqrt(1 + over)  # (E,): of each edge
     pull = (heavy * excess)[:, None] * direction
     gradient = evaluation.gradient + pattern.from_ends @ np.concatenate([pull, -pull])
 

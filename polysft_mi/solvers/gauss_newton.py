@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import LinAlgError, block_diag, cho_factor, cho_solve
+from scipy.spatial.transform import Rotation
 from threadpoolctl import ThreadpoolController
 
 from ..errors import InputError
@@ -24,6 +25,7 @@ _SUSPECT, _SUSPECT_MARGIN, _MEMORY = 1.25, 0.03, 5  # a misfit above this many t
 _PATIENT = 18  # iterations a stage where a frame is suspect
 _RAISE = 0.02  # share of the objective by which more coefficients must lower it to be taken
 _LOWER = 2.0  # the highest coefficients are kept where they are worth this many times what they would make of noise alone
+_DAMPING = {2: 1e-4, 3: 3e-3}  # at a stage's start, by the local unknowns of a vertex: with less, what no pixel holds is thrown about
 _UNDAMPED = 1e-9  # damping where a model is asked about, not followed
 _JOINT = 3  # iterations of a whole window, each of whose frames has been solved
 _ORDER_STEP = 2
@@ -32,7 +34,10 @@ _TEXTURE_MISFIT, _TEXTURE_GAIN, _TEXTURE_FARTHEST = 0.15, 0.6, 0.08
 _TEXTURE_ITERATIONS, _TEXTURE_STIFFNESS = 6, 1.0
 _SHOWN = 0.7  # share of the pixels that see the sheet below which neither a stage nor another start may go: what none sees costs nothing
 _FARTHEST_STEP = 2.0  # rotation [rad], translation and displacements [chart units]
-_FACTS = "misfit", "outlying", "order", "least_misfit"
+# The mirror twin is tried where the sheet bulges by this share of its size, and again each time that it bulges so many times as much; it is
+# taken where it costs this much less.
+_BULGE, _BULGE_GROWTH, _TWIN_GAIN = 0.01, 1.4, 0.03
+_FACTS = "misfit", "outlying", "order", "least_misfit", "bulge"
 _RELIEF_VERTICES = 3000  # of the template, above which there is no relief: its wide system takes a second an iteration at 10,000
 _RELIEF_BEND = 3e-3  # of the relief's weight, for its bending
 # Noise must not become ripples, which use up length. What noise there is, the least misfit of the frames so far tells, the first one aside,
@@ -40,7 +45,7 @@ _RELIEF_BEND = 3e-3  # of the relief's weight, for its bending
 # that power of it, to so many times.
 _NOISE_MISFIT, _NOISE_POWER, _NOISE_MOST = 0.05, 8, 1e3
 _UNEXPLAINED, _UNEXPLAINED_FACTOR = 0.02, 4.0  # a misfit above this, and above so many times the least, is no noise: the jet does not follow
-_GIVE = 0.01  # strain at which a stretched edge pulls hardest, where images are clean
+_GIVE = 0.002  # strain from which on a stretched edge hardly pulls harder, where images are clean
 _MOVED = 0.15  # misfit at a frame's start above which the sheet has moved far: lengths lead it there, and edges do not give in the coarse stages
 _TEMPORAL = 1e-3  # of k_tc: it holds a frame to the one before, in a stiffer basis than the monomials of the paper's window
 
@@ -84,7 +89,7 @@ class Stage:
 
 # Soft edges first, so that the texture coordinates register to the image before lengths are enforced: in a stiff flat sheet that is compressed
 # in the image, height has no first-order effect, and it would drift in depth instead of bending.
-STAGES = Stage(2.5, 1e2, 6, (0.0, 0.08)), Stage(1.5, 3e2, 5, (0.08, 0.08)), Stage(1.0, 1e3, 4, (math.inf, math.inf))
+STAGES = Stage(2.5, 1e2, 6, (0.0, 0.08)), Stage(1.5, 3e2, 4, (0.08, 0.08)), Stage(1.0, 1e3, 3, (math.inf, math.inf))
 FAR = Stage(6.0, 1e2, 6)  # before the others where the sheet has moved far
 
 
@@ -179,6 +184,7 @@ class GaussNewton:
         self.pattern, wide = Pattern(faces, template.edges, count), Pattern(faces, template.edges, count, across)
         self.systems = {2: Blocks(self.pattern), 3: Blocks(wide, 3)}  # by the local unknowns of a vertex
         self.bends = bends
+        self._has_relief = self.settings.k_relief > 0 and count <= _RELIEF_VERTICES
         self._relief_blocks = wide.laplacian + _RELIEF_BEND * wide.blocks_of(bends.T @ bends)
         self.lengths = np.array(problem.edge_lengths, dtype=np.float64)
         position, _ = problem.camera.project(template.vertices)
@@ -257,11 +263,49 @@ class GaussNewton:
                         best = min(best, found, key=_cost)
                 if best[1]["misfit"] <= limit:
                     break
+        best, bulge = self._turned_over(*best, frame, order, max((t.get("bulge") or 0.0 for t in past[-1:]), default=0.0))
         state, terms = self._adapt_order(*best, anchor, frame)
+        terms["bulge"] = bulge
         return self.chart.absorbed(state, self.least), terms
 
     def _reduced(self, normal, damping, dtype=np.float64):
         return Reduced(self.systems[normal.local.shape[-1]], normal, damping, dtype)
+
+    def _turned_over(self, state, terms, frame, order, tried):
+        """(state, terms), or those of its mirror twin where that explains the frame better; and the greatest bulge at which the twin was
+        ``tried``.
+
+        Seen from afar, a bulge towards the camera looks like one away from it. Which way a sheet starts to bulge is a matter of chance, and
+        only when it has gone far does the perspective tell; by then no small step leads to the other side.
+        """
+        bulge, twin = self._twin(state, order)
+        if bulge < _BULGE:
+            return (state, terms), 0.0
+        if bulge < _BULGE_GROWTH * tried:
+            return (state, terms), tried
+        fitting = dict(self._fitting)
+        found = self._descend(twin, twin, frame, order, STAGES)
+        if _cost(found) < (1 - _TWIN_GAIN) * _cost((state, terms)) and found[1]["pixels"] > _SHOWN * terms["pixels"]:
+            return found, bulge
+        self._fitting = fitting
+        return (state, terms), bulge
+
+    def _twin(self, state, order):
+        """How far the sheet bulges, and the state that bulges the other way.
+
+        The first: RMS of the depths less those of the template, laid over the sheet as a rigid body, over the template's unit of length.
+        The second has the opposite differences, and its vertices along the same rays.
+        """
+        template, camera = self.chart.template, self._problem.camera
+        vertices = self.chart.surface(state, 0).vertices
+        centre, middle = template.vertices.mean(0), vertices.mean(0)
+        motion, _ = Rotation.align_vectors(vertices - middle, template.vertices - centre)
+        depth, flat = (camera.to_camera(x)[:, 2] for x in (vertices, motion.apply(template.vertices - centre) + middle))
+        turned = camera.origin + (vertices - camera.origin) * ((2 * flat - depth) / depth)[:, None]
+        twin = self.chart.through(state, turned, order)
+        if not self._has_relief:
+            twin.offset[:, 2] = 0.0
+        return float(np.sqrt(np.mean((depth - flat) ** 2))) / template.scale, twin
 
     def _nearest(self, starts, frame, stage):
         """The start that explains the frame best, and its misfit."""
@@ -289,7 +333,7 @@ class GaussNewton:
         """Levenberg-Marquardt at one stage: (state, terms). Its robust scale is the one that fitted the frame before."""
         scale = self._scales.get(stage, _FIRST_SCALE)
         normal, terms = self._linearise(state, anchor, frame, order, stage, scale)
-        damping, least = 1e-4, _SHOWN * terms["pixels"]
+        damping, least = _DAMPING[normal.local.shape[-1]], _SHOWN * terms["pixels"]
         for _ in range(iterations):
             try:
                 step, promised = self._reduced(normal, damping, np.float32).step()
@@ -405,7 +449,7 @@ class GaussNewton:
         give = math.inf if stiffness is not None or (self._moved and stage in (FAR, STAGES[0])) else _GIVE * caution
         stiffness = s.k_mi * (stage.stiffness if stiffness is None else stiffness) / chart.template.scale**2
         projection = self.registration.projection(surface.vertices)
-        d = 3 if s.k_relief > 0 and len(state.offset) <= _RELIEF_VERTICES and self._noise < stage.relief[self._unexplained] else 2
+        d = 3 if self._has_relief and self._noise < stage.relief[self._unexplained] else 2
         relief = s.k_relief * caution
         pattern = self.systems[d].pattern
         wide = pattern if d == 3 else None
@@ -504,7 +548,7 @@ class GaussNewton:
         """:class:`Solution` of a window: its states, the terms of each, and those of its newest frame when it was solved."""
         names = [name for name in found[0] if name not in (*_FACTS, "pixels", "model", "total")]
         terms = {name: float(np.mean([f[name] for f in found])) for name in names}
-        facts = {name: newest[name] for name in _FACTS}
+        facts = {name: newest.get(name, math.nan) for name in _FACTS}
         facts |= {f"scale_{k}": self._fitting.get(stage, _FIRST_SCALE) for k, stage in enumerate((FAR, *STAGES))}
         window = [Unknowns.from_numpy(self.chart.arrays(state)) for state in states]
         return Solution(window, sum(terms.values()), terms, self._count, facts, [self._sigma(f["model"]) for f in found])
