@@ -364,10 +364,11 @@ def plot(path, results):
     figure = Figure(figsize=(4.2 * len(panels), 4), dpi=110, layout="constrained")
     for axes, name in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels):
         shown = [r for r in timed if name in r["figures"]]
+        named = []
         for sequence in dict.fromkeys(r["sequence"] for r in shown):
             points = sorted((r["seconds_a_frame"], r["figures"][name]) for r in shown if r["sequence"] == sequence)
             axes.plot(*zip(*points), color="0.85", linewidth=0.8, zorder=1)
-            axes.annotate(sequence, points[0], xytext=(6, 4), textcoords="offset points", fontsize=7, color="0.35")
+            named.append((points[0], sequence))
         for method, (colour, marker) in COLOURS.items():
             points = [(r["seconds_a_frame"], r["figures"][name]) for r in shown if r["method"] == method]
             if points:
@@ -376,6 +377,7 @@ def plot(path, results):
         for axis in (axes.xaxis, axes.yaxis):  # plain numbers
             axis.set_major_formatter(LogFormatter()), axis.set_minor_formatter(LogFormatter())
         axes.margins(0.15)
+        _label(axes, named)
         axes.set_title(LABELS[name], fontsize=9, loc="left")
         axes.set_xlabel("seconds a frame", fontsize=8)
         axes.tick_params(labelsize=7, which="both")
@@ -385,6 +387,18 @@ def plot(path, results):
     with aside(path) as temporary:
         figure.savefig(temporary, format="png", facecolor="white")
     return True
+
+
+def _label(axes, named):
+    """Write names, (point, name) each, beside their points, upwards of one another where points lie close together."""
+    axes.autoscale_view()  # else the limits come later
+    position = axes.transLimits.transform  # of logarithms, to shares of the axes
+    places = [(*position(np.log10(point)), name) for point, name in named]
+    least = -np.inf
+    for x, y, name in sorted(places, key=lambda place: place[1]):
+        y = max(y, least)
+        least = y + 0.04
+        axes.text(x + 0.025, y, name, transform=axes.transAxes, fontsize=7, color="0.35")
 
 
 def report(results, folder):

@@ -14,7 +14,7 @@ from scipy.linalg import LinAlgError, block_diag
 from scipy.spatial.transform import Rotation
 
 from polyfit import jets
-from polysft_mi import objective, prepare, pyramid, registration, scene, solvers
+from polysft_mi import normal_equations, objective, prepare, pyramid, registration, scene, solvers
 from polysft_mi.errors import InputError
 from polysft_mi.normal_equations import Blocks, Chart, Normal, Pattern, Reduced, State, assemble, hinges
 from polysft_mi.patch import Unknowns
@@ -208,8 +208,10 @@ def random_normal(pattern, size=9, d=2):
     return Normal(blocks, cross, glob, RNG.normal(size=(pattern.count, d)), RNG.normal(size=size))
 
 
+@pytest.mark.parametrize("alone", [0, 1000])  # rows a block below which one thread does it all
 @pytest.mark.parametrize("rows, columns, d", [(2, 2, 2), (3, 9, 2), (8, 7, 2), (2, 2, 3), (8, 7, 3)])
-def test_step_and_variance_are_those_of_the_dense_system(rows, columns, d):
+def test_step_and_variance_are_those_of_the_dense_system(monkeypatch, rows, columns, d, alone):
+    monkeypatch.setattr(normal_equations, "_ALONE", alone)
     template = grid_template(rows, columns, order=1)
     further = hinges(template.chart, template.faces)[0] if d == 3 else None
     pattern = Pattern(template.faces, template.edges, rows * columns, further)
@@ -247,6 +249,19 @@ def test_step_and_variance_are_those_of_the_dense_system(rows, columns, d):
     assert np.allclose(step, whole[n:], rtol=1e-5, atol=1e-7)
     assert np.allclose((reduced.following(step) - reduced.slide()).ravel(), whole[:n], rtol=1e-5, atol=1e-6)
     assert increase == pytest.approx(0.5 * whole @ h @ whole, rel=1e-5)
+
+
+@pytest.mark.parametrize("vertex", [0, 30, 55])  # in either half, and in the middle
+def test_a_block_that_is_not_positive_is_refused_in_either_thread(monkeypatch, vertex):
+    monkeypatch.setattr(normal_equations, "_ALONE", 0)
+    template = grid_template(8, 7, order=1)
+    pattern = Pattern(template.faces, template.edges, 56)
+    normal = random_normal(pattern)
+    normal.local[pattern.diagonal[pattern.order[vertex]]] -= 1e3 * np.eye(2)
+    blocks = Blocks(pattern)
+    assert len({blocks.middle, *(k for chain in blocks.chains for k in chain[:1])}) == 3
+    with pytest.raises(LinAlgError, match="not positive definite"):
+        Reduced(blocks, normal, 0)
 
 
 def test_a_disconnected_and_irregular_mesh_is_factorised():
