@@ -347,6 +347,8 @@ def page(results, picture):
             "*Best jet* is the jet that comes closest to the true vertices of each frame, found by a local search: about the least "
             "distance that its order can leave. Its normals are what they are then, not the best possible."
         )
+    if any(np.isinf(value) for r in results for value in r.get("figures", {}).values() if isinstance(value, float)):
+        text.append("*inf*: there is a frame whose surface none of the truth's rays meets; the plot leaves it out.")
     if any(r.get("seconds_a_frame") for r in results):
         text.append(f"![Accuracy against seconds a frame, one marker a method]({picture})")
     return "\n\n".join([*text, table(results)]) + "\n"
@@ -358,12 +360,12 @@ def plot(path, results):
     from matplotlib.ticker import LogFormatter
 
     timed = [r for r in results if r.get("seconds_a_frame") and "figures" in r]
-    panels = [name for name in PANELS if any(name in r["figures"] for r in timed)]
+    panels = [name for name in PANELS if any(np.isfinite(r["figures"].get(name, np.nan)) for r in timed)]
     if not panels:
         return False
     figure = Figure(figsize=(4.2 * len(panels), 4), dpi=110, layout="constrained")
     for axes, name in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels):
-        shown = [r for r in timed if name in r["figures"]]
+        shown = [r for r in timed if np.isfinite(r["figures"].get(name, np.nan))]  # infinite where a sheet has left the truth's rays
         named = []
         for sequence in dict.fromkeys(r["sequence"] for r in shown):
             points = sorted((r["seconds_a_frame"], r["figures"][name]) for r in shown if r["sequence"] == sequence)

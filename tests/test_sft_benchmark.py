@@ -1,6 +1,7 @@
 """The comparison of solvers at tiny sizes: the baseline descends towards the truth; results are kept, shown and not made twice."""
 
 import json
+import math
 import shutil
 from pathlib import Path
 
@@ -123,6 +124,14 @@ def test_report_writes_page_and_plot(tmp_path):
     page = (tmp_path / "docs" / "sft.md").read_text()
     assert text in page and "Some CPU, 2 cores, `llvm_ad_rgb`" in page and "](sft.png)" in page
     assert (tmp_path / "docs" / "sft.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_sheet_that_was_lost_is_told_and_not_plotted(tmp_path):
+    lost = result("kinect_paper", figures={"depth_rmse_mm": math.inf, "depth_rmse_mm_worst": math.inf, "depth_rmse_allpix_mm": math.inf})
+    assert "| inf | inf | inf |" in sft.report([result(), lost], str(tmp_path))
+    assert "*inf*:" in (tmp_path / "sft.md").read_text() and (tmp_path / "sft.png").exists()
+    sft.report([result()], str(tmp_path))
+    assert "*inf*:" not in (tmp_path / "sft.md").read_text()
 
 
 def test_an_empty_report_has_no_plot(tmp_path):
