@@ -37,20 +37,22 @@ def _int(n):
 
 def cholesky(a):
     """The lower triangle of a (n, n) becomes L, L L^T = a; what is above it stays. Raises LinAlgError where a is not positive definite."""
-    potrf, _ = _routine(cython_lapack, "potrf", a.dtype, 5)
-    bad, (address, apart) = ctypes.c_int(0), _matrix(a)
-    potrf(b"L", _int(len(a)), address, apart, ctypes.byref(bad))
-    if bad.value:
+    if not _lower("potrf", a):
         raise LinAlgError("the matrix is not positive definite")
 
 
 def inverse(a):
-    """The lower triangle of a (n, n), holding L, becomes that of (L L^T)^-1."""
-    potri, _ = _routine(cython_lapack, "potri", a.dtype, 5)
-    bad, (address, apart) = ctypes.c_int(0), _matrix(a)
-    potri(b"L", _int(len(a)), address, apart, ctypes.byref(bad))
-    if bad.value:
+    """The lower triangle of a (n, n), holding L, becomes that of (L L^T)^-1. Raises LinAlgError where L is singular."""
+    if not _lower("potri", a):
         raise LinAlgError("the factor is singular")
+
+
+def _lower(name, a):
+    """Run a routine of LAPACK on the lower triangle of a (n, n); whether it could."""
+    routine, _ = _routine(cython_lapack, name, a.dtype, 5)
+    bad, (address, apart) = ctypes.c_int(0), _matrix(a)
+    routine(b"L", _int(len(a)), address, apart, ctypes.byref(bad))
+    return not bad.value
 
 
 def solve(factor, b, transposed=False, right=False):
