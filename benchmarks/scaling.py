@@ -200,8 +200,9 @@ threads together: on idle cores it takes less, for reading the next frame and th
 
 With the image grow decoding, rays and residuals; only the finest of the three stages works on every pixel that sees the sheet. With the template
 grows above all the elimination of each vertex's (Δu, Δv): a sheet's block tridiagonal matrix is as wide as the sheet, so that its factorisation grows
-with the square of the number of vertices (half of the time at 10,000). Up to 3,000 vertices the relief moves too, which
-costs more evaluations, and on a sheet as smooth as this one its noise is to be seen in the distances.
+with the square of the number of vertices. Up to 3,000 vertices the relief moves too, which
+costs time, and on a sheet as smooth as this one its noise is to be seen in the distances. This sheet bends within a few frames, so that its mirror
+twin is tried in most of them: evaluations are up to twice those of a longer video.
 """
     with aside(os.path.join(docs, "scaling.md")) as temporary, open(temporary, "w", encoding="utf-8") as file:
         file.write(text)
