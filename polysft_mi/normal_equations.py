@@ -296,6 +296,10 @@ class Blocks:
         """The rows of block k, a slice; its size is the blocks' but for the last one's."""
         return slice(k * self.size, min((k + 1) * self.size, self.d * self.pattern.count))
 
+    def following(self, k):
+        """The next block after k towards the middle."""
+        return k + (1 if k < self.middle else -1)
+
     def both(self, run):
         """Run either chain of blocks, the second in a thread of its own where blocks are large enough to be worth it."""
         first, second = self.chains
@@ -327,7 +331,7 @@ class Blocks:
 
         def run(chain):
             for k in chain:
-                following = k + (1 if k < self.middle else -1)
+                following = self.following(k)
                 lapack.cholesky(factors[k])
                 lapack.solve(factors[k], y[parts[k]].T, transposed=True, right=True)
                 coupling[k] = w = beside[k].T[: sizes[k], : sizes[following]]
@@ -366,7 +370,7 @@ class Elimination:
 
         def run(chain):
             for k in reversed(chain):
-                x[blocks.rows(k)] -= self.coupling[k] @ x[blocks.rows(k + (1 if k < blocks.middle else -1))]
+                x[blocks.rows(k)] -= self.coupling[k] @ x[blocks.rows(blocks.following(k))]
                 solve(k)
 
         solve(blocks.middle)
@@ -393,7 +397,7 @@ class Elimination:
 
         def run(chain):
             for k in reversed(chain):
-                fill(k, k + (1 if k < blocks.middle else -1))
+                fill(k, blocks.following(k))
 
         fill(blocks.middle)
         blocks.both(run)
@@ -527,10 +531,10 @@ class Reduced:
         """The step (global (G,), local (N, d)), and the decrease that the model promises. Raises LinAlgError where what remains is not
         positive definite.
         """
-        g = self._least()
+        g = self._minimum()
         return (g, self.following(g)), self.promised(g)
 
-    def _least(self):
+    def _minimum(self):
         return -cho_solve(cho_factor(self.schur, check_finite=False), self.right, check_finite=False)
 
     def promised(self, g):
@@ -549,7 +553,7 @@ class Reduced:
 
     def decrease(self):
         """The decrease that :meth:`step` promises, without the step. Raises LinAlgError like it."""
-        return self.promised(self._least())
+        return self.promised(self._minimum())
 
     def lower(self, size):
         """The same where only the first ``size`` coefficients, the motion and the local unknowns may move."""

@@ -263,7 +263,8 @@ class GaussNewton:
                         best = min(best, found, key=_cost)
                 if best[1]["misfit"] <= limit:
                     break
-        best, bulge = self._turned_over(*best, frame, order, max((t.get("bulge") or 0.0 for t in past[-1:]), default=0.0))
+        tried = past[-1].get("bulge") or 0.0 if past else 0.0
+        best, bulge = self._turned_over(*best, frame, order, tried)
         state, terms = self._adapt_order(*best, anchor, frame)
         terms["bulge"] = bulge
         return self.chart.absorbed(state, self.least), terms
