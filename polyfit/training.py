@@ -7,6 +7,7 @@ import math
 import os
 import platform
 import time
+from importlib import import_module
 from pathlib import Path
 
 import torch
@@ -26,6 +27,9 @@ class Processes:
         self.count, self.rank = int(os.environ.get("WORLD_SIZE", 1)), int(os.environ.get("RANK", 0))
         self.device = torch.device(f"cuda:{os.environ.get('LOCAL_RANK', 0)}" if device == "cuda" and self.count > 1 else device)
         if self.count > 1:
+            # Its functions take the group there is when they are imported as a default, and Adam imports them: after the line below they
+            # would keep the group, whose threads then outlive destroy_process_group and now and then abort the ending interpreter.
+            import_module("torch.distributed.nn.functional")
             torch.distributed.init_process_group("nccl" if device == "cuda" else "gloo")
 
     def wait(self):
