@@ -492,6 +492,28 @@ def assemble(pattern, surface, projection, evaluation, lengths, stiffness, wide=
     return normal, energy
 
 
+def add_triangles(normal, pattern, faces, surface, residual, factor, by_corner):
+    """Adds a term of the triangles ``faces`` (F, 3) of the mesh to a :class:`Normal`: half the sum of ``factor`` (F,) times r^2, with the ``residual``
+    r (F,) and its derivatives ``by_corner`` (F, 3, 3) [1/m] by the corners' positions. ``pattern``: of the local block."""
+    count, d = len(surface.vertices), normal.local.shape[-1]
+    by_local = np.einsum("fck,fcka->fca", by_corner, surface.by_offset[faces])  # (F, 3, 3); the last is by the height
+    corners = sp.csr_matrix((by_local[:, :, 2].ravel(), faces.ravel(), 3 * np.arange(len(faces) + 1)), shape=(len(faces), count))
+    by_global = np.concatenate([corners @ surface.basis, np.einsum("fck,fckm->fm", by_corner, surface.by_motion[faces])], 1)
+    by_local = by_local[:, :, :d]
+    pulled = factor[:, None, None] * by_local
+    rows = sp.csr_matrix(
+        (by_local.ravel(), (d * faces[:, :, None] + np.arange(d)).ravel(), 3 * d * np.arange(len(faces) + 1)), shape=(len(faces), d * count)
+    )
+    weighted = factor[:, None] * by_global
+    pull = factor * residual
+    normal.local_gradient += (rows.T @ pull).reshape(-1, d)
+    normal.gradient += by_global.T @ pull
+    normal.cross += rows.T @ weighted
+    normal.glob += by_global.T @ weighted
+    blocks = by_local[:, :, None, :, None] * pulled[:, None, :, None, :]  # (F, 3, 3, d, d)
+    normal.local += (pattern.from_faces @ blocks.reshape(-1, d * d)).reshape(-1, d, d)
+
+
 def _conjugated(blocks, s, pattern):
     """s_i^T blocks_ij s_j of each block of the pattern, (B, 3, 3): ``blocks`` (B, 2, 2), ``s`` (N, 2, 3). By components: products of whole
     arrays are faster than many small matrix products.

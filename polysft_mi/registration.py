@@ -16,6 +16,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial import cKDTree
 
+from .light import Brightness
 from .problem import BadFrame
 from .pyramid import FARTHEST, compared, level_image
 
@@ -26,6 +27,7 @@ _SUMS = 18 + 9 + 4  # of second derivatives, of first ones and of figures, a tri
 _SILHOUETTE = 0.1  # of k_silhouette: robust, normalised residuals are smaller than colours, and masks are ragged
 _MISFIT = 0.5  # residual, in local standard deviations, that counts half a misfit
 _CACHED_FRAMES = 4
+SHADE = "shade"  # a frame as shading is read from it, beside its levels
 
 
 @dataclass
@@ -36,7 +38,7 @@ class Evaluation:
     Gauss-Newton blocks of each triangle's corner pairs (row by row) with respect to the corners' projections [1/pixel^2]; ``rows``: the
     silhouette's residuals as (i, j, ci, cj, h), each with derivative ci (K, 2) and cj by the projections of the vertices i and j and
     curvature h (K,); ``pixels``: how many were compared; ``outlying``: the mean of r^2 / (r^2 + scale^2) over them, and ``misfit`` with a
-    fixed scale; both 1 where no pixel is compared.
+    fixed scale; both 1 where no pixel is compared; ``seen`` (F,): pixels of the video that see each triangle and are compared.
     """
 
     photometric: float
@@ -47,6 +49,7 @@ class Evaluation:
     second: np.ndarray
     rows: tuple
     pixels: float
+    seen: np.ndarray
 
 
 class Registration:
@@ -64,12 +67,13 @@ class Registration:
         self.corner = experiment.corner
         self.faces = self.corner[faces]  # the template's vertices at the corners of the rendered triangles, (F, 3)
         self._texcoord = mi.Float(np.array(mesh.vertex_texcoords_buffer()))
+        self._faces = faces
         self._bake(mesh, faces)
         self._textures, self._frames = {}, OrderedDict()
         self._reader = ThreadPoolExecutor(1)
         sequence = problem.sequence
         self._decoded = lru_cache(2)(lambda frame: (sequence.frame(frame), sequence.mask(frame)))  # all levels are made of one decoding
-        self.levels = ()
+        self._brightness = None
         self.normalise = problem.settings.lighting == "local"
 
     # -- images -------------------------------------------------------------
@@ -104,14 +108,34 @@ class Registration:
         self._texel = [mi.Vector2f(*(float(shape[k] / size[k]) for k in (0, 1))), mi.Point2f(*(float(margin - 0.5 - low[k] * shape[k] / size[k]) for k in (0, 1)))]
         dr.make_opaque(self._texel)
 
+    @property
+    def brightness(self):
+        """:class:`polysft_mi.light.Brightness` of the template and the video."""
+        if self._brightness is None:
+            texels = self._texels()[self._faces].mean(1)
+            position, _ = self.camera.project(self.problem.template.vertices)
+            masked = bool(self.problem.experiment.masks)
+            self._brightness = Brightness(self.faces, position, self.texture, self.texture_inside, texels, _TEXELS, masked)
+        return self._brightness
+
+    def shade(self, vertices, frame, seen):
+        """The triangles' :class:`polysft_mi.light.Shade` in a frame; vertices (N, 3) [m, world], ``seen`` as in :class:`Evaluation`."""
+        if (frame, SHADE) not in self._frames:
+            self.expect([frame], [SHADE])
+        position, _ = self.camera.project(vertices)
+        return self.brightness.of(self._frames[frame, SHADE].result(), vertices, self.camera.origin, position, seen)
+
+    def _texels(self):
+        """Pixels of ``texture`` (OpenCV's, whole at their centres) of the rendered vertices, (V, 2)."""
+        return np.array(self._texcoord, dtype=np.float64).reshape(-1, 2) * np.array(self._texel[0]).ravel() + np.array(self._texel[1]).ravel()
+
     def on_template(self, texels):
         """Points (K, 3) [m, world] of the undeformed template at pixels (K, 2) of ``texture`` (OpenCV's, whole at their centres); NaN
         beyond it.
         """
         from scipy.interpolate import LinearNDInterpolator  # a tenth of the start, and seldom needed
 
-        coordinates = np.array(self._texcoord, dtype=np.float64).reshape(-1, 2) * np.array(self._texel[0]).ravel() + np.array(self._texel[1]).ravel()
-        return LinearNDInterpolator(coordinates, self.problem.template.vertices[self.corner])(texels)
+        return LinearNDInterpolator(self._texels(), self.problem.template.vertices[self.corner])(texels)
 
     def _texture_level(self, level):
         """The texture at a level: packed Float of 4 channels, width, height."""
@@ -149,12 +173,14 @@ class Registration:
                 rows = np.column_stack([np.ones(len(k)), displaced[k] - chart[i]])
                 inside[i] = np.linalg.lstsq(rows, shown[k], rcond=None)[0][0]
         moved = inside[self.corner]
-        self._texcoord = mi.Float(moved.astype(np.float32).ravel())
+        self._texcoord, self._brightness = mi.Float(moved.astype(np.float32).ravel()), None
         self.problem.set_texcoords(self._texcoord)
         return True
 
     def expect(self, frames, levels):
-        """Read and prepare frames in a second thread, for the levels given."""
+        """Read and prepare frames in a second thread, for the levels given; SHADE is one."""
+        if SHADE in levels:
+            self.brightness  # made here: a thread of its own must not touch the device
         for frame in frames:
             for level in levels:
                 key = (frame, level)
@@ -165,6 +191,8 @@ class Registration:
             self._frames.popitem(last=False)
 
     def _read(self, frame, level):
+        if level is SHADE:
+            return self.brightness.prepared(*self._decoded(frame))
         return level_image(*self._decoded(frame), level, self.normalise)
 
     def _frame_level(self, frame, level):
@@ -308,7 +336,7 @@ class Registration:
             silhouette, rows, pull = self._pull(vertices, pairs, frame, level, _SILHOUETTE * s.k_silhouette / area)
             gradient += pull
         outlying, misfit = (outlying / pixels, misfit / pixels) if pixels else (1.0, 1.0)
-        return Evaluation(weight * energy, silhouette, outlying, misfit, gradient, second, rows, pixels * level.stride**2)
+        return Evaluation(weight * energy, silhouette, outlying, misfit, gradient, second, rows, pixels * level.stride**2, table[:, 28] * level.stride**2)
 
     def _by_triangle(self, triangle, found):
         """Sums over the pixels that see each triangle (F, 31) float64: 18 of curvature, 9 of slope and 4 figures.

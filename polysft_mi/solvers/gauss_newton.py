@@ -9,11 +9,12 @@ from scipy.spatial.transform import Rotation
 from threadpoolctl import ThreadpoolController
 
 from ..errors import InputError
-from ..normal_equations import Blocks, Chart, Normal, Pattern, Reduced, State, Surface, assemble, hinges
+from ..light import Light, residuals
+from ..normal_equations import Blocks, Chart, Normal, Pattern, Reduced, State, Surface, add_triangles, assemble, hinges
 from ..patch import Unknowns
 from ..problem import BadFrame
 from ..pyramid import Level
-from ..registration import Evaluation, Registration
+from ..registration import SHADE, Evaluation, Registration
 from ..relocate import Relocator
 from . import Solution
 
@@ -37,7 +38,7 @@ _FARTHEST_STEP = 2.0  # rotation [rad], translation and displacements [chart uni
 # The mirror twin is tried where the sheet bulges by this share of its size, and again each time that it bulges so many times as much; it is
 # taken where it costs this much less.
 _BULGE, _BULGE_GROWTH, _TWIN_GAIN = 0.01, 1.4, 0.03
-_FACTS = "misfit", "outlying", "order", "least_misfit", "bulge"
+_FACTS = "misfit", "outlying", "order", "least_misfit", "bulge", *Light.NAMES
 _RELIEF_VERTICES = 3000  # of the template, above which there is no relief: its wide system takes a second an iteration at 10,000
 _RELIEF_BEND = 3e-3  # of the relief's weight, for its bending
 # Noise must not become ripples, which use up length. What noise there is, the least misfit of the frames so far tells, the first one aside,
@@ -91,6 +92,7 @@ class Stage:
 # in the image, height has no first-order effect, and it would drift in depth instead of bending.
 STAGES = Stage(2.5, 1e2, 6, (0.0, 0.08)), Stage(1.5, 3e2, 4, (0.08, 0.08)), Stage(1.0, 1e3, 3, (math.inf, math.inf))
 FAR = Stage(6.0, 1e2, 6)  # before the others where the sheet has moved far
+_SHADED = STAGES[1:]  # in the first, lengths are soft, and shading would bend the sheet before its texture lies where the image shows it
 
 
 class GaussNewton:
@@ -114,6 +116,7 @@ class GaussNewton:
         self._scales, self._fitting = {}, {}
         self._noise, self._unexplained = math.nan, False  # of the frame at work: the least misfit before it, NaN in the first, where the template has its shape
         self._moved = False  # whether the frame at work starts far from its image
+        self._light = Light.unknown()  # what the frames before say
         self._hold = 0.0  # weight of the difference to the anchor, motion included, where a frame is solved again
 
     def solve(self, problem, window, frames, report=None, past=()):
@@ -140,6 +143,7 @@ class GaussNewton:
             start = states[k] if past or k == 0 else states[k - 1]
             states[k], found = self._newest(start, frames[k], (before + states[:k])[-2:], known)
             found["least_misfit"] = float(np.fmin(least, found["misfit"])) if known else math.nan
+            found |= self._learned(found["model"], frames[k]).facts()
             known.append(found)
         if len(frames) == 1:
             return self._solution(states, [found], found)
@@ -170,6 +174,7 @@ class GaussNewton:
         finally:
             self._hold = 0.0
         found["least_misfit"] = least
+        found |= self._light.facts()
         return self._solution([state], [found], found)
 
     # -- preparation --------------------------------------------------------
@@ -226,17 +231,25 @@ class GaussNewton:
             reg.shift_texture(chart.template.chart, chart.template.chart + state.offset[:, :2])
 
     def _remember(self, known):
-        """What the frames before (their terms) say of the noise: sets it, and returns the least misfit, NaN where only the first is known."""
+        """What the frames before (their terms) say of noise and light: sets them, and returns the least misfit, NaN where only the first is
+        known."""
         misfit, least = (next((t[name] for t in reversed(known) if t.get(name) is not None), math.nan) for name in ("misfit", "least_misfit"))
         self._noise = misfit if math.isnan(least) else least
         self._unexplained = misfit > max(_UNEXPLAINED, _UNEXPLAINED_FACTOR * self._noise)
+        self._light = Light.of(next((t for t in reversed(known) if t.get(Light.NAMES[0]) is not None), {}))
         return least
 
     def _expect(self, frame):
         """Have this frame and the next one read in a second thread."""
         for k in (frame, frame + 1):
             if k < len(self._problem.sequence):
-                self.registration.expect([k], [self.levels[s] for s in STAGES])
+                self.registration.expect([k], [*(self.levels[s] for s in STAGES), *[SHADE] * (self.settings.k_shading > 0)])
+
+    def _learned(self, model, frame):
+        """What is known of the light after a frame, whose last :class:`Model` this is."""
+        if not self.settings.k_shading:
+            return self._light
+        return self._light.learned(self.registration.shade(model.surface.vertices, frame, model.evaluation.seen))
 
     # -- one frame ----------------------------------------------------------
 
@@ -455,6 +468,11 @@ class GaussNewton:
         pattern = self.systems[d].pattern
         wide = pattern if d == 3 else None
         normal, inextensibility = assemble(self.pattern, surface, projection, evaluation, self.lengths, stiffness, wide, give=give)
+        shading = 0.0
+        if s.k_shading > 0 and stage in _SHADED and self._light.frames:
+            shade = self.registration.shade(surface.vertices, frame, evaluation.seen)
+            shading, *rows = residuals(shade, self._light, s.k_shading * stage.stiffness / STAGES[-1].stiffness)
+            add_triangles(normal, pattern, self.registration.faces, surface, *rows)
         a = self.chart.size(order)
         bend = 2 * s.k_bend * chart.bending
         moved, slid = state.alpha - anchor.alpha, state.offset - anchor.offset
@@ -477,6 +495,7 @@ class GaussNewton:
         terms = {
             "rgb": evaluation.photometric,
             "silhouette": evaluation.silhouette,
+            "shading": shading,
             "inextensibility": inextensibility,
             "temporal": temporal * float((moved**2).sum()) + s.k_tc * _TEMPORAL * float((slid**2).sum()) + self._hold * float((motion**2).sum()),
             "smoothness": s.k_bend * float(state.alpha @ chart.bending @ state.alpha)

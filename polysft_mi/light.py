@@ -1,0 +1,183 @@
+"""Shading as a cue: how bright each triangle is under a light that is learned along with the video. NumPy and OpenCV.
+
+A triangle with the unit normal n towards the camera, whose texture has the luminance t, is taken to be seen with t (l_0 + l . n): light of
+first order, which holds most of what a matt surface reflects of any distant light (Basri and Jacobs, "Lambertian Reflectance and Linear
+Subspaces", PAMI 2003). Where the sheet casts shadows on itself that is wrong, hence a robust norm.
+"""
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+_LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # of linear RGB
+_BLUR = 0.45  # standard deviation of the blur of texture and frames, over the side of a square as large as a triangle is on average
+_COVERED = 0.7  # share of a triangle's pixels that must be seen
+_FRONTAL = 0.3  # cosine between normal and ray from which on a triangle counts
+_DARK = 0.01  # texture's luminance, over its mean, below which it says nothing
+_RIDGE = 3e-4  # what the light is held to be the same from all sides by, in observations a triangle
+_REFITS = 3
+_FIRST_SCALE, _SCALE, _SCALES = 0.05, 5.0, (0.005, 0.05)  # of the robust norm; then so many standard deviations, within bounds, over the texture's mean
+_NORMAL_DEVIATION = 1.4826  # standard deviation of a normal distribution over the median of its absolute values
+
+
+@dataclass(frozen=True)
+class Light:
+    """What the frames so far say of the light: normal equations ``matrix`` (4, 4) and ``right`` (4,) of (l_0, l), over the mean of the
+    texture's luminance; ``deviations``: the sum of the residuals' standard deviations in ``frames`` frames."""
+
+    matrix: np.ndarray
+    right: np.ndarray
+    deviations: float
+    frames: int
+
+    NAMES = tuple(f"light_{k}" for k in range(16))
+    _UPPER = np.triu_indices(4)
+
+    @classmethod
+    def unknown(cls):
+        return cls(np.zeros((4, 4)), np.zeros(4), 0.0, 0)
+
+    @classmethod
+    def of(cls, facts):
+        """The light that :meth:`facts` tell of; unknown where they do not."""
+        values = [facts.get(name) for name in cls.NAMES]
+        if any(v is None or not math.isfinite(v) for v in values):
+            return cls.unknown()
+        matrix = np.zeros((4, 4))
+        matrix[cls._UPPER] = values[:10]
+        return cls(matrix + np.triu(matrix, 1).T, np.array(values[10:14]), values[14], int(values[15]))
+
+    def facts(self):
+        return dict(zip(self.NAMES, (*self.matrix[self._UPPER].tolist(), *self.right.tolist(), self.deviations, self.frames)))
+
+    @property
+    def scale(self):
+        """The residual, over the texture's mean luminance, from which on one hardly counts."""
+        return float(np.clip(_SCALE * self.deviations / self.frames, *_SCALES)) if self.frames else _FIRST_SCALE
+
+    def coefficients(self, triangles):
+        """(l_0, l) (4,), of a sheet of so many triangles."""
+        held = _RIDGE * triangles * np.diag([0.0, 1.0, 1.0, 1.0])
+        return np.linalg.solve(self.matrix + held + 1e-9 * np.eye(4), self.right)
+
+    def learned(self, shade):
+        """The light after another frame, whose surface had the triangles ``shade`` (a :class:`Shade`)."""
+        rows = shade.texture[shade.seen, None] * np.column_stack([np.ones(shade.seen.sum()), shade.normal[shade.seen]])
+        value, scale = shade.luminance[shade.seen], self.scale
+        if len(value) < len(rows.T):
+            return self
+        light, found = self, np.array([1.0, 0.0, 0.0, 0.0]) if not self.frames else self.coefficients(len(shade.seen))
+        for _ in range(_REFITS):
+            weighted = rows / (1 + ((value - rows @ found) / scale) ** 2)[:, None]
+            light = Light(self.matrix + weighted.T @ rows, self.right + weighted.T @ value, self.deviations, self.frames)
+            found = light.coefficients(len(shade.seen))
+        deviation = _NORMAL_DEVIATION * float(np.median(np.abs(value - rows @ found)))
+        return Light(light.matrix, light.right, self.deviations + deviation, self.frames + 1)
+
+
+@dataclass
+class Shade:
+    """The triangles of a surface in a frame, (F,) or (F, 3) each: ``normal``, of length 1, towards the camera; ``texture`` and ``luminance``:
+    what the texture has and the frame shows, blurred alike, over the texture's mean; ``seen``: those that can be compared; ``sides``: two
+    (F, 3) [m], from the first corner; ``area`` [m^2]; ``side``: 1 or -1, whether the normal is that of the two sides or opposite."""
+
+    normal: np.ndarray
+    texture: np.ndarray
+    luminance: np.ndarray
+    seen: np.ndarray
+    sides: tuple
+    area: np.ndarray
+    side: np.ndarray
+
+
+class Brightness:
+    """Luminance of the template's texture and of frames, at the size of the triangles ``faces`` (F, 3).
+
+    ``position`` (N, 2) [pixels]: of the template's vertices in the image; ``texture`` (H, W, 3), ``inside`` (H, W): reflectance and where the
+    template has it; ``texels`` (F, 2): the triangles' centroids there [texels, whole at their centres]; ``density``: texels a pixel;
+    ``masked``: whether the frames have masks. Without them, what lies close to the border is left out, for the background is in it.
+    """
+
+    def __init__(self, faces, position, texture, inside, texels, density, masked):
+        self.faces = faces
+        self.sigma = _BLUR * math.sqrt(max(_areas(position, faces).mean(), 1.0))
+        sigma = density * self.sigma
+        covered = cv2.GaussianBlur(inside, (0, 0), sigma)
+        luminance = _blurred(texture @ _LUMINANCE, sigma, inside if masked else None)
+        found = _sampled(luminance, texels)
+        self.trusted = _sampled(covered, texels) > (0.3 if masked else 0.97)
+        self.mean = max(float(found[self.trusted].mean()) if self.trusted.any() else 0.0, 1e-6)
+        self.texture = found / self.mean
+        self.trusted &= self.texture > _DARK
+
+    def prepared(self, colour, mask):
+        """A frame (H, W, 3) as :meth:`of` wants it."""
+        image = colour @ _LUMINANCE
+        pool = max(1, int(self.sigma / 2))
+        if pool > 1:
+            height, width = image.shape[0] // pool, image.shape[1] // pool
+            shrink = lambda x: cv2.resize(x[: height * pool, : width * pool], (width, height), interpolation=cv2.INTER_AREA)
+            image, mask = shrink(image), None if mask is None else shrink(mask)
+        return _blurred(image, self.sigma / pool, mask) / self.mean, pool
+
+    def of(self, prepared, vertices, origin, position, pixels):
+        """The :class:`Shade` of the surface with ``vertices`` (N, 3) [m], which lie at ``position`` (N, 2) [pixels] in the image and of whose
+        triangles ``pixels`` (F,) are seen; ``origin`` (3,): the camera's."""
+        image, pool = prepared
+        corner = vertices[self.faces]
+        a, b = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+        ray = corner.sum(1) / 3 - origin
+        cross = _cross(a, b)
+        double = np.maximum(np.sqrt(np.einsum("fk,fk->f", cross, cross)), 1e-15)
+        towards = -np.einsum("fk,fk->f", cross, ray)
+        side = np.sign(towards)
+        normal = cross * (side / double)[:, None]
+        frontal = np.abs(towards) > _FRONTAL * double * np.sqrt(np.einsum("fk,fk->f", ray, ray))
+        luminance = _sampled(image, (position[self.faces].sum(1) / 3) / pool - 0.5)
+        seen = self.trusted & frontal & (pixels > _COVERED * _areas(position, self.faces))
+        return Shade(normal, self.texture, luminance, seen, (a, b), double / 2, side)
+
+
+def residuals(shade, light, weight):
+    """The shading term of a frame, ``weight`` times the mean over the area seen of c^2 log(1 + r^2 / c^2) with r = frame - t (l_0 + l . n).
+
+    Returns its energy, the residuals r (F,), the factors h (F,) of r^2 / 2 in its quadratic model, and the derivatives (F, 3, 3) of r by the
+    corners [1/m].
+    """
+    found, scale = light.coefficients(len(shade.seen)), light.scale
+    share = np.where(shade.seen, shade.area, 0.0)
+    share /= max(share.sum(), 1e-30)
+    residual = shade.luminance - shade.texture * (found[0] + shade.normal @ found[1:])
+    over = (residual / scale) ** 2
+    energy = weight * scale**2 * float((share * np.log1p(over)).sum())
+    # n = (a x b) / |a x b|, whose length does not change: dr = h . d(a x b), and a x b changes with the corners
+    a, b = shade.sides
+    h = (found[1:] - shade.normal * (shade.normal @ found[1:])[:, None]) * (-shade.texture * shade.side / (2 * shade.area))[:, None]
+    second, third = _cross(b, h), _cross(h, a)
+    return energy, residual, 2 * weight * share / (1 + over), np.stack([-second - third, second, third], 1)
+
+
+def _cross(a, b):
+    """a x b of (F, 3) each; several times faster than numpy.cross."""
+    return np.stack([a[:, i] * b[:, j] - a[:, j] * b[:, i] for i, j in ((1, 2), (2, 0), (0, 1))], 1)
+
+
+def _areas(position, faces):
+    corner = position[faces]
+    a, b = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+    return 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+
+
+def _blurred(image, sigma, weight):
+    image = np.ascontiguousarray(image, np.float32)
+    if weight is None:
+        return cv2.GaussianBlur(image, (0, 0), sigma)
+    return cv2.GaussianBlur(image * weight, (0, 0), sigma) / np.maximum(cv2.GaussianBlur(weight, (0, 0), sigma), 1e-3)
+
+
+def _sampled(image, points):
+    """The image at points (K, 2) [pixels, whole at their centres], (K,) float64, bilinear; the border's values beyond it."""
+    x, y = (np.ascontiguousarray(points[None, :, k], np.float32) for k in (0, 1))
+    return cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0].astype(np.float64)
