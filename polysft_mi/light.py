@@ -16,9 +16,9 @@ _BLUR = 0.45  # standard deviation of the blur of texture and frames, over the s
 _COVERED = 0.7  # share of a triangle's pixels that must be seen
 _FRONTAL = 0.3  # cosine between normal and ray from which on a triangle counts
 _DARK = 0.01  # texture's luminance, over its mean, below which it says nothing
-_RIDGE = 3e-4  # what the light is held to be the same from all sides by, in observations a triangle
+_RIDGE = 1e-3  # what the light is held to be the same from all sides by, in observations a triangle
 _REFITS = 3
-_FIRST_SCALE, _SCALE, _SCALES = 0.05, 5.0, (0.005, 0.05)  # of the robust norm; then so many standard deviations, within bounds, over the texture's mean
+_FIRST_SCALE, _SCALE, _SCALES = 0.05, 4.0, (0.005, 0.05)  # of the robust norm; then so many standard deviations, within bounds, over the texture's mean
 _NORMAL_DEVIATION = 1.4826  # standard deviation of a normal distribution over the median of its absolute values
 
 

@@ -61,13 +61,14 @@ def to_srgb(x):
     return np.round(255 * np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)).astype(np.uint8)
 
 
-def render(vertices, faces, uv, K, size, texture):
-    """(sRGB image (H, W, 3) uint8, coverage (H, W)) of the textured mesh over a grey background; ``size`` is (width, height)."""
+def render(vertices, faces, uv, K, size, texture, light=None):
+    """(sRGB image (H, W, 3) uint8, coverage (H, W)) of the textured mesh over a grey background; ``size`` is (width, height); ``light``: (l_0, l), by
+    which a triangle with the unit normal n towards the camera has l_0 + l . n times the texture's colour."""
     w, h = size[0] * SUPERSAMPLING, size[1] * SUPERSAMPLING
     x = vertices @ K.T
     inverse_depth = 1 / x[:, 2]
     x = x[:, :2] * inverse_depth[:, None] * SUPERSAMPLING
-    nearest, at = np.zeros((h, w)), np.zeros((h, w, 2))
+    nearest, at, lit = np.zeros((h, w)), np.zeros((h, w, 2)), np.ones((h, w))
     for face in faces:
         low = np.maximum(np.floor(x[face].min(0)).astype(int), 0)
         high = np.minimum(np.ceil(x[face].max(0)).astype(int), (w, h))
@@ -85,10 +86,14 @@ def render(vertices, faces, uv, K, size, texture):
         nearest[window][near] = z.reshape(py.shape)[near]
         here = (weights * inverse_depth[face]) @ uv[face] / z[:, None]  # perspective-correct
         at[window][near] = here.reshape(*py.shape, 2)[near]
+        if light is not None:
+            a, b, c = vertices[face]
+            n = np.cross(b - a, c - a)
+            lit[window][near] = light[0] - np.sign(n @ a) * (n @ light[1:]) / np.linalg.norm(n)
     rows, columns = texture.shape[:2]
     maps = (at[..., 0] * columns - 0.5, (1 - at[..., 1]) * rows - 0.5)
     colour = cv2.remap(to_linear(texture), *(m.astype(np.float32) for m in maps), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    colour = np.where(nearest[..., None] > 0, colour, BACKGROUND)
+    colour = np.where(nearest[..., None] > 0, colour * lit[..., None], BACKGROUND)
     mean = lambda image: image.reshape(size[1], SUPERSAMPLING, size[0], SUPERSAMPLING, -1).mean(axis=(1, 3))
     return to_srgb(mean(colour)), mean((nearest > 0).astype(float))[..., 0]
 
@@ -104,14 +109,14 @@ def write_obj(path, vertices, uv, polygons):
     path.write_text("\n".join(lines) + "\n")
 
 
-def _make(folder, images, frames, size, rows, columns, masks, K, **motion):
+def _make(folder, images, frames, size, rows, columns, masks, K, light=None, **motion):
     folder.mkdir(parents=True, exist_ok=True)
     vertices = np.stack([sheet(k / max(frames - 1, 1), rows, columns, **motion) for k in range(frames)])
     v, u = np.meshgrid(np.linspace(1, 0, rows), np.linspace(0, 1, columns), indexing="ij")
     truth = Truth(folder, vertices, grid_faces(rows, columns), np.stack([u, v], axis=-1).reshape(-1, 2), K)
     texture = texture_image()
     for k in range(frames):
-        image, coverage = render(vertices[k], truth.faces, truth.uv, K, size, texture)
+        image, coverage = render(vertices[k], truth.faces, truth.uv, K, size, texture, light)
         write_image(folder / images.format(k), image)
         if masks:
             write_image(folder / "masks" / f"{k:03d}.png", np.round(255 * coverage).astype(np.uint8))

@@ -92,7 +92,6 @@ class Stage:
 # in the image, height has no first-order effect, and it would drift in depth instead of bending.
 STAGES = Stage(2.5, 1e2, 6, (0.0, 0.08)), Stage(1.5, 3e2, 4, (0.08, 0.08)), Stage(1.0, 1e3, 3, (math.inf, math.inf))
 FAR = Stage(6.0, 1e2, 6)  # before the others where the sheet has moved far
-_SHADED = STAGES[1:]  # in the first, lengths are soft, and shading would bend the sheet before its texture lies where the image shows it
 
 
 class GaussNewton:
@@ -469,9 +468,9 @@ class GaussNewton:
         wide = pattern if d == 3 else None
         normal, inextensibility = assemble(self.pattern, surface, projection, evaluation, self.lengths, stiffness, wide, give=give)
         shading = 0.0
-        if s.k_shading > 0 and stage in _SHADED and self._light.frames:
+        if s.k_shading > 0 and stage is STAGES[-1] and self._light.frames:  # before, lengths are soft, and shading would bend what they should
             shade = self.registration.shade(surface.vertices, frame, evaluation.seen)
-            shading, *rows = residuals(shade, self._light, s.k_shading * stage.stiffness / STAGES[-1].stiffness)
+            shading, *rows = residuals(shade, self._light, s.k_shading)
             add_triangles(normal, pattern, self.registration.faces, surface, *rows)
         a = self.chart.size(order)
         bend = 2 * s.k_bend * chart.bending

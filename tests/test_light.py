@@ -1,0 +1,217 @@
+"""Shading as a cue: its derivatives against finite differences, its algebra against dense matrices, the light that it learns against the true one."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import synthetic
+from scipy.spatial.transform import Rotation
+
+from polysft_mi import prepare, scene, solvers
+from polysft_mi.light import Brightness, Light, residuals
+from polysft_mi.normal_equations import Chart, Normal, Pattern, State, add_triangles
+from polysft_mi.problem import Problem
+from polysft_mi.sequence import Sequence
+from polysft_mi.solvers import gauss_newton
+from polysft_mi.template import Template
+from polysft_mi.tracker import track
+
+LIGHT = np.array([0.6, 0.3, -0.2, -0.35])
+K = np.array([[200.0, 0, 80], [0, 200, 60], [0, 0, 1]])
+ROWS, COLUMNS = 7, 9
+FACES = synthetic.grid_faces(ROWS, COLUMNS)
+
+
+def project(vertices):
+    x = vertices @ K.T
+    return x[:, :2] / x[:, 2:]
+
+
+def brightness(luminance=0.5, masked=False):
+    """That of a sheet of one colour, or of an image (64, 64) of luminances over the texture coordinates."""
+    texture = np.broadcast_to(np.asarray(luminance, np.float32)[..., None], (64, 64, 3))
+    texture, inside = np.pad(texture, ((8, 8), (8, 8), (0, 0)), "edge"), np.pad(np.ones((64, 64), np.float32), 8)
+    v, u = np.meshgrid(np.linspace(71, 8, ROWS), np.linspace(8, 71, COLUMNS), indexing="ij")
+    texels = np.stack([u, v], -1).reshape(-1, 2)[FACES].mean(1)
+    return Brightness(FACES, project(synthetic.sheet(0, ROWS, COLUMNS)), texture, inside, texels, 1.5, masked)
+
+
+def shade_of(found, vertices, image, seen=1e9, mask=None):
+    colour = np.broadcast_to(np.asarray(image, np.float32)[..., None], (120, 160, 3))
+    return found.of(found.prepared(colour, mask), vertices, np.zeros(3), project(vertices), np.full(len(FACES), seen))
+
+
+def known(light=LIGHT, frames=1):
+    """A light that has been seen often."""
+    return Light(1e9 * np.eye(4), 1e9 * light, 0.01 * frames, frames)
+
+
+def wavy(seed=0, size=0.004):
+    rng = np.random.default_rng(seed)
+    return synthetic.sheet(0.5, ROWS, COLUMNS) + size * rng.normal(size=(ROWS * COLUMNS, 3))
+
+
+def normals(vertices):
+    a, b, c = (vertices[FACES[:, k]] for k in range(3))
+    n = np.cross(b - a, c - a)
+    n /= np.linalg.norm(n, axis=1, keepdims=True)
+    return np.where(((n * (a + b + c)).sum(1) < 0)[:, None], n, -n)
+
+
+def test_residuals_and_derivatives():
+    found, vertices = brightness(masked=True), wavy()
+    energy, residual, factor, by_corner = residuals(shade_of(found, vertices, 0.4), known(), 12.0)
+    np.testing.assert_allclose(residual, 0.8 - (LIGHT[0] + normals(vertices) @ LIGHT[1:]), atol=1e-6)
+    a, b, c = (vertices[FACES[:, k]] for k in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    scale = known().scale
+    assert energy == pytest.approx(12 * scale**2 * (area / area.sum() * np.log1p((residual / scale) ** 2)).sum(), rel=1e-5)
+    np.testing.assert_allclose(factor, 24 * area / area.sum() / (1 + (residual / scale) ** 2), rtol=1e-6)
+    h = 1e-6
+    for corner in range(3):
+        for axis in range(3):
+            for face in (0, 17, 61):
+                moved = vertices.copy()
+                moved[FACES[face, corner], axis] += h
+                plus = residuals(shade_of(found, moved, 0.4), known(), 12.0)[1][face]
+                moved[FACES[face, corner], axis] -= 2 * h
+                minus = residuals(shade_of(found, moved, 0.4), known(), 12.0)[1][face]
+                assert by_corner[face, corner, axis] == pytest.approx((plus - minus) / (2 * h), rel=1e-4, abs=1e-5 * np.abs(by_corner).max())
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_terms_of_triangles_are_those_of_the_dense_jacobian(d):
+    rng = np.random.default_rng(d)
+    v, u = np.meshgrid(np.linspace(1, 0, ROWS), np.linspace(0, 1, COLUMNS), indexing="ij")
+    template = Template.fit(synthetic.sheet(0.7, ROWS, COLUMNS), FACES, np.stack([u, v], -1).reshape(-1, 2), 4, tolerance=1)
+    chart, count = Chart(template), ROWS * COLUMNS
+    state = State(
+        0.02 * rng.normal(size=15), 0.02 * rng.normal(size=(count, 3)), Rotation.from_rotvec(0.1 * rng.normal(size=3)), 0.1 * rng.normal(size=3)
+    )
+    surface = chart.surface(state)
+    pattern = Pattern(FACES, template.edges, count)
+    residual, factor, by_corner = rng.normal(size=len(FACES)), rng.uniform(0, 2, len(FACES)), rng.normal(size=(len(FACES), 3, 3))
+    size = d * count + 21
+    normal = Normal(np.zeros((len(pattern.row), d, d)), np.zeros((d * count, 21)), np.zeros((21, 21)), np.zeros((count, d)), np.zeros(21))
+    add_triangles(normal, pattern, FACES, surface, residual, factor, by_corner)
+
+    def linear(step):  # of the residuals along a step of all unknowns, by differences of the surface
+        moves = [chart.surface(state.moved((step[d * count :], step[: d * count].reshape(-1, d)), f)).vertices for f in (1e-5, -1e-5)]
+        return np.einsum("fck,fck->f", by_corner, ((moves[0] - moves[1]) / 2e-5)[FACES])
+
+    jacobian = np.stack([linear(row) for row in np.eye(size)], 1)
+    matrix = np.zeros((size, size))
+    for i, j, block in zip(pattern.row, pattern.column, normal.local):
+        matrix[d * i : d * i + d, d * j : d * j + d] = block
+    matrix[: d * count, d * count :], matrix[d * count :, : d * count] = normal.cross, normal.cross.T
+    matrix[d * count :, d * count :] = normal.glob
+    expected = jacobian.T @ (factor[:, None] * jacobian)
+    np.testing.assert_allclose(matrix, expected, atol=1e-6 * np.abs(expected).max())
+    gradient = np.concatenate([normal.local_gradient.ravel(), normal.gradient])
+    np.testing.assert_allclose(gradient, jacobian.T @ (factor * residual), atol=1e-6 * np.abs(gradient).max())
+
+
+def test_what_a_frame_shows_of_each_triangle():
+    y, x = np.mgrid[:64, :64] / 63
+    texture = 0.4 + 0.2 * x + 0.1 * y
+    found, vertices = brightness(texture), synthetic.sheet(0, ROWS, COLUMNS)
+    shade = shade_of(found, vertices, 0.7 * found.mean)
+    assert shade.luminance == pytest.approx(0.7, rel=1e-5)
+    assert shade.texture[shade.seen].mean() == pytest.approx(1, rel=1e-5)
+    u, v = ((vertices[FACES].mean(1) / (0.12, 0.09, 1))[:, :2].T + 1) / 2
+    np.testing.assert_allclose(shade.texture[shade.seen] * found.mean, (0.4 + 0.2 * u + 0.1 * (1 - v))[shade.seen], atol=0.01)
+    assert (shade.normal @ [0, 0, -1] > 0.999).all() and shade.area.sum() == pytest.approx(0.24 * 0.18, rel=1e-6)
+
+
+def test_only_triangles_that_are_seen_count():
+    found, flat = brightness(masked=True), synthetic.sheet(0, ROWS, COLUMNS)
+    pixels = np.abs(np.linalg.det(project(flat)[FACES[:, 1:]] - project(flat)[FACES[:, :1]])) / 2
+    assert shade_of(found, flat, 0.4, seen=0.8 * pixels.max()).seen.all()
+    assert not shade_of(found, flat, 0.4, seen=0.5 * pixels.min()).seen.any()
+    steep = (flat - (0, 0, 0.5)) @ Rotation.from_rotvec([0, 1.4, 0]).as_matrix().T + (0, 0, 0.5)
+    assert not shade_of(found, steep, 0.4).seen.any()
+    assert not brightness().trusted.all()  # without masks the background is in what lies at the border
+    assert not brightness(np.zeros((64, 64)), masked=True).trusted.any()  # a black texture says nothing
+
+
+def test_a_frame_larger_than_its_triangles_need_is_shrunk():
+    found = brightness(masked=True)
+    found.sigma = 6.0
+    image, pool = found.prepared(np.full((120, 160, 3), 0.4, np.float32), np.ones((120, 160), np.float32))
+    assert pool == 3 and image.shape == (40, 53) and image == pytest.approx(0.8, rel=1e-5)
+
+
+def test_the_light_is_learned_from_surfaces_that_bend():
+    rng = np.random.default_rng(1)
+    found, light = brightness(masked=True), Light.unknown()
+    assert light.scale == 0.05
+    for k in range(20):
+        shade = shade_of(found, wavy(k, 0.01), 0.4)
+        value = shade.texture * (LIGHT[0] + shade.normal @ LIGHT[1:]) + 0.005 * rng.normal(size=len(FACES))
+        value[rng.random(len(FACES)) < 0.1] += 0.5  # a highlight, a shadow's end
+        light = light.learned(dataclasses.replace(shade, luminance=value))
+    assert light.frames == 20 and light.coefficients(len(FACES)) == pytest.approx(LIGHT, abs=0.02)
+    assert 0.015 < light.scale < 0.03  # four deviations of 0.005, a little more for the outliers
+    assert Light.of(light.facts()).facts() == light.facts()
+
+
+def test_a_flat_sheet_says_nothing_of_where_the_light_comes_from():
+    found, light = brightness(masked=True), Light.unknown()
+    for _ in range(20):
+        light = light.learned(shade_of(found, synthetic.sheet(0, ROWS, COLUMNS), 0.4))
+    level, *slope = light.coefficients(len(FACES))
+    towards = level - slope[2]  # what a sheet across the view is lit with
+    assert towards == pytest.approx(0.8, rel=1e-3) and np.abs(slope[:2]).max() < 1e-6
+    assert light.learned(shade_of(found, synthetic.sheet(0, ROWS, COLUMNS), 0.4, seen=0)) == light
+
+
+def test_facts_that_are_missing_are_an_unknown_light():
+    assert Light.of({}).frames == 0
+    facts = known().facts()
+    assert Light.of(facts).frames == 1 and Light.of(facts | {"light_3": None}).frames == 0 and Light.of(facts | {"light_3": float("nan")}).frames == 0
+
+
+# -- in the tracker ----------------------------------------------------------
+
+
+def problem_of(folder, **settings):
+    prepare.main([str(folder), "--overwrite"])
+    experiment = scene.load(str(folder / "scene.xml"), settings)
+    s = experiment.settings
+    return Problem(experiment, Sequence.open(experiment.frames, experiment.masks, first=s.first, last=s.last, size=experiment.size))
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("light") / "cloth"
+    return synthetic.cloth(folder, frames=5, size=(160, 120), rows=9, columns=12, light=LIGHT)
+
+
+def test_the_tracker_learns_the_light_and_follows_it(truth, tmp_path):
+    done = {}
+    for weight in (0.0, 12.0):
+        problem = problem_of(truth.folder, k_shading=weight)
+        (tmp_path / str(weight)).mkdir()
+        done[weight] = track(problem, solvers.create(problem.settings), 5, str(tmp_path / str(weight)))
+    assert Light.of(done[0.0].totals[-1]).frames == 0 and done[0.0].totals[-1]["shading"] == 0
+    found = Light.of(done[12.0].totals[-1])
+    assert found.frames == 5 and done[12.0].totals[0]["shading"] == 0 < done[12.0].totals[-1]["shading"]
+    # the sheet rolls about the image's upright: that is where the light's slope shows
+    slope = found.coefficients(len(truth.faces))[1]
+    assert 0.5 < slope / (LIGHT[1] / (LIGHT[0] - LIGHT[3])) < 1.5
+
+
+@pytest.mark.parametrize("stage", gauss_newton.STAGES)
+def test_only_the_last_stage_is_shaded_and_a_step_goes_where_the_shading_leads(truth, stage):
+    problem = problem_of(truth.folder, k_rgb=0.0, k_silhouette=0.0, k_mi=0.0, k_relief=0.0, texture_fit="none")
+    solver = gauss_newton.GaussNewton(problem.settings)
+    solver._prepare(problem)
+    rest = solver.chart.state(problem.patch.rest().to_numpy())
+    solver._light = known()
+    normal, terms = solver._linearise(rest, rest, 1, 4, stage, 0.5)
+    assert (terms["shading"] > 0) == (stage is gauss_newton.STAGES[-1]) == bool(np.abs(normal.gradient).max() > 1e-9)
+    if terms["shading"]:
+        step, _ = solver._reduced(normal, 1e-3).step()
+        slope = step[0] @ normal.gradient + (step[1] * normal.local_gradient).sum()
+        found = solver._linearise(rest.moved(step, 0.1), rest, 1, 4, stage, 0.5)[1]
+        assert found["shading"] - terms["shading"] == pytest.approx(0.1 * slope, rel=0.3) and slope < 0
