@@ -1,8 +1,9 @@
 """Shading as a cue: how bright each triangle is under a light that is learned along with the video. NumPy and OpenCV.
 
-A triangle with the unit normal n towards the camera, whose texture has the luminance t, is taken to be seen with t (l_0 + l . n): light of
-first order, which holds most of what a matt surface reflects of any distant light (Basri and Jacobs, "Lambertian Reflectance and Linear
-Subspaces", PAMI 2003). Where the sheet casts shadows on itself that is wrong, hence a robust norm.
+A triangle with the unit normal n towards the camera and its centre at x, whose texture has the luminance t, is taken to be seen with
+t (l_0 + l . n + g . x). Light of first order in the normal holds most of what a matt surface reflects of any distant light (Basri and Jacobs,
+"Lambertian Reflectance and Linear Subspaces", PAMI 2003); that in the position, what of it comes from a lamp nearby. Where the sheet casts
+shadows on itself both are wrong, hence a robust norm.
 """
 
 import math
@@ -18,13 +19,15 @@ _FRONTAL = 0.3  # cosine between normal and ray from which on a triangle counts
 _DARK = 0.01  # texture's luminance, over its mean, below which it says nothing
 _RIDGE = 1e-3  # what the light is held to be the same from all sides by, in observations a triangle
 _REFITS = 3
+_SIZE = 7  # of the unknowns (l_0, l, g)
+_UPPER = np.triu_indices(_SIZE)
 _FIRST_SCALE, _SCALE, _SCALES = 0.05, 4.0, (0.005, 0.05)  # of the robust norm; then so many standard deviations, within bounds, over the texture's mean
 _NORMAL_DEVIATION = 1.4826  # standard deviation of a normal distribution over the median of its absolute values
 
 
 @dataclass(frozen=True)
 class Light:
-    """What the frames so far say of the light: normal equations ``matrix`` (4, 4) and ``right`` (4,) of (l_0, l), over the mean of the
+    """What the frames so far say of the light: normal equations ``matrix`` (7, 7) and ``right`` (7,) of (l_0, l, g), over the mean of the
     texture's luminance; ``deviations``: the sum of the residuals' standard deviations in ``frames`` frames."""
 
     matrix: np.ndarray
@@ -32,25 +35,23 @@ class Light:
     deviations: float
     frames: int
 
-    NAMES = tuple(f"light_{k}" for k in range(16))
-    _UPPER = np.triu_indices(4)
-
     @classmethod
     def unknown(cls):
-        return cls(np.zeros((4, 4)), np.zeros(4), 0.0, 0)
+        return cls(np.zeros((_SIZE, _SIZE)), np.zeros(_SIZE), 0.0, 0)
 
     @classmethod
-    def of(cls, facts):
-        """The light that :meth:`facts` tell of; unknown where they do not."""
-        values = [facts.get(name) for name in cls.NAMES]
-        if any(v is None or not math.isfinite(v) for v in values):
+    def of(cls, numbers):
+        """The light that :meth:`numbers` tell of; unknown where they are None."""
+        if numbers is None:
             return cls.unknown()
-        matrix = np.zeros((4, 4))
-        matrix[cls._UPPER] = values[:10]
-        return cls(matrix + np.triu(matrix, 1).T, np.array(values[10:14]), values[14], int(values[15]))
+        matrix = np.zeros((_SIZE, _SIZE))
+        *upper, deviations, frames = numbers
+        matrix[_UPPER] = upper[:-_SIZE]
+        return cls(matrix + np.triu(matrix, 1).T, np.array(upper[-_SIZE:]), deviations, int(frames))
 
-    def facts(self):
-        return dict(zip(self.NAMES, (*self.matrix[self._UPPER].tolist(), *self.right.tolist(), self.deviations, self.frames)))
+    def numbers(self):
+        """All of it as a list of numbers."""
+        return [*self.matrix[_UPPER].tolist(), *self.right.tolist(), self.deviations, self.frames]
 
     @property
     def scale(self):
@@ -58,17 +59,17 @@ class Light:
         return float(np.clip(_SCALE * self.deviations / self.frames, *_SCALES)) if self.frames else _FIRST_SCALE
 
     def coefficients(self, triangles):
-        """(l_0, l) (4,), of a sheet of so many triangles."""
-        held = _RIDGE * triangles * np.diag([0.0, 1.0, 1.0, 1.0])
-        return np.linalg.solve(self.matrix + held + 1e-9 * np.eye(4), self.right)
+        """(l_0, l, g) (7,), of a sheet of so many triangles."""
+        held = _RIDGE * triangles * np.diag([0.0] + [1.0] * (_SIZE - 1))
+        return np.linalg.solve(self.matrix + held + 1e-9 * np.eye(_SIZE), self.right)
 
     def learned(self, shade):
         """The light after another frame, whose surface had the triangles ``shade`` (a :class:`Shade`)."""
-        rows = shade.texture[shade.seen, None] * np.column_stack([np.ones(shade.seen.sum()), shade.normal[shade.seen]])
+        rows = shade.texture[shade.seen, None] * np.column_stack([np.ones(shade.seen.sum()), shade.normal[shade.seen], shade.centre[shade.seen]])
         value, scale = shade.luminance[shade.seen], self.scale
         if len(value) < len(rows.T):
             return self
-        light, found = self, np.array([1.0, 0.0, 0.0, 0.0]) if not self.frames else self.coefficients(len(shade.seen))
+        light, found = self, self.coefficients(len(shade.seen)) if self.frames else np.eye(_SIZE)[0]
         for _ in range(_REFITS):
             weighted = rows / (1 + ((value - rows @ found) / scale) ** 2)[:, None]
             light = Light(self.matrix + weighted.T @ rows, self.right + weighted.T @ value, self.deviations, self.frames)
@@ -79,11 +80,14 @@ class Light:
 
 @dataclass
 class Shade:
-    """The triangles of a surface in a frame, (F,) or (F, 3) each: ``normal``, of length 1, towards the camera; ``texture`` and ``luminance``:
+    """The triangles of a surface in a frame, (F,) or (F, 3) each: ``normal``, of length 1, towards the camera; ``centre``, from that of the template,
+    over ``unit`` [m]; ``texture`` and ``luminance``:
     what the texture has and the frame shows, blurred alike, over the texture's mean; ``seen``: those that can be compared; ``sides``: two
     (F, 3) [m], from the first corner; ``area`` [m^2]; ``side``: 1 or -1, whether the normal is that of the two sides or opposite."""
 
     normal: np.ndarray
+    centre: np.ndarray
+    unit: float
     texture: np.ndarray
     luminance: np.ndarray
     seen: np.ndarray
@@ -95,13 +99,14 @@ class Shade:
 class Brightness:
     """Luminance of the template's texture and of frames, at the size of the triangles ``faces`` (F, 3).
 
-    ``position`` (N, 2) [pixels]: of the template's vertices in the image; ``texture`` (H, W, 3), ``inside`` (H, W): reflectance and where the
+    ``vertices`` (N, 3) [m], ``position`` (N, 2) [pixels]: of the template, and in the image; ``texture`` (H, W, 3), ``inside`` (H, W): reflectance and where the
     template has it; ``texels`` (F, 2): the triangles' centroids there [texels, whole at their centres]; ``density``: texels a pixel;
     ``masked``: whether the frames have masks. Without them, what lies close to the border is left out, for the background is in it.
     """
 
-    def __init__(self, faces, position, texture, inside, texels, density, masked):
-        self.faces = faces
+    def __init__(self, faces, vertices, position, texture, inside, texels, density, masked):
+        self.faces, self.centre = faces, vertices.mean(0)
+        self.unit = float(np.abs(vertices - self.centre).max())
         self.sigma = _BLUR * math.sqrt(max(_areas(position, faces).mean(), 1.0))
         sigma = density * self.sigma
         covered = cv2.GaussianBlur(inside, (0, 0), sigma)
@@ -137,11 +142,12 @@ class Brightness:
         frontal = np.abs(towards) > _FRONTAL * double * np.sqrt(np.einsum("fk,fk->f", ray, ray))
         luminance = _sampled(image, (position[self.faces].sum(1) / 3) / pool - 0.5)
         seen = self.trusted & frontal & (pixels > _COVERED * _areas(position, self.faces))
-        return Shade(normal, self.texture, luminance, seen, (a, b), double / 2, side)
+        centre = (corner.sum(1) / 3 - self.centre) / self.unit
+        return Shade(normal, centre, self.unit, self.texture, luminance, seen, (a, b), double / 2, side)
 
 
 def residuals(shade, light, weight):
-    """The shading term of a frame, ``weight`` times the mean over the area seen of c^2 log(1 + r^2 / c^2) with r = frame - t (l_0 + l . n).
+    """The shading term of a frame, ``weight`` times the mean over the area seen of c^2 log(1 + r^2 / c^2) with r = frame - t (l_0 + l . n + g . x).
 
     Returns its energy, the residuals r (F,), the factors h (F,) of r^2 / 2 in its quadratic model, and the derivatives (F, 3, 3) of r by the
     corners [1/m].
@@ -149,14 +155,16 @@ def residuals(shade, light, weight):
     found, scale = light.coefficients(len(shade.seen)), light.scale
     share = np.where(shade.seen, shade.area, 0.0)
     share /= max(share.sum(), 1e-30)
-    residual = shade.luminance - shade.texture * (found[0] + shade.normal @ found[1:])
+    slope, gradient = found[1:4], found[4:]
+    residual = shade.luminance - shade.texture * (found[0] + shade.normal @ slope + shade.centre @ gradient)
     over = (residual / scale) ** 2
     energy = weight * scale**2 * float((share * np.log1p(over)).sum())
     # n = (a x b) / |a x b|, whose length does not change: dr = h . d(a x b), and a x b changes with the corners
     a, b = shade.sides
-    h = (found[1:] - shade.normal * (shade.normal @ found[1:])[:, None]) * (-shade.texture * shade.side / (2 * shade.area))[:, None]
+    h = (slope - shade.normal * (shade.normal @ slope)[:, None]) * (-shade.texture * shade.side / (2 * shade.area))[:, None]
     second, third = _cross(b, h), _cross(h, a)
-    return energy, residual, 2 * weight * share / (1 + over), np.stack([-second - third, second, third], 1)
+    by_corner = np.stack([-second - third, second, third], 1) - (shade.texture / (3 * shade.unit))[:, None, None] * gradient
+    return energy, residual, 2 * weight * share / (1 + over), by_corner
 
 
 def _cross(a, b):

@@ -113,9 +113,9 @@ class Registration:
         """:class:`polysft_mi.light.Brightness` of the template and the video."""
         if self._brightness is None:
             texels = self._texels()[self._faces].mean(1)
-            position, _ = self.camera.project(self.problem.template.vertices)
-            masked = bool(self.problem.experiment.masks)
-            self._brightness = Brightness(self.faces, position, self.texture, self.texture_inside, texels, _TEXELS, masked)
+            vertices, masked = self.problem.template.vertices, bool(self.problem.experiment.masks)
+            position, _ = self.camera.project(vertices)
+            self._brightness = Brightness(self.faces, vertices, position, self.texture, self.texture_inside, texels, _TEXELS, masked)
         return self._brightness
 
     def shade(self, vertices, frame, seen):

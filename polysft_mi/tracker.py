@@ -125,7 +125,7 @@ def _look_back(problem, solver, done):
 
 def _numbers(values):
     """JSON has no NaN: None instead."""
-    return {name: x if np.isfinite(x) else None for name, x in values.items()}
+    return {name: x if np.isfinite(x).all() else None for name, x in values.items()}
 
 
 def _advance(problem, solver, done, start, width, log, progress):

@@ -38,7 +38,7 @@ _FARTHEST_STEP = 2.0  # rotation [rad], translation and displacements [chart uni
 # The mirror twin is tried where the sheet bulges by this share of its size, and again each time that it bulges so many times as much; it is
 # taken where it costs this much less.
 _BULGE, _BULGE_GROWTH, _TWIN_GAIN = 0.01, 1.4, 0.03
-_FACTS = "misfit", "outlying", "order", "least_misfit", "bulge", *Light.NAMES
+_FACTS = "misfit", "outlying", "order", "least_misfit", "bulge", "light"
 _RELIEF_VERTICES = 3000  # of the template, above which there is no relief: its wide system takes a second an iteration at 10,000
 _RELIEF_BEND = 3e-3  # of the relief's weight, for its bending
 # Noise must not become ripples, which use up length. What noise there is, the least misfit of the frames so far tells, the first one aside,
@@ -142,7 +142,7 @@ class GaussNewton:
             start = states[k] if past or k == 0 else states[k - 1]
             states[k], found = self._newest(start, frames[k], (before + states[:k])[-2:], known)
             found["least_misfit"] = float(np.fmin(least, found["misfit"])) if known else math.nan
-            found |= self._learned(found["model"], frames[k]).facts()
+            found["light"] = self._learned(found["model"], frames[k]).numbers()
             known.append(found)
         if len(frames) == 1:
             return self._solution(states, [found], found)
@@ -173,7 +173,7 @@ class GaussNewton:
         finally:
             self._hold = 0.0
         found["least_misfit"] = least
-        found |= self._light.facts()
+        found["light"] = self._light.numbers()
         return self._solution([state], [found], found)
 
     # -- preparation --------------------------------------------------------
@@ -235,7 +235,7 @@ class GaussNewton:
         misfit, least = (next((t[name] for t in reversed(known) if t.get(name) is not None), math.nan) for name in ("misfit", "least_misfit"))
         self._noise = misfit if math.isnan(least) else least
         self._unexplained = misfit > max(_UNEXPLAINED, _UNEXPLAINED_FACTOR * self._noise)
-        self._light = Light.of(next((t for t in reversed(known) if t.get(Light.NAMES[0]) is not None), {}))
+        self._light = Light.of(next((t["light"] for t in reversed(known) if t.get("light") is not None), None))
         return least
 
     def _expect(self, frame):
