@@ -69,7 +69,9 @@ class Light:
         value, scale = shade.luminance[shade.seen], self.scale
         if len(value) < len(rows.T):
             return self
-        light, found = self, self.coefficients(len(shade.seen)) if self.frames else np.eye(_SIZE)[0]
+        found = self.coefficients(len(shade.seen)) if self.frames else np.eye(_SIZE)[0]
+        value = value / _exposure(value, rows @ found)
+        light = self
         for _ in range(_REFITS):
             weighted = rows / (1 + ((value - rows @ found) / scale) ** 2)[:, None]
             light = Light(self.matrix + weighted.T @ rows, self.right + weighted.T @ value, self.deviations, self.frames)
@@ -156,7 +158,8 @@ def residuals(shade, light, weight):
     share = np.where(shade.seen, shade.area, 0.0)
     share /= max(share.sum(), 1e-30)
     slope, gradient = found[1:4], found[4:]
-    residual = shade.luminance - shade.texture * (found[0] + shade.normal @ slope + shade.centre @ gradient)
+    lit = shade.texture * (found[0] + shade.normal @ slope + shade.centre @ gradient)
+    residual = shade.luminance / _exposure(shade.luminance[shade.seen], lit[shade.seen]) - lit
     over = (residual / scale) ** 2
     energy = weight * scale**2 * float((share * np.log1p(over)).sum())
     # n = (a x b) / |a x b|, whose length does not change: dr = h . d(a x b), and a x b changes with the corners
@@ -165,6 +168,12 @@ def residuals(shade, light, weight):
     second, third = _cross(b, h), _cross(h, a)
     by_corner = np.stack([-second - third, second, third], 1) - (shade.texture / (3 * shade.unit))[:, None, None] * gradient
     return energy, residual, 2 * weight * share / (1 + over), by_corner
+
+
+def _exposure(value, lit):
+    """By how much a frame is brighter than the light makes it: cameras choose their exposure as they go. 1 where nothing tells."""
+    known = (value > 0) & (lit > 0)
+    return float(np.median(value[known] / lit[known])) if known.any() else 1.0
 
 
 def _cross(a, b):
