@@ -416,7 +416,7 @@ def edges_of(problem):
 
     def edges_alone(state, lengths, stiffness, **more):
         surface = chart.surface(state)
-        none = registration.Evaluation(0, 0, 0, 0, np.zeros_like(surface.vertices), np.zeros((len(first.faces), 9, 2, 2)), None, 1.0)
+        none = registration.Evaluation(0, 0, 0, 0, np.zeros_like(surface.vertices), np.zeros((len(first.faces), 9, 2, 2)), None, 1.0, np.zeros(len(first.faces)))
         return assemble(pattern, surface, first.projection(surface.vertices), none, lengths, stiffness, wide=pattern, **more)
 
     return chart, pattern, np.array(problem.edge_lengths, dtype=np.float64), edges_alone

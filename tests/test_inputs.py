@@ -91,17 +91,17 @@ def test_not_xml(tmp_path, text):
 
 
 REFUSED_BY_MITSUBA = [
-    ('type="twosided"', 'type="twosidde"', ["line 95: ", "bsdf", '"twosidde" not found']),
-    ('name="wrap_mode"', 'name="wrap_mod"', ["line 97: unknown property", '"bitmap"', '"wrap_mod": "clamp"']),
-    ('<string name="masks"', '<float name="k_foo" value="1"/><string name="masks"', ["line 41: unknown property", '"polysft"', '"k_foo"']),
-    ('<emitter type="constant"/>', '<emiter type="constant"/>', ["line 106: ", "<emiter>"]),
-    ('<emitter type="constant"/>', '<include filename="nope.xml"/>', ["line 106: ", '"nope.xml" not found']),
-    ('<integrator type="$integrator"/>', "", ["line 41: polysft: 0 nested integrators", 'e.g. <integrator type="raster"/>']),
-    ('<string name="frames" value="$frames"/>', "", ["line 41: polysft: property 'frames' is missing; a folder of images"]),
-    ('value="$frames"', 'value="$framez"', ["line 42: undefined parameter: $framez"]),
+    ('type="twosided"', 'type="twosidde"', ["line 97: ", "bsdf", '"twosidde" not found']),
+    ('name="wrap_mode"', 'name="wrap_mod"', ["line 99: unknown property", '"bitmap"', '"wrap_mod": "clamp"']),
+    ('<string name="masks"', '<float name="k_foo" value="1"/><string name="masks"', ["line 42: unknown property", '"polysft"', '"k_foo"']),
+    ('<emitter type="constant"/>', '<emiter type="constant"/>', ["line 108: ", "<emiter>"]),
+    ('<emitter type="constant"/>', '<include filename="nope.xml"/>', ["line 108: ", '"nope.xml" not found']),
+    ('<integrator type="$integrator"/>', "", ["line 42: polysft: 0 nested integrators", 'e.g. <integrator type="raster"/>']),
+    ('<string name="frames" value="$frames"/>', "", ["line 42: polysft: property 'frames' is missing; a folder of images"]),
+    ('value="$frames"', 'value="$framez"', ["line 43: undefined parameter: $framez"]),
     (' version="3.0.0"', "", ["missing version attribute"]),
-    (r'name="fov" value="[^"]*"', 'name="fov" value="abc"', ["line 76: ", 'floating point value "abc"']),
-    (r'name="fov" value="[^"]*"', 'name="fov" value="200"', ["line 75: ", '"perspective"', "field of view", "[0, 180]"]),
+    (r'name="fov" value="[^"]*"', 'name="fov" value="abc"', ["line 78: ", 'floating point value "abc"']),
+    (r'name="fov" value="[^"]*"', 'name="fov" value="200"', ["line 77: ", '"perspective"', "field of view", "[0, 180]"]),
 ]
 
 
@@ -115,7 +115,7 @@ def test_xml_that_mitsuba_refuses(sheet, old, new, words):
 
 def test_integrator(sheet):
     has(refused(sheet / "scene.xml", "-D", "integrator=depth"), "solver gauss-newton renders with raster", "give solver=adam")
-    has(refused(sheet / "scene.xml", "-D", "integrator=foo"), "line 72: ", "integrator", '"foo" not found')
+    has(refused(sheet / "scene.xml", "-D", "integrator=foo"), "line 74: ", "integrator", '"foo" not found')
     has(refused(sheet / "scene.xml", "-D", "integrator=depth", "-D", "solver=adam"), "DepthIntegrator gives no gradients; raster or prb_projective is needed")
     message = refused(edited(sheet, '<integrator type="polysft">', '<integrator type="path">'))
     has(message, 'its integrator is path; one <integrator type="polysft"> is needed')
@@ -126,7 +126,7 @@ def test_integrator(sheet):
 def test_sensors_that_are_no_pinhole(sheet):
     for kind, extra in (("thinlens", '<float name="aperture_radius" value="0.01"/>'), ("orthographic", "")):
         message = refused(edited(sheet, '<sensor type="perspective">.*?<transform', f'<sensor type="{kind}">{extra}<transform', pattern=True))
-        has(message, "line 75", f"sensor '{kind}' is not a pinhole; perspective or pinhole is needed")
+        has(message, "line 77", f"sensor '{kind}' is not a pinhole; perspective or pinhole is needed")
     has(refused(edited(sheet, "<sensor.*</sensor>", "", pattern=True)), "0 sensors; exactly one is needed")
 
 
@@ -143,11 +143,11 @@ def pinhole(folder, **values):
 
 @pytest.mark.parametrize("value", [0, -50, "nan", "inf"])
 def test_focal_length_that_is_none(sheet, value):
-    has(refused(pinhole(sheet, fy=value)), "line 75: camera: ", "is not a pinhole; finite values and positive focal lengths are needed")
+    has(refused(pinhole(sheet, fy=value)), "line 77: camera: ", "is not a pinhole; finite values and positive focal lengths are needed")
 
 
 def test_focal_length_missing(sheet):
-    has(refused(pinhole(sheet, fy=None)), "line 75: pinhole: property 'fy' is missing; fx, fy, cx, cy are needed")
+    has(refused(pinhole(sheet, fy=None)), "line 77: pinhole: property 'fy' is missing; fx, fy, cx, cy are needed")
 
 
 @pytest.mark.parametrize("integrator", ["prb_projective", "path"])
@@ -235,7 +235,7 @@ def test_image_that_cannot_be_read(sheet, name, kind):
     path = sheet / name
     data = path.read_bytes()
     path.write_bytes({"truncated": data[: len(data) // 2], "garbage": b"hello", "empty": b""}[kind])
-    has(refused(sheet / "scene.xml"), name, "line 97: " if name == "texture.png" else "not a readable image")
+    has(refused(sheet / "scene.xml"), name, "line 99: " if name == "texture.png" else "not a readable image")
 
 
 @pytest.mark.parametrize("name, words", [("frames", "3 masks for the 2 images"), ("masks", "2 masks for the 3 images")])
@@ -418,7 +418,7 @@ def process(*arguments, module="run", **options):
 def test_processes_end_with_one_line_and_status_2(sheet, tmp_path):
     scene, out = sheet / "scene.xml", tmp_path / "out"
     has(process(tmp_path / "nothing.xml", "-o", out), "nothing.xml: no such scene file")
-    has(process(scene, "-o", out, "-D", "integrator=foo"), "line 72", '"foo" not found')
+    has(process(scene, "-o", out, "-D", "integrator=foo"), "line 74", '"foo" not found')
     has(process(scene, "-o", out, "-m", "scalar_rgb"), "mode 'scalar_rgb': one of llvm_ad_rgb,")
     has(process(edited(sheet, 'name="wrap_mode"', 'name="wrap_mod"'), "-o", out), 'unknown property in texture plugin of type "bitmap"')
     (sheet / "frames" / "001.png").write_bytes(b"hello")
