@@ -18,7 +18,7 @@ _COVERED = 0.7  # share of a triangle's pixels that must be seen
 _FRONTAL = 0.3  # cosine between normal and ray from which on a triangle counts
 _DARK = 0.01  # texture's luminance, over its mean, below which it says nothing
 _RIDGE = 3e-3  # what the light is held to be the same from all sides by, in observations a triangle
-_REFITS = 3
+_REFITS = 3  # of a frame's robust regression
 _SIZE = 7  # of the unknowns (l_0, l, g)
 _UPPER = np.triu_indices(_SIZE)
 _FIRST_SCALE, _SCALE, _SCALES = 0.05, 4.0, (0.005, 0.05)  # of the robust norm; then so many standard deviations, within bounds, over the texture's mean
@@ -83,9 +83,9 @@ class Light:
 @dataclass
 class Shade:
     """The triangles of a surface in a frame, (F,) or (F, 3) each: ``normal``, of length 1, towards the camera; ``centre``, from that of the template,
-    over ``unit`` [m]; ``texture`` and ``luminance``:
-    what the texture has and the frame shows, blurred alike, over the texture's mean; ``seen``: those that can be compared; ``sides``: two
-    (F, 3) [m], from the first corner; ``area`` [m^2]; ``side``: 1 or -1, whether the normal is that of the two sides or opposite."""
+    over ``unit`` [m]; ``texture`` and ``luminance``: what the texture has and the frame shows, blurred alike, over the texture's mean;
+    ``seen``: those that can be compared; ``sides``: two (F, 3) [m], from the first corner; ``area`` [m^2]; ``side``: 1 or -1, whether the
+    normal is that of the two sides or opposite."""
 
     normal: np.ndarray
     centre: np.ndarray

@@ -111,7 +111,8 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
         "solver": problem.settings.solver,
     }
     windows = [
-        {"frame": int(indices[count - len(track.iterations) + k]), "iterations": n, "seconds": t, **{name: x for name, x in terms.items() if not isinstance(x, list)}}
+        {"frame": int(indices[count - len(track.iterations) + k]), "iterations": n, "seconds": t}
+        | {name: x for name, x in terms.items() if not isinstance(x, list)}
         for k, (n, t, terms) in enumerate(zip(track.iterations, track.seconds, track.totals))
     ]
     write_json(

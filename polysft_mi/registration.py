@@ -179,20 +179,19 @@ class Registration:
 
     def expect(self, frames, levels):
         """Read and prepare frames in a second thread, for the levels given; SHADE is one."""
-        if SHADE in levels:
-            self.brightness  # made here: a thread of its own must not touch the device
+        brightness = self.brightness if SHADE in levels else None  # made here: the thread must not touch the device
         for frame in frames:
             for level in levels:
                 key = (frame, level)
                 if key not in self._frames:
-                    self._frames[key] = self._reader.submit(self._read, frame, level)
+                    self._frames[key] = self._reader.submit(self._read, frame, level, brightness)
         keep = _CACHED_FRAMES * max(1, len(levels))
         while len(self._frames) > keep:
             self._frames.popitem(last=False)
 
-    def _read(self, frame, level):
+    def _read(self, frame, level, brightness):
         if level is SHADE:
-            return self.brightness.prepared(*self._decoded(frame))
+            return brightness.prepared(*self._decoded(frame))
         return level_image(*self._decoded(frame), level, self.normalise)
 
     def _frame_level(self, frame, level):

@@ -796,7 +796,7 @@ def test_looking_back_smooths_and_keeps_what_frames_know(truth, tmp_path):
         (tmp_path / str(smooth)).mkdir()
         done = track(problem, solvers.create(problem.settings), 4, str(tmp_path / str(smooth)))
         assert done.finished and len(done.totals) == len(done.sigma) == 4
-        assert all(t["least_misfit"] > 0 and t["order"] == 8 for t in done.totals[1:])
+        assert all(t["least_misfit"] > 0 and t["order"] == 8 and t["light"] for t in done.totals[1:])
         surfaces = np.stack([problem.surface(Unknowns.from_numpy(s)) for s in done.states])
         found[smooth] = rough(surfaces)
     assert least < found[10.0] and found[10.0] - least < 0.9 * (found[0.0] - least)

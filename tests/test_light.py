@@ -7,7 +7,7 @@ import pytest
 import synthetic
 from scipy.spatial.transform import Rotation
 
-from polysft_mi import prepare, scene, solvers
+from polysft_mi import prepare, registration, scene, solvers
 from polysft_mi.light import Brightness, Light, residuals
 from polysft_mi.normal_equations import Chart, Normal, Pattern, State, add_triangles
 from polysft_mi.problem import Problem
@@ -214,6 +214,34 @@ def test_the_tracker_learns_the_light_and_follows_it(truth, tmp_path):
     # the sheet rolls about the image's upright: that is where the light's slope shows
     slope = found.coefficients(len(truth.faces))[1]
     assert 0.5 < slope / (LIGHT[1] / (LIGHT[0] - LIGHT[3])) < 1.5
+
+
+def test_what_is_known_of_the_light_survives_an_interruption(truth, tmp_path):
+    problem = problem_of(truth.folder)
+    whole = track(problem, solvers.create(problem.settings), 5, str(tmp_path))
+
+    class Interrupted(Exception):
+        pass
+
+    def stop(frame, vertices):
+        if frame == 2:
+            raise Interrupted
+
+    parts = tmp_path / "parts"
+    parts.mkdir()
+    with pytest.raises(Interrupted):
+        track(problem, solvers.create(problem.settings), 5, str(parts), solved=stop)
+    resumed = track(problem, solvers.create(problem.settings), 5, str(parts), resume=True)
+    assert resumed.totals[-1]["light"] == whole.totals[-1]["light"]
+    assert all(np.array_equal(a[name], b[name]) for a, b in zip(whole.states, resumed.states) for name in a)
+
+
+def test_a_texture_that_moves_takes_its_brightness_along(truth):
+    problem = problem_of(truth.folder)
+    known = registration.Registration(problem)
+    before, chart = known.brightness.texture, problem.template.chart
+    assert known.shift_texture(chart, chart + 0.1)
+    assert np.abs(known.brightness.texture - before).max() > 0.05
 
 
 @pytest.mark.parametrize("stage", gauss_newton.STAGES)

@@ -148,6 +148,8 @@ def test_resume_ends_with_the_same_result(sequence, tmp_path, monkeypatch, solve
     a, b = surface(whole), surface(parts)
     assert a["vertices"].shape == b["vertices"].shape
     assert np.abs(a["vertices"] - b["vertices"]).max() < 1e-5
+    windows = json.loads((whole / "metrics.json").read_text())["windows"]
+    assert windows and not any(isinstance(x, list) for w in windows for x in w.values())  # numbers alone: what a solver keeps for itself is no figure
     assert ("sigma" in a) == (solver == []) and all(np.array_equal(a[name], b[name]) for name in a)
     lines = [(out / "log.jsonl").read_text().count("\n") for out in (whole, parts)]
     assert lines[0] == lines[1]
