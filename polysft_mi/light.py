@@ -12,9 +12,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from .pyramid import blur, shrink
+
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # of linear RGB
 _BLUR = 0.45  # standard deviation of the blur of texture and frames, over the side of a square as large as a triangle is on average
 _COVERED = 0.7  # share of a triangle's pixels that must be seen
+_INSIDE = {True: 0.3, False: 0.97}  # share of a triangle's surroundings that must be texture, by whether frames have masks
 _FRONTAL = 0.3  # cosine between normal and ray from which on a triangle counts
 _DARK = 0.01  # texture's luminance, over its mean, below which it says nothing
 _RIDGE = 3e-3  # what the light is held to be the same from all sides by, in observations a triangle
@@ -84,8 +87,8 @@ class Light:
 class Shade:
     """The triangles of a surface in a frame, (F,) or (F, 3) each: ``normal``, of length 1, towards the camera; ``centre``, from that of the template,
     over ``unit`` [m]; ``texture`` and ``luminance``: what the texture has and the frame shows, blurred alike, over the texture's mean;
-    ``seen``: those that can be compared; ``sides``: two (F, 3) [m], from the first corner; ``area`` [m^2]; ``side``: 1 or -1, whether the
-    normal is that of the two sides or opposite."""
+    ``seen``: those that can be compared; ``edges``: two (F, 3) [m], from the first corner; ``area`` [m^2]; ``facing``: 1 or -1, whether
+    the normal is that of the two edges or opposite."""
 
     normal: np.ndarray
     centre: np.ndarray
@@ -93,9 +96,9 @@ class Shade:
     texture: np.ndarray
     luminance: np.ndarray
     seen: np.ndarray
-    sides: tuple
+    edges: tuple
     area: np.ndarray
-    side: np.ndarray
+    facing: np.ndarray
 
 
 class Brightness:
@@ -109,25 +112,24 @@ class Brightness:
     def __init__(self, faces, vertices, position, texture, inside, texels, density, masked):
         self.faces, self.centre = faces, vertices.mean(0)
         self.unit = float(np.abs(vertices - self.centre).max())
-        self.sigma = _BLUR * math.sqrt(max(_areas(position, faces).mean(), 1.0))
+        self.sigma = _BLUR * math.sqrt(max(areas(position, faces).mean(), 1.0))
         sigma = density * self.sigma
         covered = cv2.GaussianBlur(inside, (0, 0), sigma)
-        luminance = _blurred(texture @ _LUMINANCE, sigma, inside if masked else None)
+        luminance = blur(texture @ _LUMINANCE, sigma, inside if masked else None)
         found = _sampled(luminance, texels)
-        self.trusted = _sampled(covered, texels) > (0.3 if masked else 0.97)
+        self.trusted = _sampled(covered, texels) > _INSIDE[masked]
         self.mean = max(float(found[self.trusted].mean()) if self.trusted.any() else 0.0, 1e-6)
         self.texture = found / self.mean
         self.trusted &= self.texture > _DARK
 
     def prepared(self, colour, mask):
-        """A frame (H, W, 3) as :meth:`of` wants it."""
+        """A frame ``colour`` (H, W, 3) [linear RGB] with its ``mask`` (H, W) or None, as :meth:`of` wants it: luminances over the texture's mean,
+        blurred, on a grid of blocks of ``pool`` x ``pool`` pixels, and ``pool``."""
         image = colour @ _LUMINANCE
         pool = max(1, int(self.sigma / 2))
         if pool > 1:
-            height, width = image.shape[0] // pool, image.shape[1] // pool
-            shrink = lambda x: cv2.resize(x[: height * pool, : width * pool], (width, height), interpolation=cv2.INTER_AREA)
-            image, mask = shrink(image), None if mask is None else shrink(mask)
-        return _blurred(image, self.sigma / pool, mask) / self.mean, pool
+            image, mask = shrink(image, pool), None if mask is None else shrink(mask, pool)
+        return blur(image, self.sigma / pool, mask) / self.mean, pool
 
     def of(self, prepared, vertices, origin, position, pixels):
         """The :class:`Shade` of the surface with ``vertices`` (N, 3) [m], which lie at ``position`` (N, 2) [pixels] in the image and of whose
@@ -139,13 +141,13 @@ class Brightness:
         cross = _cross(a, b)
         double = np.maximum(np.sqrt(np.einsum("fk,fk->f", cross, cross)), 1e-15)
         towards = -np.einsum("fk,fk->f", cross, ray)
-        side = np.sign(towards)
-        normal = cross * (side / double)[:, None]
+        facing = np.sign(towards)
+        normal = cross * (facing / double)[:, None]
         frontal = np.abs(towards) > _FRONTAL * double * np.sqrt(np.einsum("fk,fk->f", ray, ray))
         luminance = _sampled(image, (position[self.faces].sum(1) / 3) / pool - 0.5)
-        seen = self.trusted & frontal & (pixels > _COVERED * _areas(position, self.faces))
+        seen = self.trusted & frontal & (pixels > _COVERED * areas(position, self.faces))
         centre = (corner.sum(1) / 3 - self.centre) / self.unit
-        return Shade(normal, centre, self.unit, self.texture, luminance, seen, (a, b), double / 2, side)
+        return Shade(normal, centre, self.unit, self.texture, luminance, seen, (a, b), double / 2, facing)
 
 
 def residuals(shade, light, weight):
@@ -162,10 +164,10 @@ def residuals(shade, light, weight):
     residual = shade.luminance / _exposure(shade.luminance[shade.seen], lit[shade.seen]) - lit
     over = (residual / scale) ** 2
     energy = weight * scale**2 * float((share * np.log1p(over)).sum())
-    # n = (a x b) / |a x b|, whose length does not change: dr = h . d(a x b), and a x b changes with the corners
-    a, b = shade.sides
-    h = (slope - shade.normal * (shade.normal @ slope)[:, None]) * (-shade.texture * shade.side / (2 * shade.area))[:, None]
-    second, third = _cross(b, h), _cross(h, a)
+    # n = (a x b) / |a x b|, whose length does not change: dr = across . d(a x b), and a x b changes with the corners
+    a, b = shade.edges
+    across = (slope - shade.normal * (shade.normal @ slope)[:, None]) * (-shade.texture * shade.facing / (2 * shade.area))[:, None]
+    second, third = _cross(b, across), _cross(across, a)
     by_corner = np.stack([-second - third, second, third], 1) - (shade.texture / (3 * shade.unit))[:, None, None] * gradient
     return energy, residual, 2 * weight * share / (1 + over), by_corner
 
@@ -181,17 +183,11 @@ def _cross(a, b):
     return np.stack([a[:, i] * b[:, j] - a[:, j] * b[:, i] for i, j in ((1, 2), (2, 0), (0, 1))], 1)
 
 
-def _areas(position, faces):
+def areas(position, faces):
+    """Of triangles (F, 3) whose vertices lie at ``position`` (N, 2) [pixels] in an image: (F,) [pixels^2]."""
     corner = position[faces]
     a, b = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
     return 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
-
-
-def _blurred(image, sigma, weight):
-    image = np.ascontiguousarray(image, np.float32)
-    if weight is None:
-        return cv2.GaussianBlur(image, (0, 0), sigma)
-    return cv2.GaussianBlur(image * weight, (0, 0), sigma) / np.maximum(cv2.GaussianBlur(weight, (0, 0), sigma), 1e-3)
 
 
 def _sampled(image, points):

@@ -43,11 +43,11 @@ def level_image(image, mask, level, normalise=True):
     colour = compared(image, mask, level.sigma, level.window, normalise)
     inside = np.ones(image.shape[:2], np.float32) if mask is None else (mask > 0.5).astype(np.float32)
     if level.stride > 1:
-        colour, inside = _shrink(colour, level.stride), _shrink(inside, level.stride)
+        colour, inside = shrink(colour, level.stride), shrink(inside, level.stride)
         inside = (inside > 0.5).astype(np.float32)
     if mask is None:
         return LevelImage(colour, inside)
-    small = _shrink(mask, level.stride)
+    small = shrink(mask, level.stride)
     on = (small > 0.5).astype(np.uint8)
     distance = sum(cv2.distanceTransform(x, cv2.DIST_L2, 3) for x in (on, 1 - on))
     return LevelImage(colour, inside, small, distance, (x // level.stride, y // level.stride))
@@ -72,12 +72,13 @@ def compared(image, weight, sigma, window, normalise):
 
 
 def blur(image, sigma, weight=None):
-    """Gaussian blur of (H, W, C), standard deviation ``sigma`` [pixels]; with ``weight`` (H, W), only of what is inside."""
+    """Gaussian blur of (H, W, C) or (H, W), standard deviation ``sigma`` [pixels]; with ``weight`` (H, W), only of what is inside."""
     if sigma <= 0:
         return image
     if weight is None:
         return _gaussian(image, sigma)
-    return _gaussian(image * weight[..., None], sigma) / np.maximum(_gaussian(weight, sigma), 1e-3)[..., None]
+    across = (...,) + (None,) * (image.ndim - 2)  # the channels, where there are any
+    return _gaussian(image * weight[across], sigma) / np.maximum(_gaussian(weight, sigma), 1e-3)[across]
 
 
 def normalised(image, sigma, weight=None):
@@ -104,7 +105,7 @@ def _gaussian(image, sigma):
     return cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REFLECT_101)
 
 
-def _shrink(image, stride):
+def shrink(image, stride):
     """Means of blocks of stride x stride pixels; what is left over at the right and below is dropped."""
     if stride == 1:
         return image

@@ -67,7 +67,7 @@ class Registration:
         self.corner = experiment.corner
         self.faces = self.corner[faces]  # the template's vertices at the corners of the rendered triangles, (F, 3)
         self._texcoord = mi.Float(np.array(mesh.vertex_texcoords_buffer()))
-        self._faces = faces
+        self._rendered = faces  # by the rendered vertices, which texture coordinates are of
         self._bake(mesh, faces)
         self._textures, self._frames = {}, OrderedDict()
         self._reader = ThreadPoolExecutor(1)
@@ -112,7 +112,7 @@ class Registration:
     def brightness(self):
         """:class:`polysft_mi.light.Brightness` of the template and the video."""
         if self._brightness is None:
-            texels = self._texels()[self._faces].mean(1)
+            texels = self._texels()[self._rendered].mean(1)
             vertices, masked = self.problem.template.vertices, bool(self.problem.experiment.masks)
             position, _ = self.camera.project(vertices)
             self._brightness = Brightness(self.faces, vertices, position, self.texture, self.texture_inside, texels, _TEXELS, masked)

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import synthetic
+from problems import problem_of
 from scipy.linalg import LinAlgError, block_diag
 from scipy.spatial.transform import Rotation
 
@@ -22,20 +23,12 @@ from polysft_mi.problem import Problem
 from polysft_mi.pyramid import FARTHEST, Level, level_image
 from polysft_mi.registration import Registration
 from polysft_mi.relocate import Relocator
-from polysft_mi.sequence import Sequence
 from polysft_mi.settings import Settings
 from polysft_mi.solvers import gauss_newton
 from polysft_mi.template import Template
 from polysft_mi.tracker import track
 
 RNG = np.random.default_rng(4)
-
-
-def problem_of(folder, **settings):
-    prepare.main([str(folder), "--overwrite"])
-    experiment = scene.load(str(folder / "scene.xml"), settings)
-    s = experiment.settings
-    return Problem(experiment, Sequence.open(experiment.frames, experiment.masks, first=s.first, last=s.last, size=experiment.size))
 
 
 @pytest.fixture(scope="module")

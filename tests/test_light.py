@@ -5,13 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 import synthetic
+from problems import problem_of
 from scipy.spatial.transform import Rotation
 
-from polysft_mi import prepare, registration, scene, solvers
+from polysft_mi import registration, solvers
 from polysft_mi.light import Brightness, Light, residuals
 from polysft_mi.normal_equations import Chart, Normal, Pattern, State, add_triangles
-from polysft_mi.problem import Problem
-from polysft_mi.sequence import Sequence
 from polysft_mi.solvers import gauss_newton
 from polysft_mi.template import Template
 from polysft_mi.tracker import track
@@ -187,13 +186,6 @@ def test_what_no_frame_tells_is_an_unknown_light():
 
 
 # -- in the tracker ----------------------------------------------------------
-
-
-def problem_of(folder, **settings):
-    prepare.main([str(folder), "--overwrite"])
-    experiment = scene.load(str(folder / "scene.xml"), settings)
-    s = experiment.settings
-    return Problem(experiment, Sequence.open(experiment.frames, experiment.masks, first=s.first, last=s.last, size=experiment.size))
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from threadpoolctl import ThreadpoolController
 
 from ..errors import InputError
-from ..light import Light, residuals
+from ..light import Light, areas, residuals
 from ..normal_equations import Blocks, Chart, Normal, Pattern, Reduced, State, Surface, add_triangles, assemble, hinges
 from ..patch import Unknowns
 from ..problem import BadFrame
@@ -192,9 +192,7 @@ class GaussNewton:
         self._relief_blocks = wide.laplacian + _RELIEF_BEND * wide.blocks_of(bends.T @ bends)
         self.lengths = np.array(problem.edge_lengths, dtype=np.float64)
         position, _ = problem.camera.project(template.vertices)
-        corner = position[self.registration.faces]
-        a, b = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
-        unit = max(1.0, math.sqrt(0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum()) / _SHEET)
+        unit = max(1.0, math.sqrt(areas(position, self.registration.faces).sum()) / _SHEET)
         self.levels = {}
         for stage in (FAR, *STAGES):
             sigma = stage.blur * unit
