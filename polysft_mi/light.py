@@ -22,6 +22,7 @@ _FRONTAL = 0.3  # cosine between normal and ray from which on a triangle counts
 _DARK = 0.01  # texture's luminance, over its mean, below which it says nothing
 _RIDGE = 3e-3  # what the light is held to be the same from all sides by, in observations a triangle
 _REFITS = 3  # of a frame's robust regression
+_KEPT = 0.8  # of what the frames before say, from one frame to the next: their surfaces were found under a light that was less well known
 _SIZE = 7  # of the unknowns (l_0, l, g)
 _UPPER = np.triu_indices(_SIZE)
 _FIRST_SCALE, _SCALE, _SCALES = 0.05, 4.0, (0.005, 0.05)  # of the robust norm; then so many standard deviations, within bounds, over the texture's mean
@@ -30,8 +31,8 @@ _NORMAL_DEVIATION = 1.4826  # standard deviation of a normal distribution over t
 
 @dataclass(frozen=True)
 class Light:
-    """What the frames so far say of the light: normal equations ``matrix`` (7, 7) and ``right`` (7,) of (l_0, l, g), over the mean of the
-    texture's luminance; ``deviations``: the sum of the residuals' standard deviations in ``frames`` frames."""
+    """What the frames so far say of the light, the last ones most: normal equations ``matrix`` (7, 7) and ``right`` (7,) of (l_0, l, g), over the mean
+    of the texture's luminance, in triangles; ``deviations``: the sum of the residuals' standard deviations in ``frames`` frames."""
 
     matrix: np.ndarray
     right: np.ndarray
@@ -62,25 +63,49 @@ class Light:
         return float(np.clip(_SCALE * self.deviations / self.frames, *_SCALES)) if self.frames else _FIRST_SCALE
 
     def coefficients(self, triangles):
-        """(l_0, l, g) (7,), of a sheet of so many triangles."""
-        held = _RIDGE * triangles * np.diag([0.0] + [1.0] * (_SIZE - 1))
-        return np.linalg.solve(self.matrix + held + 1e-9 * np.eye(_SIZE), self.right)
+        """(l_0, l, g) (7,), of a sheet of so many triangles; the same from all sides where nothing is known."""
+        return np.linalg.solve(self._held(triangles), self.right) if self.frames else np.eye(_SIZE)[0]
+
+    def _held(self, triangles):
+        """By what (7, 7) the coefficients are held to where they are."""
+        return self.matrix + np.diag([1e-9] + [_RIDGE * triangles] * (_SIZE - 1))
+
+    def explaining(self, shade):
+        """The light that explains a frame and the frames before it best, where its surface has the triangles ``shade`` (a :class:`Shade`): :class:`Fit`."""
+        rows = shade.texture[:, None] * np.column_stack([np.ones(len(shade.seen)), shade.normal, shade.centre])
+        area = np.where(shade.seen, shade.area, 0.0)
+        area *= shade.seen.sum() / max(area.sum(), 1e-30)  # 1 on average
+        held, before = self._held(len(shade.seen)), self.coefficients(len(shade.seen))
+        value = shade.luminance / _exposure(shade.luminance[shade.seen], (rows @ before)[shade.seen])
+        found = before
+        for _ in range(_REFITS):
+            weighted = (area / (1 + ((value - rows @ found) / self.scale) ** 2))[:, None] * rows
+            matrix, right = weighted.T @ rows, weighted.T @ value
+            found = np.linalg.solve(held + matrix, held @ before + right)
+        apart = found - before
+        return Fit(found, value - rows @ found, area, float(apart @ held @ apart), matrix, right)
 
     def learned(self, shade):
-        """The light after another frame, whose surface had the triangles ``shade`` (a :class:`Shade`)."""
-        rows = shade.texture[shade.seen, None] * np.column_stack([np.ones(shade.seen.sum()), shade.normal[shade.seen], shade.centre[shade.seen]])
-        value, scale = shade.luminance[shade.seen], self.scale
-        if len(value) < len(rows.T):
+        """The light after a frame whose surface had the triangles ``shade``."""
+        if shade.seen.sum() < _SIZE:
             return self
-        found = self.coefficients(len(shade.seen)) if self.frames else np.eye(_SIZE)[0]
-        value = value / _exposure(value, rows @ found)
-        light = self
-        for _ in range(_REFITS):
-            weighted = rows / (1 + ((value - rows @ found) / scale) ** 2)[:, None]
-            light = Light(self.matrix + weighted.T @ rows, self.right + weighted.T @ value, self.deviations, self.frames)
-            found = light.coefficients(len(shade.seen))
-        deviation = _NORMAL_DEVIATION * float(np.median(np.abs(value - rows @ found)))
-        return Light(light.matrix, light.right, self.deviations + deviation, self.frames + 1)
+        fit = self.explaining(shade)
+        deviation = _NORMAL_DEVIATION * float(np.median(np.abs(fit.residual[shade.seen])))
+        return Light(_KEPT * (self.matrix + fit.matrix), _KEPT * (self.right + fit.right), self.deviations + deviation, self.frames + 1)
+
+
+@dataclass
+class Fit:
+    """How a light explains the F triangles of a frame: its ``coefficients`` (7,); ``residual`` (F,): frame, without its exposure, less the light's;
+    ``area`` (F,), 1 on average over the triangles that are seen and 0 for others; ``apart``: what it costs that the light is another than that of the
+    frames before, in squared residuals of a triangle; ``matrix`` (7, 7), ``right`` (7,): of the frame's own normal equations."""
+
+    coefficients: np.ndarray
+    residual: np.ndarray
+    area: np.ndarray
+    apart: float
+    matrix: np.ndarray
+    right: np.ndarray
 
 
 @dataclass
@@ -151,25 +176,23 @@ class Brightness:
 
 
 def residuals(shade, light, weight):
-    """The shading term of a frame, ``weight`` times the mean over the area seen of c^2 log(1 + r^2 / c^2) with r = frame - t (l_0 + l . n + g . x).
+    """The shading term of a frame, ``weight`` times the mean over the area seen of c^2 log(1 + r^2 / c^2) with r = frame - t (l_0 + l . n + g . x), where
+    (l_0, l, g) is what explains this frame best after those before, ``light``; what that departs from theirs costs too.
 
     Returns its energy, the residuals r (F,), the factors h (F,) of r^2 / 2 in its quadratic model, and the derivatives (F, 3, 3) of r by the
-    corners [1/m].
+    corners [1/m]. The light follows the surface; at its best, the energy has no slope along it.
     """
-    found, scale = light.coefficients(len(shade.seen)), light.scale
-    share = np.where(shade.seen, shade.area, 0.0)
-    share /= max(share.sum(), 1e-30)
-    slope, gradient = found[1:4], found[4:]
-    lit = shade.texture * (found[0] + shade.normal @ slope + shade.centre @ gradient)
-    residual = shade.luminance / _exposure(shade.luminance[shade.seen], lit[shade.seen]) - lit
-    over = (residual / scale) ** 2
-    energy = weight * scale**2 * float((share * np.log1p(over)).sum())
+    fit, scale = light.explaining(shade), light.scale
+    weight = weight / max(shade.seen.sum(), 1)
+    over = (fit.residual / scale) ** 2
+    energy = weight * (scale**2 * float((fit.area * np.log1p(over)).sum()) + fit.apart)
+    slope, gradient = fit.coefficients[1:4], fit.coefficients[4:]
     # n = (a x b) / |a x b|, whose length does not change: dr = across . d(a x b), and a x b changes with the corners
     a, b = shade.edges
     across = (slope - shade.normal * (shade.normal @ slope)[:, None]) * (-shade.texture * shade.facing / (2 * shade.area))[:, None]
     second, third = _cross(b, across), _cross(across, a)
     by_corner = np.stack([-second - third, second, third], 1) - (shade.texture / (3 * shade.unit))[:, None, None] * gradient
-    return energy, residual, 2 * weight * share / (1 + over), by_corner
+    return energy, fit.residual, 2 * weight * fit.area / (1 + over), by_corner
 
 
 def _exposure(value, lit):

@@ -591,6 +591,31 @@ def test_a_sheet_that_jumps_is_found_again(tmp_path, monkeypatch):
     assert found.pose(np.zeros((240, 320, 3), np.float32)) is None
 
 
+def test_a_stage_goes_on_while_it_gains(truth, problem, monkeypatch):
+    solver = gauss_newton.GaussNewton(problem.settings)
+    solver._prepare(problem)
+    rest = solver.chart.state(problem.patch.rest().to_numpy())
+    off = dataclasses.replace(rest, translation=rest.translation + [0.03, 0.02, 0.0])
+    ends, counts = [], []
+    for farther, iterations in ((1, 1), (3, 1), (3, 6)):
+        monkeypatch.setattr(gauss_newton, "_FARTHER", farther)
+        before = solver._count
+        ends.append(solver._stage(off, off, 0, 4, gauss_newton.STAGES[0], iterations)[1]["total"])
+        counts.append(solver._count - before)
+    assert ends[1] < 0.9 * ends[0] and counts[:2] == [2, 4]
+    assert counts[2] <= 7  # once it gains little it ends
+
+
+def test_what_is_suspect_is_measured_from_the_noise(problem):
+    solver = gauss_newton.GaussNewton(problem.settings)
+    frames = [{"misfit": x} for x in (0.9, 0.21, 0.22, 0.24, 0.23, 0.22)]
+    solver._noise = 0.2
+    assert solver._limit(frames) == pytest.approx(0.2 + 1.25 * 0.02 + 0.03)
+    solver._noise = 0.0
+    assert solver._limit(frames) == pytest.approx(1.25 * 0.22 + 0.03)
+    assert solver._limit([{"misfit": 0.2}, {"misfit": None}, {}, {"misfit": 0.2}]) == math.inf
+
+
 def test_a_sheet_that_matches_nothing_stays_in_view(truth, tmp_path):
     """Images of something else: what no pixel sees costs nothing, and the sheet must not flee there, nor the solver fail."""
     folder = tmp_path / "other"

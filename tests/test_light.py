@@ -85,6 +85,36 @@ def test_residuals_and_derivatives():
                 assert by_corner[face, corner, axis] == pytest.approx((minus - plus) / (2 * h), rel=1e-4, abs=1e-5 * np.abs(by_corner).max())
 
 
+def test_the_light_follows_the_surface_and_the_energy_has_no_slope_along_it(monkeypatch):
+    monkeypatch.setattr("polysft_mi.light._REFITS", 60)
+    found, vertices = brightness(masked=True), wavy()
+    light = Light(np.diag([5.0, 1, 1, 1, 2, 2, 2]), np.diag([5.0, 1, 1, 1, 2, 2, 2]) @ LIGHT, 0.01, 1)
+    shade = shade_of(found, vertices, 0.4)
+    fit = light.explaining(shade)
+    before = light.coefficients(len(FACES))
+    assert np.abs(fit.coefficients - before).max() > 0.05 and fit.apart > 0
+
+    def at(vertices, image=shade.luminance):  # what the image shows at another place is no derivative
+        return residuals(dataclasses.replace(shade_of(found, vertices, 0.4), luminance=image, area=shade.area), light, 12.0)
+
+    _, residual, factor, by_corner = at(vertices)
+    gradient = np.zeros_like(vertices)
+    np.add.at(gradient, FACES, (factor * residual)[:, None, None] * by_corner)
+    # the frame's exposure follows too: only vertices whose triangles are not those of the median
+    ratio = shade.luminance / (shade.texture * (before[0] + shade.normal @ before[1:4] + shade.centre @ before[4:]))
+    middle = np.argsort(ratio)[len(FACES) // 2 - 1 : len(FACES) // 2 + 1]
+    free = np.setdiff1d(np.arange(len(vertices)), FACES[middle])
+    h = 1e-6
+    for i in free[::9]:
+        for axis in range(3):
+            energy = []
+            for step in (h, -h):
+                moved = vertices.copy()
+                moved[i, axis] += step
+                energy.append(at(moved)[0])
+            assert gradient[i, axis] == pytest.approx((energy[0] - energy[1]) / (2 * h), rel=1e-3, abs=1e-4 * np.abs(gradient).max())
+
+
 @pytest.mark.parametrize("exposure", [0.5, 1.7])
 def test_a_frames_exposure_changes_nothing(exposure):
     found = brightness(masked=True)
@@ -169,6 +199,18 @@ def test_the_light_is_learned_from_surfaces_that_bend():
     assert light.frames == 20 and learned * (LIGHT[0] / learned[0]) == pytest.approx(LIGHT, abs=0.03)
     assert 0.015 < light.scale < 0.03  # four deviations of 0.005, a little more for the outliers
     assert Light.of(light.numbers()).numbers() == light.numbers()
+
+
+def test_the_last_frames_say_most():
+    found, light = brightness(masked=True), Light.unknown()
+    slopes = []
+    for k in range(30):  # in the first ten frames the light comes a little less from the side
+        vertices = wavy(k, 0.01)
+        value = lit(vertices) - 0.08 * normals(vertices)[:, 0] * (k < 10)
+        light = light.learned(dataclasses.replace(shade_of(found, vertices, 0.4), luminance=value))
+        level, slope = light.coefficients(len(FACES))[:2]
+        slopes.append(slope / level * LIGHT[0])
+    assert slopes[9] == pytest.approx(LIGHT[1] - 0.08, abs=0.015) and slopes[29] == pytest.approx(LIGHT[1], abs=0.015)
 
 
 def test_a_flat_sheet_says_nothing_of_where_the_light_comes_from():

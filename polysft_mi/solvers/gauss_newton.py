@@ -22,7 +22,9 @@ _SHEET = 225.0  # width [pixels] of the sheet that the stages' blurs are given f
 _WINDOW = 8.0  # standard deviation of the window of the local statistics, likewise
 _FIRST_SCALE, _SCALES = 0.3, (0.2, 1.0)  # robust scale at the start of a frame, and its bounds, in local standard deviations
 _SMALL = 2e-3  # share of the objective that a step must promise for another one to follow
-_SUSPECT, _SUSPECT_MARGIN, _MEMORY = 1.25, 0.03, 5  # a misfit above this many times the median of the frames before (plus the margin) is suspect
+_GOING, _FARTHER = 0.03, 3  # a stage goes on, to so many times its iterations, while steps lower the objective by this share
+# A misfit is suspect that exceeds the noise (the least misfit so far) by so many times what the median of the frames before does, plus the margin.
+_SUSPECT, _SUSPECT_MARGIN, _MEMORY = 1.25, 0.03, 5
 _PATIENT = 18  # iterations a stage where a frame is suspect
 _RAISE = 0.02  # share of the objective by which more coefficients must lower it to be taken
 _LOWER = 2.0  # the highest coefficients are kept where they are worth this many times what they would make of noise alone
@@ -79,8 +81,8 @@ class Model:
 
 @dataclass(frozen=True)
 class Stage:
-    """``blur`` [pixels at a sheet of _SHEET], ``stiffness`` (the factor of k_mi), the most ``iterations``, and the least misfit so far
-    below which the ``relief`` moves: the first number everywhere, the second where the frame before was not explained."""
+    """``blur`` [pixels at a sheet of _SHEET], ``stiffness`` (the factor of k_mi), the ``iterations`` it usually has, and the least misfit
+    so far below which the ``relief`` moves: the first number everywhere, the second where the frame before was not explained."""
 
     blur: float
     stiffness: float
@@ -261,8 +263,7 @@ class GaussNewton:
         nearest, misfit = self._nearest(starts, frame, STAGES[0])
         self._moved = misfit > _MOVED
         best = self._descend(nearest, anchor, frame, order, STAGES)
-        usual = [t["misfit"] for t in past[-_MEMORY:] if t.get("misfit") is not None]
-        limit = _SUSPECT * np.median(usual) + _SUSPECT_MARGIN if len(usual) >= 3 else math.inf
+        limit = self._limit(past)
         if best[1]["misfit"] > limit:
             self.registration.expect([frame], [self.levels[FAR]])
             self._moved = True
@@ -278,6 +279,11 @@ class GaussNewton:
         state, terms = self._adapt_order(*best, anchor, frame)
         terms["bulge"] = bulge
         return self.chart.absorbed(state, self.least), terms
+
+    def _limit(self, past):
+        """The misfit above which a frame is suspect, after those whose terms are ``past``: infinite while these are too few to tell."""
+        usual = [t["misfit"] for t in past[-_MEMORY:] if t.get("misfit") is not None]
+        return self._noise + _SUSPECT * (np.median(usual) - self._noise) + _SUSPECT_MARGIN if len(usual) >= 3 else math.inf
 
     def _reduced(self, normal, damping, dtype=np.float64):
         return Reduced(self.systems[normal.local.shape[-1]], normal, damping, dtype)
@@ -335,7 +341,7 @@ class GaussNewton:
         return State(rest.alpha, rest.offset, *self.chart.rigid(*motion))
 
     def _descend(self, state, anchor, frame, order, stages, iterations=None):
-        """Stage after stage, each of at most its own or so many ``iterations``: (state, terms)."""
+        """Stage after stage, each of its own or so many ``iterations``, more while they gain much: (state, terms)."""
         for stage in stages:
             state, terms = self._stage(state, anchor, frame, order, stage, iterations or stage.iterations)
         return state, terms
@@ -344,8 +350,11 @@ class GaussNewton:
         """Levenberg-Marquardt at one stage: (state, terms). Its robust scale is the one that fitted the frame before."""
         scale = self._scales.get(stage, _FIRST_SCALE)
         normal, terms = self._linearise(state, anchor, frame, order, stage, scale)
-        damping, least = _DAMPING[normal.local.shape[-1]], _SHOWN * terms["pixels"]
-        for _ in range(iterations):
+        damping, least, gained = _DAMPING[normal.local.shape[-1]], _SHOWN * terms["pixels"], 0.0
+        for k in range(_FARTHER * iterations):
+            if k >= iterations and gained < _GOING * terms["total"]:
+                break
+            gained = 0.0
             try:
                 step, promised = self._reduced(normal, damping, np.float32).step()
                 _check_step(step)
@@ -358,7 +367,8 @@ class GaussNewton:
             trial = state.moved(step)
             found = self._linearise(trial, anchor, frame, order, stage, scale)
             if found[1]["total"] < terms["total"] and found[1]["pixels"] > least:
-                if terms["total"] - found[1]["total"] > 0.5 * promised:
+                gained = terms["total"] - found[1]["total"]
+                if gained > 0.5 * promised:
                     damping = max(damping / 5, 1e-7)
                 state, (normal, terms) = trial, found
             else:
