@@ -40,6 +40,7 @@ def _draw_in_background(variant, scene, overrides, template, sequence, album, ca
 
         dr.set_thread_count(1)
         _album = Album(Problem(scenes.load(scene, overrides, template), sequence), *album)
+        import matplotlib.backends.backend_agg  # noqa: F401: for the plots at the end, while there is nothing to draw yet
     result = None
     for name, *arguments in calls:
         result = getattr(_album, name)(*arguments)
@@ -96,21 +97,21 @@ class Drawing:
             self._give(k, vertices)
 
     def _give(self, k, vertices):
-        self._given[k] = vertices, k in self._exr
         self._jobs.append(self._submit(self._call(k, vertices)))
+        self._given[k] = vertices, k in self._exr
 
     def _call(self, k, vertices):
         return "draw", k, vertices, self.problem.texcoords, k in self._exr
 
     def finish(self, vertices, surfaces, fps):
-        """Have the rest drawn, and all bound: what :meth:`polysft_mi.pictures.Album.finish` and ``bind`` return, each as a function to call
-        for it, in this order.
+        """Have the rest drawn, all bound, and plots made: what :meth:`polysft_mi.pictures.Album.finish`, ``bind`` and ``plot`` return, each as a
+        function to call for it, in this order.
 
         ``vertices``, ``surfaces`` (T, N, 3) [m]: of all frames, in the world and in the camera frame.
         """
         self._exr = self._chosen(len(vertices))
         self._remove_other_exrs()
-        last = ("finish", surfaces), ("bind", len(surfaces), fps)
+        last = ("finish", surfaces), ("bind", len(surfaces), fps), ("plot",)
         if self._pool is not None:
             for k, v in enumerate(vertices):
                 before, exr = self._given.get(k, (None, False))
@@ -132,7 +133,7 @@ class Drawing:
             name, *arguments = last[k]
             return getattr(album[0], name)(*arguments)
 
-        return partial(result, 0), partial(result, 1)
+        return tuple(partial(result, k) for k in range(len(last)))
 
     def _here(self, vertices):
         from .pictures import Album

@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import __version__, figures, meshio
+from . import __version__, meshio
 from .defaults import located
 from .files import aside
 from .patch import Unknowns
@@ -60,7 +60,8 @@ def resolved_scene(experiment):
 
 
 def write(problem, track, out, drawing, *, fps, command, say=None):
-    """Write everything for the frames that ``track`` holds. Returns the summary that ``metrics.json`` begins with.
+    """Write everything for the frames that ``track`` holds. Returns the summary that ``metrics.json`` begins with, and a function to call in
+    the end: it waits for the plots.
 
     ``drawing``: the :class:`polysft_mi.drawing.Drawing` of the run; ``fps``: of the video; ``say(text)``: told what is being written.
     """
@@ -70,7 +71,7 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
     indices = np.asarray(sequence.indices[:count], dtype=np.int64)
     world = np.stack([problem.surface(Unknowns.from_numpy(s)) for s in track.states])
     vertices = problem.camera.to_camera(world).astype(np.float32)
-    drawn, bound = drawing.finish(world, vertices, fps)
+    drawn, bound, plotted = drawing.finish(world, vertices, fps)
 
     sigma = {}
     if track.sigma:
@@ -91,11 +92,7 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
     for index, v in zip(indices, vertices):
         meshio.write_ply(os.path.join(out, "meshes", f"{index:03d}.ply"), v, template.faces, template.uv)
     say("pictures")
-    rows, per_frame = drawn()
-    figures.contact_sheet(os.path.join(out, "comparison.png"), rows)
-    with open(os.path.join(out, "log.jsonl"), encoding="utf-8") as file:
-        figures.loss_plot(os.path.join(out, "loss.png"), [json.loads(line) for line in file])
-    video = bound()
+    per_frame, video = drawn(), bound()
 
     finite = {name: [p[name] for p in per_frame if np.isfinite(p[name])] for name in ("psnr_mask", "ssim_mask")}
     summary = {
@@ -118,7 +115,7 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
     write_json(
         os.path.join(out, "metrics.json"), {**summary, "versions": versions(), "per_frame": per_frame, "windows": windows, "command": command}
     )
-    return {**summary, "video": video}
+    return {**summary, "video": video}, plotted
 
 
 def write_beginning(out, scene, camera, command, fps):

@@ -1,8 +1,9 @@
-"""The pictures of a run: each frame's rendering beside its image, as layers, EXRs and a video.
+"""The pictures of a run: each frame's rendering beside its image, as layers, EXRs, a video and a sheet; and the curves of its losses.
 
 Import only after a Mitsuba variant is set. :mod:`polysft_mi.drawing` has this done by a process of its own.
 """
 
+import json
 import os
 from concurrent.futures import ThreadPoolExecutor
 
@@ -83,7 +84,8 @@ class Album:
     """The pictures of a run in the making: frames are drawn one by one, in any order and as often as need be, and bound into a video at the
     end.
 
-    ``out``: folder of the run; ``about``: what the EXRs' headers say of it; ``folder``: where the frames' pictures lie until the end.
+    ``out``: folder of the run; ``about``: what the EXRs' headers say of it; ``folder``: where the frames' pictures lie until the end. ``rows``: of
+    the contact sheet (:func:`polysft_mi.figures.contact_sheet`), once :meth:`finish` has chosen them.
     """
 
     def __init__(self, problem, out, about, folder):
@@ -92,6 +94,7 @@ class Album:
         self._masked = problem.sequence.mask(0) is not None
         self._pool = ThreadPoolExecutor(_THREADS)
         self._drawn = {}  # frame: future of its figures
+        self.rows = []
 
     def draw(self, frame, vertices, texcoords=None, exr=False):
         """Draw a frame whose surface has ``vertices`` (N, 3) [m, world], and ``texcoords`` (2V,) other than the template's own, if any."""
@@ -136,25 +139,32 @@ class Album:
         return [*np.split(images, 3, axis=1), cv2.imread(self._place(frame, "surface"))]
 
     def finish(self, surfaces):
-        """Once all frames are drawn: the rows of a contact sheet (:func:`polysft_mi.figures.contact_sheet`), and the figures of each frame.
+        """Once all frames are drawn: the figures of each.
 
         ``surfaces`` (T, N, 3) [m, camera frame]. Where some leave the view of the first one, all are shaded again in one that holds them.
         """
-        found, rows = [self._drawn[k].result() for k in range(len(surfaces))], []
+        found = [self._drawn[k].result() for k in range(len(surfaces))]
         if not self._view.holds(surfaces):
             self._view = figures.View.around(surfaces)
             shape = self._panels(0)[0].shape
             list(self._pool.map(lambda k: self._write(k, "surface", self._shaded(surfaces[k], shape)), range(len(surfaces))))
+        self.rows = []
         for k in chosen(len(surfaces), _ROWS):
             target, render, heat, surface = self._panels(k)
             error = heat.sum(axis=2, dtype=np.float32) * (PEAK / 765)
-            rows.append({"target": target, "render": render, "error": error, "surface": surface, "label": f"frame {found[k]['frame']}"})
-        return rows, found
+            self.rows.append({"target": target, "render": render, "error": error, "surface": surface, "label": f"frame {found[k]['frame']}"})
+        return found
 
     def bind(self, count, fps):
         """Write comparison.mp4 of the first ``count`` frames, ``fps`` a second; returns its path, or its folder where no encoder is."""
         pictures = self._pool.map(lambda k: np.concatenate(self._panels(k), axis=1), range(count))
         return write_video(os.path.join(self.out, "comparison.mp4"), pictures, fps)
+
+    def plot(self):
+        """Write comparison.png, the contact sheet, and loss.png, of the run's log."""
+        figures.contact_sheet(os.path.join(self.out, "comparison.png"), self.rows)
+        with open(os.path.join(self.out, "log.jsonl"), encoding="utf-8") as file:
+            figures.loss_plot(os.path.join(self.out, "loss.png"), [json.loads(line) for line in file])
 
 
 def _figures(layers, masked):

@@ -139,8 +139,9 @@ def _run(options, overrides, out, exr_frames):
             progress.say(f"interrupted: {len(done.states)} of {count} frames are kept; --resume goes on")
         if not done.states:
             return status
-        summary = outputs.write(problem, done, out, drawing, fps=options.fps, command=command, say=progress.stage)
+        summary, plotted = outputs.write(problem, done, out, drawing, fps=options.fps, command=command, say=progress.stage)
         page = None if options.no_report else _report(out, progress)
+        plotted()
     for frame, reason in summary["lost"].items():
         print(f"frame {frame}: {reason}; it keeps the state of the frame before", file=sys.stderr)
     seconds = time.perf_counter() - began
