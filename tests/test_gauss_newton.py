@@ -605,6 +605,17 @@ def test_a_stage_goes_on_while_it_gains(truth, problem, monkeypatch):
     assert ends[1] < 0.9 * ends[0] and counts[:2] == [2, 4]
     assert counts[2] <= 7  # once it gains little it ends
 
+    def after_one(*arguments):
+        normal, terms = linearise(*arguments)
+        if solver._count > before + 2:
+            terms["total"] += 1e3
+        return normal, terms
+
+    linearise, before = solver._linearise, solver._count
+    monkeypatch.setattr(solver, "_linearise", after_one)
+    solver._stage(off, off, 0, 4, gauss_newton.STAGES[0], 1)
+    assert solver._count - before == 3  # a step that gains nothing is the last, too
+
 
 def test_what_is_suspect_is_measured_from_the_noise(problem):
     solver = gauss_newton.GaussNewton(problem.settings)

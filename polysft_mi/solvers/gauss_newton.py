@@ -22,7 +22,7 @@ _SHEET = 225.0  # width [pixels] of the sheet that the stages' blurs are given f
 _WINDOW = 8.0  # standard deviation of the window of the local statistics, likewise
 _FIRST_SCALE, _SCALES = 0.3, (0.2, 1.0)  # robust scale at the start of a frame, and its bounds, in local standard deviations
 _SMALL = 2e-3  # share of the objective that a step must promise for another one to follow
-_GOING, _FARTHER = 0.03, 3  # a stage goes on, to so many times its iterations, while steps lower the objective by this share
+_GOING, _FARTHER = 0.1, 3  # a stage goes on, to so many times its iterations, while steps lower the objective by this share
 # A misfit is suspect that exceeds the noise (the least misfit so far) by so many times what the median of the frames before does, plus the margin.
 _SUSPECT, _SUSPECT_MARGIN, _MEMORY = 1.25, 0.03, 5
 _PATIENT = 18  # iterations a stage where a frame is suspect
