@@ -156,5 +156,6 @@ class Drawing:
 
     def __exit__(self, kind, error, trace):
         if self._pool is not None:
-            self._pool.shutdown(wait=False, cancel_futures=True)
+            # not waited for, its end and that of the interpreter could meet: Python 3.11 then prints an OSError
+            self._pool.shutdown(wait=kind is None, cancel_futures=True)
         self._folder.cleanup()
