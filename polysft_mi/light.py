@@ -29,6 +29,20 @@ _FIRST_SCALE, _SCALE, _SCALES = 0.05, 4.0, (0.005, 0.05)  # of the robust norm; 
 _NORMAL_DEVIATION = 1.4826  # standard deviation of a normal distribution over the median of its absolute values
 
 
+@dataclass
+class Fit:
+    """How a light explains the F triangles of a frame: its ``coefficients`` (7,); ``residual`` (F,): frame, without its exposure, less the light's;
+    ``area`` (F,), 1 on average over the triangles that are seen and 0 for others; ``departure``: what it costs that the light is another than that of the
+    frames before, in squared residuals of a triangle; ``matrix`` (7, 7), ``right`` (7,): of the frame's own normal equations."""
+
+    coefficients: np.ndarray
+    residual: np.ndarray
+    area: np.ndarray
+    departure: float
+    matrix: np.ndarray
+    right: np.ndarray
+
+
 @dataclass(frozen=True)
 class Light:
     """What the frames so far say of the light, the last ones most: normal equations ``matrix`` (7, 7) and ``right`` (7,) of (l_0, l, g), over the mean
@@ -67,7 +81,7 @@ class Light:
         return np.linalg.solve(self._held(triangles), self.right) if self.frames else np.eye(_SIZE)[0]
 
     def _held(self, triangles):
-        """By what (7, 7) the coefficients are held to where they are."""
+        """The curvature (7, 7) that holds the coefficients where they are, in squared residuals of a triangle."""
         return self.matrix + np.diag([1e-9] + [_RIDGE * triangles] * (_SIZE - 1))
 
     def explaining(self, shade):
@@ -82,8 +96,8 @@ class Light:
             weighted = (area / (1 + ((value - rows @ found) / self.scale) ** 2))[:, None] * rows
             matrix, right = weighted.T @ rows, weighted.T @ value
             found = np.linalg.solve(held + matrix, held @ before + right)
-        apart = found - before
-        return Fit(found, value - rows @ found, area, float(apart @ held @ apart), matrix, right)
+        change = found - before
+        return Fit(found, value - rows @ found, area, float(change @ held @ change), matrix, right)
 
     def learned(self, shade):
         """The light after a frame whose surface had the triangles ``shade``."""
@@ -92,20 +106,6 @@ class Light:
         fit = self.explaining(shade)
         deviation = _NORMAL_DEVIATION * float(np.median(np.abs(fit.residual[shade.seen])))
         return Light(_KEPT * (self.matrix + fit.matrix), _KEPT * (self.right + fit.right), self.deviations + deviation, self.frames + 1)
-
-
-@dataclass
-class Fit:
-    """How a light explains the F triangles of a frame: its ``coefficients`` (7,); ``residual`` (F,): frame, without its exposure, less the light's;
-    ``area`` (F,), 1 on average over the triangles that are seen and 0 for others; ``apart``: what it costs that the light is another than that of the
-    frames before, in squared residuals of a triangle; ``matrix`` (7, 7), ``right`` (7,): of the frame's own normal equations."""
-
-    coefficients: np.ndarray
-    residual: np.ndarray
-    area: np.ndarray
-    apart: float
-    matrix: np.ndarray
-    right: np.ndarray
 
 
 @dataclass
@@ -185,7 +185,7 @@ def residuals(shade, light, weight):
     fit, scale = light.explaining(shade), light.scale
     weight = weight / max(shade.seen.sum(), 1)
     over = (fit.residual / scale) ** 2
-    energy = weight * (scale**2 * float((fit.area * np.log1p(over)).sum()) + fit.apart)
+    energy = weight * (scale**2 * float((fit.area * np.log1p(over)).sum()) + fit.departure)
     slope, gradient = fit.coefficients[1:4], fit.coefficients[4:]
     # n = (a x b) / |a x b|, whose length does not change: dr = across . d(a x b), and a x b changes with the corners
     a, b = shade.edges

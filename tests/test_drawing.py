@@ -46,8 +46,8 @@ def drawn(sheet, out, during=lambda drawing: None, *, problem=None, frames=9, ex
             made.frame(k, v)
         during(made)
         (out / "log.jsonl").write_text('{"frame": 0, "iteration": 0, "loss": 1.0}\n')
-        drawn, bound, plotted = made.finish(vertices, surfaces, 15)
-        figures, path = drawn(), bound()
+        finished, bound, plotted = made.finish(vertices, surfaces, 15)
+        figures, path = finished(), bound()
         plotted()
         folder = Path(made._folder.name)
     assert not folder.exists() and (out / "comparison.png").stat().st_size > 20_000 and (out / "loss.png").exists()
@@ -113,13 +113,12 @@ def test_fewer_frames_than_expected(sheet, here, tmp_path):
 
 def test_a_surface_that_leaves_the_view_of_the_first_is_shown_whole(sheet, tmp_path):
     problem = problem_of(sheet)
-    (tmp_path / "log.jsonl").write_text('{"frame": 0, "iteration": 0, "loss": 1.0}\n')
     album = Album(problem, str(tmp_path), {}, str(tmp_path))
-    surfaces = sheet.vertices[:3] + np.array([0, 0.2, 0.4])[:, None, None] * np.array([1, 0.3, 0])
+    surfaces = sheet.vertices[:9] + np.linspace(0, 0.4, 9)[:, None, None] * np.array([1, 0.3, 0])
     for k, v in enumerate(surfaces):
         album.draw(k, problem.camera.origin + v @ problem.camera.axes)
-    assert len(album.finish(surfaces)) == 3
-    assert album._view.holds(surfaces) and [row["label"] for row in album.rows] == [f"frame {k}" for k in chosen(3, 5)]
+    assert len(album.finish(surfaces)) == 9
+    assert album._view.holds(surfaces) and [row["label"] for row in album.rows] == [f"frame {k}" for k in chosen(9, 5)]
     for row in album.rows:
         background = row["surface"][0, 0]
         shown = (row["surface"] != background).any(-1)

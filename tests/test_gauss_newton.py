@@ -621,10 +621,10 @@ def test_what_is_suspect_is_measured_from_the_noise(problem):
     solver = gauss_newton.GaussNewton(problem.settings)
     frames = [{"misfit": x} for x in (0.9, 0.21, 0.22, 0.24, 0.23, 0.22)]
     solver._noise = 0.2
-    assert solver._limit(frames) == pytest.approx(0.2 + 1.25 * 0.02 + 0.03)
+    assert solver._suspect_above(frames) == pytest.approx(0.2 + 1.25 * 0.02 + 0.03)
     solver._noise = 0.0
-    assert solver._limit(frames) == pytest.approx(1.25 * 0.22 + 0.03)
-    assert solver._limit([{"misfit": 0.2}, {"misfit": None}, {}, {"misfit": 0.2}]) == math.inf
+    assert solver._suspect_above(frames) == pytest.approx(1.25 * 0.22 + 0.03)
+    assert solver._suspect_above([{"misfit": 0.2}, {"misfit": None}, {}, {"misfit": 0.2}]) == math.inf
 
 
 def test_a_sheet_that_matches_nothing_stays_in_view(truth, tmp_path):

@@ -92,7 +92,7 @@ def test_the_light_follows_the_surface_and_the_energy_has_no_slope_along_it(monk
     shade = shade_of(found, vertices, 0.4)
     fit = light.explaining(shade)
     before = light.coefficients(len(FACES))
-    assert np.abs(fit.coefficients - before).max() > 0.05 and fit.apart > 0
+    assert np.abs(fit.coefficients - before).max() > 0.05 and fit.departure > 0
 
     def at(vertices, image=shade.luminance):  # what the image shows at another place is no derivative
         return residuals(dataclasses.replace(shade_of(found, vertices, 0.4), luminance=image, area=shade.area), light, 12.0)

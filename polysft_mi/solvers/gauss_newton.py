@@ -263,7 +263,7 @@ class GaussNewton:
         nearest, misfit = self._nearest(starts, frame, STAGES[0])
         self._moved = misfit > _MOVED
         best = self._descend(nearest, anchor, frame, order, STAGES)
-        limit = self._limit(past)
+        limit = self._suspect_above(past)
         if best[1]["misfit"] > limit:
             self.registration.expect([frame], [self.levels[FAR]])
             self._moved = True
@@ -280,7 +280,7 @@ class GaussNewton:
         terms["bulge"] = bulge
         return self.chart.absorbed(state, self.least), terms
 
-    def _limit(self, past):
+    def _suspect_above(self, past):
         """The misfit above which a frame is suspect, after those whose terms are ``past``: infinite while these are too few to tell."""
         usual = [t["misfit"] for t in past[-_MEMORY:] if t.get("misfit") is not None]
         return self._noise + _SUSPECT * (np.median(usual) - self._noise) + _SUSPECT_MARGIN if len(usual) >= 3 else math.inf
