@@ -222,7 +222,7 @@ class Pattern:
         self.count, self.edges = count, edges
         a, b = (edges if further is None else np.concatenate([edges, further])).T
         each = np.arange(count)
-        self._keys = np.sort(np.concatenate([each * count + each, a * count + b, b * count + a]))
+        self._keys = np.unique(np.concatenate([each * count + each, a * count + b, b * count + a]))  # at a vertex of four triangles, pairs repeat
         self.row, self.column = np.divmod(self._keys, count)
         self.start = np.searchsorted(self.row, np.arange(count + 1))
         self.diagonal = self.find(each, each)

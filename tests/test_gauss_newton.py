@@ -257,6 +257,26 @@ def test_a_block_that_is_not_positive_is_refused_in_either_thread(monkeypatch, v
         Reduced(blocks, normal, 0)
 
 
+def test_pairs_that_lie_across_two_edges_are_one_block():
+    """Around a vertex of four triangles, two hinges join the same pair: its block must neither be lost nor counted twice."""
+    x = np.array([[0.0, 0], [1, 0], [0, 1], [-1, 0], [0, -1]])
+    faces = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1]])
+    edges = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [1, 4]])
+    across, bends = hinges(x, faces)
+    assert len(across) == 4 and len(np.unique(np.sort(across, 1), axis=0)) == 2
+    pattern = Pattern(faces, edges, 5, across)
+    blocks = Blocks(pattern, 3)
+    values = pattern.laplacian + pattern.blocks_of(bends.T @ bends)
+    local = values[:, None, None] * np.eye(3)
+    local[pattern.diagonal] += np.eye(3)
+    difference = np.zeros((8, 5))
+    difference[np.arange(8)[:, None], edges] = [1.0, -1.0]
+    dense = np.kron(difference.T @ difference + (bends.T @ bends).toarray() + np.eye(5), np.eye(3))
+    right = RNG.normal(size=(15, 2))
+    found = blocks.eliminate(local, right, np.float64)
+    np.testing.assert_allclose(found.back(found.columns), np.linalg.solve(dense, right), atol=1e-10)
+
+
 def test_a_disconnected_and_irregular_mesh_is_factorised():
     faces = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1], [5, 6, 7], [8, 9, 10], [9, 10, 0]])
     edges = np.unique(np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1), axis=0)
