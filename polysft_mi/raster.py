@@ -292,9 +292,9 @@ class RasterIntegrator(mi.SamplingIntegrator):
             return [dr.select(hit, x, 0) for x in si.uv]
         return [mi.Float(triangle)]
 
-    def crossings(self, view):
+    def crossings(self, view, outline=False):
         """The silhouette edges that run between neighbouring pixel centres of a :class:`View`: detached (va, vb, near, far, horizontal),
-        None where there are none.
+        None where there are none. With ``outline`` only those of which one centre sees no sheet at all.
 
         Vertices of each edge, the region's pixel whose sheet ends there, the other pixel, and whether the two lie side by side.
         """
@@ -313,7 +313,8 @@ class RasterIntegrator(mi.SamplingIntegrator):
                 return a, a + dr.select(horizontal, 1, w_), horizontal
 
             a, b, _ = pixels(dr.arange(mi.UInt32, count))
-            pair = dr.compress(dr.gather(mi.Int32, view.triangle, a) != dr.gather(mi.Int32, view.triangle, b))
+            ta, tb = (dr.gather(mi.Int32, view.triangle, k) for k in (a, b))
+            pair = dr.compress((ta < 0) != (tb < 0) if outline else ta != tb)
             if dr.width(pair) == 0:
                 return None
             a, b, horizontal = pixels(pair)

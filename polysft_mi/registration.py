@@ -195,8 +195,8 @@ class Registration:
         return level_image(*self._decoded(frame), level, self.normalise)
 
     def _frame_level(self, frame, level):
-        """The frame at a level, on the device: packed colour and weight; the mask or None; the :class:`LevelImage`; its area [pixels of
-        the grid].
+        """The frame at a level, on the device: packed colour and weight; the mask or None; the :class:`LevelImage`; the mask's sum
+        [pixels of the grid] and that of its squares.
         """
         key = (frame, level)
         if key not in self._frames:
@@ -208,8 +208,8 @@ class Registration:
                 raise BadFrame(frame, math.nan)
             packed = mi.Float(np.ascontiguousarray(np.concatenate([image.colour, image.inside[..., None]], -1)).ravel())
             mask = mi.Float(np.ascontiguousarray(image.mask).ravel()) if image.mask is not None else None
-            area = max(1.0, float(image.mask.sum())) if image.mask is not None else None
-            self._frames[key] = entry = packed, mask, image, area
+            sums = (max(1.0, float(image.mask.sum())), float((image.mask.astype(np.float64) ** 2).sum())) if image.mask is not None else (None, None)
+            self._frames[key] = entry = packed, mask, image, *sums
         return entry
 
     # -- evaluation ---------------------------------------------------------
@@ -226,7 +226,7 @@ class Registration:
     def _pixels(self, view, frame, level):
         """Residuals (Vector4f, its fourth entry 0) and weights of the region's pixels, and what their derivatives need."""
         texture, texture_width, texture_height = self._texture_level(level)
-        packed, _, image, _ = self._frame_level(frame, level)
+        packed, _, image, *_ = self._frame_level(frame, level)
         hit, topology = view.hit, self.raster.topology(self.scene)
         triangle = mi.UInt32(dr.select(hit, view.triangle, 0))
         index = [dr.gather(mi.UInt32, topology.faces, 3 * triangle + k, hit) for k in range(3)]
@@ -321,7 +321,7 @@ class Registration:
             found = mi.Vector4f(xx, xy, yy, b1), mi.Vector4f(first.x, first.y, first.z, b2), mi.Vector4f(*figures)
             table = self._by_triangle(view.triangle, found)
             pairs = self._silhouette(view, frame, level) if s.k_silhouette > 0 else None
-        *_, area = self._frame_level(frame, level)
+        *_, area, _ = self._frame_level(frame, level)
         energy, pixels, outlying, misfit = table[:, 27:31].sum(0).tolist()
         weight = s.k_rgb / (area or max(pixels, 1.0))
         blocks = table[:, :18].reshape(-1, 6, 3)
@@ -345,8 +345,8 @@ class Registration:
         the pixels, and always alike.
         """
         buffers = [dr.ravel(x) for x in found]
-        dr.eval(buffers)
         seen, faces = np.array(triangle), len(self.faces)
+        dr.eval(buffers)  # while pixels are sorted
         order = np.argsort((seen + 1).astype(np.uint16) if faces < 2**16 - 1 else seen, kind="stable")  # of 16 bits NumPy sorts by radix
         ends = np.cumsum(np.bincount(seen + 1, minlength=faces + 1))
         order, start, end = (mi.UInt32(x.astype(np.uint32)) for x in (order, ends[:-1], ends[1:]))
@@ -370,14 +370,13 @@ class Registration:
     def _silhouette(self, view, frame, level):
         """The rendered silhouette against the mask: (energy without its weight, per pair of pixels: va, vb, derivative of the pixel's
         alpha by the edge's ends (K, 2) each, alpha less mask, distance to the mask's contour); None without masks."""
-        _, mask, image, _ = self._frame_level(frame, level)
+        _, mask, image, _, total = self._frame_level(frame, level)  # the total of the whole frame, less the region's, which alpha is subtracted from
         if mask is None:
             return None
         pixel, known = self._at(view, image)
         alpha = dr.select(view.hit, mi.Float(1), 0)
         wanted = dr.gather(mi.Float, mask, pixel, known)
-        total = float((image.mask.astype(np.float64) ** 2).sum())  # of the whole frame, less the region's, which alpha is subtracted from
-        crossings = self.raster.crossings(view)
+        crossings = self.raster.crossings(view, outline=True)  # where a sheet passes before the sheet itself, alpha does not change
         if crossings is None:
             error = dr.sum(dr.square(alpha - wanted) - dr.square(wanted))
             return total + float(error[0]), None
@@ -396,13 +395,11 @@ class Registration:
         excess = dr.gather(mi.Float, alpha - wanted, to)
         at = dr.select(dr.gather(mi.Bool, known, to), mi.Int32(dr.gather(mi.UInt32, pixel, to)), -1)
         dr.eval(va, vb, da, db, step, excess, at, error)
-        kept = np.array(step) != 0  # where a sheet passes before the sheet itself, alpha does not change
-        at = np.array(at)[kept]
+        at = np.array(at)
         distance = np.where(at >= 0, image.distance.ravel()[at], FARTHEST)
-        step = np.array(step)[kept][:, None]
-        ends = [self.corner[np.array(i)[kept]] for i in (va, vb)]
-        by = [np.array(d).T[kept].astype(np.float64) * step for d in (da, db)]
-        return total + float(error[0]), (*ends, *by, np.array(excess)[kept].astype(np.float64), distance)
+        ends = [self.corner[np.array(i)] for i in (va, vb)]
+        by = [np.array(d).T.astype(np.float64) * np.array(step)[:, None] for d in (da, db)]
+        return total + float(error[0]), (*ends, *by, np.array(excess).astype(np.float64), distance)
 
     def _pull(self, vertices, pairs, frame, level, weight):
         """Energy, rows and gradient (N, 3) of the silhouette term.
