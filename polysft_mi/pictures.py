@@ -94,6 +94,7 @@ class Album:
         self._masked = problem.sequence.mask(0) is not None
         self._pool = ThreadPoolExecutor(_THREADS)
         self._drawn = {}  # frame: future of its figures
+        self._plots = None  # future of the sheet and the curves
         self.rows = []
 
     def draw(self, frame, vertices, texcoords=None, exr=False):
@@ -139,7 +140,7 @@ class Album:
         return [*np.split(images, 3, axis=1), cv2.imread(self._place(frame, "surface"))]
 
     def finish(self, surfaces):
-        """Once all frames are drawn: the figures of each.
+        """Once all frames are drawn and the log is whole: the figures of each. Plots are begun, beside whatever comes next.
 
         ``surfaces`` (T, N, 3) [m, camera frame]. Where some leave the view of the first one, all are shaded again in one that holds them.
         """
@@ -153,6 +154,7 @@ class Album:
             target, render, heat, surface = self._panels(k)
             error = heat.sum(axis=2, dtype=np.float32) * (PEAK / 765)
             self.rows.append({"target": target, "render": render, "error": error, "surface": surface, "label": f"frame {found[k]['frame']}"})
+        self._plots = self._pool.submit(self._plot)
         return found
 
     def bind(self, count, fps):
@@ -161,7 +163,10 @@ class Album:
         return write_video(os.path.join(self.out, "comparison.mp4"), pictures, fps)
 
     def plot(self):
-        """Write comparison.png, the contact sheet, and loss.png, of the run's log."""
+        """Once comparison.png, the contact sheet, and loss.png, of the run's log, are written."""
+        self._plots.result()
+
+    def _plot(self):
         figures.contact_sheet(os.path.join(self.out, "comparison.png"), self.rows)
         with open(os.path.join(self.out, "log.jsonl"), encoding="utf-8") as file:
             figures.loss_plot(os.path.join(self.out, "loss.png"), [json.loads(line) for line in file])
