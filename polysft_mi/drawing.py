@@ -110,7 +110,6 @@ class Drawing:
         ``vertices``, ``surfaces`` (T, N, 3) [m]: of all frames, in the world and in the camera frame.
         """
         self._exr = self._chosen(len(vertices))
-        self._remove_other_exrs()
         last = ("finish", surfaces), ("bind", len(surfaces), fps), ("plot",)
         if self._pool is not None:
             for k, v in enumerate(vertices):
@@ -127,13 +126,20 @@ class Drawing:
                 except Exception:  # killed, or out of memory, or what drawing it here will tell
                     pass
             if not album:
+                if self._pool is not None:
+                    self._pool.shutdown(cancel_futures=True)  # and wait for it: two must not write the same files
                 album.append(self._here(vertices))
                 if k > 0:
                     album[0].finish(surfaces)
             name, *arguments = last[k]
             return getattr(album[0], name)(*arguments)
 
-        return tuple(partial(result, k) for k in range(len(last)))
+        def drawn():
+            found = result(0)
+            self._remove_other_exrs()  # now that none is being written
+            return found
+
+        return drawn, *(partial(result, k) for k in (1, 2))
 
     def _here(self, vertices):
         from .pictures import Album

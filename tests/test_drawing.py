@@ -95,6 +95,37 @@ def test_a_killed_process_costs_nothing_but_time(sheet, here, tmp_path):
     assert_same(drawn(sheet, tmp_path / "out", kill), here)
 
 
+def test_an_error_in_the_process_has_all_drawn_here_after_its_end(sheet, here, tmp_path, monkeypatch):
+    processes, usual = [], Drawing._here
+
+    def fail(made):
+        made._jobs.append(made._submit(("no such method",)))
+        made._jobs[0].result()
+        processes.extend(made._pool._processes.values())
+
+    def alone(made, vertices):
+        assert processes and not any(p.is_alive() for p in processes)  # two would write the same files
+        return usual(made, vertices)
+
+    monkeypatch.setattr(Drawing, "_here", alone)
+    assert_same(drawn(sheet, tmp_path / "out", fail), here)
+
+
+def test_no_file_is_removed_that_is_being_written(sheet, tmp_path):
+    problem = problem_of(sheet)
+    surfaces = sheet.vertices.astype(np.float32)
+    vertices = np.stack([problem.camera.origin + v @ problem.camera.axes for v in surfaces])
+    (tmp_path / "comparison").mkdir()
+    others = [tmp_path / "comparison" / name for name in (".1.partial.008.exr", "003.exr")]
+    for path in others:
+        path.touch()
+    with Drawing(problem, {}, str(tmp_path), exr_frames=3, about={}) as made:
+        finished, *_ = made.finish(vertices, surfaces, 15)
+        assert all(path.exists() for path in others)
+        finished()
+    assert sorted(p.name for p in (tmp_path / "comparison").iterdir()) == ["000.exr", "004.exr", "008.exr"]
+
+
 def test_texture_that_was_moved_is_moved_in_the_pictures(sheet, here, tmp_path):
     problem = problem_of(sheet)
     moved = np.array(problem.experiment.mesh.vertex_texcoords_buffer()) + 0.03
