@@ -67,8 +67,8 @@ def loss_plot(path, log_records):
     axes.set_xlabel("iteration, all frames one after the other")
     axes.set_ylabel("loss")
     starts = [(s, r["frame"]) for s, r, before in zip(step, records, [None] + records) if before is None or before["frame"] != r["frame"]]
-    for s, _ in starts if len(starts) <= 200 else []:
-        axes.axvline(s, color="0.85", linewidth=0.5, zorder=0)
+    if len(starts) <= 200:
+        axes.vlines([s for s, _ in starts], 0, 1, transform=axes.get_xaxis_transform(), color="0.85", linewidth=0.5, zorder=0)
     top = axes.secondary_xaxis("top")
     shown = starts[:: max(1, -(-len(starts) // 12))]
     top.set_xticks([s for s, _ in shown], [str(frame) for _, frame in shown], fontsize=8)

@@ -219,7 +219,7 @@ class Pattern:
     """
 
     def __init__(self, faces, edges, count, further=None):
-        self.count, self.edges = count, edges
+        self.count, self.faces, self.edges = count, faces, edges
         a, b = (edges if further is None else np.concatenate([edges, further])).T
         each = np.arange(count)
         self._keys = np.unique(np.concatenate([each * count + each, a * count + b, b * count + a]))  # at a vertex of four triangles, pairs repeat
@@ -230,6 +230,7 @@ class Pattern:
         corners = np.repeat(np.arange(3), 3), np.tile(np.arange(3), 3)
         at = self.find(faces[:, corners[0]], faces[:, corners[1]])
         self.from_faces = sp.csr_matrix((np.ones(at.size), (at.ravel(), np.arange(at.size))), shape=(len(self._keys), at.size))
+        self.from_corners = sp.csr_matrix((np.ones(faces.size), (faces.ravel(), np.arange(faces.size))), shape=(count, faces.size))
         ends = np.concatenate([a, b])
         self.from_ends = sp.csr_matrix((np.ones(len(ends)), (ends, np.arange(len(ends)))), shape=(count, len(ends)))  # sums over edges' ends
         self.across = self.find(a, b), self.find(b, a)
@@ -419,15 +420,16 @@ class Normal:
     gradient: np.ndarray
 
 
-def assemble(pattern, surface, projection, evaluation, lengths, stiffness, wide=None, give=np.inf):
-    """:class:`Normal` of the images and the edges, and the edges' energy.
+def assemble(pattern, surface, projection, evaluation, lengths, stiffness, wide=None, give=np.inf, triangles=None):
+    """:class:`Normal` of the images, the edges and further residuals of triangles, and the edges' energy.
 
     ``projection`` (N, 2, 3): of the vertices; ``evaluation``: :class:`polysft_mi.registration.Evaluation`; ``lengths`` (E,) [m]: of the
     template's edges; ``stiffness`` [1/m^2]: weight of the squared differences to them; ``wide``: a :class:`Pattern` that holds
     this one, where the relief is an unknown too (d = 3) and the local block is to have that pattern; ``give``: the strain from which on
     a stretched edge hardly pulls harder. An excess e > 0 over the length L costs 2 c^2 ((1 + e^2 / c^2)^1/2 - 1), c = give L (Charbonnier):
     cloth that hangs from a point is stretched there by a tenth, and by squares that would turn the whole sheet. What is compressed buckles;
-    its costs are squares.
+    its costs are squares. ``triangles``: residuals r (F,), factors h (F,), and derivatives (F, 3, 3) [1/m] of r by the corners; half the sum of
+    h r^2 is added.
     """
     d = 2 if wide is None else 3
     a, b = pattern.edges.T
@@ -473,6 +475,17 @@ def assemble(pattern, surface, projection, evaluation, lengths, stiffness, wide=
     total[pattern.across[1]] += across.transpose(0, 2, 1)
     motion += (heavy[:, None] * by_motion).T @ by_motion
 
+    if triangles is not None:
+        residual, factor, by_corner = triangles
+        faces = pattern.faces
+        by_local = np.einsum("fck,fckm->fcm", by_corner, local[faces])
+        by_motion = np.einsum("fck,fckm->fm", by_corner, surface.by_motion[faces])
+        pulled = factor[:, None, None] * by_local
+        total += (pattern.from_faces @ (by_local[:, :, None, :, None] * pulled[:, None, :, None]).reshape(-1, 9)).reshape(-1, 3, 3)
+        local_motion += (pattern.from_corners @ (pulled[..., None] * by_motion[:, None, None]).reshape(-1, 18)).reshape(-1, 3, 6)
+        motion += (factor[:, None] * by_motion).T @ by_motion
+        gradient += pattern.from_corners @ ((factor * residual)[:, None, None] * by_corner).reshape(-1, 3)
+
     basis = surface.basis
     size = basis.shape[1]
     lifted = [sp.csr_matrix((total[:, k, 2], pattern.column, pattern.start), shape=2 * (pattern.count,)) @ basis for k in range(3)]
@@ -490,28 +503,6 @@ def assemble(pattern, surface, projection, evaluation, lengths, stiffness, wide=
         blocks[wide.find(pattern.row, pattern.column)] = total
     normal = Normal(blocks, cross, glob, np.einsum("nk,nka->na", gradient, local[:, :, :d]), along)
     return normal, energy
-
-
-def add_triangles(normal, pattern, faces, surface, residual, factor, by_corner):
-    """Adds a term of the triangles ``faces`` (F, 3) of the mesh to a :class:`Normal`: half the sum of ``factor`` (F,) times r^2, with the ``residual``
-    r (F,) and its derivatives ``by_corner`` (F, 3, 3) [1/m] by the corners' positions. ``pattern``: of the local block."""
-    count, d = len(surface.vertices), normal.local.shape[-1]
-    by_local = np.einsum("fck,fcka->fca", by_corner, surface.by_offset[faces])  # (F, 3, 3); the last is by the height
-    corners = sp.csr_matrix((by_local[:, :, 2].ravel(), faces.ravel(), 3 * np.arange(len(faces) + 1)), shape=(len(faces), count))
-    by_global = np.concatenate([corners @ surface.basis, np.einsum("fck,fckm->fm", by_corner, surface.by_motion[faces])], 1)
-    by_local = by_local[:, :, :d]
-    pulled = factor[:, None, None] * by_local
-    rows = sp.csr_matrix(
-        (by_local.ravel(), (d * faces[:, :, None] + np.arange(d)).ravel(), 3 * d * np.arange(len(faces) + 1)), shape=(len(faces), d * count)
-    )
-    weighted = factor[:, None] * by_global
-    pull = factor * residual
-    normal.local_gradient += (rows.T @ pull).reshape(-1, d)
-    normal.gradient += by_global.T @ pull
-    normal.cross += rows.T @ weighted
-    normal.glob += by_global.T @ weighted
-    blocks = by_local[:, :, None, :, None] * pulled[:, None, :, None, :]  # (F, 3, 3, d, d)
-    normal.local += (pattern.from_faces @ blocks.reshape(-1, d * d)).reshape(-1, d, d)
 
 
 def _conjugated(blocks, s, pattern):

@@ -274,7 +274,8 @@ def _error_at_vertices(camera, vertices, panel):
     """
     import cv2
 
-    error = cv2.blur(panel.sum(axis=2, dtype=np.float32) * (PEAK / 765), (3, 3))
+    red, green, blue = (panel[..., c].astype(np.float32) for c in range(3))  # a fifth of the time of a sum over the axis
+    error = cv2.blur((red + green + blue) * (PEAK / 765), (3, 3))
     before = vertices[:, 2] > 0
     x, y = (camera.project(vertices) * (panel.shape[1] / camera.width)).T
     inside = before & (x >= 0) & (y >= 0) & (x < error.shape[1]) & (y < error.shape[0])

@@ -478,7 +478,7 @@ def test_stretched_edges_give_and_compressed_ones_do_not(problem):
 def test_strain_is_held_harder_where_it_may_be_noise(problem, monkeypatch, noise, low, high):
     solver, given = gauss_newton.GaussNewton(problem.settings), []
     solver._prepare(problem)
-    monkeypatch.setattr(gauss_newton, "assemble", lambda *arguments, give: given.append(give) or assemble(*arguments, give=give))
+    monkeypatch.setattr(gauss_newton, "assemble", lambda *arguments, give, **more: given.append(give) or assemble(*arguments, give=give, **more))
     solver._noise = noise
     rest = solver.chart.state(problem.patch.rest().to_numpy())
     solver._linearise(rest, rest, 1, 4, gauss_newton.STAGES[0], 0.5)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from polysft_mi import registration, solvers
 from polysft_mi.light import Brightness, Light, residuals
-from polysft_mi.normal_equations import Chart, Normal, Pattern, State, add_triangles
+from polysft_mi.normal_equations import Chart, Pattern, State, assemble
 from polysft_mi.solvers import gauss_newton
 from polysft_mi.template import Template
 from polysft_mi.tracker import track
@@ -137,8 +137,9 @@ def test_terms_of_triangles_are_those_of_the_dense_jacobian(d):
     pattern = Pattern(FACES, template.edges, count)
     residual, factor, by_corner = rng.normal(size=len(FACES)), rng.uniform(0, 2, len(FACES)), rng.normal(size=(len(FACES), 3, 3))
     size = d * count + 21
-    normal = Normal(np.zeros((len(pattern.row), d, d)), np.zeros((d * count, 21)), np.zeros((21, 21)), np.zeros((count, d)), np.zeros(21))
-    add_triangles(normal, pattern, FACES, surface, residual, factor, by_corner)
+    dark = registration.Evaluation(0, 0, 0, 0, np.zeros((count, 3)), np.zeros((len(FACES), 9, 2, 2)), None, 1.0, np.zeros(len(FACES)))
+    projection, lengths = np.zeros((count, 2, 3)), np.ones(len(template.edges))
+    normal, _ = assemble(pattern, surface, projection, dark, lengths, 0.0, pattern if d == 3 else None, triangles=(residual, factor, by_corner))
 
     def linear(step):  # of the residuals along a step of all unknowns, by differences of the surface
         moves = [chart.surface(state.moved((step[d * count :], step[: d * count].reshape(-1, d)), f)).vertices for f in (1e-5, -1e-5)]

@@ -10,7 +10,7 @@ from threadpoolctl import ThreadpoolController
 
 from ..errors import InputError
 from ..light import Light, areas, residuals
-from ..normal_equations import Blocks, Chart, Normal, Pattern, Reduced, State, Surface, add_triangles, assemble, hinges
+from ..normal_equations import Blocks, Chart, Normal, Pattern, Reduced, State, Surface, assemble, hinges
 from ..patch import Unknowns
 from ..problem import BadFrame
 from ..pyramid import Level
@@ -474,12 +474,11 @@ class GaussNewton:
         relief = s.k_relief * caution
         pattern = self.systems[d].pattern
         wide = pattern if d == 3 else None
-        normal, inextensibility = assemble(self.pattern, surface, projection, evaluation, self.lengths, stiffness, wide, give=give)
-        shading = 0.0
+        shading, rows = 0.0, None
         if s.k_shading > 0 and stage is STAGES[-1] and self._light.frames:  # before, lengths are soft, and shading would bend what they should
             shade = self.registration.shade(surface.vertices, frame, evaluation.seen)
             shading, *rows = residuals(shade, self._light, s.k_shading)
-            add_triangles(normal, pattern, self.registration.faces, surface, *rows)
+        normal, inextensibility = assemble(self.pattern, surface, projection, evaluation, self.lengths, stiffness, wide, give=give, triangles=rows)
         a = self.chart.size(order)
         bend = 2 * s.k_bend * chart.bending
         moved, slid = state.alpha - anchor.alpha, state.offset - anchor.offset
