@@ -226,23 +226,26 @@ class Pattern:
         self.row, self.column = np.divmod(self._keys, count)
         self.start = np.searchsorted(self.row, np.arange(count + 1))
         self.diagonal = self.find(each, each)
-        a, b = edges.T
+        # a symmetric matrix's half: the blocks whose row is not below their column
+        self.upper, self._lower = np.flatnonzero(self.row <= self.column), np.flatnonzero(self.row > self.column)
+        self._half_keys = self._keys[self.upper]
+        self._mirrored = self.find_half(self.column[self._lower], self.row[self._lower])
+        self.half_diagonal, self.half_edges = self.find_half(each, each), self.find_half(*edges.T)
         corners = np.repeat(np.arange(3), 3), np.tile(np.arange(3), 3)
-        at = self.find(faces[:, corners[0]], faces[:, corners[1]])
-        self.from_faces = sp.csr_matrix((np.ones(at.size), (at.ravel(), np.arange(at.size))), shape=(len(self._keys), at.size))
+        i, j = (faces[:, k].ravel() for k in corners)
+        kept = np.flatnonzero(i <= j)
+        self.from_faces = sp.csr_matrix((np.ones(len(kept)), (self.find_half(i[kept], j[kept]), kept)), shape=(len(self.upper), len(i)))
         self.from_corners = sp.csr_matrix((np.ones(faces.size), (faces.ravel(), np.arange(faces.size))), shape=(count, faces.size))
-        ends = np.concatenate([a, b])
-        self.from_ends = sp.csr_matrix((np.ones(len(ends)), (ends, np.arange(len(ends)))), shape=(count, len(ends)))  # sums over edges' ends
-        self.across = self.find(a, b), self.find(b, a)
+        self.difference = sp.csr_matrix(  # of the edges' ends, (E, N)
+            (np.tile([1.0, -1.0], len(edges)), (np.repeat(np.arange(len(edges)), 2), edges.ravel())), shape=(len(edges), count)
+        )
+        self.to_ends, self.at_ends = self.difference.T.tocsr(), abs(self.difference).T.tocsr()  # sums over the edges at a vertex, with signs and without
         graph = sp.csr_matrix((np.ones(len(self._keys)), (self.row, self.column)), shape=(count, count))
         order = reverse_cuthill_mckee(graph, symmetric_mode=True)
         self.place = np.empty(count, dtype=np.int64)  # of each vertex in the narrow ordering
         self.place[order] = each
         self.order = order
-        difference = sp.csr_matrix(
-            (np.tile([1.0, -1.0], len(edges)), (np.repeat(np.arange(len(edges)), 2), edges.ravel())), shape=(len(edges), count)
-        )
-        self.laplacian = self.blocks_of(difference.T @ difference)  # sum over edges of (x_a - x_b)^2
+        self.laplacian = self.blocks_of(self.to_ends @ self.difference)  # sum over edges of (x_a - x_b)^2
 
     def blocks_of(self, matrix):
         """A sparse matrix (N, N) within the pattern as one number a block, (B,)."""
@@ -253,6 +256,17 @@ class Pattern:
     def find(self, i, j):
         """Indices of the blocks (i, j)."""
         return np.searchsorted(self._keys, i * self.count + j)
+
+    def find_half(self, i, j):
+        """Indices in the half of the blocks (i, j) or, where these are not in it, (j, i)."""
+        return np.searchsorted(self._half_keys, np.minimum(i, j) * self.count + np.maximum(i, j))
+
+    def whole(self, half):
+        """All blocks (B, d, d) of the symmetric matrix whose upper ``half`` (U, d, d) is given."""
+        out = np.empty((len(self._keys), *half.shape[1:]))
+        out[self.upper] = half
+        out[self._lower] = half[self._mirrored].transpose(0, 2, 1)
+        return out
 
     @staticmethod
     def add(blocks, at, values):
@@ -441,50 +455,34 @@ def assemble(pattern, surface, projection, evaluation, lengths, stiffness, wide=
     energy = stiffness * float((excess**2 * 2 / (1 + np.sqrt(1 + over))).sum())
     heavy = 2 * stiffness / np.sqrt(1 + over)  # (E,): of each edge
     pull = (heavy * excess)[:, None] * direction
-    gradient = evaluation.gradient + pattern.from_ends @ np.concatenate([pull, -pull])
+    gradient = evaluation.gradient + pattern.to_ends @ pull
 
-    # Each vertex moves by its own (u, v), by a height, which is its own and that of all coefficients there, and by the motion: blocks of the
-    # first three are sparse like the mesh, and the coefficients follow by the basis.
-    local = surface.by_offset
-    screen, screen_motion = projection @ local, projection @ surface.by_motion  # (N, 2, 3), (N, 2, 6)
+    # Curvature in the vertices' positions: half of its blocks, (U, 3, 3). Of the images, blocks in the projections first.
     blocks = (pattern.from_faces @ evaluation.second.reshape(-1, 4)).reshape(-1, 2, 2)
     if evaluation.rows is not None:
         i, j, ci, cj, h = evaluation.rows
         hi, hj = ci * h[:, None], cj * h[:, None]
-        across = ci[:, :, None] * hj[:, None]
-        at = np.concatenate([pattern.diagonal[i], pattern.diagonal[j], pattern.find(i, j), pattern.find(j, i)])
-        pattern.add(blocks, at, np.concatenate([ci[:, :, None] * hi[:, None], cj[:, :, None] * hj[:, None], across, across.transpose(0, 2, 1)]))
-    total = _conjugated(blocks, screen, pattern)  # (B, 3, 3)
-    matrix = sp.bsr_matrix((blocks, pattern.column, pattern.start), shape=2 * (2 * pattern.count,))
-    moved = (matrix @ screen_motion.reshape(-1, 6)).reshape(-1, 2, 6)
-    local_motion = screen.transpose(0, 2, 1) @ moved  # (N, 3, 6)
-    motion = screen_motion.reshape(-1, 6).T @ moved.reshape(-1, 6)
-
-    # edges: residuals of two vertices each
-    ends = np.concatenate([a, b])
-    outward = np.concatenate([direction, -direction])
-    by_local = np.einsum("ek,ekm->em", outward, local[ends])
-    by_motion = np.einsum("ek,ekm->em", direction, surface.by_motion[a] - surface.by_motion[b])
-    pulled = np.tile(heavy, 2)[:, None] * by_local
-    both = np.concatenate([by_local, np.tile(by_motion, (2, 1))], 1)
-    sums = pattern.from_ends @ (pulled[:, :, None] * both[:, None]).reshape(len(ends), 27)
-    total[pattern.diagonal] += sums.reshape(-1, 3, 9)[:, :, :3]
-    local_motion += sums.reshape(-1, 3, 9)[:, :, 3:]
-    across = pulled[: len(a), :, None] * by_local[len(a) :, None]
-    total[pattern.across[0]] += across
-    total[pattern.across[1]] += across.transpose(0, 2, 1)
-    motion += (heavy[:, None] * by_motion).T @ by_motion
-
+        across = np.where((i < j)[:, None, None], ci[:, :, None] * hj[:, None], hj[:, :, None] * ci[:, None])
+        at = np.concatenate([pattern.half_diagonal[i], pattern.half_diagonal[j], pattern.find_half(i, j)])
+        pattern.add(blocks, at, np.concatenate([ci[:, :, None] * hi[:, None], cj[:, :, None] * hj[:, None], across]))
+    half = _conjugated(blocks, projection, pattern)
+    outer = (heavy[:, None] * direction)[:, :, None] * direction[:, None]
+    half[pattern.half_diagonal] += (pattern.at_ends @ outer.reshape(-1, 9)).reshape(-1, 3, 3)
+    half[pattern.half_edges] -= outer
     if triangles is not None:
         residual, factor, by_corner = triangles
-        faces = pattern.faces
-        by_local = np.einsum("fck,fckm->fcm", by_corner, local[faces])
-        by_motion = np.einsum("fck,fckm->fm", by_corner, surface.by_motion[faces])
-        pulled = factor[:, None, None] * by_local
-        total += (pattern.from_faces @ (by_local[:, :, None, :, None] * pulled[:, None, :, None]).reshape(-1, 9)).reshape(-1, 3, 3)
-        local_motion += (pattern.from_corners @ (pulled[..., None] * by_motion[:, None, None]).reshape(-1, 18)).reshape(-1, 3, 6)
-        motion += (factor[:, None] * by_motion).T @ by_motion
-        gradient += pattern.from_corners @ ((factor * residual)[:, None, None] * by_corner).reshape(-1, 3)
+        weighted = factor[:, None, None] * by_corner
+        half += (pattern.from_faces @ (by_corner[:, :, None, :, None] * weighted[:, None, :, None]).reshape(-1, 9)).reshape(-1, 3, 3)
+        gradient += pattern.from_corners @ (residual[:, None, None] * weighted).reshape(-1, 3)
+
+    # Each vertex moves by its own (u, v), by a height, which is its own and that of all coefficients there, and by the motion: blocks of the
+    # first three are sparse like the mesh, and the coefficients follow by the basis.
+    local, by_motion = surface.by_offset, surface.by_motion.reshape(-1, 6)
+    total = pattern.whole(_conjugated(half, local, pattern))
+    matrix = sp.bsr_matrix((pattern.whole(half), pattern.column, pattern.start), shape=2 * (3 * pattern.count,))
+    moved = matrix @ by_motion
+    local_motion = local.transpose(0, 2, 1) @ moved.reshape(-1, 3, 6)  # (N, 3, 6)
+    motion = by_motion.T @ moved
 
     basis = surface.basis
     size = basis.shape[1]
@@ -505,18 +503,20 @@ def assemble(pattern, surface, projection, evaluation, lengths, stiffness, wide=
     return normal, energy
 
 
-def _conjugated(blocks, s, pattern):
-    """s_i^T blocks_ij s_j of each block of the pattern, (B, 3, 3): ``blocks`` (B, 2, 2), ``s`` (N, 2, 3). By components: products of whole
-    arrays are faster than many small matrix products.
+def _conjugated(half, s, pattern):
+    """s_i^T H_ij s_j of each block of half a matrix, (U, q, q): ``half`` (U, p, p), ``s`` (N, p, q). By components: products of whole arrays are
+    faster than many small matrix products.
     """
-    i, j = (np.ascontiguousarray(s.reshape(-1, 6).T)[:, k] for k in (pattern.row, pattern.column))
-    k = np.ascontiguousarray(blocks.reshape(-1, 4).T)
-    out = np.empty((3, 3, len(blocks)))
-    for b in range(3):
-        right = k[0] * j[b] + k[1] * j[3 + b], k[2] * j[b] + k[3] * j[3 + b]
-        for a in range(3):
-            out[a, b] = i[a] * right[0] + i[3 + a] * right[1]
-    return np.ascontiguousarray(out.reshape(9, -1).T).reshape(-1, 3, 3)
+    _, p, q = s.shape
+    flat = np.ascontiguousarray(s.reshape(-1, p * q).T)
+    i, j = (flat[:, k].reshape(p, q, -1) for k in (pattern.row[pattern.upper], pattern.column[pattern.upper]))
+    h = np.ascontiguousarray(half.reshape(-1, p * p).T).reshape(p, p, -1)
+    out = np.empty((q, q, len(half)))
+    for b in range(q):
+        right = [sum(h[k, m] * j[m, b] for m in range(p)) for k in range(p)]
+        for a in range(q):
+            out[a, b] = sum(i[k, a] * right[k] for k in range(p))
+    return np.ascontiguousarray(out.reshape(q * q, -1).T).reshape(-1, q, q)
 
 
 class Reduced:

@@ -489,10 +489,9 @@ class GaussNewton:
         normal.glob[a:, a:] += 2 * self._hold * np.eye(6)
         normal.gradient[a:] += 2 * self._hold * motion
         # neighbours' differences, of the relief its bends too
-        i, j = pattern.edges.T
-        apart, bent = state.offset[i] - state.offset[j], self.bends @ state.offset[:, 2]
+        apart, bent = pattern.difference @ state.offset, self.bends @ state.offset[:, 2]
         weights = np.array([s.k_uv, s.k_uv, relief])
-        pull = weights * (pattern.from_ends @ np.concatenate([apart, -apart]))
+        pull = weights * (pattern.to_ends @ apart)
         pull[:, 2] += relief * _RELIEF_BEND * (self.bends.T @ bent)
         normal.local_gradient += 2 * (pull + s.k_tc * _TEMPORAL * slid)[:, :d]
         for k, blocks in enumerate((pattern.laplacian, pattern.laplacian, self._relief_blocks)[:d]):
