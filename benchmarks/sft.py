@@ -8,7 +8,8 @@ Each method is a command, run as a user would and timed as a whole, start-up and
 with ``--again``), and draws the tables and the plot from everything that was run in the same way. Where the truth is a mesh, they also say
 what the best jet of the order used makes of it: one fitted to the true vertices of each frame.
 
-Writes ``sft.md`` and ``sft.png`` into ``docs`` (``--docs FOLDER`` for another; for runs that are shortened or by other settings, into OUT).
+Writes ``sft.json``, ``sft.md`` and ``sft.png`` into ``docs``, where the results of whole videos stand already (``--docs FOLDER`` for another; for
+runs that are shortened or by other settings, into OUT).
 """
 
 import argparse
@@ -90,7 +91,9 @@ def run(sequence, method, folder, out, setup):
         environment |= {name: str(setup["threads"]) for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
         chosen = set(allowed_cores()[: setup["threads"]])  # Dr.Jit and OpenCV take as many threads as there are cores for them
         limit = (lambda: os.sched_setaffinity(0, chosen)) if hasattr(os, "sched_setaffinity") else None
-    result = {"sequence": sequence, "method": method, "setup": setup, "command": line[1:]}
+    # the results are for other machines too: paths begin with the sequence's name there
+    plain = lambda text: text.replace(os.path.abspath(folder), sequence).replace(folder, sequence).replace(ROOT + os.sep, "")
+    result = {"sequence": sequence, "method": method, "setup": setup, "command": [plain(part) for part in line[1:]]}
     result |= {"machine": machine(setup), "load": os.getloadavg()[0]}
     os.makedirs(os.path.dirname(os.path.abspath(out)), exist_ok=True)
     with open(f"{out}.log", "w+", encoding="utf-8") as log:
@@ -99,8 +102,6 @@ def run(sequence, method, folder, out, setup):
         result["seconds"] = time.perf_counter() - began
         log.seek(0)
         said = log.read().split("\n")
-    # the page is for other machines: paths begin with the sequence's name there
-    plain = lambda text: text.replace(os.path.abspath(folder), sequence).replace(folder, sequence).replace(ROOT + os.sep, "")
     if status:
         return {**result, "error": plain(next((text for text in reversed(said) if text.strip()), f"exit status {status}"))}
     with open(os.path.join(out, "metrics.json"), encoding="utf-8") as file:
@@ -426,8 +427,8 @@ def parser():
     p.add_argument("--iterations", type=int, metavar="N", help="iterations a frame of per-vertex (default: its own)")
     p.add_argument("-D", dest="define", metavar="NAME=VALUE", action="append", default=[], help="override a <default> of every scene")
     p.add_argument("--again", action="store_true", help="run what has a result, too")
-    p.add_argument("-o", "--out", metavar="FOLDER", default="out/benchmarks", help="for sft.json and the runs (default: out/benchmarks)")
-    p.add_argument("--docs", metavar="FOLDER", help="for sft.md and sft.png (default: docs for whole runs by default settings, else OUT)")
+    p.add_argument("-o", "--out", metavar="FOLDER", default="out/benchmarks", help="for the runs (default: out/benchmarks)")
+    p.add_argument("--docs", metavar="FOLDER", help="for sft.json, sft.md and sft.png (default: docs for whole runs by default settings, else OUT)")
     add_mode_argument(p)
     return p
 
@@ -442,8 +443,10 @@ def main(arguments=None):
             raise InputError(f"-D {text}: NAME=VALUE is needed")
     if not os.path.isdir(options.data):
         raise InputError(f"--data {options.data}: no such folder; it must hold the sequences' folders")
-    setup, path = setup_of(options), os.path.join(options.out, "sft.json")
-    os.makedirs(options.out, exist_ok=True)
+    setup = setup_of(options)
+    docs = options.docs or (os.path.join(ROOT, "docs") if is_whole(setup) else options.out)
+    path = os.path.join(docs, "sft.json")
+    os.makedirs(docs, exist_ok=True)
     read(path)  # a damaged file is told before anything runs
     for sequence in options.only:
         folder = folder_of(options.data, sequence)
@@ -466,9 +469,8 @@ def main(arguments=None):
                 result = jet_result(sequence, folder, order, setup)
                 if result:
                     add(path, result)
-    docs = options.docs or (os.path.join(ROOT, "docs") if is_whole(setup) else options.out)
     print(report([r for r in read(path) if r["setup"] == setup], docs))
-    print(f"\n{path}; in {docs}: sft.md, sft.png")
+    print(f"\nin {docs}: sft.json, sft.md, sft.png")
 
 
 if __name__ == "__main__":

@@ -15,8 +15,8 @@ from .shading import View, shade_surface
 
 __all__ = ["View", "contact_sheet", "frame_plot", "loss_plot", "shade_surface"]
 
-TERMS = {"loss": "total", "rgb": "photometric", "silhouette": "silhouette", "inextensibility": "inextensibility", "temporal": "temporal"}
-COLOURS = {"loss": "#222222", "rgb": "#c4572e", "silhouette": "#3b6ea5", "inextensibility": "#4b8b3b", "temporal": "#8d5aa0"}
+TERMS = {"loss": "total", "rgb": "photometric"} | {t: t for t in ("silhouette", "shading", "inextensibility", "smoothness", "temporal")}
+COLOURS = dict(zip(TERMS, ("#222222", "#c4572e", "#3b6ea5", "#d19a1e", "#4b8b3b", "#7a7a7a", "#8d5aa0"), strict=True))
 
 
 def _kept_safe(draw):
