@@ -1,6 +1,8 @@
 """The one exception for a user's mistake, and how a command line ends on it."""
 
+import contextlib
 import os
+import signal
 import sys
 
 
@@ -28,6 +30,8 @@ def cli(main):
             raise
         where = f"{error.filename}: " if error.filename is not None else ""
         status = _fail(f"{where}{error.strerror or error}")
+    with contextlib.suppress(ValueError):  # which is raised beside the main thread
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # nothing is left but Python's own end, whose traceback would tell nobody anything
     sys.exit(status)
 
 

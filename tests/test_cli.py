@@ -6,8 +6,10 @@ import os
 import pty
 import re
 import shlex
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -115,3 +117,13 @@ def test_colours_only_on_a_terminal_that_wants_them(plain):
     os.close(parent)
     assert ("\033[" in shown) is not plain and "error:" in shown
     assert "\033[" not in command("wrong").stderr
+
+
+def test_ctrl_c_when_all_is_done_prints_nothing():
+    """Python's own end waits for threads, and would else tell with a traceback that it was interrupted there."""
+    code = "import threading, time\nfrom polyfit.errors import cli\nthreading.Thread(target=time.sleep, args=(20,)).start()\ncli(lambda: print('done', flush=True))"
+    with subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout.readline() == b"done\n"
+        time.sleep(0.5)
+        process.send_signal(signal.SIGINT)
+        assert process.stderr.read() == b"" and process.wait(10) == -signal.SIGINT
