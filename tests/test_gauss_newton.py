@@ -201,6 +201,65 @@ def random_normal(pattern, size=9, d=2):
     return Normal(blocks, cross, glob, RNG.normal(size=(pattern.count, d)), RNG.normal(size=size))
 
 
+@pytest.mark.parametrize("wide", [False, True])
+def test_all_terms_are_those_of_their_dense_jacobians(wide):
+    """Pixels, silhouette, edges and triangles, in the unknowns of a jet patch."""
+    rng = np.random.default_rng(7)
+    template = grid_template()
+    chart, faces, count, d = Chart(template), template.faces, len(template.chart), 3 if wide else 2
+    state = some_state(chart)
+    surface, pattern = chart.surface(state), Pattern(faces, template.edges, count)
+    wider = Pattern(faces, template.edges, count, hinges(template.chart, faces)[0]) if wide else None
+    projection = rng.normal(size=(count, 2, 3))
+    in_image, in_space, slope = np.zeros((2 * count, 2 * count)), np.zeros((3 * count, 3 * count)), rng.normal(size=(count, 3))
+
+    def add(matrix, width, at, rows):  # rows^T rows, where the rows (R, K, width) see the vertices at (K,)
+        columns = (width * np.asarray(at)[:, None] + np.arange(width)).ravel()
+        rows = rows.reshape(len(rows), -1)
+        matrix[np.ix_(columns, columns)] += rows.T @ rows
+
+    pixels = rng.normal(size=(len(faces), 4, 3, 2))
+    second = np.einsum("frad,frbe->fabde", pixels, pixels)
+    second = (second + second.transpose(0, 1, 2, 4, 3)) / 2  # a pixel's derivatives by its three corners have one direction
+    for face, blocks in zip(faces, second):
+        for a in range(3):
+            for b in range(3):
+                in_image[2 * face[a] : 2 * face[a] + 2, 2 * face[b] : 2 * face[b] + 2] += blocks[a, b]
+    i, j = np.concatenate([template.edges[:9], template.edges[5:20, ::-1]]).T  # both ways round, some twice
+    ci, cj, h = rng.normal(size=(len(i), 2)), rng.normal(size=(len(i), 2)), rng.uniform(0.5, 2, len(i))
+    for k in range(len(i)):
+        add(in_image, 2, (i[k], j[k]), math.sqrt(h[k]) * np.stack([ci[k], cj[k]])[None])
+    given = registration.Evaluation(0, 0, 0, 0, slope, second.reshape(-1, 9, 2, 2), (i, j, ci, cj, h), 1.0, np.zeros(len(faces)))
+    lengths, stiffness = rng.uniform(0.05, 0.1, len(template.edges)), 3.0
+    slope, energy = slope.copy(), 0.0
+    for (a, b), length in zip(template.edges, lengths):
+        edge = surface.vertices[a] - surface.vertices[b]
+        unit, excess = edge / np.linalg.norm(edge), np.linalg.norm(edge) - length
+        add(in_space, 3, (a, b), math.sqrt(2 * stiffness) * np.stack([unit, -unit])[None])
+        slope[a] += 2 * stiffness * excess * unit
+        slope[b] -= 2 * stiffness * excess * unit
+        energy += stiffness * excess**2
+    residual, factor, by_corner = rng.normal(size=len(faces)), rng.uniform(0, 2, len(faces)), rng.normal(size=(len(faces), 3, 3))
+    for face, r, f, by in zip(faces, residual, factor, by_corner):
+        add(in_space, 3, face, math.sqrt(f) * by[None])
+        slope[face] += f * r * by
+    images = np.zeros((2 * count, 3 * count))
+    for k in range(count):
+        images[2 * k : 2 * k + 2, 3 * k : 3 * k + 3] = projection[k]
+
+    def moved(step):  # the vertices along a step of all unknowns, by differences of the surface
+        parts = step[d * count :], step[: d * count].reshape(-1, d)
+        return (chart.surface(state.moved(parts, 1e-5)).vertices - chart.surface(state.moved(parts, -1e-5)).vertices).ravel() / 2e-5
+
+    by = np.stack([moved(row) for row in np.eye(d * count + len(chart.degree) + 6)], 1)
+    normal, found = assemble(pattern, surface, projection, given, lengths, stiffness, wider, triangles=(residual, factor, by_corner))
+    matrix, gradient = dense(wider or pattern, normal)
+    expected = by.T @ (in_space + images.T @ in_image @ images) @ by
+    assert found == pytest.approx(energy, rel=1e-9)
+    assert np.abs(matrix - expected).max() < 1e-6 * np.abs(expected).max()
+    assert np.abs(gradient - by.T @ slope.ravel()).max() < 1e-6 * np.abs(gradient).max()
+
+
 @pytest.mark.parametrize("alone", [0, 1000])  # rows a block below which one thread does it all
 @pytest.mark.parametrize("rows, columns, d", [(2, 2, 2), (3, 9, 2), (8, 7, 2), (2, 2, 3), (8, 7, 3)])
 def test_step_and_variance_are_those_of_the_dense_system(monkeypatch, rows, columns, d, alone):

@@ -10,9 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from polysft_mi import registration, solvers
 from polysft_mi.light import Brightness, Light, residuals
-from polysft_mi.normal_equations import Chart, Pattern, State, assemble
 from polysft_mi.solvers import gauss_newton
-from polysft_mi.template import Template
 from polysft_mi.tracker import track
 
 LIGHT = np.array([0.6, 0.3, -0.2, -0.35, 0.05, -0.08, 0.04])
@@ -122,39 +120,6 @@ def test_a_frames_exposure_changes_nothing(exposure):
     for brighter, usual in zip(residuals(shade_of(found, wavy(), 0.4 * exposure), light, 12.0), residuals(shade_of(found, wavy(), 0.4), light, 12.0)):
         np.testing.assert_allclose(brighter, usual, rtol=1e-5, atol=1e-7)
     assert known().learned(shade_of(found, wavy(), 0.4 * exposure)).numbers() == pytest.approx(light.numbers(), rel=1e-5)
-
-
-@pytest.mark.parametrize("d", [2, 3])
-def test_terms_of_triangles_are_those_of_the_dense_jacobian(d):
-    rng = np.random.default_rng(d)
-    v, u = np.meshgrid(np.linspace(1, 0, ROWS), np.linspace(0, 1, COLUMNS), indexing="ij")
-    template = Template.fit(synthetic.sheet(0.7, ROWS, COLUMNS), FACES, np.stack([u, v], -1).reshape(-1, 2), 4, tolerance=1)
-    chart, count = Chart(template), ROWS * COLUMNS
-    state = State(
-        0.02 * rng.normal(size=15), 0.02 * rng.normal(size=(count, 3)), Rotation.from_rotvec(0.1 * rng.normal(size=3)), 0.1 * rng.normal(size=3)
-    )
-    surface = chart.surface(state)
-    pattern = Pattern(FACES, template.edges, count)
-    residual, factor, by_corner = rng.normal(size=len(FACES)), rng.uniform(0, 2, len(FACES)), rng.normal(size=(len(FACES), 3, 3))
-    size = d * count + 21
-    dark = registration.Evaluation(0, 0, 0, 0, np.zeros((count, 3)), np.zeros((len(FACES), 9, 2, 2)), None, 1.0, np.zeros(len(FACES)))
-    projection, lengths = np.zeros((count, 2, 3)), np.ones(len(template.edges))
-    normal, _ = assemble(pattern, surface, projection, dark, lengths, 0.0, pattern if d == 3 else None, triangles=(residual, factor, by_corner))
-
-    def linear(step):  # of the residuals along a step of all unknowns, by differences of the surface
-        moves = [chart.surface(state.moved((step[d * count :], step[: d * count].reshape(-1, d)), f)).vertices for f in (1e-5, -1e-5)]
-        return np.einsum("fck,fck->f", by_corner, ((moves[0] - moves[1]) / 2e-5)[FACES])
-
-    jacobian = np.stack([linear(row) for row in np.eye(size)], 1)
-    matrix = np.zeros((size, size))
-    for i, j, block in zip(pattern.row, pattern.column, normal.local):
-        matrix[d * i : d * i + d, d * j : d * j + d] = block
-    matrix[: d * count, d * count :], matrix[d * count :, : d * count] = normal.cross, normal.cross.T
-    matrix[d * count :, d * count :] = normal.glob
-    expected = jacobian.T @ (factor[:, None] * jacobian)
-    np.testing.assert_allclose(matrix, expected, atol=1e-6 * np.abs(expected).max())
-    gradient = np.concatenate([normal.local_gradient.ravel(), normal.gradient])
-    np.testing.assert_allclose(gradient, jacobian.T @ (factor * residual), atol=1e-6 * np.abs(gradient).max())
 
 
 def test_what_a_frame_shows_of_each_triangle():
