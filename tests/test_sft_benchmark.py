@@ -198,6 +198,13 @@ def test_a_shortened_run_leaves_the_documentation_alone():
         assert not sft.is_whole({**SETUP, name: value})
 
 
+def test_the_documentation_is_drawn_from_the_results_beside_it():
+    docs = Path(sft.ROOT) / "docs"
+    results = sft.read(docs / "sft.json")
+    assert all(sft.is_whole(r["setup"]) for r in results)
+    assert sft.page(results, "sft.png") == (docs / "sft.md").read_text(encoding="utf-8")
+
+
 def test_a_damaged_file_of_results_is_told(tmp_path):
     (tmp_path / "sft.json").write_text("{")
     with pytest.raises(InputError, match="not a file of results"):
