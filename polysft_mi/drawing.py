@@ -66,6 +66,7 @@ class Drawing:
         self._folder = tempfile.TemporaryDirectory(prefix="polysft_mi-", ignore_cleanup_errors=True)
         self._album = out, about, self._folder.name
         self._given, self._jobs, self._pool = {}, [], None
+        self._here = None  # the album, where it must be drawn in this process
         self._exr = self._chosen(len(problem.sequence.indices))
         if len(problem.sequence.indices) >= _WORTH:
             import mitsuba as mi
@@ -117,22 +118,20 @@ class Drawing:
                 if not np.array_equal(before, v) or (k in self._exr and not exr):
                     self._give(k, v)
             jobs = [self._submit(call) for call in last]
-        album = []  # here, where it must be
-
         def result(k):
-            if self._pool is not None and not album:
+            if self._pool is not None and self._here is None:
                 try:
                     return [job.result() for job in (*self._jobs, *jobs[: k + 1])][-1]
                 except Exception:  # killed, or out of memory, or what drawing it here will tell
                     pass
-            if not album:
+            if self._here is None:
                 if self._pool is not None:
                     self._pool.shutdown(cancel_futures=True)  # and wait for it: two must not write the same files
-                album.append(self._here(vertices))
+                self._draw_here(vertices)
                 if k > 0:
-                    album[0].finish(surfaces)
+                    self._here.finish(surfaces)
             name, *arguments = last[k]
-            return getattr(album[0], name)(*arguments)
+            return getattr(self._here, name)(*arguments)
 
         def drawn():
             found = result(0)
@@ -141,13 +140,12 @@ class Drawing:
 
         return drawn, *(partial(result, k) for k in (1, 2))
 
-    def _here(self, vertices):
+    def _draw_here(self, vertices):
         from .pictures import Album
 
-        album = Album(self.problem, *self._album)
+        self._here = Album(self.problem, *self._album)
         for k, v in enumerate(vertices):
-            album.draw(*self._call(k, v)[1:])
-        return album
+            self._here.draw(*self._call(k, v)[1:])
 
     def _remove_other_exrs(self):
         """Of frames that were chosen when more, or fewer, were to come."""
@@ -164,4 +162,6 @@ class Drawing:
         if self._pool is not None:
             # not waited for, its end and that of the interpreter could meet: Python 3.11 then prints an OSError
             self._pool.shutdown(wait=kind is None, cancel_futures=True)
+        if self._here is not None:
+            self._here.close()  # its threads may still be at work where an error or Ctrl-C ended the rest
         self._folder.cleanup()

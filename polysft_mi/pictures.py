@@ -169,6 +169,10 @@ class Album:
         """Once comparison.png, the contact sheet, and loss.png, of the run's log, are written."""
         self._plots.result()
 
+    def close(self):
+        """Once nothing is drawn or written any more; what has not been begun is left."""
+        self._pool.shutdown(cancel_futures=True)
+
     def _plot(self):
         figures.contact_sheet(os.path.join(self.out, "comparison.png"), self.rows)
         with open(os.path.join(self.out, "log.jsonl"), encoding="utf-8") as file:

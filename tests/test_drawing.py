@@ -96,7 +96,7 @@ def test_a_killed_process_costs_nothing_but_time(sheet, here, tmp_path):
 
 
 def test_an_error_in_the_process_has_all_drawn_here_after_its_end(sheet, here, tmp_path, monkeypatch):
-    processes, usual = [], Drawing._here
+    processes, usual = [], Drawing._draw_here
 
     def fail(made):
         made._jobs.append(made._submit(("no such method",)))
@@ -105,9 +105,9 @@ def test_an_error_in_the_process_has_all_drawn_here_after_its_end(sheet, here, t
 
     def alone(made, vertices):
         assert processes and not any(p.is_alive() for p in processes)  # two would write the same files
-        return usual(made, vertices)
+        usual(made, vertices)
 
-    monkeypatch.setattr(Drawing, "_here", alone)
+    monkeypatch.setattr(Drawing, "_draw_here", alone)
     assert_same(drawn(sheet, tmp_path / "out", fail), here)
 
 
@@ -124,6 +124,25 @@ def test_no_file_is_removed_that_is_being_written(sheet, tmp_path):
         assert all(path.exists() for path in others)
         finished()
     assert sorted(p.name for p in (tmp_path / "comparison").iterdir()) == ["000.exr", "004.exr", "008.exr"]
+
+
+def test_nothing_is_drawn_any_more_after_an_error(sheet, tmp_path, monkeypatch):
+    """Drawn here: the plots are begun beside the video, which fails."""
+    done = []
+
+    def fail(*_):
+        raise OSError("no space")
+
+    def plot(*_):
+        time.sleep(0.5)
+        done.append(True)
+
+    monkeypatch.setattr(drawing, "_WORTH", 10**6)
+    monkeypatch.setattr("polysft_mi.pictures.write_video", fail)
+    monkeypatch.setattr("polysft_mi.pictures.figures.contact_sheet", plot)
+    with pytest.raises(OSError, match="no space"):
+        drawn(sheet, tmp_path / "out")
+    assert done
 
 
 def test_texture_that_was_moved_is_moved_in_the_pictures(sheet, here, tmp_path):
