@@ -160,8 +160,8 @@ class Drawing:
 
     def __exit__(self, kind, error, trace):
         if self._pool is not None:
-            # not waited for, its end and that of the interpreter could meet: Python 3.11 then prints an OSError
-            self._pool.shutdown(wait=kind is None, cancel_futures=True)
+            # not waited for, its end and that of the interpreter could meet (Python 3.11 then prints an OSError), or it would miss its folder
+            self._pool.shutdown(cancel_futures=True)
         if self._here is not None:
             self._here.close()  # its threads may still be at work where an error or Ctrl-C ended the rest
         self._folder.cleanup()

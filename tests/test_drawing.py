@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -128,12 +129,14 @@ def test_no_file_is_removed_that_is_being_written(sheet, tmp_path):
 
 def test_nothing_is_drawn_any_more_after_an_error(sheet, tmp_path, monkeypatch):
     """Drawn here: the plots are begun beside the video, which fails."""
-    done = []
+    begun, done = threading.Event(), []
 
     def fail(*_):
+        assert begun.wait(30)
         raise OSError("no space")
 
     def plot(*_):
+        begun.set()
         time.sleep(0.5)
         done.append(True)
 
