@@ -141,6 +141,7 @@ class Drawing:
         return drawn, *(partial(result, k) for k in (1, 2))
 
     def _draw_here(self, vertices):
+        """Draw all frames in this process; ``vertices`` (T, N, 3) [m, world]."""
         from .pictures import Album
 
         self._here = Album(self.problem, *self._album)

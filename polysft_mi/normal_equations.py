@@ -226,7 +226,7 @@ class Pattern:
         self.row, self.column = np.divmod(self._keys, count)
         self.start = np.searchsorted(self.row, np.arange(count + 1))
         self.diagonal = self.find(each, each)
-        # a symmetric matrix's half: the blocks whose row is not below their column
+        # half of a symmetric matrix: the U blocks on its diagonal and above
         self.upper, self._lower = np.flatnonzero(self.row <= self.column), np.flatnonzero(self.row > self.column)
         self._half_keys = self._keys[self.upper]
         self._mirrored = self.find_half(self.column[self._lower], self.row[self._lower])
@@ -258,7 +258,7 @@ class Pattern:
         return np.searchsorted(self._keys, i * self.count + j)
 
     def find_half(self, i, j):
-        """Indices in the half of the blocks (i, j) or, where these are not in it, (j, i)."""
+        """Indices in the half, (K,), of the blocks (i, j) or, where these lie below the diagonal, (j, i)."""
         return np.searchsorted(self._half_keys, np.minimum(i, j) * self.count + np.maximum(i, j))
 
     def whole(self, half):
@@ -504,7 +504,7 @@ def assemble(pattern, surface, projection, evaluation, lengths, stiffness, wide=
 
 
 def _conjugated(half, s, pattern):
-    """s_i^T H_ij s_j of each block of half a matrix, (U, q, q): ``half`` (U, p, p), ``s`` (N, p, q). By components: products of whole arrays are
+    """s_i^T H_ij s_j of each block on the diagonal and above, (U, q, q): ``half`` (U, p, p) has the H_ij, ``s`` (N, p, q) the s_i. By components: products of whole arrays are
     faster than many small matrix products.
     """
     _, p, q = s.shape
