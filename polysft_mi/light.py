@@ -21,11 +21,12 @@ _INSIDE = {True: 0.3, False: 0.97}  # share of a triangle's surroundings that mu
 _FRONTAL = 0.3  # cosine between normal and ray from which on a triangle counts
 _DARK = 0.01  # texture's luminance, over its mean, below which it says nothing
 _RIDGE = 3e-3  # what the light is held to be the same from all sides by, in observations a triangle
+_DIMMEST = 0.1  # how bright a triangle is at least, over the light that comes from all sides alike
 _REFITS = 3  # of a frame's robust regression
 _KEPT = 0.8  # of what the frames before say, from one frame to the next: their surfaces were found under a light that was less well known
 _SIZE = 7  # of the unknowns (l_0, l, g)
 _UPPER = np.triu_indices(_SIZE)
-_FIRST_SCALE, _SCALE, _SCALES = 0.05, 4.0, (0.005, 0.05)  # of the robust norm; then so many standard deviations, within bounds, over the texture's mean
+_FIRST_SCALE, _SCALE, _SCALES = 0.05, 8.0, (0.005, 0.05)  # of the robust norm; then so many standard deviations, within bounds, over the texture's mean
 _NORMAL_DEVIATION = 1.4826  # standard deviation of a normal distribution over the median of its absolute values
 
 
@@ -156,9 +157,28 @@ class Brightness:
             image, mask = shrink(image, pool), None if mask is None else shrink(mask, pool)
         return blur(image, self.sigma / pool, mask) / self.mean, pool
 
-    def of(self, prepared, vertices, origin, position, pixels):
+    def shown(self, colour, inside, stride, position):
+        """Luminance (F,) of the triangles' texture over its mean, where a sheet's image without light is ``colour`` (h, w, 3), covered by it
+        where ``inside`` (h, w) is 1, of blocks of ``stride`` x ``stride`` pixels, and its vertices lie at ``position`` (N, 2) [blocks] there."""
+        image = blur(colour @ _LUMINANCE, self.sigma / stride, inside)
+        return _sampled(image, position[self.faces].sum(1) / 3 - 0.5) / self.mean
+
+    def lit(self, vertices, origin, light):
+        """How bright the ``light`` (7,) makes the triangles (F,) of a surface with ``vertices`` (N, 3) [m], seen from ``origin`` (3,): averages
+        over their neighbours."""
+        corner = vertices[self.faces]
+        normal = _cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        normal /= np.maximum(np.sqrt(np.einsum("fk,fk->f", normal, normal)), 1e-15)[:, None]
+        centre = corner.sum(1) / 3
+        normal *= -np.sign(np.einsum("fk,fk->f", normal, centre - origin))[:, None]
+        value = light[0] + normal @ light[1:4] + (centre - self.centre) @ light[4:] / self.unit
+        value = np.maximum(value, _DIMMEST * abs(light[0]))
+        total, count = (sum(np.bincount(k, w, len(vertices)) for k in self.faces.T) for w in (value, np.ones(len(value))))
+        return (total / np.maximum(count, 1))[self.faces].mean(1)
+
+    def of(self, prepared, vertices, origin, position, pixels, texture=None):
         """The :class:`Shade` of the surface with ``vertices`` (N, 3) [m], which lie at ``position`` (N, 2) [pixels] in the image and of whose
-        triangles ``pixels`` (F,) are seen; ``origin`` (3,): the camera's."""
+        triangles ``pixels`` (F,) are seen; ``origin`` (3,): the camera's; ``texture`` (F,): the luminance of the texture, as :meth:`shown`."""
         image, pool = prepared
         corner = vertices[self.faces]
         a, b = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
@@ -170,9 +190,10 @@ class Brightness:
         normal = cross * (facing / double)[:, None]
         frontal = np.abs(towards) > _FRONTAL * double * np.sqrt(np.einsum("fk,fk->f", ray, ray))
         luminance = _sampled(image, (position[self.faces].sum(1) / 3) / pool - 0.5)
+        texture = self.texture if texture is None else np.where(texture > _DARK, texture, self.texture)
         seen = self.trusted & frontal & (pixels > _COVERED * areas(position, self.faces))
         centre = (corner.sum(1) / 3 - self.centre) / self.unit
-        return Shade(normal, centre, self.unit, self.texture, luminance, seen, (a, b), double / 2, facing)
+        return Shade(normal, centre, self.unit, texture, luminance, seen, (a, b), double / 2, facing)
 
 
 def residuals(shade, light, weight):

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from .light import Brightness
 from .problem import BadFrame
-from .pyramid import FARTHEST, compared, level_image
+from .pyramid import FARTHEST, blur, compared, level_image
 
 _TEXELS = 1.5  # texels of the baked texture to a pixel of the first frame
 _PIXEL_BLUR = 0.29  # standard deviation of a pixel's own square [pixels]
@@ -27,6 +27,8 @@ _SUMS = 18 + 9 + 4  # of second derivatives, of first ones and of figures, a tri
 _SILHOUETTE = 0.1  # of k_silhouette: robust, normalised residuals are smaller than colours, and masks are ragged
 _MISFIT = 0.5  # residual, in local standard deviations, that counts half a misfit
 _CACHED_FRAMES = 4
+_TAPS = 2  # across a pixel's footprint on the texture, and along it
+_LONGEST = 12.0  # footprint of a pixel beyond which it is cut [pixels of the first frame]
 SHADE = "shade"  # a frame as shading is read from it, beside its levels
 
 
@@ -50,6 +52,20 @@ class Evaluation:
     rows: tuple
     pixels: float
     seen: np.ndarray
+
+
+@dataclass
+class Appearance:
+    """What the camera's blur makes of a sheet in one frame, at one surface and level, and its texture on the template, blurred there, does not.
+
+    ``excess``: the texture's colours less those of the sheet's image, packed Float of 4 channels on a part of the level's grid of
+    ``shape`` (h, w) from its pixel ``corner`` (x, y) on; ``luminance`` (F,): of the triangles' texture as the image shows it, as
+    :attr:`polysft_mi.light.Shade.texture`, or None."""
+
+    excess: object
+    shape: tuple
+    corner: tuple
+    luminance: np.ndarray = None
 
 
 class Registration:
@@ -118,12 +134,15 @@ class Registration:
             self._brightness = Brightness(self.faces, vertices, position, self.texture, self.texture_inside, texels, _TEXELS, masked)
         return self._brightness
 
-    def shade(self, vertices, frame, seen):
-        """The triangles' :class:`polysft_mi.light.Shade` in a frame; vertices (N, 3) [m, world], ``seen`` as in :class:`Evaluation`."""
+    def shade(self, vertices, frame, seen, appearance=None):
+        """The triangles' :class:`polysft_mi.light.Shade` in a frame; vertices (N, 3) [m, world], ``seen`` as in :class:`Evaluation`; the
+        texture's luminance is that of the ``appearance``, where it has one.
+        """
         if (frame, SHADE) not in self._frames:
             self.expect([frame], [SHADE])
         position, _ = self.camera.project(vertices)
-        return self.brightness.of(self._frames[frame, SHADE].result(), vertices, self.camera.origin, position, seen)
+        luminance = appearance.luminance if appearance else None
+        return self.brightness.of(self._frames[frame, SHADE].result(), vertices, self.camera.origin, position, seen, luminance)
 
     def _texels(self):
         """Pixels of ``texture`` (OpenCV's, whole at their centres) of the rendered vertices, (V, 2)."""
@@ -152,6 +171,17 @@ class Registration:
             dr.eval(entry[0])
             self._textures[level] = entry
         return self._textures[level]
+
+    def _texture_fine(self, level):
+        """The texture that taps are taken of at a level, as :meth:`_texture_level`."""
+        key = "fine", level.stride
+        if key not in self._textures:
+            image = blur(self.texture, _TEXELS * _PIXEL_BLUR * level.stride / _TAPS, self.texture_inside if self.problem.experiment.masks else None)
+            packed = np.concatenate([image, np.zeros_like(image[..., :1])], -1).astype(np.float32)
+            entry = mi.Float(np.ascontiguousarray(packed).ravel()), image.shape[1], image.shape[0]
+            dr.eval(entry[0])
+            self._textures[key] = entry
+        return self._textures[key]
 
     def shift_texture(self, chart, displaced):
         """Move the texture on the template: what lies at ``chart`` (N, 2) is shown at ``displaced`` (N, 2) instead. Whether that could be
@@ -223,10 +253,10 @@ class Registration:
         position, before = self.camera.project(vertices)
         return (*position.min(0), *position.max(0)) if before.all() else None
 
-    def _pixels(self, view, frame, level):
-        """Residuals (Vector4f, its fourth entry 0) and weights of the region's pixels, and what their derivatives need."""
-        texture, texture_width, texture_height = self._texture_level(level)
-        packed, _, image, *_ = self._frame_level(frame, level)
+    def _surface(self, view):
+        """What a ray meets, for all pixels of the region: (triangle, indices of its corners, (b1, b2), (p0, e1, e2), place on the baked
+        texture [texels, whole at their centres], its derivatives by the other two corners).
+        """
         hit, topology = view.hit, self.raster.topology(self.scene)
         triangle = mi.UInt32(dr.select(hit, view.triangle, 0))
         index = [dr.gather(mi.UInt32, topology.faces, 3 * triangle + k, hit) for k in range(3)]
@@ -240,36 +270,107 @@ class Registration:
         b1 = dr.dot(tv, pv) * inverse
         b2 = dr.dot(ray.d, dr.cross(tv, e1)) * inverse
         at = (c0 + (c1 - c0) * b1 + (c2 - c0) * b2) * self._texel[0] + self._texel[1]
-
-        # bilinear, with its derivatives
-        x = dr.clip(at.x, 0, mi.Float(dr.opaque(mi.UInt32, texture_width)) - 1.001)
-        y = dr.clip(at.y, 0, mi.Float(dr.opaque(mi.UInt32, texture_height)) - 1.001)
-        ix, iy = mi.UInt32(x), mi.UInt32(y)
-        fx, fy = x - mi.Float(ix), y - mi.Float(iy)
-        row = dr.opaque(mi.UInt32, texture_width)
-        first = iy * row + ix
-        t00, t10, t01, t11 = (dr.gather(mi.Vector4f, texture, first + k, hit) for k in (0, 1, row, row + 1))
-        top, bottom = t00 + (t10 - t00) * fx, t01 + (t11 - t01) * fx
-        by_x = ((t10 - t00) * (1 - fy) + (t11 - t01) * fy) * self._texel[0].x
-        by_y = (bottom - top) * self._texel[0].y
-
-        pixel, known = self._at(view, image)
-        target = dr.gather(mi.Vector4f, packed, pixel, hit & known)
-        seen = top + (bottom - top) * fy
-        weight = dr.select(hit & (seen.w > 0.5), target.w, 0)
-        seen.w, target.w = 0, 0
-        residual = dr.select(weight > 0, seen - target, 0)
-        return residual, weight, triangle, (b1, b2), (p0, e1, e2), (c1 - c0, c2 - c0), (by_x, by_y)
+        return triangle, (b1, b2), (p0, e1, e2), at, (c1 - c0, c2 - c0)
 
     @staticmethod
-    def _at(view, image):
-        """Indices of the region's pixels in the arrays of a :class:`LevelImage`, and whether they lie there."""
+    def _bilinear(texture, at, active):
+        """A texture (packed Float of 4 channels, width, height) at a place [texels], and its derivatives by that [1/texel]."""
+        texture, width, height = texture
+        row = dr.opaque(mi.UInt32, width)
+        x = dr.clip(at.x, 0, mi.Float(row) - 1.001)
+        y = dr.clip(at.y, 0, mi.Float(dr.opaque(mi.UInt32, height)) - 1.001)
+        ix, iy = mi.UInt32(x), mi.UInt32(y)
+        fx, fy = x - mi.Float(ix), y - mi.Float(iy)
+        first = iy * row + ix
+        t00, t10, t01, t11 = (dr.gather(mi.Vector4f, texture, first + k, active) for k in (0, 1, row, row + 1))
+        top, bottom = t00 + (t10 - t00) * fx, t01 + (t11 - t01) * fx
+        return top + (bottom - top) * fy, (t10 - t00) * (1 - fy) + (t11 - t01) * fy, bottom - top
+
+    @staticmethod
+    def _plane(view, edges):
+        """(grad1, grad2, slide): derivatives of the second and third barycentric coordinates by a point in the triangle's plane, and the
+        normal over its product with the ray's direction: a plane that moves by m slides the ray's point on it by slide . m along the ray.
+        """
+        _, e1, e2 = edges
+        n = dr.cross(e1, e2)
+        inverse = dr.rcp(dr.squared_norm(n))
+        return dr.cross(e2, n) * inverse, dr.cross(n, e1) * inverse, n * dr.rcp(dr.dot(n, view.ray.d))
+
+    @staticmethod
+    def _across(view):
+        """What one pixel to the right and one down are at the depth of each ray's point [m]."""
+        return [view.depth * mi.Vector3f(*(view.basis[k, axis] for k in range(3))) for axis in (0, 1)]
+
+    def _pixels(self, view, frame, level, appearance=None):
+        """Residuals (Vector4f, its fourth entry 0) and weights of the region's pixels, and what their derivatives need."""
+        hit, packed, image = view.hit, *self._frame_level(frame, level)[:3:2]
+        triangle, b, edges, at, along = self._surface(view)
+        seen, by_x, by_y = self._bilinear(self._texture_level(level), at, hit)
+        pixel, known = self._at(view, image.inside.shape, image.corner)
+        target = dr.gather(mi.Vector4f, packed, pixel, hit & known)
+        weight = dr.select(hit & (seen.w > 0.5), target.w, 0)
+        if appearance:
+            pixel, known = self._at(view, appearance.shape, appearance.corner)
+            target += dr.gather(mi.Vector4f, appearance.excess, pixel, hit & known)
+        seen.w, target.w = 0, 0
+        residual = dr.select(weight > 0, seen - target, 0)
+        return residual, weight, triangle, b, edges, along, (by_x * self._texel[0].x, by_y * self._texel[0].y)
+
+    @staticmethod
+    def _at(view, shape, corner):
+        """Indices of the region's pixels in an array of ``shape`` (h, w) whose first pixel is ``corner`` (x, y) of the grid, and whether they
+        lie there."""
         x0, y0, width, w, h = view.region
         local = dr.arange(mi.UInt32, w * h)
         ly = local // width
-        (rows, columns), corner = (dr.opaque(mi.Int32, int(k)) for k in image.inside.shape), (dr.opaque(mi.Int32, int(k)) for k in image.corner)
+        (rows, columns), corner = (dr.opaque(mi.Int32, int(k)) for k in shape), (dr.opaque(mi.Int32, int(k)) for k in corner)
         x, y = (mi.Int32(a) - b for a, b in zip((local - ly * width + x0, ly + y0), corner))
         return mi.UInt32(y * columns + x), (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
+
+    def appearance(self, vertices, level, light=None, shaded=False):
+        """The :class:`Appearance` of the sheet with vertices (N, 3) [m, world] at a level.
+
+        A frame is blurred, and freed from lighting, in the image; the texture on the template, once for all. Where the sheet is seen at a
+        slant, or hides a part of itself, these differ. So the sheet is rendered, under the ``light`` (7,) of :class:`polysft_mi.light.Light`
+        where it is known, and made what the frame was made. ``shaded``: with the triangles' luminance.
+        """
+        lit = mi.Float(self.brightness.lit(vertices, self.camera.origin, light).astype(np.float32) if light is not None else np.ones(len(self.faces), np.float32))
+        with dr.suspend_grad():
+            self._place(vertices)
+            view = self.raster.look(self.scene, self.sensor, 1 / level.stride, self._box(vertices))
+            hit = view.hit
+            triangle, _, edges, at, (c01, c02) = self._surface(view)
+            seen, *_ = self._bilinear(self._texture_level(level), at, hit)
+            grad1, grad2, slide = self._plane(view, edges)
+            footprint = []
+            for pixel in self._across(view):
+                pixel -= view.ray.d * dr.dot(slide, pixel)
+                step = (c01 * dr.dot(grad1, pixel) + c02 * dr.dot(grad2, pixel)) * self._texel[0]
+                footprint.append(step * dr.minimum(1, _LONGEST * _TEXELS * level.stride * dr.rcp(dr.norm(step))))
+            colour = mi.Vector4f(0)
+            for i in range(_TAPS):
+                for j in range(_TAPS):
+                    a, b = ((k + 0.5) / _TAPS - 0.5 for k in (i, j))
+                    colour += self._bilinear(self._texture_fine(level), at + a * footprint[0] + b * footprint[1], hit)[0]
+            colour /= _TAPS**2
+            colour.w = dr.select(hit, dr.gather(mi.Float, lit, triangle, hit), 0)
+            colour = dr.select(hit, colour, 0)
+            flat = dr.ravel(colour)
+            dr.eval(flat, seen)
+            x0, y0, _, w, h = view.region
+            corner, (x0, y0) = (int(x0[0]), int(y0[0])), (x0, y0)
+            found = np.array(flat).reshape(h, w, 4)
+            inside = (found[..., 3] > 0).astype(np.float32)
+            image = compared(found[..., :3] * found[..., 3:], inside, level.sigma / level.stride, level.window / level.stride, self.normalise)
+            packed = mi.Float(np.ascontiguousarray(np.concatenate([image, np.zeros_like(image[..., :1])], -1)).ravel())
+            difference = dr.select(hit & (seen.w > 0.5), seen - dr.gather(mi.Vector4f, packed, dr.arange(mi.UInt32, w * h)), 0)
+            excess = dr.ravel(difference)
+            dr.eval(excess)
+        luminance = None
+        if shaded:
+            position, _ = self.camera.project(vertices)
+            luminance = self.brightness.shown(found[..., :3], inside, level.stride, position / level.stride - corner)
+        return Appearance(excess, (h, w), corner, luminance)
 
     def residuals(self, vertices, frame, level):
         """Squared residuals r^2 = |T - I|^2 / 3 of the pixels that are compared, (P,) float32; vertices (N, 3) [m, world]."""
@@ -288,30 +389,27 @@ class Registration:
         squared = self.residuals(vertices, frame, level)
         return float((squared / (squared + _MISFIT**2)).mean()) if len(squared) else 1.0
 
-    def evaluate(self, vertices, frame, level, scale):
-        """:class:`Evaluation` of the surface with vertices (N, 3) [m, world] against a frame, at a level, under the robust ``scale``."""
+    def evaluate(self, vertices, frame, level, scale, appearance=None):
+        """:class:`Evaluation` of the surface with vertices (N, 3) [m, world] against a frame, at a level, under the robust ``scale``; the
+        frame has the ``appearance``'s excess.
+        """
         s = self.problem.settings
         with dr.suspend_grad():
             self._place(vertices)
             view = self.raster.look(self.scene, self.sensor, 1 / level.stride, self._box(vertices))
-            residual, weight, triangle, (b1, b2), (p0, e1, e2), (c01, c02), (by_x, by_y) = self._pixels(view, frame, level)
+            residual, weight, triangle, (b1, b2), edges, (c01, c02), (by_x, by_y) = self._pixels(view, frame, level, appearance)
             squared = dr.squared_norm(residual) / 3
             c2 = dr.opaque(mi.Float, scale * scale)
             # the texture coordinate under a pixel moves against the triangle's plane, which slides along the ray
-            ray, depth = view.ray, view.depth
-            n = dr.cross(e1, e2)
-            inverse = dr.rcp(dr.squared_norm(n))
-            grad1, grad2 = dr.cross(e2, n) * inverse, dr.cross(n, e1) * inverse
+            grad1, grad2, slide = self._plane(view, edges)
             grad_x, grad_y = c01.x * grad1 + c02.x * grad2, c01.y * grad1 + c02.y * grad2
-            slide = n * dr.rcp(dr.dot(n, ray.d))
             robust = 2 * weight / (3 * (1 + squared / c2))
             first = mi.Vector3f(0)
             xx, xy, yy = mi.Float(0), mi.Float(0), mi.Float(0)
-            right = depth * mi.Vector3f(*(view.basis[k, 0] for k in range(3)))  # what one pixel to the right is at this depth
-            down = depth * mi.Vector3f(*(view.basis[k, 1] for k in range(3)))
+            right, down = self._across(view)
             for c in range(3):
                 k = grad_x * by_x[c] + grad_y * by_y[c]
-                g = slide * dr.dot(k, ray.d) - k
+                g = slide * dr.dot(k, view.ray.d) - k
                 first += residual[c] * g
                 a, b = dr.dot(g, right), dr.dot(g, down)
                 xx, xy, yy = xx + a * a, xy + a * b, yy + b * b
@@ -373,7 +471,7 @@ class Registration:
         _, mask, image, _, total = self._frame_level(frame, level)  # the total of the whole frame, less the region's, which alpha is subtracted from
         if mask is None:
             return None
-        pixel, known = self._at(view, image)
+        pixel, known = self._at(view, image.inside.shape, image.corner)
         alpha = dr.select(view.hit, mi.Float(1), 0)
         wanted = dr.gather(mi.Float, mask, pixel, known)
         crossings = self.raster.crossings(view, outline=True)  # where a sheet passes before the sheet itself, alpha does not change

@@ -14,7 +14,7 @@ from ..normal_equations import Blocks, Chart, Normal, Pattern, Reduced, State, S
 from ..patch import Unknowns
 from ..problem import BadFrame
 from ..pyramid import Level
-from ..registration import SHADE, Evaluation, Registration
+from ..registration import SHADE, Appearance, Evaluation, Registration
 from ..relocate import Relocator
 from . import Solution
 
@@ -69,13 +69,14 @@ def _check_step(step):
 @dataclass
 class Model:
     """The objective to second order around a ``state`` whose vertices are of ``surface``: from the images' ``evaluation``, ``normal``. ``noise``: the
-    variance of a residual; ``reduced``: ``normal`` without damping, made when it is wanted."""
+    variance of a residual; ``appearance``: the sheet's that it was found with; ``reduced``: ``normal`` without damping, made when it is wanted."""
 
     state: State
     surface: Surface
     evaluation: Evaluation
     normal: Normal
     noise: float
+    appearance: Appearance = None
     reduced: Reduced = None
 
 
@@ -248,7 +249,7 @@ class GaussNewton:
         """What is known of the light after a frame, whose last :class:`Model` this is."""
         if not self.settings.k_shading:
             return self._light
-        return self._light.learned(self.registration.shade(model.surface.vertices, frame, model.evaluation.seen))
+        return self._light.learned(self.registration.shade(model.surface.vertices, frame, model.evaluation.seen, model.appearance))
 
     # -- one frame ----------------------------------------------------------
 
@@ -349,7 +350,8 @@ class GaussNewton:
     def _stage(self, state, anchor, frame, order, stage, iterations):
         """Levenberg-Marquardt at one stage: (state, terms). Its robust scale is the one that fitted the frame before."""
         scale = self._scales.get(stage, _FIRST_SCALE)
-        normal, terms = self._linearise(state, anchor, frame, order, stage, scale)
+        appearance = self._appearance(state, order, stage)
+        normal, terms = self._linearise(state, anchor, frame, order, stage, scale, appearance)
         damping, least, gained = _DAMPING[normal.local.shape[-1]], _SHOWN * terms["pixels"], 0.0
         for k in range(_FARTHER * iterations):
             if k >= iterations and gained < _GOING * terms["total"]:
@@ -365,7 +367,7 @@ class GaussNewton:
                 state = state.moved(step)
                 break
             trial = state.moved(step)
-            found = self._linearise(trial, anchor, frame, order, stage, scale)
+            found = self._linearise(trial, anchor, frame, order, stage, scale, appearance)
             if found[1]["total"] < terms["total"] and found[1]["pixels"] > least:
                 gained = terms["total"] - found[1]["total"]
                 if gained > 0.5 * promised:
@@ -384,7 +386,8 @@ class GaussNewton:
         ``before``: the state of the frame before the window, which stays, or None; ``orders``: of the frames' jets.
         """
         states, damping = list(states), 1e-4
-        models = self._window(states, before, frames, orders)
+        appearances = [self._appearance(state, n, STAGES[-1]) for state, n in zip(states, orders)]
+        models = self._window(states, before, frames, orders, appearances)
         total = sum(terms["total"] for _, terms in models)
         for _ in range(_JOINT):
             try:
@@ -394,9 +397,9 @@ class GaussNewton:
                 continue
             trial = [state.moved(step) for state, step in zip(states, steps)]
             if promised < _SMALL * total:
-                states, models = trial, self._window(trial, before, frames, orders)
+                states, models = trial, self._window(trial, before, frames, orders, appearances)
                 break
-            found = self._window(trial, before, frames, orders)
+            found = self._window(trial, before, frames, orders, appearances)
             now = sum(terms["total"] for _, terms in found)
             if now < total:
                 states, models, total, damping = trial, found, now, max(damping / 5, 1e-7)
@@ -404,7 +407,7 @@ class GaussNewton:
                 damping *= 10
         return states, [terms for _, terms in models]
 
-    def _window(self, states, before, frames, orders):
+    def _window(self, states, before, frames, orders, appearances):
         """(Normal, terms) of every frame: the whole gradient of the window, of its curvature what lies within a frame.
 
         What couples two frames counts among the terms of the later one, and pulls both.
@@ -412,7 +415,7 @@ class GaussNewton:
         stage = STAGES[-1]
         scale = self._scales.get(stage, _FIRST_SCALE)
         anchors = [before if before is not None else states[0], *states[:-1]]
-        models = [self._linearise(s, a, f, n, stage, scale) for s, a, f, n in zip(states, anchors, frames, orders)]
+        models = [self._linearise(s, a, f, n, stage, scale, x) for s, a, f, n, x in zip(states, anchors, frames, orders, appearances)]
         temporal = 2 * self.settings.k_tc * _TEMPORAL
         for (earlier, _), (later, _), a, b, n in zip(models, models[1:], states, states[1:], orders):
             size = self.chart.size(n)
@@ -459,13 +462,22 @@ class GaussNewton:
         m = min(max(outlying, 0.02), 0.98)
         return float(np.clip(scale * math.sqrt(m / (1 - m) / 0.44), *_SCALES))
 
-    def _linearise(self, state, anchor, frame, order, stage, scale, stiffness=None, evaluation=None):
+    def _appearance(self, state, order, stage):
+        """The :class:`polysft_mi.registration.Appearance` of the sheet in a stage that begins at ``state``; None where the sheet has yet to
+        move far."""
+        if stage in (FAR, STAGES[0]):
+            return None
+        light = self._light.coefficients(len(self.registration.faces)) if self._light.frames else None
+        shaded = self.settings.k_shading > 0 and stage is STAGES[-1]
+        return self.registration.appearance(self.chart.surface(state, order).vertices, self.levels[stage], light, shaded)
+
+    def _linearise(self, state, anchor, frame, order, stage, scale, appearance=None, stiffness=None, evaluation=None):
         """(Normal, terms) of the whole objective at a state, whose ``evaluation`` may be known. Raises BadFrame where it is not finite."""
         s, chart = self.settings, self.chart
         surface = chart.surface(state, order)
         known = evaluation is not None
         if not known:
-            evaluation = self.registration.evaluate(surface.vertices, frame, self.levels[stage], scale)
+            evaluation = self.registration.evaluate(surface.vertices, frame, self.levels[stage], scale, appearance)
         caution = 1 + min((np.nan_to_num(self._noise) / _NOISE_MISFIT) ** _NOISE_POWER, _NOISE_MOST)  # before what may be noise
         give = math.inf if stiffness is not None or (self._moved and stage in (FAR, STAGES[0])) else _GIVE * caution
         stiffness = s.k_mi * (stage.stiffness if stiffness is None else stiffness) / chart.template.scale**2
@@ -476,7 +488,7 @@ class GaussNewton:
         wide = pattern if d == 3 else None
         shading, rows = 0.0, None
         if s.k_shading > 0 and stage is STAGES[-1] and self._light.frames:  # before, lengths are soft, and shading would bend what they should
-            shade = self.registration.shade(surface.vertices, frame, evaluation.seen)
+            shade = self.registration.shade(surface.vertices, frame, evaluation.seen, appearance)
             shading, *rows = residuals(shade, self._light, s.k_shading)
         normal, inextensibility = assemble(self.pattern, surface, projection, evaluation, self.lengths, stiffness, wide, give=give, triangles=rows)
         a = self.chart.size(order)
@@ -517,7 +529,7 @@ class GaussNewton:
         level = self.levels[stage]
         noise = 2 * evaluation.photometric / (3 * max(evaluation.pixels, 1.0)) * max(1.0, 4 * math.pi * level.sigma**2)
         facts = {"misfit": evaluation.misfit, "outlying": evaluation.outlying, "pixels": evaluation.pixels, "order": order}
-        facts["model"] = Model(state, surface, evaluation, normal, noise)
+        facts["model"] = Model(state, surface, evaluation, normal, noise, appearance)
         return normal, {**terms, "total": total, **facts}
 
     # -- order --------------------------------------------------------------
@@ -534,7 +546,7 @@ class GaussNewton:
     def _raised(self, state, terms, anchor, frame, order):
         """(state, terms) with more coefficients; None where they do not pay."""
         stage, model, top = STAGES[-1], terms["model"], min(order + _ORDER_STEP, self.settings.capacity)
-        wide, _ = self._linearise(model.state, anchor, frame, top, stage, self._scales.get(stage, _FIRST_SCALE), evaluation=model.evaluation)
+        wide, _ = self._linearise(model.state, anchor, frame, top, stage, self._scales.get(stage, _FIRST_SCALE), model.appearance, evaluation=model.evaluation)
         try:
             reduced = self._reduced(wide, _UNDAMPED)
             model.reduced = reduced.lower(self.chart.size(order))
