@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-_POOL = 4  # local statistics are taken on an image this many times smaller
+POOL = 4  # local statistics are taken on an image this many times smaller
 FARTHEST = 30.0  # pixels of the grid beyond which a silhouette is pulled no harder
 _FLOOR = 0.02  # local standard deviation below which an area counts as flat: it is not blown up to the contrast of the rest
 
@@ -59,7 +59,7 @@ def _around(mask, level):
     if len(rows) == 0:
         return (0, 0), (slice(None), slice(None))
     margin = int(max((FARTHEST + 2) * level.stride, 4 * level.sigma, 4 * level.window))
-    step = math.lcm(level.stride, _POOL)  # so that the grids of the part are those of the whole
+    step = math.lcm(level.stride, POOL)  # so that the grids of the part are those of the whole
     at = [(max(0, int(x[0]) - margin) // step * step, (int(x[-1]) + margin) // step * step + step) for x in (rows, columns)]
     return (at[0][0], at[1][0]), tuple(slice(*x) for x in at)
 
@@ -83,7 +83,7 @@ def blur(image, sigma, weight=None):
 
 def normalised(image, sigma, weight=None):
     """(H, W, C) less its local mean, over its local standard deviation (one for all channels), under a window of ``sigma`` [pixels]."""
-    pool = int(min(_POOL, max(1, sigma // 2)))
+    pool = int(min(POOL, max(1, sigma // 2)))
     height, width = image.shape[:2]
     small = (max(1, width // pool), max(1, height // pool))
 

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from .light import Brightness
 from .problem import BadFrame
-from .pyramid import FARTHEST, blur, compared, level_image
+from .pyramid import FARTHEST, POOL, blur, compared, level_image
 
 _TEXELS = 1.5  # texels of the baked texture to a pixel of the first frame
 _PIXEL_BLUR = 0.29  # standard deviation of a pixel's own square [pixels]
@@ -28,6 +28,7 @@ _SILHOUETTE = 0.1  # of k_silhouette: robust, normalised residuals are smaller t
 _MISFIT = 0.5  # residual, in local standard deviations, that counts half a misfit
 _CACHED_FRAMES = 4
 _TAPS = 2  # across a pixel's footprint on the texture, and along it
+_FREE = 2.0  # windows from the border beyond which the background has no say in a frame's local statistics
 _LONGEST = 12.0  # footprint of a pixel beyond which it is cut [pixels of the first frame]
 SHADE = "shade"  # a frame as shading is read from it, beside its levels
 
@@ -85,7 +86,7 @@ class Registration:
         self._texcoord = mi.Float(np.array(mesh.vertex_texcoords_buffer()))
         self._rendered = faces  # by the rendered vertices, which texture coordinates are of
         self._bake(mesh, faces)
-        self._textures, self._frames = {}, OrderedDict()
+        self._textures, self._frames, self._last = {}, OrderedDict(), None
         self._reader = ThreadPoolExecutor(1)
         sequence = problem.sequence
         self._decoded = lru_cache(2)(lambda frame: (sequence.frame(frame), sequence.mask(frame)))  # all levels are made of one decoding
@@ -244,9 +245,13 @@ class Registration:
 
     # -- evaluation ---------------------------------------------------------
 
-    def _place(self, vertices):
-        with dr.suspend_grad():
+    def _look(self, vertices, level):
+        """The :class:`polysft_mi.raster.View` of the sheet with vertices (N, 3) [m, world] on a level's grid; the last one is kept."""
+        if self._last is None or self._last[0] != level.stride or not np.array_equal(self._last[1], vertices):
             self.problem.place(mi.Point3f(np.ascontiguousarray(vertices.T, dtype=np.float32)))
+            view = self.raster.look(self.scene, self.sensor, 1 / level.stride, self._box(vertices))
+            self._last = level.stride, vertices.copy(), view
+        return self._last[2]
 
     def _box(self, vertices):
         """(x, y, x, y) [pixels of the video] around the projected vertices; None where one is not before the camera."""
@@ -336,8 +341,7 @@ class Registration:
         """
         lit = mi.Float(self.brightness.lit(vertices, self.camera.origin, light).astype(np.float32) if light is not None else np.ones(len(self.faces), np.float32))
         with dr.suspend_grad():
-            self._place(vertices)
-            view = self.raster.look(self.scene, self.sensor, 1 / level.stride, self._box(vertices))
+            view = self._look(vertices, level)
             hit = view.hit
             triangle, _, edges, at, (c01, c02) = self._surface(view)
             seen, *_ = self._bilinear(self._texture_level(level), at, hit)
@@ -360,10 +364,14 @@ class Registration:
             x0, y0, _, w, h = view.region
             corner, (x0, y0) = (int(x0[0]), int(y0[0])), (x0, y0)
             found = np.array(flat).reshape(h, w, 4)
-            inside = (found[..., 3] > 0).astype(np.float32)
-            image = compared(found[..., :3] * found[..., 3:], inside, level.sigma / level.stride, level.window / level.stride, self.normalise)
+            image, inside = self._as_frames_are(found[..., :3] * found[..., 3:], found[..., 3] > 0, corner, level)
             packed = mi.Float(np.ascontiguousarray(np.concatenate([image, np.zeros_like(image[..., :1])], -1)).ravel())
-            difference = dr.select(hit & (seen.w > 0.5), seen - dr.gather(mi.Vector4f, packed, dr.arange(mi.UInt32, w * h)), 0)
+            known = inside
+            if not self.problem.experiment.masks:  # a frame's statistics near the border have the background in them
+                padded = np.pad(inside.astype(np.uint8), 1)
+                known = (cv2.distanceTransform(padded, cv2.DIST_L2, 3)[1:-1, 1:-1] > _FREE * level.window / level.stride).astype(np.float32)
+            known = (mi.Float(known.ravel()) > 0) & (seen.w > 0.5)
+            difference = dr.select(known, seen - dr.gather(mi.Vector4f, packed, dr.arange(mi.UInt32, w * h)), 0)
             excess = dr.ravel(difference)
             dr.eval(excess)
         luminance = None
@@ -372,11 +380,20 @@ class Registration:
             luminance = self.brightness.shown(found[..., :3], inside, level.stride, position / level.stride - corner)
         return Appearance(excess, (h, w), corner, luminance)
 
+    def _as_frames_are(self, colour, inside, corner, level):
+        """An image (h, w, 3) of the sheet, ``inside`` (h, w) of it, made what frames are made at a level, on whose grid it begins at ``corner`` (x, y);
+        and inside as float32."""
+        margin = int(2 * level.window / level.stride) + 1  # of nothing, as around a mask
+        pads = [(k - (k - margin) // POOL * POOL, -((-k - n - margin) // POOL) * POOL - k - n) for k, n in zip(corner[::-1], inside.shape)]
+        inside = inside.astype(np.float32)
+        wide = compared(np.pad(colour, (*pads, (0, 0))), np.pad(inside, pads), level.sigma / level.stride, level.window / level.stride, self.normalise)
+        (top, _), (left, _) = pads
+        return wide[top : top + inside.shape[0], left : left + inside.shape[1]], inside
+
     def residuals(self, vertices, frame, level):
         """Squared residuals r^2 = |T - I|^2 / 3 of the pixels that are compared, (P,) float32; vertices (N, 3) [m, world]."""
         with dr.suspend_grad():
-            self._place(vertices)
-            view = self.raster.look(self.scene, self.sensor, 1 / level.stride, self._box(vertices))
+            view = self._look(vertices, level)
             residual, weight, *_ = self._pixels(view, frame, level)
             squared = dr.squared_norm(residual) / 3
             dr.eval(squared, weight)
@@ -395,8 +412,7 @@ class Registration:
         """
         s = self.problem.settings
         with dr.suspend_grad():
-            self._place(vertices)
-            view = self.raster.look(self.scene, self.sensor, 1 / level.stride, self._box(vertices))
+            view = self._look(vertices, level)
             residual, weight, triangle, (b1, b2), edges, (c01, c02), (by_x, by_y) = self._pixels(view, frame, level, appearance)
             squared = dr.squared_norm(residual) / 3
             c2 = dr.opaque(mi.Float, scale * scale)

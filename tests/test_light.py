@@ -258,3 +258,26 @@ def test_only_the_last_stage_is_shaded_and_a_step_goes_where_the_shading_leads(t
         slope = step[0] @ normal.gradient + (step[1] * normal.local_gradient).sum()
         found = solver._linearise(rest.moved(step, 0.1), rest, 1, 4, stage, 0.5)[1]
         assert 0.1 * slope < found["shading"] - terms["shading"] < 0.02 * slope < 0  # less than the slope says, for the exposure follows
+
+
+def test_what_a_light_makes_of_each_triangle():
+    found, vertices = brightness(), wavy()
+    each = lit(vertices)
+    around = [[t for t, face in enumerate(FACES) if k in face] for k in range(len(vertices))]
+    expected = [np.mean([each[around[k]].mean() for k in face]) for face in FACES]
+    assert np.allclose(found.lit(vertices, np.zeros(3), LIGHT), expected)
+    turned = found.faces[:, ::-1].copy()
+    found.faces = turned  # whichever way triangles are listed
+    assert np.allclose(found.lit(vertices, np.zeros(3), LIGHT), expected)
+    assert found.lit(vertices, np.zeros(3), np.array([0.5, 0, 0, 3.0, 0, 0, 0])).min() == pytest.approx(0.05)  # never black
+
+
+def test_a_textures_luminance_as_an_image_shows_it():
+    found, vertices = brightness(), synthetic.sheet(0, ROWS, COLUMNS)
+    image = np.broadcast_to(np.linspace(0.2, 0.8, 80, dtype=np.float32)[None, :, None], (60, 80, 3))  # on a grid of two pixels
+    value = found.shown(image, np.ones((60, 80), np.float32), 2, project(vertices) / 2)
+    x = project(vertices)[FACES].mean(1)[:, 0] / 2 - 0.5
+    assert np.allclose(value * found.mean, 0.2 + 0.6 * x / 79, atol=1e-3)
+    assert np.array_equal(shade_of(found, vertices, np.full((120, 160), 0.5)).texture, found.texture)
+    known = found.of(found.prepared(np.full((120, 160, 3), 0.5, np.float32), None), vertices, np.zeros(3), project(vertices), np.full(len(FACES), 1e9), value)
+    assert np.array_equal(known.texture, value)

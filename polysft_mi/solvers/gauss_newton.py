@@ -144,7 +144,7 @@ class GaussNewton:
             least = self._remember(known)
             start = states[k] if past or k == 0 else states[k - 1]
             states[k], found = self._newest(start, frames[k], (before + states[:k])[-2:], known)
-            found["least_misfit"] = float(np.fmin(least, found["misfit"])) if known else math.nan
+            found["least_misfit"] = self._least(least, found, frames[k]) if known else math.nan
             found["light"] = self._learned(found["model"], frames[k]).numbers()
             known.append(found)
         if len(frames) == 1:
@@ -235,9 +235,16 @@ class GaussNewton:
         known."""
         misfit, least = (next((t[name] for t in reversed(known) if t.get(name) is not None), math.nan) for name in ("misfit", "least_misfit"))
         self._noise = misfit if math.isnan(least) else least
-        self._unexplained = misfit > max(_UNEXPLAINED, _UNEXPLAINED_FACTOR * self._noise)
+        self._unexplained = self._is_unexplained(misfit)
         self._light = Light.of(next((t["light"] for t in reversed(known) if t.get("light") is not None), None))
         return least
+
+    def _least(self, least, found, frame):
+        """The least misfit after a frame whose terms are ``found``, of the texture as the template has it: what the camera's blur makes of it
+        is no noise."""
+        if found["misfit"] > least:
+            return least
+        return float(np.fmin(least, self.registration.misfit(found["model"].surface.vertices, frame, self.levels[STAGES[-1]])))
 
     def _expect(self, frame):
         """Have this frame and the next one read in a second thread."""
@@ -284,7 +291,10 @@ class GaussNewton:
     def _suspect_above(self, past):
         """The misfit above which a frame is suspect, after those whose terms are ``past``: infinite while these are too few to tell."""
         usual = [t["misfit"] for t in past[-_MEMORY:] if t.get("misfit") is not None]
-        return self._noise + _SUSPECT * (np.median(usual) - self._noise) + _SUSPECT_MARGIN if len(usual) >= 3 else math.inf
+        if len(usual) < 3:
+            return math.inf
+        noise = min(self._noise, *usual)
+        return noise + _SUSPECT * (np.median(usual) - noise) + _SUSPECT_MARGIN
 
     def _reduced(self, normal, damping, dtype=np.float64):
         return Reduced(self.systems[normal.local.shape[-1]], normal, damping, dtype)
@@ -345,7 +355,12 @@ class GaussNewton:
         """Stage after stage, each of its own or so many ``iterations``, more while they gain much: (state, terms)."""
         for stage in stages:
             state, terms = self._stage(state, anchor, frame, order, stage, iterations or stage.iterations)
+        if self._is_unexplained(terms["misfit"]):  # by what the sheet looked like when the last stage began; now it looks otherwise
+            state, terms = self._stage(state, anchor, frame, order, stages[-1], iterations or stages[-1].iterations)
         return state, terms
+
+    def _is_unexplained(self, misfit):
+        return misfit > max(_UNEXPLAINED, _UNEXPLAINED_FACTOR * self._noise)
 
     def _stage(self, state, anchor, frame, order, stage, iterations):
         """Levenberg-Marquardt at one stage: (state, terms). Its robust scale is the one that fitted the frame before."""
@@ -465,7 +480,7 @@ class GaussNewton:
     def _appearance(self, state, order, stage):
         """The :class:`polysft_mi.registration.Appearance` of the sheet in a stage that begins at ``state``; None where the sheet has yet to
         move far."""
-        if stage in (FAR, STAGES[0]):
+        if stage is FAR:
             return None
         light = self._light.coefficients(len(self.registration.faces)) if self._light.frames else None
         shaded = self.settings.k_shading > 0 and stage is STAGES[-1]

@@ -1,0 +1,176 @@
+"""What the camera's blur makes of a sheet: against a rendering of many samples, and frames of slanted, lit sheets against their own images."""
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import synthetic
+from problems import problem_of
+from scipy.spatial.transform import Rotation
+
+from polysft_mi import solvers
+from polysft_mi.pyramid import Level, level_image
+from polysft_mi.registration import Registration
+from polysft_mi.solvers import gauss_newton
+from polysft_mi.tracker import track
+
+LIGHT = np.array([0.6, 0.45, 0.0, -0.3])
+LEVELS = [Level(1.0, 1, 8.0), Level(2.5, 2, 8.0)]
+
+
+def chequers(size=192, across=16):
+    rng = np.random.default_rng(3)
+    y, x = np.mgrid[:size, :size] * across // size
+    return np.where(((x + y) % 2)[..., None] > 0, rng.integers(30, 90, (across, across, 3))[y, x], rng.integers(150, 240, (across, across, 3))[y, x]).astype(np.uint8)
+
+
+def cloth(folder, **more):
+    patch = pytest.MonkeyPatch()
+    patch.setattr(synthetic, "texture_image", chequers)
+    try:
+        return synthetic.cloth(folder, size=(200, 150), rows=9, columns=12, **more)
+    finally:
+        patch.undo()
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory):
+    return cloth(tmp_path_factory.mktemp("appearance") / "cloth", frames=4, bend=11.0, light=LIGHT)
+
+
+@pytest.fixture(scope="module")
+def unmasked(tmp_path_factory):
+    return cloth(tmp_path_factory.mktemp("appearance") / "unmasked", frames=2, masks=False)
+
+
+@pytest.fixture(scope="module")
+def problem(truth):
+    return problem_of(truth.folder)
+
+
+def slanted(vertices, degrees=62.0):
+    return Rotation.from_rotvec([0, math.radians(degrees), 0]).apply(vertices - vertices.mean(0)) + vertices.mean(0)
+
+
+def compared(known, vertices, frame, level, appearance):
+    """(what is compared with a frame (h, w, 3), where (h, w)) of the level's grid of the whole image."""
+    with dr.suspend_grad():
+        view = known._look(vertices, level)
+        residual, weight, *_ = known._pixels(view, frame, level, appearance)
+        packed, _, image, *_ = known._frame_level(frame, level)
+        pixel, inside = known._at(view, image.inside.shape, image.corner)
+        seen = residual + dr.gather(mi.Vector4f, packed, pixel, inside)
+    x0, y0, _, w, h = view.region
+    x0, y0 = int(x0[0]), int(y0[0])
+    rows, columns = known.problem.height // level.stride, known.problem.width // level.stride
+    colour, where = np.zeros((rows, columns, 3)), np.zeros((rows, columns), bool)
+    colour[y0 : y0 + h, x0 : x0 + w] = np.array(seen).T[:, :3].reshape(h, w, 3)
+    where[y0 : y0 + h, x0 : x0 + w] = np.array(weight).reshape(h, w) > 0
+    return colour, where
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_it_is_a_rendering_made_what_frames_are_made(problem, level):
+    known = Registration(problem)
+    vertices = slanted(problem.template.vertices)
+    appearance = known.appearance(vertices, level)
+    with dr.suspend_grad():
+        known._look(vertices, Level(1.0))
+        image = np.array(known.raster.image(known.scene, known.sensor, spp=36))
+    cover = (image[..., 3] > 0.5).astype(np.float32)
+    colour = (image[..., :3] / np.maximum(image[..., 3:], 1e-3) * cover[..., None]).astype(np.float32)
+    reference = level_image(colour, cover, level)
+    x, y = reference.corner
+    rows, columns = reference.inside.shape
+    found, where = compared(known, vertices, 0, level, appearance)
+    plain, _ = compared(known, vertices, 0, level, None)
+    here = where[y : y + rows, x : x + columns] & (reference.inside[: where.shape[0] - y, : where.shape[1] - x] > 0)
+    error = [np.abs(k[y : y + rows, x : x + columns] - reference.colour[: where.shape[0] - y, : where.shape[1] - x])[here].mean() for k in (found, plain)]
+    assert here.sum() > 500 // level.stride**2 and error[0] < 0.1 and error[0] < 0.35 * error[1], error
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_a_frame_is_explained_by_the_surface_that_it_shows(problem, truth, level):
+    known = Registration(problem)
+    light = np.array([*LIGHT, 0, 0, 0])
+    found = {}
+    for name, appearance in (("none", None), ("unlit", known.appearance(truth.vertices[3], level)), ("lit", known.appearance(truth.vertices[3], level, light))):
+        found[name] = known.evaluate(truth.vertices[3], 3, level, 0.3, appearance).misfit
+    assert found["lit"] < 0.75 * found["unlit"] < 0.6 * found["none"], found
+
+
+def test_gradient_and_curvature_are_those_of_a_frame_that_has_the_excess(problem, truth):
+    level, known, frame = LEVELS[0], Registration(problem), 2
+    vertices = truth.vertices[2]
+    appearance = known.appearance(vertices + [0.001, 0, 0.002], level)
+    mine = known.evaluate(vertices, frame, level, 0.3, appearance)
+    packed, mask, image, *sums = known._frame_level(frame, level)
+    (h, w), (x, y), (rows, columns) = appearance.shape, appearance.corner, image.inside.shape
+    whole, excess = np.array(packed).reshape(rows, columns, 4), np.array(appearance.excess).reshape(h, w, 4)
+    for i in range(h):
+        for j in range(w):
+            k, m = i + y - image.corner[1], j + x - image.corner[0]
+            if 0 <= k < rows and 0 <= m < columns:
+                whole[k, m, :3] += excess[i, j, :3]
+    known._frames[frame, level] = mi.Float(whole.ravel()), mask, image, *sums
+    expected = known.evaluate(vertices, frame, level, 0.3)
+    assert mine.photometric == pytest.approx(expected.photometric, rel=1e-6) and mine.misfit == pytest.approx(expected.misfit, rel=1e-6)
+    assert np.abs(mine.gradient - expected.gradient).max() < 1e-5 * np.abs(expected.gradient).max()
+    assert np.abs(mine.second - expected.second).max() < 1e-5 * np.abs(expected.second).max()
+
+
+def test_without_masks_only_what_is_far_from_the_border(unmasked):
+    problem = problem_of(unmasked.folder)
+    known, level = Registration(problem), Level(1.0, 1, 6.0)
+    appearance = known.appearance(problem.template.vertices, level)
+    h, w = appearance.shape
+    has = np.abs(np.array(appearance.excess).reshape(h, w, 4)).max(-1) > 0
+    position, _ = problem.camera.project(problem.template.vertices)
+    (left, top), (right, bottom) = position.min(0) - appearance.corner, position.max(0) - appearance.corner
+    rows, columns = np.flatnonzero(has.any(1)), np.flatnonzero(has.any(0))
+    for low, high, a, b in ((left, right, columns[0], columns[-1]), (top, bottom, rows[0], rows[-1])):
+        assert a - low == pytest.approx(12, abs=2) and high - b == pytest.approx(12, abs=2)  # two windows
+
+
+def test_the_last_view_is_kept_and_no_other(problem, truth):
+    known, level = Registration(problem), LEVELS[0]
+    first = known._look(truth.vertices[1], level)
+    assert known._look(truth.vertices[1].copy(), level) is first
+    assert known._look(truth.vertices[1], LEVELS[1]) is not first
+    values = [known.evaluate(x, 1, level, 0.3).photometric for x in truth.vertices[[1, 2, 1]]]
+    assert values[0] == values[2] != values[1]
+    moved = truth.vertices[1].copy()
+    known._look(moved, level)
+    moved += 0.01  # in place
+    assert known.evaluate(moved, 1, level, 0.3).photometric != values[0]
+
+
+def test_each_stage_begins_with_what_the_sheet_looks_like(problem, truth, monkeypatch):
+    solver = gauss_newton.GaussNewton(problem.settings)
+    solver._prepare(problem)
+    rest = solver.chart.state(problem.patch.rest().to_numpy())
+    known, levels = solver.registration, []
+    original = known.appearance
+    monkeypatch.setattr(known, "appearance", lambda vertices, level, light, shaded: levels.append((level, shaded)) or original(vertices, level, light, shaded))
+    solver._expect(1)
+    solver._noise = 1.0  # whatever is left is noise
+    solver._descend(rest, rest, 1, 4, (gauss_newton.FAR, *gauss_newton.STAGES))
+    usual = [(solver.levels[stage], stage is gauss_newton.STAGES[-1]) for stage in gauss_newton.STAGES]
+    assert levels == usual
+    levels.clear()
+    solver._noise = 0.0
+    monkeypatch.setattr(gauss_newton, "_UNEXPLAINED", 0.0)
+    solver._descend(rest, rest, 1, 4, gauss_newton.STAGES)
+    assert levels == [*usual, usual[-1]]  # what is not explained is looked at again
+
+
+def test_slanted_and_lit_sheets_are_followed(truth, tmp_path):
+    """A sheet rolled up to 38 degrees at its ends, under a light from the side."""
+    problem = problem_of(truth.folder)
+    done = track(problem, solvers.create(problem.settings), 4, str(tmp_path))
+    from polysft_mi.patch import Unknowns
+
+    error = np.linalg.norm(problem.surface(Unknowns.from_numpy(done.states[-1])) - truth.vertices[-1], axis=1)
+    assert error.mean() < 0.002
