@@ -339,7 +339,8 @@ class Registration:
         slant, or hides a part of itself, these differ. So the sheet is rendered, under the ``light`` (7,) of :class:`polysft_mi.light.Light`
         where it is known, and made what the frame was made. ``shaded``: with the triangles' luminance.
         """
-        lit = mi.Float(self.brightness.lit(vertices, self.camera.origin, light).astype(np.float32) if light is not None else np.ones(len(self.faces), np.float32))
+        lit = np.ones(len(self.faces)) if light is None else self.brightness.lit(vertices, self.camera.origin, light)
+        lit = mi.Float(lit.astype(np.float32))
         with dr.suspend_grad():
             view = self._look(vertices, level)
             hit = view.hit
@@ -362,7 +363,7 @@ class Registration:
             flat = dr.ravel(colour)
             dr.eval(flat, seen)
             x0, y0, _, w, h = view.region
-            corner, (x0, y0) = (int(x0[0]), int(y0[0])), (x0, y0)
+            corner = int(x0[0]), int(y0[0])
             found = np.array(flat).reshape(h, w, 4)
             image, inside = self._as_frames_are(found[..., :3] * found[..., 3:], found[..., 3] > 0, corner, level)
             packed = mi.Float(np.ascontiguousarray(np.concatenate([image, np.zeros_like(image[..., :1])], -1)).ravel())

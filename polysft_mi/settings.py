@@ -32,7 +32,7 @@ class Settings:
     k_rgb: float = _setting(1.0, "weight of the photometric loss", low=0)
     k_silhouette: float = _setting(1.0, "weight of the silhouette loss (needs masks)", low=0)
     k_shading: float = _setting(
-        6.0, "weight of the triangles' brightness under a light that is learned along with the video (gauss-newton); 0: shading is no cue", low=0
+        9.0, "weight of the triangles' brightness under a light that is learned along with the video (gauss-newton); 0: shading is no cue", low=0
     )
     k_mi: float = _setting(0.1, "weight of mesh inextensibility", low=0)
     k_tc: float = _setting(0.05, "weight of temporal consistency", low=0)

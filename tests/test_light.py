@@ -163,7 +163,8 @@ def test_the_light_is_learned_from_surfaces_that_bend():
         light = light.learned(dataclasses.replace(shade, luminance=value))
     learned = light.coefficients(len(FACES))
     assert light.frames == 20 and learned * (LIGHT[0] / learned[0]) == pytest.approx(LIGHT, abs=0.03)
-    assert 0.015 < light.scale < 0.03  # four deviations of 0.005, a little more for the outliers
+    assert light.scale == 0.05 and 0.004 < light.deviations / 20 < 0.008  # a little more than 0.005 for the outliers
+    assert 0.03 < dataclasses.replace(light, deviations=0.005 * 20).scale < 0.05  # eight deviations
     assert Light.of(light.numbers()).numbers() == light.numbers()
 
 

@@ -482,7 +482,8 @@ class GaussNewton:
         move far."""
         if stage is FAR:
             return None
-        light = self._light.coefficients(len(self.registration.faces)) if self._light.frames else None
+        lit = self.registration.normalise and self._light.frames  # colours as they are say that there is no light
+        light = self._light.coefficients(len(self.registration.faces)) if lit else None
         shaded = self.settings.k_shading > 0 and stage is STAGES[-1]
         return self.registration.appearance(self.chart.surface(state, order).vertices, self.levels[stage], light, shaded)
 
