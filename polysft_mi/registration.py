@@ -69,6 +69,11 @@ class Appearance:
     luminance: np.ndarray = None
 
 
+def _packed(colour, fourth):
+    """(h, w, 3) and (h, w) as one Float of 4 channels on the device."""
+    return mi.Float(np.ascontiguousarray(np.concatenate([colour, fourth[..., None]], -1), np.float32).ravel())
+
+
 class Registration:
     """Frames of a :class:`polysft_mi.problem.Problem` against its template's texture, level by level."""
 
@@ -167,8 +172,7 @@ class Registration:
             if weight is None and self.normalise:  # the background goes into a frame's local statistics near the border
                 distance = cv2.distanceTransform(self.texture_inside.astype(np.uint8), cv2.DIST_L2, 3)
                 trusted = (distance > min(_TEXELS * level.window, 0.5 * distance.max())).astype(np.float32)
-            packed = np.concatenate([image, trusted[..., None]], -1).astype(np.float32)
-            entry = mi.Float(np.ascontiguousarray(packed).ravel()), image.shape[1], image.shape[0]
+            entry = _packed(image, trusted), image.shape[1], image.shape[0]
             dr.eval(entry[0])
             self._textures[level] = entry
         return self._textures[level]
@@ -178,8 +182,7 @@ class Registration:
         key = "fine", level.stride
         if key not in self._textures:
             image = blur(self.texture, _TEXELS * _PIXEL_BLUR * level.stride / _TAPS, self.texture_inside if self.problem.experiment.masks else None)
-            packed = np.concatenate([image, np.zeros_like(image[..., :1])], -1).astype(np.float32)
-            entry = mi.Float(np.ascontiguousarray(packed).ravel()), image.shape[1], image.shape[0]
+            entry = _packed(image, np.zeros_like(self.texture_inside)), image.shape[1], image.shape[0]
             dr.eval(entry[0])
             self._textures[key] = entry
         return self._textures[key]
@@ -237,7 +240,7 @@ class Registration:
             image = entry.result()
             if not np.isfinite(image.colour).all():
                 raise BadFrame(frame, math.nan)
-            packed = mi.Float(np.ascontiguousarray(np.concatenate([image.colour, image.inside[..., None]], -1)).ravel())
+            packed = _packed(image.colour, image.inside)
             mask = mi.Float(np.ascontiguousarray(image.mask).ravel()) if image.mask is not None else None
             sums = (max(1.0, float(image.mask.sum())), float((image.mask.astype(np.float64) ** 2).sum())) if image.mask is not None else (None, None)
             self._frames[key] = entry = packed, mask, image, *sums
@@ -366,7 +369,7 @@ class Registration:
             corner = int(x0[0]), int(y0[0])
             found = np.array(flat).reshape(h, w, 4)
             image, inside = self._as_frames_are(found[..., :3] * found[..., 3:], found[..., 3] > 0, corner, level)
-            packed = mi.Float(np.ascontiguousarray(np.concatenate([image, np.zeros_like(image[..., :1])], -1)).ravel())
+            packed = _packed(image, np.zeros_like(inside))
             known = inside
             if not self.problem.experiment.masks:  # a frame's statistics near the border have the background in them
                 padded = np.pad(inside.astype(np.uint8), 1)

@@ -813,9 +813,10 @@ def test_the_least_misfit_goes_from_frame_to_frame(truth, tmp_path):
     done = track(problem, solvers.create(problem.settings), 4, str(tmp_path))
     misfit, least = ([t[name] for t in done.totals] for name in ("misfit", "least_misfit"))
     assert least[0] is None and all(b <= a for a, b in zip(least[1:], least[2:])) and least[-1] > 0
-    level = Registration(problem), gauss_newton.GaussNewton(problem.settings)
-    level[1]._prepare(problem)
-    bare = [level[0].misfit(problem.surface(Unknowns.from_numpy(s)), k, level[1].levels[gauss_newton.STAGES[-1]]) for k, s in enumerate(done.states)]
+    solver = gauss_newton.GaussNewton(problem.settings)
+    solver._prepare(problem)
+    level = solver.levels[gauss_newton.STAGES[-1]]
+    bare = [solver.registration.misfit(problem.surface(Unknowns.from_numpy(s)), k, level) for k, s in enumerate(done.states)]
     assert least[1] == pytest.approx(bare[1], rel=0.02) and least[-1] == pytest.approx(min(bare[1:]), rel=0.1)  # of the texture as the template has it
     assert misfit[1] < 0.9 * least[1]  # the sheet's own image explains the frame better
 

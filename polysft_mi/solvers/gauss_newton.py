@@ -360,6 +360,7 @@ class GaussNewton:
         return state, terms
 
     def _is_unexplained(self, misfit):
+        """Whether a misfit is more than noise: the surface, or its jet, does not follow what the frame shows."""
         return misfit > max(_UNEXPLAINED, _UNEXPLAINED_FACTOR * self._noise)
 
     def _stage(self, state, anchor, frame, order, stage, iterations):
