@@ -27,12 +27,14 @@ def camera(folder):
     return Intrinsics.from_matrix(_numbers(path, (3, 3)), *image_size(images(folder)[0]), where=path)
 
 
-def template(folder, resolution=33):
+def template(folder, resolution=33, pose_fit="auto", say=lambda line: None):
     """The flat template of a folder in the form of Kinect-Paper (Varol et al. 2012), in the camera frame of the first image.
 
     ``mesh.pts`` holds a grid of R x C points [mm], row after row, whose triangles ``mesh.tri`` lists (from 0), and ``cam.ext`` the
-    3x4 matrix [R|T] [mm] that takes them to the camera. The grid is interpolated (cubic where it has four points or more a side) at
-    ``resolution`` points a side, evenly between the first and last row and column, so that at 33 the 9 x 9 grid's own points are kept.
+    3x4 matrix [R|T] [mm] that takes them to the camera; with ``pose_fit`` = ``auto`` the template is then moved, as a rigid body, until its
+    outline lies on the edges in the first image that are near it, where these are clear (:mod:`polysft_mi.outline`); ``none`` leaves
+    it. The grid is interpolated (cubic where it has four points or more a side) at ``resolution`` points a side, evenly between the first
+    and last row and column, so that at 33 the 9 x 9 grid's own points are kept. ``say`` takes a line about the pose.
 
     Returns ``(vertices (N, 3) [m, camera frame], faces (F, 3), uv (N, 2))`` with N = resolution^2, vertex ``j * resolution + i`` for
     row j and column i; uv is the projection into the first image, which is the texture: (0, 0) is its bottom left, v goes up.
@@ -40,25 +42,36 @@ def template(folder, resolution=33):
     """
     from scipy.interpolate import RectBivariateSpline
 
+    from .capture.images import read_rgb
+    from .outline import fitted
+
     if resolution < 2:
         raise InputError(f"resolution = {resolution}; at least 2 vertices a side are needed")
+    if pose_fit not in ("auto", "none"):
+        raise InputError(f"pose_fit = {pose_fit!r}; auto or none is needed")
     path = os.path.join(folder, "mesh.pts")
     points = _numbers(path, (None, 3))
-    rows, columns = _grid_shape(len(points), _numbers(os.path.join(folder, "mesh.tri"), (None, 3)), folder)
+    triangles = _numbers(os.path.join(folder, "mesh.tri"), (None, 3))
+    rows, columns = _grid_shape(len(points), triangles, folder)
     pose = _numbers(os.path.join(folder, "cam.ext"), (3, 4))
     if np.abs(pose[:, :3] @ pose[:, :3].T - np.eye(3)).max() > 1e-2 or np.linalg.det(pose[:, :3]) < 0:
         raise InputError(f"{os.path.join(folder, 'cam.ext')}: its first three columns are not a rotation; [R|T] is needed")
 
-    grid = (points @ pose[:, :3].T + pose[:, 3]).reshape(rows, columns, 3) * 1e-3
+    view, points = camera(folder), 1e-3 * (points @ pose[:, :3].T + pose[:, 3])
+    if points[:, 2].min() <= 0:
+        raise InputError(f"{path}: the template lies behind the camera in the first image; check cam.ext")
+    fit = fitted(points, triangles, view, read_rgb(images(folder)[0])) if pose_fit == "auto" else None
+    if fit is not None and fit.sure:
+        points = fit(points)
+        say(f"pose: cam.ext's, moved by {fit.moved:.1f} pixels to the edges of {os.path.basename(images(folder)[0])}")
+    else:
+        say("pose: cam.ext's")
+    grid = points.reshape(rows, columns, 3)
     at = np.linspace(0, 1, resolution)
     spline = lambda z: RectBivariateSpline(
         np.linspace(0, 1, rows), np.linspace(0, 1, columns), z, kx=min(3, rows - 1), ky=min(3, columns - 1)
     )(at, at)
     vertices = np.stack([spline(grid[..., k]) for k in range(3)], axis=-1).reshape(-1, 3)
-    if vertices[:, 2].min() <= 0:
-        raise InputError(f"{path}: the template lies behind the camera in the first image; check cam.ext")
-
-    view = camera(folder)
     uv = view.project(vertices) / (view.width, view.height)
     if not ((uv > 0) & (uv < 1)).all(axis=1).any():
         raise InputError(f"{path}: the template is out of view in the first image; check cam.ext and cam.intr")

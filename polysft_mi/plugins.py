@@ -140,13 +140,18 @@ def _varol_template(props):
      * - resolution
        - |int|
        - Vertices along each side of the subdivided grid. (Default: 33)
+     * - pose_fit
+       - |string|
+       - ``auto``: the pose of ``cam.ext`` is moved to the edges of the first image where they are clear; ``none``: it is taken as it is.
+         (Default: auto)
 
     The sequence's flat template as a mesh in the camera frame, its texture coordinates the projection into the first image.
     """
     from .kinect_paper import template
 
     folder = str(mi.file_resolver().resolve(str(props["folder"])))
-    vertices, faces, uv = template(folder, int(props.get("resolution", 33)))
+    log = lambda line: mi.Log(mi.LogLevel.Info, line)
+    vertices, faces, uv = template(folder, int(props.get("resolution", 33)), str(props.get("pose_fit", "auto")), log)
     mesh = mi.Mesh("template", len(vertices), len(faces), has_vertex_texcoords=True, props=props)
     params = mi.traverse(mesh)
     params["vertex_positions"] = mi.Float(np.ascontiguousarray(vertices, dtype=np.float32).ravel())

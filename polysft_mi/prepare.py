@@ -142,9 +142,11 @@ def _template_xml(layout, template):
     if template is None and layout.obj is None:
         head = [
             '    <default name="resolution" value="33"/>',
+            '    <default name="pose_fit" value="auto"/>',
             '    <shape type="varol_template" id="template">',
             '        <string name="folder" value="$data"/>',
             '        <integer name="resolution" value="$resolution"/>',
+            '        <string name="pose_fit" value="$pose_fit"/>',
         ]
     else:
         name = template if template is not None else f"$data/{layout.obj}"
@@ -169,10 +171,11 @@ def _template_xml(layout, template):
     return "\n".join(head + body)
 
 
-def prepare(folder, out=None, resolution=33, overwrite=False):
-    """Write ``scene.xml`` for a sequence into ``out`` (default: the folder itself); for Kinect-Paper ``template.obj`` beside it.
+def prepare(folder, out=None, resolution=33, overwrite=False, pose_fit="auto"):
+    """Write ``scene.xml`` for a sequence into ``out`` (default: the folder itself); for Kinect-Paper ``template.obj`` beside it, of that
+    ``resolution``, in its pose of :func:`polysft_mi.kinect_paper.template`.
 
-    Everything that the scene names is read and checked first. Returns (path of the scene, one line on what was recognised).
+    Everything that the scene names is read and checked first. Returns (path of the scene, what was found, in lines).
     Raises InputError; then nothing is written.
     """
     folder = os.path.normpath(folder)
@@ -181,9 +184,9 @@ def prepare(folder, out=None, resolution=33, overwrite=False):
     masks = os.path.join(folder, layout.masks) if layout.masks else ""
     sequence = Sequence.open(os.path.join(folder, layout.frames), masks, size=(camera.width, camera.height))
     image_size(os.path.join(folder, layout.texture))
-    template, where = None, "template.obj"
+    template, where, said = None, "template.obj", []
     if layout.obj is None:
-        vertices, faces, uv = template = kinect_paper_template(folder, resolution)
+        vertices, faces, uv = template = kinect_paper_template(folder, resolution, pose_fit, said.append)
     else:
         where = os.path.join(folder, layout.obj)
         vertices, faces, uv = meshio.read_template(where)
@@ -212,14 +215,12 @@ def prepare(folder, out=None, resolution=33, overwrite=False):
                 os.rmdir(target)
         hint = "; give a folder that can be written by -o DIR" if here else ""
         raise InputError(f"{target}: {error.strerror or error}{hint}") from None
-    return (
-        scene,
-        (
-            f"{folder}: a sequence in the form {layout.form}, {len(sequence)} frames of {camera.width}x{camera.height},"
-            f" {'with' if masks else 'without'} masks, template of {len(vertices)} vertices"
-            f" ({layout.obj or f'subdivided to {resolution}x{resolution}'})"
-        ),
+    recognised = (
+        f"{folder}: a sequence in the form {layout.form}, {len(sequence)} frames of {camera.width}x{camera.height},"
+        f" {'with' if masks else 'without'} masks, template of {len(vertices)} vertices"
+        f" ({layout.obj or f'subdivided to {resolution}x{resolution}'})"
     )
+    return scene, "\n".join([recognised, *said])
 
 
 def _check_view(vertices, camera, where):
@@ -281,6 +282,13 @@ def parser():
         metavar="N",
         help="vertices along the longer side of a flat template; of Kinect-Paper's, along both (default: 33)",
     )
+    p.add_argument(
+        "--pose-fit",
+        choices=("auto", "none"),
+        default="auto",
+        help="move a pose that is given, by --corners or Kinect-Paper's cam.ext, to the edges of the first frame that are near the template's"
+        " outline, where these are clear; none: take it as it is (default: auto)",
+    )
     p.add_argument("-q", "--quiet", action="store_true", help="no progress, only errors")
     p.add_argument("--json", action="store_true", help="print what was found as JSON")
 
@@ -309,7 +317,7 @@ def main(argv=None):
     elif given:
         raise InputError(f"{args.folder}: {given[0]} is for a video, or a folder of images, which also needs --texture")
     else:
-        scene, line = prepare(args.folder, args.output, args.resolution, args.overwrite)
+        scene, line = prepare(args.folder, args.output, args.resolution, args.overwrite, args.pose_fit)
         found = {"folder": args.folder}
     if args.json:
         print(json.dumps({"scene": scene, **found}, ensure_ascii=False))

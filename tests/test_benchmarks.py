@@ -12,7 +12,7 @@ from polysft_mi import metrics, plugins
 
 ROOT = Path(__file__).resolve().parent.parent
 SIZE, POINTS = (64, 48), 9
-raster, scaling, stability = (load(f"benchmarks/{name}.py") for name in ("raster", "scaling", "stability"))
+outline, raster, scaling, stability = (load(f"benchmarks/{name}.py") for name in ("outline", "raster", "scaling", "stability"))
 
 
 @pytest.fixture(autouse=True)
@@ -103,3 +103,9 @@ def test_scaling_tracks_the_sheet_that_it_makes(tmp_path):
     case = scaling.summarise(POINTS, "160x120", {**found, "versions": {"variant": "v", "machine": "m"}})
     text = scaling.report([case, {**case, "vertices": 4}], str(tmp_path), 3)
     assert "| 81 | 160×120 |" in text and (tmp_path / "scaling.md").read_text(encoding="utf-8") == text and (tmp_path / "scaling.png").exists()
+
+
+def test_poses_of_the_demo_are_found_again():
+    rows, sure = outline.measure(str(ROOT / "scenes" / "demo"), 3)
+    assert rows.shape == (3, 4) and sure == 3
+    assert rows[:, 0].min() > 1 and rows[:, 2].max() < 0.3 and (rows[:, 3] < 0.25 * rows[:, 1]).all()

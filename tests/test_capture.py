@@ -174,6 +174,26 @@ def test_corners_and_the_first_frame_as_texture(clip, tmp_path):
     assert not (tmp_path / "out" / "masks").exists() and images.read_rgb(tmp_path / "out" / "texture.png").shape == (120, 160, 3)
 
 
+def test_corners_by_hand_are_moved_to_the_edges(clip, tmp_path):
+    """Corners that miss by some pixels: the sheet is moved to its edges in the frame, and a line says so; or it is not, where that is wanted."""
+    R, t = placed(2 / 11)
+    sheet_corners = np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]) * (WIDTH / 2, HEIGHT / 2, 0) @ R.T + t
+    corners = CAMERA.project(sheet_corners) + [(2, -1.5), (-1, 2), (1.5, 2), (2, -1)]
+    options = dict(texture="first-frame", size=["A4"], camera=clip[2], corners=corners.tolist(), first=2, last=2, masks=False)
+    missed, found, lines = {}, {}, []
+    for fit in ("auto", "none"):
+        _, found[fit] = capture(clip[0], str(tmp_path / fit), pose_fit=fit, say=lines.append, **options)
+        vertices, _, uv = meshio.read_template(tmp_path / fit / "template.obj")
+        camera = Intrinsics.from_json(tmp_path / fit / "camera.json")
+        np.testing.assert_allclose(uv * (320, -240) + (0, 240), camera.project(vertices), atol=1e-3)
+        ends = [vertices[np.argmin(np.linalg.norm(vertices - corner, axis=1))] for corner in sheet_corners]
+        missed[fit] = np.linalg.norm(camera.project(np.array(ends)) - CAMERA.project(sheet_corners), axis=1).max()
+    assert missed["auto"] < 0.4 and missed["none"] > 1.5
+    assert 0.5 < found["auto"]["pose"]["moved_px"] < 4 and "moved_px" not in found["none"]["pose"]
+    moved = [line for line in lines if "to the edges of the frame" in line]
+    assert len(moved) == 1 and f"moved by {found['auto']['pose']['moved_px']:.2f} pixels" in moved[0]
+
+
 def test_sheet_that_fills_the_picture(clip, tmp_path):
     words = ["--texture", "first-frame", "--size", "40cm", "30cm", "--fov", "50", "--corners", "frame", "--no-masks", "--last", "1", "-q"]
     prepare.main([clip[0], *words, "-o", str(tmp_path / "out")])

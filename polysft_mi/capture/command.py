@@ -85,6 +85,7 @@ def from_video(args, command):
             camera=args.camera, fov=args.fov,
             calibrate=args.calibrate, board=args.board, corners="frame" if corners == ["frame"] else corners,
             texture_corners=args.texture_corners and _points(args.texture_corners, "--texture-corners"),
+            pose_fit=args.pose_fit,
             masks=args.masks or not args.no_masks, first=args.first, last=args.last, stride=args.stride, scale=args.scale,
             overwrite=args.overwrite,
             say=(lambda line: None) if quiet else print, progress=progress, command=command,

@@ -12,6 +12,7 @@ import numpy as np
 
 from polysft_mi import meshio
 from polysft_mi.errors import InputError
+from polysft_mi.outline import fitted
 from polysft_mi.prepare import Layout, scene_xml, write_obj
 from polysft_mi.sequence import list_images
 
@@ -21,7 +22,7 @@ from .frames import focal_length, is_video, read_frames
 from .images import focal_35mm, read_rgb
 from .lens import Lens, Undistortion
 from .masks import Masks, iou, silhouette
-from .pose import LEAST, from_corners, from_matches, match
+from .pose import LEAST, Pose, from_corners, from_matches, match
 from .size import parse_size
 
 FIRST_FRAME = "first-frame"
@@ -38,7 +39,7 @@ _SHARPEST = 2048  # pixels of a texture's longer side; what is finer no frame sh
 
 def capture(
     video, out=None, *, texture, size=None, template=None, resolution=33, camera=None, fov=None, calibrate=None, board="9x6",
-    corners=None, texture_corners=None,
+    corners=None, texture_corners=None, pose_fit="auto",
     masks=True, first=0, last=-1, stride=1, scale=1.0, overwrite=False, say=lambda line: None, progress=lambda count: None, command="",
 ):  # fmt: skip
     """Make the folder ``out`` of a sequence from ``video`` (a file, a folder of images, a pattern): frames, masks, template, texture,
@@ -46,8 +47,9 @@ def capture(
 
     ``texture``: the photo, or "first-frame"; ``size``: words as :func:`polysft_mi.capture.size.parse_size` takes them, or ``template``, an
     OBJ; the camera by one of ``camera`` (a file), ``fov`` [degrees] and ``calibrate`` (a video of a ``board``), else by what the video
-    says; ``corners`` (4, 2): pixels of the sheet's corners in the frame ``first`` as it was taken, or "frame" for the picture's own;
-    ``texture_corners`` (4, 2): likewise in the photo, whose rest is cut off; ``masks``: True to find them, a folder of them, or False for
+    says; ``corners`` (4, 2): pixels of the sheet's corners in the frame ``first`` as it was taken, or "frame" for the picture's own,
+    and ``pose_fit``: "auto" to move the sheet from there to the edges in that frame, where they are clear, or "none"; ``texture_corners``
+    (4, 2): likewise in the photo, whose rest is cut off; ``masks``: True to find them, a folder of them, or False for
     none; ``say`` is given one line for each step, ``progress`` the number of frames done.
 
     Returns (path of the scene, a dict of what was found: what ``prepare/prepare.json`` holds). Raises InputError; then nothing is written,
@@ -83,7 +85,7 @@ def capture(
         photo = _cut_out(photo, texture_corners, size)
     mesh = _sheet(size, template, resolution, photo, texture, say)
 
-    pose, matches = _pose(mesh, photo, texture, frame, view, straight, corners, taken, out, first, found, say)
+    pose, matches = _pose(mesh, photo, texture, frame, view, straight, corners, taken, pose_fit, out, first, found, say)
     placed = pose(mesh.vertices)
     seen = _seen(placed, view)
     if seen < _IN_VIEW:
@@ -180,13 +182,19 @@ def _sheet(size, template, resolution, photo, texture, say):
     return sheet.grid(width, height, resolution)
 
 
-def _pose(mesh, photo, texture, frame, view, straight, corners, taken, out, first, found, say):
+def _pose(mesh, photo, texture, frame, view, straight, corners, taken, pose_fit, out, first, found, say):
     """(Pose, Matches or None), or InputError with a picture of the matches."""
     if corners is not None:
         corners = [(0, 0), (taken[0], 0), taken, (0, taken[1])] if isinstance(corners, str) else corners
         pose = from_corners(straight.points(corners), mesh, view)
         found["pose"] = {"by": "corners", "residual_px": float(np.sqrt((pose.residual**2).mean()))}
-        say(f"pose: by its corners, missed by {found['pose']['residual_px']:.2f} pixels")
+        said = f"pose: by its corners, missed by {found['pose']['residual_px']:.2f} pixels"
+        fit = fitted(pose(mesh.vertices), mesh.faces, view, frame) if pose_fit == "auto" else None
+        if fit is not None and fit.sure:
+            pose = Pose(fit.rotation @ pose.rotation, fit(pose.translation[None])[0], pose.residual)
+            found["pose"]["moved_px"] = fit.moved
+            said += f", moved by {fit.moved:.2f} pixels to the edges of the frame"
+        say(said)
         return pose, None
     if photo is None:
         raise InputError(

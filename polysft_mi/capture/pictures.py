@@ -3,6 +3,8 @@
 import cv2
 import numpy as np
 
+from polysft_mi.outline import loops
+
 GREEN, RED, YELLOW, WHITE = (60, 220, 90), (235, 70, 60), (255, 210, 40), (255, 255, 255)
 _CELL = 320  # pixels of a contact sheet's picture
 _COLUMNS = 4
@@ -82,7 +84,8 @@ def pose(frame, photo, sheet, placed, camera):
     edges = np.sort(np.concatenate([sheet.faces[:, [0, 1]], sheet.faces[:, [1, 2]], sheet.faces[:, [2, 0]]]), axis=1)
     draw(np.unique(edges, axis=0), GREEN, 1)
     wired = cv2.addWeighted(plain, 0.7, wired, 0.3, 0)  # what is printed shows through
-    draw(sheet.border(), YELLOW, 2)
+    for loop in loops(sheet.faces):
+        draw(np.stack([loop, np.roll(loop, -1)], axis=1), YELLOW, 2)
     label(wired, "the template in the first frame")
     laid, _ = _canvas(_laid(frame, photo, sheet, x))
     label(laid, "the photo, laid where the template is")

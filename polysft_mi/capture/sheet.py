@@ -52,12 +52,6 @@ class Sheet:
         wanted = np.array([[low[0], high[1]], high, [high[0], low[1]], low])
         return self.vertices[np.argmin(np.linalg.norm(self.uv[None] - wanted[:, None], axis=2), axis=1)]
 
-    def border(self):
-        """Its boundary edges (E, 2), as indices of vertices."""
-        edges = np.sort(np.concatenate([self.faces[:, [0, 1]], self.faces[:, [1, 2]], self.faces[:, [2, 0]]]), axis=1)
-        edges, uses = np.unique(edges, axis=0, return_counts=True)
-        return edges[uses == 1]
-
 
 def grid(width, height, resolution=33):
     """The :class:`Sheet` of a flat rectangle of ``width`` x ``height`` [m], ``resolution`` vertices along its longer side, its cells about
