@@ -61,10 +61,10 @@ def fitted(vertices, faces, camera, image):
 
     ``vertices`` (N, 3) [m, camera frame], ``faces`` (F, 3), ``image`` (H, W, 3) uint8 sRGB, ``camera``:
     :class:`polysft_mi.camera.Intrinsics`. The outline is the mesh's boundary, or the polygon that it nearly is (digitised templates are
-    not quite straight). An edge is as strong as the derivative of the image's brightness across the outline, saturated; two opposite ones
-    close together are a drawn line, which counts as both, in its middle. The motion is that under which edges are strongest on average
-    along the outline, where a drift from the given pose costs a little. What is tried, either outline and dark or bright lines, is
-    judged by how clear its edges are.
+    not quite straight). An edge is as strong as the derivative of the image's brightness across the outline, saturated; where the
+    outline is taken for a line that is drawn, dark or bright, two opposite ones close together count as both, in its middle. The motion is
+    that under which edges are strongest on average along the outline, where a drift from the given pose costs a little. What is tried,
+    either outline with edges alone, dark or bright lines, is judged by how clear it is.
     """
     vertices = np.asarray(vertices, dtype=np.float64)
     around = loops(np.asarray(faces))
@@ -77,7 +77,7 @@ def fitted(vertices, faces, camera, image):
     found = []
     for corners in (around, [_straight(loop, position, _STRAIGHT * size) for loop in around]):
         ends = np.concatenate([np.stack([vertices[loop], vertices[np.roll(loop, -1)]], 1) for loop in corners])
-        found += [_Search(ends, camera, grey, unit, dark).fit() for dark in (True, False)]
+        found += [_Search(ends, camera, grey, unit, line).fit() for line in (None, "dark", "bright")]
     return max(found, key=lambda fit: fit.clear)
 
 
@@ -89,10 +89,11 @@ def _straight(loop, position, tolerance):
 
 
 class _Search:
-    """An outline with the edges (E, 2, 3) [m, camera frame] in a blurred image ``grey`` (H, W); its lengths there are in ``unit`` [pixels]."""
+    """An outline with the edges (E, 2, 3) [m, camera frame] in a blurred image ``grey`` (H, W); its lengths there are in ``unit`` [pixels].
+    ``line``: "dark" or "bright" where it is taken for a line, else None."""
 
-    def __init__(self, ends, camera, grey, unit, dark):
-        self.camera, self.grey, self.unit, self.dark = camera, grey, unit, dark
+    def __init__(self, ends, camera, grey, unit, line=None):
+        self.camera, self.grey, self.unit, self.line = camera, grey, unit, line
         length = np.linalg.norm(camera.project(ends[:, 1]) - camera.project(ends[:, 0]), axis=1)
         count = np.maximum(1, np.round(length / (_SPACING * unit))).astype(int)
         edge = np.repeat(np.arange(len(ends)), count)
@@ -135,7 +136,9 @@ class _Search:
         slope = np.gradient(cv2.remap(self.grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), axis=1)
         strength = np.abs(slope)
         strength, slope = (a / np.maximum(strength + 0.5 * np.median(strength.max(1)), 1e-12) for a in (strength, slope))
-        before, after = (np.maximum(sign * slope, 0) for sign in ((-1, 1) if self.dark else (1, -1)))
+        if self.line is None:
+            return strength
+        before, after = (np.maximum(sign * slope, 0) for sign in ((-1, 1) if self.line == "dark" else (1, -1)))
         last = len(self.across)
         for half in range(1, int(_LINE / _STEP / 2) + 1):
             line = strength[:, half : last - half]
