@@ -164,7 +164,7 @@ def test_each_stage_begins_with_what_the_sheet_looks_like(problem, truth, monkey
     solver._noise = 0.0
     monkeypatch.setattr(gauss_newton, "_UNEXPLAINED", 0.0)
     solver._descend(rest, rest, 1, 4, gauss_newton.STAGES)
-    assert levels == [*usual, usual[-1]]  # what is not explained is looked at again
+    assert levels[:5] == [*usual, *usual[1:]]  # what is not explained is looked at again
 
 
 def test_slanted_and_lit_sheets_are_followed(truth, tmp_path):

@@ -696,6 +696,35 @@ def test_a_stage_goes_on_while_it_gains(truth, problem, monkeypatch):
     assert solver._count - before == 3  # a step that gains nothing is the last, too
 
 
+@pytest.mark.parametrize(
+    "noise, misfits, stages, kept",
+    [
+        (0.03, [0.1, 0.08, 0.079, 0.01], 3, 2),  # until it gains little
+        (0.03, [0.1, 0.08, 0.06, 0.05, 0.04], 4, 3),  # or three times
+        (0.03, [0.1, 0.035, 0.01], 2, 1),  # or what is left is noise
+        (0.03, [0.1, 0.11, 0.01], 2, 0),  # what is worse is not kept
+        (0.03, [0.035, 0.01], 1, 0),
+        (0.005, [0.015, 0.01], 1, 0),
+        (0.12, [0.3, 0.01], 1, 0),  # noisy images
+        (math.nan, [0.3, 0.01], 1, 0),  # the first frame
+    ],
+)
+def test_what_is_not_explained_goes_through_the_fine_stages_again(problem, monkeypatch, noise, misfits, stages, kept):
+    solver = gauss_newton.GaussNewton(problem.settings)
+    solver._noise, seen = noise, []
+
+    def stage_by_stage(state, anchor, frame, order, stages, iterations):
+        seen.append((state, stages))
+        solver._fitting = {"scale": len(seen) - 1}
+        return len(seen) - 1, {"misfit": misfits[len(seen) - 1], "inextensibility": 0.0, "smoothness": 0.0}
+
+    monkeypatch.setattr(solver, "_stages", stage_by_stage)
+    state, terms = solver._descend("start", None, 5, 8, (gauss_newton.FAR, *gauss_newton.STAGES))
+    assert seen[0] == ("start", (gauss_newton.FAR, *gauss_newton.STAGES))
+    assert seen[1:] == [(k, gauss_newton.STAGES[1:]) for k in range(stages - 1)]
+    assert (state, terms["misfit"], solver._fitting) == (kept, misfits[kept], {"scale": kept})
+
+
 def test_what_is_suspect_is_measured_from_the_noise(problem):
     solver = gauss_newton.GaussNewton(problem.settings)
     frames = [{"misfit": x} for x in (0.9, 0.21, 0.22, 0.24, 0.23, 0.22)]

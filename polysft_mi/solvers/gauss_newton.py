@@ -23,6 +23,10 @@ _WINDOW = 8.0  # standard deviation of the window of the local statistics, likew
 _FIRST_SCALE, _SCALES = 0.3, (0.2, 1.0)  # robust scale at the start of a frame, and its bounds, in local standard deviations
 _SMALL = 2e-3  # share of the objective that a step must promise for another one to follow
 _GOING, _FARTHER = 0.1, 3  # a stage goes on, to so many times its iterations, while steps lower the objective by this share
+_CLEAN = 0.08  # the least misfit so far, which is noise, below which images are clean enough for fine folds
+# In clean images, a frame that ends with a misfit above so many times the least so far goes through the fine stages again, so many times at most, as
+# long as that lowers its cost by this share: folds come gradually, and iterations that are too few leave each frame a little further behind.
+_AGAIN_ABOVE, _AGAIN, _AGAIN_GAIN = 1.3, 3, 0.03
 # A misfit is suspect that exceeds the noise (the least misfit so far) by so many times what the median of the frames before does, plus the margin.
 _SUSPECT, _SUSPECT_MARGIN, _MEMORY = 1.25, 0.03, 5
 _PATIENT = 18  # iterations a stage where a frame is suspect
@@ -93,7 +97,7 @@ class Stage:
 
 # Soft edges first, so that the texture coordinates register to the image before lengths are enforced: in a stiff flat sheet that is compressed
 # in the image, height has no first-order effect, and it would drift in depth instead of bending.
-STAGES = Stage(2.5, 1e2, 6, (0.0, 0.08)), Stage(1.5, 3e2, 4, (0.08, 0.08)), Stage(1.0, 1e3, 3, (math.inf, math.inf))
+STAGES = Stage(2.5, 1e2, 6, (0.0, _CLEAN)), Stage(1.5, 3e2, 4, (_CLEAN, _CLEAN)), Stage(1.0, 1e3, 3, (math.inf, math.inf))
 FAR = Stage(6.0, 1e2, 6)  # before the others where the sheet has moved far
 
 
@@ -352,11 +356,25 @@ class GaussNewton:
         return State(rest.alpha, rest.offset, *self.chart.rigid(*motion))
 
     def _descend(self, state, anchor, frame, order, stages, iterations=None):
-        """Stage after stage, each of its own or so many ``iterations``, more while they gain much: (state, terms)."""
+        """Stage after stage, each of its own or so many ``iterations``, more while they gain much; and where that leaves more than noise, the fine
+        stages again, as long as they explain more: (state, terms)."""
+        state, terms = self._stages(state, anchor, frame, order, stages, iterations)
+        for _ in range(_AGAIN):
+            if not (self._noise < _CLEAN and terms["misfit"] > max(_UNEXPLAINED, _AGAIN_ABOVE * self._noise)):
+                break
+            fitting, before = dict(self._fitting), (state, terms)
+            state, terms = self._stages(state, anchor, frame, order, STAGES[1:], iterations)
+            gain = 1 - _cost((state, terms)) / _cost(before)
+            if gain <= 0:
+                self._fitting = fitting
+                return before
+            if gain < _AGAIN_GAIN:
+                break
+        return state, terms
+
+    def _stages(self, state, anchor, frame, order, stages, iterations):
         for stage in stages:
             state, terms = self._stage(state, anchor, frame, order, stage, iterations or stage.iterations)
-        if self._is_unexplained(terms["misfit"]):  # by what the sheet looked like when the last stage began; now it looks otherwise
-            state, terms = self._stage(state, anchor, frame, order, stages[-1], iterations or stages[-1].iterations)
         return state, terms
 
     def _is_unexplained(self, misfit):
