@@ -22,7 +22,7 @@ _SPACING, _STEP = 2.0, 0.25  # between points along the outline, and between sam
 _STRAIGHT = 0.01  # of its size: how far an outline may leave the polygon that is tried in its place
 _PRIOR = 0.1, 0.05  # by which a pose that is given may be wrong, where edges do not tell: rotation [rad], shift over the distance
 _HELD = 0.005  # of the prior's square, in the strength of edges
-_STARTS, _SPREAD = 12, 1.0  # and by how much they differ in each of six ways [pixels, RMS along the outline]
+_STARTS, _SPREAD = 12, 1.0  # of the search, and by how much they differ in each of six ways [pixels, RMS along the outline]
 _CLEAR, _CLEAR_PART, _PARTS = 1.7, 1.4, 8  # times the strength of their surroundings that edges must have along the outline, and along each part
 
 

@@ -157,8 +157,8 @@ def test_kinect_paper_pose_fit(tmp_path, resolution):
     assert said[0] == "pose: cam.ext's" and re.fullmatch(r"pose: cam.ext's, moved by [34]\.\d pixels to the edges of frame_001.png", said[1])
     experiment = loaded(prepare(folder, resolution=resolution)[0])
     np.testing.assert_allclose(experiment.template.vertices, vertices, atol=1e-6)
-    flat = np.full((288, 384, 3), 128, np.uint8)
-    cv2.imwrite(str(truth.folder / "frame_001.png"), flat)  # no edge tells
+    noise = np.random.default_rng(0).integers(0, 255, (288, 384, 3)).astype(np.uint8)
+    cv2.imwrite(str(truth.folder / "frame_001.png"), noise)  # no edge tells
     np.testing.assert_array_equal(kinect_paper_template(folder, resolution)[0], kinect_paper_template(folder, resolution, "none")[0])
     with pytest.raises(InputError, match="pose_fit = 'yes'; auto or none is needed"):
         kinect_paper_template(folder, resolution, "yes")
