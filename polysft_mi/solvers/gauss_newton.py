@@ -316,7 +316,7 @@ class GaussNewton:
         if bulge < _BULGE_GROWTH * tried:
             return (state, terms), tried
         fitting = dict(self._fitting)
-        found = self._descend(twin, twin, frame, order, STAGES)
+        found = self._stages(twin, twin, frame, order, STAGES)  # once: most twins are wrong, and no repetition mends them
         if _cost(found) < (1 - _TWIN_GAIN) * _cost((state, terms)) and found[1]["pixels"] > _SHOWN * terms["pixels"]:
             return found, bulge
         self._fitting = fitting
@@ -372,7 +372,7 @@ class GaussNewton:
                 break
         return state, terms
 
-    def _stages(self, state, anchor, frame, order, stages, iterations):
+    def _stages(self, state, anchor, frame, order, stages, iterations=None):
         for stage in stages:
             state, terms = self._stage(state, anchor, frame, order, stage, iterations or stage.iterations)
         return state, terms
