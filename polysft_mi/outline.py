@@ -106,6 +106,7 @@ class _Search:
         self.across = unit * np.arange(-_REACH, _REACH + _STEP / 2, _STEP)
 
     def fit(self):
+        """The :class:`Fit`, from coarse to fine."""
         turn, shift = Rotation.identity(), np.zeros(3)
         for sigma in _ACROSS:
             spread = _SPREAD * self.unit if sigma == _ACROSS[0] else 0.0
@@ -175,4 +176,5 @@ class _Search:
 
 
 def _blurred(strength, sigma):
+    """Strengths (K, D), blurred by ``sigma`` [pixels of an outline of _SIZE] across the outline."""
     return cv2.GaussianBlur(strength, (0, 0), sigmaX=sigma / _STEP, sigmaY=1e-6)

@@ -373,6 +373,7 @@ class GaussNewton:
         return state, terms
 
     def _stages(self, state, anchor, frame, order, stages, iterations=None):
+        """Stage after stage, each once: (state, terms)."""
         for stage in stages:
             state, terms = self._stage(state, anchor, frame, order, stage, iterations or stage.iterations)
         return state, terms
