@@ -35,7 +35,7 @@ def system(pattern, rng):
     at = np.concatenate([pattern.find(i, i), pattern.find(j, j), pattern.find(i, j), pattern.find(j, i)])
     outer = lambda x, y: x[:, :, None] * y[:, None]
     blocks = np.zeros((len(pattern.row), 2, 2))
-    pattern.add(blocks, at, np.concatenate([outer(a, a), outer(b, b), outer(a, b), outer(b, a)]))
+    np.add.at(blocks, at, np.concatenate([outer(a, a), outer(b, b), outer(a, b), outer(b, a)]))
     blocks[pattern.diagonal] += 0.1 * np.eye(2)
     return blocks
 

@@ -226,20 +226,15 @@ class Pattern:
         self.row, self.column = np.divmod(self._keys, count)
         self.start = np.searchsorted(self.row, np.arange(count + 1))
         self.diagonal = self.find(each, each)
-        # half of a symmetric matrix: the U blocks on its diagonal and above
-        self.upper, self._lower = np.flatnonzero(self.row <= self.column), np.flatnonzero(self.row > self.column)
+        # the U blocks on the diagonal of a symmetric matrix and above it, the others, and of which of the first these are the transposed
+        self.upper, self.lower = np.flatnonzero(self.row <= self.column), np.flatnonzero(self.row > self.column)
         self._half_keys = self._keys[self.upper]
-        self._mirrored = self.find_half(self.column[self._lower], self.row[self._lower])
-        self.half_diagonal, self.half_edges = self.find_half(each, each), self.find_half(*edges.T)
-        corners = np.repeat(np.arange(3), 3), np.tile(np.arange(3), 3)
-        i, j = (faces[:, k].ravel() for k in corners)
-        kept = np.flatnonzero(i <= j)
-        self.from_faces = sp.csr_matrix((np.ones(len(kept)), (self.find_half(i[kept], j[kept]), kept)), shape=(len(self.upper), len(i)))
-        self.from_corners = sp.csr_matrix((np.ones(faces.size), (faces.ravel(), np.arange(faces.size))), shape=(count, faces.size))
+        self.mirrored = self.find_half(self.column[self.lower], self.row[self.lower])
+        self.half_edges = self.find_half(*edges.T)
         self.difference = sp.csr_matrix(  # of the edges' ends, (E, N)
             (np.tile([1.0, -1.0], len(edges)), (np.repeat(np.arange(len(edges)), 2), edges.ravel())), shape=(len(edges), count)
         )
-        self.to_ends, self.at_ends = self.difference.T.tocsr(), abs(self.difference).T.tocsr()  # sums over the edges at a vertex, with signs and without
+        self.to_ends = self.difference.T.tocsr()  # sums over the edges at a vertex, with signs
         graph = sp.csr_matrix((np.ones(len(self._keys)), (self.row, self.column)), shape=(count, count))
         order = reverse_cuthill_mckee(graph, symmetric_mode=True)
         self.place = np.empty(count, dtype=np.int64)  # of each vertex in the narrow ordering
@@ -265,15 +260,8 @@ class Pattern:
         """All blocks (B, d, d) of the symmetric matrix whose upper ``half`` (U, d, d) is given."""
         out = np.empty((len(self._keys), *half.shape[1:]))
         out[self.upper] = half
-        out[self._lower] = half[self._mirrored].transpose(0, 2, 1)
+        out[self.lower] = half[self.mirrored].transpose(0, 2, 1)
         return out
-
-    @staticmethod
-    def add(blocks, at, values):
-        """Add values (K, ...) to blocks (B, ...) at indices (K,), which may repeat."""
-        flat, values = blocks.reshape(len(blocks), -1), values.reshape(len(at), -1)
-        for k in range(flat.shape[1]):
-            flat[:, k] += np.bincount(at, values[:, k], len(flat))
 
 
 _ALONE = 100  # rows a block below which one thread is faster than two, which pass Python's lock to and fro
@@ -432,91 +420,6 @@ class Normal:
     glob: np.ndarray
     local_gradient: np.ndarray
     gradient: np.ndarray
-
-
-def assemble(pattern, surface, projection, evaluation, lengths, stiffness, wide=None, give=np.inf, triangles=None):
-    """:class:`Normal` of the images, the edges and further residuals of triangles, and the edges' energy.
-
-    ``projection`` (N, 2, 3): of the vertices; ``evaluation``: :class:`polysft_mi.registration.Evaluation`; ``lengths`` (E,) [m]: of the
-    template's edges; ``stiffness`` [1/m^2]: weight of the squared differences to them; ``wide``: a :class:`Pattern` that holds
-    this one, where the relief is an unknown too (d = 3) and the local block is to have that pattern; ``give``: the strain from which on
-    a stretched edge hardly pulls harder. An excess e > 0 over the length L costs 2 c^2 ((1 + e^2 / c^2)^1/2 - 1), c = give L (Charbonnier):
-    cloth that hangs from a point is stretched there by a tenth, and by squares that would turn the whole sheet. What is compressed buckles;
-    its costs are squares. ``triangles``: residuals r (F,), factors h (F,), and derivatives (F, 3, 3) [1/m] of r by the corners; half the sum of
-    h r^2 is added.
-    """
-    d = 2 if wide is None else 3
-    a, b = pattern.edges.T
-    edge = surface.vertices[a] - surface.vertices[b]
-    length = np.maximum(np.sqrt(np.einsum("ek,ek->e", edge, edge)), 1e-9)
-    direction = edge / length[:, None]
-    excess = length - lengths
-    over = (np.maximum(excess, 0) / (give * lengths)) ** 2
-    energy = stiffness * float((excess**2 * 2 / (1 + np.sqrt(1 + over))).sum())
-    heavy = 2 * stiffness / np.sqrt(1 + over)  # (E,): of each edge
-    pull = (heavy * excess)[:, None] * direction
-    gradient = evaluation.gradient + pattern.to_ends @ pull
-
-    # Curvature in the vertices' positions: half of its blocks, (U, 3, 3). Of the images, blocks in the projections first.
-    blocks = (pattern.from_faces @ evaluation.second.reshape(-1, 4)).reshape(-1, 2, 2)
-    if evaluation.rows is not None:
-        i, j, ci, cj, h = evaluation.rows
-        hi, hj = ci * h[:, None], cj * h[:, None]
-        across = np.where((i < j)[:, None, None], ci[:, :, None] * hj[:, None], hj[:, :, None] * ci[:, None])
-        at = np.concatenate([pattern.half_diagonal[i], pattern.half_diagonal[j], pattern.find_half(i, j)])
-        pattern.add(blocks, at, np.concatenate([ci[:, :, None] * hi[:, None], cj[:, :, None] * hj[:, None], across]))
-    half = _conjugated(blocks, projection, pattern)
-    outer = (heavy[:, None] * direction)[:, :, None] * direction[:, None]
-    half[pattern.half_diagonal] += (pattern.at_ends @ outer.reshape(-1, 9)).reshape(-1, 3, 3)
-    half[pattern.half_edges] -= outer
-    if triangles is not None:
-        residual, factor, by_corner = triangles
-        weighted = factor[:, None, None] * by_corner
-        half += (pattern.from_faces @ (by_corner[:, :, None, :, None] * weighted[:, None, :, None]).reshape(-1, 9)).reshape(-1, 3, 3)
-        gradient += pattern.from_corners @ (residual[:, None, None] * weighted).reshape(-1, 3)
-
-    # Each vertex moves by its own (u, v), by a height, which is its own and that of all coefficients there, and by the motion: blocks of the
-    # first three are sparse like the mesh, and the coefficients follow by the basis.
-    local, by_motion = surface.by_offset, surface.by_motion.reshape(-1, 6)
-    total = pattern.whole(_conjugated(half, local, pattern))
-    matrix = sp.bsr_matrix((pattern.whole(half), pattern.column, pattern.start), shape=2 * (3 * pattern.count,))
-    moved = matrix @ by_motion
-    local_motion = local.transpose(0, 2, 1) @ moved.reshape(-1, 3, 6)  # (N, 3, 6)
-    motion = by_motion.T @ moved
-
-    basis = surface.basis
-    size = basis.shape[1]
-    lifted = [sp.csr_matrix((total[:, k, 2], pattern.column, pattern.start), shape=2 * (pattern.count,)) @ basis for k in range(3)]
-    glob = np.empty((size + 6, size + 6))
-    glob[:size, :size] = basis.T @ lifted[2]
-    glob[:size, size:] = basis.T @ local_motion[:, 2]
-    glob[size:, :size] = glob[:size, size:].T
-    glob[size:, size:] = motion
-    cross = np.concatenate([np.stack(lifted[:d], 1), local_motion[:, :d]], 2).reshape(-1, size + 6)
-    along = np.concatenate([basis.T @ (gradient @ surface.up), np.einsum("nk,nkm->m", gradient, surface.by_motion)])
-    if wide is None:
-        blocks = total[:, :2, :2].copy()
-    else:
-        blocks = np.zeros((len(wide.row), 3, 3))
-        blocks[wide.find(pattern.row, pattern.column)] = total
-    normal = Normal(blocks, cross, glob, np.einsum("nk,nka->na", gradient, local[:, :, :d]), along)
-    return normal, energy
-
-
-def _conjugated(half, s, pattern):
-    """s_i^T H_ij s_j of each block on the diagonal and above, (U, q, q): ``half`` (U, p, p) has the H_ij, ``s`` (N, p, q) the s_i. By components: products of whole arrays are
-    faster than many small matrix products.
-    """
-    _, p, q = s.shape
-    flat = np.ascontiguousarray(s.reshape(-1, p * q).T)
-    i, j = (flat[:, k].reshape(p, q, -1) for k in (pattern.row[pattern.upper], pattern.column[pattern.upper]))
-    h = np.ascontiguousarray(half.reshape(-1, p * p).T).reshape(p, p, -1)
-    out = np.empty((q, q, len(half)))
-    for b in range(q):
-        right = [sum(h[k, m] * j[m, b] for m in range(p)) for k in range(p)]
-        for a in range(q):
-            out[a, b] = sum(i[k, a] * right[k] for k in range(p))
-    return np.ascontiguousarray(out.reshape(q * q, -1).T).reshape(-1, q, q)
 
 
 class Reduced:

@@ -10,7 +10,7 @@ Import only after a Mitsuba variant is set.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import drjit as dr
 import mitsuba as mi
@@ -31,13 +31,13 @@ def _cross2(a, b):
 
 
 @dataclass
-class View:
-    """What the pixels of a region see, detached but for ``positions`` and ``screen``; region pixels run row by row.
+class Seen:
+    """What the pixels of a region see, detached but for ``positions`` and ``screen``; region pixels run row by row. Arrays alone, so that
+    frozen functions take it.
 
-    ``region``: (x0, y0, width) opaque UInt32 and (width, height) ints; ``basis``, ``origin``: the camera as :meth:`Pinhole.device` gives
-    it; ``positions`` Float64 of 3V [m], ``screen`` Point3d of V (x, y [pixels], depth [m]): the vertices; ``ray``, and the ``length`` of
-    its direction before it was normalised (depth = t / length); ``hit``, ``triangle`` (-1 for none), ``depth``, and Mitsuba's preliminary
-    intersection.
+    ``region``: (x0, y0, width, height), opaque UInt32; ``basis``, ``origin``: the camera as :meth:`Pinhole.device` gives it;
+    ``positions`` Float64 of 3V [m], ``screen`` Point3d of V (x, y [pixels], depth [m]): the vertices; ``triangle`` (-1 for none) and
+    ``depth`` [m] of each pixel.
     """
 
     region: tuple
@@ -45,12 +45,31 @@ class View:
     origin: mi.Point3f
     positions: mi.Float64
     screen: mi.Point3d
-    ray: mi.Ray3f
-    length: mi.Float
-    hit: mi.Bool
     triangle: mi.Int32
     depth: mi.Float
+
+    @property
+    def hit(self):
+        return self.triangle >= 0
+
+    def rays(self):
+        """A ray through the centre of each pixel, and the length of its direction before it was normalised (depth = t / length)."""
+        return _rays(self.region, self.basis, self.origin, dr.width(self.triangle))
+
+
+@dataclass
+class View(Seen):
+    """:class:`Seen`, and what it was found with: the region's ``size`` (width, height), ``ray`` and ``length`` as of :meth:`Seen.rays`, and
+    Mitsuba's preliminary ``intersection``."""
+
+    size: tuple
+    ray: mi.Ray3f
+    length: mi.Float
     intersection: mi.PreliminaryIntersection3f
+
+    def seen(self):
+        """The :class:`Seen` part alone."""
+        return Seen(*(getattr(self, field.name) for field in fields(Seen)))
 
 
 class RasterIntegrator(mi.SamplingIntegrator):
@@ -186,21 +205,15 @@ class RasterIntegrator(mi.SamplingIntegrator):
         x0, y0, w, h = self._bounds(screen, width, height) if box is None else _margin([scale * x for x in box], width, height)
 
         with dr.suspend_grad():
-            x0_, y0_, w_ = (dr.opaque(mi.UInt32, k) for k in (x0, y0, w))
-            local = dr.arange(mi.UInt32, w * h)
-            ly = local // w_
-            px, py = local - ly * w_ + x0_, ly + y0_
-            centre = mi.Point2f(mi.Float(px) + 0.5, mi.Float(py) + 0.5)
-            direction = basis @ mi.Vector3f(centre.x, centre.y, 1)
-            length = dr.norm(direction)
-            ray = mi.Ray3f(origin, direction / length)
+            region = tuple(dr.opaque(mi.UInt32, k) for k in (x0, y0, w, h))
+            ray, length = _rays(region, basis, origin, w * h)
             pi = scene.ray_intersect_preliminary(ray, coherent=True)
             hit = pi.is_valid()
             shape = dr.reinterpret_array(mi.UInt32, pi.shape)
             triangle = dr.select(hit, mi.Int32(dr.gather(mi.UInt32, topology.face_offset, shape, hit) + pi.prim_index), -1)
             depth = dr.select(hit, pi.t / length, dr.inf)
             dr.eval(pi, triangle, depth)  # once: everything below reads it, and the scene may change before it is evaluated
-        return View((x0_, y0_, w_, w, h), basis, origin, positions, screen, ray, length, hit, triangle, depth, pi)
+        return View(region, basis, origin, positions, screen, triangle, depth, (w, h), ray, length, pi)
 
     def image(self, scene, sensor, seed=0, spp=0):
         """What :meth:`render` returns, without a copy of it in the sensor's film."""
@@ -218,7 +231,7 @@ class RasterIntegrator(mi.SamplingIntegrator):
             rgba = self._antialias(topology, view, rgba)
         aovs = [channel for name in self.aovs for channel in self._aov(name, si, z, view.triangle, view.ray, hit)]
         alpha = mi.has_flag(sensor.film().flags(), mi.FilmFlags.Alpha)
-        return self._assemble(rgba, aovs, view.region, self._camera(sensor), scale, alpha)
+        return self._assemble(rgba, aovs, view, self._camera(sensor), scale, alpha)
 
     def _bounds(self, screen, width, height):
         """Pixels that the surface can cover: (x, y, width, height), at least one pixel."""
@@ -298,7 +311,7 @@ class RasterIntegrator(mi.SamplingIntegrator):
 
         Vertices of each edge, the region's pixel whose sheet ends there, the other pixel, and whether the two lie side by side.
         """
-        topology, (x0, y0, w_, w, h) = self._topology, view.region
+        topology, (x0, y0, w_, _), (w, h) = self._topology, view.region, view.size
         horizontal_count, count = (w - 1) * h, (w - 1) * h + w * (h - 1)
         if count == 0:
             return None
@@ -328,28 +341,6 @@ class RasterIntegrator(mi.SamplingIntegrator):
             va, vb, near, far = (dr.gather(mi.UInt32, i, kept) for i in (va, vb, near, far))
             return va, vb, near, far, dr.gather(mi.Bool, horizontal, kept)
 
-    def blend(self, view, ea, eb, near, far, horizontal):
-        """How an edge between two pixel centres blends them: (pixel that changes, pixel whose colour comes in, its weight, where the edge
-        crosses).
-
-        ``ea``, ``eb``: the edge's ends [pixels], attached; the weight and the place are.
-        """
-        x0, y0, w_, _, _ = view.region
-        cn, cf = (self._centre(i, x0, y0, w_) for i in (near, far))
-        # where the edge crosses, from the near centre (0) to the far one (1)
-        step = eb - ea
-        along, across = dr.select(horizontal, step.x, step.y), dr.select(horizontal, step.y, step.x)
-        slope = along / across
-        crossing = dr.select(horizontal, ea.x + (cn.y - ea.y) * slope, ea.y + (cn.x - ea.x) * slope)
-        start, end = dr.select(horizontal, cn.x, cn.y), dr.select(horizontal, cf.x, cf.y)
-        t = (crossing - start) / (end - start)
-        place = mi.Point2f(dr.select(horizontal, crossing, cn.x), dr.select(horizontal, cn.y, crossing))
-        # the near sheet covers a part of the far pixel, or the far one a part of the near
-        beyond = dr.detach(t) > 0.5
-        # The pairs across either axis would account for the whole edge; sin^2 and cos^2 of its angle share it between them.
-        weight = dr.clip(dr.abs(t - 0.5), 0, 0.5) * across * across / (along * along + across * across)
-        return dr.select(beyond, far, near), dr.select(beyond, near, far), weight, place
-
     def _antialias(self, topology, view, rgba):
         """Blend the colours (packed, 4 w h) across the silhouettes that run between neighbouring pixel centres."""
         pairs = self.crossings(view)
@@ -357,7 +348,7 @@ class RasterIntegrator(mi.SamplingIntegrator):
             return rgba
         va, vb, near, far, horizontal = pairs
         ea, eb = _point2(view.screen, va), _point2(view.screen, vb)
-        target, other, weight, place = self.blend(view, ea, eb, near, far, horizontal)
+        target, other, weight, place = blend(view, ea, eb, near, far, horizontal)
 
         # The colour that comes in is the other sheet's where the edge crosses, not at the other pixel's centre: so the image stays
         # continuous when a pixel's centre passes from one sheet to the other.
@@ -376,11 +367,6 @@ class RasterIntegrator(mi.SamplingIntegrator):
         dr.scatter_add(out, weight * difference, target, mode=dr.ReduceMode.Local)
         return out
 
-    @staticmethod
-    def _centre(pixel, x0, y0, w):
-        y = pixel // w
-        return mi.Point2f(mi.Float(pixel - y * w + x0) + 0.5, mi.Float(y + y0) + 0.5)
-
     def _silhouette(self, topology, screen, triangle, near, far, x0, y0, w, horizontal):
         """Vertices (va, vb) of the silhouette edge between the centres of two pixels, and which pixel it occludes.
 
@@ -398,7 +384,7 @@ class RasterIntegrator(mi.SamplingIntegrator):
     def _walk(self, topology, screen, triangle, start, end, x0, y0, w, active):
         """From the triangle seen at pixel ``start`` over the sheet towards the centre of ``end``: whether a silhouette edge comes before
         that centre, its vertices, and the last triangle reached."""
-        c0, c1 = self._centre(start, x0, y0, w), self._centre(end, x0, y0, w)
+        c0, c1 = _centre(start, x0, y0, w), _centre(end, x0, y0, w)
 
         def corners(t, mask):
             return [dr.gather(mi.UInt32, topology.faces, 3 * mi.UInt32(t) + k, mask) for k in range(3)]
@@ -448,10 +434,10 @@ class RasterIntegrator(mi.SamplingIntegrator):
         _, last, found, va, vb, _ = dr.while_loop(state, lambda active, *_: active, step, label="walk")
         return found, va, vb, last
 
-    def _assemble(self, rgba, aovs, region, camera, scale, alpha):
+    def _assemble(self, rgba, aovs, view, camera, scale, alpha):
         """Put the region into the full image and shape it (H, W, C): colours averaged over the samples of a pixel, AOVs of its middle one.
         """
-        x0, y0, w_, w, h = region
+        (x0, y0, w_, _), (w, h) = view.region, view.size
         width, height = camera.width, camera.height
         colours = 4 if alpha else 3
         count = colours + len(aovs)
@@ -475,6 +461,42 @@ class RasterIntegrator(mi.SamplingIntegrator):
         for c, part in enumerate(aovs):
             dr.scatter(out, part, pixel * count + colours + c, middle)
         return mi.TensorXf(out, (height, width, count))
+
+
+def _rays(region, basis, origin, count):
+    """:meth:`Seen.rays` of a region of ``count`` pixels."""
+    centre = _centre(dr.arange(mi.UInt32, count), *region[:3])
+    direction = basis @ mi.Vector3f(centre.x, centre.y, 1)
+    length = dr.norm(direction)
+    return mi.Ray3f(origin, direction / length), length
+
+
+def _centre(pixel, x0, y0, w):
+    y = pixel // w
+    return mi.Point2f(mi.Float(pixel - y * w + x0) + 0.5, mi.Float(y + y0) + 0.5)
+
+
+def blend(seen, ea, eb, near, far, horizontal):
+    """How an edge between two pixel centres blends them: (pixel that changes, pixel whose colour comes in, its weight, where the edge
+    crosses).
+
+    ``ea``, ``eb``: the edge's ends [pixels], attached; the weight and the place are.
+    """
+    x0, y0, w_, _ = seen.region
+    cn, cf = (_centre(i, x0, y0, w_) for i in (near, far))
+    # where the edge crosses, from the near centre (0) to the far one (1)
+    step = eb - ea
+    along, across = dr.select(horizontal, step.x, step.y), dr.select(horizontal, step.y, step.x)
+    slope = along / across
+    crossing = dr.select(horizontal, ea.x + (cn.y - ea.y) * slope, ea.y + (cn.x - ea.x) * slope)
+    start, end = dr.select(horizontal, cn.x, cn.y), dr.select(horizontal, cf.x, cf.y)
+    t = (crossing - start) / (end - start)
+    place = mi.Point2f(dr.select(horizontal, crossing, cn.x), dr.select(horizontal, cn.y, crossing))
+    # the near sheet covers a part of the far pixel, or the far one a part of the near
+    beyond = dr.detach(t) > 0.5
+    # The pairs across either axis would account for the whole edge; sin^2 and cos^2 of its angle share it between them.
+    weight = dr.clip(dr.abs(t - 0.5), 0, 0.5) * across * across / (along * along + across * across)
+    return dr.select(beyond, far, near), dr.select(beyond, near, far), weight, place
 
 
 def _margin(box, width, height):

@@ -10,7 +10,7 @@ import synthetic
 from problems import problem_of
 from scipy.spatial.transform import Rotation
 
-from polysft_mi import solvers
+from polysft_mi import pixels, solvers
 from polysft_mi.patch import Unknowns
 from polysft_mi.pyramid import Level, level_image
 from polysft_mi.registration import Registration
@@ -59,12 +59,12 @@ def compared(known, vertices, frame, level, appearance):
     """(what is compared with a frame (h, w, 3), where (h, w)) of the level's grid of the whole image."""
     with dr.suspend_grad():
         view = known._look(vertices, level)
-        residual, weight, *_ = known._pixels(view, frame, level, appearance)
-        packed, _, image, *_ = known._frame_level(frame, level)
-        pixel, inside = known._at(view, image.inside.shape, image.corner)
-        seen = residual + dr.gather(mi.Vector4f, packed, pixel, inside)
-    x0, y0, _, w, h = view.region
-    x0, y0 = int(x0[0]), int(y0[0])
+        at = known._frame_level(frame, level).image
+        residual, weight, *_ = pixels.compared(*known._compared(view, frame, level, appearance))
+        pixel, inside = at.at(*pixels.places(view))
+        seen = residual + dr.gather(mi.Vector4f, at.texels, pixel, inside)
+    x0, y0, *_ = (int(k[0]) for k in view.region)
+    w, h = view.size
     rows, columns = known.problem.height // level.stride, known.problem.width // level.stride
     colour, where = np.zeros((rows, columns, 3)), np.zeros((rows, columns), bool)
     colour[y0 : y0 + h, x0 : x0 + w] = np.array(seen).T[:, :3].reshape(h, w, 3)
@@ -107,29 +107,31 @@ def test_gradient_and_curvature_are_those_of_a_frame_that_has_the_excess(problem
     vertices = truth.vertices[2]
     appearance = known.appearance(vertices + [0.001, 0, 0.002], level)
     mine = known.evaluate(vertices, frame, level, 0.3, appearance)
-    packed, mask, image, *sums = known._frame_level(frame, level)
-    (h, w), (x, y), (rows, columns) = appearance.shape, appearance.corner, image.inside.shape
-    whole, excess = np.array(packed).reshape(rows, columns, 4), np.array(appearance.excess).reshape(h, w, 4)
+    at, extra = known._frame_level(frame, level), appearance.excess
+    h, w, rows, columns = (int(k[0]) for k in (extra.height, extra.width, at.image.height, at.image.width))
+    whole, excess = np.array(at.image.texels).reshape(rows, columns, 4), np.array(extra.texels).reshape(h, w, 4)
     for i in range(h):
         for j in range(w):
-            k, m = i + y - image.corner[1], j + x - image.corner[0]
+            k, m = i + int((extra.y - at.image.y)[0]), j + int((extra.x - at.image.x)[0])
             if 0 <= k < rows and 0 <= m < columns:
                 whole[k, m, :3] += excess[i, j, :3]
-    known._frames[frame, level] = mi.Float(whole.ravel()), mask, image, *sums
+    at.image.texels = mi.Float(whole.ravel())
     expected = known.evaluate(vertices, frame, level, 0.3)
     assert mine.photometric == pytest.approx(expected.photometric, rel=1e-6) and mine.misfit == pytest.approx(expected.misfit, rel=1e-6)
-    assert np.abs(mine.gradient - expected.gradient).max() < 1e-5 * np.abs(expected.gradient).max()
-    assert np.abs(mine.second - expected.second).max() < 1e-5 * np.abs(expected.second).max()
+    for name in ("gradient", "second"):
+        a, b = (np.array(getattr(x.images, name)) for x in (mine, expected))
+        assert np.abs(a - b).max() < 1e-5 * np.abs(b).max()
 
 
 def test_without_masks_only_what_is_far_from_the_border(unmasked):
     problem = problem_of(unmasked.folder)
     known, level = Registration(problem), Level(1.0, 1, 6.0)
     appearance = known.appearance(problem.template.vertices, level)
-    h, w = appearance.shape
-    has = np.abs(np.array(appearance.excess).reshape(h, w, 4)).max(-1) > 0
+    extra = appearance.excess
+    w, h, x, y = (int(k[0]) for k in (extra.width, extra.height, extra.x, extra.y))
+    has = np.abs(np.array(extra.texels).reshape(h, w, 4)).max(-1) > 0
     position, _ = problem.camera.project(problem.template.vertices)
-    (left, top), (right, bottom) = position.min(0) - appearance.corner, position.max(0) - appearance.corner
+    (left, top), (right, bottom) = position.min(0) - (x, y), position.max(0) - (x, y)
     rows, columns = np.flatnonzero(has.any(1)), np.flatnonzero(has.any(0))
     for low, high, a, b in ((left, right, columns[0], columns[-1]), (top, bottom, rows[0], rows[-1])):
         assert a - low == pytest.approx(12, abs=2) and high - b == pytest.approx(12, abs=2)  # two windows

@@ -12,7 +12,7 @@ from polysft_mi import metrics, plugins
 
 ROOT = Path(__file__).resolve().parent.parent
 SIZE, POINTS = (64, 48), 9
-outline, raster, scaling, stability = (load(f"benchmarks/{name}.py") for name in ("outline", "raster", "scaling", "stability"))
+iteration, outline, raster, scaling, stability = (load(f"benchmarks/{name}.py") for name in ("iteration", "outline", "raster", "scaling", "stability"))
 
 
 @pytest.fixture(autouse=True)
@@ -87,6 +87,13 @@ def test_stability_writes_figures_and_picture(tmp_path, capsys):
     assert report["counts"]["2"]["rmse_mm"] == pytest.approx(1e3 * np.linalg.norm(truth) / np.sqrt(len(truth)) * report["counts"]["2"]["e3d"], rel=1e-5)
     assert (tmp_path / "stability.png").read_bytes().startswith(b"\x89PNG")
     assert "stability.json" in capsys.readouterr().out
+
+
+def test_iteration_times_every_part(capsys):
+    found = iteration.main(["--turns", "2"])
+    assert len(found) == 9 and all(x > 0 for x in found.values())
+    table = capsys.readouterr().out.splitlines()
+    assert [line.split(" | ")[0].strip("| ") for line in table[2:]] == list(found)
 
 
 def test_scaling_tracks_the_sheet_that_it_makes(tmp_path):

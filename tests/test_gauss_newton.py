@@ -10,14 +10,15 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import synthetic
-from problems import problem_of
+from problems import dense, grid_template, problem_of
 from scipy.linalg import LinAlgError, block_diag
 from scipy.spatial.transform import Rotation
 
 from polyfit import jets
 from polysft_mi import normal_equations, objective, prepare, pyramid, registration, scene, solvers
+from polysft_mi.assembly import Images
 from polysft_mi.errors import InputError
-from polysft_mi.normal_equations import Blocks, Chart, Normal, Pattern, Reduced, State, assemble, hinges
+from polysft_mi.normal_equations import Blocks, Chart, Normal, Pattern, Reduced, State, hinges
 from polysft_mi.patch import Unknowns
 from polysft_mi.problem import Problem
 from polysft_mi.pyramid import FARTHEST, Level, level_image
@@ -39,12 +40,6 @@ def truth(tmp_path_factory):
 @pytest.fixture(scope="module")
 def problem(truth):
     return problem_of(truth.folder, brightness="none")
-
-
-def grid_template(rows=6, columns=7, order=4, capacity=None, bend=4.0):
-    vertices = synthetic.sheet(0.7, rows, columns, bend=bend)
-    v, u = np.meshgrid(np.linspace(1, 0, rows), np.linspace(0, 1, columns), indexing="ij")
-    return Template.fit(vertices, synthetic.grid_faces(rows, columns), np.stack([u, v], -1).reshape(-1, 2), order, capacity=capacity, tolerance=1)
 
 
 def some_state(chart, size=0.05):
@@ -177,15 +172,6 @@ def test_hinges_measure_bending_and_no_plane_bends():
 # -- the normal equations ----------------------------------------------------
 
 
-def dense(pattern, normal):
-    d = normal.local.shape[-1]
-    n = d * pattern.count
-    h = np.zeros((n, n))
-    for i, j, block in zip(pattern.row, pattern.column, normal.local):
-        h[d * i : d * i + d, d * j : d * j + d] = block
-    return np.block([[h, normal.cross], [normal.cross.T, normal.glob]]), np.concatenate([normal.local_gradient.ravel(), normal.gradient])
-
-
 def random_normal(pattern, size=9, d=2):
     """Positive normal equations of the pattern: J^T J of residuals that each see one triangle and the global unknowns."""
     n, blocks = d * pattern.count, np.zeros((len(pattern.row), d, d))
@@ -199,65 +185,6 @@ def random_normal(pattern, size=9, d=2):
             cross[d * b : d * b + d] += np.outer(jb, g)
             glob += np.outer(g, g)
     return Normal(blocks, cross, glob, RNG.normal(size=(pattern.count, d)), RNG.normal(size=size))
-
-
-@pytest.mark.parametrize("wide", [False, True])
-def test_all_terms_are_those_of_their_dense_jacobians(wide):
-    """Pixels, silhouette, edges and triangles, in the unknowns of a jet patch."""
-    rng = np.random.default_rng(7)
-    template = grid_template()
-    chart, faces, count, d = Chart(template), template.faces, len(template.chart), 3 if wide else 2
-    state = some_state(chart)
-    surface, pattern = chart.surface(state), Pattern(faces, template.edges, count)
-    wider = Pattern(faces, template.edges, count, hinges(template.chart, faces)[0]) if wide else None
-    projection = rng.normal(size=(count, 2, 3))
-    in_image, in_space, slope = np.zeros((2 * count, 2 * count)), np.zeros((3 * count, 3 * count)), rng.normal(size=(count, 3))
-
-    def add(matrix, width, at, rows):  # rows^T rows, where the rows (R, K, width) see the vertices at (K,)
-        columns = (width * np.asarray(at)[:, None] + np.arange(width)).ravel()
-        rows = rows.reshape(len(rows), -1)
-        matrix[np.ix_(columns, columns)] += rows.T @ rows
-
-    pixels = rng.normal(size=(len(faces), 4, 3, 2))
-    second = np.einsum("frad,frbe->fabde", pixels, pixels)
-    second = (second + second.transpose(0, 1, 2, 4, 3)) / 2  # a pixel's derivatives by its three corners have one direction
-    for face, blocks in zip(faces, second):
-        for a in range(3):
-            for b in range(3):
-                in_image[2 * face[a] : 2 * face[a] + 2, 2 * face[b] : 2 * face[b] + 2] += blocks[a, b]
-    i, j = np.concatenate([template.edges[:9], template.edges[5:20, ::-1]]).T  # both ways round, some twice
-    ci, cj, h = rng.normal(size=(len(i), 2)), rng.normal(size=(len(i), 2)), rng.uniform(0.5, 2, len(i))
-    for k in range(len(i)):
-        add(in_image, 2, (i[k], j[k]), math.sqrt(h[k]) * np.stack([ci[k], cj[k]])[None])
-    given = registration.Evaluation(0, 0, 0, 0, slope, second.reshape(-1, 9, 2, 2), (i, j, ci, cj, h), 1.0, np.zeros(len(faces)))
-    lengths, stiffness = rng.uniform(0.05, 0.1, len(template.edges)), 3.0
-    slope, energy = slope.copy(), 0.0
-    for (a, b), length in zip(template.edges, lengths):
-        edge = surface.vertices[a] - surface.vertices[b]
-        unit, excess = edge / np.linalg.norm(edge), np.linalg.norm(edge) - length
-        add(in_space, 3, (a, b), math.sqrt(2 * stiffness) * np.stack([unit, -unit])[None])
-        slope[a] += 2 * stiffness * excess * unit
-        slope[b] -= 2 * stiffness * excess * unit
-        energy += stiffness * excess**2
-    residual, factor, by_corner = rng.normal(size=len(faces)), rng.uniform(0, 2, len(faces)), rng.normal(size=(len(faces), 3, 3))
-    for face, r, f, by in zip(faces, residual, factor, by_corner):
-        add(in_space, 3, face, math.sqrt(f) * by[None])
-        slope[face] += f * r * by
-    images = np.zeros((2 * count, 3 * count))
-    for k in range(count):
-        images[2 * k : 2 * k + 2, 3 * k : 3 * k + 3] = projection[k]
-
-    def moved(step):  # the vertices along a step of all unknowns, by differences of the surface
-        parts = step[d * count :], step[: d * count].reshape(-1, d)
-        return (chart.surface(state.moved(parts, 1e-5)).vertices - chart.surface(state.moved(parts, -1e-5)).vertices).ravel() / 2e-5
-
-    by = np.stack([moved(row) for row in np.eye(d * count + len(chart.degree) + 6)], 1)
-    normal, found = assemble(pattern, surface, projection, given, lengths, stiffness, wider, triangles=(residual, factor, by_corner))
-    matrix, gradient = dense(wider or pattern, normal)
-    expected = by.T @ (in_space + images.T @ in_image @ images) @ by
-    assert found == pytest.approx(energy, rel=1e-9)
-    assert np.abs(matrix - expected).max() < 1e-6 * np.abs(expected).max()
-    assert np.abs(gradient - by.T @ slope.ravel()).max() < 1e-6 * np.abs(gradient).max()
 
 
 @pytest.mark.parametrize("alone", [0, 1000])  # rows a block below which one thread does it all
@@ -360,9 +287,10 @@ def twin(truth, problem, tmp_path_factory):
     """A problem whose texture is the one that the level compares with, so that the renderer's autodiff sees the same objective."""
     level = Level(0.0)
     first = Registration(problem)
-    packed, width, height = first._texture_level(level)
+    texture = first._texture_level(level)
+    width, height = int(texture.width[0]), int(texture.height[0])
     folder = tmp_path_factory.mktemp("twin")
-    image = np.array(packed).reshape(height, width, 4)[..., :3]
+    image = np.array(texture.texels).reshape(height, width, 4)[..., :3]
     mi.Bitmap(np.ascontiguousarray(image)).write(str(folder / "texture.pfm"))
     synthetic.write_image(folder / "texture.png", synthetic.texture_image())
     at = np.array(first._texcoord).reshape(-1, 2) * np.array(first._texel[0]).ravel() + np.array(first._texel[1]).ravel()
@@ -409,7 +337,7 @@ def test_photometric_gradient_is_that_of_autodiff_through_raster(problem, twin, 
     dr.backward(energy)
     expected = np.array(dr.grad(flat)).reshape(-1, 3)
     assert mine.photometric == pytest.approx(energy[0], rel=1e-4)
-    gradient = mine.gradient - _silhouette_gradient(first, vertices, level)
+    gradient = slope(mine) - _silhouette_gradient(first, vertices, level)
     assert np.abs(gradient - expected).max() < 1e-3 * np.abs(expected).max()
     first._frames.clear()
 
@@ -425,23 +353,12 @@ class _Ready:
 
 
 def _silhouette_gradient(first, vertices, level):
-    return first.evaluate(vertices, 2, level, 1e-6).gradient  # at this scale no residual pulls
+    return slope(first.evaluate(vertices, 2, level, 1e-6))  # at this scale no residual pulls
 
 
-def test_sums_over_each_triangles_pixels(problem):
-    first, count = Registration(problem), 500
-    faces = len(first.faces)
-    triangle = RNG.integers(-1, faces // 3, count).astype(np.int32)  # many see none of the later triangles
-    found = RNG.random((3, count, 4)).astype(np.float32)
-    table = first._by_triangle(mi.Int32(triangle), [mi.Vector4f(np.ascontiguousarray(x.T)) for x in found])
-    expected = np.zeros((faces, 31))
-    for t, second, slope, figures in zip(triangle, *found.astype(np.float64)):
-        if t >= 0:
-            corner = 1 - second[3] - slope[3], second[3], slope[3]
-            expected[t, :18] += np.concatenate([corner[a] * corner[b] * second[:3] for a, b in registration._CORNERS])
-            expected[t, 18:] += np.concatenate([*(b * slope[:3] for b in corner), figures])
-    assert np.abs(table - expected).max() < 1e-5 * np.abs(expected).max()
-    assert np.array_equal(table, first._by_triangle(mi.Int32(triangle), [mi.Vector4f(np.ascontiguousarray(x.T)) for x in found]))
+def slope(evaluation):
+    """The images' gradient (N, 3)."""
+    return np.array(evaluation.images.gradient).reshape(-1, 3)
 
 
 @pytest.mark.parametrize("level", [Level(0.0), Level(2.5, 2), Level(3.8, 3, 10.0)])
@@ -478,18 +395,18 @@ def test_silhouette_gradient_is_that_of_autodiff_through_raster(problem, amount)
     expected = np.array(dr.grad(flat)).reshape(-1, 3)
     mine = first.evaluate(vertices, 2, level, 1e-6)
     assert mine.silhouette == pytest.approx(energy[0], rel=1e-4)
-    assert np.abs(mine.gradient - expected).max() < 1e-3 * np.abs(expected).max()
+    assert np.abs(slope(mine) - expected).max() < 1e-3 * np.abs(expected).max()
 
 
 def edges_of(problem):
     """(Chart, Pattern, the edges' lengths, and what makes the normal equations of a state by the edges alone)."""
     chart, first = Chart(problem.template), Registration(problem)
-    pattern = Pattern(first.faces, problem.template.edges, len(problem.template.vertices))
+    pattern = first.pattern
+    nothing = Images(dr.zeros(mi.Float64, 3 * pattern.count), dr.zeros(mi.Float64, 4 * len(pattern.upper)))
 
     def edges_alone(state, lengths, stiffness, **more):
         surface = chart.surface(state)
-        none = registration.Evaluation(0, 0, 0, 0, np.zeros_like(surface.vertices), np.zeros((len(first.faces), 9, 2, 2)), None, 1.0, np.zeros(len(first.faces)))
-        return assemble(pattern, surface, first.projection(surface.vertices), none, lengths, stiffness, wide=pattern, **more)
+        return first.assembly.normal(surface, nothing, lengths, stiffness, wide=pattern, **more)
 
     return chart, pattern, np.array(problem.edge_lengths, dtype=np.float64), edges_alone
 
@@ -537,7 +454,9 @@ def test_stretched_edges_give_and_compressed_ones_do_not(problem):
 def test_strain_is_held_harder_where_it_may_be_noise(problem, monkeypatch, noise, low, high):
     solver, given = gauss_newton.GaussNewton(problem.settings), []
     solver._prepare(problem)
-    monkeypatch.setattr(gauss_newton, "assemble", lambda *arguments, give, **more: given.append(give) or assemble(*arguments, give=give, **more))
+    assembly = solver.registration.assembly
+    normal = assembly.normal
+    monkeypatch.setattr(assembly, "normal", lambda *arguments: given.append(arguments[5]) or normal(*arguments))
     solver._noise = noise
     rest = solver.chart.state(problem.patch.rest().to_numpy())
     solver._linearise(rest, rest, 1, 4, gauss_newton.STAGES[0], 0.5)
@@ -901,8 +820,8 @@ def test_a_windows_step_against_finite_differences_and_the_dense_system(truth):
     assert mine == pytest.approx(slope, rel=1e-4)
 
     damping, found = 1e-4, solver._window_step(models, 1e-4)
-    parts, right, sizes = zip(*[(*dense(solver.pattern, n), len(n.gradient)) for n, _ in models])
-    n, start = 2 * solver.pattern.count, np.cumsum([0] + [len(h) for h in parts])
+    parts, right, sizes = zip(*[(*dense(solver.registration.pattern, n), len(n.gradient)) for n, _ in models])
+    n, start = 2 * solver.registration.pattern.count, np.cumsum([0] + [len(h) for h in parts])
     floor = [np.where(np.arange(len(h)) < n, 0, 1e-9 * np.diag(h)[n:].mean()) for h in parts]  # no edge holds a translation
     whole = block_diag(*[h + np.diag(np.diag(h) * damping + x) for h, x in zip(parts, floor)])
     for k in range(2):

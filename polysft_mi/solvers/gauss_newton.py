@@ -10,7 +10,7 @@ from threadpoolctl import ThreadpoolController
 
 from ..errors import InputError
 from ..light import Light, areas, residuals
-from ..normal_equations import Blocks, Chart, Normal, Pattern, Reduced, State, Surface, assemble, hinges
+from ..normal_equations import Blocks, Chart, Normal, Pattern, Reduced, State, Surface, hinges
 from ..patch import Unknowns
 from ..problem import BadFrame
 from ..pyramid import Level
@@ -192,8 +192,8 @@ class GaussNewton:
         self.chart, self.least = Chart(template), template.fitted
         faces, count = self.registration.faces, len(template.vertices)
         across, bends = hinges(template.chart, faces)
-        self.pattern, wide = Pattern(faces, template.edges, count), Pattern(faces, template.edges, count, across)
-        self.systems = {2: Blocks(self.pattern), 3: Blocks(wide, 3)}  # by the local unknowns of a vertex
+        wide = Pattern(faces, template.edges, count, across)
+        self.systems = {2: Blocks(self.registration.pattern), 3: Blocks(wide, 3)}  # by the local unknowns of a vertex
         self.bends = bends
         self._has_relief = self.settings.k_relief > 0 and count <= _RELIEF_VERTICES
         self._relief_blocks = wide.laplacian + _RELIEF_BEND * wide.blocks_of(bends.T @ bends)
@@ -517,7 +517,6 @@ class GaussNewton:
         caution = 1 + min((np.nan_to_num(self._noise) / _NOISE_MISFIT) ** _NOISE_POWER, _NOISE_MOST)  # before what may be noise
         give = math.inf if stiffness is not None or (self._moved and stage in (FAR, STAGES[0])) else _GIVE * caution
         stiffness = s.k_mi * (stage.stiffness if stiffness is None else stiffness) / chart.template.scale**2
-        projection = self.registration.projection(surface.vertices)
         d = 3 if self._has_relief and self._noise < stage.relief[self._unexplained] else 2
         relief = s.k_relief * caution
         pattern = self.systems[d].pattern
@@ -526,7 +525,7 @@ class GaussNewton:
         if s.k_shading > 0 and stage is STAGES[-1] and self._light.frames:  # before, lengths are soft, and shading would bend what they should
             shade = self.registration.shade(surface.vertices, frame, evaluation.seen, appearance)
             shading, *rows = residuals(shade, self._light, s.k_shading)
-        normal, inextensibility = assemble(self.pattern, surface, projection, evaluation, self.lengths, stiffness, wide, give=give, triangles=rows)
+        normal, inextensibility = self.registration.assembly.normal(surface, evaluation.images, self.lengths, stiffness, wide, give, rows)
         a = self.chart.size(order)
         bend = 2 * s.k_bend * chart.bending
         moved, slid = state.alpha - anchor.alpha, state.offset - anchor.offset

@@ -1,0 +1,107 @@
+"""``python benchmarks/iteration.py [scene.xml]``: the parts of an iteration of the tracker, in milliseconds, and what the one whose kernels are recorded
+(``dr.freeze``) would take if they were traced anew each time, in turns.
+
+The template as the scene has it, moved a little, in the video's second frame, at the last stage and the lowest order. Each time is a median.
+"""
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+
+
+def main(arguments=None):
+    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument("scene", nargs="?", default=str(ROOT / "scenes" / "demo.xml"))
+    p.add_argument("-D", dest="defines", metavar="NAME=VALUE", action="append", default=[], help="the scene's defaults, as for polysft_mi.run")
+    p.add_argument("--turns", type=int, default=30)
+    options = p.parse_args(arguments)
+
+    from polysft_mi.backend import set_variant
+
+    set_variant()
+    rows = measured(options.scene, dict(x.split("=", 1) for x in options.defines), options.turns)
+    print("| part | milliseconds |\n|---|---|")
+    for name, milliseconds in rows.items():
+        print(f"| {name} | {milliseconds:.2f} |")
+    return rows
+
+
+def measured(path, overrides, turns):
+    """{part: milliseconds}."""
+    import drjit as dr
+    import mitsuba as mi
+
+    from polysft_mi import scene, solvers
+    from polysft_mi.problem import Problem
+    from polysft_mi.sequence import Sequence
+    from polysft_mi.solvers.gauss_newton import STAGES
+
+    experiment = scene.load(path, {**overrides, "solver": "gauss-newton"})
+    s = experiment.settings
+    problem = Problem(experiment, Sequence.open(experiment.frames, experiment.masks, first=s.first, last=s.last, stride=s.stride, size=experiment.size))
+    solver = solvers.create(s)
+    solver._prepare(problem)
+    known, chart, stage, order = solver.registration, solver.chart, STAGES[-1], solver.least
+    level, system, assembly = solver.levels[stage], solver.systems[3 if solver._has_relief else 2], known.assembly
+    rest = chart.state(problem.patch.rest().to_numpy())
+    rest.translation += 0.005
+    surface = chart.surface(rest, order)
+    vertices, wide = surface.vertices, system.pattern if solver._has_relief else None
+    at = known._frame_level(1, level)
+    with dr.suspend_grad():
+        view = known._look(vertices, level)
+        given = *known._compared(view, 1, level, known.appearance(vertices, level)), dr.opaque(mi.Float, 0.3)
+        table, figures = known._sums(*given)
+        crossings = known.raster.crossings(view, outline=True)
+        outline = (view.seen(), crossings, at.mask, at.distance, known._corner_of) if at.mask is not None else None
+        pairs = known._outline(*outline)[1] if outline else None
+        sums = table, figures, vertices, 1.0, 1.0, at.area, level.stride, pairs
+        images = assembly.images(*sums)
+        normal, _ = assembly.normal(surface, images, solver.lengths, 1.0, wide)
+        reduced = solver._reduced(normal, 1e-3, np.float32)
+    recorded = assembly._in_unknowns
+
+    def look():
+        known._last = None
+        known._look(vertices, level)
+
+    def traced():
+        assembly._in_unknowns = recorded.__wrapped__
+        equations()
+        assembly._in_unknowns = recorded
+
+    def equations():
+        return assembly.normal(surface, images, solver.lengths, 1.0, wide)
+
+    parts = {
+        "surface of the unknowns": lambda: chart.surface(rest, order),
+        "visibility: the mesh put into the scene, a ray a pixel": look,
+        "residuals, derivatives, sums over triangles": lambda: dr.eval(known._sums(*given)),
+        "silhouette": lambda: known.raster.crossings(view, outline=True) and outline and dr.eval(known._outline(*outline)),
+        "sums at the vertices": lambda: dr.eval(assembly.images(*sums)),
+        "normal equations": equations,
+        "normal equations, traced": traced,
+        "elimination": lambda: solver._reduced(normal, 1e-3, np.float32),
+        "step": reduced.step,
+    }
+    times = {name: [] for name in parts}
+    with dr.suspend_grad(), solver._blas.limit(limits=1, user_api="blas"):  # as the tracker does
+        for turn in range(turns + 3):
+            for name, run in parts.items():
+                dr.sync_thread()
+                began = time.perf_counter()
+                run()
+                dr.sync_thread()
+                if turn >= 3:  # the first compile kernels
+                    times[name].append(1e3 * (time.perf_counter() - began))
+    return {name: float(np.median(x)) for name, x in times.items()}
+
+
+if __name__ == "__main__":
+    main()
