@@ -618,8 +618,8 @@ def test_a_stage_goes_on_while_it_gains(truth, problem, monkeypatch):
 @pytest.mark.parametrize(
     "noise, misfits, stages, kept",
     [
-        (0.03, [0.1, 0.08, 0.079, 0.01], 3, 2),  # until it gains little
-        (0.03, [0.1, 0.08, 0.06, 0.05, 0.04], 4, 3),  # or three times
+        (0.03, [0.1, 0.08, 0.0795, 0.01], 3, 2),  # until it gains little
+        (0.03, [0.2 * 0.9**k for k in range(12)], 9, 8),  # or eight times
         (0.03, [0.1, 0.035, 0.01], 2, 1),  # or what is left is noise
         (0.03, [0.1, 0.11, 0.01], 2, 0),  # what is worse is not kept
         (0.03, [0.035, 0.01], 1, 0),
@@ -632,15 +632,20 @@ def test_what_is_not_explained_goes_through_the_fine_stages_again(problem, monke
     solver = gauss_newton.GaussNewton(problem.settings)
     solver._noise, seen = noise, []
 
+    class At(int):
+        def towards(self, other, factor):
+            return self, other, factor
+
     def stage_by_stage(state, anchor, frame, order, stages, iterations):
         seen.append((state, stages))
         solver._fitting = {"scale": len(seen) - 1}
-        return len(seen) - 1, {"misfit": misfits[len(seen) - 1], "inextensibility": 0.0, "smoothness": 0.0}
+        return At(len(seen) - 1), {"misfit": misfits[len(seen) - 1], "inextensibility": 0.0, "smoothness": 0.0}
 
     monkeypatch.setattr(solver, "_stages", stage_by_stage)
     state, terms = solver._descend("start", None, 5, 8, (gauss_newton.FAR, *gauss_newton.STAGES))
     assert seen[0] == ("start", (gauss_newton.FAR, *gauss_newton.STAGES))
-    assert seen[1:] == [(k, gauss_newton.STAGES[1:]) for k in range(stages - 1)]
+    starts = [0] + [(k, k + 1, 1.0) for k in range(stages - 2)]  # from where the last led, and as far again
+    assert seen[1:] == [(start, gauss_newton.STAGES[1:]) for start in starts[: stages - 1]]
     assert (state, terms["misfit"], solver._fitting) == (kept, misfits[kept], {"scale": kept})
 
 

@@ -26,7 +26,7 @@ _GOING, _FARTHER = 0.1, 3  # a stage goes on, to so many times its iterations, w
 _CLEAN = 0.08  # the least misfit so far, which is noise, below which images are clean enough for fine folds
 # In clean images, a frame that ends with a misfit above so many times the least so far goes through the fine stages again, so many times at most, as
 # long as that lowers its cost by this share: folds come gradually, and iterations that are too few leave each frame a little further behind.
-_AGAIN_ABOVE, _AGAIN, _AGAIN_GAIN = 1.3, 3, 0.03
+_AGAIN_ABOVE, _AGAIN, _AGAIN_GAIN = 1.3, 8, 0.01
 # A misfit is suspect that exceeds the noise (the least misfit so far) by so many times what the median of the frames before does, plus the margin.
 _SUSPECT, _SUSPECT_MARGIN, _MEMORY = 1.25, 0.03, 5
 _PATIENT = 18  # iterations a stage where a frame is suspect
@@ -357,19 +357,21 @@ class GaussNewton:
 
     def _descend(self, state, anchor, frame, order, stages, iterations=None):
         """Stage after stage, each of its own or so many ``iterations``, more while they gain much; and where that leaves more than noise, the fine
-        stages again, as long as they explain more: (state, terms)."""
+        stages again, as long as they explain more, each time from where the last led and as far again: (state, terms)."""
         state, terms = self._stages(state, anchor, frame, order, stages, iterations)
+        start = state
         for _ in range(_AGAIN):
             if not (self._noise < _CLEAN and terms["misfit"] > max(_UNEXPLAINED, _AGAIN_ABOVE * self._noise)):
                 break
             fitting, before = dict(self._fitting), (state, terms)
-            state, terms = self._stages(state, anchor, frame, order, STAGES[1:], iterations)
+            state, terms = self._stages(start, anchor, frame, order, STAGES[1:], iterations)
             gain = 1 - _cost((state, terms)) / _cost(before)
             if gain <= 0:
                 self._fitting = fitting
                 return before
             if gain < _AGAIN_GAIN:
                 break
+            start = before[0].towards(state, 1.0)  # as far again: what is behind comes closer by a like share each time
         return state, terms
 
     def _stages(self, state, anchor, frame, order, stages, iterations=None):
