@@ -16,7 +16,7 @@ from .device import frozen, on_device
 from .normal_equations import Normal
 from .pixels import CORNERS, CURVATURES, FIGURES, SLOPES, packed
 
-# Silhouette pixels add to vertices in any order, which must not show: they do so in integers, in units of 2^-40 of an edge that moves by a pixel.
+# Silhouette pixels add to vertices in any order, which must not show: they do so in integers, in units of 2^-40 (of alpha a pixel, and its square).
 _UNIT, _MOST = 2.0**40, 1e4
 _PAIR = np.array([next(k for k, pair in enumerate(CORNERS) if set(pair) == {a, b}) for a in range(3) for b in range(3)])  # of corners (a, b), by 3 a + b
 _WIDTH = CURVATURES + SLOPES
@@ -28,9 +28,9 @@ class Tables:
 
     Lists of a vertex or a pair of neighbours are the entries from ``*_start[k]`` to ``*_start[k + 1]`` of another array. The U pairs i <= j, upper half of the
     pattern: ``i``, ``j``, and ``pair_start`` (N + 1) of those with each i. ``share``: 9 f + 3 a + b, for each pair, where it is the corners a and b of the
-    triangle f; ``curvature``: the first of their three sums, likewise. ``corner``: 3 f + a, for each vertex. ``a``, ``b``: the edges' ends; ``edge`` (Int32): of each pair, -1 where i = j; ``end``: 2 e, or
-    2 e + 1 for its second end, for each vertex. ``neighbour``: j of each vertex in the whole pattern, ``half``: 2 p, or 2 p + 1 where the pair p is
-    j <= i.
+    triangle f; ``curvature``: the first of their three sums, likewise. ``corner``: 3 f + a, for each vertex. ``a``, ``b``: the edges' ends; ``edge``
+    (Int32): of each pair, -1 where i = j; ``end``: 2 e, or 2 e + 1 for its second end, for each vertex. ``neighbour``: j of each vertex in the whole pattern,
+    ``half``: 2 p, or 2 p + 1 where the pair p is j <= i.
     """
 
     i: mi.UInt32
@@ -126,8 +126,8 @@ def at_vertices(tables, table, figures, vertices, camera, numbers, silhouette):
     """:class:`Images` of the sums ``table`` (Float of 27F) and ``figures`` (Float of 4F) of the triangles.
 
     ``vertices`` Float64 of 3N [m]; ``numbers`` Float64: weights of all pixels and of a mask's pixel, how many are all (0: as many as are seen), and 1
-    over the grid's stride; ``silhouette``: of each pixel
-    there the edge's ends i and j, derivatives ci and cj, excess and share, as :func:`polysft_mi.pixels.outline` gives them, or None.
+    over the grid's stride; ``silhouette``: of each pixel there the edge's ends i and j, derivatives ci and cj, excess and share, as
+    :func:`polysft_mi.pixels.outline` gives them, or None.
     """
     weight, mask_weight, area, scale = (dr.gather(mi.Float64, numbers, k) for k in range(4))
     count = dr.sum(mi.Float64(dr.gather(mi.Float, figures, FIGURES * dr.arange(mi.UInt32, dr.width(figures) // FIGURES) + 1)))
@@ -147,26 +147,28 @@ def at_vertices(tables, table, figures, vertices, camera, numbers, silhouette):
     if silhouette is not None:
         pull, block = _silhouette(tables, silhouette, dr.width(vertex), dr.width(pair))
         rows = _projection(camera, vertices, vertex)
-        pull = [2 * mask_weight * scale / _UNIT * mi.Float64(dr.gather(mi.Int64, pull, 2 * vertex + k)) for k in range(2)]
+        pull, block = (lambda k, x=x: mi.Float64(mi.Int64(dr.gather(mi.UInt64, x, k))) / _UNIT for x in (pull, block))
+        pull = [2 * mask_weight * scale * pull(2 * vertex + k) for k in range(2)]
         gradient = [x + pull[0] * rows[0][k] + pull[1] * rows[1][k] for k, x in enumerate(gradient)]
-        second = [x + 2 * mask_weight * scale * scale / _UNIT * mi.Float64(dr.gather(mi.Int64, block, 4 * pair + k)) for k, x in enumerate(second)]
+        second = [x + 2 * mask_weight * scale * scale * block(4 * pair + k) for k, x in enumerate(second)]
     return Images(packed(gradient, vertex), packed(second, pair))
 
 
 def _silhouette(tables, silhouette, vertices, pairs):
-    """Sums over the silhouette's pixels: of excess c at the vertices, Int64 of 2N, and of share c c^T at the pairs of neighbours, Int64 of 4U, both
-    in ``_UNIT``."""
+    """Sums over the silhouette's pixels: of excess c at the vertices, 2N, and of share c c^T at the pairs of neighbours, 4U; both UInt64 that hold signed
+    numbers of 1 / ``_UNIT`` (unsigned ones are what every device can add up atomically)."""
     i, j, ci, cj, excess, share = silhouette
     swapped = i > j
     low, high = dr.select(swapped, j, i), dr.select(swapped, i, j)
-    (first, second), excess, share = (mi.Vector2d(dr.select(swapped, *x)) for x in ((cj, ci), (ci, cj))), mi.Float64(excess), mi.Float64(share)
-
+    first, second = (mi.Vector2d(dr.select(swapped, *x)) for x in ((cj, ci), (ci, cj)))
+    excess, share = mi.Float64(excess), mi.Float64(share)
     begin = dr.gather(mi.UInt32, tables.pair_start, low)
     across = dr.while_loop((begin,), lambda k: dr.gather(mi.UInt32, tables.j, k) < high, lambda k: (k + 1,), label="pair")[0]
-    pull, block = dr.zeros(mi.Int64, 2 * vertices), dr.zeros(mi.Int64, 4 * pairs)
+    pull, block = dr.zeros(mi.UInt64, 2 * vertices), dr.zeros(mi.UInt64, 4 * pairs)
 
     def scatter(target, value, index):
-        dr.scatter_add(target, mi.Int64(dr.round(_UNIT * dr.clip(value, -_MOST, _MOST))), index, mode=dr.ReduceMode.Local)
+        whole = mi.Int64(dr.round(_UNIT * dr.clip(value, -_MOST, _MOST)))
+        dr.scatter_add(target, mi.UInt64(whole), index, mode=dr.ReduceMode.Local)
 
     for at, c in ((low, first), (high, second)):
         own = dr.gather(mi.UInt32, tables.pair_start, at)  # the first pair of a vertex is itself
@@ -202,10 +204,10 @@ def in_unknowns(tables, images, vertices, camera, lengths, numbers, by_offset, b
     """Normal equations of the images, the edges and the triangles' residuals, in the unknowns of a jet patch.
 
     ``vertices`` Float64 of 3N [m]; ``lengths`` Float64 of E [m], ``numbers`` Float64: stiffness [1/m^2], give; ``by_offset`` Float64 of 9N, ``by_motion`` of
-    18N, ``basis`` of A N: of :class:`polysft_mi.normal_equations.Surface`; ``entry``: 0, 1, ... of A N, and ``size``: A, UInt32; ``triangles``: None, or Float64: r h of F, h of F and
-    derivatives of 9F, as :meth:`Assembly.normal` takes them. Returns Float64: energies of the edges without their weight (E), gradient (3N) in space; by
-    (Δu, Δv, Δw): gradient (3N), curvature (9U) of the pairs; with the motion, cross curvature (18N); and with the coefficients (3 of A N each); curvature of
-    positions and the motion (18N).
+    18N, ``basis`` of A N: of :class:`polysft_mi.normal_equations.Surface`; ``entry``: 0, 1, ... of A N, and ``size``: A, UInt32; ``triangles``: None, or
+    Float64: r h of F, h of F and derivatives of 9F, as :meth:`Assembly.normal` takes them. Returns Float64: energies of the edges without their weight (E), gradient
+    (3N) in space; by (Δu, Δv, Δw): gradient (3N), curvature (9U) of the pairs; with the motion, cross curvature (18N); and with the coefficients (3 of A N
+    each); curvature of positions and the motion (18N).
     """
     vertex, pair = dr.arange(mi.UInt32, dr.width(vertices) // 3), dr.arange(mi.UInt32, dr.width(tables.i))
     energy, edges = _edges(tables, vertices, lengths, numbers)
@@ -252,14 +254,14 @@ def in_unknowns(tables, images, vertices, camera, lengths, numbers, by_offset, b
     space = packed(space, pair)
     own = _rows(_numbers(by_offset, vertex, 9), 3)
 
-    def block(entry, of):  # (neighbour, 3 x 3) of one of a vertex's pairs
+    def places(entry):  # of the 3 x 3 of one of a vertex's pairs, row by row
         half = dr.gather(mi.UInt32, tables.half, entry)
-        number, flipped = half // 2, (half & 1) != 0
-        return dr.gather(mi.UInt32, tables.neighbour, entry), _rows([dr.gather(mi.Float64, of, 9 * number + dr.select(flipped, 3 * b + a, 3 * a + b)) for a in range(3) for b in range(3)], 3)
+        first, flipped = 9 * (half // 2), (half & 1) != 0
+        return [[first + dr.select(flipped, 3 * b + a, 3 * a + b) for b in range(3)] for a in range(3)]
 
     def motion(entry):
-        neighbour, h = block(entry, space)
-        m = _rows(_numbers(by_motion, neighbour, 18), 6)
+        m = _rows(_numbers(by_motion, dr.gather(mi.UInt32, tables.neighbour, entry), 18), 6)
+        h = [[dr.gather(mi.Float64, space, k) for k in row] for row in places(entry)]
         return [sum(row[k] * m[k][c] for k in range(3)) for row in h for c in range(6)]
 
     every = dr.arange(mi.UInt32, dr.width(tables.neighbour))
@@ -272,10 +274,8 @@ def in_unknowns(tables, images, vertices, camera, lengths, numbers, by_offset, b
     begin, end = (dr.gather(mi.UInt32, tables.neighbour_start, row + k) for k in (0, 1))
 
     def lift(k, *before):
-        half = dr.gather(mi.UInt32, tables.half, k)
-        number, flipped = half // 2, (half & 1) != 0
         value = dr.gather(mi.Float64, basis, dr.gather(mi.UInt32, tables.neighbour, k) * size + coefficient)
-        heights = [dr.gather(mi.Float64, local, 9 * number + dr.select(flipped, 6 + a, 3 * a + 2)) for a in range(3)]
+        heights = [dr.gather(mi.Float64, local, row[2]) for row in places(k)]
         return k + 1, *(x + h * value for x, h in zip(before, heights))
 
     zeros = (dr.zeros(mi.Float64, dr.width(basis)) for _ in range(3))
@@ -284,16 +284,18 @@ def in_unknowns(tables, images, vertices, camera, lengths, numbers, by_offset, b
 
 
 class Assembly:
-    """Normal equations of frames, of a mesh with the ``pattern`` (:class:`polysft_mi.normal_equations.Pattern`), seen by a ``camera`` (:class:`polysft_mi.pinhole.Pinhole`)."""
+    """Normal equations of frames, of a mesh with the ``pattern`` (:class:`polysft_mi.normal_equations.Pattern`), seen by a ``camera``
+    (:class:`polysft_mi.pinhole.Pinhole`)."""
 
     def __init__(self, pattern, camera):
         self.pattern, self.tables = pattern, Tables.of(pattern)
-        self._within, self._counted = {}, {}
+        self._within, self._counted = None, {}
         self._camera = _flat(np.concatenate([camera.inverse.ravel(), camera.origin]))
         self._at_vertices, self._in_unknowns = frozen(at_vertices), frozen(in_unknowns)
 
     def images(self, table, figures, vertices, weight, mask_weight, area, stride, silhouette):
-        """:class:`Images` of the triangles' sums and a silhouette: arguments as :func:`at_vertices` takes them; vertices (N, 3) [m], ``area`` or None."""
+        """:class:`Images` of the triangles' sums and a silhouette. Arguments as :func:`at_vertices` takes them; vertices (N, 3) [m]; ``area``: of the mask
+        [pixels of the grid], or None."""
         numbers = _flat([weight, mask_weight, area or 0, 1 / stride])
         return self._at_vertices(self.tables, table, figures, _flat(vertices), self._camera, numbers, silhouette)
 
@@ -337,7 +339,6 @@ class Assembly:
         normal = Normal(blocks, cross.reshape(-1, size + 6), glob, np.ascontiguousarray(along.reshape(-1, 3)[:, :d]), right)
         return normal, stiffness * float(energy.sum())
 
-
     def _entries(self, count):
         """0, 1, ... in memory: a kernel whose only arrays of a size are gathered from would keep the size that it was recorded with."""
         if count not in self._counted:
@@ -346,9 +347,9 @@ class Assembly:
 
     def _places(self, wide):
         """Where the blocks of the pattern are among those of one that holds it."""
-        if id(wide) not in self._within:
-            self._within[id(wide)] = wide.find(self.pattern.row, self.pattern.column)
-        return self._within[id(wide)]
+        if self._within is None or self._within[0] is not wide:
+            self._within = wide, wide.find(self.pattern.row, self.pattern.column)
+        return self._within[1]
 
 
 def _flat(array):
