@@ -1,5 +1,6 @@
 """Arrays and functions on the device that Dr.Jit computes on. Import only after a Mitsuba variant is set."""
 
+import contextlib
 import functools
 import gc
 
@@ -32,6 +33,20 @@ def frozen(function):
 
     call.recorded = recorded
     return call
+
+
+@contextlib.contextmanager
+def interruptible():
+    """Ctrl-C in the middle of a loop or a recording, which Dr.Jit makes a RuntimeError, is KeyboardInterrupt again."""
+    try:
+        yield
+    except RuntimeError as error:
+        cause = error
+        while cause is not None:
+            if isinstance(cause, KeyboardInterrupt):
+                raise KeyboardInterrupt from None
+            cause = cause.__cause__ or cause.__context__
+        raise
 
 
 def on_device(array, kind):

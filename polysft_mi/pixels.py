@@ -259,7 +259,8 @@ def outline(seen, pairs, mask, distance, corner_of):
     ``pairs``: of :meth:`RasterIntegrator.crossings`; ``mask``: an :class:`Image` whose texels are of one channel, as is ``distance`` (Float) to the mask's
     contour [pixels of the grid]; ``corner_of``: the template's vertex at each rendered one. Returns (alpha - mask)^2 - mask^2 of the region's pixels,
     and of each pair: the edge's ends (i, j) on the template, the derivatives ci and cj of the pixel's alpha by them [1/pixel of the grid],
-    alpha less mask, and the share of the squares' curvature that counts.
+    alpha less mask, and the share of the squares' curvature that counts: with it the curvature is that of the quadratic which has the term's slope here and its
+    minimum at the mask's contour. A step then goes all the way, where plain Gauss-Newton, whose residuals are pixels, would go one pixel.
     """
     x, y = places(seen)
     pixel, known = mask.at(x, y)

@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from . import objective
+from .device import interruptible
 from .errors import InputError
 from .patch import JetPatch
 from .pinhole import Pinhole
@@ -249,7 +250,8 @@ class Problem:
         unknowns = self.patch.rest()
         dr.enable_grad(unknowns)
         try:
-            self.evaluate([unknowns], [0], backward=True, seed=self.settings.seed)
+            with interruptible():
+                self.evaluate([unknowns], [0], backward=True, seed=self.settings.seed)
         except FloatingPointError:
             pass  # the image is to blame, which the tracker tells
         except RuntimeError as error:

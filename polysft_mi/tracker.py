@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from .device import interruptible
 from .errors import InputError
 from .files import aside, naming
 from .patch import Unknowns
@@ -81,7 +82,7 @@ def track(problem, solver, frames, out, *, resume=False, progress=None, solved=N
     checkpoint, log_path = os.path.join(out, CHECKPOINT), os.path.join(out, LOG)
     done = Track.load(checkpoint) if resume and os.path.exists(checkpoint) else Track()
     _trim_log(log_path, done.next_window)
-    with naming(log_path), open(log_path, "a", encoding="utf-8") as log:
+    with interruptible(), naming(log_path), open(log_path, "a", encoding="utf-8") as log:
         for start in range(done.next_window, frames - width + 1):
             _advance(problem, solver, done, start, width, log, progress)
             log.flush()
@@ -89,7 +90,8 @@ def track(problem, solver, frames, out, *, resume=False, progress=None, solved=N
             if solved:
                 solved(start, problem.surface(Unknowns.from_numpy(done.states[start])))
     if hasattr(solver, "revisit") and len(done.totals) == frames and not done.finished:
-        _look_back(problem, solver, done)
+        with interruptible():
+            _look_back(problem, solver, done)
         done.finished = True
         done.save(checkpoint)
     return done

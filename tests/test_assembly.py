@@ -13,12 +13,14 @@ import synthetic
 from problems import dense, grid_template, problem_of
 from scipy.spatial.transform import Rotation
 
-from polysft_mi import pixels
+from polysft_mi import pixels, solvers
 from polysft_mi.assembly import Assembly
-from polysft_mi.device import on_device
+from polysft_mi.device import frozen, interruptible, on_device
 from polysft_mi.normal_equations import Chart, Pattern, State, hinges
 from polysft_mi.pyramid import Level
+from polysft_mi.raster import RasterIntegrator
 from polysft_mi.registration import Registration
+from polysft_mi.tracker import Track, track
 
 LEVEL = Level(1.0, 1, 8.0)
 
@@ -234,3 +236,39 @@ def test_arrays_reach_the_device_as_copies(kind):
         found = on_device(values[:, 0], getattr(mi, kind))
         values[:] = -1
         assert np.array_equal(np.array(found), np.arange(40)[start:] * 3) and isinstance(found, getattr(mi, kind))
+
+
+@pytest.mark.parametrize("where", ["loop", "record"])
+@pytest.mark.parametrize("kind", [KeyboardInterrupt, ZeroDivisionError])
+def test_ctrl_c_in_the_middle_of_a_loop_or_a_recording(where, kind):
+    """Dr.Jit makes a RuntimeError of whatever is raised there."""
+
+    def stop(*_):
+        raise kind
+
+    def work():
+        if where == "loop":
+            dr.while_loop((mi.Float([1.0, 2.0]),), lambda x: x < 3, stop)
+        else:
+            frozen(stop)(mi.Float([1.0, 2.0]))
+
+    with pytest.raises(KeyboardInterrupt if kind is KeyboardInterrupt else RuntimeError), interruptible():
+        work()
+    assert np.array_equal(np.array(frozen(lambda x: x + 1)(mi.Float([1.0, 2.0]))), [2, 3])  # what comes after works
+
+
+def test_ctrl_c_in_the_middle_of_an_evaluation_ends_the_track_as_anywhere(problem, tmp_path, monkeypatch):
+    solver, solved, original = solvers.create(problem.settings), [], RasterIntegrator.crossings
+
+    def crossings(self, view, outline=False):
+        if len(solved) == 2:
+            return dr.while_loop((mi.Float([1.0]),), lambda x: x < 3, stop)
+        return original(self, view, outline)
+
+    def stop(x):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(RasterIntegrator, "crossings", crossings)
+    with pytest.raises(KeyboardInterrupt):
+        track(problem, solver, 3, str(tmp_path), solved=lambda frame, vertices: solved.append(frame))
+    assert len(Track.load(str(tmp_path / "checkpoint.npz")).states) == 2
