@@ -269,7 +269,7 @@ def in_unknowns(tables, images, vertices, camera, lengths, numbers, by_offset, b
     by_all = [sum(own[k][a] * moved[6 * k + c] for k in range(3)) for a in range(3) for c in range(6)]
     along = [sum(own[k][a] * gradient[k] for k in range(3)) for a in range(3)]
 
-    row = entry // size
+    row = entry // size  # an argument, in memory: this kernel's size is that of what it reads elementwise
     coefficient = entry - row * size
     begin, end = (dr.gather(mi.UInt32, tables.neighbour_start, row + k) for k in (0, 1))
 
@@ -289,7 +289,7 @@ class Assembly:
 
     def __init__(self, pattern, camera):
         self.pattern, self.tables = pattern, Tables.of(pattern)
-        self._within, self._counted = None, {}
+        self._within = None
         self._camera = _flat(np.concatenate([camera.inverse.ravel(), camera.origin]))
         self._at_vertices, self._in_unknowns = frozen(at_vertices), frozen(in_unknowns)
 
@@ -316,7 +316,7 @@ class Assembly:
             triangles = tuple(_flat(x) for x in (residual * factor, factor, by_corner))
         found = self._in_unknowns(
             self.tables, images, _flat(surface.vertices), self._camera, _flat(lengths), _flat([stiffness, give]),
-            _flat(surface.by_offset), _flat(surface.by_motion), _flat(basis), self._entries(basis.size), dr.opaque(mi.UInt32, size), triangles,
+            _flat(surface.by_offset), _flat(surface.by_motion), _flat(basis), dr.arange(mi.UInt32, basis.size), dr.opaque(mi.UInt32, size), triangles,
         )  # fmt: skip
         energy, gradient, along, local, by_motion, *lifted, moved = (np.array(x) for x in found)
         gradient, by_motion = gradient.reshape(-1, 3), by_motion.reshape(-1, 3, 6)
@@ -338,12 +338,6 @@ class Assembly:
         right = np.concatenate([basis.T @ (gradient @ surface.up), np.einsum("nk,nkm->m", gradient, surface.by_motion)])
         normal = Normal(blocks, cross.reshape(-1, size + 6), glob, np.ascontiguousarray(along.reshape(-1, 3)[:, :d]), right)
         return normal, stiffness * float(energy.sum())
-
-    def _entries(self, count):
-        """0, 1, ... in memory: a kernel whose only arrays of a size are gathered from would keep the size that it was recorded with."""
-        if count not in self._counted:
-            self._counted[count] = on_device(np.arange(count), mi.UInt32)
-        return self._counted[count]
 
     def _places(self, wide):
         """Where the blocks of the pattern are among those of one that holds it."""

@@ -1,6 +1,7 @@
 """Sums on the device: pixels to triangles, triangles to vertices, vertices to unknowns, each against a slow sum on the host."""
 
 import dataclasses
+import gc
 import itertools
 import math
 from types import SimpleNamespace
@@ -17,7 +18,7 @@ from polysft_mi import pixels, solvers
 from polysft_mi.assembly import Assembly
 from polysft_mi.device import frozen, interruptible, on_device
 from polysft_mi.normal_equations import Chart, Pattern, State, hinges
-from polysft_mi.pyramid import Level
+from polysft_mi.pyramid import FARTHEST, Level
 from polysft_mi.raster import RasterIntegrator
 from polysft_mi.registration import Registration
 from polysft_mi.tracker import Track, track
@@ -117,6 +118,30 @@ def test_pixels_of_a_silhouette_pull_alike_in_every_run(problem):
     for name in ("gradient", "second"):
         first, *others = (np.array(getattr(x, name)) for x in runs)
         assert np.abs(first).max() > 0 and all(np.array_equal(first, x) for x in others)
+
+
+@pytest.mark.parametrize("shift", [3.0, 8.0, 16.0])
+def test_a_silhouettes_step_goes_far(problem, shift):
+    """Beside its mask, a sheet is moved back by half of what it is off, or more; plain Gauss-Newton would go one pixel."""
+    known = Registration(problem)
+    pixel = problem.template.vertices[:, 2:].mean() / known.camera.intrinsics().fx * np.array([1.0, 0, 0])  # one to the right
+    vertices = problem.template.vertices + shift * pixel
+    images = known.evaluate(vertices, 0, Level(1.0), 1e-6).images  # at this scale no texture pulls
+    slope = (np.array(images.gradient).reshape(-1, 3) @ pixel).sum()
+    second, (i, j) = np.array(images.second).reshape(-1, 2, 2)[:, 0, 0], (np.array(x) for x in (known.assembly.tables.i, known.assembly.tables.j))
+    curvature = second[i == j].sum() + 2 * second[i != j].sum()
+    assert 0.4 * shift < slope / curvature < 1.1 * shift
+
+
+def test_beyond_the_surroundings_of_the_mask_a_silhouette_is_as_far_as_counts(problem):
+    known, mask = Registration(problem), pixels.Image.of(on_device(np.zeros(400), mi.Float), (20, 20), (2, 3))
+    with dr.suspend_grad():
+        view = known._look(problem.template.vertices, LEVEL)
+        crossings, distance = known.raster.crossings(view, outline=True), on_device(np.full(400, 2.0), mi.Float)
+        _, (*_, ci, cj, excess, share) = pixels.outline(view.seen(), crossings, mask, distance, known._corner_of)
+    assert int(view.region[0][0]) > 2 + 20
+    slope = np.linalg.norm(np.array(ci + cj), axis=0)
+    assert np.allclose(np.array(share), 1 / np.maximum(1, FARTHEST * slope), rtol=1e-5) and (np.array(share) < 0.1).any()
 
 
 # -- from triangles to unknowns ----------------------------------------------
@@ -272,3 +297,14 @@ def test_ctrl_c_in_the_middle_of_an_evaluation_ends_the_track_as_anywhere(proble
     with pytest.raises(KeyboardInterrupt):
         track(problem, solver, 3, str(tmp_path), solved=lambda frame, vertices: solved.append(frame))
     assert len(Track.load(str(tmp_path / "checkpoint.npz")).states) == 2
+
+
+def test_nothing_is_collected_while_a_function_is_recorded():
+    state = SimpleNamespace(collecting=None)
+
+    def work(x):
+        state.collecting = gc.isenabled()
+        return x + 1
+
+    frozen(work)(mi.Float([1.0, 2.0]))
+    assert state.collecting is False and gc.isenabled()
