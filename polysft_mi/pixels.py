@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .pyramid import FARTHEST
-from .raster import blend
+from .raster import blend, point2
 
 MISFIT = 0.5  # residual, in local standard deviations, that counts half a misfit
 CORNERS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # pairs of a triangle's corners, as their curvatures are summed
@@ -23,7 +23,8 @@ _LONGEST_FOOTPRINT = 12.0  # of a pixel, beyond which it is cut [pixels of the f
 
 @dataclass
 class Image:
-    """An image of 4 packed channels: ``texels`` Float of 4 w h, ``width``, ``height``, and (``x``, ``y``), the pixel of the grid that is its first; opaque."""
+    """An image of one channel or of 4 packed ones: ``texels`` Float of w h or 4 w h, ``width`` and ``height`` [pixels], and (``x``, ``y``), the pixel of the
+    grid that is its first; opaque."""
 
     texels: mi.Float
     width: mi.Int32
@@ -33,7 +34,7 @@ class Image:
 
     @classmethod
     def of(cls, texels, shape, corner=(0, 0)):
-        """From packed ``texels``, the ``shape`` (h, w) and the first pixel's place ``corner`` (x, y)."""
+        """From ``texels``, the ``shape`` (h, w) and the first pixel's place ``corner`` (x, y) on the grid."""
         return cls(texels, *(dr.opaque(mi.Int32, int(k)) for k in (shape[1], shape[0], *corner)))
 
     def at(self, x, y):
@@ -42,7 +43,7 @@ class Image:
         return mi.UInt32(y * self.width + x), (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
 
     def bilinear(self, at, active):
-        """The image at a place (pixels, whole at their centres), and its derivatives by that."""
+        """The image of 4 channels at a place [pixels, whole at their centres], and its derivatives by x and y [1/pixel]: Vector4f each."""
         row = mi.UInt32(self.width)
         x = dr.clip(at.x, 0, mi.Float(self.width) - 1.001)
         y = dr.clip(at.y, 0, mi.Float(self.height) - 1.001)
@@ -270,7 +271,7 @@ def outline(seen, pairs, mask, distance, corner_of):
     alpha = mi.Float64(alpha)
     dr.eval(alpha, wanted, pixel, known)  # in one kernel, which reads what pixels see
     va, vb, near, far, horizontal = pairs
-    ea, eb = (mi.Point2f(*(mi.Float(dr.gather(mi.Float64, x, i)) for x in (seen.screen.x, seen.screen.y))) for i in (va, vb))
+    ea, eb = point2(seen.screen, va), point2(seen.screen, vb)
     with dr.resume_grad():
         dr.enable_grad(ea, eb)
         to, other, weight, _ = blend(seen, ea, eb, near, far, horizontal)

@@ -347,7 +347,7 @@ class RasterIntegrator(mi.SamplingIntegrator):
         if pairs is None:
             return rgba
         va, vb, near, far, horizontal = pairs
-        ea, eb = _point2(view.screen, va), _point2(view.screen, vb)
+        ea, eb = point2(view.screen, va), point2(view.screen, vb)
         target, other, weight, place = blend(view, ea, eb, near, far, horizontal)
 
         # The colour that comes in is the other sheet's where the edge crosses, not at the other pixel's centre: so the image stays
@@ -378,7 +378,7 @@ class RasterIntegrator(mi.SamplingIntegrator):
         found2, va2, vb2, _ = self._walk(topology, screen, triangle, far, near, x0, y0, w, again)
         near, far = dr.select(found2, far, near), dr.select(found2, near, far)
         va, vb, found = dr.select(found2, va2, va), dr.select(found2, vb2, vb), found | found2
-        edge = _point2(screen, vb, found) - _point2(screen, va, found)
+        edge = point2(screen, vb, found) - point2(screen, va, found)
         return found & (dr.select(horizontal, edge.y, edge.x) != 0), va, vb, near, far
 
     def _walk(self, topology, screen, triangle, start, end, x0, y0, w, active):
@@ -514,6 +514,6 @@ def _gather_point(positions, index, mask=True):
     return mi.Point3f(dr.gather(mi.Point3d, positions, index, mask))
 
 
-def _point2(screen, index, mask=True):
+def point2(screen, index, mask=True):
     """Screen positions of the vertices ``index``, attached to ``screen``."""
     return mi.Point2f(*(mi.Float(dr.gather(mi.Float64, x, index, mask)) for x in (screen.x, screen.y)))

@@ -331,20 +331,20 @@ class Registration:
         """:class:`Evaluation` of the surface with vertices (N, 3) [m, world] against a frame, at a level, under the robust ``scale``; the
         frame has the ``appearance``'s excess.
         """
-        s, at = self.problem.settings, self._frame_level(frame, level)
+        s, shown = self.problem.settings, self._frame_level(frame, level)
         with dr.suspend_grad():
             view = self._look(vertices, level)
             table, figures = self._sums(*self._compared(view, frame, level, appearance), dr.opaque(mi.Float, scale))
-            masked, error, pairs = s.k_silhouette > 0 and at.mask is not None, None, None
+            masked, error, pairs = s.k_silhouette > 0 and shown.mask is not None, None, None
             if masked:
                 crossings = self.raster.crossings(view, outline=True)  # where a sheet passes before the sheet itself, alpha does not change
-                error, pairs = self._outline(view.seen(), crossings, at.mask, at.distance, self._corner_of)
-            mask_weight = _SILHOUETTE * s.k_silhouette / at.area if masked else 0.0
-            images = self.assembly.images(table, figures, vertices, s.k_rgb, mask_weight, at.area, level.stride, pairs)
+                error, pairs = self._outline(view.seen(), crossings, shown.mask, shown.distance, self._corner_of)
+            mask_weight = _SILHOUETTE * s.k_silhouette / shown.area if masked else 0.0
+            images = self.assembly.images(table, figures, vertices, s.k_rgb, mask_weight, shown.area, level.stride, pairs)
             figures = np.array(figures).reshape(-1, pixels.FIGURES).astype(np.float64)  # waits for the device: all that it has to do is known
             energy, count, outlying, misfit = figures.sum(0).tolist()
-            weight = s.k_rgb / (at.area or max(count, 1.0))
+            weight = s.k_rgb / (shown.area or max(count, 1.0))
             # the mask's squares are of the whole frame, the errors, less these, of the region
-            silhouette = mask_weight * (at.squares + float(np.array(error).sum(dtype=np.float64))) if masked else 0.0
+            silhouette = mask_weight * (shown.squares + float(np.array(error).sum(dtype=np.float64))) if masked else 0.0
         outlying, misfit = (outlying / count, misfit / count) if count else (1.0, 1.0)
         return Evaluation(weight * energy, silhouette, outlying, misfit, images, count * level.stride**2, figures[:, 1] * level.stride**2)
