@@ -1,7 +1,9 @@
-"""``python benchmarks/factorisation.py``: ways to factorise the tracker's sparse uv block with all its right-hand sides, in milliseconds.
+"""``python benchmarks/factorisation.py``: ways to factorise the tracker's sparse uv block with all
+its right-hand sides, in milliseconds.
 
-The matrix is that of a sheet's grid (``--grid`` vertices a side) with the tracker's own pattern: residuals between neighbours, 2 unknowns
-a vertex, and ``--columns`` right-hand sides (the global unknowns and the gradient). Libraries that are not installed are left out.
+The matrix is that of a sheet's grid (``--grid`` vertices a side) with the tracker's own pattern:
+residuals between neighbours, 2 unknowns a vertex, and ``--columns`` right-hand sides (the global
+unknowns and the gradient). Libraries that are not installed are left out.
 """
 
 import argparse
@@ -25,14 +27,18 @@ def grid(side):
     k = np.arange(side * side).reshape(side, side)
     a, b, c, d = (x.ravel() for x in (k[:-1, :-1], k[:-1, 1:], k[1:, :-1], k[1:, 1:]))
     faces = np.stack([a, b, c, b, d, c], 1).reshape(-1, 3)
-    return faces, np.unique(np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1), axis=0)
+    return faces, np.unique(
+        np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1), axis=0
+    )
 
 
 def system(pattern, rng):
     """Positive definite blocks (B, 2, 2) of residuals between neighbours."""
     i, j = pattern.edges.T
     a, b = rng.normal(size=(2, len(i), 2))
-    at = np.concatenate([pattern.find(i, i), pattern.find(j, j), pattern.find(i, j), pattern.find(j, i)])
+    at = np.concatenate(
+        [pattern.find(i, i), pattern.find(j, j), pattern.find(i, j), pattern.find(j, i)]
+    )
     outer = lambda x, y: x[:, :, None] * y[:, None]
     blocks = np.zeros((len(pattern.row), 2, 2))
     np.add.at(blocks, at, np.concatenate([outer(a, a), outer(b, b), outer(a, b), outer(b, a)]))
@@ -49,12 +55,17 @@ def seconds(run, repeats):
 
 
 def main():
-    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     p.add_argument("--grid", type=int, nargs="*", default=[33, 60, 100])
     p.add_argument("--columns", type=int, nargs="*", default=[22, 73])
     p.add_argument("--repeats", type=int, default=5)
     options = p.parse_args()
-    print("| vertices | right-hand sides | ours: block tridiagonal, LAPACK | SciPy banded | SuperLU | cholespy (CHOLMOD) | qdldl |")
+    print(
+        "| vertices | right-hand sides | ours: block tridiagonal, LAPACK | SciPy banded | SuperLU |"
+        " cholespy (CHOLMOD) | qdldl |"
+    )
     print("|---|---|---|---|---|---|---|")
     for side in options.grid:
         pattern = Pattern(*grid(side), side * side)
@@ -66,8 +77,16 @@ def main():
         for columns in options.columns:
             right = rng.normal(size=(n, columns))
             cells = [seconds(lambda: blocks.eliminate(values, right), options.repeats)]
-            cells += [other(matrix, right, blocks, options.repeats) for other in (banded, superlu, cholespy, qdldl)]
-            print(f"| {side * side} | {columns} | " + " | ".join("–" if c is None else f"{1e3 * c:.1f}" for c in cells) + " |", flush=True)
+            cells += [
+                other(matrix, right, blocks, options.repeats)
+                for other in (banded, superlu, cholespy, qdldl)
+            ]
+            print(
+                f"| {side * side} | {columns} | "
+                + " | ".join("–" if c is None else f"{1e3 * c:.1f}" for c in cells)
+                + " |",
+                flush=True,
+            )
 
 
 def banded(matrix, right, blocks, repeats):
@@ -79,13 +98,19 @@ def banded(matrix, right, blocks, repeats):
     def run():
         table = np.zeros((width + 1, m.shape[0]))
         table[(m.row - m.col)[low], m.col[low]] = m.data[low]
-        return scipy.linalg.cho_solve_banded((scipy.linalg.cholesky_banded(table, lower=True), True), right[order])
+        return scipy.linalg.cho_solve_banded(
+            (scipy.linalg.cholesky_banded(table, lower=True), True), right[order]
+        )
 
     return seconds(run, repeats)
 
 
 def superlu(matrix, right, blocks, repeats):
-    options = {"permc_spec": "MMD_AT_PLUS_A", "options": {"SymmetricMode": True}, "diag_pivot_thresh": 0.0}
+    options = {
+        "permc_spec": "MMD_AT_PLUS_A",
+        "options": {"SymmetricMode": True},
+        "diag_pivot_thresh": 0.0,
+    }
     return seconds(lambda: scipy.sparse.linalg.splu(matrix, **options).solve(right), repeats)
 
 
@@ -97,7 +122,12 @@ def cholespy(matrix, right, blocks, repeats):
     m = matrix.tocoo()
     out = np.zeros_like(right)
     rows, columns = m.row.astype(np.int32), m.col.astype(np.int32)
-    return seconds(lambda: CholeskySolverD(m.shape[0], rows, columns, m.data, MatrixType.COO).solve(right, out), repeats)
+    return seconds(
+        lambda: CholeskySolverD(m.shape[0], rows, columns, m.data, MatrixType.COO).solve(
+            right, out
+        ),
+        repeats,
+    )
 
 
 def qdldl(matrix, right, blocks, repeats):

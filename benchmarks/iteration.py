@@ -1,7 +1,9 @@
-"""``python benchmarks/iteration.py [scene.xml]``: the parts of an iteration of the tracker, in milliseconds, and what the one whose kernels are recorded
-(``dr.freeze``) would take if they were traced anew each time, in turns.
+"""``python benchmarks/iteration.py [scene.xml]``: the parts of an iteration of the tracker, in
+milliseconds, and what the one whose kernels are recorded (``dr.freeze``) would take if they were
+traced anew each time, in turns.
 
-The template as the scene has it, moved a little, in the video's second frame, at the last stage and the lowest order. Each time is a median.
+The template as the scene has it, moved a little, in the video's second frame, at the last stage and
+the lowest order. Each time is a median.
 """
 
 import argparse
@@ -16,9 +18,18 @@ sys.path.insert(0, str(ROOT))
 
 
 def main(arguments=None):
-    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     p.add_argument("scene", nargs="?", default=str(ROOT / "scenes" / "demo.xml"))
-    p.add_argument("-D", dest="defines", metavar="NAME=VALUE", action="append", default=[], help="the scene's defaults, as for polysft_mi.run")
+    p.add_argument(
+        "-D",
+        dest="defines",
+        metavar="NAME=VALUE",
+        action="append",
+        default=[],
+        help="the scene's defaults, as for polysft_mi.run",
+    )
     p.add_argument("--turns", type=int, default=30)
     options = p.parse_args(arguments)
 
@@ -44,11 +55,25 @@ def measured(path, overrides, turns):
 
     experiment = scene.load(path, {**overrides, "solver": "gauss-newton"})
     s = experiment.settings
-    problem = Problem(experiment, Sequence.open(experiment.frames, experiment.masks, first=s.first, last=s.last, stride=s.stride, size=experiment.size))
+    problem = Problem(
+        experiment,
+        Sequence.open(
+            experiment.frames,
+            experiment.masks,
+            first=s.first,
+            last=s.last,
+            stride=s.stride,
+            size=experiment.size,
+        ),
+    )
     solver = solvers.create(s)
     solver._prepare(problem)
     known, chart, stage, order = solver.registration, solver.chart, STAGES[-1], solver.least
-    level, system, assembly = solver.levels[stage], solver.systems[3 if solver._has_relief else 2], known.assembly
+    level, system, assembly = (
+        solver.levels[stage],
+        solver.systems[3 if solver._has_relief else 2],
+        known.assembly,
+    )
     rest = chart.state(problem.patch.rest().to_numpy())
     rest.translation += 0.005
     surface = chart.surface(rest, order)
@@ -56,10 +81,17 @@ def measured(path, overrides, turns):
     at = known._frame_level(1, level)
     with dr.suspend_grad():
         view = known._look(vertices, level)
-        given = *known._compared(view, 1, level, known.appearance(vertices, level)), dr.opaque(mi.Float, 0.3)
+        given = (
+            *known._compared(view, 1, level, known.appearance(vertices, level)),
+            dr.opaque(mi.Float, 0.3),
+        )
         table, figures = known._sums(*given)
         crossings = known.raster.crossings(view, outline=True)
-        outline = (view.seen(), crossings, at.mask, at.distance, known._corner_of) if at.mask is not None else None
+        outline = (
+            (view.seen(), crossings, at.mask, at.distance, known._corner_of)
+            if at.mask is not None
+            else None
+        )
         pairs = known._outline(*outline)[1] if outline else None
         sums = table, figures, vertices, 1.0, 1.0, at.area, level.stride, pairs
         images = assembly.images(*sums)
@@ -83,7 +115,11 @@ def measured(path, overrides, turns):
         "surface of the unknowns": lambda: chart.surface(rest, order),
         "visibility: the mesh put into the scene, a ray a pixel": look,
         "residuals, derivatives, sums over triangles": lambda: dr.eval(known._sums(*given)),
-        "silhouette": lambda: known.raster.crossings(view, outline=True) and outline and dr.eval(known._outline(*outline)),
+        "silhouette": lambda: (
+            known.raster.crossings(view, outline=True)
+            and outline
+            and dr.eval(known._outline(*outline))
+        ),
         "sums at the vertices": lambda: dr.eval(assembly.images(*sums)),
         "normal equations": equations,
         "normal equations, traced": traced,

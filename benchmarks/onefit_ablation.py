@@ -1,9 +1,11 @@
-"""What each loss is for: a network trained on one garment with all losses, and without one of them after the other (the paper's ablation).
+"""What each loss is for: a network trained on one garment with all losses, and without one of them
+after the other (the paper's ablation).
 
     python benchmarks/onefit_ablation.py -o RUNS [--garment tank] [--epoch-steps 30]
 
-Each training has twelve epochs, ten at the full rate; a run that RUNS holds already is not made again. Measured as by onefit_accuracy.py,
-without post-processing and without ease: what the network alone makes.
+Each training has twelve epochs, ten at the full rate; a run that RUNS holds already is not made
+again. Measured as by onefit_accuracy.py, without post-processing and without ease: what the network
+alone makes.
 """
 
 import argparse
@@ -30,7 +32,10 @@ CASES = {
 
 
 def line(case, found):
-    return f"| {case} | {found['collision']:.2f} | {found['edge']:.1f} | {found['area']:.1f} | {found['energy']:.3f} |"
+    return (
+        f"| {case} | {found['collision']:.2f} | {found['edge']:.1f} | {found['area']:.1f} |"
+        f" {found['energy']:.3f} |"
+    )
 
 
 def main(argv=None):
@@ -46,13 +51,30 @@ def main(argv=None):
     for case in args.cases:
         folder = Path(args.output) / case.replace(" ", "-")
         weights = Weights(**CASES[case])
-        settings = train.Settings(garments=(args.garment,), batch=args.batch, epochs=12, epoch_steps=args.epoch_steps, weights=weights)
+        settings = train.Settings(
+            garments=(args.garment,),
+            batch=args.batch,
+            epochs=12,
+            epoch_steps=args.epoch_steps,
+            weights=weights,
+        )
         if not (folder / "weights.safetensors").exists():
-            train.train(settings, folder, resume=(folder / "checkpoint.safetensors").exists(), command="benchmarks/onefit_ablation.py")
+            train.train(
+                settings,
+                folder,
+                resume=(folder / "checkpoint.safetensors").exists(),
+                command="benchmarks/onefit_ablation.py",
+            )
         draper = onefit.load(folder / "weights.safetensors")
         garment = draper.garment(args.garment)
         if case == args.cases[0]:
-            print(line("plain skinning", accuracy.row(draper, garment, args.seconds, 4, skinning_only=True)), flush=True)
+            print(
+                line(
+                    "plain skinning",
+                    accuracy.row(draper, garment, args.seconds, 4, skinning_only=True),
+                ),
+                flush=True,
+            )
         print(line(case, accuracy.row(draper, garment, args.seconds, 4, eased=False)), flush=True)
     return 0
 

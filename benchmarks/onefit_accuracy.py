@@ -1,10 +1,13 @@
-"""Collisions, changes of size, energy and jitter of drapes, on motions and body shapes that no network was trained on.
+"""Collisions, changes of size, energy and jitter of drapes, on motions and body shapes that no
+network was trained on.
 
     python benchmarks/onefit_accuracy.py                       # the six garments by the networks of the package, and by skinning
-    python benchmarks/onefit_accuracy.py --garments jumpsuit shirt.obj --weights six-garments runs/mine/weights.safetensors
+    python benchmarks/onefit_accuracy.py --garments jumpsuit shirt.obj --weights six-garments
+    runs/mine/weights.safetensors
 
-Every garment is draped in each held-out kind of motion, on bodies drawn at random with a seed that training does not use, and on the
-standard one. ``skinning`` is plain skinning of the template, the baseline; ``+ post`` pushes vertices out of the body after draping.
+Every garment is draped in each held-out kind of motion, on bodies drawn at random with a seed that
+training does not use, and on the standard one. ``skinning`` is plain skinning of the template, the
+baseline; ``+ post`` pushes vertices out of the body after draping.
 """
 
 import argparse
@@ -23,7 +26,9 @@ SEED = 1_000_000  # of shapes and motions, see onefit.generate.HELD_OUT_SEEDS
 
 
 def drapes(draper, garment, seconds, shapes, seed=SEED, **options):
-    """Drapes of ``garment`` in every held-out motion, on as many bodies as ``shapes`` says and the standard one, in turn."""
+    """Drapes of ``garment`` in every held-out motion, on as many bodies as ``shapes`` says and the
+    standard one, in turn.
+    """
     rng = np.random.default_rng(seed)
     bodies = [None] + [draper.model.random_shape(rng) for _ in range(shapes)]
     for k, kind in enumerate(generate.HELD_OUT):
@@ -40,23 +45,46 @@ def row(draper, garment, seconds, shapes, **options):
     return mean(drape.measures() for drape in drapes(draper, garment, seconds, shapes, **options))
 
 
-HEAD = "| garment | network | ε_c % | ε_c % + post | ε_e % | ε_a % | energy J | jitter mm |\n|---|---|---|---|---|---|---|---|"
+HEAD = (
+    "| garment | network | ε_c % | ε_c % + post | ε_e % | ε_a % | energy J | jitter mm"
+    " |\n|---|---|---|---|---|---|---|---|"
+)
 
 
 def line(garment, network, plain, post):
     cells = [f"{plain['collision']:.2f}", "" if post is None else f"{post['collision']:.3f}"]
-    cells += [f"{plain['edge']:.1f}", f"{plain['area']:.1f}", f"{plain['energy']:.3f}", f"{plain['jitter']:.2f}"]
+    cells += [
+        f"{plain['edge']:.1f}",
+        f"{plain['area']:.1f}",
+        f"{plain['energy']:.3f}",
+        f"{plain['jitter']:.2f}",
+    ]
     return f"| {garment} | {network} | " + " | ".join(cells) + " |"
 
 
 def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--garments", nargs="+", default=list(STANDARD), help="templates or meshes")
-    parser.add_argument("--weights", nargs="+", default=list(onefit.pretrained()), help="networks of the package, or files")
+    parser.add_argument(
+        "--weights",
+        nargs="+",
+        default=list(onefit.pretrained()),
+        help="networks of the package, or files",
+    )
     parser.add_argument("--seconds", type=float, default=3.0, help="of each motion (default: 3)")
-    parser.add_argument("--shapes", type=int, default=4, help="random bodies beside the standard one (default: 4)")
-    parser.add_argument("--no-post", action="store_true", help="without the column of post-processing, which takes most of the time")
-    parser.add_argument("--no-ease", action="store_true", help="what the networks alone make, without the garments' ease")
+    parser.add_argument(
+        "--shapes", type=int, default=4, help="random bodies beside the standard one (default: 4)"
+    )
+    parser.add_argument(
+        "--no-post",
+        action="store_true",
+        help="without the column of post-processing, which takes most of the time",
+    )
+    parser.add_argument(
+        "--no-ease",
+        action="store_true",
+        help="what the networks alone make, without the garments' ease",
+    )
     parser.add_argument("-o", "--output", help="a JSON file of the figures")
     args = parser.parse_args(argv)
     drapers = {name: onefit.load(name) for name in args.weights}
@@ -65,10 +93,16 @@ def main(argv=None):
     for name in args.garments:
         first = next(iter(drapers.values()))
         garment = first.garment(name)
-        rows = [("skinning", first, dict(skinning_only=True))] + [(key, draper, dict(eased=not args.no_ease)) for key, draper in drapers.items()]
+        rows = [("skinning", first, dict(skinning_only=True))] + [
+            (key, draper, dict(eased=not args.no_ease)) for key, draper in drapers.items()
+        ]
         for network, draper, options in rows:
             plain = row(draper, garment, args.seconds, args.shapes, **options)
-            post = None if args.no_post else row(draper, garment, args.seconds, args.shapes, post=True, **options)
+            post = (
+                None
+                if args.no_post
+                else row(draper, garment, args.seconds, args.shapes, post=True, **options)
+            )
             print(line(garment.name, network, plain, post), flush=True)
             found.append(dict(garment=garment.name, network=network, plain=plain, post=post))
     if args.output:

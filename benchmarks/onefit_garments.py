@@ -4,14 +4,19 @@
 
 For the eight templates, and for the garment files given, it prints
 
-- the mesh: vertices, faces, openings, area, median edge, smallest angle, distance from the standard body;
-- stretch: the longest of an edge when the left shoulder and hip turn by 40 degrees, with weights smoothed (as they are);
-- skinned: vertices inside the body, %, in four frames of each kind of motion that networks are trained on, plain skinning;
-- graded: vertices inside the body, %, over random shapes, the deepest [mm], and milliseconds for each;
-- back: the distance [mm], mean and largest, from where a template was, when it is graded to random shapes, put into the T-pose and read
-  back with ``made_for``;
+- the mesh: vertices, faces, openings, area, median edge, smallest angle, distance from the standard
+  body;
+- stretch: the longest of an edge when the left shoulder and hip turn by 40 degrees, with weights
+  smoothed (as they are);
+- skinned: vertices inside the body, %, in four frames of each kind of motion that networks are
+  trained on, plain skinning;
+- graded: vertices inside the body, %, over random shapes, the deepest [mm], and milliseconds for
+  each;
+- back: the distance [mm], mean and largest, from where a template was, when it is graded to random
+  shapes, put into the T-pose and read back with ``made_for``;
 
-and the grading to a body of another topology against that of the same body. Writes ``onefit_garments.json``.
+and the grading to a body of another topology against that of the same body. Writes
+``onefit_garments.json``.
 """
 
 import argparse
@@ -48,7 +53,17 @@ def mesh_figures(garment):
     V, F = garment.vertices.double().numpy(), garment.faces.numpy()
     side = np.roll(V[F], -1, axis=1) - V[F]
     length = np.linalg.norm(side, axis=2)
-    angle = np.degrees(np.arccos(np.clip(-(side * np.roll(side, 1, axis=1)).sum(axis=2) / length / np.roll(length, 1, axis=1), -1, 1)))
+    angle = np.degrees(
+        np.arccos(
+            np.clip(
+                -(side * np.roll(side, 1, axis=1)).sum(axis=2)
+                / length
+                / np.roll(length, 1, axis=1),
+                -1,
+                1,
+            )
+        )
+    )
     d = 1e3 * standard_surface()(V).distance
     return {
         "vertices": len(V), "faces": len(F), "openings": len(loops(F)), "area": mesh.areas(V, F).sum(),
@@ -64,11 +79,15 @@ def stretch(garment):
     for turn in np.radians(40) * np.concatenate([np.eye(3), -np.eye(3)]):
         pose = body.rest_pose.clone()
         for j in (skeleton.INDEX["left_shoulder"], skeleton.INDEX["left_hip"]):
-            pose[j] = torch.as_tensor((Rotation.from_rotvec(turn) * Rotation.from_rotvec(pose[j].numpy())).as_rotvec()).float()
+            pose[j] = torch.as_tensor(
+                (Rotation.from_rotvec(turn) * Rotation.from_rotvec(pose[j].numpy())).as_rotvec()
+            ).float()
         poses.append(pose)
     maps = skinning.transforms(body, torch.stack(poses), torch.zeros(len(poses), 3))
     rest = lengths(garment.vertices.numpy(), F)
-    worst = lambda w: max((lengths(x, F) / rest).max() for x in skinning.skin(garment.vertices, w, maps).numpy())
+    worst = lambda w: max(
+        (lengths(x, F) / rest).max() for x in skinning.skin(garment.vertices, w, maps).numpy()
+    )
     return worst(garment.blend_weights), worst(torch.as_tensor(raw).float())
 
 
@@ -93,8 +112,17 @@ def inside(surfaces, vertices):
 def back(garment, bodies):
     pose, error = torch.zeros(1, 24, 3), []
     for body in bodies:
-        V = skinning.skin(garment.graded(body), garment.blend_weights, skinning.transforms(body, pose, torch.zeros(1, 3)))[0]
-        read = Garment.of_mesh(garment.name, V.double().numpy(), garment.faces.numpy(), made_for=fitting.in_pose(body, pose[0]))
+        V = skinning.skin(
+            garment.graded(body),
+            garment.blend_weights,
+            skinning.transforms(body, pose, torch.zeros(1, 3)),
+        )[0]
+        read = Garment.of_mesh(
+            garment.name,
+            V.double().numpy(),
+            garment.faces.numpy(),
+            made_for=fitting.in_pose(body, pose[0]),
+        )
         error.append(1e3 * (read.vertices - garment.vertices).norm(dim=1).numpy())
     return np.mean(error), np.max(error)
 
@@ -103,11 +131,19 @@ def other_topology(body):
     """The same surface with four times the triangles, as another kind of body."""
     faces, edges = mesh.subdivided(body.faces.numpy())
     finer = lambda x: torch.as_tensor(np.concatenate([x.numpy(), x.numpy()[edges].mean(axis=1)]))
-    return replace(body, kind="other", vertices=finer(body.vertices), blend_weights=finer(body.blend_weights), faces=torch.as_tensor(faces))
+    return replace(
+        body,
+        kind="other",
+        vertices=finer(body.vertices),
+        blend_weights=finer(body.blend_weights),
+        faces=torch.as_tensor(faces),
+    )
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("garments", nargs="*")
     parser.add_argument("--shapes", type=int, default=60)
     parser.add_argument("-o", "--output", default=os.path.join(ROOT, "out", "benchmarks"))
@@ -117,25 +153,44 @@ def main():
     surfaces = [surface_of(b) for b in bodies]
     maps, posed = posed_bodies()
     result = {}
-    for garment in [Garment.template(name) for name in TEMPLATES] + [Garment.read(path) for path in args.garments]:
+    for garment in [Garment.template(name) for name in TEMPLATES] + [
+        Garment.read(path) for path in args.garments
+    ]:
         figures = result[garment.name] = mesh_figures(garment)
         figures["stretch"], figures["stretch_unsmoothed"] = stretch(garment)
-        figures["skinned_inside"] = inside(posed, skinning.skin(garment.vertices, garment.blend_weights, maps).numpy())[0]
+        figures["skinned_inside"] = inside(
+            posed, skinning.skin(garment.vertices, garment.blend_weights, maps).numpy()
+        )[0]
         garment.graded(bodies[0])
         start = time.perf_counter()
         graded = [garment.graded(b).numpy() for b in bodies]
         figures["graded_ms"] = 1e3 * (time.perf_counter() - start) / len(bodies)
         figures["graded_inside"], figures["graded_deepest_mm"] = inside(surfaces, graded)
-        text = "{vertices} / {faces}, {openings} openings, {area:.2f} m2, edge {edge_mm:.0f} mm, angle {angle:.0f}; stretch {stretch:.1f}"
+        text = (
+            "{vertices} / {faces}, {openings} openings, {area:.2f} m2, edge {edge_mm:.0f} mm, angle"
+            " {angle:.0f}; stretch {stretch:.1f}"
+        )
         text += " ({stretch_unsmoothed:.1f}); skinned {skinned_inside:.2f} % inside"
-        text += "; graded {graded_inside:.3f} % inside, {graded_deepest_mm:.1f} mm, {graded_ms:.1f} ms"
+        text += (
+            "; graded {graded_inside:.3f} % inside, {graded_deepest_mm:.1f} mm, {graded_ms:.1f} ms"
+        )
         if garment.name in TEMPLATES:
             figures["back_mm"] = back(garment, bodies[:3])
-            other = [garment.graded(other_topology(b)) - torch.as_tensor(g) for b, g in zip(bodies[:2], graded)]
+            other = [
+                garment.graded(other_topology(b)) - torch.as_tensor(g)
+                for b, g in zip(bodies[:2], graded)
+            ]
             figures["other_topology_mm"] = 1e3 * float(torch.stack(other).norm(dim=2).mean())
-            text += "; back {back_mm[0]:.1f}, {back_mm[1]:.1f} mm; other topology {other_topology_mm:.1f} mm"
+            text += (
+                "; back {back_mm[0]:.1f}, {back_mm[1]:.1f} mm; other topology"
+                " {other_topology_mm:.1f} mm"
+            )
         low, median, high = figures["distance_mm"]
-        print(f"{garment.name}: {text.format(**figures)}; {low:.0f} to {high:.0f} mm ({median:.0f}) from the body", flush=True)
+        print(
+            f"{garment.name}: {text.format(**figures)}; {low:.0f} to {high:.0f} mm ({median:.0f})"
+            " from the body",
+            flush=True,
+        )
     os.makedirs(args.output, exist_ok=True)
     path = os.path.join(args.output, "onefit_garments.json")
     with aside(path) as temporary, open(temporary, "w", encoding="utf-8") as file:

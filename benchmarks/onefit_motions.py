@@ -1,11 +1,13 @@
-"""What the generated motions and the random bodies are like: the figures of ``docs/onefit_bodies.md``.
+"""What the generated motions and the random bodies are like: the figures of
+``docs/onefit_bodies.md``.
 
     python benchmarks/onefit_motions.py              (three minutes)
 
-A row for each kind of motion, over ``--seeds`` sequences of 8 s on the standard body: the speed of feet on the ground (98th percentile),
-the lowest point (below the floor where negative), the bend of knees, in how many of the looked-at frames a forearm or hand is more than
-1 cm deep in trunk, head or legs, and how deep at most. Then heights and volumes of random bodies, and what skinning from the T-pose to the
-A-pose and on loses.
+A row for each kind of motion, over ``--seeds`` sequences of 8 s on the standard body: the speed of
+feet on the ground (98th percentile), the lowest point (below the floor where negative), the bend of
+knees, in how many of the looked-at frames a forearm or hand is more than 1 cm deep in trunk, head
+or legs, and how deep at most. Then heights and volumes of random bodies, and what skinning from the
+T-pose to the A-pose and on loses.
 """
 
 import argparse
@@ -20,12 +22,18 @@ from onefit import generate, skeleton, skinning
 from onefit.body import AnnyBody
 from onefit.motion import Motion
 
-FOREARMS = [skeleton.INDEX[f"{side}_{part}"] for side in ("left", "right") for part in ("elbow", "wrist", "hand")]
+FOREARMS = [
+    skeleton.INDEX[f"{side}_{part}"]
+    for side in ("left", "right")
+    for part in ("elbow", "wrist", "hand")
+]
 ARMS = FOREARMS + [skeleton.INDEX["left_shoulder"], skeleton.INDEX["right_shoulder"]]
 
 
 class Core:
-    """A body without its arms: a closed surface, cut at the shoulders; a ring where it is cut is closed by a fan to its middle."""
+    """A body without its arms: a closed surface, cut at the shoulders; a ring where it is cut is
+    closed by a fan to its middle.
+    """
 
     def __init__(self, body):
         of = body.blend_weights.argmax(1).numpy()
@@ -42,20 +50,36 @@ class Core:
             while at != start:
                 self.rings[-1].append(at)
                 at = following.pop(at)
-        fans = [(a, b, len(of) + k) for k, ring in enumerate(self.rings) for a, b in zip(ring, ring[1:] + ring[:1], strict=True)]
+        fans = [
+            (a, b, len(of) + k)
+            for k, ring in enumerate(self.rings)
+            for a, b in zip(ring, ring[1:] + ring[:1], strict=True)
+        ]
         self.faces = np.concatenate([faces, np.array(fans)])
 
     def depth(self, vertices):
-        """How deep [m] the vertices (V, 3) of a posed body's forearms and hands are in it at most; 0 where none is."""
+        """How deep [m] the vertices (V, 3) of a posed body's forearms and hands are in it at most;
+        0 where none is.
+        """
         closed = np.concatenate([vertices, [vertices[ring].mean(0) for ring in self.rings]])
         select = vtkSelectEnclosedPoints()
-        select.SetSurfaceData(pyvista.PolyData(closed, np.concatenate([np.full((len(self.faces), 1), 3), self.faces], 1)))
+        select.SetSurfaceData(
+            pyvista.PolyData(
+                closed, np.concatenate([np.full((len(self.faces), 1), 3), self.faces], 1)
+            )
+        )
         select.SetInputData(pyvista.PolyData(vertices[self.forearms]))
         select.Update()
         inside = np.asarray(pyvista.wrap(select.GetOutput()).point_data["SelectedPoints"]) > 0
         if not inside.any():
             return 0.0
-        return float(np.linalg.norm(vertices[self.forearms][inside][:, None] - vertices[self.kept][None], axis=-1).min(1).max())
+        return float(
+            np.linalg.norm(
+                vertices[self.forearms][inside][:, None] - vertices[self.kept][None], axis=-1
+            )
+            .min(1)
+            .max()
+        )
 
 
 def posed(body, motion):
@@ -70,17 +94,36 @@ def row(kind, body, core, seeds, every=8):
     speeds, lowest, bends, depths = [], [], [], []
     for seed in range(seeds):
         motion = Motion.generate(kind, seconds=8, seed=seed)
-        feet = skinning.posed_joints(body, skinning.transforms(body, motion.poses, motion.translation))[:, [10, 11]].double().numpy()
+        feet = (
+            skinning.posed_joints(
+                body, skinning.transforms(body, motion.poses, motion.translation)
+            )[:, [10, 11]]
+            .double()
+            .numpy()
+        )
         down = (feet[1:, :, 2] < ball + 0.006) & (feet[:-1, :, 2] < ball + 0.006)
         speeds.append((np.linalg.norm(np.diff(feet[..., :2], axis=0), axis=-1) * motion.fps)[down])
-        bends.append(np.degrees(motion.poses[:, [skeleton.INDEX["left_knee"], skeleton.INDEX["right_knee"]], 0].numpy()))
+        bends.append(
+            np.degrees(
+                motion.poses[
+                    :, [skeleton.INDEX["left_knee"], skeleton.INDEX["right_knee"]], 0
+                ].numpy()
+            )
+        )
         vertices = posed(body, motion[::every])
         lowest.append(vertices[..., 2].min() - floor)
         depths += [core.depth(V) for V in vertices]
-    speed, bends, depths = np.percentile(np.concatenate(speeds), 98), np.concatenate(bends), np.array(depths)
+    speed, bends, depths = (
+        np.percentile(np.concatenate(speeds), 98),
+        np.concatenate(bends),
+        np.array(depths),
+    )
     knees = f"{bends.min():4.0f} to {bends.max():4.0f}"
     inside = f"{(depths > 0.01).sum()}/{len(depths)}"
-    print(f"{kind:14s} {speed:8.2f} {1000 * min(lowest):12.0f} {knees:>14s} {inside:>11s} {1000 * depths.max():10.0f}")
+    print(
+        f"{kind:14s} {speed:8.2f} {1000 * min(lowest):12.0f} {knees:>14s} {inside:>11s}"
+        f" {1000 * depths.max():10.0f}"
+    )
 
 
 def shapes(model, count):
@@ -92,11 +135,16 @@ def shapes(model, count):
         tall.append(float(V[:, 2].max() - V[:, 2].min()))
         litres.append(float(torch.linalg.det(V[body.faces]).sum() / 6 * 1000))
     for what, values in (("height [m]", tall), ("volume [l]", litres)):
-        print(f"{count} random bodies, {what}: {min(values):.2f} to {max(values):.2f}, median {np.median(values):.2f}")
+        print(
+            f"{count} random bodies, {what}: {min(values):.2f} to {max(values):.2f}, median"
+            f" {np.median(values):.2f}"
+        )
 
 
 def there_and_on(body):
-    """Distance of a body skinned from its T-pose to the A-pose and from there to a pose, from one skinned from the T-pose at once."""
+    """Distance of a body skinned from its T-pose to the A-pose and from there to a pose, from one
+    skinned from the T-pose at once.
+    """
     still = Motion(torch.zeros(1, 24, 3), torch.zeros(1, 3), 30.0)
     maps = skinning.transforms(body, still.poses, still.translation)
     at_t = replace(
@@ -108,9 +156,15 @@ def there_and_on(body):
     maps = skinning.transforms(at_t, body.rest_pose[None], still.translation)
     at_a = replace(body, vertices=skinning.skin(at_t.vertices, body.blend_weights, maps)[0])
     off = np.concatenate(
-        [np.linalg.norm(posed(at_t, m) - posed(at_a, m), axis=-1) for m in (Motion.generate(k, 8, 3)[::30] for k in generate.KINDS)]
+        [
+            np.linalg.norm(posed(at_t, m) - posed(at_a, m), axis=-1)
+            for m in (Motion.generate(k, 8, 3)[::30] for k in generate.KINDS)
+        ]
     )
-    print(f"T-pose to A-pose and on, against T-pose at once: {1000 * off.mean():.2f} mm in the mean, {1000 * off.max():.0f} mm at most")
+    print(
+        f"T-pose to A-pose and on, against T-pose at once: {1000 * off.mean():.2f} mm in the mean,"
+        f" {1000 * off.max():.0f} mm at most"
+    )
 
 
 def main():

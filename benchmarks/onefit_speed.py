@@ -2,10 +2,11 @@
 
     python benchmarks/onefit_speed.py [--weights six-garments] [--device cuda]
 
-Milliseconds a frame, the median of repeated drapes of a motion of 90 frames in batches, without rendering: all of ``Draper.drape``, the
-network alone, and post-processing; then the T-shirt at about 1,000, 4,000, 16,000 and 64,000 vertices. Cutting a garment into patches
-comes once and stands apart. The clock shows what else the machine does; the least of the repetitions is given beside the median, and the
-processor's time, of all threads together.
+Milliseconds a frame, the median of repeated drapes of a motion of 90 frames in batches, without
+rendering: all of ``Draper.drape``, the network alone, and post-processing; then the T-shirt at
+about 1,000, 4,000, 16,000 and 64,000 vertices. Cutting a garment into patches comes once and stands
+apart. The clock shows what else the machine does; the least of the repetitions is given beside the
+median, and the processor's time, of all threads together.
 """
 
 import argparse
@@ -26,7 +27,9 @@ FRAMES = 90
 
 
 def timed(function, device, repeats=9):
-    """Median and least milliseconds of ``function()`` by the clock, and the median of the processor's."""
+    """Median and least milliseconds of ``function()`` by the clock, and the median of the
+    processor's.
+    """
     found, busy = [], []
     for k in range(repeats + 2):
         start, used = time.perf_counter(), time.process_time()
@@ -40,7 +43,9 @@ def timed(function, device, repeats=9):
 
 
 def network_alone(draper, garment, motion):
-    """The embedding of the motion and the decoding of every patch in every frame, no vertex among it."""
+    """The embedding of the motion and the decoding of every patch in every frame, no vertex among
+    it.
+    """
     body = draper.model.body().to(draper.device)
     with torch.inference_mode():
         embedding = draper.embedding(motion, body)
@@ -58,11 +63,17 @@ def main(argv=None):
     start = time.perf_counter()
     subprocess.run([sys.executable, "-c", "import onefit"], check=True)
     seconds = time.perf_counter() - start
-    print(f"{torch.get_num_threads()} threads, {args.device}; a process that imports onefit and ends: {seconds:.2f} s\n")
+    print(
+        f"{torch.get_num_threads()} threads, {args.device}; a process that imports onefit and ends:"
+        f" {seconds:.2f} s\n"
+    )
     draper = onefit.load(args.weights, device=args.device)
     motion = onefit.Motion.generate("walk", seconds=FRAMES / FPS, seed=1).to(draper.device)
     shirt = draper.garment("tshirt")
-    print("| vertices | patches | cut and eased, once [s] | drape [ms a frame] | network alone | post-processing |\n|---|---|---|---|---|---|")
+    print(
+        "| vertices | patches | cut and eased, once [s] | drape [ms a frame] | network alone |"
+        " post-processing |\n|---|---|---|---|---|---|"
+    )
     rows = []
     for count in args.counts:
         garment = shirt if count == len(shirt) else shirt.remeshed(count)
@@ -72,12 +83,32 @@ def main(argv=None):
         cut = time.perf_counter() - start
         T = len(motion.poses)
         whole = [x / T for x in timed(lambda: draper.drape(garment, motion), args.device)]
-        network = [x / T for x in timed(lambda: network_alone(draper, garment, motion), args.device)]
+        network = [
+            x / T for x in timed(lambda: network_alone(draper, garment, motion), args.device)
+        ]
         drape = draper.drape(garment, motion)
-        post = [x / T for x in timed(lambda: pushed_out(drape.vertices, drape.faces, drape.body, drape.body_faces), args.device, 3)]
-        cells = [f"{len(garment)}", f"{len(patched)}", f"{cut:.1f}"] + [f"{a:.2f} ({b:.2f}; {c:.2f})" for a, b, c in (whole, network, post)]
+        post = [
+            x / T
+            for x in timed(
+                lambda: pushed_out(drape.vertices, drape.faces, drape.body, drape.body_faces),
+                args.device,
+                3,
+            )
+        ]
+        cells = [f"{len(garment)}", f"{len(patched)}", f"{cut:.1f}"] + [
+            f"{a:.2f} ({b:.2f}; {c:.2f})" for a, b, c in (whole, network, post)
+        ]
         print("| " + " | ".join(cells) + " |", flush=True)
-        rows.append(dict(vertices=len(garment), patches=len(patched), cut=cut, drape=whole, network=network, post=post))
+        rows.append(
+            dict(
+                vertices=len(garment),
+                patches=len(patched),
+                cut=cut,
+                drape=whole,
+                network=network,
+                post=post,
+            )
+        )
     if args.output:
         with open(args.output, "w", encoding="utf-8") as file:
             json.dump(dict(import_seconds=seconds, rows=rows), file, indent=2)

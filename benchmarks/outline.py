@@ -1,7 +1,8 @@
-"""How well a template's pose is found again by the edges of the first frame, from poses that miss by some pixels: ``python benchmarks/outline.py --data FOLDER``.
+"""How well a template's pose is found again by the edges of the first frame, from poses that miss
+by some pixels: ``python benchmarks/outline.py --data FOLDER``.
 
-Sequences in the form *cloth*, whose template lies where the first frame shows it. Prints, for each, by how much the outline missed and the vertices were off
-before, and after.
+Sequences in the form *cloth*, whose template lies where the first frame shows it. Prints, for each,
+by how much the outline missed and the vertices were off before, and after.
 """
 
 import argparse
@@ -22,7 +23,10 @@ from polysft_mi.sequence import list_images  # noqa: E402
 
 DATA = os.environ.get("POLYSFT_DATA") or os.path.join(os.path.dirname(ROOT), "shared", "data")
 SEQUENCES = "flag", "bend", "paper", "curtain", "corner"
-_ROTATION, _SHIFT = (0.03, 0.03, 0.015), (0.005, 0.005, 0.017)  # standard deviations of what is wrong [rad], [of the distance]
+_ROTATION, _SHIFT = (
+    (0.03, 0.03, 0.015),
+    (0.005, 0.005, 0.017),
+)  # standard deviations of what is wrong [rad], [of the distance]
 
 
 def moved(vertices, random):
@@ -33,7 +37,9 @@ def moved(vertices, random):
 
 
 def measure(folder, times):
-    """Of so many starts, (times, 4): pixels and millimetres, RMS over the vertices, before and after; and how many were sure."""
+    """Of so many starts, (times, 4): pixels and millimetres, RMS over the vertices, before and
+    after; and how many were sure.
+    """
     camera = Intrinsics.from_json(os.path.join(folder, "camera.json"))
     truth, faces, _ = meshio.read_template(os.path.join(folder, "template.obj"))
     image = read_rgb(list_images(os.path.join(folder, "frames"), "frames")[0])
@@ -44,7 +50,10 @@ def measure(folder, times):
         sure += fit.sure
         row = []
         for found in (start, fit(start) if fit.sure else start):
-            row += [np.sqrt(((camera.project(found) - camera.project(truth)) ** 2).sum(1).mean()), 1e3 * np.sqrt(((found - truth) ** 2).sum(1).mean())]
+            row += [
+                np.sqrt(((camera.project(found) - camera.project(truth)) ** 2).sum(1).mean()),
+                1e3 * np.sqrt(((found - truth) ** 2).sum(1).mean()),
+            ]
         rows.append(row)
     return np.array(rows), sure
 
@@ -54,7 +63,11 @@ def main(argv=None):
     parser.add_argument("--data", default=DATA, help="folder with cloth")
     parser.add_argument("--times", type=int, default=20, help="starts for each (default: 20)")
     args = parser.parse_args(argv)
-    print("| sequence | starts, sure | before: median, worst [px] | [mm] | after [px] | [mm] |", "|---|---|---|---|---|---|", sep="\n")
+    print(
+        "| sequence | starts, sure | before: median, worst [px] | [mm] | after [px] | [mm] |",
+        "|---|---|---|---|---|---|",
+        sep="\n",
+    )
     for name in SEQUENCES:
         rows, sure = measure(os.path.join(args.data, "cloth", name), args.times)
         pairs = (f"{np.median(x):.2f}, {x.max():.2f}" for x in rows.T)

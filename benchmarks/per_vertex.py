@@ -1,14 +1,19 @@
-"""What a Mitsuba user would write without jets: the template's vertices as the unknowns of every frame.
+"""What a Mitsuba user would write without jets: the template's vertices as the unknowns of every
+frame.
 
-    python benchmarks/per_vertex.py scene.xml -o OUT [-D name=value ...] [--iterations 150] [--step 0.003] [--smoothing 19] [--overwrite]
+    python benchmarks/per_vertex.py scene.xml -o OUT [-D name=value ...] [--iterations 150] [--step
+    0.003] [--smoothing 19] [--overwrite]
 
-The scene, the video, the renderer and the objective are those of ``python -m polysft_mi.run -D solver=adam``: photometric and silhouette
-losses and inextensibility of the mesh, with the scene's weights. Nothing couples the frames but the start: each begins where the one before
-it ended, the first from the template. The unknowns are the positions' differential form under ``mi.ad.LargeSteps`` (Nicolet et al. 2021),
-minimised by ``mi.ad.Adam`` with ``uniform=True``, as its authors advise. Of the ``--iterations`` of a frame the best is kept.
+The scene, the video, the renderer and the objective are those of ``python -m polysft_mi.run -D
+solver=adam``: photometric and silhouette losses and inextensibility of the mesh, with the scene's
+weights. Nothing couples the frames but the start: each begins where the one before it ended, the
+first from the template. The unknowns are the positions' differential form under
+``mi.ad.LargeSteps`` (Nicolet et al. 2021), minimised by ``mi.ad.Adam`` with ``uniform=True``, as
+its authors advise. Of the ``--iterations`` of a frame the best is kept.
 
-Writes ``surface.npz`` (``docs/conventions.md``) and ``metrics.json`` into OUT, no pictures: where whole commands are timed, that is in this
-script's favour. ``mi.ad.LargeSteps`` needs the package ``cholespy``.
+Writes ``surface.npz`` (``docs/conventions.md``) and ``metrics.json`` into OUT, no pictures: where
+whole commands are timed, that is in this script's favour. ``mi.ad.LargeSteps`` needs the package
+``cholespy``.
 """
 
 import argparse
@@ -34,9 +39,11 @@ SMOOTHING = 19.0  # Mitsuba's own default
 
 
 class Vertices:
-    """Takes the place of a problem's ``patch``: the surface is made of vertex positions, whose differential form is the unknown.
+    """Takes the place of a problem's ``patch``: the surface is made of vertex positions, whose
+    differential form is the unknown.
 
-    The unknown of a frame is a Float of 3N: (I + λL) (p - origin) / s, with s the template's radius [m] and its centre for origin.
+    The unknown of a frame is a Float of 3N: (I + λL) (p - origin) / s, with s the template's radius
+    [m] and its centre for origin.
     """
 
     def __init__(self, template, smoothing):
@@ -47,7 +54,9 @@ class Vertices:
         self.scale, self.origin = mi.Float(template.scale), mi.Point3f(*map(float, template.origin))
         dr.make_opaque(self.scale, self.origin)
         rest = self._flat((template.vertices - template.origin) / template.scale)
-        self._form = mi.ad.LargeSteps(rest, mi.UInt32(template.faces.astype(np.uint32).ravel()), smoothing)
+        self._form = mi.ad.LargeSteps(
+            rest, mi.UInt32(template.faces.astype(np.uint32).ravel()), smoothing
+        )
         self._rest = self._form.to_differential(rest)
         dr.eval(self._rest)
 
@@ -75,7 +84,14 @@ def load(scene, overrides, smoothing=SMOOTHING):
     experiment = scenes.load(scene, overrides)
     s = dataclasses.replace(experiment.settings, solver="adam")  # whose objective it is
     experiment = dataclasses.replace(experiment, settings=s)
-    sequence = Sequence.open(experiment.frames, experiment.masks, first=s.first, last=s.last, stride=s.stride, size=experiment.size)
+    sequence = Sequence.open(
+        experiment.frames,
+        experiment.masks,
+        first=s.first,
+        last=s.last,
+        stride=s.stride,
+        size=experiment.size,
+    )
     problem = Problem(experiment, sequence)
     problem.check_start()
     problem.patch = Vertices(problem.template, smoothing)
@@ -83,7 +99,8 @@ def load(scene, overrides, smoothing=SMOOTHING):
 
 
 def solve(problem, frame, start, iterations, step):
-    """Minimise one frame (counted in the selection) from the unknown ``start``: (unknown, losses), the best, and each iteration's loss.
+    """Minimise one frame (counted in the selection) from the unknown ``start``: (unknown, losses),
+    the best, and each iteration's loss.
 
     Where the image, or a step, makes the loss not finite, what was best before it is returned.
     """
@@ -97,7 +114,9 @@ def solve(problem, frame, start, iterations, step):
     for iteration in range(iterations):
         unknown = optimizer["u"]
         try:
-            loss, _ = problem.evaluate([unknown], [frame], backward=True, seed=(seed + 7919 * iteration) % 2**31)
+            loss, _ = problem.evaluate(
+                [unknown], [frame], backward=True, seed=(seed + 7919 * iteration) % 2**31
+            )
         except BadFrame:
             break
         losses.append(loss)
@@ -109,7 +128,9 @@ def solve(problem, frame, start, iterations, step):
 
 
 def track(problem, iterations, step, say=lambda text: None):
-    """All frames of a problem: vertices (T, N, 3) float32 [m, camera frame], and a dict of losses, iterations and seconds for each."""
+    """All frames of a problem: vertices (T, N, 3) float32 [m, camera frame], and a dict of losses,
+    iterations and seconds for each.
+    """
     import drjit as dr
 
     unknown, surfaces, rows = problem.patch.rest(), [], []
@@ -121,13 +142,19 @@ def track(problem, iterations, step, say=lambda text: None):
         first, least = (losses[0], min(losses)) if losses else (None, None)
         row = {"frame": int(index), "first_loss": first, "loss": least, "iterations": len(losses)}
         rows.append({**row, "seconds": time.perf_counter() - began})
-        told = f"loss {first:.4g} to {least:.4g}" if losses else "the loss is not finite; it keeps the surface of the frame before"
+        told = (
+            f"loss {first:.4g} to {least:.4g}"
+            if losses
+            else "the loss is not finite; it keeps the surface of the frame before"
+        )
         say(f"frame {index}: {told}, {rows[-1]['seconds']:.1f} s")
     return np.stack(surfaces), rows
 
 
 def write(problem, surfaces, rows, out, **options):
-    """``surface.npz`` and ``metrics.json`` in the folder ``out``; returns the figures that ``metrics.json`` begins with."""
+    """``surface.npz`` and ``metrics.json`` in the folder ``out``; returns the figures that
+    ``metrics.json`` begins with.
+    """
     from polysft_mi import outputs
 
     template = problem.template
@@ -142,18 +169,51 @@ def write(problem, surfaces, rows, out, **options):
         "solver": "per-vertex",
         **options,
     }
-    outputs.write_json(os.path.join(out, "metrics.json"), {**summary, "versions": outputs.versions(), "per_frame": rows})
+    outputs.write_json(
+        os.path.join(out, "metrics.json"),
+        {**summary, "versions": outputs.versions(), "per_frame": rows},
+    )
     return summary
 
 
 def parser():
-    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument("scene", metavar="scene.xml", help="Mitsuba scene with a polysft integrator (docs/scene.md)")
-    p.add_argument("-o", "--out", metavar="OUT", required=True, help="folder for surface.npz and metrics.json")
-    p.add_argument("-D", dest="define", metavar="NAME=VALUE", action="append", default=[], help="override a <default> of the scene")
-    p.add_argument("--iterations", type=int, metavar="N", default=ITERATIONS, help=f"iterations a frame (default: {ITERATIONS})")
-    p.add_argument("--step", type=float, default=STEP, help=f"Adam's step size, as a share of the template's radius (default: {STEP})")
-    p.add_argument("--smoothing", type=float, metavar="LAMBDA", default=SMOOTHING, help=f"lambda of LargeSteps (default: {SMOOTHING:g})")
+    p = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    p.add_argument(
+        "scene", metavar="scene.xml", help="Mitsuba scene with a polysft integrator (docs/scene.md)"
+    )
+    p.add_argument(
+        "-o", "--out", metavar="OUT", required=True, help="folder for surface.npz and metrics.json"
+    )
+    p.add_argument(
+        "-D",
+        dest="define",
+        metavar="NAME=VALUE",
+        action="append",
+        default=[],
+        help="override a <default> of the scene",
+    )
+    p.add_argument(
+        "--iterations",
+        type=int,
+        metavar="N",
+        default=ITERATIONS,
+        help=f"iterations a frame (default: {ITERATIONS})",
+    )
+    p.add_argument(
+        "--step",
+        type=float,
+        default=STEP,
+        help=f"Adam's step size, as a share of the template's radius (default: {STEP})",
+    )
+    p.add_argument(
+        "--smoothing",
+        type=float,
+        metavar="LAMBDA",
+        default=SMOOTHING,
+        help=f"lambda of LargeSteps (default: {SMOOTHING:g})",
+    )
     p.add_argument("--overwrite", action="store_true", help="replace the result that OUT holds")
     p.add_argument("-q", "--quiet", action="store_true", help="no progress, only the result")
     add_mode_argument(p)
@@ -165,18 +225,30 @@ def main(arguments=None):
     for text in options.define:
         if "=" not in text:
             raise InputError(f"-D {text}: NAME=VALUE is needed")
-    if options.iterations < 1 or not (0 < options.step < math.inf and 0 <= options.smoothing < math.inf):
-        given = f"--iterations {options.iterations} --step {options.step} --smoothing {options.smoothing}"
+    if options.iterations < 1 or not (
+        0 < options.step < math.inf and 0 <= options.smoothing < math.inf
+    ):
+        given = (
+            f"--iterations {options.iterations} --step {options.step} --smoothing"
+            f" {options.smoothing}"
+        )
         raise InputError(f"{given}: positive numbers are needed")
     if os.path.exists(os.path.join(options.out, "surface.npz")) and not options.overwrite:
         raise InputError(f"{options.out}: holds another result; give --overwrite to replace it")
     set_variant(options.mode)
-    problem = load(options.scene, dict(text.split("=", 1) for text in options.define), options.smoothing)
+    problem = load(
+        options.scene, dict(text.split("=", 1) for text in options.define), options.smoothing
+    )
     os.makedirs(options.out, exist_ok=True)
     say = (lambda text: None) if options.quiet else lambda text: print(text, file=sys.stderr)
     surfaces, rows = track(problem, options.iterations, options.step, say)
-    summary = write(problem, surfaces, rows, options.out, step=options.step, smoothing=options.smoothing)
-    print(f"{summary['frames']} frames, {summary['seconds_per_frame']:.2f} s a frame; surfaces: {os.path.join(options.out, 'surface.npz')}")
+    summary = write(
+        problem, surfaces, rows, options.out, step=options.step, smoothing=options.smoothing
+    )
+    print(
+        f"{summary['frames']} frames, {summary['seconds_per_frame']:.2f} s a frame; surfaces:"
+        f" {os.path.join(options.out, 'surface.npz')}"
+    )
 
 
 if __name__ == "__main__":

@@ -2,11 +2,13 @@
 
     python benchmarks/polyfit_reconstruction.py DATA/garments_snug/*.obj
 
-First the paper's own measure at the paper's number of patches: the symmetric Chamfer distance between 10,000 points of the garment and
-10,000 of the reconstruction, in the unit sphere about the box's centre, times 1e3. Its floor is that of two samplings of the garment
-itself. Then what does tell methods apart, for several numbers of patches: the distances between the surfaces (RMS and 95th percentile, of
-points of either one from the other) and the angle between their normals, beside AtlasNet's. Its charts (Groueix et al. 2018) are here
-fitted to the one surface, by Adam on the Chamfer distance, without an encoder: their decoders then have as many numbers as the jets.
+First the paper's own measure at the paper's number of patches: the symmetric Chamfer distance
+between 10,000 points of the garment and 10,000 of the reconstruction, in the unit sphere about the
+box's centre, times 1e3. Its floor is that of two samplings of the garment itself. Then what does
+tell methods apart, for several numbers of patches: the distances between the surfaces (RMS and 95th
+percentile, of points of either one from the other) and the angle between their normals, beside
+AtlasNet's. Its charts (Groueix et al. 2018) are here fitted to the one surface, by Adam on the
+Chamfer distance, without an encoder: their decoders then have as many numbers as the jets.
 """
 
 import argparse
@@ -24,14 +26,25 @@ from polyfit import errors, mesh, read_mesh  # noqa: E402
 POINTS = 10_000
 PATCHES = (10, 25, 50, 100, 200, 400)
 PAPER = {"tshirt": 0.229, "tank": 0.268, "long_sleeve_top": 0.092, "shorts": 0.372, "pants": 0.237}
-CHARTS = {10: (5, (4, 4)), 25: (5, (8, 7)), 50: (5, (13, 10)), 100: (25, (8, 5)), 200: (25, (12, 8)), 400: (25, (16, 15))}
+CHARTS = {
+    10: (5, (4, 4)),
+    25: (5, (8, 7)),
+    50: (5, (13, 10)),
+    100: (25, (8, 5)),
+    200: (25, (12, 8)),
+    400: (25, (16, 15)),
+}
 
 
 def sampled(V, F, count, seed):
     """Points (P, 3) drawn evenly from a mesh's area."""
     rng = np.random.default_rng(seed)
     area = mesh.areas(V, F)
-    return np.einsum("pj,pjc->pc", rng.dirichlet((1, 1, 1), count), V[F[rng.choice(len(F), count, p=area / area.sum())]])
+    return np.einsum(
+        "pj,pjc->pc",
+        rng.dirichlet((1, 1, 1), count),
+        V[F[rng.choice(len(F), count, p=area / area.sum())]],
+    )
 
 
 def chamfer(a, b):
@@ -45,38 +58,59 @@ def to_surface(points, V, F):
     """Distances (P,) of points from a mesh, and the faces (P,) that they are nearest to."""
     import pyvista
 
-    face, closest = pyvista.PolyData.from_regular_faces(V, F).find_closest_cell(points, return_closest_point=True)
+    face, closest = pyvista.PolyData.from_regular_faces(V, F).find_closest_cell(
+        points, return_closest_point=True
+    )
     return np.linalg.norm(points - closest, axis=1), face
 
 
 def between(V, F, W, G, points):
-    """RMS and 95th percentile [m] of the distances of points of two meshes from the other, and the mean angle [degrees] of their normals,
-    turned alike."""
+    """RMS and 95th percentile [m] of the distances of points of two meshes from the other, and the
+    mean angle [degrees] of their normals, turned alike."""
     distances, angles = [], []
     for seed, (A, B, C, D) in enumerate(((V, F, W, G), (W, G, V, F))):
         rng = np.random.default_rng(seed)
         area = mesh.areas(A, B)
         face = rng.choice(len(B), points, p=area / area.sum())
-        distance, nearest = to_surface(np.einsum("pj,pjc->pc", rng.dirichlet((1, 1, 1), points), A[B[face]]), C, D)
+        distance, nearest = to_surface(
+            np.einsum("pj,pjc->pc", rng.dirichlet((1, 1, 1), points), A[B[face]]), C, D
+        )
         normals = [mesh.face_vectors(A, B)[face], mesh.face_vectors(C, D)[nearest]]
-        normals = [n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-300) for n in normals]
+        normals = [
+            n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-300) for n in normals
+        ]
         distances.append(distance)
-        angles.append(np.degrees(np.arccos(np.clip(np.abs((normals[0] * normals[1]).sum(1)), 0, 1))))
+        angles.append(
+            np.degrees(np.arccos(np.clip(np.abs((normals[0] * normals[1]).sum(1)), 0, 1)))
+        )
     distance = np.concatenate(distances)
-    return float(np.sqrt((distance**2).mean())), float(np.percentile(distance, 95)), float(np.concatenate(angles).mean())
+    return (
+        float(np.sqrt((distance**2).mean())),
+        float(np.percentile(distance, 95)),
+        float(np.concatenate(angles).mean()),
+    )
 
 
 def jets(V, F, count, order):
-    """(vertices, faces) of the reconstruction by ``count`` patches, its number of parameters, and a function that samples it."""
+    """(vertices, faces) of the reconstruction by ``count`` patches, its number of parameters, and a
+    function that samples it.
+    """
     from polyfit import PatchedSurface
 
     surface = PatchedSurface.from_mesh(V, F, count, order)
     W = surface.vertices().double().numpy()
-    return W, surface.patches.faces, surface.parameters, lambda points, seed: surface.sample(points, seed)[0].double().numpy()
+    return (
+        W,
+        surface.patches.faces,
+        surface.parameters,
+        lambda points, seed: surface.sample(points, seed)[0].double().numpy(),
+    )
 
 
 def atlasnet(V, F, charts, widths, iterations, points=1000):
-    """(vertices, faces) of AtlasNet's charts fitted to the surface, and how many numbers hold them."""
+    """(vertices, faces) of AtlasNet's charts fitted to the surface, and how many numbers hold
+    them.
+    """
     import torch
 
     from polyfit.baselines.atlasnet import AtlasNet, chamfer, normalised
@@ -84,7 +118,9 @@ def atlasnet(V, F, charts, widths, iterations, points=1000):
     torch.manual_seed(0)
     model = AtlasNet(charts, latent=1, widths=widths)
     code = torch.zeros(1, 1)
-    target, centre, scale = normalised(torch.as_tensor(sampled(V, F, 20_000, 0), dtype=torch.float32))
+    target, centre, scale = normalised(
+        torch.as_tensor(sampled(V, F, 20_000, 0), dtype=torch.float32)
+    )
     numbers = [*model.weights, *model.biases]
     optimiser = torch.optim.Adam(numbers, lr=1e-2)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations)
@@ -104,7 +140,11 @@ def atlasnet(V, F, charts, widths, iterations, points=1000):
     a, b, c, d = (x.ravel() for x in (k[:-1, :-1], k[:-1, 1:], k[1:, :-1], k[1:, 1:]))
     cell = np.concatenate([np.stack([a, b, c], 1), np.stack([b, d, c], 1)])
     G = (cell + np.arange(charts)[:, None, None] * side * side).reshape(-1, 3)
-    return W, G, sum(p.numel() for p in numbers) - charts * widths[0]  # the code is zero, and its weights hold nothing
+    return (
+        W,
+        G,
+        sum(p.numel() for p in numbers) - charts * widths[0],
+    )  # the code is zero, and its weights hold nothing
 
 
 def paper_table(garments, order, seeds=3):
@@ -118,15 +158,25 @@ def paper_table(garments, order, seeds=3):
         unit = lambda x: (x - centre) / scale
         clouds = [unit(sampled(V, F, POINTS, 10 + s)) for s in range(2 * seeds)]
         floor = 1e3 * np.mean([chamfer(clouds[s], clouds[seeds + s]) for s in range(seeds)])
-        own = 1e3 * np.mean([chamfer(unit(sample(POINTS, 100 + s)), clouds[s]) for s in range(seeds)])
+        own = 1e3 * np.mean(
+            [chamfer(unit(sample(POINTS, 100 + s)), clouds[s]) for s in range(seeds)]
+        )
         rms, p95, angle = between(V, F, W, G, POINTS)
-        r = dict(garment=name, patches=int(_patches(V, F)), chamfer=own, floor=floor, over_floor=own / floor - 1, paper=PAPER.get(name))
+        r = dict(
+            garment=name,
+            patches=int(_patches(V, F)),
+            chamfer=own,
+            floor=floor,
+            over_floor=own / floor - 1,
+            paper=PAPER.get(name),
+        )
         r.update(rms_mm=1e3 * rms, p95_mm=1e3 * p95, normal_deg=angle, seconds=seconds)
         rows.append(r)
         print(
-            f"{name:>18} K {r['patches']:3}  Chamfer {own:.3f}  floor {floor:.3f} ({100 * r['over_floor']:+.1f} %)  "
-            f"paper {r['paper'] or '-':>5}  "
-            f"RMS {r['rms_mm']:.3f} mm  95 % {r['p95_mm']:.3f} mm  normals {angle:.2f} deg  {seconds:.1f} s",
+            f"{name:>18} K {r['patches']:3}  Chamfer {own:.3f}  floor {floor:.3f}"
+            f" ({100 * r['over_floor']:+.1f} %)  paper {r['paper'] or '-':>5}  RMS"
+            f" {r['rms_mm']:.3f} mm  95 % {r['p95_mm']:.3f} mm  normals {angle:.2f} deg "
+            f" {seconds:.1f} s",
             flush=True,
         )
     return rows
@@ -148,8 +198,13 @@ def size_table(garments, order, iterations):
         for count in [k for k in PATCHES if k <= len(V)]:
             row = dict(garment=name, patches=count)
             W, G, row["numbers"], _ = jets(V, F, count, order)
-            row["rms_mm"], row["p95_mm"], row["normal_deg"] = np.array(between(V, F, W, G, POINTS)) * (1e3, 1e3, 1)
-            line = f"{name:>18} K {count:3}  {row['numbers']:5} numbers: {told(row['rms_mm'], row['p95_mm'], row['normal_deg'])}"
+            row["rms_mm"], row["p95_mm"], row["normal_deg"] = np.array(
+                between(V, F, W, G, POINTS)
+            ) * (1e3, 1e3, 1)
+            line = (
+                f"{name:>18} K {count:3}  {row['numbers']:5} numbers:"
+                f" {told(row['rms_mm'], row['p95_mm'], row['normal_deg'])}"
+            )
             if iterations:
                 W, G, row["atlasnet_numbers"] = atlasnet(V, F, *CHARTS[count], iterations)
                 found = np.array(between(V, F, W, G, POINTS)) * (1e3, 1e3, 1)
@@ -161,14 +216,23 @@ def size_table(garments, order, iterations):
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("meshes", nargs="+", help="OBJ or PLY files [m]")
     parser.add_argument("--order", type=int, default=4)
-    parser.add_argument("--iterations", type=int, default=1500, help="of AtlasNet's fit to each surface; 0 leaves it out")
+    parser.add_argument(
+        "--iterations",
+        type=int,
+        default=1500,
+        help="of AtlasNet's fit to each surface; 0 leaves it out",
+    )
     parser.add_argument("-o", "--output", default="out/benchmarks")
     args = parser.parse_args(argv)
     garments = {Path(m).stem: read_mesh(m)[:2] for m in args.meshes}
-    report = dict(order=args.order, iterations=args.iterations, paper=paper_table(garments, args.order))
+    report = dict(
+        order=args.order, iterations=args.iterations, paper=paper_table(garments, args.order)
+    )
     report["sizes"] = size_table(garments, args.order, args.iterations)
     Path(args.output).mkdir(parents=True, exist_ok=True)
     path = Path(args.output) / "polyfit_reconstruction.json"

@@ -2,10 +2,11 @@
 
     python benchmarks/polyfit_speed.py [--threads 2] [--device cuda]
 
-Batches of 512 patches of 256 points by jets of order 4, milliseconds a patch: the fit alone, the PCA frame and the fit, and both with the
-spatial transformer; forward, and forward and backward. Then a mesh of 100,000 vertices cut into 400 patches, fitted, its boundaries moved.
-The median of repeated runs by the clock, and the least processor time (which a busy machine disturbs less); the peak of the process's
-memory (of the device's, on a GPU) is that after all of them.
+Batches of 512 patches of 256 points by jets of order 4, milliseconds a patch: the fit alone, the
+PCA frame and the fit, and both with the spatial transformer; forward, and forward and backward.
+Then a mesh of 100,000 vertices cut into 400 patches, fitted, its boundaries moved. The median of
+repeated runs by the clock, and the least processor time (which a busy machine disturbs less); the
+peak of the process's memory (of the device's, on a GPU) is that after all of them.
 """
 
 import argparse
@@ -28,7 +29,9 @@ MESH, PATCHES = (317, 317), 400
 
 
 def timed(function, device, repeats=30):
-    """Median milliseconds of ``function()`` by the clock, and the least milliseconds of processor time (of all threads)."""
+    """Median milliseconds of ``function()`` by the clock, and the least milliseconds of processor
+    time (of all threads).
+    """
     import torch
 
     wait = torch.cuda.synchronize if device.startswith("cuda") else lambda: None
@@ -38,7 +41,9 @@ def timed(function, device, repeats=30):
         function()
         wait()
         if k >= 5:
-            found.append((1e3 * (time.perf_counter() - start[0]), 1e3 * (time.process_time() - start[1])))
+            found.append(
+                (1e3 * (time.perf_counter() - start[0]), 1e3 * (time.process_time() - start[1]))
+            )
     return statistics.median(wall for wall, _ in found), min(cpu for _, cpu in found)
 
 
@@ -71,13 +76,19 @@ def batches(device):
             "PCA frame, fit": timed(pca, device),
             "PCA frame, transformer, fit": timed(lambda: model(x), device),
         }
-    forward["fit, with backward"] = timed(lambda: backward(lambda: jets.fit(leaf, ORDER).alpha), device)
-    forward["PCA frame, transformer, fit, with backward"] = timed(lambda: backward(lambda: model(x).jet.alpha), device)
+    forward["fit, with backward"] = timed(
+        lambda: backward(lambda: jets.fit(leaf, ORDER).alpha), device
+    )
+    forward["PCA frame, transformer, fit, with backward"] = timed(
+        lambda: backward(lambda: model(x).jet.alpha), device
+    )
     return {name: [ms / BATCH for ms in found] for name, found in forward.items()}
 
 
 def bumpy_tube():
-    """A closed band of 100,489 vertices (N, 3) [m] and its faces, 0.7 m long, with waves of two sizes."""
+    """A closed band of 100,489 vertices (N, 3) [m] and its faces, 0.7 m long, with waves of two
+    sizes.
+    """
     n, m = MESH
     a, z = np.meshgrid(np.arange(n) * 2 * np.pi / n, np.linspace(-0.35, 0.35, m), indexing="ij")
     r = 0.15 + 0.01 * np.sin(5 * a + 8 * z) + 0.004 * np.sin(60 * z)
@@ -92,11 +103,18 @@ def whole_mesh(device):
     from polyfit import PatchedSurface, Patches
 
     V, F = bumpy_tube()
-    PatchedSurface.from_mesh(V[: 40 * MESH[1]], F[(F < 40 * MESH[1]).all(1)], 20)  # everything is imported and warm
-    steps, clocks = {"cut": lambda: Patches.cut(V, F, PATCHES)}, (time.perf_counter, time.process_time)
+    PatchedSurface.from_mesh(
+        V[: 40 * MESH[1]], F[(F < 40 * MESH[1]).all(1)], 20
+    )  # everything is imported and warm
+    steps, clocks = (
+        {"cut": lambda: Patches.cut(V, F, PATCHES)},
+        (time.perf_counter, time.process_time),
+    )
     patches = steps["cut"]()
     steps["fit"] = lambda: PatchedSurface.fit(patches, ORDER, device=device)
-    steps["cut, fit, moved boundaries"] = lambda: PatchedSurface.from_mesh(V, F, PATCHES, ORDER, device=device)
+    steps["cut, fit, moved boundaries"] = lambda: PatchedSurface.from_mesh(
+        V, F, PATCHES, ORDER, device=device
+    )
     found = {}
     for name, step in steps.items():
         start = [clock() for clock in clocks]
@@ -106,7 +124,9 @@ def whole_mesh(device):
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("-o", "--output", default="out/benchmarks")

@@ -1,25 +1,31 @@
-"""How fast ``raster`` is beside Mitsuba's path replay: one forward and backward pass, gradient to all vertex positions.
+"""How fast ``raster`` is beside Mitsuba's path replay: one forward and backward pass, gradient to
+all vertex positions.
 
-    python benchmarks/raster.py [--sizes 160x120 640x480 ...] [--grids 33 72 225] [-o out/benchmarks] [-m llvm_ad_rgb]
+    python benchmarks/raster.py [--sizes 160x120 640x480 ...] [--grids 33 72 225] [-o
+    out/benchmarks] [-m llvm_ad_rgb]
 
-The scene is a gently bent, textured sheet that fills half of the image, under a constant emitter of radiance 1; the loss is the squared
-difference to the picture of the sheet a little further bent. The contenders:
+The scene is a gently bent, textured sheet that fills half of the image, under a constant emitter of
+radiance 1; the loss is the squared difference to the picture of the sheet a little further bent.
+The contenders:
 
     raster          ``render()`` under Dr.Jit's AD, as the solver calls it: RGB and alpha, unlit
     raster, mi      the same through ``mi.render``, which renders once more for the backward pass
     prb_projective  through ``mi.render``, 1 sample a pixel, depth 2, ``sppi = 0``: RGB alone
 
-Depth 2 is one bounce, the emitter's light off the sheet, which is the texture's own colour wherever the sheet does not shadow itself: what
-raster shows (depth 1 would be black). ``sppi = 0`` leaves out the edges of shadows, which this scene does not have. That is in path
-replay's favour: by default it looks for them with 512 samples a pixel in every backward pass, and took 500 times as long as raster at
-160x120.
+Depth 2 is one bounce, the emitter's light off the sheet, which is the texture's own colour wherever
+the sheet does not shadow itself: what raster shows (depth 1 would be black). ``sppi = 0`` leaves
+out the edges of shadows, which this scene does not have. That is in path replay's favour: by
+default it looks for them with 512 samples a pixel in every backward pass, and took 500 times as
+long as raster at 160x120.
 
-All of a case's contenders run in one process, turn by turn; times are medians after a warm-up, ratios medians of the ratios within a turn,
-so that what else the machine does meanwhile falls on both. Moving the sheet (``params.update()``, which rebuilds what rays are traced
-with) is timed apart, for it is no part of either. Peak memory is measured in a process of its own for each contender and case; growth and
-compilation over many iterations too.
+All of a case's contenders run in one process, turn by turn; times are medians after a warm-up,
+ratios medians of the ratios within a turn, so that what else the machine does meanwhile falls on
+both. Moving the sheet (``params.update()``, which rebuilds what rays are traced with) is timed
+apart, for it is no part of either. Peak memory is measured in a process of its own for each
+contender and case; growth and compilation over many iterations too.
 
-Writes ``raster.json`` and ``raster.png``, anew after every case, so that an interrupted run leaves the cases that it reached.
+Writes ``raster.json`` and ``raster.png``, anew after every case, so that an interrupted run leaves
+the cases that it reached.
 """
 
 import argparse
@@ -62,12 +68,17 @@ _SCENE = """<scene version="3.0.0">
 
 
 def sheet(points, size):
-    """A bent sheet of points x points vertices before :func:`camera`: (vertices (N, 3) [m, camera frame], faces (F, 3), uv (N, 2))."""
+    """A bent sheet of points x points vertices before :func:`camera`: (vertices (N, 3) [m, camera
+    frame], faces (F, 3), uv (N, 2)).
+    """
     u, v = (x.ravel() for x in np.meshgrid(np.linspace(0, 1, points), np.linspace(0, 1, points)))
     extent = np.sqrt(0.5) * np.array([size[0], size[1]]) / camera(size).fx
     x, y = (u - 0.5) * extent[0], (v - 0.5) * extent[1]
     z = 1 + 0.1 * extent[0] * np.cos(np.pi * (u - 0.5 + 0.3 * v))
-    c, s = np.cos(np.radians(10)), np.sin(np.radians(10))  # so that its borders run slantwise over the pixels
+    c, s = (
+        np.cos(np.radians(10)),
+        np.sin(np.radians(10)),
+    )  # so that its borders run slantwise over the pixels
     k = np.arange(points * points).reshape(points, points)
     a, b, d, e = (q.ravel() for q in (k[:-1, :-1], k[:-1, 1:], k[1:, :-1], k[1:, 1:]))
     faces = np.stack([a, d, b, b, d, e], axis=1).reshape(-1, 3)
@@ -79,7 +90,7 @@ def camera(size):
     return Intrinsics(1.1 * width, 1.1 * width, width / 2, height / 2, width, height)
 
 
-# ---- in a worker's process ------------------------------------------------------------------------------------------------
+# ---- in a worker's process -----------------------------------------------------------------------
 
 
 class Contender:
@@ -99,8 +110,14 @@ class Contender:
         if self.path_replay:
             sensor = sensor.replace("rgba", "rgb")
         texture = os.path.join(ROOT, "scenes", "demo", "texture.jpg")
-        self.scene = mi.load_string(_SCENE.format(sensor=sensor, mesh=mesh, texture=texture), optimize=False)
-        integrator = {"type": "prb_projective", "max_depth": 2, "sppi": 0} if self.path_replay else {"type": "raster"}
+        self.scene = mi.load_string(
+            _SCENE.format(sensor=sensor, mesh=mesh, texture=texture), optimize=False
+        )
+        integrator = (
+            {"type": "prb_projective", "max_depth": 2, "sppi": 0}
+            if self.path_replay
+            else {"type": "raster"}
+        )
         self.integrator = mi.load_dict(integrator)
         self.params, self.key = mi.traverse(self.scene), "template.vertex_positions"
         self.rest = mi.Float(self.params[self.key])
@@ -152,7 +169,9 @@ class Contender:
 
 
 def amount(k):
-    """How far the sheet is bent in iteration k [1/m]: never twice the same within hundreds, so that its outline changes as in a fit."""
+    """How far the sheet is bent in iteration k [1/m]: never twice the same within hundreds, so that
+    its outline changes as in a fit.
+    """
     return 0.3 * np.sin(0.37 * k)
 
 
@@ -167,7 +186,9 @@ def peak_resident():
 
 
 def measure_times(size, points, folder, seconds):
-    """Milliseconds of every turn, contender to list: ``passes`` and ``moves``; and how far the pictures differ."""
+    """Milliseconds of every turn, contender to list: ``passes`` and ``moves``; and how far the
+    pictures differ.
+    """
     contenders = [Contender(name, size, points, folder) for name in CONTENDERS]
     passes, moves = {name: [] for name in CONTENDERS}, {name: [] for name in CONTENDERS}
     began = None
@@ -185,8 +206,8 @@ def measure_times(size, points, folder, seconds):
 
 
 def compare_pictures(raster, path_replay):
-    """That both show the same: share of the image that the sheet covers, mean colour on it, and mean difference of the two (of a 16-sample
-    picture).
+    """That both show the same: share of the image that the sheet covers, mean colour on it, and
+    mean difference of the two (of a 16-sample picture).
     """
     import mitsuba as mi
 
@@ -204,7 +225,9 @@ def compare_pictures(raster, path_replay):
 
 
 def measure_memory(size, points, folder, name):
-    """Peak memory of this process [MB], what it held before the first scene, and Dr.Jit's own peak."""
+    """Peak memory of this process [MB], what it held before the first scene, and Dr.Jit's own
+    peak.
+    """
     import drjit as dr
     import mitsuba as mi
 
@@ -213,7 +236,11 @@ def measure_memory(size, points, folder, name):
     for k in range(MEMORY_PASSES):
         contender.turn(k)
     backend = dr.JitBackend.CUDA if mi.variant().startswith("cuda") else dr.JitBackend.LLVM
-    return {"started_mb": started, "peak_mb": peak_resident(), "drjit_peak_mb": dr.detail.malloc_watermark(backend) / 1e6}
+    return {
+        "started_mb": started,
+        "peak_mb": peak_resident(),
+        "drjit_peak_mb": dr.detail.malloc_watermark(backend) / 1e6,
+    }
 
 
 def measure_growth(size, points, folder, iterations):
@@ -226,8 +253,8 @@ def measure_growth(size, points, folder, iterations):
 
 
 def measure_kernels(size, points, folder, iterations):
-    """Kernels that each iteration of raster launched, and those that it did not find in Dr.Jit's memory: compiled, or read from its cache
-    on the disk.
+    """Kernels that each iteration of raster launched, and those that it did not find in Dr.Jit's
+    memory: compiled, or read from its cache on the disk.
     """
     import drjit as dr
 
@@ -236,13 +263,20 @@ def measure_kernels(size, points, folder, iterations):
     dr.kernel_history_clear()
     for k in range(iterations):
         contender.turn(k)
-        history = [entry for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT]  # reading clears it
+        history = [
+            entry for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT
+        ]  # reading clears it
         launched.append(len(history))
         new.append(sum(entry["cache_disk"] or not entry["cache_hit"] for entry in history))
     return {"launched": launched, "new": new}
 
 
-MEASURES = {"times": measure_times, "memory": measure_memory, "growth": measure_growth, "kernels": measure_kernels}
+MEASURES = {
+    "times": measure_times,
+    "memory": measure_memory,
+    "growth": measure_growth,
+    "kernels": measure_kernels,
+}
 
 
 def worker(job):
@@ -257,14 +291,22 @@ def worker(job):
     print(json.dumps({**result, "variant": variant, "versions": outputs.versions()}))
 
 
-# ---- in the benchmark's own process, which stays small: a process counts its parent's memory as its own peak ---------------------
+# ---- in the benchmark's own process, which stays small: a process counts its parent's memory as
+# its own peak
 
 
 def in_process(measure, size, grid, mode, **options):
     job = {"measure": measure, "size": size, "grid": grid, "mode": mode, "options": options}
-    done = subprocess.run([sys.executable, os.path.abspath(__file__), "--worker", json.dumps(job)], stdout=subprocess.PIPE, text=True)
+    done = subprocess.run(
+        [sys.executable, os.path.abspath(__file__), "--worker", json.dumps(job)],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
     if done.returncode:
-        raise InputError(f"{measure} at {size}, {grid}x{grid} vertices: the measuring process ended with status {done.returncode}")
+        raise InputError(
+            f"{measure} at {size}, {grid}x{grid} vertices: the measuring process ended with status"
+            f" {done.returncode}"
+        )
     return json.loads(done.stdout.splitlines()[-1])
 
 
@@ -272,7 +314,13 @@ def summarise(size, grid, times, memory):
     """The figures of a case: medians, quartiles, ratios."""
     passes = {name: np.array(values) for name, values in times["passes"].items()}
     whole = {name: passes[name] + np.array(times["moves"][name]) for name in passes}
-    case = {"size": size, "vertices": grid * grid, "triangles": 2 * (grid - 1) ** 2, "turns": len(passes["raster"]), "contenders": {}}
+    case = {
+        "size": size,
+        "vertices": grid * grid,
+        "triangles": 2 * (grid - 1) ** 2,
+        "turns": len(passes["raster"]),
+        "contenders": {},
+    }
     for name in CONTENDERS:
         low, middle, high = np.percentile(passes[name], [25, 50, 75])
         case["contenders"][name] = {
@@ -284,7 +332,13 @@ def summarise(size, grid, times, memory):
             "ratio_with_move": float(np.median(whole[name] / whole["raster"])),
             **{k: v for k, v in memory[name].items() if k.endswith("_mb")},
         }
-    return {**case, **{k: times[k] for k in ("coverage", "mean_colour", "mean_difference", "mean_absolute_difference")}}
+    return {
+        **case,
+        **{
+            k: times[k]
+            for k in ("coverage", "mean_colour", "mean_difference", "mean_absolute_difference")
+        },
+    }
 
 
 def print_table(cases):
@@ -292,7 +346,12 @@ def print_table(cases):
     from rich.table import Table
 
     console = Console(width=None if sys.stdout.isatty() else 120)
-    table = Table(title="One forward + backward pass in ms, how many times that of raster; peak memory of the process in MB (of Dr.Jit)")
+    table = Table(
+        title=(
+            "One forward + backward pass in ms, how many times that of raster; peak memory of the"
+            " process in MB (of Dr.Jit)"
+        )
+    )
     table.add_column("image")
     table.add_column("triangles", justify="right")
     for name in CONTENDERS:
@@ -304,7 +363,12 @@ def print_table(cases):
             c = case["contenders"][name]
             ratio = "" if name == "raster" else f"  [bold]{c['ratio']:.1f}x[/bold]"
             cells.append(f"{c['ms']:.1f}{ratio}\n{c['peak_mb']:.0f} ({c['drjit_peak_mb']:.0f})")
-        table.add_row(case["size"], f"{case['triangles']:,}", *cells, f"{case['contenders']['raster']['move_ms']:.1f}")
+        table.add_row(
+            case["size"],
+            f"{case['triangles']:,}",
+            *cells,
+            f"{case['contenders']['raster']['move_ms']:.1f}",
+        )
     console.print(table)
 
 
@@ -323,9 +387,18 @@ def plot(path, cases):
             axes.plot(at, ms, color=colour, marker="o", markersize=4, label=name)
             if name == "prb_projective":
                 for x, y, case in zip(at, ms, chosen):
-                    axes.annotate(f"{case['contenders'][name]['ratio']:.1f}×", (x, y), (0, 7), textcoords="offset points", ha="center", fontsize=8)
+                    axes.annotate(
+                        f"{case['contenders'][name]['ratio']:.1f}×",
+                        (x, y),
+                        (0, 7),
+                        textcoords="offset points",
+                        ha="center",
+                        fontsize=8,
+                    )
         axes.set_xscale("log"), axes.set_yscale("log")
-        axes.set_xticks(at, [case["size"].replace("x", "×") for case in chosen], fontsize=8, rotation=30)
+        axes.set_xticks(
+            at, [case["size"].replace("x", "×") for case in chosen], fontsize=8, rotation=30
+        )
         axes.minorticks_off()
         axes.margins(y=0.12)
         axes.set_title(f"{count:,} triangles", fontsize=10)
@@ -338,7 +411,9 @@ def plot(path, cases):
 
 
 def judge_long_run(growth, kernels):
-    """Memory between iteration 50 (or a sixth) and the end, and kernels that came new after the second iteration."""
+    """Memory between iteration 50 (or a sixth) and the end, and kernels that came new after the
+    second iteration.
+    """
     held, new = growth["resident_mb"], kernels["new"]
     early = min(50, len(held) // 6)
     return {
@@ -355,11 +430,31 @@ def judge_long_run(growth, kernels):
 
 
 def parser():
-    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     add_case_arguments(p, SIZES, GRIDS)
-    p.add_argument("--seconds", type=float, default=5, help=f"time for the turns of a case, of which there are at least {LEAST_TURNS} (default: 5)")
-    p.add_argument("--iterations", type=int, default=300, help="length of the run that must not grow or compile (default: 300)")
-    p.add_argument("-o", "--out", metavar="FOLDER", default="out/benchmarks", help="for raster.json and raster.png (default: out/benchmarks)")
+    p.add_argument(
+        "--seconds",
+        type=float,
+        default=5,
+        help=(
+            f"time for the turns of a case, of which there are at least {LEAST_TURNS} (default: 5)"
+        ),
+    )
+    p.add_argument(
+        "--iterations",
+        type=int,
+        default=300,
+        help="length of the run that must not grow or compile (default: 300)",
+    )
+    p.add_argument(
+        "-o",
+        "--out",
+        metavar="FOLDER",
+        default="out/benchmarks",
+        help="for raster.json and raster.png (default: out/benchmarks)",
+    )
     add_mode_argument(p)
     p.add_argument("--worker", help=argparse.SUPPRESS)
     return p
@@ -372,11 +467,17 @@ def main(arguments=None):
     for size in options.sizes:
         parse_size(size)
     if min(options.grids) < 2 or options.iterations < 12:
-        raise InputError(f"--grids {options.grids} --iterations {options.iterations}: at least 2 vertices a side and 12 iterations are needed")
+        raise InputError(
+            f"--grids {options.grids} --iterations {options.iterations}: at least 2 vertices a side"
+            " and 12 iterations are needed"
+        )
     os.makedirs(options.out, exist_ok=True)
     began, cases = time.perf_counter(), []
     size, grid = (TARGET[0] if TARGET[0] in options.sizes else options.sizes[0]), min(options.grids)
-    growth, kernels = (in_process(measure, size, grid, options.mode, iterations=options.iterations) for measure in ("growth", "kernels"))
+    growth, kernels = (
+        in_process(measure, size, grid, options.mode, iterations=options.iterations)
+        for measure in ("growth", "kernels")
+    )
     report = {
         "versions": growth["versions"],
         "load": [os.getloadavg()[0]],  # before the first case and after each
@@ -386,19 +487,28 @@ def main(arguments=None):
     for grid in options.grids:
         for size in options.sizes:
             times = in_process("times", size, grid, options.mode, seconds=options.seconds)
-            memory = {name: in_process("memory", size, grid, options.mode, name=name) for name in CONTENDERS}
+            memory = {
+                name: in_process("memory", size, grid, options.mode, name=name)
+                for name in CONTENDERS
+            }
             cases.append(summarise(size, grid, times, memory))
             report["load"].append(os.getloadavg()[0])
             report["seconds"] = time.perf_counter() - began
             write(report, options.out)
             ratio = cases[-1]["contenders"]["prb_projective"]["ratio"]
-            print(f"{report['seconds']:4.0f} s  {size}, {grid}x{grid} vertices: {ratio:.1f} times", file=sys.stderr)
+            print(
+                f"{report['seconds']:4.0f} s  {size}, {grid}x{grid} vertices: {ratio:.1f} times",
+                file=sys.stderr,
+            )
     print_table(cases)
     print_end(report, options.out)
 
 
 def write(report, out):
-    with aside(os.path.join(out, "raster.json")) as temporary, open(temporary, "w", encoding="utf-8") as file:
+    with (
+        aside(os.path.join(out, "raster.json")) as temporary,
+        open(temporary, "w", encoding="utf-8") as file,
+    ):
         json.dump(report, file, indent=1)
     plot(os.path.join(out, "raster.png"), report["cases"])
 
@@ -410,16 +520,23 @@ def print_end(report, out):
             c = case["contenders"]["prb_projective"]
             low, high = c["ratio_quartiles"]
             print(
-                f"{size}, {grid * grid:,} vertices: raster, RGB and alpha, is {c['ratio']:.2f} times as fast as prb_projective, RGB "
-                f"(quartiles {low:.2f} to {high:.2f}; {c['ratio_with_move']:.2f} with the time to move the sheet); wanted: at least {wanted:g}"
+                f"{size}, {grid * grid:,} vertices: raster, RGB and alpha, is {c['ratio']:.2f}"
+                f" times as fast as prb_projective, RGB (quartiles {low:.2f} to {high:.2f};"
+                f" {c['ratio_with_move']:.2f} with the time to move the sheet); wanted: at least"
+                f" {wanted:g}"
             )
     r = report["long_run"]
     print(
-        f"{r['iterations']} iterations of raster at {r['size']}: {r['growth_mb']:+.1f} MB between iteration {r['early_iteration']} and the last "
-        f"({r['late_mb']:.0f} MB); {r['kernels_an_iteration']:.0f} kernels an iteration, {r['new_kernels_later']} new after the second"
+        f"{r['iterations']} iterations of raster at {r['size']}: {r['growth_mb']:+.1f} MB between"
+        f" iteration {r['early_iteration']} and the last ({r['late_mb']:.0f} MB);"
+        f" {r['kernels_an_iteration']:.0f} kernels an iteration, {r['new_kernels_later']} new after"
+        " the second"
     )
     load = report["load"]
-    print(f"{report['versions']['variant']}, {report['versions']['machine']}, load {min(load):.1f} to {max(load):.1f}; in {out}: raster.json, raster.png")
+    print(
+        f"{report['versions']['variant']}, {report['versions']['machine']}, load {min(load):.1f} to"
+        f" {max(load):.1f}; in {out}: raster.json, raster.png"
+    )
 
 
 if __name__ == "__main__":

@@ -1,12 +1,16 @@
-"""How time a frame and memory of the second-order tracker grow with the template and with the image.
+"""How time a frame and memory of the second-order tracker grow with the template and with the
+image.
 
-    python benchmarks/scaling.py [--grids 33 50 71 100] [--sizes 640x480 1280x720 1920x1080] [--frames 8] [--docs docs] [-m llvm_ad_rgb]
+    python benchmarks/scaling.py [--grids 33 50 71 100] [--sizes 640x480 1280x720 1920x1080]
+    [--frames 8] [--docs docs] [-m llvm_ad_rgb]
 
-A textured sheet that covers a third of the image bends and turns (its edges keep their lengths); ``raster`` renders it, with its masks, 16
-samples a pixel. The template is the sheet in the first frame, of so many vertices a side. Each case is tracked by default settings in a
-process of its own, which has rendered nothing before. A case's seconds are medians over its frames but the first, for which kernels are
-compiled: of all the process's threads together, so that what else the machine does counts little (those of the clock are printed too). Its
-memory is the process's peak; ``started`` is what a process holds before it loads a scene.
+A textured sheet that covers a third of the image bends and turns (its edges keep their lengths);
+``raster`` renders it, with its masks, 16 samples a pixel. The template is the sheet in the first
+frame, of so many vertices a side. Each case is tracked by default settings in a process of its own,
+which has rendered nothing before. A case's seconds are medians over its frames but the first, for
+which kernels are compiled: of all the process's threads together, so that what else the machine
+does counts little (those of the clock are printed too). Its memory is the process's peak;
+``started`` is what a process holds before it loads a scene.
 
 Writes ``scaling.md`` and ``scaling.png`` into ``docs`` (``--docs FOLDER`` for another).
 """
@@ -36,7 +40,7 @@ GRIDS, SIZES, FRAMES = (33, 50, 71, 100), ("640x480", "1280x720", "1920x1080"), 
 SHARE, SAMPLES = 1 / 3, 16  # of the image that the sheet covers; a pixel
 
 
-# ---- in a worker's process ------------------------------------------------------------------------------------------------
+# ---- in a worker's process -----------------------------------------------------------------------
 
 
 def camera(size):
@@ -45,8 +49,8 @@ def camera(size):
 
 
 def sheet(points, size, t):
-    """The sheet at the time t in [0, 1]: vertices (N, 3) [m, camera frame] of a flat sheet at 0, of a cylinder around a slanting axis
-    later.
+    """The sheet at the time t in [0, 1]: vertices (N, 3) [m, camera frame] of a flat sheet at 0, of
+    a cylinder around a slanting axis later.
     """
     x, y = (a.ravel() for a in np.meshgrid(*2 * [np.linspace(-0.5, 0.5, points)]))
     extent = np.sqrt(SHARE) * np.array(size) / camera(size).fx
@@ -68,7 +72,9 @@ def faces_and_uv(points):
 
 
 def make(folder, points, size, frames):
-    """A sequence's folder: frames and masks, template.obj, texture and camera.json, and the true surfaces in gt.npz."""
+    """A sequence's folder: frames and masks, template.obj, texture and camera.json, and the true
+    surfaces in gt.npz.
+    """
     import cv2
     import mitsuba as mi
 
@@ -79,7 +85,9 @@ def make(folder, points, size, frames):
     faces, uv = faces_and_uv(points)
     truth = np.stack([sheet(points, size, k / max(frames - 1, 1)) for k in range(frames)])
     shutil.copy(os.path.join(ROOT, "scenes", "demo", "texture.jpg"), folder)
-    lines = ["v {:.8f} {:.8f} {:.8f}".format(*p) for p in truth[0]] + ["vt {:.8f} {:.8f}".format(*t) for t in uv]
+    lines = ["v {:.8f} {:.8f} {:.8f}".format(*p) for p in truth[0]] + [
+        "vt {:.8f} {:.8f}".format(*t) for t in uv
+    ]
     lines += ["f " + " ".join(f"{k}/{k}" for k in face) for face in faces + 1]
     with open(os.path.join(folder, "template.obj"), "w") as file:
         file.write("\n".join(lines) + "\n")
@@ -90,10 +98,16 @@ def make(folder, points, size, frames):
 
     def write(name, k, values):
         os.makedirs(os.path.join(folder, name), exist_ok=True)
-        cv2.imwrite(os.path.join(folder, name, f"{k:03d}.png"), values[..., ::-1] if values.ndim == 3 else values)
+        cv2.imwrite(
+            os.path.join(folder, name, f"{k:03d}.png"),
+            values[..., ::-1] if values.ndim == 3 else values,
+        )
 
     blank = np.full((size[1], size[0], 3), 255, np.uint8)
-    write("frames", 0, blank), write("masks", 0, blank[..., 0])  # so that there is a scene to render with
+    (
+        write("frames", 0, blank),
+        write("masks", 0, blank[..., 0]),
+    )  # so that there is a scene to render with
     prepare.main([folder])
     experiment = scene.load(os.path.join(folder, "scene.xml"), {"spp": str(SAMPLES)})
     problem = Problem(experiment, Sequence.open(experiment.frames, experiment.masks))
@@ -106,8 +120,8 @@ def make(folder, points, size, frames):
 
 
 def measure(folder):
-    """Seconds (of the clock, of all threads) and evaluations of each frame, memory [MB] before the scene and at most, and distances from
-    the truth [mm].
+    """Seconds (of the clock, of all threads) and evaluations of each frame, memory [MB] before the
+    scene and at most, and distances from the truth [mm].
     """
     from polysft_mi import scene, solvers
     from polysft_mi.patch import Unknowns
@@ -124,14 +138,22 @@ def measure(folder):
     def tick(frame, *_):
         ticks[frame] = time.process_time()  # after the last evaluation of a frame
 
-    done = track(problem, solvers.create(experiment.settings), len(problem.sequence), folder, progress=tick)
+    done = track(
+        problem, solvers.create(experiment.settings), len(problem.sequence), folder, progress=tick
+    )
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
     with np.load(os.path.join(folder, "gt.npz")) as truth:
         found = np.stack([problem.surface(Unknowns.from_numpy(s)) for s in done.states])
         error = 1e3 * np.sqrt(((found - truth["vertices"]) ** 2).sum(2).mean(1))
     order = max(t["order"] for t in done.totals)
     cpu = np.diff(list(ticks.values())).tolist()
-    figures = {"seconds": done.seconds[1:], "cpu": cpu, "evaluations": done.iterations[1:], "rmse_mm": error.tolist(), "order": order}
+    figures = {
+        "seconds": done.seconds[1:],
+        "cpu": cpu,
+        "evaluations": done.iterations[1:],
+        "rmse_mm": error.tolist(),
+        "order": order,
+    }
     return {**figures, "started_mb": started, "peak_mb": peak}
 
 
@@ -146,19 +168,31 @@ def worker(job):
         print(json.dumps({**measure(job["folder"]), "versions": outputs.versions()}))
 
 
-# ---- in the benchmark's own process ---------------------------------------------------------------------------------------
+# ---- in the benchmark's own process --------------------------------------------------------------
 
 
 def run_case(points, size, frames, mode):
     """The figures of a case (dict)."""
     with tempfile.TemporaryDirectory() as folder:
         for task in ("make", "measure"):
-            job = {"task": task, "folder": folder, "points": points, "size": size, "frames": frames, "mode": mode}
+            job = {
+                "task": task,
+                "folder": folder,
+                "points": points,
+                "size": size,
+                "frames": frames,
+                "mode": mode,
+            }
             command = [sys.executable, os.path.abspath(__file__), "--worker", json.dumps(job)]
-            done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+            done = subprocess.run(
+                command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+            )
             if done.returncode:
                 why = done.stderr.strip()[-500:]
-                raise InputError(f"{points * points} vertices at {size}: {task} ended with status {done.returncode}: {why}")
+                raise InputError(
+                    f"{points * points} vertices at {size}: {task} ended with status"
+                    f" {done.returncode}: {why}"
+                )
     return summarise(points, size, json.loads(done.stdout.splitlines()[-1]))
 
 
@@ -180,8 +214,8 @@ def report(cases, docs, frames):
     """Write scaling.md and scaling.png for cases that are done; the text."""
     v = cases[0]["versions"]
     rows = [
-        f"| {c['vertices']:,} | {c['size'].replace('x', '×')} | {c['cpu']:.2f} | {c['evaluations']:.0f} | {c['order']} "
-        f"| {c['peak_mb']:.0f} | {c['rmse_mm']:.2f} |"
+        f"| {c['vertices']:,} | {c['size'].replace('x', '×')} | {c['cpu']:.2f} |"
+        f" {c['evaluations']:.0f} | {c['order']} | {c['peak_mb']:.0f} | {c['rmse_mm']:.2f} |"
         for c in cases
     ]
     started = np.median([c["started_mb"] for c in cases])
@@ -190,7 +224,7 @@ def report(cases, docs, frames):
 `python benchmarks/scaling.py` makes this page: a sheet that covers a third of the image bends and turns in front of the camera, rendered with its
 masks, tracked by default settings. Seconds a frame are the tracker's (median of {frames - 1} frames), without start-up and pictures, of all its
 threads together: on idle cores it takes less, for reading the next frame and the kernels run beside the rest. Memory is the process's peak, of which
-{started:.0f} MB are Python, Mitsuba, PyTorch and LLVM. Evaluations are those of the objective with its derivatives. {v['variant']}, {v['machine']}.
+{started:.0f} MB are Python, Mitsuba, PyTorch and LLVM. Evaluations are those of the objective with its derivatives. {v["variant"]}, {v["machine"]}.
 
 | vertices | image | seconds a frame | evaluations a frame | highest order | memory [MB] | RMS distance from the truth [mm] |
 |---:|---|---:|---:|---:|---:|---:|
@@ -204,7 +238,10 @@ with the square of the number of vertices. Up to 3,000 vertices the relief moves
 costs time, and on a sheet as smooth as this one its noise is to be seen in the distances. This sheet bends within a few frames, so that its mirror
 twin is tried in most of them: evaluations are up to twice those of a longer video.
 """
-    with aside(os.path.join(docs, "scaling.md")) as temporary, open(temporary, "w", encoding="utf-8") as file:
+    with (
+        aside(os.path.join(docs, "scaling.md")) as temporary,
+        open(temporary, "w", encoding="utf-8") as file,
+    ):
         file.write(text)
     plot(os.path.join(docs, "scaling.png"), cases)
     return text
@@ -220,12 +257,21 @@ def plot(path, cases):
     counts = sorted({c["vertices"] for c in cases})
     shades = lambda n: [(0.77, 0.34, 0.18, 1 - 0.7 * k / max(n - 1, 1)) for k in reversed(range(n))]
     for row, (name, label) in enumerate((("cpu", "seconds a frame"), ("peak_mb", "memory [MB]"))):
-        for column, (groups, key, across) in enumerate(((sizes, "size", lambda c: c["vertices"]), (counts, "vertices", pixels))):
+        for column, (groups, key, across) in enumerate(
+            ((sizes, "size", lambda c: c["vertices"]), (counts, "vertices", pixels))
+        ):
             a = axes[row, column]
             for group, colour in zip(groups, shades(len(groups))):
                 chosen = sorted((c for c in cases if c[key] == group), key=across)
                 text = group.replace("x", "×") if key == "size" else f"{group:,} vertices"
-                a.plot([across(c) for c in chosen], [c[name] for c in chosen], color=colour, marker="o", markersize=3.5, label=text)
+                a.plot(
+                    [across(c) for c in chosen],
+                    [c[name] for c in chosen],
+                    color=colour,
+                    marker="o",
+                    markersize=3.5,
+                    label=text,
+                )
             a.grid(True, color="0.9", linewidth=0.6)
             a.spines[["top", "right"]].set_visible(False)
             a.set_ylim(bottom=0)
@@ -235,16 +281,27 @@ def plot(path, cases):
                 a.legend(frameon=False, fontsize=8, loc="lower right")
     axes[1, 0].set_xlabel("vertices")
     axes[1, 1].set_xlabel("pixels")
-    axes[1, 1].set_xticks([np.prod(parse_size(s)) for s in sizes], [s.replace("x", "×") for s in sizes], fontsize=8)
+    axes[1, 1].set_xticks(
+        [np.prod(parse_size(s)) for s in sizes], [s.replace("x", "×") for s in sizes], fontsize=8
+    )
     with aside(path) as temporary:
         figure.savefig(temporary, format="png", facecolor="white")
 
 
 def parser():
-    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     add_case_arguments(p, SIZES, GRIDS)
-    p.add_argument("--frames", type=int, default=FRAMES, help=f"frames of a case (default: {FRAMES})")
-    p.add_argument("--docs", metavar="FOLDER", default=os.path.join(ROOT, "docs"), help="for scaling.md and scaling.png (default: docs)")
+    p.add_argument(
+        "--frames", type=int, default=FRAMES, help=f"frames of a case (default: {FRAMES})"
+    )
+    p.add_argument(
+        "--docs",
+        metavar="FOLDER",
+        default=os.path.join(ROOT, "docs"),
+        help="for scaling.md and scaling.png (default: docs)",
+    )
     add_mode_argument(p)
     p.add_argument("--worker", help=argparse.SUPPRESS)
     return p
@@ -264,8 +321,15 @@ def main(arguments=None):
         for points in options.grids:
             cases.append(run_case(points, size, options.frames, options.mode))
             c = cases[-1]
-            figures = f"{c['seconds']:.2f} s a frame ({c['cpu']:.2f} of all threads), {c['peak_mb']:.0f} MB"
-            print(f"{time.perf_counter() - began:4.0f} s  {c['vertices']} vertices, {size}: {figures}", file=sys.stderr)
+            figures = (
+                f"{c['seconds']:.2f} s a frame ({c['cpu']:.2f} of all threads),"
+                f" {c['peak_mb']:.0f} MB"
+            )
+            print(
+                f"{time.perf_counter() - began:4.0f} s  {c['vertices']} vertices, {size}:"
+                f" {figures}",
+                file=sys.stderr,
+            )
     print(report(cases, options.docs, options.frames))
 
 

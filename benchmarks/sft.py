@@ -1,15 +1,19 @@
 """Every sequence by every solver, and by a per-vertex baseline: accuracy against time a frame.
 
-    python benchmarks/sft.py [--data FOLDER] [--only flag ...] [--methods adam ...] [--frames N] [--threads N] [-o out/benchmarks]
+    python benchmarks/sft.py [--data FOLDER] [--only flag ...] [--methods adam ...] [--frames N]
+    [--threads N] [-o out/benchmarks]
 
-Each method is a command, run as a user would and timed as a whole, start-up and everything it writes included:
-``python -m polysft_mi.run`` with the solver ``gauss-newton`` or ``adam``, and ``per_vertex.py``. The figures are those of
-``python -m polysft_mi.evaluate``. Each result goes into ``sft.json`` as soon as it is there; the next call does what is missing (all of it
-with ``--again``), and draws the tables and the plot from everything that was run in the same way. Where the truth is a mesh, they also say
-what the best jet of the order used makes of it: one fitted to the true vertices of each frame.
+Each method is a command, run as a user would and timed as a whole, start-up and everything it
+writes included: ``python -m polysft_mi.run`` with the solver ``gauss-newton`` or ``adam``, and
+``per_vertex.py``. The figures are those of ``python -m polysft_mi.evaluate``. Each result goes into
+``sft.json`` as soon as it is there; the next call does what is missing (all of it with
+``--again``), and draws the tables and the plot from everything that was run in the same way. Where
+the truth is a mesh, they also say what the best jet of the order used makes of it: one fitted to
+the true vertices of each frame.
 
-Writes ``sft.json``, ``sft.md`` and ``sft.png`` into ``docs``, where the results of whole videos stand already (``--docs FOLDER`` for another; for
-runs that are shortened or by other settings, into OUT).
+Writes ``sft.json``, ``sft.md`` and ``sft.png`` into ``docs``, where the results of whole videos
+stand already (``--docs FOLDER`` for another; for runs that are shortened or by other settings, into
+OUT).
 """
 
 import argparse
@@ -42,16 +46,31 @@ KINDS = (  # of ground truth: title, figures in the table
     ("Point clouds", ("chamfer_1e4", "chamfer_1e4_worst")),
 )
 PANELS = ("e3d_proc", "en_deg", "depth_rmse_mm", "chamfer_1e4")
-COLOURS = {"gauss-newton": ("#c4572e", "o"), "adam": ("#3b6ea5", "s"), "per-vertex": ("#4b8b3b", "^")}
+COLOURS = {
+    "gauss-newton": ("#c4572e", "o"),
+    "adam": ("#3b6ea5", "s"),
+    "per-vertex": ("#4b8b3b", "^"),
+}
 
 
-# ---- running ----------------------------------------------------------------------------------------------------------
+# ---- running -------------------------------------------------------------------------------------
 
 
 def folder_of(data, sequence):
     """The folder of a sequence in ``data`` or one folder further down; None where there is none."""
-    places = [data] + sorted(entry.path for entry in os.scandir(data) if entry.is_dir()) if os.path.isdir(data) else []
-    return next((path for path in (os.path.join(place, sequence) for place in places) if os.path.isdir(path)), None)
+    places = (
+        [data] + sorted(entry.path for entry in os.scandir(data) if entry.is_dir())
+        if os.path.isdir(data)
+        else []
+    )
+    return next(
+        (
+            path
+            for path in (os.path.join(place, sequence) for place in places)
+            if os.path.isdir(path)
+        ),
+        None,
+    )
 
 
 def command(sequence, method, folder, out, setup):
@@ -74,36 +93,74 @@ def command(sequence, method, folder, out, setup):
 
 def setup_of(options):
     """What two results must share to stand in one table."""
-    return {name: getattr(options, name) for name in ("frames", "threads", "define", "mode", "iterations")}
+    return {
+        name: getattr(options, name)
+        for name in ("frames", "threads", "define", "mode", "iterations")
+    }
 
 
 def is_whole(setup):
-    """Whether results of this setup are what the documentation shows: whole videos, default settings."""
+    """Whether results of this setup are what the documentation shows: whole videos, default
+    settings.
+    """
     return not (setup["frames"] or setup["threads"] or setup["define"] or setup["iterations"])
 
 
 def run(sequence, method, folder, out, setup):
-    """Run one command and read its accuracy: a result, a dict. A command that fails gives one with ``error``, its last line."""
+    """Run one command and read its accuracy: a result, a dict. A command that fails gives one with
+    ``error``, its last line.
+    """
     line = command(sequence, method, folder, out, setup)
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [ROOT, os.environ.get("PYTHONPATH")]))}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join(filter(None, [ROOT, os.environ.get("PYTHONPATH")])),
+    }
     limit = None
     if setup["threads"]:
-        environment |= {name: str(setup["threads"]) for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
-        chosen = set(allowed_cores()[: setup["threads"]])  # Dr.Jit and OpenCV take as many threads as there are cores for them
-        limit = (lambda: os.sched_setaffinity(0, chosen)) if hasattr(os, "sched_setaffinity") else None
+        environment |= {
+            name: str(setup["threads"])
+            for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+        }
+        chosen = set(
+            allowed_cores()[: setup["threads"]]
+        )  # Dr.Jit and OpenCV take as many threads as there are cores for them
+        limit = (
+            (lambda: os.sched_setaffinity(0, chosen)) if hasattr(os, "sched_setaffinity") else None
+        )
     # the results are for other machines too: paths begin with the sequence's name there
-    plain = lambda text: text.replace(os.path.abspath(folder), sequence).replace(folder, sequence).replace(ROOT + os.sep, "")
-    result = {"sequence": sequence, "method": method, "setup": setup, "command": [plain(part) for part in line[1:]]}
+    plain = lambda text: (
+        text.replace(os.path.abspath(folder), sequence)
+        .replace(folder, sequence)
+        .replace(ROOT + os.sep, "")
+    )
+    result = {
+        "sequence": sequence,
+        "method": method,
+        "setup": setup,
+        "command": [plain(part) for part in line[1:]],
+    }
     result |= {"machine": machine(setup), "load": os.getloadavg()[0]}
     os.makedirs(os.path.dirname(os.path.abspath(out)), exist_ok=True)
     with open(f"{out}.log", "w+", encoding="utf-8") as log:
         began = time.perf_counter()
-        status = subprocess.run(line, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment, preexec_fn=limit).returncode
+        status = subprocess.run(
+            line,
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            env=environment,
+            preexec_fn=limit,
+        ).returncode
         result["seconds"] = time.perf_counter() - began
         log.seek(0)
         said = log.read().split("\n")
     if status:
-        return {**result, "error": plain(next((text for text in reversed(said) if text.strip()), f"exit status {status}"))}
+        return {
+            **result,
+            "error": plain(
+                next((text for text in reversed(said) if text.strip()), f"exit status {status}")
+            ),
+        }
     with open(os.path.join(out, "metrics.json"), encoding="utf-8") as file:
         summary = json.load(file)
     # where a solver chooses the order itself, its windows tell
@@ -128,34 +185,49 @@ def run(sequence, method, folder, out, setup):
 
 def allowed_cores():
     """Numbers of the cores that this process may run on."""
-    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
+    return (
+        sorted(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity")
+        else list(range(os.cpu_count() or 1))
+    )
 
 
 def machine(setup):
-    """The machine in words: CPU, how many of its cores are used, and the GPU where one is asked for by name."""
+    """The machine in words: CPU, how many of its cores are used, and the GPU where one is asked for
+    by name.
+    """
     name = "CPU of unknown model"
     try:
         with open("/proc/cpuinfo", encoding="utf-8") as file:
-            name = next(text.partition(":")[2].strip() for text in file if text.startswith("model name"))
+            name = next(
+                text.partition(":")[2].strip() for text in file if text.startswith("model name")
+            )
     except (OSError, StopIteration):
         pass
     cores, used = os.cpu_count() or 1, min(len(allowed_cores()), setup["threads"] or sys.maxsize)
-    text = f"{name}, {cores} core{'s' * (cores != 1)}" + (f", {used} of them used" if used < cores else "")
+    text = f"{name}, {cores} core{'s' * (cores != 1)}" + (
+        f", {used} of them used" if used < cores else ""
+    )
     if (setup["mode"] or "").startswith("cuda"):
         ask = ["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]
-        text += ", " + (subprocess.run(ask, capture_output=True, text=True).stdout.strip().split("\n")[0] or "GPU of unknown model")
+        text += ", " + (
+            subprocess.run(ask, capture_output=True, text=True).stdout.strip().split("\n")[0]
+            or "GPU of unknown model"
+        )
     return text
 
 
-# ---- the best that a jet can hold ---------------------------------------------------------------------------------------
+# ---- the best that a jet can hold ----------------------------------------------------------------
 
 
 def best_jets(template, truth):
-    """The jets of the template's order that come closest to the true vertices (T, N, 3) [m], at the vertices: (T, N, 3) [m].
+    """The jets of the template's order that come closest to the true vertices (T, N, 3) [m], at the
+    vertices: (T, N, 3) [m].
 
-    A jet may turn and move, and each vertex may slide on it. What comes closest in the end, by least squares, is kept of three starts: the
-    template's orientation laid over the truth, the truth's own principal axes, and the jet of the frame before. From the first two the
-    order rises by and by; at once, it ends farther off. The search is local all the same.
+    A jet may turn and move, and each vertex may slide on it. What comes closest in the end, by
+    least squares, is kept of three starts: the template's orientation laid over the truth, the
+    truth's own principal axes, and the jet of the frame before. From the first two the order rises
+    by and by; at once, it ends farther off. The search is local all the same.
     """
     from polyfit.frames import CanonicalFrame
     from polysft_mi.normal_equations import Chart
@@ -165,12 +237,22 @@ def best_jets(template, truth):
 
     orders = [*range(2, template.order, 2), template.order]
     parts = (template.vertices, template.faces, template.uv)
-    charts = [Chart(template if n == template.order else Template.fit(*parts, min(n, FITTED), capacity=n, tolerance=np.inf)) for n in orders]
+    charts = [
+        Chart(
+            template
+            if n == template.order
+            else Template.fit(*parts, min(n, FITTED), capacity=n, tolerance=np.inf)
+        )
+        for n in orders
+    ]
     previous, surfaces = None, []
     for V in np.asarray(truth, dtype=np.float64):
         over = _rotation_onto(template.vertices, V) @ template.rotation
         axes = CanonicalFrame.from_points(torch.as_tensor(V)).R.numpy()
-        found = [_risen(charts, _standing_in(charts[0].template, V, turn), V) for turn in (over, _turned_to(over, axes[:, 2]))]
+        found = [
+            _risen(charts, _standing_in(charts[0].template, V, turn), V)
+            for turn in (over, _turned_to(over, axes[:, 2]))
+        ]
         if previous is not None:
             found.append(_refined(charts[-1], previous, V))
         previous = min(found, key=lambda x: x[1])[0]
@@ -179,7 +261,9 @@ def best_jets(template, truth):
 
 
 def _risen(charts, arrays, V):
-    """(state, distance [m]) as of :func:`_refined` in the last chart, by way of those before it; ``arrays`` are unknowns of the first."""
+    """(state, distance [m]) as of :func:`_refined` in the last chart, by way of those before it;
+    ``arrays`` are unknowns of the first.
+    """
     for k, chart in enumerate(charts):
         if k:  # the same jet in the higher order
             lower = charts[k - 1].template.alpha + arrays["delta_alpha"]
@@ -197,7 +281,9 @@ def _rotation_onto(A, B):
 
 
 def _turned_to(rotation, axis):
-    """The rotation (3, 3), turned the shortest way so that its third column lies along ``axis`` (3,) or against it."""
+    """The rotation (3, 3), turned the shortest way so that its third column lies along ``axis``
+    (3,) or against it.
+    """
     z = rotation[:, 2]
     axis = axis * (1 if axis @ z >= 0 else -1)
     v, c = np.cross(z, axis), z @ axis
@@ -206,7 +292,9 @@ def _turned_to(rotation, axis):
 
 
 def _standing_in(template, V, axes):
-    """Unknowns, as ``params.npz`` names them: the least-squares jet of the heights of V (N, 3) over the first two columns of ``axes``."""
+    """Unknowns, as ``params.npz`` names them: the least-squares jet of the heights of V (N, 3) over
+    the first two columns of ``axes``.
+    """
     import torch
     from scipy.spatial.transform import Rotation
 
@@ -227,13 +315,18 @@ def _standing_in(template, V, axes):
 
 
 def _refined(chart, state, V, steps=60):
-    """(state, distance [m]): Gauss-Newton from a state towards the vertices V (N, 3), with steps shortened where they gain more so."""
+    """(state, distance [m]): Gauss-Newton from a state towards the vertices V (N, 3), with steps
+    shortened where they gain more so.
+    """
     distance = lambda s: metrics.rmse(chart.surface(s).vertices, V)
     least = distance(state)
     for _ in range(steps):
         try:
             whole = chart.fitted(state, V, iterations=1, bending=1e-9)
-            tried = [(distance(x), x) for x in (state.towards(whole, -back) for back in (0, 0.5, 0.75, 0.9, 0.97))]
+            tried = [
+                (distance(x), x)
+                for x in (state.towards(whole, -back) for back in (0, 0.5, 0.75, 0.9, 0.97))
+            ]
         except (np.linalg.LinAlgError, ValueError):
             break
         now, there = min(tried, key=lambda x: x[0] if np.isfinite(x[0]) else np.inf)
@@ -257,14 +350,27 @@ def jet_result(sequence, folder, order, setup):
     if "vertices" not in truth:
         return None
     vertices, faces, uv = meshio.read_template(obj)
-    template = Template.fit(vertices, faces, uv, min(order, FITTED), capacity=order, tolerance=np.inf, where=obj)
+    template = Template.fit(
+        vertices, faces, uv, min(order, FITTED), capacity=order, tolerance=np.inf, where=obj
+    )
     meshes = truth["vertices"][: setup["frames"] or None]
-    surface = {"vertices": best_jets(template, meshes), "faces": template.faces, "frames": np.arange(len(meshes))}
+    surface = {
+        "vertices": best_jets(template, meshes),
+        "faces": template.faces,
+        "frames": np.arange(len(meshes)),
+    }
     figures = metrics.score(surface, truth_path)
-    return {"sequence": sequence, "method": JET, "setup": setup, "frames": len(meshes), "orders": [order, order], "figures": figures}
+    return {
+        "sequence": sequence,
+        "method": JET,
+        "setup": setup,
+        "frames": len(meshes),
+        "orders": [order, order],
+        "figures": figures,
+    }
 
 
-# ---- results ----------------------------------------------------------------------------------------------------------
+# ---- results -------------------------------------------------------------------------------------
 
 
 def read(path):
@@ -279,7 +385,9 @@ def read(path):
 
 
 def add(path, result):
-    """Write a result into the file, in place of an earlier one of the same sequence, method, order (of a best jet) and setup."""
+    """Write a result into the file, in place of an earlier one of the same sequence, method, order
+    (of a best jet) and setup.
+    """
     mine = identity(result)
     kept = [other for other in read(path) if identity(other) != mine]
     with aside(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
@@ -289,7 +397,12 @@ def add(path, result):
 
 def identity(result):
     """What no two results in the file share: sequence, method, order (of a best jet), setup."""
-    return result["sequence"], result["method"], result["orders"][1] if result["method"] == JET else None, result["setup"]
+    return (
+        result["sequence"],
+        result["method"],
+        result["orders"][1] if result["method"] == JET else None,
+        result["setup"],
+    )
 
 
 def find(results, sequence, method, setup, order=None):
@@ -299,22 +412,40 @@ def find(results, sequence, method, setup, order=None):
 
 
 def table(results):
-    """Results as Markdown: a table for each kind of ground truth, sequences and methods in their order here."""
+    """Results as Markdown: a table for each kind of ground truth, sequences and methods in their
+    order here.
+    """
     place = {name: k for k, name in enumerate((*METHODS, JET))}
-    ordered = sorted(results, key=lambda r: (SEQUENCES.index(r["sequence"]), place[r["method"]], r.get("orders") or []))
+    ordered = sorted(
+        results,
+        key=lambda r: (SEQUENCES.index(r["sequence"]), place[r["method"]], r.get("orders") or []),
+    )
     parts = []
     for title, names in KINDS:
         rows = [r for r in ordered if names[0] in r.get("figures", {})]
         if not rows:
             continue
-        head = ["sequence", "method", "order", "frames", *(LABELS[name] for name in names), "seconds a frame", "iterations a window"]
+        head = [
+            "sequence",
+            "method",
+            "order",
+            "frames",
+            *(LABELS[name] for name in names),
+            "seconds a frame",
+            "iterations a window",
+        ]
         lines = [f"## {title}", "", _row(head), _row(["---"] * 4 + ["---:"] * (len(head) - 4))]
         for r in rows:
             method = "*best jet*" if r["method"] == JET else f"`{r['method']}`"
             orders = "–" if not r.get("orders") else "–".join(map(str, dict.fromkeys(r["orders"])))
-            time_taken = [_number(r.get("seconds_a_frame"), ".3g"), _number(r.get("iterations"), ".0f")]
+            time_taken = [
+                _number(r.get("seconds_a_frame"), ".3g"),
+                _number(r.get("iterations"), ".0f"),
+            ]
             frames = f"{r['frames']}, {r['lost']} lost" if r.get("lost") else r["frames"]
-            figures = [f"{r['figures'][name]:.4g}" if name in r["figures"] else "–" for name in names]
+            figures = [
+                f"{r['figures'][name]:.4g}" if name in r["figures"] else "–" for name in names
+            ]
             lines.append(_row([r["sequence"], method, orders, frames, *figures, *time_taken]))
         parts.append("\n".join(lines))
     for key, title in (("error", "Failed"), ("unscored", "Without figures")):
@@ -334,46 +465,75 @@ def _number(value, form):
 
 def page(results, picture):
     """The text of ``sft.md``."""
-    machines = sorted({f"{r['machine']}, `{r['versions']['variant']}`" for r in results if r.get("versions")})
+    machines = sorted(
+        {f"{r['machine']}, `{r['versions']['variant']}`" for r in results if r.get("versions")}
+    )
     jets = any(r["method"] == JET for r in results)
     text = [
         "# Accuracy and time of the solvers",
-        "Made by `python benchmarks/sft.py`. The time is the whole command's, start-up and outputs included, over the number of frames. "
-        f"Measured on {'; '.join(machines) or 'no machine yet'}.",
-        "`per-vertex` is what a Mitsuba user would write without jets (`benchmarks/per_vertex.py`): the same renderer and objective, the "
-        "template's vertices as unknowns through `mi.ad.LargeSteps`; it writes no pictures.",
+        (
+            "Made by `python benchmarks/sft.py`. The time is the whole command's, start-up and"
+            " outputs included, over the number of frames. Measured on"
+            f" {'; '.join(machines) or 'no machine yet'}."
+        ),
+        (
+            "`per-vertex` is what a Mitsuba user would write without jets"
+            " (`benchmarks/per_vertex.py`): the same renderer and objective, the template's"
+            " vertices as unknowns through `mi.ad.LargeSteps`; it writes no pictures."
+        ),
     ]
     if jets:
         text.append(
-            "*Best jet* is the jet that comes closest to the true vertices of each frame, found by a local search: about the least "
-            "distance that its order can leave. Its normals are what they are then, not the best possible."
+            "*Best jet* is the jet that comes closest to the true vertices of each frame, found by"
+            " a local search: about the least distance that its order can leave. Its normals are"
+            " what they are then, not the best possible."
         )
-    if any(np.isinf(value) for r in results for value in r.get("figures", {}).values() if isinstance(value, float)):
-        text.append("*inf*: there is a frame whose surface none of the truth's rays meets; the plot leaves it out.")
+    if any(
+        np.isinf(value)
+        for r in results
+        for value in r.get("figures", {}).values()
+        if isinstance(value, float)
+    ):
+        text.append(
+            "*inf*: there is a frame whose surface none of the truth's rays meets; the plot leaves"
+            " it out."
+        )
     if any(r.get("seconds_a_frame") for r in results):
         text.append(f"![Accuracy against seconds a frame, one marker a method]({picture})")
     return "\n\n".join([*text, table(results)]) + "\n"
 
 
 def plot(path, results):
-    """Accuracy against seconds a frame, a panel a figure, a marker a method; lines join the methods of a sequence."""
+    """Accuracy against seconds a frame, a panel a figure, a marker a method; lines join the methods
+    of a sequence.
+    """
     from matplotlib.figure import Figure
     from matplotlib.ticker import LogFormatter
 
     timed = [r for r in results if r.get("seconds_a_frame") and "figures" in r]
-    panels = [name for name in PANELS if any(np.isfinite(r["figures"].get(name, np.nan)) for r in timed)]
+    panels = [
+        name for name in PANELS if any(np.isfinite(r["figures"].get(name, np.nan)) for r in timed)
+    ]
     if not panels:
         return False
     figure = Figure(figsize=(4.2 * len(panels), 4), dpi=110, layout="constrained")
     for axes, name in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels):
-        shown = [r for r in timed if np.isfinite(r["figures"].get(name, np.nan))]  # infinite where a sheet has left the truth's rays
+        shown = [
+            r for r in timed if np.isfinite(r["figures"].get(name, np.nan))
+        ]  # infinite where a sheet has left the truth's rays
         named = []
         for sequence in dict.fromkeys(r["sequence"] for r in shown):
-            points = sorted((r["seconds_a_frame"], r["figures"][name]) for r in shown if r["sequence"] == sequence)
+            points = sorted(
+                (r["seconds_a_frame"], r["figures"][name])
+                for r in shown
+                if r["sequence"] == sequence
+            )
             axes.plot(*zip(*points), color="0.85", linewidth=0.8, zorder=1)
             named.append((points[0], sequence))
         for method, (colour, marker) in COLOURS.items():
-            points = [(r["seconds_a_frame"], r["figures"][name]) for r in shown if r["method"] == method]
+            points = [
+                (r["seconds_a_frame"], r["figures"][name]) for r in shown if r["method"] == method
+            ]
             if points:
                 axes.plot(*zip(*points), marker, color=colour, markersize=6, label=method, zorder=2)
         axes.set_xscale("log"), axes.set_yscale("log")
@@ -393,7 +553,9 @@ def plot(path, results):
 
 
 def _label(axes, named):
-    """Write names, (point, name) each, beside their points, upwards of one another where points lie close together."""
+    """Write names, (point, name) each, beside their points, upwards of one another where points lie
+    close together.
+    """
     axes.autoscale_view()  # else the limits come later
     position = axes.transLimits.transform  # of logarithms, to shares of the axes
     places = [(*position(np.log10(point)), name) for point, name in named]
@@ -408,27 +570,71 @@ def report(results, folder):
     """Write ``sft.md`` and ``sft.png`` into a folder; returns the tables."""
     os.makedirs(folder, exist_ok=True)
     plot(os.path.join(folder, "sft.png"), results)
-    with aside(os.path.join(folder, "sft.md")) as temporary, open(temporary, "w", encoding="utf-8") as file:
+    with (
+        aside(os.path.join(folder, "sft.md")) as temporary,
+        open(temporary, "w", encoding="utf-8") as file,
+    ):
         file.write(page(results, "sft.png"))
     return table(results)
 
 
-# ---- the command --------------------------------------------------------------------------------------------------------
+# ---- the command ---------------------------------------------------------------------------------
 
 
 def parser():
-    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument("--data", metavar="FOLDER", default=DATA, help="holds the sequences' folders (default, or POLYSFT_DATA: %(default)s)")
-    p.add_argument("--only", nargs="+", metavar="SEQUENCE", choices=SEQUENCES, default=list(SEQUENCES), help=f"of {', '.join(SEQUENCES)}")
+    p = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    p.add_argument(
+        "--data",
+        metavar="FOLDER",
+        default=DATA,
+        help="holds the sequences' folders (default, or POLYSFT_DATA: %(default)s)",
+    )
+    p.add_argument(
+        "--only",
+        nargs="+",
+        metavar="SEQUENCE",
+        choices=SEQUENCES,
+        default=list(SEQUENCES),
+        help=f"of {', '.join(SEQUENCES)}",
+    )
     known = f"of {', '.join(METHODS)}; none for the report alone"
-    p.add_argument("--methods", nargs="*", metavar="METHOD", choices=METHODS, default=list(METHODS), help=known)
+    p.add_argument(
+        "--methods", nargs="*", metavar="METHOD", choices=METHODS, default=list(METHODS), help=known
+    )
     p.add_argument("--frames", type=int, metavar="N", help="only the first N frames of each")
     p.add_argument("--threads", type=int, metavar="N", help="cores for each command (default: all)")
-    p.add_argument("--iterations", type=int, metavar="N", help="iterations a frame of per-vertex (default: its own)")
-    p.add_argument("-D", dest="define", metavar="NAME=VALUE", action="append", default=[], help="override a <default> of every scene")
+    p.add_argument(
+        "--iterations",
+        type=int,
+        metavar="N",
+        help="iterations a frame of per-vertex (default: its own)",
+    )
+    p.add_argument(
+        "-D",
+        dest="define",
+        metavar="NAME=VALUE",
+        action="append",
+        default=[],
+        help="override a <default> of every scene",
+    )
     p.add_argument("--again", action="store_true", help="run what has a result, too")
-    p.add_argument("-o", "--out", metavar="FOLDER", default="out/benchmarks", help="for the runs (default: out/benchmarks)")
-    p.add_argument("--docs", metavar="FOLDER", help="for sft.json, sft.md and sft.png (default: docs for whole runs by default settings, else OUT)")
+    p.add_argument(
+        "-o",
+        "--out",
+        metavar="FOLDER",
+        default="out/benchmarks",
+        help="for the runs (default: out/benchmarks)",
+    )
+    p.add_argument(
+        "--docs",
+        metavar="FOLDER",
+        help=(
+            "for sft.json, sft.md and sft.png (default: docs for whole runs by default settings,"
+            " else OUT)"
+        ),
+    )
     add_mode_argument(p)
     return p
 
@@ -442,7 +648,9 @@ def main(arguments=None):
         if "=" not in text:
             raise InputError(f"-D {text}: NAME=VALUE is needed")
     if not os.path.isdir(options.data):
-        raise InputError(f"--data {options.data}: no such folder; it must hold the sequences' folders")
+        raise InputError(
+            f"--data {options.data}: no such folder; it must hold the sequences' folders"
+        )
     setup = setup_of(options)
     docs = options.docs or (os.path.join(ROOT, "docs") if is_whole(setup) else options.out)
     path = os.path.join(docs, "sft.json")
@@ -459,12 +667,23 @@ def main(arguments=None):
                 continue
             print(f"{sequence}, {method} ...", file=sys.stderr)
             shortened = f"-first{setup['frames']}" if setup["frames"] else ""
-            result = run(sequence, method, folder, os.path.join(options.out, "sft", f"{sequence}-{method}{shortened}"), setup)
+            result = run(
+                sequence,
+                method,
+                folder,
+                os.path.join(options.out, "sft", f"{sequence}-{method}{shortened}"),
+                setup,
+            )
             add(path, result)
-            told = result.get("error") or f"{result['seconds_a_frame']:.2f} s a frame, {json.dumps(result['figures'])}"
+            told = (
+                result.get("error")
+                or f"{result['seconds_a_frame']:.2f} s a frame, {json.dumps(result['figures'])}"
+            )
             print(f"{sequence}, {method}: {told}", file=sys.stderr)
         results = [r for r in read(path) if r["sequence"] == sequence and r["setup"] == setup]
-        for order in sorted({r["orders"][1] for r in results if r.get("orders") and r["method"] != JET}):
+        for order in sorted(
+            {r["orders"][1] for r in results if r.get("orders") and r["method"] != JET}
+        ):
             if options.again or not find(results, sequence, JET, setup, order):
                 result = jet_result(sequence, folder, order, setup)
                 if result:

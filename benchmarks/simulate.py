@@ -1,11 +1,14 @@
-"""Sequences that nobody has tuned anything on: cloth simulated by Newton, rendered by Mitsuba's path tracer.
+"""Sequences that nobody has tuned anything on: cloth simulated by Newton, rendered by Mitsuba's
+path tracer.
 
     pip install newton                                               # NVIDIA's simulator on Warp; on the CPU too
     python benchmarks/simulate.py OUT --seed 3                       # OUT/flag, bend, paper, curtain; about two minutes each on one core
-    python benchmarks/sft.py --data OUT --only flag bend paper curtain --methods gauss-newton -o RESULTS
+    python benchmarks/sft.py --data OUT --only flag bend paper curtain --methods gauss-newton -o
+    RESULTS
 
-Each folder has the form that the scenes of those names expect: ``template.obj`` (metres, camera frame), ``texture.png``, ``camera.json``,
-``frames``, ``masks`` (480x360) and ``gt.npz``, the true vertices (T, N, 3). The seed decides motion, wind, light and texture.
+Each folder has the form that the scenes of those names expect: ``template.obj`` (metres, camera
+frame), ``texture.png``, ``camera.json``, ``frames``, ``masks`` (480x360) and ``gt.npz``, the true
+vertices (T, N, 3). The seed decides motion, wind, light and texture.
 
     flag     pinned along its left edge, in gusts
     bend     stiff, its two ends pushed together and apart again
@@ -42,8 +45,10 @@ BACKGROUND = np.array([45, 49, 57]) / 255
 
 @dataclass(frozen=True)
 class Kind:
-    """``size`` (width, height) [m], ``cells`` across and down, ``bending`` stiffness [N m], ``gravity`` [m/s^2] down in the image,
-    ``pressed``: the share of its width that the pinned points come closer, ``wind``: (along the sheet, across it) [m/s], ``self_contact``."""
+    """``size`` (width, height) [m], ``cells`` across and down, ``bending`` stiffness [N m],
+    ``gravity`` [m/s^2] down in the image, ``pressed``: the share of its width that the pinned
+    points come closer, ``wind``: (along the sheet, across it) [m/s], ``self_contact``.
+    """
 
     size: tuple
     cells: tuple
@@ -62,14 +67,18 @@ KINDS = {
 }
 
 
-# ---- motion ---------------------------------------------------------------------------------------------------------------
+# ---- motion --------------------------------------------------------------------------------------
 
 
 def sheet(kind):
-    """Vertices (N, 3) [m] of the flat sheet, row by row from the top, and their texture coordinates (N, 2), v upwards."""
+    """Vertices (N, 3) [m] of the flat sheet, row by row from the top, and their texture coordinates
+    (N, 2), v upwards.
+    """
     (w, h), (nx, ny) = kind.size, kind.cells
     v, u = np.meshgrid(np.linspace(0, 1, ny + 1), np.linspace(0, 1, nx + 1), indexing="ij")
-    return np.stack([(u - 0.5) * w, (v - 0.5) * h, np.full_like(u, DEPTH)], -1).reshape(-1, 3), np.stack([u, 1 - v], -1).reshape(-1, 2)
+    return np.stack([(u - 0.5) * w, (v - 0.5) * h, np.full_like(u, DEPTH)], -1).reshape(
+        -1, 3
+    ), np.stack([u, 1 - v], -1).reshape(-1, 2)
 
 
 def pinned(name, kind, rng):
@@ -88,7 +97,11 @@ class Weather:
 
     def __init__(self, name, kind, rest, held, rng):
         self.name, self.kind, self.start, self.held = name, kind, rest[held], held
-        self.phase, self.rate, self.across = rng.uniform(0, 2 * np.pi, 6), rng.uniform(0.4, 1.6, 6), 24 * rng.normal(size=(4, 2))
+        self.phase, self.rate, self.across = (
+            rng.uniform(0, 2 * np.pi, 6),
+            rng.uniform(0.4, 1.6, 6),
+            24 * rng.normal(size=(4, 2)),
+        )
         self.side = rng.choice([-1.0, 1.0])
 
     def points(self, time):
@@ -106,22 +119,45 @@ class Weather:
         """Velocity of the air (F, 3) [m/s] at the triangles' centres (F, 3) [m]."""
         along, across = self.kind.wind
         sine = lambda k, rate: np.sin(2 * np.pi * rate * self.rate[k] * time + self.phase[k])
-        out = np.tile([along * (1 + 0.3 * sine(0, 1)), 0.0, across * self.side * (sine(1, 1) + 0.6 * sine(2, 2.3))], (len(centres), 1))
+        out = np.tile(
+            [
+                along * (1 + 0.3 * sine(0, 1)),
+                0.0,
+                across * self.side * (sine(1, 1) + 0.6 * sine(2, 2.3)),
+            ],
+            (len(centres), 1),
+        )
         for k, direction in enumerate(self.across):
-            out[:, 2] += 0.6 * across * np.sin(centres[:, :2] @ direction + 2 * np.pi * self.rate[k] * time + self.phase[k])
+            out[:, 2] += (
+                0.6
+                * across
+                * np.sin(
+                    centres[:, :2] @ direction + 2 * np.pi * self.rate[k] * time + self.phase[k]
+                )
+            )
         return out * min(1.0, 4 * time)
 
 
 def drag(x, v, faces, wind):
-    """Force of the air on each vertex (N, 3) [N], normal to the triangles ``faces`` (F, 3), of positions ``x`` (N, 3) [m], velocities ``v``
-    (N, 3) [m/s] and the air's velocity ``wind`` (F, 3) [m/s]."""
+    """Force of the air on each vertex (N, 3) [N], normal to the triangles ``faces`` (F, 3), of
+    positions ``x`` (N, 3) [m], velocities ``v`` (N, 3) [m/s] and the air's velocity ``wind`` (F, 3)
+    [m/s]."""
     corner = x[faces]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     double = np.linalg.norm(normal, axis=1, keepdims=True)
     normal = normal / double
     relative = wind - v[faces].mean(1)
-    force = AIR / 4 * double * (relative * normal).sum(1, keepdims=True) * np.linalg.norm(relative, axis=1, keepdims=True) * normal
-    return np.stack([np.bincount(faces.ravel(), np.repeat(force[:, k] / 3, 3), len(x)) for k in range(3)], 1)
+    force = (
+        AIR
+        / 4
+        * double
+        * (relative * normal).sum(1, keepdims=True)
+        * np.linalg.norm(relative, axis=1, keepdims=True)
+        * normal
+    )
+    return np.stack(
+        [np.bincount(faces.ravel(), np.repeat(force[:, k] / 3, 3), len(x)) for k in range(3)], 1
+    )
 
 
 def simulate(name, seed):
@@ -147,8 +183,14 @@ def simulate(name, seed):
         builder.particle_flags[i] &= ~int(newton.ParticleFlags.ACTIVE)
     builder.color()
     model = builder.finalize(device="cpu")
-    contact = dict(particle_enable_self_contact=True, particle_self_contact_margin=0.0015, particle_self_contact_gap=0.0015)
-    solver = newton.solvers.SolverVBD(model, iterations=ITERATIONS, **(contact if kind.self_contact else {}))
+    contact = dict(
+        particle_enable_self_contact=True,
+        particle_self_contact_margin=0.0015,
+        particle_self_contact_gap=0.0015,
+    )
+    solver = newton.solvers.SolverVBD(
+        model, iterations=ITERATIONS, **(contact if kind.self_contact else {})
+    )
     now, after, control = model.state(), model.state(), model.control()
     faces = model.tri_indices.numpy().reshape(-1, 3)
     dt, out = 1 / FPS / SUBSTEPS, [rest]
@@ -158,7 +200,9 @@ def simulate(name, seed):
         now.particle_q.assign(x)
         now.particle_qd.assign(v)
         now.clear_forces()
-        now.particle_f.assign(drag(x, v, faces, weather.wind(x[faces].mean(1), step * dt)).astype(np.float32))
+        now.particle_f.assign(
+            drag(x, v, faces, weather.wind(x[faces].mean(1), step * dt)).astype(np.float32)
+        )
         solver.step(now, after, control, None, dt)
         now, after = after, now
         if step % SUBSTEPS == 0:
@@ -168,16 +212,22 @@ def simulate(name, seed):
     return np.array(out), faces
 
 
-# ---- pictures -------------------------------------------------------------------------------------------------------------
+# ---- pictures ------------------------------------------------------------------------------------
 
 
 def _noise(rng, height, width, first, channels):
-    """Smooth noise (height, width, channels) of unit variance, in six octaves from ``first`` knots across."""
+    """Smooth noise (height, width, channels) of unit variance, in six octaves from ``first`` knots
+    across.
+    """
     out = 0
     for octave in range(6):
         knots = first * 2**octave
-        coarse = rng.normal(size=(max(2, knots * height // width), knots, channels)).astype(np.float32)
-        out = out + 0.6**octave * cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC).reshape(height, width, channels)
+        coarse = rng.normal(size=(max(2, knots * height // width), knots, channels)).astype(
+            np.float32
+        )
+        out = out + 0.6**octave * cv2.resize(
+            coarse, (width, height), interpolation=cv2.INTER_CUBIC
+        ).reshape(height, width, channels)
     return out / out.std()
 
 
@@ -190,23 +240,41 @@ def texture(rng, aspect, height=512):
     elif style == 1:
         image = np.full((height, width, 3), 0.92, np.float32)
         for _ in range(90):
-            x, y, a, b = rng.integers(0, width), rng.integers(0, height), rng.integers(8, 120), rng.integers(4, 40)
+            x, y, a, b = (
+                rng.integers(0, width),
+                rng.integers(0, height),
+                rng.integers(8, 120),
+                rng.integers(4, 40),
+            )
             image[y : y + b, x : x + a] = rng.uniform(0, 0.9, 3)
     elif style == 2:
         count = rng.integers(7, 12)
         y, x = np.mgrid[:height, :width] * count // width
-        image = np.where(((x + y) % 2)[..., None], rng.uniform(0.1, 0.9, 3), [0.9, 0.88, 0.8]) * (1 + 0.06 * _noise(rng, height, width, 30, 1))
+        image = np.where(((x + y) % 2)[..., None], rng.uniform(0.1, 0.9, 3), [0.9, 0.88, 0.8]) * (
+            1 + 0.06 * _noise(rng, height, width, 30, 1)
+        )
     else:
         image = np.tile(np.float32([0.85, 0.82, 0.77]), (height, width, 1))
         for _ in range(60):
-            at, radius = (int(rng.integers(0, width)), int(rng.integers(0, height))), int(rng.integers(6, 45))
-            cv2.circle(image, at, radius, rng.uniform(0, 0.8, 3).tolist(), -1 if rng.random() < 0.6 else 5, cv2.LINE_AA)
+            at, radius = (
+                (int(rng.integers(0, width)), int(rng.integers(0, height))),
+                int(rng.integers(6, 45)),
+            )
+            cv2.circle(
+                image,
+                at,
+                radius,
+                rng.uniform(0, 0.8, 3).tolist(),
+                -1 if rng.random() < 0.6 else 5,
+                cv2.LINE_AA,
+            )
     return (255 * np.clip(image, 0.02, 0.98)).astype(np.uint8)
 
 
 def render(folder, vertices, faces, uv, rng):
-    """Write texture, template, camera, frames and masks of vertices (T, N, 3) [m, camera frame], faces (F, 3) and texture coordinates
-    (N, 2) into ``folder``; ``rng`` draws texture, light and noise.
+    """Write texture, template, camera, frames and masks of vertices (T, N, 3) [m, camera frame],
+    faces (F, 3) and texture coordinates (N, 2) into ``folder``; ``rng`` draws texture, light and
+    noise.
     """
     import mitsuba as mi
 
@@ -218,7 +286,11 @@ def render(folder, vertices, faces, uv, rng):
     write_obj(at("template.obj"), vertices[0], faces, uv)
     width, height = SIZE
     with open(at("camera.json"), "w", encoding="utf-8") as file:
-        json.dump(dict(width=width, height=height, fx=FOCAL, fy=FOCAL, cx=width / 2, cy=height / 2), file, indent=1)
+        json.dump(
+            dict(width=width, height=height, fx=FOCAL, fy=FOCAL, cx=width / 2, cy=height / 2),
+            file,
+            indent=1,
+        )
     scene = mi.load_dict({
         "type": "scene",
         "integrator": {"type": "path", "max_depth": 3},
@@ -234,27 +306,46 @@ def render(folder, vertices, faces, uv, rng):
     })  # fmt: skip
     depth = mi.load_dict({"type": "aov", "aovs": "z:depth"})
     parameters = mi.traverse(scene)
-    key = next(k for k in parameters.keys() if k.startswith("cloth") and k.endswith("vertex_positions"))
+    key = next(
+        k for k in parameters.keys() if k.startswith("cloth") and k.endswith("vertex_positions")
+    )
     start = np.array(parameters[key]).reshape(-1, 3)
-    corner = np.linalg.norm(start[:, None] - vertices[0], axis=-1).argmin(1)  # Mitsuba orders an OBJ's vertices itself
+    corner = np.linalg.norm(start[:, None] - vertices[0], axis=-1).argmin(
+        1
+    )  # Mitsuba orders an OBJ's vertices itself
     gain = None
     for t, x in enumerate(vertices):
         parameters[key] = x[corner].astype(np.float32).ravel()
         parameters.update()
         light = np.array(mi.render(scene, spp=SAMPLES, seed=t))[..., :3]
-        mask = np.array(mi.render(scene, integrator=depth, spp=16, seed=t))[..., -1] > 0.5 * x[:, 2].min()  # most of its rays meet the sheet
+        mask = (
+            np.array(mi.render(scene, integrator=depth, spp=16, seed=t))[..., -1]
+            > 0.5 * x[:, 2].min()
+        )  # most of its rays meet the sheet
         gain = gain or 1.25 * (image.mean() / 255) ** 2.2 / np.median(light[mask].mean(-1))
         srgb = np.where(mask[..., None], np.clip(gain * light, 0, 1) ** (1 / 2.2), BACKGROUND)
         levels = 255 * srgb + rng.normal(0, NOISE, srgb.shape)
-        cv2.imwrite(at("frames", f"{t:03d}.png"), np.clip(np.round(levels), 0, 255).astype(np.uint8)[..., ::-1])
+        cv2.imwrite(
+            at("frames", f"{t:03d}.png"),
+            np.clip(np.round(levels), 0, 255).astype(np.uint8)[..., ::-1],
+        )
         cv2.imwrite(at("masks", f"{t:03d}.png"), 255 * mask.astype(np.uint8))
 
 
 def main(argv=None):
     raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(prog="python benchmarks/simulate.py", description=__doc__, formatter_class=raw)
+    parser = argparse.ArgumentParser(
+        prog="python benchmarks/simulate.py", description=__doc__, formatter_class=raw
+    )
     parser.add_argument("out", metavar="OUT", help="folder of the sequences' folders")
-    parser.add_argument("--only", nargs="+", default=list(KINDS), choices=list(KINDS), metavar="KIND", help=f"of {', '.join(KINDS)}")
+    parser.add_argument(
+        "--only",
+        nargs="+",
+        default=list(KINDS),
+        choices=list(KINDS),
+        metavar="KIND",
+        help=f"of {', '.join(KINDS)}",
+    )
     parser.add_argument("--seed", type=int, default=3)
     args = parser.parse_args(argv)
     if args.seed < 0:
@@ -265,12 +356,26 @@ def main(argv=None):
         if os.path.exists(folder):
             raise InputError(f"{folder}: exists already; another OUT is needed")
         vertices, faces = simulate(name, args.seed)
-        render(folder, vertices, faces, sheet(KINDS[name])[1], np.random.default_rng([args.seed, list(KINDS).index(name), 1]))
-        np.savez_compressed(os.path.join(folder, "gt.npz"), vertices=vertices.astype(np.float32), faces=faces.astype(np.int32))
+        render(
+            folder,
+            vertices,
+            faces,
+            sheet(KINDS[name])[1],
+            np.random.default_rng([args.seed, list(KINDS).index(name), 1]),
+        )
+        np.savez_compressed(
+            os.path.join(folder, "gt.npz"),
+            vertices=vertices.astype(np.float32),
+            faces=faces.astype(np.int32),
+        )
         a, b = edges_of(faces)[0].T
         length = np.linalg.norm(vertices[:, a] - vertices[:, b], axis=-1)
         strain = 100 * np.abs(length / length[0] - 1).mean()
-        print(f"{folder}: {len(vertices)} frames, moved by {1e3 * np.linalg.norm(vertices - vertices[0], axis=-1).mean():.0f} mm, lengths change by {strain:.2f} %")
+        print(
+            f"{folder}: {len(vertices)} frames, moved by"
+            f" {1e3 * np.linalg.norm(vertices - vertices[0], axis=-1).mean():.0f} mm, lengths"
+            f" change by {strain:.2f} %"
+        )
 
 
 if __name__ == "__main__":

@@ -1,11 +1,13 @@
 """Does the surface stay where it is when the optimisation goes on? (Supplement, "Stability test".)
 
-    python benchmarks/stability.py [scenes/demo.xml] [-D name=value ...] [--counts 50 300 1000 5000] [-o out/benchmarks] [-m llvm_ad_rgb]
+    python benchmarks/stability.py [scenes/demo.xml] [-D name=value ...] [--counts 50 300 1000 5000]
+    [-o out/benchmarks] [-m llvm_ad_rgb]
 
-The video is reconstructed as usual up to the frame before the last. The last window is then solved once, from where that leaves it, with
-patience off, and what the solver would return after each of the counts is kept: the best unknowns so far. Beside it stands the solver's
-latest step, which shows how much it wanders. Figures are those of the window's newest frame; a shorter video (``-D last=20``) tests
-another.
+The video is reconstructed as usual up to the frame before the last. The last window is then solved
+once, from where that leaves it, with patience off, and what the solver would return after each of
+the counts is kept: the best unknowns so far. Beside it stands the solver's latest step, which shows
+how much it wanders. Figures are those of the window's newest frame; a shorter video (``-D
+last=20``) tests another.
 
 Writes ``stability.json`` and ``stability.png``.
 """
@@ -32,10 +34,12 @@ CURVE = 25  # iterations between points of the curves
 
 
 class Watched:
-    """A problem whose solver is watched: what it has found, and where it is, after some numbers of evaluations.
+    """A problem whose solver is watched: what it has found, and where it is, after some numbers of
+    evaluations.
 
-    Solvers see a problem only through its methods, so this works for any. ``found`` and ``latest`` map a count to the unknowns of the
-    newest frame: the best of so many evaluations, and those of the last one. ``losses`` maps it to (best, last).
+    Solvers see a problem only through its methods, so this works for any. ``found`` and ``latest``
+    map a count to the unknowns of the newest frame: the best of so many evaluations, and those of
+    the last one. ``losses`` maps it to (best, last).
     """
 
     def __init__(self, problem, counts):
@@ -52,7 +56,10 @@ class Watched:
         if total < self._best_loss:
             self._best, self._best_loss = window[-1].copy(), total
         if self._evaluated in self._counts:
-            self.found[self._evaluated], self.latest[self._evaluated] = self._best, window[-1].copy()
+            self.found[self._evaluated], self.latest[self._evaluated] = (
+                self._best,
+                window[-1].copy(),
+            )
             self.losses[self._evaluated] = (self._best_loss, total)
         return total, terms
 
@@ -60,9 +67,10 @@ class Watched:
 def run(scene, overrides, counts, folder, say=print):
     """Solve the last window for as many iterations as the largest count.
 
-    Returns (problem, frame, surfaces, wandering, losses): the newest frame, counted in the selection; the surfaces found and the solver's
-    latest, count to vertices (N, 3) [m, camera frame]; count to (best, latest) loss. ``folder``, which exists, takes the checkpoints of
-    the run up to there.
+    Returns (problem, frame, surfaces, wandering, losses): the newest frame, counted in the
+    selection; the surfaces found and the solver's latest, count to vertices (N, 3) [m, camera
+    frame]; count to (best, latest) loss. ``folder``, which exists, takes the checkpoints of the run
+    up to there.
     """
     from polysft_mi import scene as scenes
     from polysft_mi import solvers
@@ -73,7 +81,14 @@ def run(scene, overrides, counts, folder, say=print):
 
     experiment = scenes.load(scene, {"solver": "adam", **overrides})
     s = experiment.settings
-    sequence = Sequence.open(experiment.frames, experiment.masks, first=s.first, last=s.last, stride=s.stride, size=experiment.size)
+    sequence = Sequence.open(
+        experiment.frames,
+        experiment.masks,
+        first=s.first,
+        last=s.last,
+        stride=s.stride,
+        size=experiment.size,
+    )
     problem = Problem(experiment, sequence)
     problem.check_start()
     frame = len(sequence.indices) - 1
@@ -87,11 +102,16 @@ def run(scene, overrides, counts, folder, say=print):
     last = max(counts)
     say(f"frames {members[0]} to {frame}: {last} iterations ...")
     watched = Watched(problem, {*counts, *range(CURVE, last + 1, CURVE)})
-    solvers.create(dataclasses.replace(s, patience=last, period=last)).solve(watched, window, members)
+    solvers.create(dataclasses.replace(s, patience=last, period=last)).solve(
+        watched, window, members
+    )
     missing = sorted(set(counts) - set(watched.found))
     if missing:
         raise InputError(f"--counts {' '.join(map(str, missing))}: solver {s.solver} ended before")
-    surfaces, wandering = ({n: problem.surface(u).astype(np.float64) for n, u in kept.items()} for kept in (watched.found, watched.latest))
+    surfaces, wandering = (
+        {n: problem.surface(u).astype(np.float64) for n, u in kept.items()}
+        for kept in (watched.found, watched.latest)
+    )
     return problem, frame, surfaces, wandering, watched.losses
 
 
@@ -109,8 +129,15 @@ def truth_of(problem, frame, path):
         return None
     truth = metrics.load_npz(evaluate.find_truth(path))
     index, count = problem.sequence.indices[frame], len(problem.template.vertices)
-    if "vertices" not in truth or truth["vertices"].shape[1] != count or index >= len(truth["vertices"]):
-        raise InputError(f"--truth {path}: true positions of {count} vertices in frame {index} are needed (vertices, shape (T, N, 3))")
+    if (
+        "vertices" not in truth
+        or truth["vertices"].shape[1] != count
+        or index >= len(truth["vertices"])
+    ):
+        raise InputError(
+            f"--truth {path}: true positions of {count} vertices in frame {index} are needed"
+            " (vertices, shape (T, N, 3))"
+        )
     return truth["vertices"][index].astype(np.float64)
 
 
@@ -121,24 +148,36 @@ def figures_of(surfaces, wandering, losses, usual, truth):
     out = {}
     for n, V in surfaces.items():
         moved = np.linalg.norm(V - surfaces[usual], axis=1)
-        row = {"loss": losses[n][0], "change_rms_mm": 1e3 * metrics.rmse(V, surfaces[usual]), "change_max_mm": 1e3 * float(moved.max())}
+        row = {
+            "loss": losses[n][0],
+            "change_rms_mm": 1e3 * metrics.rmse(V, surfaces[usual]),
+            "change_max_mm": 1e3 * float(moved.max()),
+        }
         row["wandering_rms_mm"] = 1e3 * metrics.rmse(wandering[n], V)
         if truth is not None:
-            row |= {"rmse_mm": 1e3 * metrics.rmse(V, truth), "e3d": metrics.e3d(V, truth), "e3d_proc": metrics.e3d_procrustes(V, truth)}
+            row |= {
+                "rmse_mm": 1e3 * metrics.rmse(V, truth),
+                "e3d": metrics.e3d(V, truth),
+                "e3d_proc": metrics.e3d_procrustes(V, truth),
+            }
             row["latest_e3d"] = metrics.e3d(wandering[n], truth)
         out[n] = row
     return out
 
 
 def picture(path, problem, frame, surfaces, counts, rows, usual, truth):
-    """The surfaces over the image and from the side, count beside count; below, what changes over the iterations."""
+    """The surfaces over the image and from the side, count beside count; below, what changes over
+    the iterations.
+    """
     from matplotlib.figure import Figure
 
     from polysft_mi import shading
     from polysft_mi.pictures import srgb
 
     template, image = problem.template, srgb(problem.sequence.frame(frame))
-    shown = [(f"{n} iterations", surfaces[n]) for n in counts] + ([("truth", truth)] if truth is not None else [])
+    shown = [(f"{n} iterations", surfaces[n]) for n in counts] + (
+        [("truth", truth)] if truth is not None else []
+    )
     view = shading.View.around(np.stack([V for _, V in shown]))
     height, width = image.shape[:2]
     projected = [problem.camera.project(V)[0] for _, V in shown]
@@ -150,15 +189,27 @@ def picture(path, problem, frame, surfaces, counts, rows, usual, truth):
     for k, ((label, V), xy) in enumerate(zip(shown, projected)):
         over, beside = grid[:, k]
         over.imshow(image, extent=(0, width, height, 0))
-        for j in range(2):  # lines of equal u and of equal v: the template's own grid of ten by ten cells
+        for j in range(
+            2
+        ):  # lines of equal u and of equal v: the template's own grid of ten by ten cells
             uv = template.uv[:, j]
             levels = np.linspace(uv.min(), uv.max(), 11)[1:-1]
-            over.tricontour(xy[:, 0], xy[:, 1], template.faces, uv, levels=levels, colors="white", linewidths=0.6)
+            over.tricontour(
+                xy[:, 0],
+                xy[:, 1],
+                template.faces,
+                uv,
+                levels=levels,
+                colors="white",
+                linewidths=0.6,
+            )
         for edge in border(template.faces):
             over.plot(xy[edge, 0], xy[edge, 1], color="#ffb000", linewidth=1.2)
         over.set_xlim(low[0], high[0]), over.set_ylim(high[1], low[1])
         over.set_title(label, fontsize=10)
-        beside.imshow(shading.shade_surface(V, template.faces, view, uv=template.uv, size=(360, 300)))
+        beside.imshow(
+            shading.shade_surface(V, template.faces, view, uv=template.uv, size=(360, 300))
+        )
         if k < len(counts):
             row = rows[counts[k]]
             text = f"e3d {row['e3d']:.4f}, " if truth is not None else ""
@@ -168,13 +219,21 @@ def picture(path, problem, frame, surfaces, counts, rows, usual, truth):
     n = sorted(rows)
     left, right = below.subplots(1, 2)
     if truth is not None:
-        left.plot(n, [rows[k]["latest_e3d"] for k in n], color="0.75", linewidth=0.8, label="the solver's latest step")
+        left.plot(
+            n,
+            [rows[k]["latest_e3d"] for k in n],
+            color="0.75",
+            linewidth=0.8,
+            label="the solver's latest step",
+        )
         left.plot(n, [rows[k]["e3d"] for k in n], color="#c4572e", label="what it would return")
         left.set_title("e3d", fontsize=9, loc="left")
     else:
         left.plot(n, [rows[k]["loss"] for k in n], color="#c4572e", label="what it would return")
         left.set_title("loss", fontsize=9, loc="left")
-    right.plot(n, [rows[k]["change_rms_mm"] for k in n], color="#3b6ea5", label="RMS over the vertices")
+    right.plot(
+        n, [rows[k]["change_rms_mm"] for k in n], color="#3b6ea5", label="RMS over the vertices"
+    )
     right.plot(n, [rows[k]["change_max_mm"] for k in n], color="#9db9d6", label="largest")
     right.set_title(f"distance from the surface at {usual} iterations [mm]", fontsize=9, loc="left")
     for axes in (left, right):
@@ -192,17 +251,53 @@ def picture(path, problem, frame, surfaces, counts, rows, usual, truth):
 
 def border(faces):
     """Edges (E, 2) that belong to one triangle alone."""
-    edges, count = np.unique(np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0, return_counts=True)
+    edges, count = np.unique(
+        np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1),
+        axis=0,
+        return_counts=True,
+    )
     return edges[count == 1]
 
 
 def parser():
-    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument("scene", nargs="?", metavar="scene.xml", default=os.path.join(ROOT, "scenes", "demo.xml"), help="default: the demo")
-    p.add_argument("-D", dest="define", metavar="NAME=VALUE", action="append", default=[], help="override a <default> of the scene; may be repeated")
-    p.add_argument("--counts", nargs="+", type=int, metavar="N", default=COUNTS, help="iterations to look at (default: 50 300 1000 5000)")
-    p.add_argument("--truth", metavar="PATH", help="gt.npz, or a folder that holds it (default: the scene's data folder, where it does)")
-    p.add_argument("-o", "--out", metavar="FOLDER", default="out/benchmarks", help="for stability.json and stability.png (default: out/benchmarks)")
+    p = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    p.add_argument(
+        "scene",
+        nargs="?",
+        metavar="scene.xml",
+        default=os.path.join(ROOT, "scenes", "demo.xml"),
+        help="default: the demo",
+    )
+    p.add_argument(
+        "-D",
+        dest="define",
+        metavar="NAME=VALUE",
+        action="append",
+        default=[],
+        help="override a <default> of the scene; may be repeated",
+    )
+    p.add_argument(
+        "--counts",
+        nargs="+",
+        type=int,
+        metavar="N",
+        default=COUNTS,
+        help="iterations to look at (default: 50 300 1000 5000)",
+    )
+    p.add_argument(
+        "--truth",
+        metavar="PATH",
+        help="gt.npz, or a folder that holds it (default: the scene's data folder, where it does)",
+    )
+    p.add_argument(
+        "-o",
+        "--out",
+        metavar="FOLDER",
+        default="out/benchmarks",
+        help="for stability.json and stability.png (default: out/benchmarks)",
+    )
     add_mode_argument(p)
     return p
 
@@ -222,10 +317,21 @@ def main(arguments=None):
 
     os.makedirs(options.out, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
-        problem, frame, surfaces, wandering, losses = run(options.scene, overrides, [*counts, usual], folder)
+        problem, frame, surfaces, wandering, losses = run(
+            options.scene, overrides, [*counts, usual], folder
+        )
     truth = truth_of(problem, frame, options.truth)
     rows = figures_of(surfaces, wandering, losses, usual, truth)
-    picture(os.path.join(options.out, "stability.png"), problem, frame, surfaces, counts, rows, usual, truth)
+    picture(
+        os.path.join(options.out, "stability.png"),
+        problem,
+        frame,
+        surfaces,
+        counts,
+        rows,
+        usual,
+        truth,
+    )
     report = {
         "scene": os.path.basename(options.scene),
         "overrides": overrides,

@@ -1,4 +1,6 @@
-"""Sphinx's settings: ``make docs`` builds these pages into ``out/docs``, and a warning is an error."""
+"""Sphinx's settings: ``make docs`` builds these pages into ``out/docs``, and a warning is an
+error.
+"""
 
 project = "PolySfT on Mitsuba 3"
 author = "the authors of PolySfT on Mitsuba 3"

@@ -1,4 +1,5 @@
-"""Draws docs/onefit.jpg: garments draped by a network of the package, in held-out motions, path-traced.
+"""Draws docs/onefit.jpg: garments draped by a network of the package, in held-out motions,
+path-traced.
 
 python docs/drapes.py [OUT.jpg] [--weights six-garments]
 """
@@ -35,13 +36,17 @@ def main(argv=None):
     args = parser.parse_args(argv)
     draper, rows = onefit.load(args.weights), []
     for garment, motion, shape, colour in ROWS:
-        drape = draper.drape(garment, onefit.Motion.generate(motion, seconds=3, seed=1_000_005), shape)
+        drape = draper.drape(
+            garment, onefit.Motion.generate(motion, seconds=3, seed=1_000_005), shape
+        )
         chosen = np.linspace(8, len(drape.vertices) - 1, FRAMES).astype(int)
         parts = [
             (drape.body[chosen].numpy(), drape.body_faces.numpy(), BODY),
             (drape.vertices[chosen].numpy(), drape.faces.numpy(), colour),
         ]
-        rows.append(np.concatenate(list(stage.render(parts, size=SIZE, spp=96, follow=True)), axis=1))
+        rows.append(
+            np.concatenate(list(stage.render(parts, size=SIZE, spp=96, follow=True)), axis=1)
+        )
     cv2.imwrite(args.output, np.concatenate(rows)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
 
 

@@ -1,7 +1,9 @@
-"""Draw ``docs/onefit_garments.png``: the eight templates on the standard body, from the front and from behind.
+"""Draw ``docs/onefit_garments.png``: the eight templates on the standard body, from the front and
+from behind.
 
-    python docs/onefit_garments.py                                        (half a minute)
-    python docs/onefit_garments.py --cuts 18 -o docs/onefit_cuts.jpg      (two minutes: random cuts, as training draws them)
+python docs/onefit_garments.py                                        (half a minute)
+python docs/onefit_garments.py --cuts 18 -o docs/onefit_cuts.jpg      (two minutes: random cuts, as
+training draws them)
 """
 
 import argparse
@@ -26,17 +28,37 @@ SKIN, CLOTH = "#c9b29b", "#4d7ba8"
 
 
 def picture(parts, direction):
-    """sRGB image (H, W, 3) of ``parts`` (vertices, faces, colour), seen from ``direction`` over white, ZOOM times as large."""
-    plotter = pyvista.Plotter(off_screen=True, window_size=(ZOOM * WIDTH, ZOOM * HEIGHT), lighting="none")
+    """sRGB image (H, W, 3) of ``parts`` (vertices, faces, colour), seen from ``direction`` over
+    white, ZOOM times as large.
+    """
+    plotter = pyvista.Plotter(
+        off_screen=True, window_size=(ZOOM * WIDTH, ZOOM * HEIGHT), lighting="none"
+    )
     plotter.set_background("white")
     for V, F, colour in parts:
         part = pyvista.PolyData.from_regular_faces(V, F)
-        plotter.add_mesh(part, color=colour, smooth_shading=True, ambient=0.25, diffuse=0.8, specular=0.05)
+        plotter.add_mesh(
+            part, color=colour, smooth_shading=True, ambient=0.25, diffuse=0.8, specular=0.05
+        )
     right = np.cross([0, 0, 1], direction)
-    for light, strength in ((direction - 0.9 * right + [0, 0, 0.9], 0.75), (direction + 1.5 * right + [0, 0, 0.2], 0.3)):
-        plotter.add_light(pyvista.Light(position=10 * light, focal_point=(0, 0, 0), intensity=strength, light_type="scene light"))
+    for light, strength in (
+        (direction - 0.9 * right + [0, 0, 0.9], 0.75),
+        (direction + 1.5 * right + [0, 0, 0.2], 0.3),
+    ):
+        plotter.add_light(
+            pyvista.Light(
+                position=10 * light,
+                focal_point=(0, 0, 0),
+                intensity=strength,
+                light_type="scene light",
+            )
+        )
     focus = np.array([0, -0.05, -0.01])
-    plotter.camera.position, plotter.camera.focal_point, plotter.camera.up = focus + 5 * direction, focus, (0, 0, 1)
+    plotter.camera.position, plotter.camera.focal_point, plotter.camera.up = (
+        focus + 5 * direction,
+        focus,
+        (0, 0, 1),
+    )
     plotter.camera.parallel_projection, plotter.camera.parallel_scale = True, 0.84
     image = plotter.screenshot(return_img=True)
     plotter.close()
@@ -44,8 +66,12 @@ def picture(parts, direction):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cuts", type=int, metavar="N", help="N random cuts instead of the templates")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--cuts", type=int, metavar="N", help="N random cuts instead of the templates"
+    )
     parser.add_argument("-o", "--output", default=os.path.join(HERE, "onefit_garments.png"))
     args = parser.parse_args()
     if args.cuts:
@@ -68,7 +94,12 @@ def main():
         for behind, side in enumerate((np.array([-0.35, -1, 0.12]), np.array([0.35, 1, 0.12]))):
             below = tall - row * band - title - (behind + 1) * HEIGHT
             axes = out.add_axes((column / columns, below / tall, 1 / columns, HEIGHT / tall))
-            axes.imshow(picture([skin, (garment.vertices.numpy(), garment.faces.numpy(), CLOTH)], side / np.linalg.norm(side)))
+            axes.imshow(
+                picture(
+                    [skin, (garment.vertices.numpy(), garment.faces.numpy(), CLOTH)],
+                    side / np.linalg.norm(side),
+                )
+            )
             axes.axis("off")
     out.savefig(args.output)
     print(f"written: {args.output}")

@@ -1,4 +1,5 @@
-"""Draw ``docs/onefit_motions.png``: every kind of generated motion, eight moments of each from left to right.
+"""Draw ``docs/onefit_motions.png``: every kind of generated motion, eight moments of each from left
+to right.
 
 python docs/onefit_motions.py        (a minute)
 """
@@ -28,18 +29,35 @@ def row(plotter, body, faces, kind):
     motion = Motion.generate(kind, seconds=SECONDS, seed=SEED)
     at = np.linspace(0.1, 0.95, MOMENTS) * (len(motion) - 1)
     motion = motion[at.astype(int)]
-    posed = skinning.skin(body.vertices, body.blend_weights, skinning.transforms(body, motion.poses, motion.translation))
+    posed = skinning.skin(
+        body.vertices,
+        body.blend_weights,
+        skinning.transforms(body, motion.poses, motion.translation),
+    )
     images = []
-    for vertices, place in zip(posed.double().numpy(), motion.translation.double().numpy(), strict=True):
+    for vertices, place in zip(
+        posed.double().numpy(), motion.translation.double().numpy(), strict=True
+    ):
         plotter.clear_actors()
-        plotter.add_mesh(pyvista.PolyData(vertices - place * [1, 1, 0], faces), color="#b9bcc4", smooth_shading=True, ambient=0.25)
-        plotter.add_mesh(pyvista.Plane(center=(0, 0, FLOOR), i_size=2.4, j_size=2.4), color="#dfe3ea", lighting=False)
+        plotter.add_mesh(
+            pyvista.PolyData(vertices - place * [1, 1, 0], faces),
+            color="#b9bcc4",
+            smooth_shading=True,
+            ambient=0.25,
+        )
+        plotter.add_mesh(
+            pyvista.Plane(center=(0, 0, FLOOR), i_size=2.4, j_size=2.4),
+            color="#dfe3ea",
+            lighting=False,
+        )
         plotter.camera_position = [(2.2, -3.9, 0.9), (0, 0, 0.02), (0, 0, 1)]
         plotter.camera.view_angle = 27
         plotter.reset_camera_clipping_range()
         images.append(plotter.screenshot(return_img=True))
     image = Image.fromarray(np.concatenate(images, 1))
-    ImageDraw.Draw(image).text((4, 2), kind + (" (held out)" if kind in generate.HELD_OUT else ""), fill="black")
+    ImageDraw.Draw(image).text(
+        (4, 2), kind + (" (held out)" if kind in generate.HELD_OUT else ""), fill="black"
+    )
     return np.asarray(image)
 
 
@@ -53,7 +71,9 @@ def main():
     while len(rows) % COLUMNS:
         rows.append(np.full_like(rows[0], 255))
     each = len(rows) // COLUMNS
-    picture = np.concatenate([np.concatenate(rows[k * each : (k + 1) * each], 0) for k in range(COLUMNS)], 1)
+    picture = np.concatenate(
+        [np.concatenate(rows[k * each : (k + 1) * each], 0) for k in range(COLUMNS)], 1
+    )
     with aside(os.path.join(HERE, "onefit_motions.png")) as temporary:
         Image.fromarray(picture).quantize(128).save(temporary)
 

@@ -1,8 +1,10 @@
-"""Draw ``docs/patches.png``: a garment, its patches, its jets' surface at four times the resolution, the error.
+"""Draw ``docs/patches.png``: a garment, its patches, its jets' surface at four times the
+resolution, the error.
 
     python docs/patches.py garment.obj        (a minute)
 
-The picture in the documentation is that of a CC0 shirt of the MakeHuman community (``m_shirt_wrinkled``).
+The picture in the documentation is that of a CC0 shirt of the MakeHuman community
+(``m_shirt_wrinkled``).
 """
 
 import argparse
@@ -30,15 +32,23 @@ ERROR = "viridis"
 
 
 def shaped(V, F, colours, smooth):
-    """A Mitsuba mesh of V (N, 3), F (F, 3) with a colour for each face, (F, 3), or for each vertex, (N, 3), linear RGB."""
+    """A Mitsuba mesh of V (N, 3), F (F, 3) with a colour for each face, (F, 3), or for each vertex,
+    (N, 3), linear RGB.
+    """
     if len(colours) == len(F):
         normals = vertex_normals(V, F)[F].reshape(-1, 3)
-        V, colours, F = V[F].reshape(-1, 3), np.repeat(colours, 3, axis=0), np.arange(3 * len(F)).reshape(-1, 3)
+        V, colours, F = (
+            V[F].reshape(-1, 3),
+            np.repeat(colours, 3, axis=0),
+            np.arange(3 * len(F)).reshape(-1, 3),
+        )
     else:
         normals = vertex_normals(V, F)
     props = mi.Properties()
     colour = {"type": "mesh_attribute", "name": "vertex_color"}
-    props["bsdf"] = mi.load_dict({"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": colour}})
+    props["bsdf"] = mi.load_dict(
+        {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": colour}}
+    )
     props["face_normals"] = not smooth
     out = mi.Mesh("garment", len(V), len(F), has_vertex_normals=smooth, props=props)
     out.add_attribute("vertex_color", 3, colours.astype(np.float32).ravel())
@@ -53,12 +63,16 @@ def shaped(V, F, colours, smooth):
 
 def vertex_normals(V, F):
     n = mesh.face_vectors(V, F)
-    total = np.stack([np.bincount(F.ravel(), np.repeat(x, 3), minlength=len(V)) for x in n.T], axis=1)
+    total = np.stack(
+        [np.bincount(F.ravel(), np.repeat(x, 3), minlength=len(V)) for x in n.T], axis=1
+    )
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
 
 
 def picture(shape, centre, distance, samples):
-    """sRGB image (H, W, 3) of the mesh over white, seen from its front and a little from its left and above."""
+    """sRGB image (H, W, 3) of the mesh over white, seen from its front and a little from its left
+    and above.
+    """
     t = mi.ScalarTransform4f()
     eye = centre + distance * np.array([-0.42, -1.0, 0.22])
     light = lambda direction, irradiance: {
@@ -74,8 +88,16 @@ def picture(shape, centre, distance, samples):
                 "type": "perspective",
                 "fov": 20,
                 "fov_axis": "y",
-                "to_world": t.look_at(origin=list(map(float, eye)), target=list(map(float, centre)), up=[0, 0, 1]),
-                "film": {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT, "pixel_format": "rgba", "rfilter": {"type": "gaussian"}},
+                "to_world": t.look_at(
+                    origin=list(map(float, eye)), target=list(map(float, centre)), up=[0, 0, 1]
+                ),
+                "film": {
+                    "type": "hdrfilm",
+                    "width": WIDTH,
+                    "height": HEIGHT,
+                    "pixel_format": "rgba",
+                    "rfilter": {"type": "gaussian"},
+                },
                 "sampler": {"type": "multijitter", "sample_count": samples},
             },
             "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.3}},
@@ -86,7 +108,11 @@ def picture(shape, centre, distance, samples):
     )
     image = np.array(mi.render(scene, seed=1))
     rgb = image[..., :3] + 1 - image[..., 3:4]
-    return np.clip(np.where(rgb <= 0.0031308, 12.92 * rgb, 1.055 * np.maximum(rgb, 1e-9) ** (1 / 2.4) - 0.055), 0, 1)
+    return np.clip(
+        np.where(rgb <= 0.0031308, 12.92 * rgb, 1.055 * np.maximum(rgb, 1e-9) ** (1 / 2.4) - 0.055),
+        0,
+        1,
+    )
 
 
 def patch_colours(surface):
@@ -107,29 +133,43 @@ def patch_colours(surface):
 def distances(points, V, F):
     import pyvista
 
-    _, closest = pyvista.PolyData.from_regular_faces(V, F).find_closest_cell(points, return_closest_point=True)
+    _, closest = pyvista.PolyData.from_regular_faces(V, F).find_closest_cell(
+        points, return_closest_point=True
+    )
     return np.linalg.norm(points - closest, axis=1)
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("mesh")
     parser.add_argument("--samples", type=int, default=144)
-    parser.add_argument("--most", type=float, default=2.0, help="upper end of the error's colours [mm]")
+    parser.add_argument(
+        "--most", type=float, default=2.0, help="upper end of the error's colours [mm]"
+    )
     parser.add_argument("-o", "--output", default=os.path.join(HERE, "patches.png"))
     args = parser.parse_args()
     V, F, _ = read_mesh(args.mesh)
     surface = PatchedSurface.from_mesh(V, F)
-    W, G = (x.double().numpy() if x.is_floating_point() else x.numpy() for x in surface.resampled(4))
+    W, G = (
+        x.double().numpy() if x.is_floating_point() else x.numpy() for x in surface.resampled(4)
+    )
     error = 1e3 * distances(W, V, F)
     p = surface.patches
     colours = patch_colours(surface)[np.median(p.corner_patch, axis=1).astype(int)]
     colour = matplotlib.colormaps[ERROR](np.clip(error / args.most, 0, 1))[:, :3] ** 2.2
     panels = {
         f"the mesh: {len(V):,} vertices": shaped(V, F, np.tile(CLOTH, (len(F), 1)), False),
-        f"{len(surface)} patches": shaped(surface.vertices().double().numpy(), p.faces, colours, True),
-        f"their jets, {surface.parameters:,} numbers, at 4× the resolution": shaped(W, G, np.tile(CLOTH, (len(W), 1)), True),
-        f"distance from the mesh: {np.sqrt((error**2).mean()):.2f} mm RMS": shaped(W, G, colour, True),
+        f"{len(surface)} patches": shaped(
+            surface.vertices().double().numpy(), p.faces, colours, True
+        ),
+        f"their jets, {surface.parameters:,} numbers, at 4× the resolution": shaped(
+            W, G, np.tile(CLOTH, (len(W), 1)), True
+        ),
+        f"distance from the mesh: {np.sqrt((error**2).mean()):.2f} mm RMS": shaped(
+            W, G, colour, True
+        ),
     }
     centre, extent = (V.max(0) + V.min(0)) / 2, np.ptp(V, axis=0)
     distance = 1.05 * max(extent[2], extent[0] * HEIGHT / WIDTH) / (2 * np.tan(np.radians(10)))

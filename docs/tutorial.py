@@ -1,7 +1,7 @@
 """Make the pictures of ``docs/tutorial.md``: ``python docs/tutorial.py`` (a minute or two).
 
-The demo's frames become a video, which is prepared and run by the tutorial's own commands, into ``out/tutorial``; the pictures go into
-``docs``.
+The demo's frames become a video, which is prepared and run by the tutorial's own commands, into
+``out/tutorial``; the pictures go into ``docs``.
 """
 
 import os
@@ -33,7 +33,9 @@ PICTURES = {  # from: (to, pixels it is wide)
 
 
 def commands():
-    """The tutorial's command lines, as lists, in its order: those that begin with ``python -m polysft_mi.`` and write into OUT."""
+    """The tutorial's command lines, as lists, in its order: those that begin with ``python -m
+    polysft_mi.`` and write into OUT.
+    """
     with open(os.path.join(HERE, "tutorial.md"), encoding="utf-8") as file:
         lines = re.findall(rf"^    (python -m polysft_mi\..*{OUT}.*)$", file.read(), re.M)
     return [shlex.split(line) for line in lines]
@@ -43,17 +45,32 @@ def write_inputs(out):
     """The video and the photo that the tutorial starts from, in the folder ``out``."""
     os.makedirs(out, exist_ok=True)
     demo = os.path.join(ROOT, "scenes", "demo")
-    write_video(os.path.join(out, "clip.mp4"), (read_rgb(p) for p in list_images(os.path.join(demo, "frames"))), fps=8)
-    photo = cv2.imread(os.path.join(demo, "texture.jpg"))  # a square: the sheet is 0.3 m wide and 0.22 m high
-    cv2.imwrite(os.path.join(out, "photo.jpg"), cv2.resize(photo, (600, 440), interpolation=cv2.INTER_AREA), [cv2.IMWRITE_JPEG_QUALITY, 95])
+    write_video(
+        os.path.join(out, "clip.mp4"),
+        (read_rgb(p) for p in list_images(os.path.join(demo, "frames"))),
+        fps=8,
+    )
+    photo = cv2.imread(
+        os.path.join(demo, "texture.jpg")
+    )  # a square: the sheet is 0.3 m wide and 0.22 m high
+    cv2.imwrite(
+        os.path.join(out, "photo.jpg"),
+        cv2.resize(photo, (600, 440), interpolation=cv2.INTER_AREA),
+        [cv2.IMWRITE_JPEG_QUALITY, 95],
+    )
 
 
 def errors():
-    """Distances [mm] (T, N) of the run's vertices from the demo's true surface, at the same places of the photo."""
+    """Distances [mm] (T, N) of the run's vertices from the demo's true surface, at the same places
+    of the photo.
+    """
     truth = np.load(os.path.join(ROOT, "scenes", "demo", "gt.npz"))["vertices"]
     vertices, faces, uv = meshio.read_template(os.path.join(ROOT, "scenes", "demo", "template.obj"))
     found = np.load(os.path.join(ROOT, OUT, "run", "surface.npz"))
-    true = [Sheet(v, faces, uv, "demo").at(found["uv"].clip(1e-6, 1 - 1e-6)) for v in truth[found["frames"]]]
+    true = [
+        Sheet(v, faces, uv, "demo").at(found["uv"].clip(1e-6, 1 - 1e-6))
+        for v in truth[found["frames"]]
+    ]
     return 1e3 * np.linalg.norm(found["vertices"] - np.stack(true), axis=2)
 
 
@@ -62,7 +79,9 @@ def main():
     write_inputs(OUT)
     for words in commands():
         print(shlex.join(words), flush=True)
-        subprocess.run([sys.executable, *words[1:], *(["--overwrite"] if "-o" in words else [])], check=True)
+        subprocess.run(
+            [sys.executable, *words[1:], *(["--overwrite"] if "-o" in words else [])], check=True
+        )
     for source, (name, width) in PICTURES.items():
         image = cv2.imread(source)
         scale = min(1.0, width / image.shape[1])
@@ -72,7 +91,10 @@ def main():
             [cv2.IMWRITE_JPEG_QUALITY, 85],
         )
     e = errors()
-    print(f"half of its vertices lie within {np.median(e):.1f} mm of it, nine tenths within {np.quantile(e, 0.9):.1f} mm")
+    print(
+        f"half of its vertices lie within {np.median(e):.1f} mm of it, nine tenths within"
+        f" {np.quantile(e, 0.9):.1f} mm"
+    )
 
 
 if __name__ == "__main__":

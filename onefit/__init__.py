@@ -1,4 +1,5 @@
-"""OneFit: one network that drapes any garment on a moving body (paper, section "OneFit"), in torch, on PolyFit's patches.
+"""OneFit: one network that drapes any garment on a moving body (paper, section "OneFit"), in torch,
+on PolyFit's patches.
 
 import onefit
 drape = onefit.load("six-garments").drape("shirt.obj", onefit.Motion.generate("walk"))

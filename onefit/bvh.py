@@ -1,4 +1,6 @@
-"""Motions from BVH files, whatever their skeleton's names, unit and axes, as far as these can be told."""
+"""Motions from BVH files, whatever their skeleton's names, unit and axes, as far as these can be
+told.
+"""
 
 import re
 
@@ -11,9 +13,9 @@ from polyfit.errors import InputError
 from . import skeleton
 from .motionfiles import _finite, placed
 
-# Names of bones, without case, separators, prefixes as in "mixamorig:", and sides, for each joint: the first that a file has counts.
-# Mixamo, CMU and MotionBuilder; Blender's Rigify; Poser and Daz; Unreal; others. The spine, the neck and what lies between are found by
-# their place.
+# Names of bones, without case, separators, prefixes as in "mixamorig:", and sides, for each joint:
+# the first that a file has counts. Mixamo, CMU and MotionBuilder; Blender's Rigify; Poser and Daz;
+# Unreal; others. The spine, the neck and what lies between are found by their place.
 _NAMES = {
     "hip": ("upleg", "thigh", "upperleg", "hip", "femur"),
     "knee": ("leg", "shin", "calf", "lowerleg", "lowleg", "knee", "tibia"),
@@ -30,11 +32,12 @@ _OPTIONAL = ("foot", "collar", "wrist")
 def read_bvh(path, name, fps=None, up=None):
     """The :class:`~onefit.motion.Motion` of a BVH file.
 
-    The file's zero pose has to be a stand (T-pose, A-pose, arms down): how it is turned from the T-pose is found as for bodies
-    (:func:`onefit.skeleton.rest_pose`), and rotations are counted from the T-pose from then on. Lengths are scaled by the legs', so that
-    any unit will do. A rotation of a bone that the 24 joints do not have goes to the next joint outwards; fingers and faces are left out;
-    up is where the head is in the zero pose. Raises InputError where the file cannot be read, a limb is not found, or the zero pose is no
-    stand.
+    The file's zero pose has to be a stand (T-pose, A-pose, arms down): how it is turned from the
+    T-pose is found as for bodies (:func:`onefit.skeleton.rest_pose`), and rotations are counted
+    from the T-pose from then on. Lengths are scaled by the legs', so that any unit will do. A
+    rotation of a bone that the 24 joints do not have goes to the next joint outwards; fingers and
+    faces are left out; up is where the head is in the zero pose. Raises InputError where the file
+    cannot be read, a limb is not found, or the zero pose is no stand.
     """
     names, parents, offsets, channels, frames, period = _parse(path)
     joint_of = _joints(path, names, parents, offsets)
@@ -48,7 +51,9 @@ def read_bvh(path, name, fps=None, up=None):
         fps = 1 / period
         fps = round(fps) if abs(fps - round(fps)) < 0.01 else fps
 
-    world, root = _posed(path, parents, channels, frames)  # rotations of bones (bones, T) and places (T, 3), in the file's axes
+    world, root = _posed(
+        path, parents, channels, frames
+    )  # rotations of bones (bones, T) and places (T, 3), in the file's axes
     C = Rotation.from_matrix(turn)
     stand = skeleton.chained_rotations(skeleton.rest_pose(joints)).numpy()
     target = [None] * 24
@@ -58,13 +63,21 @@ def read_bvh(path, name, fps=None, up=None):
             target[j] = target[parent]
         else:
             target[j] = C * world[bone] * C.inv() * Rotation.from_matrix(stand[j])
-    poses = np.stack([(r if p < 0 else target[p].inv() * r).as_rotvec() for r, p in zip(target, skeleton.PARENTS, strict=True)], 1)
+    poses = np.stack(
+        [
+            (r if p < 0 else target[p].inv() * r).as_rotvec()
+            for r, p in zip(target, skeleton.PARENTS, strict=True)
+        ],
+        1,
+    )
     scale = skeleton.leg_length(skeleton.standard_joints()) / skeleton.leg_length(joints)
     return placed(poses, root @ turn.T * scale, fps, name)
 
 
 def _parse(path):
-    """(names, parents, offsets (B, 3), channels, frames (T, C), frame time) of a BVH file; end sites are bones named ``None``."""
+    """(names, parents, offsets (B, 3), channels, frames (T, C), frame time) of a BVH file; end
+    sites are bones named ``None``.
+    """
     try:
         with open(path, encoding="utf-8", errors="replace") as file:
             text = file.read()
@@ -125,10 +138,15 @@ def _joints(path, names, parents, offsets):
     found = {}
     for side, bones in by_side.items():
         taken = set()
-        for joint, bases in reversed(_NAMES.items()):  # from the hand inwards: a shoulder is an arm only where no arm is
+        for joint, bases in reversed(
+            _NAMES.items()
+        ):  # from the hand inwards: a shoulder is an arm only where no arm is
             bone = next((bones[b] for b in bases if b in bones and bones[b] not in taken), None)
             if bone is None and joint not in _OPTIONAL:
-                raise InputError(f"{path}: no {side} {joint} among its bones ({', '.join(n for n in names if n)[:200]})")
+                raise InputError(
+                    f"{path}: no {side} {joint} among its bones"
+                    f" ({', '.join(n for n in names if n)[:200]})"
+                )
             if bone is not None:
                 found[f"{side}_{joint}"] = bone
                 taken.add(bone)
@@ -141,10 +159,15 @@ def _joints(path, names, parents, offsets):
         raise InputError(f"{path}: its legs and arms do not hang on one spine")
     found["pelvis"] = pelvis
     spine = above(chest)[: above(chest).index(pelvis)][::-1]
-    for k, joint in enumerate(("spine1", "spine2", "spine3")):  # a joint turns as the last of its third of the bones does
+    for k, joint in enumerate(
+        ("spine1", "spine2", "spine3")
+    ):  # a joint turns as the last of its third of the bones does
         if spine:
             found[joint] = spine[max(0, round((k + 1) * len(spine) / 3) - 1)]
-    head = next((b for b, n in enumerate(names) if n and re.fullmatch(r"(.*[^a-z])?head\d*", n.lower())), None)
+    head = next(
+        (b for b, n in enumerate(names) if n and re.fullmatch(r"(.*[^a-z])?head\d*", n.lower())),
+        None,
+    )
     if head is not None and chest in above(head):
         found["head"] = head
         neck = above(head)[1 : above(head).index(chest)]
@@ -168,7 +191,11 @@ def _side(name):
         ):
             rest, count = re.subn(pattern, "", base, count=1)
             if count:
-                return side, re.sub(r"[^a-z]|^(def|org)[._\-]", "", re.sub(r"(?i)^(def|org|bip\d*|character\d*)[._\- ]+", "", rest).lower())
+                return side, re.sub(
+                    r"[^a-z]|^(def|org)[._\-]",
+                    "",
+                    re.sub(r"(?i)^(def|org|bip\d*|character\d*)[._\- ]+", "", rest).lower(),
+                )
     return None, ""
 
 
@@ -180,7 +207,9 @@ def _places(parents, offsets):
 
 
 def _axes(path, places, joint_of, up):
-    """The rotation (3, 3) from the file's axes to OneFit's, its axes along the file's, told from the zero pose."""
+    """The rotation (3, 3) from the file's axes to OneFit's, its axes along the file's, told from
+    the zero pose.
+    """
     head = places[joint_of.get("head", joint_of.get("neck", joint_of["left_shoulder"]))]
     hips = 0.5 * (places[joint_of["left_hip"]] + places[joint_of["right_hip"]])
     nearest = lambda v: np.sign(v[np.abs(v).argmax()]) * np.eye(3)[np.abs(v).argmax()]
@@ -197,24 +226,42 @@ def _standing(path, rest, joint_of):
         if name in joint_of:
             joints[j] = torch.as_tensor(rest[joint_of[name]])
         else:  # beyond what the file has: on, the way the bone before it goes
-            joints[j] = joints[parent] + 0.3 * (joints[parent] - joints[skeleton.PARENTS[parent]] if parent > 0 else 0.0)
+            joints[j] = joints[parent] + 0.3 * (
+                joints[parent] - joints[skeleton.PARENTS[parent]] if parent > 0 else 0.0
+            )
     trunk = joints[skeleton.INDEX["head"]] - joints[0]
-    down = [joints[skeleton.INDEX[f"{s}_hip"], 2] - joints[skeleton.INDEX[f"{s}_ankle"], 2] for s in ("left", "right")]
+    down = [
+        joints[skeleton.INDEX[f"{s}_hip"], 2] - joints[skeleton.INDEX[f"{s}_ankle"], 2]
+        for s in ("left", "right")
+    ]
     if not (trunk[2] > 0.8 * trunk.norm() and min(down) > 0.8 * skeleton.leg_length(joints)):
-        raise InputError(f"{path}: its zero pose is no upright stand with the legs down; export the motion with a T-pose as rest pose")
+        raise InputError(
+            f"{path}: its zero pose is no upright stand with the legs down; export the motion with"
+            " a T-pose as rest pose"
+        )
     return joints
 
 
 def _posed(path, parents, channels, frames):
-    """Rotations of the bones in the file's world, a list of Rotation (T,), and the root's places (T, 3)."""
+    """Rotations of the bones in the file's world, a list of Rotation (T,), and the root's places
+    (T, 3).
+    """
     _finite(path, frames=frames)
     world, column, root = [], 0, np.zeros((len(frames), 3))
     for bone, names in enumerate(channels):
         values = frames[:, column : column + len(names)]
         column += len(names)
-        axes = [(name[0].upper(), values[:, k]) for k, name in enumerate(names) if name.lower().endswith("rotation")]
+        axes = [
+            (name[0].upper(), values[:, k])
+            for k, name in enumerate(names)
+            if name.lower().endswith("rotation")
+        ]
         order = "".join(axis for axis, _ in axes)
-        local = Rotation.from_euler(order, np.stack([v for _, v in axes], -1), degrees=True) if axes else Rotation.identity(len(frames))
+        local = (
+            Rotation.from_euler(order, np.stack([v for _, v in axes], -1), degrees=True)
+            if axes
+            else Rotation.identity(len(frames))
+        )
         world.append(local if parents[bone] < 0 else world[parents[bone]] * local)
         if parents[bone] < 0:
             for k, name in enumerate(names):

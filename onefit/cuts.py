@@ -1,7 +1,9 @@
-"""Random cuts of the tailor's patterns, to train on: tight and loose, short and long, of any neckline and mesh.
+"""Random cuts of the tailor's patterns, to train on: tight and loose, short and long, of any
+neckline and mesh.
 
-A network that has seen six garments drapes others badly: it has learned what to do at the few places where their patches lie. Each cut is
-one of the patterns with its measures drawn at random, with or without wrinkles, and triangles of another size and shape.
+A network that has seen six garments drapes others badly: it has learned what to do at the few
+places where their patches lie. Each cut is one of the patterns with its measures drawn at random,
+with or without wrinkles, and triangles of another size and shape.
 """
 
 import os
@@ -18,8 +20,9 @@ from .garment import Garment
 from .remesh import loops
 from .tailor import Block, sewn
 
-# The pattern, how many loops its boundary has, and its measures [m], from .. to, more of them near the first: little ease, to the ankles
-# and wrists, where the body is hardest to follow. The wide ones are fitted to the hips only, and swing.
+# The pattern, how many loops its boundary has, and its measures [m], from .. to, more of them near
+# the first: little ease, to the ankles and wrists, where the body is hardest to follow. The wide
+# ones are fitted to the hips only, and swing.
 CUTS = {
     "tshirt": ("tshirt", 4, dict(
         waist_ease=(0, 0.03), sleeve_ease=(0, 0.03), sleeve=(0.23, 0.07),
@@ -43,7 +46,9 @@ CUTS = {
 }  # fmt: skip
 EASE = 0.001, 0.020  # of all [m], drawn evenly in its logarithm: half of the cuts lie on the skin
 COUNT = 500, 5000  # vertices, likewise
-WRINKLES = 0.004  # the greatest amplitude [m] of four waves, halved in their sum, for half of the cuts
+WRINKLES = (
+    0.004  # the greatest amplitude [m] of four waves, halved in their sum, for half of the cuts
+)
 WAVES = 0.05, 0.15  # their lengths [m]
 STRETCH = 0.4  # of the triangles: the logarithm of the greatest
 SHORTEST = 2e-4  # edge [m]: at a rim, vertices may slide onto each other
@@ -51,19 +56,31 @@ TRIES = 20
 
 
 def drawn(name, rng):
-    """The arguments of :func:`onefit.tailor.sewn` for a cut ``name`` of :data:`CUTS`, but for its ``bumps``: a dict, lengths in metres."""
+    """The arguments of :func:`onefit.tailor.sewn` for a cut ``name`` of :data:`CUTS`, but for its
+    ``bumps``: a dict, lengths in metres.
+    """
     measures = {"snug": rng.uniform(), "ease": _log_uniform(rng, *EASE)}
     for key, (first, last) in CUTS[name][2].items():
         measures[key] = first + (last - first) * rng.uniform() ** 2
-    if "flare" in measures:  # of the skirt: its depths, and how far it is fitted to the body; a narrow one has to hold the thighs
+    if (
+        "flare" in measures
+        # of the skirt: its depths, and how far it is fitted to the body; a narrow one has to hold
+        # the thighs
+    ):
         measures["waist"] = measures["waist"], rng.uniform(0.55, 0.75) * measures["waist"]
         measures["flare"] = measures["flare"], rng.uniform(0.75, 0.95) * measures["flare"]
-        measures["fitted"] = -0.12 if name.startswith("wide") else rng.uniform(measures["hem"] - 0.02, -0.12)
-    return measures | dict(count=int(_log_uniform(rng, *COUNT)), stretch=np.exp(rng.uniform(-STRETCH, STRETCH, 3)))
+        measures["fitted"] = (
+            -0.12 if name.startswith("wide") else rng.uniform(measures["hem"] - 0.02, -0.12)
+        )
+    return measures | dict(
+        count=int(_log_uniform(rng, *COUNT)), stretch=np.exp(rng.uniform(-STRETCH, STRETCH, 3))
+    )
 
 
 def wrinkles(block, rng):
-    """Four plane waves, summed, on the grid (X, Y, Z) of ``block`` [m], at most twice :data:`WRINKLES` high; or 0."""
+    """Four plane waves, summed, on the grid (X, Y, Z) of ``block`` [m], at most twice
+    :data:`WRINKLES` high; or 0.
+    """
     if rng.random() < 0.5:
         return 0.0
     height = rng.uniform(0, WRINKLES)
@@ -71,14 +88,25 @@ def wrinkles(block, rng):
     for _ in range(4):
         direction = rng.normal(size=3)
         wave = 2 * np.pi / rng.uniform(*WAVES) * direction / np.linalg.norm(direction)
-        out = out + np.sin(wave[0] * block.x + wave[1] * block.y + wave[2] * block.z + rng.uniform(0, 2 * np.pi)) / 2
+        out = (
+            out
+            + np.sin(
+                wave[0] * block.x
+                + wave[1] * block.y
+                + wave[2] * block.z
+                + rng.uniform(0, 2 * np.pi)
+            )
+            / 2
+        )
     return (height * out).astype(np.float32)
 
 
 def cut(block, number, seed=0):
-    """``(name, vertices (N, 3) [m], faces (F, 3))`` of the cut ``number`` of all those of ``seed``: the kinds of :data:`CUTS` in turn.
+    """``(name, vertices (N, 3) [m], faces (F, 3))`` of the cut ``number`` of all those of ``seed``:
+    the kinds of :data:`CUTS` in turn.
 
-    Measures that do not go together (a hem above the crotch), or do not give a clean mesh, are drawn again.
+    Measures that do not go together (a hem above the crotch), or do not give a clean mesh, are
+    drawn again.
     """
     rng = np.random.default_rng([seed, number])
     name = list(CUTS)[number % len(CUTS)]
@@ -98,7 +126,9 @@ def cut(block, number, seed=0):
 
 
 def cuts(count, folder, seed=0, advance=lambda: None):
-    """The first ``count`` cuts as garments. Sewn once, in seconds each, into ``folder``, and read from there after."""
+    """The first ``count`` cuts as garments. Sewn once, in seconds each, into ``folder``, and read
+    from there after.
+    """
     os.makedirs(folder, exist_ok=True)
     garments, block = [], None
     for number in range(count):
@@ -109,9 +139,13 @@ def cuts(count, folder, seed=0, advance=lambda: None):
                 block = Block(body.vertices.numpy(), body.faces.numpy())
             name, V, F = cut(block, number, seed)
             with aside(path) as temporary:
-                np.savez_compressed(temporary, name=name, vertices=V.astype(np.float32), faces=F.astype(np.int32))
+                np.savez_compressed(
+                    temporary, name=name, vertices=V.astype(np.float32), faces=F.astype(np.int32)
+                )
         with np.load(path) as file:
-            garments.append(Garment.bound(f"{file['name']}, cut {number}", file["vertices"], file["faces"]))
+            garments.append(
+                Garment.bound(f"{file['name']}, cut {number}", file["vertices"], file["faces"])
+            )
         advance()
     return garments
 

@@ -31,7 +31,9 @@ def _shape(model, pairs):
     for pair in pairs:
         name, _, value = pair.partition("=")
         if name not in model.shape_names:
-            raise InputError(f"--shape {pair}: choose among {', '.join(model.shape_names)}, as in weight=0.6")
+            raise InputError(
+                f"--shape {pair}: choose among {', '.join(model.shape_names)}, as in weight=0.6"
+            )
         try:
             shape[model.shape_names.index(name)] = float(value)
         except ValueError:
@@ -46,7 +48,9 @@ def _motion(name, seconds, seed, fps, up):
     if name in KINDS:
         return Motion.generate(name, seconds=seconds, seed=seed)
     if not Path(name).exists():
-        raise InputError(f"motion {name}: no such file, and no kind of motion; there are {', '.join(KINDS)}")
+        raise InputError(
+            f"motion {name}: no such file, and no kind of motion; there are {', '.join(KINDS)}"
+        )
     return Motion.read(name, fps, up)
 
 
@@ -68,7 +72,13 @@ def _garment(args):
     if args.garment in TEMPLATES:
         return Garment.template(args.garment)
     return Garment.read(
-        args.garment, made_for=args.made_for, loose=args.loose, scale=args.scale, up=args.up, turn=args.turn, offset=tuple(args.offset)
+        args.garment,
+        made_for=args.made_for,
+        loose=args.loose,
+        scale=args.scale,
+        up=args.up,
+        turn=args.turn,
+        offset=tuple(args.offset),
     )
 
 
@@ -82,7 +92,10 @@ def _render(drape, folder, size, spp, advance):
     from polysft_mi import stage
     from polysft_mi.video import write_video
 
-    parts = [(drape.body.numpy(), drape.body_faces.numpy(), BODY), (drape.vertices.numpy(), drape.faces.numpy(), GARMENT)]
+    parts = [
+        (drape.body.numpy(), drape.body_faces.numpy(), BODY),
+        (drape.vertices.numpy(), drape.faces.numpy(), GARMENT),
+    ]
     frames = folder / "frames"
     frames.mkdir()
 
@@ -96,16 +109,35 @@ def _render(drape, folder, size, spp, advance):
 
 
 def write(drape, folder, *, skip=(), meshes=None, size=(480, 360), spp=32, advance=lambda: None):
-    """The files of a :class:`onefit.Drape` in the empty ``folder``; ``skip``: any of "usd", "render"."""
+    """The files of a :class:`onefit.Drape` in the empty ``folder``; ``skip``: any of "usd",
+    "render".
+    """
     from polyfit.animation import write_frames, write_usd
 
     folder = Path(folder)
-    arrays = {name: getattr(drape, name).numpy() for name in ("vertices", "faces", "rest", "body", "body_faces", "root")}
+    arrays = {
+        name: getattr(drape, name).numpy()
+        for name in ("vertices", "faces", "rest", "body", "body_faces", "root")
+    }
     with aside(folder / "drape.npz") as temporary:
         np.savez_compressed(temporary, fps=drape.fps, **arrays)
     if "usd" not in skip:
-        write_usd(folder / "garment.usd", arrays["vertices"], arrays["faces"], fps=drape.fps, up="z", name="garment")
-        write_usd(folder / "body.usd", arrays["body"], arrays["body_faces"], fps=drape.fps, up="z", name="body")
+        write_usd(
+            folder / "garment.usd",
+            arrays["vertices"],
+            arrays["faces"],
+            fps=drape.fps,
+            up="z",
+            name="garment",
+        )
+        write_usd(
+            folder / "body.usd",
+            arrays["body"],
+            arrays["body_faces"],
+            fps=drape.fps,
+            up="z",
+            name="body",
+        )
     if meshes:
         write_frames(folder / "meshes", meshes, arrays["vertices"], arrays["faces"], up="z")
     if "render" not in skip:
@@ -113,40 +145,112 @@ def write(drape, folder, *, skip=(), meshes=None, size=(480, 360), spp=32, advan
 
 
 def parser():
-    p = argparse.ArgumentParser(prog="python -m onefit.drape", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument("garment", metavar="GARMENT", help="a template's name, or a mesh (.obj, .ply) around the standard body")
-    p.add_argument("motion", metavar="MOTION", help="a file (AMASS or NCS .npz, .bvh), or a generated kind: walk, run, dance, ...")
-    p.add_argument("-o", "--output", required=True, metavar="OUT", help="folder of the results; must be empty or new, or --overwrite")
-    p.add_argument("--weights", default="six-garments", help="a network of the package, or a file (default: six-garments)")
-    p.add_argument("--body", default="anny", help="anny, or a file: SMPL (.npz, .pkl) or plain (body.npz) (default: anny)")
+    p = argparse.ArgumentParser(
+        prog="python -m onefit.drape",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     p.add_argument(
-        "--shape", nargs="*", default=[], metavar="NAME=VALUE", help="the body's shape, e.g. weight=0.7; what is not named is standard"
+        "garment",
+        metavar="GARMENT",
+        help="a template's name, or a mesh (.obj, .ply) around the standard body",
+    )
+    p.add_argument(
+        "motion",
+        metavar="MOTION",
+        help="a file (AMASS or NCS .npz, .bvh), or a generated kind: walk, run, dance, ...",
+    )
+    p.add_argument(
+        "-o",
+        "--output",
+        required=True,
+        metavar="OUT",
+        help="folder of the results; must be empty or new, or --overwrite",
+    )
+    p.add_argument(
+        "--weights",
+        default="six-garments",
+        help="a network of the package, or a file (default: six-garments)",
+    )
+    p.add_argument(
+        "--body",
+        default="anny",
+        help="anny, or a file: SMPL (.npz, .pkl) or plain (body.npz) (default: anny)",
+    )
+    p.add_argument(
+        "--shape",
+        nargs="*",
+        default=[],
+        metavar="NAME=VALUE",
+        help="the body's shape, e.g. weight=0.7; what is not named is standard",
     )
     group = p.add_argument_group("a garment's mesh that is not in metres around the standard body")
-    group.add_argument("--scale", type=float, default=1.0, help="to metres: 0.01 for centimetres (default: 1)")
-    group.add_argument("--up", default="z", choices=("z", "y"), help="the axis that points up (default: z)")
-    group.add_argument("--turn", type=float, default=0.0, help="about the vertical [degrees] (default: 0)")
-    group.add_argument("--offset", nargs=3, type=float, default=(0.0, 0.0, 0.0), metavar=("X", "Y", "Z"), help="to move it by [m]")
-    group.add_argument("--made-for", choices=("T-pose",), help="T-pose: the standard body with its arms stretched out")
-    group.add_argument("--loose", action="store_true", help="a skirt or dress: the legs' pose is not followed")
-    p.add_argument("--fps", type=float, help="frames a second of a motion file, in place of what it says")
-    p.add_argument("--motion-up", choices=("y", "z"), help="the axis that points up in a motion file, in place of what its kind has")
+    group.add_argument(
+        "--scale", type=float, default=1.0, help="to metres: 0.01 for centimetres (default: 1)"
+    )
+    group.add_argument(
+        "--up", default="z", choices=("z", "y"), help="the axis that points up (default: z)"
+    )
+    group.add_argument(
+        "--turn", type=float, default=0.0, help="about the vertical [degrees] (default: 0)"
+    )
+    group.add_argument(
+        "--offset",
+        nargs=3,
+        type=float,
+        default=(0.0, 0.0, 0.0),
+        metavar=("X", "Y", "Z"),
+        help="to move it by [m]",
+    )
+    group.add_argument(
+        "--made-for",
+        choices=("T-pose",),
+        help="T-pose: the standard body with its arms stretched out",
+    )
+    group.add_argument(
+        "--loose", action="store_true", help="a skirt or dress: the legs' pose is not followed"
+    )
+    p.add_argument(
+        "--fps", type=float, help="frames a second of a motion file, in place of what it says"
+    )
+    p.add_argument(
+        "--motion-up",
+        choices=("y", "z"),
+        help="the axis that points up in a motion file, in place of what its kind has",
+    )
     p.add_argument("--seconds", type=float, default=3.0, help="of a generated motion (default: 3)")
     p.add_argument("--seed", type=int, default=0, help="of a generated motion (default: 0)")
     p.add_argument("--post", action="store_true", help="push vertices out of the body afterwards")
-    p.add_argument("--skip", nargs="*", default=[], choices=("usd", "render"), help="what not to write")
+    p.add_argument(
+        "--skip", nargs="*", default=[], choices=("usd", "render"), help="what not to write"
+    )
     p.add_argument("--meshes", choices=("obj", "ply"), help="also one mesh a frame")
-    p.add_argument("--size", nargs=2, type=int, default=(480, 360), metavar=("HEIGHT", "WIDTH"), help="of the rendering (default: 480 360)")
+    p.add_argument(
+        "--size",
+        nargs=2,
+        type=int,
+        default=(480, 360),
+        metavar=("HEIGHT", "WIDTH"),
+        help="of the rendering (default: 480 360)",
+    )
     p.add_argument("--spp", type=int, default=32, help="samples a pixel (default: 32)")
     p.add_argument("--device", default="cpu", help="cpu or cuda, for the network (default: cpu)")
-    p.add_argument("--overwrite", action="store_true", help="replace what a previous drape left in OUT")
+    p.add_argument(
+        "--overwrite", action="store_true", help="replace what a previous drape left in OUT"
+    )
     return p
 
 
 def main(argv=None):
     args = parser().parse_args(argv)
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
 
     from polyfit.training import device_of
 
@@ -172,15 +276,42 @@ def main(argv=None):
     figures = drape.measures().as_dict()
     T, N = drape.vertices.shape[:2]
     console.print(
-        f"{N} vertices in {T} frames: {1e3 * seconds / T:.1f} ms a frame, {figures['collision']:.2f} % of the vertices inside the body"
+        f"{N} vertices in {T} frames: {1e3 * seconds / T:.1f} ms a frame,"
+        f" {figures['collision']:.2f} % of the vertices inside the body"
     )
-    about = dict(garment=args.garment, motion=motion.name, weights=args.weights, shape=shape.tolist(), post=args.post, vertices=N, frames=T)
+    about = dict(
+        garment=args.garment,
+        motion=motion.name,
+        weights=args.weights,
+        shape=shape.tolist(),
+        post=args.post,
+        vertices=N,
+        frames=T,
+    )
     folder.parent.mkdir(parents=True, exist_ok=True)
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=console) as progress, folder_aside(folder, lambda name: True) as temporary:
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+    )
+    with (
+        Progress(*columns, console=console) as progress,
+        folder_aside(folder, lambda name: True) as temporary,
+    ):
         task = progress.add_task("rendering", total=T, visible="render" not in args.skip)
-        write(drape, temporary, skip=args.skip, meshes=args.meshes, size=args.size, spp=args.spp, advance=lambda: progress.advance(task))
-        (Path(temporary) / "figures.json").write_text(json.dumps(about | figures, indent=2) + "\n", encoding="utf-8")
+        write(
+            drape,
+            temporary,
+            skip=args.skip,
+            meshes=args.meshes,
+            size=args.size,
+            spp=args.spp,
+            advance=lambda: progress.advance(task),
+        )
+        (Path(temporary) / "figures.json").write_text(
+            json.dumps(about | figures, indent=2) + "\n", encoding="utf-8"
+        )
     print(folder)
 
 

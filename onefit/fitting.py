@@ -1,7 +1,9 @@
-"""A garment's place on the standard body: units, axes and stand found by the distance to it, other bodies and stands turned into it.
+"""A garment's place on the standard body: units, axes and stand found by the distance to it, other
+bodies and stands turned into it.
 
-The paper's "Garment preprocessing" (supplement). Distances to the body tell whether a garment lies on it; where it does not, other units,
-axes, places and the T-pose are tried on a few hundred of its vertices, and the error names the one with which it would.
+The paper's "Garment preprocessing" (supplement). Distances to the body tell whether a garment lies
+on it; where it does not, other units, axes, places and the T-pose are tried on a few hundred of its
+vertices, and the error names the one with which it would.
 """
 
 from dataclasses import replace
@@ -14,20 +16,38 @@ import torch
 from polyfit.errors import InputError
 
 from . import skeleton, skinning
-from .binding import Binding, smoother, cotangent_laplacian, standard_body, standard_surface, surface_of, vertex_normals
+from .binding import (
+    Binding,
+    smoother,
+    cotangent_laplacian,
+    standard_body,
+    standard_surface,
+    surface_of,
+    vertex_normals,
+)
 from .remesh import neighbour_mean
 
 DEEP = 0.03  # vertices inside the body by less than this are pushed out [m]
-CLEARANCE, SPREAD = 0.004, 0.02  # that a vertex pushed out is left with, and how far it takes its neighbours with it [m]
-UNITS = {1.0: "metres", 0.01: "centimetres", 0.001: "millimetres", 0.1: "decimetres", 0.0254: "inches", 100.0: "hundreds of metres"}
+CLEARANCE, SPREAD = (
+    0.004,
+    0.02,
+)  # that a vertex pushed out is left with, and how far it takes its neighbours with it [m]
+UNITS = {
+    1.0: "metres",
+    0.01: "centimetres",
+    0.001: "millimetres",
+    0.1: "decimetres",
+    0.0254: "inches",
+    100.0: "hundreds of metres",
+}
 T_POSE = "T-pose"
 ON_GROUND = np.array([0.0, 0.0, -0.82])  # from a world in which the body stands at z = 0 [m]
 SEEN = 400  # vertices that places are tried on
 
 
 def placed(V, scale=1.0, up="z", turn=0.0, offset=(0.0, 0.0, 0.0)):
-    """Vertices (N, 3) scaled to metres, turned from ``up`` ("z" or "y") to z up and by ``turn`` [degrees] about z, then moved by ``offset``
-    [m].
+    """Vertices (N, 3) scaled to metres, turned from ``up`` ("z" or "y") to z up and by ``turn``
+    [degrees] about z, then moved by ``offset`` [m].
     """
     if up not in ("y", "z"):
         raise InputError(f"up={up!r}; 'z' or 'y' is needed")
@@ -35,13 +55,18 @@ def placed(V, scale=1.0, up="z", turn=0.0, offset=(0.0, 0.0, 0.0)):
     if up == "y":
         y, z = -z, y
     c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
-    return np.stack([c * x - s * y, s * x + c * y, z], axis=1) + np.asarray(offset, dtype=np.float64)
+    return np.stack([c * x - s * y, s * x + c * y, z], axis=1) + np.asarray(
+        offset, dtype=np.float64
+    )
 
 
 def in_pose(body, pose):
     """``body`` standing in ``pose`` (24, 3) [rad]: its vertices, joints and rest pose."""
     maps = skinning.transforms(body, pose[None].to(body.vertices), body.vertices.new_zeros(1, 3))
-    vertices, joints = skinning.skin(body.vertices, body.blend_weights, maps)[0], skinning.posed_joints(body, maps)[0]
+    vertices, joints = (
+        skinning.skin(body.vertices, body.blend_weights, maps)[0],
+        skinning.posed_joints(body, maps)[0],
+    )
     return replace(body, vertices=vertices, joints=joints, rest_pose=pose.to(body.rest_pose))
 
 
@@ -57,16 +82,20 @@ def _t_surface():
 
 
 def misfit(surface, V):
-    """How far vertices (N, 3) are from lying on the body [m]: the mean distance, and five times the mean depth of those inside."""
+    """How far vertices (N, 3) are from lying on the body [m]: the mean distance, and five times the
+    mean depth of those inside.
+    """
     d = surface(V, 1.0).distance
     return np.abs(d).mean() + 5 * np.maximum(-d, 0).mean()
 
 
 def check_place(V, surface, where, tell_pose=True):
-    """Raises InputError, with a suggestion, where vertices (N, 3) [m] do not lie on the body of ``surface``.
+    """Raises InputError, with a suggestion, where vertices (N, 3) [m] do not lie on the body of
+    ``surface``.
 
-    They do if they are 15 cm from it on average at most, at most 2 % of them more than 3 cm inside, and no other place or stand would fit
-    much better: half the misfit where it is above 4 cm, 0.87 times of it for the T-pose (with ``tell_pose``).
+    They do if they are 15 cm from it on average at most, at most 2 % of them more than 3 cm inside,
+    and no other place or stand would fit much better: half the misfit where it is above 4 cm, 0.87
+    times of it for the T-pose (with ``tell_pose``).
     """
     seen = V[np.linspace(0, len(V) - 1, min(SEEN, len(V))).astype(int)]
     d, own = surface(V, 1e9).distance, misfit(surface, seen)
@@ -75,7 +104,9 @@ def check_place(V, surface, where, tell_pose=True):
         other = misfit(_t_surface(), seen)
         if other < 0.87 * own and own - other > 0.005:
             fits = f"{_mm(other)} from it, {_mm(own)} from the stand with lowered arms"
-            raise InputError(f"{where}: looks made for the T-pose ({fits}): give made_for='{T_POSE}'")
+            raise InputError(
+                f"{where}: looks made for the T-pose ({fits}): give made_for='{T_POSE}'"
+            )
     if lies and own < 0.04:
         return
     best = _best_place(seen, surface, [1.0] if lies else list(UNITS), tell_pose)
@@ -83,18 +114,32 @@ def check_place(V, surface, where, tell_pose=True):
         return
     size = " x ".join(f"{s:.3g}" for s in np.ptp(V, axis=0))
     deep = 100 * (d < -DEEP).mean()
-    found = f"{where}: does not lie on the body: {_mm(np.abs(d).mean())} from it on average, {deep:.0f} % of the vertices deep inside"
+    found = (
+        f"{where}: does not lie on the body: {_mm(np.abs(d).mean())} from it on average, {deep:.0f}"
+        " % of the vertices deep inside"
+    )
     if best is None:
-        raise InputError(f"{found}; it spans {size} m; the body is 1.63 m tall (z from -0.82 to 0.81), z up, and faces -y")
+        raise InputError(
+            f"{found}; it spans {size} m; the body is 1.63 m tall (z from -0.82 to 0.81), z up, and"
+            " faces -y"
+        )
     raise InputError(f"{found}; it looks like {best[1]}: give {best[2]}")
 
 
 def _mm(distance):
-    return f"{1000 * distance:.0f} mm" if distance < 0.1 else f"{distance:.2f} m" if distance < 1 else f"{distance:,.0f} m"
+    return (
+        f"{1000 * distance:.0f} mm"
+        if distance < 0.1
+        else f"{distance:.2f} m"
+        if distance < 1
+        else f"{distance:,.0f} m"
+    )
 
 
 def _best_place(seen, surface, scales, tell_pose):
-    """``(misfit [m], what it looks like, what to give)`` of the plainest place in which the vertices lie on a body, or None."""
+    """``(misfit [m], what it looks like, what to give)`` of the plainest place in which the
+    vertices lie on a body, or None.
+    """
     bodies = [(surface, None)] + ([(_t_surface(), T_POSE)] if tell_pose else [])
     found = []
     for scale, up, turn in product(scales, ("z", "y"), (0, 180)):
@@ -104,7 +149,17 @@ def _best_place(seen, surface, scales, tell_pose):
         for (at, pose), moved in product(bodies, range(3)):
             offset = _offset(V, at) if moved == 2 else moved * ON_GROUND
             worse = (scale != 1) + (up != "z") + (turn != 0) + 0.5 * (pose is not None) + moved
-            found.append((misfit(at, V + offset) * 1.25**worse, misfit(at, V + offset), scale, up, turn, pose, offset))
+            found.append(
+                (
+                    misfit(at, V + offset) * 1.25**worse,
+                    misfit(at, V + offset),
+                    scale,
+                    up,
+                    turn,
+                    pose,
+                    offset,
+                )
+            )
     if not found:
         return None
     _, value, scale, up, turn, pose, offset = min(found, key=lambda f: f[0])
@@ -124,7 +179,11 @@ def _best_place(seen, surface, scales, tell_pose):
         looks.append("made for the T-pose")
         give.append(f"made_for='{pose}'")
     if offset.any():
-        looks.append("on a body that stands on the ground" if (offset == ON_GROUND).all() else "in another place")
+        looks.append(
+            "on a body that stands on the ground"
+            if (offset == ON_GROUND).all()
+            else "in another place"
+        )
         give.append(f"offset=({', '.join(f'{o:g}' for o in offset)})")
     return (value, ", ".join(looks), ", ".join(give)) if give else None
 
@@ -140,7 +199,12 @@ def _offset(V, surface):
     offset = np.round(start + [0, 0, best], 2)
     step, value = 0.02, misfit(surface, V + offset)
     while step >= 0.01:
-        tried = [(misfit(surface, V + offset + step * sign * e), sign, k) for k, e in enumerate(np.eye(3)) for sign in (-1, 1) if k]
+        tried = [
+            (misfit(surface, V + offset + step * sign * e), sign, k)
+            for k, e in enumerate(np.eye(3))
+            for sign in (-1, 1)
+            if k
+        ]
         least, sign, k = min(tried)
         if least < value:
             offset, value = np.round(offset + step * sign * np.eye(3)[k], 2), least
@@ -150,21 +214,35 @@ def _offset(V, surface):
 
 
 def to_standard(V, F, made_for, loose=False):
-    """Vertices (N, 3) [m] of a garment made on the body ``made_for``, in the stand and shape of the standard body.
+    """Vertices (N, 3) [m] of a garment made on the body ``made_for``, in the stand and shape of the
+    standard body.
 
-    The paper displaces each vertex by the difference of its nearest body vertex between the two bodies. That shears sleeves where the
-    stand differs, so the stand is changed by skinning with the garment's smoothed blend weights, and the rest, the difference in shape,
-    by the displacement (smoothed too); one step of Laplacian smoothing follows. Of ``loose`` garments, which do not follow the legs, the
-    legs' pose is left as it is.
+    The paper displaces each vertex by the difference of its nearest body vertex between the two
+    bodies. That shears sleeves where the stand differs, so the stand is changed by skinning with
+    the garment's smoothed blend weights, and the rest, the difference in shape, by the displacement
+    (smoothed too); one step of Laplacian smoothing follows. Of ``loose`` garments, which do not
+    follow the legs, the legs' pose is left as it is.
     """
     standard = standard_body()
     pose = standard.rest_pose.clone()
     if loose:
-        legs = [skeleton.INDEX[f"{side}_{joint}"] for side in ("left", "right") for joint in ("hip", "knee", "ankle", "foot")]
+        legs = [
+            skeleton.INDEX[f"{side}_{joint}"]
+            for side in ("left", "right")
+            for joint in ("hip", "knee", "ankle", "foot")
+        ]
         pose[legs] = made_for.rest_pose[legs]
     weights = Binding(V, F, surface_of(made_for)).blend_weights(made_for.blend_weights.numpy())
     maps = skinning.transforms(made_for, pose[None], torch.zeros(1, 3))
-    V = skinning.skin(torch.as_tensor(V, dtype=torch.float32), torch.as_tensor(weights, dtype=torch.float32), maps)[0].double().numpy()
+    V = (
+        skinning.skin(
+            torch.as_tensor(V, dtype=torch.float32),
+            torch.as_tensor(weights, dtype=torch.float32),
+            maps,
+        )[0]
+        .double()
+        .numpy()
+    )
     stands = in_pose(made_for, pose)
     target = standard if not loose else in_pose(standard, pose)
     difference = counterpart(stands, target) - stands.vertices.numpy()
@@ -173,10 +251,12 @@ def to_standard(V, F, made_for, loose=False):
 
 
 def counterpart(source, target):
-    """Where the vertices of the body ``source`` (V, 3) lie on the body ``target``, in the same stand [m].
+    """Where the vertices of the body ``source`` (V, 3) lie on the body ``target``, in the same
+    stand [m].
 
-    Bodies of the same kind have the same vertices. Otherwise the source is warped through the joints (thin-plate spline), then drawn to
-    the nearest points of the target that face the same way, over shorter and shorter lengths.
+    Bodies of the same kind have the same vertices. Otherwise the source is warped through the
+    joints (thin-plate spline), then drawn to the nearest points of the target that face the same
+    way, over shorter and shorter lengths.
     """
     if source.kind == target.kind and source.vertices.shape == target.vertices.shape:
         return target.vertices.numpy().astype(np.float64)
@@ -196,38 +276,55 @@ def counterpart(source, target):
 
 
 def pushed_out(V, F, where="garment"):
-    """``(vertices (N, 3), sentences)``: vertices up to 3 cm inside the standard body are taken out of it, with the faces that it pokes
-    through and their neighbours. Raises InputError for more than 2 % deeper ones.
+    """``(vertices (N, 3), sentences)``: vertices up to 3 cm inside the standard body are taken out
+    of it, with the faces that it pokes through and their neighbours. Raises InputError for more
+    than 2 % deeper ones.
     """
     surface = standard_surface()
     d = surface(V).distance
     if (d >= 0).all():
         return V, ()
     if (deep := (d < -DEEP).mean()) > 0.02:
-        raise InputError(f"{where}: {100 * deep:.0f} % of the vertices are more than {100 * DEEP:.0f} cm inside the body")
+        raise InputError(
+            f"{where}: {100 * deep:.0f} % of the vertices are more than {100 * DEEP:.0f} cm inside"
+            " the body"
+        )
     area, stiffness = cotangent_laplacian(V, F)
     out = V
     for _ in range(8):
         found, middle = surface(out), surface(out[F].mean(axis=1))
-        move = np.where(found.distance[:, None] < 0, (CLEARANCE - found.distance)[:, None] * found.normal, 0)
+        move = np.where(
+            found.distance[:, None] < 0, (CLEARANCE - found.distance)[:, None] * found.normal, 0
+        )
         poked = np.flatnonzero(middle.distance < 0)
         if not move.any() and not len(poked):
             break
-        move[F[poked].ravel()] += np.repeat((CLEARANCE - middle.distance[poked])[:, None] * middle.normal[poked], 3, axis=0) / 2
+        move[F[poked].ravel()] += (
+            np.repeat(
+                (CLEARANCE - middle.distance[poked])[:, None] * middle.normal[poked], 3, axis=0
+            )
+            / 2
+        )
         out = out + smoother(area * np.where(move.any(axis=1), 1.0, 0.1), stiffness, SPREAD)(move)
     for _ in range(8):
         found = surface(out)
-        out = np.where((found.distance < CLEARANCE / 4)[:, None], found.point + CLEARANCE * found.normal, out)
-    return out, (f"pushed {(d < 0).sum()} vertices out of the body, by up to {-1000 * d.min():.1f} mm",)
+        out = np.where(
+            (found.distance < CLEARANCE / 4)[:, None], found.point + CLEARANCE * found.normal, out
+        )
+    return out, (
+        f"pushed {(d < 0).sum()} vertices out of the body, by up to {-1000 * d.min():.1f} mm",
+    )
 
 
 _correspondences = {}
 
 
 def standard_on(body):
-    """Where the standard body's vertices (V, 3) [m] lie on ``body``, which rests in the standard stand.
+    """Where the standard body's vertices (V, 3) [m] lie on ``body``, which rests in the standard
+    stand.
 
-    For bodies of another kind the correspondence is found on the first body of that kind seen, and kept for its other shapes.
+    For bodies of another kind the correspondence is found on the first body of that kind seen, and
+    kept for its other shapes.
     """
     standard = standard_body()
     vertices = body.vertices.detach().cpu().double().numpy()

@@ -1,4 +1,6 @@
-"""Kinds of motion that go somewhere on their feet: walking, running, sneaking. See :mod:`onefit.generate`."""
+"""Kinds of motion that go somewhere on their feet: walking, running, sneaking. See
+:mod:`onefit.generate`.
+"""
 
 import numpy as np
 
@@ -7,7 +9,9 @@ from .script import cycle, ease
 
 
 def _along(path, side, curvature):
-    """Places (T, 2) in the world and headings (T,), of lengths ``path`` and offsets to the left ``side`` along an arc that starts to -y."""
+    """Places (T, 2) in the world and headings (T,), of lengths ``path`` and offsets to the left
+    ``side`` along an arc that starts to -y.
+    """
     k = curvature if abs(curvature) > 1e-6 else 1e-6
     yaw = k * path
     x, y = (1 - np.cos(yaw)) / k, -np.sin(yaw) / k
@@ -15,12 +19,14 @@ def _along(path, side, curvature):
 
 
 def gait(t, rng, *, stride, rate, stance, lift, heel, sway, bob, narrow, behind, curvature):
-    """(channels of pelvis and feet, phase (T,)) of a gait. A print stays where it is; at phase 0 the left foot touches the ground.
+    """(channels of pelvis and feet, phase (T,)) of a gait. A print stays where it is; at phase 0
+    the left foot touches the ground.
 
-    ``stride`` [m] from print to print of one foot, ``rate`` strides a second, ``stance`` the part of the time that a foot is on the ground;
-    ``lift`` and ``heel`` courses of (phase, height of the ball [m]) and (phase, pitch of the foot [rad]); ``sway`` and ``bob`` of the
-    pelvis [m]; ``narrow``, how much closer to the middle than in standing the feet are put [m]; ``behind``, how far behind the hips a print
-    is at mid-stance [m]; ``curvature`` of the way [1/m].
+    ``stride`` [m] from print to print of one foot, ``rate`` strides a second, ``stance`` the part
+    of the time that a foot is on the ground; ``lift`` and ``heel`` courses of (phase, height of the
+    ball [m]) and (phase, pitch of the foot [rad]); ``sway`` and ``bob`` of the pelvis [m];
+    ``narrow``, how much closer to the middle than in standing the feet are put [m]; ``behind``, how
+    far behind the hips a print is at mid-stance [m]; ``curvature`` of the way [1/m].
     """
     phase = rate * t + rng.uniform(0, 1)
     c = figure.stand(len(t))
@@ -32,7 +38,10 @@ def gait(t, rng, *, stride, rate, stance, lift, heel, sway, bob, narrow, behind,
     for name, offset, sign in (("left", 0.0, 1.0), ("right", 0.5, -1.0)):
         at = phase + offset
         n, p = np.floor(at), at - np.floor(at)
-        path = stride * (n + ease((p - stance) / (1 - stance)) + stance / 2 - offset - phase[0]) - behind
+        path = (
+            stride * (n + ease((p - stance) / (1 - stance)) + stance / 2 - offset - phase[0])
+            - behind
+        )
         place, yaw = _along(path, sign * (figure.BALL[0] - narrow), curvature)
         place += front * np.stack([np.sin(yaw), -np.cos(yaw)], -1)
         c[f"{name}_foot"][:, :2] = place - [sign * figure.BALL[0], -front]
@@ -63,7 +72,9 @@ def walk(t, rng):
     bent = rng.uniform(0.15, 0.6)
     for side, sign in (("left", -1.0), ("right", 1.0)):
         forward = sign * np.cos(2 * np.pi * (phase - 0.03))
-        c[f"{side}_arm"] = np.stack([swing * forward, 0.23 + zero, 0.15 + zero, bent + 0.5 * swing * (1 + forward)], -1)
+        c[f"{side}_arm"] = np.stack(
+            [swing * forward, 0.23 + zero, 0.15 + zero, bent + 0.5 * swing * (1 + forward)], -1
+        )
     return c
 
 
@@ -85,5 +96,7 @@ def run(t, rng):
     swing, bent = rng.uniform(0.55, 0.8), rng.uniform(1.3, 1.7)
     for side, sign in (("left", -1.0), ("right", 1.0)):
         forward = sign * np.cos(2 * np.pi * (phase - 0.02))
-        c[f"{side}_arm"] = np.stack([swing * forward - 0.1, 0.33 + zero, 0.25 + 0.2 * forward, bent + 0.25 * forward], -1)
+        c[f"{side}_arm"] = np.stack(
+            [swing * forward - 0.1, 0.33 + zero, 0.25 + 0.2 * forward, bent + 0.25 * forward], -1
+        )
     return c

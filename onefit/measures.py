@@ -1,4 +1,6 @@
-"""Figures of a drape: collisions, changes of lengths and areas, jitter, physical energy (paper, section "Experiments", OneFit)."""
+"""Figures of a drape: collisions, changes of lengths and areas, jitter, physical energy (paper,
+section "Experiments", OneFit).
+"""
 
 from dataclasses import asdict, dataclass
 
@@ -11,9 +13,10 @@ from . import losses
 
 @dataclass(frozen=True)
 class Measures:
-    """``collision``: % of the vertices inside the body (the paper's epsilon_c); ``edge``, ``area``: mean % by which edges and faces change
-    (epsilon_e, epsilon_a), against the garment graded to the body; ``energy``: stretching, gravity and inertia [J], a mean over frames;
-    ``jitter``: mean length of the vertices' second differences in time [mm]."""
+    """``collision``: % of the vertices inside the body (the paper's epsilon_c); ``edge``, ``area``:
+    mean % by which edges and faces change (epsilon_e, epsilon_a), against the garment graded to the
+    body; ``energy``: stretching, gravity and inertia [J], a mean over frames; ``jitter``: mean
+    length of the vertices' second differences in time [mm]."""
 
     collision: float
     edge: float
@@ -37,15 +40,18 @@ def lengths(vertices, edges):
 
 
 def physical_energy(vertices, rest, faces, root, dt, k_mi=losses.Weights.k_mi):
-    """Stretching, gravity and inertia [J], each (T - 2,), of vertices (T, N, 3) of a garment that rests at ``rest`` (N, 3).
+    """Stretching, gravity and inertia [J], each (T - 2,), of vertices (T, N, 3) of a garment that
+    rests at ``rest`` (N, 3).
 
-    They are the terms of the training's objective, frame by frame: k_mi sum of squared changes of edge lengths; m g (z - z of the ``root``
-    (T, 3)); m |second difference|^2 / (2 dt^2).
+    They are the terms of the training's objective, frame by frame: k_mi sum of squared changes of
+    edge lengths; m g (z - z of the ``root`` (T, 3)); m |second difference|^2 / (2 dt^2).
     """
     edges = torch.as_tensor(mesh.edges_of(faces.numpy())[0])
     stretch = k_mi * (lengths(vertices[2:], edges) - lengths(rest[None], edges)).square().sum(1)
     face_area = areas(rest[None], faces)[0]
-    mass = losses.DENSITY * torch.zeros(len(rest)).index_add(0, faces.flatten(), (face_area / 3).repeat_interleave(3))
+    mass = losses.DENSITY * torch.zeros(len(rest)).index_add(
+        0, faces.flatten(), (face_area / 3).repeat_interleave(3)
+    )
     gravity = losses.GRAVITY * ((vertices[2:, :, 2] - root[2:, None, 2]) * mass).sum(1)
     second = vertices[2:] - 2 * vertices[1:-1] + vertices[:-2]
     inertia = (second.square().sum(-1) * mass).sum(1) / (2 * dt * dt)
@@ -53,10 +59,17 @@ def physical_energy(vertices, rest, faces, root, dt, k_mi=losses.Weights.k_mi):
 
 
 def measure(vertices, faces, rest, body_vertices, collider, root, fps):
-    """:class:`Measures` of the vertices (T, N, 3) [m] of a garment with ``faces`` (F, 3), at ``rest`` (N, 3), on bodies (T, V, 3) whose
-    roots are at ``root`` (T, 3), in at least three frames."""
+    """:class:`Measures` of the vertices (T, N, 3) [m] of a garment with ``faces`` (F, 3), at
+    ``rest`` (N, 3), on bodies (T, V, 3) whose roots are at ``root`` (T, 3), in at least three
+    frames."""
     edges = torch.as_tensor(mesh.edges_of(faces.numpy())[0])
-    inside = torch.stack([collider.distances(v[None], b[None])[0] < 0 for v, b in zip(vertices, body_vertices)]).float().mean()
+    inside = (
+        torch.stack(
+            [collider.distances(v[None], b[None])[0] < 0 for v, b in zip(vertices, body_vertices)]
+        )
+        .float()
+        .mean()
+    )
     change = lambda now, then: ((now - then).abs() / then).mean()
     energy = sum(physical_energy(vertices, rest, faces, root, 1 / fps)).mean()
     second = (vertices[2:] - 2 * vertices[1:-1] + vertices[:-2]).norm(dim=-1).mean()

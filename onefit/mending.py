@@ -1,13 +1,17 @@
-"""Meshes of garments made clean, or refused: one layer of cloth, at most two faces an edge, wound alike, with openings. NumPy.
+"""Meshes of garments made clean, or refused: one layer of cloth, at most two faces an edge, wound
+alike, with openings. NumPy.
 
 The rules, in this order; whatever is changed is told in a sentence:
 
 1. Faces whose corners coincide, faces that repeat others, and vertices in no face are dropped.
-2. Where edges of the boundary lie on one another (a seam of the texture, a soup of triangles), their vertices are merged.
-3. At an edge of three or more faces the two that continue each other straightest stay joined; parts that touch in a point come apart.
-4. Of separate parts, those below 5 % of the area (buttons, labels, pockets) are dropped; the others stay, each for itself. Refused if
-   less than 80 % of the area would be left.
-5. A part without an opening is refused: a solid, or cloth with a thickness. So is one with a single side (a Moebius strip).
+2. Where edges of the boundary lie on one another (a seam of the texture, a soup of triangles),
+   their vertices are merged.
+3. At an edge of three or more faces the two that continue each other straightest stay joined; parts
+   that touch in a point come apart.
+4. Of separate parts, those below 5 % of the area (buttons, labels, pockets) are dropped; the others
+   stay, each for itself. Refused if less than 80 % of the area would be left.
+5. A part without an opening is refused: a solid, or cloth with a thickness. So is one with a single
+   side (a Moebius strip).
 6. Faces wound against the others of their part are turned.
 7. Holes of less than 10 cm around are filled.
 """
@@ -25,7 +29,9 @@ SMALL_HOLE = 0.10  # around [m]
 
 
 def mended(V, F, where="garment"):
-    """``(vertices (N', 3), faces (F', 3), sentences)`` of a mesh in metres. Raises InputError, in one line that starts with ``where``."""
+    """``(vertices (N', 3), faces (F', 3), sentences)`` of a mesh in metres. Raises InputError, in
+    one line that starts with ``where``.
+    """
     V, F = np.asarray(V, dtype=np.float64), np.asarray(F, dtype=np.int64)
     check(V, F, where)
     told = []
@@ -40,7 +46,9 @@ def mended(V, F, where="garment"):
 
 
 def check(V, F, where="garment"):
-    """Raises InputError where there are no faces, or vertices of theirs that are not finite or all in one place."""
+    """Raises InputError where there are no faces, or vertices of theirs that are not finite or all
+    in one place.
+    """
     if len(V) == 0 or len(F) == 0:
         raise InputError(f"{where}: no faces; a garment is a mesh of triangles or quads")
     used = np.unique(F)
@@ -104,17 +112,25 @@ def _sewn(V, F, told):
     edges, uses = _uses(F)
     rim_edges = edges[uses == 1]
     rim = np.unique(rim_edges)
-    pairs = rim[cKDTree(V[rim]).query_pairs(COINCIDENT, output_type="ndarray")] if len(rim) else np.empty((0, 2), dtype=np.int64)
+    pairs = (
+        rim[cKDTree(V[rim]).query_pairs(COINCIDENT, output_type="ndarray")]
+        if len(rim)
+        else np.empty((0, 2), dtype=np.int64)
+    )
     if not len(pairs):
         return V, F
     # only where two edges of the boundary coincide: parts that touch in a point stay apart
     place = mesh.components(len(V), pairs)
-    _, which, times = np.unique(np.sort(place[rim_edges], axis=1), axis=0, return_inverse=True, return_counts=True)
+    _, which, times = np.unique(
+        np.sort(place[rim_edges], axis=1), axis=0, return_inverse=True, return_counts=True
+    )
     seam = np.unique(rim_edges[(times > 1)[which.ravel()]])
     pairs = pairs[np.isin(pairs, seam).all(axis=1)]
     W, G = _merged(V, F, pairs)
     if len(W) < len(V):
-        told.append(f"merged {len(V) - len(W)} vertices of the boundary with others that lie on them")
+        told.append(
+            f"merged {len(V) - len(W)} vertices of the boundary with others that lie on them"
+        )
     return W, G
 
 
@@ -136,7 +152,10 @@ def _cut_apart(V, F, told):
     one, two = np.concatenate(pairs).T
     after = lambda corner: corner - corner % 3 + (corner + 1) % 3
     alike = F.ravel()[one] == F.ravel()[two]
-    joined = [(one, np.where(alike, two, after(two))), (after(one), np.where(alike, after(two), two))]
+    joined = [
+        (one, np.where(alike, two, after(two))),
+        (after(one), np.where(alike, after(two), two)),
+    ]
     label = mesh.components(F.size, np.concatenate([np.stack(p, axis=1) for p in joined]))
     if (uses > 2).any():
         told.append(f"cut apart at {(uses > 2).sum()} edges where more than two faces meet")
@@ -155,11 +174,17 @@ def _large_parts(V, F, where, told):
     share = np.bincount(part, area) / area.sum()
     keep = share >= SMALL_PART
     if share[keep].sum() < MOST:
-        found = f"falls apart into {len(share)} parts, {100 * share[~keep].sum():.0f} % of its area in small ones"
+        found = (
+            f"falls apart into {len(share)} parts, {100 * share[~keep].sum():.0f} % of its area in"
+            " small ones"
+        )
         raise InputError(f"{where}: {found}; faces joined by common vertices are needed")
     if not keep.all():
         few = "a part" if (~keep).sum() == 1 else f"{(~keep).sum()} parts"
-        told.append(f"dropped {few} of {(~keep[part]).sum()} faces, {100 * share[~keep].sum():.2g} % of the area")
+        told.append(
+            f"dropped {few} of {(~keep[part]).sum()} faces, {100 * share[~keep].sum():.2g} % of the"
+            " area"
+        )
     if keep.sum() > 1:
         told.append(f"has {keep.sum()} separate parts, which move each for itself")
     V, F = _used(V, F[keep[part]])
@@ -177,7 +202,10 @@ def _wound_alike(V, F, where, told):
     F = np.where(turned[:, None], F[:, ::-1], F)
     walks = np.stack([F, np.roll(F, -1, axis=1)], axis=-1).reshape(-1, 2)
     if len(np.unique(walks, axis=0)) < len(walks):
-        raise InputError(f"{where}: a surface with one side only (a Moebius strip); cloth with two sides is needed")
+        raise InputError(
+            f"{where}: a surface with one side only (a Moebius strip); cloth with two sides is"
+            " needed"
+        )
     if turned.any():
         told.append(f"turned {turned.sum()} faces that were wound against their neighbours")
     return F
@@ -198,5 +226,8 @@ def _filled(V, F, told):
         faces.append(np.stack([following, loop, np.full(len(loop), centre)], axis=1))
     if not filled:
         return V, F
-    told.append(f"filled {filled} hole{'s' if filled > 1 else ''} of less than {100 * SMALL_HOLE:.0f} cm around")
+    told.append(
+        f"filled {filled} hole{'s' if filled > 1 else ''} of less than {100 * SMALL_HOLE:.0f} cm"
+        " around"
+    )
     return np.concatenate([V, *[x[None] for x in extra]]), np.concatenate(faces)

@@ -1,7 +1,9 @@
-"""The nearest point of a closed triangle mesh, still or moving, and on which side of it a point lies: Warp's bounding volume hierarchy.
+"""The nearest point of a closed triangle mesh, still or moving, and on which side of it a point
+lies: Warp's bounding volume hierarchy.
 
-The side is that of the pseudonormal at the nearest point (Baerentzen and Aanaes 2005): of the face, of the two faces of an edge, or of
-all around a vertex, weighted by their angles. It is summed up where it is asked for, so that nothing but the hierarchy follows a motion.
+The side is that of the pseudonormal at the nearest point (Baerentzen and Aanaes 2005): of the face,
+of the two faces of an edge, or of all around a vertex, weighted by their angles. It is summed up
+where it is asked for, so that nothing but the hierarchy follows a motion.
 """
 
 from dataclasses import dataclass
@@ -13,14 +15,16 @@ import torch
 from .quietwarp import warp
 
 FAR = 0.15  # [m]; how far :meth:`ClosestSurface.distances` looks
-ON = 1e-5  # barycentric coordinates below it are on an edge; points nearer than this [m] are on the surface
+# barycentric coordinates below it are on an edge; points nearer than this [m] are on the surface
+ON = 1e-5
 
 
 @dataclass(frozen=True)
 class Nearest:
-    """``face`` (N,) int64, ``barycentric`` (N, 3), ``point`` (N, 3) [m] on the mesh, ``distance`` (N,) [m]: negative inside the mesh,
-    ``normal`` (N, 3): the unit pseudonormal there, that of the face, of the edge or of the vertex on which the point lies. Arrays of
-    points that were an array, tensors otherwise.
+    """``face`` (N,) int64, ``barycentric`` (N, 3), ``point`` (N, 3) [m] on the mesh, ``distance``
+    (N,) [m]: negative inside the mesh, ``normal`` (N, 3): the unit pseudonormal there, that of the
+    face, of the edge or of the vertex on which the point lies. Arrays of points that were an array,
+    tensors otherwise.
     """
 
     face: np.ndarray | torch.Tensor
@@ -33,11 +37,19 @@ class Nearest:
 @lru_cache(maxsize=1)
 def _warp():
     wp = warp()
-    row = wp.types.vector(length=10, dtype=float)  # barycentric coordinates, point, distance, normal
+    row = wp.types.vector(
+        length=10, dtype=float
+    )  # barycentric coordinates, point, distance, normal
     ON_EDGE = wp.constant(ON)
 
     @wp.func
-    def pseudonormal(mesh: wp.uint64, face: int, b: wp.vec3, first: wp.array(dtype=int), around: wp.array(dtype=int)):
+    def pseudonormal(
+        mesh: wp.uint64,
+        face: int,
+        b: wp.vec3,
+        first: wp.array(dtype=int),
+        around: wp.array(dtype=int),
+    ):
         most = int(0)
         for k in range(3):
             if b[k] > b[most]:
@@ -52,10 +64,17 @@ def _warp():
             normal = wp.vec3(0.0, 0.0, 0.0)
             for j in range(first[v], first[v + 1]):
                 f, k = around[j] // 3, around[j] % 3
-                p, q = wp.mesh_get_index(mesh, 3 * f + (k + 1) % 3), wp.mesh_get_index(mesh, 3 * f + (k + 2) % 3)
+                p, q = (
+                    wp.mesh_get_index(mesh, 3 * f + (k + 1) % 3),
+                    wp.mesh_get_index(mesh, 3 * f + (k + 2) % 3),
+                )
                 weight = float(0.0)
                 if on_vertex:
-                    weight = wp.acos(wp.dot(wp.normalize(points[p] - points[v]), wp.normalize(points[q] - points[v])))
+                    weight = wp.acos(
+                        wp.dot(
+                            wp.normalize(points[p] - points[v]), wp.normalize(points[q] - points[v])
+                        )
+                    )
                 elif p == other or q == other:
                     weight = 1.0
                 normal += weight * wp.mesh_eval_face_normal(mesh, f)
@@ -91,7 +110,8 @@ def _warp():
 
 
 class ClosestSurface:
-    """Queries of one closed mesh, ``vertices`` (V, 3) [m] and ``faces`` (F, 3) wound outward, arrays or tensors; on the vertices' device.
+    """Queries of one closed mesh, ``vertices`` (V, 3) [m] and ``faces`` (F, 3) wound outward,
+    arrays or tensors; on the vertices' device.
     """
 
     def __init__(self, vertices, faces):
@@ -101,10 +121,15 @@ class ClosestSurface:
         self._device = self._wp.device_from_torch(vertices.device)
         self._vertices = vertices.float().clone().contiguous()
         on_device = lambda x: self._wp.array(x.astype(np.int32), dtype=int, device=self._device)
-        self._mesh = self._wp.Mesh(self._wp.from_torch(self._vertices, dtype=self._wp.vec3), on_device(self.faces.ravel()))
+        self._mesh = self._wp.Mesh(
+            self._wp.from_torch(self._vertices, dtype=self._wp.vec3), on_device(self.faces.ravel())
+        )
         counts = np.bincount(self.faces.ravel(), minlength=len(vertices))
         # the corners of faces at vertex v are around[first[v]:first[v + 1]]
-        self._corners = on_device(np.concatenate([[0], np.cumsum(counts)])), on_device(np.argsort(self.faces.ravel(), kind="stable"))
+        self._corners = (
+            on_device(np.concatenate([[0], np.cumsum(counts)])),
+            on_device(np.argsort(self.faces.ravel(), kind="stable")),
+        )
 
     @property
     def vertices(self):
@@ -117,28 +142,41 @@ class ClosestSurface:
         self._mesh.refit()
 
     def __call__(self, points, reach=10.0):
-        """:class:`Nearest` of points (N, 3) [m], an array or a tensor on the mesh's device. Those farther than ``reach`` [m] get the
-        distance ``reach``, the face -1 and NaN. Without gradient.
+        """:class:`Nearest` of points (N, 3) [m], an array or a tensor on the mesh's device. Those
+        farther than ``reach`` [m] get the distance ``reach``, the face -1 and NaN. Without
+        gradient.
         """
         wp = self._wp
         x = torch.as_tensor(points, device=self._vertices.device).detach().float().contiguous()
         face, found = x.new_empty(len(x), dtype=torch.int32), x.new_full((len(x), 10), torch.nan)
-        arrays = wp.from_torch(x, dtype=wp.vec3), float(reach), wp.from_torch(face), wp.from_torch(found, dtype=self._row)
-        wp.launch(self._nearest, len(x), [self._mesh.id, *self._corners, *arrays], device=self._device)
+        arrays = (
+            wp.from_torch(x, dtype=wp.vec3),
+            float(reach),
+            wp.from_torch(face),
+            wp.from_torch(found, dtype=self._row),
+        )
+        wp.launch(
+            self._nearest, len(x), [self._mesh.id, *self._corners, *arrays], device=self._device
+        )
         parts = face.long(), found[:, :3], found[:, 3:6], found[:, 6], found[:, 7:]
         return Nearest(*parts if torch.is_tensor(points) else (p.cpu().numpy() for p in parts))
 
     def distances(self, points, vertices):
-        """Signed distances (T, P) [m], negative inside, of points (T, P, 3) [m] from the mesh with its vertices at (T, V, 3);
-        differentiable in ``points``. Points farther than FAR have FAR.
+        """Signed distances (T, P) [m], negative inside, of points (T, P, 3) [m] from the mesh with
+        its vertices at (T, V, 3); differentiable in ``points``. Points farther than FAR have FAR.
         """
         found = []
         for x, at in zip(points, vertices):
             self.follow(at)
             found.append(self(x, FAR))
-        face, point, distance, normal = (torch.stack([getattr(n, k) for n in found]) for k in ("face", "point", "distance", "normal"))
+        face, point, distance, normal = (
+            torch.stack([getattr(n, k) for n in found])
+            for k in ("face", "point", "distance", "normal")
+        )
         away = (points.detach() - point) / distance[..., None]
-        away = torch.where(distance[..., None].abs() > ON, away, normal)  # the gradient of the distance
+        away = torch.where(
+            distance[..., None].abs() > ON, away, normal
+        )  # the gradient of the distance
         missed = (face < 0)[..., None]
         d = ((points - point.masked_fill(missed, 0)) * away.masked_fill(missed, 0)).sum(-1)
         return torch.where(face < 0, FAR, d)

@@ -1,5 +1,5 @@
-"""The whole objective of a garment's deformation in a few frames (paper, section "OneFit"): what training lowers, and what a drape is
-measured by.
+"""The whole objective of a garment's deformation in a few frames (paper, section "OneFit"): what
+training lowers, and what a drape is measured by.
 """
 
 from dataclasses import dataclass
@@ -8,14 +8,18 @@ import torch
 
 from . import losses
 
-RANDOM_POINTS = 1000  # vertices drawn for the collision, beside those nearest to the metric's points
+RANDOM_POINTS = (
+    1000  # vertices drawn for the collision, beside those nearest to the metric's points
+)
 
 
 @dataclass(frozen=True)
 class Scene:
-    """T frames of bodies, each on its own: ``transforms`` (T, J, 3, 4); ``body`` (T, V, 3) [m], the posed surface; ``collider``, the
-    :class:`onefit.nearest.ClosestSurface` of its triangles; ``rest`` (N, T, 3) [m], the garment's vertices in the rest space, graded to
-    each frame's shape, and ``field`` (3 P, T, 3), what :attr:`onefit.charts.PatchedGarment.field` makes of them."""
+    """T frames of bodies, each on its own: ``transforms`` (T, J, 3, 4); ``body`` (T, V, 3) [m], the
+    posed surface; ``collider``, the :class:`onefit.nearest.ClosestSurface` of its triangles;
+    ``rest`` (N, T, 3) [m], the garment's vertices in the rest space, graded to each frame's shape,
+    and ``field`` (3 P, T, 3), what :attr:`onefit.charts.PatchedGarment.field` makes of them.
+    """
 
     transforms: torch.Tensor
     body: torch.Tensor
@@ -25,25 +29,29 @@ class Scene:
 
 
 def posed(points, weights, transforms):
-    """Points (N, T, 3) of the rest space, skinned with blend weights (N, J) and transforms (T, J, 3, 4): (N, T, 3) [m]."""
+    """Points (N, T, 3) of the rest space, skinned with blend weights (N, J) and transforms (T, J,
+    3, 4): (N, T, 3) [m].
+    """
     T, J = transforms.shape[:2]
     maps = (weights @ transforms.transpose(0, 1).reshape(J, T * 12)).unflatten(1, (T, 3, 4))
     return (maps[..., :3] @ points[..., None])[..., 0] + maps[..., 3]
 
 
 def vertices(garment, changes, rest, transforms):
-    """The garment's vertices (N, T, 3) [m], of :meth:`onefit.charts.PatchedGarment.changes`, rest (N, T, 3) [m] and transforms (T, J, 3,
-    4).
+    """The garment's vertices (N, T, 3) [m], of :meth:`onefit.charts.PatchedGarment.changes`, rest
+    (N, T, 3) [m] and transforms (T, J, 3, 4).
     """
     return posed(rest + garment.displacement(changes), garment.garment.blend_weights, transforms)
 
 
 def evaluate(garment, deformation, scene, weights, epoch=100, past=None, dt=1 / 30, generator=None):
-    """The terms of the objective, a dict of tensors in which the weights are in force, and the posed vertices (N, T, 3) [m].
+    """The terms of the objective, a dict of tensors in which the weights are in force, and the
+    posed vertices (N, T, 3) [m].
 
-    ``garment``: a :class:`onefit.charts.PatchedGarment`; ``deformation``: its :class:`onefit.charts.Deformation` in the T frames;
-    ``past``: the vertices one and two frames, of ``dt`` [s], before each of them, (N, T, 3) [m] each; None leaves inertia out. A term
-    whose weight is 0 is left out too.
+    ``garment``: a :class:`onefit.charts.PatchedGarment`; ``deformation``: its
+    :class:`onefit.charts.Deformation` in the T frames; ``past``: the vertices one and two frames,
+    of ``dt`` [s], before each of them, (N, T, 3) [m] each; None leaves inertia out. A term whose
+    weight is 0 is left out too.
     """
     changes = garment.changes(deformation)
     x = vertices(garment, changes, scene.rest, scene.transforms)
@@ -55,7 +63,9 @@ def evaluate(garment, deformation, scene, weights, epoch=100, past=None, dt=1 / 
         chosen = torch.cat([garment.metric_vertex, drawn])
         distance = scene.collider.distances(x[chosen].transpose(0, 1), scene.body).T
         share = area.sum() / len(chosen)
-        terms["collision"] = weights.k_c * losses.collision(distance, share.expand(len(chosen)), weights.epsilon)
+        terms["collision"] = weights.k_c * losses.collision(
+            distance, share.expand(len(chosen)), weights.epsilon
+        )
         k_ext = losses.extension(distance[: len(garment.metric_vertex)], epoch, weights.epsilon)
     if weights.k_i:
         terms["inextensibility"] = weights.k_i * _metric_term(garment, changes, scene, k_ext)
@@ -71,7 +81,9 @@ def evaluate(garment, deformation, scene, weights, epoch=100, past=None, dt=1 / 
         terms["boundary"] = losses.boundary(at[:, :, 0], normals, weights.k_b, weights.k_bn)
     mass = losses.DENSITY * area
     if weights.k_g:
-        terms["gravity"] = weights.k_g * losses.gravity(x[..., 2] - scene.transforms[:, 0, 2, 3], mass)
+        terms["gravity"] = weights.k_g * losses.gravity(
+            x[..., 2] - scene.transforms[:, 0, 2, 3], mass
+        )
     if weights.k_in and past is not None:
         terms["inertia"] = weights.k_in * losses.inertia(x, *past, mass, dt)
     return terms, x
@@ -81,6 +93,8 @@ def _metric_term(garment, changes, scene, k_ext):
     points, *tangents = scene.field.unflatten(0, (-1, 3)).unbind(1)
     moved = garment.at_metric(changes).unbind(1)
     deformed = [t + d for t, d in zip(tangents, moved[1:])]
-    skinned = losses.skinned_tangents(points + moved[0], deformed, garment.metric_weights, scene.transforms)
+    skinned = losses.skinned_tangents(
+        points + moved[0], deformed, garment.metric_weights, scene.transforms
+    )
     s = garment.frame.s.to(points).repeat_interleave(len(points) // len(garment))
     return losses.inextensibility(losses.metric(tangents), losses.metric(skinned), k_ext, s)

@@ -1,4 +1,6 @@
-"""Kinds of motion that go from posture to posture: squatting, reaching, kicking and so on. See :mod:`onefit.generate`."""
+"""Kinds of motion that go from posture to posture: squatting, reaching, kicking and so on. See
+:mod:`onefit.generate`.
+"""
 
 import numpy as np
 from scipy.interpolate import BPoly
@@ -29,11 +31,21 @@ def squat(t, rng):
     """Squats, shallow and deep, with arms in front, hanging or overhead."""
     s = Script(rng)
     wide, out = rng.uniform(0.02, 0.12), rng.uniform(0.15, 0.5)
-    s.move(0.6, left_foot=(wide, 0, 0), left_foot_turn=(0, out, 0.1), pelvis=(-0.03, 0, -0.02), after=0.5)
+    s.move(
+        0.6,
+        left_foot=(wide, 0, 0),
+        left_foot_turn=(0, out, 0.1),
+        pelvis=(-0.03, 0, -0.02),
+        after=0.5,
+    )
     s.move(0.6, right_foot=(-wide, 0, 0), right_foot_turn=(0, out, 0.1), pelvis=(0, 0, -0.03))
     while s.clock < t[-1] + 1:
         deep, pace = rng.uniform(0.12, 0.42), rng.uniform(0.7, 1.4)
-        arm = [(rng.uniform(1.2, 1.7), 0.15, 0.2, 0.2), (0.3, 0.5, 0.2, 0.5), (rng.uniform(2.6, 2.9), 0.15, 0.0, 0.2)][rng.choice(3)]
+        arm = [
+            (rng.uniform(1.2, 1.7), 0.15, 0.2, 0.2),
+            (0.3, 0.5, 0.2, 0.5),
+            (rng.uniform(2.6, 2.9), 0.15, 0.0, 0.2),
+        ][rng.choice(3)]
         s.move(
             pace, pelvis=(0, 0.45 * deep, -deep), turn=(1.4 * deep + rng.uniform(0, 0.15), 0, 0), spine=(0.5 * deep, 0, 0),
             head=(-1.2 * deep, 0, 0), left_arm=arm, right_arm=arm,
@@ -55,7 +67,12 @@ def reach(t, rng):
         both = rng.random() < 0.35
         height = rng.uniform(0.9, 2.8)
         aside = rng.uniform(-0.35, 0.9) if height < 2.2 else rng.uniform(0.0, 0.4)
-        arm = (height, max(aside, 0.0) if both else aside, rng.uniform(-0.2, 0.2), rng.uniform(0.05, 0.4))
+        arm = (
+            height,
+            max(aside, 0.0) if both else aside,
+            rng.uniform(-0.2, 0.2),
+            rng.uniform(0.05, 0.4),
+        )
         high = max(0.0, height - 2.0)
         turned = (not both) * (0.35 - 0.5 * aside)
         s.move(
@@ -82,7 +99,14 @@ def twist(t, rng):
     s = Script(rng)
     wide = rng.uniform(0.0, 0.1)
     one, other, sign = sides(rng)
-    s.move(0.6, left_foot=(wide, 0, 0), pelvis=(-0.03, 0, -0.02), left_arm=(0.1, 0.6, 0.1, 0.6), right_arm=(0.1, 0.6, 0.1, 0.6), after=0.5)
+    s.move(
+        0.6,
+        left_foot=(wide, 0, 0),
+        pelvis=(-0.03, 0, -0.02),
+        left_arm=(0.1, 0.6, 0.1, 0.6),
+        right_arm=(0.1, 0.6, 0.1, 0.6),
+        after=0.5,
+    )
     s.move(0.6, right_foot=(-wide, 0, 0), pelvis=(0, 0, -0.03))
     while s.clock < t[-1] + 1:
         far, lift, bent = rng.uniform(0.4, 0.9), rng.uniform(0.7, 1.5), rng.uniform(0.3, 1.2)
@@ -101,9 +125,23 @@ def arms_up(t, rng):
     while s.clock < t[-1] + 1:
         high, pace, bent = rng.uniform(2.2, 2.95), rng.uniform(0.9, 1.6), rng.uniform(0.05, 0.5)
         up = (high, 0.2, 0.0, bent) if rng.random() < 0.5 else (0.15, high, 0.0, bent)
-        s.move(pace, left_arm=up, right_arm=up, spine=(-0.15, rng.uniform(-0.2, 0.2), 0), head=(-0.3, 0, 0), pelvis=(0, -0.02, 0))
+        s.move(
+            pace,
+            left_arm=up,
+            right_arm=up,
+            spine=(-0.15, rng.uniform(-0.2, 0.2), 0),
+            head=(-0.3, 0, 0),
+            pelvis=(0, -0.02, 0),
+        )
         s.hold(rng.uniform(0.1, 0.8))
-        s.move(pace, left_arm=hanging(rng), right_arm=hanging(rng), spine=(0.05, 0, 0), head=(0, 0, 0), pelvis=(0, 0, -0.01))
+        s.move(
+            pace,
+            left_arm=hanging(rng),
+            right_arm=hanging(rng),
+            spine=(0.05, 0, 0),
+            head=(0, 0, 0),
+            pelvis=(0, 0, -0.01),
+        )
         s.hold(rng.uniform(0.0, 0.5))
     return s.channels(t)
 
@@ -117,9 +155,20 @@ def arms_crossed(t, rng):
         inner = figure.arm_to(one, (0.03 * sign, -0.222, 0.2 + low), pole=(0.7, 0.2, -1.0))
         outer = figure.arm_to(other, (-0.03 * sign, -0.272, 0.33 + low), pole=(1.2, 0.0, -0.6))
         before = (0.75, 0.25, 0.3, 1.3)
-        s.move(0.7 * pace, **{f"{one}_arm": (0.6, 0.2, 0.4, 1.5), f"{other}_arm": before}, spine=(0.03, 0, 0))
-        s.move(0.6 * pace, **{f"{one}_arm": inner, f"{other}_arm": (0.95, 0.15, 0.5, 1.4)}, after=0.45 * pace)
-        s.move(0.6 * pace, **{f"{other}_arm": outer, f"{one}_hand": (0.1, 0), f"{other}_hand": (0.35, 0)})
+        s.move(
+            0.7 * pace,
+            **{f"{one}_arm": (0.6, 0.2, 0.4, 1.5), f"{other}_arm": before},
+            spine=(0.03, 0, 0),
+        )
+        s.move(
+            0.6 * pace,
+            **{f"{one}_arm": inner, f"{other}_arm": (0.95, 0.15, 0.5, 1.4)},
+            after=0.45 * pace,
+        )
+        s.move(
+            0.6 * pace,
+            **{f"{other}_arm": outer, f"{one}_hand": (0.1, 0), f"{other}_hand": (0.35, 0)},
+        )
         for _ in range(rng.integers(1, 4)):
             s.move(
                 rng.uniform(0.7, 1.4), turn=(0, 0, rng.uniform(-0.2, 0.2)), spine=(rng.uniform(-0.1, 0.15), rng.uniform(-0.1, 0.1),
@@ -127,15 +176,28 @@ def arms_crossed(t, rng):
                 head=(rng.uniform(-0.2, 0.2), 0, rng.uniform(-0.5, 0.5)), pelvis=(rng.uniform(-0.04, 0.04), 0, -0.01),
             )  # fmt: skip
         s.move(0.6 * pace, **{f"{other}_arm": before, f"{other}_hand": (0, 0)}, after=0.3 * pace)
-        s.move(0.8 * pace, **{f"{one}_arm": (0.6, 0.3, 0.2, 1.2), f"{one}_hand": (0, 0)}, after=0.6 * pace)
-        s.move(pace, left_arm=hanging(rng), right_arm=hanging(rng), turn=(0, 0, 0), spine=(0, 0, 0), head=(0, 0, 0))
+        s.move(
+            0.8 * pace,
+            **{f"{one}_arm": (0.6, 0.3, 0.2, 1.2), f"{one}_hand": (0, 0)},
+            after=0.6 * pace,
+        )
+        s.move(
+            pace,
+            left_arm=hanging(rng),
+            right_arm=hanging(rng),
+            turn=(0, 0, 0),
+            spine=(0, 0, 0),
+            head=(0, 0, 0),
+        )
         s.hold(rng.uniform(0.0, 0.5))
     return s.channels(t)
 
 
 def kick(t, rng):
     """High kicks to the front with a nearly straight leg that swings from behind."""
-    s = Script(rng, left_swing=2, right_swing=2)  # the leg's angle, and how far the foot is off the ground
+    s = Script(
+        rng, left_swing=2, right_swing=2
+    )  # the leg's angle, and how far the foot is off the ground
     guard = (0.5, 0.4, 0.3, 1.4)
     s.move(0.5, left_arm=guard, right_arm=guard, pelvis=(0, 0, -0.03))
     while s.clock < t[-1] + 1:
@@ -143,7 +205,11 @@ def kick(t, rng):
         high, pace = rng.uniform(1.1, 1.9), rng.uniform(0.45, 0.65)
         turn = f"{one}_foot_turn"
         s.move(0.5 * pace, **{f"{one}_swing": (0.0, 0.06), turn: (0.2, 0.1, 0)}, after=0.25 * pace)
-        s.move(pace, pelvis=(-0.06 * sign, -0.03, -0.05), **{f"{one}_swing": (-0.5, 0.06), turn: (0.7, 0.1, 0)})
+        s.move(
+            pace,
+            pelvis=(-0.06 * sign, -0.03, -0.05),
+            **{f"{one}_swing": (-0.5, 0.06), turn: (0.7, 0.1, 0)},
+        )
         s.move(
             1.2 * pace, pelvis=(-0.085 * sign, 0.0, -0.02), turn=(-0.1 - 0.15 * high, -0.08 * sign, -0.15 * sign), spine=(0.2, 0,
             0.2 * sign),
@@ -166,7 +232,9 @@ def kick(t, rng):
 
 
 def sit(t, rng):
-    """Sitting down on a chair that is not there, hands on the thighs or beside, leaning and looking round, and standing up."""
+    """Sitting down on a chair that is not there, hands on the thighs or beside, leaning and looking
+    round, and standing up.
+    """
     s = Script(rng)
     while s.clock < t[-1] + 1:
         deep, pace = rng.uniform(0.31, 0.38), rng.uniform(0.8, 1.2)
@@ -178,9 +246,19 @@ def sit(t, rng):
             arms = {"left": (0.0, 0.4, 0.1, 0.35), "right": (0.0, 0.4, 0.1, 0.35)}
             if on_thighs:
                 for side, sign in (("left", 1.0), ("right", -1.0)):
-                    place = np.array([sign * (0.13 + 0.5 * apart * far), seat[1] - far, seat[2] + 0.21])
-                    arms[side] = figure.arm_to(side, figure.in_chest(place, seat, turn, spine), pole=(1.0, 0.6, -0.6))
-            return {"pelvis": seat, "turn": turn, "spine": spine, "left_arm": arms["left"], "right_arm": arms["right"]}
+                    place = np.array(
+                        [sign * (0.13 + 0.5 * apart * far), seat[1] - far, seat[2] + 0.21]
+                    )
+                    arms[side] = figure.arm_to(
+                        side, figure.in_chest(place, seat, turn, spine), pole=(1.0, 0.6, -0.6)
+                    )
+            return {
+                "pelvis": seat,
+                "turn": turn,
+                "spine": spine,
+                "left_arm": arms["left"],
+                "right_arm": arms["right"],
+            }
 
         s.move(
             pace, pelvis=(0, 0.33, -0.75 * deep), turn=(0.55, 0, 0), spine=(0.25, 0, 0), head=(-0.4, 0, 0), left_arm=(0.7, 0.35, 0.1, 0.6),
@@ -189,10 +267,34 @@ def sit(t, rng):
         s.move(pace, head=(0, 0, 0), **posture((0.12, 0, 0)))
         for _ in range(rng.integers(1, 4)):
             spine = (rng.uniform(-0.05, 0.35), rng.uniform(-0.12, 0.12), rng.uniform(-0.3, 0.3))
-            s.move(rng.uniform(0.8, 1.6), head=(rng.uniform(-0.3, 0.2), 0, rng.uniform(-0.6, 0.6)), **posture(spine))
-        s.move(0.5 * pace, left_arm=(0.7, 0.45, 0.1, 0.8), right_arm=(0.7, 0.45, 0.1, 0.8), after=0.2 * pace)
-        s.move(0.8 * pace, pelvis=(0, 0.3, -0.75 * deep), turn=(0.6, 0, 0), spine=(0.25, 0, 0), head=(-0.4, 0, 0), after=0.55 * pace)
-        s.move(pace, pelvis=(0, 0, 0), turn=(0, 0, 0), spine=(0, 0, 0), head=(0, 0, 0), left_arm=hanging(rng), right_arm=hanging(rng))
+            s.move(
+                rng.uniform(0.8, 1.6),
+                head=(rng.uniform(-0.3, 0.2), 0, rng.uniform(-0.6, 0.6)),
+                **posture(spine),
+            )
+        s.move(
+            0.5 * pace,
+            left_arm=(0.7, 0.45, 0.1, 0.8),
+            right_arm=(0.7, 0.45, 0.1, 0.8),
+            after=0.2 * pace,
+        )
+        s.move(
+            0.8 * pace,
+            pelvis=(0, 0.3, -0.75 * deep),
+            turn=(0.6, 0, 0),
+            spine=(0.25, 0, 0),
+            head=(-0.4, 0, 0),
+            after=0.55 * pace,
+        )
+        s.move(
+            pace,
+            pelvis=(0, 0, 0),
+            turn=(0, 0, 0),
+            spine=(0, 0, 0),
+            head=(0, 0, 0),
+            left_arm=hanging(rng),
+            right_arm=hanging(rng),
+        )
         s.hold(rng.uniform(0.1, 0.6))
     return s.channels(t)
 
@@ -216,7 +318,15 @@ def turn(t, rng):
             )  # fmt: skip
             for foot in (first, second):
                 s.move(0.85 * pace, **step(foot, yaw), after=0.75 * pace)
-        s.move(0.7, turn=(0, 0, yaw), head=(0, 0, 0), spine=(0, 0, 0), pelvis=(0, 0, -0.01), left_arm=hanging(rng), right_arm=hanging(rng))
+        s.move(
+            0.7,
+            turn=(0, 0, yaw),
+            head=(0, 0, 0),
+            spine=(0, 0, 0),
+            pelvis=(0, 0, -0.01),
+            left_arm=hanging(rng),
+            right_arm=hanging(rng),
+        )
         s.hold(rng.uniform(0.0, 0.8))
     return s.channels(t)
 
@@ -227,7 +337,12 @@ def side_step(t, rng):
     x = 0.0
     while s.clock < t[-1] + 1:
         one, other, sign = sides(rng)
-        far, pace, lift, low = rng.uniform(0.25, 0.45), rng.uniform(0.35, 0.6), rng.uniform(0.3, 1.2), rng.uniform(0.03, 0.12)
+        far, pace, lift, low = (
+            rng.uniform(0.25, 0.45),
+            rng.uniform(0.35, 0.6),
+            rng.uniform(0.3, 1.2),
+            rng.uniform(0.03, 0.12),
+        )
         for _ in range(rng.integers(1, 4)):
             x += sign * far
             s.move(
@@ -250,7 +365,12 @@ def lunge(t, rng):
     while s.clock < t[-1] + 1:
         one, other, _ = sides(rng)
         far, deep, pace = rng.uniform(0.5, 0.8), rng.uniform(0.18, 0.34), rng.uniform(0.7, 1.1)
-        arm = [(0.1, 0.35, 0.1, 0.3), (rng.uniform(2.5, 2.9), 0.15, 0.0, 0.2), (0.2, 1.4, 0.0, 0.2), (1.3, 0.2, 0.2, 0.3)][rng.choice(4)]
+        arm = [
+            (0.1, 0.35, 0.1, 0.3),
+            (rng.uniform(2.5, 2.9), 0.15, 0.0, 0.2),
+            (0.2, 1.4, 0.0, 0.2),
+            (1.3, 0.2, 0.2, 0.3),
+        ][rng.choice(4)]
         s.move(
             pace, pelvis=(0, -0.48 * far, -deep), turn=(0.1, 0, rng.uniform(-0.1, 0.1)), spine=(0.02, 0, rng.uniform(-0.3, 0.3)),
             left_arm=arm,
@@ -266,14 +386,18 @@ def lunge(t, rng):
 
 
 def bend(t, rng):
-    """Bending down to the front until the hands reach for the toes, and to the sides with an arm overhead."""
+    """Bending down to the front until the hands reach for the toes, and to the sides with an arm
+    overhead.
+    """
     s = Script(rng)
     while s.clock < t[-1] + 1:
         pace = rng.uniform(1.0, 1.6)
         if rng.random() < 0.55:
             lean, curl = rng.uniform(0.5, 1.1), rng.uniform(0.4, 0.9)
             arm = (lean + curl + rng.uniform(-0.1, 0.3), 0.15, 0.1, 0.15)
-            s.move(0.8 * pace, left_arm=arm, right_arm=arm, after=0.05)  # arms first, clear of the thighs
+            s.move(
+                0.8 * pace, left_arm=arm, right_arm=arm, after=0.05
+            )  # arms first, clear of the thighs
             s.move(
                 pace, pelvis=(0, 0.11 * lean, -0.03 - 0.05 * rng.random()), turn=(lean, 0, 0), spine=(curl, 0, rng.uniform(-0.2, 0.2)),
                 head=(rng.uniform(-0.2, 0.4), 0, 0),
@@ -287,14 +411,23 @@ def bend(t, rng):
                 **{f"{one}_arm": (0.1, rng.uniform(2.4, 2.8), 0.0, 0.5), f"{other}_arm": (0.15, 0.3 + 1.2 * far, 0.1, 0.2)},
             )  # fmt: skip
         s.hold(rng.uniform(0.1, 0.6))
-        s.move(pace, pelvis=(0, 0, -0.01), turn=(0, 0, 0), spine=(0, 0, 0), head=(0, 0, 0), after=0.55 * pace)
+        s.move(
+            pace,
+            pelvis=(0, 0, -0.01),
+            turn=(0, 0, 0),
+            spine=(0, 0, 0),
+            head=(0, 0, 0),
+            after=0.55 * pace,
+        )
         s.move(0.8 * pace, left_arm=hanging(rng), right_arm=hanging(rng))
         s.hold(rng.uniform(0.0, 0.4))
     return s.channels(t)
 
 
 def stretch(t, rng):
-    """Arms swung out, drawn across the chest one at a time, and lifted to the sides; shoulders and trunk follow."""
+    """Arms swung out, drawn across the chest one at a time, and lifted to the sides; shoulders and
+    trunk follow.
+    """
     s = Script(rng)
     while s.clock < t[-1] + 1:
         pace = rng.uniform(0.8, 1.5)
@@ -302,8 +435,20 @@ def stretch(t, rng):
         style = rng.choice(3)
         if style == 0:  # open wide, then close in front
             for _ in range(rng.integers(1, 4)):
-                s.move(0.7 * pace, left_arm=(1.45, 1.35, 0, 0.25), right_arm=(1.45, 1.35, 0, 0.25), spine=(-0.12, 0, 0), head=(-0.1, 0, 0))
-                s.move(0.7 * pace, left_arm=(1.4, 0.05, 0.1, 0.3), right_arm=(1.4, 0.05, 0.1, 0.3), spine=(0.15, 0, 0), head=(0.1, 0, 0))
+                s.move(
+                    0.7 * pace,
+                    left_arm=(1.45, 1.35, 0, 0.25),
+                    right_arm=(1.45, 1.35, 0, 0.25),
+                    spine=(-0.12, 0, 0),
+                    head=(-0.1, 0, 0),
+                )
+                s.move(
+                    0.7 * pace,
+                    left_arm=(1.4, 0.05, 0.1, 0.3),
+                    right_arm=(1.4, 0.05, 0.1, 0.3),
+                    spine=(0.15, 0, 0),
+                    head=(0.1, 0, 0),
+                )
         elif style == 1:  # one arm across
             s.move(
                 pace, spine=(0.03, 0, -0.3 * sign), head=(0, 0, 0.2 * sign),
@@ -314,14 +459,18 @@ def stretch(t, rng):
             arm = (0.5, 1.15, 0.9, 1.9)
             s.move(pace, left_arm=arm, right_arm=arm, spine=(0.05, 0, 0))
             for _ in range(rng.integers(1, 4)):
-                s.move(0.6 * pace, spine=(0.05, 0, rng.uniform(-0.5, 0.5)), left_arm=arm, right_arm=arm)
+                s.move(
+                    0.6 * pace, spine=(0.05, 0, rng.uniform(-0.5, 0.5)), left_arm=arm, right_arm=arm
+                )
         s.move(pace, left_arm=hanging(rng), right_arm=hanging(rng), spine=(0, 0, 0), head=(0, 0, 0))
         s.hold(rng.uniform(0.0, 0.4))
     return s.channels(t)
 
 
 def improvise(t, rng):
-    """One posture after another at random: hands anywhere before and beside the body, trunk and hips moving, small steps."""
+    """One posture after another at random: hands anywhere before and beside the body, trunk and
+    hips moving, small steps.
+    """
     s = Script(rng)
     s.move(0.5, left_arm=(0.1, 0.6, 0.1, 0.4), right_arm=(0.1, 0.6, 0.1, 0.4), after=0.2)
     while s.clock < t[-1] + 1:
@@ -331,7 +480,9 @@ def improvise(t, rng):
                 place = rng.uniform((0.12, -0.6, 0.22), (0.6, -0.28, 0.95))
                 if rng.random() < 0.35:
                     place = rng.uniform((0.42, -0.4, 0.05), (0.65, 0.05, 0.9))
-                changes[f"{side}_arm"] = figure.arm_to(side, place * [sign, 1, 1], pole=(rng.uniform(0.4, 1.2), 0.4, -1.0))
+                changes[f"{side}_arm"] = figure.arm_to(
+                    side, place * [sign, 1, 1], pole=(rng.uniform(0.4, 1.2), 0.4, -1.0)
+                )
                 changes[f"{side}_hand"] = rng.uniform((-0.4, -0.3), (0.4, 0.8))
         low = rng.uniform(0.0, 0.14)
         s.move(
@@ -343,18 +494,29 @@ def improvise(t, rng):
         if rng.random() < 0.5:
             foot = rng.choice(["left", "right"])
             s.move(
-                0.5, **step(foot, rng.uniform(-0.25, 0.25), rng.uniform((-0.05, -0.15), (0.05, 0.1)), apart=rng.uniform(0, 0.15)), after=0.3
+                0.5,
+                **step(
+                    foot,
+                    rng.uniform(-0.25, 0.25),
+                    rng.uniform((-0.05, -0.15), (0.05, 0.1)),
+                    apart=rng.uniform(0, 0.15),
+                ),
+                after=0.3,
             )
     return s.channels(t)
 
 
 def _flights(t, starts, heights):
-    """Course of the ground-free height (T,) [m] of jumps that leave the ground at ``starts`` [s] and rise by ``heights`` [m]: parabolas."""
+    """Course of the ground-free height (T,) [m] of jumps that leave the ground at ``starts`` [s]
+    and rise by ``heights`` [m]: parabolas.
+    """
     fine = np.arange(t[0] - 1, t[-1] + 1, 1 / 480)
     total = np.zeros(len(fine))
     for start, height in zip(starts, heights, strict=True):
         half = np.sqrt(2 * height / G)
-        total += np.maximum(0.0, height - 0.5 * G * (fine - start - half) ** 2) * (np.abs(fine - start - half) <= half)
+        total += np.maximum(0.0, height - 0.5 * G * (fine - start - half) ** 2) * (
+            np.abs(fine - start - half) <= half
+        )
     return fine, total
 
 
@@ -371,8 +533,24 @@ def jump(t, rng):
         lift = start + load + push
         up = [(2.4, 0.2, 0, 0.3), (0.8, 0.5, 0.2, 1.0), (0.2, 1.5, 0.0, 0.3)][rng.choice(3)]
         # the pelvis: crouch, spring off with the velocity of the flight, fall, land, stand
-        keys += [start, start + load, lift, lift + half, lift + 2 * half, lift + 2 * half + soak, lift + 2 * half + soak + 0.8]
-        values += [[-0.01, 0, 0], [-deep, 0, 0], [0.07, v, -G], [0.07 + height, 0, -G], [0.07, -v, -G], [-0.8 * deep, 0, 0], [-0.01, 0, 0]]
+        keys += [
+            start,
+            start + load,
+            lift,
+            lift + half,
+            lift + 2 * half,
+            lift + 2 * half + soak,
+            lift + 2 * half + soak + 0.8,
+        ]
+        values += [
+            [-0.01, 0, 0],
+            [-deep, 0, 0],
+            [0.07, v, -G],
+            [0.07 + height, 0, -G],
+            [0.07, -v, -G],
+            [-0.8 * deep, 0, 0],
+            [-0.01, 0, 0],
+        ]
         flights.append((lift, height))
         s.move(
             load,
@@ -388,18 +566,39 @@ def jump(t, rng):
             right_foot_turn=(0.75, 0.1, 0),
         )  # fmt: skip
         s.hold(0.5 * half)
-        s.move(half + 0.3 * soak, left_foot_turn=(0, 0.1, 0), right_foot_turn=(0, 0.1, 0), after=0.6 * half)
-        s.move(0.4 * half + soak, turn=(deep, 0, 0), spine=(0.25, 0, 0), left_arm=(0.5, 0.4, 0.1, 0.5), right_arm=(0.5, 0.4, 0.1, 0.5))
-        s.move(0.8, turn=(0, 0, 0), spine=(0, 0, 0), left_arm=(0.1, 0.3, 0.1, 0.5), right_arm=(0.1, 0.3, 0.1, 0.5))
+        s.move(
+            half + 0.3 * soak,
+            left_foot_turn=(0, 0.1, 0),
+            right_foot_turn=(0, 0.1, 0),
+            after=0.6 * half,
+        )
+        s.move(
+            0.4 * half + soak,
+            turn=(deep, 0, 0),
+            spine=(0.25, 0, 0),
+            left_arm=(0.5, 0.4, 0.1, 0.5),
+            right_arm=(0.5, 0.4, 0.1, 0.5),
+        )
+        s.move(
+            0.8,
+            turn=(0, 0, 0),
+            spine=(0, 0, 0),
+            left_arm=(0.1, 0.3, 0.1, 0.5),
+            right_arm=(0.1, 0.3, 0.1, 0.5),
+        )
         s.hold(rng.uniform(0.1, 0.6))
     c = s.channels(t)
-    first = [i for i, (a, b) in enumerate(zip(keys, keys[1:], strict=False)) if b > a]  # holds of no length
+    first = [
+        i for i, (a, b) in enumerate(zip(keys, keys[1:], strict=False)) if b > a
+    ]  # holds of no length
     keys, values = [keys[i] for i in first] + [keys[-1]], [values[i] for i in first] + [values[-1]]
     height = BPoly.from_derivatives(keys, values)(np.minimum(t, keys[-1]))
     fine, free = _flights(t, *zip(*flights, strict=True))
     feet = np.interp(t, fine, _smoothed(free, 480 * 0.03))
     c["pelvis"][:, 2] = height
-    c["pelvis"][:, 1] = 0.3 * np.logaddexp(0.0, -height / 0.03) * 0.03  # the seat goes back as it goes down
+    c["pelvis"][:, 1] = (
+        0.3 * np.logaddexp(0.0, -height / 0.03) * 0.03
+    )  # the seat goes back as it goes down
     for side in ("left", "right"):
         c[f"{side}_foot"][:, 2] += feet
     return c

@@ -7,7 +7,9 @@ from functools import lru_cache
 
 @lru_cache
 def warp():
-    """The module ``warp``, ready. What it writes at its start, from native code too, is left out; its errors are not."""
+    """The module ``warp``, ready. What it writes at its start, from native code too, is left out;
+    its errors are not.
+    """
     import warp as wp
 
     wp.config.log_level = wp.LOG_ERROR

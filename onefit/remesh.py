@@ -1,4 +1,6 @@
-"""A surface with the same shape and loops at another number of vertices. NumPy; ``vertices`` (N, 3) [m], ``faces`` (F, 3)."""
+"""A surface with the same shape and loops at another number of vertices. NumPy; ``vertices`` (N, 3)
+[m], ``faces`` (F, 3).
+"""
 
 import warnings
 
@@ -18,7 +20,9 @@ def boundary_edges(F):
 
 
 def loops(F):
-    """The boundary of a manifold mesh as a list of vertex indices, in the order in which their faces walk them; the longest first."""
+    """The boundary of a manifold mesh as a list of vertex indices, in the order in which their
+    faces walk them; the longest first.
+    """
     after = dict(boundary_edges(F).tolist())
     found = []
     while after:
@@ -30,8 +34,8 @@ def loops(F):
 
 
 def neighbour_mean(F, count, boundary_apart=False):
-    """Sparse (count, count) matrix that takes the mean of each vertex's neighbours; with ``boundary_apart`` boundary vertices have those
-    along their loop only.
+    """Sparse (count, count) matrix that takes the mean of each vertex's neighbours; with
+    ``boundary_apart`` boundary vertices have those along their loop only.
     """
     e = mesh.edges_of(F)[0]
     if boundary_apart:
@@ -46,7 +50,9 @@ def neighbour_mean(F, count, boundary_apart=False):
 
 
 def nearest_on_segments(points, a, b):
-    """Of points (N, 3) the nearest point (N, 3) on any of the segments from a (S, 3) to b (S, 3)."""
+    """Of points (N, 3) the nearest point (N, 3) on any of the segments from a (S, 3) to b (S,
+    3).
+    """
     d = b - a
     t = np.einsum("nsd,sd->ns", points[:, None] - a, d) / np.maximum((d * d).sum(axis=1), 1e-300)
     at = a + np.clip(t, 0, 1)[..., None] * d
@@ -55,13 +61,18 @@ def nearest_on_segments(points, a, b):
 
 
 def delaunay(V, F):
-    """Faces (F, 3) with the edges flipped whose two opposite angles together are more than 180 degrees, as long as there are any."""
+    """Faces (F, 3) with the edges flipped whose two opposite angles together are more than 180
+    degrees, as long as there are any.
+    """
     F = F.copy()
     for _ in range(20):
         edges, side = mesh.edges_of(F)
         order, uses = np.argsort(side.ravel(), kind="stable"), np.bincount(side.ravel())
         start = (np.cumsum(uses) - uses)[uses == 2]
-        one, two = order[start], order[start + 1]  # corners from which the edge is walked, 3 face + k
+        one, two = (
+            order[start],
+            order[start + 1],
+        )  # corners from which the edge is walked, 3 face + k
         to_next = V[np.roll(F, -1, axis=1)] - V[F]
         to_next /= np.maximum(np.linalg.norm(to_next, axis=2, keepdims=True), 1e-300)
         cosine = -(np.roll(to_next, -1, axis=1) * np.roll(to_next, 1, axis=1)).sum(axis=2)
@@ -85,11 +96,12 @@ def delaunay(V, F):
 
 
 def remeshed(V, F, count, steps=40):
-    """``(vertices, faces)`` with about ``count`` vertices, evenly spread over the surface, the boundary's on its loops.
+    """``(vertices, faces)`` with about ``count`` vertices, evenly spread over the surface, the
+    boundary's on its loops.
 
-    Clusters of equal area (ACVD) give the triangles; then vertices slide on the surface towards the mean of their neighbours, those of a
-    loop along it, and edges are flipped to the Delaunay triangulation. A mesh of fewer than 20 vertices for each new one is cut finer
-    first.
+    Clusters of equal area (ACVD) give the triangles; then vertices slide on the surface towards the
+    mean of their neighbours, those of a loop along it, and edges are flipped to the Delaunay
+    triangulation. A mesh of fewer than 20 vertices for each new one is cut finer first.
     """
     import pyacvd
     import pyvista

@@ -6,7 +6,9 @@ from .figure import BALL, stand
 
 
 def ease(x):
-    """From 0 at x <= 0 to 1 at x >= 1 with the least jerk: 10 x³ - 15 x⁴ + 6 x⁵, velocity and acceleration zero at both ends."""
+    """From 0 at x <= 0 to 1 at x >= 1 with the least jerk: 10 x³ - 15 x⁴ + 6 x⁵, velocity and
+    acceleration zero at both ends.
+    """
     x = np.clip(x, 0.0, 1.0)
     return x * x * x * (10.0 + x * (6.0 * x - 15.0))
 
@@ -18,7 +20,9 @@ def bump(x):
 
 
 def wander(t, rng, size, period):
-    """Slow, aimless movement (T, len(size)) of about ``size``: three sines each, of about ``period`` seconds."""
+    """Slow, aimless movement (T, len(size)) of about ``size``: three sines each, of about
+    ``period`` seconds.
+    """
     total = np.zeros((len(t), len(size)))
     for part in (1.0, 0.6, 0.35):
         turn = 2 * np.pi * t[:, None] / (period * part * rng.uniform(0.8, 1.25, len(size)))
@@ -27,31 +31,38 @@ def wander(t, rng, size, period):
 
 
 def cycle(phase, keys, width=0.04):
-    """A periodic course through ``keys``, pairs (phase from 0 to 1, value): straight between them, then smoothed by a Gaussian of
-    ``width``."""
+    """A periodic course through ``keys``, pairs (phase from 0 to 1, value): straight between them,
+    then smoothed by a Gaussian of ``width``."""
     at, values = zip(*keys, strict=True)
     count = 512
     samples = np.interp(np.arange(count) / count, at, values, period=1.0)
     spectrum = np.fft.rfft(samples) * np.exp(-2 * (np.pi * width * np.arange(count // 2 + 1)) ** 2)
     order = np.arange(33)  # a width of 0.02 leaves less than 1e-3 of what is beyond
-    waves = np.exp(2j * np.pi * np.asarray(phase)[:, None] * order) * spectrum[:33] * np.where(order == 0, 1.0, 2.0) / count
+    waves = (
+        np.exp(2j * np.pi * np.asarray(phase)[:, None] * order)
+        * spectrum[:33]
+        * np.where(order == 0, 1.0, 2.0)
+        / count
+    )
     return waves.real.sum(1)
 
 
 class Script:
-    """A course of movements from posture to posture, each eased in and out; movements may overlap, because they add up.
+    """A course of movements from posture to posture, each eased in and out; movements may overlap,
+    because they add up.
 
-    ``move(0.8, spine=(0.3, 0, 0), pelvis=...)`` takes 0.8 s to bring channels of :mod:`onefit.figure` to new values,
-    the others stay. A foot
-    that goes elsewhere is lifted on its way. ``channels(t)`` gives the figure's channels at times t,
-    and those of ``others`` (sizes by names),
-    which start at zero.
+    ``move(0.8, spine=(0.3, 0, 0), pelvis=...)`` takes 0.8 s to bring channels of
+    :mod:`onefit.figure` to new values, the others stay. A foot that goes elsewhere is lifted on its
+    way. ``channels(t)`` gives the figure's channels at times t, and those of ``others`` (sizes by
+    names), which start at zero.
     """
 
     def __init__(self, rng, **others):
         self.rng = rng
         self.clock = 0.0
-        self.now = {name: values[0] for name, values in stand(1).items()} | {name: np.zeros(size) for name, size in others.items()}
+        self.now = {name: values[0] for name, values in stand(1).items()} | {
+            name: np.zeros(size) for name, size in others.items()
+        }
         self._start = dict(self.now)
         self._moves = []
 
@@ -59,12 +70,16 @@ class Script:
         self.clock += seconds
 
     def move(self, seconds, after=None, **changes):
-        """Reach ``changes`` in ``seconds``; the next movement starts then, or ``after`` seconds from this one's start where that is
-        given."""
+        """Reach ``changes`` in ``seconds``; the next movement starts then, or ``after`` seconds
+        from this one's start where that is given."""
         for name, value in changes.items():
             value = np.asarray(value, dtype=np.float64)
             # limbs do not start all at once: the trunk leads, arms and head follow
-            lag = 0.0 if name.endswith(("foot", "turn", "swing")) or name == "pelvis" else self.rng.uniform(0.0, 0.12) * seconds
+            lag = (
+                0.0
+                if name.endswith(("foot", "turn", "swing")) or name == "pelvis"
+                else self.rng.uniform(0.0, 0.12) * seconds
+            )
             self._moves.append((name, self.clock + lag, seconds, value - self.now[name]))
             self.now[name] = value
         self.clock += seconds if after is None else after
@@ -94,7 +109,9 @@ def hanging(rng):
 
 
 def step(foot, yaw, place=(0.0, 0.0), apart=0.0):
-    """Changes that put a foot where it belongs for a body at ``place`` (2,) [m] that faces ``yaw``, its feet ``apart`` [m] farther out."""
+    """Changes that put a foot where it belongs for a body at ``place`` (2,) [m] that faces ``yaw``,
+    its feet ``apart`` [m] farther out.
+    """
     sign = 1.0 if foot == "left" else -1.0
     x, y = sign * (BALL[0] + apart), BALL[1]
     c, w = np.cos(yaw), np.sin(yaw)

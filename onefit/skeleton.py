@@ -1,7 +1,9 @@
-"""The one skeleton of OneFit: SMPL's 24 joints, the T-pose that angles count from, and the A-pose in which bodies rest.
+"""The one skeleton of OneFit: SMPL's 24 joints, the T-pose that angles count from, and the A-pose
+in which bodies rest.
 
-World: metres, z up; the body faces -y and its left is +x. A pose (24, 3) holds each joint's rotation relative to its parent as an
-axis-angle vector [rad] in these axes, counted from the T-pose: arms stretched out along x, palms down, legs straight down.
+World: metres, z up; the body faces -y and its left is +x. A pose (24, 3) holds each joint's
+rotation relative to its parent as an axis-angle vector [rad] in these axes, counted from the
+T-pose: arms stretched out along x, palms down, legs straight down.
 """
 
 import math
@@ -21,13 +23,20 @@ def _levels():
     depth = []
     for parent in PARENTS:
         depth.append(0 if parent < 0 else depth[parent] + 1)
-    return tuple(tuple(j for j, d in enumerate(depth) if d == level) for level in range(max(depth) + 1))
+    return tuple(
+        tuple(j for j, d in enumerate(depth) if d == level) for level in range(max(depth) + 1)
+    )
 
 
-LEVELS = _levels()  # joints by their distance from the root: a level's rotations follow from the level before it at once
+LEVELS = (
+    _levels()
+    # joints by their distance from the root: a level's rotations follow from the level before it at
+    # once
+)
 
-# The A-pose in which every body rests, from the T-pose, [rad]: rest_pose() of the standard body (Anny with every phenotype at 0.5). Each
-# entry is the left side's; the right side's has the opposite y and z. Joints that are not named stay as in the T-pose.
+# The A-pose in which every body rests, from the T-pose, [rad]: rest_pose() of the standard body
+# (Anny with every phenotype at 0.5). Each entry is the left side's; the right side's has the
+# opposite y and z. Joints that are not named stay as in the T-pose.
 _STANDARD = {
     "hip": (0.0, -0.084941, 0.0),
     "knee": (0.0, -0.018970, 0.0),
@@ -47,8 +56,8 @@ def standard_rest_pose():
     return pose
 
 
-# Joints of the standard body in the T-pose [m], the right side mirrored. Generated motions are made for them, and the size of others is
-# told by them.
+# Joints of the standard body in the T-pose [m], the right side mirrored. Generated motions are made
+# for them, and the size of others is told by them.
 _STANDARD_JOINTS = {
     "pelvis": (0.0, -0.0108, 0.0504), "spine1": (0.0, 0.0223, 0.1178), "spine2": (0.0, 0.0076, 0.2612), "spine3": (0.0, 0.0319, 0.3939),
     "neck": (0.0, -0.0075, 0.5597), "head": (0.0, -0.0419, 0.6567), "hip": (0.1019, -0.0079, 0.0389), "knee": (0.1019, -0.0402, -0.3515),
@@ -71,12 +80,18 @@ def standard_joints():
 
 def leg_length(joints):
     """Length of a leg from hip to ankle, mean of both, in the unit of ``joints`` (24, 3)."""
-    bones = [(f"{side}_{a}", f"{side}_{b}") for side in ("left", "right") for a, b in (("hip", "knee"), ("knee", "ankle"))]
+    bones = [
+        (f"{side}_{a}", f"{side}_{b}")
+        for side in ("left", "right")
+        for a, b in (("hip", "knee"), ("knee", "ankle"))
+    ]
     return sum(float((joints[INDEX[b]] - joints[INDEX[a]]).norm()) for a, b in bones) / 2
 
 
 def chained(rotations):
-    """Rotations (..., 24, 3, 3) relative to the parent, to rotations (..., 24, 3, 3) relative to the world."""
+    """Rotations (..., 24, 3, 3) relative to the parent, to rotations (..., 24, 3, 3) relative to
+    the world.
+    """
     done = [None] * len(PARENTS)
     for level in LEVELS:
         own = rotations[..., list(level), :, :]
@@ -95,12 +110,15 @@ def chained_rotations(poses):
 
 
 def rest_pose(joints):
-    """The pose (24, 3) [rad] that takes the T-pose to the stand in which a body has its joints at ``joints`` (24, 3) [m].
+    """The pose (24, 3) [rad] that takes the T-pose to the stand in which a body has its joints at
+    ``joints`` (24, 3) [m].
 
-    A T-pose is made from any stand by these rules, one angle fewer for each bone than a rotation has; what they leave open stays as it is
-    in the stand. The upper arm is turned by the smallest rotation onto the x axis; the forearm, then the hand, by the smallest relative to
-    the bone before it. A thigh and a shin are turned about the y axis only, until they stand upright seen from the front: a soft knee stays
-    soft. Feet keep their rotation in the world, so that soles stay on the ground. Spine, neck, head and collars stay as they are.
+    A T-pose is made from any stand by these rules, one angle fewer for each bone than a rotation
+    has; what they leave open stays as it is in the stand. The upper arm is turned by the smallest
+    rotation onto the x axis; the forearm, then the hand, by the smallest relative to the bone
+    before it. A thigh and a shin are turned about the y axis only, until they stand upright seen
+    from the front: a soft knee stays soft. Feet keep their rotation in the world, so that soles
+    stay on the ground. Spine, neck, head and collars stay as they are.
     """
     with torch.no_grad():
         joints = joints.to(torch.float64)
@@ -114,7 +132,9 @@ def rest_pose(joints):
                 world[joint] = before
             world[chain[-1]] = before
             for joint, end in (("hip", "knee"), ("knee", "ankle")):
-                x, _, z = (joints[INDEX[f"{side}_{end}"]] - joints[INDEX[f"{side}_{joint}"]]).tolist()
+                x, _, z = (
+                    joints[INDEX[f"{side}_{end}"]] - joints[INDEX[f"{side}_{joint}"]]
+                ).tolist()
                 world[INDEX[f"{side}_{joint}"]] = _about_y(math.atan2(-x, -z))
         return _relative(world)
 
@@ -129,7 +149,9 @@ def _relative(world):
 
 
 def smallest_rotation(a, b):
-    """The rotation (3, 3) about a × b that takes the direction of a (3,) to that of b (3,); they may not be opposite."""
+    """The rotation (3, 3) about a × b that takes the direction of a (3,) to that of b (3,); they
+    may not be opposite.
+    """
     a, b = a / a.norm(), b / b.norm()
     v, c = torch.linalg.cross(a, b), a @ b
     K = v.new_tensor([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])

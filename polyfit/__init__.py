@@ -1,4 +1,6 @@
-"""PolyFit: surfaces as patches, each a jet in a canonical frame (paper, section "PolyFit"), in torch."""
+"""PolyFit: surfaces as patches, each a jet in a canonical frame (paper, section "PolyFit"), in
+torch.
+"""
 
 _EXPORTS = {
     "CanonicalFrame": "frames",

@@ -1,4 +1,6 @@
-"""A mesh as patches of jets, from the command line: ``python -m polyfit garment.obj -o surface.ply``."""
+"""A mesh as patches of jets, from the command line: ``python -m polyfit garment.obj -o
+surface.ply``.
+"""
 
 import argparse
 import os
@@ -8,14 +10,27 @@ from .errors import InputError, cli
 
 def main(argv=None):
     parser = argparse.ArgumentParser(
-        prog="python -m polyfit", description="Fit patches of jets to a mesh, write their surface at any resolution."
+        prog="python -m polyfit",
+        description="Fit patches of jets to a mesh, write their surface at any resolution.",
     )
     parser.add_argument("mesh", help="an .obj or .ply file [m]")
     parser.add_argument("-o", "--output", required=True, help="the .ply file to write")
-    parser.add_argument("--patches", type=int, help="how many; by default the paper's number for the mesh's area")
+    parser.add_argument(
+        "--patches", type=int, help="how many; by default the paper's number for the mesh's area"
+    )
     parser.add_argument("--order", type=int, default=4, help="of the jets, 1 to 10 (default: 4)")
-    parser.add_argument("--resolution", type=int, default=4, help="in how many parts every side of the mesh's faces is cut (default: 4)")
-    parser.add_argument("--smoothing", type=int, default=0, help="rounds of Laplacian smoothing along the patches' boundaries (default: 0)")
+    parser.add_argument(
+        "--resolution",
+        type=int,
+        default=4,
+        help="in how many parts every side of the mesh's faces is cut (default: 4)",
+    )
+    parser.add_argument(
+        "--smoothing",
+        type=int,
+        default=0,
+        help="rounds of Laplacian smoothing along the patches' boundaries (default: 0)",
+    )
     args = parser.parse_args(argv)
     if not args.output.lower().endswith(".ply"):
         raise InputError(f"{args.output}: a .ply file is written")
@@ -31,7 +46,10 @@ def main(argv=None):
     fine, fine_faces = surface.resampled(args.resolution, args.smoothing)
     write_ply(args.output, fine.numpy(), fine_faces.numpy())
     rms = surface.residual.square().mean().sqrt()
-    print(f"{len(surface)} patches, {surface.parameters} numbers, {1e3 * float(rms):.3f} mm RMS from the mesh")
+    print(
+        f"{len(surface)} patches, {surface.parameters} numbers, {1e3 * float(rms):.3f} mm RMS from"
+        " the mesh"
+    )
     print(f"written: {args.output}, {len(fine)} vertices")
 
 

@@ -1,9 +1,12 @@
-"""Clusters of vertices that one jet can hold: ACVD (Valette & Chassery 2004), with the normals in its energy.
+"""Clusters of vertices that one jet can hold: ACVD (Valette & Chassery 2004), with the normals in
+its energy.
 
-ACVD finds connected clusters of least sum of squared distances from their centroids, so round ones of equal area. A jet also needs its
-cluster to be a height graph, and a round cluster of a sleeve may go all the way around it. Here a vertex is the point (x / r, w n) in six
-dimensions, with r the radius of a disc of the clusters' mean area and n its normal; the energy is ACVD's. A fine cut by pyacvd is merged to
-the number asked for, each time where the energy grows least (Ward 1963), and the boundaries then move to where it is lowest.
+ACVD finds connected clusters of least sum of squared distances from their centroids, so round ones
+of equal area. A jet also needs its cluster to be a height graph, and a round cluster of a sleeve
+may go all the way around it. Here a vertex is the point (x / r, w n) in six dimensions, with r the
+radius of a disc of the clusters' mean area and n its normal; the energy is ACVD's. A fine cut by
+pyacvd is merged to the number asked for, each time where the energy grows least (Ward 1963), and
+the boundaries then move to where it is lowest.
 """
 
 import heapq
@@ -13,20 +16,22 @@ import numpy as np
 
 from . import mesh
 
-# Weights w of the normals against positions, tried in this order until no more than this share of the area is folded over.
+# Weights w of the normals against positions, tried in this order until no more than this share of
+# the area is folded over.
 NORMALS, FOLDED = (1.5, 3.0, 6.0), 0.01
-# Clusters of the fine cut for each cluster asked for, and the vertices that each of them should have.
+# Clusters of the fine cut for each cluster asked for, and the vertices that each of them should
+# have.
 FINE, FINE_VERTICES = 12, 4
 # Sweeps over the boundaries, at most.
 SWEEPS = 100
 
 
 def clusters(points, normals, area, faces, edges, count):
-    """Labels 0 .. count - 1 (P,) of a connected mesh: points (P, 3) [m], unit normals (P, 3), area (P,) [m^2] around each, faces (F, 3),
-    edges (E, 2).
+    """Labels 0 .. count - 1 (P,) of a connected mesh: points (P, 3) [m], unit normals (P, 3), area
+    (P,) [m^2] around each, faces (F, 3), edges (E, 2).
 
-    Every cluster is connected; there may be fewer than ``count``. Where clusters still fold over, the normals get more weight, as long as
-    that helps.
+    Every cluster is connected; there may be fewer than ``count``. Where clusters still fold over,
+    the normals get more weight, as long as that helps.
     """
     radius = np.sqrt(area.sum() / (np.pi * count))
     fine = max(count, min(FINE * count, len(points) // FINE_VERTICES))
@@ -35,7 +40,9 @@ def clusters(points, normals, area, faces, edges, count):
     best, least = None, np.inf
     for weight in NORMALS:
         feature = np.concatenate([points / radius, weight * normals], axis=1)
-        label = connected(_relaxed(_merged(fine, feature, area, edges, count), feature, area, edges), edges, area)
+        label = connected(
+            _relaxed(_merged(fine, feature, area, edges, count), feature, area, edges), edges, area
+        )
         folded = _folded(label, normals, area)
         if folded < 0.9 * least:
             best, least = label, folded
@@ -58,8 +65,11 @@ def _acvd(points, faces, count):
         return np.arange(len(points))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # pyacvd uses what pyvista has renamed
-        # its own joining of pieces (iso_try) can leave clusters of a single vertex: connected() does it
-        found = pyacvd.Clustering(pyvista.PolyData.from_regular_faces(points, faces)).cluster(int(count), iso_try=0)
+        # its own joining of pieces (iso_try) can leave clusters of a single vertex: connected()
+        # does it
+        found = pyacvd.Clustering(pyvista.PolyData.from_regular_faces(points, faces)).cluster(
+            int(count), iso_try=0
+        )
     return np.asarray(found, dtype=np.int64)
 
 
@@ -104,7 +114,9 @@ def _merged(label, feature, area, edges, count):
 
 
 def _relaxed(label, feature, area, edges):
-    """Vertices at the boundaries given to the neighbouring cluster where that lowers the energy, until few move."""
+    """Vertices at the boundaries given to the neighbouring cluster where that lowers the energy,
+    until few move.
+    """
     label = label.copy()
     for sweep in range(SWEEPS):
         total, size = _sums(label, feature, area)
@@ -122,10 +134,11 @@ def _relaxed(label, feature, area, edges):
 
 
 def swept(label, edges, sweep, cost):
-    """Give, in place, vertices at the clusters' boundaries to that neighbouring cluster for which ``cost(vertices, own, to)`` (C,) is
-    least, where it is negative.
+    """Give, in place, vertices at the clusters' boundaries to that neighbouring cluster for which
+    ``cost(vertices, own, to)`` (C,) is least, where it is negative.
 
-    Each sweep looks at every other vertex, so that neighbours seldom move together. Returns how many of those looked at moved, as a share.
+    Each sweep looks at every other vertex, so that neighbours seldom move together. Returns how
+    many of those looked at moved, as a share.
     """
     between = edges[label[edges[:, 0]] != label[edges[:, 1]]]
     both = np.concatenate([between, between[:, ::-1]])
@@ -143,7 +156,9 @@ def swept(label, edges, sweep, cost):
 
 def _sums(label, feature, area):
     size = np.bincount(label, area)
-    return np.stack([np.bincount(label, area * f, minlength=len(size)) for f in feature.T], axis=1), np.maximum(size, 1e-300)
+    return np.stack(
+        [np.bincount(label, area * f, minlength=len(size)) for f in feature.T], axis=1
+    ), np.maximum(size, 1e-300)
 
 
 def _squared(x):
@@ -151,7 +166,9 @@ def _squared(x):
 
 
 def connected(label, edges, weight):
-    """The labels with each cluster's heaviest connected piece kept, and the rest given to the clusters around it."""
+    """The labels with each cluster's heaviest connected piece kept, and the rest given to the
+    clusters around it.
+    """
     piece = mesh.components(len(label), edges[label[edges[:, 0]] == label[edges[:, 1]]])
     weight_of = np.bincount(piece, weight)
     owner = np.empty(len(weight_of), dtype=np.int64)
@@ -168,7 +185,9 @@ def connected(label, edges, weight):
 
 
 def halved(label, which, points, edges, weight):
-    """The labels with the cluster ``which`` cut across its longest extent; the new cluster has the next free number."""
+    """The labels with the cluster ``which`` cut across its longest extent; the new cluster has the
+    next free number.
+    """
     inside = np.flatnonzero(label == which)
     centred = points[inside] - points[inside].mean(axis=0)
     along = centred @ np.linalg.svd(centred, full_matrices=False)[2][0]

@@ -1,23 +1,24 @@
-"""Random smooth maps of space that fold, bend and stretch patches: how few garments become many (``polyfit.train``), and how held-out
-garments are posed.
+"""Random smooth maps of space that fold, bend and stretch patches: how few garments become many
+(``polyfit.train``), and how held-out garments are posed.
 
-A map is a stretch along random axes, then bends about random axes, then plane waves. Each is applied to a batch, one map a patch, and
-carries the normals with it by its own derivative. Coordinates are in the unit of the patch (or garment): a ball of radius 1 about the
-origin.
+A map is a stretch along random axes, then bends about random axes, then plane waves. Each is
+applied to a batch, one map a patch, and carries the normals with it by its own derivative.
+Coordinates are in the unit of the patch (or garment): a ball of radius 1 about the origin.
 """
 
 from dataclasses import dataclass
 
 import torch
 
-# curvature * |height| of a bend, at most, for the points farthest from its axis: they are stretched by 1.8 or shrunk to 0.2.
+# curvature * |height| of a bend, at most, for the points farthest from its axis: they are stretched
+# by 1.8 or shrunk to 0.2.
 STRONGEST = 0.8
 
 
 @dataclass(frozen=True)
 class SmoothMaps:
-    """B maps of space. ``scale`` (B, 3), ``axes`` (B, 3, 3); ``bend_frames`` (B, M, 3, 3), ``bend`` (B, M); ``wave`` (B, W, 3), ``push``
-    (B, W, 3), ``phase`` (B, W).
+    """B maps of space. ``scale`` (B, 3), ``axes`` (B, 3, 3); ``bend_frames`` (B, M, 3, 3), ``bend``
+    (B, M); ``wave`` (B, W, 3), ``push`` (B, W, 3), ``phase`` (B, W).
     """
 
     scale: torch.Tensor
@@ -37,7 +38,9 @@ class SmoothMaps:
         return x + torch.sin(angle) @ self.push
 
     def carry(self, x, normals):
-        """Where points and their unit normals (B, P, 3) go: (points, normals), by the map's derivative along two tangents."""
+        """Where points and their unit normals (B, P, 3) go: (points, normals), by the map's
+        derivative along two tangents.
+        """
         helper = torch.nn.functional.one_hot(normals.abs().argmin(-1), 3).to(normals.dtype)
         t1 = torch.nn.functional.normalize(torch.linalg.cross(normals, helper), dim=-1)
         t2 = torch.linalg.cross(normals, t1)
@@ -47,8 +50,8 @@ class SmoothMaps:
 
 
 def _bend(x, frame, curvature):
-    """Rolls space about the second axis of ``frame`` (B, 3, 3; columns: along, across, up): the plane up = 0 becomes a cylinder of
-    ``curvature`` (B, 1).
+    """Rolls space about the second axis of ``frame`` (B, 3, 3; columns: along, across, up): the
+    plane up = 0 becomes a cylinder of ``curvature`` (B, 1).
     """
     along, across, up = (x @ frame).unbind(-1)
     # at up = 1 / curvature space would shrink to a line, and turn inside out beyond
@@ -67,13 +70,24 @@ def _frames(shape, generator):
     return q * torch.linalg.det(q)[..., None, None]
 
 
-def random(count, generator, *, stretch=0.3, bend=4.0, bends=3, waves=4, frequency=(1.0, 6.0), steepness=0.9):
+def random(
+    count,
+    generator,
+    *,
+    stretch=0.3,
+    bend=4.0,
+    bends=3,
+    waves=4,
+    frequency=(1.0, 6.0),
+    steepness=0.9,
+):
     """``count`` random maps, float32.
 
-    ``stretch`` is the largest logarithm of a scale; ``bend`` the largest curvature of a bend; ``waves`` plane waves have wave numbers in
-    ``frequency`` and together push with a derivative of at most ``steepness`` (below 1 no wave folds space over itself). Every patch draws
-    its own strength in [0, 1] for each of the three, so that mild maps are as frequent as strong ones. ``generator`` is a CPU
-    ``torch.Generator``.
+    ``stretch`` is the largest logarithm of a scale; ``bend`` the largest curvature of a bend;
+    ``waves`` plane waves have wave numbers in ``frequency`` and together push with a derivative of
+    at most ``steepness`` (below 1 no wave folds space over itself). Every patch draws its own
+    strength in [0, 1] for each of the three, so that mild maps are as frequent as strong ones.
+    ``generator`` is a CPU ``torch.Generator``.
     """
 
     def uniform(*shape):
@@ -86,7 +100,9 @@ def random(count, generator, *, stretch=0.3, bend=4.0, bends=3, waves=4, frequen
     wave = torch.nn.functional.normalize(torch.randn(count, waves, 3, generator=generator), dim=-1)
     number = frequency[0] + (frequency[1] - frequency[0]) * uniform(waves, 1)
     share = torch.softmax(3 * torch.rand(count, waves, 1, generator=generator), 1)
-    direction = torch.nn.functional.normalize(torch.randn(count, waves, 3, generator=generator), dim=-1)
+    direction = torch.nn.functional.normalize(
+        torch.randn(count, waves, 3, generator=generator), dim=-1
+    )
     push = steepness * strength()[..., None] * share / number * direction
     return SmoothMaps(
         scale,

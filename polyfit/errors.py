@@ -16,7 +16,8 @@ class InputError(ValueError):
 def cli(main):
     """Run ``main()`` as a process: its return value is the exit status.
 
-    An :class:`InputError` or an ``OSError`` that names a file ends in one line on stderr and exit status 2, Ctrl-C in 130.
+    An :class:`InputError` or an ``OSError`` that names a file ends in one line on stderr and exit
+    status 2, Ctrl-C in 130.
     """
     try:
         status = main()
@@ -31,11 +32,16 @@ def cli(main):
         where = f"{error.filename}: " if error.filename is not None else ""
         status = _fail(f"{where}{error.strerror or error}")
     with contextlib.suppress(ValueError):  # which is raised beside the main thread
-        signal.signal(signal.SIGINT, signal.SIG_DFL)  # nothing is left but Python's own end, whose traceback would tell nobody anything
+        signal.signal(
+            signal.SIGINT, signal.SIG_DFL
+        )  # nothing is left but Python's own end, whose traceback would tell nobody anything
     sys.exit(status)
 
 
 def _fail(message):
     coloured = sys.stderr.isatty() and not os.environ.get("NO_COLOR")
-    print(("\033[1;31merror:\033[0m " if coloured else "error: ") + " ".join(message.split()), file=sys.stderr)
+    print(
+        ("\033[1;31merror:\033[0m " if coloured else "error: ") + " ".join(message.split()),
+        file=sys.stderr,
+    )
     return 2

@@ -1,14 +1,14 @@
-"""The four analytic families that PolyFit is trained on (paper, supplement, "Training dataset"): surfaces z = f(u, v) with their exact
-normals.
+"""The four analytic families that PolyFit is trained on (paper, supplement, "Training dataset"):
+surfaces z = f(u, v) with their exact normals.
 
     jet             sum_i sum_j alpha_{i-j,j} u^(i-j) v^j, i <= 4
     trigonometric   alpha cos(theta sqrt(u^2 + v^2))
     gaussian        alpha exp(-((u - u0)^2 + (v - v0)^2) / (2 sigma^2))
     bessel          alpha J0(k sqrt((u - u0)^2 + (v - v0)^2))
 
-with alpha in [-0.5, 0.5], theta in [pi, 2 pi], sigma in [0.5, 1], k = 5, over (u, v) in [-1, 1]^2, and summed, as in the paper. The paper
-leaves the centres (u0, v0) open; here they are uniform in [-1, 1]^2. Numbers are uniform in their ranges, and each function of a patch
-draws its own.
+with alpha in [-0.5, 0.5], theta in [pi, 2 pi], sigma in [0.5, 1], k = 5, over (u, v) in [-1, 1]^2,
+and summed, as in the paper. The paper leaves the centres (u0, v0) open; here they are uniform in
+[-1, 1]^2. Numbers are uniform in their ranges, and each function of a patch draws its own.
 """
 
 import math
@@ -46,32 +46,47 @@ def trigonometric(alpha, theta, uv):
 
 
 def gaussian(alpha, centre, sigma, uv):
-    """Height (B, P) and slopes (B, P, 2) of a Gaussian; ``alpha``, ``sigma`` (B,), ``centre`` (B, 2)."""
+    """Height (B, P) and slopes (B, P, 2) of a Gaussian; ``alpha``, ``sigma`` (B,), ``centre`` (B,
+    2).
+    """
     d = uv - centre[:, None]
     z = alpha[:, None] * torch.exp(-0.5 * (d * d).sum(-1) / sigma[:, None] ** 2)
     return z, -(z / sigma[:, None] ** 2)[..., None] * d
 
 
 def bessel(alpha, centre, uv):
-    """Height (B, P) and slopes (B, P, 2) of alpha J0(k r) about ``centre`` (B, 2); ``alpha`` (B,)."""
+    """Height (B, P) and slopes (B, P, 2) of alpha J0(k r) about ``centre`` (B, 2); ``alpha``
+    (B,).
+    """
     d = uv - centre[:, None]
     x = BESSEL_K * d.norm(dim=-1)
     # J1(x) / x -> 1/2 at the centre
-    ratio = torch.where(x > 1e-6, torch.special.bessel_j1(x) / x.clamp_min(1e-6), torch.full_like(x, 0.5))
-    return alpha[:, None] * torch.special.bessel_j0(x), -(alpha[:, None] * BESSEL_K**2 * ratio)[..., None] * d
+    ratio = torch.where(
+        x > 1e-6, torch.special.bessel_j1(x) / x.clamp_min(1e-6), torch.full_like(x, 0.5)
+    )
+    return (
+        alpha[:, None] * torch.special.bessel_j0(x),
+        -(alpha[:, None] * BESSEL_K**2 * ratio)[..., None] * d,
+    )
 
 
 def sample(patches, points, generator, families=FAMILIES):
-    """``patches`` random surfaces at ``points`` random places each: points (B, P, 3) and unit normals (B, P, 3), float64, z up.
+    """``patches`` random surfaces at ``points`` random places each: points (B, P, 3) and unit
+    normals (B, P, 3), float64, z up.
 
-    ``families`` names the functions that are summed; ``generator`` is a CPU ``torch.Generator``. Raises InputError for a name that is none
-    of ``FAMILIES``.
+    ``families`` names the functions that are summed; ``generator`` is a CPU ``torch.Generator``.
+    Raises InputError for a name that is none of ``FAMILIES``.
     """
     unknown = sorted(set(families) - set(FAMILIES))
     if unknown or not families:
-        raise InputError(f"families {', '.join(unknown) or 'empty'}: choose among {', '.join(FAMILIES)}")
+        raise InputError(
+            f"families {', '.join(unknown) or 'empty'}: choose among {', '.join(FAMILIES)}"
+        )
     uv = _uniform((patches, points, 2), -1, 1, generator)
-    z, slope = torch.zeros(patches, points, dtype=torch.float64), torch.zeros(patches, points, 2, dtype=torch.float64)
+    z, slope = (
+        torch.zeros(patches, points, dtype=torch.float64),
+        torch.zeros(patches, points, 2, dtype=torch.float64),
+    )
 
     def amplitude(*shape):
         return _uniform((patches, *shape), -AMPLITUDE, AMPLITUDE, generator)
@@ -89,5 +104,7 @@ def sample(patches, points, generator, families=FAMILIES):
         else:
             part = bessel(amplitude(), centre(), uv)
         z, slope = z + part[0], slope + part[1]
-    normals = torch.nn.functional.normalize(torch.cat([-slope, torch.ones_like(z)[..., None]], -1), dim=-1)
+    normals = torch.nn.functional.normalize(
+        torch.cat([-slope, torch.ones_like(z)[..., None]], -1), dim=-1
+    )
     return torch.cat([uv, z[..., None]], -1), normals

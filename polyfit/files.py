@@ -7,12 +7,18 @@ import shutil
 
 from .errors import InputError
 
-FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # numbers of the OSErrors that say that no more can be written
+FULL = (
+    errno.ENOSPC,
+    errno.EDQUOT,
+    errno.EFBIG,
+)  # numbers of the OSErrors that say that no more can be written
 
 
 @contextlib.contextmanager
 def naming(path):
-    """An OSError of the block that names no file, as a full disk's does where a file is flushed, names ``path``."""
+    """An OSError of the block that names no file, as a full disk's does where a file is flushed,
+    names ``path``.
+    """
     try:
         yield
     except OSError as error:
@@ -23,38 +29,53 @@ def naming(path):
 
 @contextlib.contextmanager
 def aside(path):
-    """``with aside(path) as temporary:`` write the file ``temporary``; it becomes ``path`` at the end of the block.
+    """``with aside(path) as temporary:`` write the file ``temporary``; it becomes ``path`` at the
+    end of the block.
 
-    The name keeps its extension, because writers choose the format by it. On any exception (Ctrl-C included) what was written is
-    removed and what stood at ``path`` before stays. An OSError of the write names ``path``.
+    The name keeps its extension, because writers choose the format by it. On any exception (Ctrl-C
+    included) what was written is removed and what stood at ``path`` before stays. An OSError of the
+    write names ``path``.
     """
     folder, name = os.path.split(os.fspath(path))
     temporary = os.path.join(folder, f".{os.getpid()}.partial.{name}")
     try:
         yield temporary
-        with open(temporary, "rb+") as file:  # a full disk shows here at the latest, before the rename
+        with open(
+            temporary, "rb+"
+        ) as file:  # a full disk shows here at the latest, before the rename
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except BaseException as error:
         with contextlib.suppress(OSError):
             os.remove(temporary)
-        if isinstance(error, OSError) and error.errno is not None and error.filename in (None, temporary):
-            error.filename = os.fspath(path)  # the name that the user knows; a full disk comes with none
+        if (
+            isinstance(error, OSError)
+            and error.errno is not None
+            and error.filename in (None, temporary)
+        ):
+            error.filename = os.fspath(
+                path
+            )  # the name that the user knows; a full disk comes with none
         raise
 
 
 @contextlib.contextmanager
 def folder_aside(path, ours):
-    """``with folder_aside(path, ours) as temporary:`` fill the folder ``temporary``; it becomes ``path`` at the end of the block, or is
-    removed on any exception.
+    """``with folder_aside(path, ours) as temporary:`` fill the folder ``temporary``; it becomes
+    ``path`` at the end of the block, or is removed on any exception.
 
-    What stands at ``path`` is replaced where it is a folder in which ``ours(name)`` is true of every name, and else refused by an
-    InputError.
+    What stands at ``path`` is replaced where it is a folder in which ``ours(name)`` is true of
+    every name, and else refused by an InputError.
     """
     path = os.path.abspath(path)
     if os.path.lexists(path) and not (os.path.isdir(path) and all(map(ours, os.listdir(path)))):
-        raise InputError(f"{path}: {'holds other files' if os.path.isdir(path) else 'is a file'}; a new or empty folder is needed")
-    temporary = os.path.join(os.path.dirname(path), f".{os.getpid()}.partial.{os.path.basename(path)}")
+        raise InputError(
+            f"{path}: {'holds other files' if os.path.isdir(path) else 'is a file'}; a new or empty"
+            " folder is needed"
+        )
+    temporary = os.path.join(
+        os.path.dirname(path), f".{os.getpid()}.partial.{os.path.basename(path)}"
+    )
     os.mkdir(temporary)
     try:
         yield temporary

@@ -1,4 +1,6 @@
-"""Canonical frames: the orientations O = (s, R, T) that take patches to their charts and back (paper, section "PolyFit")."""
+"""Canonical frames: the orientations O = (s, R, T) that take patches to their charts and back
+(paper, section "PolyFit").
+"""
 
 from dataclasses import dataclass
 
@@ -11,8 +13,8 @@ from .errors import InputError
 class CanonicalFrame:
     """p = s R x + T, with x in the chart (u, v, z) and p in the surface's own frame [m].
 
-    ``s`` (...,) [m], ``R`` (..., 3, 3) rotations whose columns are the chart's axes, ``T`` (..., 3) the charts' origins [m]: one
-    frame, or a batch of them.
+    ``s`` (...,) [m], ``R`` (..., 3, 3) rotations whose columns are the chart's axes, ``T`` (..., 3)
+    the charts' origins [m]: one frame, or a batch of them.
     """
 
     s: torch.Tensor
@@ -21,20 +23,26 @@ class CanonicalFrame:
 
     @classmethod
     def from_points(cls, points, mask=None, *, weights=None):
-        """By principal components of points (..., P, 3): T is their mean, s their largest distance from it, z the direction of least
-        spread.
+        """By principal components of points (..., P, 3): T is their mean, s their largest distance
+        from it, z the direction of least spread.
 
-        ``mask`` (..., P) bool: the points that exist; ``weights`` (..., P) not negative, for mean and spread. Signs are fixed by the data,
-        so that the frame turns with the points: u and v point to the side where the third moment of the coordinate is positive (for a
-        symmetric patch: to the side of the first point that is half as far out as the farthest), z follows by the right hand. In float64
-        inside, in the points' dtype outside, and without gradient: a frame is a choice of coordinates. Raises InputError where a patch has
-        no points, or points that are not finite or all the same.
+        ``mask`` (..., P) bool: the points that exist; ``weights`` (..., P) not negative, for mean
+        and spread. Signs are fixed by the data, so that the frame turns with the points: u and v
+        point to the side where the third moment of the coordinate is positive (for a symmetric
+        patch: to the side of the first point that is half as far out as the farthest), z follows by
+        the right hand. In float64 inside, in the points' dtype outside, and without gradient: a
+        frame is a choice of coordinates. Raises InputError where a patch has no points, or points
+        that are not finite or all the same.
         """
         with torch.no_grad():
             dtype, points = points.dtype, points.detach().to(torch.float64)
             if points.shape[-2] == 0:
                 raise InputError("patches without points")
-            w = points.new_ones(points.shape[:-1]) if weights is None else weights.detach().to(torch.float64)
+            w = (
+                points.new_ones(points.shape[:-1])
+                if weights is None
+                else weights.detach().to(torch.float64)
+            )
             if mask is not None:
                 w = torch.where(mask, w, 0)
                 points = torch.where(mask[..., None], points, 0)
@@ -65,12 +73,16 @@ class CanonicalFrame:
         return self.s[..., None, None] * x @ self.R.mT + self.T[..., None, :]
 
     def rotated(self, quaternion):
-        """The frame whose chart is turned by the unit quaternion (..., 4) in the order (x, y, z, w): R Q, so that a point of chart
-        coordinates x has Q^T x in the new chart. Differentiable; the quaternion is divided by its norm."""
+        """The frame whose chart is turned by the unit quaternion (..., 4) in the order (x, y, z,
+        w): R Q, so that a point of chart coordinates x has Q^T x in the new chart. Differentiable;
+        the quaternion is divided by its norm.
+        """
         return CanonicalFrame(self.s, self.R @ rotation_matrix(quaternion), self.T)
 
     def turned_over(self):
-        """The frame with v and z pointing the other way: a half turn about u. :func:`polyfit.jets.turned_over` does it to a jet."""
+        """The frame with v and z pointing the other way: a half turn about u.
+        :func:`polyfit.jets.turned_over` does it to a jet.
+        """
         return CanonicalFrame(self.s, self.R * self.R.new_tensor([1, -1, -1]), self.T)
 
     def __getitem__(self, index):
@@ -82,7 +94,9 @@ class CanonicalFrame:
 
 
 def rotation_matrix(quaternion):
-    """Rotations (..., 3, 3) of quaternions (..., 4) in the order (x, y, z, w), which are divided by their norm."""
+    """Rotations (..., 3, 3) of quaternions (..., 4) in the order (x, y, z, w), which are divided by
+    their norm.
+    """
     x, y, z, w = torch.nn.functional.normalize(quaternion, dim=-1).unbind(-1)
     rows = [
         (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),

@@ -1,5 +1,5 @@
-"""Patches of garment meshes, to train on and to measure on: cut by ACVD, sampled evenly by area, with the mesh's normals; as they are, or
-posed.
+"""Patches of garment meshes, to train on and to measure on: cut by ACVD, sampled evenly by area,
+with the mesh's normals; as they are, or posed.
 """
 
 from dataclasses import dataclass
@@ -29,29 +29,37 @@ class GarmentPatches:
 
     @classmethod
     def cut(cls, vertices, faces, count, points, generator, where="mesh"):
-        """The mesh (N, 3) [m], (F, 3) cut into ``count`` patches (None: the paper's number), each sampled at ``points`` places;
-        ``generator`` is NumPy's.
+        """The mesh (N, 3) [m], (F, 3) cut into ``count`` patches (None: the paper's number), each
+        sampled at ``points`` places; ``generator`` is NumPy's.
         """
         return cls.sample(Patches.cut(vertices, faces, count, where=where), points, generator)
 
     @classmethod
     def sample(cls, patches, points, generator, vertices=None):
-        """``points`` places, uniform in area, of every patch of a :class:`polyfit.patches.Patches`, with its vertices where they are or at
-        ``vertices`` (M, 3) [m].
+        """``points`` places, uniform in area, of every patch of a :class:`polyfit.patches.Patches`,
+        with its vertices where they are or at ``vertices`` (M, 3) [m].
 
-        Normals are interpolated between those of the vertices, which are means of the faces around them. A face that touches several
-        patches belongs to that of its first corner.
+        Normals are interpolated between those of the vertices, which are means of the faces around
+        them. A face that touches several patches belongs to that of its first corner.
         """
-        V, F = patches.vertices if vertices is None else np.asarray(vertices, dtype=np.float64), patches.faces
+        V, F = (
+            patches.vertices if vertices is None else np.asarray(vertices, dtype=np.float64),
+            patches.faces,
+        )
         face_vectors = mesh.face_vectors(V, F)
-        N = np.stack([np.bincount(F.ravel(), np.repeat(x, 3), minlength=len(V)) for x in face_vectors.T], axis=1)
+        N = np.stack(
+            [np.bincount(F.ravel(), np.repeat(x, 3), minlength=len(V)) for x in face_vectors.T],
+            axis=1,
+        )
         area, owner = np.linalg.norm(face_vectors, axis=1), patches.corner_patch[:, 0]
         order = np.argsort(owner, kind="stable")
         ends = np.searchsorted(owner[order], np.arange(len(patches) + 1))
         chosen = []
         for k in range(len(patches)):
             faces = order[ends[k] : ends[k + 1]]
-            if len(faces) and area[faces].sum() > 0:  # a patch of a few vertices may be no face's first corner
+            if (
+                len(faces) and area[faces].sum() > 0
+            ):  # a patch of a few vertices may be no face's first corner
                 chosen.append(generator.choice(faces, points, p=area[faces] / area[faces].sum()))
         chosen = np.array(chosen)
         b = generator.dirichlet((1, 1, 1), chosen.shape)
@@ -60,22 +68,27 @@ class GarmentPatches:
         return cls(torch.as_tensor(x, dtype=torch.float32), torch.as_tensor(n, dtype=torch.float32))
 
     def deformed(self, count, generator, **strength):
-        """``count`` of the patches, drawn at random and each taken through a random smooth map in its own canonical frame; ``strength`` as
-        in :func:`deformations.random`.
+        """``count`` of the patches, drawn at random and each taken through a random smooth map in
+        its own canonical frame; ``strength`` as in :func:`deformations.random`.
         """
         index = torch.randint(len(self), (count,), generator=generator)
         x, n = self.points[index], self.normals[index]
         frame = CanonicalFrame.from_points(x)
-        return GarmentPatches(*deformations.random(count, generator, **strength).carry(frame.to_chart(x), n @ frame.R))
+        return GarmentPatches(
+            *deformations.random(count, generator, **strength).carry(frame.to_chart(x), n @ frame.R)
+        )
 
 
 def cut_meshes(paths, counts, points, seed):
-    """:class:`GarmentPatches` of the mesh files ``paths``, each cut at every one of ``counts``. Raises InputError for a file that is no
-    mesh.
+    """:class:`GarmentPatches` of the mesh files ``paths``, each cut at every one of ``counts``.
+    Raises InputError for a file that is no mesh.
     """
     generator = np.random.default_rng(seed)
     parts = []
     for path in paths:
         vertices, faces = read_mesh(path)[:2]
-        parts += [GarmentPatches.cut(vertices, faces, count, points, generator, str(path)) for count in counts]
+        parts += [
+            GarmentPatches.cut(vertices, faces, count, points, generator, str(path))
+            for count in counts
+        ]
     return GarmentPatches.join(parts)

@@ -1,9 +1,12 @@
-"""n-jets: heights z(u, v) = sum_i sum_j alpha_{i-j,j} u^(i-j) v^j and their closed-form geometry (paper, section "PolyFit").
+"""n-jets: heights z(u, v) = sum_i sum_j alpha_{i-j,j} u^(i-j) v^j and their closed-form geometry
+(paper, section "PolyFit").
 
-``alpha`` (..., A) has A = (n+1)(n+2)/2 entries, in the paper's order: i = 0..n, and j = 0..i within each i, that is 1, u, v, u^2, uv, v^2,
-u^3, ... ``uv`` (..., P, 2) are P chart coordinates of each jet; leading dimensions broadcast, so that one jet (A,) takes (P, 2) and a batch
-(B, A) takes (B, P, 2). All lengths are in the canonical unit (:class:`polyfit.frames.CanonicalFrame`), curvatures in its inverse.
-Everything is differentiable in ``alpha`` and ``uv``. The same functions stand in Dr.Jit in ``polysft_mi.jet``, by the same names.
+``alpha`` (..., A) has A = (n+1)(n+2)/2 entries, in the paper's order: i = 0..n, and j = 0..i within
+each i, that is 1, u, v, u^2, uv, v^2, u^3, ... ``uv`` (..., P, 2) are P chart coordinates of each
+jet; leading dimensions broadcast, so that one jet (A,) takes (P, 2) and a batch (B, A) takes (B, P,
+2). All lengths are in the canonical unit (:class:`polyfit.frames.CanonicalFrame`), curvatures in
+its inverse. Everything is differentiable in ``alpha`` and ``uv``. The same functions stand in
+Dr.Jit in ``polysft_mi.jet``, by the same names.
 """
 
 from dataclasses import dataclass
@@ -17,7 +20,9 @@ from .monomials import exponents, order_of, size_of
 
 
 def matrix(alpha):
-    """alpha (..., A) as the matrix m (..., n+1, n+1) of z = sum_ab m_ab u^a v^b; zero where a + b > n."""
+    """alpha (..., A) as the matrix m (..., n+1, n+1) of z = sum_ab m_ab u^a v^b; zero where a + b >
+    n.
+    """
     order = order_of(alpha.shape[-1])
     out = alpha.new_zeros(*alpha.shape[:-1], (order + 1) ** 2)
     out[..., _places(order, alpha.device)] = alpha
@@ -95,22 +100,28 @@ def metric(alpha, uv):
 
 
 def turned_over(alpha):
-    """The jets alpha (..., A) in charts with v and z pointing the other way: z'(u, v) = -z(u, -v)."""
+    """The jets alpha (..., A) in charts with v and z pointing the other way: z'(u, v) = -z(u,
+    -v).
+    """
     odd = torch.as_tensor(exponents(order_of(alpha.shape[-1]))[:, 1] % 2, device=alpha.device)
     return torch.where(odd == 1, alpha, -alpha)
 
 
 def second_fundamental_form(alpha, uv):
-    """(z_uu, z_uv, z_vv) / sqrt(1 + z_u^2 + z_v^2) as a matrix, (..., P, 2, 2); positive where the surface bends towards +z."""
+    """(z_uu, z_uv, z_vv) / sqrt(1 + z_u^2 + z_v^2) as a matrix, (..., P, 2, 2); positive where the
+    surface bends towards +z.
+    """
     zu, zv, zuu, zuv, zvv = derivatives(alpha, uv, (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
     n = (1 + zu * zu + zv * zv).sqrt()
     return _symmetric(zuu / n, zuv / n, zvv / n)
 
 
 def principal_curvatures(alpha, uv):
-    """Eigenvalues of the shape operator, the smaller first, (..., P, 2); positive where the surface bends towards +z.
+    """Eigenvalues of the shape operator, the smaller first, (..., P, 2); positive where the surface
+    bends towards +z.
 
-    At an umbilic, where both are equal and not differentiable, each has the gradient of the mean curvature.
+    At an umbilic, where both are equal and not differentiable, each has the gradient of the mean
+    curvature.
     """
     g, h = metric(alpha, uv), second_fundamental_form(alpha, uv)
     E, F, G = g[..., 0, 0], g[..., 0, 1], g[..., 1, 1]
@@ -124,8 +135,8 @@ def principal_curvatures(alpha, uv):
 
 
 def nearest(alpha, x, steps=4):
-    """Chart coordinates uv (..., P, 2) of the jets' points nearest to points x (..., P, 3) of their charts, found from the points' own (u,
-    v) by Gauss and Newton.
+    """Chart coordinates uv (..., P, 2) of the jets' points nearest to points x (..., P, 3) of their
+    charts, found from the points' own (u, v) by Gauss and Newton.
 
     A step that does not bring the point nearer is not taken. Without gradient.
     """
@@ -136,10 +147,15 @@ def nearest(alpha, x, steps=4):
             r = torch.stack([uv[..., 0] - x[..., 0], uv[..., 1] - x[..., 1], z - x[..., 2]], -1)
             a, b = r[..., 0] + zu * r[..., 2], r[..., 1] + zv * r[..., 2]
             det = 1 + zu * zu + zv * zv
-            step = torch.stack([(1 + zv * zv) * a - zu * zv * b, (1 + zu * zu) * b - zu * zv * a], -1) / det[..., None]
+            step = (
+                torch.stack([(1 + zv * zv) * a - zu * zv * b, (1 + zu * zu) * b - zu * zv * a], -1)
+                / det[..., None]
+            )
             tried = uv - step
             found = derivatives(alpha, tried, (0, 0), (1, 0), (0, 1))
-            nearer = ((tried - x[..., :2]) ** 2).sum(-1) + (found[0] - x[..., 2]) ** 2 < (r * r).sum(-1)
+            nearer = ((tried - x[..., :2]) ** 2).sum(-1) + (found[0] - x[..., 2]) ** 2 < (
+                r * r
+            ).sum(-1)
             uv = torch.where(nearer[..., None], tried, uv)
             z, zu, zv = (torch.where(nearer, new, old) for new, old in zip(found, (z, zu, zv)))
         return uv
@@ -151,20 +167,22 @@ def _symmetric(a, b, c):
 
 @dataclass(frozen=True)
 class JetFit:
-    """``alpha`` (..., A): the coefficients, zero beyond the order fitted. ``order`` (...,) int64: the order that the points
-    determine, at most the one asked for; 0 is a constant."""
+    """``alpha`` (..., A): the coefficients, zero beyond the order fitted. ``order`` (...,) int64:
+    the order that the points determine, at most the one asked for; 0 is a constant."""
 
     alpha: torch.Tensor
     order: torch.Tensor
 
 
 def fit(points, order, *, weights=None, mask=None):
-    """Least-squares n-jets through ``points`` (..., P, 3), in charts with |u|, |v| of about 1: a :class:`JetFit`.
+    """Least-squares n-jets through ``points`` (..., P, 3), in charts with |u|, |v| of about 1: a
+    :class:`JetFit`.
 
-    ``weights`` (..., P) not negative; ``mask`` (..., P) bool: the points that exist, the others are padding of any value.
-    Where the points are too few for ``order``, or lie such (on a line, on a small grid) that they do not determine it, the
-    patch is fitted by the highest order that they do determine. Differentiable once in points and weights, at the cost of
-    evaluating two jets. Raises InputError where a patch has no points or weight, or where numbers are not finite.
+    ``weights`` (..., P) not negative; ``mask`` (..., P) bool: the points that exist, the others are
+    padding of any value. Where the points are too few for ``order``, or lie such (on a line, on a
+    small grid) that they do not determine it, the patch is fitted by the highest order that they do
+    determine. Differentiable once in points and weights, at the cost of evaluating two jets. Raises
+    InputError where a patch has no points or weight, or where numbers are not finite.
     """
     from .least_squares import LeastSquares
 
@@ -185,8 +203,12 @@ def fit(points, order, *, weights=None, mask=None):
         weights = weights.expand(shape).reshape(flat.shape[:2])
         if mask is not None:
             weights = torch.where(mask, weights, 0)
-    if mask is not None:  # padding is moved onto a point of the patch, where it changes neither box nor sums
+    if (
+        mask is not None
+    ):  # padding is moved onto a point of the patch, where it changes neither box nor sums
         first = mask.to(torch.uint8).argmax(1)
-        flat = torch.where(mask[..., None], flat, flat[torch.arange(len(flat), device=flat.device), first][:, None])
+        flat = torch.where(
+            mask[..., None], flat, flat[torch.arange(len(flat), device=flat.device), first][:, None]
+        )
     alpha, fitted = LeastSquares.apply(flat, weights, order)
     return JetFit(alpha.reshape(*shape[:-1], -1), fitted.reshape(shape[:-1]))

@@ -1,8 +1,10 @@
-"""The solve behind :func:`polyfit.jets.fit`: weighted least squares for batches of patches (Cazals & Pouget 2003).
+"""The solve behind :func:`polyfit.jets.fit`: weighted least squares for batches of patches (Cazals
+& Pouget 2003).
 
-Each patch is fitted in the box of its own points, in a basis of products of Chebyshev polynomials, whose Gram matrix follows
-from the products' moments: T_a T_c = (T_{a+c} + T_{|a-c|}) / 2. So no matrix of points times coefficients is ever made, and
-the systems stay well conditioned up to order 10. Sums and solves are in float64, whatever the points are in.
+Each patch is fitted in the box of its own points, in a basis of products of Chebyshev polynomials,
+whose Gram matrix follows from the products' moments: T_a T_c = (T_{a+c} + T_{|a-c|}) / 2. So no
+matrix of points times coefficients is ever made, and the systems stay well conditioned up to order
+10. Sums and solves are in float64, whatever the points are in.
 """
 
 from dataclasses import dataclass
@@ -23,10 +25,14 @@ class LeastSquares(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, points, weights, order):
-        x = points.movedim(-1, 0).to(torch.float64, memory_format=torch.contiguous_format, copy=True)  # (3, B, P)
+        x = points.movedim(-1, 0).to(
+            torch.float64, memory_format=torch.contiguous_format, copy=True
+        )  # (3, B, P)
         box = _Box.of(x[:2])
         w, total = _normalised(weights, points)
-        tx, ty = _chebyshev(box.normalised(x[:2]), 2 * order).permute(1, 2, 0, 3)  # (B, 2n+1, P) of u and of v, each row contiguous
+        tx, ty = _chebyshev(box.normalised(x[:2]), 2 * order).permute(
+            1, 2, 0, 3
+        )  # (B, 2n+1, P) of u and of v, each row contiguous
         wty = ty if w is None else w[:, None] * ty
         scale = 1 / points.shape[1] if w is None else 1
         gram = _gram(tx @ wty.mT * scale, order)
@@ -44,18 +50,23 @@ class LeastSquares(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad, _):
-        # At the minimum sum w (z - c.b) b = 0 holds for the points' basis values b. Differentiated: dc = G^-1 d(sum w (z - c.b) b) at fixed
-        # c, and the gradient contracts it with y = G^-1 grad, a jet like c itself.
+        # At the minimum sum w (z - c.b) b = 0 holds for the points' basis values b. Differentiated:
+        # dc = G^-1 d(sum w (z - c.b) b) at fixed c, and the gradient contracts it with y = G^-1
+        # grad, a jet like c itself.
         points, weights, alpha, factor, kept, total = ctx.saved_tensors
         right = ctx.box.to_monomials_transposed(grad.to(torch.float64), ctx.order) * kept
-        y = ctx.box.to_monomials(torch.cholesky_solve(right[..., None], factor)[..., 0] * kept, ctx.order)
+        y = ctx.box.to_monomials(
+            torch.cholesky_solve(right[..., None], factor)[..., 0] * kept, ctx.order
+        )
         dtype, uv = points.dtype, points[..., :2]
         which = (0, 0), (1, 0), (0, 1)
         c, cu, cv = jets.derivatives(alpha.to(dtype), uv, *which)
         y, yu, yv = jets.derivatives(y.to(dtype), uv, *which)
         residual = points[..., 2] - c
         w = weights / total.to(dtype)
-        to_points = torch.stack([w * (residual * yu - cu * y), w * (residual * yv - cv * y), w * y], -1)
+        to_points = torch.stack(
+            [w * (residual * yu - cu * y), w * (residual * yv - cv * y), w * y], -1
+        )
         to_weights = residual * y / total.to(dtype) if ctx.needs_input_grad[1] else None
         return to_points, to_weights, None
 
@@ -99,8 +110,8 @@ class _Box:
 
 @lru_cache
 def _chebyshev_in_powers(order, device):
-    """Chebyshev polynomials in powers of x; and of (x - c)^m, for each power x^i, the binomial coefficient and the power of -c: (n+1, n+1)
-    each."""
+    """Chebyshev polynomials in powers of x; and of (x - c)^m, for each power x^i, the binomial
+    coefficient and the power of -c: (n+1, n+1) each."""
     rows = np.zeros((order + 1, order + 1))
     for k in range(order + 1):
         rows[k, : k + 1] = chebyshev.cheb2poly(np.eye(order + 1)[k])[: k + 1]
@@ -128,7 +139,11 @@ def _normalised(weights, points):
     bad = ~((total > 0) & total.isfinite() & (weights >= 0).all(1, keepdim=True))
     if bad.any():
         k = int(bad[:, 0].to(torch.uint8).argmax())
-        what = "no points" if not weights[k].abs().sum() > 0 else "weights that are negative or not finite"
+        what = (
+            "no points"
+            if not weights[k].abs().sum() > 0
+            else "weights that are negative or not finite"
+        )
         raise InputError(f"patch {k} has {what}")
     return weights / total, total
 
@@ -136,16 +151,22 @@ def _normalised(weights, points):
 def _check(box, right):
     good = box.centre.isfinite().all(1) & box.half.isfinite().all(1) & right.isfinite().all(1)
     if not good.all():
-        raise InputError(f"patch {int((~good).to(torch.uint8).argmax())} has points that are not finite")
+        raise InputError(
+            f"patch {int((~good).to(torch.uint8).argmax())} has points that are not finite"
+        )
 
 
 @lru_cache
 def _products(order, device):
-    """Indices (4, A^2) into the flat moments (2n+1)^2, whose mean are the moments of the products of two basis functions."""
+    """Indices (4, A^2) into the flat moments (2n+1)^2, whose mean are the moments of the products
+    of two basis functions.
+    """
     e = jets.exponents(order)
     a, b = e[:, None, :], e[None, :, :]
     n = 2 * order + 1
-    index = [p[..., 0] * n + q[..., 1] for p in (a + b, np.abs(a - b)) for q in (a + b, np.abs(a - b))]
+    index = [
+        p[..., 0] * n + q[..., 1] for p in (a + b, np.abs(a - b)) for q in (a + b, np.abs(a - b))
+    ]
     return torch.as_tensor(np.stack(index).reshape(4, -1), device=device)
 
 
@@ -157,17 +178,23 @@ def _gram(moments, order):
 
 
 def _factorise(gram, order):
-    """Cholesky factors (B, A, A) of the leading blocks that the points determine, the orders (B,), and the coefficients kept (B, A)."""
+    """Cholesky factors (B, A, A) of the leading blocks that the points determine, the orders (B,),
+    and the coefficients kept (B, A).
+    """
     degree = torch.as_tensor(jets.exponents(order).sum(1), device=gram.device)
     fitted = torch.full((len(gram),), order, device=gram.device)
     eye = torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)
     factor, info = torch.linalg.cholesky_ex(gram)
     while True:
-        short = (factor.diagonal(dim1=1, dim2=2) < DETERMINED) | (torch.arange(1, len(degree) + 1, device=gram.device) == info[:, None])
+        short = (factor.diagonal(dim1=1, dim2=2) < DETERMINED) | (
+            torch.arange(1, len(degree) + 1, device=gram.device) == info[:, None]
+        )
         low = torch.where(short, degree, order + 1).amin(1) - 1
         again = (low < fitted).nonzero()[:, 0]
         if not len(again):
             return factor, fitted, degree <= fitted[:, None]
         fitted[again] = low[again]
         kept = degree <= fitted[again, None]
-        factor[again], info[again] = torch.linalg.cholesky_ex(torch.where(kept[:, :, None] & kept[:, None, :], gram[again], eye))
+        factor[again], info[again] = torch.linalg.cholesky_ex(
+            torch.where(kept[:, :, None] & kept[:, None, :], gram[again], eye)
+        )

@@ -1,9 +1,11 @@
-"""How far fitted jets are from the patches they were fitted to: what training lowers and what the tables report.
+"""How far fitted jets are from the patches they were fitted to: what training lowers and what the
+tables report.
 
-Heights are in the chart's unit s (the patch's largest distance from its mean), which no rotation changes. A height residual alone can be
-made small by a frame that looks at the patch from its edge, where it folds onto itself and its two sheets lie close. The normals tell: over
-a fold half of them point against the jet's. So training lowers both, and every table gives both, and the distance to the surface, which
-does not depend on the frame.
+Heights are in the chart's unit s (the patch's largest distance from its mean), which no rotation
+changes. A height residual alone can be made small by a frame that looks at the patch from its edge,
+where it folds onto itself and its two sheets lie close. The normals tell: over a fold half of them
+point against the jet's. So training lowers both, and every table gives both, and the distance to
+the surface, which does not depend on the frame.
 """
 
 from dataclasses import dataclass
@@ -17,10 +19,11 @@ from . import jets
 class Discrepancy:
     """Of each patch, (B,).
 
-    ``height``: RMS of z - z(u, v), in s. ``distance``: RMS of the same divided by the jet's slope there, sqrt(1 + z_u^2 + z_v^2): the
-    distance to the tangent plane, and to first order to the surface, in s. ``cosine``: mean cosine between the jet's normal and the
-    surface's own; ``angle``: mean angle between them in degrees; both with the side of the surface, inner or outer, chosen once for a whole
-    patch.
+    ``height``: RMS of z - z(u, v), in s. ``distance``: RMS of the same divided by the jet's slope
+    there, sqrt(1 + z_u^2 + z_v^2): the distance to the tangent plane, and to first order to the
+    surface, in s. ``cosine``: mean cosine between the jet's normal and the surface's own;
+    ``angle``: mean angle between them in degrees; both with the side of the surface, inner or
+    outer, chosen once for a whole patch.
     """
 
     height: torch.Tensor
@@ -30,8 +33,8 @@ class Discrepancy:
 
 
 def discrepancy(alpha, x, normals, mask=None):
-    """:class:`Discrepancy` between jets ``alpha`` (B, A) and the points x (B, P, 3) of their charts with unit ``normals`` (B, P, 3) in the
-    same axes; differentiable.
+    """:class:`Discrepancy` between jets ``alpha`` (B, A) and the points x (B, P, 3) of their charts
+    with unit ``normals`` (B, P, 3) in the same axes; differentiable.
     """
     count = x.shape[1] if mask is None else mask.sum(1)
 
@@ -48,12 +51,17 @@ def discrepancy(alpha, x, normals, mask=None):
     # RMS of an exact fit has no derivative; a residual of 1e-6 s is nothing
     height = (mean(residual**2) + 1e-12).sqrt()
     distance = (mean(residual**2 / slope) + 1e-12).sqrt()
-    return Discrepancy(height, distance, mean(cosine), torch.rad2deg(mean(torch.arccos(cosine.detach().clamp(-1, 1)))))
+    return Discrepancy(
+        height,
+        distance,
+        mean(cosine),
+        torch.rad2deg(mean(torch.arccos(cosine.detach().clamp(-1, 1)))),
+    )
 
 
 def behind(normals, mask=None):
-    """Share of each patch, (B,), that faces away from the z axis, whichever side of the patch is up: 0 for a height graph; ``normals`` (B,
-    P, 3).
+    """Share of each patch, (B,), that faces away from the z axis, whichever side of the patch is
+    up: 0 for a height graph; ``normals`` (B, P, 3).
     """
     count = normals.shape[1] if mask is None else mask.sum(1)
     down = normals[..., 2] < 0

@@ -11,8 +11,9 @@ from .errors import InputError
 
 
 def checked(vertices, faces, where="mesh"):
-    """``(vertices float64, faces int64)`` of a mesh that can be cut. Faces that name a vertex twice, and those that repeat
-    another's vertices, are dropped. Raises InputError, in one line that starts with ``where``, for anything else that is wrong.
+    """``(vertices float64, faces int64)`` of a mesh that can be cut. Faces that name a vertex
+    twice, and those that repeat another's vertices, are dropped. Raises InputError, in one line
+    that starts with ``where``, for anything else that is wrong.
     """
     V, F = np.asarray(vertices, dtype=np.float64), np.asarray(faces)
     if V.ndim != 2 or V.shape[1] != 3 or len(V) == 0:
@@ -23,7 +24,9 @@ def checked(vertices, faces, where="mesh"):
         raise InputError(f"{where}: faces of shape {F.shape}; (F, 3) is needed")
     F = F.astype(np.int64)
     if F.min() < 0 or F.max() >= len(V):
-        raise InputError(f"{where}: faces name vertices {F.min()} to {F.max()}; 0 to {len(V) - 1} exist")
+        raise InputError(
+            f"{where}: faces name vertices {F.min()} to {F.max()}; 0 to {len(V) - 1} exist"
+        )
     _refuse(~np.isfinite(V).all(axis=1), where, "vertices have coordinates that are not finite")
     F = F[(F != np.roll(F, 1, axis=1)).all(axis=1)]
     _, first = np.unique(np.sort(F, axis=1), axis=0, return_index=True)
@@ -36,7 +39,10 @@ def checked(vertices, faces, where="mesh"):
 
 def _refuse(bad, where, what):
     if bad.any():
-        raise InputError(f"{where}: {bad.sum()} {what} (the first is vertex {int(np.argmax(bad))}, counted from 0)")
+        raise InputError(
+            f"{where}: {bad.sum()} {what} (the first is vertex {int(np.argmax(bad))}, counted"
+            " from 0)"
+        )
 
 
 def face_vectors(V, F):
@@ -50,8 +56,8 @@ def areas(V, F):
 
 
 def edges_of(F):
-    """Edges of the faces, each once and the smaller vertex first, (E, 2); and of which edge the side from corner k to the next is, (F,
-    3)."""
+    """Edges of the faces, each once and the smaller vertex first, (E, 2); and of which edge the
+    side from corner k to the next is, (F, 3)."""
     side = np.stack([F, np.roll(F, -1, axis=1)], axis=-1)
     side.sort(axis=-1)
     size = int(F.max()) + 1
@@ -62,8 +68,9 @@ def edges_of(F):
 def sheets(F):
     """Faces (F, 3) whose vertices are those of F, split where the surface is no manifold.
 
-    At an edge of three or more faces, and at a vertex where parts meet that share no edge there, each part gets a vertex of
-    its own; so the new faces are joined by edges of two faces only, as far as a local cut can achieve that. Winding does not matter.
+    At an edge of three or more faces, and at a vertex where parts meet that share no edge there,
+    each part gets a vertex of its own; so the new faces are joined by edges of two faces only, as
+    far as a local cut can achieve that. Winding does not matter.
     """
     one, two = _across(F)
     after = lambda corner: corner - corner % 3 + (corner + 1) % 3
@@ -76,14 +83,18 @@ def sheets(F):
 
 
 def winding(F):
-    """1 or -1 for each face (F,): -1 where it is wound against most faces of its component, so that all agree after it is turned round.
+    """1 or -1 for each face (F,): -1 where it is wound against most faces of its component, so that
+    all agree after it is turned round.
 
-    Components that have no two sides (a Moebius strip) are left as they are. F as of :func:`sheets`.
+    Components that have no two sides (a Moebius strip) are left as they are. F as of
+    :func:`sheets`.
     """
     one, two = _across(F)
     against = (F.ravel()[one] == F.ravel()[two]) * len(F)
     f, g = one // 3, two // 3  # faces f and g are wound alike, or f and g turned round are
-    pairs = np.concatenate([np.stack([f, g + against], axis=1), np.stack([f + len(F), g + len(F) - against], axis=1)])
+    pairs = np.concatenate(
+        [np.stack([f, g + against], axis=1), np.stack([f + len(F), g + len(F) - against], axis=1)]
+    )
     kept, turned = components(2 * len(F), pairs).reshape(2, -1)
     agree = np.bincount(kept, minlength=max(kept.max(), turned.max()) + 1)
     more = (agree[kept] > agree[turned]) | ((agree[kept] == agree[turned]) & (kept <= turned))
@@ -91,7 +102,9 @@ def winding(F):
 
 
 def _across(F):
-    """The edges of two faces: the corners (of F.ravel()) from which the one and the other walk along them."""
+    """The edges of two faces: the corners (of F.ravel()) from which the one and the other walk
+    along them.
+    """
     _, edge = edges_of(F)
     order = np.argsort(edge.ravel(), kind="stable")
     uses = np.bincount(edge.ravel())
@@ -100,16 +113,21 @@ def _across(F):
 
 
 def components(count, pairs):
-    """Numbers (count,) from 0 of the connected components of a graph with the edges ``pairs`` (E, 2)."""
-    graph = coo_matrix((np.ones(len(pairs), dtype=np.int8), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    """Numbers (count,) from 0 of the connected components of a graph with the edges ``pairs`` (E,
+    2).
+    """
+    graph = coo_matrix(
+        (np.ones(len(pairs), dtype=np.int8), (pairs[:, 0], pairs[:, 1])), shape=(count, count)
+    )
     return connected_components(graph, directed=False)[1].astype(np.int64)
 
 
 def subdivided(F):
     """Every face cut in four at the middles of its sides: ``(faces (4 F, 3), edges (E, 2))``.
 
-    The middle of ``edges[e]`` is the vertex n + e, n the number of vertices of F. The children of face f are the rows 4 f + k: k = 0, 1, 2
-    at corner k and 3 in the middle, each with its corners in the order of the parent's (the middle one: opposite to them).
+    The middle of ``edges[e]`` is the vertex n + e, n the number of vertices of F. The children of
+    face f are the rows 4 f + k: k = 0, 1, 2 at corner k and 3 in the middle, each with its corners
+    in the order of the parent's (the middle one: opposite to them).
     """
     edges, side = edges_of(F)
     (a, b, c), (ab, bc, ca) = F.T, (side + int(F.max()) + 1).T
@@ -118,7 +136,9 @@ def subdivided(F):
 
 
 def child(face, barycentric, levels):
-    """Where points on a mesh lie after ``levels`` subdivisions: (face (...,), barycentric (..., 3)) turned into those of the finer mesh."""
+    """Where points on a mesh lie after ``levels`` subdivisions: (face (...,), barycentric (..., 3))
+    turned into those of the finer mesh.
+    """
     face, b = np.asarray(face, dtype=np.int64), np.asarray(barycentric, dtype=np.float64)
     for _ in range(levels):
         corner = b.argmax(axis=-1)
@@ -130,12 +150,17 @@ def child(face, barycentric, levels):
 
 
 def refined(F, parts):
-    """The faces with every side cut in ``parts``: ``(faces (parts^2 F, 3), face (N',), barycentric (N', 3))``, where the new vertex k lies
-    at ``barycentric[k]`` on the face ``face[k]`` of F. The vertices of F come first, in their order; neighbours share the new ones.
+    """The faces with every side cut in ``parts``: ``(faces (parts^2 F, 3), face (N',), barycentric
+    (N', 3))``, where the new vertex k lies at ``barycentric[k]`` on the face ``face[k]`` of F. The
+    vertices of F come first, in their order; neighbours share the new ones.
     """
-    grid = np.array([(i, j, parts - i - j) for i in range(parts, -1, -1) for j in range(parts - i, -1, -1)])
+    grid = np.array(
+        [(i, j, parts - i - j) for i in range(parts, -1, -1) for j in range(parts - i, -1, -1)]
+    )
     count, edges, side = int(F.max()) + 1, *edges_of(F)
-    forward = edges[side][..., 0] == F  # whether the side from corner k runs from the smaller vertex to the larger
+    forward = (
+        edges[side][..., 0] == F
+    )  # whether the side from corner k runs from the smaller vertex to the larger
     inner = np.cumsum((grid > 0).all(axis=1)) - 1
     index = np.empty((len(F), len(grid)), dtype=np.int64)
     for n, b in enumerate(grid):
@@ -147,11 +172,24 @@ def refined(F, parts):
             step = np.where(forward[:, k], b[(k + 1) % 3], b[k])
             index[:, n] = count + side[:, k] * (parts - 1) + step - 1
         else:
-            index[:, n] = count + len(edges) * (parts - 1) + np.arange(len(F)) * ((parts - 1) * (parts - 2) // 2) + inner[n]
+            index[:, n] = (
+                count
+                + len(edges) * (parts - 1)
+                + np.arange(len(F)) * ((parts - 1) * (parts - 2) // 2)
+                + inner[n]
+            )
     at = {tuple(b): n for n, b in enumerate(grid)}
     small = [[at[i, j, k], at[i - 1, j + 1, k], at[i - 1, j, k + 1]] for i, j, k in at if i > 0]
-    small += [[at[i - 1, j + 1, k], at[i - 2, j + 1, k + 1], at[i - 1, j, k + 1]] for i, j, k in at if i > 1]
+    small += [
+        [at[i - 1, j + 1, k], at[i - 2, j + 1, k + 1], at[i - 1, j, k + 1]]
+        for i, j, k in at
+        if i > 1
+    ]
     total = count + len(edges) * (parts - 1) + len(F) * ((parts - 1) * (parts - 2) // 2)
     first = np.empty(total, dtype=np.int64)
     first[index.ravel()[::-1]] = np.arange(index.size)[::-1]
-    return index[:, np.array(small)].reshape(-1, 3), first // len(grid), grid[first % len(grid)] / parts
+    return (
+        index[:, np.array(small)].reshape(-1, 3),
+        first // len(grid),
+        grid[first % len(grid)] / parts,
+    )

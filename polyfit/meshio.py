@@ -14,9 +14,11 @@ from .files import aside
 
 
 def write_ply(path, vertices, faces, uv=None):
-    """Write a triangle mesh as binary PLY: vertices (N, 3) as float32, faces (F, 3), uv (N, 2) as the properties ``s``, ``t``.
+    """Write a triangle mesh as binary PLY: vertices (N, 3) as float32, faces (F, 3), uv (N, 2) as
+    the properties ``s``, ``t``.
 
-    Blender, MeshLab, trimesh and Mitsuba read uv under these names. Raises OSError where the file cannot be written.
+    Blender, MeshLab, trimesh and Mitsuba read uv under these names. Raises OSError where the file
+    cannot be written.
     """
     columns = np.asarray(vertices, dtype="<f4")
     names = ["x", "y", "z"]
@@ -26,7 +28,12 @@ def write_ply(path, vertices, faces, uv=None):
     corners["count"], corners["vertices"] = 3, faces
     header = ["ply", "format binary_little_endian 1.0"]
     header += [f"element vertex {len(columns)}"] + [f"property float {name}" for name in names]
-    header += [f"element face {len(corners)}", "property list uchar int vertex_indices", "end_header", ""]
+    header += [
+        f"element face {len(corners)}",
+        "property list uchar int vertex_indices",
+        "end_header",
+        "",
+    ]
     with aside(path) as temporary, open(temporary, "wb") as file:
         file.write("\n".join(header).encode())
         file.write(columns.tobytes())
@@ -34,11 +41,13 @@ def write_ply(path, vertices, faces, uv=None):
 
 
 def read_mesh(path, what="mesh"):
-    """``(vertices (N, 3) float64, faces (F, 3) int64, uv (N, 2) float64 or None)`` of an OBJ or PLY file.
+    """``(vertices (N, 3) float64, faces (F, 3) int64, uv (N, 2) float64 or None)`` of an OBJ or PLY
+    file.
 
-    Vertices keep the file's order. Polygons of an OBJ file become fans of triangles around their first corner, in the file's
-    order; those of a PLY file triangles in trimesh's order. uv is None where the file has none for some corner, or several for
-    one vertex (a seam). Raises InputError in one line, in which the mesh is called ``what``.
+    Vertices keep the file's order. Polygons of an OBJ file become fans of triangles around their
+    first corner, in the file's order; those of a PLY file triangles in trimesh's order. uv is None
+    where the file has none for some corner, or several for one vertex (a seam). Raises InputError
+    in one line, in which the mesh is called ``what``.
     """
     path = os.fspath(path)
     extension = os.path.splitext(path)[1].lower()
@@ -50,7 +59,9 @@ def read_mesh(path, what="mesh"):
 
 
 def _read_obj(path):
-    """By hand, because trimesh reorders the triangles of quads, drops loose vertices, and loses uv beside normals."""
+    """By hand, because trimesh reorders the triangles of quads, drops loose vertices, and loses uv
+    beside normals.
+    """
     vertices, coordinates, triangles, corner_uv = [], [], [], []
     try:
         with open(path, encoding="utf-8", errors="replace") as file:
@@ -62,7 +73,9 @@ def _read_obj(path):
                     x, y, z = words[1:4]
                     vertices.append((float(x), float(y), float(z)))
                 elif words[0] == "vt":
-                    coordinates.append((float(words[1]), float(words[2]) if len(words) > 2 else 0.0))
+                    coordinates.append(
+                        (float(words[1]), float(words[2]) if len(words) > 2 else 0.0)
+                    )
                 elif words[0] == "f":
                     corners = [_corner(word, len(vertices), len(coordinates)) for word in words[1:]]
                     if len(corners) < 3:
@@ -72,7 +85,9 @@ def _read_obj(path):
                         triangles.append([v for v, _ in fan])
                         corner_uv.append([t for _, t in fan])
     except (ValueError, IndexError) as error:
-        raise InputError(f"{path}: line {number}: '{line.strip()[:60]}' is not OBJ ({error})") from None
+        raise InputError(
+            f"{path}: line {number}: '{line.strip()[:60]}' is not OBJ ({error})"
+        ) from None
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}") from None
     V = np.array(vertices, dtype=np.float64).reshape(-1, 3)
@@ -86,7 +101,9 @@ def _read_obj(path):
 
 
 def _corner(word, vertices, coordinates):
-    """(vertex, texture coordinate or -1) of ``v``, ``v/vt``, ``v//vn`` or ``v/vt/vn``, counted from 0."""
+    """(vertex, texture coordinate or -1) of ``v``, ``v/vt``, ``v//vn`` or ``v/vt/vn``, counted from
+    0.
+    """
     v, t = (word.split("/") + [""])[:2]
     out = []
     for text, count in ((v, vertices), (t, coordinates)):
@@ -98,7 +115,9 @@ def _corner(word, vertices, coordinates):
 
 
 def _uv_of_vertices(count, F, VT, T):
-    """uv (N, 2) where every corner of a vertex agrees, else None. Vertices without a face get NaN."""
+    """uv (N, 2) where every corner of a vertex agrees, else None. Vertices without a face get
+    NaN.
+    """
     if not T.size or T.min() < 0:
         return None
     uv = np.full((count, 2), np.nan)
@@ -110,13 +129,20 @@ def _read_ply(path):
     import trimesh
 
     log = logging.getLogger("trimesh")
-    was_disabled, log.disabled = log.disabled, True  # it prints a traceback where a TextureFile is missing
+    was_disabled, log.disabled = (
+        log.disabled,
+        True,
+    )  # it prints a traceback where a TextureFile is missing
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             mesh = trimesh.load(path, file_type="ply", process=False, maintain_order=True)
-    except Exception as error:  # trimesh lets everything through: KeyError, IndexError, UnicodeDecodeError, ...
-        raise InputError(f"{path}: not a readable PLY file ({type(error).__name__}: {error})") from None
+    except (
+        Exception
+    ) as error:  # trimesh lets everything through: KeyError, IndexError, UnicodeDecodeError, ...
+        raise InputError(
+            f"{path}: not a readable PLY file ({type(error).__name__}: {error})"
+        ) from None
     finally:
         log.disabled = was_disabled
     if not isinstance(mesh, trimesh.Trimesh):
@@ -126,5 +152,7 @@ def _read_ply(path):
     if uv is None and {"s", "t"} <= set(mesh.vertex_attributes):
         uv = np.stack([mesh.vertex_attributes["s"], mesh.vertex_attributes["t"]], axis=1)
     if F.size and not 0 <= F.min() <= F.max() < len(V):
-        raise InputError(f"{path}: faces name vertices {F.min()} to {F.max()}; 0 to {len(V) - 1} exist")
+        raise InputError(
+            f"{path}: faces name vertices {F.min()} to {F.max()}; 0 to {len(V) - 1} exist"
+        )
     return V, F, None if uv is None or len(uv) != len(V) else np.array(uv, dtype=np.float64)

@@ -1,19 +1,25 @@
-"""The monomials of an n-jet and their order (paper, section "PolyFit"). NumPy only: :mod:`polyfit.jets` has the jets, in torch."""
+"""The monomials of an n-jet and their order (paper, section "PolyFit"). NumPy only:
+:mod:`polyfit.jets` has the jets, in torch.
+"""
 
 from functools import lru_cache
 
 import numpy as np
 
-# Of the least squares of jets, in polyfit.least_squares and for a tracker's template:
-# A coefficient counts as determined where its basis function, over the weighted points, keeps this RMS beyond those before it.
+# Of the least squares of jets, in polyfit.least_squares and for a tracker's template: A coefficient
+# counts as determined where its basis function, over the weighted points, keeps this RMS beyond
+# those before it.
 DETERMINED = 1e-5
-# A box is taken to be at least this share of its longer side wide, so that rounding across a straight line is not stretched into a patch.
+# A box is taken to be at least this share of its longer side wide, so that rounding across a
+# straight line is not stretched into a patch.
 NARROWEST = 1e-2
 
 
 @lru_cache
 def exponents(order):
-    """Exponents (of u, of v) of the coefficients, shape (A, 2); the same array each time, not to be written to."""
+    """Exponents (of u, of v) of the coefficients, shape (A, 2); the same array each time, not to be
+    written to.
+    """
     return np.array([(i - j, j) for i in range(order + 1) for j in range(i + 1)], dtype=np.int64)
 
 

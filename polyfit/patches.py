@@ -1,4 +1,6 @@
-"""Patches: a mesh cut into connected clusters by ACVD (Valette & Chassery 2004; paper, section "PolyFit" and supplement)."""
+"""Patches: a mesh cut into connected clusters by ACVD (Valette & Chassery 2004; paper, section
+"PolyFit" and supplement).
+"""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,14 +11,16 @@ from . import mesh
 from .clusters import clusters, halved
 from .errors import InputError
 
-# Vertices that a mesh should have before it is cut, for each patch and altogether: enough for the patches' outlines and for their jets'
-# fit.
+# Vertices that a mesh should have before it is cut, for each patch and altogether: enough for the
+# patches' outlines and for their jets' fit.
 DENSITY = 100
 LEAST = 10_000
 
 
 def patch_count(area):
-    """The paper's number of patches K for a surface of ``area`` [m^2]: max(100, min(400, floor(area / 0.008)))."""
+    """The paper's number of patches K for a surface of ``area`` [m^2]: max(100, min(400, floor(area
+    / 0.008))).
+    """
     return max(100, min(400, int(area / 0.008)))
 
 
@@ -24,14 +28,16 @@ def patch_count(area):
 class Patches:
     """A mesh and its cut.
 
-    The cut is made on the mesh after ``levels`` subdivisions, ``vertices`` (M, 3) float64 [m] and ``faces`` (G, 3); the first N vertices
-    are those given, the ``given`` faces (F, 3) become the rows 4^levels f onwards. ``sheets`` (G, 3) are the same faces on vertices that
-    are split where the surface is no manifold (:func:`polyfit.mesh.sheets`), S of them, and ``label`` (S,) is the patch of each. ``side``
-    (G,) is -1 where a face is wound against most of its part, else 1.
+    The cut is made on the mesh after ``levels`` subdivisions, ``vertices`` (M, 3) float64 [m] and
+    ``faces`` (G, 3); the first N vertices are those given, the ``given`` faces (F, 3) become the
+    rows 4^levels f onwards. ``sheets`` (G, 3) are the same faces on vertices that are split where
+    the surface is no manifold (:func:`polyfit.mesh.sheets`), S of them, and ``label`` (S,) is the
+    patch of each. ``side`` (G,) is -1 where a face is wound against most of its part, else 1.
 
-    A patch's *chart* holds all vertices of the faces that touch the patch, so that the charts of neighbours overlap by one row
-    of faces. One vertex in one chart is an *entry*: ``entry_patch`` (E,), rising, and ``entry_vertex`` (E,).
-    ``face_entries`` (G, 3, 3): entry [g, j, i] is that of vertex i of face g in the chart of the patch of its corner j.
+    A patch's *chart* holds all vertices of the faces that touch the patch, so that the charts of
+    neighbours overlap by one row of faces. One vertex in one chart is an *entry*: ``entry_patch``
+    (E,), rising, and ``entry_vertex`` (E,). ``face_entries`` (G, 3, 3): entry [g, j, i] is that of
+    vertex i of face g in the chart of the patch of its corner j.
     """
 
     vertices: np.ndarray
@@ -51,11 +57,14 @@ class Patches:
 
     @classmethod
     def cut(cls, vertices, faces, count=None, *, density=DENSITY, where="mesh"):
-        """Cut the mesh (N, 3) [m], (F, 3) into ``count`` connected patches; by default :func:`patch_count` of them.
+        """Cut the mesh (N, 3) [m], (F, 3) into ``count`` connected patches; by default
+        :func:`patch_count` of them.
 
-        The mesh is subdivided until it has about ``density`` vertices a patch, and 10,000. Separate components, and sheets that meet in an
-        edge of three or more faces, share no patch: each has at least one, and the default count is raised where that needs more. Raises
-        InputError for a mesh that :func:`polyfit.mesh.checked` refuses, and for a count that its components or its vertices do not allow.
+        The mesh is subdivided until it has about ``density`` vertices a patch, and 10,000. Separate
+        components, and sheets that meet in an edge of three or more faces, share no patch: each has
+        at least one, and the default count is raised where that needs more. Raises InputError for a
+        mesh that :func:`polyfit.mesh.checked` refuses, and for a count that its components or its
+        vertices do not allow.
         """
         V, given = mesh.checked(vertices, faces, where)
         split = mesh.sheets(given)
@@ -66,9 +75,13 @@ class Patches:
         if count is None:
             count = max(parts, min(len(V), patch_count(area.sum())))
         if not 1 <= count <= len(V):
-            raise InputError(f"{where}: {count} patches; 1 to {len(V)}, the number of its vertices, are possible")
+            raise InputError(
+                f"{where}: {count} patches; 1 to {len(V)}, the number of its vertices, are possible"
+            )
         if count < parts:
-            raise InputError(f"{where}: {count} patches, but it has {parts} separate parts, and each needs one")
+            raise InputError(
+                f"{where}: {count} patches, but it has {parts} separate parts, and each needs one"
+            )
         F, levels = given, _levels(len(V), area, count, density)
         for _ in range(levels):
             F, edges = mesh.subdivided(F)
@@ -81,7 +94,16 @@ class Patches:
     def relabelled(self, label):
         """The same mesh cut otherwise: ``label`` (S,), each of 0 .. K - 1 used and connected."""
         entries = _entries(len(self.vertices), self.faces, label[self.sheets])
-        return Patches(self.vertices, self.faces, self.given, self.levels, self.sheets, label, self.side, *entries)
+        return Patches(
+            self.vertices,
+            self.faces,
+            self.given,
+            self.levels,
+            self.sheets,
+            label,
+            self.side,
+            *entries,
+        )
 
     @cached_property
     def corner_patch(self):
@@ -90,7 +112,9 @@ class Patches:
 
     @cached_property
     def vertex_entry(self):
-        """The entry of each vertex in its own patch, (M,). Where sheets meet, the first of them has the vertex."""
+        """The entry of each vertex in its own patch, (M,). Where sheets meet, the first of them has
+        the vertex.
+        """
         out = np.full(len(self.vertices), -1)
         j = np.arange(3)
         out[self.faces[::-1].ravel()] = self.face_entries[::-1, j, j].ravel()
@@ -108,7 +132,8 @@ class Patches:
 
     @cached_property
     def entry_weight(self):
-        """The area around each entry that its patch has a share in, (E,) [m^2]; all together they are the surface's area.
+        """The area around each entry that its patch has a share in, (E,) [m^2]; all together they
+        are the surface's area.
 
         A face that touches several patches is shared by them in proportion to their corners.
         """
@@ -117,14 +142,28 @@ class Patches:
 
     @cached_property
     def direction(self):
-        """Mean normals of the patches by the winding of most faces, as long as the area they speak for, (K, 3) [m^2]."""
-        n = np.repeat(self.side[:, None] * mesh.face_vectors(self.vertices, self.faces) / 6, 3, axis=0)
-        return np.stack([np.bincount(self.corner_patch.ravel(), n[:, k], minlength=len(self)) for k in range(3)], axis=1)
+        """Mean normals of the patches by the winding of most faces, as long as the area they speak
+        for, (K, 3) [m^2].
+        """
+        n = np.repeat(
+            self.side[:, None] * mesh.face_vectors(self.vertices, self.faces) / 6, 3, axis=0
+        )
+        return np.stack(
+            [
+                np.bincount(self.corner_patch.ravel(), n[:, k], minlength=len(self))
+                for k in range(3)
+            ],
+            axis=1,
+        )
 
     @cached_property
     def boundary(self):
-        """Pairs of entries (B, 2) that are the same point of the surface in the charts of two patches, the lower patch first."""
-        order = np.argsort(self.entry_vertex, kind="stable")  # entries of one vertex, patches rising
+        """Pairs of entries (B, 2) that are the same point of the surface in the charts of two
+        patches, the lower patch first.
+        """
+        order = np.argsort(
+            self.entry_vertex, kind="stable"
+        )  # entries of one vertex, patches rising
         vertex, pairs, step = self.entry_vertex[order], [], 1
         while True:
             same = vertex[step:] == vertex[:-step]
@@ -141,7 +180,9 @@ class Patches:
 
     @cached_property
     def padded(self):
-        """The entries of each patch, (K, P), padded with the patch's first entry, and which of them exist, (K, P) bool."""
+        """The entries of each patch, (K, P), padded with the patch's first entry, and which of them
+        exist, (K, P) bool.
+        """
         counts = np.bincount(self.entry_patch)
         first = np.cumsum(counts) - counts
         column = np.arange(counts.max())
@@ -149,7 +190,9 @@ class Patches:
         return np.where(exists, first[:, None] + column, first[:, None]), exists
 
     def locate(self, face, barycentric):
-        """Points on the given mesh, by face (P,) and barycentric coordinates (P, 3), as points on ``faces``."""
+        """Points on the given mesh, by face (P,) and barycentric coordinates (P, 3), as points on
+        ``faces``.
+        """
         return mesh.child(face, barycentric, self.levels)
 
 
@@ -160,8 +203,8 @@ def _components_of_faces(F):
 
 
 def _levels(vertices, area, count, density):
-    """Subdivisions until there are vertices enough, and no face is larger than a tenth of a patch (or until there are some million
-    faces)."""
+    """Subdivisions until there are vertices enough, and no face is larger than a tenth of a patch
+    (or until there are some million faces)."""
     few = np.log(max(density * count, LEAST) / vertices) / np.log(4)
     large = np.log(10 * count * area.max() / area.sum()) / np.log(4)
     most = np.log(4e6 / len(area)) / np.log(4)
@@ -169,21 +212,28 @@ def _levels(vertices, area, count, density):
 
 
 def _cluster(V, F, split, part, side, count):
-    """The patch of each vertex of ``split`` (G, 3): clusters of each part of the surface, ``part`` (G,), as many as its share of the
-    area."""
+    """The patch of each vertex of ``split`` (G, 3): clusters of each part of the surface, ``part``
+    (G,), as many as its share of the area."""
     size = int(split.max()) + 1
     points, of_vertex = np.empty((size, 3)), np.empty(size, dtype=np.int64)
     points[split], of_vertex[split] = V[F], part[:, None]
     vectors = side[:, None] * mesh.face_vectors(points, split)
-    normals = np.stack([np.bincount(split.ravel(), np.repeat(x, 3), minlength=size) for x in vectors.T], axis=1)
+    normals = np.stack(
+        [np.bincount(split.ravel(), np.repeat(x, 3), minlength=size) for x in vectors.T], axis=1
+    )
     area = np.bincount(split.ravel(), np.repeat(mesh.areas(points, split) / 3, 3), minlength=size)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
     area = np.maximum(area, 1e-9 * area.mean())
     edges = mesh.edges_of(split)[0]
     shares = _shares(np.bincount(of_vertex, area), np.bincount(of_vertex), count)
     label, local = np.empty(size, dtype=np.int64), np.empty(size, dtype=np.int64)
-    faces_by_part, edges_by_part = (np.argsort(x, kind="stable") for x in (part, of_vertex[edges[:, 0]]))
-    face_ends, edge_ends = np.cumsum(np.bincount(part)), np.cumsum(np.bincount(of_vertex[edges[:, 0]]))
+    faces_by_part, edges_by_part = (
+        np.argsort(x, kind="stable") for x in (part, of_vertex[edges[:, 0]])
+    )
+    face_ends, edge_ends = (
+        np.cumsum(np.bincount(part)),
+        np.cumsum(np.bincount(of_vertex[edges[:, 0]])),
+    )
     for k, (share, first) in enumerate(zip(shares, np.cumsum(shares) - shares)):
         faces = split[faces_by_part[face_ends[k - 1] if k else 0 : face_ends[k]]]
         inside = np.unique(faces)
@@ -191,22 +241,36 @@ def _cluster(V, F, split, part, side, count):
         if share > 1:
             local[inside] = np.arange(len(inside))
             sides = local[edges[edges_by_part[edge_ends[k - 1] if k else 0 : edge_ends[k]]]]
-            found = clusters(points[inside], normals[inside], area[inside], local[faces], sides, share)
+            found = clusters(
+                points[inside], normals[inside], area[inside], local[faces], sides, share
+            )
             while found.max() + 1 < share:
                 several = np.bincount(found) > 1
-                found = halved(found, np.where(several, np.bincount(found, area[inside]), -1).argmax(), points[inside], sides, area[inside])
+                found = halved(
+                    found,
+                    np.where(several, np.bincount(found, area[inside]), -1).argmax(),
+                    points[inside],
+                    sides,
+                    area[inside],
+                )
                 found = np.unique(found, return_inverse=True)[1]
             label[inside] += found
     return label
 
 
 def _shares(area, vertices, count):
-    """``count`` patches dealt out to the parts, by area, at least one and at most as many as it has vertices each."""
+    """``count`` patches dealt out to the parts, by area, at least one and at most as many as it has
+    vertices each.
+    """
     wanted = area / area.sum() * count
     share = np.clip(np.floor(wanted).astype(int), 1, vertices)
     while share.sum() != count:
         more = share.sum() < count
-        gain = np.where(share < vertices, wanted - share, -np.inf) if more else np.where(share > 1, share - wanted, -np.inf)
+        gain = (
+            np.where(share < vertices, wanted - share, -np.inf)
+            if more
+            else np.where(share > 1, share - wanted, -np.inf)
+        )
         share[gain.argmax()] += 1 if more else -1
     return share
 

@@ -1,10 +1,13 @@
-"""PolyFit as a network: the PCA frame, a spatial transformer that refines it, the jet (paper, section "PolyFit").
+"""PolyFit as a network: the PCA frame, a spatial transformer that refines it, the jet (paper,
+section "PolyFit").
 
-The plane of least spread is the wrong one for a patch that is large or folded: over it the patch is no height graph. The transformer sees
-the patch in its PCA frame and answers with a few unit quaternions, each a turn of the frame; the PCA frame itself is always one of them.
-The turn whose jet leaves the least height is kept. So the refined frame is never worse than PCA at the points that were read, and a patch
-with two plausible planes needs no guess between them. A rotation within the plane changes nothing, for a jet of full degree spans the same
-heights in any (u, v); what counts is where z points.
+The plane of least spread is the wrong one for a patch that is large or folded: over it the patch is
+no height graph. The transformer sees the patch in its PCA frame and answers with a few unit
+quaternions, each a turn of the frame; the PCA frame itself is always one of them. The turn whose
+jet leaves the least height is kept. So the refined frame is never worse than PCA at the points that
+were read, and a patch with two plausible planes needs no guess between them. A rotation within the
+plane changes nothing, for a jet of full degree spans the same heights in any (u, v); what counts is
+where z points.
 """
 
 import math
@@ -26,9 +29,9 @@ TILT = math.radians(55)  # between the PCA frame's z and the first guesses'
 class SpatialTransformer(torch.nn.Module):
     """A PointNet that reads a patch and answers with unit quaternions.
 
-    ``widths`` are those of the layers that see each point alone, ``hidden`` of the two layers after the maximum over points; at most
-    ``points`` points are read, every so many-th of the patch's own order. ``turns`` quaternions are learned; they start as tilts to all
-    sides.
+    ``widths`` are those of the layers that see each point alone, ``hidden`` of the two layers after
+    the maximum over points; at most ``points`` points are read, every so many-th of the patch's own
+    order. ``turns`` quaternions are learned; they start as tilts to all sides.
     """
 
     def __init__(self, widths=(32, 64, 128), hidden=64, points=64, turns=5):
@@ -43,19 +46,29 @@ class SpatialTransformer(torch.nn.Module):
             torch.nn.Linear(hidden, 4 * turns),
         )
         side = torch.arange(turns) * 2 * math.pi / turns
-        first = torch.stack([math.sin(TILT / 2) * side.cos(), math.sin(TILT / 2) * side.sin(), 0 * side, math.cos(TILT / 2) + 0 * side], -1)
+        first = torch.stack(
+            [
+                math.sin(TILT / 2) * side.cos(),
+                math.sin(TILT / 2) * side.sin(),
+                0 * side,
+                math.cos(TILT / 2) + 0 * side,
+            ],
+            -1,
+        )
         with torch.no_grad():
             self.head[-1].weight.mul_(0.1)
             self.head[-1].bias.copy_(first.flatten())
 
     def forward(self, x, mask=None):
-        """Unit quaternions (B, turns + 1, 4) in the order (x, y, z, w), the first the identity, for patches x (B, P, 3) in the chart of
-        their PCA frame.
+        """Unit quaternions (B, turns + 1, 4) in the order (x, y, z, w), the first the identity, for
+        patches x (B, P, 3) in the chart of their PCA frame.
 
         ``mask`` (B, P) marks the points that count.
         """
         x = thinned(x.to(self.head[-1].weight.dtype), self.points, mask)
-        turns = torch.nn.functional.normalize(self.head(self.local(x).amax(1)).unflatten(-1, (-1, 4)), dim=-1)
+        turns = torch.nn.functional.normalize(
+            self.head(self.local(x).amax(1)).unflatten(-1, (-1, 4)), dim=-1
+        )
         return torch.cat([turns.new_tensor([0, 0, 0, 1]).expand(len(x), 1, 4), turns], 1)
 
 
@@ -81,7 +94,8 @@ def normalised_layer(entries, exits):
 
 
 def thinned(x, count, mask=None):
-    """At most ``count`` of the points x (B, P, 3), evenly through the order of those that ``mask`` (B, P) leaves: (B, count, 3).
+    """At most ``count`` of the points x (B, P, 3), evenly through the order of those that ``mask``
+    (B, P) leaves: (B, count, 3).
 
     A patch with fewer has some of its points twice, which no maximum over points notices.
     """
@@ -97,8 +111,8 @@ def thinned(x, count, mask=None):
 
 @dataclass(frozen=True)
 class PatchFit:
-    """Patches as PolyFit holds them: ``frame``, the orientation O = (s, R, T), and ``jet``, a :class:`polyfit.jets.JetFit` with ``alpha``
-    (B, A) in that frame.
+    """Patches as PolyFit holds them: ``frame``, the orientation O = (s, R, T), and ``jet``, a
+    :class:`polyfit.jets.JetFit` with ``alpha`` (B, A) in that frame.
     """
 
     frame: CanonicalFrame
@@ -108,8 +122,8 @@ class PatchFit:
 class PolyFit(torch.nn.Module):
     """Patches of points to frames and jets: PCA, spatial transformer, least squares.
 
-    ``order`` is that of the jets; ``stn`` a :class:`SpatialTransformer`, or None for the PCA frame alone. ``PolyFit.pretrained()`` has the
-    weights of the package.
+    ``order`` is that of the jets; ``stn`` a :class:`SpatialTransformer`, or None for the PCA frame
+    alone. ``PolyFit.pretrained()`` has the weights of the package.
     """
 
     def __init__(self, order=4, stn=None):
@@ -120,37 +134,46 @@ class PolyFit(torch.nn.Module):
         self.stn = stn
 
     def frame(self, points, mask=None, *, weights=None):
-        """The :class:`CanonicalFrame` of patches ``points`` (B, P, 3), of which ``mask`` (B, P) counts; ``weights`` (B, P) for mean and
-        spread.
+        """The :class:`CanonicalFrame` of patches ``points`` (B, P, 3), of which ``mask`` (B, P)
+        counts; ``weights`` (B, P) for mean and spread.
 
-        Differentiable with respect to the network's weights, through the turn that was kept. Raises InputError as
-        :meth:`CanonicalFrame.from_points` does.
+        Differentiable with respect to the network's weights, through the turn that was kept. Raises
+        InputError as :meth:`CanonicalFrame.from_points` does.
         """
         frame = CanonicalFrame.from_points(points, mask, weights=weights)
         if self.stn is None:
             return frame
         x = frame.to_chart(points)
         turns = self.stn(x, mask)
-        kept = self.least_height(thinned(x, max(self.stn.points, 4 * jets.size_of(self.order)), mask), turns.detach())
-        return frame.rotated(turns[torch.arange(len(turns), device=turns.device), kept].to(frame.R.dtype))
+        kept = self.least_height(
+            thinned(x, max(self.stn.points, 4 * jets.size_of(self.order)), mask), turns.detach()
+        )
+        return frame.rotated(
+            turns[torch.arange(len(turns), device=turns.device), kept].to(frame.R.dtype)
+        )
 
     @torch.no_grad()
     def least_height(self, x, turns):
-        """Which of the ``turns`` (B, H, 4) leaves the jets through x (B, P, 3) the least RMS of height, (B,)."""
+        """Which of the ``turns`` (B, H, 4) leaves the jets through x (B, P, 3) the least RMS of
+        height, (B,).
+        """
         y = x[:, None] @ rotation_matrix(turns.to(x.dtype))
         alpha = jets.fit(y, self.order).alpha
         return (jets.height(alpha, y[..., :2]) - y[..., 2]).square().mean(-1).argmin(-1)
 
     def forward(self, points, *, weights=None, mask=None):
-        """:class:`PatchFit` of patches ``points`` (B, P, 3) in any unit and frame; ``weights`` and ``mask`` (B, P) as in
-        :func:`polyfit.jets.fit`.
+        """:class:`PatchFit` of patches ``points`` (B, P, 3) in any unit and frame; ``weights`` and
+        ``mask`` (B, P) as in :func:`polyfit.jets.fit`.
         """
         frame = self.frame(points, mask, weights=weights)
-        return PatchFit(frame, jets.fit(frame.to_chart(points), self.order, weights=weights, mask=mask))
+        return PatchFit(
+            frame, jets.fit(frame.to_chart(points), self.order, weights=weights, mask=mask)
+        )
 
     @classmethod
     def pretrained(cls, order=4):
-        """PolyFit with the weights that ship in the package (``polyfit/data``; the JSON file there says what made them).
+        """PolyFit with the weights that ship in the package (``polyfit/data``; the JSON file there
+        says what made them).
 
         Raises InputError for an order that they are not for.
         """
@@ -158,8 +181,8 @@ class PolyFit(torch.nn.Module):
 
     @classmethod
     def load(cls, path, order=None):
-        """PolyFit with the weights of the file ``path``, as ``polyfit.train`` writes them. Raises InputError where they are no such, of
-        another version, or not for ``order``.
+        """PolyFit with the weights of the file ``path``, as ``polyfit.train`` writes them. Raises
+        InputError where they are no such, of another version, or not for ``order``.
         """
         weights, about = read_weights(path, "polyfit", VERSION)
         if order is not None and about["order"] != order:
@@ -169,5 +192,13 @@ class PolyFit(torch.nn.Module):
         return model.eval()
 
     def save(self, path, **about):
-        """Writes the weights to ``path`` (safetensors), with what they are for, and ``about``, inside."""
-        write_weights(path, self.state_dict(), dict(model="polyfit", version=VERSION, order=self.order, network=self.stn.shape, **about))
+        """Writes the weights to ``path`` (safetensors), with what they are for, and ``about``,
+        inside.
+        """
+        write_weights(
+            path,
+            self.state_dict(),
+            dict(
+                model="polyfit", version=VERSION, order=self.order, network=self.stn.shape, **about
+            ),
+        )

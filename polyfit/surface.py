@@ -1,4 +1,6 @@
-"""Patched surfaces: a mesh as jets in canonical frames, that can be evaluated anywhere and at any resolution (paper, section "PolyFit")."""
+"""Patched surfaces: a mesh as jets in canonical frames, that can be evaluated anywhere and at any
+resolution (paper, section "PolyFit").
+"""
 
 import dataclasses
 from dataclasses import dataclass
@@ -14,13 +16,15 @@ from .patches import Patches
 
 @dataclass(frozen=True)
 class PatchedSurface:
-    """S_k = {O_k, phi_k(u, v)}, k = 1..K: patches, their orientations, their jets, and the chart of every vertex.
+    """S_k = {O_k, phi_k(u, v)}, k = 1..K: patches, their orientations, their jets, and the chart of
+    every vertex.
 
-    ``patches``: the :class:`polyfit.patches.Patches` of the mesh; ``frame``: the orientations, (K,); ``alpha`` (K, A): the coefficients, in
-    charts whose z points to the side of the faces' normals; ``order`` (K,): the order fitted; ``uv`` (E, 2): chart coordinates of the
-    entries, those of the jet's point nearest to the vertex. ``dataclasses.replace`` with another ``alpha`` or ``frame`` gives the deformed
-    surface on the same charts; all that follows from them is differentiable. Charts overlap at the patches' boundaries, where :meth:`at`
-    blends them.
+    ``patches``: the :class:`polyfit.patches.Patches` of the mesh; ``frame``: the orientations,
+    (K,); ``alpha`` (K, A): the coefficients, in charts whose z points to the side of the faces'
+    normals; ``order`` (K,): the order fitted; ``uv`` (E, 2): chart coordinates of the entries,
+    those of the jet's point nearest to the vertex. ``dataclasses.replace`` with another ``alpha``
+    or ``frame`` gives the deformed surface on the same charts; all that follows from them is
+    differentiable. Charts overlap at the patches' boundaries, where :meth:`at` blends them.
     """
 
     patches: Patches
@@ -35,18 +39,25 @@ class PatchedSurface:
 
     @property
     def parameters(self):
-        """How many numbers hold the surface: the coefficients, and scale, rotation (3) and translation (3) of each patch."""
+        """How many numbers hold the surface: the coefficients, and scale, rotation (3) and
+        translation (3) of each patch.
+        """
         return len(self) * (self.alpha.shape[1] + 7)
 
     @classmethod
     def fit(cls, patches, order=4, *, polyfit=None, dtype=torch.float32, device=None):
-        """Fit a jet to each of the :class:`polyfit.patches.Patches`, weighted by area, in its PCA frame.
+        """Fit a jet to each of the :class:`polyfit.patches.Patches`, weighted by area, in its PCA
+        frame.
 
-        ``polyfit``, a :class:`polyfit.PolyFit`, finds frames and jets in its own way and order instead.
+        ``polyfit``, a :class:`polyfit.PolyFit`, finds frames and jets in its own way and order
+        instead.
         """
         index, exists = patches.padded
         tensor = lambda x, kind=dtype: torch.as_tensor(x, dtype=kind, device=device)
-        points, mask = tensor(patches.vertices[patches.entry_vertex[index]]), tensor(exists, torch.bool)
+        points, mask = (
+            tensor(patches.vertices[patches.entry_vertex[index]]),
+            tensor(exists, torch.bool),
+        )
         weights = tensor(patches.entry_weight[index])
         if polyfit is None:
             frame = CanonicalFrame.from_points(points, mask, weights=weights)
@@ -63,36 +74,57 @@ class PatchedSurface:
 
     @classmethod
     def from_mesh(cls, vertices, faces, count=None, order=4, *, rounds=5, where="mesh", **options):
-        """Cut the mesh (N, 3) [m], (F, 3) into patches (:meth:`polyfit.patches.Patches.cut`), :meth:`fit` them with ``options``, and let
-        the boundaries move to where the jets fit best, ``rounds`` times (:func:`polyfit.refine.refined`)."""
+        """Cut the mesh (N, 3) [m], (F, 3) into patches (:meth:`polyfit.patches.Patches.cut`),
+        :meth:`fit` them with ``options``, and let the boundaries move to where the jets fit best,
+        ``rounds`` times (:func:`polyfit.refine.refined`).
+        """
         from .refine import refined
 
-        return refined(cls.fit(Patches.cut(vertices, faces, count, where=where), order, **options), rounds, **options)
+        return refined(
+            cls.fit(Patches.cut(vertices, faces, count, where=where), order, **options),
+            rounds,
+            **options,
+        )
 
     @property
     def residual(self):
-        """Distance of each entry's vertex from its chart's jet, (E,) [m], to first order: along z, divided by the slope."""
-        vertices = torch.as_tensor(self.patches.vertices, dtype=self.uv.dtype, device=self.uv.device)
-        return self.distance(self._index(self.patches.entry_patch), vertices[self._index(self.patches.entry_vertex)])
+        """Distance of each entry's vertex from its chart's jet, (E,) [m], to first order: along z,
+        divided by the slope.
+        """
+        vertices = torch.as_tensor(
+            self.patches.vertices, dtype=self.uv.dtype, device=self.uv.device
+        )
+        return self.distance(
+            self._index(self.patches.entry_patch), vertices[self._index(self.patches.entry_vertex)]
+        )
 
-    # ---- patches and chart coordinates -> the surface -----------------------------------------------------------------
+    # ---- patches and chart coordinates -> the surface --------------------------------------------
 
     def points(self, patch, uv):
         """Points (..., 3) [m] at uv (..., 2) of the patches ``patch`` (...,)."""
         z = self._of(jets.height, patch, uv)
-        return self._turned(patch, torch.cat([uv, z[..., None]], -1)) * self.frame.s[patch][..., None] + self.frame.T[patch]
+        return (
+            self._turned(patch, torch.cat([uv, z[..., None]], -1)) * self.frame.s[patch][..., None]
+            + self.frame.T[patch]
+        )
 
     def distance(self, patch, points):
-        """Distances (...,) [m] of points (..., 3) [m] from the jets of the patches ``patch`` (...,), to first order: along z, divided by
-        the slope."""
+        """Distances (...,) [m] of points (..., 3) [m] from the jets of the patches ``patch``
+        (...,), to first order: along z, divided by the slope."""
         frame = self.frame[patch]
         x = frame.to_chart(points[..., None, :])
-        z, zu, zv = (d.squeeze(-1) for d in jets.derivatives(self.alpha[patch], x[..., :2], (0, 0), (1, 0), (0, 1)))
+        z, zu, zv = (
+            d.squeeze(-1)
+            for d in jets.derivatives(self.alpha[patch], x[..., :2], (0, 0), (1, 0), (0, 1))
+        )
         return frame.s * (z - x[..., 0, 2]).abs() / (1 + zu * zu + zv * zv).sqrt()
 
     def tangents(self, patch, uv):
         """Derivatives of the points along u and v, each (..., 3) [m]."""
-        return tuple(self._turned(patch, t) * self.frame.s[patch][..., None] for t in self._of(jets.tangents, patch, uv))
+        return tuple(
+            self._turned(patch, t) * self.frame.s[patch][..., None]
+            for t in self._of(jets.tangents, patch, uv)
+        )
 
     def normals(self, patch, uv):
         """Unit normals (..., 3), to the side of the faces' normals."""
@@ -103,7 +135,9 @@ class PatchedSurface:
         return self._of(jets.metric, patch, uv) * self.frame.s[patch][..., None, None] ** 2
 
     def principal_curvatures(self, patch, uv):
-        """Principal curvatures (..., 2) [1/m], the smaller first; positive where the surface bends towards its normal."""
+        """Principal curvatures (..., 2) [1/m], the smaller first; positive where the surface bends
+        towards its normal.
+        """
         return self._of(jets.principal_curvatures, patch, uv) / self.frame.s[patch][..., None]
 
     def _of(self, function, patch, uv):
@@ -115,11 +149,13 @@ class PatchedSurface:
     def _turned(self, patch, x):
         return (self.frame.R[patch] @ x[..., None])[..., 0]
 
-    # ---- points of the mesh -> patches and chart coordinates ----------------------------------------------------------
+    # ---- points of the mesh -> patches and chart coordinates -------------------------------------
 
     @cached_property
     def vertex_patch(self):
-        """The patch of each vertex of ``patches.vertices``, (M,); those of the given mesh come first."""
+        """The patch of each vertex of ``patches.vertices``, (M,); those of the given mesh come
+        first.
+        """
         return self._index(self.patches.vertex_patch)
 
     @property
@@ -132,16 +168,20 @@ class PatchedSurface:
         return self.points(self.vertex_patch, self.vertex_uv)
 
     def at(self, face, barycentric, what="points"):
-        """The surface at points of the given mesh, by face (P,) and barycentric coordinates (P, 3): (P, 3) [m].
+        """The surface at points of the given mesh, by face (P,) and barycentric coordinates (P, 3):
+        (P, 3) [m].
 
-        ``what``: "points" or "normals" (unit). Where a point's face (of ``patches.faces``) touches several patches, theirs are blended in
-        proportion to the point's nearness to their corners; so neighbouring patches join without a gap.
+        ``what``: "points" or "normals" (unit). Where a point's face (of ``patches.faces``) touches
+        several patches, theirs are blended in proportion to the point's nearness to their corners;
+        so neighbouring patches join without a gap.
         """
         face, barycentric = self.patches.locate(np.asarray(face), np.asarray(barycentric))
         return self._blended(face, barycentric, what)
 
     def sample(self, count, seed=0, what=("points",)):
-        """``count`` points drawn evenly from the mesh's area, on the surface: a tuple of what ``what`` names, as in :meth:`at`."""
+        """``count`` points drawn evenly from the mesh's area, on the surface: a tuple of what
+        ``what`` names, as in :meth:`at`.
+        """
         rng = np.random.default_rng(seed)
         area = mesh.areas(self.patches.vertices, self.patches.faces)
         face = rng.choice(len(area), count, p=area / area.sum())
@@ -149,8 +189,8 @@ class PatchedSurface:
         return tuple(self._blended(face, barycentric, w) for w in what)
 
     def resampled(self, parts=4, smoothing=0):
-        """A mesh of the surface with every side of the given mesh's faces cut in ``parts``: ``(vertices (N', 3) [m], faces (parts^2 F, 3)
-        int64)``.
+        """A mesh of the surface with every side of the given mesh's faces cut in ``parts``:
+        ``(vertices (N', 3) [m], faces (parts^2 F, 3) int64)``.
 
         The given mesh's vertices come first. ``smoothing``: how often :meth:`smoothed` is applied.
         """
@@ -175,11 +215,13 @@ class PatchedSurface:
         out = out.index_put((self._index(np.flatnonzero(~mixed)),), pure)
         return out.index_put((self._index(np.flatnonzero(mixed)),), blend)
 
-    # ---- boundaries ---------------------------------------------------------------------------------------------------
+    # ---- boundaries ------------------------------------------------------------------------------
 
     @cached_property
     def boundary_patch(self):
-        """The patches (B, 2) that hold each boundary point, the lower first. ``patches.neighbours`` lists which patches meet."""
+        """The patches (B, 2) that hold each boundary point, the lower first. ``patches.neighbours``
+        lists which patches meet.
+        """
         return self._index(self.patches.entry_patch[self.patches.boundary])
 
     @property
@@ -188,27 +230,36 @@ class PatchedSurface:
         return self.uv[self._index(self.patches.boundary)]
 
     def boundary(self):
-        """The boundary points by their two patches, ``(points (B, 2, 3) [m], normals (B, 2, 3))``: what a boundary loss compares."""
+        """The boundary points by their two patches, ``(points (B, 2, 3) [m], normals (B, 2, 3))``:
+        what a boundary loss compares.
+        """
         patch, uv = self.boundary_patch, self.boundary_uv
         return self.points(patch, uv), self.normals(patch, uv)
 
     def _index(self, array):
         return torch.as_tensor(np.ascontiguousarray(array), device=self.uv.device)
 
-    # ---- as a whole ---------------------------------------------------------------------------------------------------
+    # ---- as a whole ------------------------------------------------------------------------------
 
     def to(self, *args, **kwargs):
         """The surface in another dtype or on another device."""
         move = lambda x: x.to(*args, **kwargs)
         order = self.order.to(move(self.alpha).device)
-        return dataclasses.replace(self, frame=self.frame.to(*args, **kwargs), alpha=move(self.alpha), order=order, uv=move(self.uv))
+        return dataclasses.replace(
+            self,
+            frame=self.frame.to(*args, **kwargs),
+            alpha=move(self.alpha),
+            order=order,
+            uv=move(self.uv),
+        )
 
 
 def smoothed(vertices, faces, where, times=1):
-    """Vertices (N, 3) with those of ``where`` (N,) bool moved ``times`` times halfway to the mean of their neighbours (Laplacian
-    smoothing).
+    """Vertices (N, 3) with those of ``where`` (N,) bool moved ``times`` times halfway to the mean
+    of their neighbours (Laplacian smoothing).
 
-    Vertices at the mesh's own boundary only feel their neighbours along it, so that the outline does not shrink. Differentiable.
+    Vertices at the mesh's own boundary only feel their neighbours along it, so that the outline
+    does not shrink. Differentiable.
     """
     if not times:
         return vertices

@@ -1,9 +1,10 @@
 """Trains PolyFit's spatial transformer, or a network that it is held against.
 
-    python -m polyfit.train [MESH ...] -o OUT [--model polyfit] [--families jet trigonometric gaussian bessel] [--steps 2500] [--resume]
-    torchrun --nproc-per-node 2 -m polyfit.train ...
+    python -m polyfit.train [MESH ...] -o OUT [--model polyfit] [--families jet trigonometric
+    gaussian bessel] [--steps 2500] [--resume] torchrun --nproc-per-node 2 -m polyfit.train ...
 
-MESH are garments (.obj, .ply), cut into patches and deformed at random; without any, the analytic families are all there is. OUT receives
+MESH are garments (.obj, .ply), cut into patches and deformed at random; without any, the analytic
+families are all there is. OUT receives
 
     weights.safetensors     the trained network, for ``PolyFit.load``, and weights.json: what made it
     log.jsonl               a line every so many steps
@@ -34,15 +35,17 @@ from .weights import read_weights, write_weights
 VERSION = 1  # of the training sets
 MODELS = ("polyfit", "pointnet", "dgcnn", "atlasnet")
 SAMPLES = 256  # points that are made of each patch
-CHOICE = 0.01  # height [s] by which one turn must be better than another to be chosen e times as likely, in training
+# height [s] by which one turn must be better than another to be chosen e times as likely, in
+# training
+CHOICE = 0.01
 SHARPNESS = (15.0, 80.0)  # of the table's smoothing over directions, at the start and at the end
 ATLAS_POINTS = 1000  # of a garment, and of its reconstruction
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What decides the result. ``cuts``: the numbers of patches that each mesh is cut into; ``points`` are kept of each patch and ``reads``
-    of them read in a step.
+    """What decides the result. ``cuts``: the numbers of patches that each mesh is cut into;
+    ``points`` are kept of each patch and ``reads`` of them read in a step.
     """
 
     model: str = "polyfit"
@@ -64,7 +67,9 @@ class Settings:
             raise InputError(f"model {self.model}: choose among {', '.join(MODELS)}")
         unknown = sorted(set(self.families) - set(families.FAMILIES))
         if unknown:
-            raise InputError(f"families {', '.join(unknown)}: choose among {', '.join(families.FAMILIES)}")
+            raise InputError(
+                f"families {', '.join(unknown)}: choose among {', '.join(families.FAMILIES)}"
+            )
         for name in ("patches", "points", "reads", "steps", "batch", "charts"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} = {getattr(self, name)}: 1 at least")
@@ -73,14 +78,23 @@ class Settings:
         if not self.lr > 0:
             raise InputError(f"lr = {self.lr}: more than 0")
         if self.points > SAMPLES or self.reads > self.points:
-            raise InputError(f"reads {self.reads}, points {self.points}: at most points, at most {SAMPLES}")
+            raise InputError(
+                f"reads {self.reads}, points {self.points}: at most points, at most {SAMPLES}"
+            )
         if not self.meshes and (not self.families or self.model == "atlasnet"):
-            raise InputError("nothing to train on: give meshes" + ("" if self.model == "atlasnet" else ", or families"))
+            raise InputError(
+                "nothing to train on: give meshes"
+                + ("" if self.model == "atlasnet" else ", or families")
+            )
 
     def network(self):
         if self.model == "polyfit":
             return PolyFit(self.order, SpatialTransformer(points=self.reads))
-        return {"pointnet": PointNet, "dgcnn": DGCNN}[self.model](self.order) if self.model != "atlasnet" else AtlasNet(self.charts)
+        return (
+            {"pointnet": PointNet, "dgcnn": DGCNN}[self.model](self.order)
+            if self.model != "atlasnet"
+            else AtlasNet(self.charts)
+        )
 
 
 class PolyFitTraining(Training):
@@ -90,7 +104,13 @@ class PolyFitTraining(Training):
         self.given, self.data = settings, data
         torch.manual_seed(settings.seed)
         network = settings.network().to(processes.device)
-        super().__init__(network, torch.optim.Adam(network.parameters(), settings.lr), _plain(settings), processes, settings.steps)
+        super().__init__(
+            network,
+            torch.optim.Adam(network.parameters(), settings.lr),
+            _plain(settings),
+            processes,
+            settings.steps,
+        )
 
     def write_weights(self, path):
         self.network.save(path)
@@ -108,7 +128,9 @@ class PolyFitTraining(Training):
 
 
 class _Patches:
-    """Batches of a :class:`training_set.TrainingSet`, and the losses of the networks that see patches."""
+    """Batches of a :class:`training_set.TrainingSet`, and the losses of the networks that see
+    patches.
+    """
 
     def __init__(self, patches):
         self.patches = patches
@@ -118,15 +140,26 @@ class _Patches:
     def loss(self, network, settings, share, generator, processes):
         if settings.model != "polyfit":
             index = torch.randint(len(self.patches), (settings.batch,), generator=generator)
-            return self._of_regressor(network, index[processes.rank :: processes.count].to(processes.device))
-        # half of the batch in proportion to what another axis than PCA's would gain: few patches are folded, and they have the most to
-        # teach
-        index = torch.multinomial(self.likely, settings.batch, replacement=True, generator=generator)
+            return self._of_regressor(
+                network, index[processes.rank :: processes.count].to(processes.device)
+            )
+        # half of the batch in proportion to what another axis than PCA's would gain: few patches
+        # are folded, and they have the most to teach
+        index = torch.multinomial(
+            self.likely, settings.batch, replacement=True, generator=generator
+        )
         index = index[processes.rank :: processes.count].to(processes.device)
-        read = torch.randperm(settings.points, generator=generator)[: settings.reads].to(processes.device)
+        read = torch.randperm(settings.points, generator=generator)[: settings.reads].to(
+            processes.device
+        )
         quaternion = network.stn(self.patches.points[index][:, read])
-        height, loss = self.patches.at(index, _z_axis(quaternion), SHARPNESS[0] + (SHARPNESS[1] - SHARPNESS[0]) * min(1, 1.2 * share))
-        # the turn of least height is kept; here softly, so that all of them learn which patches are theirs
+        height, loss = self.patches.at(
+            index,
+            _z_axis(quaternion),
+            SHARPNESS[0] + (SHARPNESS[1] - SHARPNESS[0]) * min(1, 1.2 * share),
+        )
+        # the turn of least height is kept; here softly, so that all of them learn which patches are
+        # theirs
         return (torch.softmax(-height / CHOICE, 1) * loss).sum(1).mean()
 
     def _of_regressor(self, network, index):
@@ -145,8 +178,12 @@ class _Garments:
         from . import deformations
 
         index = torch.randint(len(self.points), (settings.batch,), generator=generator)
-        maps = deformations.random(settings.batch, generator, bend=1.0, waves=2, frequency=(1.0, 3.0))
-        read = torch.randint(self.points.shape[1], (settings.batch, ATLAS_POINTS), generator=generator)
+        maps = deformations.random(
+            settings.batch, generator, bend=1.0, waves=2, frequency=(1.0, 3.0)
+        )
+        read = torch.randint(
+            self.points.shape[1], (settings.batch, ATLAS_POINTS), generator=generator
+        )
         x = normalised(maps(self.points[index].gather(1, read[..., None].expand(-1, -1, 3))))[0]
         x = x[processes.rank :: processes.count].to(processes.device)
         return chamfer(network(x, math.ceil(ATLAS_POINTS / settings.charts), generator), x).mean()
@@ -160,12 +197,14 @@ def _z_axis(quaternion):
 
 def _plain(settings):
     """The settings as JSON gives them back; meshes by name, for they may lie elsewhere."""
-    return json.loads(json.dumps(asdict(settings) | dict(meshes=[os.path.basename(m) for m in settings.meshes])))
+    return json.loads(
+        json.dumps(asdict(settings) | dict(meshes=[os.path.basename(m) for m in settings.meshes]))
+    )
 
 
 def _prepare(settings, folder, processes, progress):
-    """The data that ``settings`` ask for; a training set is kept in ``folder``, and one of the same settings that lies there is used
-    again.
+    """The data that ``settings`` ask for; a training set is kept in ``folder``, and one of the same
+    settings that lies there is used again.
     """
     if settings.model == "atlasnet":
         import numpy as np
@@ -173,50 +212,103 @@ def _prepare(settings, folder, processes, progress):
         generator, points = np.random.default_rng(settings.seed), []
         for path in settings.meshes:
             vertices, faces = read_mesh(path)[:2]
-            points.append(garments.GarmentPatches.cut(vertices, faces, None, 64, generator, str(path)).points.flatten(0, 1))
+            points.append(
+                garments.GarmentPatches.cut(
+                    vertices, faces, None, 64, generator, str(path)
+                ).points.flatten(0, 1)
+            )
         least = min(len(p) for p in points)
-        return _Garments(normalised(torch.stack([p[torch.linspace(0, len(p) - 1, least).long()] for p in points]))[0])
+        return _Garments(
+            normalised(
+                torch.stack([p[torch.linspace(0, len(p) - 1, least).long()] for p in points])
+            )[0]
+        )
     path = folder / "set.safetensors"
     names = [f.name for f in fields(training_set.TrainingSet)]
-    wanted = {k: v for k, v in _plain(settings).items() if k in ("order", "families", "meshes", "cuts", "patches", "points", "seed")}
-    if processes.rank == 0 and not (path.exists() and read_weights(path, "training set", VERSION)[1]["settings"] == wanted):
-        cut = garments.cut_meshes(settings.meshes, settings.cuts, SAMPLES, settings.seed) if settings.meshes else None
+    wanted = {
+        k: v
+        for k, v in _plain(settings).items()
+        if k in ("order", "families", "meshes", "cuts", "patches", "points", "seed")
+    }
+    if processes.rank == 0 and not (
+        path.exists() and read_weights(path, "training set", VERSION)[1]["settings"] == wanted
+    ):
+        cut = (
+            garments.cut_meshes(settings.meshes, settings.cuts, SAMPLES, settings.seed)
+            if settings.meshes
+            else None
+        )
         task = progress.add_task("patches", total=settings.patches)
         made = training_set.build(
             settings.patches, settings.points, settings.order, settings.seed,
             garments=cut, names=settings.families, device=processes.device, advance=lambda done: progress.update(task, completed=done),
         )  # fmt: skip
-        write_weights(path, {name: getattr(made, name) for name in names}, dict(model="training set", version=VERSION, settings=wanted))
+        write_weights(
+            path,
+            {name: getattr(made, name) for name in names},
+            dict(model="training set", version=VERSION, settings=wanted),
+        )
     processes.wait()
     tensors, _ = read_weights(path, "training set", VERSION)
-    return _Patches(training_set.TrainingSet(*(tensors[name] for name in names)).to(processes.device))
+    return _Patches(
+        training_set.TrainingSet(*(tensors[name] for name in names)).to(processes.device)
+    )
 
 
 def train(settings, folder, *, device="cpu", resume=False, until=None, every=120.0, command=None):
-    """Trains and leaves weights in ``folder``; returns their path. ``until`` (steps) ends early, with a checkpoint and no weights (None);
-    ``every`` [s] checkpoints.
+    """Trains and leaves weights in ``folder``; returns their path. ``until`` (steps) ends early,
+    with a checkpoint and no weights (None); ``every`` [s] checkpoints.
     """
 
     def make(folder, processes, progress):
         return PolyFitTraining(settings, _prepare(settings, folder, processes, progress), processes)
 
-    return conduct(make, folder, device=device, resume=resume, until=until, every=every, command=command)
+    return conduct(
+        make, folder, device=device, resume=resume, until=until, every=every, command=command
+    )
 
 
 def parser():
     p = argparse.ArgumentParser(prog="python -m polyfit.train", description=__doc__.splitlines()[0])
     default = Settings()
-    p.add_argument("meshes", nargs="*", metavar="MESH", help="garments (.obj, .ply) to cut and deform")
+    p.add_argument(
+        "meshes", nargs="*", metavar="MESH", help="garments (.obj, .ply) to cut and deform"
+    )
     p.add_argument("-o", "--output", required=True, metavar="OUT", help="folder of the results")
-    p.add_argument("--model", default=default.model, help=f"{', '.join(MODELS)} (default: {default.model})")
-    p.add_argument("--families", nargs="*", default=list(default.families), help="analytic functions that are summed (default: all four)")
-    p.add_argument("--cuts", nargs="+", type=int, default=list(default.cuts), help="numbers of patches that each mesh is cut into")
+    p.add_argument(
+        "--model", default=default.model, help=f"{', '.join(MODELS)} (default: {default.model})"
+    )
+    p.add_argument(
+        "--families",
+        nargs="*",
+        default=list(default.families),
+        help="analytic functions that are summed (default: all four)",
+    )
+    p.add_argument(
+        "--cuts",
+        nargs="+",
+        type=int,
+        default=list(default.cuts),
+        help="numbers of patches that each mesh is cut into",
+    )
     for name in ("order", "patches", "points", "reads", "steps", "batch", "charts", "seed"):
-        p.add_argument(f"--{name}", type=int, default=getattr(default, name), help=f"(default: {getattr(default, name)})")
-    p.add_argument("--lr", type=float, default=default.lr, help=f"of Adam, falling to a hundredth as a cosine (default: {default.lr})")
+        p.add_argument(
+            f"--{name}",
+            type=int,
+            default=getattr(default, name),
+            help=f"(default: {getattr(default, name)})",
+        )
+    p.add_argument(
+        "--lr",
+        type=float,
+        default=default.lr,
+        help=f"of Adam, falling to a hundredth as a cosine (default: {default.lr})",
+    )
     p.add_argument("--checkpoint-every", type=float, default=120.0, metavar="SECONDS")
     p.add_argument("--resume", action="store_true", help="go on from OUT/checkpoint.safetensors")
-    p.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu", help="cpu or cuda")
+    p.add_argument(
+        "--device", default="cuda" if torch.cuda.is_available() else "cpu", help="cpu or cuda"
+    )
     return p
 
 
@@ -224,9 +316,19 @@ def main(argv=None):
     args = parser().parse_args(argv)
     values = {f.name: getattr(args, f.name) for f in fields(Settings)}
     settings = Settings(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
-    names = [os.path.basename(a) if a in args.meshes else a for a in (sys.argv[1:] if argv is None else argv)]
+    names = [
+        os.path.basename(a) if a in args.meshes else a
+        for a in (sys.argv[1:] if argv is None else argv)
+    ]
     command = "python -m polyfit.train " + shlex.join(names)
-    path = train(settings, args.output, device=device_of(args.device), resume=args.resume, every=args.checkpoint_every, command=command)
+    path = train(
+        settings,
+        args.output,
+        device=device_of(args.device),
+        resume=args.resume,
+        every=args.checkpoint_every,
+        command=command,
+    )
     if path and int(os.environ.get("RANK", 0)) == 0:
         print(path)
 

@@ -1,4 +1,5 @@
-"""What every training here does: steps that can be interrupted, resumed and shared by several processes, a log, and what made the weights.
+"""What every training here does: steps that can be interrupted, resumed and shared by several
+processes, a log, and what made the weights.
 """
 
 import contextlib
@@ -25,10 +26,15 @@ class Processes:
 
     def __init__(self, device):
         self.count, self.rank = int(os.environ.get("WORLD_SIZE", 1)), int(os.environ.get("RANK", 0))
-        self.device = torch.device(f"cuda:{os.environ.get('LOCAL_RANK', 0)}" if device == "cuda" and self.count > 1 else device)
+        self.device = torch.device(
+            f"cuda:{os.environ.get('LOCAL_RANK', 0)}"
+            if device == "cuda" and self.count > 1
+            else device
+        )
         if self.count > 1:
-            # Its functions take the group there is when they are imported as a default, and Adam imports them: after the line below they
-            # would keep the group, whose threads then outlive destroy_process_group and now and then abort the ending interpreter.
+            # Its functions take the group there is when they are imported as a default, and Adam
+            # imports them: after the line below they would keep the group, whose threads then
+            # outlive destroy_process_group and now and then abort the ending interpreter.
             import_module("torch.distributed.nn.functional")
             torch.distributed.init_process_group("nccl" if device == "cuda" else "gloo")
 
@@ -41,7 +47,10 @@ class Processes:
         if self.count > 1:
             flat = torch.cat([p.grad.flatten() for p in network.parameters()])
             torch.distributed.all_reduce(flat)
-            for p, g in zip(network.parameters(), (flat / self.count).split([p.numel() for p in network.parameters()])):
+            for p, g in zip(
+                network.parameters(),
+                (flat / self.count).split([p.numel() for p in network.parameters()]),
+            ):
                 p.grad.copy_(g.view_as(p))
 
     def mean(self, figures):
@@ -58,17 +67,26 @@ class Processes:
 
 
 class Training:
-    """One training: its ``network``, its ``optimiser``, how many of its ``steps`` are ``done``. ``settings``: all that decides the result,
-    as JSON gives it back. Subclasses have :meth:`update`, whose random numbers come from :meth:`generator` alone, and take of each batch
-    the share of their process. So a resumed training, and one on several processes, do what one process does without interruption.
+    """One training: its ``network``, its ``optimiser``, how many of its ``steps`` are ``done``.
+    ``settings``: all that decides the result, as JSON gives it back. Subclasses have
+    :meth:`update`, whose random numbers come from :meth:`generator` alone, and take of each batch
+    the share of their process. So a resumed training, and one on several processes, do what one
+    process does without interruption.
     """
 
     def __init__(self, network, optimiser, settings, processes, steps):
-        self.network, self.optimiser, self.settings, self.processes = network, optimiser, settings, processes
+        self.network, self.optimiser, self.settings, self.processes = (
+            network,
+            optimiser,
+            settings,
+            processes,
+        )
         self.steps, self.done, self.seconds = steps, 0, 0.0
 
     def update(self):
-        """One step of the optimiser; what it lowered, as a dict of numbers with the sum as ``loss``."""
+        """One step of the optimiser; what it lowered, as a dict of numbers with the sum as
+        ``loss``.
+        """
         raise NotImplementedError
 
     def write_weights(self, path):
@@ -77,7 +95,9 @@ class Training:
 
     def generator(self):
         """The random numbers of this step."""
-        return torch.Generator().manual_seed(self.settings["seed"] * 1_000_003 + 7919 * self.done + 1)
+        return torch.Generator().manual_seed(
+            self.settings["seed"] * 1_000_003 + 7919 * self.done + 1
+        )
 
     def step(self):
         start = time.perf_counter()
@@ -86,22 +106,35 @@ class Training:
         self.seconds += time.perf_counter() - start
         return figures
 
-    # ---- checkpoints --------------------------------------------------------------------------------------------------
+    # ---- checkpoints -----------------------------------------------------------------------------
 
     def save(self, path):
         tensors = {f"network.{k}": v for k, v in self.network.state_dict().items()}
         for k, state in self.optimiser.state_dict()["state"].items():
             tensors |= {f"adam.{k}.{name}": value for name, value in state.items()}
         progress = dict(done=self.done, seconds=self.seconds)
-        write_weights(path, tensors, dict(model="checkpoint", version=VERSION, settings=self.settings, **progress))
+        write_weights(
+            path,
+            tensors,
+            dict(model="checkpoint", version=VERSION, settings=self.settings, **progress),
+        )
 
     def restore(self, path):
         """Goes on from a checkpoint. Raises InputError where it was made with other settings."""
         tensors, about = read_weights(path, "checkpoint", VERSION)
-        other = [f"{k} {about['settings'].get(k)}" for k, v in self.settings.items() if about["settings"].get(k) != v]
+        other = [
+            f"{k} {about['settings'].get(k)}"
+            for k, v in self.settings.items()
+            if about["settings"].get(k) != v
+        ]
         if other:
-            raise InputError(f"{path}: a checkpoint of other settings ({', '.join(other)}); give the same, or another -o")
-        load_into(self.network, {k[8:]: v for k, v in tensors.items() if k.startswith("network.")}, path)
+            raise InputError(
+                f"{path}: a checkpoint of other settings ({', '.join(other)}); give the same, or"
+                " another -o"
+            )
+        load_into(
+            self.network, {k[8:]: v for k, v in tensors.items() if k.startswith("network.")}, path
+        )
         state = {}
         for k, v in tensors.items():
             if k.startswith("adam."):
@@ -110,21 +143,30 @@ class Training:
         self.optimiser.load_state_dict(self.optimiser.state_dict() | {"state": state})
         self.done, self.seconds = about["done"], about["seconds"]
 
-    # ---- the loop -----------------------------------------------------------------------------------------------------
+    # ---- the loop --------------------------------------------------------------------------------
 
     def run(self, folder, end, every, advance):
-        """Steps up to ``end``, with a line of ``folder``/log.jsonl every LINE of them and a checkpoint every so many seconds, at the end,
-        and at Ctrl-C. ``advance()`` is called after each step. Raises InputError where the loss is not finite."""
+        """Steps up to ``end``, with a line of ``folder``/log.jsonl every LINE of them and a
+        checkpoint every so many seconds, at the end, and at Ctrl-C. ``advance()`` is called after
+        each step. Raises InputError where the loss is not finite.
+        """
         checkpoint, first = folder / "checkpoint.safetensors", self.processes.rank == 0
         saved, lines = time.monotonic(), []
         with contextlib.ExitStack() as stack:
-            file = stack.enter_context(open(folder / "log.jsonl", "a", encoding="utf-8")) if first else None
+            file = (
+                stack.enter_context(open(folder / "log.jsonl", "a", encoding="utf-8"))
+                if first
+                else None
+            )
             try:
                 while self.done < end:
                     lines.append(self.step())
                     advance()
                     if not math.isfinite(lines[-1]["loss"]):
-                        raise InputError(f"the loss is {lines[-1]['loss']} at step {self.done}; a lower --lr may help")
+                        raise InputError(
+                            f"the loss is {lines[-1]['loss']} at step {self.done}; a lower --lr may"
+                            " help"
+                        )
                     if first and (self.done % LINE == 0 or self.done == end):
                         file.write(json.dumps(self._line(lines)) + "\n")
                         file.flush()
@@ -141,8 +183,17 @@ class Training:
 
     def _line(self, lines):
         names = list(dict.fromkeys(name for line in lines for name in line))
-        means = {name: sum(found) / len(found) for name in names if (found := [line[name] for line in lines if name in line])}
-        return dict(step=self.done, **means, lr=self.optimiser.param_groups[0]["lr"], seconds=round(self.seconds, 2))
+        means = {
+            name: sum(found) / len(found)
+            for name in names
+            if (found := [line[name] for line in lines if name in line])
+        }
+        return dict(
+            step=self.done,
+            **means,
+            lr=self.optimiser.param_groups[0]["lr"],
+            seconds=round(self.seconds, 2),
+        )
 
     def write_about(self, path, command):
         """The JSON file that says what made the weights."""
@@ -158,13 +209,20 @@ class Training:
 
 
 def conduct(make, folder, *, device="cpu", resume=False, until=None, every=120.0, command=None):
-    """Trains what ``make(folder, processes, progress)`` gives, a :class:`Training`, and leaves its weights in ``folder``; returns their
-    path.
+    """Trains what ``make(folder, processes, progress)`` gives, a :class:`Training`, and leaves its
+    weights in ``folder``; returns their path.
 
-    ``until`` (steps) ends early, with a checkpoint and no weights (None); ``every`` [s] checkpoints; ``progress`` is a
-    rich.progress.Progress. Raises InputError for a folder that holds weights already, or nothing to ``resume``.
+    ``until`` (steps) ends early, with a checkpoint and no weights (None); ``every`` [s]
+    checkpoints; ``progress`` is a rich.progress.Progress. Raises InputError for a folder that holds
+    weights already, or nothing to ``resume``.
     """
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
 
     folder = Path(folder)
     checkpoint, weights = folder / "checkpoint.safetensors", folder / "weights.safetensors"
@@ -174,7 +232,12 @@ def conduct(make, folder, *, device="cpu", resume=False, until=None, every=120.0
         raise InputError(f"{weights}: exists; give another -o, or --resume")
     folder.mkdir(parents=True, exist_ok=True)
     processes = Processes(device)
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+    )
     try:
         with Progress(*columns, disable=processes.rank > 0) as progress:
             training = make(folder, processes, progress)

@@ -1,9 +1,11 @@
-"""What is trained on: patches in the charts of their PCA frames, and how well a jet fits each of them from every side.
+"""What is trained on: patches in the charts of their PCA frames, and how well a jet fits each of
+them from every side.
 
-A transformer that follows the gradient of a fit's error from the PCA frame finds the valley next to it, not the right one: across a fold
-the error first rises. So the height discrepancy is tabulated once for every patch, on axes all over the half sphere, and training reads the
-table, smoothed over directions (:meth:`TrainingSet.at`). The table is the loss itself, the jets' own fits; the smoothing narrows as
-training goes on.
+A transformer that follows the gradient of a fit's error from the PCA frame finds the valley next to
+it, not the right one: across a fold the error first rises. So the height discrepancy is tabulated
+once for every patch, on axes all over the half sphere, and training reads the table, smoothed over
+directions (:meth:`TrainingSet.at`). The table is the loss itself, the jets' own fits; the smoothing
+narrows as training goes on.
 """
 
 from dataclasses import dataclass, fields
@@ -23,8 +25,10 @@ NORMALS = 0.1  # weight of 1 - cosine of the normals against RMS of height
 
 @dataclass(frozen=True)
 class TrainingSet:
-    """``points`` and ``normals`` (N, P, 3) in the charts of the PCA frames; ``height`` and ``loss`` (N, D): RMS of height, and that plus
-    ``NORMALS`` (1 - cosine) between the normals, of the jets fitted with z along each of :func:`axes`. float32."""
+    """``points`` and ``normals`` (N, P, 3) in the charts of the PCA frames; ``height`` and ``loss``
+    (N, D): RMS of height, and that plus ``NORMALS`` (1 - cosine) between the normals, of the jets
+    fitted with z along each of :func:`axes`. float32.
+    """
 
     points: torch.Tensor
     normals: torch.Tensor
@@ -38,11 +42,13 @@ class TrainingSet:
         return TrainingSet(*(getattr(self, f.name).to(device) for f in fields(self)))
 
     def at(self, index, z, sharpness):
-        """Height and loss, each (B, H), of patches ``index`` (B,) fitted along unit axes z (B, H, 3): means over the table, weighted by
-        exp(``sharpness`` cos^2).
+        """Height and loss, each (B, H), of patches ``index`` (B,) fitted along unit axes z (B, H,
+        3): means over the table, weighted by exp(``sharpness`` cos^2).
         """
         weight = torch.softmax(sharpness * (z @ axes(z.device).T) ** 2, -1)
-        return (weight * self.height[index][:, None]).sum(-1), (weight * self.loss[index][:, None]).sum(-1)
+        return (weight * self.height[index][:, None]).sum(-1), (
+            weight * self.loss[index][:, None]
+        ).sum(-1)
 
 
 def axes(device=None):
@@ -50,7 +56,9 @@ def axes(device=None):
     k = torch.arange(AXES - 1, device=device) + 0.5
     z, turn = 1 - k / (AXES - 1), k * torch.pi * (3 - 5**0.5)
     r = (1 - z * z).sqrt()
-    return torch.cat([z.new_tensor([[0.0, 0.0, 1.0]]), torch.stack([r * turn.cos(), r * turn.sin(), z], -1)])
+    return torch.cat(
+        [z.new_tensor([[0.0, 0.0, 1.0]]), torch.stack([r * turn.cos(), r * turn.sin(), z], -1)]
+    )
 
 
 def rotations_to(z):
@@ -60,11 +68,22 @@ def rotations_to(z):
     return torch.stack([u, torch.linalg.cross(z, u), z], -1)
 
 
-def build(count, points, order, seed, *, garments=None, names=families.FAMILIES, device="cpu", advance=lambda done: None):
+def build(
+    count,
+    points,
+    order,
+    seed,
+    *,
+    garments=None,
+    names=families.FAMILIES,
+    device="cpu",
+    advance=lambda done: None,
+):
     """:class:`TrainingSet` of ``count`` patches of ``points`` points each, for jets of ``order``.
 
-    ``garments`` (:class:`GarmentPatches` or None) are deformed at random; ``names`` are the analytic families that are summed, or empty.
-    ``advance`` is told how many patches there are so far.
+    ``garments`` (:class:`GarmentPatches` or None) are deformed at random; ``names`` are the
+    analytic families that are summed, or empty. ``advance`` is told how many patches there are so
+    far.
     """
     parts = []
     turns = rotations_to(axes())
@@ -77,11 +96,27 @@ def build(count, points, order, seed, *, garments=None, names=families.FAMILIES,
             made.append(garments.deformed(deformed, generator))
         if size > deformed:
             samples = points if garments is None else garments.points.shape[1]
-            made.append(GarmentPatches(*(t.float() for t in families.sample(size - deformed, samples, generator, names))))
+            made.append(
+                GarmentPatches(
+                    *(
+                        t.float()
+                        for t in families.sample(size - deformed, samples, generator, names)
+                    )
+                )
+            )
         made = GarmentPatches.join(made)
-        parts.append(_tabulated(made.points[:, :points].to(device), made.normals[:, :points].to(device), turns.to(device), order))
+        parts.append(
+            _tabulated(
+                made.points[:, :points].to(device),
+                made.normals[:, :points].to(device),
+                turns.to(device),
+                order,
+            )
+        )
         advance(first + size)
-    return TrainingSet(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(TrainingSet)))
+    return TrainingSet(
+        *(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(TrainingSet))
+    )
 
 
 def _tabulated(points, normals, turns, order):

@@ -10,14 +10,16 @@ def write_weights(path, weights, about):
     """Tensors by name, and what they are for; written aside and then renamed."""
     from safetensors.torch import save
 
-    data = save({k: v.detach().cpu().contiguous() for k, v in weights.items()}, {"about": json.dumps(about)})
+    data = save(
+        {k: v.detach().cpu().contiguous() for k, v in weights.items()}, {"about": json.dumps(about)}
+    )
     with aside(path) as temporary, open(temporary, "wb") as file:
         file.write(data)
 
 
 def read_weights(path, model, version):
-    """(tensors, description) of a file of :func:`write_weights`. Raises InputError where it cannot be read, or is of another model or
-    version.
+    """(tensors, description) of a file of :func:`write_weights`. Raises InputError where it cannot
+    be read, or is of another model or version.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -44,4 +46,6 @@ def load_into(module, weights, path):
     try:
         module.load_state_dict(weights)
     except RuntimeError as error:
-        raise InputError(f"{path}: weights for a network of another shape ({' '.join(str(error).split())[:160]})") from None
+        raise InputError(
+            f"{path}: weights for a network of another shape ({' '.join(str(error).split())[:160]})"
+        ) from None

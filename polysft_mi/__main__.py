@@ -33,7 +33,12 @@ def main(arguments=None):
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         width = max(map(len, COMMANDS))
-        print(_HELP.format(commands="\n".join(f"  {name:{width}s}  {what}" for name, what in COMMANDS.items())), end="")
+        print(
+            _HELP.format(
+                commands="\n".join(f"  {name:{width}s}  {what}" for name, what in COMMANDS.items())
+            ),
+            end="",
+        )
         return 0 if arguments else 2
     if arguments[0] in ("-V", "--version"):
         print(f"polysft {__version__}")
@@ -41,7 +46,10 @@ def main(arguments=None):
     name, rest = arguments[0], arguments[1:]
     if name not in COMMANDS:
         near = difflib.get_close_matches(name, COMMANDS, 1)
-        raise InputError(f"polysft {name}: no such command{f', did you mean {near[0]}?' if near else ';'} there are {', '.join(COMMANDS)}")
+        raise InputError(
+            f"polysft {name}: no such command{f', did you mean {near[0]}?' if near else ';'} there"
+            f" are {', '.join(COMMANDS)}"
+        )
     sys.argv = [f"polysft {name}", *rest]  # what the command's help and the record of a run name
     return importlib.import_module(f"{__package__}.{name}").main(rest)
 

@@ -1,9 +1,12 @@
-"""Normal equations accumulated on the device: per triangle, per vertex and pair of neighbours, per unknown.
+"""Normal equations accumulated on the device: per triangle, per vertex and pair of neighbours, per
+unknown.
 
-What images say comes as sums over the pixels of each triangle (:mod:`polysft_mi.pixels`); gathered at the vertices, in the image plane, it is joined
-by the edges' lengths and by shading, in space, and turned into the unknowns of a jet patch. What is left is for the host's linear algebra
-(:mod:`polysft_mi.normal_equations`). Everything is a gather, in a fixed order: a thread a vertex, or a pair of neighbours, adds up what its triangles and
-edges have; double precision. Kernels are recorded once and launched again without tracing. Import only after a Mitsuba variant is set.
+What images say comes as sums over the pixels of each triangle (:mod:`polysft_mi.pixels`); gathered
+at the vertices, in the image plane, it is joined by the edges' lengths and by shading, in space,
+and turned into the unknowns of a jet patch. What is left is for the host's linear algebra
+(:mod:`polysft_mi.normal_equations`). Everything is a gather, in a fixed order: a thread a vertex,
+or a pair of neighbours, adds up what its triangles and edges have; double precision. Kernels are
+recorded once and launched again without tracing. Import only after a Mitsuba variant is set.
 """
 
 from dataclasses import dataclass, fields
@@ -16,9 +19,16 @@ from .device import frozen, on_device
 from .normal_equations import Normal
 from .pixels import CORNERS, CURVATURES, FIGURES, SLOPES, packed
 
-# Silhouette pixels add to vertices in any order, which must not show: they do so in integers, in units of 2^-40 (of alpha a pixel, and its square).
+# Silhouette pixels add to vertices in any order, which must not show: they do so in integers, in
+# units of 2^-40 (of alpha a pixel, and its square).
 _UNIT, _MOST = 2.0**40, 1e4
-_PAIR = np.array([next(k for k, pair in enumerate(CORNERS) if set(pair) == {a, b}) for a in range(3) for b in range(3)])  # of corners (a, b), by 3 a + b
+_PAIR = np.array(
+    [
+        next(k for k, pair in enumerate(CORNERS) if set(pair) == {a, b})
+        for a in range(3)
+        for b in range(3)
+    ]
+)  # of corners (a, b), by 3 a + b
 _WIDTH = CURVATURES + SLOPES
 
 
@@ -26,11 +36,14 @@ _WIDTH = CURVATURES + SLOPES
 class Tables:
     """A :class:`polysft_mi.normal_equations.Pattern` on the device, UInt32 unless told otherwise.
 
-    Lists of a vertex or a pair of neighbours are the entries from ``*_start[k]`` to ``*_start[k + 1]`` of another array. The U pairs i <= j, upper half of the
-    pattern: ``i``, ``j``, and ``pair_start`` (N + 1) of those with each i. ``share``: 9 f + 3 a + b, for each pair, where it is the corners a and b of the
-    triangle f; ``curvature``: the first of their three sums, likewise. ``corner``: 3 f + a, for each vertex. ``a``, ``b``: the edges' ends; ``edge``
-    (Int32): of each pair, -1 where i = j; ``end``: 2 e, or 2 e + 1 for its second end, for each vertex. ``neighbour``: j of each vertex in the whole pattern,
-    ``half``: 2 p, or 2 p + 1 where the pair p is j <= i.
+    Lists of a vertex or a pair of neighbours are the entries from ``*_start[k]`` to ``*_start[k +
+    1]`` of another array. The U pairs i <= j, upper half of the pattern: ``i``, ``j``, and
+    ``pair_start`` (N + 1) of those with each i. ``share``: 9 f + 3 a + b, for each pair, where it
+    is the corners a and b of the triangle f; ``curvature``: the first of their three sums,
+    likewise. ``corner``: 3 f + a, for each vertex. ``a``, ``b``: the edges' ends; ``edge`` (Int32):
+    of each pair, -1 where i = j; ``end``: 2 e, or 2 e + 1 for its second end, for each vertex.
+    ``neighbour``: j of each vertex in the whole pattern, ``half``: 2 p, or 2 p + 1 where the pair p
+    is j <= i.
     """
 
     i: mi.UInt32
@@ -66,7 +79,23 @@ class Tables:
         corner_start, corner = _listed(faces.ravel(), np.arange(faces.size), count)
         end_start, end = _listed(edges.ravel(), np.arange(edges.size), count)
         pair_start = np.searchsorted(i, np.arange(count + 1))
-        arrays = i, j, pair_start, share_start, share, curvature, corner_start, corner, *edges.T, edge, end_start, end, pattern.start, pattern.column, half
+        arrays = (
+            i,
+            j,
+            pair_start,
+            share_start,
+            share,
+            curvature,
+            corner_start,
+            corner,
+            *edges.T,
+            edge,
+            end_start,
+            end,
+            pattern.start,
+            pattern.column,
+            half,
+        )
         return cls(*(on_device(x, f.type) for f, x in zip(fields(cls), arrays)))
 
 
@@ -78,8 +107,9 @@ def _listed(keys, values, count):
 
 @dataclass
 class Images:
-    """What a frame's images say at the vertices: ``gradient`` Float64 of 3N [1/m]; ``second`` Float64 of 4U: Gauss-Newton's curvature, 2 x 2, of each pair of
-    neighbours, in their projections [1/pixel^2]."""
+    """What a frame's images say at the vertices: ``gradient`` Float64 of 3N [1/m]; ``second``
+    Float64 of 4U: Gauss-Newton's curvature, 2 x 2, of each pair of neighbours, in their projections
+    [1/pixel^2]."""
 
     gradient: mi.Float64
     second: mi.Float64
@@ -103,10 +133,14 @@ def _numbers(array, index, count):
 
 
 def _projection(camera, vertices, index):
-    """Derivatives, 2 rows of 3, of vertices' projections [pixels of the video] by their positions. ``camera``: Float64 of 12, the inverse of
-    :class:`polysft_mi.pinhole.Pinhole`'s basis row by row, and its origin."""
+    """Derivatives, 2 rows of 3, of vertices' projections [pixels of the video] by their positions.
+    ``camera``: Float64 of 12, the inverse of :class:`polysft_mi.pinhole.Pinhole`'s basis row by
+    row, and its origin."""
     numbers = [dr.gather(mi.Float64, camera, k) for k in range(12)]
-    inverse, d = (mi.Vector3d(*numbers[3 * k : 3 * k + 3]) for k in range(3)), dr.gather(mi.Vector3d, vertices, index) - mi.Vector3d(*numbers[9:])
+    inverse, d = (
+        (mi.Vector3d(*numbers[3 * k : 3 * k + 3]) for k in range(3)),
+        dr.gather(mi.Vector3d, vertices, index) - mi.Vector3d(*numbers[9:]),
+    )
     x, y, z = inverse
     depth = dr.rcp(dr.dot(z, d))
     return [(row - z * (dr.dot(row, d) * depth)) * depth for row in (x, y)]
@@ -114,8 +148,14 @@ def _projection(camera, vertices, index):
 
 def _between(left, matrix, right):
     """left^T matrix right, of lists of rows: (p, q), (p, p), (p, r)."""
-    half = [[sum(row[m] * right[m][b] for m in range(len(right))) for b in range(len(right[0]))] for row in matrix]
-    return [[sum(left[k][a] * half[k][b] for k in range(len(left))) for b in range(len(right[0]))] for a in range(len(left[0]))]
+    half = [
+        [sum(row[m] * right[m][b] for m in range(len(right))) for b in range(len(right[0]))]
+        for row in matrix
+    ]
+    return [
+        [sum(left[k][a] * half[k][b] for k in range(len(left))) for b in range(len(right[0]))]
+        for a in range(len(left[0]))
+    ]
 
 
 def _rows(numbers, width):
@@ -123,16 +163,27 @@ def _rows(numbers, width):
 
 
 def at_vertices(tables, table, figures, vertices, camera, numbers, silhouette):
-    """:class:`Images` of the sums ``table`` (Float of 27F) and ``figures`` (Float of 4F) of the triangles.
+    """:class:`Images` of the sums ``table`` (Float of 27F) and ``figures`` (Float of 4F) of the
+    triangles.
 
-    ``vertices`` Float64 of 3N [m]; ``numbers`` Float64: weights of all pixels and of a mask's pixel, how many are all (0: as many as are seen), and 1
-    over the grid's stride; ``silhouette``: of each pixel there the edge's ends i and j, derivatives ci and cj, excess and share, as
+    ``vertices`` Float64 of 3N [m]; ``numbers`` Float64: weights of all pixels and of a mask's
+    pixel, how many are all (0: as many as are seen), and 1 over the grid's stride; ``silhouette``:
+    of each pixel there the edge's ends i and j, derivatives ci and cj, excess and share, as
     :func:`polysft_mi.pixels.outline` gives them, or None.
     """
     weight, mask_weight, area, scale = (dr.gather(mi.Float64, numbers, k) for k in range(4))
-    count = dr.sum(mi.Float64(dr.gather(mi.Float, figures, FIGURES * dr.arange(mi.UInt32, dr.width(figures) // FIGURES) + 1)))
+    count = dr.sum(
+        mi.Float64(
+            dr.gather(
+                mi.Float, figures, FIGURES * dr.arange(mi.UInt32, dr.width(figures) // FIGURES) + 1
+            )
+        )
+    )
     weight = weight / dr.select(area > 0, area, dr.maximum(count, 1))
-    vertex, pair = dr.arange(mi.UInt32, dr.width(vertices) // 3), dr.arange(mi.UInt32, dr.width(tables.i))
+    vertex, pair = (
+        dr.arange(mi.UInt32, dr.width(vertices) // 3),
+        dr.arange(mi.UInt32, dr.width(tables.i)),
+    )
 
     def slope(entry):
         face = entry // 3
@@ -142,28 +193,41 @@ def at_vertices(tables, table, figures, vertices, camera, numbers, silhouette):
         return [mi.Float64(dr.gather(mi.Float, table, first + k)) for k in range(3)]
 
     gradient = [weight * x for x in _add(tables.corner_start, tables.corner, slope, 3)]
-    xx, xy, yy = (weight * scale * scale * x for x in _add(tables.share_start, tables.curvature, three, 3))
+    xx, xy, yy = (
+        weight * scale * scale * x for x in _add(tables.share_start, tables.curvature, three, 3)
+    )
     second = [xx, xy, xy, yy]
     if silhouette is not None:
         pull, block = _silhouette(tables, silhouette, dr.width(vertex), dr.width(pair))
         rows = _projection(camera, vertices, vertex)
-        pull, block = (lambda k, x=x: mi.Float64(mi.Int64(dr.gather(mi.UInt64, x, k))) / _UNIT for x in (pull, block))
+        pull, block = (
+            lambda k, x=x: mi.Float64(mi.Int64(dr.gather(mi.UInt64, x, k))) / _UNIT
+            for x in (pull, block)
+        )
         pull = [2 * mask_weight * scale * pull(2 * vertex + k) for k in range(2)]
         gradient = [x + pull[0] * rows[0][k] + pull[1] * rows[1][k] for k, x in enumerate(gradient)]
-        second = [x + 2 * mask_weight * scale * scale * block(4 * pair + k) for k, x in enumerate(second)]
+        second = [
+            x + 2 * mask_weight * scale * scale * block(4 * pair + k) for k, x in enumerate(second)
+        ]
     return Images(packed(gradient, vertex), packed(second, pair))
 
 
 def _silhouette(tables, silhouette, vertices, pairs):
-    """Sums over the silhouette's pixels: of excess c at the vertices, 2N, and of share c c^T at the pairs of neighbours, 4U; both UInt64 that hold signed
-    numbers of 1 / ``_UNIT`` (unsigned ones are what every device can add up atomically)."""
+    """Sums over the silhouette's pixels: of excess c at the vertices, 2N, and of share c c^T at the
+    pairs of neighbours, 4U; both UInt64 that hold signed numbers of 1 / ``_UNIT`` (unsigned ones
+    are what every device can add up atomically)."""
     i, j, ci, cj, excess, share = silhouette
     swapped = i > j
     low, high = dr.select(swapped, j, i), dr.select(swapped, i, j)
     first, second = (mi.Vector2d(dr.select(swapped, *x)) for x in ((cj, ci), (ci, cj)))
     excess, share = mi.Float64(excess), mi.Float64(share)
     begin = dr.gather(mi.UInt32, tables.pair_start, low)
-    across = dr.while_loop((begin,), lambda k: dr.gather(mi.UInt32, tables.j, k) < high, lambda k: (k + 1,), label="pair")[0]
+    across = dr.while_loop(
+        (begin,),
+        lambda k: dr.gather(mi.UInt32, tables.j, k) < high,
+        lambda k: (k + 1,),
+        label="pair",
+    )[0]
     pull, block = dr.zeros(mi.UInt64, 2 * vertices), dr.zeros(mi.UInt64, 4 * pairs)
 
     def scatter(target, value, index):
@@ -183,8 +247,8 @@ def _silhouette(tables, silhouette, vertices, pairs):
 
 
 def _edges(tables, vertices, lengths, numbers):
-    """What lengths cost: energy of each edge without its weight, and packed, a row an edge: the pull on its first end (3), and the curvature, 6 of a symmetric
-    3 x 3, of either end."""
+    """What lengths cost: energy of each edge without its weight, and packed, a row an edge: the
+    pull on its first end (3), and the curvature, 6 of a symmetric 3 x 3, of either end."""
     stiffness, give = (dr.gather(mi.Float64, numbers, k) for k in range(2))
     a, b = (dr.gather(mi.Vector3d, vertices, k) for k in (tables.a, tables.b))
     edge = a - b
@@ -193,23 +257,47 @@ def _edges(tables, vertices, lengths, numbers):
     over = dr.square(dr.maximum(excess, 0) / (give * lengths))
     heavy = 2 * stiffness / dr.sqrt(1 + over)
     x, y, z = direction
-    columns = [heavy * excess * d for d in direction] + [heavy * d for d in (x * x, x * y, x * z, y * y, y * z, z * z)]
-    return dr.square(excess) * 2 / (1 + dr.sqrt(1 + over)), packed(columns, dr.arange(mi.UInt32, dr.width(tables.a)))
+    columns = [heavy * excess * d for d in direction] + [
+        heavy * d for d in (x * x, x * y, x * z, y * y, y * z, z * z)
+    ]
+    return dr.square(excess) * 2 / (1 + dr.sqrt(1 + over)), packed(
+        columns, dr.arange(mi.UInt32, dr.width(tables.a))
+    )
 
 
 _SYMMETRIC = (0, 1, 2, 1, 3, 4, 2, 4, 5)  # a symmetric 3 x 3, row by row, from its upper half
 
 
-def in_unknowns(tables, images, vertices, camera, lengths, numbers, by_offset, by_motion, basis, entry, size, triangles):
-    """Normal equations of the images, the edges and the triangles' residuals, in the unknowns of a jet patch.
+def in_unknowns(
+    tables,
+    images,
+    vertices,
+    camera,
+    lengths,
+    numbers,
+    by_offset,
+    by_motion,
+    basis,
+    entry,
+    size,
+    triangles,
+):
+    """Normal equations of the images, the edges and the triangles' residuals, in the unknowns of a
+    jet patch.
 
-    ``vertices`` Float64 of 3N [m]; ``lengths`` Float64 of E [m], ``numbers`` Float64: stiffness [1/m^2], give; ``by_offset`` Float64 of 9N, ``by_motion`` of
-    18N, ``basis`` of A N: of :class:`polysft_mi.normal_equations.Surface`; ``entry``: 0, 1, ... of A N, and ``size``: A, UInt32; ``triangles``: None, or
-    Float64: r h of F, h of F and derivatives of 9F, as :meth:`Assembly.normal` takes them. Returns Float64: energies of the edges without their weight (E), gradient
-    (3N) in space; by (Δu, Δv, Δw): gradient (3N), curvature (9U) of the pairs; with the motion, cross curvature (18N); and with the coefficients (3 of A N
-    each); curvature of positions and the motion (18N).
+    ``vertices`` Float64 of 3N [m]; ``lengths`` Float64 of E [m], ``numbers`` Float64: stiffness
+    [1/m^2], give; ``by_offset`` Float64 of 9N, ``by_motion`` of 18N, ``basis`` of A N: of
+    :class:`polysft_mi.normal_equations.Surface`; ``entry``: 0, 1, ... of A N, and ``size``: A,
+    UInt32; ``triangles``: None, or Float64: r h of F, h of F and derivatives of 9F, as
+    :meth:`Assembly.normal` takes them. Returns Float64: energies of the edges without their weight
+    (E), gradient (3N) in space; by (Δu, Δv, Δw): gradient (3N), curvature (9U) of the pairs; with
+    the motion, cross curvature (18N); and with the coefficients (3 of A N each); curvature of
+    positions and the motion (18N).
     """
-    vertex, pair = dr.arange(mi.UInt32, dr.width(vertices) // 3), dr.arange(mi.UInt32, dr.width(tables.i))
+    vertex, pair = (
+        dr.arange(mi.UInt32, dr.width(vertices) // 3),
+        dr.arange(mi.UInt32, dr.width(tables.i)),
+    )
     energy, edges = _edges(tables, vertices, lengths, numbers)
 
     def ends(entry):
@@ -228,14 +316,18 @@ def in_unknowns(tables, images, vertices, camera, lengths, numbers, by_offset, b
             factor = dr.gather(mi.Float64, pulls, entry // 3)
             return [factor * x for x in _numbers(by_corner, entry, 3)]
 
-        gradient = [x + y for x, y in zip(gradient, _add(tables.corner_start, tables.corner, corner, 3))]
+        gradient = [
+            x + y for x, y in zip(gradient, _add(tables.corner_start, tables.corner, corner, 3))
+        ]
 
     # curvature in the positions, of each pair of neighbours: of the images by their projections
     left, right = (_projection(camera, vertices, k) for k in (tables.i, tables.j))
     space = sum(_between(left, _rows(_numbers(images.second, pair, 4), 2), right), [])
     same = tables.i == tables.j
     own = _numbers(around, tables.i, 6)
-    other = [dr.gather(mi.Float64, edges, 9 * mi.UInt32(tables.edge) + 3 + k, ~same) for k in range(6)]
+    other = [
+        dr.gather(mi.Float64, edges, 9 * mi.UInt32(tables.edge) + 3 + k, ~same) for k in range(6)
+    ]
     space = [x + dr.select(same, own[k], -other[k]) for x, k in zip(space, _SYMMETRIC)]
     if triangles is not None:
 
@@ -243,12 +335,16 @@ def in_unknowns(tables, images, vertices, camera, lengths, numbers, by_offset, b
             face = entry // 9
             a = (entry - 9 * face) // 3
             factor = dr.gather(mi.Float64, factors, face)
-            one, two = _numbers(by_corner, 3 * face + a, 3), _numbers(by_corner, 3 * face + entry - 9 * face - 3 * a, 3)
+            one, two = (
+                _numbers(by_corner, 3 * face + a, 3),
+                _numbers(by_corner, 3 * face + entry - 9 * face - 3 * a, 3),
+            )
             return [factor * x * y for x in one for y in two]
 
         space = [x + y for x, y in zip(space, _add(tables.share_start, tables.share, share, 9))]
 
-    # each vertex moves by its own (u, v), by a height, which is its own and that of all coefficients there, and by the motion
+    # each vertex moves by its own (u, v), by a height, which is its own and that of all
+    # coefficients there, and by the motion
     left, right = (_rows(_numbers(by_offset, k, 9), 3) for k in (tables.i, tables.j))
     local = packed(sum(_between(left, _rows(space, 3), right), []), pair)
     space = packed(space, pair)
@@ -257,7 +353,9 @@ def in_unknowns(tables, images, vertices, camera, lengths, numbers, by_offset, b
     def places(entry):  # of the 3 x 3 of one of a vertex's pairs, row by row
         half = dr.gather(mi.UInt32, tables.half, entry)
         first, flipped = 9 * (half // 2), (half & 1) != 0
-        return [[first + dr.select(flipped, 3 * b + a, 3 * a + b) for b in range(3)] for a in range(3)]
+        return [
+            [first + dr.select(flipped, 3 * b + a, 3 * a + b) for b in range(3)] for a in range(3)
+        ]
 
     def motion(entry):
         m = _rows(_numbers(by_motion, dr.gather(mi.UInt32, tables.neighbour, entry), 18), 6)
@@ -266,25 +364,40 @@ def in_unknowns(tables, images, vertices, camera, lengths, numbers, by_offset, b
 
     every = dr.arange(mi.UInt32, dr.width(tables.neighbour))
     moved = _add(tables.neighbour_start, every, motion, 18)
-    by_all = [sum(own[k][a] * moved[6 * k + c] for k in range(3)) for a in range(3) for c in range(6)]
+    by_all = [
+        sum(own[k][a] * moved[6 * k + c] for k in range(3)) for a in range(3) for c in range(6)
+    ]
     along = [sum(own[k][a] * gradient[k] for k in range(3)) for a in range(3)]
 
-    row = entry // size  # an argument, in memory: this kernel's size is that of what it reads elementwise
+    row = (
+        entry // size
+    )  # an argument, in memory: this kernel's size is that of what it reads elementwise
     coefficient = entry - row * size
     begin, end = (dr.gather(mi.UInt32, tables.neighbour_start, row + k) for k in (0, 1))
 
     def lift(k, *before):
-        value = dr.gather(mi.Float64, basis, dr.gather(mi.UInt32, tables.neighbour, k) * size + coefficient)
+        value = dr.gather(
+            mi.Float64, basis, dr.gather(mi.UInt32, tables.neighbour, k) * size + coefficient
+        )
         heights = [dr.gather(mi.Float64, local, row[2]) for row in places(k)]
         return k + 1, *(x + h * value for x, h in zip(before, heights))
 
     zeros = (dr.zeros(mi.Float64, dr.width(basis)) for _ in range(3))
     lifted = dr.while_loop((begin, *zeros), lambda k, *_: k < end, lift, label="coefficients")[1:]
-    return energy, packed(gradient, vertex), packed(along, vertex), local, packed(by_all, vertex), *lifted, packed(moved, vertex)
+    return (
+        energy,
+        packed(gradient, vertex),
+        packed(along, vertex),
+        local,
+        packed(by_all, vertex),
+        *lifted,
+        packed(moved, vertex),
+    )
 
 
 class Assembly:
-    """Normal equations of frames, of a mesh with the ``pattern`` (:class:`polysft_mi.normal_equations.Pattern`), seen by a ``camera``
+    """Normal equations of frames, of a mesh with the ``pattern``
+    (:class:`polysft_mi.normal_equations.Pattern`), seen by a ``camera``
     (:class:`polysft_mi.pinhole.Pinhole`)."""
 
     def __init__(self, pattern, camera):
@@ -294,20 +407,26 @@ class Assembly:
         self._at_vertices, self._in_unknowns = frozen(at_vertices), frozen(in_unknowns)
 
     def images(self, table, figures, vertices, weight, mask_weight, area, stride, silhouette):
-        """:class:`Images` of the triangles' sums and a silhouette. Arguments as :func:`at_vertices` takes them; vertices (N, 3) [m]; ``area``: of the mask
-        [pixels of the grid], or None."""
+        """:class:`Images` of the triangles' sums and a silhouette. Arguments as :func:`at_vertices`
+        takes them; vertices (N, 3) [m]; ``area``: of the mask [pixels of the grid], or None."""
         numbers = _flat([weight, mask_weight, area or 0, 1 / stride])
-        return self._at_vertices(self.tables, table, figures, _flat(vertices), self._camera, numbers, silhouette)
+        return self._at_vertices(
+            self.tables, table, figures, _flat(vertices), self._camera, numbers, silhouette
+        )
 
     def normal(self, surface, images, lengths, stiffness, wide=None, give=np.inf, triangles=None):
-        """:class:`polysft_mi.normal_equations.Normal` of the images, the edges and further residuals of triangles, and the edges' energy.
+        """:class:`polysft_mi.normal_equations.Normal` of the images, the edges and further
+        residuals of triangles, and the edges' energy.
 
-        ``surface``: :class:`polysft_mi.normal_equations.Surface`; ``lengths`` (E,) [m]: of the template's edges; ``stiffness`` [1/m^2]: weight of the
-        squared differences to them; ``wide``: a :class:`polysft_mi.normal_equations.Pattern` that holds this one, where the relief is an unknown too (d = 3) and
-        the local block is to have that pattern; ``give``: the strain from which on a stretched edge hardly pulls harder. An excess e > 0 over the
-        length L costs 2 c^2 ((1 + e^2 / c^2)^1/2 - 1), c = give L (Charbonnier): cloth that hangs from a point is stretched there by a tenth, and by squares
-        that would turn the whole sheet. What is compressed buckles; its costs are squares. ``triangles``: residuals r (F,), factors h (F,), and
-        derivatives (F, 3, 3) [1/m] of r by the corners; half the sum of h r^2 is added.
+        ``surface``: :class:`polysft_mi.normal_equations.Surface`; ``lengths`` (E,) [m]: of the
+        template's edges; ``stiffness`` [1/m^2]: weight of the squared differences to them;
+        ``wide``: a :class:`polysft_mi.normal_equations.Pattern` that holds this one, where the
+        relief is an unknown too (d = 3) and the local block is to have that pattern; ``give``: the
+        strain from which on a stretched edge hardly pulls harder. An excess e > 0 over the length L
+        costs 2 c^2 ((1 + e^2 / c^2)^1/2 - 1), c = give L (Charbonnier): cloth that hangs from a
+        point is stretched there by a tenth, and by squares that would turn the whole sheet. What is
+        compressed buckles; its costs are squares. ``triangles``: residuals r (F,), factors h (F,),
+        and derivatives (F, 3, 3) [1/m] of r by the corners; half the sum of h r^2 is added.
         """
         pattern, count, basis = self.pattern, self.pattern.count, surface.basis
         size, d = basis.shape[1], 2 if wide is None else 3
@@ -335,8 +454,16 @@ class Assembly:
         for k in range(d):
             cross[:, k, :size] = lifted[k].reshape(-1, size)
         cross[:, :, size:] = by_motion[:, :d]
-        right = np.concatenate([basis.T @ (gradient @ surface.up), np.einsum("nk,nkm->m", gradient, surface.by_motion)])
-        normal = Normal(blocks, cross.reshape(-1, size + 6), glob, np.ascontiguousarray(along.reshape(-1, 3)[:, :d]), right)
+        right = np.concatenate(
+            [basis.T @ (gradient @ surface.up), np.einsum("nk,nkm->m", gradient, surface.by_motion)]
+        )
+        normal = Normal(
+            blocks,
+            cross.reshape(-1, size + 6),
+            glob,
+            np.ascontiguousarray(along.reshape(-1, 3)[:, :d]),
+            right,
+        )
         return normal, stiffness * float(energy.sum())
 
     def _places(self, wide):

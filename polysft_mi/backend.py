@@ -1,9 +1,11 @@
 """What Mitsuba computes on: the variant, and the LLVM library that the CPU variants need.
 
-Dr.Jit compiles its CPU kernels with a libLLVM that it loads at run time, and takes the first one that it finds. LLVM 14 is refused, and
-LLVM 15 and 16 end the process in the middle of a render, past any ``try`` (x86-64: "Cannot select: fminimum"); so the library is chosen
-here, before Dr.Jit starts. Command lines, tests and library users all call :func:`set_variant`. Importing this module has no side effect
-and needs the standard library alone; ``python -m polysft_mi.backend`` prints the library that would be used.
+Dr.Jit compiles its CPU kernels with a libLLVM that it loads at run time, and takes the first one
+that it finds. LLVM 14 is refused, and LLVM 15 and 16 end the process in the middle of a render,
+past any ``try`` (x86-64: "Cannot select: fminimum"); so the library is chosen here, before Dr.Jit
+starts. Command lines, tests and library users all call :func:`set_variant`. Importing this module
+has no side effect and needs the standard library alone; ``python -m polysft_mi.backend`` prints the
+library that would be used.
 """
 
 import ctypes
@@ -21,9 +23,11 @@ from .errors import InputError, cli
 OLDEST_LLVM = 16  # the first that tells its version; an older one is not tried
 PROVEN_LLVM = (19, 22)  # what the tests passed with; any other is tried before it is used
 VARIABLE = "DRJIT_LIBLLVM_PATH"  # Dr.Jit's own
-SUFFIX = "_ad_rgb"  # what the code needs of a variant: Dr.Jit arrays with derivatives, three colour channels
+# what the code needs of a variant: Dr.Jit arrays with derivatives, three colour channels
+SUFFIX = "_ad_rgb"
 
-# libLLVM-15.so.1, libLLVM-14.0.6.so.1, libLLVM.so.19.1, libLLVM.so, libLLVM.dylib; not libLLVM-C.so (a part of the interface alone)
+# libLLVM-15.so.1, libLLVM-14.0.6.so.1, libLLVM.so.19.1, libLLVM.so, libLLVM.dylib; not libLLVM-C.so
+# (a part of the interface alone)
 _NAME = re.compile(r"libLLVM(?:-(?P<before>\d[\d.]*))?\.(?:so|dylib)(?:\.(?P<after>\d[\d.]*))?")
 
 # Where packages of Linux distributions, FreeBSD and Homebrew put it
@@ -40,8 +44,8 @@ _FOLDERS = (
     "/opt/homebrew/opt/llvm*/lib",
 )
 
-# In a process of its own: loading two LLVMs into one process, or one whose own libraries are missing, can end it.
-# LLVMGetVersion exists from LLVM 16 on, so a library without it is too old.
+# In a process of its own: loading two LLVMs into one process, or one whose own libraries are
+# missing, can end it. LLVMGetVersion exists from LLVM 16 on, so a library without it is too old.
 _ASK_VERSION = """
 import ctypes, sys
 numbers = [ctypes.c_uint() for _ in range(3)]
@@ -49,7 +53,8 @@ ctypes.CDLL(sys.argv[1]).LLVMGetVersion(*[ctypes.byref(number) for number in num
 print(*[number.value for number in numbers])
 """
 
-# One ray against one rectangle, a derivative, and the instruction that LLVM 15 and 16 lack: needs a driver, a device, the compiler, and (on a GPU) OptiX
+# One ray against one rectangle, a derivative, and the instruction that LLVM 15 and 16 lack: needs a
+# driver, a device, the compiler, and (on a GPU) OptiX
 _TRY_VARIANT = """
 import sys
 import mitsuba as mi
@@ -68,12 +73,14 @@ print(list(area) == [4, 8] and list(dr.grad(distance)) == [4, 0])
 def find_libllvm(folders=None):
     """The newest libLLVM that Dr.Jit can use.
 
-    ``DRJIT_LIBLLVM_PATH`` goes before everything, and must then hold; else the files of ``folders`` (by default: the environment's, the
-    system's usual ones, and what ``ldconfig`` knows) are each asked for their version. One that is not in ``PROVEN_LLVM`` must compile and
-    run a kernel first. Asking and trying happen in processes of their own.
+    ``DRJIT_LIBLLVM_PATH`` goes before everything, and must then hold; else the files of ``folders``
+    (by default: the environment's, the system's usual ones, and what ``ldconfig`` knows) are each
+    asked for their version. One that is not in ``PROVEN_LLVM`` must compile and run a kernel first.
+    Asking and trying happen in processes of their own.
 
-    Returns (path, version): the file's real path, and its version as a tuple of three ints.
-    Raises :class:`InputError` where ``DRJIT_LIBLLVM_PATH`` names what cannot be used, or where nothing is found.
+    Returns (path, version): the file's real path, and its version as a tuple of three ints. Raises
+    :class:`InputError` where ``DRJIT_LIBLLVM_PATH`` names what cannot be used, or where nothing is
+    found.
     """
     chosen = os.environ.get(VARIABLE)
     if chosen:
@@ -91,20 +98,21 @@ def find_libllvm(folders=None):
         unusable.add(versions[path][0])
     found = f" (only LLVM {', '.join(str(v) for v in sorted(unusable))})" if unusable else ""
     raise InputError(
-        f"no usable LLVM found{found}, which rendering on the CPU needs: install one "
-        f"(Debian, Ubuntu: apt-get install libllvm19; Fedora: dnf install llvm-libs; macOS: brew install llvm), or set {VARIABLE} to the file of its libLLVM"
+        f"no usable LLVM found{found}, which rendering on the CPU needs: install one (Debian,"
+        " Ubuntu: apt-get install libllvm19; Fedora: dnf install llvm-libs; macOS: brew install"
+        f" llvm), or set {VARIABLE} to the file of its libLLVM"
     )
 
 
 def set_variant(mode=None):
-    """Set Mitsuba's variant; a second call with the same mode does nothing. Best called before ``import mitsuba``, which makes Dr.Jit
-    choose an LLVM.
+    """Set Mitsuba's variant; a second call with the same mode does nothing. Best called before
+    ``import mitsuba``, which makes Dr.Jit choose an LLVM.
 
-    ``mode``: a variant that ends in ``_ad_rgb``. None takes one that is already set and fits, else ``cuda_ad_rgb`` where a GPU
-    really works, else ``llvm_ad_rgb``.
+    ``mode``: a variant that ends in ``_ad_rgb``. None takes one that is already set and fits, else
+    ``cuda_ad_rgb`` where a GPU really works, else ``llvm_ad_rgb``.
 
-    Returns the variant's name. Raises :class:`InputError` where the mode is unknown or does not fit, a GPU is asked for and none works, or
-    LLVM is missing.
+    Returns the variant's name. Raises :class:`InputError` where the mode is unknown or does not
+    fit, a GPU is asked for and none works, or LLVM is missing.
     """
     mitsuba = sys.modules.get("mitsuba")
     current = mitsuba and mitsuba.variant()
@@ -124,55 +132,86 @@ def set_variant(mode=None):
     if mode not in known:
         raise InputError(f"mode {mode!r}: one of {', '.join(known)} is needed")
     if mode.startswith("cuda") and not gpu_works():
-        raise InputError(f"mode {mode!r}: no working GPU (NVIDIA, with its driver and OptiX) was found; leave the mode out, or give llvm_ad_rgb")
+        raise InputError(
+            f"mode {mode!r}: no working GPU (NVIDIA, with its driver and OptiX) was found; leave"
+            " the mode out, or give llvm_ad_rgb"
+        )
     try:
         mi.set_variant(mode)
     except ImportError as error:
-        raise InputError(f"mode {mode!r} cannot be used here: {' '.join(str(error).split())}") from None
+        raise InputError(
+            f"mode {mode!r} cannot be used here: {' '.join(str(error).split())}"
+        ) from None
     if mode.startswith("llvm"):
         import drjit as dr
 
         running = dr.detail.llvm_version()
-        if running != version and running[0] not in PROVEN_LLVM:  # Mitsuba or Dr.Jit was imported before
+        if (
+            running != version and running[0] not in PROVEN_LLVM
+        ):  # Mitsuba or Dr.Jit was imported before
             raise InputError(
-                f"Dr.Jit already runs on LLVM {running[0]}: call polysft_mi.backend.set_variant before importing mitsuba or drjit, or set {VARIABLE}"
+                f"Dr.Jit already runs on LLVM {running[0]}: call polysft_mi.backend.set_variant"
+                f" before importing mitsuba or drjit, or set {VARIABLE}"
             )
     return mode
 
 
 @functools.cache
 def gpu_works():
-    """Whether ``cuda_ad_rgb`` computes and traces rays here; costs nothing on a machine without an NVIDIA driver."""
+    """Whether ``cuda_ad_rgb`` computes and traces rays here; costs nothing on a machine without an
+    NVIDIA driver.
+    """
     return _driver_sees_device() and variant_works("cuda_ad_rgb")
 
 
 def variant_works(mode, library=None, timeout=120.0):
-    """Whether a variant traces a ray and takes a derivative, in a process of its own so that a broken driver or compiler cannot end this
-    one.
+    """Whether a variant traces a ray and takes a derivative, in a process of its own so that a
+    broken driver or compiler cannot end this one.
 
-    ``library``: the libLLVM to do it with (default: what Dr.Jit takes). ``timeout``: seconds after which it counts as not working.
+    ``library``: the libLLVM to do it with (default: what Dr.Jit takes). ``timeout``: seconds after
+    which it counts as not working.
     """
     with tempfile.TemporaryDirectory() as empty:
         # Dr.Jit's cache on the disk would answer with kernels that another LLVM compiled
-        environment = {**os.environ, VARIABLE: library, "DRJIT_CACHE_DIR": empty} if library else None
+        environment = (
+            {**os.environ, VARIABLE: library, "DRJIT_CACHE_DIR": empty} if library else None
+        )
         code = [sys.executable, "-c", _TRY_VARIANT, mode]
         try:
-            tried = subprocess.run(code, env=environment, capture_output=True, text=True, timeout=timeout, stdin=subprocess.DEVNULL)
+            tried = subprocess.run(
+                code,
+                env=environment,
+                capture_output=True,
+                text=True,
+                timeout=timeout,
+                stdin=subprocess.DEVNULL,
+            )
         except (OSError, subprocess.TimeoutExpired):
             return False
     return tried.returncode == 0 and tried.stdout.split()[-1:] == ["True"]
 
 
 def add_mode_argument(parser):
-    """Give an ``argparse`` parser ``-m`` / ``--mode`` as Mitsuba's own command line has it; its value is for :func:`set_variant`."""
-    parser.add_argument("-m", "--mode", metavar="VARIANT", help="Mitsuba variant (default: cuda_ad_rgb where a GPU works, else llvm_ad_rgb)")
+    """Give an ``argparse`` parser ``-m`` / ``--mode`` as Mitsuba's own command line has it; its
+    value is for :func:`set_variant`.
+    """
+    parser.add_argument(
+        "-m",
+        "--mode",
+        metavar="VARIANT",
+        help="Mitsuba variant (default: cuda_ad_rgb where a GPU works, else llvm_ad_rgb)",
+    )
 
 
 def _driver_sees_device():
     try:
         driver = ctypes.CDLL("libcuda.so.1")
         count = ctypes.c_int()
-        return driver.cuInit(0) == 0 and driver.cuDeviceGetCount(ctypes.byref(count)) == 0 and count.value > 0
+        return (
+            driver.cuInit(0) == 0
+            and driver.cuDeviceGetCount(ctypes.byref(count)) == 0
+            and count.value > 0
+        )
     except (OSError, AttributeError):
         return False
 
@@ -183,14 +222,20 @@ def _check_chosen(path):
         raise InputError(f"{VARIABLE}={path}: no such file; {accepted}")
     version = _version(path)
     if version is None:
-        raise InputError(f"{VARIABLE}={path}: cannot be loaded as an LLVM {OLDEST_LLVM} or newer; {accepted}")
+        raise InputError(
+            f"{VARIABLE}={path}: cannot be loaded as an LLVM {OLDEST_LLVM} or newer; {accepted}"
+        )
     if not _usable(path, version):
-        raise InputError(f"{VARIABLE}={path}: is LLVM {version[0]}, which Dr.Jit cannot use here; {accepted}")
+        raise InputError(
+            f"{VARIABLE}={path}: is LLVM {version[0]}, which Dr.Jit cannot use here; {accepted}"
+        )
     return version
 
 
 def _usable(path, version):
-    return version[0] >= OLDEST_LLVM and (version[0] in PROVEN_LLVM or variant_works("llvm_ad_rgb", library=path))
+    return version[0] >= OLDEST_LLVM and (
+        version[0] in PROVEN_LLVM or variant_works("llvm_ad_rgb", library=path)
+    )
 
 
 def _search_folders():
@@ -199,10 +244,18 @@ def _search_folders():
     folders += [folder for folder in os.environ.get("LD_LIBRARY_PATH", "").split(":") if folder]
     for pattern in _FOLDERS:
         folders += sorted(glob.glob(pattern))
-    ldconfig = shutil.which("ldconfig", path=os.pathsep.join([os.environ.get("PATH", ""), "/sbin", "/usr/sbin"]))
+    ldconfig = shutil.which(
+        "ldconfig", path=os.pathsep.join([os.environ.get("PATH", ""), "/sbin", "/usr/sbin"])
+    )
     if ldconfig and sys.platform.startswith("linux"):
-        listed = subprocess.run([ldconfig, "-p"], capture_output=True, text=True, stdin=subprocess.DEVNULL).stdout
-        folders += [os.path.dirname(line.rpartition("=> ")[2]) for line in listed.splitlines() if "libLLVM" in line and "=> " in line]
+        listed = subprocess.run(
+            [ldconfig, "-p"], capture_output=True, text=True, stdin=subprocess.DEVNULL
+        ).stdout
+        folders += [
+            os.path.dirname(line.rpartition("=> ")[2])
+            for line in listed.splitlines()
+            if "libLLVM" in line and "=> " in line
+        ]
     return folders
 
 
@@ -217,26 +270,34 @@ def _libraries(folders):
 
 
 def _named_version(path):
-    """The version that a file's name tells, as a tuple of ints, or None: libLLVM-14.0.6.so.1 is (14, 0, 6), libLLVM.so.19.1 is (19, 1)."""
+    """The version that a file's name tells, as a tuple of ints, or None: libLLVM-14.0.6.so.1 is
+    (14, 0, 6), libLLVM.so.19.1 is (19, 1).
+    """
     name = _NAME.fullmatch(os.path.basename(os.path.realpath(path)))
     text = name and (name["before"] or name["after"])
     return tuple(int(part) for part in text.split(".") if part) if text else None
 
 
 def _version(path):
-    """A library's version as a tuple of ints, told by its name if that is too old to be loaded, else by itself; None where it does not
-    load or does not tell.
+    """A library's version as a tuple of ints, told by its name if that is too old to be loaded,
+    else by itself; None where it does not load or does not tell.
     """
     named = _named_version(path)
     if named and named[0] < OLDEST_LLVM:
         return named
     code = [sys.executable, "-I", "-S", "-c", _ASK_VERSION, path]
     try:
-        asked = subprocess.run(code, capture_output=True, text=True, timeout=60, stdin=subprocess.DEVNULL)
+        asked = subprocess.run(
+            code, capture_output=True, text=True, timeout=60, stdin=subprocess.DEVNULL
+        )
     except (OSError, subprocess.TimeoutExpired):
         return None
     numbers = asked.stdout.split()
-    return tuple(int(number) for number in numbers) if asked.returncode == 0 and len(numbers) == 3 else None
+    return (
+        tuple(int(number) for number in numbers)
+        if asked.returncode == 0 and len(numbers) == 3
+        else None
+    )
 
 
 def main():

@@ -1,4 +1,5 @@
-"""Where torch and Dr.Jit meet: PolyFit sets up the Dr.Jit template, and gradients cross both ways (``dr.wrap``).
+"""Where torch and Dr.Jit meet: PolyFit sets up the Dr.Jit template, and gradients cross both ways
+(``dr.wrap``).
 
     torch   points -> PolyFit -> alpha, O -> vertices -> loss
                                                   \\-> :func:`rendering` -> image -> loss          a rendering loss reaches PolyFit's
@@ -21,39 +22,52 @@ from .template import Template
 
 
 def template(polyfit, vertices, faces, uv, **options):
-    """The :class:`polysft_mi.template.Template` of the mesh in the frame, and of the order, of ``polyfit`` (:class:`polyfit.PolyFit`).
+    """The :class:`polysft_mi.template.Template` of the mesh in the frame, and of the order, of
+    ``polyfit`` (:class:`polyfit.PolyFit`).
 
-    ``vertices`` (N, 3) [m], ``faces`` (F, 3), ``uv`` (N, 2); ``options`` and errors are those of ``Template.fit``.
+    ``vertices`` (N, 3) [m], ``faces`` (F, 3), ``uv`` (N, 2); ``options`` and errors are those of
+    ``Template.fit``.
     """
     points = torch.as_tensor(np.asarray(vertices))
     with torch.no_grad():
         frame = polyfit(points[None].float()).frame[0]
     frame = frame.to(torch.float64)
     left, _, right = torch.linalg.svd(frame.R)  # a rotation to the last digit again
-    return Template.fit(vertices, faces, uv, polyfit.order, frame=type(frame)(frame.s, left @ right, frame.T), **options)
+    return Template.fit(
+        vertices,
+        faces,
+        uv,
+        polyfit.order,
+        frame=type(frame)(frame.s, left @ right, frame.T),
+        **options,
+    )
 
 
 def surface(polyfit, points):
-    """The points (..., P, 3) [m] of patches, put onto the patches' jets along the frames' z; differentiable to the weights of
-    ``polyfit``."""
+    """The points (..., P, 3) [m] of patches, put onto the patches' jets along the frames' z;
+    differentiable to the weights of ``polyfit``."""
     found = polyfit(points)
     chart = found.frame.to_chart(points)
     return found.frame.from_chart(jets.point(found.jet.alpha, chart[..., :2]))
 
 
 def in_drjit(function):
-    """A Dr.Jit ``function`` as a torch function: of tensors, on tensors, torch's autograd runs through it."""
+    """A Dr.Jit ``function`` as a torch function: of tensors, on tensors, torch's autograd runs
+    through it.
+    """
     return dr.wrap(source="torch", target="drjit")(function)
 
 
 def in_torch(function):
-    """A torch ``function`` as a Dr.Jit function: of Dr.Jit tensors and arrays, Dr.Jit's AD runs through it."""
+    """A torch ``function`` as a Dr.Jit function: of Dr.Jit tensors and arrays, Dr.Jit's AD runs
+    through it.
+    """
     return dr.wrap(source="drjit", target="torch")(function)
 
 
 def rendering(problem, seed=0):
-    """The rendering of a :class:`polysft_mi.problem.Problem` as a torch function: vertices (N, 3) [m, camera frame] -> (rgb (H, W, 3)
-    linear, alpha (H, W))."""
+    """The rendering of a :class:`polysft_mi.problem.Problem` as a torch function: vertices (N, 3)
+    [m, camera frame] -> (rgb (H, W, 3) linear, alpha (H, W))."""
 
     @in_drjit
     def render(vertices):
@@ -64,8 +78,9 @@ def rendering(problem, seed=0):
 
 
 def deformed(patch):
-    """The surface of a :class:`polysft_mi.patch.JetPatch` as a torch function of the unknowns: delta_alpha (A,), delta_u, delta_v,
-    delta_w (N,), rotation (4,), translation (3,) -> vertices (N, 3) [m, camera frame]."""
+    """The surface of a :class:`polysft_mi.patch.JetPatch` as a torch function of the unknowns:
+    delta_alpha (A,), delta_u, delta_v, delta_w (N,), rotation (4,), translation (3,) -> vertices
+    (N, 3) [m, camera frame]."""
 
     @in_drjit
     def vertices(*unknowns):

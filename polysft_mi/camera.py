@@ -11,10 +11,11 @@ from .errors import InputError
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """A pinhole camera in its own frame (OpenCV: x right, y down, z forward, origin at the centre of projection).
+    """A pinhole camera in its own frame (OpenCV: x right, y down, z forward, origin at the centre
+    of projection).
 
-    A point (X, Y, Z) is seen at pixel ``(fx X/Z + cx, fy Y/Z + cy)``; the centre of the first pixel is (0.5, 0.5).
-    All values are in pixels.
+    A point (X, Y, Z) is seen at pixel ``(fx X/Z + cx, fy Y/Z + cy)``; the centre of the first pixel
+    is (0.5, 0.5). All values are in pixels.
     """
 
     fx: float
@@ -27,9 +28,14 @@ class Intrinsics:
     def __post_init__(self):
         values = (self.fx, self.fy, self.cx, self.cy)
         if not all(math.isfinite(v) for v in values) or min(self.fx, self.fy) <= 0:
-            raise InputError(f"camera: (fx, fy, cx, cy) = {values} is not a pinhole; finite values and positive focal lengths are needed")
+            raise InputError(
+                f"camera: (fx, fy, cx, cy) = {values} is not a pinhole; finite values and positive"
+                " focal lengths are needed"
+            )
         if self.width < 1 or self.height < 1:
-            raise InputError(f"camera: image size {self.width}x{self.height}; both must be positive")
+            raise InputError(
+                f"camera: image size {self.width}x{self.height}; both must be positive"
+            )
 
     def matrix(self):
         """K, shape (3, 3)."""
@@ -45,11 +51,19 @@ class Intrinsics:
         """From K (3, 3). Raises InputError where K is not that of a pinhole without skew."""
         K = np.asarray(K, dtype=np.float64)
         if K.shape != (3, 3) or not np.isfinite(K).all():
-            raise InputError(f"{where}: K has shape {K.shape} or values that are not finite; a finite 3x3 matrix is needed")
+            raise InputError(
+                f"{where}: K has shape {K.shape} or values that are not finite; a finite 3x3 matrix"
+                " is needed"
+            )
         if np.abs(K[[1, 2, 2], [0, 0, 1]]).max() > 1e-9 or abs(K[2, 2] - 1) > 1e-9:
-            raise InputError(f"{where}: K = {K.tolist()} is not a pinhole; it must read [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
+            raise InputError(
+                f"{where}: K = {K.tolist()} is not a pinhole; it must read [[fx, 0, cx], [0, fy,"
+                " cy], [0, 0, 1]]"
+            )
         if abs(K[0, 1]) > 1e-6 * abs(K[0, 0]):
-            raise InputError(f"{where}: K has skew {K[0, 1]:g}; only a pinhole without skew is supported")
+            raise InputError(
+                f"{where}: K has skew {K[0, 1]:g}; only a pinhole without skew is supported"
+            )
         return cls(K[0, 0], K[1, 1], K[0, 2], K[1, 2], int(width), int(height))
 
     @classmethod
@@ -59,20 +73,30 @@ class Intrinsics:
             with open(path, encoding="utf-8") as file:
                 data = json.load(file)
         except FileNotFoundError:
-            raise InputError(f"{path}: no such file; a camera file holds fx, fy, cx, cy, width, height in pixels") from None
+            raise InputError(
+                f"{path}: no such file; a camera file holds fx, fy, cx, cy, width, height in pixels"
+            ) from None
         except (json.JSONDecodeError, UnicodeDecodeError) as error:
             raise InputError(f"{path}: not JSON ({error})") from None
         try:
-            return cls(*(float(data[k]) for k in ("fx", "fy", "cx", "cy")), int(data["width"]), int(data["height"]))
+            return cls(
+                *(float(data[k]) for k in ("fx", "fy", "cx", "cy")),
+                int(data["width"]),
+                int(data["height"]),
+            )
         except (KeyError, TypeError, ValueError) as error:
             if isinstance(error, InputError):
                 raise InputError(f"{path}: {error}") from None
-            raise InputError(f"{path}: {error} missing or not a number; fx, fy, cx, cy, width, height are needed") from None
+            raise InputError(
+                f"{path}: {error} missing or not a number; fx, fy, cx, cy, width, height are needed"
+            ) from None
 
     def sensor_xml(self, indent="    "):
-        """The ``<sensor>`` element: Mitsuba's ``perspective`` where the pixels are square, else our ``pinhole``.
+        """The ``<sensor>`` element: Mitsuba's ``perspective`` where the pixels are square, else our
+        ``pinhole``.
 
-        Only ``perspective`` is accepted by path replay with moving silhouettes (``prb_projective``).
+        Only ``perspective`` is accepted by path replay with moving silhouettes
+        (``prb_projective``).
         """
         if math.isclose(self.fx, self.fy, rel_tol=1e-6):
             fov = math.degrees(2 * math.atan(self.width / (2 * self.fx)))
@@ -80,13 +104,20 @@ class Intrinsics:
                 '<sensor type="perspective">',
                 f'    <float name="fov" value="{fov:.12g}"/>',
                 '    <string name="fov_axis" value="x"/>',
-                f'    <float name="principal_point_offset_x" value="{0.5 - self.cx / self.width:.12g}"/>',
-                f'    <float name="principal_point_offset_y" value="{0.5 - self.cy / self.height:.12g}"/>',
+                (
+                    '    <float name="principal_point_offset_x"'
+                    f' value="{0.5 - self.cx / self.width:.12g}"/>'
+                ),
+                (
+                    '    <float name="principal_point_offset_y"'
+                    f' value="{0.5 - self.cy / self.height:.12g}"/>'
+                ),
                 '    <float name="near_clip" value="0.001"/>',
             ]
         else:
             lens = ['<sensor type="pinhole">'] + [
-                f'    <float name="{k}" value="{getattr(self, k):.12g}"/>' for k in ("fx", "fy", "cx", "cy")
+                f'    <float name="{k}" value="{getattr(self, k):.12g}"/>'
+                for k in ("fx", "fy", "cx", "cy")
             ]
         lines = lens + [
             '    <transform name="to_world">',

@@ -25,9 +25,14 @@ class Parser(argparse.ArgumentParser):
 
 
 def parser(name, description, examples):
-    """The parser of the command ``name``, called as the user called it; ``examples`` are pairs of its arguments and what they do."""
+    """The parser of the command ``name``, called as the user called it; ``examples`` are pairs of
+    its arguments and what they do.
+    """
     prog = sys.argv[0] if sys.argv[0] == f"polysft {name}" else f"python -m polysft_mi.{name}"
     lines = [f"  {prog} {arguments}\n      {what}" for arguments, what in examples]
     return Parser(
-        prog=prog, description=description, epilog="examples:\n" + "\n".join(lines), formatter_class=argparse.RawDescriptionHelpFormatter
+        prog=prog,
+        description=description,
+        epilog="examples:\n" + "\n".join(lines),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )

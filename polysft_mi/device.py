@@ -1,4 +1,6 @@
-"""Arrays and functions on the device that Dr.Jit computes on. Import only after a Mitsuba variant is set."""
+"""Arrays and functions on the device that Dr.Jit computes on. Import only after a Mitsuba variant
+is set.
+"""
 
 import contextlib
 import functools
@@ -8,23 +10,34 @@ import drjit as dr
 import numpy as np
 
 _ALIGNED = 64  # bytes: what kernels take for granted of memory, or are recorded again for
-_NUMPY = {dr.VarType.Float32: np.float32, dr.VarType.Float64: np.float64, dr.VarType.UInt32: np.uint32, dr.VarType.Int32: np.int32}
-_WARN_AFTER = 64  # recordings of one function: with and without shading, and where arrays happen to be of one size
+_NUMPY = {
+    dr.VarType.Float32: np.float32,
+    dr.VarType.Float64: np.float64,
+    dr.VarType.UInt32: np.uint32,
+    dr.VarType.Int32: np.int32,
+}
+# recordings of one function: with and without shading, and where arrays happen to be of one size
+_WARN_AFTER = 64
 
 
 def frozen(function):
-    """A function of Dr.Jit arrays, whose kernels are recorded once for each kind of arguments and launched again without tracing.
+    """A function of Dr.Jit arrays, whose kernels are recorded once for each kind of arguments and
+    launched again without tracing.
 
-    A replayed kernel has the size of the largest array that it reads elementwise; one that only gathers from arrays, and arrays that are made to be
-    scattered to, keep the size that was recorded. So where the sizes of arguments change, every kernel whose size follows them must read one of that size
-    elementwise, and nothing of such a size may be made inside, or it is written beyond its end.
+    A replayed kernel has the size of the largest array that it reads elementwise; one that only
+    gathers from arrays, and arrays that are made to be scattered to, keep the size that was
+    recorded. So where the sizes of arguments change, every kernel whose size follows them must read
+    one of that size elementwise, and nothing of such a size may be made inside, or it is written
+    beyond its end.
     """
     recorded = dr.freeze(function, warn_after=_WARN_AFTER)
 
     @functools.wraps(function)
     def call(*arguments):
         collecting = gc.isenabled()
-        gc.disable()  # arrays of others that are freed in the middle of a recording would be part of it, and the process would abort
+        # arrays of others that are freed in the middle of a recording would be part of it, and the
+        # process would abort
+        gc.disable()
         try:
             return recorded(*arguments)
         finally:
@@ -37,7 +50,9 @@ def frozen(function):
 
 @contextlib.contextmanager
 def interruptible():
-    """Ctrl-C in the middle of a loop or a recording, which Dr.Jit makes a RuntimeError, is KeyboardInterrupt again."""
+    """Ctrl-C in the middle of a loop or a recording, which Dr.Jit makes a RuntimeError, is
+    KeyboardInterrupt again.
+    """
     try:
         yield
     except RuntimeError as error:

@@ -1,7 +1,8 @@
 """A run's pictures, drawn while the tracker works on.
 
-A track leaves a second processor idle for the most part, and pictures need nothing of it but the surfaces. So a process of its own opens the
-scene once more and draws each frame as soon as it is solved (:class:`polysft_mi.pictures.Album`).
+A track leaves a second processor idle for the most part, and pictures need nothing of it but the
+surfaces. So a process of its own opens the scene once more and draws each frame as soon as it is
+solved (:class:`polysft_mi.pictures.Album`).
 """
 
 import multiprocessing
@@ -21,8 +22,8 @@ _album = None  # of the drawing process
 
 
 def _draw_in_background(variant, scene, overrides, template, sequence, album, calls):
-    """In the drawing process: make the album (by these arguments) where there is none yet, and call these of its methods. Returns what the
-    last one does.
+    """In the drawing process: make the album (by these arguments) where there is none yet, and call
+    these of its methods. Returns what the last one does.
     """
     global _album
     if _album is None:
@@ -55,10 +56,12 @@ def _end_with_parent(folder):
 
 
 class Drawing:
-    """The pictures of ``problem``'s run in the folder ``out``: hand over each frame when it is solved, and :meth:`finish`.
+    """The pictures of ``problem``'s run in the folder ``out``: hand over each frame when it is
+    solved, and :meth:`finish`.
 
-    ``overrides``: of the scene's defaults; ``exr_frames``: how many comparison EXRs at most; ``about``: for their headers. Runs of a few
-    frames are drawn here, at the end, as is everything where the drawing process fails.
+    ``overrides``: of the scene's defaults; ``exr_frames``: how many comparison EXRs at most;
+    ``about``: for their headers. Runs of a few frames are drawn here, at the end, as is everything
+    where the drawing process fails.
     """
 
     def __init__(self, problem, overrides, out, *, exr_frames, about):
@@ -71,7 +74,14 @@ class Drawing:
         if len(problem.sequence.indices) >= _WORTH:
             import mitsuba as mi
 
-            self._first = mi.variant(), problem.experiment.path, overrides, problem.template, problem.sequence, self._album
+            self._first = (
+                mi.variant(),
+                problem.experiment.path,
+                overrides,
+                problem.template,
+                problem.sequence,
+                self._album,
+            )
             self._pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"))
             self._submit()  # starts the process
 
@@ -81,9 +91,13 @@ class Drawing:
         return set(chosen(count, self.exr_frames))
 
     def _submit(self, *calls):
-        """Have the album's methods called: the future of the last one, None where the process is gone, which :meth:`finish` minds."""
+        """Have the album's methods called: the future of the last one, None where the process is
+        gone, which :meth:`finish` minds.
+        """
         alone = threading.current_thread() is threading.main_thread()
-        kept = signal.signal(signal.SIGINT, signal.SIG_IGN) if alone else None  # Ctrl-C is for the tracker; the process inherits this
+        kept = (
+            signal.signal(signal.SIGINT, signal.SIG_IGN) if alone else None
+        )  # Ctrl-C is for the tracker; the process inherits this
         try:
             return self._pool.submit(_draw_in_background, *self._first, calls)
         except RuntimeError:  # the pool is broken
@@ -93,7 +107,9 @@ class Drawing:
                 signal.signal(signal.SIGINT, kept)
 
     def frame(self, k, vertices):
-        """The surface of frame ``k`` has ``vertices`` (N, 3) [m, world]; later calls replace earlier ones."""
+        """The surface of frame ``k`` has ``vertices`` (N, 3) [m, world]; later calls replace
+        earlier ones.
+        """
         if self._pool is not None:
             self._give(k, vertices)
 
@@ -105,10 +121,12 @@ class Drawing:
         return "draw", k, vertices, self.problem.texcoords, k in self._exr
 
     def finish(self, vertices, surfaces, fps):
-        """Have the rest drawn, all bound, and plots made: what :meth:`polysft_mi.pictures.Album.finish`, ``bind`` and ``plot`` return, each as a
-        function to call for it, in this order.
+        """Have the rest drawn, all bound, and plots made: what
+        :meth:`polysft_mi.pictures.Album.finish`, ``bind`` and ``plot`` return, each as a function
+        to call for it, in this order.
 
-        ``vertices``, ``surfaces`` (T, N, 3) [m]: of all frames, in the world and in the camera frame.
+        ``vertices``, ``surfaces`` (T, N, 3) [m]: of all frames, in the world and in the camera
+        frame.
         """
         self._exr = self._chosen(len(vertices))
         last = ("finish", surfaces), ("bind", len(surfaces), fps), ("plot",)
@@ -118,6 +136,7 @@ class Drawing:
                 if not np.array_equal(before, v) or (k in self._exr and not exr):
                     self._give(k, v)
             jobs = [self._submit(call) for call in last]
+
         def result(k):
             if self._pool is not None and self._here is None:
                 try:
@@ -126,7 +145,9 @@ class Drawing:
                     pass
             if self._here is None:
                 if self._pool is not None:
-                    self._pool.shutdown(cancel_futures=True)  # and wait for it: two must not write the same files
+                    self._pool.shutdown(
+                        cancel_futures=True
+                    )  # and wait for it: two must not write the same files
                 self._draw_here(vertices)
                 if k > 0:
                     self._here.finish(surfaces)
@@ -161,8 +182,10 @@ class Drawing:
 
     def __exit__(self, kind, error, trace):
         if self._pool is not None:
-            # not waited for, its end and that of the interpreter could meet (Python 3.11 then prints an OSError), or it would miss its folder
+            # not waited for, its end and that of the interpreter could meet (Python 3.11 then
+            # prints an OSError), or it would miss its folder
             self._pool.shutdown(cancel_futures=True)
         if self._here is not None:
-            self._here.close()  # its threads may still be at work where an error or Ctrl-C ended the rest
+            # its threads may still be at work where an error or Ctrl-C ended the rest
+            self._here.close()
         self._folder.cleanup()

@@ -1,4 +1,6 @@
-"""The exception for a user's mistake, and how a command line ends on it: those of :mod:`polyfit.errors`, by the same names."""
+"""The exception for a user's mistake, and how a command line ends on it: those of
+:mod:`polyfit.errors`, by the same names.
+"""
 
 from polyfit.errors import InputError, cli
 

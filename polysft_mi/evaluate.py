@@ -1,7 +1,9 @@
-"""``python -m polysft_mi.evaluate OUT TRUTH``: the figures of a run against ground truth, as a table or as JSON.
+"""``python -m polysft_mi.evaluate OUT TRUTH``: the figures of a run against ground truth, as a
+table or as JSON.
 
-OUT is a run's folder (with ``surface.npz``) or a ``surface.npz``. TRUTH is ``gt.npz`` (vertices of every frame), an .npz of depth points,
-a folder of ``cloud_*.npz``, or a sequence's folder that holds one of them. :func:`polysft_mi.metrics.score` says what the figures are.
+OUT is a run's folder (with ``surface.npz``) or a ``surface.npz``. TRUTH is ``gt.npz`` (vertices of
+every frame), an .npz of depth points, a folder of ``cloud_*.npz``, or a sequence's folder that
+holds one of them. :func:`polysft_mi.metrics.score` says what the figures are.
 """
 
 import glob
@@ -44,31 +46,53 @@ LABELS = {
 
 
 def read_surface(path):
-    """The arrays of a ``surface.npz``, or of a run's folder that holds one. Raises InputError where it is not of that form."""
+    """The arrays of a ``surface.npz``, or of a run's folder that holds one. Raises InputError where
+    it is not of that form.
+    """
     if os.path.isdir(path):
         if not os.path.exists(os.path.join(path, "surface.npz")):
-            raise InputError(f"{path}: holds no surface.npz; the folder of a run, or a surface.npz, is needed")
+            raise InputError(
+                f"{path}: holds no surface.npz; the folder of a run, or a surface.npz, is needed"
+            )
         path = os.path.join(path, "surface.npz")
     surface = load_npz(path)
     missing = [name for name in ("vertices", "faces", "frames") if name not in surface]
     if missing:
-        raise InputError(f"{path}: holds no {', '.join(missing)}; vertices (T,N,3), faces (F,3) and frames (T,) are needed")
-    V, F, frames = (surface[name] for name in ("vertices", "faces", "frames"))
-    if V.ndim != 3 or V.shape[2] != 3 or F.ndim != 2 or F.shape[1] != 3 or frames.shape != V.shape[:1] or not len(frames):
         raise InputError(
-            f"{path}: vertices {V.shape}, faces {F.shape}, frames {frames.shape}; (T,N,3), (F,3) and (T,) with T > 0 are needed"
+            f"{path}: holds no {', '.join(missing)}; vertices (T,N,3), faces (F,3) and frames (T,)"
+            " are needed"
+        )
+    V, F, frames = (surface[name] for name in ("vertices", "faces", "frames"))
+    if (
+        V.ndim != 3
+        or V.shape[2] != 3
+        or F.ndim != 2
+        or F.shape[1] != 3
+        or frames.shape != V.shape[:1]
+        or not len(frames)
+    ):
+        raise InputError(
+            f"{path}: vertices {V.shape}, faces {F.shape}, frames {frames.shape}; (T,N,3), (F,3)"
+            " and (T,) with T > 0 are needed"
         )
     if V.dtype.kind not in "fiu" or F.dtype.kind not in "iu" or frames.dtype.kind not in "iu":
-        raise InputError(f"{path}: types {V.dtype}, {F.dtype}, {frames.dtype} of vertices, faces, frames; a float and two integers are needed")
+        raise InputError(
+            f"{path}: types {V.dtype}, {F.dtype}, {frames.dtype} of vertices, faces, frames; a"
+            " float and two integers are needed"
+        )
     if F.size and not 0 <= F.min() <= F.max() < V.shape[1]:
-        raise InputError(f"{path}: faces name vertices {F.min()} to {F.max()}; 0 to {V.shape[1] - 1} exist")
+        raise InputError(
+            f"{path}: faces name vertices {F.min()} to {F.max()}; 0 to {V.shape[1] - 1} exist"
+        )
     if not np.isfinite(V).all():
         raise InputError(f"{path}: vertices hold values that are not finite")
     return surface
 
 
 def find_truth(path):
-    """The ground truth in ``path``: a file as it is, a folder of clouds as it is, else what a sequence's folder holds."""
+    """The ground truth in ``path``: a file as it is, a folder of clouds as it is, else what a
+    sequence's folder holds.
+    """
     if not os.path.isdir(path):
         return path
     if glob.glob(os.path.join(glob.escape(path), "cloud_*.npz")):
@@ -79,7 +103,9 @@ def find_truth(path):
     clouds = os.path.join(path, "clouds")
     if glob.glob(os.path.join(glob.escape(clouds), "cloud_*.npz")):
         return clouds
-    raise InputError(f"{path}: holds no ground truth; gt.npz, gt_points.npz or clouds/cloud_*.npz is needed")
+    raise InputError(
+        f"{path}: holds no ground truth; gt.npz, gt_points.npz or clouds/cloud_*.npz is needed"
+    )
 
 
 def image_figures(out):
@@ -94,7 +120,11 @@ def image_figures(out):
         raise InputError(f"{path}: not JSON ({error})") from None
     if not isinstance(figures, dict):
         return {}
-    return {k: v for k, v in figures.items() if k.startswith(("psnr", "ssim")) and isinstance(v, (int, float))}
+    return {
+        k: v
+        for k, v in figures.items()
+        if k.startswith(("psnr", "ssim")) and isinstance(v, (int, float))
+    }
 
 
 def evaluate(out, truth):
@@ -131,7 +161,11 @@ def print_table(figures, title, labels=LABELS):
 def parser():
     p = commands.parser("evaluate", "Figures of a reconstruction against ground truth.", _EXAMPLES)
     p.add_argument("out", metavar="OUT", help="folder of a run, or a surface.npz")
-    p.add_argument("truth", metavar="TRUTH", help="gt.npz, an .npz of depth points, a folder of cloud_*.npz, or a sequence's folder")
+    p.add_argument(
+        "truth",
+        metavar="TRUTH",
+        help="gt.npz, an .npz of depth points, a folder of cloud_*.npz, or a sequence's folder",
+    )
     p.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
     return p
 

@@ -1,4 +1,6 @@
-"""``python -m polysft_mi.export OUT --format usd|glb|obj|ply|npz``: the moving surface of a run for other programs."""
+"""``python -m polysft_mi.export OUT --format usd|glb|obj|ply|npz``: the moving surface of a run for
+other programs.
+"""
 
 import os
 
@@ -12,7 +14,10 @@ from .results import Run
 _EXAMPLES = [
     ("out/demo --format glb", "out/demo/export/surface.glb, for browsers, Blender, Windows"),
     ("out/demo --format usd", "out/demo/export/surface.usdz, one file with its texture"),
-    ("out/demo --format usd -o flag.usdc --up z --fps 30", "USD with z up; the texture lies beside it"),
+    (
+        "out/demo --format usd -o flag.usdc --up z --fps 30",
+        "USD with z up; the texture lies beside it",
+    ),
     ("out/demo --format obj -o meshes", "one OBJ a frame, with material and texture"),
     ("out/demo --format npz --up camera", "arrays, in the camera frame"),
 ]
@@ -26,11 +31,13 @@ _PACKAGES = {"usd": ("pxr", "usd-core"), "glb": ("pygltflib", "pygltflib")}
 
 
 def export(run, kind, path=None, *, up="y", fps=None, texture=None):
-    """Write the surface of a :class:`polysft_mi.results.Run` in the format ``kind``; returns the path written.
+    """Write the surface of a :class:`polysft_mi.results.Run` in the format ``kind``; returns the
+    path written.
 
-    ``path``: the file, for "obj" and "ply" the folder, by default in the run's ``export`` folder. ``up``: "y", "z", or "camera" for the
-    OpenCV camera frame as it is (which USD and glTF do not have); ``fps``: frames a second, by default the run's; ``texture``: another
-    image than the scene's. Raises InputError.
+    ``path``: the file, for "obj" and "ply" the folder, by default in the run's ``export`` folder.
+    ``up``: "y", "z", or "camera" for the OpenCV camera frame as it is (which USD and glTF do not
+    have); ``fps``: frames a second, by default the run's; ``texture``: another image than the
+    scene's. Raises InputError.
     """
     from polyfit import animation
 
@@ -39,14 +46,18 @@ def export(run, kind, path=None, *, up="y", fps=None, texture=None):
         raise InputError(f"--fps {fps:g}: a rate above 0, at most 1000, is needed")
     if kind == "glb" and up != "y" or kind == "usd" and up == "camera":
         raise InputError(
-            f"--up {up}: {'glTF has y up' if kind == 'glb' else 'USD has y or z up'}; leave it out{' or give z' if kind == 'usd' else ''}"
+            f"--up {up}: {'glTF has y up' if kind == 'glb' else 'USD has y or z up'}; leave it"
+            f" out{' or give z' if kind == 'usd' else ''}"
         )
     if kind in _PACKAGES:
         module, package = _PACKAGES[kind]
         try:
             __import__(module)
         except ImportError:
-            raise InputError(f"--format {kind}: needs {package}, which is not installed: python -m pip install {package}") from None
+            raise InputError(
+                f"--format {kind}: needs {package}, which is not installed: python -m pip install"
+                f" {package}"
+            ) from None
     path = _place(run, kind, path)
     vertices = run.vertices if up == "camera" else animation.from_camera(run.vertices, up)
     image = _texture(run, texture) if kind in ("usd", "glb", "obj") else None
@@ -56,11 +67,20 @@ def export(run, kind, path=None, *, up="y", fps=None, texture=None):
     elif kind == "glb":
         animation.write_glb(path, vertices, run.faces, run.uv, image, fps=fps)
     elif kind == "npz":
-        arrays = {"vertices": vertices, "faces": run.faces, "uv": run.uv, "frames": run.frames, "fps": np.float64(fps), "up": up}
+        arrays = {
+            "vertices": vertices,
+            "faces": run.faces,
+            "uv": run.uv,
+            "frames": run.frames,
+            "fps": np.float64(fps),
+            "up": up,
+        }
         with aside(path) as temporary:
             np.savez_compressed(temporary, **arrays)
     else:
-        animation.write_frames(path, kind, vertices, run.faces, run.uv, image, labels=run.frames, up=up)
+        animation.write_frames(
+            path, kind, vertices, run.faces, run.uv, image, labels=run.frames, up=up
+        )
     return path
 
 
@@ -81,20 +101,36 @@ def _place(run, kind, path):
 
 
 def _texture(run, given):
-    """The path of the image, or InputError where the one that the scene names is gone. None where the scene names none."""
+    """The path of the image, or InputError where the one that the scene names is gone. None where
+    the scene names none.
+    """
     path = given if given is not None else run.texture
     if path is not None and not os.path.isfile(path):
-        raise InputError(f"{path}: no such file; {'--texture' if given else 'the scene names it as the texture: --texture'} takes an image")
+        raise InputError(
+            f"{path}: no such file;"
+            f" {'--texture' if given else 'the scene names it as the texture: --texture'} takes an"
+            " image"
+        )
     return path
 
 
 def parser():
     p = commands.parser(
-        "export", "Write the moving surface of a run for other programs: metres, y up unless asked otherwise, textured.", _EXAMPLES
+        "export",
+        "Write the moving surface of a run for other programs: metres, y up unless asked otherwise,"
+        " textured.",
+        _EXAMPLES,
     )
     p.add_argument("out", metavar="OUT", help="folder of a run")
-    p.add_argument("--format", choices=("usd", "glb", "obj", "ply", "npz"), required=True, help="what to write")
-    p.add_argument("-o", "--output", metavar="FILE", help="file to write, for obj and ply a folder (default: in OUT/export)")
+    p.add_argument(
+        "--format", choices=("usd", "glb", "obj", "ply", "npz"), required=True, help="what to write"
+    )
+    p.add_argument(
+        "-o",
+        "--output",
+        metavar="FILE",
+        help="file to write, for obj and ply a folder (default: in OUT/export)",
+    )
     p.add_argument(
         "--up",
         choices=("y", "z", "camera"),
@@ -102,7 +138,9 @@ def parser():
         help="which way is up; camera: x right, y down, z forward, as in surface.npz (default: y)",
     )
     p.add_argument("--fps", type=float, help="frames a second (default: that of the run)")
-    p.add_argument("--texture", metavar="IMAGE", help="another image than the one that the scene names")
+    p.add_argument(
+        "--texture", metavar="IMAGE", help="another image than the one that the scene names"
+    )
     p.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
     return p
 
@@ -110,14 +148,21 @@ def parser():
 def main(arguments=None):
     options = parser().parse_args(arguments)
     run = Run.open(options.out)
-    path = export(run, options.format, options.output, up=options.up, fps=options.fps, texture=options.texture)
+    path = export(
+        run, options.format, options.output, up=options.up, fps=options.fps, texture=options.texture
+    )
     if not options.quiet:
-        print(f"written: {path}, {len(run.frames)} frames of {run.vertices.shape[1]} vertices, {_size(path)}")
+        print(
+            f"written: {path}, {len(run.frames)} frames of {run.vertices.shape[1]} vertices,"
+            f" {_size(path)}"
+        )
     return 0
 
 
 def _size(path):
-    files = [os.path.join(path, name) for name in os.listdir(path)] if os.path.isdir(path) else [path]
+    files = (
+        [os.path.join(path, name) for name in os.listdir(path)] if os.path.isdir(path) else [path]
+    )
     return f"{sum(map(os.path.getsize, files)) / 1e6:.1f} MB"
 
 

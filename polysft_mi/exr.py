@@ -1,7 +1,9 @@
-"""Multi-layer OpenEXR files: several images of one frame in one file, each layer a group of channels by its prefix.
+"""Multi-layer OpenEXR files: several images of one frame in one file, each layer a group of
+channels by its prefix.
 
-A layer ``name`` becomes the channels ``name.R``, ``name.G``, ... in the way that viewers group them (tev, mrViewer, Nuke, Blender). The
-layer ``render`` is written once more as plain R, G, B (and A), which is what programs without layers show.
+A layer ``name`` becomes the channels ``name.R``, ``name.G``, ... in the way that viewers group them
+(tev, mrViewer, Nuke, Blender). The layer ``render`` is written once more as plain R, G, B (and A),
+which is what programs without layers show.
 """
 
 import json
@@ -12,30 +14,43 @@ import numpy as np
 from .files import aside
 
 # by the layer's name, and float32; the others by their count, and half
-_KINDS = {"depth": "Z", "normal": "XYZ", "uv": "UV", "depth_a": "Z", "depth_b": "Z", "depth_difference": "Z", "distance": "Y"}
+_KINDS = {
+    "depth": "Z",
+    "normal": "XYZ",
+    "uv": "UV",
+    "depth_a": "Z",
+    "depth_b": "Z",
+    "depth_difference": "Z",
+    "distance": "Y",
+}
 _COLOURS = {1: "Y", 3: "RGB", 4: "RGBA"}
 _REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 DEFAULT_LAYER = "render"
 
 
 def channel_names(layer, count):
-    """The names of the ``count`` channels of a layer, for example ``["render.R", "render.G", "render.B"]``.
+    """The names of the ``count`` channels of a layer, for example ``["render.R", "render.G",
+    "render.B"]``.
 
     Raises ValueError where the layer's kind has another number of channels.
     """
     suffixes = _KINDS.get(layer, _COLOURS.get(count))
     if suffixes is None or len(suffixes) != count:
-        raise ValueError(f"layer {layer} has {count} channels; {len(_KINDS[layer]) if layer in _KINDS else '1, 3 or 4'} are needed")
+        raise ValueError(
+            f"layer {layer} has {count} channels;"
+            f" {len(_KINDS[layer]) if layer in _KINDS else '1, 3 or 4'} are needed"
+        )
     return [f"{layer}.{s}" for s in suffixes]
 
 
 def write_exr(path, layers, metadata=None, plain=DEFAULT_LAYER):
-    """Write ``layers`` (name -> (H, W) or (H, W, C)) to the EXR file ``path``, ZIP-compressed; the layer ``plain`` once more as plain R,
-    G, B.
+    """Write ``layers`` (name -> (H, W) or (H, W, C)) to the EXR file ``path``, ZIP-compressed; the
+    layer ``plain`` once more as plain R, G, B.
 
-    Colours, errors and masks are linear values (Rec.709 primaries) and are stored as half; ``depth`` and its kin [m], ``normal``
-    (camera frame) and ``uv`` as float32. ``metadata`` (name -> str, int, float, or anything that JSON holds, as a string)
-    goes into the header. Raises ValueError for layers of different sizes and OSError where the file cannot be written.
+    Colours, errors and masks are linear values (Rec.709 primaries) and are stored as half;
+    ``depth`` and its kin [m], ``normal`` (camera frame) and ``uv`` as float32. ``metadata`` (name
+    -> str, int, float, or anything that JSON holds, as a string) goes into the header. Raises
+    ValueError for layers of different sizes and OSError where the file cannot be written.
     """
     import OpenEXR
 
@@ -44,13 +59,18 @@ def write_exr(path, layers, metadata=None, plain=DEFAULT_LAYER):
         image = np.asarray(image)
         image = image[..., None] if image.ndim == 2 else image
         if image.ndim != 3 or image.size == 0 or size not in (None, image.shape[:2]):
-            raise ValueError(f"layer {layer} has shape {image.shape}; (H, W) or (H, W, C) and one size for all are needed")
+            raise ValueError(
+                f"layer {layer} has shape {image.shape}; (H, W) or (H, W, C) and one size for all"
+                " are needed"
+            )
         size = image.shape[:2]
         names = channel_names(layer, image.shape[2])
         if layer in _KINDS:
             image = image.astype(np.float32)
         else:
-            image = np.clip(image, -65504, 65504).astype(np.float16)  # beyond half's range lies only infinity
+            image = np.clip(image, -65504, 65504).astype(
+                np.float16
+            )  # beyond half's range lies only infinity
         for k, name in enumerate(names):
             plane = np.ascontiguousarray(image[..., k])
             channels[name] = OpenEXR.Channel(plane)
@@ -58,7 +78,11 @@ def write_exr(path, layers, metadata=None, plain=DEFAULT_LAYER):
                 channels[name[-1]] = OpenEXR.Channel(plane)
     if not channels:
         raise ValueError("no layers; at least one is needed")
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "chromaticities": _REC709}
+    header = {
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+        "chromaticities": _REC709,
+    }
     for name, value in (metadata or {}).items():
         header[name] = _attribute(value)
     with aside(path) as temporary:
@@ -72,11 +96,16 @@ def write_exr(path, layers, metadata=None, plain=DEFAULT_LAYER):
 def _attribute(value):
     if isinstance(value, np.generic):
         value = value.item()
-    return value if isinstance(value, (str, int, float)) and not isinstance(value, bool) else json.dumps(value)
+    return (
+        value
+        if isinstance(value, (str, int, float)) and not isinstance(value, bool)
+        else json.dumps(value)
+    )
 
 
 def read_exr(path):
-    """``(layers, header)`` of a file of :func:`write_exr`: name -> (H, W, C), without the plain copy of ``render``.
+    """``(layers, header)`` of a file of :func:`write_exr`: name -> (H, W, C), without the plain
+    copy of ``render``.
 
     Raises OSError where the file cannot be read.
     """

@@ -1,7 +1,8 @@
 """Pictures of a run: loss curves, figures a frame, and a sheet of chosen frames.
 
-matplotlib is loaded on first use and without a display. Each function returns the path, or None after a warning where the picture could
-not be drawn or written: a run must not be lost to its pictures.
+matplotlib is loaded on first use and without a display. Each function returns the path, or None
+after a warning where the picture could not be drawn or written: a run must not be lost to its
+pictures.
 """
 
 import functools
@@ -15,8 +16,16 @@ from .shading import View, shade_surface
 
 __all__ = ["View", "contact_sheet", "frame_plot", "loss_plot", "shade_surface"]
 
-TERMS = {"loss": "total", "rgb": "photometric"} | {t: t for t in ("silhouette", "shading", "inextensibility", "smoothness", "temporal")}
-COLOURS = dict(zip(TERMS, ("#222222", "#c4572e", "#3b6ea5", "#d19a1e", "#4b8b3b", "#7a7a7a", "#8d5aa0"), strict=True))
+TERMS = {"loss": "total", "rgb": "photometric"} | {
+    t: t for t in ("silhouette", "shading", "inextensibility", "smoothness", "temporal")
+}
+COLOURS = dict(
+    zip(
+        TERMS,
+        ("#222222", "#c4572e", "#3b6ea5", "#d19a1e", "#4b8b3b", "#7a7a7a", "#8d5aa0"),
+        strict=True,
+    )
+)
 
 
 def _kept_safe(draw):
@@ -30,7 +39,11 @@ def _kept_safe(draw):
         except Exception as error:  # whatever it is, the results stand without the picture
             if getattr(error, "errno", None) in FULL:
                 raise
-            warnings.warn(f"{path}: picture not written ({type(error).__name__}: {error})", RuntimeWarning, stacklevel=2)
+            warnings.warn(
+                f"{path}: picture not written ({type(error).__name__}: {error})",
+                RuntimeWarning,
+                stacklevel=2,
+            )
             return None
 
     return wrapper
@@ -53,22 +66,41 @@ def _plain(axes):
 
 @_kept_safe
 def loss_plot(path, log_records):
-    """Loss and its terms over all iterations, on a logarithmic axis, with a mark where a new frame begins.
+    """Loss and its terms over all iterations, on a logarithmic axis, with a mark where a new frame
+    begins.
 
-    ``log_records``: dicts with ``frame``, ``iteration``, ``loss`` and any of the terms in ``TERMS``, in the order of the run; records
-    without a loss are passed over.
+    ``log_records``: dicts with ``frame``, ``iteration``, ``loss`` and any of the terms in
+    ``TERMS``, in the order of the run; records without a loss are passed over.
     """
     records, step, curves = loss_curves(log_records)
     figure = _figure(9, 4, layout="constrained")
     axes = figure.add_subplot()
     for term, values in curves.items():
-        axes.plot(step, values, color=COLOURS[term], label=TERMS[term], linewidth=1.4 if term == "loss" else 0.9)
+        axes.plot(
+            step,
+            values,
+            color=COLOURS[term],
+            label=TERMS[term],
+            linewidth=1.4 if term == "loss" else 0.9,
+        )
     axes.set_yscale("log")
     axes.set_xlabel("iteration, all frames one after the other")
     axes.set_ylabel("loss")
-    starts = [(s, r["frame"]) for s, r, before in zip(step, records, [None] + records) if before is None or before["frame"] != r["frame"]]
+    starts = [
+        (s, r["frame"])
+        for s, r, before in zip(step, records, [None] + records)
+        if before is None or before["frame"] != r["frame"]
+    ]
     if len(starts) <= 200:
-        axes.vlines([s for s, _ in starts], 0, 1, transform=axes.get_xaxis_transform(), color="0.85", linewidth=0.5, zorder=0)
+        axes.vlines(
+            [s for s, _ in starts],
+            0,
+            1,
+            transform=axes.get_xaxis_transform(),
+            color="0.85",
+            linewidth=0.5,
+            zorder=0,
+        )
     top = axes.secondary_xaxis("top")
     shown = starts[:: max(1, -(-len(starts) // 12))]
     top.set_xticks([s for s, _ in shown], [str(frame) for _, frame in shown], fontsize=8)
@@ -82,8 +114,9 @@ def loss_plot(path, log_records):
 
 
 def loss_curves(log_records):
-    """``(records, step, curves)``: the records with a loss, the iteration (R,) of each counted over all frames, and each term of
-    ``TERMS`` that has one as its values (R,), NaN where they are not positive. Raises ValueError where no record holds a loss.
+    """``(records, step, curves)``: the records with a loss, the iteration (R,) of each counted over
+    all frames, and each term of ``TERMS`` that has one as its values (R,), NaN where they are not
+    positive. Raises ValueError where no record holds a loss.
     """
     records = [r for r in log_records if "loss" in r and "frame" in r]
     if not records:
@@ -99,9 +132,15 @@ def loss_curves(log_records):
 
 
 def _advance(before, record):
-    """Iterations from one record to the next, so that records logged now and then keep their place."""
+    """Iterations from one record to the next, so that records logged now and then keep their
+    place.
+    """
     iteration = _number(record.get("iteration"))
-    if before is None or before["frame"] != record["frame"] or not iteration > _number(before.get("iteration")):
+    if (
+        before is None
+        or before["frame"] != record["frame"]
+        or not iteration > _number(before.get("iteration"))
+    ):
         return 1
     return iteration - before["iteration"]
 
@@ -112,8 +151,8 @@ def _number(value):
 
 @_kept_safe
 def frame_plot(path, per_frame, labels=None):
-    """One small plot over the frames for each figure: ``per_frame`` is a dict of equally long lists, one of them ``frame``; ``labels``
-    names them.
+    """One small plot over the frames for each figure: ``per_frame`` is a dict of equally long
+    lists, one of them ``frame``; ``labels`` names them.
     """
     from .evaluate import LABELS
 
@@ -130,7 +169,9 @@ def frame_plot(path, per_frame, labels=None):
             axes.axhline(finite.mean(), color="0.55", linewidth=0.8, linestyle="--")
             if finite.min() >= 0:
                 axes.set_ylim(0, 1.1 * finite.max() or 1)
-            axes.set_title(f"{labels.get(name, name)}: mean {finite.mean():.4g}", fontsize=9, loc="left")
+            axes.set_title(
+                f"{labels.get(name, name)}: mean {finite.mean():.4g}", fontsize=9, loc="left"
+            )
         _plain(axes)
         axes.tick_params(labelsize=8, labelbottom=k == len(names) - 1)
     axes.set_xlabel("frame")
@@ -139,19 +180,33 @@ def frame_plot(path, per_frame, labels=None):
 
 @_kept_safe
 def contact_sheet(path, rows):
-    """A row for each chosen frame: target, render, error as a heat map, the surface seen from the side.
+    """A row for each chosen frame: target, render, error as a heat map, the surface seen from the
+    side.
 
-    ``rows``: dicts of ``target``, ``render`` and ``surface`` (H, W, 3), sRGB, uint8 or float in [0, 1], ``error`` (H, W) float in one
-    unit for all rows, and ``label``, a short text such as "frame 12". A picture that is missing leaves its place empty.
+    ``rows``: dicts of ``target``, ``render`` and ``surface`` (H, W, 3), sRGB, uint8 or float in [0,
+    1], ``error`` (H, W) float in one unit for all rows, and ``label``, a short text such as "frame
+    12". A picture that is missing leaves its place empty.
     """
     rows = list(rows)
-    first = next(np.asarray(r[k]) for r in rows for k in ("target", "render", "surface") if r.get(k) is not None)
+    first = next(
+        np.asarray(r[k])
+        for r in rows
+        for k in ("target", "render", "surface")
+        if r.get(k) is not None
+    )
     columns = [k for k in _SHEET if any(r.get(k) is not None for r in rows)]
     errors = [np.asarray(r["error"], dtype=np.float64) for r in rows if r.get("error") is not None]
     finite = np.concatenate([e[np.isfinite(e)] for e in errors]) if errors else np.zeros(0)
     peak = max(float(np.quantile(finite, 0.995)), 1e-6) if finite.size else 1.0
     # places in inches, by hand: finding them takes matplotlib longer than all the rest
-    wide, high, left, top, bottom, gap = 2.6, 2.6 * first.shape[0] / first.shape[1], 0.25, 0.25, 0.45 if errors else 0.05, 0.04
+    wide, high, left, top, bottom, gap = (
+        2.6,
+        2.6 * first.shape[0] / first.shape[1],
+        0.25,
+        0.25,
+        0.45 if errors else 0.05,
+        0.04,
+    )
     whole = left + len(columns) * (wide + gap), bottom + top + len(rows) * (high + gap)
     figure = _figure(*whole)
 
@@ -161,32 +216,46 @@ def contact_sheet(path, rows):
     heat = None
     for i, row in enumerate(rows):
         for j, name in enumerate(columns):
-            axes = axes_at(left + j * (wide + gap), bottom + (len(rows) - 1 - i) * (high + gap), wide, high)
+            axes = axes_at(
+                left + j * (wide + gap), bottom + (len(rows) - 1 - i) * (high + gap), wide, high
+            )
             axes.set_xticks([]), axes.set_yticks([])
             for spine in axes.spines.values():
                 spine.set_visible(False)
             image = row.get(name)
             if image is not None and name == "error":
-                heat = axes.imshow(np.asarray(image, dtype=np.float64), cmap="inferno", vmin=0, vmax=peak)
+                heat = axes.imshow(
+                    np.asarray(image, dtype=np.float64), cmap="inferno", vmin=0, vmax=peak
+                )
             elif image is not None:
                 image = np.asarray(image)
-                axes.imshow(image if image.dtype == np.uint8 else np.clip(np.nan_to_num(image), 0, 1))
+                axes.imshow(
+                    image if image.dtype == np.uint8 else np.clip(np.nan_to_num(image), 0, 1)
+                )
             if i == 0:
                 axes.set_title(_SHEET[name], fontsize=9)
             if name == columns[0]:
                 axes.set_ylabel(row.get("label", ""), fontsize=9)
     if heat is not None:
-        below = axes_at(left + columns.index("error") * (wide + gap) + 0.1 * wide, bottom - 0.15, 0.8 * wide, 0.08)
+        below = axes_at(
+            left + columns.index("error") * (wide + gap) + 0.1 * wide,
+            bottom - 0.15,
+            0.8 * wide,
+            0.08,
+        )
         figure.colorbar(heat, cax=below, orientation="horizontal").ax.tick_params(labelsize=7)
     return figure
 
 
-_MAPS = {"distance": ("distance of A from B [mm]", "viridis", 0), "depth_difference": ("depth of A minus B [mm]", "RdBu_r", -1)}
+_MAPS = {
+    "distance": ("distance of A from B [mm]", "viridis", 0),
+    "depth_difference": ("depth of A minus B [mm]", "RdBu_r", -1),
+}
 
 
 def false_colour(name, values, scale):
-    """The difference ``name``, values (H, W) [mm], as linear RGB (H, W, 3): in the colours of :func:`false_colours`, black where it is
-    not known.
+    """The difference ``name``, values (H, W) [mm], as linear RGB (H, W, 3): in the colours of
+    :func:`false_colours`, black where it is not known.
     """
     import matplotlib
 
@@ -198,9 +267,10 @@ def false_colour(name, values, scale):
 
 
 def false_colours(path, title, images, maps, scale):
-    """Pictures side by side, and differences in false colours with their scale: ``images`` are (title, (h, w, 3) uint8), ``maps``
-    (name, (H, W) [mm], NaN where unknown), the name one of "distance" and "depth_difference"; colours end at ``scale`` [mm]. Raises
-    OSError where it cannot be written.
+    """Pictures side by side, and differences in false colours with their scale: ``images`` are
+    (title, (h, w, 3) uint8), ``maps`` (name, (H, W) [mm], NaN where unknown), the name one of
+    "distance" and "depth_difference"; colours end at ``scale`` [mm]. Raises OSError where it cannot
+    be written.
     """
     height, width = images[0][1].shape[:2]
     columns, wide = len(images) + len(maps), 3.2
@@ -213,10 +283,14 @@ def false_colours(path, title, images, maps, scale):
     for axes, (name, values) in zip(grid[len(images) :], maps):
         label, colours, low = _MAPS[name]
         axes.set_facecolor("0.93")
-        shown = axes.imshow(values, cmap=colours, vmin=low * scale, vmax=scale, interpolation="nearest")
+        shown = axes.imshow(
+            values, cmap=colours, vmin=low * scale, vmax=scale, interpolation="nearest"
+        )
         axes.set_title(label, fontsize=9)
         ends = "max" if low == 0 else "both"
-        figure.colorbar(shown, ax=axes, location="bottom", shrink=0.9, aspect=30, pad=0.02, extend=ends).ax.tick_params(labelsize=7)
+        figure.colorbar(
+            shown, ax=axes, location="bottom", shrink=0.9, aspect=30, pad=0.02, extend=ends
+        ).ax.tick_params(labelsize=7)
     for axes in grid:
         axes.set_anchor("N")
         axes.set_xticks([]), axes.set_yticks([])
@@ -227,4 +301,9 @@ def false_colours(path, title, images, maps, scale):
         figure.savefig(temporary, facecolor="white")
 
 
-_SHEET = {"target": "target", "render": "render", "error": "error", "surface": "surface from the side"}
+_SHEET = {
+    "target": "target",
+    "render": "render",
+    "error": "error",
+    "surface": "surface from the side",
+}

@@ -1,8 +1,8 @@
 """n-jets in Dr.Jit: the functions of ``polyfit.jets``, by the same names, on Mitsuba's types.
 
-Arrays: ``alpha`` is a Float of A = (n+1)(n+2)/2 coefficients in the paper's order (``polyfit.monomials.exponents``), shared by
-all points; ``u`` and ``v`` are Floats of N chart coordinates. Lengths are in the chart's unit.
-Import only after a Mitsuba variant is set.
+Arrays: ``alpha`` is a Float of A = (n+1)(n+2)/2 coefficients in the paper's order
+(``polyfit.monomials.exponents``), shared by all points; ``u`` and ``v`` are Floats of N chart
+coordinates. Lengths are in the chart's unit. Import only after a Mitsuba variant is set.
 """
 
 import drjit as dr
@@ -26,7 +26,9 @@ def _term(coefficient, pu, pv, a, b):
 
 
 def _coefficients(alpha, like):
-    """alpha_k for every point: a gather, whose gradient is one scatter in the same kernel, in double so that its order does not show."""
+    """alpha_k for every point: a gather, whose gradient is one scatter in the same kernel, in
+    double so that its order does not show.
+    """
     zero = dr.zeros(mi.UInt32, dr.width(like))
     alpha = mi.Float64(alpha)
     return [mi.Float(dr.gather(mi.Float64, alpha, zero + k)) for k in range(dr.width(alpha))]

@@ -1,9 +1,11 @@
-"""Shading as a cue: how bright each triangle is under a light that is learned along with the video. NumPy and OpenCV.
+"""Shading as a cue: how bright each triangle is under a light that is learned along with the video.
+NumPy and OpenCV.
 
-A triangle with the unit normal n towards the camera and its centre at x, whose texture has the luminance t, is taken to be seen with
-t (l_0 + l . n + g . x). Light of first order in the normal holds most of what a matt surface reflects of any distant light (Basri and Jacobs,
-"Lambertian Reflectance and Linear Subspaces", PAMI 2003); that in the position, what of it comes from a lamp nearby. Where the sheet casts
-shadows on itself both are wrong, hence a robust norm.
+A triangle with the unit normal n towards the camera and its centre at x, whose texture has the
+luminance t, is taken to be seen with t (l_0 + l . n + g . x). Light of first order in the normal
+holds most of what a matt surface reflects of any distant light (Basri and Jacobs, "Lambertian
+Reflectance and Linear Subspaces", PAMI 2003); that in the position, what of it comes from a lamp
+nearby. Where the sheet casts shadows on itself both are wrong, hence a robust norm.
 """
 
 import math
@@ -15,26 +17,42 @@ import numpy as np
 from .pyramid import blur, shrink
 
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # of linear RGB
-_BLUR = 0.45  # standard deviation of the blur of texture and frames, over the side of a square as large as a triangle is on average
+# standard deviation of the blur of texture and frames, over the side of a square as large as a
+# triangle is on average
+_BLUR = 0.45
 _COVERED = 0.7  # share of a triangle's pixels that must be seen
-_INSIDE = {True: 0.3, False: 0.97}  # share of a triangle's surroundings that must be texture, by whether frames have masks
+_INSIDE = {
+    True: 0.3,
+    False: 0.97,
+}  # share of a triangle's surroundings that must be texture, by whether frames have masks
 _FRONTAL = 0.3  # cosine between normal and ray from which on a triangle counts
 _DARK = 0.01  # texture's luminance, over its mean, below which it says nothing
 _RIDGE = 3e-3  # what the light is held to be the same from all sides by, in observations a triangle
 _DIMMEST = 0.1  # how bright a triangle is at least, over the light that comes from all sides alike
 _REFITS = 3  # of a frame's robust regression
-_KEPT = 0.8  # of what the frames before say, from one frame to the next: their surfaces were found under a light that was less well known
+# of what the frames before say, from one frame to the next: their surfaces were found under a light
+# that was less well known
+_KEPT = 0.8
 _SIZE = 7  # of the unknowns (l_0, l, g)
 _UPPER = np.triu_indices(_SIZE)
-_FIRST_SCALE, _SCALE, _SCALES = 0.05, 8.0, (0.005, 0.05)  # of the robust norm; then so many standard deviations, within bounds, over the texture's mean
-_NORMAL_DEVIATION = 1.4826  # standard deviation of a normal distribution over the median of its absolute values
+_FIRST_SCALE, _SCALE, _SCALES = (
+    0.05,
+    8.0,
+    (0.005, 0.05),
+)  # of the robust norm; then so many standard deviations, within bounds, over the texture's mean
+_NORMAL_DEVIATION = (
+    1.4826  # standard deviation of a normal distribution over the median of its absolute values
+)
 
 
 @dataclass
 class Fit:
-    """How a light explains the F triangles of a frame: its ``coefficients`` (7,); ``residual`` (F,): frame, without its exposure, less the light's;
-    ``area`` (F,), 1 on average over the triangles that are seen and 0 for others; ``departure``: what it costs that the light is another than that of the
-    frames before, in squared residuals of a triangle; ``matrix`` (7, 7), ``right`` (7,): of the frame's own normal equations."""
+    """How a light explains the F triangles of a frame: its ``coefficients`` (7,); ``residual``
+    (F,): frame, without its exposure, less the light's; ``area`` (F,), 1 on average over the
+    triangles that are seen and 0 for others; ``departure``: what it costs that the light is another
+    than that of the frames before, in squared residuals of a triangle; ``matrix`` (7, 7), ``right``
+    (7,): of the frame's own normal equations.
+    """
 
     coefficients: np.ndarray
     residual: np.ndarray
@@ -46,8 +64,10 @@ class Fit:
 
 @dataclass(frozen=True)
 class Light:
-    """What the frames so far say of the light, the last ones most: normal equations ``matrix`` (7, 7) and ``right`` (7,) of (l_0, l, g), over the mean
-    of the texture's luminance, in triangles; ``deviations``: the sum of the residuals' standard deviations in ``frames`` frames."""
+    """What the frames so far say of the light, the last ones most: normal equations ``matrix`` (7,
+    7) and ``right`` (7,) of (l_0, l, g), over the mean of the texture's luminance, in triangles;
+    ``deviations``: the sum of the residuals' standard deviations in ``frames`` frames.
+    """
 
     matrix: np.ndarray
     right: np.ndarray
@@ -75,23 +95,39 @@ class Light:
     @property
     def scale(self):
         """The residual, over the texture's mean luminance, from which on one hardly counts."""
-        return float(np.clip(_SCALE * self.deviations / self.frames, *_SCALES)) if self.frames else _FIRST_SCALE
+        return (
+            float(np.clip(_SCALE * self.deviations / self.frames, *_SCALES))
+            if self.frames
+            else _FIRST_SCALE
+        )
 
     def coefficients(self, triangles):
-        """(l_0, l, g) (7,), of a sheet of so many triangles; the same from all sides where nothing is known."""
-        return np.linalg.solve(self._held(triangles), self.right) if self.frames else np.eye(_SIZE)[0]
+        """(l_0, l, g) (7,), of a sheet of so many triangles; the same from all sides where nothing
+        is known.
+        """
+        return (
+            np.linalg.solve(self._held(triangles), self.right) if self.frames else np.eye(_SIZE)[0]
+        )
 
     def _held(self, triangles):
-        """The curvature (7, 7) that holds the coefficients where they are, in squared residuals of a triangle."""
+        """The curvature (7, 7) that holds the coefficients where they are, in squared residuals of
+        a triangle.
+        """
         return self.matrix + np.diag([1e-9] + [_RIDGE * triangles] * (_SIZE - 1))
 
     def explaining(self, shade):
-        """The light that explains a frame and the frames before it best, where its surface has the triangles ``shade`` (a :class:`Shade`): :class:`Fit`."""
-        rows = shade.texture[:, None] * np.column_stack([np.ones(len(shade.seen)), shade.normal, shade.centre])
+        """The light that explains a frame and the frames before it best, where its surface has the
+        triangles ``shade`` (a :class:`Shade`): :class:`Fit`.
+        """
+        rows = shade.texture[:, None] * np.column_stack(
+            [np.ones(len(shade.seen)), shade.normal, shade.centre]
+        )
         area = np.where(shade.seen, shade.area, 0.0)
         area *= shade.seen.sum() / max(area.sum(), 1e-30)  # 1 on average
         held, before = self._held(len(shade.seen)), self.coefficients(len(shade.seen))
-        value = shade.luminance / _exposure(shade.luminance[shade.seen], (rows @ before)[shade.seen])
+        value = shade.luminance / _exposure(
+            shade.luminance[shade.seen], (rows @ before)[shade.seen]
+        )
         found = before
         for _ in range(_REFITS):
             weighted = (area / (1 + ((value - rows @ found) / self.scale) ** 2))[:, None] * rows
@@ -106,15 +142,21 @@ class Light:
             return self
         fit = self.explaining(shade)
         deviation = _NORMAL_DEVIATION * float(np.median(np.abs(fit.residual[shade.seen])))
-        return Light(_KEPT * (self.matrix + fit.matrix), _KEPT * (self.right + fit.right), self.deviations + deviation, self.frames + 1)
+        return Light(
+            _KEPT * (self.matrix + fit.matrix),
+            _KEPT * (self.right + fit.right),
+            self.deviations + deviation,
+            self.frames + 1,
+        )
 
 
 @dataclass
 class Shade:
-    """The triangles of a surface in a frame, (F,) or (F, 3) each: ``normal``, of length 1, towards the camera; ``centre``, from that of the template,
-    over ``unit`` [m]; ``texture`` and ``luminance``: what the texture has and the frame shows, blurred alike, over the texture's mean;
-    ``seen``: those that can be compared; ``edges``: two (F, 3) [m], from the first corner; ``area`` [m^2]; ``facing``: 1 or -1, whether
-    the normal is that of the two edges or opposite."""
+    """The triangles of a surface in a frame, (F,) or (F, 3) each: ``normal``, of length 1, towards
+    the camera; ``centre``, from that of the template, over ``unit`` [m]; ``texture`` and
+    ``luminance``: what the texture has and the frame shows, blurred alike, over the texture's mean;
+    ``seen``: those that can be compared; ``edges``: two (F, 3) [m], from the first corner; ``area``
+    [m^2]; ``facing``: 1 or -1, whether the normal is that of the two edges or opposite."""
 
     normal: np.ndarray
     centre: np.ndarray
@@ -128,11 +170,14 @@ class Shade:
 
 
 class Brightness:
-    """Luminance of the template's texture and of frames, at the size of the triangles ``faces`` (F, 3).
+    """Luminance of the template's texture and of frames, at the size of the triangles ``faces`` (F,
+    3).
 
-    ``vertices`` (N, 3) [m], ``position`` (N, 2) [pixels]: of the template, and in the image; ``texture`` (H, W, 3), ``inside`` (H, W): reflectance and where the
-    template has it; ``texels`` (F, 2): the triangles' centroids there [texels, whole at their centres]; ``density``: texels a pixel;
-    ``masked``: whether the frames have masks. Without them, what lies close to the border is left out, for the background is in it.
+    ``vertices`` (N, 3) [m], ``position`` (N, 2) [pixels]: of the template, and in the image;
+    ``texture`` (H, W, 3), ``inside`` (H, W): reflectance and where the template has it; ``texels``
+    (F, 2): the triangles' centroids there [texels, whole at their centres]; ``density``: texels a
+    pixel; ``masked``: whether the frames have masks. Without them, what lies close to the border is
+    left out, for the background is in it.
     """
 
     def __init__(self, faces, vertices, position, texture, inside, texels, density, masked):
@@ -149,8 +194,9 @@ class Brightness:
         self.trusted &= self.texture > _DARK
 
     def prepared(self, colour, mask):
-        """A frame ``colour`` (H, W, 3) [linear RGB] with its ``mask`` (H, W) or None, as :meth:`of` wants it: luminances over the texture's mean,
-        blurred, on a grid of blocks of ``pool`` x ``pool`` pixels, and ``pool``."""
+        """A frame ``colour`` (H, W, 3) [linear RGB] with its ``mask`` (H, W) or None, as :meth:`of`
+        wants it: luminances over the texture's mean, blurred, on a grid of blocks of ``pool`` x
+        ``pool`` pixels, and ``pool``."""
         image = colour @ _LUMINANCE
         pool = max(1, int(self.sigma / 2))
         if pool > 1:
@@ -158,14 +204,16 @@ class Brightness:
         return blur(image, self.sigma / pool, mask) / self.mean, pool
 
     def shown(self, colour, inside, stride, position):
-        """Luminance (F,) of the triangles' texture over its mean, where a sheet's image without light is ``colour`` (h, w, 3), covered by it
-        where ``inside`` (h, w) is 1, of blocks of ``stride`` x ``stride`` pixels, and its vertices lie at ``position`` (N, 2) [blocks] there."""
+        """Luminance (F,) of the triangles' texture over its mean, where a sheet's image without
+        light is ``colour`` (h, w, 3), covered by it where ``inside`` (h, w) is 1, of blocks of
+        ``stride`` x ``stride`` pixels, and its vertices lie at ``position`` (N, 2) [blocks] there.
+        """
         image = blur(colour @ _LUMINANCE, self.sigma / stride, inside)
         return _sampled(image, position[self.faces].sum(1) / 3 - 0.5) / self.mean
 
     def lit(self, vertices, origin, light):
-        """How bright the ``light`` (7,) makes the triangles (F,) of a surface with ``vertices`` (N, 3) [m], seen from ``origin`` (3,): averages
-        over their neighbours."""
+        """How bright the ``light`` (7,) makes the triangles (F,) of a surface with ``vertices`` (N,
+        3) [m], seen from ``origin`` (3,): averages over their neighbours."""
         corner = vertices[self.faces]
         normal = _cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
         normal /= np.maximum(np.sqrt(np.einsum("fk,fk->f", normal, normal)), 1e-15)[:, None]
@@ -173,12 +221,17 @@ class Brightness:
         normal *= -np.sign(np.einsum("fk,fk->f", normal, centre - origin))[:, None]
         value = light[0] + normal @ light[1:4] + (centre - self.centre) @ light[4:] / self.unit
         value = np.maximum(value, _DIMMEST * abs(light[0]))
-        total, count = (sum(np.bincount(k, w, len(vertices)) for k in self.faces.T) for w in (value, np.ones(len(value))))
+        total, count = (
+            sum(np.bincount(k, w, len(vertices)) for k in self.faces.T)
+            for w in (value, np.ones(len(value)))
+        )
         return (total / np.maximum(count, 1))[self.faces].mean(1)
 
     def of(self, prepared, vertices, origin, position, pixels, texture=None):
-        """The :class:`Shade` of the surface with ``vertices`` (N, 3) [m], which lie at ``position`` (N, 2) [pixels] in the image and of whose
-        triangles ``pixels`` (F,) are seen; ``origin`` (3,): the camera's; ``texture`` (F,): the luminance of the texture, as :meth:`shown`."""
+        """The :class:`Shade` of the surface with ``vertices`` (N, 3) [m], which lie at ``position``
+        (N, 2) [pixels] in the image and of whose triangles ``pixels`` (F,) are seen; ``origin``
+        (3,): the camera's; ``texture`` (F,): the luminance of the texture, as :meth:`shown`.
+        """
         image, pool = prepared
         corner = vertices[self.faces]
         a, b = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
@@ -190,34 +243,48 @@ class Brightness:
         normal = cross * (facing / double)[:, None]
         frontal = np.abs(towards) > _FRONTAL * double * np.sqrt(np.einsum("fk,fk->f", ray, ray))
         luminance = _sampled(image, (position[self.faces].sum(1) / 3) / pool - 0.5)
-        texture = self.texture if texture is None else np.where(texture > _DARK, texture, self.texture)
+        texture = (
+            self.texture if texture is None else np.where(texture > _DARK, texture, self.texture)
+        )
         seen = self.trusted & frontal & (pixels > _COVERED * areas(position, self.faces))
         centre = (corner.sum(1) / 3 - self.centre) / self.unit
-        return Shade(normal, centre, self.unit, texture, luminance, seen, (a, b), double / 2, facing)
+        return Shade(
+            normal, centre, self.unit, texture, luminance, seen, (a, b), double / 2, facing
+        )
 
 
 def residuals(shade, light, weight):
-    """The shading term of a frame, ``weight`` times the mean over the area seen of c^2 log(1 + r^2 / c^2) with r = frame - t (l_0 + l . n + g . x), where
-    (l_0, l, g) is what explains this frame best after those before, ``light``; what that departs from theirs costs too.
+    """The shading term of a frame, ``weight`` times the mean over the area seen of c^2 log(1 + r^2
+    / c^2) with r = frame - t (l_0 + l . n + g . x), where (l_0, l, g) is what explains this frame
+    best after those before, ``light``; what that departs from theirs costs too.
 
-    Returns its energy, the residuals r (F,), the factors h (F,) of r^2 / 2 in its quadratic model, and the derivatives (F, 3, 3) of r by the
-    corners [1/m]. The light follows the surface; at its best, the energy has no slope along it.
+    Returns its energy, the residuals r (F,), the factors h (F,) of r^2 / 2 in its quadratic model,
+    and the derivatives (F, 3, 3) of r by the corners [1/m]. The light follows the surface; at its
+    best, the energy has no slope along it.
     """
     fit, scale = light.explaining(shade), light.scale
     weight = weight / max(shade.seen.sum(), 1)
     over = (fit.residual / scale) ** 2
     energy = weight * (scale**2 * float((fit.area * np.log1p(over)).sum()) + fit.departure)
     slope, gradient = fit.coefficients[1:4], fit.coefficients[4:]
-    # n = (a x b) / |a x b|, whose length does not change: dr = across . d(a x b), and a x b changes with the corners
+    # n = (a x b) / |a x b|, whose length does not change: dr = across . d(a x b), and a x b changes
+    # with the corners
     a, b = shade.edges
-    across = (slope - shade.normal * (shade.normal @ slope)[:, None]) * (-shade.texture * shade.facing / (2 * shade.area))[:, None]
+    across = (slope - shade.normal * (shade.normal @ slope)[:, None]) * (
+        -shade.texture * shade.facing / (2 * shade.area)
+    )[:, None]
     second, third = _cross(b, across), _cross(across, a)
-    by_corner = np.stack([-second - third, second, third], 1) - (shade.texture / (3 * shade.unit))[:, None, None] * gradient
+    by_corner = (
+        np.stack([-second - third, second, third], 1)
+        - (shade.texture / (3 * shade.unit))[:, None, None] * gradient
+    )
     return energy, fit.residual, 2 * weight * fit.area / (1 + over), by_corner
 
 
 def _exposure(value, lit):
-    """By how much a frame is brighter than the light makes it: cameras choose their exposure as they go. 1 where nothing tells."""
+    """By how much a frame is brighter than the light makes it: cameras choose their exposure as
+    they go. 1 where nothing tells.
+    """
     known = (value > 0) & (lit > 0)
     return float(np.median(value[known] / lit[known])) if known.any() else 1.0
 
@@ -228,13 +295,19 @@ def _cross(a, b):
 
 
 def areas(position, faces):
-    """Of triangles (F, 3) whose vertices lie at ``position`` (N, 2) [pixels] in an image: (F,) [pixels^2]."""
+    """Of triangles (F, 3) whose vertices lie at ``position`` (N, 2) [pixels] in an image: (F,)
+    [pixels^2].
+    """
     corner = position[faces]
     a, b = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
     return 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
 
 
 def _sampled(image, points):
-    """The image at points (K, 2) [pixels, whole at their centres], (K,) float64, bilinear; the border's values beyond it."""
+    """The image at points (K, 2) [pixels, whole at their centres], (K,) float64, bilinear; the
+    border's values beyond it.
+    """
     x, y = (np.ascontiguousarray(points[None, :, k], np.float32) for k in (0, 1))
-    return cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0].astype(np.float64)
+    return cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0].astype(
+        np.float64
+    )

@@ -2,13 +2,17 @@
 
 What the paper leaves open is decided here and nowhere else (``docs/conventions.md`` repeats it):
 
-- Images are compared in linear RGB. Photometric and silhouette losses are sums over pixels divided by the area of the surface in the image
-  (the target mask's, or the rendered interior's where there are no masks), so that neither the background nor the resolution weighs in.
-- The photometric norm is |r| by default: shading that the texture does not have, and what one patch cannot follow, weigh less than in r^2.
-- With masks, the target is cut out by its mask and the rendering stands over black. Without, the photometric loss lives inside the rendered
-  silhouette (pixels that the surface fills, detached) and there is no silhouette loss.
-- Edge lengths, jet coefficients and uv are measured in the chart's unit s. Inextensibility is the sum over edges, as in eq. isometry_mesh;
-  per-frame terms are averaged over the window; temporal consistency is eq. tc.
+- Images are compared in linear RGB. Photometric and silhouette losses are sums over pixels divided
+  by the area of the surface in the image (the target mask's, or the rendered interior's where there
+  are no masks), so that neither the background nor the resolution weighs in.
+- The photometric norm is |r| by default: shading that the texture does not have, and what one patch
+  cannot follow, weigh less than in r^2.
+- With masks, the target is cut out by its mask and the rendering stands over black. Without, the
+  photometric loss lives inside the rendered silhouette (pixels that the surface fills, detached)
+  and there is no silhouette loss.
+- Edge lengths, jet coefficients and uv are measured in the chart's unit s. Inextensibility is the
+  sum over edges, as in eq. isometry_mesh; per-frame terms are averaged over the window; temporal
+  consistency is eq. tc.
 
 Import only after a Mitsuba variant is set.
 """
@@ -21,7 +25,8 @@ _INTERIOR = 0.999  # alpha above which a pixel counts as filled by the surface
 
 
 def robust(squared, norm, scale):
-    """rho of squared residuals r^2: r^2 (``l2``), |r| (``l1``), or scale^2 (sqrt(1 + r^2/scale^2) - 1) * 2 (``charbonnier``, r^2 near 0).
+    """rho of squared residuals r^2: r^2 (``l2``), |r| (``l1``), or scale^2 (sqrt(1 + r^2/scale^2) -
+    1) * 2 (``charbonnier``, r^2 near 0).
     """
     if norm == "l2":
         return squared
@@ -33,7 +38,8 @@ def robust(squared, norm, scale):
 def photometric(render, target, weight, area, *, norm="l1", scale=0.1):
     """Mean over the surface of rho(|I - T|^2 / 3).
 
-    ``render``, ``target``: lists of 3 Floats of P pixels; ``weight``: Float of P, detached; ``area``: Float of 1, pixels.
+    ``render``, ``target``: lists of 3 Floats of P pixels; ``weight``: Float of P, detached;
+    ``area``: Float of 1, pixels.
     """
     squared = sum(dr.square(a - b) for a, b in zip(render, target)) / 3
     return dr.sum(weight * robust(squared, norm, scale)) / area
@@ -50,8 +56,12 @@ def interior(alpha):
 
 
 def edge_lengths(points, edges):
-    """Lengths of the edges (pair of UInt32 of E) between points (Point3f of N): a Float of E [unit of the points]."""
-    flat = mi.Float64(dr.ravel(points))  # double for the gradients: their sum over a vertex's edges then does not depend on the order
+    """Lengths of the edges (pair of UInt32 of E) between points (Point3f of N): a Float of E [unit
+    of the points].
+    """
+    flat = mi.Float64(
+        dr.ravel(points)
+    )  # double for the gradients: their sum over a vertex's edges then does not depend on the order
     a, b = (mi.Point3f(dr.gather(mi.Point3d, flat, i)) for i in edges)
     return dr.norm(a - b)
 
@@ -62,7 +72,9 @@ def inextensibility(points, edges, rest, scale):
 
 
 def temporal(window):
-    """(1 / (W-1)) sum_t |δα_t|^2 + |δuv_t|^2 over a list of W Unknowns (eq. tc without its weight); 0 where W = 1."""
+    """(1 / (W-1)) sum_t |δα_t|^2 + |δuv_t|^2 over a list of W Unknowns (eq. tc without its weight);
+    0 where W = 1.
+    """
     total = mi.Float(0)
     for a, b in zip(window[:-1], window[1:]):
         for name in ("delta_alpha", "delta_u", "delta_v"):
@@ -71,7 +83,9 @@ def temporal(window):
 
 
 def gain(render, target, weight):
-    """The gain g (Float of 1, detached) for which g render fits target best in the least-squares sense where weight is 1."""
+    """The gain g (Float of 1, detached) for which g render fits target best in the least-squares
+    sense where weight is 1.
+    """
     with dr.suspend_grad():
         top = sum(dr.sum(weight * a * b) for a, b in zip(render, target))
         bottom = sum(dr.sum(weight * a * a) for a in render)
@@ -98,15 +112,21 @@ _POOL = 4  # local statistics are taken on an image this many times smaller
 
 
 def _smooth(image, sigma):
-    """A wide Gaussian blur (H, W, C) for slowly varying statistics: shrink, blur, enlarge; differentiable."""
+    """A wide Gaussian blur (H, W, C) for slowly varying statistics: shrink, blur, enlarge;
+    differentiable.
+    """
     height, width, channels = image.shape
-    small = dr.resample(image, (max(1, height // _POOL), max(1, width // _POOL), channels), filter="box")
+    small = dr.resample(
+        image, (max(1, height // _POOL), max(1, width // _POOL), channels), filter="box"
+    )
     return dr.resample(blur(small, sigma / _POOL), image.shape, filter="linear")
 
 
 def normalise_locally(image, weight, sigma=8.0, floor=0.02):
-    """Colours (H, W, 3) less their local mean, over their local standard deviation, both inside ``weight`` (H, W, 1) and under a window of
-    standard deviation ``sigma`` [pixels]; ``floor`` keeps flat areas from being blown up. Zero outside ``weight``."""
+    """Colours (H, W, 3) less their local mean, over their local standard deviation, both inside
+    ``weight`` (H, W, 1) and under a window of standard deviation ``sigma`` [pixels]; ``floor``
+    keeps flat areas from being blown up. Zero outside ``weight``.
+    """
     pixel = dr.arange(mi.UInt32, 3 * weight.shape[0] * weight.shape[1]) // 3
     inside = dr.gather(mi.Float, weight.array, pixel)
     share = dr.maximum(dr.gather(mi.Float, _smooth(weight, sigma).array, pixel), 1e-3)

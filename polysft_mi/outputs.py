@@ -43,12 +43,21 @@ def write_json(path, value):
 
 
 def resolved_scene(experiment):
-    """The scene file as text, with the defaults in force in place of its own and relative paths made absolute."""
-    tree = ET.parse(experiment.path, parser=ET.XMLParser(target=ET.TreeBuilder(insert_comments=True)))
+    """The scene file as text, with the defaults in force in place of its own and relative paths
+    made absolute.
+    """
+    tree = ET.parse(
+        experiment.path, parser=ET.XMLParser(target=ET.TreeBuilder(insert_comments=True))
+    )
     for element in tree.getroot().iter():
         if element.tag == "default":
             value = experiment.defaults[element.get("name")]
-        elif element.tag == "string" and element.get("name") in ("filename", "frames", "masks", "folder"):
+        elif element.tag == "string" and element.get("name") in (
+            "filename",
+            "frames",
+            "masks",
+            "folder",
+        ):
             value = element.get("value")
         else:
             continue
@@ -60,10 +69,11 @@ def resolved_scene(experiment):
 
 
 def write(problem, track, out, drawing, *, fps, command, say=None):
-    """Write everything for the frames that ``track`` holds. Returns the summary that ``metrics.json`` begins with, and a function to call in
-    the end: it waits for the plots.
+    """Write everything for the frames that ``track`` holds. Returns the summary that
+    ``metrics.json`` begins with, and a function to call in the end: it waits for the plots.
 
-    ``drawing``: the :class:`polysft_mi.drawing.Drawing` of the run; ``fps``: of the video; ``say(text)``: told what is being written.
+    ``drawing``: the :class:`polysft_mi.drawing.Drawing` of the run; ``fps``: of the video;
+    ``say(text)``: told what is being written.
     """
     say = say or (lambda text: None)
     sequence, template = problem.sequence, problem.template
@@ -79,7 +89,12 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
         sigma["sigma"] = np.stack([track.sigma.get(k, unknown) for k in range(count)])
     with aside(os.path.join(out, "surface.npz")) as temporary:
         np.savez_compressed(
-            temporary, vertices=vertices, faces=template.faces.astype(np.int32), uv=template.uv.astype(np.float32), frames=indices, **sigma
+            temporary,
+            vertices=vertices,
+            faces=template.faces.astype(np.int32),
+            uv=template.uv.astype(np.float32),
+            frames=indices,
+            **sigma,
         )
     arrays = {name: np.stack([s[name] for s in track.states]) for name in Unknowns.NAMES}
     with aside(os.path.join(out, "params.npz")) as temporary:
@@ -90,11 +105,16 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
     say("meshes")
     os.makedirs(os.path.join(out, "meshes"), exist_ok=True)
     for index, v in zip(indices, vertices):
-        meshio.write_ply(os.path.join(out, "meshes", f"{index:03d}.ply"), v, template.faces, template.uv)
+        meshio.write_ply(
+            os.path.join(out, "meshes", f"{index:03d}.ply"), v, template.faces, template.uv
+        )
     say("pictures")
     per_frame, video = drawn(), bound()
 
-    finite = {name: [p[name] for p in per_frame if np.isfinite(p[name])] for name in ("psnr_mask", "ssim_mask")}
+    finite = {
+        name: [p[name] for p in per_frame if np.isfinite(p[name])]
+        for name in ("psnr_mask", "ssim_mask")
+    }
     summary = {
         "frames": count,
         "frames_wanted": len(sequence.indices),
@@ -113,19 +133,34 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
         for k, (n, t, terms) in enumerate(zip(track.iterations, track.seconds, track.totals))
     ]
     write_json(
-        os.path.join(out, "metrics.json"), {**summary, "versions": versions(), "per_frame": per_frame, "windows": windows, "command": command}
+        os.path.join(out, "metrics.json"),
+        {
+            **summary,
+            "versions": versions(),
+            "per_frame": per_frame,
+            "windows": windows,
+            "command": command,
+        },
     )
     return {**summary, "video": video}, plotted
 
 
 def write_beginning(out, scene, camera, command, fps):
-    """What stands in the folder from the first second: the resolved scene (text), the :class:`polysft_mi.pinhole.Pinhole`, and what the
-    run is.
+    """What stands in the folder from the first second: the resolved scene (text), the
+    :class:`polysft_mi.pinhole.Pinhole`, and what the run is.
     """
-    with aside(os.path.join(out, "scene.xml")) as temporary, open(temporary, "w", encoding="utf-8") as file:
+    with (
+        aside(os.path.join(out, "scene.xml")) as temporary,
+        open(temporary, "w", encoding="utf-8") as file,
+    ):
         file.write(scene)
     write_json(os.path.join(out, "camera.json"), dataclasses.asdict(camera.intrinsics()))
-    about = {"command": command, "started": time.strftime("%Y-%m-%dT%H:%M:%S"), "fps": fps, "versions": versions()}
+    about = {
+        "command": command,
+        "started": time.strftime("%Y-%m-%dT%H:%M:%S"),
+        "fps": fps,
+        "versions": versions(),
+    }
     write_json(os.path.join(out, RUN), about)
 
 

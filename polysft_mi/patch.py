@@ -1,4 +1,5 @@
-"""The deforming jet patch in Dr.Jit: unknowns of a frame, and the surface they make (paper, section "PolySfT").
+"""The deforming jet patch in Dr.Jit: unknowns of a frame, and the surface they make (paper, section
+"PolySfT").
 
     vertices = O( R_c (phi(u + Δu, v + Δv; alpha + Δalpha) + (0, 0, Δw)) + T_c ),   O(x) = s R x + T
 
@@ -20,8 +21,9 @@ from . import jet
 class Unknowns:
     """The unknowns of one frame, in the chart's unit.
 
-    ``delta_alpha`` Float of A; ``delta_u``, ``delta_v``, ``delta_w`` Floats of N, the last the relief, a height over the jet; ``rotation``
-    Float of 4, the quaternion (x, y, z, w) of R_c, normalised where it is used; ``translation`` Float of 3, T_c.
+    ``delta_alpha`` Float of A; ``delta_u``, ``delta_v``, ``delta_w`` Floats of N, the last the
+    relief, a height over the jet; ``rotation`` Float of 4, the quaternion (x, y, z, w) of R_c,
+    normalised where it is used; ``translation`` Float of 3, T_c.
     """
 
     delta_alpha: mi.Float
@@ -69,7 +71,12 @@ class Unknowns:
 
     @classmethod
     def from_numpy(cls, arrays):
-        return cls(**{name: mi.Float(np.ascontiguousarray(arrays[name], dtype=np.float32)) for name in cls.NAMES})
+        return cls(
+            **{
+                name: mi.Float(np.ascontiguousarray(arrays[name], dtype=np.float32))
+                for name in cls.NAMES
+            }
+        )
 
 
 class JetPatch:
@@ -78,11 +85,14 @@ class JetPatch:
     def __init__(self, template):
         self.template = template
         self.alpha = mi.Float(template.alpha.astype(np.float32))
-        self.u, self.v = (mi.Float(np.ascontiguousarray(template.chart[:, k], dtype=np.float32)) for k in (0, 1))
+        self.u, self.v = (
+            mi.Float(np.ascontiguousarray(template.chart[:, k], dtype=np.float32)) for k in (0, 1)
+        )
         self.rotation = mi.Matrix3f(template.rotation)
         self.origin = mi.Point3f(*map(float, template.origin))
         self.scale = mi.Float(template.scale)
-        # opaque: the numbers of one template must not be baked into kernels that serve every template
+        # opaque: the numbers of one template must not be baked into kernels that serve every
+        # template
         dr.make_opaque(self.alpha, self.u, self.v, self.rotation, self.origin, self.scale)
 
     def rest(self):
@@ -98,7 +108,11 @@ class JetPatch:
         return self.scale * (self.rotation @ (x + twice * (w * across + dr.cross(axis, across))))
 
     def _chart(self, unknowns):
-        return self.alpha + unknowns.delta_alpha, self.u + unknowns.delta_u, self.v + unknowns.delta_v
+        return (
+            self.alpha + unknowns.delta_alpha,
+            self.u + unknowns.delta_u,
+            self.v + unknowns.delta_v,
+        )
 
     def vertices(self, unknowns):
         """Positions of the vertices, Point3f of N [m, camera frame]."""
@@ -108,13 +122,21 @@ class JetPatch:
         return self.origin + self._to_camera(x, unknowns) + self.scale * (self.rotation @ t)
 
     def tangents(self, unknowns):
-        """Derivatives of the jet, without relief, along u and along v at the vertices, Vector3f of N each [m per chart unit, camera frame]."""
+        """Derivatives of the jet, without relief, along u and along v at the vertices, Vector3f of
+        N each [m per chart unit, camera frame].
+        """
         return tuple(self._to_camera(t, unknowns) for t in jet.tangents(*self._chart(unknowns)))
 
     def normals(self, unknowns):
-        """Unit normals of the jet, without relief, at the vertices, Normal3f of N [camera frame]."""
-        return mi.Normal3f(self._to_camera(mi.Vector3f(jet.normal(*self._chart(unknowns))), unknowns) / self.scale)
+        """Unit normals of the jet, without relief, at the vertices, Normal3f of N [camera
+        frame].
+        """
+        return mi.Normal3f(
+            self._to_camera(mi.Vector3f(jet.normal(*self._chart(unknowns))), unknowns) / self.scale
+        )
 
     def metric(self, unknowns):
-        """First fundamental form (E, F, G) of the jet, without relief, with respect to (u, v) at the vertices, Floats of N [m^2 per chart unit squared]."""
+        """First fundamental form (E, F, G) of the jet, without relief, with respect to (u, v) at
+        the vertices, Floats of N [m^2 per chart unit squared].
+        """
         return tuple(self.scale * self.scale * g for g in jet.metric(*self._chart(unknowns)))

@@ -1,7 +1,7 @@
 """The problem that a solver solves: unknowns of a window of frames in, the objective out.
 
-It knows the scene, the template's patch, the images and the weights; it knows nothing of how it is minimised.
-Import only after a Mitsuba variant is set.
+It knows the scene, the template's patch, the images and the weights; it knows nothing of how it is
+minimised. Import only after a Mitsuba variant is set.
 """
 
 from collections import OrderedDict
@@ -23,18 +23,23 @@ _CACHED_FRAMES = 8
 
 
 def _positions_key(params, mesh):
-    """The key of the mesh's vertex positions among a scene's parameters. (Mitsuba names meshes by id, or by address where they have none.)
+    """The key of the mesh's vertex positions among a scene's parameters. (Mitsuba names meshes by
+    id, or by address where they have none.)
     """
     keys = [k for k in params.keys() if k.endswith("vertex_positions")]
     for key in keys:
         if len(keys) == 1 or key.split(".")[0] == mesh.id():
             return key
-    raise InputError(f"template {mesh.id()!r}: not found among the scene's parameters; give its shape id=\"template\"")
+    raise InputError(
+        f"template {mesh.id()!r}: not found among the scene's parameters; give its shape"
+        ' id="template"'
+    )
 
 
 @dataclass
 class Target:
-    """One image on the device: ``rgb`` (H, W, 3), cut out by the mask where there is one; ``mask`` Float of P or None; ``area`` [pixels].
+    """One image on the device: ``rgb`` (H, W, 3), cut out by the mask where there is one; ``mask``
+    Float of P or None; ``area`` [pixels].
     """
 
     rgb: mi.TensorXf
@@ -53,7 +58,8 @@ class BadFrame(FloatingPointError):
 class Problem:
     """Shape from template on one video.
 
-    ``experiment``: :class:`polysft_mi.scene.Experiment`; ``sequence``: :class:`polysft_mi.sequence.Sequence`.
+    ``experiment``: :class:`polysft_mi.scene.Experiment`; ``sequence``:
+    :class:`polysft_mi.sequence.Sequence`.
     """
 
     def __init__(self, experiment, sequence):
@@ -63,14 +69,18 @@ class Problem:
         self.width, self.height = experiment.size
         self.pixels = self.width * self.height
         edges = self.template.edges
-        self.edges = tuple(mi.UInt32(np.ascontiguousarray(edges[:, k], dtype=np.uint32)) for k in (0, 1))
-        # of the jet at rest, not of the mesh: what the jet smooths away of a noisy template would else be stretched for ever
+        self.edges = tuple(
+            mi.UInt32(np.ascontiguousarray(edges[:, k], dtype=np.uint32)) for k in (0, 1)
+        )
+        # of the jet at rest, not of the mesh: what the jet smooths away of a noisy template would
+        # else be stretched for ever
         rest = self.surface(self.patch.rest()).astype(np.float64)
         lengths = np.linalg.norm(rest[edges[:, 0]] - rest[edges[:, 1]], axis=1)
         self.edge_lengths = mi.Float(lengths.astype(np.float32))
         self._corner = mi.UInt32(experiment.corner.astype(np.uint32))
         self._identity = np.array_equal(experiment.corner, np.arange(len(self.template.vertices)))
-        # through the scene, not the mesh alone: only so does the scene rebuild what it traces rays with
+        # through the scene, not the mesh alone: only so does the scene rebuild what it traces rays
+        # with
         self._params = mi.traverse(experiment.scene)
         self._key = _positions_key(self._params, experiment.mesh)
         self._targets = OrderedDict()
@@ -82,45 +92,79 @@ class Problem:
 
     def _setup_renderer(self):
         renderer = self.experiment.renderer
-        renderer.hide_emitters = True  # what is behind the surface is black, with a silhouette's gradient towards black
+        renderer.hide_emitters = (
+            True  # what is behind the surface is black, with a silhouette's gradient towards black
+        )
         self._raster = isinstance(renderer, RasterIntegrator)
         self._mask_renderer = None
         if not self._raster:
             if not str(self.experiment.sensor).startswith("PerspectiveCamera"):
-                raise InputError(f"{self.experiment.path}: {renderer.class_name()} takes Mitsuba's perspective sensor only (fx = fy); use raster")
+                raise InputError(
+                    f"{self.experiment.path}: {renderer.class_name()} takes Mitsuba's perspective"
+                    " sensor only (fx = fy); use raster"
+                )
             self._mask_renderer = mi.load_dict({"type": "silhouette_projective"})
 
     def place(self, vertices):
         """Put the surface (Point3f of N, attached or not) into the scene."""
         points = vertices
-        if not self._identity:  # in double, as wherever gradients are summed (objective.edge_lengths)
+        if (
+            not self._identity
+        ):  # in double, as wherever gradients are summed (objective.edge_lengths)
             points = mi.Point3f(dr.gather(mi.Point3d, mi.Float64(dr.ravel(vertices)), self._corner))
         self._params[self._key] = dr.ravel(points)
         self._params.update()
 
     def set_texcoords(self, texcoords):
-        """Replace the template's texture coordinates (Float of 2V, in the order of the rendered mesh); ``texcoords`` (NumPy) tells them."""
+        """Replace the template's texture coordinates (Float of 2V, in the order of the rendered
+        mesh); ``texcoords`` (NumPy) tells them.
+        """
         self.texcoords = np.array(texcoords)
         key = self._key.removesuffix("positions") + "texcoords"
         self._params[key] = texcoords
         self._params.update()
 
     def image(self, vertices, seed=0):
-        """Render the surface: (rgb tensor (H, W, 3), alpha Float of P), attached to the vertices."""
+        """Render the surface: (rgb tensor (H, W, 3), alpha Float of P), attached to the
+        vertices.
+        """
         self.place(vertices)
         scene, sensor, spp = self.experiment.scene, self.experiment.sensor, self.settings.spp
         if self._raster:
             image = self.experiment.renderer.image(scene, sensor, seed, spp)
             alpha = None
         else:
-            image = mi.render(scene, self._params, sensor=sensor, integrator=self.experiment.renderer, spp=spp, seed=seed)
-            mask = mi.render(scene, self._params, sensor=sensor, integrator=self._mask_renderer, spp=max(spp, 16), seed=~seed & 0xFFFFFFFF)
-            alpha = dr.gather(mi.Float, mask.array, dr.arange(mi.UInt32, self.pixels) * mask.shape[2])
+            image = mi.render(
+                scene,
+                self._params,
+                sensor=sensor,
+                integrator=self.experiment.renderer,
+                spp=spp,
+                seed=seed,
+            )
+            mask = mi.render(
+                scene,
+                self._params,
+                sensor=sensor,
+                integrator=self._mask_renderer,
+                spp=max(spp, 16),
+                seed=~seed & 0xFFFFFFFF,
+            )
+            alpha = dr.gather(
+                mi.Float, mask.array, dr.arange(mi.UInt32, self.pixels) * mask.shape[2]
+            )
         channels = image.shape[2]
         pixel = dr.arange(mi.UInt32, 3 * self.pixels)
-        rgb = dr.gather(mi.Float, image.array, pixel // 3 * channels + pixel % 3, mode=dr.ReduceMode.Permute)
+        rgb = dr.gather(
+            mi.Float, image.array, pixel // 3 * channels + pixel % 3, mode=dr.ReduceMode.Permute
+        )
         if alpha is None:
-            alpha = dr.gather(mi.Float, image.array, dr.arange(mi.UInt32, self.pixels) * channels + 3, mode=dr.ReduceMode.Permute)
+            alpha = dr.gather(
+                mi.Float,
+                image.array,
+                dr.arange(mi.UInt32, self.pixels) * channels + 3,
+                mode=dr.ReduceMode.Permute,
+            )
         return mi.TensorXf(rgb, (self.height, self.width, 3)), alpha
 
     # -- images -------------------------------------------------------------
@@ -135,7 +179,11 @@ class Problem:
             if mask is not None:
                 tensor = objective.blur(tensor, self.settings.blur)
             area = mi.Float(max(1.0, float(mask.sum()))) if mask is not None else None
-            device_mask = mi.Float(np.ascontiguousarray(mask, dtype=np.float32).ravel()) if mask is not None else None
+            device_mask = (
+                mi.Float(np.ascontiguousarray(mask, dtype=np.float32).ravel())
+                if mask is not None
+                else None
+            )
             if device_mask is not None and self.settings.lighting == "local":
                 tensor = objective.normalise_locally(tensor, self._weight_image(device_mask))
             dr.eval(tensor, area, device_mask)
@@ -163,41 +211,58 @@ class Problem:
             weight = objective.interior(alpha)
             area = dr.maximum(dr.sum(weight), 1)
         wanted = target.rgb
-        if target.mask is None and s.blur > 0:  # both cut out alike, else a band inside the silhouette would compare with the background
+        if (
+            target.mask is None and s.blur > 0
+            # both cut out alike, else a band inside the silhouette would compare with the
+            # background
+        ):
             inside = dr.gather(mi.Float, weight, dr.arange(mi.UInt32, 3 * self.pixels) // 3)
             rgb, wanted = (mi.TensorXf(x.array * inside, x.shape) for x in (rgb, wanted))
             wanted = objective.blur(wanted, s.blur)
         rgb = objective.blur(rgb, s.blur)
         if s.lighting == "local":
-            rgb = objective.normalise_locally(rgb, self._weight_image(alpha if target.mask is not None else weight))
+            rgb = objective.normalise_locally(
+                rgb, self._weight_image(alpha if target.mask is not None else weight)
+            )
             if target.mask is None:
                 wanted = objective.normalise_locally(wanted, self._weight_image(weight))
         a, b = self._channels(rgb), self._channels(wanted)
         if s.lighting == "gain":
             g = objective.gain([dr.detach(x) for x in a], b, objective.interior(alpha))
             a = [g * x for x in a]
-        terms["rgb"] = s.k_rgb * objective.photometric(a, b, weight, area, norm=s.rgb_norm, scale=s.rgb_scale)
-        terms["inextensibility"] = s.k_mi * objective.inextensibility(vertices, self.edges, self.edge_lengths, self.patch.scale)
+        terms["rgb"] = s.k_rgb * objective.photometric(
+            a, b, weight, area, norm=s.rgb_norm, scale=s.rgb_scale
+        )
+        terms["inextensibility"] = s.k_mi * objective.inextensibility(
+            vertices, self.edges, self.edge_lengths, self.patch.scale
+        )
         return terms
 
     def _channels(self, tensor):
         index = dr.arange(mi.UInt32, self.pixels) * 3
-        return [dr.gather(mi.Float, tensor.array, index + c, mode=dr.ReduceMode.Permute) for c in range(3)]
+        return [
+            dr.gather(mi.Float, tensor.array, index + c, mode=dr.ReduceMode.Permute)
+            for c in range(3)
+        ]
 
     def temporal_term(self, window):
         """The weighted temporal consistency of a list of Unknowns, a Float of 1, attached."""
         return self.settings.k_tc * objective.temporal(window)
 
     def evaluate(self, window, frames, *, backward=False, seed=0):
-        """The objective over a window: (total, terms), numbers; with ``backward``, the gradients are added to the unknowns.
+        """The objective over a window: (total, terms), numbers; with ``backward``, the gradients
+        are added to the unknowns.
 
-        ``window``: list of W Unknowns; ``frames``: their frames. Each frame's graph is traversed and freed before the next. Raises
-        :class:`BadFrame` where a frame's part is not finite.
+        ``window``: list of W Unknowns; ``frames``: their frames. Each frame's graph is traversed
+        and freed before the next. Raises :class:`BadFrame` where a frame's part is not finite.
         """
         sums = dict.fromkeys(TERMS, 0.0)
         parts = []
         for k, (unknowns, frame) in enumerate(zip(window, frames)):
-            terms = {name: value / len(window) for name, value in self.frame_terms(unknowns, frame, seed + 2 * k).items()}
+            terms = {
+                name: value / len(window)
+                for name, value in self.frame_terms(unknowns, frame, seed + 2 * k).items()
+            }
             parts.append(self._finish(terms, backward))
             value = sum(x[0] for x in parts[-1].values())
             if not np.isfinite(value):
@@ -222,31 +287,47 @@ class Problem:
         return values
 
     def check_start(self):
-        """Raise InputError where the template, as the scene places it, cannot be seen in the first frame."""
+        """Raise InputError where the template, as the scene places it, cannot be seen in the first
+        frame.
+        """
         position, before = self.camera.project(self.template.vertices)
         where = f"{self.experiment.path}: the template"
         if not before.all():
-            raise InputError(f"{where} has {int((~before).sum())} of {len(before)} vertices behind the camera; it must stand in its pose of the first frame")
+            raise InputError(
+                f"{where} has {int((~before).sum())} of {len(before)} vertices behind the camera;"
+                " it must stand in its pose of the first frame"
+            )
         low, high = position.min(0).round(), position.max(0).round()
         if self.visible_share(self.patch.rest()) == 0:
             raise InputError(
-                f"{where} is out of view in the first frame: it projects to x {low[0]:g}..{high[0]:g}, y {low[1]:g}..{high[1]:g} "
-                f"of an image of {self.width}x{self.height} pixels"
+                f"{where} is out of view in the first frame: it projects to x"
+                f" {low[0]:g}..{high[0]:g}, y {low[1]:g}..{high[1]:g} of an image of"
+                f" {self.width}x{self.height} pixels"
             )
         mask = self.sequence.mask(0)
         if mask is not None:
-            alpha = np.array(self.image(self.patch.vertices(self.patch.rest()))[1]).reshape(mask.shape)
+            alpha = np.array(self.image(self.patch.vertices(self.patch.rest()))[1]).reshape(
+                mask.shape
+            )
             if float((alpha * mask).sum()) == 0:
-                raise InputError(f"{where} does not meet the mask of the first frame: it projects to x {low[0]:g}..{high[0]:g}, y {low[1]:g}..{high[1]:g}")
+                raise InputError(
+                    f"{where} does not meet the mask of the first frame: it projects to x"
+                    f" {low[0]:g}..{high[0]:g}, y {low[1]:g}..{high[1]:g}"
+                )
 
         if not self._raster:
             if self.settings.solver != "adam":
                 name = self.experiment.renderer.class_name()
-                raise InputError(f"{self.experiment.path}: solver {self.settings.solver} renders with raster, not with {name}; give solver=adam for that")
+                raise InputError(
+                    f"{self.experiment.path}: solver {self.settings.solver} renders with raster,"
+                    f" not with {name}; give solver=adam for that"
+                )
             self._check_gradient()
 
     def _check_gradient(self):
-        """Raise InputError where the integrator cannot be differentiated; Mitsuba tells only when it is."""
+        """Raise InputError where the integrator cannot be differentiated; Mitsuba tells only when
+        it is.
+        """
         unknowns = self.patch.rest()
         dr.enable_grad(unknowns)
         try:
@@ -256,7 +337,10 @@ class Problem:
             pass  # the image is to blame, which the tracker tells
         except RuntimeError as error:
             name, cause = self.experiment.renderer.class_name(), str(error).strip().splitlines()[0]
-            raise InputError(f"{self.experiment.path}: integrator {name} gives no gradients; raster or prb_projective is needed ({cause[:120]})") from None
+            raise InputError(
+                f"{self.experiment.path}: integrator {name} gives no gradients; raster or"
+                f" prb_projective is needed ({cause[:120]})"
+            ) from None
 
     def visible_share(self, unknowns):
         """Share of the vertices that are before the camera and inside the image."""

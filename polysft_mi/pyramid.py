@@ -1,5 +1,5 @@
-"""Levels of an image: blurred, freed from lighting by local normalisation, on a coarser grid; of the video's frames and of the template's
-texture alike. NumPy and OpenCV only."""
+"""Levels of an image: blurred, freed from lighting by local normalisation, on a coarser grid; of
+the video's frames and of the template's texture alike. NumPy and OpenCV only."""
 
 import math
 from dataclasses import dataclass
@@ -9,13 +9,16 @@ import numpy as np
 
 POOL = 4  # local statistics are taken on an image this many times smaller
 FARTHEST = 30.0  # pixels of the grid beyond which a silhouette is pulled no harder
-_FLOOR = 0.02  # local standard deviation below which an area counts as flat: it is not blown up to the contrast of the rest
+# local standard deviation below which an area counts as flat: it is not blown up to the contrast of
+# the rest
+_FLOOR = 0.02
 
 
 @dataclass(frozen=True)
 class Level:
-    """How images are compared: blurred by ``sigma``, freed from lighting under a window of ``window`` (standard deviations, pixels of the
-    video), on a grid of every ``stride``-th pixel."""
+    """How images are compared: blurred by ``sigma``, freed from lighting under a window of
+    ``window`` (standard deviations, pixels of the video), on a grid of every ``stride``-th
+    pixel."""
 
     sigma: float
     stride: int = 1
@@ -24,10 +27,11 @@ class Level:
 
 @dataclass
 class LevelImage:
-    """A frame at a level: ``colour`` (h, w, 3) float32; ``inside`` (h, w), 1 where the sheet may be compared; with a mask, ``mask`` (h, w)
-    in [0, 1], and ``distance`` (h, w), pixels of this grid from the mask's contour, of either side. ``corner`` (x, y) [pixels of this
-    grid]: where these arrays begin; with a mask they end where it does, and everything that it takes part in: what lies beyond is not of
-    the sheet, and farther than ``FARTHEST`` from the contour."""
+    """A frame at a level: ``colour`` (h, w, 3) float32; ``inside`` (h, w), 1 where the sheet may be
+    compared; with a mask, ``mask`` (h, w) in [0, 1], and ``distance`` (h, w), pixels of this grid
+    from the mask's contour, of either side. ``corner`` (x, y) [pixels of this grid]: where these
+    arrays begin; with a mask they end where it does, and everything that it takes part in: what
+    lies beyond is not of the sheet, and farther than ``FARTHEST`` from the contour."""
 
     colour: np.ndarray
     inside: np.ndarray
@@ -41,7 +45,9 @@ def level_image(image, mask, level, normalise=True):
     (y, x), near = _around(mask, level)
     image, mask = image[near], mask[near] if mask is not None else None
     colour = compared(image, mask, level.sigma, level.window, normalise)
-    inside = np.ones(image.shape[:2], np.float32) if mask is None else (mask > 0.5).astype(np.float32)
+    inside = (
+        np.ones(image.shape[:2], np.float32) if mask is None else (mask > 0.5).astype(np.float32)
+    )
     if level.stride > 1:
         colour, inside = shrink(colour, level.stride), shrink(inside, level.stride)
         inside = (inside > 0.5).astype(np.float32)
@@ -54,35 +60,49 @@ def level_image(image, mask, level, normalise=True):
 
 
 def _around(mask, level):
-    """(y, x) where the part of an image begins that a mask (H, W) has a say in at a level, and its slices: everything without a mask."""
-    rows, columns = (np.flatnonzero(mask.any(axis=k)) for k in (1, 0)) if mask is not None else ((), ())
+    """(y, x) where the part of an image begins that a mask (H, W) has a say in at a level, and its
+    slices: everything without a mask.
+    """
+    rows, columns = (
+        (np.flatnonzero(mask.any(axis=k)) for k in (1, 0)) if mask is not None else ((), ())
+    )
     if len(rows) == 0:
         return (0, 0), (slice(None), slice(None))
     margin = int(max((FARTHEST + 2) * level.stride, 4 * level.sigma, 4 * level.window))
     step = math.lcm(level.stride, POOL)  # so that the grids of the part are those of the whole
-    at = [(max(0, int(x[0]) - margin) // step * step, (int(x[-1]) + margin) // step * step + step) for x in (rows, columns)]
+    at = [
+        (max(0, int(x[0]) - margin) // step * step, (int(x[-1]) + margin) // step * step + step)
+        for x in (rows, columns)
+    ]
     return (at[0][0], at[1][0]), tuple(slice(*x) for x in at)
 
 
 def compared(image, weight, sigma, window, normalise):
-    """The image as it is compared: blurred by ``sigma`` and, with ``normalise``, freed from lighting under ``window`` [pixels]; only what
-    is inside ``weight`` (H, W) counts."""
+    """The image as it is compared: blurred by ``sigma`` and, with ``normalise``, freed from
+    lighting under ``window`` [pixels]; only what is inside ``weight`` (H, W) counts."""
     image = blur(image, sigma, weight)
     return normalised(image, window, weight) if normalise else image
 
 
 def blur(image, sigma, weight=None):
-    """Gaussian blur of (H, W, C) or (H, W), standard deviation ``sigma`` [pixels]; with ``weight`` (H, W), only of what is inside."""
+    """Gaussian blur of (H, W, C) or (H, W), standard deviation ``sigma`` [pixels]; with ``weight``
+    (H, W), only of what is inside.
+    """
     if sigma <= 0:
         return image
     if weight is None:
         return _gaussian(image, sigma)
     across = (...,) + (None,) * (image.ndim - 2)  # the channels, where there are any
-    return _gaussian(image * weight[across], sigma) / np.maximum(_gaussian(weight, sigma), 1e-3)[across]
+    return (
+        _gaussian(image * weight[across], sigma)
+        / np.maximum(_gaussian(weight, sigma), 1e-3)[across]
+    )
 
 
 def normalised(image, sigma, weight=None):
-    """(H, W, C) less its local mean, over its local standard deviation (one for all channels), under a window of ``sigma`` [pixels]."""
+    """(H, W, C) less its local mean, over its local standard deviation (one for all channels),
+    under a window of ``sigma`` [pixels].
+    """
     pool = int(min(POOL, max(1, sigma // 2)))
     height, width = image.shape[:2]
     small = (max(1, width // pool), max(1, height // pool))
@@ -97,7 +117,11 @@ def normalised(image, sigma, weight=None):
     power = local(np.einsum("hwc,hwc->hw", weighted, image) / image.shape[2]) / share
     variance = power - (mean * mean).mean(-1)
     scale = 1 / np.sqrt(np.maximum(variance, 0) + _FLOOR**2)
-    both = cv2.resize(np.concatenate([mean * scale[..., None], scale[..., None]], -1), (width, height), interpolation=cv2.INTER_LINEAR)
+    both = cv2.resize(
+        np.concatenate([mean * scale[..., None], scale[..., None]], -1),
+        (width, height),
+        interpolation=cv2.INTER_LINEAR,
+    )
     return image * both[..., 3:] - both[..., :3]
 
 
@@ -106,8 +130,12 @@ def _gaussian(image, sigma):
 
 
 def shrink(image, stride):
-    """Means of blocks of stride x stride pixels; what is left over at the right and below is dropped."""
+    """Means of blocks of stride x stride pixels; what is left over at the right and below is
+    dropped.
+    """
     if stride == 1:
         return image
     height, width = image.shape[0] // stride, image.shape[1] // stride
-    return cv2.resize(image[: height * stride, : width * stride], (width, height), interpolation=cv2.INTER_AREA)
+    return cv2.resize(
+        image[: height * stride, : width * stride], (width, height), interpolation=cv2.INTER_AREA
+    )

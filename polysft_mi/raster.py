@@ -1,10 +1,13 @@
-"""The ``raster`` integrator: primary visibility, attached shading, analytic antialiasing of silhouettes.
+"""The ``raster`` integrator: primary visibility, attached shading, analytic antialiasing of
+silhouettes.
 
-One ray a pixel finds the visible triangle (detached). Its hit point, texture coordinates and colour are then recomputed
-with gradients. Where two neighbouring pixels see different sheets, the silhouette edge between their centres is found by walking
-over the mesh from the nearer one, and the two colours are blended by where the edge crosses, which makes the image a continuous,
-differentiable function of the vertices (after Laine et al. 2020, "Modular Primitives for High-Performance Differentiable
-Rendering", section 3.5; here the edge need not belong to the triangles seen at the two centres). ``docs/raster.md`` explains it.
+One ray a pixel finds the visible triangle (detached). Its hit point, texture coordinates and colour
+are then recomputed with gradients. Where two neighbouring pixels see different sheets, the
+silhouette edge between their centres is found by walking over the mesh from the nearer one, and the
+two colours are blended by where the edge crosses, which makes the image a continuous,
+differentiable function of the vertices (after Laine et al. 2020, "Modular Primitives for
+High-Performance Differentiable Rendering", section 3.5; here the edge need not belong to the
+triangles seen at the two centres). ``docs/raster.md`` explains it.
 
 Import only after a Mitsuba variant is set.
 """
@@ -20,7 +23,8 @@ from .errors import InputError
 from .pinhole import NEAR, Pinhole
 from .topology import Topology
 
-_TOLERANCE = 1e-3  # pixels by which an edge through a centre may pass it: the ray and the projection round differently
+# pixels by which an edge through a centre may pass it: the ray and the projection round differently
+_TOLERANCE = 1e-3
 _MAX_STEPS = 64  # triangles crossed between two neighbouring pixel centres before the walk gives up
 _AOVS = {"depth": 1, "normal": 3, "uv": 2, "triangle": 1}
 _AOV_CHANNELS = {"depth": "Z", "normal": "XYZ", "uv": "UV", "triangle": "I"}
@@ -32,12 +36,12 @@ def _cross2(a, b):
 
 @dataclass
 class Seen:
-    """What the pixels of a region see, detached but for ``positions`` and ``screen``; region pixels run row by row. Arrays alone, so that
-    frozen functions take it.
+    """What the pixels of a region see, detached but for ``positions`` and ``screen``; region pixels
+    run row by row. Arrays alone, so that frozen functions take it.
 
-    ``region``: (x0, y0, width, height), opaque UInt32; ``basis``, ``origin``: the camera as :meth:`Pinhole.device` gives it;
-    ``positions`` Float64 of 3V [m], ``screen`` Point3d of V (x, y [pixels], depth [m]): the vertices; ``triangle`` (-1 for none) and
-    ``depth`` [m] of each pixel.
+    ``region``: (x0, y0, width, height), opaque UInt32; ``basis``, ``origin``: the camera as
+    :meth:`Pinhole.device` gives it; ``positions`` Float64 of 3V [m], ``screen`` Point3d of V (x, y
+    [pixels], depth [m]): the vertices; ``triangle`` (-1 for none) and ``depth`` [m] of each pixel.
     """
 
     region: tuple
@@ -53,14 +57,16 @@ class Seen:
         return self.triangle >= 0
 
     def rays(self):
-        """A ray through the centre of each pixel, and the length of its direction before it was normalised (depth = t / length)."""
+        """A ray through the centre of each pixel, and the length of its direction before it was
+        normalised (depth = t / length).
+        """
         return _rays(self.region, self.basis, self.origin, dr.width(self.triangle))
 
 
 @dataclass
 class View(Seen):
-    """:class:`Seen`, and what it was found with: the region's ``size`` (width, height), ``ray`` and ``length`` as of :meth:`Seen.rays`, and
-    Mitsuba's preliminary ``intersection``."""
+    """:class:`Seen`, and what it was found with: the region's ``size`` (width, height), ``ray`` and
+    ``length`` as of :meth:`Seen.rays`, and Mitsuba's preliminary ``intersection``."""
 
     size: tuple
     ray: mi.Ray3f
@@ -79,30 +85,35 @@ class RasterIntegrator(mi.SamplingIntegrator):
 
      * - shading
        - |string|
-       - ``unlit``: the diffuse reflectance itself, from both sides. ``bsdf``: the BSDF under the scene's
-         emitters at the first hit, by ``shading_samples`` samples of the emitters, with shadows; the
-         environment shows behind the surface. (Default: ``unlit``)
+       - ``unlit``: the diffuse reflectance itself, from both sides. ``bsdf``: the BSDF under the
+         scene's emitters at the first hit, by ``shading_samples`` samples of the emitters, with
+         shadows; the environment shows behind the surface. (Default: ``unlit``)
      * - shading_samples
        - |int|
        - Emitter samples of each image sample where ``shading`` is ``bsdf``. (Default: 1)
      * - hide_emitters
        - |bool|
-       - Black instead of the environment behind the surface, where ``shading`` is ``bsdf``. (Default: false)
+       - Black instead of the environment behind the surface, where ``shading`` is ``bsdf``.
+         (Default: false)
      * - antialias
        - |bool|
-       - Blend the colours across silhouettes. Without it silhouettes carry no gradient. (Default: true)
+       - Blend the colours across silhouettes. Without it silhouettes carry no gradient. (Default:
+         true)
      * - aovs
        - |string|
        - Comma-separated channels behind colour and alpha: ``depth`` (z along the optical axis [m]),
-         ``normal`` (unit, world frame, towards the camera), ``uv`` (texture coordinates), ``triangle`` (index over all meshes
-         in the scene's order, -1 for none). They are not antialiased. (Default: none)
+         ``normal`` (unit, world frame, towards the camera), ``uv`` (texture coordinates),
+         ``triangle`` (index over all meshes in the scene's order, -1 for none). They are not
+         antialiased. (Default: none)
 
     What it is for: fitting a surface to an image and its silhouette together, from one noise-free
-    render. RGB is over black (premultiplied by alpha) where ``shading`` is ``unlit``. ``spp`` takes square numbers: 4 is a grid of
-    2x2 samples a pixel, each pixel their mean. The film's reconstruction filter is not used: a pixel is its own square.
+    render. RGB is over black (premultiplied by alpha) where ``shading`` is ``unlit``. ``spp`` takes
+    square numbers: 4 is a grid of 2x2 samples a pixel, each pixel their mean. The film's
+    reconstruction filter is not used: a pixel is its own square.
 
-    It is used like any integrator: ``mi.render(scene, params, integrator=...)``, in forward and reverse mode. Called directly under
-    Dr.Jit's AD, ``render()`` returns an attached image in one pass.
+    It is used like any integrator: ``mi.render(scene, params, integrator=...)``, in forward and
+    reverse mode. Called directly under Dr.Jit's AD, ``render()`` returns an attached image in one
+    pass.
     """
 
     def __init__(self, props):
@@ -114,7 +125,9 @@ class RasterIntegrator(mi.SamplingIntegrator):
         if self.shading not in ("unlit", "bsdf"):
             raise InputError(f"raster: shading = {self.shading!r}; known: unlit, bsdf")
         if self.shading_samples < 1:
-            raise InputError(f"raster: shading_samples = {self.shading_samples}; it must be at least 1")
+            raise InputError(
+                f"raster: shading_samples = {self.shading_samples}; it must be at least 1"
+            )
         for name in self.aovs:
             if name not in _AOVS:
                 raise InputError(f"raster: aov {name!r}; known: {', '.join(_AOVS)}")
@@ -125,16 +138,23 @@ class RasterIntegrator(mi.SamplingIntegrator):
         return [f"{name}.{channel}" for name in self.aovs for channel in _AOV_CHANNELS[name]]
 
     def to_string(self):
-        return f"RasterIntegrator[shading = {self.shading}, antialias = {self.antialias}, aovs = {self.aovs}]"
+        return (
+            f"RasterIntegrator[shading = {self.shading}, antialias = {self.antialias}, aovs ="
+            f" {self.aovs}]"
+        )
 
     # -- Mitsuba's interface ------------------------------------------------
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
-        """Image tensor (H, W, C) of the crop window, attached to whatever the scene is attached to."""
+        """Image tensor (H, W, C) of the crop window, attached to whatever the scene is attached
+        to.
+        """
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         image = self.image(scene, sensor, int(seed) if not dr.is_array_v(seed) else seed, spp)
         film = sensor.film()
-        if not dr.grad_enabled(image):  # let the film have it too, for whoever develops or writes that
+        if not dr.grad_enabled(
+            image
+        ):  # let the film have it too, for whoever develops or writes that
             film.prepare(self.aov_names())
             film.put_block(self._block(film, image))
             if evaluate:
@@ -173,11 +193,20 @@ class RasterIntegrator(mi.SamplingIntegrator):
     # -- the image ----------------------------------------------------------
 
     def _camera(self, sensor):
-        """The sensor as a linear map, made anew when the sensor, its pose, its lens or its crop window has changed."""
+        """The sensor as a linear map, made anew when the sensor, its pose, its lens or its crop
+        window has changed.
+        """
         film = sensor.film()
-        pose = [sensor.world_transform()] + ([sensor.projection_transform()] if hasattr(sensor, "projection_transform") else [])
+        pose = [sensor.world_transform()] + (
+            [sensor.projection_transform()] if hasattr(sensor, "projection_transform") else []
+        )
         with dr.suspend_grad():
-            key = (id(sensor), tuple(film.crop_size()), tuple(film.crop_offset()), *(np.array(t.matrix).tobytes() for t in pose))
+            key = (
+                id(sensor),
+                tuple(film.crop_size()),
+                tuple(film.crop_offset()),
+                *(np.array(t.matrix).tobytes() for t in pose),
+            )
         if self._camera_of != key:
             self._camera_of, self._pinhole = key, Pinhole(sensor)
         return self._pinhole
@@ -189,9 +218,11 @@ class RasterIntegrator(mi.SamplingIntegrator):
         return self._topology
 
     def look(self, scene, sensor, scale=1, box=None):
-        """Trace one ray a pixel: the :class:`View` of the scene at ``scale`` pixels a pixel and axis (a fraction for a coarser grid).
+        """Trace one ray a pixel: the :class:`View` of the scene at ``scale`` pixels a pixel and
+        axis (a fraction for a coarser grid).
 
-        ``box`` (x, y, x, y) [pixels]: what the surface covers, where the caller knows; else it is computed.
+        ``box`` (x, y, x, y) [pixels]: what the surface covers, where the caller knows; else it is
+        computed.
         """
         camera, topology = self._camera(sensor), self.topology(scene)
         width, height = int(camera.width * scale), int(camera.height * scale)
@@ -200,9 +231,15 @@ class RasterIntegrator(mi.SamplingIntegrator):
         positions = topology.positions()
         vertex = _gather_point(positions, dr.arange(mi.UInt32, topology.vertex_count))
         relative = inverse @ (vertex - origin)  # (x z, y z, z): pixels times depth
-        screen = mi.Point3d(mi.Point3f(relative.x / relative.z, relative.y / relative.z, relative.z))
+        screen = mi.Point3d(
+            mi.Point3f(relative.x / relative.z, relative.y / relative.z, relative.z)
+        )
         dr.eval(screen)
-        x0, y0, w, h = self._bounds(screen, width, height) if box is None else _margin([scale * x for x in box], width, height)
+        x0, y0, w, h = (
+            self._bounds(screen, width, height)
+            if box is None
+            else _margin([scale * x for x in box], width, height)
+        )
 
         with dr.suspend_grad():
             region = tuple(dr.opaque(mi.UInt32, k) for k in (x0, y0, w, h))
@@ -210,10 +247,18 @@ class RasterIntegrator(mi.SamplingIntegrator):
             pi = scene.ray_intersect_preliminary(ray, coherent=True)
             hit = pi.is_valid()
             shape = dr.reinterpret_array(mi.UInt32, pi.shape)
-            triangle = dr.select(hit, mi.Int32(dr.gather(mi.UInt32, topology.face_offset, shape, hit) + pi.prim_index), -1)
+            triangle = dr.select(
+                hit,
+                mi.Int32(dr.gather(mi.UInt32, topology.face_offset, shape, hit) + pi.prim_index),
+                -1,
+            )
             depth = dr.select(hit, pi.t / length, dr.inf)
-            dr.eval(pi, triangle, depth)  # once: everything below reads it, and the scene may change before it is evaluated
-        return View(region, basis, origin, positions, screen, triangle, depth, (w, h), ray, length, pi)
+            dr.eval(
+                pi, triangle, depth
+            )  # once: everything below reads it, and the scene may change before it is evaluated
+        return View(
+            region, basis, origin, positions, screen, triangle, depth, (w, h), ray, length, pi
+        )
 
     def image(self, scene, sensor, seed=0, spp=0):
         """What :meth:`render` returns, without a copy of it in the sensor's film."""
@@ -223,13 +268,29 @@ class RasterIntegrator(mi.SamplingIntegrator):
             raise InputError(f"raster: spp = {spp}; a square number is needed (1, 4, 9, 16, ...)")
         view = self.look(scene, sensor, scale)
         topology, hit = self._topology, view.hit
-        si, z = self._interaction(topology, view.positions, view.intersection.shape, view.triangle, view.ray, view.length, hit)
-        colour = self._unlit(si, hit) if self.shading == "unlit" else self._lit(scene, view.intersection, view.ray, hit, seed)
+        si, z = self._interaction(
+            topology,
+            view.positions,
+            view.intersection.shape,
+            view.triangle,
+            view.ray,
+            view.length,
+            hit,
+        )
+        colour = (
+            self._unlit(si, hit)
+            if self.shading == "unlit"
+            else self._lit(scene, view.intersection, view.ray, hit, seed)
+        )
         # red, green, blue and alpha packed; in double for the gradients, as positions are
         rgba = dr.ravel(mi.Vector4d(*colour, dr.select(hit, mi.Float(1), 0)))
         if self.antialias:
             rgba = self._antialias(topology, view, rgba)
-        aovs = [channel for name in self.aovs for channel in self._aov(name, si, z, view.triangle, view.ray, hit)]
+        aovs = [
+            channel
+            for name in self.aovs
+            for channel in self._aov(name, si, z, view.triangle, view.ray, hit)
+        ]
         alpha = mi.has_flag(sensor.film().flags(), mi.FilmFlags.Alpha)
         return self._assemble(rgba, aovs, view, self._camera(sensor), scale, alpha)
 
@@ -238,7 +299,13 @@ class RasterIntegrator(mi.SamplingIntegrator):
         if self.shading != "unlit" and not self.hide_emitters:
             return 0, 0, width, height  # the environment is seen everywhere
         with dr.suspend_grad():
-            box = [dr.min(screen.x), dr.min(screen.y), dr.max(screen.x), dr.max(screen.y), dr.min(screen.z)]
+            box = [
+                dr.min(screen.x),
+                dr.min(screen.y),
+                dr.max(screen.x),
+                dr.max(screen.y),
+                dr.min(screen.z),
+            ]
             dr.eval(box)
             xa, ya, xb, yb, near = (x[0] for x in box)
         if not near > NEAR or not all(map(math.isfinite, (xa, ya, xb, yb))):
@@ -246,7 +313,9 @@ class RasterIntegrator(mi.SamplingIntegrator):
         return _margin((xa, ya, xb, yb), width, height)
 
     def _interaction(self, topology, positions, shape, triangle, ray, length, hit):
-        """Surface interaction of rays with the planes of their triangles (attached), and depth along the axis."""
+        """Surface interaction of rays with the planes of their triangles (attached), and depth
+        along the axis.
+        """
         t = mi.UInt32(dr.select(hit, triangle, 0))
         index = [dr.gather(mi.UInt32, topology.faces, 3 * t + k, hit) for k in range(3)]
         p0, p1, p2 = (_gather_point(positions, i, hit) for i in index)
@@ -275,10 +344,14 @@ class RasterIntegrator(mi.SamplingIntegrator):
     @staticmethod
     def _unlit(si, hit):
         """The texture's own colour, from either side: 3 Floats, 0 where there is no surface."""
-        return [dr.select(hit, c, 0) for c in mi.Color3f(si.bsdf().eval_diffuse_reflectance(si, hit))]
+        return [
+            dr.select(hit, c, 0) for c in mi.Color3f(si.bsdf().eval_diffuse_reflectance(si, hit))
+        ]
 
     def _lit(self, scene, pi, ray, hit, seed):
-        """Emitted and directly reflected radiance at the first hit; the environment where there is none."""
+        """Emitted and directly reflected radiance at the first hit; the environment where there is
+        none.
+        """
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All, hit)
         bsdf = si.bsdf()
         seen = hit if self.hide_emitters else mi.Bool(True)
@@ -306,10 +379,12 @@ class RasterIntegrator(mi.SamplingIntegrator):
         return [mi.Float(triangle)]
 
     def crossings(self, view, outline=False):
-        """The silhouette edges that run between neighbouring pixel centres of a :class:`View`: detached (va, vb, near, far, horizontal),
-        None where there are none. With ``outline`` only those of which one centre sees no sheet at all.
+        """The silhouette edges that run between neighbouring pixel centres of a :class:`View`:
+        detached (va, vb, near, far, horizontal), None where there are none. With ``outline`` only
+        those of which one centre sees no sheet at all.
 
-        Vertices of each edge, the region's pixel whose sheet ends there, the other pixel, and whether the two lie side by side.
+        Vertices of each edge, the region's pixel whose sheet ends there, the other pixel, and
+        whether the two lie side by side.
         """
         topology, (x0, y0, w_, _), (w, h) = self._topology, view.region, view.size
         horizontal_count, count = (w - 1) * h, (w - 1) * h + w * (h - 1)
@@ -333,8 +408,12 @@ class RasterIntegrator(mi.SamplingIntegrator):
             a, b, horizontal = pixels(pair)
             swap = dr.gather(mi.Float, view.depth, b) < dr.gather(mi.Float, view.depth, a)
             near, far = dr.select(swap, b, a), dr.select(swap, a, b)
-            found, va, vb, near, far = self._silhouette(topology, view.screen, view.triangle, near, far, x0, y0, w_, horizontal)
-            dr.eval(found, va, vb, near, far, horizontal)  # in one kernel: compress and gather would each walk again
+            found, va, vb, near, far = self._silhouette(
+                topology, view.screen, view.triangle, near, far, x0, y0, w_, horizontal
+            )
+            dr.eval(
+                found, va, vb, near, far, horizontal
+            )  # in one kernel: compress and gather would each walk again
             kept = dr.compress(found)
             if dr.width(kept) == 0:
                 return None
@@ -342,7 +421,9 @@ class RasterIntegrator(mi.SamplingIntegrator):
             return va, vb, near, far, dr.gather(mi.Bool, horizontal, kept)
 
     def _antialias(self, topology, view, rgba):
-        """Blend the colours (packed, 4 w h) across the silhouettes that run between neighbouring pixel centres."""
+        """Blend the colours (packed, 4 w h) across the silhouettes that run between neighbouring
+        pixel centres.
+        """
         pairs = self.crossings(view)
         if pairs is None:
             return rgba
@@ -350,17 +431,28 @@ class RasterIntegrator(mi.SamplingIntegrator):
         ea, eb = point2(view.screen, va), point2(view.screen, vb)
         target, other, weight, place = blend(view, ea, eb, near, far, horizontal)
 
-        # The colour that comes in is the other sheet's where the edge crosses, not at the other pixel's centre: so the image stays
-        # continuous when a pixel's centre passes from one sheet to the other.
-        # (Local reduction, because the default would bake the size of the region into the kernels.)
+        # The colour that comes in is the other sheet's where the edge crosses, not at the other
+        # pixel's centre: so the image stays continuous when a pixel's centre passes from one sheet
+        # to the other. (Local reduction, because the default would bake the size of the region into
+        # the kernels.)
         incoming = dr.gather(mi.Vector4d, rgba, other, mode=dr.ReduceMode.Local)
         if self.shading == "unlit":
             direction = view.basis @ mi.Vector3f(place.x, place.y, 1)
             length = dr.norm(direction)
-            shape = dr.gather(mi.UInt32, dr.reinterpret_array(mi.UInt32, view.intersection.shape), other)
+            shape = dr.gather(
+                mi.UInt32, dr.reinterpret_array(mi.UInt32, view.intersection.shape), other
+            )
             visible = dr.gather(mi.Int32, view.triangle, other)
             ray = mi.Ray3f(view.origin, direction / length)
-            si, _ = self._interaction(topology, view.positions, dr.reinterpret_array(mi.ShapePtr, shape), visible, ray, length, visible >= 0)
+            si, _ = self._interaction(
+                topology,
+                view.positions,
+                dr.reinterpret_array(mi.ShapePtr, shape),
+                visible,
+                ray,
+                length,
+                visible >= 0,
+            )
             incoming = mi.Vector4d(*self._unlit(si, visible >= 0), incoming.w)
         difference = incoming - dr.gather(mi.Vector4d, rgba, target, mode=dr.ReduceMode.Local)
         out = rgba + 0
@@ -368,11 +460,15 @@ class RasterIntegrator(mi.SamplingIntegrator):
         return out
 
     def _silhouette(self, topology, screen, triangle, near, far, x0, y0, w, horizontal):
-        """Vertices (va, vb) of the silhouette edge between the centres of two pixels, and which pixel it occludes.
+        """Vertices (va, vb) of the silhouette edge between the centres of two pixels, and which
+        pixel it occludes.
 
-        Walks from the near pixel's triangle towards the far centre; where that sheet has no silhouette in between, from the far one's.
+        Walks from the near pixel's triangle towards the far centre; where that sheet has no
+        silhouette in between, from the far one's.
         """
-        found, va, vb, last = self._walk(topology, screen, triangle, near, far, x0, y0, w, mi.Bool(True))
+        found, va, vb, last = self._walk(
+            topology, screen, triangle, near, far, x0, y0, w, mi.Bool(True)
+        )
         beyond = dr.gather(mi.Int32, triangle, far)
         again = ~found & (beyond >= 0) & (last != beyond)  # else the two centres lie on one sheet
         found2, va2, vb2, _ = self._walk(topology, screen, triangle, far, near, x0, y0, w, again)
@@ -382,12 +478,15 @@ class RasterIntegrator(mi.SamplingIntegrator):
         return found & (dr.select(horizontal, edge.y, edge.x) != 0), va, vb, near, far
 
     def _walk(self, topology, screen, triangle, start, end, x0, y0, w, active):
-        """From the triangle seen at pixel ``start`` over the sheet towards the centre of ``end``: whether a silhouette edge comes before
-        that centre, its vertices, and the last triangle reached."""
+        """From the triangle seen at pixel ``start`` over the sheet towards the centre of ``end``:
+        whether a silhouette edge comes before that centre, its vertices, and the last triangle
+        reached."""
         c0, c1 = _centre(start, x0, y0, w), _centre(end, x0, y0, w)
 
         def corners(t, mask):
-            return [dr.gather(mi.UInt32, topology.faces, 3 * mi.UInt32(t) + k, mask) for k in range(3)]
+            return [
+                dr.gather(mi.UInt32, topology.faces, 3 * mi.UInt32(t) + k, mask) for k in range(3)
+            ]
 
         def area(points):
             return _cross2(points[1] - points[0], points[2] - points[0])
@@ -410,7 +509,9 @@ class RasterIntegrator(mi.SamplingIntegrator):
                 exit_at, exit_edge = dr.select(first, t, exit_at), dr.select(first, k, exit_edge)
             usable = (dr.minimum(dr.minimum(p[0].z, p[1].z), p[2].z) > NEAR) & (sign != 0)
             leaves = active & usable & (exit_at < 1 + _TOLERANCE)
-            across = dr.gather(mi.Int32, topology.neighbours, 3 * mi.UInt32(current) + exit_edge, leaves)
+            across = dr.gather(
+                mi.Int32, topology.neighbours, 3 * mi.UInt32(current) + exit_edge, leaves
+            )
             inner = leaves & (across >= 0)
             r = [dr.gather(mi.Point3f, flat, i, inner) for i in corners(across, inner)]
             silhouette = leaves & ((across < 0) | (area(r) * sign <= 0))
@@ -431,11 +532,14 @@ class RasterIntegrator(mi.SamplingIntegrator):
             dr.zeros(mi.UInt32, n),
             dr.zeros(mi.UInt32, n),
         )
-        _, last, found, va, vb, _ = dr.while_loop(state, lambda active, *_: active, step, label="walk")
+        _, last, found, va, vb, _ = dr.while_loop(
+            state, lambda active, *_: active, step, label="walk"
+        )
         return found, va, vb, last
 
     def _assemble(self, rgba, aovs, view, camera, scale, alpha):
-        """Put the region into the full image and shape it (H, W, C): colours averaged over the samples of a pixel, AOVs of its middle one.
+        """Put the region into the full image and shape it (H, W, C): colours averaged over the
+        samples of a pixel, AOVs of its middle one.
         """
         (x0, y0, w_, _), (w, h) = view.region, view.size
         width, height = camera.width, camera.height
@@ -449,14 +553,24 @@ class RasterIntegrator(mi.SamplingIntegrator):
         out = dr.zeros(mi.Float, width * height * count)
         value = mi.Vector4f(dr.gather(mi.Vector4d, rgba, index, mode=dr.ReduceMode.Local))
         value = value if alpha else mi.Vector3f(value.x, value.y, value.z)
-        place = [(value, pixel)] if not aovs else [(value[c], pixel * count + c) for c in range(colours)]
+        place = (
+            [(value, pixel)]
+            if not aovs
+            else [(value[c], pixel * count + c) for c in range(colours)]
+        )
         for part, at in place:
             if scale > 1:
                 dr.scatter_add(out, part / (scale * scale), at, mode=dr.ReduceMode.Local)
             else:
                 dr.scatter(out, part, at)
         if "triangle" in self.aovs:  # no triangle is -1, outside the region too
-            dr.scatter(out, mi.Float(-1), dr.arange(mi.UInt32, width * height) * count + colours + self.aov_names().index("triangle.I"))
+            dr.scatter(
+                out,
+                mi.Float(-1),
+                dr.arange(mi.UInt32, width * height) * count
+                + colours
+                + self.aov_names().index("triangle.I"),
+            )
         middle = (sx - px * scale == scale // 2) & (sy - py * scale == scale // 2)
         for c, part in enumerate(aovs):
             dr.scatter(out, part, pixel * count + colours + c, middle)
@@ -477,8 +591,8 @@ def _centre(pixel, x0, y0, w):
 
 
 def blend(seen, ea, eb, near, far, horizontal):
-    """How an edge between two pixel centres blends them: (pixel that changes, pixel whose colour comes in, its weight, where the edge
-    crosses).
+    """How an edge between two pixel centres blends them: (pixel that changes, pixel whose colour
+    comes in, its weight, where the edge crosses).
 
     ``ea``, ``eb``: the edge's ends [pixels], attached; the weight and the place are.
     """
@@ -494,14 +608,15 @@ def blend(seen, ea, eb, near, far, horizontal):
     place = mi.Point2f(dr.select(horizontal, crossing, cn.x), dr.select(horizontal, cn.y, crossing))
     # the near sheet covers a part of the far pixel, or the far one a part of the near
     beyond = dr.detach(t) > 0.5
-    # The pairs across either axis would account for the whole edge; sin^2 and cos^2 of its angle share it between them.
+    # The pairs across either axis would account for the whole edge; sin^2 and cos^2 of its angle
+    # share it between them.
     weight = dr.clip(dr.abs(t - 0.5), 0, 0.5) * across * across / (along * along + across * across)
     return dr.select(beyond, far, near), dr.select(beyond, near, far), weight, place
 
 
 def _margin(box, width, height):
-    """(x, y, width, height) of the pixels around a box (x, y, x, y) within the image, with a margin for the neighbours that antialiasing
-    blends with.
+    """(x, y, width, height) of the pixels around a box (x, y, x, y) within the image, with a margin
+    for the neighbours that antialiasing blends with.
     """
     xa, ya, xb, yb = box
     xa, ya = max(0, math.floor(min(xa, width)) - 1), max(0, math.floor(min(ya, height)) - 1)
@@ -516,4 +631,6 @@ def _gather_point(positions, index, mask=True):
 
 def point2(screen, index, mask=True):
     """Screen positions of the vertices ``index``, attached to ``screen``."""
-    return mi.Point2f(*(mi.Float(dr.gather(mi.Float64, x, index, mask)) for x in (screen.x, screen.y)))
+    return mi.Point2f(
+        *(mi.Float(dr.gather(mi.Float64, x, index, mask)) for x in (screen.x, screen.y))
+    )

@@ -1,10 +1,13 @@
-"""Finding a lost sheet again: features of the template's texture in the image, and the rigid pose that they give. NumPy and OpenCV only."""
+"""Finding a lost sheet again: features of the template's texture in the image, and the rigid pose
+that they give. NumPy and OpenCV only.
+"""
 
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-_RATIO = 0.8  # of the distances to the best and the second match, above which a match counts as ambiguous
+# of the distances to the best and the second match, above which a match counts as ambiguous
+_RATIO = 0.8
 _INLIERS = 12
 _TOLERANCE = 12.0  # pixels that the flat template may miss a match by: the sheet is bent
 
@@ -15,7 +18,9 @@ def grey(image):
 
 
 class Relocator:
-    """The template's features, on the baked texture of a :class:`polysft_mi.registration.Registration`."""
+    """The template's features, on the baked texture of a
+    :class:`polysft_mi.registration.Registration`.
+    """
 
     def __init__(self, registration):
         self.camera = registration.camera
@@ -23,16 +28,25 @@ class Relocator:
         texture = registration.texture
         inside = registration.texture_inside.astype(np.uint8)
         keys, self._descriptors = self._detector.detectAndCompute(grey(texture), inside)
-        self._points = registration.on_template(np.array([k.pt for k in keys]).reshape(-1, 2)) if keys else np.empty((0, 3))
+        self._points = (
+            registration.on_template(np.array([k.pt for k in keys]).reshape(-1, 2))
+            if keys
+            else np.empty((0, 3))
+        )
         known = np.isfinite(self._points).all(axis=1)
         self._points = self._points[known]
         self._descriptors = self._descriptors[known] if self._descriptors is not None else None
 
     def pose(self, image):
-        """The motion (Rotation, translation (3,) [m]), p -> R p + t in the world, from the template to a linear image (H, W, 3); None
-        where too few features agree."""
+        """The motion (Rotation, translation (3,) [m]), p -> R p + t in the world, from the template
+        to a linear image (H, W, 3); None where too few features agree."""
         keys, descriptors = self._detector.detectAndCompute(grey(image), None)
-        if descriptors is None or self._descriptors is None or len(keys) < _INLIERS or len(self._points) < _INLIERS:
+        if (
+            descriptors is None
+            or self._descriptors is None
+            or len(keys) < _INLIERS
+            or len(self._points) < _INLIERS
+        ):
             return None
         matches = cv2.BFMatcher().knnMatch(self._descriptors, descriptors, k=2)
         good = [m[0] for m in matches if len(m) == 2 and m[0].distance < _RATIO * m[1].distance]
@@ -45,12 +59,20 @@ class Relocator:
         rays = rays[:, :2] / rays[:, 2:]
         focal = 1 / np.linalg.norm(camera.basis[:, 0])
         found, turn, shift, inliers = cv2.solvePnPRansac(
-            points, rays, np.eye(3), None, reprojectionError=_TOLERANCE / focal, iterationsCount=300, flags=cv2.SOLVEPNP_EPNP
+            points,
+            rays,
+            np.eye(3),
+            None,
+            reprojectionError=_TOLERANCE / focal,
+            iterationsCount=300,
+            flags=cv2.SOLVEPNP_EPNP,
         )
         if not found or inliers is None or len(inliers) < _INLIERS:
             return None
         inliers = inliers.ravel()
-        turn, shift = cv2.solvePnPRefineLM(points[inliers], rays[inliers], np.eye(3), None, turn, shift)
+        turn, shift = cv2.solvePnPRefineLM(
+            points[inliers], rays[inliers], np.eye(3), None, turn, shift
+        )
         rotation = to_camera.T @ cv2.Rodrigues(turn)[0] @ to_camera
         translation = camera.origin + to_camera.T @ shift.ravel() - rotation @ camera.origin
         if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):

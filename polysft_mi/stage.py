@@ -1,4 +1,5 @@
-"""A stage: moving meshes, a floor and light, path-traced by Mitsuba. How drapes of OneFit become pictures and videos.
+"""A stage: moving meshes, a floor and light, path-traced by Mitsuba. How drapes of OneFit become
+pictures and videos.
 
 Import only after a Mitsuba variant is set.
 """
@@ -15,16 +16,23 @@ FOV = 28.0  # degrees, of the picture's height
 def render(parts, *, size=(640, 480), spp=24, azimuth=25.0, elevation=8.0, follow=False):
     """Images (H, W, 3) uint8 sRGB, one a frame, of moving meshes on a floor.
 
-    ``parts``: of each mesh its vertices (T, N, 3) [m, z up], its faces (F, 3) and its colour, linear RGB. ``size``: (height, width)
-    [pixels]; ``azimuth`` [degrees] to the side of the -y axis that the camera stands on, ``elevation`` above the floor. The camera keeps
-    all in the picture; with ``follow`` it goes along with what moves.
+    ``parts``: of each mesh its vertices (T, N, 3) [m, z up], its faces (F, 3) and its colour,
+    linear RGB. ``size``: (height, width) [pixels]; ``azimuth`` [degrees] to the side of the -y axis
+    that the camera stands on, ``elevation`` above the floor. The camera keeps all in the picture;
+    with ``follow`` it goes along with what moves.
     """
     height, width = size
     everything = np.concatenate([np.asarray(v, np.float32) for v, _, _ in parts], axis=1)
     low, high = everything.min(axis=1), everything.max(axis=1)  # (T, 3)
     scene = mi.load_dict(_scene(parts, low[:, 2].min()))
     params = mi.traverse(scene)
-    film = {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "gaussian"}, "pixel_format": "rgb"}
+    film = {
+        "type": "hdrfilm",
+        "width": width,
+        "height": height,
+        "rfilter": {"type": "gaussian"},
+        "pixel_format": "rgb",
+    }
     middle = (low.min(axis=0) + high.max(axis=0)) / 2
     half = ((high - low).max(axis=0) if follow else high.max(axis=0) - low.min(axis=0)) / 2 * MARGIN
     across = max(half[2], np.hypot(half[0], half[1]) * height / width)
@@ -33,7 +41,9 @@ def render(parts, *, size=(640, 480), spp=24, azimuth=25.0, elevation=8.0, follo
     away = distance * np.array([np.sin(a) * np.cos(e), -np.cos(a) * np.cos(e), np.sin(e)])
     for t in range(len(everything)):
         for k, (vertices, _, _) in enumerate(parts):
-            params[f"part{k}.vertex_positions"] = mi.Float(np.asarray(vertices[t], np.float32).ravel())
+            params[f"part{k}.vertex_positions"] = mi.Float(
+                np.asarray(vertices[t], np.float32).ravel()
+            )
         params.update()
         target = (low[t] + high[t]) / 2 if follow else middle
         sensor = mi.load_dict({
@@ -41,7 +51,11 @@ def render(parts, *, size=(640, 480), spp=24, azimuth=25.0, elevation=8.0, follo
             "to_world": mi.ScalarTransform4f().look_at(origin=list(target + away), target=list(target), up=[0, 0, 1]),
         })  # fmt: skip
         image = mi.render(scene, sensor=sensor, spp=spp, seed=t)
-        yield np.array(mi.Bitmap(image).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True))
+        yield np.array(
+            mi.Bitmap(image).convert(
+                mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True
+            )
+        )
 
 
 def _scene(parts, floor):
@@ -59,14 +73,21 @@ def _scene(parts, floor):
         },
     }  # fmt: skip
     for k, (vertices, faces, colour) in enumerate(parts):
-        stage[f"part{k}"] = _mesh(f"part{k}", np.asarray(vertices[0], np.float32), np.asarray(faces), colour)
+        stage[f"part{k}"] = _mesh(
+            f"part{k}", np.asarray(vertices[0], np.float32), np.asarray(faces), colour
+        )
     return stage
 
 
 def _mesh(name, vertices, faces, colour):
     bsdf = {
         "type": "twosided",
-        "bsdf": {"type": "principled", "base_color": {"type": "rgb", "value": list(colour)}, "roughness": 0.7, "specular": 0.2},
+        "bsdf": {
+            "type": "principled",
+            "base_color": {"type": "rgb", "value": list(colour)},
+            "roughness": 0.7,
+            "specular": 0.2,
+        },
     }
     props = mi.Properties()
     props["bsdf"] = mi.load_dict(bsdf)

@@ -1,7 +1,9 @@
-"""The template: a mesh held by one jet in its canonical frame (paper, sections "PolyFit" and "PolySfT"). NumPy.
+"""The template: a mesh held by one jet in its canonical frame (paper, sections "PolyFit" and
+"PolySfT"). NumPy.
 
-The frame and the fit are those of :class:`polyfit.frames.CanonicalFrame` and :func:`polyfit.jets.fit`, for one patch: to load torch would take
-longer than the rest of a run's start.
+The frame and the fit are those of :class:`polyfit.frames.CanonicalFrame` and
+:func:`polyfit.jets.fit`, for one patch: to load torch would take longer than the rest of a run's
+start.
 """
 
 from dataclasses import dataclass
@@ -18,10 +20,12 @@ from .errors import InputError
 class Template:
     """A surface S = {O, phi(u, v)}: mesh, orientation, chart and coefficients, float64.
 
-    ``vertices`` (N, 3) [m, camera frame] and ``faces`` (F, 3) as in the file; ``uv`` (N, 2) texture coordinates, v up; ``scale`` [m],
-    ``rotation`` (3, 3), ``origin`` (3,) [m]: the orientation O = (s, R, T), p = s R x + T; ``chart`` (N, 2): (u, v) of each vertex, at
-    most 1 in norm; ``alpha`` (A,): the jet, in the chart's unit, zero beyond the order that was fitted; ``residual`` (N,) [m]: signed
-    distance along the chart's normal that the jet leaves; ``fitted``: the order that was fitted.
+    ``vertices`` (N, 3) [m, camera frame] and ``faces`` (F, 3) as in the file; ``uv`` (N, 2) texture
+    coordinates, v up; ``scale`` [m], ``rotation`` (3, 3), ``origin`` (3,) [m]: the orientation O =
+    (s, R, T), p = s R x + T; ``chart`` (N, 2): (u, v) of each vertex, at most 1 in norm; ``alpha``
+    (A,): the jet, in the chart's unit, zero beyond the order that was fitted; ``residual`` (N,)
+    [m]: signed distance along the chart's normal that the jet leaves; ``fitted``: the order that
+    was fitted.
     """
 
     vertices: np.ndarray
@@ -43,7 +47,10 @@ class Template:
     @property
     def edges(self):
         """Edges of the mesh, each once, (E, 2)."""
-        e = np.sort(np.concatenate([self.faces[:, [0, 1]], self.faces[:, [1, 2]], self.faces[:, [2, 0]]]), axis=1)
+        e = np.sort(
+            np.concatenate([self.faces[:, [0, 1]], self.faces[:, [1, 2]], self.faces[:, [2, 0]]]),
+            axis=1,
+        )
         return np.unique(e, axis=0)
 
     @property
@@ -57,16 +64,34 @@ class Template:
         return float(np.abs(self.residual).max())
 
     @classmethod
-    def fit(cls, vertices, faces, uv, order, *, capacity=None, exact=True, frame=None, tolerance=0.05, where="template"):
-        """Fit a jet of ``order`` to the mesh, in ``frame``, a :class:`polyfit.frames.CanonicalFrame` in float64, or else in its PCA frame;
-        it has the coefficients of order ``capacity`` (default: the same), those beyond ``order`` zero. Where not ``exact``, vertices that
-        determine less get the highest order that they do.
+    def fit(
+        cls,
+        vertices,
+        faces,
+        uv,
+        order,
+        *,
+        capacity=None,
+        exact=True,
+        frame=None,
+        tolerance=0.05,
+        where="template",
+    ):
+        """Fit a jet of ``order`` to the mesh, in ``frame``, a
+        :class:`polyfit.frames.CanonicalFrame` in float64, or else in its PCA frame; it has the
+        coefficients of order ``capacity`` (default: the same), those beyond ``order`` zero. Where
+        not ``exact``, vertices that determine less get the highest order that they do.
 
-        Raises InputError where the order is too high for the vertices (if ``exact``), where the surface folds over in its chart (a closed surface does),
-        or where the largest residual exceeds ``tolerance`` times the scale s.
+        Raises InputError where the order is too high for the vertices (if ``exact``), where the
+        surface folds over in its chart (a closed surface does), or where the largest residual
+        exceeds ``tolerance`` times the scale s.
         """
         points = np.asarray(vertices, dtype=np.float64)
-        scale, rotation, origin = _principal_frame(points) if frame is None else (np.asarray(x) for x in (frame.s, frame.R, frame.T))
+        scale, rotation, origin = (
+            _principal_frame(points)
+            if frame is None
+            else (np.asarray(x) for x in (frame.s, frame.R, frame.T))
+        )
         x = (points - origin) @ rotation / scale
         alpha, fitted = _fitted(x, order)
         if fitted < order and exact:
@@ -87,18 +112,20 @@ class Template:
             fitted,
         )
         measured = (
-            f"the residual of the {template.fitted}-jet is {1e3 * template.residual_rms:.3g} mm RMS, {1e3 * template.residual_max:.3g} mm at most, "
-            f"of a radius of {1e3 * template.scale:.3g} mm"
+            f"the residual of the {template.fitted}-jet is {1e3 * template.residual_rms:.3g} mm"
+            f" RMS, {1e3 * template.residual_max:.3g} mm at most, of a radius of"
+            f" {1e3 * template.scale:.3g} mm"
         )
         flipped = _flipped(template.chart, template.faces)
         if flipped:
             raise InputError(
-                f"{where}: one jet cannot hold it: {flipped} of {len(faces)} triangles fold over in its chart ({measured}); "
-                "a height graph over a plane is needed"
+                f"{where}: one jet cannot hold it: {flipped} of {len(faces)} triangles fold over in"
+                f" its chart ({measured}); a height graph over a plane is needed"
             )
         if template.residual_max > tolerance * template.scale:
             raise InputError(
-                f"{where}: one jet cannot hold it: {measured}; at most fit_tolerance = {tolerance:g} of the radius is accepted, a higher order may do"
+                f"{where}: one jet cannot hold it: {measured}; at most fit_tolerance ="
+                f" {tolerance:g} of the radius is accepted, a higher order may do"
             )
         return template
 
@@ -112,7 +139,9 @@ def _flipped(chart, faces):
 
 
 def _principal_frame(points):
-    """(s, R, T) of points (P, 3) by their principal components, signs by the data, as ``CanonicalFrame.from_points`` has them."""
+    """(s, R, T) of points (P, 3) by their principal components, signs by the data, as
+    ``CanonicalFrame.from_points`` has them.
+    """
     origin = points.mean(0)
     centred = points - origin
     scale = np.sqrt((centred**2).sum(1).max())
@@ -125,21 +154,25 @@ def _principal_frame(points):
 
 
 def _side(along):
-    """1 or -1: where the third moment of coordinates (P,) lies; of symmetric ones, where the first lies that is half as far out as the
-    farthest."""
+    """1 or -1: where the third moment of coordinates (P,) lies; of symmetric ones, where the first
+    lies that is half as far out as the farthest."""
     skew = (along**3).mean()
     far = np.abs(along) >= 0.5 * np.abs(along).max()
     return -1.0 if (skew if abs(skew) > 1e-9 else along[far.argmax()]) < 0 else 1.0
 
 
 def _fitted(x, order):
-    """(coefficients (A,), order) of the least-squares jet of ``order`` through points x (P, 3) of a chart, or of the highest order that they
-    determine: products of Chebyshev polynomials in the points' box, turned into monomials."""
+    """(coefficients (A,), order) of the least-squares jet of ``order`` through points x (P, 3) of a
+    chart, or of the highest order that they determine: products of Chebyshev polynomials in the
+    points' box, turned into monomials."""
     powers = exponents(order)
     low, high = x[:, :2].min(0), x[:, :2].max(0)
     centre, half = (low + high) / 2, (high - low) / 2
     half = np.maximum(half, max(NARROWEST * half.max(), 1e-300))
-    values = [chebyshev.chebvander((x[:, k] - centre[k]) / half[k], order)[:, powers[:, k]] for k in (0, 1)]
+    values = [
+        chebyshev.chebvander((x[:, k] - centre[k]) / half[k], order)[:, powers[:, k]]
+        for k in (0, 1)
+    ]
     basis = values[0] * values[1] / np.sqrt(len(x))
     kept = np.zeros(len(powers))
     diagonal = np.abs(np.diagonal(np.linalg.qr(basis, mode="r")))
@@ -148,8 +181,16 @@ def _fitted(x, order):
     size = size_of(fitted)
     solution = np.zeros(len(powers))
     solution[:size] = np.linalg.lstsq(basis[:, :size], x[:, 2] / np.sqrt(len(x)), rcond=None)[0]
-    axes = [[Chebyshev.basis(n, domain=[c - h, c + h]).convert(kind=Polynomial).coef for n in range(order + 1)] for c, h in zip(centre, half)]
-    to_u, to_v = (np.stack([np.pad(row, (0, order + 1 - len(row))) for row in rows]) for rows in axes)
+    axes = [
+        [
+            Chebyshev.basis(n, domain=[c - h, c + h]).convert(kind=Polynomial).coef
+            for n in range(order + 1)
+        ]
+        for c, h in zip(centre, half)
+    ]
+    to_u, to_v = (
+        np.stack([np.pad(row, (0, order + 1 - len(row))) for row in rows]) for rows in axes
+    )
     return (to_u.T @ matrix(solution) @ to_v)[tuple(powers.T)], fitted
 
 

@@ -1,4 +1,6 @@
-"""Which triangle lies across each edge, over all meshes of a scene. Import only after a Mitsuba variant is set."""
+"""Which triangle lies across each edge, over all meshes of a scene. Import only after a Mitsuba
+variant is set.
+"""
 
 import drjit as dr
 import mitsuba as mi
@@ -8,13 +10,18 @@ from .errors import InputError
 
 
 class Topology:
-    """Triangles of all meshes of a scene in one numbering, with their neighbours. Detached; vertices that coincide are one."""
+    """Triangles of all meshes of a scene in one numbering, with their neighbours. Detached;
+    vertices that coincide are one.
+    """
 
     def __init__(self, scene):
         self.shapes = scene.shapes()
         for shape in self.shapes:
             if not shape.is_mesh():
-                raise InputError(f"shape {shape.id()!r}: raster renders triangle meshes only; {type(shape).__name__} is none")
+                raise InputError(
+                    f"shape {shape.id()!r}: raster renders triangle meshes only;"
+                    f" {type(shape).__name__} is none"
+                )
         self._key = _key(self.shapes)
         faces, neighbours, face_offset, vertex_offset = [], [], [0], [0]
         for shape in self.shapes:
@@ -30,9 +37,16 @@ class Topology:
         self.faces = mi.UInt32(np.concatenate(faces).ravel().astype(np.uint32))
         self.neighbours = mi.Int32(np.concatenate(neighbours).ravel().astype(np.int32))
         # from a shape's place in the registry to its first triangle
-        self.face_offset = dr.zeros(mi.UInt32, 1 + max(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(s))[0] for s in self.shapes))
+        self.face_offset = dr.zeros(
+            mi.UInt32,
+            1 + max(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(s))[0] for s in self.shapes),
+        )
         for shape, offset in zip(self.shapes, face_offset):
-            dr.scatter(self.face_offset, mi.UInt32(offset), dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape)))
+            dr.scatter(
+                self.face_offset,
+                mi.UInt32(offset),
+                dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape)),
+            )
         dr.eval(self.faces, self.neighbours, self.face_offset)
 
     def fits(self, scene):
@@ -42,22 +56,31 @@ class Topology:
     def positions(self):
         """Positions of all vertices, a flat Float64 of 3V, attached.
 
-        In double precision for the sake of their gradients: threads add these up in any order, and only in float32 does the order show.
+        In double precision for the sake of their gradients: threads add these up in any order, and
+        only in float32 does the order show.
         """
         return mi.Float64(_joined([s.vertex_positions_buffer() for s in self.shapes]))
 
     def texcoords(self):
-        """Texture coordinates of all vertices, a flat Float of 2V; zeros for meshes that have none."""
+        """Texture coordinates of all vertices, a flat Float of 2V; zeros for meshes that have
+        none.
+        """
         return _joined(
             [
-                s.vertex_texcoords_buffer() if s.has_vertex_texcoords() else dr.zeros(mi.Float, 2 * s.vertex_count())
+                (
+                    s.vertex_texcoords_buffer()
+                    if s.has_vertex_texcoords()
+                    else dr.zeros(mi.Float, 2 * s.vertex_count())
+                )
                 for s in self.shapes
             ]
         )
 
 
 def _key(shapes):
-    return tuple((id(s), s.face_count(), s.vertex_count()) if s.is_mesh() else id(s) for s in shapes)
+    return tuple(
+        (id(s), s.face_count(), s.vertex_count()) if s.is_mesh() else id(s) for s in shapes
+    )
 
 
 def _joined(arrays):
@@ -65,7 +88,9 @@ def _joined(arrays):
 
 
 def _neighbours(faces):
-    """Across edge k of each triangle, from corner k to corner k+1: the other triangle, or -1. faces (F, 3) -> (F, 3)."""
+    """Across edge k of each triangle, from corner k to corner k+1: the other triangle, or -1. faces
+    (F, 3) -> (F, 3).
+    """
     edge = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], -1).reshape(-1, 2), axis=1)
     _, edge_id, count = np.unique(edge, axis=0, return_inverse=True, return_counts=True)
     edge_id = edge_id.reshape(-1)

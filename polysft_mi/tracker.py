@@ -1,4 +1,5 @@
-"""The adaptive sliding window over a video (supplement, "Adaptive Window Optimization"), with checkpoints.
+"""The adaptive sliding window over a video (supplement, "Adaptive Window Optimization"), with
+checkpoints.
 
 Import only after a Mitsuba variant is set.
 """
@@ -19,9 +20,15 @@ from .patch import Unknowns
 from .problem import TERMS, BadFrame
 
 CHECKPOINT, LOG = "checkpoint.npz", "log.jsonl"
-_VISIBLE = 0.02  # share of the vertices inside the image below which the surface is said to have left it
+_VISIBLE = (
+    0.02  # share of the vertices inside the image below which the surface is said to have left it
+)
 _PAST = 20  # frames that a solver is told of
-_AROUND, _SUSPECT, _SUSPECT_MARGIN = 5, 1.25, 0.05  # frames, and how far above their median misfit one is solved again
+_AROUND, _SUSPECT, _SUSPECT_MARGIN = (
+    5,
+    1.25,
+    0.05,
+)  # frames, and how far above their median misfit one is solved again
 _HOLD = 0.1  # weight that then holds it to the middle of its neighbours
 _LOG_EVERY = 10  # iterations between records of the log
 
@@ -30,11 +37,12 @@ _LOG_EVERY = 10  # iterations between records of the log
 class Track:
     """The state of a run: unknowns of the frames reached so far, and what each window took.
 
-    ``states``: one dict of arrays (:meth:`Unknowns.to_numpy`) a frame; ``next_window``: first frame of the next window to solve;
-    ``iterations``, ``seconds``: one entry a solved window; ``totals``: its terms at the minimum; ``lost``: frame -> reason for
-    those that keep the state of the frame before; ``unusable``: those among them whose image breaks the objective; ``sigma``: frame ->
-    standard deviation of each vertex along its ray [m], from solvers that know; ``finished``: whether the
-    solver has looked back over the whole.
+    ``states``: one dict of arrays (:meth:`Unknowns.to_numpy`) a frame; ``next_window``: first frame
+    of the next window to solve; ``iterations``, ``seconds``: one entry a solved window; ``totals``:
+    its terms at the minimum; ``lost``: frame -> reason for those that keep the state of the frame
+    before; ``unusable``: those among them whose image breaks the objective; ``sigma``: frame ->
+    standard deviation of each vertex along its ray [m], from solvers that know; ``finished``:
+    whether the solver has looked back over the whole.
     """
 
     states: list = field(default_factory=list)
@@ -49,9 +57,27 @@ class Track:
 
     def save(self, path):
         arrays = {name: np.stack([s[name] for s in self.states]) for name in Unknowns.NAMES}
-        meta = {k: getattr(self, k) for k in ("next_window", "iterations", "seconds", "totals", "lost", "unusable", "finished")}
+        meta = {
+            k: getattr(self, k)
+            for k in (
+                "next_window",
+                "iterations",
+                "seconds",
+                "totals",
+                "lost",
+                "unusable",
+                "finished",
+            )
+        }
         known = sorted(self.sigma)
-        sigma = {"sigma_frames": np.array(known, dtype=np.int64), "sigma": np.stack([self.sigma[k] for k in known])} if known else {}
+        sigma = (
+            {
+                "sigma_frames": np.array(known, dtype=np.int64),
+                "sigma": np.stack([self.sigma[k] for k in known]),
+            }
+            if known
+            else {}
+        )
         with aside(path) as temporary:
             np.savez(temporary, meta=json.dumps(meta), **arrays, **sigma)
 
@@ -61,22 +87,35 @@ class Track:
             with np.load(path) as data:
                 meta = json.loads(str(data["meta"]))
                 arrays = {name: data[name] for name in Unknowns.NAMES}
-                sigma = dict(zip(data["sigma_frames"].tolist(), data["sigma"])) if "sigma" in data else {}
+                sigma = (
+                    dict(zip(data["sigma_frames"].tolist(), data["sigma"]))
+                    if "sigma" in data
+                    else {}
+                )
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            raise InputError(f"{path}: not a checkpoint of a run ({error}); start again with --overwrite") from None
+            raise InputError(
+                f"{path}: not a checkpoint of a run ({error}); start again with --overwrite"
+            ) from None
         for name in ("lost", "unusable"):
             meta[name] = {int(k): v for k, v in meta[name].items()}
         count = len(arrays["rotation"])
-        return cls(states=[{name: arrays[name][k] for name in arrays} for k in range(count)], sigma=sigma, **meta)
+        return cls(
+            states=[{name: arrays[name][k] for name in arrays} for k in range(count)],
+            sigma=sigma,
+            **meta,
+        )
 
 
 def track(problem, solver, frames, out, *, resume=False, progress=None, solved=None):
-    """Solve window after window; checkpoints and the log go to the folder ``out``. Returns the :class:`Track`.
+    """Solve window after window; checkpoints and the log go to the folder ``out``. Returns the
+    :class:`Track`.
 
-    ``frames``: number of frames. ``progress(frame, iteration, total, terms)`` is called after each evaluation, ``solved(frame, vertices)``
-    with the surface (N, 3) [m, world] of each frame that no later window moves, as soon as it stands; the look back may still change some.
-    Where the objective stops being finite, or the surface leaves the image, the new frame keeps the state of the one before, and the run goes on. KeyboardInterrupt
-    passes through; the checkpoint on disk is then that of the last whole window.
+    ``frames``: number of frames. ``progress(frame, iteration, total, terms)`` is called after each
+    evaluation, ``solved(frame, vertices)`` with the surface (N, 3) [m, world] of each frame that no
+    later window moves, as soon as it stands; the look back may still change some. Where the
+    objective stops being finite, or the surface leaves the image, the new frame keeps the state of
+    the one before, and the run goes on. KeyboardInterrupt passes through; the checkpoint on disk is
+    then that of the last whole window.
     """
     width = min(problem.settings.width, frames)
     checkpoint, log_path = os.path.join(out, CHECKPOINT), os.path.join(out, LOG)
@@ -98,8 +137,8 @@ def track(problem, solver, frames, out, *, resume=False, progress=None, solved=N
 
 
 def _look_back(problem, solver, done):
-    """Solve again, now that both neighbours are known: the frames that explain their image far worse than those around them; with
-    ``smooth``, all.
+    """Solve again, now that both neighbours are known: the frames that explain their image far
+    worse than those around them; with ``smooth``, all.
     """
     misfit = np.array([t.get("misfit") or math.nan for t in done.totals])
     count, smooth = len(misfit), problem.settings.smooth
@@ -116,10 +155,15 @@ def _look_back(problem, solver, done):
             continue
         began = time.perf_counter()
         try:
-            solution = solver.revisit(problem, k, done.states[k - 1], done.states[k + 1], done.totals[k], weight)
+            solution = solver.revisit(
+                problem, k, done.states[k - 1], done.states[k + 1], done.totals[k], weight
+            )
         except BadFrame:
             continue
-        done.states[k], done.totals[k] = solution.window[0].to_numpy(), _numbers({**solution.terms, **solution.facts})
+        done.states[k], done.totals[k] = (
+            solution.window[0].to_numpy(),
+            _numbers({**solution.terms, **solution.facts}),
+        )
         done.sigma[k] = solution.sigma[0]
         done.seconds[k] += time.perf_counter() - began
         done.lost.pop(k, None)
@@ -134,13 +178,25 @@ def _advance(problem, solver, done, start, width, log, progress):
     """Solve the window of frames start .. start + width - 1."""
     members = list(range(start, start + width))
     while len(done.states) < start + width:
-        done.states.append(dict(done.states[-1]) if done.states else problem.patch.rest().to_numpy())
+        done.states.append(
+            dict(done.states[-1]) if done.states else problem.patch.rest().to_numpy()
+        )
     began = time.perf_counter()
     latest = [0]
 
     def record(iteration, total, terms, **more):
         numbers = _numbers({"loss": total, **terms})
-        log.write(json.dumps({"frame": problem.sequence.indices[members[-1]], "iteration": iteration, **numbers, **more}) + "\n")
+        log.write(
+            json.dumps(
+                {
+                    "frame": problem.sequence.indices[members[-1]],
+                    "iteration": iteration,
+                    **numbers,
+                    **more,
+                }
+            )
+            + "\n"
+        )
 
     def report(iteration, total, terms):
         latest[0] = iteration + 1
@@ -154,13 +210,23 @@ def _advance(problem, solver, done, start, width, log, progress):
         before = [Unknowns.from_numpy(done.states[k]) for k in usable]
         try:
             earlier = range(max(0, members[-1] - _PAST), members[-1]) if start else []
-            past = [(done.states[k], done.totals[k - width + 1] if k >= width - 1 else {}) for k in earlier]
+            past = [
+                (done.states[k], done.totals[k - width + 1] if k >= width - 1 else {})
+                for k in earlier
+            ]
             solution = solver.solve(problem, before, usable, report, past)
-            solved, terms, facts, latest[0] = dict(zip(usable, solution.window)), solution.terms, solution.facts, solution.iterations
+            solved, terms, facts, latest[0] = (
+                dict(zip(usable, solution.window)),
+                solution.terms,
+                solution.facts,
+                solution.iterations,
+            )
             sigma = dict(zip(usable, solution.sigma or []))
             break
         except BadFrame as error:
-            if latest[0]:  # it was finite at the start: the solver ran away, the image is not to blame
+            if latest[
+                0
+            ]:  # it was finite at the start: the solver ran away, the image is not to blame
                 failed[members[-1]] = f"{error} at iteration {latest[0]}"
                 break
             done.unusable[error.frame] = f"{error} from the start"
@@ -179,7 +245,9 @@ def _advance(problem, solver, done, start, width, log, progress):
                     done.sigma[k] = sigma[k]
         if k > 0 and (k in failed or k in done.unusable):
             done.states[k] = dict(done.states[k - 1])
-    done.lost = {k: reason for k, reason in done.lost.items() if k not in members} | failed | done.unusable
+    done.lost = (
+        {k: reason for k, reason in done.lost.items() if k not in members} | failed | done.unusable
+    )
     done.next_window = start + 1
     done.iterations.append(latest[0])
     done.seconds.append(time.perf_counter() - began)
@@ -187,7 +255,9 @@ def _advance(problem, solver, done, start, width, log, progress):
 
 
 def _trim_log(path, next_window):
-    """Keep the records of the windows that the checkpoint holds: each ends with one marked ``best``."""
+    """Keep the records of the windows that the checkpoint holds: each ends with one marked
+    ``best``.
+    """
     if not os.path.exists(path):
         return
     kept, whole = [], 0

@@ -12,12 +12,17 @@ from .results import Run
 
 _EXAMPLES = [
     ("out/demo", "opens a window"),
-    ("out/demo --frame 40 --screenshot view.png", "writes a picture instead (needs a display too, or EGL)"),
+    (
+        "out/demo --frame 40 --screenshot view.png",
+        "writes a picture instead (needs a display too, or EGL)",
+    ),
 ]
 
 
 class Viewer:
-    """The window of a run: ``show(k)`` puts its k-th frame there. polyscope holds one window a process."""
+    """The window of a run: ``show(k)`` puts its k-th frame there. polyscope holds one window a
+    process.
+    """
 
     def __init__(self, run, ps):
         from polyfit.animation import from_camera
@@ -29,7 +34,9 @@ class Viewer:
         ps.set_up_dir("y_up")
         ps.set_front_dir("z_front")
         ps.set_ground_plane_mode("none")
-        self.mesh = ps.register_surface_mesh("surface", self.vertices[0], run.faces, smooth_shade=True, back_face_policy="identical")
+        self.mesh = ps.register_surface_mesh(
+            "surface", self.vertices[0], run.faces, smooth_shade=True, back_face_policy="identical"
+        )
         self.limits = np.quantile(np.abs(self.curvature), 0.99)
         if run.texture and os.path.isfile(run.texture):
             self._texture()
@@ -42,17 +49,24 @@ class Viewer:
         if image is not None:
             self.mesh.add_parameterization_quantity("uv", self.run.uv, defined_on="vertices")
             colours = image[..., ::-1].astype(np.float32) / 255
-            self.mesh.add_color_quantity("texture", colours, defined_on="texture", param_name="uv", enabled=True)
+            self.mesh.add_color_quantity(
+                "texture", colours, defined_on="texture", param_name="uv", enabled=True
+            )
 
     def show(self, k):
         self.frame = int(np.clip(k, 0, len(self.vertices) - 1))
         self.mesh.update_vertex_positions(self.vertices[self.frame])
         self.mesh.add_scalar_quantity(
-            "mean curvature [1/m]", self.curvature[self.frame], cmap="coolwarm", vminmax=(-self.limits, self.limits)
+            "mean curvature [1/m]",
+            self.curvature[self.frame],
+            cmap="coolwarm",
+            vminmax=(-self.limits, self.limits),
         )
         if self.run.sigma is not None and np.isfinite(self.run.sigma[self.frame]).all():
             top = 1e3 * float(np.nanquantile(self.run.sigma, 0.99))
-            self.mesh.add_scalar_quantity("sigma [mm]", 1e3 * self.run.sigma[self.frame], vminmax=(0, top))
+            self.mesh.add_scalar_quantity(
+                "sigma [mm]", 1e3 * self.run.sigma[self.frame], vminmax=(0, top)
+            )
 
     def controls(self):
         """Drawn by polyscope in every frame of its own."""
@@ -78,7 +92,9 @@ _INSTEAD = "report.html in the run's folder needs none, and --screenshot FILE wr
 
 
 def _display():
-    """Whether a window could be opened, found out without polyscope, which ends untidily where it cannot."""
+    """Whether a window could be opened, found out without polyscope, which ends untidily where it
+    cannot.
+    """
     if not sys.platform.startswith("linux") or os.environ.get("WAYLAND_DISPLAY"):
         return True
     try:
@@ -96,7 +112,9 @@ def _polyscope(screenshot):
     try:
         import polyscope as ps
     except ImportError:
-        raise InputError("view: polyscope is not installed: python -m pip install 'polysft-mi[view]'") from None
+        raise InputError(
+            "view: polyscope is not installed: python -m pip install 'polysft-mi[view]'"
+        ) from None
     ps.set_program_name("polysft")
     ps.set_verbosity(0)
     ps.set_use_prefs_file(False)
@@ -104,15 +122,30 @@ def _polyscope(screenshot):
     try:
         ps.init()
     except RuntimeError:
-        raise InputError(f"view: no window can be opened here, for want of OpenGL or of a display; {_INSTEAD}") from None
+        raise InputError(
+            f"view: no window can be opened here, for want of OpenGL or of a display; {_INSTEAD}"
+        ) from None
     return ps
 
 
 def parser():
-    p = commands.parser("view", "Look at a run in an interactive viewer (polyscope, of the optional extra 'view').", _EXAMPLES)
+    p = commands.parser(
+        "view",
+        "Look at a run in an interactive viewer (polyscope, of the optional extra 'view').",
+        _EXAMPLES,
+    )
     p.add_argument("out", metavar="OUT", help="folder of a run")
-    p.add_argument("--frame", type=int, metavar="K", help="frame to begin with, by its index (default: the first)")
-    p.add_argument("--screenshot", metavar="FILE", help="write a .png of that frame instead of opening a window")
+    p.add_argument(
+        "--frame",
+        type=int,
+        metavar="K",
+        help="frame to begin with, by its index (default: the first)",
+    )
+    p.add_argument(
+        "--screenshot",
+        metavar="FILE",
+        help="write a .png of that frame instead of opening a window",
+    )
     return p
 
 

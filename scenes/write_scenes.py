@@ -1,6 +1,8 @@
-"""Write the scene files of this folder: ``python scenes/write_scenes.py``, by the writer of ``polysft_mi.prepare``.
+"""Write the scene files of this folder: ``python scenes/write_scenes.py``, by the writer of
+``polysft_mi.prepare``.
 
-``SCENES`` holds what differs between them. The data of a scene other than the demo is given by ``-D data=FOLDER``.
+``SCENES`` holds what differs between them. The data of a scene other than the demo is given by ``-D
+data=FOLDER``.
 """
 
 import os
@@ -15,19 +17,41 @@ from polysft_mi.prepare import Layout, scene_xml  # noqa: E402
 
 def _cloth(**settings):
     camera = Intrinsics(552, 552, 240, 180, 480, 360)
-    return Layout("cloth", camera, "frames", "masks", "texture.png", "template.obj", settings=settings)
+    return Layout(
+        "cloth", camera, "frames", "masks", "texture.png", "template.obj", settings=settings
+    )
 
 
 SCENES = {
-    "demo": Layout("cloth", Intrinsics(368, 368, 160, 120, 320, 240), "frames", "masks", "texture.jpg", "template.obj", settings={"period": 150, "patience": 50}),
+    "demo": Layout(
+        "cloth",
+        Intrinsics(368, 368, 160, 120, 320, 240),
+        "frames",
+        "masks",
+        "texture.jpg",
+        "template.obj",
+        settings={"period": 150, "patience": 50},
+    ),
     "flag": _cloth(),
     "bend": _cloth(),
     "paper": _cloth(),
     "curtain": _cloth(),
     "corner": _cloth(),
-    "kinect_paper": Layout("Kinect-Paper", Intrinsics(528.0144, 528.0144, 320, 240, 640, 480), "frame_*.png", "", "frame_001.png"),
+    "kinect_paper": Layout(
+        "Kinect-Paper",
+        Intrinsics(528.0144, 528.0144, 320, 240, 640, 480),
+        "frame_*.png",
+        "",
+        "frame_001.png",
+    ),
     "phi_sft_R1": Layout(
-        "phi-SfT", Intrinsics(971.522, 944.575, 962.134, 554.778, 1920, 1080), "rgbs", "masks", "texture.png", "0_R1_quad.obj", flip=True
+        "phi-SfT",
+        Intrinsics(971.522, 944.575, 962.134, 554.778, 1920, 1080),
+        "rgbs",
+        "masks",
+        "texture.png",
+        "0_R1_quad.obj",
+        flip=True,
     ),
 }
 
@@ -35,8 +59,17 @@ SCENES = {
 def text(name):
     """The text of the scene file ``name``.xml."""
     if name == "demo":
-        return scene_xml(SCENES[name], "demo", comment="A cloth that swings to the side: python -m polysft_mi.run scenes/demo.xml -o OUT")
-    comment = f"The sequence {name}, in the form {SCENES[name].form}: python -m polysft_mi.run scenes/{name}.xml -D data=FOLDER -o OUT"
+        return scene_xml(
+            SCENES[name],
+            "demo",
+            comment=(
+                "A cloth that swings to the side: python -m polysft_mi.run scenes/demo.xml -o OUT"
+            ),
+        )
+    comment = (
+        f"The sequence {name}, in the form {SCENES[name].form}: python -m polysft_mi.run"
+        f" scenes/{name}.xml -D data=FOLDER -o OUT"
+    )
     return scene_xml(SCENES[name], f"../data/{name}", comment=comment)
 
 

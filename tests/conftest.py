@@ -1,4 +1,6 @@
-"""One variant for the whole session, a cleared Dr.Jit between modules, and the data that is not in the repository."""
+"""One variant for the whole session, a cleared Dr.Jit between modules, and the data that is not in
+the repository.
+"""
 
 import gc
 import os
@@ -13,11 +15,14 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def pytest_addoption(parser):
-    parser.addoption("--mode", default="llvm_ad_rgb", help="Mitsuba variant of the tests (default: llvm_ad_rgb)")
+    parser.addoption(
+        "--mode", default="llvm_ad_rgb", help="Mitsuba variant of the tests (default: llvm_ad_rgb)"
+    )
 
 
 def pytest_configure(config):
-    # Before the test modules are imported: classes that derive from Mitsuba's can be defined only with a variant set
+    # Before the test modules are imported: classes that derive from Mitsuba's can be defined only
+    # with a variant set
     try:
         config.variant = set_variant(config.getoption("--mode"))
     except InputError as error:
@@ -30,10 +35,11 @@ def pytest_report_header(config):
 
 @pytest.fixture(scope="module", autouse=True)
 def cleared_dr_jit():
-    """Leave no scene, memory or flag of one module to the next; compiled kernels are kept, for they cost most of the tests' time.
+    """Leave no scene, memory or flag of one module to the next; compiled kernels are kept, for they
+    cost most of the tests' time.
 
-    An exception that pytest keeps for its report also keeps the scenes of its frames in Dr.Jit's registry, where the next module's virtual
-    function calls would still compile their code.
+    An exception that pytest keeps for its report also keeps the scenes of its frames in Dr.Jit's
+    registry, where the next module's virtual function calls would still compile their code.
     """
     yield
     import drjit as dr
@@ -49,7 +55,9 @@ def cleared_dr_jit():
 
 @pytest.fixture(scope="session")
 def shared_data():
-    """The folder with the sequences that are too large or not free for the repository; POLYSFT_DATA names another."""
+    """The folder with the sequences that are too large or not free for the repository; POLYSFT_DATA
+    names another.
+    """
     folder = Path(os.environ.get("POLYSFT_DATA") or ROOT.parent / "shared" / "data")
     if not folder.is_dir():
         pytest.skip(f"the sequences are not at {folder} (POLYSFT_DATA names another folder)")
@@ -58,15 +66,23 @@ def shared_data():
 
 @pytest.fixture(scope="session")
 def finished_run(tmp_path_factory):
-    """``(truth, out)``: a short run as the command leaves it, and the true surface; to be read, not changed. Its jets are of order 4 at
-    least: on so coarse a mesh, what the mesh's own edges say of normals and curvatures is near to what a jet of order 8 has only by luck.
+    """``(truth, out)``: a short run as the command leaves it, and the true surface; to be read, not
+    changed. Its jets are of order 4 at least: on so coarse a mesh, what the mesh's own edges say of
+    normals and curvatures is near to what a jet of order 8 has only by luck.
     """
     import synthetic
 
     from polysft_mi import prepare, run
 
-    truth = synthetic.cloth(tmp_path_factory.mktemp("finished") / "sheet", frames=4, bend=2.5, turn=0.1)
+    truth = synthetic.cloth(
+        tmp_path_factory.mktemp("finished") / "sheet", frames=4, bend=2.5, turn=0.1
+    )
     prepare.main([str(truth.folder)])
     out = tmp_path_factory.mktemp("finished") / "out"
-    assert run.main([str(truth.folder / "scene.xml"), "-o", str(out), "-q", "--exr", "all", "-D", "order=4"]) == 0
+    assert (
+        run.main(
+            [str(truth.folder / "scene.xml"), "-o", str(out), "-q", "--exr", "all", "-D", "order=4"]
+        )
+        == 0
+    )
     return truth, out

@@ -1,5 +1,5 @@
-"""Problems of the tracker from folders that :mod:`synthetic` makes, templates of grids, and normal equations written out. Import only where a Mitsuba
-variant is set."""
+"""Problems of the tracker from folders that :mod:`synthetic` makes, templates of grids, and normal
+equations written out. Import only where a Mitsuba variant is set."""
 
 import numpy as np
 import synthetic
@@ -14,13 +14,25 @@ def problem_of(folder, **settings):
     prepare.main([str(folder), "--overwrite"])
     experiment = scene.load(str(folder / "scene.xml"), settings)
     s = experiment.settings
-    return Problem(experiment, Sequence.open(experiment.frames, experiment.masks, first=s.first, last=s.last, size=experiment.size))
+    return Problem(
+        experiment,
+        Sequence.open(
+            experiment.frames, experiment.masks, first=s.first, last=s.last, size=experiment.size
+        ),
+    )
 
 
 def grid_template(rows=6, columns=7, order=4, capacity=None, bend=4.0):
     vertices = synthetic.sheet(0.7, rows, columns, bend=bend)
     v, u = np.meshgrid(np.linspace(1, 0, rows), np.linspace(0, 1, columns), indexing="ij")
-    return Template.fit(vertices, synthetic.grid_faces(rows, columns), np.stack([u, v], -1).reshape(-1, 2), order, capacity=capacity, tolerance=1)
+    return Template.fit(
+        vertices,
+        synthetic.grid_faces(rows, columns),
+        np.stack([u, v], -1).reshape(-1, 2),
+        order,
+        capacity=capacity,
+        tolerance=1,
+    )
 
 
 def dense(pattern, normal):
@@ -30,4 +42,6 @@ def dense(pattern, normal):
     h = np.zeros((n, n))
     for i, j, block in zip(pattern.row, pattern.column, normal.local):
         h[d * i : d * i + d, d * j : d * j + d] = block
-    return np.block([[h, normal.cross], [normal.cross.T, normal.glob]]), np.concatenate([normal.local_gradient.ravel(), normal.gradient])
+    return np.block([[h, normal.cross], [normal.cross.T, normal.glob]]), np.concatenate(
+        [normal.local_gradient.ravel(), normal.gradient]
+    )

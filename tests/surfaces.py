@@ -20,8 +20,12 @@ def sheet(height=lambda x, y: 0 * x, size=0.3, n=15):
 
 def tube(radius=0.05, length=0.4, around=24, along=20):
     """A sleeve about z, open at both ends, its normals outwards."""
-    z, a = np.meshgrid(np.linspace(0, length, along), np.arange(around) * 2 * np.pi / around, indexing="ij")
-    return np.stack([radius * np.cos(a), radius * np.sin(a), z], -1).reshape(-1, 3), grid(along, around, wrap=True)
+    z, a = np.meshgrid(
+        np.linspace(0, length, along), np.arange(around) * 2 * np.pi / around, indexing="ij"
+    )
+    return np.stack([radius * np.cos(a), radius * np.sin(a), z], -1).reshape(-1, 3), grid(
+        along, around, wrap=True
+    )
 
 
 def sphere(radius=0.2, subdivisions=3):
@@ -32,12 +36,14 @@ def sphere(radius=0.2, subdivisions=3):
 def joined(*meshes):
     """Several meshes as one, each with vertices of its own."""
     start = np.cumsum([0] + [len(V) for V, _ in meshes])
-    return np.concatenate([V for V, _ in meshes]), np.concatenate([F + k for (_, F), k in zip(meshes, start)])
+    return np.concatenate([V for V, _ in meshes]), np.concatenate(
+        [F + k for (_, F), k in zip(meshes, start)]
+    )
 
 
 def with_fin(n=11):
-    """A sheet with a second one standing on its middle row: an edge of three faces along it. Some of the fin's faces are wound the other
-    way."""
+    """A sheet with a second one standing on its middle row: an edge of three faces along it. Some
+    of the fin's faces are wound the other way."""
     V, F = sheet(n=n)
     row = np.arange(n) + n * (n // 2)
     fin = np.concatenate([row] + [np.arange(n) + len(V) + n * k for k in range(4)])
@@ -48,7 +54,9 @@ def with_fin(n=11):
 
 
 def moebius(around=40, across=5):
-    a, t = np.meshgrid(np.arange(around) * 2 * np.pi / around, np.linspace(-0.05, 0.05, across), indexing="ij")
+    a, t = np.meshgrid(
+        np.arange(around) * 2 * np.pi / around, np.linspace(-0.05, 0.05, across), indexing="ij"
+    )
     r = 0.2 + t * np.cos(a / 2)
     V = np.stack([r * np.cos(a), r * np.sin(a), t * np.sin(a / 2)], -1).reshape(-1, 3)
     k = np.arange(around * across).reshape(around, across)

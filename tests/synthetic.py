@@ -1,6 +1,8 @@
-"""Small sequences made on the spot, with known surfaces: a textured sheet that bends, turns and moves, rendered by NumPy alone.
+"""Small sequences made on the spot, with known surfaces: a textured sheet that bends, turns and
+moves, rendered by NumPy alone.
 
-Folders in the three forms that ``polysft_mi.prepare`` knows: :func:`cloth`, :func:`phi_sft`, :func:`kinect_paper`.
+Folders in the three forms that ``polysft_mi.prepare`` knows: :func:`cloth`, :func:`phi_sft`,
+:func:`kinect_paper`.
 """
 
 import json
@@ -16,7 +18,9 @@ SUPERSAMPLING = 4
 
 @dataclass
 class Truth:
-    """``folder``; ``vertices`` (T, N, 3) [m, camera frame], frame 0 is the flat template; ``faces`` (F, 3); ``uv`` (N, 2), v up; K (3, 3)."""
+    """``folder``; ``vertices`` (T, N, 3) [m, camera frame], frame 0 is the flat template; ``faces``
+    (F, 3); ``uv`` (N, 2), v up; K (3, 3).
+    """
 
     folder: Path
     vertices: np.ndarray
@@ -33,8 +37,12 @@ def grid_faces(rows, columns):
 
 
 def sheet(t, rows, columns, width=0.24, height=0.18, depth=0.5, bend=3.0, turn=0.15, shift=0.01):
-    """Points (rows * columns, 3) [m] at the time t in [0, 1]: a cylinder of curvature t * bend [1/m] (an isometry of the flat sheet), moved."""
-    x, y = np.meshgrid(np.linspace(-width / 2, width / 2, columns), np.linspace(-height / 2, height / 2, rows))
+    """Points (rows * columns, 3) [m] at the time t in [0, 1]: a cylinder of curvature t * bend
+    [1/m] (an isometry of the flat sheet), moved.
+    """
+    x, y = np.meshgrid(
+        np.linspace(-width / 2, width / 2, columns), np.linspace(-height / 2, height / 2, rows)
+    )
     k = max(t * bend, 1e-9)
     p = np.stack([np.sin(k * x) / k, y, (1 - np.cos(k * x)) / k], axis=-1).reshape(-1, 3)
     c, s = np.cos(turn * t), np.sin(turn * t)
@@ -58,12 +66,16 @@ def to_linear(x):
 
 
 def to_srgb(x):
-    return np.round(255 * np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)).astype(np.uint8)
+    return np.round(
+        255 * np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)
+    ).astype(np.uint8)
 
 
 def render(vertices, faces, uv, K, size, texture, light=None):
-    """(sRGB image (H, W, 3) uint8, coverage (H, W)) of the textured mesh over a grey background; ``size`` is (width, height); ``light``: (l_0, l), by
-    which a triangle with the unit normal n towards the camera has l_0 + l . n times the texture's colour."""
+    """(sRGB image (H, W, 3) uint8, coverage (H, W)) of the textured mesh over a grey background;
+    ``size`` is (width, height); ``light``: (l_0, l), by which a triangle with the unit normal n
+    towards the camera has l_0 + l . n times the texture's colour.
+    """
     w, h = size[0] * SUPERSAMPLING, size[1] * SUPERSAMPLING
     x = vertices @ K.T
     inverse_depth = 1 / x[:, 2]
@@ -92,9 +104,16 @@ def render(vertices, faces, uv, K, size, texture, light=None):
             lit[window][near] = light[0] - np.sign(n @ a) * (n @ light[1:]) / np.linalg.norm(n)
     rows, columns = texture.shape[:2]
     maps = (at[..., 0] * columns - 0.5, (1 - at[..., 1]) * rows - 0.5)
-    colour = cv2.remap(to_linear(texture), *(m.astype(np.float32) for m in maps), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    colour = cv2.remap(
+        to_linear(texture),
+        *(m.astype(np.float32) for m in maps),
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
     colour = np.where(nearest[..., None] > 0, colour * lit[..., None], BACKGROUND)
-    mean = lambda image: image.reshape(size[1], SUPERSAMPLING, size[0], SUPERSAMPLING, -1).mean(axis=(1, 3))
+    mean = lambda image: image.reshape(size[1], SUPERSAMPLING, size[0], SUPERSAMPLING, -1).mean(
+        axis=(1, 3)
+    )
     return to_srgb(mean(colour)), mean((nearest > 0).astype(float))[..., 0]
 
 
@@ -104,49 +123,82 @@ def write_image(path, rgb):
 
 
 def write_obj(path, vertices, uv, polygons):
-    lines = ["v {:.8f} {:.8f} {:.8f}".format(*p) for p in vertices] + ["vt {:.8f} {:.8f}".format(*t) for t in uv]
+    lines = ["v {:.8f} {:.8f} {:.8f}".format(*p) for p in vertices] + [
+        "vt {:.8f} {:.8f}".format(*t) for t in uv
+    ]
     lines += ["f " + " ".join(f"{k}/{k}" for k in np.asarray(polygon) + 1) for polygon in polygons]
     path.write_text("\n".join(lines) + "\n")
 
 
 def _make(folder, images, frames, size, rows, columns, masks, K, light=None, **motion):
     folder.mkdir(parents=True, exist_ok=True)
-    vertices = np.stack([sheet(k / max(frames - 1, 1), rows, columns, **motion) for k in range(frames)])
+    vertices = np.stack(
+        [sheet(k / max(frames - 1, 1), rows, columns, **motion) for k in range(frames)]
+    )
     v, u = np.meshgrid(np.linspace(1, 0, rows), np.linspace(0, 1, columns), indexing="ij")
-    truth = Truth(folder, vertices, grid_faces(rows, columns), np.stack([u, v], axis=-1).reshape(-1, 2), K)
+    truth = Truth(
+        folder, vertices, grid_faces(rows, columns), np.stack([u, v], axis=-1).reshape(-1, 2), K
+    )
     texture = texture_image()
     for k in range(frames):
         image, coverage = render(vertices[k], truth.faces, truth.uv, K, size, texture, light)
         write_image(folder / images.format(k), image)
         if masks:
-            write_image(folder / "masks" / f"{k:03d}.png", np.round(255 * coverage).astype(np.uint8))
+            write_image(
+                folder / "masks" / f"{k:03d}.png", np.round(255 * coverage).astype(np.uint8)
+            )
     return truth, texture
 
 
 def _camera(size, aspect=1.0):
-    return np.array([[1.15 * size[0], 0, size[0] / 2 + 0.75], [0, 1.15 * aspect * size[0], size[1] / 2 - 0.5], [0, 0, 1]])
+    return np.array(
+        [
+            [1.15 * size[0], 0, size[0] / 2 + 0.75],
+            [0, 1.15 * aspect * size[0], size[1] / 2 - 0.5],
+            [0, 0, 1],
+        ]
+    )
 
 
 def _write_camera(folder, K, size):
-    camera = {"width": size[0], "height": size[1], "fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+    camera = {
+        "width": size[0],
+        "height": size[1],
+        "fx": K[0, 0],
+        "fy": K[1, 1],
+        "cx": K[0, 2],
+        "cy": K[1, 2],
+    }
     (folder / "camera.json").write_text(json.dumps(camera))
 
 
 def cloth(folder, frames=5, size=(96, 72), rows=9, columns=11, masks=True, **motion):
     """A sequence in the form ``cloth``, with ``gt.npz``; returns its :class:`Truth`."""
     K = _camera(size)
-    truth, texture = _make(Path(folder), "frames/{:03d}.png", frames, size, rows, columns, masks, K, **motion)
+    truth, texture = _make(
+        Path(folder), "frames/{:03d}.png", frames, size, rows, columns, masks, K, **motion
+    )
     write_image(truth.folder / "texture.png", texture)
     write_obj(truth.folder / "template.obj", truth.vertices[0], truth.uv, truth.faces)
     _write_camera(truth.folder, K, size)
-    np.savez(truth.folder / "gt.npz", vertices=truth.vertices.astype(np.float32), faces=truth.faces.astype(np.int32))
+    np.savez(
+        truth.folder / "gt.npz",
+        vertices=truth.vertices.astype(np.float32),
+        faces=truth.faces.astype(np.int32),
+    )
     return truth
 
 
-def phi_sft(folder, frames=5, size=(96, 72), rows=9, columns=11, masks=True, obj="0_S3_quad.obj", **motion):
-    """A sequence in the form ``phi-SfT``: quads, x and y negated, focal lengths that differ; returns its :class:`Truth`."""
+def phi_sft(
+    folder, frames=5, size=(96, 72), rows=9, columns=11, masks=True, obj="0_S3_quad.obj", **motion
+):
+    """A sequence in the form ``phi-SfT``: quads, x and y negated, focal lengths that differ;
+    returns its :class:`Truth`.
+    """
     K = _camera(size, aspect=0.95)
-    truth, texture = _make(Path(folder), "rgbs/rgb_{:03d}.png", frames, size, rows, columns, masks, K, **motion)
+    truth, texture = _make(
+        Path(folder), "rgbs/rgb_{:03d}.png", frames, size, rows, columns, masks, K, **motion
+    )
     write_image(truth.folder / "texture.png", texture)
     quads = truth.faces.reshape(-1, 6)[:, [0, 1, 4, 2]]
     write_obj(truth.folder / obj, truth.vertices[0] * (-1, -1, 1), truth.uv, quads)
@@ -155,9 +207,13 @@ def phi_sft(folder, frames=5, size=(96, 72), rows=9, columns=11, masks=True, obj
 
 
 def kinect_paper(folder, frames=5, size=(96, 72), rows=5, columns=6, **motion):
-    """A sequence in the form ``Kinect-Paper``: the sheet's own grid in mm in a frame of its own, its pose; returns its :class:`Truth`."""
+    """A sequence in the form ``Kinect-Paper``: the sheet's own grid in mm in a frame of its own,
+    its pose; returns its :class:`Truth`.
+    """
     K = _camera(size)
-    truth, _ = _make(Path(folder), "frame_{:03d}.png", frames, size, rows, columns, False, K, **motion)
+    truth, _ = _make(
+        Path(folder), "frame_{:03d}.png", frames, size, rows, columns, False, K, **motion
+    )
     for k in reversed(range(frames)):  # images count from 1 there
         (truth.folder / f"frame_{k:03d}.png").rename(truth.folder / f"frame_{k + 1:03d}.png")
     turn = cv2.Rodrigues(np.array([0.0, 0.0, 0.1]))[0] @ np.diag([1.0, -1.0, -1.0])

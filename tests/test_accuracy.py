@@ -1,4 +1,6 @@
-"""The benchmark of PolyFit's accuracy: that it chooses and measures what it says. Its figures are no part of the tests."""
+"""The benchmark of PolyFit's accuracy: that it chooses and measures what it says. Its figures are
+no part of the tests.
+"""
 
 import json
 import math
@@ -19,7 +21,9 @@ accuracy = load("benchmarks/polyfit_accuracy.py")
 
 
 def arcs(angle, length=0.5, points=400):
-    """A strip of a cylinder of radius 1 around ``angle`` radians, as a :class:`GarmentPatches` of one patch."""
+    """A strip of a cylinder of radius 1 around ``angle`` radians, as a :class:`GarmentPatches` of
+    one patch.
+    """
     g = torch.Generator().manual_seed(0)
     t, y = (torch.rand(points, 2, generator=g) - 0.5).unbind(-1)
     n = torch.stack([(angle * t).sin(), 0 * t, (angle * t).cos()], -1)
@@ -43,7 +47,9 @@ def test_a_deep_valley_is_folded_until_it_is_shallow():
         g = torch.Generator().manual_seed(0)
         x, y = (2 * torch.rand(2, 400, generator=g) - 1).unbind(0)
         z, slope = depth * x.abs() ** 3, 3 * depth * x * x.abs() / 0.3
-        n = torch.nn.functional.normalize(torch.stack([-slope, 0 * slope, torch.ones_like(slope)], -1), dim=-1)
+        n = torch.nn.functional.normalize(
+            torch.stack([-slope, 0 * slope, torch.ones_like(slope)], -1), dim=-1
+        )
         return GarmentPatches(torch.stack([0.3 * x, y, z], -1)[None], n[None])
 
     assert bool(accuracy.is_folded(valley(1.5))) and not bool(accuracy.is_folded(valley(0.2)))
@@ -51,19 +57,25 @@ def test_a_deep_valley_is_folded_until_it_is_shallow():
 
 def test_search_over_axes_is_at_least_as_good_as_pca_and_the_fixed_tilts_are_those_of_a_fresh_network():
     ball = trimesh.creation.icosphere(3)
-    patches = GarmentPatches.cut(ball.vertices, ball.faces, 6, 64, np.random.default_rng(0)).deformed(40, torch.Generator().manual_seed(0))
+    patches = GarmentPatches.cut(
+        ball.vertices, ball.faces, 6, 64, np.random.default_rng(0)
+    ).deformed(40, torch.Generator().manual_seed(0))
     heights = [accuracy.figures(m, patches)["height"] for m in (PolyFit(4), accuracy.BestAxis())]
     assert heights[1] < heights[0]
     fresh = SpatialTransformer()
     with torch.no_grad():
         fresh.head[-1].weight.zero_()
-        assert accuracy.Tilted()(patches.points).numpy() == pytest.approx(fresh(patches.points).numpy(), abs=1e-6)
+        assert accuracy.Tilted()(patches.points).numpy() == pytest.approx(
+            fresh(patches.points).numpy(), abs=1e-6
+        )
 
 
 def test_networks_that_saw_a_held_out_garment_are_refused(tmp_path):
     (tmp_path / "main").mkdir()
     PolyFit(4, SpatialTransformer()).save(tmp_path / "main" / "weights.safetensors")
-    (tmp_path / "main" / "weights.json").write_text(json.dumps(dict(meshes=["f_shorts.obj", "tank.obj"])))
+    (tmp_path / "main" / "weights.json").write_text(
+        json.dumps(dict(meshes=["f_shorts.obj", "tank.obj"]))
+    )
     with pytest.raises(InputError, match="trained on tank.obj, which this benchmark holds out"):
         accuracy.trained(tmp_path, "main", PolyFit.load)
     (tmp_path / "main" / "weights.json").write_text(json.dumps(dict(meshes=["f_shorts.obj"])))
@@ -93,7 +105,9 @@ def test_missing_data_is_named(tmp_path):
 
 
 def test_refined_frames_are_closer_on_folded_patches_of_held_out_garments(shared_data):
-    """The benchmark's headline on a small sample: at least 20 % less height, less distance, better normals."""
+    """The benchmark's headline on a small sample: at least 20 % less height, less distance, better
+    normals.
+    """
     paths = [shared_data / m for m in accuracy.HELD_OUT if "snug/tank" in m or "skirt" in m]
     generator = torch.Generator().manual_seed(5)
     patches = accuracy.garments.cut_meshes(paths, (10, 25), 256, 5).deformed(1500, generator)

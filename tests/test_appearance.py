@@ -1,4 +1,6 @@
-"""What the camera's blur makes of a sheet: against a rendering of many samples, and frames of slanted, lit sheets against their own images."""
+"""What the camera's blur makes of a sheet: against a rendering of many samples, and frames of
+slanted, lit sheets against their own images.
+"""
 
 import math
 
@@ -24,7 +26,11 @@ LEVELS = [Level(1.0, 1, 8.0), Level(2.5, 2, 8.0)]
 def chequers(size=192, across=16):
     rng = np.random.default_rng(3)
     y, x = np.mgrid[:size, :size] * across // size
-    return np.where(((x + y) % 2)[..., None] > 0, rng.integers(30, 90, (across, across, 3))[y, x], rng.integers(150, 240, (across, across, 3))[y, x]).astype(np.uint8)
+    return np.where(
+        ((x + y) % 2)[..., None] > 0,
+        rng.integers(30, 90, (across, across, 3))[y, x],
+        rng.integers(150, 240, (across, across, 3))[y, x],
+    ).astype(np.uint8)
 
 
 def cloth(folder, **more):
@@ -52,11 +58,15 @@ def problem(truth):
 
 
 def slanted(vertices, degrees=62.0):
-    return Rotation.from_rotvec([0, math.radians(degrees), 0]).apply(vertices - vertices.mean(0)) + vertices.mean(0)
+    return Rotation.from_rotvec([0, math.radians(degrees), 0]).apply(
+        vertices - vertices.mean(0)
+    ) + vertices.mean(0)
 
 
 def compared(known, vertices, frame, level, appearance):
-    """(what is compared with a frame (h, w, 3), where (h, w)) of the level's grid of the whole image."""
+    """(what is compared with a frame (h, w, 3), where (h, w)) of the level's grid of the whole
+    image.
+    """
     with dr.suspend_grad():
         view = known._look(vertices, level)
         at = known._frame_level(frame, level).image
@@ -81,15 +91,27 @@ def test_it_is_a_rendering_made_what_frames_are_made(problem, level):
         known._look(vertices, Level(1.0))
         image = np.array(known.raster.image(known.scene, known.sensor, spp=36))
     cover = (image[..., 3] > 0.5).astype(np.float32)
-    colour = (image[..., :3] / np.maximum(image[..., 3:], 1e-3) * cover[..., None]).astype(np.float32)
+    colour = (image[..., :3] / np.maximum(image[..., 3:], 1e-3) * cover[..., None]).astype(
+        np.float32
+    )
     reference = level_image(colour, cover, level)
     x, y = reference.corner
     rows, columns = reference.inside.shape
     found, where = compared(known, vertices, 0, level, appearance)
     plain, _ = compared(known, vertices, 0, level, None)
-    here = where[y : y + rows, x : x + columns] & (reference.inside[: where.shape[0] - y, : where.shape[1] - x] > 0)
-    error = [np.abs(k[y : y + rows, x : x + columns] - reference.colour[: where.shape[0] - y, : where.shape[1] - x])[here].mean() for k in (found, plain)]
-    assert here.sum() > 500 // level.stride**2 and error[0] < 0.1 and error[0] < 0.35 * error[1], error
+    here = where[y : y + rows, x : x + columns] & (
+        reference.inside[: where.shape[0] - y, : where.shape[1] - x] > 0
+    )
+    error = [
+        np.abs(
+            k[y : y + rows, x : x + columns]
+            - reference.colour[: where.shape[0] - y, : where.shape[1] - x]
+        )[here].mean()
+        for k in (found, plain)
+    ]
+    assert here.sum() > 500 // level.stride**2 and error[0] < 0.1 and error[0] < 0.35 * error[1], (
+        error
+    )
 
 
 @pytest.mark.parametrize("level", LEVELS)
@@ -97,7 +119,11 @@ def test_a_frame_is_explained_by_the_surface_that_it_shows(problem, truth, level
     known = Registration(problem)
     light = np.array([*LIGHT, 0, 0, 0])
     found = {}
-    for name, appearance in (("none", None), ("unlit", known.appearance(truth.vertices[3], level)), ("lit", known.appearance(truth.vertices[3], level, light))):
+    for name, appearance in (
+        ("none", None),
+        ("unlit", known.appearance(truth.vertices[3], level)),
+        ("lit", known.appearance(truth.vertices[3], level, light)),
+    ):
         found[name] = known.evaluate(truth.vertices[3], 3, level, 0.3, appearance).misfit
     assert found["lit"] < 0.75 * found["unlit"] < 0.6 * found["none"], found
 
@@ -108,8 +134,13 @@ def test_gradient_and_curvature_are_those_of_a_frame_that_has_the_excess(problem
     appearance = known.appearance(vertices + [0.001, 0, 0.002], level)
     mine = known.evaluate(vertices, frame, level, 0.3, appearance)
     at, extra = known._frame_level(frame, level), appearance.excess
-    h, w, rows, columns = (int(k[0]) for k in (extra.height, extra.width, at.image.height, at.image.width))
-    whole, excess = np.array(at.image.texels).reshape(rows, columns, 4), np.array(extra.texels).reshape(h, w, 4)
+    h, w, rows, columns = (
+        int(k[0]) for k in (extra.height, extra.width, at.image.height, at.image.width)
+    )
+    whole, excess = (
+        np.array(at.image.texels).reshape(rows, columns, 4),
+        np.array(extra.texels).reshape(h, w, 4),
+    )
     for i in range(h):
         for j in range(w):
             k, m = i + int((extra.y - at.image.y)[0]), j + int((extra.x - at.image.x)[0])
@@ -117,7 +148,9 @@ def test_gradient_and_curvature_are_those_of_a_frame_that_has_the_excess(problem
                 whole[k, m, :3] += excess[i, j, :3]
     at.image.texels = mi.Float(whole.ravel())
     expected = known.evaluate(vertices, frame, level, 0.3)
-    assert mine.photometric == pytest.approx(expected.photometric, rel=1e-6) and mine.misfit == pytest.approx(expected.misfit, rel=1e-6)
+    assert mine.photometric == pytest.approx(
+        expected.photometric, rel=1e-6
+    ) and mine.misfit == pytest.approx(expected.misfit, rel=1e-6)
     for name in ("gradient", "second"):
         a, b = (np.array(getattr(x.images, name)) for x in (mine, expected))
         assert np.abs(a - b).max() < 1e-5 * np.abs(b).max()
@@ -133,8 +166,13 @@ def test_without_masks_only_what_is_far_from_the_border(unmasked):
     position, _ = problem.camera.project(problem.template.vertices)
     (left, top), (right, bottom) = position.min(0) - (x, y), position.max(0) - (x, y)
     rows, columns = np.flatnonzero(has.any(1)), np.flatnonzero(has.any(0))
-    for low, high, a, b in ((left, right, columns[0], columns[-1]), (top, bottom, rows[0], rows[-1])):
-        assert a - low == pytest.approx(12, abs=2) and high - b == pytest.approx(12, abs=2)  # two windows
+    for low, high, a, b in (
+        (left, right, columns[0], columns[-1]),
+        (top, bottom, rows[0], rows[-1]),
+    ):
+        assert a - low == pytest.approx(12, abs=2) and high - b == pytest.approx(
+            12, abs=2
+        )  # two windows
 
 
 def test_the_last_view_is_kept_and_no_other(problem, truth):
@@ -156,11 +194,19 @@ def test_each_stage_begins_with_what_the_sheet_looks_like(problem, truth, monkey
     rest = solver.chart.state(problem.patch.rest().to_numpy())
     known, levels = solver.registration, []
     original = known.appearance
-    monkeypatch.setattr(known, "appearance", lambda vertices, level, light, shaded: levels.append((level, shaded)) or original(vertices, level, light, shaded))
+    monkeypatch.setattr(
+        known,
+        "appearance",
+        lambda vertices, level, light, shaded: (
+            levels.append((level, shaded)) or original(vertices, level, light, shaded)
+        ),
+    )
     solver._expect(1)
     solver._noise = 1.0  # whatever is left is noise
     solver._descend(rest, rest, 1, 4, (gauss_newton.FAR, *gauss_newton.STAGES))
-    usual = [(solver.levels[stage], stage is gauss_newton.STAGES[-1]) for stage in gauss_newton.STAGES]
+    usual = [
+        (solver.levels[stage], stage is gauss_newton.STAGES[-1]) for stage in gauss_newton.STAGES
+    ]
     assert levels == usual
     levels.clear()
     solver._noise = 0.0
@@ -173,5 +219,7 @@ def test_slanted_and_lit_sheets_are_followed(truth, tmp_path):
     """A sheet rolled by up to 76 degrees at its ends, under a light from the side."""
     problem = problem_of(truth.folder)
     done = track(problem, solvers.create(problem.settings), 4, str(tmp_path))
-    error = np.linalg.norm(problem.surface(Unknowns.from_numpy(done.states[-1])) - truth.vertices[-1], axis=1)
+    error = np.linalg.norm(
+        problem.surface(Unknowns.from_numpy(done.states[-1])) - truth.vertices[-1], axis=1
+    )
     assert error.mean() < 0.002

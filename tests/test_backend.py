@@ -1,4 +1,6 @@
-"""The search for libLLVM, on libraries compiled here, and the choice of the variant, in processes of their own."""
+"""The search for libLLVM, on libraries compiled here, and the choice of the variant, in processes
+of their own.
+"""
 
 import argparse
 import os
@@ -14,15 +16,31 @@ from polysft_mi.errors import InputError
 
 ROOT = Path(__file__).resolve().parent.parent
 COMPILER = shutil.which("cc") or shutil.which("gcc")
-OLD_LLVM = [path for path in backend._libraries(backend._search_folders()) if (backend._named_version(path) or (0,))[0] == 15]
+OLD_LLVM = [
+    path
+    for path in backend._libraries(backend._search_folders())
+    if (backend._named_version(path) or (0,))[0] == 15
+]
 needs_compiler = pytest.mark.skipif(not COMPILER, reason="needs a C compiler")
 
 
 def library(folder, name, version=None):
-    """A shared library in ``folder`` that tells ``version`` as LLVM 16 and newer do, or, as LLVM 15 and older, none."""
-    function = "void LLVMGetVersion(unsigned *a, unsigned *b, unsigned *c) { *a = %d; *b = %d; *c = %d; }" % version if version else "int unused;"
+    """A shared library in ``folder`` that tells ``version`` as LLVM 16 and newer do, or, as LLVM 15
+    and older, none.
+    """
+    function = (
+        "void LLVMGetVersion(unsigned *a, unsigned *b, unsigned *c) { *a = %d; *b = %d; *c = %d; }"
+        % version
+        if version
+        else "int unused;"
+    )
     path = os.path.join(str(folder), name)
-    subprocess.run([COMPILER, "-shared", "-fPIC", "-x", "c", "-", "-o", path], input=function, text=True, check=True)
+    subprocess.run(
+        [COMPILER, "-shared", "-fPIC", "-x", "c", "-", "-o", path],
+        input=function,
+        text=True,
+        check=True,
+    )
     return path
 
 
@@ -30,7 +48,13 @@ def python(code, **environment):
     """Run ``code`` in a fresh interpreter; variables given as None are unset."""
     env = {**os.environ, "PYTHONPATH": str(ROOT), **environment}
     env = {name: value for name, value in env.items() if value is not None}
-    return subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, stdin=subprocess.DEVNULL)
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        env=env,
+        capture_output=True,
+        text=True,
+        stdin=subprocess.DEVNULL,
+    )
 
 
 def one_line_and_status_2(process):
@@ -107,16 +131,28 @@ def test_the_trial_accepts_a_working_library_and_refuses_an_old_one(monkeypatch)
     for old in OLD_LLVM:
         assert not backend.variant_works("llvm_ad_rgb", library=old)
 
+
 @needs_compiler
 def test_none_found_names_the_older_ones_and_what_to_install(tmp_path):
     library(tmp_path, "libLLVM-15.so.1")
     library(tmp_path, "libLLVM-14.0.6.so.1")
-    with pytest.raises(InputError, match=r"no usable LLVM found \(only LLVM 14, 15\).*apt-get install libllvm19.*DRJIT_LIBLLVM_PATH"):
+    with pytest.raises(
+        InputError,
+        match=(
+            r"no usable LLVM found \(only LLVM 14, 15\).*apt-get install"
+            r" libllvm19.*DRJIT_LIBLLVM_PATH"
+        ),
+    ):
         backend.find_libllvm([str(tmp_path)])
 
 
 def test_none_found_ends_the_command_in_one_line(tmp_path):
-    message = one_line_and_status_2(python(f"from polysft_mi import backend; backend._search_folders = lambda: [{str(tmp_path)!r}]; backend.cli(backend.main)"))
+    message = one_line_and_status_2(
+        python(
+            "from polysft_mi import backend; backend._search_folders = lambda:"
+            f" [{str(tmp_path)!r}]; backend.cli(backend.main)"
+        )
+    )
     assert "no usable LLVM found" in message and "libllvm19" in message
 
 
@@ -137,25 +173,40 @@ def test_the_users_choice_is_taken_before_newer_ones(tmp_path, monkeypatch):
         ("libLLVM.so", lambda path: library(path.parent, path.name), "cannot be loaded"),
         ("libLLVM-15.so.1", lambda path: library(path.parent, path.name), "is LLVM 15"),
         ("libLLVM.so", lambda path: library(path.parent, path.name, (12, 0, 1)), "is LLVM 12"),
-        ("libLLVM.so", lambda path: library(path.parent, path.name, (17, 0, 6)), "is LLVM 17, which Dr.Jit cannot use"),
+        (
+            "libLLVM.so",
+            lambda path: library(path.parent, path.name, (17, 0, 6)),
+            "is LLVM 17, which Dr.Jit cannot use",
+        ),
     ],
 )
-def test_a_bad_choice_is_refused_though_others_are_there(tmp_path, monkeypatch, name, make, complaint):
+def test_a_bad_choice_is_refused_though_others_are_there(
+    tmp_path, monkeypatch, name, make, complaint
+):
     library(tmp_path, "libLLVM.so.19.1", (19, 1, 7))
     make(tmp_path / name)
     monkeypatch.setenv(backend.VARIABLE, str(tmp_path / name))
-    with pytest.raises(InputError, match=f"DRJIT_LIBLLVM_PATH={tmp_path / name}: {complaint}.*newer libLLVM.* is needed"):
+    with pytest.raises(
+        InputError,
+        match=f"DRJIT_LIBLLVM_PATH={tmp_path / name}: {complaint}.*newer libLLVM.* is needed",
+    ):
         backend.find_libllvm([str(tmp_path)])
 
 
 def test_a_bad_choice_ends_the_command_in_one_line(tmp_path):
-    code = "from polysft_mi.backend import cli, set_variant; cli(lambda: set_variant('llvm_ad_rgb') and 0)"
+    code = (
+        "from polysft_mi.backend import cli, set_variant; cli(lambda: set_variant('llvm_ad_rgb')"
+        " and 0)"
+    )
     message = one_line_and_status_2(python(code, DRJIT_LIBLLVM_PATH=str(tmp_path / "libLLVM.so")))
     assert str(tmp_path / "libLLVM.so") in message
 
 
 def test_importing_has_no_side_effect():
-    code = "import os, sys, polysft_mi.backend; print([m for m in ('mitsuba', 'drjit', 'numpy', 'torch') if m in sys.modules], 'DRJIT_LIBLLVM_PATH' in os.environ)"
+    code = (
+        "import os, sys, polysft_mi.backend; print([m for m in ('mitsuba', 'drjit', 'numpy',"
+        " 'torch') if m in sys.modules], 'DRJIT_LIBLLVM_PATH' in os.environ)"
+    )
     assert python(code, DRJIT_LIBLLVM_PATH=None).stdout.strip() == "[] False"
 
 
@@ -167,19 +218,27 @@ import mitsuba as mi, drjit as dr, os
 x = mi.Float(3)
 print(first, set_variant("llvm_ad_rgb"), set_variant(), dr.detail.llvm_version()[0] >= 16, os.path.isfile(os.environ["DRJIT_LIBLLVM_PATH"]), (x + 1)[0])
 """
-    assert python(code, DRJIT_LIBLLVM_PATH=None).stdout.split() == ["llvm_ad_rgb"] * 3 + ["True", "True", "4.0"]
+    assert python(code, DRJIT_LIBLLVM_PATH=None).stdout.split() == ["llvm_ad_rgb"] * 3 + [
+        "True",
+        "True",
+        "4.0",
+    ]
 
 
 @pytest.mark.skipif(not OLD_LLVM, reason="needs an LLVM 15 to start Dr.Jit on")
 def test_dr_jit_already_on_an_old_llvm_is_told():
-    """As where the caller imported Mitsuba before and LLVM 15 was found first: nothing may be computed then."""
+    """As where the caller imported Mitsuba before and LLVM 15 was found first: nothing may be
+    computed then.
+    """
     code = """
 import os, mitsuba
 del os.environ["DRJIT_LIBLLVM_PATH"]
 from polysft_mi.backend import cli, set_variant
 cli(lambda: set_variant("llvm_ad_rgb") and 0)
 """
-    assert "already runs on LLVM 15" in one_line_and_status_2(python(code, DRJIT_LIBLLVM_PATH=OLD_LLVM[0]))
+    assert "already runs on LLVM 15" in one_line_and_status_2(
+        python(code, DRJIT_LIBLLVM_PATH=OLD_LLVM[0])
+    )
 
 
 def test_a_fitting_variant_that_is_set_stays_and_another_is_replaced():
@@ -206,18 +265,31 @@ def test_an_unfit_mode_is_refused_with_the_fitting_ones(mode):
 
 @pytest.mark.skipif(backend.gpu_works(), reason="a GPU works here")
 def test_without_a_gpu_the_default_is_llvm_and_cuda_is_refused():
-    assert python("from polysft_mi.backend import set_variant; print(set_variant())").stdout.strip() == "llvm_ad_rgb"
-    message = one_line_and_status_2(python("from polysft_mi.backend import cli, set_variant; cli(lambda: set_variant('cuda_ad_rgb') and 0)"))
+    assert (
+        python("from polysft_mi.backend import set_variant; print(set_variant())").stdout.strip()
+        == "llvm_ad_rgb"
+    )
+    message = one_line_and_status_2(
+        python(
+            "from polysft_mi.backend import cli, set_variant; cli(lambda:"
+            " set_variant('cuda_ad_rgb') and 0)"
+        )
+    )
     assert "cuda_ad_rgb" in message and "GPU" in message
 
 
 @pytest.mark.skipif(not backend.gpu_works(), reason="needs a GPU")
 def test_with_a_gpu_the_default_is_cuda():
-    assert python("from polysft_mi.backend import set_variant; print(set_variant())").stdout.strip() == "cuda_ad_rgb"
+    assert (
+        python("from polysft_mi.backend import set_variant; print(set_variant())").stdout.strip()
+        == "cuda_ad_rgb"
+    )
 
 
 def test_trying_a_variant_tells_working_from_broken(monkeypatch):
-    """The GPU's own check, on the CPU's variant: it must see a ray and a derivative come out right, and survive a process that dies."""
+    """The GPU's own check, on the CPU's variant: it must see a ray and a derivative come out right,
+    and survive a process that dies.
+    """
     assert backend.variant_works("llvm_ad_rgb")
     assert not backend.variant_works("scalar_rgb")  # no Dr.Jit arrays
     assert not backend.variant_works("llvm_ad_rgb", timeout=0.01)
@@ -229,4 +301,8 @@ def test_mode_on_the_command_line():
     parser = argparse.ArgumentParser()
     backend.add_mode_argument(parser)
     assert parser.parse_args([]).mode is None
-    assert parser.parse_args(["-m", "cuda_ad_rgb"]).mode == parser.parse_args(["--mode", "cuda_ad_rgb"]).mode == "cuda_ad_rgb"
+    assert (
+        parser.parse_args(["-m", "cuda_ad_rgb"]).mode
+        == parser.parse_args(["--mode", "cuda_ad_rgb"]).mode
+        == "cuda_ad_rgb"
+    )

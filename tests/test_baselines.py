@@ -34,7 +34,9 @@ def test_edge_convolution_is_that_of_the_paper():
                 distances = (x[b] - x[b, i]).norm(dim=1)
                 near = distances.argsort()[:4]
                 assert set(neighbours[b, i].tolist()) == set(near.tolist())
-                edges = torch.stack([torch.relu(centre(x[b, i]) + edge(x[b, j] - x[b, i])) for j in near])
+                edges = torch.stack(
+                    [torch.relu(centre(x[b, i]) + edge(x[b, j] - x[b, i])) for j in near]
+                )
                 assert got[b, i].numpy() == pytest.approx(edges.amax(0).numpy(), abs=1e-5)
 
 
@@ -73,14 +75,18 @@ def test_charts_are_networks_of_their_own():
                     x = torch.relu(x) if i < 2 else x
                 assert got[b, k].numpy() == pytest.approx(x.numpy(), abs=1e-5)
         corners = network.grid(code, 3)[:, :, [0, 8]]
-        assert corners.numpy() == pytest.approx(network.decode(code, torch.tensor([[0.0, 0], [1, 1]]).expand(3, 2, 2)).numpy(), abs=1e-6)
+        assert corners.numpy() == pytest.approx(
+            network.decode(code, torch.tensor([[0.0, 0], [1, 1]]).expand(3, 2, 2)).numpy(), abs=1e-6
+        )
 
 
 def test_chamfer_is_that_of_a_tree_and_its_gradient_that_of_differences():
     a, b = torch.rand(2, 40, 3, dtype=torch.float64), torch.rand(2, 30, 3, dtype=torch.float64)
     for k in range(2):
         to_b, to_a = cKDTree(b[k]).query(a[k])[0], cKDTree(a[k]).query(b[k])[0]
-        assert chamfer(a, b)[k].item() == pytest.approx((to_b**2).mean() + (to_a**2).mean(), rel=1e-9)
+        assert chamfer(a, b)[k].item() == pytest.approx(
+            (to_b**2).mean() + (to_a**2).mean(), rel=1e-9
+        )
     assert torch.autograd.gradcheck(chamfer, (a.requires_grad_(), b.requires_grad_()))
     assert chamfer(a, a).detach().numpy() == pytest.approx(0, abs=1e-12)
 
@@ -100,7 +106,9 @@ def test_weights_come_back_and_others_are_refused(tmp_path):
     for network in (lively(PointNet(2)), lively(DGCNN(2))):
         network.save(tmp_path / "w.safetensors")
         with torch.no_grad():
-            assert torch.equal(type(network).load(tmp_path / "w.safetensors", 2).alpha(x), network.alpha(x))
+            assert torch.equal(
+                type(network).load(tmp_path / "w.safetensors", 2).alpha(x), network.alpha(x)
+            )
         with pytest.raises(InputError, match="for jets of order 2, not 4"):
             type(network).load(tmp_path / "w.safetensors", 4)
         with pytest.raises(InputError, match="not of atlasnet"):
@@ -109,6 +117,10 @@ def test_weights_come_back_and_others_are_refused(tmp_path):
     network.save(tmp_path / "a.safetensors")
     with torch.no_grad():
         assert torch.equal(AtlasNet.load(tmp_path / "a.safetensors").encode(x), network.encode(x))
-    write_weights(tmp_path / "old.safetensors", network.state_dict(), dict(model="atlasnet", version=0, network=network.shape))
+    write_weights(
+        tmp_path / "old.safetensors",
+        network.state_dict(),
+        dict(model="atlasnet", version=0, network=network.shape),
+    )
     with pytest.raises(InputError, match="version 0"):
         AtlasNet.load(tmp_path / "old.safetensors")

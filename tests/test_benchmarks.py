@@ -1,4 +1,6 @@
-"""The benchmarks at tiny sizes: that they measure what they say. Their times are no part of the tests."""
+"""The benchmarks at tiny sizes: that they measure what they say. Their times are no part of the
+tests.
+"""
 
 import json
 from pathlib import Path
@@ -12,7 +14,10 @@ from polysft_mi import metrics, plugins
 
 ROOT = Path(__file__).resolve().parent.parent
 SIZE, POINTS = (64, 48), 9
-iteration, outline, raster, scaling, stability = (load(f"benchmarks/{name}.py") for name in ("iteration", "outline", "raster", "scaling", "stability"))
+iteration, outline, raster, scaling, stability = (
+    load(f"benchmarks/{name}.py")
+    for name in ("iteration", "outline", "raster", "scaling", "stability")
+)
 
 
 @pytest.fixture(autouse=True)
@@ -21,7 +26,9 @@ def registered():
 
 
 def test_contenders_show_the_same_sheet_on_half_of_the_image(tmp_path):
-    result = raster.measure_times((320, 240), POINTS, str(tmp_path), seconds=0)  # large enough for the texture's detail
+    result = raster.measure_times(
+        (320, 240), POINTS, str(tmp_path), seconds=0
+    )  # large enough for the texture's detail
     assert {len(ms) for ms in result["passes"].values()} == {raster.LEAST_TURNS}
     assert result["coverage"] == pytest.approx(0.5, abs=0.03)
     assert result["mean_difference"] == pytest.approx(0, abs=0.01)
@@ -33,7 +40,10 @@ def test_contenders_take_the_same_gradient(tmp_path):
     for name in raster.CONTENDERS:
         contender = raster.Contender(name, SIZE, POINTS, str(tmp_path))
         contender.place(-2.0)
-        gradients[name] = sum(np.array(contender.forward_backward(k), dtype=np.float64) for k in range(40 if contender.path_replay else 1))
+        gradients[name] = sum(
+            np.array(contender.forward_backward(k), dtype=np.float64)
+            for k in range(40 if contender.path_replay else 1)
+        )
     g, through_mi, noisy = (gradients[name] for name in raster.CONTENDERS)
     assert np.linalg.norm(g) > 0
     assert through_mi == pytest.approx(g, rel=1e-3, abs=1e-3 * np.abs(g).max())
@@ -50,13 +60,28 @@ def test_iterations_of_raster_need_no_new_kernels(tmp_path):
 
 
 def test_kernels_that_come_late_are_counted():
-    summary = raster.judge_long_run({"resident_mb": [1.0] * 12}, {"launched": [5] * 12, "new": [5, 2, 0, 1] + [0] * 8})
-    assert (summary["new_kernels_first_two"], summary["new_kernels_later"], summary["iterations_with_new_kernels"]) == (7, 1, [1, 2, 4])
+    summary = raster.judge_long_run(
+        {"resident_mb": [1.0] * 12}, {"launched": [5] * 12, "new": [5, 2, 0, 1] + [0] * 8}
+    )
+    assert (
+        summary["new_kernels_first_two"],
+        summary["new_kernels_later"],
+        summary["iterations_with_new_kernels"],
+    ) == (7, 1, [1, 2, 4])
 
 
 def test_ratios_are_those_within_a_turn():
-    times = dict(passes={}, moves={}, coverage=0.5, mean_colour=0.5, mean_difference=0.0, mean_absolute_difference=0.0)
-    for name, ms in zip(raster.CONTENDERS, ([1, 10, 2], [1, 10, 2], [4, 40, 8])):  # the machine was busy in the second turn
+    times = dict(
+        passes={},
+        moves={},
+        coverage=0.5,
+        mean_colour=0.5,
+        mean_difference=0.0,
+        mean_absolute_difference=0.0,
+    )
+    for name, ms in zip(
+        raster.CONTENDERS, ([1, 10, 2], [1, 10, 2], [4, 40, 8])
+    ):  # the machine was busy in the second turn
         times["passes"][name], times["moves"][name] = ms, [1, 1, 1]
     case = raster.summarise("64x48", POINTS, times, {name: {} for name in raster.CONTENDERS})
     assert case["contenders"]["prb_projective"]["ratio"] == 4
@@ -79,12 +104,16 @@ def test_snapshots_are_what_shorter_runs_return(tmp_path):
 
 
 def test_stability_writes_figures_and_picture(tmp_path, capsys):
-    stability.main([DEMO[0], "-D", "first=3", "-D", "last=3", "--counts", "2", "6", "-o", str(tmp_path)])
+    stability.main(
+        [DEMO[0], "-D", "first=3", "-D", "last=3", "--counts", "2", "6", "-o", str(tmp_path)]
+    )
     report = json.loads((tmp_path / "stability.json").read_text())
     assert report["frame"] == 3 and list(report["counts"]) == ["2", "6"]
     assert report["counts"]["6"]["change_rms_mm"] == 0 < report["counts"]["2"]["change_rms_mm"]
     truth = metrics.load_npz(ROOT / "scenes" / "demo" / "gt.npz")["vertices"][3]
-    assert report["counts"]["2"]["rmse_mm"] == pytest.approx(1e3 * np.linalg.norm(truth) / np.sqrt(len(truth)) * report["counts"]["2"]["e3d"], rel=1e-5)
+    assert report["counts"]["2"]["rmse_mm"] == pytest.approx(
+        1e3 * np.linalg.norm(truth) / np.sqrt(len(truth)) * report["counts"]["2"]["e3d"], rel=1e-5
+    )
     assert (tmp_path / "stability.png").read_bytes().startswith(b"\x89PNG")
     assert "stability.json" in capsys.readouterr().out
 
@@ -107,12 +136,20 @@ def test_scaling_tracks_the_sheet_that_it_makes(tmp_path):
     assert len(found["seconds"]) == len(found["cpu"]) == len(found["evaluations"]) == 2
     moved = 1e3 * np.linalg.norm(vertices[-1] - vertices[0], axis=1).mean()
     assert 0 < found["rmse_mm"][-1] < 0.1 * moved and found["peak_mb"] >= found["started_mb"]
-    case = scaling.summarise(POINTS, "160x120", {**found, "versions": {"variant": "v", "machine": "m"}})
+    case = scaling.summarise(
+        POINTS, "160x120", {**found, "versions": {"variant": "v", "machine": "m"}}
+    )
     text = scaling.report([case, {**case, "vertices": 4}], str(tmp_path), 3)
-    assert "| 81 | 160×120 |" in text and (tmp_path / "scaling.md").read_text(encoding="utf-8") == text and (tmp_path / "scaling.png").exists()
+    assert (
+        "| 81 | 160×120 |" in text
+        and (tmp_path / "scaling.md").read_text(encoding="utf-8") == text
+        and (tmp_path / "scaling.png").exists()
+    )
 
 
 def test_poses_of_the_demo_are_found_again():
     rows, sure = outline.measure(str(ROOT / "scenes" / "demo"), 3)
     assert rows.shape == (3, 4) and sure == 3
-    assert rows[:, 0].min() > 1 and rows[:, 2].max() < 0.2 and (rows[:, 3] < 0.25 * rows[:, 1]).all()
+    assert (
+        rows[:, 0].min() > 1 and rows[:, 2].max() < 0.2 and (rows[:, 3] < 0.25 * rows[:, 1]).all()
+    )

@@ -1,4 +1,6 @@
-"""torch and Dr.Jit joined: PolyFit's template, and gradients across the bridge in both directions against finite differences."""
+"""torch and Dr.Jit joined: PolyFit's template, and gradients across the bridge in both directions
+against finite differences.
+"""
 
 import drjit as dr
 import mitsuba as mi
@@ -20,7 +22,9 @@ RNG = np.random.default_rng(2)
 
 @pytest.fixture(scope="module")
 def network():
-    """PolyFit whose turns are slight, so that one of them, and not the PCA frame, is kept for the sheet."""
+    """PolyFit whose turns are slight, so that one of them, and not the PCA frame, is kept for the
+    sheet.
+    """
     torch.manual_seed(0)
     model = PolyFit(4, SpatialTransformer(widths=(8, 16), hidden=8, points=64)).eval()
     with torch.no_grad():
@@ -30,7 +34,9 @@ def network():
 
 @pytest.fixture(scope="module")
 def bent(tmp_path_factory):
-    """A small scene whose rendering is a problem's, and a bent sheet in it: points (N, 3) float32."""
+    """A small scene whose rendering is a problem's, and a bent sheet in it: points (N, 3)
+    float32.
+    """
     folder = tmp_path_factory.mktemp("bridge")
     truth = synthetic.cloth(folder / "sequence", frames=2, bend=6.0)
     path, _ = prepare.prepare(str(truth.folder), out=str(folder / "scene"))
@@ -44,11 +50,18 @@ def weights_of(network):
 
 
 def gradient_and_numeric(loss, network, direction, h):
-    """The derivative of ``loss()`` along ``direction`` in the network's weights, by autograd and by central differences."""
+    """The derivative of ``loss()`` along ``direction`` in the network's weights, by autograd and by
+    central differences.
+    """
     start = weights_of(network)
     network.zero_grad()
     loss().backward()
-    gradient = torch.cat([(torch.zeros_like(p) if p.grad is None else p.grad).flatten() for p in network.parameters()])
+    gradient = torch.cat(
+        [
+            (torch.zeros_like(p) if p.grad is None else p.grad).flatten()
+            for p in network.parameters()
+        ]
+    )
     ends = []
     with torch.no_grad():
         for sign in (1, -1):
@@ -62,7 +75,9 @@ def test_polyfit_sets_up_the_template(bent, network):
     problem, points = bent
     t = problem.template
     made = bridge.template(network, points.numpy(), t.faces, t.uv)
-    assert made.rotation @ made.rotation.T == pytest.approx(np.eye(3), abs=1e-12) and np.linalg.det(made.rotation) == pytest.approx(1)
+    assert made.rotation @ made.rotation.T == pytest.approx(np.eye(3), abs=1e-12) and np.linalg.det(
+        made.rotation
+    ) == pytest.approx(1)
     frame = network(points[None]).frame[0]
     assert made.rotation == pytest.approx(frame.R.detach().numpy(), abs=1e-5)
     patch = JetPatch(made)
@@ -73,9 +88,16 @@ def test_polyfit_sets_up_the_template(bent, network):
 def test_a_rendering_loss_reaches_the_network(bent, network):
     problem, points = bent
     render = bridge.rendering(problem)
-    beyond = (points[:, 0] - 0.03).clamp(min=0)  # bent up there by 80 degrees: its jet depends on the frame, and so on the network
-    rough = points + beyond[:, None] * torch.tensor([np.cos(1.4) - 1, 0, -np.sin(1.4)], dtype=torch.float32)
-    weight = torch.as_tensor(synthetic.to_linear(255 * RNG.random((problem.height, problem.width, 3))), dtype=torch.float32)
+    beyond = (points[:, 0] - 0.03).clamp(
+        min=0
+    )  # bent up there by 80 degrees: its jet depends on the frame, and so on the network
+    rough = points + beyond[:, None] * torch.tensor(
+        [np.cos(1.4) - 1, 0, -np.sin(1.4)], dtype=torch.float32
+    )
+    weight = torch.as_tensor(
+        synthetic.to_linear(255 * RNG.random((problem.height, problem.width, 3))),
+        dtype=torch.float32,
+    )
 
     def loss():
         rgb, alpha = render(bridge.surface(network, rough[None])[0])
@@ -85,7 +107,12 @@ def test_a_rendering_loss_reaches_the_network(bent, network):
     assert (network.frame(rough[None])[0].R - pca.R).abs().max() > 1e-3
     network.zero_grad()
     loss().backward()
-    direction = torch.cat([(torch.zeros_like(p) if p.grad is None else p.grad).flatten() for p in network.parameters()])
+    direction = torch.cat(
+        [
+            (torch.zeros_like(p) if p.grad is None else p.grad).flatten()
+            for p in network.parameters()
+        ]
+    )
     direction /= direction.norm()
     found, numeric = gradient_and_numeric(loss, network, direction, 3e-3)
     assert found > 1 and found == pytest.approx(numeric, rel=0.05)
@@ -103,7 +130,9 @@ def test_rendering_in_torch_is_the_problems(bent):
 def test_a_torch_loss_reaches_alpha(bent, network):
     """The loss is one of coefficients that torch fits to the surface that Dr.Jit makes of alpha."""
     problem, points = bent
-    patch = JetPatch(bridge.template(network, points.numpy(), problem.template.faces, problem.template.uv))
+    patch = JetPatch(
+        bridge.template(network, points.numpy(), problem.template.faces, problem.template.uv)
+    )
     weight = torch.as_tensor(RNG.normal(size=(2, 15)), dtype=torch.float32)
 
     @bridge.in_torch
@@ -123,16 +152,28 @@ def test_a_torch_loss_reaches_alpha(bent, network):
     dr.enable_grad(delta)
     dr.backward(value(delta))
     gradient, direction, h = np.array(dr.grad(delta)), RNG.normal(size=15), 1e-2
-    ends = [float(np.ravel(np.array(value(mi.Float((start + sign * h * direction).astype(np.float32)))))[0]) for sign in (1, -1)]
+    ends = [
+        float(
+            np.ravel(np.array(value(mi.Float((start + sign * h * direction).astype(np.float32)))))[
+                0
+            ]
+        )
+        for sign in (1, -1)
+    ]
     assert np.linalg.norm(gradient) > 0.1
     assert gradient @ direction == pytest.approx((ends[0] - ends[1]) / (2 * h), rel=0.01)
 
 
 def test_gradient_of_the_deformed_patch_in_torch(bent, network):
     problem, points = bent
-    patch = JetPatch(bridge.template(network, points.numpy(), problem.template.faces, problem.template.uv))
+    patch = JetPatch(
+        bridge.template(network, points.numpy(), problem.template.faces, problem.template.uv)
+    )
     vertices, N = bridge.deformed(patch), len(points)
-    unknowns = [0.05 * torch.randn(n, generator=torch.Generator().manual_seed(k)) for k, n in enumerate((15, N, N, N, 4, 3))]
+    unknowns = [
+        0.05 * torch.randn(n, generator=torch.Generator().manual_seed(k))
+        for k, n in enumerate((15, N, N, N, 4, 3))
+    ]
     unknowns[4] = unknowns[4] + torch.tensor([0, 0, 0, 1.0])
     weight = torch.as_tensor(RNG.normal(size=(N, 3)), dtype=torch.float32)
     unknowns = [x.requires_grad_() for x in unknowns]
@@ -144,4 +185,6 @@ def test_gradient_of_the_deformed_patch_in_torch(bent, network):
             moved = [y.detach() for y in unknowns]
             moved[k] = moved[k] + sign * h * direction
             ends.append(float((weight * vertices(*moved)).sum()))
-        assert float(x.grad @ direction) == pytest.approx((ends[0] - ends[1]) / (2 * h), rel=0.02, abs=2e-3), k
+        assert float(x.grad @ direction) == pytest.approx(
+            (ends[0] - ends[1]) / (2 * h), rel=0.02, abs=2e-3
+        ), k

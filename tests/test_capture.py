@@ -1,4 +1,6 @@
-"""A sequence's folder from a video and a photo: each step against what is known of rendered videos, and each bad input in one line."""
+"""A sequence's folder from a video and a photo: each step against what is known of rendered videos,
+and each bad input in one line.
+"""
 
 import json
 import os
@@ -36,7 +38,9 @@ def refused(function, *arguments, **options):
 
 
 def photo(seed=1, size=(594, 420)):
-    """A print with detail everywhere (H, W, 3) uint8, bright against the background of :func:`clip`."""
+    """A print with detail everywhere (H, W, 3) uint8, bright against the background of
+    :func:`clip`.
+    """
     rng = np.random.default_rng(seed)
     image = np.full((size[1], size[0], 3), 235, np.uint8)
     for _ in range(220):
@@ -52,7 +56,9 @@ def photo(seed=1, size=(594, 420)):
 
 
 def background(size=(320, 240)):
-    noise = np.random.default_rng(7).integers(0, 90, (size[1] // 8, size[0] // 8, 3)).astype(np.uint8)
+    noise = (
+        np.random.default_rng(7).integers(0, 90, (size[1] // 8, size[0] // 8, 3)).astype(np.uint8)
+    )
     return cv2.resize(noise, size, interpolation=cv2.INTER_CUBIC)
 
 
@@ -80,7 +86,9 @@ def rendered(print_, t=0.0, camera=CAMERA, over=None):
 
 def write_png(path, rgb):
     path.parent.mkdir(parents=True, exist_ok=True)
-    done, data = cv2.imencode(".png", rgb[..., ::-1] if rgb.ndim == 3 and rgb.shape[2] == 3 else rgb)
+    done, data = cv2.imencode(
+        ".png", rgb[..., ::-1] if rgb.ndim == 3 and rgb.shape[2] == 3 else rgb
+    )
     assert done
     path.write_bytes(data.tobytes())
     return str(path)
@@ -88,36 +96,63 @@ def write_png(path, rgb):
 
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory):
-    """(video, photo, camera file, coverages) in a folder whose name has spaces and letters that are not ASCII."""
+    """(video, photo, camera file, coverages) in a folder whose name has spaces and letters that are
+    not ASCII.
+    """
     folder = tmp_path_factory.mktemp("a") / "vidéo 紙 &1"
     folder.mkdir()
     print_ = photo()
     made = [rendered(print_, k / 11) for k in range(12)]
     video = write_video(folder / "my clip.mp4", [image for image, _ in made])
-    (folder / "camera.json").write_text(json.dumps({k: getattr(CAMERA, k) for k in ("fx", "fy", "cx", "cy", "width", "height")}))
-    return video, write_png(folder / "my photo.png", print_), str(folder / "camera.json"), [cover for _, cover in made]
+    (folder / "camera.json").write_text(
+        json.dumps({k: getattr(CAMERA, k) for k in ("fx", "fy", "cx", "cy", "width", "height")})
+    )
+    return (
+        video,
+        write_png(folder / "my photo.png", print_),
+        str(folder / "camera.json"),
+        [cover for _, cover in made],
+    )
 
 
 def given(clip, **options):
     return {"texture": clip[1], "size": ["297mm", "210mm"], "camera": clip[2], **options}
 
 
-# ---- the whole way ------------------------------------------------------------------------------------------------------------
+# ---- the whole way -------------------------------------------------------------------------------
 
 
 def test_folder_of_a_video(clip, tmp_path):
     lines, out = [], str(tmp_path / "aus gabe é")
     scene_path, found = capture(clip[0], out, say=lines.append, **given(clip))
-    assert sorted(os.listdir(out)) == ["camera.json", "frames", "masks", "prepare", "scene.xml", "template.obj", "texture.png"]
+    assert sorted(os.listdir(out)) == [
+        "camera.json",
+        "frames",
+        "masks",
+        "prepare",
+        "scene.xml",
+        "template.obj",
+        "texture.png",
+    ]
     assert sorted(os.listdir(tmp_path)) == ["aus gabe é"]  # nothing beside it
-    assert sorted(os.listdir(f"{out}/prepare")) == ["frames.png", "masks.png", "matches.png", "pose.png", "prepare.json"]
-    assert json.loads(Path(out, "prepare", "prepare.json").read_text()) == json.loads(json.dumps(found))
+    assert sorted(os.listdir(f"{out}/prepare")) == [
+        "frames.png",
+        "masks.png",
+        "matches.png",
+        "pose.png",
+        "prepare.json",
+    ]
+    assert json.loads(Path(out, "prepare", "prepare.json").read_text()) == json.loads(
+        json.dumps(found)
+    )
     assert found["frames"] == 12 and found["in_view"] == 1 and found["pose"]["agree"] > 100
 
     vertices, faces, uv = meshio.read_template(f"{out}/template.obj")
     R, t = placed()
     flat = np.column_stack([(uv[:, 0] - 0.5) * WIDTH, (0.5 - uv[:, 1]) * HEIGHT, np.zeros(len(uv))])
-    assert np.abs(vertices - (flat @ R.T + t)).max() < 1e-3  # of 550 mm, by a compressed video of 320x240
+    assert (
+        np.abs(vertices - (flat @ R.T + t)).max() < 1e-3
+    )  # of 550 mm, by a compressed video of 320x240
     assert len(vertices) == 33 * 24
     for k, cover in enumerate(clip[3]):
         mask = images.read_rgb(f"{out}/masks/{k:05d}.png")[..., 0]
@@ -131,27 +166,43 @@ def test_folder_of_a_video(clip, tmp_path):
     image = np.array(mi.render(experiment.scene, sensor=experiment.sensor, spp=1))
     frame = Sequence.open(experiment.frames, experiment.masks, size=experiment.size).frame(0)
     inside = image[..., 3] > 0.999
-    right, upside_down, mirrored = (np.abs(image[..., :3] - x)[inside].mean() for x in (frame, frame[::-1], frame[:, ::-1]))
+    right, upside_down, mirrored = (
+        np.abs(image[..., :3] - x)[inside].mean() for x in (frame, frame[::-1], frame[:, ::-1])
+    )
     assert inside.mean() > 0.2 and right < 0.05 and min(upside_down, mirrored) > 3 * right
 
 
 def test_demo_is_found_by_its_texture(tmp_path):
     """The demo's first frame is curved: its own mesh as the template."""
-    write_video(tmp_path / "demo.mp4", [images.read_rgb(p) for p in sorted((DEMO / "frames").glob("*.jpg"))[:3]])
+    write_video(
+        tmp_path / "demo.mp4",
+        [images.read_rgb(p) for p in sorted((DEMO / "frames").glob("*.jpg"))[:3]],
+    )
     capture(
-        str(tmp_path / "demo.mp4"), texture=str(DEMO / "texture.jpg"), template=str(DEMO / "template.obj"), camera=str(DEMO / "camera.json")
+        str(tmp_path / "demo.mp4"),
+        texture=str(DEMO / "texture.jpg"),
+        template=str(DEMO / "template.obj"),
+        camera=str(DEMO / "camera.json"),
     )
     vertices, _, _ = meshio.read_template(tmp_path / "demo" / "template.obj")
     truth, _, _ = meshio.read_template(DEMO / "template.obj")
     assert np.linalg.norm(vertices - truth, axis=1).max() < 3e-3
     for k in range(3):
-        found, drawn = (images.read_rgb(p)[..., 0] for p in (tmp_path / "demo" / "masks" / f"{k:05d}.png", DEMO / "masks" / f"{k:03d}.png"))
+        found, drawn = (
+            images.read_rgb(p)[..., 0]
+            for p in (tmp_path / "demo" / "masks" / f"{k:05d}.png", DEMO / "masks" / f"{k:03d}.png")
+        )
         assert masks.iou(found, drawn) > 0.97
 
 
 def test_corners_and_the_first_frame_as_texture(clip, tmp_path):
     R, t = placed(2 / 11)
-    corners = CAMERA.project(np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]) * (WIDTH / 2, HEIGHT / 2, 0) @ R.T + t)
+    corners = CAMERA.project(
+        np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)])
+        * (WIDTH / 2, HEIGHT / 2, 0)
+        @ R.T
+        + t
+    )
     _, found = capture(
         clip[0],
         str(tmp_path / "out"),
@@ -170,32 +221,74 @@ def test_corners_and_the_first_frame_as_texture(clip, tmp_path):
     assert np.linalg.norm(vertices.mean(0) - t) < 2e-3
     camera = Intrinsics.from_json(tmp_path / "out" / "camera.json")
     assert (camera.width, camera.height, camera.fx, camera.cx) == (160, 120, 165, 81)
-    np.testing.assert_allclose(uv * (160, -120) + (0, 120), camera.project(vertices), atol=1e-3)  # the texture is the frame
-    assert not (tmp_path / "out" / "masks").exists() and images.read_rgb(tmp_path / "out" / "texture.png").shape == (120, 160, 3)
+    np.testing.assert_allclose(
+        uv * (160, -120) + (0, 120), camera.project(vertices), atol=1e-3
+    )  # the texture is the frame
+    assert not (tmp_path / "out" / "masks").exists() and images.read_rgb(
+        tmp_path / "out" / "texture.png"
+    ).shape == (120, 160, 3)
 
 
 def test_corners_by_hand_are_moved_to_the_edges(clip, tmp_path):
-    """Corners that miss by some pixels: the sheet is moved to its edges in the frame, and a line says so; or it is not, where that is wanted."""
+    """Corners that miss by some pixels: the sheet is moved to its edges in the frame, and a line
+    says so; or it is not, where that is wanted.
+    """
     R, t = placed(2 / 11)
-    sheet_corners = np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]) * (WIDTH / 2, HEIGHT / 2, 0) @ R.T + t
+    sheet_corners = (
+        np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)])
+        * (WIDTH / 2, HEIGHT / 2, 0)
+        @ R.T
+        + t
+    )
     corners = CAMERA.project(sheet_corners) + [(2, -1.5), (-1, 2), (1.5, 2), (2, -1)]
-    options = dict(texture="first-frame", size=["A4"], camera=clip[2], corners=corners.tolist(), first=2, last=2, masks=False)
+    options = dict(
+        texture="first-frame",
+        size=["A4"],
+        camera=clip[2],
+        corners=corners.tolist(),
+        first=2,
+        last=2,
+        masks=False,
+    )
     missed, found, lines = {}, {}, []
     for fit in ("auto", "none"):
-        _, found[fit] = capture(clip[0], str(tmp_path / fit), pose_fit=fit, say=lines.append, **options)
+        _, found[fit] = capture(
+            clip[0], str(tmp_path / fit), pose_fit=fit, say=lines.append, **options
+        )
         vertices, _, uv = meshio.read_template(tmp_path / fit / "template.obj")
         camera = Intrinsics.from_json(tmp_path / fit / "camera.json")
         np.testing.assert_allclose(uv * (320, -240) + (0, 240), camera.project(vertices), atol=1e-3)
-        ends = [vertices[np.argmin(np.linalg.norm(vertices - corner, axis=1))] for corner in sheet_corners]
-        missed[fit] = np.linalg.norm(camera.project(np.array(ends)) - CAMERA.project(sheet_corners), axis=1).max()
+        ends = [
+            vertices[np.argmin(np.linalg.norm(vertices - corner, axis=1))]
+            for corner in sheet_corners
+        ]
+        missed[fit] = np.linalg.norm(
+            camera.project(np.array(ends)) - CAMERA.project(sheet_corners), axis=1
+        ).max()
     assert missed["auto"] < 0.4 and missed["none"] > 1.5
     assert 0.5 < found["auto"]["pose"]["moved_px"] < 4 and "moved_px" not in found["none"]["pose"]
     moved = [line for line in lines if "to the edges of the frame" in line]
-    assert len(moved) == 1 and f"moved by {found['auto']['pose']['moved_px']:.2f} pixels" in moved[0]
+    assert (
+        len(moved) == 1 and f"moved by {found['auto']['pose']['moved_px']:.2f} pixels" in moved[0]
+    )
 
 
 def test_sheet_that_fills_the_picture(clip, tmp_path):
-    words = ["--texture", "first-frame", "--size", "40cm", "30cm", "--fov", "50", "--corners", "frame", "--no-masks", "--last", "1", "-q"]
+    words = [
+        "--texture",
+        "first-frame",
+        "--size",
+        "40cm",
+        "30cm",
+        "--fov",
+        "50",
+        "--corners",
+        "frame",
+        "--no-masks",
+        "--last",
+        "1",
+        "-q",
+    ]
     prepare.main([clip[0], *words, "-o", str(tmp_path / "out")])
     vertices, _, uv = meshio.read_template(tmp_path / "out" / "template.obj")
     assert (uv.min(), uv.max()) == pytest.approx((0, 1), abs=1e-3)
@@ -225,11 +318,27 @@ def test_photo_that_shows_more_than_the_sheet(clip, tmp_path):
 def test_given_masks(clip, tmp_path):
     for k, cover in enumerate(clip[3]):
         write_png(tmp_path / "given" / f"{k}.png", np.round(255 * cover).astype(np.uint8))
-    capture(clip[0], str(tmp_path / "out"), masks=str(tmp_path / "given"), first=4, last=6, **given(clip))
-    assert np.abs(images.read_rgb(tmp_path / "out" / "masks" / "00002.png")[..., 0] / 255 - clip[3][6]).max() < 0.01
+    capture(
+        clip[0],
+        str(tmp_path / "out"),
+        masks=str(tmp_path / "given"),
+        first=4,
+        last=6,
+        **given(clip),
+    )
+    assert (
+        np.abs(
+            images.read_rgb(tmp_path / "out" / "masks" / "00002.png")[..., 0] / 255 - clip[3][6]
+        ).max()
+        < 0.01
+    )
     (tmp_path / "given" / "11.png").unlink()
-    assert "11 masks" in refused(capture, clip[0], str(tmp_path / "b"), masks=str(tmp_path / "given"), **given(clip))
-    assert "no such folder" in refused(capture, clip[0], str(tmp_path / "b"), masks=str(tmp_path / "none" / "x"), **given(clip))
+    assert "11 masks" in refused(
+        capture, clip[0], str(tmp_path / "b"), masks=str(tmp_path / "given"), **given(clip)
+    )
+    assert "no such folder" in refused(
+        capture, clip[0], str(tmp_path / "b"), masks=str(tmp_path / "none" / "x"), **given(clip)
+    )
     assert not (tmp_path / "b").exists()
 
 
@@ -238,44 +347,98 @@ def test_masks_that_cannot_be_believed_are_not_used(clip, tmp_path):
         write_png(tmp_path / "in" / f"{k}.png", image)
     lines = []
     _, found = capture(str(tmp_path / "in"), str(tmp_path / "out"), say=lines.append, **given(clip))
-    assert not found["masks"]["used"] and any("not used, for what is inside in frame 1" in line for line in lines)
-    assert not (tmp_path / "out" / "masks").exists() and (tmp_path / "out" / "prepare" / "masks.png").exists()
+    assert not found["masks"]["used"] and any(
+        "not used, for what is inside in frame 1" in line for line in lines
+    )
+    assert (
+        not (tmp_path / "out" / "masks").exists()
+        and (tmp_path / "out" / "prepare" / "masks.png").exists()
+    )
     assert 'name="masks" value=""' in (tmp_path / "out" / "scene.xml").read_text()
 
 
 def test_command_line(clip, tmp_path):
     def command(*words):
-        return subprocess.run([sys.executable, "-m", "polysft_mi.prepare", *map(str, words)], cwd=ROOT, capture_output=True, text=True)
+        return subprocess.run(
+            [sys.executable, "-m", "polysft_mi.prepare", *map(str, words)],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+        )
 
-    words = [clip[0], "--texture", clip[1], "--size", "A4", "--camera", clip[2], "-o", tmp_path / "o ut", "--last", 1]
+    words = [
+        clip[0],
+        "--texture",
+        clip[1],
+        "--size",
+        "A4",
+        "--camera",
+        clip[2],
+        "-o",
+        tmp_path / "o ut",
+        "--last",
+        1,
+    ]
     done = command(*words)
     assert done.returncode == 0 and done.stderr == ""
     assert f"python -m polysft_mi.run '{tmp_path / 'o ut' / 'scene.xml'}'" in done.stdout
     again = command(*words)
-    assert again.returncode == 2 and again.stderr.startswith("error: ") and again.stderr.count("\n") == 1 and "--overwrite" in again.stderr
-    assert "python -m polysft_mi.prepare clip.mp4 --texture photo.jpg" in prepare.parser().format_help()
+    assert (
+        again.returncode == 2
+        and again.stderr.startswith("error: ")
+        and again.stderr.count("\n") == 1
+        and "--overwrite" in again.stderr
+    )
+    assert (
+        "python -m polysft_mi.prepare clip.mp4 --texture photo.jpg"
+        in prepare.parser().format_help()
+    )
 
 
 def test_replacing_a_folder(clip, tmp_path, capsys):
-    words = [clip[0], "--texture", clip[1], "--size", "A4", "--camera", clip[2], "-o", str(tmp_path / "out"), "--no-masks"]
+    words = [
+        clip[0],
+        "--texture",
+        clip[1],
+        "--size",
+        "A4",
+        "--camera",
+        clip[2],
+        "-o",
+        str(tmp_path / "out"),
+        "--no-masks",
+    ]
     prepare.main([*words, "--last", "0", "-q"])
     assert capsys.readouterr().out == ""
     prepare.main([*words, "--last", "1", "--overwrite", "--json"])
-    assert json.loads(capsys.readouterr().out)["frames"] == 2 and len(os.listdir(tmp_path / "out" / "frames")) == 2
+    assert (
+        json.loads(capsys.readouterr().out)["frames"] == 2
+        and len(os.listdir(tmp_path / "out" / "frames")) == 2
+    )
     assert os.listdir(tmp_path) == ["out"]
     (tmp_path / "out" / "prepare" / "prepare.json").unlink()
-    assert "not replaced" in refused(prepare.main, [*words, "--overwrite"]) and (tmp_path / "out" / "scene.xml").exists()
+    assert (
+        "not replaced" in refused(prepare.main, [*words, "--overwrite"])
+        and (tmp_path / "out" / "scene.xml").exists()
+    )
 
 
-# ---- frames and images ----------------------------------------------------------------------------------------------------------
+# ---- frames and images ---------------------------------------------------------------------------
 
 
 def test_frames_are_upright_and_in_their_colours(tmp_path):
     image = np.zeros((48, 64, 3), np.uint8)
-    image[:24, :32], image[:24, 32:], image[24:, :32], image[24:, 32:] = (200, 40, 30), (30, 180, 60), (40, 50, 220), (240, 240, 100)
+    image[:24, :32], image[:24, 32:], image[24:, :32], image[24:, 32:] = (
+        (200, 40, 30),
+        (30, 180, 60),
+        (40, 50, 220),
+        (240, 240, 100),
+    )
     write_video(tmp_path / "a.mp4", [image] * 3)
     got = [x for _, x in frames.read_frames(tmp_path / "a.mp4")]
-    assert len(got) == 3 and all(np.abs(x[8:40:31, 8:50:41].astype(int) - image[8:40:31, 8:50:41]).max() < 6 for x in got)
+    assert len(got) == 3 and all(
+        np.abs(x[8:40:31, 8:50:41].astype(int) - image[8:40:31, 8:50:41]).max() < 6 for x in got
+    )
     import imageio_ffmpeg
 
     turned = [
@@ -323,14 +486,19 @@ def test_depth_and_alpha_of_a_photo(tmp_path):
 
 def test_deep_and_transparent_inputs_go_the_whole_way(clip, tmp_path):
     deep = images.read_rgb(clip[1])[..., ::-1].astype(np.uint16) * 257
-    path = write_png(tmp_path / "deep.png", np.dstack([deep, np.full(deep.shape[:2], 65535, np.uint16)]))
+    path = write_png(
+        tmp_path / "deep.png", np.dstack([deep, np.full(deep.shape[:2], 65535, np.uint16)])
+    )
     for k, (_, image) in enumerate(frames.read_frames(clip[0], last=1)):
-        write_png(tmp_path / "in" / f"{k}.png", np.dstack([image[..., ::-1], np.full(image.shape[:2], 255, np.uint8)]))
+        write_png(
+            tmp_path / "in" / f"{k}.png",
+            np.dstack([image[..., ::-1], np.full(image.shape[:2], 255, np.uint8)]),
+        )
     _, found = capture(str(tmp_path / "in"), str(tmp_path / "out"), **given(clip, texture=path))
     assert found["pose"]["agree"] > 100 and found["frames"] == 2
 
 
-# ---- the camera -----------------------------------------------------------------------------------------------------------------
+# ---- the camera ----------------------------------------------------------------------------------
 
 DISTORTION = (-0.18, 0.06, 0.001, -0.002, 0.0)
 
@@ -340,8 +508,14 @@ def distorted(image, camera=CAMERA):
     K = camera.matrix()
     K[:2, 2] -= 0.5
     y, x = np.mgrid[: image.shape[0], : image.shape[1]].astype(np.float64)
-    at = cv2.undistortPoints(np.stack([x, y], -1).reshape(-1, 1, 2), K, np.array(DISTORTION), P=K).reshape(*x.shape, 2).astype(np.float32)
-    return cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    at = (
+        cv2.undistortPoints(np.stack([x, y], -1).reshape(-1, 1, 2), K, np.array(DISTORTION), P=K)
+        .reshape(*x.shape, 2)
+        .astype(np.float32)
+    )
+    return cv2.remap(
+        image, at[..., 0], at[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+    )
 
 
 def test_distortion_is_removed():
@@ -370,7 +544,9 @@ def test_scaling_scales_the_camera():
 
 def test_field_of_view_and_film():
     assert lens.Lens.from_fov(90, 640, 480).camera.fx == pytest.approx(320)
-    assert lens.Lens.from_focal_35mm(36, 1000, 1000 * 24 / 36, "a").camera.fx == pytest.approx(1000)  # a picture as wide as the film is
+    assert lens.Lens.from_focal_35mm(36, 1000, 1000 * 24 / 36, "a").camera.fx == pytest.approx(
+        1000
+    )  # a picture as wide as the film is
     assert "170" in refused(lens.Lens.from_fov, 200, 640, 480)
 
 
@@ -380,35 +556,60 @@ def test_camera_that_a_photo_tells(clip, tmp_path):
     exif = Image.Exif()
     exif.get_ifd(0x8769)[0xA405] = 30
     Image.fromarray(images.read_rgb(clip[1])).save(tmp_path / "exif.jpg", exif=exif, quality=95)
-    _, found = capture(clip[0], str(tmp_path / "out"), last=0, texture=str(tmp_path / "exif.jpg"), size=["A4"])
-    assert found["camera"]["fx"] == pytest.approx(30 / np.hypot(36, 24) * 400) and "same camera" in found["camera"]["from"]
+    _, found = capture(
+        clip[0], str(tmp_path / "out"), last=0, texture=str(tmp_path / "exif.jpg"), size=["A4"]
+    )
+    assert (
+        found["camera"]["fx"] == pytest.approx(30 / np.hypot(36, 24) * 400)
+        and "same camera" in found["camera"]["from"]
+    )
     assert "--fov" in refused(capture, clip[0], str(tmp_path / "b"), texture=clip[1], size=["A4"])
 
 
 def board_image(kind):
     if kind == "chessboard":
         squares = np.indices((7, 10)).sum(0) % 2 * 255
-        return np.kron(np.pad(squares, 1, constant_values=255), np.ones((40, 40))).astype(np.uint8), 40
-    board = cv2.aruco.CharucoBoard((7, 5), 1.0, 0.75, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50))
+        return (
+            np.kron(np.pad(squares, 1, constant_values=255), np.ones((40, 40))).astype(np.uint8),
+            40,
+        )
+    board = cv2.aruco.CharucoBoard(
+        (7, 5), 1.0, 0.75, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    )
     return board.generateImage((840, 600), marginSize=0), 120
 
 
-@pytest.mark.parametrize("kind, board", [("chessboard", "9x6"), ("charuco", "charuco:7x5:4X4_50:0.75")])
+@pytest.mark.parametrize(
+    "kind, board", [("chessboard", "9x6"), ("charuco", "charuco:7x5:4X4_50:0.75")]
+)
 def test_calibration(kind, board, tmp_path):
     image, _ = board_image(kind)
     h, w = image.shape
     camera = Intrinsics(640.0, 640.0, 330.0, 235.0, 640, 480)
     K = camera.matrix()
     K[:2, 2] -= 0.5
-    turns = [(0, 0, 0), (0.6, 0, 0), (-0.6, 0, 0.2), (0, 0.6, 0), (0, -0.6, 0.3), (0.4, 0.4, 0), (-0.4, 0.4, 0), (0.4, -0.4, 0)]
+    turns = [
+        (0, 0, 0),
+        (0.6, 0, 0),
+        (-0.6, 0, 0.2),
+        (0, 0.6, 0),
+        (0, -0.6, 0.3),
+        (0.4, 0.4, 0),
+        (-0.4, 0.4, 0),
+        (0.4, -0.4, 0),
+    ]
     for k, turn in enumerate(turns):
         R = cv2.Rodrigues(np.array(turn, float))[0]
         to_board = np.array([[0.3 / w, 0, -0.15], [0, 0.3 / w, -0.15 * h / w], [0, 0, 1]])
         H = K @ np.column_stack([R[:, :2], [0.02 * (k % 3 - 1), 0.02 * (k % 2), 0.42]]) @ to_board
         view = cv2.warpPerspective(image, H, (640, 480), flags=cv2.INTER_AREA, borderValue=120)
-        write_png(tmp_path / "boards" / f"{k}.png", distorted(cv2.GaussianBlur(view, (0, 0), 0.8), camera))
+        write_png(
+            tmp_path / "boards" / f"{k}.png", distorted(cv2.GaussianBlur(view, (0, 0), 0.8), camera)
+        )
     found, picture = calibration.calibrate(str(tmp_path / "boards"), board)
-    assert found.camera.fx == pytest.approx(640, rel=0.01) and found.camera.fy == pytest.approx(640, rel=0.01)
+    assert found.camera.fx == pytest.approx(640, rel=0.01) and found.camera.fy == pytest.approx(
+        640, rel=0.01
+    )
     assert (found.camera.cx, found.camera.cy) == pytest.approx((330, 235), abs=4)
     assert found.distortion[0] == pytest.approx(DISTORTION[0], abs=0.05) and picture.ndim == 3
     for k in range(2, len(turns)):
@@ -418,15 +619,21 @@ def test_calibration(kind, board, tmp_path):
 
 
 def test_views_of_a_board_that_tell_nothing(tmp_path):
-    image = cv2.copyMakeBorder(board_image("charuco")[0], 30, 30, 30, 30, cv2.BORDER_CONSTANT, value=255)
+    image = cv2.copyMakeBorder(
+        board_image("charuco")[0], 30, 30, 30, 30, cv2.BORDER_CONSTANT, value=255
+    )
     for k in range(5):  # from the front, from one distance
         write_png(tmp_path / f"{k}.png", np.roll(image, 4 * k, axis=1))
         if k == 2:
-            assert "at least 4" in refused(calibration.calibrate, str(tmp_path), "charuco:7x5:4X4_50:0.75")
-    assert "focal length open" in refused(calibration.calibrate, str(tmp_path), "charuco:7x5:4X4_50:0.75")
+            assert "at least 4" in refused(
+                calibration.calibrate, str(tmp_path), "charuco:7x5:4X4_50:0.75"
+            )
+    assert "focal length open" in refused(
+        calibration.calibrate, str(tmp_path), "charuco:7x5:4X4_50:0.75"
+    )
 
 
-# ---- sizes ----------------------------------------------------------------------------------------------------------------------
+# ---- sizes ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -459,7 +666,7 @@ def test_sizes_that_no_sheet_has(words, said):
     assert said in refused(parse_size, words)
 
 
-# ---- what is refused ------------------------------------------------------------------------------------------------------------
+# ---- what is refused -----------------------------------------------------------------------------
 
 
 def test_videos_that_cannot_be_read(clip, tmp_path):
@@ -471,7 +678,9 @@ def test_videos_that_cannot_be_read(clip, tmp_path):
     for name in ("empty.mp4", "noise.mp4", "half.mp4", "folder", "none.mp4"):
         message = refused(capture, str(tmp_path / name), str(tmp_path / "out"), **given(clip))
         assert name in message
-    assert "11 frames" not in refused(capture, clip[0], str(tmp_path / "out"), first=12, **given(clip))
+    assert "11 frames" not in refused(
+        capture, clip[0], str(tmp_path / "out"), first=12, **given(clip)
+    )
     assert "12 frames" in refused(capture, clip[0], str(tmp_path / "out"), last=12, **given(clip))
     assert sorted(os.listdir(tmp_path)) == ["empty.mp4", "folder", "half.mp4", "noise.mp4"]
 
@@ -487,11 +696,20 @@ def test_frames_of_several_sizes(clip, tmp_path):
         with av.open(str(tmp_path / f"{k}.mjpeg"), "w") as container:
             stream = container.add_stream("mjpeg", rate=10)
             stream.width, stream.height, stream.pix_fmt = image.shape[1], image.shape[0], "yuvj420p"
-            for packet in [*stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")), *stream.encode()]:
+            for packet in [
+                *stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")),
+                *stream.encode(),
+            ]:
                 container.mux(packet)
-    (tmp_path / "both.mjpeg").write_bytes(b"".join((tmp_path / f"{k}.mjpeg").read_bytes() for k in range(2)))
-    assert "320x200" in refused(capture, str(tmp_path / "both.mjpeg"), str(tmp_path / "out"), **given(clip))
-    assert not (tmp_path / "out").exists() and not [n for n in os.listdir(tmp_path) if "partial" in n]
+    (tmp_path / "both.mjpeg").write_bytes(
+        b"".join((tmp_path / f"{k}.mjpeg").read_bytes() for k in range(2))
+    )
+    assert "320x200" in refused(
+        capture, str(tmp_path / "both.mjpeg"), str(tmp_path / "out"), **given(clip)
+    )
+    assert not (tmp_path / "out").exists() and not [
+        n for n in os.listdir(tmp_path) if "partial" in n
+    ]
 
 
 def test_photo_that_is_not_in_the_video(clip, tmp_path):
@@ -499,16 +717,34 @@ def test_photo_that_is_not_in_the_video(clip, tmp_path):
     plain = write_png(tmp_path / "plain.png", np.full((210, 297, 3), 200, np.uint8))
     for k, path in enumerate((other, plain)):
         message = refused(capture, clip[0], str(tmp_path / f"out{k}"), **given(clip, texture=path))
-        assert "--corners" in message and f"out{k}.matches.png" in message and os.path.isfile(tmp_path / f"out{k}.matches.png")
+        assert (
+            "--corners" in message
+            and f"out{k}.matches.png" in message
+            and os.path.isfile(tmp_path / f"out{k}.matches.png")
+        )
         assert not (tmp_path / f"out{k}").exists()
     flipped = write_png(tmp_path / "flipped.png", images.read_rgb(clip[1])[:, ::-1])
-    assert "mirror" in refused(capture, clip[0], str(tmp_path / "out2"), **given(clip, texture=flipped))
-    assert "not a readable image" in refused(capture, clip[0], str(tmp_path / "out3"), **given(clip, texture=clip[0]))
-    assert "no such file" in refused(capture, clip[0], str(tmp_path / "out3"), **given(clip, texture=str(tmp_path / "none.jpg"))).lower()
+    assert "mirror" in refused(
+        capture, clip[0], str(tmp_path / "out2"), **given(clip, texture=flipped)
+    )
+    assert "not a readable image" in refused(
+        capture, clip[0], str(tmp_path / "out3"), **given(clip, texture=clip[0])
+    )
+    assert (
+        "no such file"
+        in refused(
+            capture,
+            clip[0],
+            str(tmp_path / "out3"),
+            **given(clip, texture=str(tmp_path / "none.jpg")),
+        ).lower()
+    )
 
 
 def test_fewer_than_four_matches():
-    made = pose.Matches(np.random.default_rng(0).random((3, 2)), np.zeros((3, 2)), np.zeros(3, bool))
+    made = pose.Matches(
+        np.random.default_rng(0).random((3, 2)), np.zeros((3, 2)), np.zeros(3, bool)
+    )
     found, after = pose.from_matches(made, sheet.grid(WIDTH, HEIGHT, 5), CAMERA)
     assert found is None and not after.agree.any()
 
@@ -539,7 +775,19 @@ def test_what_does_not_go_together(clip, tmp_path):
     camera = tmp_path / "camera.json"
     camera.write_text(json.dumps({"fx": 1, "fy": 1, "cx": 1, "cy": 1, "width": 100, "height": 100}))
     assert "320x240" in call(camera=str(camera))
-    camera.write_text(json.dumps({"fx": 330, "fy": 330, "cx": 160, "cy": 120, "width": 320, "height": 240, "distortion": [1, 2]}))
+    camera.write_text(
+        json.dumps(
+            {
+                "fx": 330,
+                "fy": 330,
+                "cx": 160,
+                "cy": 120,
+                "width": 320,
+                "height": 240,
+                "distortion": [1, 2],
+            }
+        )
+    )
     assert "distortion" in call(camera=str(camera))
     obj = tmp_path / "large.obj"
     vertices, faces, uv = meshio.read_template(DEMO / "template.obj")
@@ -569,8 +817,26 @@ def test_nothing_is_left_of_an_interrupted_run(clip, tmp_path):
     "words, said",
     [
         ([], "needs --texture"),
-        (["--texture", "first-frame", "--size", "A4", "--fov", "60", "--corners", "1,2", "3,4"], "four points"),
-        (["--texture", "first-frame", "--size", "A4", "--fov", "60", "--corners", "a,b", "1,2", "3,4", "5,6"], "four points"),
+        (
+            ["--texture", "first-frame", "--size", "A4", "--fov", "60", "--corners", "1,2", "3,4"],
+            "four points",
+        ),
+        (
+            [
+                "--texture",
+                "first-frame",
+                "--size",
+                "A4",
+                "--fov",
+                "60",
+                "--corners",
+                "a,b",
+                "1,2",
+                "3,4",
+                "5,6",
+            ],
+            "four points",
+        ),
     ],
 )
 def test_words_of_the_command_line(words, said, clip):
@@ -586,8 +852,15 @@ def test_print_that_the_benchmark_rectifies(tmp_path):
 
     truth = synthetic.kinect_paper(tmp_path / "data", frames=1, size=(320, 240))
     got = load("benchmarks/prepare.py").rectified_print(str(truth.folder))
-    wanted = cv2.flip(synthetic.texture_image(), 0)  # there the template's first row is the print's highest, in Kinect-Paper its lowest
-    assert np.abs(cv2.resize(got, (64, 64), interpolation=cv2.INTER_AREA).astype(int) - wanted)[2:-2, 2:-2].mean() < 6
+    wanted = cv2.flip(
+        synthetic.texture_image(), 0
+    )  # there the template's first row is the print's highest, in Kinect-Paper its lowest
+    assert (
+        np.abs(cv2.resize(got, (64, 64), interpolation=cv2.INTER_AREA).astype(int) - wanted)[
+            2:-2, 2:-2
+        ].mean()
+        < 6
+    )
 
 
 def test_bent_first_frame_is_said(tmp_path):
@@ -596,10 +869,18 @@ def test_bent_first_frame_is_said(tmp_path):
     x = flat.vertices[:, 0]
     lines = []
     for k, curvature in enumerate((0.3, 5.0)):  # 1/m
-        bent = np.column_stack([np.sin(curvature * x) / curvature, flat.vertices[:, 1], (1 - np.cos(curvature * x)) / curvature])
+        bent = np.column_stack(
+            [
+                np.sin(curvature * x) / curvature,
+                flat.vertices[:, 1],
+                (1 - np.cos(curvature * x)) / curvature,
+            ]
+        )
         R, t = placed()
         pixels = CAMERA.project(bent @ R.T + t)
-        found, after = pose.from_matches(pose.Matches(flat.uv.clip(1e-6, 1 - 1e-6), pixels, np.zeros(len(x), bool)), flat, CAMERA)
+        found, after = pose.from_matches(
+            pose.Matches(flat.uv.clip(1e-6, 1 - 1e-6), pixels, np.zeros(len(x), bool)), flat, CAMERA
+        )
         missed = np.sqrt((found.residual**2).mean()) / np.hypot(320, 240)
         lines.append(missed > folder._BENT)
         assert after.agree.sum() >= pose.LEAST

@@ -23,7 +23,12 @@ ROOT = Path(__file__).resolve().parent.parent
 
 def command(*arguments, **options):
     return subprocess.run(
-        [sys.executable, "-m", "polysft_mi", *map(str, arguments)], capture_output=True, text=True, cwd=ROOT, timeout=120, **options
+        [sys.executable, "-m", "polysft_mi", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        timeout=120,
+        **options,
     )
 
 
@@ -40,7 +45,10 @@ def test_help_lists_every_command_and_loads_nothing_heavy(capsys):
     for name in commands.COMMANDS:
         assert callable(importlib.import_module(f"polysft_mi.{name}").main)
     heavy = ("numpy", "torch", "mitsuba", "plotly", "pxr")
-    code = f"import sys, polysft_mi.__main__ as m; m.main(['--help']); print([x for x in {heavy} if x in sys.modules])"
+    code = (
+        f"import sys, polysft_mi.__main__ as m; m.main(['--help']); print([x for x in {heavy} if x"
+        " in sys.modules])"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
     assert done.stdout.splitlines()[-1] == "[]", done.stdout + done.stderr
 
@@ -64,7 +72,9 @@ def test_no_command_and_a_wrong_one(capsys):
     assert polysft.main([]) == 2
     with pytest.raises(InputError, match="exprot: no such command, did you mean export"):
         polysft.main(["exprot"])
-    assert polysft.main(["--version"]) == 0 and capsys.readouterr().out.splitlines()[-1].startswith("polysft ")
+    assert polysft.main(["--version"]) == 0 and capsys.readouterr().out.splitlines()[-1].startswith(
+        "polysft "
+    )
 
 
 @pytest.mark.parametrize(
@@ -98,11 +108,30 @@ def test_json_is_all_that_stdout_holds(finished_run, tmp_path, capsys, monkeypat
     compared = json.loads(printed("compare", out, truth.folder, "--json"))
     assert evaluated["rmse_mm"] == pytest.approx(compared["difference"]["rmse_mm"])
     new = tmp_path / "a folder"
-    figures = json.loads(printed("run", truth.folder / "scene.xml", "-o", new, "-D", "last=1", "-q", "--json", "--no-report"))
-    assert (figures["frames"], figures["report"], figures["out"]) == (2, None, str(new)) and not (new / "report.html").exists()
+    figures = json.loads(
+        printed(
+            "run",
+            truth.folder / "scene.xml",
+            "-o",
+            new,
+            "-D",
+            "last=1",
+            "-q",
+            "--json",
+            "--no-report",
+        )
+    )
+    assert (figures["frames"], figures["report"], figures["out"]) == (2, None, str(new)) and not (
+        new / "report.html"
+    ).exists()
     recorded = json.loads((new / "run.json").read_text())["command"]
-    assert shlex.split(recorded)[:3] == ["python", "-m", "polysft_mi.run"] and str(new) in shlex.split(recorded)
-    assert printed("export", new, "--format", "npz", "-q") == "" and (new / "export" / "surface.npz").exists()
+    assert shlex.split(recorded)[:3] == ["python", "-m", "polysft_mi.run"] and str(
+        new
+    ) in shlex.split(recorded)
+    assert (
+        printed("export", new, "--format", "npz", "-q") == ""
+        and (new / "export" / "surface.npz").exists()
+    )
 
 
 @pytest.mark.parametrize("plain", [False, True])
@@ -111,7 +140,9 @@ def test_colours_only_on_a_terminal_that_wants_them(plain):
     if not plain:
         environment.pop("NO_COLOR", None)
     parent, child = pty.openpty()
-    subprocess.run([sys.executable, "-m", "polysft_mi", "wrong"], stderr=child, cwd=ROOT, env=environment)
+    subprocess.run(
+        [sys.executable, "-m", "polysft_mi", "wrong"], stderr=child, cwd=ROOT, env=environment
+    )
     os.close(child)
     shown = os.read(parent, 4096).decode()
     os.close(parent)
@@ -120,9 +151,17 @@ def test_colours_only_on_a_terminal_that_wants_them(plain):
 
 
 def test_ctrl_c_when_all_is_done_prints_nothing():
-    """Python's own end waits for threads, and would else tell with a traceback that it was interrupted there."""
-    code = "import threading, time\nfrom polyfit.errors import cli\nthreading.Thread(target=time.sleep, args=(20,)).start()\ncli(lambda: print('done', flush=True))"
-    with subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+    """Python's own end waits for threads, and would else tell with a traceback that it was
+    interrupted there.
+    """
+    code = (
+        "import threading, time\nfrom polyfit.errors import"
+        " cli\nthreading.Thread(target=time.sleep, args=(20,)).start()\ncli(lambda: print('done',"
+        " flush=True))"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
         assert process.stdout.readline() == b"done\n"
         time.sleep(0.5)
         process.send_signal(signal.SIGINT)

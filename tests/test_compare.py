@@ -19,7 +19,9 @@ from polysft_mi.shading import seen
 
 @pytest.fixture
 def moved(finished_run, tmp_path):
-    """A copy of the run whose surfaces lie 2 mm nearer to the camera, and a function that changes its surface.npz."""
+    """A copy of the run whose surfaces lie 2 mm nearer to the camera, and a function that changes
+    its surface.npz.
+    """
     out = tmp_path / "moved"
     shutil.copytree(finished_run[1], out)
 
@@ -38,12 +40,21 @@ def test_what_the_camera_sees_agrees_with_rays(finished_run):
     camera = Intrinsics(25, 23, 10.2, 7, 20, 15)
     depth, x, height = seen(V, F, camera, [V[:, 0], 2 * V[:, 2] + 1])
     rows, columns = np.mgrid[:15, :20]
-    rays = np.stack([(columns.ravel() + 0.5 - camera.cx) / camera.fx, (rows.ravel() + 0.5 - camera.cy) / camera.fy, np.ones(300)], 1)
+    rays = np.stack(
+        [
+            (columns.ravel() + 0.5 - camera.cx) / camera.fx,
+            (rows.ravel() + 0.5 - camera.cy) / camera.fy,
+            np.ones(300),
+        ],
+        1,
+    )
     expected = slow_ray_depth(V, F, rays).reshape(15, 20)
     inside = np.isfinite(expected) & np.isfinite(depth)
     assert (np.isfinite(expected) != np.isfinite(depth)).mean() < 0.02 < inside.mean()
     np.testing.assert_allclose(depth[inside], expected[inside], atol=1e-9)
-    np.testing.assert_allclose(x[inside], (expected * rays[:, 0].reshape(15, 20))[inside], atol=1e-9)  # perspective: x = z times the ray's
+    np.testing.assert_allclose(
+        x[inside], (expected * rays[:, 0].reshape(15, 20))[inside], atol=1e-9
+    )  # perspective: x = z times the ray's
     np.testing.assert_allclose(height[inside], 2 * expected[inside] + 1, atol=1e-9)
     behind = np.concatenate([V, V * (1, 1, -1), [[0, 0, 0]]])
     again = seen(behind, np.concatenate([F, F + len(V), [[0, 1, len(behind) - 1]]]), camera)[0]
@@ -54,7 +65,10 @@ def test_what_the_camera_sees_agrees_with_rays(finished_run):
 
 def test_a_run_against_the_truth_has_the_figures_of_evaluate(finished_run):
     truth, out = finished_run
-    ours, theirs = compare.compare(str(out), str(truth.folder))[0], evaluate.evaluate(str(out), str(truth.folder))
+    ours, theirs = (
+        compare.compare(str(out), str(truth.folder))[0],
+        evaluate.evaluate(str(out), str(truth.folder)),
+    )
     for name in ("rmse_mm", "rmse_mm_worst", "e3d", "e3d_proc", "en_deg"):
         assert ours["difference"][name] == pytest.approx(theirs[name])
     assert ours["frames"] == 4 and ours["own"] == {}
@@ -62,29 +76,64 @@ def test_a_run_against_the_truth_has_the_figures_of_evaluate(finished_run):
 
 def test_two_runs(finished_run, moved, tmp_path, capsys):
     out, b = finished_run[1], moved[0]
-    assert compare.main([str(out), str(b), "-o", str(tmp_path / "pictures"), "--frames", "2", "--scale", "4", "--json"]) == 0
-    printed = json.loads(capsys.readouterr().out)
-    assert printed["difference"]["rmse_mm"] == pytest.approx(2, abs=1e-3) and printed["difference"]["depth_difference_mm"] == pytest.approx(
-        2, rel=0.1
+    assert (
+        compare.main(
+            [
+                str(out),
+                str(b),
+                "-o",
+                str(tmp_path / "pictures"),
+                "--frames",
+                "2",
+                "--scale",
+                "4",
+                "--json",
+            ]
+        )
+        == 0
     )
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["difference"]["rmse_mm"] == pytest.approx(2, abs=1e-3) and printed["difference"][
+        "depth_difference_mm"
+    ] == pytest.approx(2, rel=0.1)
     assert printed["own"]["psnr_mask"] == [Run.open(out).metrics["psnr_mask"]] * 2
     folder = tmp_path / "pictures"
-    assert sorted(p.name for p in folder.iterdir()) == ["000.exr", "000.png", "003.exr", "003.png", "compare.json", "figures.png"]
+    assert sorted(p.name for p in folder.iterdir()) == [
+        "000.exr",
+        "000.png",
+        "003.exr",
+        "003.png",
+        "compare.json",
+        "figures.png",
+    ]
     assert json.loads((folder / "compare.json").read_text())["false_colour_mm"] == 4
     layers, header = read_exr(folder / "003.exr")
-    assert (header["frame"], header["a"], header["b"], header["false_colour_mm"]) == (3, str(out), str(b), 4)
+    assert (header["frame"], header["a"], header["b"], header["false_colour_mm"]) == (
+        3,
+        str(out),
+        str(b),
+        4,
+    )
     assert "mitsuba" in header and "chromaticities" in header
     distance, difference = layers["distance"][..., 0], layers["depth_difference"][..., 0]
     inside = np.isfinite(difference)
     np.testing.assert_allclose(distance[np.isfinite(distance)], 0.002, atol=1e-6)
     assert np.median(difference[inside]) == pytest.approx(0.002, rel=0.05)  # A lies farther away
-    np.testing.assert_allclose(layers["depth_a"] - layers["depth_b"], layers["depth_difference"], atol=1e-6)
+    np.testing.assert_allclose(
+        layers["depth_a"] - layers["depth_b"], layers["depth_difference"], atol=1e-6
+    )
     run_layers = read_exr(out / "comparison" / "003.exr")[0]
     np.testing.assert_array_equal(layers["a"], run_layers["render"])
     np.testing.assert_array_equal(layers["target"], run_layers["target"])
     assert (layers["difference"] == 0).all()
-    own = np.isfinite(run_layers["depth"][..., 0]) & (run_layers["depth"][..., 0] > 0) & np.isfinite(layers["depth_a"][..., 0])
-    assert own.mean() > 0.1 and np.abs(run_layers["depth"] - layers["depth_a"])[own].max() < 1e-4  # Mitsuba's depth is ours
+    own = (
+        np.isfinite(run_layers["depth"][..., 0])
+        & (run_layers["depth"][..., 0] > 0)
+        & np.isfinite(layers["depth_a"][..., 0])
+    )
+    assert (
+        own.mean() > 0.1 and np.abs(run_layers["depth"] - layers["depth_a"])[own].max() < 1e-4
+    )  # Mitsuba's depth is ours
     with OpenEXR.File(str(folder / "003.exr"), separate_channels=True) as file:
         names = set(file.channels())
     assert {
@@ -102,7 +151,11 @@ def test_two_runs(finished_run, moved, tmp_path, capsys):
     } <= names
     colour = layers["false_colour"][np.isfinite(distance)]
     np.testing.assert_allclose(
-        colour, np.broadcast_to(figures.false_colour("distance", np.full((1, 1), 2.0), 4.0)[0, 0], colour.shape), atol=6e-3
+        colour,
+        np.broadcast_to(
+            figures.false_colour("distance", np.full((1, 1), 2.0), 4.0)[0, 0], colour.shape
+        ),
+        atol=6e-3,
     )  # half, and a colour map of 256 steps
     image = cv2.imread(str(folder / "003.png"))
     viridis = np.array([140, 145, 33])  # B, G, R at the middle of the scale
@@ -116,7 +169,9 @@ def test_surfaces_of_other_vertices_are_compared_in_depth(finished_run, moved):
     change(faces=half)
     ours, other = compare.compare(str(out), str(b))
     assert set(ours["difference"]) == {"depth_difference_mm", "depth_difference_mm_worst", "shared"}
-    assert ours["difference"]["depth_difference_mm"] == pytest.approx(2, rel=0.1) and "distance" not in other.maps(0, run.camera)
+    assert ours["difference"]["depth_difference_mm"] == pytest.approx(
+        2, rel=0.1
+    ) and "distance" not in other.maps(0, run.camera)
 
 
 def test_against_points_and_clouds(finished_run, tmp_path):
@@ -124,17 +179,28 @@ def test_against_points_and_clouds(finished_run, tmp_path):
     points = run.vertices[2:3, ::5] * np.float32(1.01)
     np.savez(tmp_path / "points.npz", points=points, frames=[2])
     ours, other = compare.compare(run.folder, str(tmp_path / "points.npz"))
-    assert ours["difference"]["depth_rmse_mm"] == pytest.approx(1e3 * np.sqrt(((0.01 * run.vertices[2, ::5, 2]) ** 2).mean()), rel=0.05)
+    assert ours["difference"]["depth_rmse_mm"] == pytest.approx(
+        1e3 * np.sqrt(((0.01 * run.vertices[2, ::5, 2]) ** 2).mean()), rel=0.05
+    )
     map_ = other.maps(2, run.camera)["depth_difference"]
     assert 5 < np.isfinite(map_).sum() <= points.shape[1] and np.nanmedian(map_) == pytest.approx(
         -0.01 * np.median(run.vertices[2, :, 2]), rel=0.2
     )
     dots = compare._dots(map_)
-    assert np.isfinite(dots).sum() > 3 * np.isfinite(map_).sum() and set(dots[np.isfinite(dots)]) <= set(map_[np.isfinite(map_)])
+    assert np.isfinite(dots).sum() > 3 * np.isfinite(map_).sum() and set(
+        dots[np.isfinite(dots)]
+    ) <= set(map_[np.isfinite(map_)])
     compare.write(ours, other, tmp_path / "p")
-    assert sorted(p.name for p in (tmp_path / "p").iterdir()) == ["002.exr", "002.png", "compare.json", "figures.png"]
+    assert sorted(p.name for p in (tmp_path / "p").iterdir()) == [
+        "002.exr",
+        "002.png",
+        "compare.json",
+        "figures.png",
+    ]
     (tmp_path / "clouds").mkdir()
-    np.savez(tmp_path / "clouds" / "cloud_1.npz", points=run.vertices[1] + np.float32([0, 0, 0.003]))
+    np.savez(
+        tmp_path / "clouds" / "cloud_1.npz", points=run.vertices[1] + np.float32([0, 0, 0.003])
+    )
     ours, other = compare.compare(run.folder, str(tmp_path / "clouds"))
     distance = other.maps(1, run.camera)["distance"]
     assert np.nanmax(distance) <= 0.003 + 1e-6 and ours["difference"]["chamfer_1e4"] > 0
@@ -161,4 +227,7 @@ def test_refusals_leave_nothing(finished_run, moved, tmp_path):
     ]:
         with pytest.raises(InputError, match=words):
             compare.main(arguments)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["mine", "moved"] and (tmp_path / "mine" / "notes.txt").exists()
+    assert (
+        sorted(p.name for p in tmp_path.iterdir()) == ["mine", "moved"]
+        and (tmp_path / "mine" / "notes.txt").exists()
+    )

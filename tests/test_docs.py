@@ -17,7 +17,15 @@ from polysft_mi.problem import Problem
 from polysft_mi.sequence import Sequence
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGES = [p for p in [ROOT / "README.md", ROOT / "scenes" / "README.md", *sorted((ROOT / "docs").glob("*.md"))] if p.exists()]
+PAGES = [
+    p
+    for p in [
+        ROOT / "README.md",
+        ROOT / "scenes" / "README.md",
+        *sorted((ROOT / "docs").glob("*.md")),
+    ]
+    if p.exists()
+]
 SCENE = (ROOT / "docs" / "scene.md").read_text(encoding="utf-8")
 FOLDERS = "polysft_mi|polyfit|onefit|scenes|tests|docs|benchmarks"
 
@@ -25,7 +33,9 @@ FOLDERS = "polysft_mi|polyfit|onefit|scenes|tests|docs|benchmarks"
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
 class TestPage:
     def test_files_that_it_names_are_there(self, page):
-        named = set(re.findall(rf"(?<![\w/$.])((?:{FOLDERS})/[\w./-]*\w)", page.read_text(encoding="utf-8")))
+        named = set(
+            re.findall(rf"(?<![\w/$.])((?:{FOLDERS})/[\w./-]*\w)", page.read_text(encoding="utf-8"))
+        )
         assert [n for n in sorted(named) if not (ROOT / n).exists()] == []
 
     def test_modules_and_names_that_it_names_are_there(self, page):
@@ -46,7 +56,9 @@ class TestPage:
             assert target.exists(), link
             if anchor:
                 headings = re.findall(r"^#+ (.+)$", target.read_text(encoding="utf-8"), re.M)
-                assert anchor in [re.sub(r"[^\w\- ]", "", h).strip().lower().replace(" ", "-") for h in headings], link
+                assert anchor in [
+                    re.sub(r"[^\w\- ]", "", h).strip().lower().replace(" ", "-") for h in headings
+                ], link
 
 
 def test_table_of_settings_is_the_generated_one():
@@ -68,14 +80,20 @@ def test_every_plugin_and_parameter_is_described():
         documented = re.findall(r"^\s*\* - ([\w, ]+)$", plugin.__doc__, re.M)
         for parameter in ", ".join(documented).split(", ") if documented else []:
             assert f"`{parameter}`" in parts[name], (name, parameter)
-        described = re.findall(r"`(\w+)`", " ".join(re.findall(r"^\| (`[^|]+)\|", parts[name], re.M)))
+        described = re.findall(
+            r"`(\w+)`", " ".join(re.findall(r"^\| (`[^|]+)\|", parts[name], re.M))
+        )
         assert set(described) <= set(", ".join(documented).split(", ")), name
 
 
 def test_example_scene_runs(tmp_path):
     (tmp_path / "example.xml").write_text(re.search(r"```xml\n(<scene.*?)```", SCENE, re.S)[1])
-    experiment = scene.load(tmp_path / "example.xml", {"data": str(ROOT / "scenes" / "demo"), "last": "0"})
-    sequence = Sequence.open(experiment.frames, experiment.masks, last=experiment.settings.last, size=experiment.size)
+    experiment = scene.load(
+        tmp_path / "example.xml", {"data": str(ROOT / "scenes" / "demo"), "last": "0"}
+    )
+    sequence = Sequence.open(
+        experiment.frames, experiment.masks, last=experiment.settings.last, size=experiment.size
+    )
     problem = Problem(experiment, sequence)
     assert experiment.settings == settings.Settings(last=0)
     _, alpha = problem.image(problem.patch.vertices(problem.patch.rest()))
@@ -106,23 +124,47 @@ def test_files_of_a_run_are_described():
 def test_options_of_the_command_are_described():
     from polysft_mi import run
 
-    options = [o for action in run.parser()._actions for o in action.option_strings if o not in ("-h", "--help", "-o", "--output")]
+    options = [
+        o
+        for action in run.parser()._actions
+        for o in action.option_strings
+        if o not in ("-h", "--help", "-o", "--output")
+    ]
     assert [o for o in options if f"`{o}" not in SCENE] == []
 
 
 def test_pages_build_without_a_warning(tmp_path):
-    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html", ROOT / "docs", tmp_path / "html"]
+    command = [
+        sys.executable,
+        "-m",
+        "sphinx",
+        "-W",
+        "--keep-going",
+        "-q",
+        "-b",
+        "html",
+        ROOT / "docs",
+        tmp_path / "html",
+    ]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     index = (tmp_path / "html" / "index.html").read_text(encoding="utf-8")
-    assert [p.stem for p in (ROOT / "docs").glob("*.md") if p.stem != "index" and f'href="{p.stem}.html"' not in index] == []
+    assert [
+        p.stem
+        for p in (ROOT / "docs").glob("*.md")
+        if p.stem != "index" and f'href="{p.stem}.html"' not in index
+    ] == []
 
 
 def test_options_of_prepare_are_described():
     text = (ROOT / "docs" / "prepare.md").read_text(encoding="utf-8")
     known = ("-h", "--help", "-o", "--output", "--quiet")
-    options = [o for action in prepare_parser()._actions for o in action.option_strings if o not in known]
-    assert [o for o in options if f"`{o}" not in text and f"[{o} " not in text and f"| {o} " not in text] == []
+    options = [
+        o for action in prepare_parser()._actions for o in action.option_strings if o not in known
+    ]
+    assert [
+        o for o in options if f"`{o}" not in text and f"[{o} " not in text and f"| {o} " not in text
+    ] == []
 
 
 def test_commands_of_the_tutorial_are_those_that_its_pictures_come_from():
@@ -130,6 +172,13 @@ def test_commands_of_the_tutorial_are_those_that_its_pictures_come_from():
     lines = tutorial.commands()
     assert [words[2] for words in lines] == ["polysft_mi.prepare", "polysft_mi.run"]
     arguments = prepare_parser().parse_args(lines[0][3:])
-    assert (arguments.folder, arguments.texture) == (f"{tutorial.OUT}/clip.mp4", f"{tutorial.OUT}/photo.jpg")
+    assert (arguments.folder, arguments.texture) == (
+        f"{tutorial.OUT}/clip.mp4",
+        f"{tutorial.OUT}/photo.jpg",
+    )
     text = (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")
-    assert [name for name, _ in tutorial.PICTURES.values() if f"({name})" not in text or not (ROOT / "docs" / name).exists()] == []
+    assert [
+        name
+        for name, _ in tutorial.PICTURES.values()
+        if f"({name})" not in text or not (ROOT / "docs" / name).exists()
+    ] == []

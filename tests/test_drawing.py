@@ -25,21 +25,27 @@ ROOT = Path(__file__).resolve().parent.parent
 
 @pytest.fixture(scope="module")
 def sheet(tmp_path_factory):
-    truth = synthetic.cloth(tmp_path_factory.mktemp("drawing") / "sheet", frames=9, bend=2.5, turn=0.1)
+    truth = synthetic.cloth(
+        tmp_path_factory.mktemp("drawing") / "sheet", frames=9, bend=2.5, turn=0.1
+    )
     prepare.main([str(truth.folder)])
     return truth
 
 
 def problem_of(sheet):
     experiment = scene.load(str(sheet.folder / "scene.xml"))
-    return Problem(experiment, Sequence.open(experiment.frames, experiment.masks, size=experiment.size))
+    return Problem(
+        experiment, Sequence.open(experiment.frames, experiment.masks, size=experiment.size)
+    )
 
 
 def drawn(sheet, out, during=lambda drawing: None, *, problem=None, frames=9, exr_frames=3):
     """(figures of each frame, the video's frames, names of the EXRs): of the true surfaces."""
     problem = problem or problem_of(sheet)
     surfaces = sheet.vertices[:frames].astype(np.float32)
-    vertices = np.stack([problem.camera.origin + v @ problem.camera.axes for v in surfaces]).astype(np.float32)
+    vertices = np.stack([problem.camera.origin + v @ problem.camera.axes for v in surfaces]).astype(
+        np.float32
+    )
     assert np.allclose(problem.camera.to_camera(vertices), surfaces, atol=1e-6)
     out.mkdir(exist_ok=True)
     with Drawing(problem, {}, str(out), exr_frames=exr_frames, about={"scene": "sheet"}) as made:
@@ -51,8 +57,16 @@ def drawn(sheet, out, during=lambda drawing: None, *, problem=None, frames=9, ex
         figures, path = finished(), bound()
         plotted()
         folder = Path(made._folder.name)
-    assert not folder.exists() and (out / "comparison.png").stat().st_size > 20_000 and (out / "loss.png").exists()
-    return figures, np.stack(list(video.read_video(path))), sorted(p.name for p in (out / "comparison").glob("*.exr"))
+    assert (
+        not folder.exists()
+        and (out / "comparison.png").stat().st_size > 20_000
+        and (out / "loss.png").exists()
+    )
+    return (
+        figures,
+        np.stack(list(video.read_video(path))),
+        sorted(p.name for p in (out / "comparison").glob("*.exr")),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -75,9 +89,15 @@ def assert_same(a, b):
 def test_another_process_draws_the_same(sheet, here, tmp_path):
     found = drawn(sheet, tmp_path / "out", lambda made: [job.result() for job in made._jobs])
     assert_same(found, here)
-    assert [f["frame"] for f in found[0]] == list(range(9)) and found[2] == ["000.exr", "004.exr", "008.exr"]
+    assert [f["frame"] for f in found[0]] == list(range(9)) and found[2] == [
+        "000.exr",
+        "004.exr",
+        "008.exr",
+    ]
     assert found[0][0]["psnr_mask"] > 30
-    assert np.isfinite(exr.read_exr(str(tmp_path / "out" / "comparison" / "004.exr"))[0]["depth"]).all()
+    assert np.isfinite(
+        exr.read_exr(str(tmp_path / "out" / "comparison" / "004.exr"))[0]["depth"]
+    ).all()
 
 
 def test_frames_that_change_are_drawn_again(sheet, here, tmp_path):
@@ -96,7 +116,9 @@ def test_a_killed_process_costs_nothing_but_time(sheet, here, tmp_path):
     assert_same(drawn(sheet, tmp_path / "out", kill), here)
 
 
-def test_an_error_in_the_process_has_all_drawn_here_after_its_end(sheet, here, tmp_path, monkeypatch):
+def test_an_error_in_the_process_has_all_drawn_here_after_its_end(
+    sheet, here, tmp_path, monkeypatch
+):
     processes, usual = [], Drawing._draw_here
 
     def fail(made):
@@ -105,7 +127,9 @@ def test_an_error_in_the_process_has_all_drawn_here_after_its_end(sheet, here, t
         processes.extend(made._pool._processes.values())
 
     def alone(made, vertices):
-        assert processes and not any(p.is_alive() for p in processes)  # two would write the same files
+        assert processes and not any(
+            p.is_alive() for p in processes
+        )  # two would write the same files
         usual(made, vertices)
 
     monkeypatch.setattr(Drawing, "_draw_here", alone)
@@ -124,7 +148,11 @@ def test_no_file_is_removed_that_is_being_written(sheet, tmp_path):
         finished, *_ = made.finish(vertices, surfaces, 15)
         assert all(path.exists() for path in others)
         finished()
-    assert sorted(p.name for p in (tmp_path / "comparison").iterdir()) == ["000.exr", "004.exr", "008.exr"]
+    assert sorted(p.name for p in (tmp_path / "comparison").iterdir()) == [
+        "000.exr",
+        "004.exr",
+        "008.exr",
+    ]
 
 
 def test_nothing_is_drawn_any_more_after_an_error(sheet, tmp_path, monkeypatch):
@@ -171,7 +199,9 @@ def test_a_surface_that_leaves_the_view_of_the_first_is_shown_whole(sheet, tmp_p
     for k, v in enumerate(surfaces):
         album.draw(k, problem.camera.origin + v @ problem.camera.axes)
     assert len(album.finish(surfaces)) == 9
-    assert album._view.holds(surfaces) and [row["label"] for row in album.rows] == [f"frame {k}" for k in chosen(9, 5)]
+    assert album._view.holds(surfaces) and [row["label"] for row in album.rows] == [
+        f"frame {k}" for k in chosen(9, 5)
+    ]
     for row in album.rows:
         background = row["surface"][0, 0]
         shown = (row["surface"] != background).any(-1)
@@ -181,8 +211,18 @@ def test_a_surface_that_leaves_the_view_of_the_first_is_shown_whole(sheet, tmp_p
 @pytest.mark.skipif(not os.path.isdir("/proc"), reason="children are found in /proc")
 def test_the_process_ends_with_a_run_that_is_killed(sheet, tmp_path):
     out = tmp_path / "out"
-    arguments = [sys.executable, "-m", "polysft_mi.run", str(sheet.folder / "scene.xml"), "-o", str(out), "-q"]
-    run = subprocess.Popen(arguments, cwd=ROOT, env={**os.environ, "TMPDIR": str(tmp_path)}, start_new_session=True)
+    arguments = [
+        sys.executable,
+        "-m",
+        "polysft_mi.run",
+        str(sheet.folder / "scene.xml"),
+        "-o",
+        str(out),
+        "-q",
+    ]
+    run = subprocess.Popen(
+        arguments, cwd=ROOT, env={**os.environ, "TMPDIR": str(tmp_path)}, start_new_session=True
+    )
     try:
         wait_for(lambda: list(out.glob("checkpoint.npz")))
         ours = members(run.pid)
@@ -220,7 +260,12 @@ def test_metrics_name_the_frames_in_order(sheet, tmp_path):
     from polysft_mi import run
 
     out = tmp_path / "out"
-    assert run.main([str(sheet.folder / "scene.xml"), "-o", str(out), "-q", "-D", "first=1", "--exr", "2"]) == 0
+    assert (
+        run.main(
+            [str(sheet.folder / "scene.xml"), "-o", str(out), "-q", "-D", "first=1", "--exr", "2"]
+        )
+        == 0
+    )
     metrics = json.loads((out / "metrics.json").read_text())
     assert [f["frame"] for f in metrics["per_frame"]] == list(range(1, 9))
     assert sorted(p.name for p in (out / "comparison").iterdir()) == ["001.exr", "008.exr"]

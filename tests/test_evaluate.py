@@ -1,4 +1,6 @@
-"""The evaluate command: the same figures as the benchmark's own scorer, and one line for what cannot be scored."""
+"""The evaluate command: the same figures as the benchmark's own scorer, and one line for what
+cannot be scored.
+"""
 
 import json
 import math
@@ -15,11 +17,15 @@ from polysft_mi.errors import InputError
 ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 SHARED = os.path.join(os.path.dirname(ROOT), "shared")
 SCORER = os.path.join(SHARED, "tools", "score_sft.py")
-needs_scorer = pytest.mark.skipif(not os.path.exists(SCORER), reason="needs ../shared/tools/score_sft.py and ../shared/data")
+needs_scorer = pytest.mark.skipif(
+    not os.path.exists(SCORER), reason="needs ../shared/tools/score_sft.py and ../shared/data"
+)
 
 
 def command(*arguments):
-    return subprocess.run([sys.executable, *map(str, arguments)], capture_output=True, text=True, cwd=ROOT)
+    return subprocess.run(
+        [sys.executable, *map(str, arguments)], capture_output=True, text=True, cwd=ROOT
+    )
 
 
 def agree(surface, truth, tmp_path):
@@ -54,15 +60,21 @@ def test_agrees_with_the_scorer_on_meshes(tmp_path):
 
 
 def sheet_in_view(points, n=25):
-    """A sheet through points (P, 3): a quadratic fit of their depth over their directions, smaller than their extent."""
+    """A sheet through points (P, 3): a quadratic fit of their depth over their directions, smaller
+    than their extent.
+    """
     xy = points[:, :2] / points[:, 2:]
-    basis = lambda p: np.stack([p[:, 0] ** i * p[:, 1] ** j for i in range(3) for j in range(3 - i)], 1)
+    basis = lambda p: np.stack(
+        [p[:, 0] ** i * p[:, 1] ** j for i in range(3) for j in range(3 - i)], 1
+    )
     c = np.linalg.lstsq(basis(xy), points[:, 2], rcond=None)[0]
     low, high = np.quantile(xy, [0.1, 0.9], axis=0)
     u, v = np.meshgrid(*(np.linspace(low[k], high[k], n) for k in (0, 1)))
     p = np.stack([u.ravel(), v.ravel()], 1)
     k = np.arange(n * n).reshape(n, n)
-    F = np.stack([k[:-1, :-1], k[1:, :-1], k[:-1, 1:], k[1:, :-1], k[1:, 1:], k[:-1, 1:]], -1).reshape(-1, 3)
+    F = np.stack(
+        [k[:-1, :-1], k[1:, :-1], k[:-1, 1:], k[1:, :-1], k[1:, 1:], k[:-1, 1:]], -1
+    ).reshape(-1, 3)
     return np.column_stack([p, np.ones(len(p))]) * (basis(p) @ c)[:, None], F
 
 
@@ -81,7 +93,10 @@ def test_agrees_with_the_scorer_on_depth_points(tmp_path):
 @needs_scorer
 def test_agrees_with_the_scorer_on_clouds(tmp_path):
     folder = os.path.join(SHARED, "data", "phi_sft_R1")
-    clouds = [np.load(os.path.join(folder, "clouds", f"cloud_{k:03d}.npz"))["points"].astype(float) for k in (0, 6)]
+    clouds = [
+        np.load(os.path.join(folder, "clouds", f"cloud_{k:03d}.npz"))["points"].astype(float)
+        for k in (0, 6)
+    ]
     sheets = [sheet_in_view(P) for P in clouds]
     V = bent(np.stack([V for V, _ in sheets]), np.random.default_rng(2), 0.003)
     surface = {"vertices": V, "faces": sheets[0][1], "frames": np.array([0, 6])}
@@ -96,19 +111,37 @@ def run_folder(tmp_path):
     F = np.array([[0, 1, 2]])
     (tmp_path / "out").mkdir()
     (tmp_path / "seq").mkdir()
-    np.savez(tmp_path / "out" / "surface.npz", vertices=G + np.float32([0, 0, 0.01]), faces=F, frames=np.arange(2))
+    np.savez(
+        tmp_path / "out" / "surface.npz",
+        vertices=G + np.float32([0, 0, 0.01]),
+        faces=F,
+        frames=np.arange(2),
+    )
     np.savez(tmp_path / "seq" / "gt.npz", vertices=G, faces=F)
     return tmp_path
 
 
 def test_table_and_json_with_image_figures(run_folder):
-    (run_folder / "out" / "metrics.json").write_text(json.dumps({"psnr": 31.25, "ssim": 0.9, "time_s": 3, "psnr_frames": [1, 2]}))
+    (run_folder / "out" / "metrics.json").write_text(
+        json.dumps({"psnr": 31.25, "ssim": 0.9, "time_s": 3, "psnr_frames": [1, 2]})
+    )
     done = command("-m", "polysft_mi.evaluate", run_folder / "out", run_folder / "seq")
     assert done.returncode == 0 and done.stderr == ""
     table = dict(line.rsplit("  ", 1) for line in done.stdout.splitlines())
-    assert float({k.strip(): v for k, v in table.items()}["vertex RMSE [mm]"]) == pytest.approx(10, rel=1e-4)
-    figures = json.loads(command("-m", "polysft_mi.evaluate", run_folder / "out", run_folder / "seq" / "gt.npz", "--json").stdout)
-    assert figures["psnr"] == 31.25 and figures["ssim"] == 0.9 and "time_s" not in figures and "psnr_frames" not in figures
+    assert float({k.strip(): v for k, v in table.items()}["vertex RMSE [mm]"]) == pytest.approx(
+        10, rel=1e-4
+    )
+    figures = json.loads(
+        command(
+            "-m", "polysft_mi.evaluate", run_folder / "out", run_folder / "seq" / "gt.npz", "--json"
+        ).stdout
+    )
+    assert (
+        figures["psnr"] == 31.25
+        and figures["ssim"] == 0.9
+        and "time_s" not in figures
+        and "psnr_frames" not in figures
+    )
     assert figures["frames"] == 2 and figures["rmse_mm"] == pytest.approx(10, rel=1e-4)
     without = evaluate.evaluate(run_folder / "out" / "surface.npz", run_folder / "seq")
     assert "psnr" not in without

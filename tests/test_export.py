@@ -1,4 +1,6 @@
-"""Exports say what surface.npz says: read back by other programs than those that wrote them, frame by frame."""
+"""Exports say what surface.npz says: read back by other programs than those that wrote them, frame
+by frame.
+"""
 
 import io
 import json
@@ -50,11 +52,16 @@ def read_glb(path):
         view = scene["bufferViews"][a["bufferView"]]
         columns = {"SCALAR": 1, "VEC2": 2, "VEC3": 3}[a["type"]]
         dtype = {5126: "<f4", 5123: "<u2", 5125: "<u4"}[a["componentType"]]
-        out = np.frombuffer(data, dtype, a["count"] * columns, start + view.get("byteOffset", 0) + a.get("byteOffset", 0)).reshape(
-            -1, columns
-        )
+        out = np.frombuffer(
+            data,
+            dtype,
+            a["count"] * columns,
+            start + view.get("byteOffset", 0) + a.get("byteOffset", 0),
+        ).reshape(-1, columns)
         if "min" in a:
-            assert np.allclose(out.min(0), a["min"], atol=1e-7) and np.allclose(out.max(0), a["max"], atol=1e-7)
+            assert np.allclose(out.min(0), a["min"], atol=1e-7) and np.allclose(
+                out.max(0), a["max"], atol=1e-7
+            )
         return out
 
     def image(k):
@@ -73,15 +80,29 @@ def test_glb_plays_the_frames(run, expected, tmp_path):
     targets = np.stack([accessor(t["POSITION"]) for t in primitive["targets"]])
     animated = scene["animations"][0]
     sampler = animated["samplers"][animated["channels"][0]["sampler"]]
-    assert animated["channels"][0]["target"] == {"node": 0, "path": "weights"} and scene["nodes"][0]["mesh"] == 0
-    times, weights = accessor(sampler["input"])[:, 0], accessor(sampler["output"]).reshape(len(expected), len(targets))
+    assert (
+        animated["channels"][0]["target"] == {"node": 0, "path": "weights"}
+        and scene["nodes"][0]["mesh"] == 0
+    )
+    times, weights = (
+        accessor(sampler["input"])[:, 0],
+        accessor(sampler["output"]).reshape(len(expected), len(targets)),
+    )
     np.testing.assert_allclose(times, np.arange(len(expected)) / FPS, atol=1e-6)
-    np.testing.assert_allclose(base + np.einsum("tk,knc->tnc", weights, targets), expected, atol=1e-6)
-    normals = accessor(primitive["attributes"]["NORMAL"]) + accessor(primitive["targets"][-1]["NORMAL"])
-    of_faces = np.cross(*(expected[-1][run.faces[:, k]] - expected[-1][run.faces[:, 0]] for k in (1, 2)))
+    np.testing.assert_allclose(
+        base + np.einsum("tk,knc->tnc", weights, targets), expected, atol=1e-6
+    )
+    normals = accessor(primitive["attributes"]["NORMAL"]) + accessor(
+        primitive["targets"][-1]["NORMAL"]
+    )
+    of_faces = np.cross(
+        *(expected[-1][run.faces[:, k]] - expected[-1][run.faces[:, 0]] for k in (1, 2))
+    )
     by_area = np.zeros_like(expected[-1])
     np.add.at(by_area, run.faces, of_faces[:, None])
-    np.testing.assert_allclose(normals, by_area / np.linalg.norm(by_area, axis=1, keepdims=True), atol=1e-3)
+    np.testing.assert_allclose(
+        normals, by_area / np.linalg.norm(by_area, axis=1, keepdims=True), atol=1e-3
+    )
     assert image(0) == open(run.texture, "rb").read()
 
 
@@ -102,7 +123,10 @@ def test_another_reader_of_usd_sees_the_frames(run, expected, tmp_path, name):
     command(run, "--format", "usd", "-o", tmp_path / name)
     stage = tinyusdz.load(str(tmp_path / name))
     assert (stage.get_metadata("upAxis"), stage.get_metadata("metersPerUnit")) == ("Y", 1)
-    assert stage.get_metadata("timeCodesPerSecond") == FPS and stage.get_metadata("endTimeCode") == len(expected) - 1
+    assert (
+        stage.get_metadata("timeCodesPerSecond") == FPS
+        and stage.get_metadata("endTimeCode") == len(expected) - 1
+    )
     prims = {prim.type_name: prim for prim in tinyusdz.traverse(stage)}
     mesh = prims["Mesh"]
     samples = mesh.get_attribute_timesamples("points")
@@ -146,7 +170,9 @@ np.savez(sys.argv[2], points=points, uv=uv, faces=np.array(mesh.GetFaceVertexInd
 def test_trimesh_reads_every_mesh(run, expected, tmp_path, kind):
     command(run, "--format", kind, "-o", tmp_path / "meshes")
     for k, V in zip(run.frames, expected):
-        mesh = trimesh.load(tmp_path / "meshes" / f"{k:03d}.{kind}", process=False, maintain_order=True)
+        mesh = trimesh.load(
+            tmp_path / "meshes" / f"{k:03d}.{kind}", process=False, maintain_order=True
+        )
         np.testing.assert_allclose(mesh.vertices, V, atol=1e-6)
         assert np.array_equal(mesh.faces, run.faces)
         if kind == "obj":
@@ -157,7 +183,9 @@ def test_trimesh_reads_every_mesh(run, expected, tmp_path, kind):
 def test_npz_holds_the_arrays(run, tmp_path):
     command(run, "--format", "npz", "-o", tmp_path / "s.npz", "--up", "camera")
     seen = np.load(tmp_path / "s.npz")
-    assert np.array_equal(seen["vertices"], run.vertices) and np.array_equal(seen["frames"], run.frames)
+    assert np.array_equal(seen["vertices"], run.vertices) and np.array_equal(
+        seen["frames"], run.frames
+    )
     assert float(seen["fps"]) == FPS and str(seen["up"]) == "camera"
 
 
@@ -175,10 +203,17 @@ def test_other_images_become_png_and_no_texture_is_no_texture(tmp_path):
     Image.new("RGB", (3, 2), (10, 20, 30)).save(tmp_path / "t.bmp")
     animation.write_glb(tmp_path / "a.glb", V, F, uv, tmp_path / "t.bmp")
     scene, _, image = read_glb(tmp_path / "a.glb")
-    assert "animations" not in scene and Image.open(io.BytesIO(image(0))).getpixel((2, 1)) == (10, 20, 30)
+    assert "animations" not in scene and Image.open(io.BytesIO(image(0))).getpixel((2, 1)) == (
+        10,
+        20,
+        30,
+    )
     animation.write_glb(tmp_path / "b.glb", V, F)
     scene, _, _ = read_glb(tmp_path / "b.glb")
-    assert "images" not in scene and "TEXCOORD_0" not in scene["meshes"][0]["primitives"][0]["attributes"]
+    assert (
+        "images" not in scene
+        and "TEXCOORD_0" not in scene["meshes"][0]["primitives"][0]["attributes"]
+    )
     animation.write_usd(tmp_path / "c.usda", V, F)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.glb", "b.glb", "c.usda", "t.bmp"]
 
@@ -205,9 +240,9 @@ class TestRefusals:
         before = sorted(shutil.os.listdir(run.folder))
         with pytest.raises(InputError, match=words):
             export.main([run.folder, *arguments])
-        assert list(tmp_path.iterdir()) == [] and sorted(set(shutil.os.listdir(run.folder)) - {"export"}) == sorted(
-            set(before) - {"export"}
-        )
+        assert list(tmp_path.iterdir()) == [] and sorted(
+            set(shutil.os.listdir(run.folder)) - {"export"}
+        ) == sorted(set(before) - {"export"})
 
     def test_in_the_folder(self, run, tmp_path):
         with pytest.raises(InputError, match="no such folder"):

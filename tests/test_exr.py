@@ -30,18 +30,30 @@ def layers():
     }
 
 
-NAMES = "target.R target.G target.B render.R render.G render.B R G B error.Y mask_target.Y mask_render.Y depth.Z"
+NAMES = (
+    "target.R target.G target.B render.R render.G render.B R G B error.Y mask_target.Y"
+    " mask_render.Y depth.Z"
+)
 NAMES = set(NAMES.split()) | {"normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V"}
 
 
 def test_values_names_types_and_header(tmp_path, layers):
     path = tmp_path / "000.exr"
-    write_exr(path, layers, {"frame": np.int64(12), "loss": 0.25, "software": "polysft-mi", "weights": [1, 0.1]})
+    write_exr(
+        path,
+        layers,
+        {"frame": np.int64(12), "loss": 0.25, "software": "polysft-mi", "weights": [1, 0.1]},
+    )
     with OpenEXR.File(str(path), separate_channels=True) as file:
         planes = {k: c.pixels for k, c in file.channels().items()}
         header = dict(file.header())
     assert set(planes) == NAMES
-    for layer, suffixes in {"target": "RGB", "error": "Y", "mask_target": "Y", "mask_render": "Y"}.items():
+    for layer, suffixes in {
+        "target": "RGB",
+        "error": "Y",
+        "mask_target": "Y",
+        "mask_render": "Y",
+    }.items():
         for k, s in enumerate(suffixes):
             plane = planes[f"{layer}.{s}"]
             assert plane.dtype == np.float16
@@ -56,7 +68,9 @@ def test_values_names_types_and_header(tmp_path, layers):
     assert header["frame"] == 12 and header["loss"] == 0.25 and header["software"] == "polysft-mi"
     assert json.loads(header["weights"]) == [1, 0.1]
     assert header["compression"] == OpenEXR.ZIP_COMPRESSION
-    np.testing.assert_allclose(header["chromaticities"], (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290), rtol=1e-6)
+    np.testing.assert_allclose(
+        header["chromaticities"], (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290), rtol=1e-6
+    )
     assert os.listdir(tmp_path) == ["000.exr"]
 
 
@@ -82,7 +96,11 @@ def test_mitsuba_reads_the_layers(tmp_path, layers):
         "import sys, numpy as np, mitsuba as mi; mi.set_variant('scalar_rgb')\n"
         "np.savez(sys.argv[2], **{n: np.array(b) for n, b in mi.Bitmap(sys.argv[1]).split()})"
     )
-    subprocess.run([sys.executable, "-c", script, tmp_path / "a.exr", tmp_path / "a.npz"], check=True, timeout=60)
+    subprocess.run(
+        [sys.executable, "-c", script, tmp_path / "a.exr", tmp_path / "a.npz"],
+        check=True,
+        timeout=60,
+    )
     seen = dict(np.load(tmp_path / "a.npz"))
     np.testing.assert_allclose(seen.pop("<root>"), layers["render"], atol=1e-3)
     assert set(seen) == set(layers)

@@ -36,20 +36,27 @@ def test_shaded_sheet_covers_its_area_and_is_even():
     assert np.ptp(image[30:90, 60:120].reshape(-1, 3), axis=0).max() <= 1
     assert tuple(image[2, 2]) == BACKGROUND
     back = shade_surface(V, F[:, ::-1], front, size=(180, 120))
-    assert back[60, 90, 2] > back[60, 90, 0] and image[60, 90, 0] > image[60, 90, 2]  # cool and warm
+    assert (
+        back[60, 90, 2] > back[60, 90, 0] and image[60, 90, 0] > image[60, 90, 2]
+    )  # cool and warm
     assert back[60, 90].max() > 150 and image[60, 90].max() > 150  # and both lit
 
 
 def test_relief_shows_by_shading():
     V, F = sheet(lambda x, y: 0.02 * np.sin(60 * x))
-    image = shade_surface(V, F, View(np.eye(3), np.array([0, 0, 0.6]), 0.15), size=(120, 120)).astype(int)
+    image = shade_surface(
+        V, F, View(np.eye(3), np.array([0, 0, 0.6]), 0.15), size=(120, 120)
+    ).astype(int)
     assert np.ptp(image[60, 25:95, 0]) > 40  # across the waves
     assert np.ptp(image[25:95, 60, 0]) <= 2  # along them
 
 
 def test_the_nearer_surface_hides_the_other():
     V, F = sheet()
-    both, faces = np.concatenate([V, 0.5 * V + (0, 0, 0.1)]), np.concatenate([F, (F + len(V))[:, ::-1]])
+    both, faces = (
+        np.concatenate([V, 0.5 * V + (0, 0, 0.1)]),
+        np.concatenate([F, (F + len(V))[:, ::-1]]),
+    )
     front = View(np.eye(3), np.array([0, 0, 0.6]), 0.15)
     for order in (faces, faces[::-1]):
         image = shade_surface(both, order, front, size=(120, 120)).astype(int)
@@ -78,7 +85,9 @@ def test_grid_and_degenerate_triangles():
     V, F = sheet()
     front = View(np.eye(3), np.array([0, 0, 0.6]), 0.11)
     plain = shade_surface(V, F, front, size=(200, 200)).astype(int)
-    lines = shade_surface(V, np.concatenate([F, [[0, 0, 1], [0, 1, 2]]]), front, uv=V[:, :2], size=(200, 200)).astype(int)
+    lines = shade_surface(
+        V, np.concatenate([F, [[0, 0, 1], [0, 1, 2]]]), front, uv=V[:, :2], size=(200, 200)
+    ).astype(int)
     dark = (plain - lines)[..., 0] > 10
     assert 0.05 < dark.mean() < 0.4
     assert shade_surface(V + (0, 0, 0), F[:0], front, size=(20, 20)).min() == 243
@@ -91,7 +100,15 @@ def image_of(path):
 
 
 RECORDS = [
-    {"frame": f, "iteration": i, "loss": 0.1 / (1 + i), "rgb": 0.08 / (1 + i), "silhouette": 0.0, "inextensibility": 1e-3, "temporal": None}
+    {
+        "frame": f,
+        "iteration": i,
+        "loss": 0.1 / (1 + i),
+        "rgb": 0.08 / (1 + i),
+        "silhouette": 0.0,
+        "inextensibility": 1e-3,
+        "temporal": None,
+    }
     for f in range(3)
     for i in range(0, 50, 5)
 ]
@@ -101,7 +118,11 @@ def test_loss_plot_shows_terms_and_survives_bad_values(tmp_path):
     assert loss_plot(tmp_path / "loss.png", RECORDS) == str(tmp_path / "loss.png")
     rgb = np.array([0x2E, 0x57, 0xC4])  # B, G, R of the photometric curve
     assert (np.abs(image_of(tmp_path / "loss.png").astype(int) - rgb).max(-1) < 30).sum() > 100
-    odd = [{"event": "start"}] + RECORDS + [{"frame": 3, "iteration": 0, "loss": float("nan")}, {"frame": 4, "loss": float("inf")}]
+    odd = (
+        [{"event": "start"}]
+        + RECORDS
+        + [{"frame": 3, "iteration": 0, "loss": float("nan")}, {"frame": 4, "loss": float("inf")}]
+    )
     assert loss_plot(tmp_path / "odd.png", odd) is not None
     assert loss_plot(tmp_path / "one.png", RECORDS[:1]) is not None
     assert sorted(os.listdir(tmp_path)) == ["loss.png", "odd.png", "one.png"]
@@ -126,7 +147,10 @@ def test_contact_sheet_holds_its_pictures(tmp_path):
     red[..., 0], green[..., 1] = 255, 1.0
     error = np.full((h, w), np.nan)
     error[:30] = 0.2
-    rows = [{"label": f"frame {k}", "target": red, "render": green, "error": error, "surface": red} for k in range(3)]
+    rows = [
+        {"label": f"frame {k}", "target": red, "render": green, "error": error, "surface": red}
+        for k in range(3)
+    ]
     rows[1]["render"] = None
     assert contact_sheet(tmp_path / "sheet.png", rows)
     image = image_of(tmp_path / "sheet.png").astype(int)
@@ -146,8 +170,14 @@ def test_a_picture_that_fails_is_a_warning(tmp_path, monkeypatch):
 
 def test_importing_loads_no_heavy_module():
     script = (
-        "import sys, polysft_mi.figures, polysft_mi.metrics, polysft_mi.evaluate, polysft_mi.exr, polysft_mi.video, polysft_mi.meshio\n"
-        "print([m for m in ('matplotlib', 'OpenEXR', 'trimesh', 'skimage', 'scipy', 'rich', 'mitsuba', 'torch', 'cv2') if m in sys.modules])"
+        "import sys, polysft_mi.figures, polysft_mi.metrics, polysft_mi.evaluate, polysft_mi.exr,"
+        " polysft_mi.video, polysft_mi.meshio\nprint([m for m in ('matplotlib', 'OpenEXR',"
+        " 'trimesh', 'skimage', 'scipy', 'rich', 'mitsuba', 'torch', 'cv2') if m in sys.modules])"
     )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=os.path.dirname(os.path.dirname(__file__)))
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        capture_output=True,
+        text=True,
+        cwd=os.path.dirname(os.path.dirname(__file__)),
+    )
     assert done.stdout.strip() == "[]", done.stdout + done.stderr

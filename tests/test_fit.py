@@ -1,4 +1,6 @@
-"""Least-squares jets of batches of patches, against exact jets, NumPy's least squares and finite differences."""
+"""Least-squares jets of batches of patches, against exact jets, NumPy's least squares and finite
+differences.
+"""
 
 import numpy as np
 import pytest
@@ -28,7 +30,9 @@ def test_recovers_jets_of_its_order(order):
     found = jets.fit(points, order, mask=mask)
     assert (found.order == order).all()
     scale = points[..., 2].abs().max()
-    assert (jets.height(found.alpha, points[..., :2]) - points[..., 2])[mask].abs().max() < 1e-8 * scale
+    assert (jets.height(found.alpha, points[..., :2]) - points[..., 2])[
+        mask
+    ].abs().max() < 1e-8 * scale
     assert (found.alpha - alpha).abs().max() < 1e-6 * alpha.abs().max()
 
 
@@ -47,7 +51,9 @@ def test_is_numpys_least_squares():
     found = jets.fit(points, 4, weights=weights, mask=mask).alpha
     for p, w, m, alpha in zip(points, weights, mask, found):
         root = w[m, None].sqrt()
-        reference = np.linalg.lstsq((jets.basis(p[m, :2], 4) * root).numpy(), (p[m, 2:] * root).numpy(), rcond=None)[0]
+        reference = np.linalg.lstsq(
+            (jets.basis(p[m, :2], 4) * root).numpy(), (p[m, 2:] * root).numpy(), rcond=None
+        )[0]
         assert np.abs(alpha.numpy() - reference[:, 0]).max() < 1e-9
 
 
@@ -63,7 +69,9 @@ def test_padding_is_not_looked_at():
     points, _, mask = patches(4)
     expected = jets.fit(points, 4, mask=mask).alpha
     for value in (float("nan"), float("inf"), 1e30):
-        assert torch.equal(jets.fit(torch.where(mask[..., None], points, value), 4, mask=mask).alpha, expected)
+        assert torch.equal(
+            jets.fit(torch.where(mask[..., None], points, value), 4, mask=mask).alpha, expected
+        )
     alone = jets.fit(points[1, :120], 4)
     assert alone.alpha.shape == (15,) and alone.order.shape == ()
     assert (alone.alpha - expected[1]).abs().max() < 1e-9
@@ -76,7 +84,9 @@ def test_weights_of_zero_and_repeated_points():
     weights[:, 40:] = 0
     weights[:, :5] = 3
     repeated = torch.cat([points[:, :5]] * 2 + [points[:, :40]], 1)
-    assert (jets.fit(points, 3, weights=weights).alpha - jets.fit(repeated, 3).alpha).abs().max() < 1e-9
+    assert (
+        jets.fit(points, 3, weights=weights).alpha - jets.fit(repeated, 3).alpha
+    ).abs().max() < 1e-9
 
 
 @pytest.mark.parametrize("count, order", [(1, 0), (2, 0), (3, 1), (5, 1), (6, 2), (14, 3), (18, 4)])
@@ -115,7 +125,9 @@ def test_gradient_against_finite_differences():
     points = points.requires_grad_()
     weights = torch.as_tensor(0.5 + RNG.random(mask.shape)).requires_grad_()
     assert jets.fit(points, 4, mask=mask).order.tolist() == [4, 4, 2]
-    assert torch.autograd.gradcheck(lambda p, w: jets.fit(p, 4, weights=w, mask=mask).alpha, (points, weights))
+    assert torch.autograd.gradcheck(
+        lambda p, w: jets.fit(p, 4, weights=w, mask=mask).alpha, (points, weights)
+    )
     assert torch.autograd.gradcheck(lambda p: jets.fit(p, 2).alpha, (points,))
 
 
@@ -134,7 +146,9 @@ def test_gradient_in_single_precision_at_order_8():
 
 def test_a_second_derivative_is_refused_rather_than_wrong():
     points = patches(3)[0].requires_grad_()
-    (gradient,) = torch.autograd.grad(jets.fit(points, 3).alpha.square().sum(), points, create_graph=True)
+    (gradient,) = torch.autograd.grad(
+        jets.fit(points, 3).alpha.square().sum(), points, create_graph=True
+    )
     with pytest.raises(RuntimeError, match="once_differentiable"):
         gradient.sum().backward()
 
@@ -145,8 +159,12 @@ def test_what_cannot_be_fitted_is_named():
     for message, call in {
         "patch 1 has no points": lambda: jets.fit(points, 2, mask=empty),
         "patch 0 has no points": lambda: jets.fit(points[:, :0], 2),
-        "patch 1 has points that are not finite": lambda: jets.fit(points * torch.tensor([[[1.0]], [[float("nan")]]]), 2),
-        "patch 0 has weights that are negative": lambda: jets.fit(points, 2, weights=torch.tensor([[-1.0], [1.0]]).expand(2, 20)),
+        "patch 1 has points that are not finite": lambda: jets.fit(
+            points * torch.tensor([[[1.0]], [[float("nan")]]]), 2
+        ),
+        "patch 0 has weights that are negative": lambda: jets.fit(
+            points, 2, weights=torch.tensor([[-1.0], [1.0]]).expand(2, 20)
+        ),
         "order = 11; the order of a jet is 1 to 10": lambda: jets.fit(points, 11),
         "(..., points, 3) is needed": lambda: jets.fit(points[..., :2], 2),
     }.items():

@@ -1,4 +1,6 @@
-"""Canonical frames: that they turn, grow and move with their points, in batches of patches of any size."""
+"""Canonical frames: that they turn, grow and move with their points, in batches of patches of any
+size.
+"""
 
 import numpy as np
 import pytest
@@ -12,7 +14,10 @@ RNG = np.random.default_rng(5)
 
 def patches(counts=(300, 150, 40)):
     """Bent patches (B, P, 3) in general position and which points exist."""
-    x = RNG.normal(size=(len(counts), max(counts), 2)) * (1.0, 0.6) + RNG.random((len(counts), max(counts), 2)) ** 2
+    x = (
+        RNG.normal(size=(len(counts), max(counts), 2)) * (1.0, 0.6)
+        + RNG.random((len(counts), max(counts), 2)) ** 2
+    )
     z = 0.2 * x[..., :1] ** 2 - 0.1 * x[..., 1:] * x[..., :1]
     turn = Rotation.random(len(counts), random_state=1).as_matrix()
     points = torch.as_tensor(np.concatenate([x, z], -1) @ turn)
@@ -29,7 +34,10 @@ def similarity(count, seed=2):
 def test_chart_does_not_change_when_the_points_move():
     points, mask = patches()
     move = similarity(3)
-    frame, moved = CanonicalFrame.from_points(points, mask), CanonicalFrame.from_points(move(points), mask)
+    frame, moved = (
+        CanonicalFrame.from_points(points, mask),
+        CanonicalFrame.from_points(move(points), mask),
+    )
     x = frame.to_chart(points)
     assert (x - moved.to_chart(move(points)))[mask].abs().max() < 1e-9
     assert (frame.from_chart(x) - points).abs().max() < 1e-12
@@ -42,7 +50,10 @@ def test_chart_does_not_change_when_the_points_move():
 def test_coefficients_do_not_change_when_the_points_move():
     points, mask = patches()
     move = similarity(3)
-    found = [jets.fit(CanonicalFrame.from_points(p, mask).to_chart(p), 4, mask=mask).alpha for p in (points, move(points))]
+    found = [
+        jets.fit(CanonicalFrame.from_points(p, mask).to_chart(p), 4, mask=mask).alpha
+        for p in (points, move(points))
+    ]
     assert (found[0] - found[1]).abs().max() < 1e-8
 
 
@@ -72,16 +83,22 @@ def test_a_symmetric_patch_keeps_its_signs(dtype):
     still = CanonicalFrame.from_points(grid).to_chart(grid)
     for seed in range(10):
         moved = similarity(1, seed)(grid).to(dtype)
-        assert (CanonicalFrame.from_points(moved).to_chart(moved) - still).abs().max() < (1e-4 if dtype == torch.float32 else 1e-9)
+        assert (CanonicalFrame.from_points(moved).to_chart(moved) - still).abs().max() < (
+            1e-4 if dtype == torch.float32 else 1e-9
+        )
 
 
 def test_rotated_frame():
     points, mask = patches()
     q = torch.as_tensor(Rotation.random(3, random_state=4).as_quat())
-    assert (rotation_matrix(2 * q) - torch.as_tensor(Rotation.from_quat(q.numpy()).as_matrix())).abs().max() < 1e-12
+    assert (
+        rotation_matrix(2 * q) - torch.as_tensor(Rotation.from_quat(q.numpy()).as_matrix())
+    ).abs().max() < 1e-12
     frame = CanonicalFrame.from_points(points, mask)
     turned = frame.rotated(q)
-    assert (turned.to_chart(points) - frame.to_chart(points) @ rotation_matrix(q)).abs().max() < 1e-12
+    assert (
+        turned.to_chart(points) - frame.to_chart(points) @ rotation_matrix(q)
+    ).abs().max() < 1e-12
     assert (turned.from_chart(turned.to_chart(points)) - points).abs().max() < 1e-12
     q.requires_grad_()
     assert torch.autograd.gradcheck(lambda q: frame.rotated(q).to_chart(points[:, :3]), (q,))
@@ -91,7 +108,9 @@ def test_frame_turned_over():
     points, mask = patches()
     frame = CanonicalFrame.from_points(points, mask)
     over = frame.turned_over()
-    assert (over.to_chart(points) - frame.to_chart(points) * torch.tensor([1, -1, -1])).abs().max() < 1e-12
+    assert (
+        over.to_chart(points) - frame.to_chart(points) * torch.tensor([1, -1, -1])
+    ).abs().max() < 1e-12
     assert torch.linalg.det(over.R).numpy() == pytest.approx(1)
 
 
@@ -99,8 +118,14 @@ def test_what_has_no_frame_is_named():
     points, mask = patches()
     for message, change in {
         "patch 1 has no points": lambda p, m: (p, m & torch.tensor([[True], [False], [True]])),
-        "patch 2 has points that are not finite": lambda p, m: (torch.where(torch.arange(3)[:, None, None] == 2, np.inf, p), m),
-        "patch 0: its 300 points coincide": lambda p, m: (torch.where(torch.arange(3)[:, None, None] == 0, 1.0, p), m),
+        "patch 2 has points that are not finite": lambda p, m: (
+            torch.where(torch.arange(3)[:, None, None] == 2, np.inf, p),
+            m,
+        ),
+        "patch 0: its 300 points coincide": lambda p, m: (
+            torch.where(torch.arange(3)[:, None, None] == 0, 1.0, p),
+            m,
+        ),
     }.items():
         with pytest.raises(InputError, match=message):
             CanonicalFrame.from_points(*change(points, mask))

@@ -17,8 +17,26 @@ from onefit.remesh import loops
 from polyfit import mesh, write_ply
 from polyfit.errors import InputError
 
-LOOPS = {"tshirt": 4, "dress": 4, "tank": 4, "long_sleeve_top": 4, "shorts": 3, "trousers": 3, "jumpsuit": 5, "skirt": 2}
-AREA = {"tshirt": 0.6, "dress": 1.0, "tank": 0.4, "long_sleeve_top": 0.75, "shorts": 0.45, "trousers": 0.85, "jumpsuit": 1.25, "skirt": 0.8}  # [m^2]
+LOOPS = {
+    "tshirt": 4,
+    "dress": 4,
+    "tank": 4,
+    "long_sleeve_top": 4,
+    "shorts": 3,
+    "trousers": 3,
+    "jumpsuit": 5,
+    "skirt": 2,
+}
+AREA = {
+    "tshirt": 0.6,
+    "dress": 1.0,
+    "tank": 0.4,
+    "long_sleeve_top": 0.75,
+    "shorts": 0.45,
+    "trousers": 0.85,
+    "jumpsuit": 1.25,
+    "skirt": 0.8,
+}  # [m^2]
 
 
 @pytest.fixture(scope="module")
@@ -62,13 +80,19 @@ class TestTemplates:
         V, F = garment.vertices.double().numpy(), garment.faces.numpy()
         side = np.roll(V[F], -1, axis=1) - V[F]
         length = np.linalg.norm(side, axis=2)
-        angle = np.degrees(np.arccos(-(side * np.roll(side, 1, axis=1)).sum(axis=2) / length / np.roll(length, 1, axis=1)))
+        angle = np.degrees(
+            np.arccos(
+                -(side * np.roll(side, 1, axis=1)).sum(axis=2) / length / np.roll(length, 1, axis=1)
+            )
+        )
         assert angle.min() > 20 and np.percentile(angle.min(axis=1), 1) > 35
         assert length.max() < 2.2 * np.median(length) and length.min() > 0.3 * np.median(length)
         for loop in loops(F):
             step = np.roll(V[loop], -1, axis=0) - V[loop]
             step /= np.linalg.norm(step, axis=1, keepdims=True)
-            turn = np.degrees(np.arccos(np.clip((step * np.roll(step, 1, axis=0)).sum(axis=1), -1, 1)))
+            turn = np.degrees(
+                np.arccos(np.clip((step * np.roll(step, 1, axis=0)).sum(axis=1), -1, 1))
+            )
             assert turn.max() < 45
 
     def test_lies_outside_the_body_with_its_outer_side_out(self, garment):
@@ -81,16 +105,22 @@ class TestTemplates:
             assert found.distance.max() < 0.04
 
     def test_blend_weights_are_shares_and_no_edge_is_torn_by_a_turned_limb(self, garment):
-        assert garment.blend_weights.shape == (len(garment), 24) and garment.blend_weights.min() >= 0
+        assert (
+            garment.blend_weights.shape == (len(garment), 24) and garment.blend_weights.min() >= 0
+        )
         assert torch.allclose(garment.blend_weights.sum(1), torch.ones(len(garment)), atol=1e-5)
         F, body = garment.faces.numpy(), standard_body()
         rest = edge_lengths(garment.vertices.numpy(), F)
-        raw = torch.as_tensor(Binding(garment.vertices.double().numpy(), F).on_body(body.blend_weights.numpy())).float()
+        raw = torch.as_tensor(
+            Binding(garment.vertices.double().numpy(), F).on_body(body.blend_weights.numpy())
+        ).float()
         worst = {"smoothed": 0, "raw": 0}
         for joint in ("left_shoulder", "left_hip"):
             for axis in np.eye(3):
                 pose = body.rest_pose.clone()
-                pose[skeleton.INDEX[joint]] = turned(pose[skeleton.INDEX[joint]], np.radians(40) * axis)
+                pose[skeleton.INDEX[joint]] = turned(
+                    pose[skeleton.INDEX[joint]], np.radians(40) * axis
+                )
                 maps = skinning.transforms(body, pose[None], torch.zeros(1, 3))
                 for key, weights in (("smoothed", garment.blend_weights), ("raw", raw)):
                     moved = skinning.skin(garment.vertices, weights, maps)[0].numpy()
@@ -106,7 +136,10 @@ class TestTemplates:
             moved = garment.graded(body).numpy()
             distance = surface_of(body)(moved).distance
             assert (distance < 0).mean() < 0.001 and distance.min() > -0.001
-            assert np.abs(distance - standard_surface()(garment.vertices.numpy()).distance).mean() < 0.01
+            assert (
+                np.abs(distance - standard_surface()(garment.vertices.numpy()).distance).mean()
+                < 0.01
+            )
 
 
 @pytest.mark.parametrize("name, times", [("tshirt", 4), ("shorts", 0.4)])
@@ -115,11 +148,18 @@ def test_at_another_resolution_is_the_same_garment(templates, name, times):
     count = times * len(garment)
     other = garment.remeshed(count)
     V, F = other.vertices.double().numpy(), other.faces.numpy()
-    assert 0.9 * count < len(other) < 1.1 * count and len(loops(F)) == LOOPS[name] and mended(V, F)[2] == ()
+    assert (
+        0.9 * count < len(other) < 1.1 * count
+        and len(loops(F)) == LOOPS[name]
+        and mended(V, F)[2] == ()
+    )
     W, G = garment.vertices.double().numpy(), garment.faces.numpy()
     area, area_was = mesh.areas(V, F), mesh.areas(W, G)
     assert area.sum() == pytest.approx(area_was.sum(), rel=0.01)
-    assert np.abs(ClosestSurface(W, G)(V).distance).max() < 0.005 and np.abs(ClosestSurface(V, F)(W).distance).max() < 0.02
+    assert (
+        np.abs(ClosestSurface(W, G)(V).distance).max() < 0.005
+        and np.abs(ClosestSurface(V, F)(W).distance).max() < 0.02
+    )
     share = lambda g, area, F: area @ g.blend_weights.numpy()[F].mean(axis=1) / area.sum()
     assert share(other, area, F) == pytest.approx(share(garment, area_was, G), abs=0.005)
 
@@ -127,7 +167,9 @@ def test_at_another_resolution_is_the_same_garment(templates, name, times):
 def turned(vector, by):
     from scipy.spatial.transform import Rotation
 
-    return torch.as_tensor((Rotation.from_rotvec(by) * Rotation.from_rotvec(vector.numpy())).as_rotvec()).float()
+    return torch.as_tensor(
+        (Rotation.from_rotvec(by) * Rotation.from_rotvec(vector.numpy())).as_rotvec()
+    ).float()
 
 
 def test_grading_is_fast(templates, anny):
@@ -143,10 +185,18 @@ def test_grading_to_a_body_of_other_topology(templates, anny):
     body = anny.body(anny.random_shape(np.random.default_rng(8)))
     faces, edges = mesh.subdivided(body.faces.numpy())
     finer = lambda x: torch.as_tensor(np.concatenate([x.numpy(), x.numpy()[edges].mean(axis=1)]))
-    order = torch.randperm(len(body.vertices) + len(edges), generator=torch.Generator().manual_seed(0))
+    order = torch.randperm(
+        len(body.vertices) + len(edges), generator=torch.Generator().manual_seed(0)
+    )
     place = torch.argsort(order)
     vertices, weights = finer(body.vertices)[order], finer(body.blend_weights)[order]
-    other = replace(body, kind="other", vertices=vertices, blend_weights=weights, faces=place[torch.as_tensor(faces)])
+    other = replace(
+        body,
+        kind="other",
+        vertices=vertices,
+        blend_weights=weights,
+        faces=place[torch.as_tensor(faces)],
+    )
     garment = templates["tshirt"]
     difference = (garment.graded(other) - garment.graded(body)).norm(dim=1)
     assert difference.mean() < 0.012 and difference.max() < 0.03
@@ -160,7 +210,9 @@ def test_unknown_template():
 
 def test_shorts_are_sewn_as_the_template_was(templates):
     body = standard_body()
-    block = tailor.Block(body.vertices.numpy(), body.faces.numpy(), spacing=0.016)  # twice as coarse, several times as fast
+    block = tailor.Block(
+        body.vertices.numpy(), body.faces.numpy(), spacing=0.016
+    )  # twice as coarse, several times as fast
     V, F = tailor.sewn(block, "shorts")
     assert abs(len(V) - len(templates["shorts"])) <= 5 and len(loops(F)) == 3
     far = np.abs(ClosestSurface(V, F)(templates["shorts"].vertices.numpy()).distance)
@@ -170,7 +222,11 @@ def test_shorts_are_sewn_as_the_template_was(templates):
 def test_smooth_union_is_the_minimum_away_from_the_fillet():
     a, b = np.array([0.1, 0.0, 0.3, 0.2]), np.array([0.2, 0.1, 0.3, 0.21])
     got = tailor.smooth_union(a, b, 0.05)
-    assert got[:2] == pytest.approx([0.1, 0.0]) and got[2] == pytest.approx(0.3 - 0.05 / 4) and 0.2 - 0.0125 < got[3] < 0.2
+    assert (
+        got[:2] == pytest.approx([0.1, 0.0])
+        and got[2] == pytest.approx(0.3 - 0.05 / 4)
+        and 0.2 - 0.0125 < got[3] < 0.2
+    )
     assert tailor.ramp(np.array([-1, 0, 0.5, 1, 2.0]), 0, 1) == pytest.approx([0, 0, 0.5, 1, 1])
 
 
@@ -181,13 +237,16 @@ def test_nearest_points_and_sides():
     got = ClosestSurface(V, F)(x)
     slow = np.array([distance_to_triangles(p, V[F]) for p in x])
     assert np.abs(np.abs(got.distance) - slow).max() < 1e-6
-    # inside a polyhedron that is star-shaped about its centre: below the face that the ray from there meets
+    # inside a polyhedron that is star-shaped about its centre: below the face that the ray from
+    # there meets
     inside = np.zeros(len(x), dtype=bool)
     for centre in ([0, 0, 0], [0.5, 0, 0]):
         inside |= winding_number(x - centre, V[F] - centre) > 0.5
     far = slow > 1e-5
     assert np.array_equal((got.distance < 0)[far], inside[far]) and inside.sum() > 5
-    assert np.allclose(np.einsum("nk,nkd->nd", got.barycentric, V[F[got.face]]), got.point, atol=1e-6)
+    assert np.allclose(
+        np.einsum("nk,nkd->nd", got.barycentric, V[F[got.face]]), got.point, atol=1e-6
+    )
     missed = ClosestSurface(V, F)(np.array([[3.0, 0, 0]]), reach=1.0)
     assert missed.face[0] == -1 and missed.distance[0] == 1.0 and np.isnan(missed.point).all()
     # a mesh that moves there, and tensors
@@ -203,12 +262,17 @@ def test_pseudonormals_of_a_cube():
     import trimesh
 
     cube = trimesh.creation.box((2, 2, 2))
-    edge, half = np.array([[1, 1, 0], [0, -1, 1], [-1, 0, -1.0]]), 0.3 * np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]])
+    edge, half = (
+        np.array([[1, 1, 0], [0, -1, 1], [-1, 0, -1.0]]),
+        0.3 * np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]]),
+    )
     x = np.concatenate([cube.vertices, edge + half, [[1, 0.2, 0.1], [0.1, -1, 0.4]]])
     expected = np.concatenate([cube.vertices, edge, [[1, 0, 0], [0, -1, 0]]])
     expected /= np.linalg.norm(expected, axis=1, keepdims=True)
     found = ClosestSurface(cube.vertices, cube.faces)(x + 0.2 * expected)
-    assert np.allclose(found.distance, 0.2, atol=1e-6) and np.allclose(found.normal, expected, atol=1e-5)
+    assert np.allclose(found.distance, 0.2, atol=1e-6) and np.allclose(
+        found.normal, expected, atol=1e-5
+    )
 
 
 def test_points_between_the_legs_are_outside():
@@ -225,7 +289,13 @@ def distance_to_triangles(p, T):
     n /= np.linalg.norm(n, axis=1, keepdims=True)
     height = ((p - T[:, 0]) * n).sum(axis=1)
     foot = p - height[:, None] * n
-    within = np.all([(np.cross(T[:, (k + 1) % 3] - T[:, k], foot - T[:, k]) * n).sum(axis=1) >= 0 for k in range(3)], axis=0)
+    within = np.all(
+        [
+            (np.cross(T[:, (k + 1) % 3] - T[:, k], foot - T[:, k]) * n).sum(axis=1) >= 0
+            for k in range(3)
+        ],
+        axis=0,
+    )
     best = np.abs(height[within]).min(initial=np.inf)
     for k in range(3):
         a, d = T[:, k], T[:, (k + 1) % 3] - T[:, k]
@@ -261,16 +331,24 @@ def flipped(F, rows):
 
 
 class TestRepairs:
-    """Each case is made from the tank top; what reading says of it, and that the tank top comes out."""
+    """Each case is made from the tank top; what reading says of it, and that the tank top comes
+    out.
+    """
 
     def check(self, V, F, *said):
         g = Garment.of_mesh("case", V, F)
         assert len(g.repairs) == len(said), g.repairs
         for sentence, expected in zip(g.repairs, said):
             assert re.search(expected, sentence), (sentence, expected)
-        assert len(loops(g.faces.numpy())) == 4 and mended(g.vertices.double().numpy(), g.faces.numpy())[2] == ()
+        assert (
+            len(loops(g.faces.numpy())) == 4
+            and mended(g.vertices.double().numpy(), g.faces.numpy())[2] == ()
+        )
         assert standard_surface()(g.vertices.numpy()).distance.min() > 0
-        agree = (standard_surface()(g.vertices.numpy()).normal * vertex_normals(g.vertices.numpy(), g.faces.numpy())).sum(axis=1)
+        agree = (
+            standard_surface()(g.vertices.numpy()).normal
+            * vertex_normals(g.vertices.numpy(), g.faces.numpy())
+        ).sum(axis=1)
         assert (agree > 0).mean() > 0.999
         return g
 
@@ -283,7 +361,13 @@ class TestRepairs:
         V, F = tank
         V, F = np.concatenate([[[0, 0, 0], [9, 9, np.nan]], V]), F + 2
         F = np.concatenate([F[:100], [[5, 5, 9]], F[100:], F[40:42]])
-        self.check(V, F, "2 vertices that are in no face", "1 faces without area", "2 faces that repeat others")
+        self.check(
+            V,
+            F,
+            "2 vertices that are in no face",
+            "1 faces without area",
+            "2 faces that repeat others",
+        )
 
     def test_seams_and_soups_are_sewn(self, tank):
         V, F = tank
@@ -306,21 +390,33 @@ class TestRepairs:
     def test_a_pocket_sewn_on_comes_off(self, tank):
         V, F = tank
         # five faces that stand on one side each of five of the front
-        front = [np.argmin(np.linalg.norm(V[F].mean(axis=1) - [x, -0.14, 0.2], axis=1)) for x in np.linspace(-0.08, 0.08, 5)]
+        front = [
+            np.argmin(np.linalg.norm(V[F].mean(axis=1) - [x, -0.14, 0.2], axis=1))
+            for x in np.linspace(-0.08, 0.08, 5)
+        ]
         outer = V[F[front]].mean(axis=1) + [0, -0.01, 0]
         extra = np.stack([F[front, 0], F[front, 1], len(V) + np.arange(5)], axis=1)
-        g = self.check(np.concatenate([V, outer]), np.concatenate([F, extra]), "cut apart at 5 edges", "dropped 5 parts of 5 faces")
+        g = self.check(
+            np.concatenate([V, outer]),
+            np.concatenate([F, extra]),
+            "cut apart at 5 edges",
+            "dropped 5 parts of 5 faces",
+        )
         assert len(g) == len(V)
 
     def test_buttons_are_dropped(self, tank):
         button, G = sphere(0.006, 1)
-        self.check(*joined(tank, (button + [0, -0.16, 0.3], G)), f"dropped a part of {len(G)} faces")
+        self.check(
+            *joined(tank, (button + [0, -0.16, 0.3], G)), f"dropped a part of {len(G)} faces"
+        )
 
     def test_separate_parts_stay(self, templates, tank):
         shorts = templates["shorts"]
         V, F = joined(tank, (shorts.vertices.double().numpy(), shorts.faces.numpy()))
         g = Garment.of_mesh("both", V, F)
-        assert g.repairs == ("has 2 separate parts, which move each for itself",) and len(g) == len(V)
+        assert g.repairs == ("has 2 separate parts, which move each for itself",) and len(g) == len(
+            V
+        )
 
     def test_parts_that_touch_in_a_point(self, tank):
         V, F = tank
@@ -334,10 +430,18 @@ class TestRepairs:
     def test_vertices_inside_the_body_are_pushed_out(self, tank):
         V, F = tank
         found = standard_surface()(V)
-        dent = np.linalg.norm(V - V[np.argmin(np.linalg.norm(V - [0, -0.13, 0.2], axis=1))], axis=1) < 0.05
+        dent = (
+            np.linalg.norm(V - V[np.argmin(np.linalg.norm(V - [0, -0.13, 0.2], axis=1))], axis=1)
+            < 0.05
+        )
         W = V - np.where(dent, found.distance + 0.015, 0)[:, None] * found.normal
         g = self.check(W, F, rf"pushed {dent.sum()} vertices out of the body, by up to 15\.\d mm")
-        assert np.abs(g.vertices.numpy() - W)[np.linalg.norm(V - V[dent].mean(axis=0), axis=1) > 0.2].max() < 0.002
+        assert (
+            np.abs(g.vertices.numpy() - W)[
+                np.linalg.norm(V - V[dent].mean(axis=0), axis=1) > 0.2
+            ].max()
+            < 0.002
+        )
 
 
 class TestRefusals:
@@ -356,13 +460,22 @@ class TestRefusals:
         self.refused(W, F, "1 vertices have coordinates that are not finite .*vertex 17")
         self.refused(np.zeros_like(V), F, "no area")
         loose, G = soup(V, F)
-        self.refused(loose + np.random.default_rng(0).normal(0, 3e-4, loose.shape), G, f"falls apart into {len(F)} parts, 100 % of its area")
+        self.refused(
+            loose + np.random.default_rng(0).normal(0, 3e-4, loose.shape),
+            G,
+            f"falls apart into {len(F)} parts, 100 % of its area",
+        )
         body = standard_body()
         self.refused(body.vertices.numpy(), body.faces.numpy(), "closed surface without openings")
         rim = np.concatenate([np.stack([x, np.roll(x, -1)], 1) for x in loops(F)])
-        walls = [np.stack([rim[:, 1], rim[:, 0], rim[:, 0] + len(V)], 1), np.stack([rim[:, 1], rim[:, 0] + len(V), rim[:, 1] + len(V)], 1)]
+        walls = [
+            np.stack([rim[:, 1], rim[:, 0], rim[:, 0] + len(V)], 1),
+            np.stack([rim[:, 1], rim[:, 0] + len(V), rim[:, 1] + len(V)], 1),
+        ]
         thick = np.concatenate([F, F[:, ::-1] + len(V), *walls])
-        self.refused(np.concatenate([V, V + 0.003 * vertex_normals(V, F)]), thick, "cloth with a thickness")
+        self.refused(
+            np.concatenate([V, V + 0.003 * vertex_normals(V, F)]), thick, "cloth with a thickness"
+        )
 
     def test_moebius_strip(self):
         a = np.linspace(0, 2 * np.pi, 60, endpoint=False)
@@ -372,7 +485,9 @@ class TestRefusals:
         number = np.arange(180).reshape(3, 60)
         number = np.concatenate([number, number[::-1, :1]], axis=1)
         p, q, r, s = number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]
-        F = np.concatenate([np.stack([p, q, r], -1).reshape(-1, 3), np.stack([p, r, s], -1).reshape(-1, 3)])
+        F = np.concatenate(
+            [np.stack([p, q, r], -1).reshape(-1, 3), np.stack([p, r, s], -1).reshape(-1, 3)]
+        )
         self.refused(V.reshape(-1, 3), F, "one side only")
 
     @pytest.mark.parametrize(
@@ -382,8 +497,16 @@ class TestRefusals:
             ("millimetres", lambda V: 1000 * V, dict(scale=0.001)),
             ("y up", lambda V: np.stack([V[:, 0], V[:, 2], -V[:, 1]], 1), dict(up="y")),
             ("facing backwards", lambda V: V * [-1, -1, 1], dict(turn=180.0)),
-            ("centimetres, y up", lambda V: 100 * np.stack([V[:, 0], V[:, 2], -V[:, 1]], 1), dict(scale=0.01, up="y")),
-            ("on a body that stands on the ground", lambda V: V + [0, 0, 0.82], dict(offset=(0, 0, -0.82))),
+            (
+                "centimetres, y up",
+                lambda V: 100 * np.stack([V[:, 0], V[:, 2], -V[:, 1]], 1),
+                dict(scale=0.01, up="y"),
+            ),
+            (
+                "on a body that stands on the ground",
+                lambda V: V + [0, 0, 0.82],
+                dict(offset=(0, 0, -0.82)),
+            ),
         ],
     )
     def test_units_axes_and_places_are_found(self, templates, what, change, expected, tmp_path):
@@ -392,11 +515,17 @@ class TestRefusals:
         write_ply(path, change(g.vertices.double().numpy()), g.faces.numpy())
         with pytest.raises(InputError) as error:
             Garment.read(path)
-        found = re.fullmatch(rf"{re.escape(str(path))}: does not lie on the body: .*; it looks like {what}: give (.*)", str(error.value))
+        found = re.fullmatch(
+            rf"{re.escape(str(path))}: does not lie on the body: .*; it looks like {what}: give"
+            r" (.*)",
+            str(error.value),
+        )
         assert found, error.value
         given = eval(f"dict({found[1]})")
         assert given == expected
-        assert np.abs(Garment.read(path, **given).vertices.numpy() - g.vertices.numpy()).max() < 1e-4
+        assert (
+            np.abs(Garment.read(path, **given).vertices.numpy() - g.vertices.numpy()).max() < 1e-4
+        )
 
     def test_nothing_fits(self):
         V, F = tube(0.5, 0.4)
@@ -442,10 +571,14 @@ def test_loose_leaves_the_pose_of_the_legs(templates):
     g, body = templates["dress"], standard_body()
     wide = body.rest_pose.clone()
     for side, sign in (("left", -1), ("right", 1)):
-        wide[skeleton.INDEX[f"{side}_hip"]] = turned(wide[skeleton.INDEX[f"{side}_hip"]], [0, 0.12 * sign, 0])
+        wide[skeleton.INDEX[f"{side}_hip"]] = turned(
+            wide[skeleton.INDEX[f"{side}_hip"]], [0, 0.12 * sign, 0]
+        )
     V, F = g.vertices.double().numpy(), g.faces.numpy()
     made_for = fitting.in_pose(body, wide)
-    moved = lambda loose: np.linalg.norm(fitting.to_standard(V, F, made_for, loose) - V, axis=1).max()
+    moved = lambda loose: np.linalg.norm(
+        fitting.to_standard(V, F, made_for, loose) - V, axis=1
+    ).max()
     assert moved(True) < 0.005 < 0.02 < moved(False)
 
 
@@ -454,12 +587,21 @@ def test_garments_of_others(shared_data):
         if path.stem == "body_rest":
             continue
         g = Garment.read(path)
-        assert g.repairs == () and g.name == path.stem and g.blend_weights.sum(1) == pytest.approx(torch.ones(len(g)), abs=1e-5)
+        assert (
+            g.repairs == ()
+            and g.name == path.stem
+            and g.blend_weights.sum(1) == pytest.approx(torch.ones(len(g)), abs=1e-5)
+        )
 
 
 def test_garments_in_another_pose_and_axes(shared_data):
-    for path in (shared_data / "garments_snug" / name for name in ("long_sleeve_top.obj", "shorts.obj")):
-        with pytest.raises(InputError, match="does not lie on the body: .* it looks like y up, .*give up='y'.*offset=") as error:
+    for path in (
+        shared_data / "garments_snug" / name for name in ("long_sleeve_top.obj", "shorts.obj")
+    ):
+        with pytest.raises(
+            InputError,
+            match="does not lie on the body: .* it looks like y up, .*give up='y'.*offset=",
+        ) as error:
             Garment.read(path)
         given = eval(f"dict({str(error.value).partition('give ')[2]})")
         g = Garment.read(path, **{"made_for": "T-pose", **given})

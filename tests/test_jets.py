@@ -62,11 +62,20 @@ def test_second_derivatives_against_finite_differences():
 def test_a_batch_of_jets_is_its_jets():
     uv = torch.stack([chart(30) for _ in range(6)]).reshape(2, 3, 30, 2)
     alpha = torch.stack([random_alpha(4) for _ in range(6)]).reshape(2, 3, 15)
-    for function in (jets.height, jets.point, jets.normal, jets.metric, jets.second_fundamental_form, jets.principal_curvatures):
+    for function in (
+        jets.height,
+        jets.point,
+        jets.normal,
+        jets.metric,
+        jets.second_fundamental_form,
+        jets.principal_curvatures,
+    ):
         together = function(alpha, uv)
         for k in np.ndindex(2, 3):
             assert (together[k] - function(alpha[k], uv[k])).abs().max() < 1e-12
-    assert (jets.height(alpha, uv[0, 0]) - (jets.basis(uv[0, 0], 4) * alpha[..., None, :]).sum(-1)).abs().max() < 1e-12
+    assert (
+        jets.height(alpha, uv[0, 0]) - (jets.basis(uv[0, 0], 4) * alpha[..., None, :]).sum(-1)
+    ).abs().max() < 1e-12
 
 
 def fitted(height, extent=0.3, order=8):
@@ -93,12 +102,16 @@ def test_gradient_of_curvatures():
     assert torch.autograd.gradcheck(jets.principal_curvatures, (alpha, uv))
     flat = torch.zeros(15, dtype=torch.float64, requires_grad=True)
     jets.principal_curvatures(flat, uv).sum().backward()
-    assert flat.grad.isfinite().all() and flat.grad[3] == pytest.approx(2 * 5)  # of the mean curvature, at an umbilic
+    assert flat.grad.isfinite().all() and flat.grad[3] == pytest.approx(
+        2 * 5
+    )  # of the mean curvature, at an umbilic
 
 
 def test_nearest_points_are_feet_of_normals():
     alpha, uv = 0.2 * random_alpha(4), chart(100)
-    x = jets.point(alpha, uv) + 0.05 * torch.as_tensor(RNG.normal(size=(100, 1))) * jets.normal(alpha, uv)
+    x = jets.point(alpha, uv) + 0.05 * torch.as_tensor(RNG.normal(size=(100, 1))) * jets.normal(
+        alpha, uv
+    )
     found = jets.nearest(alpha, x, steps=30)
     off = x - jets.point(alpha, found)
     assert (torch.linalg.cross(off, jets.normal(alpha, found)).norm(dim=-1) < 1e-6).all()
@@ -109,7 +122,9 @@ def test_nearest_points_are_feet_of_normals():
 
 def test_a_jet_turned_over_is_the_same_surface():
     alpha, uv = random_alpha(5), chart(20)
-    over = jets.point(jets.turned_over(alpha), uv * torch.tensor([1, -1])) * torch.tensor([1, -1, -1])
+    over = jets.point(jets.turned_over(alpha), uv * torch.tensor([1, -1])) * torch.tensor(
+        [1, -1, -1]
+    )
     assert (over - jets.point(alpha, uv)).abs().max() < 1e-12
 
 
@@ -173,7 +188,9 @@ def test_patch_against_plain_numpy(patch):
     R = Rotation.from_quat(x["rotation"]).as_matrix()
     expected = t.scale * (canonical @ R.T + x["translation"]) @ t.rotation.T + t.origin
     assert np.abs(np.array(patch.vertices(unknowns)).T - expected).max() < 1e-6
-    normal = jets.normal(torch.as_tensor(t.alpha + x["delta_alpha"]), uv).numpy() @ R.T @ t.rotation.T
+    normal = (
+        jets.normal(torch.as_tensor(t.alpha + x["delta_alpha"]), uv).numpy() @ R.T @ t.rotation.T
+    )
     assert np.abs(np.array(patch.normals(unknowns)).T - normal).max() < 1e-5
 
 
@@ -187,7 +204,10 @@ def test_patch_tangents_and_metric_against_finite_differences(patch):
             moved = dict(x)
             moved[name] = x[name] + sign * h
             ends.append(np.array(patch.vertices(type(unknowns).from_numpy(moved))).T)
-        assert np.abs((ends[0] - ends[1]) / (2 * h) - tangents[k]).max() < 1e-3 * np.abs(tangents[k]).max()
+        assert (
+            np.abs((ends[0] - ends[1]) / (2 * h) - tangents[k]).max()
+            < 1e-3 * np.abs(tangents[k]).max()
+        )
     E, F, G = (np.array(g) for g in patch.metric(unknowns))
     for value, (a, b) in ((E, (0, 0)), (F, (0, 1)), (G, (1, 1))):
         expected = (tangents[a] * tangents[b]).sum(1)
@@ -211,4 +231,6 @@ def test_gradient_of_vertices_to_every_unknown(patch):
         gradient, h = np.array(dr.grad(v)), 1e-2
         direction = RNG.normal(size=gradient.shape)
         ends = [value({**x, name: x[name] + sign * h * direction})[0] for sign in (1, -1)]
-        assert gradient @ direction == pytest.approx((ends[0] - ends[1]) / (2 * h), rel=0.02, abs=2e-3), name
+        assert gradient @ direction == pytest.approx(
+            (ends[0] - ends[1]) / (2 * h), rel=0.02, abs=2e-3
+        ), name

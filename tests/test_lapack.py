@@ -13,7 +13,9 @@ TOLERANCE = {np.float32: 1e-4, np.float64: 1e-11}
 
 
 def positive(n, dtype, room=0):
-    """(a view (n, n) in Fortran order whose columns lie n + room apart, the same as an ordinary array in float64)."""
+    """(a view (n, n) in Fortran order whose columns lie n + room apart, the same as an ordinary
+    array in float64).
+    """
     a = RNG.normal(size=(n, 2 * n))
     a = a @ a.T / n
     held = np.full((n + room, n + room), np.nan, dtype, order="F")
@@ -39,7 +41,10 @@ def test_factor_solve_inverse_and_square(dtype, room):
         expected = b.astype(np.float64) @ np.linalg.inv(left)
         lapack.solve(a, b, transposed=transposed, right=True)
         assert np.allclose(b, expected, **close)
-    w, (c, before) = np.asfortranarray(RNG.normal(size=(5, 7)).astype(dtype)), positive(7, dtype, room)
+    w, (c, before) = (
+        np.asfortranarray(RNG.normal(size=(5, 7)).astype(dtype)),
+        positive(7, dtype, room),
+    )
     lapack.subtract_square(c, w)
     assert np.allclose(np.tril(c), np.tril(before - w.T.astype(np.float64) @ w), **close)
     lapack.inverse(a)

@@ -1,4 +1,6 @@
-"""Shading as a cue: its derivatives against finite differences, its algebra against dense matrices, the light that it learns against the true one."""
+"""Shading as a cue: its derivatives against finite differences, its algebra against dense matrices,
+the light that it learns against the true one.
+"""
 
 import dataclasses
 
@@ -25,9 +27,14 @@ def project(vertices):
 
 
 def brightness(luminance=0.5, masked=False):
-    """That of a sheet of one colour, or of an image (64, 64) of luminances over the texture coordinates."""
+    """That of a sheet of one colour, or of an image (64, 64) of luminances over the texture
+    coordinates.
+    """
     texture = np.broadcast_to(np.asarray(luminance, np.float32)[..., None], (64, 64, 3))
-    texture, inside = np.pad(texture, ((8, 8), (8, 8), (0, 0)), "edge"), np.pad(np.ones((64, 64), np.float32), 8)
+    texture, inside = (
+        np.pad(texture, ((8, 8), (8, 8), (0, 0)), "edge"),
+        np.pad(np.ones((64, 64), np.float32), 8),
+    )
     v, u = np.meshgrid(np.linspace(71, 8, ROWS), np.linspace(8, 71, COLUMNS), indexing="ij")
     texels = np.stack([u, v], -1).reshape(-1, 2)[FACES].mean(1)
     flat = synthetic.sheet(0, ROWS, COLUMNS)
@@ -36,7 +43,13 @@ def brightness(luminance=0.5, masked=False):
 
 def shade_of(found, vertices, image, seen=1e9, mask=None):
     colour = np.broadcast_to(np.asarray(image, np.float32)[..., None], (120, 160, 3))
-    return found.of(found.prepared(colour, mask), vertices, np.zeros(3), project(vertices), np.full(len(FACES), seen))
+    return found.of(
+        found.prepared(colour, mask),
+        vertices,
+        np.zeros(3),
+        project(vertices),
+        np.full(len(FACES), seen),
+    )
 
 
 def known(light=LIGHT, frames=1):
@@ -51,7 +64,11 @@ def wavy(seed=0, size=0.004):
 
 def lit(vertices):
     """What a triangle is lit with by LIGHT, (F,)."""
-    return LIGHT[0] + normals(vertices) @ LIGHT[1:4] + (vertices[FACES].mean(1) - (0, 0, 0.5)) / 0.12 @ LIGHT[4:]
+    return (
+        LIGHT[0]
+        + normals(vertices) @ LIGHT[1:4]
+        + (vertices[FACES].mean(1) - (0, 0, 0.5)) / 0.12 @ LIGHT[4:]
+    )
 
 
 def normals(vertices):
@@ -69,8 +86,12 @@ def test_residuals_and_derivatives():
     a, b, c = (vertices[FACES[:, k]] for k in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     scale = known().scale
-    assert energy == pytest.approx(12 * scale**2 * (area / area.sum() * np.log1p((residual / scale) ** 2)).sum(), rel=1e-5)
-    np.testing.assert_allclose(factor, 24 * area / area.sum() / (1 + (residual / scale) ** 2), rtol=1e-6)
+    assert energy == pytest.approx(
+        12 * scale**2 * (area / area.sum() * np.log1p((residual / scale) ** 2)).sum(), rel=1e-5
+    )
+    np.testing.assert_allclose(
+        factor, 24 * area / area.sum() / (1 + (residual / scale) ** 2), rtol=1e-6
+    )
     h = 1e-6
     for corner in range(3):
         for axis in range(3):
@@ -80,26 +101,38 @@ def test_residuals_and_derivatives():
                 plus = lit(moved)[face]
                 moved[FACES[face, corner], axis] -= 2 * h
                 minus = lit(moved)[face]
-                assert by_corner[face, corner, axis] == pytest.approx((minus - plus) / (2 * h), rel=1e-4, abs=1e-5 * np.abs(by_corner).max())
+                assert by_corner[face, corner, axis] == pytest.approx(
+                    (minus - plus) / (2 * h), rel=1e-4, abs=1e-5 * np.abs(by_corner).max()
+                )
 
 
 def test_the_light_follows_the_surface_and_the_energy_has_no_slope_along_it(monkeypatch):
     monkeypatch.setattr("polysft_mi.light._REFITS", 60)
     found, vertices = brightness(masked=True), wavy()
-    light = Light(np.diag([5.0, 1, 1, 1, 2, 2, 2]), np.diag([5.0, 1, 1, 1, 2, 2, 2]) @ LIGHT, 0.01, 1)
+    light = Light(
+        np.diag([5.0, 1, 1, 1, 2, 2, 2]), np.diag([5.0, 1, 1, 1, 2, 2, 2]) @ LIGHT, 0.01, 1
+    )
     shade = shade_of(found, vertices, 0.4)
     fit = light.explaining(shade)
     before = light.coefficients(len(FACES))
     assert np.abs(fit.coefficients - before).max() > 0.05 and fit.departure > 0
 
-    def at(vertices, image=shade.luminance):  # what the image shows at another place is no derivative
-        return residuals(dataclasses.replace(shade_of(found, vertices, 0.4), luminance=image, area=shade.area), light, 12.0)
+    def at(
+        vertices, image=shade.luminance
+    ):  # what the image shows at another place is no derivative
+        return residuals(
+            dataclasses.replace(shade_of(found, vertices, 0.4), luminance=image, area=shade.area),
+            light,
+            12.0,
+        )
 
     _, residual, factor, by_corner = at(vertices)
     gradient = np.zeros_like(vertices)
     np.add.at(gradient, FACES, (factor * residual)[:, None, None] * by_corner)
     # the frame's exposure follows too: only vertices whose triangles are not those of the median
-    ratio = shade.luminance / (shade.texture * (before[0] + shade.normal @ before[1:4] + shade.centre @ before[4:]))
+    ratio = shade.luminance / (
+        shade.texture * (before[0] + shade.normal @ before[1:4] + shade.centre @ before[4:])
+    )
     middle = np.argsort(ratio)[len(FACES) // 2 - 1 : len(FACES) // 2 + 1]
     free = np.setdiff1d(np.arange(len(vertices)), FACES[middle])
     h = 1e-6
@@ -110,16 +143,23 @@ def test_the_light_follows_the_surface_and_the_energy_has_no_slope_along_it(monk
                 moved = vertices.copy()
                 moved[i, axis] += step
                 energy.append(at(moved)[0])
-            assert gradient[i, axis] == pytest.approx((energy[0] - energy[1]) / (2 * h), rel=1e-3, abs=1e-4 * np.abs(gradient).max())
+            assert gradient[i, axis] == pytest.approx(
+                (energy[0] - energy[1]) / (2 * h), rel=1e-3, abs=1e-4 * np.abs(gradient).max()
+            )
 
 
 @pytest.mark.parametrize("exposure", [0.5, 1.7])
 def test_a_frames_exposure_changes_nothing(exposure):
     found = brightness(masked=True)
     light = known().learned(shade_of(found, wavy(), 0.4))
-    for brighter, usual in zip(residuals(shade_of(found, wavy(), 0.4 * exposure), light, 12.0), residuals(shade_of(found, wavy(), 0.4), light, 12.0)):
+    for brighter, usual in zip(
+        residuals(shade_of(found, wavy(), 0.4 * exposure), light, 12.0),
+        residuals(shade_of(found, wavy(), 0.4), light, 12.0),
+    ):
         np.testing.assert_allclose(brighter, usual, rtol=1e-5, atol=1e-7)
-    assert known().learned(shade_of(found, wavy(), 0.4 * exposure)).numbers() == pytest.approx(light.numbers(), rel=1e-5)
+    assert known().learned(shade_of(found, wavy(), 0.4 * exposure)).numbers() == pytest.approx(
+        light.numbers(), rel=1e-5
+    )
 
 
 def test_what_a_frame_shows_of_each_triangle():
@@ -130,8 +170,14 @@ def test_what_a_frame_shows_of_each_triangle():
     assert shade.luminance == pytest.approx(0.7, rel=1e-5)
     assert shade.texture[shade.seen].mean() == pytest.approx(1, rel=1e-5)
     u, v = ((vertices[FACES].mean(1) / (0.12, 0.09, 1))[:, :2].T + 1) / 2
-    np.testing.assert_allclose(shade.texture[shade.seen] * found.mean, (0.4 + 0.2 * u + 0.1 * (1 - v))[shade.seen], atol=0.01)
-    assert (shade.normal @ [0, 0, -1] > 0.999).all() and shade.area.sum() == pytest.approx(0.24 * 0.18, rel=1e-6)
+    np.testing.assert_allclose(
+        shade.texture[shade.seen] * found.mean,
+        (0.4 + 0.2 * u + 0.1 * (1 - v))[shade.seen],
+        atol=0.01,
+    )
+    assert (shade.normal @ [0, 0, -1] > 0.999).all() and shade.area.sum() == pytest.approx(
+        0.24 * 0.18, rel=1e-6
+    )
 
 
 def test_only_triangles_that_are_seen_count():
@@ -141,14 +187,20 @@ def test_only_triangles_that_are_seen_count():
     assert not shade_of(found, flat, 0.4, seen=0.5 * pixels.min()).seen.any()
     steep = (flat - (0, 0, 0.5)) @ Rotation.from_rotvec([0, 1.4, 0]).as_matrix().T + (0, 0, 0.5)
     assert not shade_of(found, steep, 0.4).seen.any()
-    assert not brightness().trusted.all()  # without masks the background is in what lies at the border
-    assert not brightness(np.zeros((64, 64)), masked=True).trusted.any()  # a black texture says nothing
+    assert (
+        not brightness().trusted.all()
+    )  # without masks the background is in what lies at the border
+    assert not brightness(
+        np.zeros((64, 64)), masked=True
+    ).trusted.any()  # a black texture says nothing
 
 
 def test_a_frame_larger_than_its_triangles_need_is_shrunk():
     found = brightness(masked=True)
     found.sigma = 6.0
-    image, pool = found.prepared(np.full((120, 160, 3), 0.4, np.float32), np.ones((120, 160), np.float32))
+    image, pool = found.prepared(
+        np.full((120, 160, 3), 0.4, np.float32), np.ones((120, 160), np.float32)
+    )
     assert pool == 3 and image.shape == (40, 53) and image == pytest.approx(0.8, rel=1e-5)
 
 
@@ -162,8 +214,12 @@ def test_the_light_is_learned_from_surfaces_that_bend():
         value[rng.random(len(FACES)) < 0.1] += 0.5  # a highlight, a shadow's end
         light = light.learned(dataclasses.replace(shade, luminance=value))
     learned = light.coefficients(len(FACES))
-    assert light.frames == 20 and learned * (LIGHT[0] / learned[0]) == pytest.approx(LIGHT, abs=0.03)
-    assert light.scale == 0.05 and 0.004 < light.deviations / 20 < 0.008  # a little more than 0.005 for the outliers
+    assert light.frames == 20 and learned * (LIGHT[0] / learned[0]) == pytest.approx(
+        LIGHT, abs=0.03
+    )
+    assert (
+        light.scale == 0.05 and 0.004 < light.deviations / 20 < 0.008
+    )  # a little more than 0.005 for the outliers
     assert 0.03 < dataclasses.replace(light, deviations=0.005 * 20).scale < 0.05  # eight deviations
     assert Light.of(light.numbers()).numbers() == light.numbers()
 
@@ -177,7 +233,9 @@ def test_the_last_frames_say_most():
         light = light.learned(dataclasses.replace(shade_of(found, vertices, 0.4), luminance=value))
         level, slope = light.coefficients(len(FACES))[:2]
         slopes.append(slope / level * LIGHT[0])
-    assert slopes[9] == pytest.approx(LIGHT[1] - 0.08, abs=0.015) and slopes[29] == pytest.approx(LIGHT[1], abs=0.015)
+    assert slopes[9] == pytest.approx(LIGHT[1] - 0.08, abs=0.015) and slopes[29] == pytest.approx(
+        LIGHT[1], abs=0.015
+    )
 
 
 def test_a_flat_sheet_says_nothing_of_where_the_light_comes_from():
@@ -186,7 +244,11 @@ def test_a_flat_sheet_says_nothing_of_where_the_light_comes_from():
         light = light.learned(shade_of(found, synthetic.sheet(0, ROWS, COLUMNS), 0.4))
     level, *slope = light.coefficients(len(FACES))
     across = level - slope[2]  # what a sheet across the view is lit with, but for the exposure
-    assert across == pytest.approx(1, rel=1e-3) and np.abs(slope[:2]).max() < 1e-6 and np.abs(slope[3:]).max() < 1e-4
+    assert (
+        across == pytest.approx(1, rel=1e-3)
+        and np.abs(slope[:2]).max() < 1e-6
+        and np.abs(slope[3:]).max() < 1e-4
+    )
     assert light.learned(shade_of(found, synthetic.sheet(0, ROWS, COLUMNS), 0.4, seen=0)) == light
 
 
@@ -208,10 +270,17 @@ def test_the_tracker_learns_the_light_and_follows_it(truth, tmp_path):
     for weight in (0.0, 12.0):
         problem = problem_of(truth.folder, k_shading=weight)
         (tmp_path / str(weight)).mkdir()
-        done[weight] = track(problem, solvers.create(problem.settings), 5, str(tmp_path / str(weight)))
-    assert Light.of(done[0.0].totals[-1]["light"]).frames == 0 and done[0.0].totals[-1]["shading"] == 0
+        done[weight] = track(
+            problem, solvers.create(problem.settings), 5, str(tmp_path / str(weight))
+        )
+    assert (
+        Light.of(done[0.0].totals[-1]["light"]).frames == 0 and done[0.0].totals[-1]["shading"] == 0
+    )
     found = Light.of(done[12.0].totals[-1]["light"])
-    assert found.frames == 5 and done[12.0].totals[0]["shading"] == 0 < done[12.0].totals[-1]["shading"]
+    assert (
+        found.frames == 5
+        and done[12.0].totals[0]["shading"] == 0 < done[12.0].totals[-1]["shading"]
+    )
     # the sheet rolls about the image's upright: that is where the light's slope shows
     slope = found.coefficients(len(truth.faces))[1]
     assert 0.5 < slope / (LIGHT[1] / (LIGHT[0] - LIGHT[3])) < 1.5
@@ -234,7 +303,9 @@ def test_what_is_known_of_the_light_survives_an_interruption(truth, tmp_path):
         track(problem, solvers.create(problem.settings), 5, str(parts), solved=stop)
     resumed = track(problem, solvers.create(problem.settings), 5, str(parts), resume=True)
     assert resumed.totals[-1]["light"] == whole.totals[-1]["light"]
-    assert all(np.array_equal(a[name], b[name]) for a, b in zip(whole.states, resumed.states) for name in a)
+    assert all(
+        np.array_equal(a[name], b[name]) for a, b in zip(whole.states, resumed.states) for name in a
+    )
 
 
 def test_a_texture_that_moves_takes_its_brightness_along(truth):
@@ -247,18 +318,28 @@ def test_a_texture_that_moves_takes_its_brightness_along(truth):
 
 @pytest.mark.parametrize("stage", gauss_newton.STAGES)
 def test_only_the_last_stage_is_shaded_and_a_step_goes_where_the_shading_leads(truth, stage):
-    problem = problem_of(truth.folder, k_rgb=0.0, k_silhouette=0.0, k_mi=0.0, k_relief=0.0, texture_fit="none")
+    problem = problem_of(
+        truth.folder, k_rgb=0.0, k_silhouette=0.0, k_mi=0.0, k_relief=0.0, texture_fit="none"
+    )
     solver = gauss_newton.GaussNewton(problem.settings)
     solver._prepare(problem)
     rest = solver.chart.state(problem.patch.rest().to_numpy())
-    solver._light = known(LIGHT * (1, 1, 1, 1, 0, 0, 0))  # what an image shows at another place is no derivative
+    solver._light = known(
+        LIGHT * (1, 1, 1, 1, 0, 0, 0)
+    )  # what an image shows at another place is no derivative
     normal, terms = solver._linearise(rest, rest, 1, 4, stage, 0.5)
-    assert (terms["shading"] > 0) == (stage is gauss_newton.STAGES[-1]) == bool(np.abs(normal.gradient).max() > 1e-9)
+    assert (
+        (terms["shading"] > 0)
+        == (stage is gauss_newton.STAGES[-1])
+        == bool(np.abs(normal.gradient).max() > 1e-9)
+    )
     if terms["shading"]:
         step, _ = solver._reduced(normal, 1e-3).step()
         slope = step[0] @ normal.gradient + (step[1] * normal.local_gradient).sum()
         found = solver._linearise(rest.moved(step, 0.1), rest, 1, 4, stage, 0.5)[1]
-        assert 0.1 * slope < found["shading"] - terms["shading"] < 0.02 * slope < 0  # less than the slope says, for the exposure follows
+        assert (
+            0.1 * slope < found["shading"] - terms["shading"] < 0.02 * slope < 0
+        )  # less than the slope says, for the exposure follows
 
 
 def test_what_a_light_makes_of_each_triangle():
@@ -270,15 +351,28 @@ def test_what_a_light_makes_of_each_triangle():
     turned = found.faces[:, ::-1].copy()
     found.faces = turned  # whichever way triangles are listed
     assert np.allclose(found.lit(vertices, np.zeros(3), LIGHT), expected)
-    assert found.lit(vertices, np.zeros(3), np.array([0.5, 0, 0, 3.0, 0, 0, 0])).min() == pytest.approx(0.05)  # never black
+    assert found.lit(
+        vertices, np.zeros(3), np.array([0.5, 0, 0, 3.0, 0, 0, 0])
+    ).min() == pytest.approx(0.05)  # never black
 
 
 def test_a_textures_luminance_as_an_image_shows_it():
     found, vertices = brightness(), synthetic.sheet(0, ROWS, COLUMNS)
-    image = np.broadcast_to(np.linspace(0.2, 0.8, 80, dtype=np.float32)[None, :, None], (60, 80, 3))  # on a grid of two pixels
+    image = np.broadcast_to(
+        np.linspace(0.2, 0.8, 80, dtype=np.float32)[None, :, None], (60, 80, 3)
+    )  # on a grid of two pixels
     value = found.shown(image, np.ones((60, 80), np.float32), 2, project(vertices) / 2)
     x = project(vertices)[FACES].mean(1)[:, 0] / 2 - 0.5
     assert np.allclose(value * found.mean, 0.2 + 0.6 * x / 79, atol=1e-3)
-    assert np.array_equal(shade_of(found, vertices, np.full((120, 160), 0.5)).texture, found.texture)
-    known = found.of(found.prepared(np.full((120, 160, 3), 0.5, np.float32), None), vertices, np.zeros(3), project(vertices), np.full(len(FACES), 1e9), value)
+    assert np.array_equal(
+        shade_of(found, vertices, np.full((120, 160), 0.5)).texture, found.texture
+    )
+    known = found.of(
+        found.prepared(np.full((120, 160, 3), 0.5, np.float32), None),
+        vertices,
+        np.zeros(3),
+        project(vertices),
+        np.full(len(FACES), 1e9),
+        value,
+    )
     assert np.array_equal(known.texture, value)

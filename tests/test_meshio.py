@@ -1,4 +1,6 @@
-"""Meshes written and read back, templates in the file's own order, and every reason to refuse one."""
+"""Meshes written and read back, templates in the file's own order, and every reason to refuse
+one.
+"""
 
 import os
 
@@ -10,7 +12,9 @@ from polysft_mi.errors import InputError
 from polysft_mi.files import aside
 from polysft_mi.meshio import _count_fans, check_template, read_template, write_ply
 
-SHARED = os.path.join(os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)))), "shared", "data")
+SHARED = os.path.join(
+    os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)))), "shared", "data"
+)
 needs_data = pytest.mark.skipif(not os.path.isdir(SHARED), reason="needs ../shared/data")
 
 
@@ -19,7 +23,11 @@ def sheet(n=4, m=3):
     V = np.stack([x, y, 1 + 0.1 * x * y], -1).reshape(-1, 3)
     k = np.arange(n * m).reshape(m, n)
     a, b, c, d = (i.ravel() for i in (k[:-1, :-1], k[:-1, 1:], k[1:, :-1], k[1:, 1:]))
-    return V, np.concatenate([np.stack([a, c, b], 1), np.stack([b, c, d], 1)]), V[:, :2] * (1, -1) + (0, 1)
+    return (
+        V,
+        np.concatenate([np.stack([a, c, b], 1), np.stack([b, c, d], 1)]),
+        V[:, :2] * (1, -1) + (0, 1),
+    )
 
 
 def test_ply_reads_back(tmp_path):
@@ -51,11 +59,16 @@ def test_ply_is_what_mitsuba_reads(tmp_path):
     V, F, uv = sheet()
     write_ply(tmp_path / "a.ply", V, F, uv)
     script = (
-        "import sys, numpy as np, mitsuba as mi; mi.set_variant('scalar_rgb')\n"
-        "m = mi.traverse(mi.load_dict({'type': 'ply', 'filename': sys.argv[1], 'flip_tex_coords': False}))\n"
-        "np.savez(sys.argv[2], **{k: np.array(m[k]) for k in ('vertex_positions', 'faces', 'vertex_texcoords')})"
+        "import sys, numpy as np, mitsuba as mi; mi.set_variant('scalar_rgb')\nm ="
+        " mi.traverse(mi.load_dict({'type': 'ply', 'filename': sys.argv[1], 'flip_tex_coords':"
+        " False}))\nnp.savez(sys.argv[2], **{k: np.array(m[k]) for k in ('vertex_positions',"
+        " 'faces', 'vertex_texcoords')})"
     )
-    subprocess.run([sys.executable, "-c", script, tmp_path / "a.ply", tmp_path / "a.npz"], check=True, timeout=60)
+    subprocess.run(
+        [sys.executable, "-c", script, tmp_path / "a.ply", tmp_path / "a.npz"],
+        check=True,
+        timeout=60,
+    )
     seen = np.load(tmp_path / "a.npz")
     np.testing.assert_allclose(seen["vertex_positions"].reshape(-1, 3), V, atol=1e-6)
     np.testing.assert_array_equal(seen["faces"].reshape(-1, 3), F)
@@ -92,7 +105,9 @@ ORDERED = np.array([[1, 4, 5], [1, 5, 2], [0, 1, 2], [0, 2, 3]])
 def test_obj_keeps_the_files_order_and_uv(tmp_path, faces):
     (tmp_path / "a.obj").write_text(OBJ + faces)
     V, F, uv = read_template(tmp_path / "a.obj")
-    np.testing.assert_array_equal(V, [[0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1], [2, 0, 1], [2, 1, 1]])
+    np.testing.assert_array_equal(
+        V, [[0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1], [2, 0, 1], [2, 1, 1]]
+    )
     np.testing.assert_array_equal(F, ORDERED)
     np.testing.assert_array_equal(uv, V[:, :2] * (0.5, 1))
 
@@ -135,7 +150,9 @@ def test_shared_quads_with_normals_keep_order_and_uv():
     V, F, uv = read_template(path)
     check_template(V, F, uv)
     assert V.shape == (1024, 3) and F.shape == (1922, 3)
-    np.testing.assert_array_equal(F[:2], [[982, 981, 1013], [982, 1013, 1014]])  # the file's first quad
+    np.testing.assert_array_equal(
+        F[:2], [[982, 981, 1013], [982, 1013, 1014]]
+    )  # the file's first quad
     np.testing.assert_array_equal(V[0], [0.713166, 0.153658, 1.274754])  # and its first vertex
 
 
@@ -171,7 +188,8 @@ def test_missing_file_and_folder(tmp_path):
 
 def test_a_ply_of_points_is_refused(tmp_path):
     (tmp_path / "a.ply").write_text(
-        "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n0 0 0\n"
+        "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty"
+        " float z\nend_header\n0 0 0\n"
     )
     with pytest.raises(InputError, match="holds no faces"):
         read_template(tmp_path / "a.ply")
@@ -218,7 +236,10 @@ def _change(kind):
         F = np.concatenate([F, F + len(V)])
         V, uv = np.concatenate([V, V + 2]), np.concatenate([uv, uv])
     elif kind == "bow tie":
-        V, uv = np.concatenate([V, [[-1, 0, 1], [-1, -1, 1.0]]]), np.concatenate([uv, [[0, 0], [0, 0]]])
+        V, uv = (
+            np.concatenate([V, [[-1, 0, 1], [-1, -1, 1.0]]]),
+            np.concatenate([uv, [[0, 0], [0, 0]]]),
+        )
         F = np.concatenate([F, [[0, len(V) - 2, len(V) - 1]]])
     return V, F, uv
 
@@ -247,7 +268,11 @@ def _change(kind):
 def test_refuses_what_cannot_be_a_template(kind, words):
     with pytest.raises(InputError) as error:
         check_template(*_change(kind), where="cloth.obj")
-    assert str(error.value).startswith("cloth.obj: ") and words in str(error.value) and "\n" not in str(error.value)
+    assert (
+        str(error.value).startswith("cloth.obj: ")
+        and words in str(error.value)
+        and "\n" not in str(error.value)
+    )
 
 
 def slow_fans(F):
@@ -276,7 +301,9 @@ def test_fans_agree_with_the_slow_reference():
     counts = set()
     for share in (0.3, 0.5, 0.7, 0.9, 1.0):
         faces = F[rng.random(len(F)) <= share]
-        edges = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
+        edges = np.sort(
+            np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2), axis=1
+        )
         edge_of = np.unique(edges, axis=0, return_inverse=True)[1].ravel()
         assert _count_fans(edge_of) == slow_fans(faces)
         counts.add(_count_fans(edge_of) - len(np.unique(faces)))
@@ -285,7 +312,11 @@ def test_fans_agree_with_the_slow_reference():
 
 def test_a_broken_write_leaves_the_older_file_and_names_it(tmp_path):
     (tmp_path / "a.ply").write_text("older")
-    with pytest.raises(OSError) as error, aside(tmp_path / "a.ply") as temporary, open(temporary, "wb") as file:
+    with (
+        pytest.raises(OSError) as error,
+        aside(tmp_path / "a.ply") as temporary,
+        open(temporary, "wb") as file,
+    ):
         file.write(b"half")
         raise OSError(28, "No space left on device")
     assert error.value.filename == str(tmp_path / "a.ply")

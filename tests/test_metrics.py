@@ -90,18 +90,31 @@ def test_ray_depth_agrees_with_the_slow_reference():
     V2 = np.concatenate([V, V * (0.5, 0.5, 0.7)])  # a second sheet in front of part of the first
     F2 = np.concatenate([F, (F + len(V))[:, ::-1]])  # seen from behind
     points = rng.uniform((-0.2, -0.2, 0.4), (0.2, 0.2, 0.8), size=(120, 3))
-    points[:20] = V[rng.integers(len(V), size=20)] * rng.uniform(0.5, 2, size=(20, 1))  # rays through vertices
+    points[:20] = V[rng.integers(len(V), size=20)] * rng.uniform(
+        0.5, 2, size=(20, 1)
+    )  # rays through vertices
     want = slow_ray_depth(V2, F2, points)
     assert 20 < np.isnan(want).sum() < 100
     np.testing.assert_allclose(metrics.ray_depth(V2, F2, points), want, rtol=1e-9)
-    large = np.array([[-5, -4, -0.3], [5, -4, 0.9], [0, 6, 1.2], [0, 0.1, 0.5]])  # a triangle that passes beside the camera, a sliver
-    V3, F3 = np.concatenate([V2, large]), np.concatenate([F2, len(V2) + np.array([[0, 1, 2], [3, 1, 2]])])
+    large = np.array(
+        [[-5, -4, -0.3], [5, -4, 0.9], [0, 6, 1.2], [0, 0.1, 0.5]]
+    )  # a triangle that passes beside the camera, a sliver
+    V3, F3 = (
+        np.concatenate([V2, large]),
+        np.concatenate([F2, len(V2) + np.array([[0, 1, 2], [3, 1, 2]])]),
+    )
     want = slow_ray_depth(V3, F3, points)
     np.testing.assert_allclose(metrics.ray_depth(V3, F3, points), want, rtol=1e-9)
-    assert np.isnan(metrics.ray_depth(V2 * (1, 1, -1), F2, points)).all()  # a mesh behind the camera
-    assert np.isnan(metrics.ray_depth(V2, F2[:0], points)).all() and metrics.ray_depth(V2, F2, points[:0]).shape == (0,)
+    assert np.isnan(
+        metrics.ray_depth(V2 * (1, 1, -1), F2, points)
+    ).all()  # a mesh behind the camera
+    assert np.isnan(metrics.ray_depth(V2, F2[:0], points)).all() and metrics.ray_depth(
+        V2, F2, points[:0]
+    ).shape == (0,)
     broken = np.concatenate([points, [[0.1, 0, 0], [np.nan, 0, 1]]])
-    np.testing.assert_allclose(metrics.ray_depth(V3, F3, broken), [*want, np.nan, np.nan], rtol=1e-9)
+    np.testing.assert_allclose(
+        metrics.ray_depth(V3, F3, broken), [*want, np.nan, np.nan], rtol=1e-9
+    )
 
 
 def test_depth_rmse_of_a_shifted_plane_and_its_hits():
@@ -133,7 +146,9 @@ def test_chamfer_agrees_with_all_pairs():
 
 
 def test_samples_lie_on_the_surface_and_are_even():
-    V = np.array([[0, 0, 1], [3, 0, 1], [3, 1, 1], [0, 1, 1], [-1, 0, 1], [-1, 1, 1.0]])  # areas 3/2, 3/2, 1/2, 1/2
+    V = np.array(
+        [[0, 0, 1], [3, 0, 1], [3, 1, 1], [0, 1, 1], [-1, 0, 1], [-1, 1, 1.0]]
+    )  # areas 3/2, 3/2, 1/2, 1/2
     F = np.array([[0, 1, 2], [0, 2, 3], [4, 0, 5], [0, 3, 5]])
     S = metrics.sample_surface(V, F, 40000, np.random.default_rng(6))
     assert np.abs(S[:, 2] - 1).max() < 1e-12 and S[:, 0].min() >= -1 and S[:, 0].max() <= 3
@@ -156,7 +171,9 @@ def test_psnr_inside_and_outside_a_mask():
 
 
 def slow_ssim(x, y):
-    """Wang et al. 2004, window by window, one channel; the mean over windows that lie inside the image."""
+    """Wang et al. 2004, window by window, one channel; the mean over windows that lie inside the
+    image.
+    """
     r = np.arange(-5, 6)
     window = np.exp(-(r[:, None] ** 2 + r[None] ** 2) / (2 * 1.5**2))
     window /= window.sum()
@@ -167,7 +184,11 @@ def slow_ssim(x, y):
             ma, mb = (window * a).sum(), (window * b).sum()
             va, vb = (window * a * a).sum() - ma**2, (window * b * b).sum() - mb**2
             cov = (window * a * b).sum() - ma * mb
-            out[i, j] = (2 * ma * mb + 1e-4) * (2 * cov + 9e-4) / ((ma**2 + mb**2 + 1e-4) * (va + vb + 9e-4))
+            out[i, j] = (
+                (2 * ma * mb + 1e-4)
+                * (2 * cov + 9e-4)
+                / ((ma**2 + mb**2 + 1e-4) * (va + vb + 9e-4))
+            )
     return out
 
 
@@ -203,7 +224,9 @@ def test_score_refuses_what_cannot_be_compared(tmp_path):
         with pytest.raises(InputError, match=words):
             metrics.score(surface, str(tmp_path / name))
     with pytest.raises(InputError, match="not finite"):
-        metrics.score({**surface, "vertices": surface["vertices"] * np.nan}, str(tmp_path / "short.npz"))
+        metrics.score(
+            {**surface, "vertices": surface["vertices"] * np.nan}, str(tmp_path / "short.npz")
+        )
 
 
 def test_confidence_says_how_far_sigma_is_off():
@@ -214,6 +237,16 @@ def test_confidence_says_how_far_sigma_is_off():
     found = truth + (3 * sigma * rng.normal(size=(4, 500)))[..., None] * ray
     surface = {"vertices": found, "frames": np.arange(4), "sigma": sigma}
     figures = metrics.confidence(surface, {"vertices": truth})
-    assert abs(figures["sigma_factor"] - 3) < 0.2 and abs(figures["sigma_two"] - 0.954) < 0.02 and figures["sigma_rank"] > 0.7
-    assert metrics.confidence({**surface, "sigma": np.full((4, 500), np.nan)}, {"vertices": truth}) == {}
-    assert metrics.confidence({k: v for k, v in surface.items() if k != "sigma"}, {"vertices": truth}) == {}
+    assert (
+        abs(figures["sigma_factor"] - 3) < 0.2
+        and abs(figures["sigma_two"] - 0.954) < 0.02
+        and figures["sigma_rank"] > 0.7
+    )
+    assert (
+        metrics.confidence({**surface, "sigma": np.full((4, 500), np.nan)}, {"vertices": truth})
+        == {}
+    )
+    assert (
+        metrics.confidence({k: v for k, v in surface.items() if k != "sigma"}, {"vertices": truth})
+        == {}
+    )

@@ -1,4 +1,6 @@
-"""Each term of the objective: its value on a case worked out by hand, and its gradient against finite differences."""
+"""Each term of the objective: its value on a case worked out by hand, and its gradient against
+finite differences.
+"""
 
 import drjit as dr
 import mitsuba as mi
@@ -28,11 +30,18 @@ def check_gradient(f, x, h=1e-2, rel=0.01):
     dr.enable_grad(v)
     dr.backward(f(v))
     direction = RNG.normal(size=x.shape)
-    assert np.array(dr.grad(v)) @ direction == pytest.approx(numeric(f, x, direction, h), rel=rel, abs=1e-3)
+    assert np.array(dr.grad(v)) @ direction == pytest.approx(
+        numeric(f, x, direction, h), rel=rel, abs=1e-3
+    )
 
 
 @pytest.mark.parametrize(
-    "norm, expected", [("l2", (0.09 + 0.36) / 2), ("l1", (0.3 + 0.6) / 2), ("charbonnier", 0.02 * (10**0.5 - 1 + 37**0.5 - 1) / 2)]
+    "norm, expected",
+    [
+        ("l2", (0.09 + 0.36) / 2),
+        ("l1", (0.3 + 0.6) / 2),
+        ("charbonnier", 0.02 * (10**0.5 - 1 + 37**0.5 - 1) / 2),
+    ],
 )
 def test_photometric_value_and_gradient(norm, expected):
     target = [floats([0.1, 0.2, 0.9])] * 3
@@ -46,28 +55,39 @@ def test_photometric_value_and_gradient(norm, expected):
 
     def f(v):
         channels = [dr.gather(mi.Float, v, 3 * index + c) for c in range(3)]
-        return objective.photometric(channels, goal, floats([1, 0.5, 0, 1]), mi.Float(2.5), norm=norm, scale=0.1)
+        return objective.photometric(
+            channels, goal, floats([1, 0.5, 0, 1]), mi.Float(2.5), norm=norm, scale=0.1
+        )
 
     check_gradient(f, x, h=1e-3, rel=0.02)
 
 
 def test_silhouette_value_and_gradient():
     mask = floats([1, 1, 0, 0])
-    assert objective.silhouette(floats([1, 0.5, 0.5, 0]), mask, mi.Float(2))[0] == pytest.approx(0.25)
+    assert objective.silhouette(floats([1, 0.5, 0.5, 0]), mask, mi.Float(2))[0] == pytest.approx(
+        0.25
+    )
     check_gradient(lambda v: objective.silhouette(v, mask, mi.Float(2)), RNG.random(4))
 
 
 def test_inextensibility_value_and_gradient():
-    # a unit square's diagonal pulled from sqrt(2) to 2, one side from 1 to sqrt(2) and one to sqrt(2): points (0,0), (1,0), (1+a, 1+b)
+    # a unit square's diagonal pulled from sqrt(2) to 2, one side from 1 to sqrt(2) and one to
+    # sqrt(2): points (0,0), (1,0), (1+a, 1+b)
     edges = (mi.UInt32([0, 1, 0]), mi.UInt32([1, 2, 2]))
     rest = floats([1, 1, 2**0.5])
     points = mi.Point3f([0, 1, 2], [0, 0, 1], [0, 0, 0])
     expected = (2**0.5 - 1) ** 2 + (5**0.5 - 2**0.5) ** 2
-    assert objective.inextensibility(points, edges, rest, mi.Float(1))[0] == pytest.approx(expected, rel=1e-5)
-    assert objective.inextensibility(points, edges, rest, mi.Float(2))[0] == pytest.approx(expected / 4, rel=1e-5)
+    assert objective.inextensibility(points, edges, rest, mi.Float(1))[0] == pytest.approx(
+        expected, rel=1e-5
+    )
+    assert objective.inextensibility(points, edges, rest, mi.Float(2))[0] == pytest.approx(
+        expected / 4, rel=1e-5
+    )
 
     def f(v):
-        return objective.inextensibility(dr.gather(mi.Point3f, v, dr.arange(mi.UInt32, 3)), edges, rest, mi.Float(0.7))
+        return objective.inextensibility(
+            dr.gather(mi.Point3f, v, dr.arange(mi.UInt32, 3)), edges, rest, mi.Float(0.7)
+        )
 
     check_gradient(f, [0, 0, 0, 1.1, 0.2, 0, 1.3, 0.9, 0.4], h=1e-3)
 
@@ -77,18 +97,32 @@ def test_isometries_are_free():
     flat = mi.Point3f([0, 1, 2], [0, 0, 0], [1, 1, 1])
     bent = mi.Point3f([0, 1, 1], [0, 0, 0], [1, 1, 2])
     rest = objective.edge_lengths(flat, edges)
-    assert objective.inextensibility(bent, edges, rest, mi.Float(1))[0] == pytest.approx(0, abs=1e-12)
+    assert objective.inextensibility(bent, edges, rest, mi.Float(1))[0] == pytest.approx(
+        0, abs=1e-12
+    )
 
 
 def window_of(values):
     rows = values.reshape(3, 7)
-    return [Unknowns(floats(r[:3]), floats(r[3:5]), floats(r[5:7]), floats([0, 0]), floats([0, 0, 0, 1]), floats([0, 0, 0])) for r in rows]
+    return [
+        Unknowns(
+            floats(r[:3]),
+            floats(r[3:5]),
+            floats(r[5:7]),
+            floats([0, 0]),
+            floats([0, 0, 0, 1]),
+            floats([0, 0, 0]),
+        )
+        for r in rows
+    ]
 
 
 def test_temporal_value_and_gradient():
     x = RNG.normal(size=21)
     rows = x.reshape(3, 7)
-    assert objective.temporal(window_of(x))[0] == pytest.approx((np.diff(rows, axis=0) ** 2).sum() / 2, rel=1e-5)
+    assert objective.temporal(window_of(x))[0] == pytest.approx(
+        (np.diff(rows, axis=0) ** 2).sum() / 2, rel=1e-5
+    )
     assert objective.temporal(window_of(x)[:1])[0] == 0
     index = dr.arange(mi.UInt32, 7)
 
@@ -96,15 +130,25 @@ def test_temporal_value_and_gradient():
         rows = [dr.gather(mi.Float, v, 7 * k + index) for k in range(3)]
         zero = floats([0, 0, 0])  # relief, rotation and translation do not count
         part = lambda r, a, n: dr.gather(mi.Float, r, a + dr.arange(mi.UInt32, n))
-        return objective.temporal([Unknowns(part(r, 0, 3), part(r, 3, 2), part(r, 5, 2), zero, zero, zero) for r in rows])
+        return objective.temporal(
+            [Unknowns(part(r, 0, 3), part(r, 3, 2), part(r, 5, 2), zero, zero, zero) for r in rows]
+        )
 
     check_gradient(f, x)
 
 
 def test_gain_is_the_least_squares_one():
-    render, target, weight = RNG.random((3, 50)), RNG.random((3, 50)), (RNG.random(50) > 0.3).astype(float)
-    found = objective.gain([floats(c) for c in render], [floats(c) for c in target], floats(weight))[0]
-    assert found == pytest.approx((weight * render * target).sum() / (weight * render**2).sum(), rel=1e-4)
+    render, target, weight = (
+        RNG.random((3, 50)),
+        RNG.random((3, 50)),
+        (RNG.random(50) > 0.3).astype(float),
+    )
+    found = objective.gain(
+        [floats(c) for c in render], [floats(c) for c in target], floats(weight)
+    )[0]
+    assert found == pytest.approx(
+        (weight * render * target).sum() / (weight * render**2).sum(), rel=1e-4
+    )
 
 
 def test_blur_keeps_the_sum_and_its_width():
@@ -113,14 +157,22 @@ def test_blur_keeps_the_sum_and_its_width():
     out = np.array(objective.blur(mi.TensorXf(image), 1.5))
     assert out.sum((0, 1)) == pytest.approx([1, 2], rel=1e-4)
     x = np.arange(41) - 20
-    assert (out[..., 0].sum(0) * x**2).sum() == pytest.approx(1.5**2, rel=0.06)  # the Gaussian is cut off
+    assert (out[..., 0].sum(0) * x**2).sum() == pytest.approx(
+        1.5**2, rel=0.06
+    )  # the Gaussian is cut off
     assert objective.blur(mi.TensorXf(image), 0).array is not None
 
 
 def test_gradient_of_local_normalisation():
     weight = mi.TensorXf(RNG.random((24, 32, 1)).astype(np.float32))
     goal = floats(RNG.normal(size=24 * 32 * 3))
-    check_gradient(lambda v: dr.sum(goal * objective.normalise_locally(mi.TensorXf(v, (24, 32, 3)), weight).array), RNG.random(24 * 32 * 3), h=2e-3)
+    check_gradient(
+        lambda v: dr.sum(
+            goal * objective.normalise_locally(mi.TensorXf(v, (24, 32, 3)), weight).array
+        ),
+        RNG.random(24 * 32 * 3),
+        h=2e-3,
+    )
 
 
 def test_local_normalisation_takes_out_gain_and_offset():
@@ -128,12 +180,15 @@ def test_local_normalisation_takes_out_gain_and_offset():
     image = 0.5 + 0.2 * np.stack([np.sin(3 * x + y), np.cos(4 * y), np.sin(2 * x * y)], -1)
     weight = mi.TensorXf(np.ones((48, 64, 1), np.float32))
     lit = image * (0.6 + 0.004 * x[..., None]) + 0.1
-    a, b = (np.array(objective.normalise_locally(mi.TensorXf(i.astype(np.float32)), weight)) for i in (image, lit))
+    a, b = (
+        np.array(objective.normalise_locally(mi.TensorXf(i.astype(np.float32)), weight))
+        for i in (image, lit)
+    )
     assert np.abs(a).mean() > 0.5
     assert np.abs(a - b)[8:-8, 8:-8].mean() < 0.03 * np.abs(a).mean()
 
 
-# ---- the objective of a frame --------------------------------------------------------------------------------------------
+# ---- the objective of a frame --------------------------------------------------------------------
 
 
 def problem(folder, masks=True, **overrides):
@@ -142,7 +197,12 @@ def problem(folder, masks=True, **overrides):
     path = folder / "scene.xml"
     path.write_text(prepare.scene_xml(layout, str(truth.folder)))
     experiment = scene.load(path, {"solver": "adam", **overrides})
-    return Problem(experiment, Sequence.open(experiment.frames, experiment.masks, size=experiment.size)), truth
+    return (
+        Problem(
+            experiment, Sequence.open(experiment.frames, experiment.masks, size=experiment.size)
+        ),
+        truth,
+    )
 
 
 @pytest.mark.parametrize(
@@ -176,14 +236,25 @@ def test_gradient_of_the_whole_objective(tmp_path, masks, overrides):
         ad = float(np.array(dr.grad(getattr(unknowns, name))) @ direction)
         slopes = []
         for h in (1e-3, 2e-3, 4e-3):
-            ends = [p.evaluate([Unknowns.from_numpy({**rest, name: rest[name] + s * h * direction})], [2])[0] for s in (1, -1)]
+            ends = [
+                p.evaluate(
+                    [Unknowns.from_numpy({**rest, name: rest[name] + s * h * direction})], [2]
+                )[0]
+                for s in (1, -1)
+            ]
             slopes.append((ends[0] - ends[1]) / (2 * h))
-        # 96x72 pixels leave kinks at every pixel that changes sheets, and without masks the interior jumps by whole pixels
-        assert ad == pytest.approx(np.median(slopes), rel=0.15, abs=0.03 * max(1, total)), (name, slopes)
+        # 96x72 pixels leave kinks at every pixel that changes sheets, and without masks the
+        # interior jumps by whole pixels
+        assert ad == pytest.approx(np.median(slopes), rel=0.15, abs=0.03 * max(1, total)), (
+            name,
+            slopes,
+        )
 
 
 def test_truth_is_nearly_a_minimum(tmp_path):
-    """The bent sheet's own surface explains the image better than the flat template and than its mirror twin."""
+    """The bent sheet's own surface explains the image better than the flat template and than its
+    mirror twin.
+    """
     from polysft_mi.template import Template
 
     p, truth = problem(tmp_path)
@@ -211,7 +282,9 @@ def test_without_masks_the_background_does_not_matter(tmp_path):
 
 
 def test_padding_does_not_change_the_loss(tmp_path):
-    """The same sheet in a larger film: neither background nor resolution of the empty part weighs in."""
+    """The same sheet in a larger film: neither background nor resolution of the empty part weighs
+    in.
+    """
     totals = []
     for name, size in (("small", (96, 72)), ("large", (160, 120))):
         truth = synthetic.cloth(tmp_path / name, size=(96, 72))
@@ -221,25 +294,40 @@ def test_padding_does_not_change_the_loss(tmp_path):
             for kind in ("frames", "masks"):
                 for f in sorted((truth.folder / kind).iterdir()):
                     image = cv2.imread(str(f), cv2.IMREAD_UNCHANGED)
-                    big = np.full((120, 160, *image.shape[2:]), 0 if kind == "masks" else 40, np.uint8)
+                    big = np.full(
+                        (120, 160, *image.shape[2:]), 0 if kind == "masks" else 40, np.uint8
+                    )
                     big[24:96, 32:128] = image
                     cv2.imwrite(str(f), big)
             K = truth.K
             import json
 
             (truth.folder / "camera.json").write_text(
-                json.dumps({"width": 160, "height": 120, "fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2] + 32, "cy": K[1, 2] + 24})
+                json.dumps(
+                    {
+                        "width": 160,
+                        "height": 120,
+                        "fx": K[0, 0],
+                        "fy": K[1, 1],
+                        "cx": K[0, 2] + 32,
+                        "cy": K[1, 2] + 24,
+                    }
+                )
             )
         path = tmp_path / f"{name}.xml"
         path.write_text(prepare.scene_xml(prepare.recognise(str(truth.folder)), str(truth.folder)))
         experiment = scene.load(path, {"solver": "adam"})
-        p = Problem(experiment, Sequence.open(experiment.frames, experiment.masks, size=experiment.size))
+        p = Problem(
+            experiment, Sequence.open(experiment.frames, experiment.masks, size=experiment.size)
+        )
         totals.append(p.evaluate([p.patch.rest()], [4])[0])
     assert totals[1] == pytest.approx(totals[0], rel=1e-3)
 
 
 def test_path_replay_gives_the_gradient_of_raster(tmp_path):
-    """On an unshadowed sheet under light from everywhere both integrators render the texture, so their gradients are the same but for noise."""
+    """On an unshadowed sheet under light from everywhere both integrators render the texture, so
+    their gradients are the same but for noise.
+    """
     gradients = {}
     for integrator, spp in (("raster", 1), ("prb_projective", 64)):
         folder = tmp_path / integrator

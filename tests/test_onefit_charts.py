@@ -36,7 +36,12 @@ def deformation(patched, size=1.0, frames=T, seed=0):
     g = torch.Generator().manual_seed(seed)
     K, A = patched.alpha.shape
     random = lambda *shape: size * torch.randn(*shape, generator=g)
-    return Deformation(0.05 * random(frames, K, A), 0.1 * random(frames, K, 3), 0.1 * random(frames, K), 0.2 * random(frames, K, 3))
+    return Deformation(
+        0.05 * random(frames, K, A),
+        0.1 * random(frames, K, 3),
+        0.1 * random(frames, K),
+        0.2 * random(frames, K, 3),
+    )
 
 
 def points_of(patched, d, t, uv, patch):
@@ -54,7 +59,9 @@ def room(patched):
 
 
 def drifted(patched, drift, uv, patch):
-    """The plane, at points (P, 2) of the charts, that fits the drifts of the patches around by weighted least squares."""
+    """The plane, at points (P, 2) of the charts, that fits the drifts of the patches around by
+    weighted least squares.
+    """
     T, s, R = patched.frame.T.float(), patched.frame.s.float(), patched.frame.R.float()
     drift = drift * room(patched)
     meet = torch.eye(len(T), dtype=torch.bool)
@@ -68,7 +75,12 @@ def drifted(patched, drift, uv, patch):
         w = (-(away.square().sum(1)) / (AROUND * length) ** 2 / 2).exp()  # the root of the weights
         b = torch.cat([torch.ones(len(around), 1), (away @ R[k])[:, :2] / s[k]], 1)
         held = torch.diag(torch.tensor([0.0, LEVEL, LEVEL]).sqrt()) * w.norm()
-        planes.append(torch.linalg.lstsq(torch.cat([w[:, None] * b, held]), torch.cat([w[:, None] * drift[around], torch.zeros(3, 3)])).solution)
+        planes.append(
+            torch.linalg.lstsq(
+                torch.cat([w[:, None] * b, held]),
+                torch.cat([w[:, None] * drift[around], torch.zeros(3, 3)]),
+            ).solution
+        )
     return (torch.cat([torch.ones(len(uv), 1), uv], 1)[:, None] @ torch.stack(planes)[patch])[:, 0]
 
 
@@ -79,7 +91,9 @@ def test_a_sparse_matrix_multiplies_and_differentiates_as_a_dense_one():
     sparse, full = SparseMatrix(dense.numpy()) @ x, torch.einsum("nm,mab->nab", dense, x)
     assert torch.allclose(sparse, full, atol=1e-6)
     weights = torch.randn(7, 2, 3, generator=g)
-    a, b = (torch.autograd.grad((y * weights).sum(), x, retain_graph=True)[0] for y in (sparse, full))
+    a, b = (
+        torch.autograd.grad((y * weights).sum(), x, retain_graph=True)[0] for y in (sparse, full)
+    )
     assert torch.allclose(a, b, atol=1e-6)
     assert torch.allclose(SparseMatrix(dense.numpy()) @ x[:, 0, 0], full[:, 0, 0], atol=1e-6)
 
@@ -100,32 +114,48 @@ def test_changes_are_those_of_the_deformed_jets(patched):
         assert torch.allclose(at[:, :, 0, t].flatten(0, 1), moved, atol=1e-6)
         step = 1e-2  # of a polynomial of degree 4 in float32: central differences of the right size
         for k, axis in enumerate(torch.eye(2)):
-            ahead, behind = (points_of(patched, d, t, uv + sign * step * axis, patch) for sign in (1, -1))
-            ahead0, behind0 = (points_of(patched, deformation(patched, 0.0), 0, uv + sign * step * axis, patch) for sign in (1, -1))
+            ahead, behind = (
+                points_of(patched, d, t, uv + sign * step * axis, patch) for sign in (1, -1)
+            )
+            ahead0, behind0 = (
+                points_of(patched, deformation(patched, 0.0), 0, uv + sign * step * axis, patch)
+                for sign in (1, -1)
+            )
             slope = ((ahead - behind) - (ahead0 - behind0)) / (2 * step)
             assert torch.allclose(at[:, :, 1 + k, t].flatten(0, 1), slope, atol=2e-4)
 
 
 def test_blending_keeps_a_common_motion(patched):
-    # every patch moved by the same vector of the rest space: so is every vertex, whatever charts it is blended from
+    # every patch moved by the same vector of the rest space: so is every vertex, whatever charts it
+    # is blended from
     move = torch.tensor([0.03, -0.02, 0.05])
     local = (patched.frame.R.float().mT @ move) / patched.frame.s.float()[:, None]
     zero = deformation(patched, 0.0, 1)
-    for common in (replace(zero, translation=local[None]), replace(zero, drift=(move / room(patched))[None])):
+    for common in (
+        replace(zero, translation=local[None]),
+        replace(zero, drift=(move / room(patched))[None]),
+    ):
         moved = patched.displacement(patched.changes(common))
         assert torch.allclose(moved[:, 0], move.expand(len(moved), 3), atol=1e-6)
 
 
 def test_a_drift_turns_and_stretches_the_cloth_with_it(patched, garment):
-    # drifts that grow with the place: every chart moves by its part of the same field, so that no seam opens
+    # drifts that grow with the place: every chart moves by its part of the same field, so that no
+    # seam opens
     slope = torch.tensor([[0.1, 0, 0.2], [0.05, -0.1, 0.3], [0, 0.1, 0.1]])
     zero, field = deformation(patched, 0.0, 1), patched.frame.T.float() @ slope.T / room(patched)
     moved = patched.displacement(patched.changes(replace(zero, drift=field[None])))[:, 0]
     wanted = garment.vertices @ slope.T
-    inner = (garment.vertices[:, None] - patched.frame.T.float()).norm(dim=-1).topk(4, largest=False).values[:, 3] < 0.1  # not at the rims
-    assert (moved - wanted)[inner].norm(dim=1).median() < 0.04 * (wanted - wanted.mean(0)).norm(dim=1).median()
+    inner = (garment.vertices[:, None] - patched.frame.T.float()).norm(dim=-1).topk(
+        4, largest=False
+    ).values[:, 3] < 0.1  # not at the rims
+    assert (moved - wanted)[inner].norm(dim=1).median() < 0.04 * (wanted - wanted.mean(0)).norm(
+        dim=1
+    ).median()
     at = patched.at_boundary(patched.changes(replace(zero, drift=field[None])))[:, :, 0, 0]
-    alone = patched.at_boundary(patched.changes(replace(zero, translation=_in_charts(patched, slope)[None])))[:, :, 0, 0]
+    alone = patched.at_boundary(
+        patched.changes(replace(zero, translation=_in_charts(patched, slope)[None]))
+    )[:, :, 0, 0]
     apart = lambda x: (x[0] - x[1]).norm(dim=1).median()
     assert apart(at) < 0.2 * apart(alone)
 
@@ -142,7 +172,9 @@ def test_looseness_tells_how_far_patches_are_from_the_body(patched, garment):
     for k in (0, len(patched) // 2, len(patched) - 1):
         own = distance[patched.vertex_patch == k]
         least, mean, greatest = found[k].tolist()
-        assert least <= own.min() + 1e-6 and greatest >= own.max() - 1e-6  # the patches' own, finer vertices
+        assert (
+            least <= own.min() + 1e-6 and greatest >= own.max() - 1e-6
+        )  # the patches' own, finer vertices
         assert mean == pytest.approx(own.mean(), abs=1.5e-3)
 
 
@@ -155,13 +187,23 @@ def test_garments_are_held_at_the_waist_or_hang_from_the_shoulders(body):
         if name not in ("trousers", "shorts", "skirt"):
             assert not found.any()
             continue
-        rim = V[next(loop for loop in loops(F) if V[loop, 2].min() > V[:, 2].max() - 0.001)]  # the waists are level
-        line = np.concatenate([(1 - t) * rim + t * np.roll(rim, -1, axis=0) for t in np.linspace(0, 1, 50)])
-        away = np.concatenate([np.linalg.norm(V[i : i + 500, None] - line, axis=2).min(1) for i in range(0, len(V), 500)])
+        rim = V[
+            next(loop for loop in loops(F) if V[loop, 2].min() > V[:, 2].max() - 0.001)
+        ]  # the waists are level
+        line = np.concatenate(
+            [(1 - t) * rim + t * np.roll(rim, -1, axis=0) for t in np.linspace(0, 1, 50)]
+        )
+        away = np.concatenate(
+            [
+                np.linalg.norm(V[i : i + 500, None] - line, axis=2).min(1)
+                for i in range(0, len(V), 500)
+            ]
+        )
         x = np.clip((BAND[1] - away) / (BAND[1] - BAND[0]), 0, 1)
         assert np.allclose(found, 3 * x**2 - 2 * x**3, atol=0.01)
         assert (found == 1).sum() > 50
-    # the dress without what is above its waist is a skirt; a dress that ends below the shoulders is held, too
+    # the dress without what is above its waist is a skirt; a dress that ends below the shoulders is
+    # held, too
     dress = Garment.template("dress")
     V, F = dress.vertices.double().numpy(), dress.faces.numpy()
     skirt = F[(V[F, 2] < 0.1).all(1)]
@@ -170,7 +212,10 @@ def test_garments_are_held_at_the_waist_or_hang_from_the_shoulders(body):
     found = held(V[used], skirt, joints)
     assert found[V[used, 2] > 0.085].min() > 0.99 and not found[V[used, 2] < 0.02].any()
     assert held(V, F, joints + [0, 0, 0.2]).any()
-    box = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, -1.0]]), np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]])
+    box = (
+        np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, -1.0]]),
+        np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]]),
+    )
     assert not held(*box, joints).any()  # no boundary at all
 
 
@@ -181,7 +226,9 @@ def test_a_band_gives_way_but_does_not_slide(body):
     d.drift.requires_grad_()
     moved = shorts.displacement(shorts.changes(d))  # (N, T, 3)
     free = shorts.blend @ shorts.changes(d).flatten(0, 1)
-    firmly = torch.as_tensor(held(V.double().numpy(), shorts.garment.faces.numpy(), body.joints.double().numpy())).float()
+    firmly = torch.as_tensor(
+        held(V.double().numpy(), shorts.garment.faces.numpy(), body.joints.double().numpy())
+    ).float()
     normal = torch.as_tensor(standard_surface()(V.numpy()).normal)
     outwards = lambda x: torch.einsum("ntd,nd->nt", x, normal)
     slid = lambda x: (x - outwards(x)[..., None] * normal[:, None]).norm(dim=-1)
@@ -189,23 +236,30 @@ def test_a_band_gives_way_but_does_not_slide(body):
     assert torch.allclose(slid(moved), (1 - firmly[:, None]) * slid(free), atol=1e-6)
     assert (firmly == 1).sum() > 50 and slid(free)[firmly == 1].median() > 0.005
     # what is held has no gradient along the body
-    (gradient,) = torch.autograd.grad((moved - outwards(moved)[..., None] * normal[:, None])[firmly == 1].sum(), d.drift)
+    (gradient,) = torch.autograd.grad(
+        (moved - outwards(moved)[..., None] * normal[:, None])[firmly == 1].sum(), d.drift
+    )
     assert gradient.abs().max() < 1e-5
     # the network is told which patches are held
     own = torch.as_tensor(shorts.vertex_patch)
     share = torch.zeros(len(shorts)).index_add(0, own, firmly) / torch.bincount(own)
-    assert torch.allclose(shorts.features[4][:, 0], share, atol=0.1) and shorts.features[4].max() > 0.5
+    assert (
+        torch.allclose(shorts.features[4][:, 0], share, atol=0.1) and shorts.features[4].max() > 0.5
+    )
     assert shorts.features[4][share == 0].median() == 0
 
 
 def test_seams_are_not_torn(patched, garment):
-    # the charts disagree at random; an edge across a seam jumps far less than if each vertex had its own patch's displacement alone
+    # the charts disagree at random; an edge across a seam jumps far less than if each vertex had
+    # its own patch's displacement alone
     d = deformation(patched, 0.2)
     moved = patched.displacement(patched.changes(d))[:, 0]
     own = torch.as_tensor(patched.vertex_patch)
     frame = patched.frame.to(torch.float32)[own]
     uv = ((garment.vertices - frame.T)[:, None] @ frame.R)[:, 0, :2] / frame.s[:, None]
-    alone = points_of(patched, d, 0, uv, own) - points_of(patched, deformation(patched, 0.0), 0, uv, own)
+    alone = points_of(patched, d, 0, uv, own) - points_of(
+        patched, deformation(patched, 0.0), 0, uv, own
+    )
     a, b = patched.edges[(own[patched.edges[:, 0]] != own[patched.edges[:, 1]])].T
     assert len(a) > 200
     jump = lambda x: (x[a] - x[b]).norm(dim=-1).median()
@@ -213,16 +267,29 @@ def test_seams_are_not_torn(patched, garment):
 
 
 def test_a_strip_follows_its_neighbours(body):
-    # a hem turned in: where the strip's own chart alone is moved, the strip follows little of it; a patch on the outside follows it
+    # a hem turned in: where the strip's own chart alone is moved, the strip follows little of it; a
+    # patch on the outside follows it
     garment = Garment.template("shorts")
     V, F = garment.vertices.double().numpy(), garment.faces.numpy()
     rim = max(loops(F), key=lambda loop: V[loop, 2].mean())  # the waist
-    inner = V[rim] - [0, 0, 0.012] + 0.004 * (V[rim].mean(0) - V[rim]) / np.linalg.norm(V[rim].mean(0) - V[rim], axis=1, keepdims=True)
+    inner = (
+        V[rim]
+        - [0, 0, 0.012]
+        + 0.004
+        * (V[rim].mean(0) - V[rim])
+        / np.linalg.norm(V[rim].mean(0) - V[rim], axis=1, keepdims=True)
+    )
     new, after = len(V) + np.arange(len(rim)), np.roll(np.arange(len(rim)), -1)
-    turned_in = np.concatenate([np.stack([rim[after], rim, new], 1), np.stack([rim[after], new, new[after]], 1)])
-    hemmed = PatchedGarment(Garment.bound("hemmed", np.concatenate([V, inner]), np.concatenate([F, turned_in])), body)
+    turned_in = np.concatenate(
+        [np.stack([rim[after], rim, new], 1), np.stack([rim[after], new, new[after]], 1)]
+    )
+    hemmed = PatchedGarment(
+        Garment.bound("hemmed", np.concatenate([V, inner]), np.concatenate([F, turned_in])), body
+    )
     own = torch.as_tensor(hemmed.vertex_patch)
-    area = torch.zeros(len(hemmed)).index_add(0, own, hemmed.vertex_area) / (np.pi * hemmed.frame.s.float() ** 2)
+    area = torch.zeros(len(hemmed)).index_add(0, own, hemmed.vertex_area) / (
+        np.pi * hemmed.frame.s.float() ** 2
+    )
     zero = deformation(hemmed, 0.0, 1)
 
     def followed(k):
@@ -264,13 +331,18 @@ def test_frames_lie_along_the_bones_and_outwards(patched, garment, body):
 
 
 def test_jets_of_strips_stay_within_reason():
-    # a strip 20 times as long as wide with 0.5 mm of noise: least squares alone would have coefficients of hundreds
+    # a strip 20 times as long as wide with 0.5 mm of noise: least squares alone would have
+    # coefficients of hundreds
     g = torch.Generator().manual_seed(0)
     uv = (torch.rand(200, 2, generator=g, dtype=torch.float64) * 2 - 1) * torch.tensor([0.05, 1.0])
     z = 0.1 * uv[:, 1] ** 2 + 0.01 * torch.randn(200, generator=g, dtype=torch.float64)
     disc = torch.rand(200, 2, generator=g, dtype=torch.float64) * 1.6 - 0.8
-    shape = torch.tensor([0.02, 0, 0.1, -0.2, 0.1, 0.3, 0, 0.1, 0, -0.1, 0.1, 0, 0.2, 0, 0], dtype=torch.float64)
-    x = torch.cat([torch.cat([uv, z[:, None]], 1), torch.cat([disc, jets.height(shape, disc)[:, None]], 1)])
+    shape = torch.tensor(
+        [0.02, 0, 0.1, -0.2, 0.1, 0.3, 0, 0.1, 0, -0.1, 0.1, 0, 0.2, 0, 0], dtype=torch.float64
+    )
+    x = torch.cat(
+        [torch.cat([uv, z[:, None]], 1), torch.cat([disc, jets.height(shape, disc)[:, None]], 1)]
+    )
     patch = torch.arange(2).repeat_interleave(200)
     alone = jets.fit(x[:200], 4).alpha
     strip, whole = _steady_jets(x, patch, torch.ones(400, dtype=torch.float64), 2, 4)
@@ -285,7 +357,9 @@ def test_signed_distances(body):
     g = torch.Generator().manual_seed(1)
     face = torch.randint(len(body.faces), (200,), generator=g)
     corners = body.vertices[body.faces[face]]
-    normal = torch.nn.functional.normalize(torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), dim=-1)
+    normal = torch.nn.functional.normalize(
+        torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), dim=-1
+    )
     for away in (0.002, -0.002):
         found = collider.distances((corners.mean(1) + away * normal)[None], body.vertices[None])[0]
         assert (found - away).abs().median() < 1e-5
@@ -293,9 +367,13 @@ def test_signed_distances(body):
     # moved bodies move their distances; the far is far
     shift = torch.tensor([0.5, 0, 0])
     x = corners.mean(1) + 0.01 * normal
-    both = collider.distances(torch.stack([x, x + shift]), torch.stack([body.vertices, body.vertices + shift]))
+    both = collider.distances(
+        torch.stack([x, x + shift]), torch.stack([body.vertices, body.vertices + shift])
+    )
     assert torch.allclose(both[0], both[1], atol=1e-5)
-    assert collider.distances(torch.full((1, 1, 3), 9.0), body.vertices[None]).item() == pytest.approx(FAR)
+    assert collider.distances(
+        torch.full((1, 1, 3), 9.0), body.vertices[None]
+    ).item() == pytest.approx(FAR)
 
 
 def test_gradient_of_the_signed_distance(body):
@@ -305,7 +383,10 @@ def test_gradient_of_the_signed_distance(body):
     (gradient,) = torch.autograd.grad(distance.sum(), x)
     step = 1e-3
     for k, axis in enumerate(torch.eye(3)):
-        ends = [collider.distances((x + sign * step * axis).detach(), body.vertices[None]) for sign in (1, -1)]
+        ends = [
+            collider.distances((x + sign * step * axis).detach(), body.vertices[None])
+            for sign in (1, -1)
+        ]
         slope = (ends[0] - ends[1]) / (2 * step)
         assert (gradient[..., k] - slope).abs().median() < 1e-2
     assert torch.allclose(gradient.norm(dim=-1), torch.ones(1), atol=1e-4)
@@ -317,36 +398,66 @@ def scene(body, patched, frames=T, seed=2, bend=0.15):
     transforms = skinning.transforms(body, poses, 0.02 * torch.randn(frames, 3, generator=g))
     posed = skinning.skin(body.vertices, body.blend_weights, transforms)
     rest = patched.garment.vertices[:, None].expand(-1, frames, -1)
-    return objective.Scene(transforms, posed, ClosestSurface(body.vertices, body.faces), rest, patched.field @ rest)
+    return objective.Scene(
+        transforms, posed, ClosestSurface(body.vertices, body.faces), rest, patched.field @ rest
+    )
 
 
 def test_without_deformation_the_objective_is_plain_skinning(patched, garment, body):
     s = scene(body, patched)
-    _, x = objective.evaluate(patched, deformation(patched, 0.0), s, losses.Weights(), generator=torch.Generator().manual_seed(0))
+    _, x = objective.evaluate(
+        patched,
+        deformation(patched, 0.0),
+        s,
+        losses.Weights(),
+        generator=torch.Generator().manual_seed(0),
+    )
     expected = skinning.skin(garment.vertices, garment.blend_weights, s.transforms)
     assert torch.allclose(x.transpose(0, 1), expected, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["collision", "inextensibility", "mesh_inextensibility", "boundary", "gravity", "inertia"])
+@pytest.mark.parametrize(
+    "name",
+    ["collision", "inextensibility", "mesh_inextensibility", "boundary", "gravity", "inertia"],
+)
 def test_gradient_of_the_whole_objective(patched, body, name):
-    # little for the collision: its distance jumps where a point in the body has another part of it for its nearest
-    s, d = scene(body, patched, bend=0.02 if name == "collision" else 0.15), deformation(patched, 0.2 if name == "collision" else 0.3)
-    past = [objective.vertices(patched, patched.changes(deformation(patched, 0.3, seed=k)), s.rest, s.transforms) for k in (1, 2)]
-    switches = dict(collision="k_c", inextensibility="k_i", mesh_inextensibility="k_mi", boundary="k_b", gravity="k_g", inertia="k_in")
+    # little for the collision: its distance jumps where a point in the body has another part of it
+    # for its nearest
+    s, d = (
+        scene(body, patched, bend=0.02 if name == "collision" else 0.15),
+        deformation(patched, 0.2 if name == "collision" else 0.3),
+    )
+    past = [
+        objective.vertices(
+            patched, patched.changes(deformation(patched, 0.3, seed=k)), s.rest, s.transforms
+        )
+        for k in (1, 2)
+    ]
+    switches = dict(
+        collision="k_c",
+        inextensibility="k_i",
+        mesh_inextensibility="k_mi",
+        boundary="k_b",
+        gravity="k_g",
+        inertia="k_in",
+    )
     off = {k: 0.0 for k in ("k_c", "k_i", "k_b", "k_bn", "k_mi", "k_g", "k_in")}
     on = {switches[name]: 1.0} | ({"k_bn": 1.0} if name == "boundary" else {})
     weights = losses.Weights(**off | on)
 
     def value(*parts):
         generator = torch.Generator().manual_seed(5)
-        terms, _ = objective.evaluate(patched, Deformation(*parts), s, weights, past=past, generator=generator)
+        terms, _ = objective.evaluate(
+            patched, Deformation(*parts), s, weights, past=past, generator=generator
+        )
         assert list(terms) == [name]
         return terms[name]
 
     inputs = [x.clone().requires_grad_() for x in (d.alpha, d.translation, d.scale, d.drift)]
     gradients = torch.autograd.grad(value(*inputs), inputs)
     g = torch.Generator().manual_seed(7)
-    # directions in which the value changes: random ones, leaning towards the gradient, for float32 shows nothing else
+    # directions in which the value changes: random ones, leaning towards the gradient, for float32
+    # shows nothing else
     for x, gradient in zip(range(4), gradients):
         direction = gradient / gradient.norm() + 0.3 * torch.nn.functional.normalize(
             torch.randn(gradient.shape, generator=g).flatten(), dim=0
@@ -358,13 +469,20 @@ def test_gradient_of_the_whole_objective(patched, body, name):
             moved[x] = moved[x] + sign * step * direction
             ends.append(float(value(*moved)))
         slope = (ends[0] - ends[1]) / (2 * step)
-        assert float((gradient * direction).sum()) == pytest.approx(slope, rel=0.03), ("alpha", "translation", "scale", "drift")[x]
+        assert float((gradient * direction).sum()) == pytest.approx(slope, rel=0.03), (
+            "alpha",
+            "translation",
+            "scale",
+            "drift",
+        )[x]
 
 
 def test_metric_points_lie_on_their_vertices(patched, garment):
     value = (patched.field @ garment.vertices).unflatten(0, (-1, 3))[:, 0]
     apart = (value - garment.vertices[patched.metric_vertex]).norm(dim=-1)
-    edge = (garment.vertices[patched.edges[:, 0]] - garment.vertices[patched.edges[:, 1]]).norm(dim=-1)
+    edge = (garment.vertices[patched.edges[:, 0]] - garment.vertices[patched.edges[:, 1]]).norm(
+        dim=-1
+    )
     assert apart.max() < 2 * np.float64(edge.max())
 
 
@@ -373,7 +491,17 @@ def test_transforms_of_a_body_for_each_frame():
     bodies = [model.body(), model.body(torch.tensor([0.9, 0.7, 0.5, 0.6, 0.7, 0.4]))]
     g = torch.Generator().manual_seed(4)
     poses, translation = 0.3 * torch.randn(2, 24, 3, generator=g), torch.randn(2, 3, generator=g)
-    both = replace(bodies[0], **{name: torch.stack([getattr(b, name) for b in bodies]) for name in ("joints", "rest_pose")})
+    both = replace(
+        bodies[0],
+        **{
+            name: torch.stack([getattr(b, name) for b in bodies])
+            for name in ("joints", "rest_pose")
+        },
+    )
     together = skinning.transforms(both, poses, translation)
     for k, body in enumerate(bodies):
-        assert torch.allclose(together[k], skinning.transforms(body, poses[k : k + 1], translation[k : k + 1])[0], atol=1e-6)
+        assert torch.allclose(
+            together[k],
+            skinning.transforms(body, poses[k : k + 1], translation[k : k + 1])[0],
+            atol=1e-6,
+        )

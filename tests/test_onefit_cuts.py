@@ -21,7 +21,9 @@ NAMES = list(cuts.CUTS)
 @pytest.fixture(scope="module")
 def block():
     body = standard_body()
-    return tailor.Block(body.vertices.numpy(), body.faces.numpy(), spacing=0.016)  # twice as coarse, several times as fast
+    return tailor.Block(
+        body.vertices.numpy(), body.faces.numpy(), spacing=0.016
+    )  # twice as coarse, several times as fast
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +41,9 @@ def test_a_cut_is_the_pattern_where_its_measures_are(block):
     assert inside(*p) > 0 > shorter[1](*p)
     snug = tailor.shorts(block, snug=1)[0]
     near = (np.abs(field) < 0.02) & (block.z > -0.27) & (block.z < 0.1)
-    assert (snug - field)[near].min() > 0 and (snug - field)[near].max() > 0.01  # hollows are no longer spanned
+    assert (snug - field)[near].min() > 0 and (snug - field)[
+        near
+    ].max() > 0.01  # hollows are no longer spanned
     long = tailor.dress(block, hem=-0.5, top=0.1)[1]
     assert long(p[0], p[1], np.array([0.2])) < 0 < long(p[0], p[1], np.array([-0.45]))
 
@@ -58,14 +62,18 @@ def test_cuts_are_clean_and_off_the_body(sewn):
 def test_cuts_differ_and_are_the_same_each_time(block, sewn):
     for n in sorted(sewn)[:2]:
         (_, V, F), (_, W, G) = sewn[n], sewn[n + len(NAMES)]
-        assert abs(V[:, 2].min() - W[:, 2].min()) > 0.01 or abs(V[:, 2].max() - W[:, 2].max()) > 0.01
+        assert (
+            abs(V[:, 2].min() - W[:, 2].min()) > 0.01 or abs(V[:, 2].max() - W[:, 2].max()) > 0.01
+        )
         assert abs(mesh.areas(V, F).sum() / mesh.areas(W, G).sum() - 1) > 0.005
     n = min(sewn)
     again = cuts.cut(block, n)
     assert np.array_equal(again[1], sewn[n][1]) and np.array_equal(again[2], sewn[n][2])
     rngs = [np.random.default_rng(seed) for seed in (0, 0, 1)]
     a, b, c = (cuts.drawn("dress", rng) for rng in rngs)
-    assert a.keys() == b.keys() and all(np.array_equal(a[k], b[k]) for k in a) and a["hem"] != c["hem"]
+    assert (
+        a.keys() == b.keys() and all(np.array_equal(a[k], b[k]) for k in a) and a["hem"] != c["hem"]
+    )
 
 
 def test_measures_are_within_their_ranges():
@@ -75,13 +83,22 @@ def test_measures_are_within_their_ranges():
         for key, ends in ranges.items():
             low, high = sorted(ends)
             values = [m[key][0] if isinstance(m[key], tuple) else m[key] for m in many]
-            assert low <= min(values) < low + 0.1 * (high - low) and high - 0.1 * (high - low) < max(values) <= high
+            assert (
+                low <= min(values) < low + 0.1 * (high - low)
+                and high - 0.1 * (high - low) < max(values) <= high
+            )
         ease = np.array([m["ease"] for m in many])
-        assert cuts.EASE[0] <= ease.min() and ease.max() <= cuts.EASE[1] and 0.3 < (ease < 0.0045).mean() < 0.7
+        assert (
+            cuts.EASE[0] <= ease.min()
+            and ease.max() <= cuts.EASE[1]
+            and 0.3 < (ease < 0.0045).mean() < 0.7
+        )
 
 
 def test_wrinkles_are_as_high_as_they_say(block):
-    heights = [np.abs(cuts.wrinkles(block, np.random.default_rng(seed))).max() for seed in range(20)]
+    heights = [
+        np.abs(cuts.wrinkles(block, np.random.default_rng(seed))).max() for seed in range(20)
+    ]
     assert max(heights) <= 2 * cuts.WRINKLES and 4 < sum(h > 0 for h in heights) < 16
 
 
@@ -98,8 +115,12 @@ def test_what_was_sewn_is_read_again_and_trained_on(block, sewn, tmp_path, monke
 
     monkeypatch.setattr(cuts, "cut", refuse)
     again = cuts.cuts(1, folder)
-    assert torch.equal(first[0].vertices, again[0].vertices) and torch.equal(first[0].faces, again[0].faces)
-    settings = train.Settings(garments=("tank",), batch=300, epochs=1, epoch_steps=2, shapes=1, seeds=1, cuts=1)
+    assert torch.equal(first[0].vertices, again[0].vertices) and torch.equal(
+        first[0].faces, again[0].faces
+    )
+    settings = train.Settings(
+        garments=("tank",), batch=300, epochs=1, epoch_steps=2, shapes=1, seeds=1, cuts=1
+    )
     assert train.train(settings, tmp_path / "out").exists()
 
 

@@ -37,8 +37,15 @@ def out(network, tmp_path_factory):
 def test_arrays_and_figures(out):
     with np.load(out / "drape.npz") as file:
         T, N, _ = file["vertices"].shape
-        assert T == 3 and file["rest"].shape == (N, 3) and file["body"].shape[0] == T and float(file["fps"]) == 30
-        assert file["faces"].max() == N - 1 and file["body_faces"].max() == file["body"].shape[1] - 1
+        assert (
+            T == 3
+            and file["rest"].shape == (N, 3)
+            and file["body"].shape[0] == T
+            and float(file["fps"]) == 30
+        )
+        assert (
+            file["faces"].max() == N - 1 and file["body_faces"].max() == file["body"].shape[1] - 1
+        )
     about = json.loads((out / "figures.json").read_text())
     assert about["garment"] == "shorts" and about["frames"] == T and about["vertices"] == N
     assert about["shape"] == pytest.approx([0.5, 0.5, 0.5, 0.4, 0.6, 0.5])
@@ -52,7 +59,9 @@ def test_animations_hold_the_arrays(out):
         for name, vertices in (("garment", file["vertices"]), ("body", file["body"])):
             stage = Usd.Stage.Open(str(out / f"{name}.usd"))
             assert (
-                UsdGeom.GetStageUpAxis(stage) == "Z" and UsdGeom.GetStageMetersPerUnit(stage) == 1 and stage.GetTimeCodesPerSecond() == 30
+                UsdGeom.GetStageUpAxis(stage) == "Z"
+                and UsdGeom.GetStageMetersPerUnit(stage) == 1
+                and stage.GetTimeCodesPerSecond() == 30
             )
             points = UsdGeom.Mesh(stage.GetPrimAtPath(f"/{name}/mesh")).GetPointsAttr()
             for t in range(len(vertices)):
@@ -75,13 +84,18 @@ def test_what_is_there_is_not_lost(out, network):
     with pytest.raises(InputError, match="not empty; give another -o, or --overwrite"):
         drape.main(["shorts", "walk", "-o", str(out), "--weights", network])
     with pytest.raises(InputError, match="holds no drape"):
-        drape.main(["shorts", "walk", "-o", str(ROOT / "tests"), "--weights", network, "--overwrite"])
+        drape.main(
+            ["shorts", "walk", "-o", str(ROOT / "tests"), "--weights", network, "--overwrite"]
+        )
 
 
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        (("shorts", "tango"), "motion tango: no such file, and no kind of motion; there are idle, walk"),
+        (
+            ("shorts", "tango"),
+            "motion tango: no such file, and no kind of motion; there are idle, walk",
+        ),
         (("tuxedo.obj", "walk"), "tuxedo.obj: no such file"),
         (("shorts", "walk", "--shape", "girth=3"), "--shape girth=3: choose among gender, age"),
         (("shorts", "walk", "--shape", "weight=heavy"), "--shape weight=heavy: a number is needed"),
@@ -97,11 +111,15 @@ def test_refused_in_one_line(arguments, message, network, tmp_path):
 
 
 def test_importing_onefit_is_quick_and_loads_nothing_heavy():
-    code = "import sys, onefit; print([x for x in ('torch', 'numpy', 'mitsuba', 'drjit', 'warp', 'anny') if x in sys.modules])"
+    code = (
+        "import sys, onefit; print([x for x in ('torch', 'numpy', 'mitsuba', 'drjit', 'warp',"
+        " 'anny') if x in sys.modules])"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
     assert done.stdout.strip() == "[]"
     code = (
-        "import sys, onefit; onefit.load, onefit.Garment, onefit.AnnyBody, onefit.Motion, onefit.SmplBody; print('mitsuba' in sys.modules)"
+        "import sys, onefit; onefit.load, onefit.Garment, onefit.AnnyBody, onefit.Motion,"
+        " onefit.SmplBody; print('mitsuba' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
     assert done.stdout.strip() == "False", done.stderr
@@ -110,8 +128,21 @@ def test_importing_onefit_is_quick_and_loads_nothing_heavy():
 def test_what_a_motion_file_does_not_say_is_said_by_flags(network, tmp_path):
     # the advice of the messages is taken word for word
     np.savez(tmp_path / "still.npz", poses=np.zeros((9, 72)), trans=np.zeros((9, 3)))
-    arguments = ["shorts", str(tmp_path / "still.npz"), "--weights", network, "--skip", "usd", "render", "-o", str(tmp_path / "out")]
-    for flags, message in (([], "no frame rate .*say it: .* --fps 30$"), (["--fps", "60"], "lies down throughout .* --motion-up y$")):
+    arguments = [
+        "shorts",
+        str(tmp_path / "still.npz"),
+        "--weights",
+        network,
+        "--skip",
+        "usd",
+        "render",
+        "-o",
+        str(tmp_path / "out"),
+    ]
+    for flags, message in (
+        ([], "no frame rate .*say it: .* --fps 30$"),
+        (["--fps", "60"], "lies down throughout .* --motion-up y$"),
+    ):
         with pytest.raises(InputError, match=message):
             drape.main([*arguments, *flags])
     drape.main([*arguments, "--fps", "60", "--motion-up", "y"])
@@ -126,7 +157,17 @@ def test_a_mesh_in_centimetres_with_y_up(network, tmp_path):
     shorts = Garment.template("shorts")
     x, y, z = 100 * shorts.vertices.double().numpy().T
     write_ply(tmp_path / "shorts.ply", np.stack([x, z, -y], 1), shorts.faces.numpy())
-    arguments = [str(tmp_path / "shorts.ply"), "walk", "--weights", network, "--seconds", "0.1", "--skip", "usd", "render"]
+    arguments = [
+        str(tmp_path / "shorts.ply"),
+        "walk",
+        "--weights",
+        network,
+        "--seconds",
+        "0.1",
+        "--skip",
+        "usd",
+        "render",
+    ]
     with pytest.raises(InputError, match="it looks like .*y up"):
         drape.main([*arguments, "-o", str(tmp_path / "wrong")])
     drape.main([*arguments, "-o", str(tmp_path / "right"), "--scale", "0.01", "--up", "y"])

@@ -36,43 +36,60 @@ def test_collision_counts_depth_below_epsilon():
     area = torch.full((3,), losses.POINT)
     assert float(losses.collision(distance, area, 0.004)) == pytest.approx(0.004**2 + 0.01**2)
     # twice the points for half the area each are the same cloth
-    assert float(losses.collision(distance.repeat(2, 1), area.repeat(2) / 2, 0.004)) == pytest.approx(0.004**2 + 0.01**2)
-    gradient_agrees(lambda d: losses.collision(d, torch.ones(6, dtype=torch.float64), 0.3), random(6, 2))
+    assert float(
+        losses.collision(distance.repeat(2, 1), area.repeat(2) / 2, 0.004)
+    ) == pytest.approx(0.004**2 + 0.01**2)
+    gradient_agrees(
+        lambda d: losses.collision(d, torch.ones(6, dtype=torch.float64), 0.3), random(6, 2)
+    )
 
 
 def test_extension_grows_with_the_epochs_and_where_the_body_is():
     distance = torch.tensor([0.02, 0.0, -1.0])
     assert losses.extension(distance, 0, 0.004).tolist() == [1, 1, 1]
-    assert losses.extension(distance, 50, 0.004).tolist() == pytest.approx([1, 1 + 0.004 * 50, 1 + 0.01 * 50])
-    assert torch.equal(losses.extension(distance, 100, 0.004), losses.extension(distance, 1000, 0.004))
+    assert losses.extension(distance, 50, 0.004).tolist() == pytest.approx(
+        [1, 1 + 0.004 * 50, 1 + 0.01 * 50]
+    )
+    assert torch.equal(
+        losses.extension(distance, 100, 0.004), losses.extension(distance, 1000, 0.004)
+    )
 
 
 def test_inextensibility_of_an_isometry_and_of_a_stretch():
     u, v = torch.tensor([[[1.0, 0, 0]]]), torch.tensor([[[0.0, 2, 0]]])
     turn = torch.linalg.qr(random(3, 3).float())[0]
     rest, one, s = losses.metric((u, v)), torch.ones(1, 1), torch.ones(1)
-    assert float(losses.inextensibility(rest, losses.metric((u @ turn, v @ turn)), one, s)) == pytest.approx(0, abs=1e-5)
+    assert float(
+        losses.inextensibility(rest, losses.metric((u @ turn, v @ turn)), one, s)
+    ) == pytest.approx(0, abs=1e-5)
     # 10 % along u: E from 1 to 1.21
-    assert float(losses.inextensibility(rest, losses.metric((1.1 * u, v)), one, s)) == pytest.approx(losses.METRIC * (0.21), rel=1e-4)
+    assert float(
+        losses.inextensibility(rest, losses.metric((1.1 * u, v)), one, s)
+    ) == pytest.approx(losses.METRIC * (0.21), rel=1e-4)
     # shear: F from 0 to 0.2, and it stands twice in the matrix
-    assert float(losses.inextensibility(rest, losses.metric((u, v + 0.2 * u)), one, s)) == pytest.approx(
-        losses.METRIC * (0.4 + 0.04), rel=1e-4
-    )
+    assert float(
+        losses.inextensibility(rest, losses.metric((u, v + 0.2 * u)), one, s)
+    ) == pytest.approx(losses.METRIC * (0.4 + 0.04), rel=1e-4)
     # where the metric may be larger by k_ext, that much costs nothing
-    assert float(losses.inextensibility(rest, 1.3 * rest, 1.3 * one, s)) == pytest.approx(0, abs=1e-6)
-    assert float(losses.inextensibility(rest, losses.metric((1.1 * u, v)), one, 2 * s)) == pytest.approx(
-        losses.METRIC * (0.21 / 4), rel=1e-4
+    assert float(losses.inextensibility(rest, 1.3 * rest, 1.3 * one, s)) == pytest.approx(
+        0, abs=1e-6
     )
+    assert float(
+        losses.inextensibility(rest, losses.metric((1.1 * u, v)), one, 2 * s)
+    ) == pytest.approx(losses.METRIC * (0.21 / 4), rel=1e-4)
     T = losses.metric((random(4, 2, 3), random(4, 2, 3)))
     weights = random(4, 2).abs() + 1
     gradient_agrees(
-        lambda x: losses.inextensibility(T, losses.metric(x.unbind(0)), weights, torch.full((4,), 0.7, dtype=torch.float64)),
+        lambda x: losses.inextensibility(
+            T, losses.metric(x.unbind(0)), weights, torch.full((4,), 0.7, dtype=torch.float64)
+        ),
         random(2, 4, 2, 3),
     )
 
 
 def test_skinned_tangents_are_derivatives_of_skinned_points():
-    # a curve through the rest space with blend weights that change along it, posed: its derivative by finite differences
+    # a curve through the rest space with blend weights that change along it, posed: its derivative
+    # by finite differences
     transforms = random(2, 3, 3, 4)
     a, b = random(3), random(3)
     point = lambda t: a * torch.sin(t) + b * t * t
@@ -92,13 +109,21 @@ def test_skinned_tangents_are_derivatives_of_skinned_points():
     u, v = losses.skinned_tangents(points, (tangent, 2 * tangent), w, transforms)
     assert torch.allclose(u[0], slope(posed), atol=1e-8)
     assert torch.allclose(v[0], 2 * slope(posed), atol=1e-8)
-    gradient_agrees(lambda x: losses.skinned_tangents(x[:1], (x[1:2], x[2:]), w, transforms)[0].square().sum(), random(3, 2, 3))
+    gradient_agrees(
+        lambda x: losses.skinned_tangents(x[:1], (x[1:2], x[2:]), w, transforms)[0].square().sum(),
+        random(3, 2, 3),
+    )
 
 
 def test_mesh_inextensibility():
     rest = torch.full((4, 1), 0.01)
-    assert float(losses.mesh_inextensibility(rest * torch.tensor([[1.0], [1.1], [0.9], [1.0]]), rest)) == pytest.approx(2e-6, rel=1e-4)
-    gradient_agrees(lambda x: losses.mesh_inextensibility(x, torch.ones(5, 2, dtype=torch.float64)), random(5, 2).abs() + 0.5)
+    assert float(
+        losses.mesh_inextensibility(rest * torch.tensor([[1.0], [1.1], [0.9], [1.0]]), rest)
+    ) == pytest.approx(2e-6, rel=1e-4)
+    gradient_agrees(
+        lambda x: losses.mesh_inextensibility(x, torch.ones(5, 2, dtype=torch.float64)),
+        random(5, 2).abs() + 0.5,
+    )
 
 
 def test_boundary_of_positions_and_normals():
@@ -107,10 +132,14 @@ def test_boundary_of_positions_and_normals():
     up, side = torch.tensor([0.0, 0, 1]), torch.tensor([1.0, 0, 0])
     same = torch.stack([up, up])[:, None, None]
     assert float(losses.boundary(apart, same, 5e3, 7.0)) == pytest.approx(5e3 * 4e-6)
-    assert float(losses.boundary(0 * apart, torch.stack([up, side])[:, None, None], 5e3, 7.0)) == pytest.approx(7.0)
+    assert float(
+        losses.boundary(0 * apart, torch.stack([up, side])[:, None, None], 5e3, 7.0)
+    ) == pytest.approx(7.0)
     n = torch.nn.functional.normalize(random(2, 3, 2, 3), dim=-1)
     gradient_agrees(lambda x: losses.boundary(x, n, 1.0, 1.0), random(2, 3, 2, 3))
-    gradient_agrees(lambda x: losses.boundary(n, losses.normals((x[:2], x[2:])), 0.0, 1.0), random(4, 3, 2, 3))
+    gradient_agrees(
+        lambda x: losses.boundary(n, losses.normals((x[:2], x[2:])), 0.0, 1.0), random(4, 3, 2, 3)
+    )
 
 
 def test_gravity_and_inertia():
@@ -120,23 +149,30 @@ def test_gravity_and_inertia():
     # 1 m/s^2 for 1/30 s: half m a^2 dt^2
     x = lambda t: torch.tensor([0.5 * t * t, 0.0, 0.0]).expand(2, 1, 3)
     dt = 1 / 30
-    assert float(losses.inertia(x(2 * dt), x(dt), x(0.0), mass, dt)) == pytest.approx(0.5 * 0.4 * dt * dt, rel=1e-4)
+    assert float(losses.inertia(x(2 * dt), x(dt), x(0.0), mass, dt)) == pytest.approx(
+        0.5 * 0.4 * dt * dt, rel=1e-4
+    )
     # at constant velocity there is none
     move = torch.tensor([0.1, 0.2, 0.3]).expand(2, 1, 3)
     assert float(losses.inertia(2 * move, move, 0 * move, mass, dt)) == pytest.approx(0, abs=1e-9)
     frames = [random(3, 2, 3) for _ in range(3)]
     for k in range(3):  # of the frame itself, and of those before it
-        at = lambda x: losses.inertia(*frames[:k], x, *frames[k + 1 :], torch.ones(3, dtype=torch.float64), 0.5)
+        at = lambda x: losses.inertia(
+            *frames[:k], x, *frames[k + 1 :], torch.ones(3, dtype=torch.float64), 0.5
+        )
         gradient_agrees(at, frames[k])
 
 
 def test_a_swing_does_not_grow_by_its_inertia():
-    # cloth that follows a body's motion of three a second by a fifth: following it further costs more, for the past moves along
+    # cloth that follows a body's motion of three a second by a fifth: following it further costs
+    # more, for the past moves along
     t = torch.arange(300, dtype=torch.float64) / 30
     motion = (2 * torch.pi * 3 * t).sin()[:, None, None].expand(-1, 1, 3)
     size = torch.tensor(0.2, dtype=torch.float64, requires_grad=True)
     x = (size * motion).transpose(0, 1)  # (1, T, 3)
-    value = losses.inertia(x[:, 2:], x[:, 1:-1], x[:, :-2], torch.ones(1, dtype=torch.float64), 1 / 30)
+    value = losses.inertia(
+        x[:, 2:], x[:, 1:-1], x[:, :-2], torch.ones(1, dtype=torch.float64), 1 / 30
+    )
     assert float(torch.autograd.grad(value, size)[0]) > 0
 
 

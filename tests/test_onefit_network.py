@@ -45,7 +45,9 @@ def walk():
 
 def test_positional_encoding():
     x = torch.tensor([[0.25, 0.0]])
-    assert encoded(x, 2).tolist()[0] == pytest.approx([0.25, 0, 0.5**0.5, 1, 0, 0, 0.5**0.5, 0, 1, 1], abs=1e-6)
+    assert encoded(x, 2).tolist()[0] == pytest.approx(
+        [0.25, 0, 0.5**0.5, 1, 0, 0, 0.5**0.5, 0, 1, 1], abs=1e-6
+    )
 
 
 def test_descriptors_are_rotations_and_gravity_seen_from_the_joints():
@@ -57,12 +59,15 @@ def test_descriptors_are_rotations_and_gravity_seen_from_the_joints():
     for x in (a, b, down):
         assert torch.allclose(x.norm(dim=-1), torch.ones(1), atol=1e-5)
     assert (a * b).sum(-1).abs().max() < 1e-5
-    # standing: gravity points down in every joint; turning about the vertical does not change what a joint feels of it
+    # standing: gravity points down in every joint; turning about the vertical does not change what
+    # a joint feels of it
     upright = torch.zeros(1, 24, 3)
     assert torch.allclose(descriptors(upright)[0, :, 6:], torch.tensor([0.0, 0, -1]).expand(24, 3))
     turned = upright.clone()
     turned[0, 0] = torch.tensor([0, 0, 1.3])
-    assert torch.allclose(descriptors(turned)[0, :, 6:], torch.tensor([0.0, 0, -1]).expand(24, 3), atol=1e-6)
+    assert torch.allclose(
+        descriptors(turned)[0, :, 6:], torch.tensor([0.0, 0, -1]).expand(24, 3), atol=1e-6
+    )
     # on its face, a body feels gravity towards its front, -y
     face = upright.clone()
     face[0, 0] = torch.tensor([torch.pi / 2, 0, 0])
@@ -72,7 +77,9 @@ def test_descriptors_are_rotations_and_gravity_seen_from_the_joints():
 def test_the_patch_encoder_reads_all_it_is_given():
     encoder = perturbed().patches
     g = torch.Generator().manual_seed(0)
-    inputs = [torch.randn(5, *size, generator=g) for size in ((15,), (7,), (3,), (3,), (1,), (24,))] + [torch.randn(24, 3, generator=g)]
+    inputs = [
+        torch.randn(5, *size, generator=g) for size in ((15,), (7,), (3,), (3,), (1,), (24,))
+    ] + [torch.randn(24, 3, generator=g)]
     codes = encoder(*inputs)
     for k, x in enumerate(inputs):
         assert (encoder(*inputs[:k], x + 0.1, *inputs[k + 1 :]) - codes).abs().max() > 1e-4
@@ -93,24 +100,42 @@ def test_the_decoder_is_that_of_the_concatenation():
 
 def test_layers_are_those_of_the_paper():
     network = OneFit()
-    widths = lambda layers: [(m.in_features, m.out_features) for m in layers if isinstance(m, torch.nn.Linear)]
+    widths = lambda layers: [
+        (m.in_features, m.out_features) for m in layers if isinstance(m, torch.nn.Linear)
+    ]
     assert widths(network.body.static) == [(216, 64), (64, 128), (128, 256), (256, 512)]
-    assert widths(network.body.local) == [(9, 32), (32, 32)] and widths(network.body.moving) == [(768, 512), (512, 512)]
+    assert widths(network.body.local) == [(9, 32), (32, 32)] and widths(network.body.moving) == [
+        (768, 512),
+        (512, 512),
+    ]
     assert network.body.memory.hidden_size == 512
     assert not any(
-        "bias" in name for part in (network.body.local, network.body.moving, network.body.memory) for name, _ in part.named_parameters()
+        "bias" in name
+        for part in (network.body.local, network.body.moving, network.body.memory)
+        for name, _ in part.named_parameters()
     )
-    assert [b for _, b in widths(network.body.join)][:4] == [256] * 4 and len(widths(network.body.join)) == 5
+    assert [b for _, b in widths(network.body.join)][:4] == [256] * 4 and len(
+        widths(network.body.join)
+    ) == 5
     assert widths(network.decoder.trunk) == [(512, 512), (512, 512), (512, 256)]
-    assert all([b for _, b in widths(head)][:2] == [128, 64] for head in network.decoder.heads.values())
+    assert all(
+        [b for _, b in widths(head)][:2] == [128, 64] for head in network.decoder.heads.values()
+    )
 
 
 def test_a_body_at_rest_leaves_the_dynamic_encoding_at_zero():
     body = perturbed().body
-    poses = 0.3 * torch.randn(1, 1, 24, 3, generator=torch.Generator().manual_seed(2)).expand(1, 12, 24, 3)
+    poses = 0.3 * torch.randn(1, 1, 24, 3, generator=torch.Generator().manual_seed(2)).expand(
+        1, 12, 24, 3
+    )
     _, memory = body(poses, torch.zeros(1, 12, 3), torch.zeros(1, 6), 30.0)
     assert memory.abs().max() == 0
-    _, moving = body(poses * torch.linspace(0, 1, 12)[:, None, None], torch.zeros(1, 12, 3), torch.zeros(1, 6), 30.0)
+    _, moving = body(
+        poses * torch.linspace(0, 1, 12)[:, None, None],
+        torch.zeros(1, 12, 3),
+        torch.zeros(1, 6),
+        30.0,
+    )
     assert moving.abs().max() > 1e-3
     # a memory that was anything fades while the body stands still
     noise = torch.randn(1, 1, 512, generator=torch.Generator().manual_seed(3))
@@ -126,7 +151,9 @@ def test_the_memory_goes_on_where_it_stopped():
     again, _ = body(poses, translation, torch.zeros(1, 6), 30.0)
     assert torch.equal(whole, again)
     shape, _ = body(poses, translation, 0.2 * torch.ones(1, 6), 30.0)
-    moved, _ = body(poses, translation + torch.arange(8)[None, :, None] * 0.05, torch.zeros(1, 6), 30.0)
+    moved, _ = body(
+        poses, translation + torch.arange(8)[None, :, None] * 0.05, torch.zeros(1, 6), 30.0
+    )
     assert (whole - shape).abs().max() > 1e-4 and (whole - moved).abs().max() > 1e-4
     elsewhere, _ = body(poses, translation + 3.0, torch.zeros(1, 6), 30.0)
     assert torch.allclose(whole, elsewhere, atol=1e-4)  # where the body stands does not matter
@@ -135,7 +162,9 @@ def test_the_memory_goes_on_where_it_stopped():
 def test_an_untrained_network_is_plain_skinning(model, walk):
     torch.manual_seed(0)
     fresh = Draper(weights.Trained(OneFit().eval(), "anny", ()), model)
-    assert torch.equal(fresh.drape("tank", walk).vertices, fresh.drape("tank", walk, skinning_only=True).vertices)
+    assert torch.equal(
+        fresh.drape("tank", walk).vertices, fresh.drape("tank", walk, skinning_only=True).vertices
+    )
 
 
 def test_draping_in_batches_is_draping_at_once(draper, walk, monkeypatch):
@@ -154,12 +183,21 @@ def test_place_and_direction_of_a_motion_only_move_the_drape(draper, walk):
     root = roma.rotmat_to_rotvec(turn @ roma.rotvec_to_rotmat(walk.poses[:, 0]))
     poses = torch.cat([root[:, None], walk.poses[:, 1:]], 1)
     place = draper.standard.joints[0]
-    other = dataclasses.replace(walk, poses=poses, translation=(walk.translation + place) @ turn.T - place + torch.tensor([1.0, 2.0, 0]))
+    other = dataclasses.replace(
+        walk,
+        poses=poses,
+        translation=(walk.translation + place) @ turn.T - place + torch.tensor([1.0, 2.0, 0]),
+    )
     a, b = draper.drape("tank", walk), draper.drape("tank", other)
     expected = a.vertices @ turn.T + torch.tensor([1.0, 2.0, 0])
     # the root's descriptor says where the body faces, so the network may see a little of it
     plain = draper.drape("tank", other, skinning_only=True).vertices
-    assert torch.allclose(draper.drape("tank", walk, skinning_only=True).vertices @ turn.T + torch.tensor([1.0, 2.0, 0]), plain, atol=1e-4)
+    assert torch.allclose(
+        draper.drape("tank", walk, skinning_only=True).vertices @ turn.T
+        + torch.tensor([1.0, 2.0, 0]),
+        plain,
+        atol=1e-4,
+    )
     assert (b.vertices - expected).norm(dim=-1).mean() < (b.vertices - plain).norm(dim=-1).mean()
 
 
@@ -204,18 +242,27 @@ def test_ease_takes_away_what_a_network_does_wrongly_in_most_frames():
 
 
 def test_ease_looks_at_the_centres_of_coarse_triangles():
-    (vertices, faces), (rest, triangles) = ball(0.1, 4), ball(0.125, 1)  # with sides of 7 cm: the centres are 7 mm nearer
+    (vertices, faces), (rest, triangles) = (
+        ball(0.1, 4),
+        ball(0.125, 1),
+    )  # with sides of 7 cm: the centres are 7 mm nearer
     body = SimpleNamespace(vertices=vertices, faces=faces)
     surface = ClosestSurface(vertices, faces)
     sunk = rest * (0.107 / 0.125)
     distance = lambda x: surface(x, 1.0).distance.min()
-    assert distance(rest[triangles].mean(1)) > 0.01 and distance(sunk) > 0.0069 and distance(sunk[triangles].mean(1)) < 0.001
+    assert (
+        distance(rest[triangles].mean(1)) > 0.01
+        and distance(sunk) > 0.0069
+        and distance(sunk[triangles].mean(1)) < 0.001
+    )
     eased = sunk + ease.ease(rest, triangles, body, [(sunk, rest, vertices)] * 5)
     assert distance(eased[triangles].mean(1)) > 0.004
 
 
 def test_ease_keeps_a_network_out_of_the_body(model, walk):
-    draper = Draper(weights.Trained(perturbed(1, 0.15), "anny", ("tank",)), model)  # ten times as much inside as skinning
+    draper = Draper(
+        weights.Trained(perturbed(1, 0.15), "anny", ("tank",)), model
+    )  # ten times as much inside as skinning
     garment = draper.garment("tank")
     offset = draper.ease(garment)
     assert offset is draper.ease(garment) and offset.shape == garment.vertices.shape
@@ -230,7 +277,10 @@ def test_pushing_out_of_a_sphere():
     import trimesh
 
     ball = trimesh.creation.icosphere(subdivisions=4, radius=0.1)
-    body, faces = torch.as_tensor(ball.vertices, dtype=torch.float32)[None], torch.as_tensor(ball.faces)
+    body, faces = (
+        torch.as_tensor(ball.vertices, dtype=torch.float32)[None],
+        torch.as_tensor(ball.faces),
+    )
     cloth = trimesh.creation.icosphere(subdivisions=3, radius=0.1)
     x = torch.as_tensor(cloth.vertices, dtype=torch.float32)[None].clone()
     x[:, ::7] *= 0.95
@@ -242,10 +292,17 @@ def test_pushing_out_of_a_sphere():
 def test_pushing_out_finds_deep_vertices_from_their_neighbours(monkeypatch):
     import trimesh
 
-    ball, cloth = (trimesh.creation.icosphere(subdivisions=k, radius=r) for k, r in ((4, 0.1), (5, 0.103)))
-    body, faces = torch.as_tensor(ball.vertices, dtype=torch.float32)[None], torch.as_tensor(ball.faces)
+    ball, cloth = (
+        trimesh.creation.icosphere(subdivisions=k, radius=r) for k, r in ((4, 0.1), (5, 0.103))
+    )
+    body, faces = (
+        torch.as_tensor(ball.vertices, dtype=torch.float32)[None],
+        torch.as_tensor(ball.faces),
+    )
     x = torch.as_tensor(cloth.vertices, dtype=torch.float32)[None]
-    x = x - 0.4 * x * torch.exp(-((x / 0.103 - torch.tensor([0, 0, 1.0])).square().sum(-1, keepdim=True) / 0.5**2))
+    x = x - 0.4 * x * torch.exp(
+        -((x / 0.103 - torch.tensor([0, 0, 1.0])).square().sum(-1, keepdim=True) / 0.5**2)
+    )
     surface = ClosestSurface(body[0], faces)
     before = surface.distances(x, body)
     assert before.min() < -0.03
@@ -253,7 +310,11 @@ def test_pushing_out_finds_deep_vertices_from_their_neighbours(monkeypatch):
     assert surface.distances(out, body).min() > 0
     # as when every vertex is asked how deep it is
     query = ClosestSurface.__call__
-    monkeypatch.setattr(ClosestSurface, "__call__", lambda self, points, reach: query(self, points, onefit.post.REACH))
+    monkeypatch.setattr(
+        ClosestSurface,
+        "__call__",
+        lambda self, points, reach: query(self, points, onefit.post.REACH),
+    )
     assert torch.allclose(pushed_out(x, torch.as_tensor(cloth.faces), body, faces), out, atol=1e-5)
 
 
@@ -263,9 +324,15 @@ def test_weights_in_eight_bits_drape_alike(draper, model, walk, tmp_path):
     assert path.stat().st_size < 1.1 * sum(p.numel() for p in draper.network.parameters())
     loaded = onefit.load(path, model=model)
     assert loaded.trained.garments == ("tank",)
-    a, b, c = draper.drape("tank", walk), loaded.drape("tank", walk), draper.drape("tank", walk, skinning_only=True)
+    a, b, c = (
+        draper.drape("tank", walk),
+        loaded.drape("tank", walk),
+        draper.drape("tank", walk, skinning_only=True),
+    )
     # eight bits cost a few per cent of the deformation
-    assert (a.vertices - b.vertices).norm(dim=-1).mean() < 0.05 * (a.vertices - c.vertices).norm(dim=-1).mean()
+    assert (a.vertices - b.vertices).norm(dim=-1).mean() < 0.05 * (a.vertices - c.vertices).norm(
+        dim=-1
+    ).mean()
 
 
 def test_patches_are_cut_once_for_a_garment(draper, walk):
@@ -296,14 +363,18 @@ def test_decoder_of_another_order():
 
 
 def test_a_body_of_another_kind_is_draped_too(draper, walk, tmp_path):
-    # Anny's own surface as a plain file is another kind: the network is told the standard shape, and the drape is that of the standard body
+    # Anny's own surface as a plain file is another kind: the network is told the standard shape,
+    # and the drape is that of the standard body
     import numpy as np
 
     body = draper.standard
     path = tmp_path / "body.npz"
     np.savez(
         path,
-        **{name: getattr(body, name).numpy() for name in ("vertices", "faces", "blend_weights", "joints", "rest_pose")},
+        **{
+            name: getattr(body, name).numpy()
+            for name in ("vertices", "faces", "blend_weights", "joints", "rest_pose")
+        },
         parents=np.array(body.parents),
     )
     other = Draper(draper.trained, onefit.PlainBody(path))

@@ -22,7 +22,9 @@ ROOT = Path(__file__).resolve().parent.parent
 
 @pytest.fixture(scope="module")
 def motion(tmp_path_factory):
-    """A file in the form of AMASS: arms that swing, knees that bend, half a second at 60 frames a second."""
+    """A file in the form of AMASS: arms that swing, knees that bend, half a second at 60 frames a
+    second.
+    """
     t = np.linspace(0, 1, 31)
     poses = np.zeros((31, 156))
     poses[:, 3 * 16 + 2], poses[:, 3 * 17 + 2] = -0.9 + 0.4 * t, 0.9 - 0.4 * t
@@ -36,7 +38,15 @@ def motion(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def small(motion):
-    return train.Settings(garments=("shorts",), motions=(motion,), batch=600, epochs=2, lr_epochs=1, epoch_steps=4, shapes=1)
+    return train.Settings(
+        garments=("shorts",),
+        motions=(motion,),
+        batch=600,
+        epochs=2,
+        lr_epochs=1,
+        epoch_steps=4,
+        shapes=1,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +55,9 @@ def data(small):
     from onefit.motion import Motion
     from onefit.training_data import TrainingData
 
-    return TrainingData([Garment.template("shorts")], motions=[Motion.read(small.motions[0])], shapes=1)
+    return TrainingData(
+        [Garment.template("shorts")], motions=[Motion.read(small.motions[0])], shapes=1
+    )
 
 
 def test_windows_are_of_consecutive_frames_at_30_a_second(data):
@@ -62,7 +74,9 @@ def test_motions_are_read_as_the_flags_say(motion, tmp_path):
 
     args = ["shorts", "--motions", motion, "--fps", "20", "--motion-up", "z", "--shapes", "1"]
     args = train.parser().parse_args([*args, "-o", str(tmp_path)])
-    settings = train.Settings(garments=("shorts",), motions=(motion,), fps=args.fps, motion_up=args.motion_up, shapes=1)
+    settings = train.Settings(
+        garments=("shorts",), motions=(motion,), fps=args.fps, motion_up=args.motion_up, shapes=1
+    )
     (read,) = train._data(settings, str(tmp_path), Progress()).motions
     assert len(read.poses) == 46  # 31 frames at 20 a second last 1.5 s
     with pytest.raises(InputError, match="lies down throughout"):
@@ -70,11 +84,19 @@ def test_motions_are_read_as_the_flags_say(motion, tmp_path):
 
 
 def test_training_lowers_the_loss(small, data):
-    training = train.OneFitTraining(replace(small, epochs=1, epoch_steps=60), data, Processes("cpu"))
+    training = train.OneFitTraining(
+        replace(small, epochs=1, epoch_steps=60), data, Processes("cpu")
+    )
 
     def loss():
         with torch.no_grad():
-            return sum(sum(training.loss(torch.Generator().manual_seed(k)).values()).item() for k in range(3)) / 3
+            return (
+                sum(
+                    sum(training.loss(torch.Generator().manual_seed(k)).values()).item()
+                    for k in range(3)
+                )
+                / 3
+            )
 
     before = loss()
     for _ in range(25):
@@ -83,13 +105,23 @@ def test_training_lowers_the_loss(small, data):
 
 
 def test_each_loss_has_a_switch(small, data):
-    names = dict(k_c="collision", k_i="inextensibility", k_mi="mesh_inextensibility", k_g="gravity", k_in="inertia")
+    names = dict(
+        k_c="collision",
+        k_i="inextensibility",
+        k_mi="mesh_inextensibility",
+        k_g="gravity",
+        k_in="inertia",
+    )
     for switch, name in names.items():
-        training = train.OneFitTraining(replace(small, weights=Weights(**{switch: 0.0})), data, Processes("cpu"))
+        training = train.OneFitTraining(
+            replace(small, weights=Weights(**{switch: 0.0})), data, Processes("cpu")
+        )
         with torch.no_grad():
             terms = training.loss(torch.Generator().manual_seed(0))
         assert set(terms) == (set(names.values()) | {"boundary"}) - {name}
-    training = train.OneFitTraining(replace(small, weights=Weights(k_b=0.0, k_bn=0.0)), data, Processes("cpu"))
+    training = train.OneFitTraining(
+        replace(small, weights=Weights(k_b=0.0, k_bn=0.0)), data, Processes("cpu")
+    )
     with torch.no_grad():
         assert "boundary" not in training.loss(torch.Generator().manual_seed(0))
 
@@ -109,7 +141,11 @@ def test_a_step_that_is_not_finite_is_stepped_over(small, data, monkeypatch, cap
     before = {k: v.clone() for k, v in training.network.state_dict().items()}
     loss = train.OneFitTraining.loss
     monkeypatch.setattr(
-        train.OneFitTraining, "loss", lambda self, g: {k: v * float("nan") if k == "gravity" else v for k, v in loss(self, g).items()}
+        train.OneFitTraining,
+        "loss",
+        lambda self, g: {
+            k: v * float("nan") if k == "gravity" else v for k, v in loss(self, g).items()
+        },
     )
     figures = training.step()
     assert figures["stepped_over"] == 1 and np.isfinite(figures["loss"])
@@ -122,7 +158,9 @@ def test_a_step_that_is_not_finite_is_stepped_over(small, data, monkeypatch, cap
 
 @pytest.fixture
 def one_thread():
-    """Sums of several threads come out in one order or another; on one thread they are the same each time."""
+    """Sums of several threads come out in one order or another; on one thread they are the same
+    each time.
+    """
     count = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -142,12 +180,17 @@ def test_a_resumed_training_ends_where_an_uninterrupted_one_does(small, tmp_path
         and about["garments"] == ["shorts"]
         and about["weights"]["k_b"] == 5e3
     )
-    lines = [json.loads(line) for line in (tmp_path / "whole" / "log.jsonl").read_text().splitlines()]
+    lines = [
+        json.loads(line) for line in (tmp_path / "whole" / "log.jsonl").read_text().splitlines()
+    ]
     assert lines[-1]["step"] == 8 and {"loss", "collision", "inertia", "lr"} <= set(lines[-1])
     with pytest.raises(InputError, match="a checkpoint of other settings"):
         train.train(replace(small, seed=5), tmp_path / "parts", resume=True)
     # and it can be gone on from, with another garment
-    tuned = train.train(replace(small, garments=("tank",), start=str(whole), epochs=1, epoch_steps=1), tmp_path / "tuned")
+    tuned = train.train(
+        replace(small, garments=("tank",), start=str(whole), epochs=1, epoch_steps=1),
+        tmp_path / "tuned",
+    )
     assert onefit.load(tuned).trained.garments == ("tank",)
     first, then = onefit.load(whole).network.state_dict(), onefit.load(tuned).network.state_dict()
     changes = [float((first[k] - then[k]).abs().max()) for k in first]
@@ -155,7 +198,19 @@ def test_a_resumed_training_ends_where_an_uninterrupted_one_does(small, tmp_path
 
 
 def test_two_processes_of_torchrun_have_the_curve_of_one(small, tmp_path):
-    flags = ["shorts", "--motions", small.motions[0], "--batch", "600", "--epochs", "1", "--epoch-steps", "3", "--shapes", "1"]
+    flags = [
+        "shorts",
+        "--motions",
+        small.motions[0],
+        "--batch",
+        "600",
+        "--epochs",
+        "1",
+        "--epoch-steps",
+        "3",
+        "--shapes",
+        "1",
+    ]
     command = [
         sys.executable,
         "-m",
@@ -180,13 +235,20 @@ def test_two_processes_of_torchrun_have_the_curve_of_one(small, tmp_path):
     train.main([*flags, "-o", str(tmp_path / "one")])
     two, one = (load_file(tmp_path / name / "checkpoint.safetensors") for name in ("two", "one"))
     assert json.loads((tmp_path / "two" / "weights.json").read_text())["processes"] == 2
-    curves = [[json.loads(line) for line in (tmp_path / name / "log.jsonl").read_text().splitlines()] for name in ("two", "one")]
+    curves = [
+        [json.loads(line) for line in (tmp_path / name / "log.jsonl").read_text().splitlines()]
+        for name in ("two", "one")
+    ]
     for a, b in zip(*curves):
-        assert {k: a[k] for k in a if k != "seconds"} == pytest.approx({k: b[k] for k in b if k != "seconds"}, rel=1e-3)
+        assert {k: a[k] for k in a if k != "seconds"} == pytest.approx(
+            {k: b[k] for k in b if k != "seconds"}, rel=1e-3
+        )
     # three steps of 1e-3 at most; where a gradient is nearly zero, Adam makes much of its rounding
     apart = torch.cat([(two[k] - one[k]).abs().flatten() for k in one if k.startswith("network.")])
     assert apart.max() < 1e-3 and apart.mean() < 1e-5
-    fresh = train.OneFitTraining(replace(small, epochs=1, epoch_steps=3), _Nothing(), Processes("cpu")).network.state_dict()
+    fresh = train.OneFitTraining(
+        replace(small, epochs=1, epoch_steps=3), _Nothing(), Processes("cpu")
+    ).network.state_dict()
     moved = torch.cat([(one[f"network.{k}"] - v).abs().flatten() for k, v in fresh.items()])
     assert moved.mean() > 10 * apart.mean()
 
@@ -218,7 +280,10 @@ def test_settings_are_checked(change, message):
 
 def test_a_wrong_name_ends_in_one_line(tmp_path):
     done = subprocess.run(
-        [sys.executable, "-m", "onefit.train", "tuxedo.obj", "-o", str(tmp_path / "out")], cwd=ROOT, capture_output=True, text=True
+        [sys.executable, "-m", "onefit.train", "tuxedo.obj", "-o", str(tmp_path / "out")],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
     )
     assert done.returncode == 2
     assert done.stderr.strip().splitlines()[-1].startswith("error: tuxedo.obj: no such file")

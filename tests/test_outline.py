@@ -1,4 +1,6 @@
-"""A template's outline on the edges of an image: against known poses, of prints with a drawn frame and of sheets before a background."""
+"""A template's outline on the edges of an image: against known poses, of prints with a drawn frame
+and of sheets before a background.
+"""
 
 import cv2
 import numpy as np
@@ -17,7 +19,9 @@ PIXELS_A_METRE = 3000
 
 
 def grid(rows=7, columns=9, width=WIDTH, height=HEIGHT):
-    x, y = np.meshgrid(np.linspace(-0.5, 0.5, columns) * width, np.linspace(-0.5, 0.5, rows) * height)
+    x, y = np.meshgrid(
+        np.linspace(-0.5, 0.5, columns) * width, np.linspace(-0.5, 0.5, rows) * height
+    )
     return np.stack([x, y, 0 * x], -1).reshape(-1, 3), grid_faces(rows, columns)
 
 
@@ -40,35 +44,65 @@ def missed(a, b):
 
 
 def picture(place, frame=None, paper=230, second=0.0, seed=0):
-    """(480, 640, 3) uint8: a sheet of paper with a print full of strokes, of WIDTH x HEIGHT, where ``place`` puts it, before a dim background. ``frame``: grey
-    of a line of 1.2 mm around the print, around which there is paper; ``second`` [m]: at what distance outside another line runs along its left side."""
+    """(480, 640, 3) uint8: a sheet of paper with a print full of strokes, of WIDTH x HEIGHT, where
+    ``place`` puts it, before a dim background. ``frame``: grey of a line of 1.2 mm around the
+    print, around which there is paper; ``second`` [m]: at what distance outside another line runs
+    along its left side.
+    """
     rng = np.random.default_rng(seed)
     margin = 0.05 if frame is not None else 0.0
     size = [round(PIXELS_A_METRE * (s + 2 * margin)) for s in (WIDTH, HEIGHT)]
     flat = np.full((size[1], size[0], 3), paper, np.uint8)
-    at = lambda p: tuple(int(round(PIXELS_A_METRE * (v + s / 2 + margin) - 0.5)) for v, s in zip(p, (WIDTH, HEIGHT)))
+    at = lambda p: tuple(
+        int(round(PIXELS_A_METRE * (v + s / 2 + margin) - 0.5)) for v, s in zip(p, (WIDTH, HEIGHT))
+    )
     for _ in range(250):
         a = rng.uniform(-0.47, 0.47, 2) * (WIDTH, HEIGHT)
         b = np.clip(a + rng.normal(size=2) * 0.02, *np.outer((-0.47, 0.47), (WIDTH, HEIGHT)))
         cv2.line(flat, at(a), at(b), tuple(int(v) for v in rng.integers(0, 150, 3)), 4, cv2.LINE_AA)
     if frame is not None:
         thick = round(PIXELS_A_METRE * 0.0012)
-        cv2.rectangle(flat, at((-WIDTH / 2, -HEIGHT / 2)), at((WIDTH / 2, HEIGHT / 2)), (frame,) * 3, thick)
+        cv2.rectangle(
+            flat, at((-WIDTH / 2, -HEIGHT / 2)), at((WIDTH / 2, HEIGHT / 2)), (frame,) * 3, thick
+        )
         if second:
-            cv2.line(flat, at((-WIDTH / 2 - second, -HEIGHT / 2)), at((-WIDTH / 2 - second, HEIGHT / 2)), (frame,) * 3, thick)
-    corners = np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]) * (WIDTH / 2 + margin, HEIGHT / 2 + margin, 0)
+            cv2.line(
+                flat,
+                at((-WIDTH / 2 - second, -HEIGHT / 2)),
+                at((-WIDTH / 2 - second, HEIGHT / 2)),
+                (frame,) * 3,
+                thick,
+            )
+    corners = np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]) * (
+        WIDTH / 2 + margin,
+        HEIGHT / 2 + margin,
+        0,
+    )
     s = 4
     to = s * CAMERA.project(place(corners)) - 0.5
     of = np.array([(0, 0), (size[0], 0), (size[0], size[1]), (0, size[1])]) - 0.5
-    large = cv2.resize(rng.integers(20, 90, (60, 80, 3)).astype(np.uint8), (640 * s, 480 * s), interpolation=cv2.INTER_CUBIC)
-    cv2.warpPerspective(flat, cv2.getPerspectiveTransform(np.float32(of), np.float32(to)), (640 * s, 480 * s), large, cv2.INTER_AREA, cv2.BORDER_TRANSPARENT)
+    large = cv2.resize(
+        rng.integers(20, 90, (60, 80, 3)).astype(np.uint8),
+        (640 * s, 480 * s),
+        interpolation=cv2.INTER_CUBIC,
+    )
+    cv2.warpPerspective(
+        flat,
+        cv2.getPerspectiveTransform(np.float32(of), np.float32(to)),
+        (640 * s, 480 * s),
+        large,
+        cv2.INTER_AREA,
+        cv2.BORDER_TRANSPARENT,
+    )
     small = cv2.resize(large, (640, 480), interpolation=cv2.INTER_AREA).astype(np.float64)
     return np.clip(small + rng.normal(size=small.shape) * 3, 0, 255).astype(np.uint8)
 
 
 @pytest.mark.parametrize("frame, paper", [(30, 230), (None, 230), (240, 120)])
 def test_pose_is_recovered(frame, paper):
-    """A dark or a bright line around the print, or the sheet's own edge: its middle, or the edge, within a fraction of a pixel."""
+    """A dark or a bright line around the print, or the sheet's own edge: its middle, or the edge,
+    within a fraction of a pixel.
+    """
     vertices, faces = grid()
     truth, image = pose()(vertices), picture(pose(), frame, paper)
     (loop,) = loops(faces)
@@ -93,14 +127,25 @@ def test_gap_between_two_lines_is_no_line():
 
 
 def test_digitised_outline_is_straightened():
-    """Corners are where they should be, and what lies between is a pixel off: the polygon fits better, and is taken."""
+    """Corners are where they should be, and what lies between is a pixel off: the polygon fits
+    better, and is taken.
+    """
     vertices, faces = grid()
     image = picture(pose(), 30)
     uneven = vertices.copy()
     inner = np.setdiff1d(np.arange(len(vertices)), [0, 8, 54, 62])
-    uneven[inner, :2] += np.random.default_rng(0).normal(size=(len(inner), 2)) * 0.0006 + (0, 0.0008)
+    uneven[inner, :2] += np.random.default_rng(0).normal(size=(len(inner), 2)) * 0.0006 + (
+        0,
+        0.0008,
+    )
     start = shifted(pose()(uneven), 2)
-    assert missed(fitted(start, faces, CAMERA, image)(start)[[0, 8, 54, 62]], pose()(vertices)[[0, 8, 54, 62]]) < 0.45
+    assert (
+        missed(
+            fitted(start, faces, CAMERA, image)(start)[[0, 8, 54, 62]],
+            pose()(vertices)[[0, 8, 54, 62]],
+        )
+        < 0.45
+    )
 
 
 def test_what_edges_do_not_tell_is_left():
@@ -108,7 +153,11 @@ def test_what_edges_do_not_tell_is_left():
     framed = picture(pose(), 30)
     smaller = pose()(0.7 * vertices)  # amid the strokes
     noise = np.random.default_rng(0).integers(0, 255, (480, 640, 3)).astype(np.uint8)
-    for points, image in ((smaller, framed), (pose()(vertices), noise), (pose()(vertices), np.full_like(noise, 128))):
+    for points, image in (
+        (smaller, framed),
+        (pose()(vertices), noise),
+        (pose()(vertices), np.full_like(noise, 128)),
+    ):
         fit = fitted(points, faces, CAMERA, image)
         assert not fit.sure and np.isfinite(fit.clear) and np.isfinite(fit(points)).all()
     three = framed.copy()
@@ -127,13 +176,17 @@ def test_gradient_against_finite_differences():
     start = shifted(pose()(vertices), 0)
     loop = loops(faces)[0]
     ends = np.stack([start[loop], start[np.roll(loop, -1)]], 1)
-    grey = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255, (0, 0), 1.0)
+    grey = cv2.GaussianBlur(
+        cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255, (0, 0), 1.0
+    )
     search = outline._Search(ends, CAMERA, grey, 1.2, "dark")
     turn, shift = Rotation.from_rotvec((0.01, -0.02, 0.005)), np.array([1e-3, -2e-3, 4e-3])
     cost, to_motion = search.costs(turn, shift, 2.5)
     for seed in range(5):
         q = np.random.default_rng(seed).normal(size=6)
-        assert check_grad(lambda q: cost(q)[0], lambda q: cost(q)[1], q, epsilon=1e-6) < 2e-3 * np.linalg.norm(cost(q)[1])
+        assert check_grad(
+            lambda q: cost(q)[0], lambda q: cost(q)[1], q, epsilon=1e-6
+        ) < 2e-3 * np.linalg.norm(cost(q)[1])
     # what the search takes for a shift across the outline is one
     change = 0.2 * to_motion[:, -1]
     before, normal, _ = search._projected(turn, shift)

@@ -28,14 +28,19 @@ def test_points_are_found_on_the_subdivided_mesh():
     V, F = surfaces.tube()
     rng = np.random.default_rng(0)
     face = rng.integers(len(F), size=500)
-    barycentric = np.concatenate([rng.dirichlet((1, 1, 1), 400), np.repeat(np.eye(3), [40, 30, 30], axis=0)])
+    barycentric = np.concatenate(
+        [rng.dirichlet((1, 1, 1), 400), np.repeat(np.eye(3), [40, 30, 30], axis=0)]
+    )
     W, G = V, F
     for levels in range(1, 4):
         G, edges = mesh.subdivided(G)
         W = np.concatenate([W, W[edges].mean(axis=1)])
         child, b = mesh.child(face, barycentric, levels)
         assert b.min() > -1e-12
-        assert np.abs(refined_points(V, F, face, barycentric) - refined_points(W, G, child, b)).max() < 1e-12
+        assert (
+            np.abs(refined_points(V, F, face, barycentric) - refined_points(W, G, child, b)).max()
+            < 1e-12
+        )
         assert (child // 4**levels == face).all()
         assert trimesh.Trimesh(W, G, process=False).is_winding_consistent
 
@@ -45,10 +50,15 @@ def test_sheets_are_manifold_and_keep_their_places():
         split = mesh.sheets(F)
         _, side = mesh.edges_of(split)
         assert np.bincount(side.ravel()).max() <= 2
-        assert all(len({F.ravel()[k] for k in np.flatnonzero(split.ravel() == s)}) == 1 for s in range(split.max() + 1))
+        assert all(
+            len({F.ravel()[k] for k in np.flatnonzero(split.ravel() == s)}) == 1
+            for s in range(split.max() + 1)
+        )
     assert len(np.unique(mesh.sheets(surfaces.sheet()[1]))) == len(surfaces.sheet()[0])
     V, F = surfaces.with_fin()
-    assert mesh.sheets(F).max() + 1 == len(V) + 2 * 11  # the row of the fin's foot exists three times
+    assert (
+        mesh.sheets(F).max() + 1 == len(V) + 2 * 11
+    )  # the row of the fin's foot exists three times
 
 
 def test_a_vertex_where_two_cones_meet_is_split():
@@ -67,7 +77,9 @@ def test_faces_wound_the_other_way_are_found():
     assert (mesh.winding(surfaces.moebius()[1]) == 1).all()
     a, b = Patches.cut(V, F, 20), Patches.cut(V, mixed, 20)
     rms = [np.linalg.norm(p.direction, axis=1).sum() for p in (a, b)]
-    assert rms[1] == pytest.approx(rms[0], rel=0.05)  # the patches of the one are as flat as those of the other
+    assert rms[1] == pytest.approx(
+        rms[0], rel=0.05
+    )  # the patches of the one are as flat as those of the other
 
 
 SHAPES = {
@@ -76,7 +88,15 @@ SHAPES = {
     "annulus": (trimesh.creation.annulus(0.1, 0.2, 0.01), 12),
     "fin": (surfaces.with_fin(), 9),
     "moebius": (surfaces.moebius(), 8),
-    "parts": (surfaces.joined(surfaces.sphere(), surfaces.sphere(0.01, 0), surfaces.sheet(n=2, size=1e-3), surfaces.tube(0.02)), 30),
+    "parts": (
+        surfaces.joined(
+            surfaces.sphere(),
+            surfaces.sphere(0.01, 0),
+            surfaces.sheet(n=2, size=1e-3),
+            surfaces.tube(0.02),
+        ),
+        30,
+    ),
     "one": (surfaces.sheet(), 1),
     "each vertex": (surfaces.sheet(n=4), 16),
 }
@@ -84,7 +104,9 @@ SHAPES = {
 
 @pytest.fixture(params=SHAPES, scope="module")
 def shape(request):
-    (V, F), count = (lambda m, k: ((np.array(m.vertices), np.array(m.faces)) if hasattr(m, "faces") else m, k))(*SHAPES[request.param])
+    (V, F), count = (
+        lambda m, k: ((np.array(m.vertices), np.array(m.faces)) if hasattr(m, "faces") else m, k)
+    )(*SHAPES[request.param])
     return V, F, count, Patches.cut(V, F, count)
 
 
@@ -107,7 +129,12 @@ def test_no_patch_goes_around_an_edge_of_three_faces_or_onto_another_part(shape)
 
 def test_charts_overlap_by_the_faces_that_touch_several_patches(shape):
     _, _, count, p = shape
-    expected = {(k, v) for patches, corners in zip(p.corner_patch, p.faces) for k in patches for v in corners}
+    expected = {
+        (k, v)
+        for patches, corners in zip(p.corner_patch, p.faces)
+        for k in patches
+        for v in corners
+    }
     assert sorted(expected) == list(zip(p.entry_patch.tolist(), p.entry_vertex.tolist()))
     assert (p.entry_vertex[p.face_entries] == p.faces[:, None, :]).all()
     assert (p.entry_patch[p.face_entries] == p.corner_patch[:, :, None]).all()
@@ -119,8 +146,13 @@ def test_charts_overlap_by_the_faces_that_touch_several_patches(shape):
 
 def test_shares_of_area_and_direction_add_up(shape):
     _, _, _, p = shape
-    assert p.entry_weight.sum() == pytest.approx(mesh.areas(p.vertices, p.faces).sum()) and p.entry_weight.min() >= 0
-    assert p.direction.sum(axis=0) == pytest.approx((p.side[:, None] * mesh.face_vectors(p.vertices, p.faces)).sum(axis=0) / 2, abs=1e-12)
+    assert (
+        p.entry_weight.sum() == pytest.approx(mesh.areas(p.vertices, p.faces).sum())
+        and p.entry_weight.min() >= 0
+    )
+    assert p.direction.sum(axis=0) == pytest.approx(
+        (p.side[:, None] * mesh.face_vectors(p.vertices, p.faces)).sum(axis=0) / 2, abs=1e-12
+    )
 
 
 def test_boundary_pairs_and_neighbours(shape):
@@ -128,9 +160,17 @@ def test_boundary_pairs_and_neighbours(shape):
     charts = {}
     for e, v in enumerate(p.entry_vertex.tolist()):
         charts.setdefault(v, []).append(e)
-    expected = sorted((a, b) for es in charts.values() for a in es for b in es if p.entry_patch[a] < p.entry_patch[b])
+    expected = sorted(
+        (a, b)
+        for es in charts.values()
+        for a in es
+        for b in es
+        if p.entry_patch[a] < p.entry_patch[b]
+    )
     assert sorted(map(tuple, p.boundary.tolist())) == expected
-    assert sorted(map(tuple, p.neighbours.tolist())) == sorted({(p.entry_patch[a], p.entry_patch[b]) for a, b in expected})
+    assert sorted(map(tuple, p.neighbours.tolist())) == sorted(
+        {(p.entry_patch[a], p.entry_patch[b]) for a, b in expected}
+    )
 
 
 def test_patches_have_about_the_same_area():
@@ -152,7 +192,9 @@ def test_number_of_patches_of_the_paper():
     assert [patch_count(a) for a in (0.1, 0.81, 0.92, 2, 5)] == [100, 101, 115, 250, 400]
     V, F = surfaces.sphere(0.3)  # 1.13 m^2
     assert len(Patches.cut(V, F)) == patch_count(mesh.areas(V, F).sum()) == 140
-    many = surfaces.joined(*[(x + 0.1 * k, F) for k, (x, F) in enumerate([surfaces.sheet(n=2, size=0.01)] * 120)])
+    many = surfaces.joined(
+        *[(x + 0.1 * k, F) for k, (x, F) in enumerate([surfaces.sheet(n=2, size=0.01)] * 120)]
+    )
     assert len(Patches.cut(*many)) == 120  # each part needs a patch
     assert len(Patches.cut(*surfaces.sheet(n=5))) == 25  # no more patches than vertices
 
@@ -183,7 +225,10 @@ def test_bad_meshes_and_counts_are_named():
         "its faces have no area": (V * (1, 0, 0), F),
         "26 patches; 1 to 25, the number of its vertices, are possible": (V, F, 26),
         "0 patches; 1 to 25": (V, F, 0),
-        "2 patches, but it has 3 separate parts": (*surfaces.joined(*[(V + k, F) for k in range(3)]), 2),
+        "2 patches, but it has 3 separate parts": (
+            *surfaces.joined(*[(V + k, F) for k in range(3)]),
+            2,
+        ),
     }.items():
         with pytest.raises(InputError) as error:
             Patches.cut(*args, where="shirt.obj")

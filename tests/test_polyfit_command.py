@@ -1,4 +1,6 @@
-"""``python -m polyfit`` and ``import polyfit`` from outside: what they write, what they refuse, what they load."""
+"""``python -m polyfit`` and ``import polyfit`` from outside: what they write, what they refuse,
+what they load.
+"""
 
 import subprocess
 import sys
@@ -18,7 +20,17 @@ def run(*args):
 def test_the_surface_is_written(tmp_path, capsys):
     V, F = surfaces.tube()
     write_ply(tmp_path / "tube.ply", V, F)
-    main([str(tmp_path / "tube.ply"), "-o", str(tmp_path / "out.ply"), "--patches", "8", "--resolution", "2"])
+    main(
+        [
+            str(tmp_path / "tube.ply"),
+            "-o",
+            str(tmp_path / "out.ply"),
+            "--patches",
+            "8",
+            "--resolution",
+            "2",
+        ]
+    )
     W, G, _ = read_mesh(tmp_path / "out.ply")
     assert len(G) == 4 * len(F)
     assert np.abs(np.hypot(W[:, 0], W[:, 1]) - 0.05).max() < 2e-3
@@ -58,5 +70,8 @@ def test_import_is_light():
         "dir(polyfit)": {"torch", "mitsuba", "drjit", "pyvista", "numpy"},
         "polyfit.PatchedSurface, polyfit.PolyFit": {"mitsuba", "drjit", "polysft_mi", "onefit"},
     }.items():
-        done = run("-c", f"import sys, polyfit; {use}; bad = {heavy} & set(sys.modules); assert not bad, bad")
+        done = run(
+            "-c",
+            f"import sys, polyfit; {use}; bad = {heavy} & set(sys.modules); assert not bad, bad",
+        )
         assert done.returncode == 0, done.stderr

@@ -1,4 +1,6 @@
-"""The benchmark of reconstruction: that its measures measure what they say, on surfaces whose distance is known."""
+"""The benchmark of reconstruction: that its measures measure what they say, on surfaces whose
+distance is known.
+"""
 
 import json
 from pathlib import Path
@@ -19,9 +21,15 @@ def test_distance_and_angle_between_surfaces():
     tilted = V + np.column_stack([np.zeros((len(V), 2)), 0.01 + 0.1 * V[:, 0]])
     rms, p95, angle = benchmark.between(V, F, V + (0, 0, 0.01), F[:, ::-1], 500)
     assert (rms, p95, angle) == pytest.approx((0.01, 0.01, 0), abs=1e-6)
-    assert benchmark.between(V, F, tilted, F, 500)[2] == pytest.approx(np.degrees(np.arctan(0.1)), abs=1e-6)
-    half = F[V[F][:, :, 0].max(axis=1) <= 0]  # what is missing counts: points of the sheet are far from its half
-    assert benchmark.between(V, F, V, half, 4000)[0] == pytest.approx(np.sqrt(0.5 * 0.5 * 0.3**2 / 3), rel=0.3)
+    assert benchmark.between(V, F, tilted, F, 500)[2] == pytest.approx(
+        np.degrees(np.arctan(0.1)), abs=1e-6
+    )
+    half = F[
+        V[F][:, :, 0].max(axis=1) <= 0
+    ]  # what is missing counts: points of the sheet are far from its half
+    assert benchmark.between(V, F, V, half, 4000)[0] == pytest.approx(
+        np.sqrt(0.5 * 0.5 * 0.3**2 / 3), rel=0.3
+    )
 
 
 def test_chamfer_is_the_sum_of_both_mean_squares():
@@ -31,7 +39,9 @@ def test_chamfer_is_the_sum_of_both_mean_squares():
 
 def test_samples_are_even():
     points = benchmark.sampled(*surfaces.sheet(n=4), 8000, 0)
-    assert np.histogram2d(*points[:, :2].T, bins=4, range=[[-0.3, 0.3]] * 2)[0] == pytest.approx(np.full((4, 4), 500), abs=120)
+    assert np.histogram2d(*points[:, :2].T, bins=4, range=[[-0.3, 0.3]] * 2)[0] == pytest.approx(
+        np.full((4, 4), 500), abs=120
+    )
 
 
 def test_tables_at_a_small_size(tmp_path, monkeypatch, capsys):

@@ -1,4 +1,6 @@
-"""The raster integrator: its image against geometry, its gradients against central finite differences."""
+"""The raster integrator: its image against geometry, its gradients against central finite
+differences.
+"""
 
 import drjit as dr
 import mitsuba as mi
@@ -11,7 +13,10 @@ from polysft_mi.patch import JetPatch, Unknowns
 from polysft_mi.template import Template
 
 WIDTH, HEIGHT = 96, 72
-UNLIT_MESH = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [1, 1, 1]}}}
+UNLIT_MESH = {
+    "type": "twosided",
+    "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [1, 1, 1]}},
+}
 
 
 @pytest.fixture(autouse=True)
@@ -24,8 +29,18 @@ def sensor(width=WIDTH, height=HEIGHT, fov=40, **film):
         "type": "perspective",
         "fov": fov,
         "near_clip": 0.001,
-        "to_world": mi.ScalarTransform4f().look_at(origin=[0, 0, 0], target=[0, 0, 1], up=[0, -1, 0]),
-        "film": {"type": "hdrfilm", "width": width, "height": height, "pixel_format": "rgba", "rfilter": {"type": "box"}, "sample_border": True, **film},
+        "to_world": (
+            mi.ScalarTransform4f().look_at(origin=[0, 0, 0], target=[0, 0, 1], up=[0, -1, 0])
+        ),
+        "film": {
+            "type": "hdrfilm",
+            "width": width,
+            "height": height,
+            "pixel_format": "rgba",
+            "rfilter": {"type": "box"},
+            "sample_border": True,
+            **film,
+        },
     }
 
 
@@ -45,7 +60,9 @@ def triangles(path, *corners, **options):
     """A scene of loose triangles, each three points."""
     vertices = np.concatenate([np.asarray(c, float) for c in corners])
     mesh = write_mesh(path / "triangles.ply", vertices, np.arange(len(vertices)).reshape(-1, 3))
-    return mi.load_dict({"type": "scene", "sensor": sensor(**options), "mesh": {**mesh, "bsdf": UNLIT_MESH}})
+    return mi.load_dict(
+        {"type": "scene", "sensor": sensor(**options), "mesh": {**mesh, "bsdf": UNLIT_MESH}}
+    )
 
 
 def raster(**options):
@@ -60,13 +77,16 @@ def pixel_size(depth=1.0, width=WIDTH, fov=40):
     return depth * 2 * np.tan(np.radians(fov / 2)) / width
 
 
-# ---- the image ----------------------------------------------------------------------------------------------------------
+# ---- the image -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("share", [0.1, 0.3, 0.5, 0.8, 1.0])
 @pytest.mark.parametrize("axis", [0, 1])
-def test_antialiasing_is_exact_where_an_edge_along_an_axis_covers_a_part_of_a_pixel(tmp_path, axis, share):
-    # a half plane x < (10 + share) pixels right of (or below) the centre: pixel 10 is covered by that share
+def test_antialiasing_is_exact_where_an_edge_along_an_axis_covers_a_part_of_a_pixel(
+    tmp_path, axis, share
+):
+    # a half plane x < (10 + share) pixels right of (or below) the centre: pixel 10 is covered by
+    # that share
     p = pixel_size()
     edge = (10 + share) * p
     corners = np.array([[edge, -20, 1], [edge, 20, 1], [-60, 0, 1]], float)
@@ -88,20 +108,25 @@ def test_slanted_edges_keep_the_area(tmp_path):
 
 
 def test_edge_of_a_sliver_narrower_than_a_pixel_belongs_to_the_sheet(tmp_path):
-    # the last strip of the sheet is a tenth of a pixel wide, so no pixel's centre sees the triangles that own the silhouette
+    # the last strip of the sheet is a tenth of a pixel wide, so no pixel's centre sees the
+    # triangles that own the silhouette
     p = pixel_size()
     x = np.array([-5.0, 10.2, 10.3]) * p
     vertices = np.array([[a, b, 1] for b in (-9 * p, 9 * p) for a in x])
     faces = [[0, 1, 3], [1, 4, 3], [1, 2, 4], [2, 5, 4]]
     mesh = write_mesh(tmp_path / "sliver.ply", vertices, faces)
-    scene = mi.load_dict({"type": "scene", "sensor": sensor(), "mesh": {**mesh, "bsdf": UNLIT_MESH}})
+    scene = mi.load_dict(
+        {"type": "scene", "sensor": sensor(), "mesh": {**mesh, "bsdf": UNLIT_MESH}}
+    )
     assert picture(scene)[HEIGHT // 2, WIDTH // 2 + 10, 3] == pytest.approx(0.3, abs=1e-3)
 
 
 def test_more_samples_approach_the_coverage(tmp_path):
     p = pixel_size()
     angle = np.radians(np.arange(3) * 120 + 40)
-    scene = triangles(tmp_path, np.stack([20 * p * np.cos(angle), 20 * p * np.sin(angle), np.ones(3)], 1))
+    scene = triangles(
+        tmp_path, np.stack([20 * p * np.cos(angle), 20 * p * np.sin(angle), np.ones(3)], 1)
+    )
     reference = picture(scene, spp=400, antialias=False)
     errors = [np.abs(picture(scene, spp=spp) - reference).max() for spp in (1, 16)]
     assert errors[1] < 0.06 < errors[0] < 0.25
@@ -109,29 +134,44 @@ def test_more_samples_approach_the_coverage(tmp_path):
 
 def test_both_sides_look_the_same(tmp_path):
     corners = np.array([[-0.2, -0.2, 1], [0.2, -0.2, 1], [0, 0.2, 1.0]])
-    assert np.abs(picture(triangles(tmp_path, corners)) - picture(triangles(tmp_path, corners[::-1]))).max() < 1e-4
+    assert (
+        np.abs(
+            picture(triangles(tmp_path, corners)) - picture(triangles(tmp_path, corners[::-1]))
+        ).max()
+        < 1e-4
+    )
 
 
 def test_crop_window_is_a_part_of_the_image(tmp_path):
     corners = np.array([[-0.2, -0.2, 1], [0.25, -0.1, 1.2], [0, 0.2, 0.9]])
     whole = picture(triangles(tmp_path, corners))
-    crop = picture(triangles(tmp_path, corners, crop_offset_x=30, crop_offset_y=20, crop_width=40, crop_height=31))
+    crop = picture(
+        triangles(
+            tmp_path, corners, crop_offset_x=30, crop_offset_y=20, crop_width=40, crop_height=31
+        )
+    )
     # at the window's border antialiasing lacks the neighbours beyond
     assert np.abs(crop[1:-1, 1:-1] - whole[21:50, 31:69]).max() < 1e-4
 
 
 def test_aovs(tmp_path):
-    corners = [np.array([[-0.6, -0.5, 1], [0.6, -0.5, 1], [0, 0.5, 2.0]]), np.array([[-0.1, -0.1, 0.5], [0.1, -0.1, 0.5], [0, 0.1, 0.5]])]
+    corners = [
+        np.array([[-0.6, -0.5, 1], [0.6, -0.5, 1], [0, 0.5, 2.0]]),
+        np.array([[-0.1, -0.1, 0.5], [0.1, -0.1, 0.5], [0, 0.1, 0.5]]),
+    ]
     image = picture(triangles(tmp_path, *corners), aovs="depth,normal,triangle", spp=4)
     p = pixel_size(1.0)
     for y, x in ((HEIGHT // 2, WIDTH // 2), (HEIGHT // 2 - 20, WIDTH // 2 - 25), (0, 0)):
-        # reference: intersect the ray through the pixel's sample nearest the centre by hand (the lower right one of the 2x2)
+        # reference: intersect the ray through the pixel's sample nearest the centre by hand (the
+        # lower right one of the 2x2)
         d = np.array([(x + 0.75 - WIDTH / 2) * p, (y + 0.75 - HEIGHT / 2) * p, 1])
         best = (0, [0, 0, 0], -1)
         for k, c in enumerate(corners):
             n = np.cross(c[1] - c[0], c[2] - c[0])
             z = (n @ c[0]) / (n @ d)
-            b = np.linalg.lstsq(np.stack([c[1] - c[0], c[2] - c[0]], 1), z * d - c[0], rcond=None)[0]
+            b = np.linalg.lstsq(np.stack([c[1] - c[0], c[2] - c[0]], 1), z * d - c[0], rcond=None)[
+                0
+            ]
             if b.min() > 0 and b.sum() < 1 and (best[2] < 0 or z < best[0]):
                 n = n / np.linalg.norm(n)
                 best = (z, n * -np.sign(n @ d), k)
@@ -146,14 +186,29 @@ def test_bsdf_shading_agrees_with_direct_illumination(tmp_path):
         {
             "type": "scene",
             "sensor": sensor(),
-            "mesh": {**mesh, "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.2, 0.5, 0.8]}}}},
-            "light": {"type": "point", "position": [0.3, -0.4, 0.2], "intensity": {"type": "rgb", "value": [1, 0.8, 0.5]}},
+            "mesh": {
+                **mesh,
+                "bsdf": {
+                    "type": "twosided",
+                    "bsdf": {
+                        "type": "diffuse",
+                        "reflectance": {"type": "rgb", "value": [0.2, 0.5, 0.8]},
+                    },
+                },
+            },
+            "light": {
+                "type": "point",
+                "position": [0.3, -0.4, 0.2],
+                "intensity": {"type": "rgb", "value": [1, 0.8, 0.5]},
+            },
         }
     )
     ours = picture(scene, shading="bsdf", antialias=False)
     theirs = np.array(mi.render(scene, integrator=mi.load_dict({"type": "direct"}), spp=64))
     inner = ours[..., 3] == 1
-    inner[1:-1, 1:-1] &= (ours[:-2, 1:-1, 3] + ours[2:, 1:-1, 3] + ours[1:-1, :-2, 3] + ours[1:-1, 2:, 3]) == 4
+    inner[1:-1, 1:-1] &= (
+        ours[:-2, 1:-1, 3] + ours[2:, 1:-1, 3] + ours[1:-1, :-2, 3] + ours[1:-1, 2:, 3]
+    ) == 4
     assert inner.sum() > 1000
     assert np.abs(ours[inner, :3] / theirs[inner, :3] - 1).mean() < 0.01
 
@@ -167,7 +222,12 @@ def test_develops_through_the_film(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "options, message", [({"shading": "phong"}, "known: unlit, bsdf"), ({"aovs": "depth,colour"}, "aov 'colour'"), ({"shading_samples": 0}, "at least 1")]
+    "options, message",
+    [
+        ({"shading": "phong"}, "known: unlit, bsdf"),
+        ({"aovs": "depth,colour"}, "aov 'colour'"),
+        ({"shading_samples": 0}, "at least 1"),
+    ],
 )
 def test_unknown_options(options, message):
     with pytest.raises(Exception, match=message):
@@ -180,7 +240,7 @@ def test_samples_must_be_a_square(tmp_path):
         raster().render(scene, spp=3)
 
 
-# ---- gradients ----------------------------------------------------------------------------------------------------------
+# ---- gradients -----------------------------------------------------------------------------------
 
 
 class Sheet:
@@ -198,11 +258,16 @@ class Sheet:
         mesh = write_mesh(folder / "sheet.ply", vertices, faces, uv)
         v, u = np.meshgrid(np.linspace(0, 1, 192), np.linspace(0, 1, 256), indexing="ij")
         frequency = 5 if kind != "textured" else 30
-        texture = 0.5 + 0.35 * np.stack([np.sin(frequency * u), np.cos(0.8 * frequency * v), np.sin(0.7 * frequency * (u + v))], -1)
+        texture = 0.5 + 0.35 * np.stack(
+            [np.sin(frequency * u), np.cos(0.8 * frequency * v), np.sin(0.7 * frequency * (u + v))],
+            -1,
+        )
         bitmap = mi.Bitmap(texture.astype(np.float32))
         reflectance = {"type": "bitmap", "bitmap": bitmap, "raw": True, "wrap_mode": "clamp"}
         bsdf = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": reflectance}}
-        self.scene = mi.load_dict({"type": "scene", "sensor": sensor(), "sheet": {**mesh, "bsdf": bsdf}})
+        self.scene = mi.load_dict(
+            {"type": "scene", "sensor": sensor(), "sheet": {**mesh, "bsdf": bsdf}}
+        )
         self.params = mi.traverse(self.scene)
         self.key = next(k for k in self.params.keys() if k.endswith("vertex_positions"))
         self.integrator = raster()
@@ -234,7 +299,11 @@ DIRECTIONS = ["delta_alpha", "delta_u", "delta_v", "delta_w", "rotation", "trans
 
 def direction_of(name, size):
     rng = np.random.default_rng(11)
-    if name in ("delta_u", "delta_v", "delta_w"):  # a smooth field over the sheet, as a deformation is
+    if name in (
+        "delta_u",
+        "delta_v",
+        "delta_w",
+    ):  # a smooth field over the sheet, as a deformation is
         return np.sin(np.linspace(0, 4, size) + 0.5).astype(np.float32)
     out = rng.normal(size=size).astype(np.float32)
     if name == "rotation":
@@ -259,7 +328,8 @@ def test_gradients_against_finite_differences(tmp_path, kind):
         chosen = mi.Float(chosen.ravel())
 
         def loss(unknowns):
-            # blurred, so that the loss is smooth where the image has a kink at every pixel that changes sheets
+            # blurred, so that the loss is smooth where the image has a kink at every pixel that
+            # changes sheets
             difference = mi.TensorXf(sheet.image(unknowns).array - target.array, target.shape)
             return dr.sum(chosen * dr.square(objective.blur(difference, 2.0).array))
 
@@ -272,10 +342,16 @@ def test_gradients_against_finite_differences(tmp_path, kind):
             gradient = np.array(dr.grad(getattr(unknowns, name)))
             ad = float(gradient @ direction)
             # the median over steps, for single pixels jump where triangles are seen edge-on
-            slopes = [(loss(sheet.step(name, direction, h))[0] - loss(sheet.step(name, direction, -h))[0]) / (2 * h) for h in (2.5e-4, 5e-4, 1e-3, 2e-3)]
+            slopes = [
+                (loss(sheet.step(name, direction, h))[0] - loss(sheet.step(name, direction, -h))[0])
+                / (2 * h)
+                for h in (2.5e-4, 5e-4, 1e-3, 2e-3)
+            ]
             fd = float(np.median(slopes))
             # of a direction across the gradient, what its length would give
-            assert abs(ad - fd) <= 0.05 * max(abs(fd), 0.25 * np.linalg.norm(gradient) * np.linalg.norm(direction), 2.0), f"{kind}, channels {channels}, {name}: AD {ad:.4g}, finite differences {fd:.4g}"
+            assert abs(ad - fd) <= 0.05 * max(
+                abs(fd), 0.25 * np.linalg.norm(gradient) * np.linalg.norm(direction), 2.0
+            ), f"{kind}, channels {channels}, {name}: AD {ad:.4g}, finite differences {fd:.4g}"
 
 
 def test_self_occlusion_is_there(tmp_path):
@@ -321,14 +397,18 @@ def test_direct_call_is_the_same_as_mi_render(tmp_path):
             image = sheet.integrator.render(sheet.scene, spp=1)
         dr.backward(dr.sum(dr.square(image.array - 0.3)))
         gradients.append(np.array(dr.grad(unknowns.delta_alpha)))
-    assert gradients[0] == pytest.approx(gradients[1], rel=1e-3, abs=1e-3 * float(np.abs(gradients[1]).max()))
+    assert gradients[0] == pytest.approx(
+        gradients[1], rel=1e-3, abs=1e-3 * float(np.abs(gradients[1]).max())
+    )
 
 
 def test_no_kernel_is_compiled_and_no_memory_grows_in_a_loop(tmp_path):
     sheet = Sheet(tmp_path, "smooth")
 
     def iterate(k):
-        unknowns = Unknowns.from_numpy({**sheet.arrays, "translation": sheet.arrays["translation"] + 0.01 * k})
+        unknowns = Unknowns.from_numpy(
+            {**sheet.arrays, "translation": sheet.arrays["translation"] + 0.01 * k}
+        )
         for _, value in unknowns.items():
             dr.enable_grad(value)
         dr.backward(dr.sum(dr.square(sheet.image(unknowns).array - 0.3)))
@@ -351,7 +431,9 @@ def test_a_moved_camera_is_noticed(tmp_path):
     before = np.array(mi.render(scene, integrator=integrator, spp=1))
     params = mi.traverse(scene)
     key = next(k for k in params.keys() if k.endswith("to_world"))
-    moved = mi.ScalarTransform4f().look_at(origin=[10 * pixel_size(), 0, 0], target=[10 * pixel_size(), 0, 1], up=[0, -1, 0])
+    moved = mi.ScalarTransform4f().look_at(
+        origin=[10 * pixel_size(), 0, 0], target=[10 * pixel_size(), 0, 1], up=[0, -1, 0]
+    )
     params[key] = mi.Transform4f(moved.matrix)
     params.update()
     after = np.array(mi.render(scene, integrator=integrator, spp=1))

@@ -20,8 +20,13 @@ from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError
 from polysft_mi.results import PEAK, Run
 
-BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None)
-needs_browser = pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed (Debian, Ubuntu: apt-get install chromium)")
+BROWSER = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))),
+    None,
+)
+needs_browser = pytest.mark.skipif(
+    BROWSER is None, reason="no Chromium is installed (Debian, Ubuntu: apt-get install chromium)"
+)
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +39,13 @@ def page(finished_run, tmp_path_factory):
 
 
 def data_of(path):
-    return json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', path.read_text(encoding="utf-8"), re.S)[1])
+    return json.loads(
+        re.search(
+            r'<script type="application/json" id="data">(.*?)</script>',
+            path.read_text(encoding="utf-8"),
+            re.S,
+        )[1]
+    )
 
 
 def array(text, dtype):
@@ -44,7 +55,10 @@ def array(text, dtype):
 def scalar(data, label, shape):
     (found,) = [s for s in data["scalars"] if s["label"] == label]
     raw = array(found["values"], np.uint8).reshape(shape)
-    return np.where(raw == 255, np.nan, found["low"] + raw / 254 * (found["high"] - found["low"])), found
+    return (
+        np.where(raw == 255, np.nan, found["low"] + raw / 254 * (found["high"] - found["low"])),
+        found,
+    )
 
 
 def test_a_run_leaves_its_report(finished_run):
@@ -54,7 +68,9 @@ def test_a_run_leaves_its_report(finished_run):
 
 def test_page_needs_nothing_else(page):
     text = page.read_text(encoding="utf-8")
-    own = text.replace(re.search(r"<script>(.{100000,}?)</script>", text, re.S)[1], "")  # without plotly itself
+    own = text.replace(
+        re.search(r"<script>(.{100000,}?)</script>", text, re.S)[1], ""
+    )  # without plotly itself
     assert not re.search(r"""(src|href)\s*=\s*["']?(https?:)?//|@import|url\(""", own)
     assert "{{" not in own
 
@@ -66,20 +82,35 @@ def test_surface_and_pictures_are_those_of_the_run(finished_run, page):
     V = low + array(mesh["positions"], "<u2").reshape(run.vertices.shape) / 65535 * (high - low)
     x, y, z = np.moveaxis(run.vertices, -1, 0)
     np.testing.assert_allclose(V, np.stack([x, z, -y], -1), atol=1e-5)
-    corners, weights = array(mesh["corners"], "<u4").reshape(-1, 3), array(mesh["weights"], "<f4").reshape(-1, 3)
+    corners, weights = (
+        array(mesh["corners"], "<u4").reshape(-1, 3),
+        array(mesh["weights"], "<f4").reshape(-1, 3),
+    )
     fine = np.einsum("nk,nkc->nc", weights, V[0][corners])
     F = array(mesh["faces"], "<u4").reshape(-1, 3)
-    area = lambda V, F: 0.5 * np.linalg.norm(np.cross(V[F[:, 1]] - V[F[:, 0]], V[F[:, 2]] - V[F[:, 0]]), axis=1).sum()
+    area = lambda V, F: (
+        0.5
+        * np.linalg.norm(np.cross(V[F[:, 1]] - V[F[:, 0]], V[F[:, 2]] - V[F[:, 0]]), axis=1).sum()
+    )
     assert area(fine, F) == pytest.approx(area(V[0], run.faces), rel=1e-6)
     texture = np.asarray(Image.open(run.texture).convert("RGB")).astype(float)
     colours = array(mesh["colours"], np.uint8).reshape(-1, 3)
     uv = np.einsum("nk,nkc->nc", weights, run.uv[corners])
-    at = np.clip((np.stack([1 - uv[:, 1], uv[:, 0]], 1) * texture.shape[:2]).astype(int), 0, np.array(texture.shape[:2]) - 1)
-    assert np.abs(colours - texture[at[:, 0], at[:, 1]]).mean() < 12  # one end of the texture differs from the other by 150
-    target, render, error = (
-        np.asarray(Image.open(io.BytesIO(base64.b64decode(data["images"][n][2])))) for n in ("target", "render", "error")
+    at = np.clip(
+        (np.stack([1 - uv[:, 1], uv[:, 0]], 1) * texture.shape[:2]).astype(int),
+        0,
+        np.array(texture.shape[:2]) - 1,
     )
-    expected = np.asarray(Image.open(finished_run[0].folder / "frames" / "002.png").convert("RGB")).astype(float)
+    assert (
+        np.abs(colours - texture[at[:, 0], at[:, 1]]).mean() < 12
+    )  # one end of the texture differs from the other by 150
+    target, render, error = (
+        np.asarray(Image.open(io.BytesIO(base64.b64decode(data["images"][n][2]))))
+        for n in ("target", "render", "error")
+    )
+    expected = np.asarray(
+        Image.open(finished_run[0].folder / "frames" / "002.png").convert("RGB")
+    ).astype(float)
     assert np.abs(target.astype(float) - expected).mean() < 6
     assert render.shape == error.shape == target.shape and len(data["images"]["error"]) == 4
 
@@ -89,31 +120,46 @@ def test_figures_and_colours(finished_run, page):
     run, data = Run.open(out), data_of(page)
     shape = run.vertices.shape[:2]
     true_distance = 1e3 * np.linalg.norm(run.vertices - truth.vertices, axis=2)
-    np.testing.assert_allclose(data["columns"]["rmse_mm"], np.sqrt((true_distance**2).mean(1)), rtol=1e-4)
+    np.testing.assert_allclose(
+        data["columns"]["rmse_mm"], np.sqrt((true_distance**2).mean(1)), rtol=1e-4
+    )
     assert data["columns"]["psnr_mask"] == [row["psnr_mask"] for row in run.metrics["per_frame"]]
     distance, found = scalar(data, "distance to the truth", shape)
-    assert np.abs(distance - np.clip(true_distance, 0, found["high"])).max() <= 0.6 * found["high"] / 254
+    assert (
+        np.abs(distance - np.clip(true_distance, 0, found["high"])).max()
+        <= 0.6 * found["high"] / 254
+    )
     error, _ = scalar(data, "error", shape)
     assert np.isfinite(error).all() and 0 < error.mean() < 0.1
     sigma, found = scalar(data, "sigma", shape)
     known = np.isfinite(run.sigma)
     assert np.array_equal(np.isfinite(sigma), known)
-    assert np.abs(sigma - np.clip(1e3 * run.sigma, 0, found["high"]))[known].max() <= 0.6 * found["high"] / 254
+    assert (
+        np.abs(sigma - np.clip(1e3 * run.sigma, 0, found["high"]))[known].max()
+        <= 0.6 * found["high"] / 254
+    )
     assert [label for label, _ in data["cards"]].count("lost frames") == 1
 
 
 def test_curvature_is_the_mean_of_polyfits_principal_ones():
     rng = np.random.default_rng(0)
-    p = {name: 0.3 * rng.normal(size=size) for name, size in dict(chart=(20, 2), delta_u=(3, 20), delta_v=(3, 20), alpha=15, delta_alpha=(3, 15)).items()}
+    p = {
+        name: 0.3 * rng.normal(size=size)
+        for name, size in dict(
+            chart=(20, 2), delta_u=(3, 20), delta_v=(3, 20), alpha=15, delta_alpha=(3, 15)
+        ).items()
+    }
     p |= dict(scale=0.2, frame_rotation=np.eye(3), rotation=np.tile([0.1, 0.2, 0.3, 1.0], (3, 1)))
     uv = torch.as_tensor(p["chart"] + np.stack([p["delta_u"], p["delta_v"]], -1))
-    wanted = jets.principal_curvatures(torch.as_tensor(p["alpha"] + p["delta_alpha"]), uv).mean(-1) / 0.2
+    wanted = (
+        jets.principal_curvatures(torch.as_tensor(p["alpha"] + p["delta_alpha"]), uv).mean(-1) / 0.2
+    )
     np.testing.assert_allclose(Run.mean_curvature(SimpleNamespace(params=p)), wanted, rtol=1e-9)
 
 
 def test_curvature_is_that_of_the_jets(finished_run):
-    """On the middle row of the grid, whose rows and columns stay at right angles: half the sum of the normal curvatures along both, by
-    differences of the mesh's own edges.
+    """On the middle row of the grid, whose rows and columns stay at right angles: half the sum of
+    the normal curvatures along both, by differences of the mesh's own edges.
     """
     run = Run.open(finished_run[1])
     p = run.params
@@ -125,7 +171,9 @@ def test_curvature_is_that_of_the_jets(finished_run):
     normal = np.cross(row[2] - row[0], column[2] - column[0])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     bent = sum(_turning(*points, normal) for points in (row, column)) / 2
-    np.testing.assert_allclose(run.mean_curvature()[-1].reshape(9, 11)[4, 1:-1], np.abs(bent), rtol=0.03)
+    np.testing.assert_allclose(
+        run.mean_curvature()[-1].reshape(9, 11)[4, 1:-1], np.abs(bent), rtol=0.03
+    )
 
 
 def _turning(a, b, c, normal):
@@ -150,10 +198,18 @@ def test_fewer_frames_and_odd_names(finished_run, tmp_path):
     (out / "run.json").write_text(json.dumps({**about, "command": "</script><!-- x"}))
     report.write(out, frames=2)
     data = data_of(out / "report.html")
-    assert data["shown"] == [0, 3] and len(data["images"]["target"]) == 2 and len(data["columns"]["frame"]) == 4
+    assert (
+        data["shown"] == [0, 3]
+        and len(data["images"]["target"]) == 2
+        and len(data["columns"]["frame"]) == 4
+    )
     assert data["command"] == "</script><!-- x" and data["title"] == out.name
     assert "<title>a &lt;b> &amp; 'ü'</title>" in (out / "report.html").read_text(encoding="utf-8")
-    assert report.spread(5, 3) == [0, 2, 4] and report.spread(2, 9) == [0, 1] and report.spread(9, 1) == [0]
+    assert (
+        report.spread(5, 3) == [0, 2, 4]
+        and report.spread(2, 9) == [0, 1]
+        and report.spread(9, 1) == [0]
+    )
 
 
 def test_pngs_stand_in_for_the_video(finished_run, tmp_path):
@@ -164,12 +220,17 @@ def test_pngs_stand_in_for_the_video(finished_run, tmp_path):
         Image.fromarray(frame).save(out / "comparison" / f"{k:03d}.png")
     (out / "comparison.mp4").unlink()
     report.write(out)
-    assert data_of(out / "report.html")["images"] == data_of(finished_run[1] / "report.html")["images"]
+    assert (
+        data_of(out / "report.html")["images"] == data_of(finished_run[1] / "report.html")["images"]
+    )
     metrics = json.loads((out / "metrics.json").read_text())
     lost = {"frames_wanted": 9, "lost": {"2": "left the image"}}
     (out / "metrics.json").write_text(json.dumps({**metrics, **lost}))
     report.write(out)
-    assert data_of(out / "report.html")["warning"] == "Interrupted: 4 of 9 frames. Frame 2: left the image."
+    assert (
+        data_of(out / "report.html")["warning"]
+        == "Interrupted: 4 of 9 frames. Frame 2: left the image."
+    )
 
 
 def test_refusals_leave_nothing(finished_run, tmp_path):
@@ -189,10 +250,13 @@ def test_refusals_leave_nothing(finished_run, tmp_path):
         report.write(out, tmp_path / "nowhere" / "a.html")
     with pytest.raises(InputError, match="--frames 0"):
         report.main([str(out), "--frames", "0"])
-    assert not (out / "report.html").exists() and [p for p in out.iterdir() if "partial" in p.name] == []
+    assert (
+        not (out / "report.html").exists()
+        and [p for p in out.iterdir() if "partial" in p.name] == []
+    )
 
 
-# ---- in a browser ------------------------------------------------------------------------------------------------------------
+# ---- in a browser --------------------------------------------------------------------------------
 
 _WATCH = """<script>
 const problems = [];
@@ -224,7 +288,9 @@ _STEPS = """
 
 
 def browse(page, tmp_path, steps):
-    """The page opened in a browser, with steps done in it: what it noted, and a screenshot (H, W, 3) from the page's top."""
+    """The page opened in a browser, with steps done in it: what it noted, and a screenshot (H, W,
+    3) from the page's top.
+    """
     text = page.read_text(encoding="utf-8").replace("<head>", "<head>" + _WATCH, 1)
     before, _, after = text.rpartition("</body>")
     copy, picture = tmp_path / "page.html", tmp_path / "page.png"
@@ -244,8 +310,15 @@ def browse(page, tmp_path, steps):
         "--no-first-run",
         f"--user-data-dir={tmp_path / 'profile'}",
     ]
-    flags += ["--window-size=1300,1500", "--virtual-time-budget=6000", "--enable-logging=stderr", f"--screenshot={picture}"]
-    done = subprocess.run([BROWSER, *flags, copy.as_uri()], capture_output=True, text=True, timeout=120)
+    flags += [
+        "--window-size=1300,1500",
+        "--virtual-time-budget=6000",
+        "--enable-logging=stderr",
+        f"--screenshot={picture}",
+    ]
+    done = subprocess.run(
+        [BROWSER, *flags, copy.as_uri()], capture_output=True, text=True, timeout=120
+    )
     seen = re.search(r'"SEEN (\{.*\})"', done.stderr)
     assert seen, done.stderr[-2000:]
     return json.loads(seen[1]), np.asarray(Image.open(picture).convert("RGB")).astype(int)
@@ -263,10 +336,16 @@ def test_browser_shows_it(page, tmp_path):
     seen, last = browse(page, tmp_path / "moved", _STEPS)
     assert seen["problems"] == still["problems"] == [] and seen["fetched"] == []
     assert [seen[n]["now"] for n in ("start", "slid", "right", "home", "end")] == [0, 2, 3, 0, 3]
-    assert seen["slid"]["label"].startswith("frame 2") and seen["slid"]["row"] == 3 and seen["start"]["drawn"] > 50
+    assert (
+        seen["slid"]["label"].startswith("frame 2")
+        and seen["slid"]["row"] == 3
+        and seen["start"]["drawn"] > 50
+    )
     assert seen["slid"]["z"] != seen["start"]["z"] == seen["home"]["z"]
     assert (seen["start"]["kind"], seen["curvature"]["kind"]) == (False, True)
-    (before, surface), (after, same) = ([part(p, box) for box in seen["boxes"]] for p in (first, last))
+    (before, surface), (after, same) = (
+        [part(p, box) for box in seen["boxes"]] for p in (first, last)
+    )
     assert np.abs(before - after).max(2).mean() > 5  # the slider changed the picture
     for picture in (surface, same):
         assert (np.ptp(picture, axis=2) > 60).mean() > 0.05, "the surface in 3D is blank"

@@ -1,4 +1,6 @@
-"""The whole way, from a scene file to what a run leaves: on a small sheet whose true surface is known."""
+"""The whole way, from a scene file to what a run leaves: on a small sheet whose true surface is
+known.
+"""
 
 import json
 import os
@@ -46,7 +48,11 @@ def surface(out):
 
 def test_reconstruction_is_right(sequence, result):
     figures = evaluate.evaluate(str(result), str(sequence.folder))
-    still = {"vertices": np.repeat(sequence.vertices[:1], 6, 0), "faces": sequence.faces, "frames": np.arange(6)}
+    still = {
+        "vertices": np.repeat(sequence.vertices[:1], 6, 0),
+        "faces": sequence.faces,
+        "frames": np.arange(6),
+    }
     start = metrics.score(still, str(sequence.folder / "gt.npz"))
     assert figures["frames"] == 6
     assert figures["e3d_proc"] < 0.5 * start["e3d_proc"]
@@ -73,17 +79,28 @@ def test_unknowns_make_the_surface(result):
         p = {k: p[k] for k in p}
     for k, expected in enumerate(surface(result)["vertices"]):
         uv = p["chart"] + np.stack([p["delta_u"][k], p["delta_v"][k]], 1)
-        x = jets.point(torch.as_tensor(p["alpha"] + p["delta_alpha"][k]), torch.as_tensor(uv)).numpy()
+        x = jets.point(
+            torch.as_tensor(p["alpha"] + p["delta_alpha"][k]), torch.as_tensor(uv)
+        ).numpy()
         x[:, 2] += p["delta_w"][k]
         x = x @ Rotation.from_quat(p["rotation"][k]).as_matrix().T + p["translation"][k]
-        assert np.abs(p["scale"] * x @ p["frame_rotation"].T + p["frame_origin"] - expected).max() < 1e-5
+        assert (
+            np.abs(p["scale"] * x @ p["frame_rotation"].T + p["frame_origin"] - expected).max()
+            < 1e-5
+        )
 
 
 def test_files_of_a_run(sequence, result):
-    assert sorted(f.name for f in (result / "meshes").iterdir()) == [f"{k:03d}.ply" for k in range(6)]
+    assert sorted(f.name for f in (result / "meshes").iterdir()) == [
+        f"{k:03d}.ply" for k in range(6)
+    ]
     mesh = trimesh.load(result / "meshes" / "003.ply", process=False)
     assert np.abs(mesh.vertices - surface(result)["vertices"][3]).max() < 1e-6
-    assert sorted(f.name for f in (result / "comparison").iterdir()) == ["000.exr", "002.exr", "005.exr"]
+    assert sorted(f.name for f in (result / "comparison").iterdir()) == [
+        "000.exr",
+        "002.exr",
+        "005.exr",
+    ]
     layers, header = exr.read_exr(result / "comparison" / "005.exr")
     assert {k: v.shape for k, v in layers.items()} == {
         "target": (72, 96, 3), "render": (72, 96, 3), "error": (72, 96, 1), "mask_target": (72, 96, 1),
@@ -99,7 +116,11 @@ def test_files_of_a_run(sequence, result):
         assert (result / name).stat().st_size > 5000
     assert (result / "comparison.mp4").exists()
     figures = json.loads((result / "metrics.json").read_text())
-    assert figures["frames"] == 6 and figures["lost"] == {} and figures["versions"]["variant"].endswith("_ad_rgb")
+    assert (
+        figures["frames"] == 6
+        and figures["lost"] == {}
+        and figures["versions"]["variant"].endswith("_ad_rgb")
+    )
     records = [json.loads(line) for line in (result / "log.jsonl").read_text().splitlines()]
     assert {r["frame"] for r in records} == set(range(6)) and sum("best" in r for r in records) == 6
 
@@ -141,7 +162,9 @@ def test_resume_ends_with_the_same_result(sequence, tmp_path, monkeypatch, solve
 
     monkeypatch.setattr(tracker, "_advance", interrupted)
     assert run.main([*arguments, "-o", str(parts)]) == 130
-    assert surface(parts)["vertices"].shape[0] == kept  # two windows, of three frames or of one: valid, and shorter
+    assert (
+        surface(parts)["vertices"].shape[0] == kept
+    )  # two windows, of three frames or of one: valid, and shorter
     assert json.loads((parts / "metrics.json").read_text())["frames"] == kept
     monkeypatch.setattr(tracker, "_advance", advance)
     assert run.main([*arguments, "-o", str(parts), "--resume"]) == 0
@@ -149,7 +172,9 @@ def test_resume_ends_with_the_same_result(sequence, tmp_path, monkeypatch, solve
     assert a["vertices"].shape == b["vertices"].shape
     assert np.abs(a["vertices"] - b["vertices"]).max() < 1e-5
     windows = json.loads((whole / "metrics.json").read_text())["windows"]
-    assert windows and not any(isinstance(x, list) for w in windows for x in w.values())  # numbers alone: what a solver keeps for itself is no figure
+    assert windows and not any(
+        isinstance(x, list) for w in windows for x in w.values()
+    )  # numbers alone: what a solver keeps for itself is no figure
     assert ("sigma" in a) == (solver == []) and all(np.array_equal(a[name], b[name]) for name in a)
     lines = [(out / "log.jsonl").read_text().count("\n") for out in (whole, parts)]
     assert lines[0] == lines[1]
@@ -160,7 +185,8 @@ def test_ctrl_c_leaves_a_valid_shorter_result(sequence, tmp_path):
     process = subprocess.Popen(
         command(sequence.folder / "scene.xml", "-o", out, *QUICK, "-D", "patience=100000", "-D", "period=60"),
         cwd=ROOT, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a shell's background jobs inherit that it is ignored
+        # a shell's background jobs inherit that it is ignored
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
     checkpoint = out / "checkpoint.npz"
     deadline = time.time() + 120
@@ -175,23 +201,34 @@ def test_ctrl_c_leaves_a_valid_shorter_result(sequence, tmp_path):
 
 
 @pytest.mark.parametrize("solver", [QUICK, []], ids=["adam", "gauss-newton"])
-def test_a_frame_that_breaks_the_loss_is_reported_and_passed_over(sequence, tmp_path, capsys, monkeypatch, solver):
+def test_a_frame_that_breaks_the_loss_is_reported_and_passed_over(
+    sequence, tmp_path, capsys, monkeypatch, solver
+):
     from polysft_mi.sequence import Sequence
 
     frame = Sequence.frame
-    monkeypatch.setattr(Sequence, "frame", lambda self, i: frame(self, i) * (np.nan if i == 3 else 1))
+    monkeypatch.setattr(
+        Sequence, "frame", lambda self, i: frame(self, i) * (np.nan if i == 3 else 1)
+    )
     out = tmp_path / "out"
     assert run.main([str(sequence.folder / "scene.xml"), "-o", str(out), "-q", *solver]) == 0
     err = capsys.readouterr().err
-    assert "frame 3: the loss is nan from the start; it keeps the state of the frame before" in err and err.count("\n") == 1
+    assert (
+        "frame 3: the loss is nan from the start; it keeps the state of the frame before" in err
+        and err.count("\n") == 1
+    )
     s = surface(out)
     assert np.isfinite(s["vertices"]).all() and s["vertices"].shape[0] == 6
     assert np.array_equal(s["vertices"][3], s["vertices"][2])
     assert list(json.loads((out / "metrics.json").read_text())["lost"]) == ["3"]
-    assert np.abs(s["vertices"][4] - s["vertices"][2]).max() > 1e-3  # the frames after it are tracked on
+    assert (
+        np.abs(s["vertices"][4] - s["vertices"][2]).max() > 1e-3
+    )  # the frames after it are tracked on
 
 
-def test_a_surface_that_leaves_the_image_is_reported_and_held(sequence, tmp_path, capsys, monkeypatch):
+def test_a_surface_that_leaves_the_image_is_reported_and_held(
+    sequence, tmp_path, capsys, monkeypatch
+):
     from polysft_mi.solvers.adam import Adam
 
     solve, thrown = Adam.solve, []
@@ -205,21 +242,55 @@ def test_a_surface_that_leaves_the_image_is_reported_and_held(sequence, tmp_path
 
     monkeypatch.setattr(Adam, "solve", thrown_out)
     out = tmp_path / "out"
-    assert run.main([str(sequence.folder / "scene.xml"), "-o", str(out), "-q", *QUICK, "-D", "last=4"]) == 0
-    assert "frame 4: the surface left the image; it keeps the state of the frame before" in capsys.readouterr().err
+    assert (
+        run.main([str(sequence.folder / "scene.xml"), "-o", str(out), "-q", *QUICK, "-D", "last=4"])
+        == 0
+    )
+    assert (
+        "frame 4: the surface left the image; it keeps the state of the frame before"
+        in capsys.readouterr().err
+    )
     V = surface(out)["vertices"]
     assert np.array_equal(V[4], V[3])
 
 
 def test_fewer_frames_than_the_window(sequence, tmp_path):
     out = tmp_path / "out"
-    assert run.main([str(sequence.folder / "scene.xml"), "-o", str(out), "-q", *QUICK, "-D", "first=1", "-D", "last=1"]) == 0
+    assert (
+        run.main(
+            [
+                str(sequence.folder / "scene.xml"),
+                "-o",
+                str(out),
+                "-q",
+                *QUICK,
+                "-D",
+                "first=1",
+                "-D",
+                "last=1",
+            ]
+        )
+        == 0
+    )
     assert surface(out)["frames"].tolist() == [1]
 
 
 def test_path_replay_runs_from_the_same_scene(sequence, tmp_path):
     out = tmp_path / "out"
-    arguments = [str(sequence.folder / "scene.xml"), "-o", str(out), "-q", "-D", "integrator=prb_projective", "-D", "solver=adam", "-D", "last=1", "-D", "window=2"]
+    arguments = [
+        str(sequence.folder / "scene.xml"),
+        "-o",
+        str(out),
+        "-q",
+        "-D",
+        "integrator=prb_projective",
+        "-D",
+        "solver=adam",
+        "-D",
+        "last=1",
+        "-D",
+        "window=2",
+    ]
     assert run.main([*arguments, "-D", "period=11"]) == 0
     records = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
     first = [r for r in records if r["frame"] == 1]
@@ -227,11 +298,16 @@ def test_path_replay_runs_from_the_same_scene(sequence, tmp_path):
 
 
 def test_no_masks(tmp_path):
-    truth = synthetic.cloth(tmp_path / "sheet", frames=4, size=(240, 180), masks=False, bend=1.5, turn=0.1)
+    truth = synthetic.cloth(
+        tmp_path / "sheet", frames=4, size=(240, 180), masks=False, bend=1.5, turn=0.1
+    )
     prepare.main([str(truth.folder)])
     out = tmp_path / "out"
     # the smooth texture here has little that survives local normalisation
-    assert run.main([str(truth.folder / "scene.xml"), "-o", str(out), "-q", "-D", "brightness=none"]) == 0
+    assert (
+        run.main([str(truth.folder / "scene.xml"), "-o", str(out), "-q", "-D", "brightness=none"])
+        == 0
+    )
     figures = metrics.score(surface(out), str(truth.folder / "gt.npz"))
     assert figures["rmse_mm"] < 4
 
@@ -242,7 +318,10 @@ def test_the_form_of_phi_sft_with_its_other_frame_and_pixels(tmp_path):
     out = tmp_path / "out"
     assert run.main([str(truth.folder / "scene.xml"), "-o", str(out), "-q"]) == 0
     # a small picture leaves the depth open; what it shows must fit all the same
-    seen, true = (v[..., :2] / v[..., 2:] * truth.K[[0, 1], [0, 1]] + truth.K[:2, 2] for v in (surface(out)["vertices"], truth.vertices))
+    seen, true = (
+        v[..., :2] / v[..., 2:] * truth.K[[0, 1], [0, 1]] + truth.K[:2, 2]
+        for v in (surface(out)["vertices"], truth.vertices)
+    )
     still = np.linalg.norm(true - true[:1], axis=-1)[3].mean()
     assert np.linalg.norm(seen - true, axis=-1).mean() < 0.5 < 0.2 * still
 
@@ -256,12 +335,19 @@ def test_a_camera_elsewhere_gives_the_same_surface(sequence, result, tmp_path):
     move = '<rotate y="1" angle="90"/><translate x="1" y="2" z="-0.5"/>'
     assert text.count(look) == 1
     text = text.replace(look, look + move)
-    text = text.replace('value="$data/template.obj"/>', f'value="$data/template.obj"/><transform name="to_world">{move}</transform>')
+    text = text.replace(
+        'value="$data/template.obj"/>',
+        f'value="$data/template.obj"/><transform name="to_world">{move}</transform>',
+    )
     (folder / "scene.xml").write_text(text)
     out = tmp_path / "out"
     assert run.main([str(folder / "scene.xml"), "-o", str(out), "-q", "-D", "last=2"]) == 0
     first = surface(result)["vertices"][2]
-    assert np.abs(surface(out)["vertices"][2] - first).max() < 1e-3 < np.abs(first[:, 2] - first[0, 2]).max()
+    assert (
+        np.abs(surface(out)["vertices"][2] - first).max()
+        < 1e-3
+        < np.abs(first[:, 2] - first[0, 2]).max()
+    )
 
 
 @pytest.mark.slow
@@ -269,7 +355,16 @@ def test_a_camera_elsewhere_gives_the_same_surface(sequence, result, tmp_path):
 def test_scenes_run_on_their_sequences(name, shared_data, tmp_path):
     folder = shared_data / (name if name in ("kinect_paper", "phi_sft_R1") else f"cloth/{name}")
     out = tmp_path / "out"
-    arguments = [str(ROOT / "scenes" / f"{name}.xml"), "-D", f"data={folder}", "-o", str(out), "-q", "-D", "last=3"]
+    arguments = [
+        str(ROOT / "scenes" / f"{name}.xml"),
+        "-D",
+        f"data={folder}",
+        "-o",
+        str(out),
+        "-q",
+        "-D",
+        "last=3",
+    ]
     assert run.main(arguments) == 0
     figures = json.loads((out / "metrics.json").read_text())
     assert figures["frames"] == 4 and figures["lost"] == {} and figures["psnr_mask"] > 18

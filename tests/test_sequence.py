@@ -47,7 +47,12 @@ def test_pattern_selects_and_folder_may_have_brackets(video):
 
 def test_srgb_is_decoded_at_8_and_16_bits(tmp_path):
     codes = np.zeros((2, 3, 3), np.uint8)
-    codes[0, 0], codes[0, 1], codes[0, 2], codes[1, 0] = 255, (0, 0, 255), (10, 188, 1), 128  # OpenCV writes BGR
+    codes[0, 0], codes[0, 1], codes[0, 2], codes[1, 0] = (
+        255,
+        (0, 0, 255),
+        (10, 188, 1),
+        128,
+    )  # OpenCV writes BGR
     eight = Sequence.open(write(tmp_path / "8.png", codes)).frame(0)
     assert eight.shape == (2, 3, 3) and eight.dtype == np.float32
     np.testing.assert_allclose(eight[0, 0], 1)
@@ -64,22 +69,35 @@ def test_grey_alpha_and_exr(tmp_path):
     colour = np.repeat(grey[..., None], 3, axis=2)
     expected = Sequence.open(write(tmp_path / "c.png", colour)).frame(0)
     with_alpha = np.concatenate([colour, np.full((3, 4, 1), 7, np.uint8)], axis=2)
-    for name, image in (("g.png", grey), ("a.png", with_alpha), ("t.tif", colour), ("g.jpg", np.full((3, 4), 140, np.uint8))):
+    for name, image in (
+        ("g.png", grey),
+        ("a.png", with_alpha),
+        ("t.tif", colour),
+        ("g.jpg", np.full((3, 4), 140, np.uint8)),
+    ):
         frame = Sequence.open(write(tmp_path / name, image)).frame(0)
         assert frame.shape == (3, 4, 3)
-        np.testing.assert_allclose(frame, expected if name != "g.jpg" else np.broadcast_to(expected[1, 3], (3, 4, 3)), atol=1e-6)
+        np.testing.assert_allclose(
+            frame,
+            expected if name != "g.jpg" else np.broadcast_to(expected[1, 3], (3, 4, 3)),
+            atol=1e-6,
+        )
     write_exr(tmp_path / "x.exr", {"render": np.broadcast_to([0.25, 0.5, 3.0], (3, 4, 3))})
     s = Sequence.open(tmp_path / "x.exr")
     assert s.size == (4, 3)
     np.testing.assert_allclose(s.frame(0), np.broadcast_to([0.25, 0.5, 1], (3, 4, 3)))
 
 
-@pytest.mark.parametrize("dtype, high", [(np.uint8, 255), (np.uint8, 1), (np.uint16, 65535), (np.uint16, 1)])
+@pytest.mark.parametrize(
+    "dtype, high", [(np.uint8, 255), (np.uint8, 1), (np.uint16, 65535), (np.uint16, 1)]
+)
 @pytest.mark.parametrize("channels", [1, 3])
 def test_mask_scale(tmp_path, video, dtype, high, channels):
     mask = np.zeros((36, 48), dtype)
     mask[10:20, 12:30] = high
-    masks = write(tmp_path / "masks" / "0.png", np.repeat(mask[..., None], channels, axis=2).squeeze())
+    masks = write(
+        tmp_path / "masks" / "0.png", np.repeat(mask[..., None], channels, axis=2).squeeze()
+    )
     s = Sequence.open(video.folder / "frames" / "000.png", masks)
     assert s.mask(0).dtype == np.float32
     np.testing.assert_array_equal(s.mask(0), mask > 0)
@@ -87,7 +105,9 @@ def test_mask_scale(tmp_path, video, dtype, high, channels):
 
 def test_mask_keeps_antialiasing(video):
     s = Sequence.open(video.folder / "frames", video.folder / "masks")
-    _, coverage = synthetic.render(video.vertices[3], video.faces, video.uv, video.K, s.size, synthetic.texture_image())
+    _, coverage = synthetic.render(
+        video.vertices[3], video.faces, video.uv, video.K, s.size, synthetic.texture_image()
+    )
     assert ((coverage > 0.2) & (coverage < 0.8)).any()
     np.testing.assert_allclose(s.mask(3), coverage, atol=0.5 / 255 + 1e-6)
 
@@ -100,7 +120,10 @@ def test_stray_components(tmp_path, video):
     path = write(tmp_path / "masks" / "0.png", mask)
     clean = Sequence.open(video.folder / "frames" / "000.png", path).mask(0)
     assert clean[:25].sum() == 112 and clean[25:].sum() == 0
-    assert Sequence.open(video.folder / "frames" / "000.png", path, drop_stray=False).mask(0).sum() == 121
+    assert (
+        Sequence.open(video.folder / "frames" / "000.png", path, drop_stray=False).mask(0).sum()
+        == 121
+    )
     assert not drop_stray_components(np.zeros((4, 4), np.float32)).any()
 
 
@@ -112,7 +135,9 @@ def fails(*arguments, **options):
     return message
 
 
-@pytest.mark.parametrize("options", [{"first": 5}, {"first": -1}, {"last": 5}, {"first": 3, "last": 2}, {"stride": 0}])
+@pytest.mark.parametrize(
+    "options", [{"first": 5}, {"first": -1}, {"last": 5}, {"first": 3, "last": 2}, {"stride": 0}]
+)
 def test_selection_out_of_range(video, options):
     message = fails(video.folder / "frames", **options)
     assert any(f"{k} = {v}" in message for k, v in options.items())
@@ -135,7 +160,13 @@ def test_unreadable_frame_is_named_at_the_start(video, kind):
         write_exr(path, {"render": image / 255})
     elif len(kind) == 3:
         write(path, image)
-    content = path.read_bytes()[: path.stat().st_size * 2 // 3] if len(kind) == 3 else b"" if kind == "empty" else b"hello"
+    content = (
+        path.read_bytes()[: path.stat().st_size * 2 // 3]
+        if len(kind) == 3
+        else b""
+        if kind == "empty"
+        else b"hello"
+    )
     path.write_bytes(content)
     message = fails(frames)
     assert path.name in message and "not a readable image" in message

@@ -1,4 +1,6 @@
-"""The comparison of solvers at tiny sizes: the baseline descends towards the truth; results are kept, shown and not made twice."""
+"""The comparison of solvers at tiny sizes: the baseline descends towards the truth; results are
+kept, shown and not made twice.
+"""
 
 import json
 import math
@@ -24,12 +26,14 @@ SETUP = {"frames": None, "threads": None, "define": [], "mode": None, "iteration
 @pytest.fixture(scope="module")
 def sheet(tmp_path_factory):
     """A sheet that bends and moves, as a folder ``flag`` with its scene.xml."""
-    truth = synthetic.cloth(tmp_path_factory.mktemp("data") / "flag", frames=2, bend=1.5, turn=0.05, shift=0.005)
+    truth = synthetic.cloth(
+        tmp_path_factory.mktemp("data") / "flag", frames=2, bend=1.5, turn=0.05, shift=0.005
+    )
     prepare.main([str(truth.folder)])
     return truth
 
 
-# ---- the baseline -------------------------------------------------------------------------------------------------------
+# ---- the baseline --------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -53,7 +57,9 @@ def test_objective_of_the_baseline_is_adams(sheet, large_steps):
 
     baseline = per_vertex.load(str(sheet.folder / "scene.xml"), {})
     experiment = scene.load(str(sheet.folder / "scene.xml"), {"solver": "adam"})
-    problem = Problem(experiment, Sequence.open(experiment.frames, experiment.masks, size=experiment.size))
+    problem = Problem(
+        experiment, Sequence.open(experiment.frames, experiment.masks, size=experiment.size)
+    )
     mine, terms = baseline.evaluate([baseline.patch.rest()], [1])
     theirs, wanted = problem.evaluate([problem.patch.rest()], [1])
     assert mine == pytest.approx(theirs, rel=1e-3) and mine > 0
@@ -62,12 +68,24 @@ def test_objective_of_the_baseline_is_adams(sheet, large_steps):
 
 def test_baseline_descends_towards_the_truth(sheet, large_steps, tmp_path):
     out = tmp_path / "out"
-    arguments = [str(sheet.folder / "scene.xml"), "-o", str(out), "--iterations", "60", "--step", "0.01", "-q"]
+    arguments = [
+        str(sheet.folder / "scene.xml"),
+        "-o",
+        str(out),
+        "--iterations",
+        "60",
+        "--step",
+        "0.01",
+        "-q",
+    ]
     assert not per_vertex.main(arguments)
     first, second = json.loads((out / "metrics.json").read_text())["per_frame"]
     assert second["loss"] < 0.5 * second["first_loss"] and second["iterations"] == 60
     surface = evaluate.read_surface(str(out))
-    assert surface["vertices"].shape == sheet.vertices.shape and surface["uv"].shape == (len(sheet.uv), 2)
+    assert surface["vertices"].shape == sheet.vertices.shape and surface["uv"].shape == (
+        len(sheet.uv),
+        2,
+    )
     assert np.array_equal(surface["faces"], sheet.faces) and surface["frames"].tolist() == [0, 1]
     still = metrics.rmse(sheet.vertices[0], sheet.vertices[1])
     assert metrics.rmse(surface["vertices"][1].astype(float), sheet.vertices[1]) < 0.6 * still
@@ -75,19 +93,41 @@ def test_baseline_descends_towards_the_truth(sheet, large_steps, tmp_path):
         per_vertex.main(arguments)
 
 
-# ---- results and tables -------------------------------------------------------------------------------------------------
+# ---- results and tables --------------------------------------------------------------------------
 
 
 def result(sequence="flag", method="adam", setup=SETUP, **more):
     figures = {"frames": 45, "e3d": 0.02, "e3d_proc": 0.0123, "en_deg": 7.5}
-    base = {"sequence": sequence, "method": method, "setup": setup, "machine": "Some CPU, 2 cores", "frames": 45, "orders": [4, 4]}
-    return {**base, "seconds_a_frame": 5.25, "iterations": 150.4, "figures": figures, "versions": {"variant": "llvm_ad_rgb"}, **more}
+    base = {
+        "sequence": sequence,
+        "method": method,
+        "setup": setup,
+        "machine": "Some CPU, 2 cores",
+        "frames": 45,
+        "orders": [4, 4],
+    }
+    return {
+        **base,
+        "seconds_a_frame": 5.25,
+        "iterations": 150.4,
+        "figures": figures,
+        "versions": {"variant": "llvm_ad_rgb"},
+        **more,
+    }
 
 
 def test_table_shows_each_kind_of_truth_apart():
-    depth = {"frames": 97, "depth_rmse_mm": 6.5, "depth_rmse_mm_worst": 12.25, "depth_rmse_allpix_mm": 2.75, "hit": 1.0}
+    depth = {
+        "frames": 97,
+        "depth_rmse_mm": 6.5,
+        "depth_rmse_mm_worst": 12.25,
+        "depth_rmse_allpix_mm": 2.75,
+        "hit": 1.0,
+    }
     mesh = {"e3d": 0.002, "e3d_proc": 0.001, "en_deg": 2.0}
-    best = result(method=sft.JET, orders=[6, 6], figures=mesh, seconds_a_frame=None, iterations=None)
+    best = result(
+        method=sft.JET, orders=[6, 6], figures=mesh, seconds_a_frame=None, iterations=None
+    )
     rows = [
         best,
         result("kinect_paper", "gauss-newton", orders=[4, 6], figures=depth, lost=3),
@@ -101,7 +141,10 @@ def test_table_shows_each_kind_of_truth_apart():
     assert cells[2] == ["flag", "`adam`", "4", "45", "0.0123", "7.5", "0.02", "5.25", "150"]
     assert cells[3] == ["flag", "*best jet*", "6", "45", "0.001", "2", "0.002", "–", "–"]
     assert points.startswith("Depth points")
-    assert "| kinect_paper | `gauss-newton` | 4–6 | 45, 3 lost | 6.5 | 12.25 | 2.75 | 5.25 | 150 |" in points
+    assert (
+        "| kinect_paper | `gauss-newton` | 4–6 | 45, 3 lost | 6.5 | 12.25 | 2.75 | 5.25 | 150 |"
+        in points
+    )
     assert failed.splitlines()[-1] == "- corner, `adam`: error: it broke"
 
 
@@ -113,21 +156,36 @@ def test_what_has_no_truth_is_said(sheet, tmp_path, monkeypatch):
     np.savez(data / "gt_points.npz", points=np.ones((1, 4, 3)), frames=[7])
     (data / "gt.npz").unlink()
     monkeypatch.setattr(sft, "SCENES", str(scenes))
-    r = sft.run("flag", "adam", str(data), str(tmp_path / "out"), {**SETUP, "frames": 1, "define": ["period=2"], "mode": "llvm_ad_rgb"})
+    r = sft.run(
+        "flag",
+        "adam",
+        str(data),
+        str(tmp_path / "out"),
+        {**SETUP, "frames": 1, "define": ["period=2"], "mode": "llvm_ad_rgb"},
+    )
     assert r["seconds_a_frame"] > 0 and r["figures"] == {} and "no frame in common" in r["unscored"]
     assert r["unscored"].startswith("flag/gt_points.npz")
     assert "## Without figures" in sft.table([r]) and "no frame in common" in sft.table([r])
 
 
 def test_report_writes_page_and_plot(tmp_path):
-    text = sft.report([result(), result(method="gauss-newton", seconds_a_frame=0.5)], str(tmp_path / "docs"))
+    text = sft.report(
+        [result(), result(method="gauss-newton", seconds_a_frame=0.5)], str(tmp_path / "docs")
+    )
     page = (tmp_path / "docs" / "sft.md").read_text()
     assert text in page and "Some CPU, 2 cores, `llvm_ad_rgb`" in page and "](sft.png)" in page
     assert (tmp_path / "docs" / "sft.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_sheet_that_was_lost_is_told_and_not_plotted(tmp_path):
-    lost = result("kinect_paper", figures={"depth_rmse_mm": math.inf, "depth_rmse_mm_worst": math.inf, "depth_rmse_allpix_mm": math.inf})
+    lost = result(
+        "kinect_paper",
+        figures={
+            "depth_rmse_mm": math.inf,
+            "depth_rmse_mm_worst": math.inf,
+            "depth_rmse_allpix_mm": math.inf,
+        },
+    )
     assert "| inf | inf | inf |" in sft.report([result(), lost], str(tmp_path))
     assert "*inf*:" in (tmp_path / "sft.md").read_text() and (tmp_path / "sft.png").exists()
     sft.report([result()], str(tmp_path))
@@ -160,11 +218,23 @@ def test_what_is_done_is_not_run_again_but_what_failed_is(sheet, tmp_path, monke
         ran.append((sequence, method))
         assert Path(folder) == sheet.folder
         if method == "adam" and ran.count((sequence, method)) == 1:
-            return {"sequence": sequence, "method": method, "setup": setup, "error": "error: no power"}
+            return {
+                "sequence": sequence,
+                "method": method,
+                "setup": setup,
+                "error": "error: no power",
+            }
         return result(sequence, method, setup, orders=None)
 
     monkeypatch.setattr(sft, "run", run)
-    places = ["--data", str(sheet.folder.parent), "-o", str(tmp_path), "--docs", str(tmp_path / "docs")]
+    places = [
+        "--data",
+        str(sheet.folder.parent),
+        "-o",
+        str(tmp_path),
+        "--docs",
+        str(tmp_path / "docs"),
+    ]
     arguments = [*places, "--methods", "adam", "gauss-newton"]
     sft.main(arguments)
     assert ran == [("flag", "adam"), ("flag", "gauss-newton")]
@@ -183,11 +253,24 @@ def test_what_is_done_is_not_run_again_but_what_failed_is(sheet, tmp_path, monke
 def test_commands_are_those_of_a_user():
     setup = {**SETUP, "frames": 5, "define": ["period=7"], "mode": "llvm_ad_rgb", "iterations": 9}
     line = sft.command("bend", "gauss-newton", "/data/bend", "out/x", setup)
-    assert line[1:3] == ["-m", "polysft_mi.run"] and line[3].endswith("scenes/bend.xml") and "--iterations" not in line
-    assert [line[k + 1] for k, x in enumerate(line) if x == "-D"] == ["data=/data/bend", "period=7", "last=4", "solver=gauss-newton"]
+    assert (
+        line[1:3] == ["-m", "polysft_mi.run"]
+        and line[3].endswith("scenes/bend.xml")
+        and "--iterations" not in line
+    )
+    assert [line[k + 1] for k, x in enumerate(line) if x == "-D"] == [
+        "data=/data/bend",
+        "period=7",
+        "last=4",
+        "solver=gauss-newton",
+    ]
     line = sft.command("bend", "per-vertex", "/data/bend", "out/x", setup)
     assert line[1].endswith("per_vertex.py") and line[line.index("--iterations") + 1] == "9"
-    assert [line[k + 1] for k, x in enumerate(line) if x == "-D"] == ["data=/data/bend", "period=7", "last=4"]
+    assert [line[k + 1] for k, x in enumerate(line) if x == "-D"] == [
+        "data=/data/bend",
+        "period=7",
+        "last=4",
+    ]
     for sequence in sft.SEQUENCES:
         assert Path(sft.command(sequence, "adam", "/data", "out", SETUP)[3]).is_file()
 
@@ -226,13 +309,22 @@ def test_one_command_is_run_timed_and_scored(sheet, tmp_path, monkeypatch):
     r = sft.run("flag", "adam", str(sheet.folder), str(tmp_path / "runs" / "flag-adam"), setup)
     assert "error" not in r and r["frames"] == 2 and r["iterations"] == 3 and r["orders"] == [4, 4]
     assert r["seconds_a_frame"] == r["seconds"] / 2 > 0
-    assert r["figures"]["e3d_proc"] == evaluate.evaluate(str(tmp_path / "runs" / "flag-adam"), str(sheet.folder))["e3d_proc"]
+    assert (
+        r["figures"]["e3d_proc"]
+        == evaluate.evaluate(str(tmp_path / "runs" / "flag-adam"), str(sheet.folder))["e3d_proc"]
+    )
     assert r["versions"]["variant"] == "llvm_ad_rgb" and "core" in r["machine"]
-    broken = sft.run("flag", "adam", str(sheet.folder), str(tmp_path / "runs" / "broken"), {**setup, "define": ["perod=3"]})
+    broken = sft.run(
+        "flag",
+        "adam",
+        str(sheet.folder),
+        str(tmp_path / "runs" / "broken"),
+        {**setup, "define": ["perod=3"]},
+    )
     assert "perod" in broken["error"] and "figures" not in broken
 
 
-# ---- best jets ------------------------------------------------------------------------------------------------------------
+# ---- best jets -----------------------------------------------------------------------------------
 
 
 def template_of(sheet, order):
@@ -246,12 +338,21 @@ def test_a_jet_that_was_turned_is_found_again(sheet):
 
     template, rng = template_of(sheet, 4), np.random.default_rng(0)
     chart = Chart(template)
-    arrays = {"delta_alpha": 0.1 * rng.standard_normal(15), **{name: np.zeros(99) for name in ("delta_u", "delta_v", "delta_w")}}
+    arrays = {
+        "delta_alpha": 0.1 * rng.standard_normal(15),
+        **{name: np.zeros(99) for name in ("delta_u", "delta_v", "delta_w")},
+    }
     turn = Rotation.from_euler("xyz", [0.3, -0.4, 0.2]).as_quat()
-    truth = chart.surface(chart.state({**arrays, "rotation": turn, "translation": [0.1, 0, 0.2]})).vertices
+    truth = chart.surface(
+        chart.state({**arrays, "rotation": turn, "translation": [0.1, 0, 0.2]})
+    ).vertices
     found = sft.best_jets(template, truth[None])
-    heights = chart.surface(chart.state(sft._standing_in(template, truth, template.rotation))).vertices
-    assert metrics.rmse(heights, truth) > 1e-4  # heights over the template's plane do not hold it: it is turned
+    heights = chart.surface(
+        chart.state(sft._standing_in(template, truth, template.rotation))
+    ).vertices
+    assert (
+        metrics.rmse(heights, truth) > 1e-4
+    )  # heights over the template's plane do not hold it: it is turned
     assert metrics.rmse(found[0], truth) < 0.02 * metrics.rmse(heights, truth)
 
 

@@ -1,4 +1,6 @@
-"""Simulated sequences: what they show is what their truth says, in the form that the scenes expect. The simulator itself need not be installed."""
+"""Simulated sequences: what they show is what their truth says, in the form that the scenes expect.
+The simulator itself need not be installed.
+"""
 
 import subprocess
 import sys
@@ -26,10 +28,15 @@ def bent(tmp_path_factory):
     flat, uv = simulate.sheet(KIND)
     angle = 0.8 * (uv[:, 0] - 0.5)
     x = flat.copy()
-    x[:, 0], x[:, 2] = KIND.size[0] / 0.8 * np.sin(angle), simulate.DEPTH + KIND.size[0] / 0.8 * (1 - np.cos(angle))
+    x[:, 0], x[:, 2] = (
+        KIND.size[0] / 0.8 * np.sin(angle),
+        simulate.DEPTH + KIND.size[0] / 0.8 * (1 - np.cos(angle)),
+    )
     nx, ny = KIND.cells
     a = (np.arange(ny)[:, None] * (nx + 1) + np.arange(nx)).ravel()
-    faces = np.concatenate([np.stack([a, a + 1, a + nx + 2], 1), np.stack([a, a + nx + 2, a + nx + 1], 1)])
+    faces = np.concatenate(
+        [np.stack([a, a + 1, a + nx + 2], 1), np.stack([a, a + nx + 2, a + nx + 1], 1)]
+    )
     simulate.render(str(folder), np.stack([flat, x]), faces, uv, np.random.default_rng(2))
     return folder, np.stack([flat, x])
 
@@ -42,14 +49,21 @@ def test_masks_are_where_the_vertices_are(bent):
         rows, columns = np.nonzero(mask)
         low, high = np.array([columns.min(), rows.min()]), np.array([columns.max(), rows.max()]) + 1
         assert np.abs(low - pixel.min(0)).max() < 1.5 and np.abs(high - pixel.max(0)).max() < 1.5
-        assert mask[rows.min() + 3 : rows.max() - 3, columns.min() + 5 : columns.max() - 5].mean() > 0.97
+        assert (
+            mask[rows.min() + 3 : rows.max() - 3, columns.min() + 5 : columns.max() - 5].mean()
+            > 0.97
+        )
 
 
 def test_frames_show_the_texture_on_the_true_surface(bent):
-    """The solver's own misfit of the truth is small, and large where the texture is turned over or the surface is off by six pixels."""
+    """The solver's own misfit of the truth is small, and large where the texture is turned over or
+    the surface is off by six pixels.
+    """
     folder, vertices = bent
     experiment = scene.load(str(ROOT / "scenes" / "bend.xml"), {"data": str(folder)})
-    problem = Problem(experiment, Sequence.open(experiment.frames, experiment.masks, size=experiment.size))
+    problem = Problem(
+        experiment, Sequence.open(experiment.frames, experiment.masks, size=experiment.size)
+    )
     registration = Registration(problem)
     level = finest_level(problem)
     for t, x in enumerate(vertices):
@@ -75,7 +89,9 @@ def test_drag_pushes_along_the_normal_and_not_in_still_air():
     assert not still.any()
     area = 0.5 * KIND.size[0] / nx * KIND.size[1] / KIND.cells[1]
     assert gust.sum(0) == pytest.approx([0, 0, 0.5 * simulate.AIR * area * 2.0 * np.hypot(3, 2)])
-    with_the_wind = simulate.drag(flat, np.tile([3.0, 0.0, 2.0], (len(flat), 1)), faces, np.array([[3.0, 0.0, 2.0]]))
+    with_the_wind = simulate.drag(
+        flat, np.tile([3.0, 0.0, 2.0], (len(flat), 1)), faces, np.array([[3.0, 0.0, 2.0]])
+    )
     assert np.abs(with_the_wind).max() < 1e-12
 
 
@@ -88,11 +104,23 @@ def test_pinned_points_come_together_by_the_share_that_is_said():
         assert np.allclose(weather.points(0.0), rest[held]) and not weather.wind(rest, 0.0).any()
         end = weather.points(simulate.FRAMES / simulate.FPS)
         assert np.ptp(end[:, 0]) == pytest.approx((1 - kind.pressed) * np.ptp(rest[held, 0]))
-        assert uv.min() == 0 and uv.max() == 1 and uv[0].tolist() == [0, 1]  # the image's upper left corner
+        assert (
+            uv.min() == 0 and uv.max() == 1 and uv[0].tolist() == [0, 1]
+        )  # the image's upper left corner
 
 
 def test_a_folder_that_exists_is_refused(tmp_path):
     (tmp_path / "flag").mkdir()
-    line = [sys.executable, str(ROOT / "benchmarks" / "simulate.py"), str(tmp_path), "--only", "flag"]
+    line = [
+        sys.executable,
+        str(ROOT / "benchmarks" / "simulate.py"),
+        str(tmp_path),
+        "--only",
+        "flag",
+    ]
     done = subprocess.run(line, capture_output=True, text=True)
-    assert done.returncode == 2 and done.stderr.strip().endswith("exists already; another OUT is needed") and len(done.stderr.strip().splitlines()) == 1
+    assert (
+        done.returncode == 2
+        and done.stderr.strip().endswith("exists already; another OUT is needed")
+        and len(done.stderr.strip().splitlines()) == 1
+    )

@@ -14,8 +14,8 @@ from polyfit.weights import read_weights, write_weights
 
 
 def bent_sheets(count, points=200, dtype=torch.float64, depth=(0.9, 1.6), width=(0.5, 0.9)):
-    """Narrow valleys z = depth |x / width|^3 in random positions: points and normals (B, P, 3). The deeper ones have their least spread
-    across the valley.
+    """Narrow valleys z = depth |x / width|^3 in random positions: points and normals (B, P, 3). The
+    deeper ones have their least spread across the valley.
     """
     g = torch.Generator().manual_seed(3)
     low, high = (torch.tensor(x, dtype=dtype) for x in zip(depth, width))
@@ -24,7 +24,9 @@ def bent_sheets(count, points=200, dtype=torch.float64, depth=(0.9, 1.6), width=
     x, y = (2 * torch.rand(count, points, 2, generator=g, dtype=dtype) - 1).unbind(-1)
     z, slope = d * x.abs() ** 3, 3 * d * x * x.abs() / w
     p = torch.stack([w * x, y, z], -1)
-    n = torch.nn.functional.normalize(torch.stack([-slope, torch.zeros_like(slope), torch.ones_like(slope)], -1), dim=-1)
+    n = torch.nn.functional.normalize(
+        torch.stack([-slope, torch.zeros_like(slope), torch.ones_like(slope)], -1), dim=-1
+    )
     q = torch.nn.functional.normalize(torch.randn(count, 4, generator=g, dtype=dtype), dim=-1)
     R = rotation_matrix(q)
     return p @ R.mT, n @ R.mT
@@ -56,7 +58,9 @@ def test_thinned_takes_points_evenly_and_none_that_the_mask_leaves_out():
     x = torch.arange(2 * 11 * 3, dtype=torch.float32).reshape(2, 11, 3)
     assert torch.equal(thinned(x, 20), x)
     assert torch.equal(thinned(x, 4), x[:, [0, 2, 5, 8]])
-    mask = torch.tensor([[1, 0, 1, 1, 0, 1, 1, 0, 1, 0, 0], [0, 0, 0, 1, 0, 0, 1, 0, 0, 0, 0]], dtype=torch.bool)
+    mask = torch.tensor(
+        [[1, 0, 1, 1, 0, 1, 1, 0, 1, 0, 0], [0, 0, 0, 1, 0, 0, 1, 0, 0, 0, 0]], dtype=torch.bool
+    )
     got = thinned(x, 4, mask)
     for k in range(2):
         left = x[k][mask[k]]
@@ -66,7 +70,9 @@ def test_thinned_takes_points_evenly_and_none_that_the_mask_leaves_out():
 @pytest.mark.parametrize("shipped", [True, False])
 def test_a_turned_scaled_moved_patch_has_the_same_alpha(model, shipped):
     """In float64, where a patch's own rounding does not stand in the way."""
-    equivariant = (PolyFit.pretrained() if shipped else PolyFit(4, random_network())).double().eval()
+    equivariant = (
+        (PolyFit.pretrained() if shipped else PolyFit(4, random_network())).double().eval()
+    )
     points, _ = bent_sheets(60)
     fit = equivariant(points)
     g = torch.Generator().manual_seed(9)
@@ -74,12 +80,18 @@ def test_a_turned_scaled_moved_patch_has_the_same_alpha(model, shipped):
     scale = 0.01 + 50 * torch.rand(60, 1, 1, generator=g, dtype=torch.float64)
     shift = 10 * torch.randn(60, 1, 3, generator=g, dtype=torch.float64)
     moved = equivariant(scale * points @ Q.mT + shift)
-    assert moved.jet.alpha.detach().numpy() == pytest.approx(fit.jet.alpha.detach().numpy(), rel=1e-6, abs=1e-7)
+    assert moved.jet.alpha.detach().numpy() == pytest.approx(
+        fit.jet.alpha.detach().numpy(), rel=1e-6, abs=1e-7
+    )
     assert moved.frame.s.numpy() == pytest.approx((scale[:, 0, 0] * fit.frame.s).numpy(), rel=1e-9)
-    assert moved.frame.R.detach().numpy() == pytest.approx((Q @ fit.frame.R).detach().numpy(), abs=1e-8)
+    assert moved.frame.R.detach().numpy() == pytest.approx(
+        (Q @ fit.frame.R).detach().numpy(), abs=1e-8
+    )
     uv = 0.3 * torch.randn(60, 5, 2, generator=g, dtype=torch.float64)
     surface = [f.frame.from_chart(jets.point(f.jet.alpha, uv)).detach() for f in (fit, moved)]
-    assert surface[1].numpy() == pytest.approx((scale * surface[0] @ Q.mT + shift).numpy(), abs=1e-5)
+    assert surface[1].numpy() == pytest.approx(
+        (scale * surface[0] @ Q.mT + shift).numpy(), abs=1e-5
+    )
 
 
 def test_float32_patches_keep_their_alpha_too(model):
@@ -95,7 +107,12 @@ def test_padding_changes_nothing(model):
     points, _ = bent_sheets(12, points=90)
     padded = torch.full((12, 130, 3), torch.nan, dtype=torch.float64)
     mask = torch.zeros(12, 130, dtype=torch.bool)
-    at = torch.rand(12, 130, generator=torch.Generator().manual_seed(0)).argsort(1)[:, :90].sort(1).values
+    at = (
+        torch.rand(12, 130, generator=torch.Generator().manual_seed(0))
+        .argsort(1)[:, :90]
+        .sort(1)
+        .values
+    )
     padded.scatter_(1, at[..., None].expand(-1, -1, 3), points)
     mask.scatter_(1, at, True)
     with torch.no_grad():
@@ -104,14 +121,19 @@ def test_padding_changes_nothing(model):
 
 
 def test_points_of_no_weight_change_nothing_but_the_scale():
-    """Without a transformer, which reads points whatever their weight: T, R and the jet are those of the points that have weight."""
+    """Without a transformer, which reads points whatever their weight: T, R and the jet are those
+    of the points that have weight.
+    """
     points, _ = bent_sheets(5, points=80)
     weights = torch.ones(5, 80, dtype=torch.float64)
     weights[:, 60:] = 0
     a, b = PolyFit(4)(points, weights=weights), PolyFit(4)(points[:, :60])
     assert a.frame.T.numpy() == pytest.approx(b.frame.T.numpy(), abs=1e-12)
     assert a.frame.R.abs().numpy() == pytest.approx(b.frame.R.abs().numpy(), abs=1e-9)
-    x = [f.frame.from_chart(jets.point(f.jet.alpha, f.frame.to_chart(points[:, :60])[..., :2])) for f in (a, b)]
+    x = [
+        f.frame.from_chart(jets.point(f.jet.alpha, f.frame.to_chart(points[:, :60])[..., :2]))
+        for f in (a, b)
+    ]
     assert x[0].numpy() == pytest.approx(x[1].numpy(), abs=1e-8)
 
 
@@ -139,7 +161,9 @@ def test_the_turn_that_is_kept_is_the_one_of_least_height():
         heights = []
         for q in turns[b]:
             y = x[b] @ rotation_matrix(q)
-            heights.append((jets.height(jets.fit(y, 4).alpha, y[:, :2]) - y[:, 2]).square().mean().item())
+            heights.append(
+                (jets.height(jets.fit(y, 4).alpha, y[:, :2]) - y[:, 2]).square().mean().item()
+            )
         assert kept[b] == int(np.argmin(heights))
 
 
@@ -151,7 +175,13 @@ def test_gradients_reach_the_network_s_weights():
 
     def loss():
         fit = model(points)
-        return ((fit.frame.from_chart(jets.point(fit.jet.alpha, fit.frame.to_chart(points)[..., :2])) - target) ** 2).mean()
+        return (
+            (
+                fit.frame.from_chart(jets.point(fit.jet.alpha, fit.frame.to_chart(points)[..., :2]))
+                - target
+            )
+            ** 2
+        ).mean()
 
     loss().backward()
     weight = model.stn.head[-1].weight
@@ -176,11 +206,18 @@ def test_shipped_weights_turn_narrow_valleys_the_right_way_up(model):
         with torch.no_grad():
             fit = m(points)
             n = normals @ fit.frame.R
-            found[name] = behind(n).mean(), discrepancy(fit.jet.alpha, fit.frame.to_chart(points), n)
-    assert found["pca"][0] > 0.2  # PCA looks at about half of them from the edge, where half of the patch is seen from behind
+            found[name] = (
+                behind(n).mean(),
+                discrepancy(fit.jet.alpha, fit.frame.to_chart(points), n),
+            )
+    assert (
+        found["pca"][0] > 0.2
+    )  # PCA looks at about half of them from the edge, where half of the patch is seen from behind
     assert found["stn"][0] < 0.6 * found["pca"][0]
     for figure in ("height", "distance", "angle"):
-        assert getattr(found["stn"][1], figure).mean() < 0.7 * getattr(found["pca"][1], figure).mean(), figure
+        assert (
+            getattr(found["stn"][1], figure).mean() < 0.7 * getattr(found["pca"][1], figure).mean()
+        ), figure
 
 
 def test_what_made_the_shipped_weights_is_beside_them(model):
@@ -196,14 +233,20 @@ def test_what_made_the_shipped_weights_is_beside_them(model):
 def test_discrepancy_of_a_tilted_plane_is_its_distance_and_its_angle():
     uv = torch.rand(1, 50, 2, dtype=torch.float64)
     x = torch.cat([uv, 0 * uv[..., :1]], -1)  # the plane z = 0
-    n = torch.tensor([0, 0, -1.0], dtype=torch.float64).expand(1, 50, 3)  # seen from below: which side is up is no error
+    n = torch.tensor([0, 0, -1.0], dtype=torch.float64).expand(
+        1, 50, 3
+    )  # seen from below: which side is up is no error
     alpha = torch.tensor([[0.2, 0, 0]], dtype=torch.float64)
     flat = discrepancy(alpha, x, n)
-    assert (flat.height.item(), flat.distance.item(), flat.angle.item()) == pytest.approx((0.2, 0.2, 0), abs=1e-6)
+    assert (flat.height.item(), flat.distance.item(), flat.angle.item()) == pytest.approx(
+        (0.2, 0.2, 0), abs=1e-6
+    )
     tilted = discrepancy(torch.tensor([[0.0, 1, 0]], dtype=torch.float64), x, n)
     assert tilted.angle.item() == pytest.approx(45, abs=1e-6)
     assert tilted.distance.item() == pytest.approx(tilted.height.item() / 2**0.5, rel=1e-6)
-    half = torch.where(torch.arange(50) < 20, -1.0, 1.0)[None, :, None] * n  # 20 of 50 face the other way
+    half = (
+        torch.where(torch.arange(50) < 20, -1.0, 1.0)[None, :, None] * n
+    )  # 20 of 50 face the other way
     assert behind(half).item() == pytest.approx(0.4)
     assert discrepancy(alpha, x, half).angle.item() == pytest.approx(0.4 * 180, abs=1e-4)
     mask = torch.arange(50)[None] >= 20
@@ -217,7 +260,10 @@ class TestWeights:
         model.save(tmp_path / "w.safetensors", seed=7)
         again = PolyFit.load(tmp_path / "w.safetensors", 3)
         assert again.order == 3 and again.stn.shape == model.stn.shape
-        assert all(torch.equal(a, b) for a, b in zip(model.state_dict().values(), again.state_dict().values()))
+        assert all(
+            torch.equal(a, b)
+            for a, b in zip(model.state_dict().values(), again.state_dict().values())
+        )
 
     def test_of_another_order_are_refused(self):
         with pytest.raises(InputError, match="for jets of order 4, not 6"):
@@ -236,7 +282,11 @@ class TestWeights:
         write_weights(path, {"a": torch.zeros(2)}, dict(model="pointnet", version=1, order=4))
         with pytest.raises(InputError, match="weights of pointnet, not of polyfit"):
             PolyFit.load(path)
-        write_weights(path, {"a": torch.zeros(2)}, dict(model="polyfit", version=1, order=4, network=SpatialTransformer().shape))
+        write_weights(
+            path,
+            {"a": torch.zeros(2)},
+            dict(model="polyfit", version=1, order=4, network=SpatialTransformer().shape),
+        )
         with pytest.raises(InputError, match="network of another shape"):
             PolyFit.load(path)
 

@@ -1,4 +1,6 @@
-"""Patched surfaces: meshes to patches and charts and back, at any resolution, and their derivatives."""
+"""Patched surfaces: meshes to patches and charts and back, at any resolution, and their
+derivatives.
+"""
 
 import dataclasses
 
@@ -9,7 +11,17 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 import surfaces
-from polyfit import CanonicalFrame, InputError, PatchedSurface, Patches, PolyFit, mesh, patch_count, read_mesh, smoothed
+from polyfit import (
+    CanonicalFrame,
+    InputError,
+    PatchedSurface,
+    Patches,
+    PolyFit,
+    mesh,
+    patch_count,
+    read_mesh,
+    smoothed,
+)
 
 RNG = np.random.default_rng(3)
 
@@ -39,10 +51,14 @@ def on_mesh(surface, count=500):
 
 def test_a_plane_is_held_exactly():
     V, F = surfaces.sheet(n=7)
-    surface = PatchedSurface.from_mesh(V @ Rotation.random(random_state=1).as_matrix() + 3, F, 5, dtype=torch.float64)
+    surface = PatchedSurface.from_mesh(
+        V @ Rotation.random(random_state=1).as_matrix() + 3, F, 5, dtype=torch.float64
+    )
     assert (surface.vertices() - torch.as_tensor(surface.patches.vertices)).abs().max() < 1e-12
     vertices, faces = surface.resampled(3)
-    assert mesh.areas(vertices.numpy(), faces.numpy()).sum() == pytest.approx(mesh.areas(V, F).sum())
+    assert mesh.areas(vertices.numpy(), faces.numpy()).sum() == pytest.approx(
+        mesh.areas(V, F).sum()
+    )
     assert surface.parameters == 5 * 22
 
 
@@ -50,10 +66,14 @@ def test_vertices_come_back(ball, sleeve):
     for surface, bound in ((ball, 1e-3), (sleeve, 3e-3)):
         V = torch.as_tensor(surface.patches.vertices)
         assert (surface.vertices() - V).norm(dim=1).max() < bound
-        assert (surface.points(surface.vertex_patch, surface.vertex_uv) - V).norm(dim=1).max() < bound
+        assert (surface.points(surface.vertex_patch, surface.vertex_uv) - V).norm(
+            dim=1
+        ).max() < bound
         face = np.arange(len(surface.patches.given))
         corners = surface.at(face, np.tile([[1.0, 0, 0]], (len(face), 1)))
-        assert (corners - surface.vertices()[torch.as_tensor(surface.patches.given[:, 0])]).abs().max() < 1e-12
+        assert (
+            corners - surface.vertices()[torch.as_tensor(surface.patches.given[:, 0])]
+        ).abs().max() < 1e-12
 
 
 def test_resampling_keeps_the_mesh_whole(ball):
@@ -67,7 +87,9 @@ def test_resampling_keeps_the_mesh_whole(ball):
 
 
 def test_surface_is_smoother_than_its_mesh():
-    """Jets fitted to a coarse sphere, evaluated at four times its resolution, are nearer to the sphere's normals than its facets are."""
+    """Jets fitted to a coarse sphere, evaluated at four times its resolution, are nearer to the
+    sphere's normals than its facets are.
+    """
     V, F = surfaces.sphere(0.2, 2)
     vertices, faces = PatchedSurface.from_mesh(V, F, 20, dtype=torch.float64).resampled(4)
 
@@ -92,7 +114,10 @@ def test_neighbours_join_without_a_gap(sleeve):
         face, k = corner // 3, corner % 3
         forward = F[face, k] == edges[twice, 0]
         b = np.zeros((len(face), 3))
-        b[np.arange(len(face)), k], b[np.arange(len(face)), (k + 1) % 3] = np.where(forward, t, 1 - t), np.where(forward, 1 - t, t)
+        b[np.arange(len(face)), k], b[np.arange(len(face)), (k + 1) % 3] = (
+            np.where(forward, t, 1 - t),
+            np.where(forward, 1 - t, t),
+        )
         found.append(sleeve.at(face, b))
     assert (found[0] - found[1]).norm(dim=1).max() < 1e-12
 
@@ -100,10 +125,14 @@ def test_neighbours_join_without_a_gap(sleeve):
 def test_sample_is_on_the_surface_and_even(sleeve):
     points, normals = sleeve.sample(4000, what=("points", "normals"))
     V, F = sleeve.patches.vertices[: len(surfaces.tube()[0])], sleeve.patches.given
-    closest, distance, face = trimesh.proximity.closest_point_naive(trimesh.Trimesh(V, F, process=False), points[:300].numpy())
+    closest, distance, face = trimesh.proximity.closest_point_naive(
+        trimesh.Trimesh(V, F, process=False), points[:300].numpy()
+    )
     assert np.sqrt((distance**2).mean()) < 5e-4
     outwards = mesh.face_vectors(V, F)[face]
-    assert ((normals[:300].numpy() * outwards).sum(axis=1) > 0.8 * np.linalg.norm(outwards, axis=1)).all()
+    assert (
+        (normals[:300].numpy() * outwards).sum(axis=1) > 0.8 * np.linalg.norm(outwards, axis=1)
+    ).all()
     height = points[:, 2].numpy() / 0.4
     assert np.histogram(height, 8, (0, 1))[0] == pytest.approx(np.full(8, 500), abs=100)
 
@@ -130,18 +159,28 @@ def test_curvature_of_a_sphere(ball):
 
 
 def test_normals_are_on_the_side_of_the_faces(ball):
-    outwards = (ball.normals(ball.vertex_patch, ball.vertex_uv) * torch.as_tensor(ball.patches.vertices)).sum(1)
+    outwards = (
+        ball.normals(ball.vertex_patch, ball.vertex_uv) * torch.as_tensor(ball.patches.vertices)
+    ).sum(1)
     assert (outwards > 0.19).all()
     V, F = surfaces.sphere(0.2)
     inverse = PatchedSurface.from_mesh(V, F[:, ::-1], 20, dtype=torch.float64)
-    assert ((inverse.normals(inverse.vertex_patch, inverse.vertex_uv) * torch.as_tensor(inverse.patches.vertices)).sum(1) < -0.19).all()
+    assert (
+        (
+            inverse.normals(inverse.vertex_patch, inverse.vertex_uv)
+            * torch.as_tensor(inverse.patches.vertices)
+        ).sum(1)
+        < -0.19
+    ).all()
 
 
 def test_normals_agree_where_the_winding_does_not():
     V, F = surfaces.sphere(0.2)
     F = np.where(np.random.default_rng(1).random(len(F))[:, None] < 0.3, F[:, ::-1], F)
     mixed = PatchedSurface.from_mesh(V, F, 20, dtype=torch.float64)
-    outwards = (mixed.normals(mixed.vertex_patch, mixed.vertex_uv) * torch.as_tensor(mixed.patches.vertices)).sum(1)
+    outwards = (
+        mixed.normals(mixed.vertex_patch, mixed.vertex_uv) * torch.as_tensor(mixed.patches.vertices)
+    ).sum(1)
     assert (outwards > 0.19).all()
 
 
@@ -150,26 +189,45 @@ def test_boundary_points_of_two_patches_are_the_same_place(sleeve):
     assert points.shape == normals.shape == (len(sleeve.patches.boundary), 2, 3)
     assert (points[:, 0] - points[:, 1]).norm(dim=1).square().mean().sqrt() < 1e-3
     assert (normals[:, 0] * normals[:, 1]).sum(1).mean() > 0.98
-    one = points[:, 0] - torch.as_tensor(sleeve.patches.vertices[sleeve.patches.entry_vertex[sleeve.patches.boundary[:, 0]]])
+    one = points[:, 0] - torch.as_tensor(
+        sleeve.patches.vertices[sleeve.patches.entry_vertex[sleeve.patches.boundary[:, 0]]]
+    )
     assert one.norm(dim=1).max() < 5e-3
     assert (sleeve.boundary_patch[:, 0] < sleeve.boundary_patch[:, 1]).all()
 
 
 def test_gradients_against_finite_differences():
-    surface = PatchedSurface.fit(Patches.cut(*surfaces.sheet(lambda x, y: x * y, n=4), 3), dtype=torch.float64)
+    surface = PatchedSurface.fit(
+        Patches.cut(*surfaces.sheet(lambda x, y: x * y, n=4), 3), dtype=torch.float64
+    )
     face, b = on_mesh(surface, 20)
-    names = {"alpha": surface.alpha, "s": surface.frame.s, "R": surface.frame.R, "T": surface.frame.T}
+    names = {
+        "alpha": surface.alpha,
+        "s": surface.frame.s,
+        "R": surface.frame.R,
+        "T": surface.frame.T,
+    }
 
     def values(alpha, s, R, T):
         moved = dataclasses.replace(surface, alpha=alpha, frame=CanonicalFrame(s, R, T))
-        return moved.at(face, b), moved.at(face, b, "normals"), *moved.boundary(), moved.resampled(2, smoothing=1)[0]
+        return (
+            moved.at(face, b),
+            moved.at(face, b, "normals"),
+            *moved.boundary(),
+            moved.resampled(2, smoothing=1)[0],
+        )
 
-    assert torch.autograd.gradcheck(values, [x.clone().requires_grad_() for x in names.values()], fast_mode=True)
+    assert torch.autograd.gradcheck(
+        values, [x.clone().requires_grad_() for x in names.values()], fast_mode=True
+    )
 
 
 def test_smoothing_moves_seams_only_and_keeps_the_outline_in_place():
     V, F = surfaces.sheet(n=21)
-    rough, where = torch.as_tensor(V + RNG.normal(size=V.shape) * (0, 0, 0.005)), torch.zeros(len(V), dtype=torch.bool)
+    rough, where = (
+        torch.as_tensor(V + RNG.normal(size=V.shape) * (0, 0, 0.005)),
+        torch.zeros(len(V), dtype=torch.bool),
+    )
     where[torch.as_tensor(np.abs(V[:, 0]) < 0.1)] = True
     faces = torch.as_tensor(F)
     smooth = smoothed(rough, faces, where, 20)
@@ -198,13 +256,22 @@ def test_smoothing_closes_torn_seams(sleeve):
 
 
 def test_moved_boundaries_fit_better_and_stay_connected():
-    V, F = surfaces.sheet(lambda x, y: 0.1 * np.exp(-((x - 0.05) ** 2 + (y + 0.02) ** 2) / 0.004), n=40)
+    V, F = surfaces.sheet(
+        lambda x, y: 0.1 * np.exp(-((x - 0.05) ** 2 + (y + 0.02) ** 2) / 0.004), n=40
+    )
     before, after = PatchedSurface.fit(Patches.cut(V, F, 12)), PatchedSurface.from_mesh(V, F, 12)
-    rms = [(s.residual.square() * torch.as_tensor(s.patches.entry_weight)).sum().sqrt() for s in (before, after)]
+    rms = [
+        (s.residual.square() * torch.as_tensor(s.patches.entry_weight)).sum().sqrt()
+        for s in (before, after)
+    ]
     assert rms[1] < 0.8 * rms[0]
     p = after.patches
     edges = mesh.edges_of(p.sheets)[0]
-    assert mesh.components(len(p.label), edges[p.label[edges[:, 0]] == p.label[edges[:, 1]]]).max() + 1 == len(after) == 12
+    assert (
+        mesh.components(len(p.label), edges[p.label[edges[:, 0]] == p.label[edges[:, 1]]]).max() + 1
+        == len(after)
+        == 12
+    )
 
 
 @pytest.mark.parametrize("name", ["fin", "moebius", "parts"])
@@ -212,7 +279,9 @@ def test_what_is_no_manifold_is_held_as_well(name):
     V, F = {
         "fin": surfaces.with_fin,
         "moebius": surfaces.moebius,
-        "parts": lambda: surfaces.joined(surfaces.sphere(subdivisions=2), surfaces.sheet(n=2, size=1e-3), surfaces.tube(0.03)),
+        "parts": lambda: surfaces.joined(
+            surfaces.sphere(subdivisions=2), surfaces.sheet(n=2, size=1e-3), surfaces.tube(0.03)
+        ),
     }[name]()
     surface = PatchedSurface.from_mesh(V, F, 30, dtype=torch.float64)
     assert surface.alpha.isfinite().all() and len(surface) == 30
@@ -224,7 +293,9 @@ def test_a_tiny_closed_part_stays_in_its_place():
     """One patch cannot hold a closed ball, but neither does it harm the rest."""
     V, F = surfaces.joined(surfaces.sphere(0.2, 2), surfaces.sphere(0.005, 0))
     surface = PatchedSurface.from_mesh(V, F, 20)
-    off = (surface.vertices() - torch.as_tensor(surface.patches.vertices, dtype=torch.float32)).norm(dim=1)
+    off = (
+        surface.vertices() - torch.as_tensor(surface.patches.vertices, dtype=torch.float32)
+    ).norm(dim=1)
     tiny = torch.as_tensor(np.linalg.norm(surface.patches.vertices, axis=1) < 0.1)
     assert off[tiny].max() < 0.01 and off[~tiny].square().mean().sqrt() < 1e-3
 
@@ -246,12 +317,21 @@ def test_surface_moves_to_another_type(ball):
     assert (single.vertices() - ball.vertices()).abs().max() < 1e-6
 
 
-@pytest.mark.parametrize("garment", ["garments_snug/shorts", "garments_snug/pants", "garments_makehuman/m_shirt_wrinkled"])
+@pytest.mark.parametrize(
+    "garment",
+    ["garments_snug/shorts", "garments_snug/pants", "garments_makehuman/m_shirt_wrinkled"],
+)
 def test_real_garments(shared_data, garment):
     V, F, _ = read_mesh(shared_data / f"{garment}.obj")
     surface = PatchedSurface.from_mesh(V, F)
     assert len(surface) == patch_count(mesh.areas(V, F).sum())
-    rms = (surface.vertices() - torch.as_tensor(surface.patches.vertices, dtype=torch.float32)).square().sum(1).mean().sqrt()
+    rms = (
+        (surface.vertices() - torch.as_tensor(surface.patches.vertices, dtype=torch.float32))
+        .square()
+        .sum(1)
+        .mean()
+        .sqrt()
+    )
     assert rms < (1.5e-3 if "wrinkled" in garment else 6e-4)
 
 

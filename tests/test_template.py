@@ -27,7 +27,10 @@ def grid(n=15, m=13, height=lambda x, y: 0 * x):
 def test_residual_is_what_the_jet_leaves():
     vertices, faces, uv = grid(height=lambda x, y: 0.004 * np.sin(60 * x))
     t = Template.fit(vertices, faces, uv, 4)
-    held = np.concatenate([t.chart, jets.height(torch.as_tensor(t.alpha), torch.as_tensor(t.chart)).numpy()[:, None]], 1)
+    held = np.concatenate(
+        [t.chart, jets.height(torch.as_tensor(t.alpha), torch.as_tensor(t.chart)).numpy()[:, None]],
+        1,
+    )
     points = t.scale * held @ t.rotation.T + t.origin
     assert np.linalg.norm(points - vertices, axis=1) == pytest.approx(np.abs(t.residual), abs=1e-12)
     assert 1e-3 < t.residual_rms < 4e-3 < 1.5 * t.residual_max
@@ -38,8 +41,12 @@ def test_frame_and_jet_are_those_of_polyfit(narrow):
     rng = np.random.default_rng(3)
     turn = Rotation.from_rotvec([0.4, -0.7, 0.2]).as_matrix()
     for order in range(1, 11):
-        vertices, faces, uv = grid(14, 12, height=lambda x, y: 0.02 * np.sin(15 * x + 1) * np.cos(20 * y / narrow))
-        vertices = (vertices * [1, narrow, narrow] + 1e-3 * narrow * rng.normal(size=vertices.shape)) @ turn.T
+        vertices, faces, uv = grid(
+            14, 12, height=lambda x, y: 0.02 * np.sin(15 * x + 1) * np.cos(20 * y / narrow)
+        )
+        vertices = (
+            vertices * [1, narrow, narrow] + 1e-3 * narrow * rng.normal(size=vertices.shape)
+        ) @ turn.T
         t = Template.fit(vertices, faces, uv, order, capacity=10, exact=False, tolerance=np.inf)
         points = torch.as_tensor(vertices)
         frame = CanonicalFrame.from_points(points)
@@ -49,11 +56,19 @@ def test_frame_and_jet_are_those_of_polyfit(narrow):
         np.testing.assert_allclose(t.rotation, frame.R, atol=1e-9)
         np.testing.assert_allclose(t.origin, frame.T, atol=1e-12)
         np.testing.assert_allclose(t.chart, x[:, :2], atol=1e-9)
-        np.testing.assert_allclose(t.residual, (x[:, 2] - jets.height(jet.alpha, x[:, :2])) * frame.s, atol=1e-9)
+        np.testing.assert_allclose(
+            t.residual, (x[:, 2] - jets.height(jet.alpha, x[:, :2])) * frame.s, atol=1e-9
+        )
         size = len(jet.alpha)
-        np.testing.assert_allclose(t.alpha[:size], jet.alpha, rtol=1e-5, atol=1e-9 + 1e-6 * np.abs(jet.alpha.numpy()).max())
+        np.testing.assert_allclose(
+            t.alpha[:size], jet.alpha, rtol=1e-5, atol=1e-9 + 1e-6 * np.abs(jet.alpha.numpy()).max()
+        )
         assert not t.alpha[size:].any()
-    given = CanonicalFrame(frame.s * 1.1, frame.rotated(torch.tensor([0.0, 0, 0.3, 1], dtype=torch.float64)).R, frame.T + 0.01)
+    given = CanonicalFrame(
+        frame.s * 1.1,
+        frame.rotated(torch.tensor([0.0, 0, 0.3, 1], dtype=torch.float64)).R,
+        frame.T + 0.01,
+    )
     t = Template.fit(vertices, faces, uv, 3, frame=given, tolerance=np.inf)
     np.testing.assert_allclose(t.chart, given.to_chart(points)[:, :2], atol=1e-12)
 
@@ -64,7 +79,11 @@ def test_what_the_vertices_hardly_determine_is_as_in_polyfit(jitter):
     vertices = vertices + jitter * np.random.default_rng(0).normal(size=vertices.shape)
     t = Template.fit(vertices, faces, uv, 5, exact=False, tolerance=np.inf)
     points = torch.as_tensor(vertices)
-    assert t.fitted == jets.fit(CanonicalFrame.from_points(points).to_chart(points), 5).order == {1e-8: 3, 1e-4: 4}[jitter]
+    assert (
+        t.fitted
+        == jets.fit(CanonicalFrame.from_points(points).to_chart(points), 5).order
+        == {1e-8: 3, 1e-4: 4}[jitter]
+    )
 
 
 def test_signs_of_the_frame_turn_with_a_symmetric_sheet():
@@ -102,18 +121,28 @@ def test_higher_orders_leave_less():
 
 def test_closed_surface_is_refused_with_the_residual():
     ball = trimesh.creation.icosphere(subdivisions=2)
-    with pytest.raises(InputError, match=r"fold over in its chart.*residual of the 4-jet is [\d.]+ mm RMS"):
+    with pytest.raises(
+        InputError, match=r"fold over in its chart.*residual of the 4-jet is [\d.]+ mm RMS"
+    ):
         Template.fit(ball.vertices, ball.faces, ball.vertices[:, :2], 4)
 
 
 def test_rough_surface_is_refused_with_the_residual():
     vertices, faces, uv = grid(height=lambda x, y: 0.03 * np.sin(120 * x))
-    with pytest.raises(InputError, match=r"residual of the 4-jet is [\d.]+ mm RMS.*fit_tolerance = 0.05"):
+    with pytest.raises(
+        InputError, match=r"residual of the 4-jet is [\d.]+ mm RMS.*fit_tolerance = 0.05"
+    ):
         Template.fit(vertices, faces, uv, 4)
 
 
 def test_order_too_high_for_the_vertices():
-    with pytest.raises(InputError, match="order = 10 is too high: .*66 coefficients, and the 20 vertices determine no more than order 3"):
+    with pytest.raises(
+        InputError,
+        match=(
+            "order = 10 is too high: .*66 coefficients, and the 20 vertices determine no more than"
+            " order 3"
+        ),
+    ):
         Template.fit(*grid(5, 4), 10)
 
 

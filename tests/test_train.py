@@ -1,4 +1,6 @@
-"""``python -m polyfit.train``: the table that is trained on, resuming, several processes, what it refuses."""
+"""``python -m polyfit.train``: the table that is trained on, resuming, several processes, what it
+refuses.
+"""
 
 import json
 import os
@@ -19,7 +21,9 @@ from polyfit.losses import discrepancy
 from polyfit.training import Processes
 
 ROOT = Path(__file__).resolve().parent.parent
-SMALL = train.Settings(families=("gaussian", "jet"), patches=120, points=40, reads=30, steps=8, batch=16, order=2)
+SMALL = train.Settings(
+    families=("gaussian", "jet"), patches=120, points=40, reads=30, steps=8, batch=16, order=2
+)
 FLAGS = "--families gaussian jet --patches 120 --points 40 --reads 30 --steps 8 --batch 16 --order 2".split()
 
 
@@ -45,23 +49,33 @@ def test_table_is_the_loss_of_jets_fitted_along_each_axis(table):
         x, n = table.points[patch] @ turn, table.normals[patch] @ turn
         d = discrepancy(jets.fit(x, 3).alpha[None], x[None], n[None])
         assert table.height[patch, k].item() == pytest.approx(d.height.item(), rel=1e-3)
-        assert table.loss[patch, k].item() == pytest.approx((d.height + training_set.NORMALS * (1 - d.cosine)).item(), rel=1e-3)
+        assert table.loss[patch, k].item() == pytest.approx(
+            (d.height + training_set.NORMALS * (1 - d.cosine)).item(), rel=1e-3
+        )
 
 
 def test_table_is_read_sharply_or_smoothly(table):
     index, axes = torch.tensor([3, 8]), training_set.axes()
     height, loss = table.at(index, axes[[20, 30]].expand(2, 2, 3), 1e5)
-    assert torch.equal(height, table.height[index][:, [20, 30]]) and torch.equal(loss, table.loss[index][:, [20, 30]])
-    below, _ = table.at(index, -axes[[20, 30]].expand(2, 2, 3), 1e5)  # a jet seen from below is a jet
+    assert torch.equal(height, table.height[index][:, [20, 30]]) and torch.equal(
+        loss, table.loss[index][:, [20, 30]]
+    )
+    below, _ = table.at(
+        index, -axes[[20, 30]].expand(2, 2, 3), 1e5
+    )  # a jet seen from below is a jet
     assert torch.equal(below, height)
     smooth, _ = table.at(index, axes[None, :2].expand(2, 2, 3), 0.0)
-    assert smooth.numpy() == pytest.approx(table.height[index].mean(1, keepdim=True).expand(2, 2).numpy(), rel=1e-5)
+    assert smooth.numpy() == pytest.approx(
+        table.height[index].mean(1, keepdim=True).expand(2, 2).numpy(), rel=1e-5
+    )
 
 
 def test_axes_cover_the_half_sphere():
     axes = training_set.axes()
     assert axes.norm(dim=1).numpy() == pytest.approx(1, abs=1e-6) and (axes[:, 2] > 0).all()
-    anywhere = torch.nn.functional.normalize(torch.randn(2000, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    anywhere = torch.nn.functional.normalize(
+        torch.randn(2000, 3, generator=torch.Generator().manual_seed(0)), dim=1
+    )
     assert torch.rad2deg(torch.arccos((anywhere @ axes.T).abs().amax(1))).max() < 15
 
 
@@ -72,7 +86,13 @@ def test_training_lowers_the_loss(tmp_path):
 
     def loss():
         with torch.no_grad():
-            return data.loss(training.network, settings, 0.0, torch.Generator().manual_seed(1), training.processes).item()
+            return data.loss(
+                training.network,
+                settings,
+                0.0,
+                torch.Generator().manual_seed(1),
+                training.processes,
+            ).item()
 
     before = loss()
     for _ in range(60):
@@ -86,7 +106,9 @@ def test_command_leaves_weights_their_making_and_a_log(tmp_path, capsys):
     model = PolyFit.load(tmp_path / "out" / "weights.safetensors", 2)
     assert model(torch.rand(3, 30, 3)).jet.alpha.shape == (3, 6)
     about = json.loads((tmp_path / "out" / "weights.json").read_text())
-    assert about["command"] == "python -m polyfit.train " + " ".join([*FLAGS, "-o", str(tmp_path / "out")])
+    assert about["command"] == "python -m polyfit.train " + " ".join(
+        [*FLAGS, "-o", str(tmp_path / "out")]
+    )
     assert (about["steps"], about["seed"], about["processes"]) == (8, 0, 1)
     lines = [json.loads(line) for line in (tmp_path / "out" / "log.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines] == [8] and 0 < lines[0]["loss"] < 1
@@ -103,7 +125,9 @@ def test_resumed_training_ends_where_an_uninterrupted_one_does(tmp_path, model):
     a, b = load_file(whole), load_file(resumed)
     assert a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a)
     short = train.train(replace(settings, steps=3), tmp_path / "short")
-    assert any((load_file(short)[k] - a[k]).abs().max() > 1e-5 for k in a)  # the later steps did something
+    assert any(
+        (load_file(short)[k] - a[k]).abs().max() > 1e-5 for k in a
+    )  # the later steps did something
 
 
 def test_ctrl_c_leaves_a_checkpoint(tmp_path, monkeypatch):
@@ -126,16 +150,35 @@ def test_ctrl_c_leaves_a_checkpoint(tmp_path, monkeypatch):
 def test_two_processes_of_torchrun_do_what_one_does(tmp_path):
     # a thread of the group that outlives it may abort the ending interpreter
     (tmp_path / "run.py").write_text(
-        "import sys\nfrom pathlib import Path\nfrom polyfit import train\ntrain.main()\n"
-        "left = [name for task in Path('/proc/self/task').glob('*') if 'gloo' in (name := (task / 'comm').read_text())]\n"
-        "sys.exit(f'threads left: {left}' if left else 0)\n"
+        "import sys\nfrom pathlib import Path\nfrom polyfit import train\ntrain.main()\nleft ="
+        " [name for task in Path('/proc/self/task').glob('*') if 'gloo' in (name := (task /"
+        " 'comm').read_text())]\nsys.exit(f'threads left: {left}' if left else 0)\n"
     )
-    command = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", "--master-port", "29731", str(tmp_path / "run.py")]
+    command = [
+        sys.executable,
+        "-m",
+        "torch.distributed.run",
+        "--nproc-per-node",
+        "2",
+        "--master-port",
+        "29731",
+        str(tmp_path / "run.py"),
+    ]
     command += [*FLAGS, "-o", str(tmp_path / "two")]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, env=os.environ | {"OMP_NUM_THREADS": "1"})
+    done = subprocess.run(
+        command,
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+    )
     assert done.returncode == 0, done.stderr[-2000:]
     assert json.loads((tmp_path / "two" / "weights.json").read_text())["processes"] == 2
-    two, one = load_file(tmp_path / "two" / "weights.safetensors"), load_file(train.train(SMALL, tmp_path / "one"))
+    two, one = (
+        load_file(tmp_path / "two" / "weights.safetensors"),
+        load_file(train.train(SMALL, tmp_path / "one")),
+    )
     fresh = train.PolyFitTraining(SMALL, None, Processes("cpu")).network.state_dict()
     for k in one:
         assert (two[k] - one[k]).abs().max() <= 1e-4, k
@@ -151,13 +194,20 @@ def test_networks_of_others_train_on_the_same_patches(tmp_path, mesh):
             PolyFit.load(path)
     sets = [load_file(tmp_path / model / "set.safetensors") for model in ("pointnet", "dgcnn")]
     assert all(torch.equal(sets[0][k], sets[1][k]) for k in sets[0])
-    path = train.train(replace(settings, model="atlasnet", charts=3, steps=2, batch=2), tmp_path / "atlasnet")
+    path = train.train(
+        replace(settings, model="atlasnet", charts=3, steps=2, batch=2), tmp_path / "atlasnet"
+    )
     assert AtlasNet.load(path).charts == 3
 
 
 class TestRefused:
     def run(self, *flags):
-        return subprocess.run([sys.executable, "-m", "polyfit.train", *flags], cwd=ROOT, capture_output=True, text=True)
+        return subprocess.run(
+            [sys.executable, "-m", "polyfit.train", *flags],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+        )
 
     def test_on_the_command_line_in_one_line(self, tmp_path):
         done = self.run("none.obj", "-o", str(tmp_path / "out"))
@@ -201,7 +251,11 @@ class TestRefused:
         assert (tmp_path / "weights.safetensors").read_bytes() == before
 
     def test_a_loss_that_is_not_finite(self, tmp_path, monkeypatch):
-        monkeypatch.setattr(train._Patches, "loss", lambda self, network, *_: next(network.parameters()).sum() * torch.nan)
+        monkeypatch.setattr(
+            train._Patches,
+            "loss",
+            lambda self, network, *_: next(network.parameters()).sum() * torch.nan,
+        )
         with pytest.raises(InputError, match="the loss is nan at step 1"):
             train.train(SMALL, tmp_path)
         assert not (tmp_path / "weights.safetensors").exists()

@@ -11,7 +11,9 @@ import pytest
 from polysft_mi import video
 from polysft_mi.errors import InputError
 
-needs_encoder = pytest.mark.skipif(video.encoder() is None, reason="no ffmpeg with an H.264 encoder here")
+needs_encoder = pytest.mark.skipif(
+    video.encoder() is None, reason="no ffmpeg with an H.264 encoder here"
+)
 
 
 def frames(count=7, height=47, width=63):
@@ -35,7 +37,9 @@ def test_decodes_to_the_same_frames(tmp_path):
         assert np.abs(got[4:40, 4:25].reshape(-1, 3).mean(0) - want[10, 10]).max() < 6
         assert np.abs(got[4:40, 40:60].reshape(-1, 3).mean(0) - 128).max() < 6
     ours = list(video.read_video(path))
-    assert len(ours) == 7 and all(np.abs(a.astype(int) - b).max() <= 2 for a, b in zip(ours, decoded))
+    assert len(ours) == 7 and all(
+        np.abs(a.astype(int) - b).max() <= 2 for a, b in zip(ours, decoded)
+    )
     next(video.read_video(path))  # the rest is left unread
     (tmp_path / "broken.mp4").write_bytes(path.read_bytes()[:400])
     with pytest.raises(InputError, match="broken.mp4: not a readable video"):
@@ -46,11 +50,25 @@ def test_decodes_to_the_same_frames(tmp_path):
 def test_colours_are_rec709_and_marked_so(tmp_path):
     rgb = np.array([220, 40, 60])
     video.write_video(tmp_path / "a.mp4", [np.full((64, 64, 3), rgb, np.uint8)] * 2)
-    command = [video.encoder(), "-i", tmp_path / "a.mp4", "-f", "rawvideo", "-pix_fmt", "yuv420p", "-"]
+    command = [
+        video.encoder(),
+        "-i",
+        tmp_path / "a.mp4",
+        "-f",
+        "rawvideo",
+        "-pix_fmt",
+        "yuv420p",
+        "-",
+    ]
     done = subprocess.run(command, capture_output=True, check=True)
     luma = np.frombuffer(done.stdout, np.uint8)[: 64 * 64]
-    assert np.abs(luma - (16 + 219 / 255 * rgb @ (0.2126, 0.7152, 0.0722))).max() < 2  # Rec.601 has 98, Rec.709 84
-    assert b"yuv420p(tv, bt709" in done.stderr and b"unknown" not in done.stderr.split(b"Video:")[1].split(b"\n")[0]
+    assert (
+        np.abs(luma - (16 + 219 / 255 * rgb @ (0.2126, 0.7152, 0.0722))).max() < 2
+    )  # Rec.601 has 98, Rec.709 84
+    assert (
+        b"yuv420p(tv, bt709" in done.stderr
+        and b"unknown" not in done.stderr.split(b"Video:")[1].split(b"\n")[0]
+    )
 
 
 @needs_encoder
@@ -75,7 +93,9 @@ def test_falls_back_to_pngs(tmp_path, monkeypatch):
         (folder / name).write_bytes(b"x")
     assert video.write_video(tmp_path / "comparison.mp4", frames(), fps=10) == str(folder)
     names = sorted(os.listdir(folder))
-    assert names == sorted([f"{k:03d}.png" for k in range(7)] + ["000.exr", "notes.png"])  # the stale 009.png is gone
+    assert names == sorted(
+        [f"{k:03d}.png" for k in range(7)] + ["000.exr", "notes.png"]
+    )  # the stale 009.png is gone
     for k, want in enumerate(frames()):
         np.testing.assert_array_equal(cv2.imread(str(folder / f"{k:03d}.png"))[..., ::-1], want)
     assert os.listdir(tmp_path) == ["comparison"]
@@ -110,7 +130,9 @@ def test_refuses_frames_of_another_form(tmp_path, monkeypatch, with_encoder, wro
         monkeypatch.setattr(video, "encoder", lambda: None)
     with pytest.raises(ValueError, match="video frame"):
         video.write_video(tmp_path / "v.mp4", wrong)
-    assert not (tmp_path / "v.mp4").exists() and not [n for n in os.listdir(tmp_path) if "partial" in n]
+    assert not (tmp_path / "v.mp4").exists() and not [
+        n for n in os.listdir(tmp_path) if "partial" in n
+    ]
 
 
 @needs_encoder

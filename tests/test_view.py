@@ -35,7 +35,13 @@ cli(main)
 def test_draws_the_textured_surface_of_a_frame(finished_run, tmp_path):
     """In a process of its own, without a display."""
     pytest.importorskip("polyscope", reason="polyscope is not installed (the extra 'view')")
-    done = subprocess.run([sys.executable, "-c", SCRIPT, finished_run[1], tmp_path], capture_output=True, text=True, cwd=ROOT, timeout=120)
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT, finished_run[1], tmp_path],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        timeout=120,
+    )
     if "for want of OpenGL" in done.stderr:
         pytest.skip("polyscope finds no OpenGL here (EGL, or a display)")
     assert done.returncode == 0, done.stderr

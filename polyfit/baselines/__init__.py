@@ -1,1 +1,3 @@
-"""Networks of others that PolyFit is held against: PointNet and DGCNN regressing jets, AtlasNet generating surfaces."""
+"""Networks of others that PolyFit is held against: PointNet and DGCNN regressing jets, AtlasNet
+generating surfaces.
+"""

@@ -1,7 +1,8 @@
-"""PointNet (Qi et al. 2017) and DGCNN (Wang et al. 2019) that regress a jet's coefficients from a patch (paper, supplement, "Additional
-ablation studies").
+"""PointNet (Qi et al. 2017) and DGCNN (Wang et al. 2019) that regress a jet's coefficients from a
+patch (paper, supplement, "Additional ablation studies").
 
-Both see a patch in the chart of its PCA frame and answer with alpha (B, A) in that chart, where PolyFit solves for it.
+Both see a patch in the chart of its PCA frame and answer with alpha (B, A) in that chart, where
+PolyFit solves for it.
 """
 
 import torch
@@ -16,8 +17,8 @@ VERSION = 1
 
 
 class Regressor(torch.nn.Module):
-    """What both have in common: the PCA frame before, the layers from a patch's feature to alpha, the files of weights. ``points`` of each
-    patch are read.
+    """What both have in common: the PCA frame before, the layers from a patch's feature to alpha,
+    the files of weights. ``points`` of each patch are read.
     """
 
     def __init__(self, order, points, feature, hidden=64):
@@ -40,12 +41,14 @@ class Regressor(torch.nn.Module):
         """:class:`PatchFit` of patches ``points`` (B, P, 3) in any unit and frame."""
         frame = CanonicalFrame.from_points(points, mask)
         alpha = self.alpha(frame.to_chart(points), mask)
-        return PatchFit(frame, jets.JetFit(alpha, torch.full((len(alpha),), self.order, device=alpha.device)))
+        return PatchFit(
+            frame, jets.JetFit(alpha, torch.full((len(alpha),), self.order, device=alpha.device))
+        )
 
     @classmethod
     def load(cls, path, order=None):
-        """The network with the weights of the file ``path``. Raises InputError where they are no such, of another version, or not for
-        ``order``.
+        """The network with the weights of the file ``path``. Raises InputError where they are no
+        such, of another version, or not for ``order``.
         """
         weights, about = read_weights(path, cls.__name__.lower(), VERSION)
         if order is not None and about["order"] != order:
@@ -55,8 +58,14 @@ class Regressor(torch.nn.Module):
         return model.eval()
 
     def save(self, path, **about):
-        """Writes the weights to ``path`` (safetensors), with what they are for, and ``about``, inside."""
-        write_weights(path, self.state_dict(), dict(model=type(self).__name__.lower(), version=VERSION, order=self.order, **about))
+        """Writes the weights to ``path`` (safetensors), with what they are for, and ``about``,
+        inside.
+        """
+        write_weights(
+            path,
+            self.state_dict(),
+            dict(model=type(self).__name__.lower(), version=VERSION, order=self.order, **about),
+        )
 
 
 class PointNet(Regressor):
@@ -71,15 +80,16 @@ class PointNet(Regressor):
 
 
 class DGCNN(Regressor):
-    """EdgeConv layers over the ``neighbours`` nearest points, anew in each layer's features; their outputs together through one more layer,
-    the maximum over points, two layers.
+    """EdgeConv layers over the ``neighbours`` nearest points, anew in each layer's features; their
+    outputs together through one more layer, the maximum over points, two layers.
     """
 
     def __init__(self, order=4, points=64, widths=(32, 64), neighbours=8, feature=128):
         super().__init__(order, points, feature)
         self.neighbours = neighbours
         entries = [3, *widths[:-1]]
-        # an edge's layer on (x_i, x_j - x_i) is linear in both: one product a point instead of one an edge
+        # an edge's layer on (x_i, x_j - x_i) is linear in both: one product a point instead of one
+        # an edge
         self.centre = torch.nn.ModuleList(linear(e, w) for e, w in zip(entries, widths))
         self.edge = torch.nn.ModuleList(linear(e, w) for e, w in zip(entries, widths))
         self.last = linear(sum(widths), feature)
@@ -99,9 +109,13 @@ def nearest(x, count):
 
 
 def edge_convolution(x, neighbours, centre, edge):
-    """max_j relu(centre(x_i) + edge(x_j - x_i)) over the ``neighbours`` (B, P, k) of each of x (B, P, C): (B, P, W)."""
+    """max_j relu(centre(x_i) + edge(x_j - x_i)) over the ``neighbours`` (B, P, k) of each of x (B,
+    P, C): (B, P, W).
+    """
     y = torch.nn.functional.linear(x, edge.weight)
     with torch.no_grad():  # which neighbour is highest; gradients then pass through these alone
         at = neighbours.flatten(1)[..., None].expand(-1, -1, y.shape[-1])
-        which = neighbours.gather(2, y.gather(1, at).unflatten(1, neighbours.shape[1:]).max(2).indices)
+        which = neighbours.gather(
+            2, y.gather(1, at).unflatten(1, neighbours.shape[1:]).max(2).indices
+        )
     return torch.relu(centre(x) + edge.bias + y.gather(1, which) - y)

@@ -1,4 +1,6 @@
-"""All steps, from a video and a photo to a folder that ``polysft_mi.run`` takes: written aside, then renamed."""
+"""All steps, from a video and a photo to a folder that ``polysft_mi.run`` takes: written aside,
+then renamed.
+"""
 
 import contextlib
 import json
@@ -30,8 +32,12 @@ REPORT = "prepare"  # the folder with the pictures and prepare.json
 _FRAME, _MASK = "frames/{:05d}.png", "masks/{:05d}.png"
 _IN_VIEW = 0.3  # share of the vertices that must be seen in the first frame
 _ASPECT = 1.06  # ratio of the aspects of photo and size that is said
-_ALIKE = 0.85  # IoU of the first mask and the template's silhouette, below which masks are not believed
-_BENT = 0.005  # of the frame's diagonal, by which a rigid pose misses matches, from which it is said
+_ALIKE = (
+    0.85  # IoU of the first mask and the template's silhouette, below which masks are not believed
+)
+_BENT = (
+    0.005  # of the frame's diagonal, by which a rigid pose misses matches, from which it is said
+)
 _STRANGE = 0.75  # of their colours, likewise
 _JUMP = 1.5  # ratio of the areas of two masks in a row, likewise
 _SHARPEST = 2048  # pixels of a texture's longer side; what is finer no frame shows
@@ -42,24 +48,32 @@ def capture(
     corners=None, texture_corners=None, pose_fit="auto",
     masks=True, first=0, last=-1, stride=1, scale=1.0, overwrite=False, say=lambda line: None, progress=lambda count: None, command="",
 ):  # fmt: skip
-    """Make the folder ``out`` of a sequence from ``video`` (a file, a folder of images, a pattern): frames, masks, template, texture,
-    camera, ``scene.xml``.
+    """Make the folder ``out`` of a sequence from ``video`` (a file, a folder of images, a pattern):
+    frames, masks, template, texture, camera, ``scene.xml``.
 
-    ``texture``: the photo, or "first-frame"; ``size``: words as :func:`polysft_mi.capture.size.parse_size` takes them, or ``template``, an
-    OBJ; the camera by one of ``camera`` (a file), ``fov`` [degrees] and ``calibrate`` (a video of a ``board``), else by what the video
-    says; ``corners`` (4, 2): pixels of the sheet's corners in the frame ``first`` as it was taken, or "frame" for the picture's own,
-    and ``pose_fit``: "auto" to move the sheet from there to the edges in that frame, where they are clear, or "none"; ``texture_corners``
-    (4, 2): likewise in the photo, whose rest is cut off; ``masks``: True to find them, a folder of them, or False for
-    none; ``say`` is given one line for each step, ``progress`` the number of frames done.
+    ``texture``: the photo, or "first-frame"; ``size``: words as
+    :func:`polysft_mi.capture.size.parse_size` takes them, or ``template``, an OBJ; the camera by
+    one of ``camera`` (a file), ``fov`` [degrees] and ``calibrate`` (a video of a ``board``), else
+    by what the video says; ``corners`` (4, 2): pixels of the sheet's corners in the frame ``first``
+    as it was taken, or "frame" for the picture's own, and ``pose_fit``: "auto" to move the sheet
+    from there to the edges in that frame, where they are clear, or "none"; ``texture_corners`` (4,
+    2): likewise in the photo, whose rest is cut off; ``masks``: True to find them, a folder of
+    them, or False for none; ``say`` is given one line for each step, ``progress`` the number of
+    frames done.
 
-    Returns (path of the scene, a dict of what was found: what ``prepare/prepare.json`` holds). Raises InputError; then nothing is written,
-    but where the sheet is not found in the first frame, a picture of the matches, which the message names.
+    Returns (path of the scene, a dict of what was found: what ``prepare/prepare.json`` holds).
+    Raises InputError; then nothing is written, but where the sheet is not found in the first frame,
+    a picture of the matches, which the message names.
     """
     if sum(x is not None for x in (camera, fov, calibrate)) > 1:
         raise InputError("--camera, --fov and --calibrate: one of them is needed, not several")
     if (size is None) == (template is None):
         raise InputError("give either --size WIDTH HEIGHT, of a flat sheet, or --template mesh.obj")
-    inputs = [x for x in (video, texture, template, camera, calibrate, masks) if isinstance(x, str) and x != FIRST_FRAME]
+    inputs = [
+        x
+        for x in (video, texture, template, camera, calibrate, masks)
+        if isinstance(x, str) and x != FIRST_FRAME
+    ]
     out = _target(video, out, inputs, overwrite)
     if isinstance(masks, str):
         list_images(masks, "masks")  # that they are there is known before the work
@@ -74,30 +88,51 @@ def capture(
     frame = straight.image(frame)
     found["camera"] = {**lens.as_json(), "from": lens.source}
     say(
-        f"camera: {view.fx:.1f} pixels focal length, {view.width}x{view.height}, {'undistorted, ' if any(lens.distortion) else ''}from"
-        f" {lens.source}"
+        f"camera: {view.fx:.1f} pixels focal length, {view.width}x{view.height},"
+        f" {'undistorted, ' if any(lens.distortion) else ''}from {lens.source}"
     )
 
     photo = None if texture == FIRST_FRAME else read_rgb(texture)
     if texture_corners is not None:
         if photo is None:
-            raise InputError("--texture-corners: for a photo; --corners says where the sheet lies in the first frame")
+            raise InputError(
+                "--texture-corners: for a photo; --corners says where the sheet lies in the first"
+                " frame"
+            )
         photo = _cut_out(photo, texture_corners, size)
     mesh = _sheet(size, template, resolution, photo, texture, say)
 
-    pose, matches = _pose(mesh, photo, texture, frame, view, straight, corners, taken, pose_fit, out, first, found, say)
+    pose, matches = _pose(
+        mesh,
+        photo,
+        texture,
+        frame,
+        view,
+        straight,
+        corners,
+        taken,
+        pose_fit,
+        out,
+        first,
+        found,
+        say,
+    )
     placed = pose(mesh.vertices)
     seen = _seen(placed, view)
     if seen < _IN_VIEW:
         raise InputError(
-            f"{video}, frame {index}: {100 * seen:.0f} % of the sheet is in view; at least {100 * _IN_VIEW:.0f} % must be: start later, by"
-            " --first"
+            f"{video}, frame {index}: {100 * seen:.0f} % of the sheet is in view; at least"
+            f" {100 * _IN_VIEW:.0f} % must be: start later, by --first"
         )
     if photo is None:
         photo, uv = frame, view.project(placed) / (view.width, view.height)
         uv[:, 1] = 1 - uv[:, 1]
         mesh = sheet.Sheet(mesh.vertices, mesh.faces, uv, mesh.name)
-    found |= {"template": mesh.name, "in_view": seen, "size_m": np.ptp(mesh.vertices, axis=0).tolist()}
+    found |= {
+        "template": mesh.name,
+        "in_view": seen,
+        "size_m": np.ptp(mesh.vertices, axis=0).tolist(),
+    }
     meshio.check_template(placed, mesh.faces, mesh.uv, "template")
 
     os.makedirs(os.path.dirname(out) or ".", exist_ok=True)
@@ -127,9 +162,20 @@ def capture(
         write_obj(os.path.join(partial, "template.obj"), placed, mesh.faces, mesh.uv)
         _write_json(os.path.join(partial, "camera.json"), Lens(view).as_json())
         _write_json(os.path.join(partial, REPORT, "prepare.json"), found)
-        layout = Layout("cloth", view, "frames", "masks" if used else "", "texture.png", "template.obj")
+        layout = Layout(
+            "cloth", view, "frames", "masks" if used else "", "texture.png", "template.obj"
+        )
         with open(os.path.join(partial, "scene.xml"), "w", encoding="utf-8") as file:
-            file.write(scene_xml(layout, ".", comment="A video prepared by python -m polysft_mi.prepare; prepare/ shows what it found."))
+            file.write(
+                scene_xml(
+                    layout,
+                    ".",
+                    comment=(
+                        "A video prepared by python -m polysft_mi.prepare; prepare/ shows what it"
+                        " found."
+                    ),
+                )
+            )
         _replace(partial, out)
     except BaseException as error:
         shutil.rmtree(partial, ignore_errors=True)
@@ -139,7 +185,7 @@ def capture(
     return os.path.join(out, "scene.xml"), found
 
 
-# ---- steps -------------------------------------------------------------------------------------------------------------------
+# ---- steps ---------------------------------------------------------------------------------------
 
 
 def _lens(video, texture, camera, fov, calibrate, board, size):
@@ -156,8 +202,8 @@ def _lens(video, texture, camera, fov, calibrate, board, size):
         focal, where = focal_35mm(texture), f"{texture}, taken for the same camera and zoom"
     if focal is None:
         raise InputError(
-            f"{video}: does not say its camera; give --fov DEGREES (across the picture), --camera camera.json, or --calibrate VIDEO of a"
-            " chessboard"
+            f"{video}: does not say its camera; give --fov DEGREES (across the picture), --camera"
+            " camera.json, or --calibrate VIDEO of a chessboard"
         )
     return Lens.from_focal_35mm(focal, *size, where), None
 
@@ -169,23 +215,31 @@ def _sheet(size, template, resolution, photo, texture, say):
     width, height = parse_size(size, aspect)
     if aspect is not None:
         ratio, turned = aspect / (width / height), aspect / (height / width)
-        if max(ratio, 1 / ratio) > _ASPECT and max(turned, 1 / turned) < max(ratio, 1 / ratio) / 1.2:
+        if (
+            max(ratio, 1 / ratio) > _ASPECT
+            and max(turned, 1 / turned) < max(ratio, 1 / ratio) / 1.2
+        ):
             raise InputError(
-                f"{texture}: {photo.shape[1]}x{photo.shape[0]} pixels, for a sheet {width:g} m wide and {height:g} m high; give --size"
-                f" {height:g} {width:g}?"
+                f"{texture}: {photo.shape[1]}x{photo.shape[0]} pixels, for a sheet {width:g} m wide"
+                f" and {height:g} m high; give --size {height:g} {width:g}?"
             )
         if max(ratio, 1 / ratio) > _ASPECT:
             say(
-                f"note: the photo is {aspect:.3g} times as wide as high, the sheet {width / height:.3g} times; does it show the sheet from"
-                " edge to edge (--texture-corners)?"
+                f"note: the photo is {aspect:.3g} times as wide as high, the sheet"
+                f" {width / height:.3g} times; does it show the sheet from edge to edge"
+                " (--texture-corners)?"
             )
     return sheet.grid(width, height, resolution)
 
 
-def _pose(mesh, photo, texture, frame, view, straight, corners, taken, pose_fit, out, first, found, say):
+def _pose(
+    mesh, photo, texture, frame, view, straight, corners, taken, pose_fit, out, first, found, say
+):
     """(Pose, Matches or None), or InputError with a picture of the matches."""
     if corners is not None:
-        corners = [(0, 0), (taken[0], 0), taken, (0, taken[1])] if isinstance(corners, str) else corners
+        corners = (
+            [(0, 0), (taken[0], 0), taken, (0, taken[1])] if isinstance(corners, str) else corners
+        )
         pose = from_corners(straight.points(corners), mesh, view)
         found["pose"] = {"by": "corners", "residual_px": float(np.sqrt((pose.residual**2).mean()))}
         said = f"pose: by its corners, missed by {found['pose']['residual_px']:.2f} pixels"
@@ -198,8 +252,8 @@ def _pose(mesh, photo, texture, frame, view, straight, corners, taken, pose_fit,
         return pose, None
     if photo is None:
         raise InputError(
-            "--texture first-frame: --corners x,y x,y x,y x,y must say where the sheet lies in it (top left, top right, bottom right,"
-            " bottom left), or --corners frame"
+            "--texture first-frame: --corners x,y x,y x,y x,y must say where the sheet lies in it"
+            " (top left, top right, bottom right, bottom left), or --corners frame"
         )
     matches = match(photo, frame)
     pose, matches = from_matches(matches, mesh, view)
@@ -208,14 +262,25 @@ def _pose(mesh, photo, texture, frame, view, straight, corners, taken, pose_fit,
         with contextlib.suppress(OSError):
             os.makedirs(os.path.dirname(out) or ".", exist_ok=True)
             _write_png(picture, pictures.matches(photo, frame, matches))
-        raise InputError(f"{texture}: not found in frame {first}: {_why_not(photo, frame, matches, mesh, view)}; {picture} shows them")
+        raise InputError(
+            f"{texture}: not found in frame {first}: {_why_not(photo, frame, matches, mesh, view)};"
+            f" {picture} shows them"
+        )
     residual = float(np.sqrt((pose.residual**2).mean()))
-    found["pose"] = {"by": "features", "matches": len(matches.agree), "agree": int(matches.agree.sum()), "residual_px": residual}
-    say(f"pose: {int(matches.agree.sum())} of {len(matches.agree)} matches agree, missed by {residual:.2f} pixels RMS")
+    found["pose"] = {
+        "by": "features",
+        "matches": len(matches.agree),
+        "agree": int(matches.agree.sum()),
+        "residual_px": residual,
+    }
+    say(
+        f"pose: {int(matches.agree.sum())} of {len(matches.agree)} matches agree, missed by"
+        f" {residual:.2f} pixels RMS"
+    )
     if residual > _BENT * np.hypot(view.width, view.height):
         say(
-            f"note: the sheet is bent in frame {first}, and the template is not; a run may start wrongly there: see pose.png, or choose"
-            " another --first"
+            f"note: the sheet is bent in frame {first}, and the template is not; a run may start"
+            " wrongly there: see pose.png, or choose another --first"
         )
     return pose, matches
 
@@ -224,12 +289,22 @@ def _why_not(photo, frame, matches, mesh, view):
     """In words, why no pose was found."""
     agree = int(matches.agree.sum())
     mirrored = replace(mesh, uv=mesh.uv * (-1, 1) + (1, 0))
-    if from_matches(match(np.ascontiguousarray(photo[:, ::-1]), frame), mirrored, view)[1].agree.sum() >= max(2 * agree, 2 * LEAST):
+    if from_matches(match(np.ascontiguousarray(photo[:, ::-1]), frame), mirrored, view)[
+        1
+    ].agree.sum() >= max(2 * agree, 2 * LEAST):
         return "its mirror image is; flip the photo, or the video (cameras for selfies mirror)"
-    advice = "start where the sheet is seen whole and sharp (--first N), or say where it is (--corners x,y x,y x,y x,y)"
+    advice = (
+        "start where the sheet is seen whole and sharp (--first N), or say where it is (--corners"
+        " x,y x,y x,y x,y)"
+    )
     if agree < LEAST:
-        return f"{agree} of {len(matches.agree)} matches agree on a pose, {LEAST} are needed; {advice}"
-    return f"the {agree} matches that agree, of {len(matches.agree)}, put the sheet behind the camera or on its back; {advice}"
+        return (
+            f"{agree} of {len(matches.agree)} matches agree on a pose, {LEAST} are needed; {advice}"
+        )
+    return (
+        f"the {agree} matches that agree, of {len(matches.agree)}, put the sheet behind the camera"
+        f" or on its back; {advice}"
+    )
 
 
 def _write_frames(folder, index, frame, stream, straight, masks, expected, found, say, progress):
@@ -269,7 +344,12 @@ def _write_frames(folder, index, frame, stream, straight, masks, expected, found
         say(f"masks: those of {masks}")
     elif tracked:
         used, why = _believable(first_iou, areas, strange, indices)
-        found["masks"] = {"first_iou": first_iou, "strangeness": max(strange), "used": used, **({"why": why} if why else {})}
+        found["masks"] = {
+            "first_iou": first_iou,
+            "strangeness": max(strange),
+            "used": used,
+            **({"why": why} if why else {}),
+        }
         say(
             f"masks: by GrabCut, the first overlaps with the template by {100 * first_iou:.0f} %"
             if used
@@ -284,10 +364,18 @@ def _write_frames(folder, index, frame, stream, straight, masks, expected, found
 def _show(folder, indices, masked):
     """Contact sheets of the frames and masks that were written."""
     read = lambda name: read_rgb(os.path.join(folder, name))
-    few = [(k, f"frame {indices[k]}", read(_FRAME.format(k))) for k in pictures.chosen(len(indices))]
-    _write_png(os.path.join(folder, REPORT, "frames.png"), pictures.contact_sheet([(caption, image) for _, caption, image in few]))
+    few = [
+        (k, f"frame {indices[k]}", read(_FRAME.format(k))) for k in pictures.chosen(len(indices))
+    ]
+    _write_png(
+        os.path.join(folder, REPORT, "frames.png"),
+        pictures.contact_sheet([(caption, image) for _, caption, image in few]),
+    )
     if masked:
-        cells = [(caption, pictures.masked(image, read(_MASK.format(k))[..., 0])) for k, caption, image in few]
+        cells = [
+            (caption, pictures.masked(image, read(_MASK.format(k))[..., 0]))
+            for k, caption, image in few
+        ]
         _write_png(os.path.join(folder, REPORT, "masks.png"), pictures.contact_sheet(cells))
 
 
@@ -297,8 +385,8 @@ def _believable(first_iou, areas, strange, indices):
         return (
             False,
             (
-                f"in the first frame they overlap with the template by {100 * first_iou:.0f} % only: the sheet does not stand out from what"
-                " is behind it"
+                f"in the first frame they overlap with the template by {100 * first_iou:.0f} %"
+                " only: the sheet does not stand out from what is behind it"
             ),
         )
     for before, after, index in zip(areas, areas[1:], indices[1:]):
@@ -306,7 +394,10 @@ def _believable(first_iou, areas, strange, indices):
             return False, f"in frame {index} their area jumps from {before} to {after} pixels"
     for index, value in zip(indices, strange):
         if value > _STRANGE:
-            return False, f"what is inside in frame {index} has other colours than the sheet in the first"
+            return (
+                False,
+                f"what is inside in frame {index} has other colours than the sheet in the first",
+            )
     return True, None
 
 
@@ -314,38 +405,53 @@ def _given_masks(folder, masks, indices, straight):
     paths = list_images(masks, "masks")
     if len(paths) != len(indices) and len(paths) <= indices[-1]:
         raise InputError(
-            f"{masks}: {len(paths)} masks for {len(indices)} frames, the last of them frame {indices[-1]}; one a frame is needed"
+            f"{masks}: {len(paths)} masks for {len(indices)} frames, the last of them frame"
+            f" {indices[-1]}; one a frame is needed"
         )
     paths = paths if len(paths) == len(indices) else [paths[k] for k in indices]
     for k, path in enumerate(paths):
         mask = read_rgb(path).max(axis=2)
         if mask.shape[::-1] != straight.size:
-            raise InputError(f"{path}: {mask.shape[1]}x{mask.shape[0]} pixels; the frames have {straight.size[0]}x{straight.size[1]}")
+            raise InputError(
+                f"{path}: {mask.shape[1]}x{mask.shape[0]} pixels; the frames have"
+                f" {straight.size[0]}x{straight.size[1]}"
+            )
         mask = straight.image(255 * mask if 0 < mask.max() <= 1 else mask)
         if k == 0 and not (mask > 127).any():
-            raise InputError(f"{path}: the mask of the first frame is empty; the sheet must be seen in it")
+            raise InputError(
+                f"{path}: the mask of the first frame is empty; the sheet must be seen in it"
+            )
         _write_png(os.path.join(folder, _MASK.format(k)), mask)
 
 
-# ---- files -------------------------------------------------------------------------------------------------------------------
+# ---- files ---------------------------------------------------------------------------------------
 
 
 def _target(video, out, inputs, overwrite):
     """The folder to write, checked before any work."""
     if out is None:
         if not is_video(video):
-            raise InputError(f"{video}: -o DIR, the folder to write, is needed beside a folder of images")
+            raise InputError(
+                f"{video}: -o DIR, the folder to write, is needed beside a folder of images"
+            )
         out = os.path.splitext(video)[0]
     out = os.path.normpath(out)
     for path in inputs:
         a, b = os.path.realpath(path), os.path.realpath(out)
         if a == b or a.startswith(b + os.sep):
-            raise InputError(f"{out}: {path} lies in it, and would be replaced; give another folder by -o")
+            raise InputError(
+                f"{out}: {path} lies in it, and would be replaced; give another folder by -o"
+            )
     if os.path.isdir(out) and os.listdir(out):
         if not overwrite:
-            raise InputError(f"{out}: is there already; give --overwrite to replace it, or another folder by -o")
+            raise InputError(
+                f"{out}: is there already; give --overwrite to replace it, or another folder by -o"
+            )
         if not os.path.isfile(os.path.join(out, REPORT, "prepare.json")):
-            raise InputError(f"{out}: holds what this command did not write, and is not replaced; give another folder by -o")
+            raise InputError(
+                f"{out}: holds what this command did not write, and is not replaced; give another"
+                " folder by -o"
+            )
     elif os.path.exists(out) and not os.path.isdir(out):
         raise InputError(f"{out}: is a file; -o needs a folder")
     return out
@@ -394,5 +500,10 @@ def _cut_out(photo, corners, size):
     w, h = max(2, round(w)), max(2, round(h))
     if max(w, h) > 16384:
         raise InputError("--texture-corners: they span more than the photo")
-    H = cv2.getPerspectiveTransform(corners - 0.5, np.float32([(-0.5, -0.5), (w - 0.5, -0.5), (w - 0.5, h - 0.5), (-0.5, h - 0.5)]))
-    return cv2.warpPerspective(photo, H, (w, h), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    H = cv2.getPerspectiveTransform(
+        corners - 0.5,
+        np.float32([(-0.5, -0.5), (w - 0.5, -0.5), (w - 0.5, h - 0.5), (-0.5, h - 0.5)]),
+    )
+    return cv2.warpPerspective(
+        photo, H, (w, h), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+    )

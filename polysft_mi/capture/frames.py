@@ -1,4 +1,6 @@
-"""The frames of a video file, or of a folder of images: decoded one after the other, checked, turned upright."""
+"""The frames of a video file, or of a folder of images: decoded one after the other, checked,
+turned upright.
+"""
 
 import os
 
@@ -14,14 +16,17 @@ _MOST = 16384  # pixels a side
 
 
 def read_frames(path, first=0, last=-1, stride=1):
-    """Yield (index, image (H, W, 3) uint8 sRGB) of the frames ``first`` to ``last`` (inclusive, -1 for the end) in steps of ``stride``.
+    """Yield (index, image (H, W, 3) uint8 sRGB) of the frames ``first`` to ``last`` (inclusive, -1
+    for the end) in steps of ``stride``.
 
-    ``path``: a video file, a folder of images or a glob pattern. Raises InputError: for a file that is not a video or breaks off, for no
-    frames, for frames of several sizes, and where ``first`` or ``last`` lies beyond the end.
+    ``path``: a video file, a folder of images or a glob pattern. Raises InputError: for a file that
+    is not a video or breaks off, for no frames, for frames of several sizes, and where ``first`` or
+    ``last`` lies beyond the end.
     """
     if first < 0 or last < -1 or (last != -1 and last < first) or stride < 1:
         raise InputError(
-            f"first = {first}, last = {last}, stride = {stride}; 0 <= first <= last (or last = -1 for the end) and stride >= 1 are needed"
+            f"first = {first}, last = {last}, stride = {stride}; 0 <= first <= last (or last = -1"
+            " for the end) and stride >= 1 are needed"
         )
     seen, size = 0, None
     for index, (where, load) in enumerate(_sources(path)):
@@ -35,17 +40,22 @@ def read_frames(path, first=0, last=-1, stride=1):
         size = size or here
         if here != size:
             raise InputError(
-                f"{where}: {here[0]}x{here[1]} pixels, and those before have {size[0]}x{size[1]}; all frames must be of one size"
+                f"{where}: {here[0]}x{here[1]} pixels, and those before have {size[0]}x{size[1]};"
+                " all frames must be of one size"
             )
         if min(here) < 16 or max(here) > _MOST:
-            raise InputError(f"{where}: {here[0]}x{here[1]} pixels; 16 to {_MOST} a side are needed")
+            raise InputError(
+                f"{where}: {here[0]}x{here[1]} pixels; 16 to {_MOST} a side are needed"
+            )
         yield index, image
     if not seen:
         raise InputError(f"{path}: holds no frames; a video, or a folder of images, is needed")
     if seen <= first:
         raise InputError(f"first = {first}; {path} holds {seen} frames, counted from 0")
     if last >= seen:
-        raise InputError(f"last = {last}; {path} holds {seen} frames, counted from 0 (-1 is for the end)")
+        raise InputError(
+            f"last = {last}; {path} holds {seen} frames, counted from 0 (-1 is for the end)"
+        )
 
 
 def is_video(path):
@@ -54,8 +64,8 @@ def is_video(path):
 
 
 def focal_length(path):
-    """(the focal length for film of 36x24 mm [mm], where it is written), or (None, None). A video has it where the telephone wrote it
-    there, images in Exif data."""
+    """(the focal length for film of 36x24 mm [mm], where it is written), or (None, None). A video
+    has it where the telephone wrote it there, images in Exif data."""
     if not is_video(path):
         image = list_images(path, "frames")[0]
         return focal_35mm(image), image
@@ -93,7 +103,8 @@ def _decoded(path):
         with av.open(_name(path)) as container:
             if not container.streams.video:
                 raise InputError(
-                    f"{path}: holds no pictures (streams: {', '.join(s.type for s in container.streams) or 'none'}); a video is needed"
+                    f"{path}: holds no pictures (streams:"
+                    f" {', '.join(s.type for s in container.streams) or 'none'}); a video is needed"
                 )
             stream = container.streams.video[0]
             stream.thread_type = "AUTO"
@@ -102,12 +113,20 @@ def _decoded(path):
                 count += 1
     except (av.FFmpegError, OSError) as error:
         text = getattr(error, "strerror", None) or str(error)
-        at = f"; the {count} frames before can be used: --last {count - 1}" if count else "; a video that FFmpeg decodes is needed"
-        raise InputError(f"{path}: cannot be decoded{f' after frame {count - 1}' if count else ''} ({text}){at}") from None
+        at = (
+            f"; the {count} frames before can be used: --last {count - 1}"
+            if count
+            else "; a video that FFmpeg decodes is needed"
+        )
+        raise InputError(
+            f"{path}: cannot be decoded{f' after frame {count - 1}' if count else ''} ({text}){at}"
+        ) from None
 
 
 def _upright(frame):
-    """Pixels of a decoded frame, turned by its display matrix (telephones store what the sensor saw)."""
+    """Pixels of a decoded frame, turned by its display matrix (telephones store what the sensor
+    saw).
+    """
     turns = round(frame.rotation / 90) % 4  # quarter turns against the clock
     return np.ascontiguousarray(np.rot90(frame.to_ndarray(format="rgb24"), turns))
 

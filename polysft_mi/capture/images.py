@@ -15,8 +15,9 @@ _FOCAL_35MM = 0xA405
 def read_rgb(path):
     """The image (H, W, 3), uint8 sRGB, upright.
 
-    Turned as its Exif orientation says; 16 bits become 8, float pixels are taken as linear, grey becomes RGB; what is transparent becomes
-    white. Raises InputError where it is not a readable image.
+    Turned as its Exif orientation says; 16 bits become 8, float pixels are taken as linear, grey
+    becomes RGB; what is transparent becomes white. Raises InputError where it is not a readable
+    image.
     """
     if os.fspath(path).lower().endswith((".heic", ".heif", ".avif")):
         raise InputError(f"{path}: HEIC and AVIF are not read; export it as JPEG or PNG")
@@ -52,7 +53,9 @@ def upright(image, orientation):
 
 
 def focal_35mm(path):
-    """The focal length [mm], for film of 36x24 mm, that an image's Exif data have; None where they have none."""
+    """The focal length [mm], for film of 36x24 mm, that an image's Exif data have; None where they
+    have none.
+    """
     value = _exif(path).get_ifd(_EXIF_BLOCK).get(_FOCAL_35MM)
     try:
         return float(value) if value and float(value) > 0 else None
@@ -66,7 +69,11 @@ def _exif(path):
     try:
         with Image.open(path) as image:
             return image.getexif()
-    except (OSError, SyntaxError, ValueError):  # EXR, and what Pillow does not know; the pixels are read by others
+    except (
+        OSError,
+        SyntaxError,
+        ValueError,
+    ):  # EXR, and what Pillow does not know; the pixels are read by others
         return Image.Exif()
 
 
@@ -75,6 +82,10 @@ def _encoded(linear):
     x = np.clip(linear, 0, 1)
     colours = x[..., :3] if x.shape[2] >= 3 else x[..., :1]
     x = np.concatenate(
-        [np.where(colours <= 0.0031308, 12.92 * colours, 1.055 * colours ** (1 / 2.4) - 0.055), x[..., colours.shape[2] :]], axis=2
+        [
+            np.where(colours <= 0.0031308, 12.92 * colours, 1.055 * colours ** (1 / 2.4) - 0.055),
+            x[..., colours.shape[2] :],
+        ],
+        axis=2,
     )
     return np.round(255 * x).astype(np.uint8)

@@ -1,5 +1,5 @@
-"""The camera that took the frames: focal length, principal point, and the lens's distortion, which is removed before anything else looks at
-a frame."""
+"""The camera that took the frames: focal length, principal point, and the lens's distortion, which
+is removed before anything else looks at a frame."""
 
 import json
 import math
@@ -20,8 +20,9 @@ _ALIKE = 0.01  # relative difference of two aspect ratios that rounding the size
 class Lens:
     """A pinhole and what keeps the lens from being one.
 
-    ``camera``: :class:`polysft_mi.camera.Intrinsics` of the frames as they were taken; ``distortion``: OpenCV's coefficients (k1, k2, p1,
-    p2, k3, ...), in normalised image coordinates; ``source``: how they are known, in words.
+    ``camera``: :class:`polysft_mi.camera.Intrinsics` of the frames as they were taken;
+    ``distortion``: OpenCV's coefficients (k1, k2, p1, p2, k3, ...), in normalised image
+    coordinates; ``source``: how they are known, in words.
     """
 
     camera: Intrinsics
@@ -31,28 +32,38 @@ class Lens:
     def __post_init__(self):
         if len(self.distortion) not in _COEFFICIENTS or not np.isfinite(self.distortion).all():
             raise InputError(
-                f"{self.source}: {len(self.distortion)} distortion coefficients; 4, 5, 8, 12 or 14 finite numbers, in OpenCV's order, are"
-                " needed"
+                f"{self.source}: {len(self.distortion)} distortion coefficients; 4, 5, 8, 12 or 14"
+                " finite numbers, in OpenCV's order, are needed"
             )
 
     @classmethod
     def from_fov(cls, fov, width, height, source="--fov"):
         """A pinhole whose picture is ``fov`` degrees wide, its principal point in the middle."""
         if not 1 <= fov <= 170:
-            raise InputError(f"{source} {fov:g}: 1 to 170 degrees, across the width of the picture, can be used")
+            raise InputError(
+                f"{source} {fov:g}: 1 to 170 degrees, across the width of the picture, can be used"
+            )
         f = width / (2 * math.tan(math.radians(fov) / 2))
-        return cls(Intrinsics(f, f, width / 2, height / 2, width, height), (), f"{source} {fov:g} degrees")
+        return cls(
+            Intrinsics(f, f, width / 2, height / 2, width, height), (), f"{source} {fov:g} degrees"
+        )
 
     @classmethod
     def from_focal_35mm(cls, focal, width, height, source):
-        """A pinhole by the focal length [mm] that gives the same diagonal angle of view on film of 36x24 mm."""
+        """A pinhole by the focal length [mm] that gives the same diagonal angle of view on film of
+        36x24 mm.
+        """
         f = focal / _FILM_DIAGONAL * math.hypot(width, height)
-        return cls(Intrinsics(f, f, width / 2, height / 2, width, height), (), f"{focal:g} mm on film, said by {source}")
+        return cls(
+            Intrinsics(f, f, width / 2, height / 2, width, height),
+            (),
+            f"{focal:g} mm on film, said by {source}",
+        )
 
     @classmethod
     def from_json(cls, path, width, height):
-        """From a camera file (fx, fy, cx, cy, width, height, and ``distortion``, a list, or none), for frames of this size. Raises
-        InputError."""
+        """From a camera file (fx, fy, cx, cy, width, height, and ``distortion``, a list, or none),
+        for frames of this size. Raises InputError."""
         camera = Intrinsics.from_json(path)
         with open(path, encoding="utf-8") as file:
             distortion = json.load(file).get("distortion") or ()
@@ -60,33 +71,50 @@ class Lens:
             distortion = tuple(float(x) for x in distortion)
         except (TypeError, ValueError):
             raise InputError(
-                f"{path}: distortion = {distortion!r}; a list of 4, 5, 8, 12 or 14 numbers, in OpenCV's order, is needed"
+                f"{path}: distortion = {distortion!r}; a list of 4, 5, 8, 12 or 14 numbers, in"
+                " OpenCV's order, is needed"
             ) from None
         return cls(camera, distortion, str(path)).resized(width, height)
 
     def resized(self, width, height):
-        """The same lens for frames of another size of the same aspect. Raises InputError where the aspect differs."""
+        """The same lens for frames of another size of the same aspect. Raises InputError where the
+        aspect differs.
+        """
         c = self.camera
         if (width, height) == (c.width, c.height):
             return self
         x, y = width / c.width, height / c.height
         if abs(x / y - 1) > _ALIKE:
             raise InputError(
-                f"{self.source}: for pictures of {c.width}x{c.height}; the frames have {width}x{height}, which is no scaled version of them"
+                f"{self.source}: for pictures of {c.width}x{c.height}; the frames have"
+                f" {width}x{height}, which is no scaled version of them"
             )
-        return Lens(Intrinsics(c.fx * x, c.fy * y, c.cx * x, c.cy * y, width, height), self.distortion, self.source)
+        return Lens(
+            Intrinsics(c.fx * x, c.fy * y, c.cx * x, c.cy * y, width, height),
+            self.distortion,
+            self.source,
+        )
 
     def as_json(self):
         """What a camera file holds."""
         c = self.camera
-        values = {"width": c.width, "height": c.height, "fx": c.fx, "fy": c.fy, "cx": c.cx, "cy": c.cy}
+        values = {
+            "width": c.width,
+            "height": c.height,
+            "fx": c.fx,
+            "fy": c.fy,
+            "cx": c.cx,
+            "cy": c.cy,
+        }
         return {**values, "distortion": list(self.distortion)} if self.distortion else values
 
 
 class Undistortion:
-    """Frames as the pinhole ``camera`` (its attribute) would have taken them: distortion removed, then scaled by ``scale``.
+    """Frames as the pinhole ``camera`` (its attribute) would have taken them: distortion removed,
+    then scaled by ``scale``.
 
-    The undistorted picture has the lens's own K, so that its middle keeps its size; what lies beyond the frame's border repeats the border.
+    The undistorted picture has the lens's own K, so that its middle keeps its size; what lies
+    beyond the frame's border repeats the border.
     """
 
     def __init__(self, lens, scale=1.0):
@@ -96,18 +124,28 @@ class Undistortion:
             raise InputError(f"--scale {scale:g}: above 0, and at most 4, is needed")
         size = max(1, round(c.width * scale)), max(1, round(c.height * scale))
         if min(size) < 16:
-            raise InputError(f"--scale {scale:g}: makes frames of {size[0]}x{size[1]} pixels; at least 16 a side are needed")
-        self.camera = lens.resized(*size).camera if abs(size[0] * c.height / (size[1] * c.width) - 1) < _ALIKE else None
+            raise InputError(
+                f"--scale {scale:g}: makes frames of {size[0]}x{size[1]} pixels; at least 16 a side"
+                " are needed"
+            )
+        self.camera = (
+            lens.resized(*size).camera
+            if abs(size[0] * c.height / (size[1] * c.width) - 1) < _ALIKE
+            else None
+        )
         if self.camera is None:
             raise InputError(
-                f"--scale {scale:g}: makes frames of {size[0]}x{size[1]} pixels, too small to keep the shape of {c.width}x{c.height}"
+                f"--scale {scale:g}: makes frames of {size[0]}x{size[1]} pixels, too small to keep"
+                f" the shape of {c.width}x{c.height}"
             )
         self._distortion = np.array(lens.distortion) if any(lens.distortion) else None
         self._K = c.matrix()
         self._K[:2, 2] -= 0.5  # OpenCV counts from the centre of the first pixel
         self._maps = None
         if self._distortion is not None:
-            self._maps = cv2.initUndistortRectifyMap(self._K, self._distortion, None, self._K, (c.width, c.height), cv2.CV_16SC2)
+            self._maps = cv2.initUndistortRectifyMap(
+                self._K, self._distortion, None, self._K, (c.width, c.height), cv2.CV_16SC2
+            )
 
     def image(self, image):
         """A frame (H, W, 3) uint8, undistorted and scaled."""
@@ -115,12 +153,26 @@ class Undistortion:
             image = cv2.remap(image, *self._maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         size = self.camera.width, self.camera.height
         if size != image.shape[1::-1]:
-            image = cv2.resize(image, size, interpolation=cv2.INTER_AREA if size[0] < image.shape[1] else cv2.INTER_CUBIC)
+            image = cv2.resize(
+                image,
+                size,
+                interpolation=cv2.INTER_AREA if size[0] < image.shape[1] else cv2.INTER_CUBIC,
+            )
         return image
 
     def points(self, points):
-        """Where pixels (N, 2) of the frame as it was taken lie in :meth:`image`; (0.5, 0.5) is the centre of the first pixel of both."""
+        """Where pixels (N, 2) of the frame as it was taken lie in :meth:`image`; (0.5, 0.5) is the
+        centre of the first pixel of both.
+        """
         points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
         if self._distortion is not None:
-            points = cv2.undistortPoints((points - 0.5)[:, None], self._K, self._distortion, P=self._K)[:, 0] + 0.5
-        return points * (self.camera.width / self._from.width, self.camera.height / self._from.height)
+            points = (
+                cv2.undistortPoints((points - 0.5)[:, None], self._K, self._distortion, P=self._K)[
+                    :, 0
+                ]
+                + 0.5
+            )
+        return points * (
+            self.camera.width / self._from.width,
+            self.camera.height / self._from.height,
+        )

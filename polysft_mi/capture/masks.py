@@ -1,5 +1,5 @@
-"""The sheet's silhouette in every frame: GrabCut around the template's projection in the first, then around where the optical flow carries
-the frame before's."""
+"""The sheet's silhouette in every frame: GrabCut around the template's projection in the first,
+then around where the optical flow carries the frame before's."""
 
 import cv2
 import numpy as np
@@ -11,7 +11,9 @@ _ITERATIONS = 2
 
 
 class Masks:
-    """``first(image, silhouette)``, then ``next(image)`` for each frame: masks (H, W) uint8, 0 or 255, of images (H, W, 3) uint8 RGB."""
+    """``first(image, silhouette)``, then ``next(image)`` for each frame: masks (H, W) uint8, 0 or
+    255, of images (H, W, 3) uint8 RGB.
+    """
 
     def __init__(self, size):
         """``size``: (width, height) of the frames [pixels]."""
@@ -21,7 +23,9 @@ class Masks:
         self._grey = self._mask = None
         self._models = np.zeros((1, 65)), np.zeros((1, 65))
         self._colours = None
-        self.strangeness = 0.0  # of the last mask: 0 where its colours are those of the first, 1 where they share none (Bhattacharyya)
+        # of the last mask: 0 where its colours are those of the first, 1 where they share none
+        # (Bhattacharyya)
+        self.strangeness = 0.0
 
     def first(self, image, silhouette):
         """From the template's silhouette (H, W), 0 or 255."""
@@ -39,7 +43,9 @@ class Masks:
         y, x = np.mgrid[: grey.shape[0], : grey.shape[1]].astype(np.float32)
         moved = cv2.remap(255 * self._mask, x + flow[..., 0], y + flow[..., 1], cv2.INTER_LINEAR)
         self._grey, self._mask = grey, self._cut(small, (moved > 127).astype(np.uint8), _ITERATIONS)
-        self.strangeness = cv2.compareHist(_histogram(small, self._mask), self._colours, cv2.HISTCMP_BHATTACHARYYA)
+        self.strangeness = cv2.compareHist(
+            _histogram(small, self._mask), self._colours, cv2.HISTCMP_BHATTACHARYYA
+        )
         return self._enlarged()
 
     def _cut(self, image, expected, iterations):
@@ -50,19 +56,32 @@ class Masks:
         inner = cv2.erode(expected, disc, borderValue=1)
         outer = cv2.dilate(expected, disc)
         trimap = np.where(
-            inner > 0, cv2.GC_FGD, np.where(outer > 0, np.where(expected > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD), cv2.GC_BGD)
+            inner > 0,
+            cv2.GC_FGD,
+            np.where(outer > 0, np.where(expected > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD), cv2.GC_BGD),
         ).astype(np.uint8)
         x, y, w, h = cv2.boundingRect(outer)
         window = np.s_[max(0, y - 4 * r) : y + h + 4 * r, max(0, x - 4 * r) : x + w + 4 * r]
         part = np.ascontiguousarray(trimap[window])
         cv2.setRNGSeed(0)
-        cv2.grabCut(np.ascontiguousarray(image[window]), part, None, *self._models, iterations, cv2.GC_INIT_WITH_MASK)
+        cv2.grabCut(
+            np.ascontiguousarray(image[window]),
+            part,
+            None,
+            *self._models,
+            iterations,
+            cv2.GC_INIT_WITH_MASK,
+        )
         cut = np.zeros_like(expected)
         cut[window] = (part == cv2.GC_FGD) | (part == cv2.GC_PR_FGD)
         return _connected(cut, inner)
 
     def _reduced(self, image):
-        return image if self._small == self._size else cv2.resize(image, self._small, interpolation=cv2.INTER_AREA)
+        return (
+            image
+            if self._small == self._size
+            else cv2.resize(image, self._small, interpolation=cv2.INTER_AREA)
+        )
 
     def _enlarged(self):
         if self._small == self._size:
@@ -86,10 +105,12 @@ def _connected(mask, core):
 
 
 def silhouette(pixels, faces, size):
-    """The projection of a mesh: mask (H, W) uint8, 0 or 255, of triangles ``faces`` (F, 3) between ``pixels`` (N, 2), (0.5, 0.5) the first
-    pixel's centre."""
+    """The projection of a mesh: mask (H, W) uint8, 0 or 255, of triangles ``faces`` (F, 3) between
+    ``pixels`` (N, 2), (0.5, 0.5) the first pixel's centre."""
     mask = np.zeros(size[::-1], np.uint8)
-    shift = 4  # binary places of the fixed-point coordinates that OpenCV takes; it counts from the first pixel's centre
+    # binary places of the fixed-point coordinates that OpenCV takes; it counts from the first
+    # pixel's centre
+    shift = 4
     corners = np.round((np.clip(pixels, -1e5, 1e5) - 0.5) * 2**shift).astype(np.int32)
     for face in corners[faces]:
         cv2.fillConvexPoly(mask, face, 255, cv2.LINE_8, shift)
@@ -97,7 +118,9 @@ def silhouette(pixels, faces, size):
 
 
 def iou(a, b):
-    """Intersection over union of two masks, above half their largest value each; 1 where both are empty."""
+    """Intersection over union of two masks, above half their largest value each; 1 where both are
+    empty.
+    """
     a, b = (np.asarray(m) > 0.5 * max(np.max(m), 1e-9) for m in (a, b))
     union = (a | b).sum()
     return float((a & b).sum() / union) if union else 1.0

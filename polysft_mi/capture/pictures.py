@@ -1,4 +1,6 @@
-"""Pictures of what each step of the preparation found, for a person to look at: (H, W, 3) uint8 RGB images."""
+"""Pictures of what each step of the preparation found, for a person to look at: (H, W, 3) uint8 RGB
+images.
+"""
 
 import cv2
 import numpy as np
@@ -16,13 +18,26 @@ _HEIGHT = 480  # pixels of a picture that is drawn on
 def shrunk(image, side=_SIDE):
     """(image no larger than ``side``, what it was scaled by)."""
     scale = min(1.0, side / max(image.shape[:2]))
-    return (cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else image.copy()), scale
+    return (
+        cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        if scale < 1
+        else image.copy()
+    ), scale
 
 
 def _canvas(image):
     """(image of _HEIGHT rows, enlarged where it has fewer, what it was scaled by)."""
     scale = _HEIGHT / image.shape[0]
-    return cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC), scale
+    return (
+        cv2.resize(
+            image,
+            None,
+            fx=scale,
+            fy=scale,
+            interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC,
+        ),
+        scale,
+    )
 
 
 def contact_sheet(cells):
@@ -43,19 +58,27 @@ def contact_sheet(cells):
 
 
 def chosen(count, most=12):
-    """Indices of at most ``most`` of ``count`` things, evenly spread, the first and the last among them."""
+    """Indices of at most ``most`` of ``count`` things, evenly spread, the first and the last among
+    them.
+    """
     return sorted({round(k) for k in np.linspace(0, count - 1, min(count, most))})
 
 
 def masked(image, mask):
     """An image whose part outside of the mask is dark, the border drawn."""
     shown = np.where(mask[..., None] > 127, image, image // 3)
-    outline, _ = cv2.findContours((mask > 127).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-    return cv2.drawContours(np.ascontiguousarray(shown), outline, -1, YELLOW, max(1, round(max(image.shape[:2]) / 320)))
+    outline, _ = cv2.findContours(
+        (mask > 127).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE
+    )
+    return cv2.drawContours(
+        np.ascontiguousarray(shown), outline, -1, YELLOW, max(1, round(max(image.shape[:2]) / 320))
+    )
 
 
 def matches(photo, frame, found):
-    """Photo and frame side by side, :class:`polysft_mi.capture.pose.Matches` as lines: green where they agree, red where not."""
+    """Photo and frame side by side, :class:`polysft_mi.capture.pose.Matches` as lines: green where
+    they agree, red where not.
+    """
     (left, _), (right, b) = _canvas(photo), _canvas(frame)
     canvas = np.hstack([left // 2 + 64, np.full((_HEIGHT, 8, 3), 255, np.uint8), right // 2 + 64])
     at = np.column_stack([found.photo[:, 0], 1 - found.photo[:, 1]]) * left.shape[1::-1]
@@ -67,12 +90,18 @@ def matches(photo, frame, found):
             cv2.line(canvas, p, q, colour, 1, cv2.LINE_AA)
             for x in (p, q):
                 cv2.circle(canvas, x, 3, colour, 1, cv2.LINE_AA)
-    label(canvas, f"{len(found.agree)} features of the photo found in the frame, {int(found.agree.sum())} agree on one pose (green)")
+    label(
+        canvas,
+        f"{len(found.agree)} features of the photo found in the frame, {int(found.agree.sum())}"
+        " agree on one pose (green)",
+    )
     return canvas
 
 
 def pose(frame, photo, sheet, placed, camera):
-    """Two pictures of the first frame: the template's mesh and border drawn on it; and the photo laid on it where the template is."""
+    """Two pictures of the first frame: the template's mesh and border drawn on it; and the photo
+    laid on it where the template is.
+    """
     wired, scale = _canvas(frame)
     plain, x = wired.copy(), camera.project(placed)
 
@@ -81,7 +110,10 @@ def pose(frame, photo, sheet, placed, camera):
             a, b = (tuple(int(round(v)) for v in np.clip(x[k] * scale, -1e4, 1e4)) for k in edge)
             cv2.line(wired, a, b, colour, width, cv2.LINE_AA)
 
-    edges = np.sort(np.concatenate([sheet.faces[:, [0, 1]], sheet.faces[:, [1, 2]], sheet.faces[:, [2, 0]]]), axis=1)
+    edges = np.sort(
+        np.concatenate([sheet.faces[:, [0, 1]], sheet.faces[:, [1, 2]], sheet.faces[:, [2, 0]]]),
+        axis=1,
+    )
     draw(np.unique(edges, axis=0), GREEN, 1)
     wired = cv2.addWeighted(plain, 0.7, wired, 0.3, 0)  # what is printed shows through
     for loop in loops(sheet.faces):
@@ -109,11 +141,19 @@ def _laid(frame, photo, sheet, x):
     u, v, w = (sheet.uv[corners[:, k]] for k in range(3))
     uv = u + t[:, :1] * (v - u) + t[:, 1:] * (w - u)
     side = max(1.0, max(photo.shape[:2]) / max(np.ptp(p, axis=0).max() if len(p) else 1, 1))
-    photo = cv2.resize(photo, None, fx=1 / side, fy=1 / side, interpolation=cv2.INTER_AREA) if side > 1 else photo
-    maps = np.stack([uv[:, 0] * photo.shape[1] - 0.5, (1 - uv[:, 1]) * photo.shape[0] - 0.5], axis=-1).astype(np.float32)
+    photo = (
+        cv2.resize(photo, None, fx=1 / side, fy=1 / side, interpolation=cv2.INTER_AREA)
+        if side > 1
+        else photo
+    )
+    maps = np.stack(
+        [uv[:, 0] * photo.shape[1] - 0.5, (1 - uv[:, 1]) * photo.shape[0] - 0.5], axis=-1
+    ).astype(np.float32)
     whole = np.full((*frame.shape[:2], 2), -1, np.float32)
     whole[seen] = maps
-    colours = cv2.remap(photo, whole[..., 0], whole[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    colours = cv2.remap(
+        photo, whole[..., 0], whole[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
     laid = frame.copy()
     laid[seen] = colours[seen]
     return laid
@@ -124,4 +164,6 @@ def label(image, text):
     scale = 0.45 if image.shape[1] < 500 else 0.6
     (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
     cv2.rectangle(image, (0, 0), (width + 8, height + 10), (0, 0, 0), -1)
-    cv2.putText(image, text, (4, height + 5), cv2.FONT_HERSHEY_SIMPLEX, scale, WHITE, 1, cv2.LINE_AA)
+    cv2.putText(
+        image, text, (4, height + 5), cv2.FONT_HERSHEY_SIMPLEX, scale, WHITE, 1, cv2.LINE_AA
+    )

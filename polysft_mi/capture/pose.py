@@ -1,4 +1,6 @@
-"""Where the sheet is in the first frame: features of its photo, or its corners, and the rigid pose that explains them."""
+"""Where the sheet is in the first frame: features of its photo, or its corners, and the rigid pose
+that explains them.
+"""
 
 from dataclasses import dataclass
 
@@ -10,18 +12,21 @@ from scipy.spatial.transform import Rotation
 from polysft_mi.errors import InputError
 
 LEAST = 10  # matches that must agree: four fix a plane's pose, and some agree by chance
-_RATIO = 0.8  # of the distances to the best and the second match, above which a match counts as ambiguous
+# of the distances to the best and the second match, above which a match counts as ambiguous
+_RATIO = 0.8
 _FEATURES = 5000
 _PHOTO_SIDE = 2000  # pixels to which a photo is shrunk before its features are sought
-_TOLERANCE = 0.012  # of the frame's diagonal, by which a rigid pose may miss a match: the sheet may be bent
+_TOLERANCE = (
+    0.012  # of the frame's diagonal, by which a rigid pose may miss a match: the sheet may be bent
+)
 _SOFT = 1.5  # pixels at which a residual starts to count less
 _SMALLEST = 2e-4  # share of the frame that a sheet must cover
 
 
 @dataclass(frozen=True)
 class Matches:
-    """Features found in both: ``photo`` (K, 2) uv on the photo (v up), ``frame`` (K, 2) pixels, ``agree`` (K,) bool: those that one motion
-    explains."""
+    """Features found in both: ``photo`` (K, 2) uv on the photo (v up), ``frame`` (K, 2) pixels,
+    ``agree`` (K,) bool: those that one motion explains."""
 
     photo: np.ndarray
     frame: np.ndarray
@@ -30,8 +35,8 @@ class Matches:
 
 @dataclass(frozen=True)
 class Pose:
-    """p -> ``rotation`` p + ``translation`` [m] from the template's frame to the camera's; ``residual`` (K,): pixels by which it misses
-    what it was found by."""
+    """p -> ``rotation`` p + ``translation`` [m] from the template's frame to the camera's;
+    ``residual`` (K,): pixels by which it misses what it was found by."""
 
     rotation: np.ndarray
     translation: np.ndarray
@@ -43,17 +48,23 @@ class Pose:
 
 
 def match(photo, frame):
-    """:class:`Matches` of SIFT features of two images (H, W, 3) uint8, each of the photo's best in the frame, both ways; none agrees
-    yet."""
+    """:class:`Matches` of SIFT features of two images (H, W, 3) uint8, each of the photo's best in
+    the frame, both ways; none agrees yet."""
     shrink = min(1.0, _PHOTO_SIDE / max(photo.shape[:2]))
     if shrink < 1:
         photo = cv2.resize(photo, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
     detector = cv2.SIFT_create(nfeatures=_FEATURES, contrastThreshold=0.02)
-    (keys_a, a), (keys_b, b) = (detector.detectAndCompute(cv2.cvtColor(x, cv2.COLOR_RGB2GRAY), None) for x in (photo, frame))
+    (keys_a, a), (keys_b, b) = (
+        detector.detectAndCompute(cv2.cvtColor(x, cv2.COLOR_RGB2GRAY), None) for x in (photo, frame)
+    )
     if len(keys_a) < 2 or len(keys_b) < 2:
         return Matches(np.empty((0, 2)), np.empty((0, 2)), np.empty(0, bool))
     there, back = (cv2.BFMatcher().knnMatch(x, y, k=2) for x, y in ((a, b), (b, a)))
-    good = [m for m, n in there if m.distance < _RATIO * n.distance and back[m.trainIdx][0].trainIdx == m.queryIdx]
+    good = [
+        m
+        for m, n in there
+        if m.distance < _RATIO * n.distance and back[m.trainIdx][0].trainIdx == m.queryIdx
+    ]
     at = np.array([keys_a[m.queryIdx].pt for m in good]).reshape(-1, 2) + 0.5
     to = np.array([keys_b[m.trainIdx].pt for m in good]).reshape(-1, 2) + 0.5
     uv = at / (photo.shape[1], photo.shape[0])
@@ -62,17 +73,20 @@ def match(photo, frame):
 
 
 def from_matches(matches, sheet, camera):
-    """(:class:`Pose`, the matches with those that agree) of a :class:`polysft_mi.capture.sheet.Sheet`.
+    """(:class:`Pose`, the matches with those that agree) of a
+    :class:`polysft_mi.capture.sheet.Sheet`.
 
-    A plane by a RANSAC homography and the two poses that it allows, other templates by RANSAC over poses; then robust least squares over
-    what agrees. Where it is not found, the pose is None.
+    A plane by a RANSAC homography and the two poses that it allows, other templates by RANSAC over
+    poses; then robust least squares over what agrees. Where it is not found, the pose is None.
     """
     points = sheet.at(matches.photo)
     on = np.isfinite(points).all(axis=1)
     tolerance = _TOLERANCE * np.hypot(camera.width, camera.height)
     agree = np.zeros(len(on), bool)
     if on.sum() >= 4:
-        starts, inliers = _starts(points[on], matches.photo[on], matches.frame[on], sheet.flat, camera, tolerance)
+        starts, inliers = _starts(
+            points[on], matches.photo[on], matches.frame[on], sheet.flat, camera, tolerance
+        )
         agree[np.flatnonzero(on)[inliers]] = True
     matches = Matches(matches.photo, matches.frame, agree)
     if agree.sum() < LEAST or not starts:
@@ -83,32 +97,44 @@ def from_matches(matches, sheet, camera):
 
 
 def from_corners(corners, sheet, camera):
-    """The :class:`Pose` by the pixels (4, 2) of the template's corners: top left, top right, bottom right, bottom left of its photo. Raises
-    InputError."""
+    """The :class:`Pose` by the pixels (4, 2) of the template's corners: top left, top right, bottom
+    right, bottom left of its photo. Raises InputError."""
     corners = np.asarray(corners, dtype=np.float64)
     sides = np.roll(corners, -1, axis=0) - corners
-    turns = sides[:, 0] * np.roll(sides, -1, axis=0)[:, 1] - sides[:, 1] * np.roll(sides, -1, axis=0)[:, 0]
+    turns = (
+        sides[:, 0] * np.roll(sides, -1, axis=0)[:, 1]
+        - sides[:, 1] * np.roll(sides, -1, axis=0)[:, 0]
+    )
     if (turns < 0).all():
-        raise InputError("--corners: they run against the clock; top left, top right, bottom right, bottom left of the print are needed")
+        raise InputError(
+            "--corners: they run against the clock; top left, top right, bottom right, bottom left"
+            " of the print are needed"
+        )
     if not (turns > 0).all():
         raise InputError(
-            "--corners: they make no convex quadrangle; top left, top right, bottom right, bottom left of the print are needed"
+            "--corners: they make no convex quadrangle; top left, top right, bottom right, bottom"
+            " left of the print are needed"
         )
     points = sheet.corners()
     starts, _ = _starts(points, None, corners, sheet.flat, camera, np.inf)
     pose = _refined(starts, points, corners, camera) if starts else None
     if pose is None:
-        raise InputError("--corners: no pose of the sheet before the camera explains them; check their order, --size and the camera")
+        raise InputError(
+            "--corners: no pose of the sheet before the camera explains them; check their order,"
+            " --size and the camera"
+        )
     return pose
 
 
 def _starts(points, photo, pixels, flat, camera, tolerance):
-    """Poses (R, t) to start from, and which of the K pairs agree with one motion (indices); ``photo`` (K, 2): their uv, where ``tolerance``
-    [pixels] is finite."""
+    """Poses (R, t) to start from, and which of the K pairs agree with one motion (indices);
+    ``photo`` (K, 2): their uv, where ``tolerance`` [pixels] is finite."""
     rays = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
     if not flat:
         if len(points) < 6:
-            found, turn, shift = cv2.solvePnP(points, rays, np.eye(3), None, flags=cv2.SOLVEPNP_SQPNP)
+            found, turn, shift = cv2.solvePnP(
+                points, rays, np.eye(3), None, flags=cv2.SOLVEPNP_SQPNP
+            )
             return ([(turn, shift)] if found else []), np.arange(len(points))
         found, turn, shift, inliers = cv2.solvePnPRansac(
             points,
@@ -120,26 +146,48 @@ def _starts(points, photo, pixels, flat, camera, tolerance):
             confidence=0.9999,
             flags=cv2.SOLVEPNP_EPNP,
         )
-        return ([(turn, shift)], inliers.ravel()) if found and inliers is not None else ([], np.empty(0, int))
+        return (
+            ([(turn, shift)], inliers.ravel())
+            if found and inliers is not None
+            else ([], np.empty(0, int))
+        )
     origin, axes = _plane(points)
     plane = (points - origin) @ axes.T  # x, y, 0
     inliers = np.arange(len(points))
     if np.isfinite(tolerance):
         cv2.setRNGSeed(0)
         if (
-            _cross(*(np.linalg.lstsq(plane[:, :2], photo - photo.mean(0), rcond=None)[0][:, None]))[0] > 0
+            _cross(*(np.linalg.lstsq(plane[:, :2], photo - photo.mean(0), rcond=None)[0][:, None]))[
+                0
+            ]
+            > 0
         ):  # RANSAC takes no mirror images: v goes up, y down
             axes = axes * np.array([[1.0], [-1.0], [-1.0]])
             plane = (points - origin) @ axes.T
-        unit = camera.width / max(np.ptp(plane[:, :2], axis=0).max(), 1e-12)  # RANSAC's checks are for coordinates of the size of pixels
-        H, mask = cv2.findHomography(unit * plane[:, :2], pixels, cv2.USAC_MAGSAC, tolerance, maxIters=10000, confidence=0.9999)
+        unit = camera.width / max(
+            np.ptp(plane[:, :2], axis=0).max(), 1e-12
+        )  # RANSAC's checks are for coordinates of the size of pixels
+        H, mask = cv2.findHomography(
+            unit * plane[:, :2],
+            pixels,
+            cv2.USAC_MAGSAC,
+            tolerance,
+            maxIters=10000,
+            confidence=0.9999,
+        )
         if H is None or not mask.any():
             return [], np.empty(0, int)
         inliers = np.flatnonzero(mask.ravel())
     if len(inliers) < 4:
         return [], inliers
     try:
-        _, turns, shifts, _ = cv2.solvePnPGeneric(plane[inliers][:, None], rays[inliers][:, None], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
+        _, turns, shifts, _ = cv2.solvePnPGeneric(
+            plane[inliers][:, None],
+            rays[inliers][:, None],
+            np.eye(3),
+            None,
+            flags=cv2.SOLVEPNP_IPPE,
+        )
     except cv2.error:  # points on a line
         return [], inliers
     starts = []
@@ -157,7 +205,9 @@ def _plane(points):
 
 
 def _refined(starts, points, pixels, camera):
-    """The best :class:`Pose` by robust least squares over the pixels, from each start; None where none is before the camera."""
+    """The best :class:`Pose` by robust least squares over the pixels, from each start; None where
+    none is before the camera.
+    """
 
     def missed(x):
         return (camera.project(Rotation.from_rotvec(x[:3]).apply(points) + x[3:]) - pixels).ravel()
@@ -171,11 +221,17 @@ def _refined(starts, points, pixels, camera):
     if not found:
         return None
     x = min(found, key=lambda f: f.cost).x
-    return Pose(Rotation.from_rotvec(x[:3]).as_matrix(), x[3:], np.linalg.norm(missed(x).reshape(-1, 2), axis=1))
+    return Pose(
+        Rotation.from_rotvec(x[:3]).as_matrix(),
+        x[3:],
+        np.linalg.norm(missed(x).reshape(-1, 2), axis=1),
+    )
 
 
 def _sane(pose, sheet, camera):
-    """Whether the sheet lies before the camera, shows its front, and covers some pixels: what matches by chance seldom does."""
+    """Whether the sheet lies before the camera, shows its front, and covers some pixels: what
+    matches by chance seldom does.
+    """
     placed = pose(sheet.vertices)
     if placed[:, 2].min() <= 0:
         return False
@@ -184,7 +240,9 @@ def _sane(pose, sheet, camera):
     uv = [sheet.uv[sheet.faces[:, k]] for k in range(3)]
     area = _cross(b - a, c - a)
     facing = -_cross(uv[1] - uv[0], uv[2] - uv[0])  # v goes up, y down
-    return (np.sign(area) == np.sign(facing)).mean() > 0.7 and 0.5 * np.abs(area).sum() > _SMALLEST * camera.width * camera.height
+    return (np.sign(area) == np.sign(facing)).mean() > 0.7 and 0.5 * np.abs(
+        area
+    ).sum() > _SMALLEST * camera.width * camera.height
 
 
 def _cross(a, b):

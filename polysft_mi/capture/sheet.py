@@ -1,4 +1,6 @@
-"""The template before it is placed: a flat grid of the given size, or an OBJ of one's own; and where on it a place of the photo lies."""
+"""The template before it is placed: a flat grid of the given size, or an OBJ of one's own; and
+where on it a place of the photo lies.
+"""
 
 from dataclasses import dataclass
 
@@ -13,8 +15,9 @@ _SMALLEST, _LARGEST = 0.005, 20.0  # m
 
 @dataclass(frozen=True)
 class Sheet:
-    """A template in a frame of its own (x right, y down, z away from who looks at its print): ``vertices`` (N, 3) [m], ``faces`` (F, 3),
-    ``uv`` (N, 2) of its photo, v up; ``name``: what it is, in words."""
+    """A template in a frame of its own (x right, y down, z away from who looks at its print):
+    ``vertices`` (N, 3) [m], ``faces`` (F, 3), ``uv`` (N, 2) of its photo, v up; ``name``: what it
+    is, in words."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -28,14 +31,17 @@ class Sheet:
         return s[2] <= _FLAT * s[0]
 
     def at(self, uv):
-        """Points (K, 3) [m] of the surface whose photo has the coordinates uv (K, 2); NaN where the photo does not lie on it."""
+        """Points (K, 3) [m] of the surface whose photo has the coordinates uv (K, 2); NaN where the
+        photo does not lie on it.
+        """
         from matplotlib.tri import Triangulation
 
         try:
             finder = Triangulation(*self.uv.T, triangles=self.faces).get_trifinder()
         except (RuntimeError, ValueError):
             raise InputError(
-                f"{self.name}: its texture coordinates overlap; each place of the photo may lie on one place of the template only"
+                f"{self.name}: its texture coordinates overlap; each place of the photo may lie on"
+                " one place of the template only"
             ) from None
         face = finder(*np.asarray(uv, dtype=float).T)
         found = self.faces[face]
@@ -47,21 +53,31 @@ class Sheet:
         return points
 
     def corners(self):
-        """Its points (4, 3) [m] that are nearest to the photo's corners: top left, top right, bottom right, bottom left."""
+        """Its points (4, 3) [m] that are nearest to the photo's corners: top left, top right,
+        bottom right, bottom left.
+        """
         low, high = self.uv.min(0), self.uv.max(0)
         wanted = np.array([[low[0], high[1]], high, [high[0], low[1]], low])
-        return self.vertices[np.argmin(np.linalg.norm(self.uv[None] - wanted[:, None], axis=2), axis=1)]
+        return self.vertices[
+            np.argmin(np.linalg.norm(self.uv[None] - wanted[:, None], axis=2), axis=1)
+        ]
 
 
 def grid(width, height, resolution=33):
-    """The :class:`Sheet` of a flat rectangle of ``width`` x ``height`` [m], ``resolution`` vertices along its longer side, its cells about
-    square."""
+    """The :class:`Sheet` of a flat rectangle of ``width`` x ``height`` [m], ``resolution`` vertices
+    along its longer side, its cells about square."""
     if not 2 <= resolution <= 400:
-        raise InputError(f"--resolution {resolution}: 2 to 400 vertices along the longer side can be used")
+        raise InputError(
+            f"--resolution {resolution}: 2 to 400 vertices along the longer side can be used"
+        )
     longer = max(width, height)
-    columns, rows = (max(2, round((resolution - 1) * side / longer) + 1) for side in (width, height))
+    columns, rows = (
+        max(2, round((resolution - 1) * side / longer) + 1) for side in (width, height)
+    )
     y, x = np.meshgrid(np.linspace(0, 1, rows), np.linspace(0, 1, columns), indexing="ij")
-    vertices = np.stack([(x - 0.5) * width, (y - 0.5) * height, np.zeros_like(x)], axis=-1).reshape(-1, 3)
+    vertices = np.stack([(x - 0.5) * width, (y - 0.5) * height, np.zeros_like(x)], axis=-1).reshape(
+        -1, 3
+    )
     k = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = (corner.ravel() for corner in (k[:-1, :-1], k[:-1, 1:], k[1:, :-1], k[1:, 1:]))
     faces = np.stack([a, b, c, b, d, c], axis=1).reshape(-1, 3)
@@ -74,7 +90,9 @@ def grid(width, height, resolution=33):
 
 
 def from_obj(path):
-    """The :class:`Sheet` of an OBJ in metres with texture coordinates, its frame any; order 4 must hold it. Raises InputError."""
+    """The :class:`Sheet` of an OBJ in metres with texture coordinates, its frame any; order 4 must
+    hold it. Raises InputError.
+    """
     from polysft_mi.template import Template
 
     vertices, faces, uv = meshio.read_template(path)
@@ -82,6 +100,9 @@ def from_obj(path):
     extent = np.ptp(vertices, axis=0).max()
     if not _SMALLEST <= extent <= _LARGEST:
         hint = "in millimetres? write it in metres" if extent > _LARGEST else "write it in metres"
-        raise InputError(f"{path}: a template of {extent:.4g} m; {1e3 * _SMALLEST:g} mm to {_LARGEST:g} m can be used ({hint})")
+        raise InputError(
+            f"{path}: a template of {extent:.4g} m; {1e3 * _SMALLEST:g} mm to {_LARGEST:g} m can be"
+            f" used ({hint})"
+        )
     Template.fit(vertices, faces, uv, 4, where=path)  # raises where one patch cannot hold it
     return Sheet(vertices - vertices.mean(0), faces, uv, f"{path}, {len(vertices)} vertices")

@@ -18,10 +18,13 @@ _FORMS = "give --size WIDTH HEIGHT, as in 0.297 0.210 (metres), 297mm 210mm, or 
 def parse_size(words, aspect=None):
     """(width, height) [m] of a sheet, from the words behind ``--size``.
 
-    Two lengths, one (of a square), or the name of a sheet of paper, which lies as the photo does, whose width / height is ``aspect``.
-    Raises InputError for what is none of these, and for sizes that no sheet has.
+    Two lengths, one (of a square), or the name of a sheet of paper, which lies as the photo does,
+    whose width / height is ``aspect``. Raises InputError for what is none of these, and for sizes
+    that no sheet has.
     """
-    words = [part for word in words for part in re.split(r"[x×](?=\s*\d)|\s+", str(word).strip()) if part]
+    words = [
+        part for word in words for part in re.split(r"[x×](?=\s*\d)|\s+", str(word).strip()) if part
+    ]
     if len(words) == 1 and words[0].upper() in SHEETS:
         long, short = SHEETS[words[0].upper()]
         return (short, long) if aspect is not None and aspect < 1 else (long, short)
@@ -35,10 +38,14 @@ def parse_size(words, aspect=None):
         raise InputError(f"--size {' '.join(words)}: a length must be positive")
     if unit is None and max(size) > _LARGEST_BARE:
         raise InputError(
-            f"--size {' '.join(words)}: metres, as numbers without a unit are, make a sheet of {_text(size)}; {_suggestion(numbers)}"
+            f"--size {' '.join(words)}: metres, as numbers without a unit are, make a sheet of"
+            f" {_text(size)}; {_suggestion(numbers)}"
         )
     if not (_SMALLEST <= min(size) and max(size) <= _LARGEST):
-        raise InputError(f"--size {' '.join(words)}: a sheet of {_text(size)}; {1e3 * _SMALLEST:g} mm to {_LARGEST:g} m a side can be used")
+        raise InputError(
+            f"--size {' '.join(words)}: a sheet of {_text(size)}; {1e3 * _SMALLEST:g} mm to"
+            f" {_LARGEST:g} m a side can be used"
+        )
     return size if len(size) == 2 else size * 2
 
 

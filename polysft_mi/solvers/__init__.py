@@ -1,8 +1,8 @@
 """Solvers, by the name that the setting ``solver`` takes.
 
-A solver is built from :class:`polysft_mi.settings.Settings` and has ``solve(problem, window, frames, report=None, past=()) -> Solution``;
-it sees :class:`polysft_mi.problem.Problem` only through its methods. To add one: a module here, its name in ``create`` and in the
-setting's choices.
+A solver is built from :class:`polysft_mi.settings.Settings` and has ``solve(problem, window,
+frames, report=None, past=()) -> Solution``; it sees :class:`polysft_mi.problem.Problem` only
+through its methods. To add one: a module here, its name in ``create`` and in the setting's choices.
 """
 
 from dataclasses import dataclass, field
@@ -10,8 +10,9 @@ from dataclasses import dataclass, field
 
 @dataclass
 class Solution:
-    """``window``: list of Unknowns; ``total`` and ``terms``: the objective there; ``iterations``: evaluations that it took; ``facts``:
-    other numbers, and lists of them, that the solver wants to see again in ``past``; ``sigma``: for each frame of the window the standard deviation (N,) [m]
+    """``window``: list of Unknowns; ``total`` and ``terms``: the objective there; ``iterations``:
+    evaluations that it took; ``facts``: other numbers, and lists of them, that the solver wants to
+    see again in ``past``; ``sigma``: for each frame of the window the standard deviation (N,) [m]
     of each vertex along its ray, or None where the solver has none."""
 
     window: list

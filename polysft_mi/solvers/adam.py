@@ -1,4 +1,6 @@
-"""Adam with the paper's step sizes (section "Experiments", PolySfT). Import only after a Mitsuba variant is set."""
+"""Adam with the paper's step sizes (section "Experiments", PolySfT). Import only after a Mitsuba
+variant is set.
+"""
 
 import dataclasses
 import math
@@ -11,17 +13,20 @@ from . import Solution
 class Adam:
     """First-order descent on the objective of a window, until it stops improving.
 
-    ``patience`` iterations without a new minimum, or ``period`` iterations, end it (supplement, "Adaptive Window Optimization"). The best
-    unknowns seen are kept. Moments start at zero in every window, so that a window depends on nothing but its start.
+    ``patience`` iterations without a new minimum, or ``period`` iterations, end it (supplement,
+    "Adaptive Window Optimization"). The best unknowns seen are kept. Moments start at zero in every
+    window, so that a window depends on nothing but its start.
     """
 
     def __init__(self, settings):
         self.settings = settings
 
     def solve(self, problem, window, frames, report=None, past=()):
-        """Minimise ``problem`` over ``window`` (list of Unknowns) for ``frames``: a :class:`Solution`; ``past`` is not used.
+        """Minimise ``problem`` over ``window`` (list of Unknowns) for ``frames``: a
+        :class:`Solution`; ``past`` is not used.
 
-        ``report(iteration, total, terms)`` is called after each evaluation. BadFrame passes through.
+        ``report(iteration, total, terms)`` is called after each evaluation. BadFrame passes
+        through.
         """
         s = self.settings
         optimizer = mi.ad.Adam(lr=s.lr_uv)
@@ -35,12 +40,25 @@ class Adam:
         for k, unknowns in enumerate(window):
             for name in steps:  # the paper has no relief: it stays as it is
                 optimizer[f"{k}.{name}"] = mi.Float(getattr(unknowns, name))
-        optimizer.set_learning_rate({f"{k}.{name}": steps[name] for k in range(len(window)) for name in steps})
+        optimizer.set_learning_rate(
+            {f"{k}.{name}": steps[name] for k in range(len(window)) for name in steps}
+        )
 
-        best, best_total, best_terms, since, iteration = [w.copy() for w in window], math.inf, {}, 0, 0
+        best, best_total, best_terms, since, iteration = (
+            [w.copy() for w in window],
+            math.inf,
+            {},
+            0,
+            0,
+        )
         while True:
-            current = [dataclasses.replace(unknowns, **{n: optimizer[f"{k}.{n}"] for n in steps}) for k, unknowns in enumerate(window)]
-            total, terms = problem.evaluate(current, frames, backward=True, seed=(s.seed + 7919 * iteration) % 2**31)
+            current = [
+                dataclasses.replace(unknowns, **{n: optimizer[f"{k}.{n}"] for n in steps})
+                for k, unknowns in enumerate(window)
+            ]
+            total, terms = problem.evaluate(
+                current, frames, backward=True, seed=(s.seed + 7919 * iteration) % 2**31
+            )
             if total < best_total:
                 best, best_total, best_terms, since = [w.copy() for w in current], total, terms, 0
             else:
