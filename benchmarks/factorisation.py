@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from polysft_mi.normal_equations import Blocks, Pattern  # noqa: E402
+from polysft_mi.solvers.normal_equations import Blocks, Pattern  # noqa: E402
 
 
 def grid(side):

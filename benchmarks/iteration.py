@@ -48,9 +48,10 @@ def measured(path, overrides, turns):
     import drjit as dr
     import mitsuba as mi
 
-    from polysft_mi import scene, solvers
-    from polysft_mi.problem import Problem
-    from polysft_mi.sequence import Sequence
+    from polysft_mi import solvers
+    from polysft_mi.objective.problem import Problem
+    from polysft_mi.scene import experiment as scene
+    from polysft_mi.scene.sequence import Sequence
     from polysft_mi.solvers.gauss_newton import STAGES
 
     experiment = scene.load(path, {**overrides, "solver": "gauss-newton"})

@@ -15,11 +15,11 @@ from scipy.spatial.transform import Rotation
 ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 sys.path.insert(0, ROOT)
 
-from polysft_mi import meshio  # noqa: E402
 from polysft_mi.camera import Intrinsics  # noqa: E402
-from polysft_mi.capture.images import read_rgb  # noqa: E402
-from polysft_mi.outline import fitted  # noqa: E402
-from polysft_mi.sequence import list_images  # noqa: E402
+from polysft_mi.scene.images import read_rgb  # noqa: E402
+from polysft_mi.scene.outline import fitted  # noqa: E402
+from polysft_mi.scene.sequence import list_images  # noqa: E402
+from polysft_mi.surface import meshio  # noqa: E402
 
 DATA = os.environ.get("POLYSFT_DATA") or os.path.join(os.path.dirname(ROOT), "shared", "data")
 SEQUENCES = "flag", "bend", "paper", "curtain", "corner"

@@ -74,12 +74,12 @@ class Vertices:
 
 
 def load(scene, overrides, smoothing=SMOOTHING):
-    """The :class:`polysft_mi.problem.Problem` of a scene, with vertices for unknowns."""
+    """The :class:`polysft_mi.objective.problem.Problem` of a scene, with vertices for unknowns."""
     if importlib.util.find_spec("cholespy") is None:
         raise InputError("mi.ad.LargeSteps needs the package cholespy: pip install cholespy")
-    from polysft_mi import scene as scenes
-    from polysft_mi.problem import Problem
-    from polysft_mi.sequence import Sequence
+    from polysft_mi.objective.problem import Problem
+    from polysft_mi.scene import experiment as scenes
+    from polysft_mi.scene.sequence import Sequence
 
     experiment = scenes.load(scene, overrides)
     s = dataclasses.replace(experiment.settings, solver="adam")  # whose objective it is
@@ -106,7 +106,7 @@ def solve(problem, frame, start, iterations, step):
     """
     import mitsuba as mi
 
-    from polysft_mi.problem import BadFrame
+    from polysft_mi.objective.problem import BadFrame
 
     optimizer = mi.ad.Adam(lr=step, uniform=True)
     optimizer["u"] = start
@@ -155,7 +155,7 @@ def write(problem, surfaces, rows, out, **options):
     """``surface.npz`` and ``metrics.json`` in the folder ``out``; returns the figures that
     ``metrics.json`` begins with.
     """
-    from polysft_mi import outputs
+    from polysft_mi.results import outputs
 
     template = problem.template
     indices = np.asarray(problem.sequence.indices, dtype=np.int64)

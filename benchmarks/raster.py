@@ -100,7 +100,7 @@ class Contender:
         import drjit as dr
         import mitsuba as mi
 
-        from polysft_mi import meshio
+        from polysft_mi.surface import meshio
 
         self.name, self.path_replay = name, name.startswith("prb")
         vertices, faces, uv = sheet(points, size)
@@ -282,7 +282,8 @@ MEASURES = {
 def worker(job):
     """Do one measurement and print its result, a line of JSON."""
     variant = set_variant(job["mode"])
-    from polysft_mi import outputs, plugins
+    from polysft_mi.results import outputs
+    from polysft_mi.scene import plugins
 
     plugins.register()
     size = parse_size(job["size"])

@@ -78,9 +78,11 @@ def make(folder, points, size, frames):
     import cv2
     import mitsuba as mi
 
-    from polysft_mi import pictures, prepare, scene
-    from polysft_mi.problem import Problem
-    from polysft_mi.sequence import Sequence
+    from polysft_mi import prepare
+    from polysft_mi.objective.problem import Problem
+    from polysft_mi.pictures import album as pictures
+    from polysft_mi.scene import experiment as scene
+    from polysft_mi.scene.sequence import Sequence
 
     faces, uv = faces_and_uv(points)
     truth = np.stack([sheet(points, size, k / max(frames - 1, 1)) for k in range(frames)])
@@ -123,10 +125,11 @@ def measure(folder):
     """Seconds (of the clock, of all threads) and evaluations of each frame, memory [MB] before the
     scene and at most, and distances from the truth [mm].
     """
-    from polysft_mi import scene, solvers
-    from polysft_mi.patch import Unknowns
-    from polysft_mi.problem import Problem
-    from polysft_mi.sequence import Sequence
+    from polysft_mi import solvers
+    from polysft_mi.objective.problem import Problem
+    from polysft_mi.scene import experiment as scene
+    from polysft_mi.scene.sequence import Sequence
+    from polysft_mi.surface.patch import Unknowns
     from polysft_mi.tracker import track
 
     with open("/proc/self/statm") as file:
@@ -159,7 +162,8 @@ def measure(folder):
 
 def worker(job):
     set_variant(job["mode"])
-    from polysft_mi import outputs, plugins
+    from polysft_mi.results import outputs
+    from polysft_mi.scene import plugins
 
     plugins.register()
     if job["task"] == "make":

@@ -28,11 +28,12 @@ import numpy as np
 ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 sys.path.insert(0, ROOT)
 
-from polysft_mi import meshio, metrics
 from polysft_mi.backend import add_mode_argument
 from polysft_mi.errors import InputError, cli
 from polysft_mi.evaluate import LABELS, evaluate, find_truth
 from polysft_mi.files import aside
+from polysft_mi.results import metrics
+from polysft_mi.surface import meshio
 
 SCENES = os.path.join(ROOT, "scenes")
 DATA = os.environ.get("POLYSFT_DATA") or os.path.join(os.path.dirname(ROOT), "shared", "data")
@@ -229,11 +230,11 @@ def best_jets(template, truth):
     truth's own principal axes, and the jet of the frame before. From the first two the order rises
     by and by; at once, it ends farther off. The search is local all the same.
     """
-    from polyfit.frames import CanonicalFrame
-    from polysft_mi.normal_equations import Chart
-    from polysft_mi.template import Template
-
     import torch
+
+    from polyfit.frames import CanonicalFrame
+    from polysft_mi.solvers.normal_equations import Chart
+    from polysft_mi.surface.template import Template
 
     orders = [*range(2, template.order, 2), template.order]
     parts = (template.vertices, template.faces, template.uv)
@@ -341,7 +342,7 @@ def _refined(chart, state, V, steps=60):
 
 def jet_result(sequence, folder, order, setup):
     """The result of :func:`best_jets` on a sequence whose truth is a mesh; None on others."""
-    from polysft_mi.template import Template
+    from polysft_mi.surface.template import Template
 
     truth_path, obj = find_truth(folder), os.path.join(folder, "template.obj")
     if os.path.isdir(truth_path) or not os.path.isfile(obj):

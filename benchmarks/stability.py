@@ -72,11 +72,11 @@ def run(scene, overrides, counts, folder, say=print):
     frame]; count to (best, latest) loss. ``folder``, which exists, takes the checkpoints of the run
     up to there.
     """
-    from polysft_mi import scene as scenes
     from polysft_mi import solvers
-    from polysft_mi.patch import Unknowns
-    from polysft_mi.problem import Problem
-    from polysft_mi.sequence import Sequence
+    from polysft_mi.objective.problem import Problem
+    from polysft_mi.scene import experiment as scenes
+    from polysft_mi.scene.sequence import Sequence
+    from polysft_mi.surface.patch import Unknowns
     from polysft_mi.tracker import track
 
     experiment = scenes.load(scene, {"solver": "adam", **overrides})
@@ -117,8 +117,9 @@ def run(scene, overrides, counts, folder, say=print):
 
 def truth_of(problem, frame, path):
     """True vertices (N, 3) of a frame, or None where nothing is known."""
-    from polysft_mi import evaluate, metrics
-    from polysft_mi.defaults import located
+    from polysft_mi import evaluate
+    from polysft_mi.results import metrics
+    from polysft_mi.scene.defaults import located
 
     experiment = problem.experiment
     if path is None and experiment.defaults.get("data"):
@@ -143,7 +144,7 @@ def truth_of(problem, frame, path):
 
 def figures_of(surfaces, wandering, losses, usual, truth):
     """Count to figures: distance to the truth, and to the surface after ``usual`` iterations."""
-    from polysft_mi import metrics
+    from polysft_mi.results import metrics
 
     out = {}
     for n, V in surfaces.items():
@@ -171,8 +172,8 @@ def picture(path, problem, frame, surfaces, counts, rows, usual, truth):
     """
     from matplotlib.figure import Figure
 
-    from polysft_mi import shading
-    from polysft_mi.pictures import srgb
+    from polysft_mi.pictures import shading
+    from polysft_mi.pictures.album import srgb
 
     template, image = problem.template, srgb(problem.sequence.frame(frame))
     shown = [(f"{n} iterations", surfaces[n]) for n in counts] + (
@@ -313,7 +314,7 @@ def main(arguments=None):
     overrides = dict(text.split("=", 1) for text in options.define)
     usual = min(USUAL, counts[-1])
     set_variant(options.mode)
-    from polysft_mi import outputs
+    from polysft_mi.results import outputs
 
     os.makedirs(options.out, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:

@@ -17,7 +17,7 @@ from polysft_mi.backend import set_variant  # noqa: E402
 
 set_variant()
 import onefit  # noqa: E402
-from polysft_mi import stage  # noqa: E402
+from polysft_mi.render import stage  # noqa: E402
 
 ROWS = [  # garment, motion, shape, colour
     ("dress", "dance", None, (0.35, 0.03, 0.06)),

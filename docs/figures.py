@@ -21,7 +21,7 @@ import numpy as np  # noqa: E402
 from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 
-from polysft_mi import plugins  # noqa: E402
+from polysft_mi.scene import plugins  # noqa: E402
 from polysft_mi.camera import Intrinsics  # noqa: E402
 
 WIDTH, HEIGHT, FOCAL = 16, 12, 20.0

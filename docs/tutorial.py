@@ -17,11 +17,11 @@ sys.path.insert(0, ROOT)
 import cv2  # noqa: E402
 import numpy as np  # noqa: E402
 
-from polysft_mi import meshio  # noqa: E402
-from polysft_mi.capture.images import read_rgb  # noqa: E402
+from polysft_mi.surface import meshio  # noqa: E402
+from polysft_mi.scene.images import read_rgb  # noqa: E402
 from polysft_mi.capture.sheet import Sheet  # noqa: E402
-from polysft_mi.sequence import list_images  # noqa: E402
-from polysft_mi.video import write_video  # noqa: E402
+from polysft_mi.scene.sequence import list_images  # noqa: E402
+from polysft_mi.pictures.video import write_video  # noqa: E402
 
 OUT = "out/tutorial"
 PICTURES = {  # from: (to, pixels it is wide)

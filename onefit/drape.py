@@ -89,8 +89,8 @@ def _render(drape, folder, size, spp, advance):
     set_variant()
     import cv2
 
-    from polysft_mi import stage
-    from polysft_mi.video import write_video
+    from polysft_mi.render import stage
+    from polysft_mi.pictures.video import write_video
 
     parts = [
         (drape.body.numpy(), drape.body_faces.numpy(), BODY),

@@ -17,12 +17,12 @@ import torch
 
 from polyfit import jets
 
-from .patch import Unknowns
-from .template import Template
+from .surface.patch import Unknowns
+from .surface.template import Template
 
 
 def template(polyfit, vertices, faces, uv, **options):
-    """The :class:`polysft_mi.template.Template` of the mesh in the frame, and of the order, of
+    """The :class:`polysft_mi.surface.template.Template` of the mesh in the frame, and of the order, of
     ``polyfit`` (:class:`polyfit.PolyFit`).
 
     ``vertices`` (N, 3) [m], ``faces`` (F, 3), ``uv`` (N, 2); ``options`` and errors are those of
@@ -66,7 +66,7 @@ def in_torch(function):
 
 
 def rendering(problem, seed=0):
-    """The rendering of a :class:`polysft_mi.problem.Problem` as a torch function: vertices (N, 3)
+    """The rendering of a :class:`polysft_mi.objective.problem.Problem` as a torch function: vertices (N, 3)
     [m, camera frame] -> (rgb (H, W, 3) linear, alpha (H, W))."""
 
     @in_drjit
@@ -78,7 +78,7 @@ def rendering(problem, seed=0):
 
 
 def deformed(patch):
-    """The surface of a :class:`polysft_mi.patch.JetPatch` as a torch function of the unknowns:
+    """The surface of a :class:`polysft_mi.surface.patch.JetPatch` as a torch function of the unknowns:
     delta_alpha (A,), delta_u, delta_v, delta_w (N,), rotation (4,), translation (3,) -> vertices
     (N, 3) [m, camera frame]."""
 

@@ -11,11 +11,12 @@ import re
 
 import numpy as np
 
-from . import commands, evaluate, exr, metrics
+from . import commands, evaluate
 from .errors import InputError, cli
 from .files import folder_aside
-from .results import Run
-from .shading import seen
+from .pictures.shading import seen
+from .results import exr, metrics
+from .results.run import Run
 
 _EXAMPLES = [
     ("out/a out/b", "two runs: their figures"),
@@ -208,7 +209,7 @@ def write(figures, other, out, *, count=20, scale=None):
     ``scale``: the difference [mm] at which the colours end, by default what 98 % of the pixels lie
     below.
     """
-    from . import figures as pictures
+    from .pictures import figures as pictures
     from .report import spread
 
     camera = other.run.camera
@@ -284,7 +285,7 @@ def write(figures, other, out, *, count=20, scale=None):
 
 
 def _pictures(run, shown):
-    """The pictures of :meth:`polysft_mi.results.Run.panels` of the frames ``shown``, by their
+    """The pictures of :meth:`polysft_mi.results.run.Run.panels` of the frames ``shown``, by their
     index.
     """
     return {

@@ -3,7 +3,7 @@ table or as JSON.
 
 OUT is a run's folder (with ``surface.npz``) or a ``surface.npz``. TRUTH is ``gt.npz`` (vertices of
 every frame), an .npz of depth points, a folder of ``cloud_*.npz``, or a sequence's folder that
-holds one of them. :func:`polysft_mi.metrics.score` says what the figures are.
+holds one of them. :func:`polysft_mi.results.metrics.score` says what the figures are.
 """
 
 import glob
@@ -15,7 +15,7 @@ import numpy as np
 
 from . import commands
 from .errors import InputError, cli
-from .metrics import load_npz, score
+from .results.metrics import load_npz, score
 
 _EXAMPLES = [
     ("out/demo scenes/demo", "a run against the truth in its sequence's folder"),

@@ -9,7 +9,7 @@ import numpy as np
 from . import commands
 from .errors import InputError, cli
 from .files import aside
-from .results import Run
+from .results.run import Run
 
 _EXAMPLES = [
     ("out/demo --format glb", "out/demo/export/surface.glb, for browsers, Blender, Windows"),
@@ -31,7 +31,7 @@ _PACKAGES = {"usd": ("pxr", "usd-core"), "glb": ("pygltflib", "pygltflib")}
 
 
 def export(run, kind, path=None, *, up="y", fps=None, texture=None):
-    """Write the surface of a :class:`polysft_mi.results.Run` in the format ``kind``; returns the
+    """Write the surface of a :class:`polysft_mi.results.run.Run` in the format ``kind``; returns the
     path written.
 
     ``path``: the file, for "obj" and "ply" the folder, by default in the run's ``export`` folder.

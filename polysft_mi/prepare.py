@@ -15,13 +15,14 @@ from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 
-from . import kinect_paper, meshio
 from .camera import Intrinsics
 from .errors import InputError, cli
 from .files import aside
-from .kinect_paper import template as kinect_paper_template
-from .sequence import EXTENSIONS, Sequence, image_size
-from .settings import defaults_xml, properties_xml
+from .scene import kinect_paper
+from .scene.kinect_paper import template as kinect_paper_template
+from .scene.sequence import EXTENSIONS, Sequence, image_size
+from .scene.settings import defaults_xml, properties_xml
+from .surface import meshio
 
 FORMS = (
     "cloth (camera.json, an OBJ file, a texture image, frames/, masks/ or none), "
@@ -37,7 +38,7 @@ class Layout:
 
     ``obj``: the template's file, None where the form has none; ``flip``: its x and y are negated in
     the camera frame; ``settings``: what differs from the defaults of
-    :class:`polysft_mi.settings.Settings`.
+    :class:`polysft_mi.scene.settings.Settings`.
     """
 
     form: str

@@ -15,7 +15,7 @@ import numpy as np
 from . import commands
 from .errors import InputError, cli
 from .files import aside
-from .results import PEAK, Run
+from .results.run import PEAK, Run
 
 _EXAMPLES = [
     ("out/demo", "out/demo/report.html again (a run writes it at its end)"),
@@ -149,7 +149,8 @@ def _figures(run, truth):
     """``(columns, cards, distance)``: lists by frame, pairs of label and value for the top, and (T,
     N) [mm] to a truth of the same vertices or None.
     """
-    from . import evaluate, metrics
+    from . import evaluate
+    from .results import metrics
 
     at = {int(k): n for n, k in enumerate(run.frames)}
     columns = {"frame": [int(k) for k in run.frames]}
@@ -216,7 +217,7 @@ def _distance(run, where):
     """Distance (T, N) [mm] of each vertex from the truth, NaN in frames without one; None where the
     truth has other vertices.
     """
-    from .metrics import load_npz
+    from .results.metrics import load_npz
 
     truth = load_npz(where) if os.path.isfile(where) else {}
     G = truth.get("vertices")
@@ -271,7 +272,7 @@ def _about(run):
 
 
 def _loss(records):
-    from .figures import COLOURS, TERMS, loss_curves
+    from .pictures.figures import COLOURS, TERMS, loss_curves
 
     try:
         records, step, curves = loss_curves(records)

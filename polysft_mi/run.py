@@ -96,7 +96,7 @@ def main(arguments=None):
 
     out = options.output
     _check_output(out, options)
-    from .defaults import resolved_defaults
+    from .scene.defaults import resolved_defaults
 
     resolved_defaults(
         options.scene, overrides
@@ -140,10 +140,12 @@ def _clear(out):
 
 
 def _run(options, overrides, out, exr_frames):
-    from . import outputs, scene, solvers
-    from .drawing import Drawing
-    from .problem import Problem
-    from .sequence import Sequence
+    from . import solvers
+    from .objective.problem import Problem
+    from .pictures.drawing import Drawing
+    from .results import outputs
+    from .scene import experiment as scene
+    from .scene.sequence import Sequence
     from .tracker import Track, track
 
     experiment = scene.load(options.scene, overrides)

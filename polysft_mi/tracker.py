@@ -13,11 +13,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from .device import interruptible
 from .errors import InputError
 from .files import aside, naming
-from .patch import Unknowns
-from .problem import TERMS, BadFrame
+from .objective.problem import TERMS, BadFrame
+from .render.device import interruptible
+from .surface.patch import Unknowns
 
 CHECKPOINT, LOG = "checkpoint.npz", "log.jsonl"
 _VISIBLE = (

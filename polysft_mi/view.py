@@ -8,7 +8,7 @@ import numpy as np
 
 from . import commands
 from .errors import InputError, cli
-from .results import Run
+from .results.run import Run
 
 _EXAMPLES = [
     ("out/demo", "opens a window"),

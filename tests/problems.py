@@ -4,10 +4,11 @@ equations written out. Import only where a Mitsuba variant is set."""
 import numpy as np
 import synthetic
 
-from polysft_mi import prepare, scene
-from polysft_mi.problem import Problem
-from polysft_mi.sequence import Sequence
-from polysft_mi.template import Template
+from polysft_mi import prepare
+from polysft_mi.objective.problem import Problem
+from polysft_mi.scene import experiment as scene
+from polysft_mi.scene.sequence import Sequence
+from polysft_mi.surface.template import Template
 
 
 def problem_of(folder, **settings):

@@ -12,11 +12,12 @@ import synthetic
 from problems import problem_of
 from scipy.spatial.transform import Rotation
 
-from polysft_mi import pixels, solvers
-from polysft_mi.patch import Unknowns
-from polysft_mi.pyramid import Level, level_image
-from polysft_mi.registration import Registration
+from polysft_mi import solvers
+from polysft_mi.images import pixels
+from polysft_mi.images.pyramid import Level, level_image
+from polysft_mi.images.registration import Registration
 from polysft_mi.solvers import gauss_newton
+from polysft_mi.surface.patch import Unknowns
 from polysft_mi.tracker import track
 
 LIGHT = np.array([0.6, 0.45, 0.0, -0.3])

@@ -16,13 +16,14 @@ import synthetic
 from problems import dense, grid_template, problem_of
 from scipy.spatial.transform import Rotation
 
-from polysft_mi import pixels, solvers
-from polysft_mi.assembly import Assembly
-from polysft_mi.device import frozen, interruptible, on_device
-from polysft_mi.normal_equations import Chart, Pattern, State, hinges
-from polysft_mi.pyramid import FARTHEST, Level
-from polysft_mi.raster import RasterIntegrator
-from polysft_mi.registration import Registration
+from polysft_mi import solvers
+from polysft_mi.images import pixels
+from polysft_mi.images.pyramid import FARTHEST, Level
+from polysft_mi.images.registration import Registration
+from polysft_mi.objective.assembly import Assembly
+from polysft_mi.render.device import frozen, interruptible, on_device
+from polysft_mi.render.raster import RasterIntegrator
+from polysft_mi.solvers.normal_equations import Chart, Pattern, State, hinges
 from polysft_mi.tracker import Track, track
 
 LEVEL = Level(1.0, 1, 8.0)

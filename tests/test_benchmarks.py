@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from scripts import load
 
-from polysft_mi import metrics, plugins
+from polysft_mi.results import metrics
+from polysft_mi.scene import plugins
 
 ROOT = Path(__file__).resolve().parent.parent
 SIZE, POINTS = (64, 48), 9

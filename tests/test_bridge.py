@@ -12,10 +12,11 @@ import torch
 import polyfit
 from polyfit import jets
 from polyfit.stn import PolyFit, SpatialTransformer
-from polysft_mi import bridge, prepare, scene
-from polysft_mi.patch import JetPatch
-from polysft_mi.problem import Problem
-from polysft_mi.sequence import Sequence
+from polysft_mi import bridge, prepare
+from polysft_mi.objective.problem import Problem
+from polysft_mi.scene import experiment as scene
+from polysft_mi.scene.sequence import Sequence
+from polysft_mi.surface.patch import JetPatch
 
 RNG = np.random.default_rng(2)
 

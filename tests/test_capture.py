@@ -11,17 +11,18 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-
 from scripts import load
 
-from polysft_mi import meshio, prepare
+from polysft_mi import prepare
 from polysft_mi.camera import Intrinsics
-from polysft_mi.capture import calibration, folder, frames, images, lens, masks, pose, sheet
+from polysft_mi.capture import calibration, folder, frames, lens, masks, pose, sheet
 from polysft_mi.capture.folder import capture
 from polysft_mi.capture.size import parse_size
 from polysft_mi.errors import InputError
-from polysft_mi.sequence import Sequence
-from polysft_mi.video import write_video
+from polysft_mi.pictures.video import write_video
+from polysft_mi.scene import images
+from polysft_mi.scene.sequence import Sequence
+from polysft_mi.surface import meshio
 
 ROOT = Path(__file__).resolve().parent.parent
 DEMO = ROOT / "scenes" / "demo"
@@ -158,9 +159,9 @@ def test_folder_of_a_video(clip, tmp_path):
         mask = images.read_rgb(f"{out}/masks/{k:05d}.png")[..., 0]
         assert masks.iou(mask, cover) > 0.97
 
-    from polysft_mi import scene
-
     import mitsuba as mi
+
+    from polysft_mi.scene import experiment as scene
 
     experiment = scene.load(scene_path)
     image = np.array(mi.render(experiment.scene, sensor=experiment.sensor, spp=1))

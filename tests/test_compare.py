@@ -9,12 +9,13 @@ import OpenEXR
 import pytest
 from test_metrics import slow_ray_depth
 
-from polysft_mi import compare, evaluate, figures
+from polysft_mi import compare, evaluate
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError
-from polysft_mi.exr import read_exr
-from polysft_mi.results import Run
-from polysft_mi.shading import seen
+from polysft_mi.pictures import figures
+from polysft_mi.pictures.shading import seen
+from polysft_mi.results.exr import read_exr
+from polysft_mi.results.run import Run
 
 
 @pytest.fixture

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
 from scripts import load
 
-from polysft_mi import plugins, scene, settings
+from polysft_mi.objective.problem import Problem
 from polysft_mi.prepare import parser as prepare_parser
-from polysft_mi.problem import Problem
-from polysft_mi.sequence import Sequence
+from polysft_mi.scene import experiment as scene
+from polysft_mi.scene import plugins, settings
+from polysft_mi.scene.sequence import Sequence
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [

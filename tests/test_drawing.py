@@ -14,11 +14,14 @@ import numpy as np
 import pytest
 import synthetic
 
-from polysft_mi import drawing, exr, prepare, scene, video
-from polysft_mi.drawing import Drawing
-from polysft_mi.pictures import Album, chosen
-from polysft_mi.problem import Problem
-from polysft_mi.sequence import Sequence
+from polysft_mi import prepare
+from polysft_mi.objective.problem import Problem
+from polysft_mi.pictures import drawing, video
+from polysft_mi.pictures.album import Album, chosen
+from polysft_mi.pictures.drawing import Drawing
+from polysft_mi.results import exr
+from polysft_mi.scene import experiment as scene
+from polysft_mi.scene.sequence import Sequence
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -169,7 +172,7 @@ def test_nothing_is_drawn_any_more_after_an_error(sheet, tmp_path, monkeypatch):
         done.append(True)
 
     monkeypatch.setattr(drawing, "_WORTH", 10**6)
-    monkeypatch.setattr("polysft_mi.pictures.write_video", fail)
+    monkeypatch.setattr("polysft_mi.pictures.album.write_video", fail)
     monkeypatch.setattr("polysft_mi.pictures.figures.contact_sheet", plot)
     with pytest.raises(OSError, match="no space"):
         drawn(sheet, tmp_path / "out")

@@ -17,7 +17,7 @@ from PIL import Image
 from polyfit import animation
 from polysft_mi import export
 from polysft_mi.errors import InputError
-from polysft_mi.results import Run
+from polysft_mi.results.run import Run
 
 FPS = 12.5
 

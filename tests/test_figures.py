@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from polysft_mi import figures
-from polysft_mi.figures import View, contact_sheet, frame_plot, loss_plot, shade_surface
+from polysft_mi.pictures import figures
+from polysft_mi.pictures.figures import View, contact_sheet, frame_plot, loss_plot, shade_surface
 
 BACKGROUND = (243, 243, 243)
 
@@ -170,8 +170,8 @@ def test_a_picture_that_fails_is_a_warning(tmp_path, monkeypatch):
 
 def test_importing_loads_no_heavy_module():
     script = (
-        "import sys, polysft_mi.figures, polysft_mi.metrics, polysft_mi.evaluate, polysft_mi.exr,"
-        " polysft_mi.video, polysft_mi.meshio\nprint([m for m in ('matplotlib', 'OpenEXR',"
+        "import sys, polysft_mi.pictures.figures, polysft_mi.results.metrics, polysft_mi.evaluate, polysft_mi.results.exr,"
+        " polysft_mi.pictures.video, polysft_mi.surface.meshio\nprint([m for m in ('matplotlib', 'OpenEXR',"
         " 'trimesh', 'skimage', 'scipy', 'rich', 'mitsuba', 'torch', 'cv2') if m in sys.modules])"
     )
     done = subprocess.run(

@@ -17,18 +17,28 @@ from scipy.linalg import LinAlgError, block_diag
 from scipy.spatial.transform import Rotation
 
 from polyfit import jets
-from polysft_mi import normal_equations, objective, prepare, pyramid, registration, scene, solvers
-from polysft_mi.assembly import Images
+from polysft_mi import prepare, solvers
 from polysft_mi.errors import InputError
-from polysft_mi.normal_equations import Blocks, Chart, Normal, Pattern, Reduced, State, hinges
-from polysft_mi.patch import Unknowns
-from polysft_mi.problem import Problem
-from polysft_mi.pyramid import FARTHEST, Level, level_image
-from polysft_mi.registration import Registration
-from polysft_mi.relocate import Relocator
-from polysft_mi.settings import Settings
-from polysft_mi.solvers import gauss_newton
-from polysft_mi.template import Template
+from polysft_mi.images import pyramid, registration
+from polysft_mi.images.pyramid import FARTHEST, Level, level_image
+from polysft_mi.images.registration import Registration
+from polysft_mi.objective import terms as objective
+from polysft_mi.objective.assembly import Images
+from polysft_mi.objective.problem import Problem
+from polysft_mi.scene import experiment as scene
+from polysft_mi.scene.settings import Settings
+from polysft_mi.solvers import gauss_newton, normal_equations
+from polysft_mi.solvers.normal_equations import (
+    Blocks,
+    Chart,
+    Normal,
+    Pattern,
+    Reduced,
+    State,
+    hinges,
+)
+from polysft_mi.solvers.relocate import Relocator
+from polysft_mi.surface.patch import Unknowns
 from polysft_mi.tracker import track
 
 RNG = np.random.default_rng(4)

@@ -18,7 +18,9 @@ import pytest
 import synthetic
 import trimesh
 
-from polysft_mi import errors, exr, meshio, prepare, run
+from polysft_mi import errors, prepare, run
+from polysft_mi.results import exr
+from polysft_mi.surface import meshio
 
 ROOT = Path(__file__).resolve().parent.parent
 SIZE = (48, 36)

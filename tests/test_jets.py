@@ -130,7 +130,7 @@ def test_a_jet_turned_over_is_the_same_surface():
 
 @pytest.mark.parametrize("order", [1, 4, 10])
 def test_drjit_and_torch_agree(order):
-    from polysft_mi import jet
+    from polysft_mi.surface import jet
 
     uv, alpha = chart(), random_alpha(order)
     u, v = (mi.Float(uv[:, k].numpy().astype(np.float32)) for k in (0, 1))
@@ -153,8 +153,8 @@ def test_drjit_and_torch_agree(order):
 @pytest.fixture
 def patch():
     """A bent sheet as a patch, and unknowns away from rest."""
-    from polysft_mi.patch import JetPatch, Unknowns
-    from polysft_mi.template import Template
+    from polysft_mi.surface.patch import JetPatch, Unknowns
+    from polysft_mi.surface.template import Template
 
     y, x = np.meshgrid(np.linspace(-0.1, 0.1, 7), np.linspace(-0.15, 0.15, 9), indexing="ij")
     vertices = np.stack([x, y, 0.6 + 1.5 * x**2 + x * y], -1).reshape(-1, 3)
@@ -215,7 +215,7 @@ def test_patch_tangents_and_metric_against_finite_differences(patch):
 
 
 def test_gradient_of_vertices_to_every_unknown(patch):
-    from polysft_mi.patch import Unknowns
+    from polysft_mi.surface.patch import Unknowns
 
     patch, _, x = patch
     weight = mi.Vector3f(RNG.normal(size=(3, 63)).astype(np.float32))

@@ -10,8 +10,9 @@ import synthetic
 from problems import problem_of
 from scipy.spatial.transform import Rotation
 
-from polysft_mi import registration, solvers
-from polysft_mi.light import Brightness, Light, residuals
+from polysft_mi import solvers
+from polysft_mi.images import registration
+from polysft_mi.images.light import Brightness, Light, residuals
 from polysft_mi.solvers import gauss_newton
 from polysft_mi.tracker import track
 
@@ -107,7 +108,7 @@ def test_residuals_and_derivatives():
 
 
 def test_the_light_follows_the_surface_and_the_energy_has_no_slope_along_it(monkeypatch):
-    monkeypatch.setattr("polysft_mi.light._REFITS", 60)
+    monkeypatch.setattr("polysft_mi.images.light._REFITS", 60)
     found, vertices = brightness(masked=True), wavy()
     light = Light(
         np.diag([5.0, 1, 1, 1, 2, 2, 2]), np.diag([5.0, 1, 1, 1, 2, 2, 2]) @ LIGHT, 0.01, 1

@@ -10,7 +10,7 @@ import trimesh
 
 from polysft_mi.errors import InputError
 from polysft_mi.files import aside
-from polysft_mi.meshio import _count_fans, check_template, read_template, write_ply
+from polysft_mi.surface.meshio import _count_fans, check_template, read_template, write_ply
 
 SHARED = os.path.join(
     os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)))), "shared", "data"

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from polysft_mi import metrics
 from polysft_mi.errors import InputError
+from polysft_mi.results import metrics
 
 
 def grid(n=9, m=7, size=0.3, depth=0.6):

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 import synthetic
 
-from polysft_mi import objective, prepare, scene
-from polysft_mi.patch import Unknowns
-from polysft_mi.problem import Problem
-from polysft_mi.sequence import Sequence
+from polysft_mi import prepare
+from polysft_mi.objective import terms as objective
+from polysft_mi.objective.problem import Problem
+from polysft_mi.scene import experiment as scene
+from polysft_mi.scene.sequence import Sequence
+from polysft_mi.surface.patch import Unknowns
 
 RNG = np.random.default_rng(1)
 
@@ -255,7 +257,7 @@ def test_truth_is_nearly_a_minimum(tmp_path):
     """The bent sheet's own surface explains the image better than the flat template and than its
     mirror twin.
     """
-    from polysft_mi.template import Template
+    from polysft_mi.surface.template import Template
 
     p, truth = problem(tmp_path)
 

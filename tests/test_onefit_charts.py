@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from onefit import losses, objective, skinning
-from onefit.body import AnnyBody
 from onefit.binding import standard_surface
+from onefit.body import AnnyBody
 from onefit.charts import AROUND, LEVEL, Deformation, PatchedGarment, SparseMatrix, _steady_jets
 from onefit.garment import TEMPLATES, Garment
 from onefit.nearest import FAR, ClosestSurface

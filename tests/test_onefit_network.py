@@ -6,7 +6,7 @@ import torch
 
 import onefit
 import onefit.post
-from onefit import ease, post, weights
+from onefit import ease, weights
 from onefit.body import AnnyBody
 from onefit.charts import PatchedGarment
 from onefit.draper import Draper

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from scipy.optimize import check_grad
 from scipy.spatial.transform import Rotation
-
-from polysft_mi import outline
-from polysft_mi.camera import Intrinsics
-from polysft_mi.outline import fitted, loops
 from synthetic import grid_faces
+
+from polysft_mi.camera import Intrinsics
+from polysft_mi.scene import outline
+from polysft_mi.scene.outline import fitted, loops
 
 CAMERA = Intrinsics(500.0, 500.0, 315.0, 242.0, 640, 480)
 WIDTH, HEIGHT = 0.3, 0.24

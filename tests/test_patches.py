@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+import surfaces
 import trimesh
 
-import surfaces
 from polyfit import InputError, Patches, mesh, patch_count
 
 

@@ -14,15 +14,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-
 import synthetic
 from scripts import load
-from polysft_mi import kinect_paper, meshio
+
 from polysft_mi.errors import InputError
-from polysft_mi.kinect_paper import template as kinect_paper_template
 from polysft_mi.prepare import Layout, prepare, recognise, scene_xml
-from polysft_mi.sequence import Sequence
-from polysft_mi.settings import Settings
+from polysft_mi.scene import kinect_paper
+from polysft_mi.scene.kinect_paper import template as kinect_paper_template
+from polysft_mi.scene.sequence import Sequence
+from polysft_mi.scene.settings import Settings
+from polysft_mi.surface import meshio
 
 ROOT = Path(__file__).resolve().parent.parent
 FORMS = {
@@ -42,7 +43,7 @@ def refused(*arguments, **options):
 
 
 def loaded(path, **overrides):
-    from polysft_mi import scene
+    from polysft_mi.scene import experiment as scene
 
     return scene.load(path, overrides)
 

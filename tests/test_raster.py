@@ -7,10 +7,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from polysft_mi import objective, plugins
 from polysft_mi.errors import InputError
-from polysft_mi.patch import JetPatch, Unknowns
-from polysft_mi.template import Template
+from polysft_mi.objective import terms as objective
+from polysft_mi.scene import plugins
+from polysft_mi.surface.patch import JetPatch, Unknowns
+from polysft_mi.surface.template import Template
 
 WIDTH, HEIGHT = 96, 72
 UNLIT_MESH = {

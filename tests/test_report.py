@@ -11,14 +11,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from polyfit import jets
-from polysft_mi import report, video
+from polysft_mi import report
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError
-from polysft_mi.results import PEAK, Run
+from polysft_mi.pictures import video
+from polysft_mi.results.run import PEAK, Run
 
 BROWSER = next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))),

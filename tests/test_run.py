@@ -16,7 +16,9 @@ import pytest
 import synthetic
 import trimesh
 
-from polysft_mi import evaluate, exr, metrics, prepare, run, scene, tracker
+from polysft_mi import evaluate, prepare, run, tracker
+from polysft_mi.results import exr, metrics
+from polysft_mi.scene import experiment as scene
 
 ROOT = Path(__file__).resolve().parent.parent
 QUICK = ["-D", "solver=adam", "-D", "period=30", "-D", "patience=30"]
@@ -129,7 +131,7 @@ def test_depth_of_the_exr_is_that_of_the_surface(result):
     layers, _ = exr.read_exr(result / "comparison" / "002.exr")
     s = surface(result)
     experiment = scene.load(result / "scene.xml")
-    from polysft_mi.pinhole import Pinhole
+    from polysft_mi.render.pinhole import Pinhole
 
     camera = Pinhole(experiment.sensor)
     y, x = np.nonzero(layers["mask_render"][..., 0] > 0.999)
@@ -204,7 +206,7 @@ def test_ctrl_c_leaves_a_valid_shorter_result(sequence, tmp_path):
 def test_a_frame_that_breaks_the_loss_is_reported_and_passed_over(
     sequence, tmp_path, capsys, monkeypatch, solver
 ):
-    from polysft_mi.sequence import Sequence
+    from polysft_mi.scene.sequence import Sequence
 
     frame = Sequence.frame
     monkeypatch.setattr(

@@ -5,11 +5,11 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-
 import synthetic
+
 from polysft_mi.errors import InputError
-from polysft_mi.exr import write_exr
-from polysft_mi.sequence import Sequence, drop_stray_components, image_size, list_images
+from polysft_mi.results.exr import write_exr
+from polysft_mi.scene.sequence import Sequence, drop_stray_components, image_size, list_images
 
 
 @pytest.fixture

@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import synthetic
-from scripts import load
 from scipy.spatial.transform import Rotation
+from scripts import load
 
-from polysft_mi import evaluate, metrics, prepare
+from polysft_mi import evaluate, prepare
 from polysft_mi.errors import InputError
+from polysft_mi.results import metrics
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -51,9 +52,9 @@ def test_baseline_starts_from_the_template_and_moves_what_its_unknowns_move(shee
 
 
 def test_objective_of_the_baseline_is_adams(sheet, large_steps):
-    from polysft_mi import scene
-    from polysft_mi.problem import Problem
-    from polysft_mi.sequence import Sequence
+    from polysft_mi.objective.problem import Problem
+    from polysft_mi.scene import experiment as scene
+    from polysft_mi.scene.sequence import Sequence
 
     baseline = per_vertex.load(str(sheet.folder / "scene.xml"), {})
     experiment = scene.load(str(sheet.folder / "scene.xml"), {"solver": "adam"})
@@ -328,13 +329,13 @@ def test_one_command_is_run_timed_and_scored(sheet, tmp_path, monkeypatch):
 
 
 def template_of(sheet, order):
-    from polysft_mi.template import Template
+    from polysft_mi.surface.template import Template
 
     return Template.fit(sheet.vertices[0], sheet.faces, sheet.uv, order)
 
 
 def test_a_jet_that_was_turned_is_found_again(sheet):
-    from polysft_mi.normal_equations import Chart
+    from polysft_mi.solvers.normal_equations import Chart
 
     template, rng = template_of(sheet, 4), np.random.default_rng(0)
     chart = Chart(template)

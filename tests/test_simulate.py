@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from scripts import load
 
-from polysft_mi import scene
-from polysft_mi.problem import Problem
-from polysft_mi.registration import Registration
-from polysft_mi.sequence import Sequence
+from polysft_mi.images.registration import Registration
+from polysft_mi.objective.problem import Problem
+from polysft_mi.scene import experiment as scene
+from polysft_mi.scene.sequence import Sequence
 
 simulate = load("benchmarks/simulate.py")
 ROOT = Path(__file__).resolve().parent.parent

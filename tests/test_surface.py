@@ -6,11 +6,11 @@ import dataclasses
 
 import numpy as np
 import pytest
+import surfaces
 import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
-import surfaces
 from polyfit import (
     CanonicalFrame,
     InputError,

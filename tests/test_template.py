@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from polyfit import jets
 from polyfit.frames import CanonicalFrame
 from polysft_mi.errors import InputError
-from polysft_mi.template import Template
+from polysft_mi.surface.template import Template
 
 
 def grid(n=15, m=13, height=lambda x, y: 0 * x):

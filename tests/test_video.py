@@ -8,8 +8,8 @@ import imageio
 import numpy as np
 import pytest
 
-from polysft_mi import video
 from polysft_mi.errors import InputError
+from polysft_mi.pictures import video
 
 needs_encoder = pytest.mark.skipif(
     video.encoder() is None, reason="no ffmpeg with an H.264 encoder here"

@@ -12,16 +12,16 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from polysft_mi import meshio
 from polysft_mi.errors import InputError
-from polysft_mi.outline import fitted
 from polysft_mi.prepare import Layout, scene_xml, write_obj
-from polysft_mi.sequence import list_images
+from polysft_mi.scene.images import focal_35mm, read_rgb
+from polysft_mi.scene.outline import fitted
+from polysft_mi.scene.sequence import list_images
+from polysft_mi.surface import meshio
 
 from . import pictures, sheet
 from .calibration import calibrate as calibrate_camera
 from .frames import focal_length, is_video, read_frames
-from .images import focal_35mm, read_rgb
 from .lens import Lens, Undistortion
 from .masks import Masks, iou, silhouette
 from .pose import LEAST, Pose, from_corners, from_matches, match

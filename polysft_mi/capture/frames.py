@@ -7,9 +7,8 @@ import os
 import numpy as np
 
 from polysft_mi.errors import InputError
-from polysft_mi.sequence import list_images
-
-from .images import focal_35mm, read_rgb
+from polysft_mi.scene.images import focal_35mm, read_rgb
+from polysft_mi.scene.sequence import list_images
 
 _APPLE = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
 _MOST = 16384  # pixels a side

@@ -5,7 +5,7 @@ images.
 import cv2
 import numpy as np
 
-from polysft_mi.outline import loops
+from polysft_mi.scene.outline import loops
 
 GREEN, RED, YELLOW, WHITE = (60, 220, 90), (235, 70, 60), (255, 210, 40), (255, 255, 255)
 _CELL = 320  # pixels of a contact sheet's picture

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from polysft_mi import meshio
 from polysft_mi.errors import InputError
+from polysft_mi.surface import meshio
 
 _FLAT = 1e-3  # depth, of its extent, up to which a template counts as flat
 _SMALLEST, _LARGEST = 0.005, 20.0  # m
@@ -93,7 +93,7 @@ def from_obj(path):
     """The :class:`Sheet` of an OBJ in metres with texture coordinates, its frame any; order 4 must
     hold it. Raises InputError.
     """
-    from polysft_mi.template import Template
+    from polysft_mi.surface.template import Template
 
     vertices, faces, uv = meshio.read_template(path)
     meshio.check_template(vertices, faces, uv, path)

@@ -10,15 +10,16 @@ from scipy.linalg import LinAlgError, block_diag, cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 from threadpoolctl import ThreadpoolController
 
-from ..errors import InputError
-from ..light import Light, areas, residuals
-from ..normal_equations import Blocks, Chart, Normal, Pattern, Reduced, State, Surface, hinges
-from ..patch import Unknowns
-from ..problem import BadFrame
-from ..pyramid import Level
-from ..registration import SHADE, Appearance, Evaluation, Registration
-from ..relocate import Relocator
+from polysft_mi.errors import InputError
+from polysft_mi.images.light import Light, areas, residuals
+from polysft_mi.images.pyramid import Level
+from polysft_mi.images.registration import SHADE, Appearance, Evaluation, Registration
+from polysft_mi.objective.problem import BadFrame
+from polysft_mi.surface.patch import Unknowns
+
 from . import Solution
+from .normal_equations import Blocks, Chart, Normal, Pattern, Reduced, State, Surface, hinges
+from .relocate import Relocator
 
 # width [pixels] of the sheet that the stages' blurs are given for; they grow with the sheet in the
 # image
@@ -656,7 +657,7 @@ class GaussNewton:
         return float(np.clip(scale * math.sqrt(m / (1 - m) / 0.44), *_SCALES))
 
     def _appearance(self, state, order, stage):
-        """The :class:`polysft_mi.registration.Appearance` of the sheet in a stage that begins at
+        """The :class:`polysft_mi.images.registration.Appearance` of the sheet in a stage that begins at
         ``state``; None where the sheet has yet to move far."""
         if stage is FAR:
             return None

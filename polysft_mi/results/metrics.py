@@ -1,0 +1,388 @@
+"""How far a reconstruction is from the truth: surfaces against meshes, depth points or point
+clouds, images against images.
+
+Lengths are metres in the camera frame (x right, y down, z forward) unless a name ends in ``_mm``.
+``V`` and ``G`` are vertices (N, 3), ``F`` faces (F, 3). A figure of a sequence is the mean of the
+figures of its frames.
+"""
+
+import glob
+import os
+import re
+
+import numpy as np
+
+from polysft_mi.errors import InputError
+
+PIXELS = 640 * 480  # image size behind the published "all pixels" figures of Kinect-Paper
+
+
+# ---- meshes of one topology ----------------------------------------------------------------------
+
+
+def rmse(V, G):
+    """Root mean squared distance of corresponding vertices [m]."""
+    return float(np.sqrt(np.mean(np.sum((V - G) ** 2, axis=1))))
+
+
+def e3d(V, G):
+    """||V - G||_F / ||G||_F, without alignment."""
+    return float(np.linalg.norm(V - G) / np.linalg.norm(G))
+
+
+def align_similarity(V, G):
+    """V moved onto G (N, 3) by the similarity (scale, rotation without reflection, translation)
+    that is best in least squares.
+
+    Umeyama 1991, with the scale that minimises ||s V R + t - G||.
+    """
+    mean_v, mean_g = V.mean(axis=0), G.mean(axis=0)
+    v, g = V - mean_v, G - mean_g
+    left, singular, right = np.linalg.svd(v.T @ g)
+    flip = np.ones(3)
+    flip[2] = np.sign(np.linalg.det(left) * np.linalg.det(right))
+    rotation = (left * flip) @ right
+    scale = np.dot(singular, flip) / np.sum(v**2)
+    return scale * (v @ rotation) + mean_g
+
+
+def e3d_procrustes(V, G):
+    """e3d after :func:`align_similarity` (the definition behind the table of phi-SfT)."""
+    return e3d(align_similarity(V, G), G)
+
+
+def vertex_normals(V, F):
+    """Unit normals (N, 3): the mean of the adjacent triangles' normals, weighted by their area.
+    Zero where no triangle is.
+    """
+    cross = np.cross(V[F[:, 1]] - V[F[:, 0]], V[F[:, 2]] - V[F[:, 0]])
+    total = np.stack(
+        [np.bincount(F.ravel(), np.repeat(cross[:, k], 3), minlength=len(V)) for k in range(3)],
+        axis=1,
+    )
+    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-20)
+
+
+def normal_angle(V, G, F):
+    """Mean angle between corresponding vertex normals [degrees], without alignment."""
+    cosine = np.sum(vertex_normals(V, F) * vertex_normals(G, F), axis=1)
+    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1)).mean()))
+
+
+# ---- depth points --------------------------------------------------------------------------------
+
+
+def ray_depth(V, F, points):
+    """Depth z (P,) [m] at which the rays from the camera through ``points`` (P, 3) first meet the
+    mesh; NaN where they do not.
+
+    Moeller and Trumbore 1997, with the ray's origin at 0, for the pairs of :func:`_close_pairs`.
+    Triangles count from both sides.
+    """
+    p, e1, e2 = V[F[:, 0]], V[F[:, 1]] - V[F[:, 0]], V[F[:, 2]] - V[F[:, 0]]
+    across, along, normal = np.cross(e1, p), np.cross(p, e2), np.cross(e2, e1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        rays = points / points[:, 2:3]
+    directed = np.flatnonzero(
+        np.isfinite(rays).all(axis=1)
+    )  # a point that is missing, or lies at z = 0, has no ray
+    triangle, ray = _close_pairs(V[F], rays[directed, :2])
+    ray = directed[ray]
+    dot = lambda a, b: np.einsum("ij,ij->i", a, b)
+    det = dot(rays[ray], normal[triangle])
+    usable = np.abs(det) > 1e-18
+    inverse = np.divide(1.0, det, out=np.zeros_like(det), where=usable)
+    b1, b2 = dot(rays[ray], along[triangle]) * inverse, dot(rays[ray], across[triangle]) * inverse
+    t = dot(p, normal)[triangle] * inverse
+    # the slack keeps rays through the triangles' common edges
+    hit = usable & (b1 >= -1e-6) & (b2 >= -1e-6) & (b1 + b2 <= 1 + 1e-6) & (t > 0)
+    nearest = np.full(len(rays), np.inf)
+    np.minimum.at(nearest, ray[hit], t[hit])
+    return np.where(np.isfinite(nearest), nearest, np.nan)
+
+
+def _close_pairs(corners, xy):
+    """(triangle, ray) of the pairs that may meet: the ray's xy (P, 2) at z = 1 lies in a circle
+    around the triangle's projection.
+
+    ``corners`` (F, 3, 3). A triangle that reaches behind the camera has no such circle and is
+    paired with every ray.
+    """
+    from scipy.spatial import cKDTree
+
+    before = (corners[:, :, 2] > 1e-9).all(axis=1)
+    flat = corners[before, :, :2] / corners[before, :, 2:]
+    centre = flat.mean(axis=1)
+    radius = 1.01 * np.linalg.norm(flat - centre[:, None], axis=2).max(axis=1) + 1e-9
+    near = cKDTree(xy).query_ball_point(centre, radius)
+    every = np.flatnonzero(~before)
+    triangle = np.concatenate(
+        [np.repeat(np.flatnonzero(before), [len(n) for n in near]), np.repeat(every, len(xy))]
+    )
+    ray = np.concatenate(
+        [np.asarray(n, dtype=np.int64) for n in near] + [np.tile(np.arange(len(xy)), len(every))]
+    )
+    return triangle.astype(np.int64), ray.astype(np.int64)
+
+
+def depth_rmse(V, F, points):
+    """(RMSE in depth [m] over the points (P, 3) whose ray meets the mesh, share of those points).
+    The RMSE of none is inf.
+    """
+    error = ray_depth(V, F, points) - points[:, 2]
+    error = error[np.isfinite(error)]
+    share = len(error) / len(points)
+    return (float(np.sqrt(np.mean(error**2))) if len(error) else float("inf")), share
+
+
+def image_share(V, F, K, pixels=PIXELS):
+    """Area of the mesh's triangles in the image, by its projection with K (3, 3), over the number
+    of the image's pixels.
+    """
+    xy = V @ K.T
+    corner = (xy[:, :2] / xy[:, 2:])[F]
+    a, b = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+    return float(0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum() / pixels)
+
+
+def depth_rmse_all_pixels(V, F, points, K, pixels=PIXELS):
+    """Depth RMSE [m] when the surface's squared errors are spread over all pixels of the image."""
+    return depth_rmse(V, F, points)[0] * float(np.sqrt(image_share(V, F, K, pixels)))
+
+
+# ---- point clouds --------------------------------------------------------------------------------
+
+
+def sample_surface(V, F, count, rng):
+    """``count`` points (count, 3) spread evenly over the mesh's area."""
+    edge1, edge2 = V[F[:, 1]] - V[F[:, 0]], V[F[:, 2]] - V[F[:, 0]]
+    area = np.linalg.norm(np.cross(edge1, edge2), axis=1)
+    pick = rng.choice(len(F), count, p=area / area.sum())
+    outward, along = np.sqrt(rng.random(count))[:, None], rng.random(count)[:, None]
+    return V[F[pick, 0]] + outward * (edge1[pick] * (1 - along) + edge2[pick] * along)
+
+
+def chamfer(A, B):
+    """mean_a min_b |a - b|^2 + mean_b min_a |b - a|^2 [m^2] of the clouds A (P, 3) and B (Q, 3)."""
+    from scipy.spatial import cKDTree
+
+    return float(np.mean(cKDTree(B).query(A)[0] ** 2) + np.mean(cKDTree(A).query(B)[0] ** 2))
+
+
+# ---- images --------------------------------------------------------------------------------------
+
+
+def psnr(image, target, mask=None):
+    """Peak signal-to-noise ratio [dB] of images (H, W, C) in [0, 1], over the pixels of ``mask``
+    (H, W) where one is given.
+
+    Infinite for equal images; NaN where the mask is empty.
+    """
+    squared = (np.asarray(image, np.float64) - target) ** 2
+    if mask is not None:
+        squared = squared[np.asarray(mask) > 0.5]
+    if not squared.size:
+        return float("nan")
+    error = squared.mean()
+    return float(-10 * np.log10(error)) if error > 0 else float("inf")
+
+
+def ssim(image, target, mask=None):
+    """Structural similarity of images (H, W, C) in [0, 1], as Wang et al. 2004 define it (Gaussian
+    window of 1.5 pixels).
+
+    With ``mask`` (H, W) the mean is taken over its pixels. NaN where the mask is empty or the image
+    smaller than the window of 11 pixels.
+    """
+    import cv2
+
+    if min(image.shape[:2]) < 11:
+        return float("nan")
+    inside = np.zeros(image.shape[:2], bool)
+    inside[5:-5, 5:-5] = (
+        True if mask is None else np.asarray(mask)[5:-5, 5:-5] > 0.5
+    )  # the border, where the window leaves the image, never counts
+    if not inside.any():
+        return float("nan")
+    rows, columns = (np.flatnonzero(inside.any(axis=k)) for k in (1, 0))
+    near = slice(rows[0] - 5, rows[-1] + 6), slice(columns[0] - 5, columns[-1] + 6)
+    x, y, inside = (
+        np.asarray(image[near], np.float64),
+        np.asarray(target[near], np.float64),
+        inside[near],
+    )
+
+    def local(z):
+        return cv2.GaussianBlur(z, (11, 11), 1.5)
+
+    mx, my = local(x), local(y)
+    cxx, cyy, cxy = local(x * x) - mx * mx, local(y * y) - my * my, local(x * y) - mx * my
+    c1, c2 = 0.01**2, 0.03**2
+    field = (2 * mx * my + c1) * (2 * cxy + c2) / ((mx * mx + my * my + c1) * (cxx + cyy + c2))
+    return float(field[inside].mean())
+
+
+# ---- a sequence against its truth ----------------------------------------------------------------
+
+
+def score(surface, truth_path):
+    """The figures of a reconstruction: a dict of numbers, its keys by the kind of truth.
+
+    ``surface`` maps ``vertices`` (T, N, 3) [m], ``faces`` (F, 3), ``frames`` (T,). ``truth_path``
+    is an .npz with ``vertices`` (S, N, 3) of every frame and ``faces``; or one with ``points`` (G,
+    P, 3), ``frames`` (G,) and perhaps ``K``; or a folder of ``cloud_NNN.npz`` with ``points`` (P,
+    3). Raises InputError where they cannot be compared.
+    """
+    summary = {}
+    columns = per_frame(surface, truth_path)
+    summary["frames"] = len(columns["frame"])
+    for name, values in columns.items():
+        if name != "frame":
+            summary[name] = float(np.mean(values))
+        if name in _WORST:
+            summary[f"{name}_worst"] = float(np.max(values))
+    if "depth_rmse_mm" in columns:
+        summary["per_frame_mm"] = {
+            str(k): round(v, 2) for k, v in zip(columns["frame"], columns["depth_rmse_mm"])
+        }
+    if not os.path.isdir(truth_path):
+        summary |= confidence(surface, load_npz(truth_path))
+    return summary
+
+
+def confidence(surface, truth):
+    """How ``sigma`` (T, N) [m] of a surface relates to its errors along the rays, where the truth
+    has the same vertices (S, N, 3); {} where it cannot be told.
+
+    ``sigma_factor``: what sigma has to be multiplied by for 68 % of the errors to lie within it;
+    ``sigma_two``: the share that then lies within twice as much (95 % were they Gaussian);
+    ``sigma_rank``: rank correlation of sigma and error. The first frame, where the template stands
+    in its place, is left out.
+    """
+    if (
+        "sigma" not in surface
+        or "vertices" not in truth
+        or truth["vertices"].shape[1:] != surface["vertices"].shape[1:]
+    ):
+        return {}
+    known = [i for i, k in enumerate(surface["frames"]) if 0 < k < len(truth["vertices"])]
+    found = np.asarray(surface["vertices"], dtype=np.float64)[known]
+    ray = found / np.linalg.norm(found, axis=2, keepdims=True)
+    missing = found - truth["vertices"][np.asarray(surface["frames"])[known]]
+    error, sigma = (
+        np.abs((missing * ray).sum(2)).ravel(),
+        np.asarray(surface["sigma"], dtype=np.float64)[known].ravel(),
+    )
+    usable = np.isfinite(sigma) & (sigma > 0)
+    if usable.sum() < 2:
+        return {}
+    error, sigma = error[usable], sigma[usable]
+    ratio = error / sigma
+    factor = float(np.quantile(ratio, 0.68))
+    ranks = [np.argsort(np.argsort(x)) for x in (error, sigma)]
+    return {
+        "sigma_factor": factor,
+        "sigma_two": float((ratio <= 2 * factor).mean()),
+        "sigma_rank": float(np.corrcoef(*ranks)[0, 1]),
+    }
+
+
+_WORST = ("rmse_mm", "depth_rmse_mm", "chamfer_1e4")
+
+
+def per_frame(surface, truth_path):
+    """The figures of each frame that both have: a dict of equally long lists, ``frame`` and the
+    figures of :func:`score`.
+    """
+    meshes = np.asarray(surface["vertices"], dtype=np.float64)
+    faces = np.asarray(surface["faces"], dtype=np.int64)
+    if not np.isfinite(meshes).all():
+        raise InputError("surface: vertices hold values that are not finite")
+    at = {int(k): V for k, V in zip(surface["frames"], meshes)}
+    if os.path.isdir(truth_path):
+        rows = _against_clouds(at, faces, truth_path)
+    else:
+        truth = load_npz(truth_path)
+        if "points" in truth and "frames" in truth:
+            rows = _against_points(at, faces, truth)
+        elif "vertices" in truth and "faces" in truth:
+            rows = against_meshes(
+                at, dict(enumerate(truth["vertices"])), truth["faces"], truth_path
+            )
+        else:
+            raise InputError(
+                f"{truth_path}: holds {', '.join(truth)}; vertices and faces, or points and frames,"
+                " are needed"
+            )
+    rows = list(rows)
+    if not rows:
+        raise InputError(
+            f"{truth_path}: has no frame in common with the surface's frames {min(at)} to {max(at)}"
+        )
+    return {name: [row[name] for row in rows] for name in rows[0]}
+
+
+def against_meshes(at, truth, faces, where):
+    """Figures of each frame that both have: ``at`` and ``truth`` map frames to vertices (N, 3) [m],
+    ``faces`` (F, 3) are those of both.
+    """
+    for k in sorted(at):
+        if k not in truth:
+            continue
+        V, G = at[k], truth[k].astype(np.float64)
+        if len(V) != len(G):
+            raise InputError(
+                f"surface has {len(V)} vertices, {where} has {len(G)}; the template's own vertices"
+                " are needed"
+            )
+        moved = align_similarity(V, G)
+        yield {
+            "frame": k,
+            "rmse_mm": 1e3 * rmse(V, G),
+            "e3d": e3d(V, G),
+            "e3d_proc": e3d(moved, G),
+            "en_deg": normal_angle(moved, G, faces),
+        }
+
+
+def _against_points(at, faces, truth):
+    for points, k in zip(truth["points"].astype(np.float64), truth["frames"]):
+        if int(k) not in at:
+            continue
+        V = at[int(k)]
+        error, share = depth_rmse(V, faces, points)
+        row = {"frame": int(k), "depth_rmse_mm": 1e3 * error, "hit": share}
+        if "K" in truth:
+            row["depth_rmse_allpix_mm"] = row["depth_rmse_mm"] * float(
+                np.sqrt(image_share(V, faces, truth["K"]))
+            )
+        yield row
+
+
+def _against_clouds(at, faces, folder):
+    rng = np.random.default_rng(0)  # one stream through all frames, so that figures repeat
+    for path in sorted(glob.glob(os.path.join(glob.escape(folder), "cloud_*.npz"))):
+        number = re.fullmatch(r"cloud_(\d+)\.npz", os.path.basename(path))
+        if number is None or int(number[1]) not in at:
+            continue
+        cloud = load_npz(path)
+        if "points" not in cloud:
+            raise InputError(f"{path}: holds {', '.join(cloud)}; points are needed")
+        points = cloud["points"].astype(np.float64)
+        sample = sample_surface(at[int(number[1])], faces, len(points), rng)
+        yield {"frame": int(number[1]), "chamfer_1e4": 1e4 * chamfer(sample, points)}
+
+
+def load_npz(path):
+    """The arrays of an .npz file, a dict. Raises InputError where it is missing or not such a
+    file.
+    """
+    try:
+        with np.load(path) as file:
+            return {name: file[name] for name in file.files}
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; an .npz file is needed") from None
+    except Exception as error:  # zipfile, zlib and numpy each have their own for a damaged file
+        raise InputError(
+            f"{path}: not a readable .npz file ({type(error).__name__}: {error})"
+        ) from None

@@ -1,0 +1,169 @@
+"""What a run leaves in its folder: surfaces, unknowns, pictures, figures.
+
+Import only after a Mitsuba variant is set.
+"""
+
+import dataclasses
+import json
+import os
+import platform
+import shlex
+import sys
+import time
+import xml.etree.ElementTree as ET
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from polysft_mi import __version__
+from polysft_mi.files import aside
+from polysft_mi.scene.defaults import located
+from polysft_mi.surface import meshio
+from polysft_mi.surface.patch import Unknowns
+
+RUN = "run.json"
+
+
+def versions():
+    """What a result depends on besides its scene."""
+    return {
+        "polysft_mi": __version__,
+        "mitsuba": mi.__version__,
+        "drjit": dr.__version__,
+        "python": platform.python_version(),
+        "variant": mi.variant(),
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+    }
+
+
+def write_json(path, value):
+    with aside(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
+        json.dump(value, file, indent=1, default=float)
+        file.write("\n")
+
+
+def resolved_scene(experiment):
+    """The scene file as text, with the defaults in force in place of its own and relative paths
+    made absolute.
+    """
+    tree = ET.parse(
+        experiment.path, parser=ET.XMLParser(target=ET.TreeBuilder(insert_comments=True))
+    )
+    for element in tree.getroot().iter():
+        if element.tag == "default":
+            value = experiment.defaults[element.get("name")]
+        elif element.tag == "string" and element.get("name") in (
+            "filename",
+            "frames",
+            "masks",
+            "folder",
+        ):
+            value = element.get("value")
+        else:
+            continue
+        if value and "$" not in value:
+            place = located(experiment.path, value)
+            value = place if os.path.exists(place) or "*" in value else value
+        element.set("value", value)
+    return ET.tostring(tree.getroot(), encoding="unicode") + "\n"
+
+
+def write(problem, track, out, drawing, *, fps, command, say=None):
+    """Write everything for the frames that ``track`` holds. Returns the summary that
+    ``metrics.json`` begins with, and a function to call in the end: it waits for the plots.
+
+    ``drawing``: the :class:`polysft_mi.pictures.drawing.Drawing` of the run; ``fps``: of the video;
+    ``say(text)``: told what is being written.
+    """
+    say = say or (lambda text: None)
+    sequence, template = problem.sequence, problem.template
+    count = len(track.states)
+    indices = np.asarray(sequence.indices[:count], dtype=np.int64)
+    world = np.stack([problem.surface(Unknowns.from_numpy(s)) for s in track.states])
+    vertices = problem.camera.to_camera(world).astype(np.float32)
+    drawn, bound, plotted = drawing.finish(world, vertices, fps)
+
+    sigma = {}
+    if track.sigma:
+        unknown = np.full(vertices.shape[1], np.nan, np.float32)
+        sigma["sigma"] = np.stack([track.sigma.get(k, unknown) for k in range(count)])
+    with aside(os.path.join(out, "surface.npz")) as temporary:
+        np.savez_compressed(
+            temporary,
+            vertices=vertices,
+            faces=template.faces.astype(np.int32),
+            uv=template.uv.astype(np.float32),
+            frames=indices,
+            **sigma,
+        )
+    arrays = {name: np.stack([s[name] for s in track.states]) for name in Unknowns.NAMES}
+    with aside(os.path.join(out, "params.npz")) as temporary:
+        np.savez_compressed(
+            temporary, frames=indices, alpha=template.alpha, chart=template.chart, scale=template.scale,
+            frame_rotation=problem.camera.axes @ template.rotation, frame_origin=problem.camera.to_camera(template.origin), **arrays,
+        )  # fmt: skip
+    say("meshes")
+    os.makedirs(os.path.join(out, "meshes"), exist_ok=True)
+    for index, v in zip(indices, vertices):
+        meshio.write_ply(
+            os.path.join(out, "meshes", f"{index:03d}.ply"), v, template.faces, template.uv
+        )
+    say("pictures")
+    per_frame, video = drawn(), bound()
+
+    finite = {
+        name: [p[name] for p in per_frame if np.isfinite(p[name])]
+        for name in ("psnr_mask", "ssim_mask")
+    }
+    summary = {
+        "frames": count,
+        "frames_wanted": len(sequence.indices),
+        "lost": {str(int(indices[k])): reason for k, reason in track.lost.items() if k < count},
+        **{name: float(np.mean(values)) for name, values in finite.items() if values},
+        "seconds_per_frame": float(sum(track.seconds) / count),
+        "iterations_per_window": float(np.mean(track.iterations)) if track.iterations else 0.0,
+        "order": template.order,
+        "template_residual_rms_mm": 1e3 * template.residual_rms,
+        "template_residual_max_mm": 1e3 * template.residual_max,
+        "solver": problem.settings.solver,
+    }
+    windows = [
+        {"frame": int(indices[count - len(track.iterations) + k]), "iterations": n, "seconds": t}
+        | {name: x for name, x in terms.items() if not isinstance(x, list)}
+        for k, (n, t, terms) in enumerate(zip(track.iterations, track.seconds, track.totals))
+    ]
+    write_json(
+        os.path.join(out, "metrics.json"),
+        {
+            **summary,
+            "versions": versions(),
+            "per_frame": per_frame,
+            "windows": windows,
+            "command": command,
+        },
+    )
+    return {**summary, "video": video}, plotted
+
+
+def write_beginning(out, scene, camera, command, fps):
+    """What stands in the folder from the first second: the resolved scene (text), the
+    :class:`polysft_mi.render.pinhole.Pinhole`, and what the run is.
+    """
+    with (
+        aside(os.path.join(out, "scene.xml")) as temporary,
+        open(temporary, "w", encoding="utf-8") as file,
+    ):
+        file.write(scene)
+    write_json(os.path.join(out, "camera.json"), dataclasses.asdict(camera.intrinsics()))
+    about = {
+        "command": command,
+        "started": time.strftime("%Y-%m-%dT%H:%M:%S"),
+        "fps": fps,
+        "versions": versions(),
+    }
+    write_json(os.path.join(out, RUN), about)
+
+
+def command_line():
+    return f"python -m polysft_mi.run {shlex.join(sys.argv[1:])}"

@@ -1,0 +1,203 @@
+"""What a run left in its folder, read back without Mitsuba."""
+
+import json
+import os
+import re
+import xml.etree.ElementTree as ET
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from polysft_mi.camera import Intrinsics
+from polysft_mi.errors import InputError
+from polysft_mi.evaluate import read_surface
+from polysft_mi.pictures.video import read_video
+from polysft_mi.scene.defaults import known_defaults, located
+from polysft_mi.surface.template import matrix
+
+from .metrics import load_npz
+
+PEAK = 0.25  # the error that is white in the pictures of a run
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run: ``folder``; ``vertices`` (T, N, 3) float32 [m, camera frame], ``faces`` (F,
+    3), ``uv`` (N, 2) v up, ``frames`` (T,) the index of each, ``sigma`` (T, N) [m] or None;
+    ``metrics`` and ``about``: its metrics.json and run.json.
+    """
+
+    folder: str
+    vertices: np.ndarray
+    faces: np.ndarray
+    uv: np.ndarray
+    frames: np.ndarray
+    sigma: np.ndarray = None
+    metrics: dict = field(default_factory=dict)
+    about: dict = field(default_factory=dict)
+
+    @classmethod
+    def open(cls, folder):
+        """Read a run's folder. Raises InputError where it is not one, or where the run has not
+        ended.
+        """
+        folder = os.fspath(folder)
+        if not os.path.isdir(folder):
+            raise InputError(
+                f"{folder}: {'is a file' if os.path.exists(folder) else 'no such folder'}; the"
+                " folder of a run is needed"
+            )
+        if not os.path.isfile(os.path.join(folder, "run.json")):
+            raise InputError(f"{folder}: is not the folder of a run (it holds no run.json)")
+        if not os.path.isfile(os.path.join(folder, "metrics.json")):  # which a run writes last
+            raise InputError(
+                f"{folder}: the run has not ended; go on with it by the command in its run.json and"
+                " --resume"
+            )
+        surface = read_surface(folder)
+        if "uv" not in surface or surface["uv"].shape != (surface["vertices"].shape[1], 2):
+            raise InputError(
+                f"{os.path.join(folder, 'surface.npz')}: holds no uv of"
+                f" ({surface['vertices'].shape[1]}, 2)"
+            )
+        read = lambda name: read_json(os.path.join(folder, name))
+        names = ("vertices", "faces", "uv", "frames")
+        return cls(
+            folder,
+            *(surface[n] for n in names),
+            surface.get("sigma"),
+            read("metrics.json"),
+            read("run.json"),
+        )
+
+    def path(self, *names):
+        """A path in the run's folder."""
+        return os.path.join(self.folder, *names)
+
+    @property
+    def fps(self):
+        """Frames a second that the run was given."""
+        return float(self.about.get("fps", 15))
+
+    @cached_property
+    def camera(self):
+        """The :class:`polysft_mi.camera.Intrinsics` of the images, None in a folder of an older
+        version, which has no camera.json.
+        """
+        path = self.path("camera.json")
+        return Intrinsics.from_json(path) if os.path.exists(path) else None
+
+    @cached_property
+    def settings(self):
+        """Name to value of every ``<default>`` in force."""
+        return known_defaults(self.path("scene.xml"))
+
+    @cached_property
+    def texture(self):
+        """The path of the template's texture as the scene names it, or None where it names none.
+        The file may be gone.
+        """
+        path = self.path("scene.xml")
+        defaults = self.settings
+        root = ET.parse(path).getroot()
+        shapes = root.findall("shape[@id='template']") or root.findall("shape")
+        ids = {ref.get("id") for shape in shapes for ref in shape.iter("ref")}
+        places = shapes + [e for e in root if e.get("id") in ids]
+        for texture in (t for place in places for t in place.iter("texture")):
+            name = texture.find("string[@name='filename']")
+            if name is not None:
+                text = re.sub(r"\$(\w+)", lambda m: defaults.get(m[1], m[0]), name.get("value"))
+                return located(path, text)
+        return None
+
+    @cached_property
+    def params(self):
+        """The arrays of params.npz."""
+        return load_npz(self.path("params.npz"))
+
+    def log(self):
+        """The records of log.jsonl."""
+        path = self.path("log.jsonl")
+        if not os.path.exists(path):
+            return []
+        with open(path, encoding="utf-8") as file:
+            try:
+                return [json.loads(line) for line in file if line.strip()]
+            except ValueError as error:
+                raise InputError(f"{path}: not JSON lines ({error})") from None
+
+    def mean_curvature(self):
+        """Mean curvature (T, N) [1/m] of the jets, without relief, at the vertices, positive where
+        the surface bulges towards the camera (by its pose in the first frame).
+        """
+        from numpy.polynomial.polynomial import polyder, polyval2d
+        from scipy.spatial.transform import Rotation
+
+        p = self.params
+        up = (
+            p["frame_rotation"] @ Rotation.from_quat(p["rotation"][0]).as_matrix()[:, 2]
+        )  # the chart's z in the camera frame
+        u, v = (p["chart"][:, k] + p[name] for k, name in enumerate(("delta_u", "delta_v")))
+        out = np.empty_like(u)
+        for t, alpha in enumerate(p["alpha"] + p["delta_alpha"]):
+            z = matrix(alpha)
+            zu, zv, zuu, zuv, zvv = (
+                polyval2d(u[t], v[t], polyder(polyder(z, i), j, axis=1))
+                for i, j in ((1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
+            )
+            out[t] = ((1 + zv**2) * zuu - 2 * zu * zv * zuv + (1 + zu**2) * zvv) / (
+                2 * (1 + zu**2 + zv**2) ** 1.5
+            )
+        return np.sign(up[2]) * out / float(p["scale"])
+
+    def panels(self):
+        """For each frame in turn the pictures of the comparison video: target, rendering and error,
+        each (h, w, 3) uint8 RGB.
+
+        The error picture runs from black (0) through red and yellow to white (:data:`PEAK`); the
+        sum of its channels is proportional to the error.
+        """
+        count = 0
+        for picture in self._comparison():
+            width = picture.shape[1] // 4
+            yield tuple(picture[:, k * width : (k + 1) * width] for k in range(3))
+            count += 1
+        if count != len(self.frames):
+            raise InputError(
+                f"{self.path('comparison.mp4')}: shows {count} frames; the run has"
+                f" {len(self.frames)}"
+            )
+
+    def _comparison(self):
+        path = self.path("comparison.mp4")
+        if os.path.isfile(path):
+            yield from read_video(path)
+            return
+        names = [self.path("comparison", f"{k:03d}.png") for k in range(len(self.frames))]
+        if not os.path.isfile(names[0]):
+            raise InputError(
+                f"{path}: no such file, nor numbered PNGs in {self.path('comparison')}; the run's"
+                " pictures are needed"
+            )
+        import cv2
+
+        for name in names:
+            image = cv2.imread(name)
+            if image is None:
+                raise InputError(f"{name}: not a readable image")
+            yield image[..., ::-1]
+
+
+def read_json(path):
+    """The object that a JSON file holds. Raises InputError."""
+    try:
+        with open(path, encoding="utf-8") as file:
+            value = json.load(file)
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{path}: not readable JSON ({getattr(error, 'strerror', None) or error})"
+        ) from None
+    if not isinstance(value, dict):
+        raise InputError(f"{path}: not a JSON object")
+    return value

@@ -1,0 +1,56 @@
+"""The ``<default>``s of a scene file, and where its paths lead. Needs no Mitsuba, so that a wrong
+name is told at once.
+"""
+
+import difflib
+import os
+import xml.etree.ElementTree as ET
+
+from polysft_mi.errors import InputError
+
+from . import settings
+
+
+def known_defaults(path):
+    """Name to value of every ``<default>`` of a scene file. Raises InputError where the file is
+    missing or not XML.
+    """
+    if not os.path.isfile(path):
+        raise InputError(f"{path}: no such scene file")
+    try:
+        root = ET.parse(path).getroot()
+    except (ET.ParseError, ValueError, LookupError) as error:  # the latter two: encodings
+        raise InputError(f"{path}: not a readable XML scene: {error}") from None
+    return {e.get("name"): e.get("value") for e in root.iter("default") if e.get("name")}
+
+
+def resolved_defaults(path, overrides):
+    """The defaults of a scene file with ``overrides`` (name to text) in force. Raises InputError
+    for a name that the file does not have, and for a value that its setting does not take (Mitsuba
+    reads an empty number as 0)."""
+    known = known_defaults(path)
+    for name in overrides:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, 1)
+            hint = f", did you mean {near[0]}?" if near else ""
+            raise InputError(
+                f"-D {name}: {path} has no such setting{hint}; known:"
+                f" {', '.join(sorted(known)) or 'none'}"
+            )
+    resolved = {**known, **overrides}
+    try:
+        settings.from_properties(
+            {name: text for name, text in resolved.items() if text is not None and "$" not in text}
+        )
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return resolved
+
+
+def located(scene, path):
+    """A path of a scene file, found as Mitsuba finds it: beside the scene, else from the working
+    directory.
+    """
+    path = path.removeprefix("./")
+    beside = os.path.join(os.path.dirname(os.path.abspath(scene)), path)
+    return os.path.abspath(path) if not os.path.exists(beside) and os.path.exists(path) else beside

@@ -1,0 +1,223 @@
+"""Loading an experiment: a Mitsuba scene with a ``polysft`` integrator, its template mesh, its
+defaults.
+
+Import only after a Mitsuba variant is set.
+"""
+
+import os
+import re
+from dataclasses import dataclass, field
+
+import mitsuba as mi
+import numpy as np
+from scipy.spatial import cKDTree
+
+from polysft_mi.errors import InputError
+from polysft_mi.surface import meshio
+from polysft_mi.surface.template import Template
+
+from . import plugins
+from .defaults import located, resolved_defaults
+from .settings import Settings
+
+
+@dataclass
+class Experiment:
+    """What a scene file describes, loaded: the scene, the template in it, the video's place, and
+    the settings.
+
+    ``corner`` (V,) is the template vertex of each vertex that Mitsuba renders (its loaders split
+    vertices along texture seams); ``defaults`` maps each ``<default>`` to the value in force.
+    """
+
+    path: str
+    scene: mi.Scene
+    sensor: mi.Sensor
+    renderer: mi.Integrator
+    mesh: mi.Mesh
+    template: Template
+    corner: np.ndarray
+    frames: str
+    masks: str
+    settings: Settings
+    defaults: dict = field(default_factory=dict)
+
+    @property
+    def size(self):
+        """(width, height) of the film's crop window, pixels."""
+        return tuple(int(x) for x in self.sensor.film().crop_size())
+
+
+def load(path, overrides=None, template=None):
+    """Load a scene file as an :class:`Experiment`; ``overrides`` maps names of its defaults to
+    text, ``template`` is the :class:`Template` of the same scene where it is known already.
+
+    Raises InputError for whatever a user can get wrong in it.
+    """
+    path = os.fspath(path)
+    overrides = {k: str(v) for k, v in (overrides or {}).items()}
+    defaults = resolved_defaults(path, overrides)
+    plugins.register()
+    if defaults.get("data") and not os.path.isdir(located(path, defaults["data"])):
+        raise InputError(
+            f"{path}: data = {defaults['data']}: no such folder, neither beside the scene nor here;"
+            " give -D data=FOLDER"
+        )
+    source = _source(_check_nodes(path, overrides))
+    try:
+        scene = mi.load_file(path, optimize=False, **overrides)
+    except Exception as error:  # whatever a plugin raised reaches us wrapped by the parser
+        raise InputError(_told(error, path)) from None
+
+    if len(scene.sensors()) != 1:
+        raise InputError(f"{path}: {len(scene.sensors())} sensors; exactly one is needed")
+    if not mi.has_flag(scene.sensors()[0].film().flags(), mi.FilmFlags.Alpha):
+        raise InputError(
+            f"{path}: the film has no alpha, which the silhouette is read from; pixel_format rgba"
+            " is needed"
+        )
+    meshes = [s for s in scene.shapes() if s.is_mesh() and s.id() == "template"] or [
+        s for s in scene.shapes() if s.is_mesh()
+    ]
+    if len(meshes) != 1:
+        raise InputError(f'{path}: {len(meshes)} meshes; give the template\'s shape id="template"')
+    experiment, mesh = scene.integrator(), meshes[0]
+    settings = experiment.settings
+    template, corner = _template(mesh, source, settings, template)
+    return Experiment(
+        path,
+        scene,
+        scene.sensors()[0],
+        experiment.renderer,
+        mesh,
+        template,
+        corner,
+        experiment.frames,
+        experiment.masks,
+        settings,
+        defaults,
+    )
+
+
+def _told(error, path):
+    """What Mitsuba's parser says of the scene at ``path``, in one line: the file, the line, and the
+    cause.
+    """
+    text = re.sub(r"\[\w+\.cpp:\d+\] *|\[[A-Z]\w+\] +", "", str(error))
+    here = re.search(rf"{re.escape(path)} \(line (\d+), col \d+\)", text)
+    if "InputError: " in text:  # raised by a plugin of ours, at the end of a traceback
+        text = text.rpartition("InputError: ")[2]
+    else:
+        lines = [line for line in text.splitlines() if not line.startswith(("Traceback", "  File"))]
+        text = " ".join(line.strip().removeprefix("- ") for line in lines)
+        text = re.sub(rf"(At|(Error )?[Ww]hile loading) {re.escape(path)} \(.*?\): ", "", text)
+        text = text.replace("unreferenced", "unknown").replace(
+            "Found 1 unknown property", "unknown property"
+        )
+    return (
+        f"{path}:"
+        f" {f'line {here[1]}: ' if here else ''}{text if len(text) <= 300 else text[:300] + ' ...'}"
+    )
+
+
+def _check_nodes(path, overrides):
+    """Parse the file, check its integrator, its sensor and that the files it names are there;
+    return the properties of the template's shape (or None).
+    """
+    config = mi.parser.ParserConfig(mi.variant())
+    try:
+        state = mi.parser.parse_file(config, path, **overrides)
+    except Exception as error:
+        raise InputError(_told(error, path)) from None
+    shapes = []
+    top = [
+        state.nodes[v.index()]
+        for _, v in state.root.props.items()
+        if isinstance(v, mi.Properties.ResolvedReference)
+    ]
+    integrators = [
+        node.props.plugin_name() for node in top if node.type == mi.ObjectType.Integrator
+    ]
+    if integrators != ["polysft"]:
+        raise InputError(
+            f"{path}: its integrator is {', '.join(integrators) or 'missing'}; one <integrator"
+            ' type="polysft"> is needed'
+        )
+    for node in state.nodes:
+        props = node.props
+        if node.type == mi.ObjectType.Sensor and props.plugin_name() not in (
+            "perspective",
+            "pinhole",
+        ):
+            raise InputError(
+                f"{mi.parser.file_location(state, node)}: sensor {props.plugin_name()!r} is not a"
+                " pinhole; perspective or pinhole is needed"
+            )
+        if "filename" in props and isinstance(props["filename"], str):
+            name = located(path, props["filename"])
+            if not os.path.isfile(name):
+                raise InputError(
+                    f"{name}: no such file (filename of <{props.plugin_name()}> in {path})"
+                )
+            props["filename"] = name
+        if props.plugin_name() in ("obj", "ply", "serialized", "varol_template"):
+            shapes.append(props)
+    return next((p for p in shapes if p.id() == "template"), shapes[0] if shapes else None)
+
+
+def _source(props):
+    """(file, vertices (N, 3), faces (F, 3)) of the template's shape in its file's own order, None
+    where it has no file.
+
+    Read and checked before Mitsuba loads the scene, for its loaders tell less, and take files that
+    are no meshes.
+    """
+    if props is None or "filename" not in props:
+        return None
+    where = props["filename"]
+    vertices, faces, _ = meshio.read_template(where)
+    if "to_world" in props:
+        m = np.array(props["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+        vertices = vertices @ m[:3, :3].T + m[:3, 3]
+    meshio.check_template(vertices, faces, np.zeros((len(vertices), 2)), where)
+    return where, vertices, faces
+
+
+def _template(mesh, source, settings, template):
+    """The template that the mesh shows, in its file's own vertex order (fitted, where it is not
+    given), and the map from rendered vertices to it.
+    """
+    rendered = np.array(mesh.vertex_positions_buffer(), dtype=np.float64).reshape(-1, 3)
+    faces = np.array(mesh.faces_buffer(), dtype=np.int64).reshape(-1, 3)
+    where, vertices, faces = source or (f"template {mesh.id()!r}", rendered, faces)
+    if not mesh.has_vertex_texcoords():
+        raise InputError(
+            f"{where}: it has no texture coordinates (uv); the texture cannot be placed on it"
+        )
+    texcoords = np.array(mesh.vertex_texcoords_buffer(), dtype=np.float64).reshape(-1, 2)
+    if not np.isfinite(rendered).all():
+        raise InputError(f"{where}: positions are not finite (NaN)")
+    distance, corner = cKDTree(vertices).query(rendered)
+    if template is not None:
+        return template, corner
+    size = np.ptp(vertices, axis=0).max()
+    if distance.max() > 1e-4 * size:
+        raise InputError(
+            f"{where}: its vertices are not those that Mitsuba loads (up to {distance.max():.3g} m"
+            " apart)"
+        )
+    uv = np.zeros((len(vertices), 2))
+    uv[corner[::-1]] = texcoords[::-1]
+    uv[:, 1] = 1 - uv[:, 1]  # Mitsuba's v runs down, a file's up
+    meshio.check_template(vertices, faces, uv, where)
+    template = Template.fit(
+        vertices,
+        faces,
+        uv,
+        settings.least,
+        capacity=settings.capacity,
+        exact=settings.order > 0,
+        tolerance=settings.fit_tolerance,
+        where=where,
+    )
+    return template, corner

@@ -1,0 +1,250 @@
+"""Where a template's outline lies in an image. A pose given by hand misses by some pixels; the edge
+of a print, or of a sheet, tells it better. NumPy, OpenCV and SciPy only.
+"""
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+
+from polysft_mi.images.light import areas
+
+# Lengths in an image are those for an outline as large as a square of _SIZE pixels; they grow with
+# it.
+_SIZE = 225.0
+_REACH = 8.0  # how far from where it is given an outline is looked for
+_BLUR = 0.4  # of the image
+_ACROSS = 2.5, 1.25, 0.6  # of the edges' strength, across the outline: from afar first
+_LINE = 4.0  # width up to which two opposite edges are those of a drawn line
+_SPACING, _STEP = 2.0, 0.25  # between points along the outline, and between samples across it
+_STRAIGHT = 0.01  # of its size: how far an outline may leave the polygon that is tried in its place
+_PRIOR = (
+    0.1,
+    0.05,
+    # by which a pose that is given may be wrong, where edges do not tell: rotation [rad], shift
+    # over the distance
+)
+_HELD = 0.005  # of the prior's square, in the strength of edges
+_STARTS, _SPREAD = (
+    12,
+    1.0,
+)  # of the search, and by how much they differ in each of six ways [pixels, RMS along the outline]
+_CLEAR, _CLEAR_PART, _PARTS = (
+    1.7,
+    1.4,
+    8,
+    # times the strength of their surroundings that edges must have along the outline, and along
+    # each part
+)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A rigid motion p -> ``rotation`` p + ``translation`` [m, camera frame]; how far it moves the
+    outline, ``moved`` [pixels, RMS]; how many times as strong edges are along it as around it,
+    ``clear``; and whether it is ``sure`` that these are the outline's: pictures are full of edges,
+    but seldom of one that runs all along an outline."""
+
+    rotation: np.ndarray
+    translation: np.ndarray
+    moved: float
+    clear: float
+    sure: bool
+
+    def __call__(self, points):
+        """Points (N, 3) [m], moved."""
+        return points @ self.rotation.T + self.translation
+
+
+def loops(faces):
+    """The boundary of a mesh with faces (F, 3): of each loop its vertices, in their order."""
+    half = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    _, index, uses = np.unique(
+        np.sort(half, axis=1), axis=0, return_inverse=True, return_counts=True
+    )
+    following, found = dict(half[uses[index.ravel()] == 1].tolist()), []
+    while following:
+        loop = [next(iter(following))]
+        while loop[-1] in following:
+            loop.append(following.pop(loop[-1]))
+        found.append(np.array(loop[:-1] if loop[0] == loop[-1] else loop))
+    return found
+
+
+def fitted(vertices, faces, camera, image):
+    """The :class:`Fit` that takes a mesh's outline to the edges in an image that are near it; None
+    where it has none before the camera.
+
+    ``vertices`` (N, 3) [m, camera frame], ``faces`` (F, 3), ``image`` (H, W, 3) uint8 sRGB,
+    ``camera``: :class:`polysft_mi.camera.Intrinsics`. The outline is the mesh's boundary, or the
+    polygon that it nearly is (digitised templates are not quite straight). An edge is as strong as
+    the derivative of the image's brightness across the outline, saturated; where the outline is
+    taken for a line that is drawn, dark or bright, two opposite ones close together count as both,
+    in its middle. The motion is that under which edges are strongest on average along the outline,
+    where a drift from the given pose costs a little. What is tried, either outline with edges
+    alone, dark or bright lines, is judged by how clear it is.
+    """
+    vertices = np.asarray(vertices, dtype=np.float64)
+    around = loops(np.asarray(faces))
+    if not around or vertices[:, 2].min() <= 0:
+        return None
+    position = camera.project(vertices)
+    size = math.sqrt(areas(position, faces).sum())
+    unit = max(1.0, size / _SIZE)
+    grey = cv2.GaussianBlur(
+        cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255, (0, 0), _BLUR * unit
+    )
+    found = []
+    for corners in (around, [_straight(loop, position, _STRAIGHT * size) for loop in around]):
+        ends = np.concatenate(
+            [np.stack([vertices[loop], vertices[np.roll(loop, -1)]], 1) for loop in corners]
+        )
+        found += [
+            _Search(ends, camera, grey, unit, line).fit() for line in (None, "dark", "bright")
+        ]
+    return max(found, key=lambda fit: fit.clear)
+
+
+def _straight(loop, position, tolerance):
+    """Those of a loop's vertices that a polygon within ``tolerance`` [pixels] of it goes
+    through.
+    """
+    polygon = cv2.approxPolyDP(np.float32(position[loop])[:, None], tolerance, True)[:, 0]
+    kept = loop[np.isin(np.float32(position[loop]) @ [1, 1j], polygon @ [1, 1j])]
+    return kept if len(kept) > 2 else loop
+
+
+class _Search:
+    """An outline with the edges (E, 2, 3) [m, camera frame] in a blurred image ``grey`` (H, W); its
+    lengths there are in ``unit`` [pixels]. ``line``: "dark" or "bright" where it is taken for a
+    line, else None."""
+
+    def __init__(self, ends, camera, grey, unit, line=None):
+        self.camera, self.grey, self.unit, self.line = camera, grey, unit, line
+        length = np.linalg.norm(camera.project(ends[:, 1]) - camera.project(ends[:, 0]), axis=1)
+        count = np.maximum(1, np.round(length / (_SPACING * unit))).astype(int)
+        edge = np.repeat(np.arange(len(ends)), count)
+        at = (np.arange(len(edge)) - np.repeat(np.cumsum(count) - count, count) + 0.5) / count[edge]
+        step = ends[edge, 1] - ends[edge, 0]
+        self.points = ends[edge, 0] + at[:, None] * step
+        self.beside = self.points + 1e-3 * step  # a little further along
+        self.centre = self.points.mean(0)
+        self.sd = np.repeat([_PRIOR[0], _PRIOR[1] * self.centre[2]], 3)
+        self.across = unit * np.arange(-_REACH, _REACH + _STEP / 2, _STEP)
+
+    def fit(self):
+        """The :class:`Fit`, from coarse to fine."""
+        turn, shift = Rotation.identity(), np.zeros(3)
+        for sigma in _ACROSS:
+            spread = _SPREAD * self.unit if sigma == _ACROSS[0] else 0.0
+            cost, to_motion = self.costs(turn, shift, sigma)
+            starts = (
+                spread * np.random.default_rng(0).normal(size=(_STARTS, 6))
+                if spread
+                else np.zeros((1, 6))
+            )
+            starts[0] = 0
+            change = (
+                to_motion
+                @ min(
+                    (minimize(cost, q, jac=True, method="BFGS") for q in starts),
+                    key=lambda f: f.fun,
+                ).x
+            )
+            turn, shift = Rotation.from_rotvec(change[:3]) * turn, shift + change[3:]
+        position, normal, _ = self._projected(turn, shift)
+        strength = _blurred(self._strength(position, normal), _ACROSS[-1])
+        parts = np.array_split(np.argsort(np.arctan2(*(position - position.mean(0)).T)), _PARTS)
+        clear, *clear_parts = (
+            float(s[:, len(self.across) // 2].mean() / max(s.mean(), 1e-12))
+            for s in (strength, *(strength[k] for k in parts))
+        )
+        moved = np.sqrt(((position - self.camera.project(self.points)) ** 2).sum(1).mean())
+        sure = clear > _CLEAR and min(clear_parts) > _CLEAR_PART and moved <= _REACH * self.unit
+        rotation = turn.as_matrix()
+        return Fit(
+            rotation, self.centre + shift - rotation @ self.centre, float(moved), clear, bool(sure)
+        )
+
+    def _projected(self, turn, shift):
+        """The outline's points after a motion: projections (K, 2), unit normals (K, 2) there, and
+        places (K, 3).
+        """
+        points, beside = (
+            turn.apply(x - self.centre) + self.centre + shift for x in (self.points, self.beside)
+        )
+        position = self.camera.project(points)
+        x, y = (self.camera.project(beside) - position).T
+        return position, np.stack([-y, x], 1) / np.maximum(np.hypot(x, y), 1e-12)[:, None], points
+
+    def _strength(self, position, normal):
+        """How strong edges are across each point, (K, D): 0 to 1, and twice that of a line."""
+        x, y = (
+            np.float32(position[:, k, None] + self.across * normal[:, k, None] - 0.5)
+            for k in (0, 1)
+        )  # OpenCV's pixels are whole at their centres
+        slope = np.gradient(
+            cv2.remap(self.grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), axis=1
+        )
+        strength = np.abs(slope)
+        strength, slope = (
+            a / np.maximum(strength + 0.5 * np.median(strength.max(1)), 1e-12)
+            for a in (strength, slope)
+        )
+        if self.line is None:
+            return strength
+        before, after = (
+            np.maximum(sign * slope, 0) for sign in ((-1, 1) if self.line == "dark" else (1, -1))
+        )
+        last = len(self.across)
+        for half in range(1, int(_LINE / _STEP / 2) + 1):
+            line = strength[:, half : last - half]
+            np.maximum(
+                line, 2 * np.minimum(before[:, : last - 2 * half], after[:, 2 * half :]), out=line
+            )
+        return strength
+
+    def costs(self, turn, shift, sigma):
+        """What a change after a motion costs, less where edges are stronger along the outline: a
+        function of q (6,) that returns the cost and its gradient (6,), and the matrix (6, 6) that
+        makes of q the rotation [rad] and shift [m]; q is in pixels.
+        """
+        position, normal, points = self._projected(turn, shift)
+        smooth = _blurred(self._strength(position, normal), sigma)
+        scaled = normal * (self.camera.fx, self.camera.fy)
+        inwards = ((position - (self.camera.cx, self.camera.cy)) * normal).sum(1)
+        by_point = (
+            np.column_stack([scaled, -inwards]) / points[:, 2:]
+        )  # of the place across the outline
+        by_motion = np.column_stack([np.cross(points - self.centre - shift, by_point), by_point])
+        # in units in which all ways to move it shift the outline alike, as far as the prior does
+        # not hold them
+        values, vectors = np.linalg.eigh(
+            by_motion.T @ by_motion / len(by_motion) + np.diag(self.sd**-2.0)
+        )
+        to_motion = vectors / np.sqrt(values)
+        by_unit, step = by_motion @ to_motion, self.across[1] - self.across[0]
+        before = np.concatenate([turn.as_rotvec(), shift]) / self.sd
+        held = to_motion / self.sd[:, None]
+        rows, last = np.arange(len(smooth)), smooth.shape[1] - 2
+
+        def cost(q):
+            at = (by_unit @ q - self.across[0]) / step
+            k = np.clip(at.astype(int), 0, last)
+            low, high = smooth[rows, k], smooth[rows, k + 1]
+            slope = np.where((at > 0) & (at < last + 1), high - low, 0) / step
+            drift = before + held @ q
+            value = -(low + np.clip(at - k, 0, 1) * (high - low)).mean() + _HELD * float(
+                drift @ drift
+            )
+            return value, -slope @ by_unit / len(smooth) + 2 * _HELD * drift @ held
+
+        return cost, to_motion
+
+
+def _blurred(strength, sigma):
+    """Strengths (K, D), blurred by ``sigma`` [pixels of an outline of _SIZE] across the outline."""
+    return cv2.GaussianBlur(strength, (0, 0), sigmaX=sigma / _STEP, sigmaY=1e-6)

@@ -1,0 +1,124 @@
+"""Templates in (OBJ and PLY, in the file's own vertex order) and what a template must be;
+:mod:`polyfit.meshio` reads and writes the files.
+
+Texture coordinates are those of OBJ files: (0, 0) is the texture's bottom left, v goes up.
+"""
+
+import numpy as np
+
+from polyfit.meshio import read_mesh, write_ply
+from polysft_mi.errors import InputError
+
+__all__ = ["check_template", "read_template", "write_ply"]
+
+
+def read_template(path):
+    """:func:`polyfit.meshio.read_mesh` of a template."""
+    return read_mesh(path, what="template")
+
+
+def check_template(vertices, faces, uv, where="template"):
+    """Raise InputError, in one line that starts with ``where``, unless the mesh can be a template.
+
+    A template is one connected, consistently oriented manifold (closed or with a boundary) of at
+    least three vertices, each of them in some face, with triangles of positive area and a finite
+    texture coordinate a vertex.
+    """
+    V, F = np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64)
+    if len(V) < 3:
+        raise InputError(f"{where}: {len(V)} vertices; a template has at least 3")
+    if len(F) == 0:
+        raise InputError(f"{where}: no faces; a template is a triangle mesh")
+    if F.min() < 0 or F.max() >= len(V):
+        raise InputError(
+            f"{where}: faces name vertices {F.min()} to {F.max()}; 0 to {len(V) - 1} exist"
+        )
+    _refuse(
+        ~np.isfinite(V).all(axis=1),
+        where,
+        "vertices have coordinates that are not finite",
+        "vertex",
+    )
+    _refuse(
+        np.bincount(F.ravel(), minlength=len(V)) == 0, where, "vertices are in no face", "vertex"
+    )
+    if uv is None:
+        raise InputError(
+            f"{where}: no texture coordinates, or several at one vertex; one uv a vertex is needed"
+        )
+    uv = np.asarray(uv, dtype=np.float64)
+    if uv.shape != (len(V), 2):
+        raise InputError(
+            f"{where}: texture coordinates of shape {uv.shape}; ({len(V)}, 2) is needed"
+        )
+    _refuse(~np.isfinite(uv).all(axis=1), where, "texture coordinates are not finite", "vertex")
+    area = 0.5 * np.linalg.norm(np.cross(V[F[:, 1]] - V[F[:, 0]], V[F[:, 2]] - V[F[:, 0]]), axis=1)
+    _refuse(area <= 1e-12 * np.ptp(V, axis=0).max() ** 2, where, "faces have no area", "face")
+    _check_topology(V, F, where)
+
+
+def _check_topology(V, F, where):
+    directed = np.stack([F, np.roll(F, -1, axis=1)], axis=2).reshape(
+        -1, 2
+    )  # edge k of face f is row 3 f + k
+    edges, edge_of, uses = np.unique(
+        np.sort(directed, axis=1), axis=0, return_inverse=True, return_counts=True
+    )
+    if (uses > 2).any():
+        a, b = edges[uses > 2][0]
+        raise InputError(
+            f"{where}: {(uses > 2).sum()} edges have more than two faces (the first joins vertices"
+            f" {a} and {b})"
+        )
+    _, ways = np.unique(directed, axis=0, return_counts=True)
+    if (ways > 1).any():
+        raise InputError(
+            f"{where}: {(ways > 1).sum()} pairs of neighbouring faces are oriented against each"
+            " other; one orientation is needed"
+        )
+    parts = _count_components(len(V), directed)
+    if parts > 1:
+        raise InputError(f"{where}: {parts} separate components; one connected mesh is needed")
+    fans = _count_fans(edge_of.ravel())
+    if fans > len(V):
+        raise InputError(
+            f"{where}: {fans - len(V)} vertices join parts that share no edge there; a manifold is"
+            " needed"
+        )
+
+
+def _count_fans(edge_of):
+    """How many fans the faces form around the vertices, one at each vertex of a manifold.
+
+    ``edge_of`` (3 F,): the edge from each corner to the next of its face. Two corners belong to one
+    fan where their faces, oriented alike, share an edge at the corners' vertex.
+    """
+    order = np.argsort(edge_of, kind="stable")
+    shared = edge_of[order[:-1]] == edge_of[order[1:]]
+    first, second = (
+        order[:-1][shared],
+        order[1:][shared],
+    )  # the two sides of each inner edge, which run against each other
+    after_first, after_second = (
+        corner - corner % 3 + (corner + 1) % 3 for corner in (first, second)
+    )
+    joined = np.concatenate(
+        [np.stack([first, after_second], axis=1), np.stack([after_first, second], axis=1)]
+    )
+    return _count_components(len(edge_of), joined)
+
+
+def _count_components(count, pairs):
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    return connected_components(graph, directed=False)[0]
+
+
+def _refuse(bad, where, what, element):
+    if bad.any():
+        raise InputError(
+            f"{where}: {bad.sum()} {what} (the first is {element} {int(np.argmax(bad))}, counted"
+            " from 0)"
+        )
