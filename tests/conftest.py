@@ -7,11 +7,10 @@ import os
 from pathlib import Path
 
 import pytest
+from places import ROOT
 
 from polysft_mi.backend import set_variant
 from polysft_mi.errors import InputError
-
-ROOT = Path(__file__).resolve().parent.parent
 
 
 def pytest_addoption(parser):

@@ -3,17 +3,14 @@
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from places import ROOT
 
 from polysft_mi import view
 from polysft_mi.errors import InputError
-
-ROOT = Path(__file__).resolve().parent.parent
-
 
 SCRIPT = """
 import sys

@@ -9,18 +9,17 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 import synthetic
 import trimesh
+from places import ROOT
 
 from polysft_mi import evaluate, prepare, run, tracker
 from polysft_mi.results import exr, metrics
 from polysft_mi.scene import experiment as scene
 
-ROOT = Path(__file__).resolve().parent.parent
 QUICK = ["-D", "solver=adam", "-D", "period=30", "-D", "patience=30"]
 
 

@@ -17,12 +17,12 @@ import numpy as np
 import pytest
 import synthetic
 import trimesh
+from places import ROOT
 
 from polysft_mi import errors, prepare, run
 from polysft_mi.results import exr
 from polysft_mi.surface import meshio
 
-ROOT = Path(__file__).resolve().parent.parent
 SIZE = (48, 36)
 QUICK = ["-q", "--exr", "2", "-D", "period=2", "-D", "last=1", "-D", "window=2"]
 

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 import synthetic
+from places import ROOT
 from scripts import load
 
 from polysft_mi.errors import InputError
@@ -25,7 +26,6 @@ from polysft_mi.scene.sequence import Sequence
 from polysft_mi.scene.settings import Settings
 from polysft_mi.surface import meshio
 
-ROOT = Path(__file__).resolve().parent.parent
 FORMS = {
     "cloth": synthetic.cloth,
     "phi-SfT": synthetic.phi_sft,

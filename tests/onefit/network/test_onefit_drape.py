@@ -1,19 +1,17 @@
 import json
 import subprocess
 import sys
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from places import ROOT
 
 from onefit import drape, weights
 from onefit.body import AnnyBody
 from onefit.network import OneFit
 from polyfit.errors import InputError
-
-ROOT = Path(__file__).resolve().parent.parent
 
 
 @pytest.fixture(scope="module")

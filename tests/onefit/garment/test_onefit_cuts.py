@@ -1,11 +1,11 @@
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from places import ROOT
 
 from onefit import cuts, tailor, train
 from onefit.binding import standard_body, standard_surface
@@ -14,7 +14,6 @@ from onefit.remesh import loops
 from polyfit import mesh
 from polyfit.errors import InputError
 
-ROOT = Path(__file__).resolve().parent.parent
 NAMES = list(cuts.CUTS)
 
 

@@ -3,11 +3,11 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from places import ROOT
 from safetensors.torch import load_file
 
 import onefit
@@ -16,8 +16,6 @@ from onefit.losses import Weights
 from onefit.training_data import LENGTH
 from polyfit.errors import InputError
 from polyfit.training import Processes
-
-ROOT = Path(__file__).resolve().parent.parent
 
 
 @pytest.fixture(scope="module")

@@ -4,11 +4,11 @@ The simulator itself need not be installed.
 
 import subprocess
 import sys
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from places import ROOT
 from scripts import load
 
 from polysft_mi.images.registration import Registration
@@ -17,7 +17,6 @@ from polysft_mi.scene import experiment as scene
 from polysft_mi.scene.sequence import Sequence
 
 simulate = load("benchmarks/simulate.py")
-ROOT = Path(__file__).resolve().parent.parent
 KIND = simulate.KINDS["bend"]
 
 

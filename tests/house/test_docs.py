@@ -4,10 +4,10 @@ import importlib.util
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
+from places import ROOT
 from scripts import load
 
 from polysft_mi.objective.problem import Problem
@@ -16,7 +16,6 @@ from polysft_mi.scene import experiment as scene
 from polysft_mi.scene import plugins, settings
 from polysft_mi.scene.sequence import Sequence
 
-ROOT = Path(__file__).resolve().parent.parent
 PAGES = [
     p
     for p in [

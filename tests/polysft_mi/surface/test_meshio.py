@@ -7,14 +7,13 @@ import os
 import numpy as np
 import pytest
 import trimesh
+from places import ROOT
 
 from polysft_mi.errors import InputError
 from polysft_mi.files import aside
 from polysft_mi.surface.meshio import _count_fans, check_template, read_template, write_ply
 
-SHARED = os.path.join(
-    os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)))), "shared", "data"
-)
+SHARED = os.path.join(ROOT.parent, "shared", "data")
 needs_data = pytest.mark.skipif(not os.path.isdir(SHARED), reason="needs ../shared/data")
 
 

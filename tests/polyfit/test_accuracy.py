@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from places import ROOT
 from scripts import load
 
 from polyfit import InputError, PolyFit
 from polyfit.garments import GarmentPatches
 from polyfit.stn import SpatialTransformer
 
-ROOT = Path(__file__).resolve().parent.parent
 accuracy = load("benchmarks/polyfit_accuracy.py")
 
 

@@ -7,11 +7,11 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
 import trimesh
+from places import ROOT
 from safetensors.torch import load_file
 
 from polyfit import InputError, PolyFit, jets, train, training_set
@@ -20,7 +20,6 @@ from polyfit.baselines.regressors import DGCNN, PointNet
 from polyfit.losses import discrepancy
 from polyfit.training import Processes
 
-ROOT = Path(__file__).resolve().parent.parent
 SMALL = train.Settings(
     families=("gaussian", "jet"), patches=120, points=40, reads=30, steps=8, batch=16, order=2
 )

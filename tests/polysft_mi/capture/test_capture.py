@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from places import ROOT
 from scripts import load
 
 from polysft_mi import prepare
@@ -24,7 +25,6 @@ from polysft_mi.scene import images
 from polysft_mi.scene.sequence import Sequence
 from polysft_mi.surface import meshio
 
-ROOT = Path(__file__).resolve().parent.parent
 DEMO = ROOT / "scenes" / "demo"
 CAMERA = Intrinsics(330.0, 330.0, 162.0, 117.0, 320, 240)
 WIDTH, HEIGHT = 0.297, 0.21

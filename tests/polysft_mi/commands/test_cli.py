@@ -10,15 +10,13 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
+from places import ROOT
 
 from polysft_mi import __main__ as polysft
 from polysft_mi import commands
 from polysft_mi.errors import InputError
-
-ROOT = Path(__file__).resolve().parent.parent
 
 
 def command(*arguments, **options):

@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import synthetic
+from places import ROOT
 
 from polysft_mi import prepare
 from polysft_mi.objective.problem import Problem
@@ -22,8 +23,6 @@ from polysft_mi.pictures.drawing import Drawing
 from polysft_mi.results import exr
 from polysft_mi.scene import experiment as scene
 from polysft_mi.scene.sequence import Sequence
-
-ROOT = Path(__file__).resolve().parent.parent
 
 
 @pytest.fixture(scope="module")

@@ -3,17 +3,16 @@ tests.
 """
 
 import json
-from pathlib import Path
 
 import drjit as dr
 import numpy as np
 import pytest
+from places import ROOT
 from scripts import load
 
 from polysft_mi.results import metrics
 from polysft_mi.scene import plugins
 
-ROOT = Path(__file__).resolve().parent.parent
 SIZE, POINTS = (64, 48), 9
 iteration, outline, raster, scaling, stability = (
     load(f"benchmarks/{name}.py")

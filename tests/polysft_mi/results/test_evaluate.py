@@ -10,11 +10,11 @@ import sys
 
 import numpy as np
 import pytest
+from places import ROOT
 
 from polysft_mi import evaluate
 from polysft_mi.errors import InputError
 
-ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 SHARED = os.path.join(os.path.dirname(ROOT), "shared")
 SCORER = os.path.join(SHARED, "tools", "score_sft.py")
 needs_scorer = pytest.mark.skipif(

@@ -3,7 +3,6 @@ distance is known.
 """
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +11,6 @@ from scripts import load
 
 from polyfit import write_ply
 
-ROOT = Path(__file__).resolve().parent.parent
 benchmark = load("benchmarks/polyfit_reconstruction.py")
 
 

@@ -7,6 +7,7 @@ import sys
 import cv2
 import numpy as np
 import pytest
+from places import ROOT
 
 from polysft_mi.pictures import figures
 from polysft_mi.pictures.figures import View, contact_sheet, frame_plot, loss_plot, shade_surface
@@ -178,6 +179,6 @@ def test_importing_loads_no_heavy_module():
         [sys.executable, "-c", script],
         capture_output=True,
         text=True,
-        cwd=os.path.dirname(os.path.dirname(__file__)),
+        cwd=ROOT,
     )
     assert done.stdout.strip() == "[]", done.stdout + done.stderr

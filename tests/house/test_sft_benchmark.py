@@ -17,9 +17,6 @@ from polysft_mi import evaluate, prepare
 from polysft_mi.errors import InputError
 from polysft_mi.results import metrics
 
-ROOT = Path(__file__).resolve().parent.parent
-
-
 sft, per_vertex = load("benchmarks/sft.py"), load("benchmarks/per_vertex.py")
 SETUP = {"frames": None, "threads": None, "define": [], "mode": None, "iterations": None}
 
