@@ -25,9 +25,9 @@ sys.path.insert(0, ROOT)
 
 from polysft_mi.capture.masks import iou
 from polysft_mi.errors import InputError, cli
-from polysft_mi.evaluate import evaluate
 from polysft_mi.pictures.video import write_video
 from polysft_mi.prepare import write_obj
+from polysft_mi.results.evaluation import evaluate
 from polysft_mi.scene import kinect_paper
 from polysft_mi.scene.images import read_rgb
 from polysft_mi.scene.sequence import drop_stray_components, list_images

@@ -30,9 +30,10 @@ sys.path.insert(0, ROOT)
 
 from polysft_mi.backend import add_mode_argument
 from polysft_mi.errors import InputError, cli
-from polysft_mi.evaluate import LABELS, evaluate, find_truth
 from polysft_mi.files import aside
 from polysft_mi.results import metrics
+from polysft_mi.results.evaluation import LABELS, evaluate, score
+from polysft_mi.results.truth import find_truth, load_npz
 from polysft_mi.surface import meshio
 
 SCENES = os.path.join(ROOT, "scenes")
@@ -347,7 +348,7 @@ def jet_result(sequence, folder, order, setup):
     truth_path, obj = find_truth(folder), os.path.join(folder, "template.obj")
     if os.path.isdir(truth_path) or not os.path.isfile(obj):
         return None
-    truth = metrics.load_npz(truth_path)
+    truth = load_npz(truth_path)
     if "vertices" not in truth:
         return None
     vertices, faces, uv = meshio.read_template(obj)
@@ -360,7 +361,7 @@ def jet_result(sequence, folder, order, setup):
         "faces": template.faces,
         "frames": np.arange(len(meshes)),
     }
-    figures = metrics.score(surface, truth_path)
+    figures = score(surface, truth_path)
     return {
         "sequence": sequence,
         "method": JET,

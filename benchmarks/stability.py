@@ -117,8 +117,7 @@ def run(scene, overrides, counts, folder, say=print):
 
 def truth_of(problem, frame, path):
     """True vertices (N, 3) of a frame, or None where nothing is known."""
-    from polysft_mi import evaluate
-    from polysft_mi.results import metrics
+    from polysft_mi.results.truth import find_truth, load_npz
     from polysft_mi.scene.defaults import located
 
     experiment = problem.experiment
@@ -128,7 +127,7 @@ def truth_of(problem, frame, path):
             return None
     if path is None:
         return None
-    truth = metrics.load_npz(evaluate.find_truth(path))
+    truth = load_npz(find_truth(path))
     index, count = problem.sequence.indices[frame], len(problem.template.vertices)
     if (
         "vertices" not in truth

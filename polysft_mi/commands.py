@@ -36,3 +36,30 @@ def parser(name, description, examples):
         epilog="examples:\n" + "\n".join(lines),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+
+
+def print_table(figures, labels, title):
+    """Print ``figures`` (name to number) as a table: by rich on a terminal, as aligned plain text
+    elsewhere. ``labels``: name to what it is called.
+    """
+    shown = {k: v for k, v in figures.items() if not isinstance(v, dict)}
+    rows = [(labels.get(k, k), _format(v)) for k, v in shown.items()]
+    if not sys.stdout.isatty():
+        width = max(len(label) for label, _ in rows)
+        for label, value in rows:
+            print(f"{label:{width}s}  {value}")
+        return
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=Text(title))  # as Text, because rich takes "[mm]" in a str for markup
+    table.add_column("figure")
+    table.add_column("value", justify="right")
+    for row in rows:
+        table.add_row(*map(Text, row))
+    Console().print(table)
+
+
+def _format(value):
+    return str(value) if isinstance(value, int) else f"{value:.5g}"

@@ -6,12 +6,15 @@ import contextlib
 import gc
 import json
 import os
-import shutil
+import shlex
 import sys
 import time
+from dataclasses import dataclass, field
 
 from . import commands
 from .errors import InputError, cli
+from .results import folder
+from .results.progress import Progress
 
 _EXAMPLES = [
     ("scenes/demo.xml -o out/demo", "the demo; then open out/demo/report.html"),
@@ -22,19 +25,6 @@ _EXAMPLES = [
     ("scenes/flag.xml -D data=/data/flag -o out/flag --resume", "go on after an interruption"),
     ("scenes/demo.xml -o out/demo --overwrite -q --json", "for scripts: one JSON object on stdout"),
 ]
-
-_OURS = (
-    "scene.xml",
-    "camera.json",
-    "run.json",
-    "checkpoint.npz",
-    "log.jsonl",
-    "surface.npz",
-    "params.npz",
-    "metrics.json",
-)
-_PICTURES = ("loss.png", "comparison.png", "comparison.mp4", "report.html")
-_FOLDERS = ("meshes", "comparison")
 
 
 def parser():
@@ -93,62 +83,107 @@ def main(arguments=None):
             f"--exr {options.exr} --fps {options.fps}: a number of frames or 'all', and a positive"
             " rate, are needed"
         ) from None
+    outcome = reconstruct(
+        options.scene,
+        options.output,
+        overrides,
+        variant=options.mode,
+        resume=options.resume,
+        overwrite=options.overwrite,
+        exr_frames=exr_frames,
+        fps=options.fps,
+        report=not options.no_report,
+        quiet=options.quiet,
+        command=f"python -m polysft_mi.run {shlex.join(sys.argv[1:])}",
+    )
+    if options.json and outcome.summary:
+        print(json.dumps(outcome.as_json(), default=float))
+    else:
+        print(outcome.as_text(), end="")
+    return 130 if outcome.interrupted else 0
 
-    out = options.output
-    _check_output(out, options)
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a run ended.
+
+    ``out``: its folder; ``summary``: the figures that metrics.json begins with, and the path
+    ``video``; empty where no frame was done. ``report``: the path of the page, or None;
+    ``seconds``: what the run took; ``interrupted``: whether Ctrl-C ended it.
+    """
+
+    out: str
+    summary: dict = field(default_factory=dict)
+    report: str = None
+    seconds: float = 0.0
+    interrupted: bool = False
+
+    def as_json(self):
+        """The summary as one object, with ``out``, ``seconds`` and ``report``."""
+        return {"out": self.out, "seconds": self.seconds, "report": self.report, **self.summary}
+
+    def as_text(self):
+        """What the command prints: one fact a line, last the file to open."""
+        if not self.summary:
+            return ""
+        s = self.summary
+        lines = [
+            f"frames: {s['frames']} of {s['frames_wanted']} in {self.seconds:.0f} s",
+            f"speed: {s['seconds_per_frame']:.2f} s a frame,"
+            f" {s['iterations_per_window']:.0f} iterations a window",
+            f"inside the surface: PSNR {s.get('psnr_mask', float('nan')):.2f} dB,"
+            f" SSIM {s.get('ssim_mask', float('nan')):.3f}",
+            f"surfaces: {os.path.join(self.out, 'surface.npz')}",
+            f"meshes: {os.path.join(self.out, 'meshes')}",
+            f"pictures: {os.path.join(self.out, 'comparison.png')}",
+            f"report: {self.report}" if self.report else f"video: {s['video']}",
+        ]
+        return "".join(line + "\n" for line in lines)
+
+
+def reconstruct(
+    scene,
+    out,
+    overrides=None,
+    *,
+    variant=None,
+    resume=False,
+    overwrite=False,
+    exr_frames=20,
+    fps=15,
+    report=True,
+    quiet=True,
+    command="polysft_mi.reconstruct",
+):
+    """Reconstruct the surface in every frame of a scene's video: what ``polysft run`` does.
+
+    ``scene``: the path of the scene; ``out``: the folder for the results; ``overrides``: name to
+    value of the scene's defaults; ``variant``: Mitsuba's, as
+    :func:`polysft_mi.backend.set_variant` takes it. ``resume`` goes on with the run that ``out``
+    holds, ``overwrite`` replaces it. ``exr_frames``: comparison EXRs at most; ``fps``: frames a
+    second of the video; ``report``: whether report.html is written; ``quiet``: no progress on
+    stderr; ``command``: what run.json and the report say made the result.
+
+    Returns the :class:`Outcome`; Ctrl-C ends the run early and keeps the frames that are done.
+    Raises InputError.
+    """
+    from .backend import set_variant
     from .scene.defaults import resolved_defaults
 
-    resolved_defaults(
-        options.scene, overrides
-    )  # a wrong name is told before anything heavy is loaded
-    from .backend import set_variant
+    began, overrides = time.perf_counter(), overrides or {}
+    folder.check_output(out, resume=resume, overwrite=overwrite)
+    resolved_defaults(scene, overrides)  # a wrong name is told before anything heavy is loaded
+    set_variant(variant)
 
-    set_variant(options.mode)
-    return _run(options, overrides, out, exr_frames)
-
-
-def _check_output(out, options):
-    """Refuse an OUT that cannot be used, before anything is computed."""
-    if os.path.exists(out) and not os.path.isdir(out):
-        raise InputError(f"{out}: is a file; OUT must be a folder")
-    existing = os.path.abspath(out)
-    while not os.path.lexists(existing):
-        existing = os.path.dirname(existing)
-    if not out or not os.path.isdir(existing) or not os.access(existing, os.W_OK | os.X_OK):
-        raise InputError(
-            f"-o '{out}': {existing} is not a folder that can be written to; OUT must be a folder"
-            " there, or a new one"
-        )
-    holds_run = os.path.exists(os.path.join(out, "run.json"))
-    if options.resume and not holds_run:
-        raise InputError(f"{out}: holds no run to resume; leave out --resume to start one")
-    if holds_run and not (options.overwrite or options.resume):
-        raise InputError(
-            f"{out}: holds another run; give --overwrite to replace it or --resume to go on with it"
-        )
-    if os.path.isdir(out) and os.listdir(out) and not holds_run:
-        raise InputError(f"{out}: is not empty and holds no run; give an empty or new folder")
-
-
-def _clear(out):
-    """Remove what an earlier run of ours left; nothing else."""
-    for name in (*_OURS, *_PICTURES):
-        if os.path.exists(os.path.join(out, name)):
-            os.remove(os.path.join(out, name))
-    for name in (*_FOLDERS, "comparison.mp4", "export"):
-        shutil.rmtree(os.path.join(out, name), ignore_errors=True)
-
-
-def _run(options, overrides, out, exr_frames):
     from . import solvers
     from .objective.problem import Problem
     from .pictures.drawing import Drawing
+    from .render.device import threads
     from .results import outputs
-    from .scene import experiment as scene
+    from .scene import experiment as experiments
     from .scene.sequence import Sequence
-    from .tracker import Track, track
 
-    experiment = scene.load(options.scene, overrides)
+    experiment = experiments.load(scene, overrides)
     s = experiment.settings
     sequence = Sequence.open(
         experiment.frames,
@@ -162,196 +197,77 @@ def _run(options, overrides, out, exr_frames):
     problem.check_start()
     solver = solvers.create(s)
     text = outputs.resolved_scene(experiment)
-    if options.resume:
-        _check_same(out, text)
-    elif options.overwrite:
-        _clear(out)
+    if resume:
+        folder.check_same(out, text)
+    elif overwrite:
+        folder.clear(out)
     os.makedirs(out, exist_ok=True)
-    command = outputs.command_line()
-    if not options.resume:
-        outputs.write_beginning(out, text, problem.camera, command, options.fps)
+    if not resume:
+        outputs.write_beginning(out, text, problem.camera, command, fps)
 
     gc.freeze()  # what is loaded by now stays: the collector need not go through it again and again
-    count = len(sequence.indices)
-    began, status = time.perf_counter(), 0
     about = {"scene": os.path.abspath(experiment.path), **outputs.versions()}
     with (
-        _half_the_threads() if s.solver == "gauss-newton" else contextlib.nullcontext(),
-        Progress(count, s, options.quiet) as progress,
+        threads(0.5) if s.solver == "gauss-newton" else contextlib.nullcontext(),
+        Progress(len(sequence.indices), s, quiet) as progress,
         Drawing(problem, overrides, out, exr_frames=exr_frames, about=about) as drawing,
     ):
-        progress.say(
-            f"template: {len(problem.template.vertices)} vertices, order {problem.template.fitted},"
-            f" residual {1e3 * problem.template.residual_rms:.3g} mm RMS; {count} frames of"
-            f" {experiment.size[0]}x{experiment.size[1]}, masks:"
-            f" {'yes' if experiment.masks else 'no'}"
-        )
-        try:
-            done = track(
-                problem,
-                solver,
-                count,
-                out,
-                resume=options.resume,
-                progress=progress,
-                solved=drawing.frame,
-            )
-        except KeyboardInterrupt:
-            path = os.path.join(out, "checkpoint.npz")
-            done, status = (Track.load(path) if os.path.exists(path) else Track()), 130
-            progress.say(
-                f"interrupted: {len(done.states)} of {count} frames are kept; --resume goes on"
-            )
+        progress.say(_beginning(problem))
+        done, interrupted = _track(problem, solver, out, resume, progress, drawing)
         if not done.states:
-            return status
+            return Outcome(out, interrupted=interrupted)
         summary, plotted = outputs.write(
-            problem, done, out, drawing, fps=options.fps, command=command, say=progress.stage
+            problem, done, out, drawing, fps=fps, command=command, say=progress.stage
         )
-        page = None if options.no_report else _report(out, progress)
+        page = _report(out, progress) if report else None
         plotted()
     for frame, reason in summary["lost"].items():
         print(f"frame {frame}: {reason}; it keeps the state of the frame before", file=sys.stderr)
-    seconds = time.perf_counter() - began
-    if options.json:
-        print(
-            json.dumps({"out": out, "seconds": seconds, "report": page, **summary}, default=float)
-        )
-    else:
-        _print_end(out, summary, page, seconds)
-    return status
+    return Outcome(out, summary, page, time.perf_counter() - began, interrupted)
 
 
-@contextlib.contextmanager
-def _half_the_threads():
-    """The second-order solver's kernels are short: with a thread a processor, threads mostly wait
-    for each other, and none is left to draw.
-    """
-    import drjit as dr
+def _beginning(problem):
+    experiment, template = problem.experiment, problem.template
+    return (
+        f"template: {len(template.vertices)} vertices\n"
+        f"its jet: order {template.fitted}, residual {1e3 * template.residual_rms:.3g} mm RMS\n"
+        f"video: {len(problem.sequence.indices)} frames of"
+        f" {experiment.size[0]}x{experiment.size[1]},"
+        f" {'with' if experiment.masks else 'without'} masks"
+    )
 
-    before = dr.thread_count()
-    dr.set_thread_count(max(1, (os.cpu_count() or 1) // 2))
+
+def _track(problem, solver, out, resume, progress, drawing):
+    """The :class:`polysft_mi.tracker.Track`, and whether Ctrl-C ended it early."""
+    from .tracker import Track, track
+
+    count = len(problem.sequence.indices)
     try:
-        yield
-    finally:
-        dr.set_thread_count(before)
+        done = track(
+            problem, solver, count, out, resume=resume, progress=progress, solved=drawing.frame
+        )
+        return done, False
+    except KeyboardInterrupt:
+        path = os.path.join(out, "checkpoint.npz")
+        done = Track.load(path) if os.path.exists(path) else Track()
+        progress.say(
+            f"interrupted: {len(done.states)} of {count} frames are kept; --resume goes on"
+        )
+        return done, True
 
 
 def _report(out, progress):
     """The path of the report, or None after a warning: a finished run must not be lost to its
     page.
     """
-    from . import report
+    from .pictures.report.page import write_report
 
     progress.stage("report")
     try:
-        return report.write(out)
+        return write_report(out)
     except Exception as error:  # whatever it is, the results stand without the page
         print(f"no report: {type(error).__name__}: {error}", file=sys.stderr)
         return None
-
-
-def _check_same(out, text):
-    """Resuming with other settings would give a result that no scene describes."""
-    path = os.path.join(out, "scene.xml")
-    try:
-        with open(path, encoding="utf-8") as file:
-            same = file.read() == text
-    except OSError:
-        raise InputError(
-            f"{path}: missing; the run cannot be resumed, give --overwrite to start again"
-        ) from None
-    if not same:
-        raise InputError(
-            f"{out}: was run with another scene or other settings (see {path}); resume with those,"
-            " or give --overwrite"
-        )
-
-
-def _print_end(out, summary, page, seconds):
-    print(
-        f"{summary['frames']} of {summary['frames_wanted']} frames in {seconds:.0f} s,"
-        f" {summary['seconds_per_frame']:.2f} s a frame ({summary['iterations_per_window']:.0f}"
-        " iterations a window); inside the surface PSNR"
-        f" {summary.get('psnr_mask', float('nan')):.2f} dB, SSIM"
-        f" {summary.get('ssim_mask', float('nan')):.3f}"
-    )
-    look = f"{page or summary['video']} and {os.path.join(out, 'comparison.png')}"
-    print(
-        f"surfaces: {os.path.join(out, 'surface.npz')}, {os.path.join(out, 'meshes')}; look at"
-        f" {look}"
-    )
-
-
-class Progress:
-    """Where the run is: a bar on a terminal, a line now and then elsewhere, nothing where quiet."""
-
-    def __init__(self, frames, settings, quiet):
-        self.windows = frames - min(settings.width, frames) + 1
-        self.first = min(settings.width, frames) - 1  # newest frame of the first window
-        self.period, self.quiet, self.terminal = settings.period, quiet, sys.stderr.isatty()
-        self._frame, self._began, self._done, self._shown = None, time.perf_counter(), 0, 0.0
-
-    def __enter__(self):
-        if self.terminal and not self.quiet:
-            from rich.console import Console
-            from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
-            from rich.progress import Progress as Bar
-
-            self._bar = Bar(
-                TextColumn("{task.description}"),
-                BarColumn(),
-                TextColumn("{task.fields[state]}"),
-                TimeRemainingColumn(),
-                console=Console(stderr=True),
-            )
-            self._bar.start()
-            self._task = self._bar.add_task("tracking", total=self.windows, state="")
-        return self
-
-    def __exit__(self, *_):
-        if self.terminal and not self.quiet:
-            self._bar.stop()
-
-    def __call__(self, frame, iteration, total, terms):
-        if self.quiet:
-            return
-        now = time.perf_counter()
-        if self._frame is None:
-            self._start_window, self._began = frame - self.first, now
-        if frame != self._frame:
-            self._frame, self._done = frame, frame - self.first
-        elif now - self._shown < (0.2 if self.terminal else 10):
-            return
-        self._shown = now
-        state = f"frame {frame + 1}/{self.windows + self.first} it {iteration} loss {total:.4g}"
-        detail = " ".join(f"{name[:3]} {value:.2g}" for name, value in terms.items() if value)
-        if self.terminal:
-            self._bar.update(
-                self._task,
-                completed=self._done + iteration / self.period,
-                state=f"{state} ({detail})",
-            )
-        else:
-            solved = self._done - self._start_window
-            left = (
-                f", {(now - self._began) / solved * (self.windows - self._done):.0f} s left"
-                if solved
-                else ""
-            )
-            print(f"{state} ({detail}){left}", file=sys.stderr)
-
-    def say(self, text):
-        if self.quiet:
-            return
-        if self.terminal:
-            self._bar.console.print(text, highlight=False)
-        else:
-            print(text, file=sys.stderr)
-
-    def stage(self, name):
-        """What is being written after the tracking."""
-        if self.terminal and not self.quiet:
-            self._bar.update(self._task, completed=self.windows, state=f"writing {name}")
 
 
 if __name__ == "__main__":

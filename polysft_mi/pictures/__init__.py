@@ -1,0 +1,20 @@
+"""Pictures of a run: surfaces, images and figures in; PNG, EXR, video and one HTML page out.
+
+The album of a run is drawn while it tracks (:class:`Drawing`); its report, comparisons and the
+viewer read a finished run. matplotlib, plotly, polyscope and Mitsuba are loaded on use.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach(
+    __name__,
+    submod_attrs={
+        "comparison": ["write_comparison"],
+        "drawing": ["Drawing"],
+        "exr": ["read_exr", "write_exr"],
+        "report.page": ["write_report"],
+        "shading": ["View", "seen", "shade_surface"],
+        "video": ["read_video", "write_video"],
+        "viewer": ["show"],
+    },
+)

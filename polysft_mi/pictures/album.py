@@ -16,10 +16,10 @@ import numpy as np
 
 from polysft_mi.render.raster import RasterIntegrator
 from polysft_mi.results import metrics
-from polysft_mi.results.exr import write_exr
-from polysft_mi.results.run import PEAK
 
 from . import figures
+from .exr import write_exr
+from .panels import PEAK, spread
 from .video import write_video
 
 _WIDTH = 640  # pixels across of a picture in the video, at most
@@ -41,17 +41,6 @@ def srgb(linear):
     """Linear values (..., 3) as sRGB in [0, 1]."""
     x = np.clip(np.nan_to_num(linear), 0, 1)
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
-
-
-def chosen(count, limit):
-    """At most ``limit`` of ``count`` frames, spread evenly, first and last among them."""
-    if limit >= count:
-        return list(range(count))
-    return (
-        sorted(set(np.linspace(0, count - 1, limit).round().astype(int).tolist()))
-        if limit > 0
-        else []
-    )
 
 
 class Renderings:
@@ -189,7 +178,7 @@ class Album:
                 )
             )
         self.rows = []
-        for k in chosen(len(surfaces), _ROWS):
+        for k in spread(len(surfaces), _ROWS):
             target, render, heat, surface = self._panels(k)
             error = heat.sum(axis=2, dtype=np.float32) * (PEAK / 765)
             self.rows.append(

@@ -16,6 +16,8 @@ from functools import partial
 
 import numpy as np
 
+from .panels import spread
+
 _WORTH = 8  # frames from which on another process is worth its start
 _NICE = 5  # below the tracker in rank
 _album = None  # of the drawing process
@@ -86,9 +88,7 @@ class Drawing:
             self._submit()  # starts the process
 
     def _chosen(self, count):
-        from .album import chosen
-
-        return set(chosen(count, self.exr_frames))
+        return set(spread(count, self.exr_frames))
 
     def _submit(self, *calls):
         """Have the album's methods called: the future of the last one, None where the process is

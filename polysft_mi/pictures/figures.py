@@ -155,7 +155,7 @@ def frame_plot(path, per_frame, labels=None):
     """One small plot over the frames for each figure: ``per_frame`` is a dict of equally long
     lists, one of them ``frame``; ``labels`` names them.
     """
-    from polysft_mi.evaluate import LABELS
+    from polysft_mi.results.evaluation import LABELS
 
     labels = labels or LABELS
     names = [k for k in per_frame if k != "frame"]

@@ -5,6 +5,7 @@ is set.
 import contextlib
 import functools
 import gc
+import os
 
 import drjit as dr
 import numpy as np
@@ -73,3 +74,18 @@ def on_device(array, kind):
     out = room[skipped : skipped + array.size * scalar.itemsize].view(scalar)
     out.reshape(array.shape)[...] = array
     return kind(out)
+
+
+@contextlib.contextmanager
+def threads(share):
+    """Let Dr.Jit use this share of the processors meanwhile.
+
+    Short kernels, as those of the second-order solver, run as fast on half of them: with a thread a
+    processor, threads mostly wait for each other, and none is left to draw.
+    """
+    before = dr.thread_count()
+    dr.set_thread_count(max(1, int(share * (os.cpu_count() or 1))))
+    try:
+        yield
+    finally:
+        dr.set_thread_count(before)

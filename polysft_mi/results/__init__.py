@@ -1,0 +1,18 @@
+"""What a run leaves, and what it is worth: a track in; files in the run's folder, figures and
+exports out.
+
+It needs no Mitsuba but to write a run's folder (:mod:`outputs`). :mod:`polysft_mi.pictures` draws.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach(
+    __name__,
+    submod_attrs={
+        "comparison": ["Comparison", "compare"],
+        "evaluation": ["evaluate", "score"],
+        "formats": ["export"],
+        "run": ["Run"],
+        "truth": ["Truth", "load_npz", "read_surface"],
+    },
+)

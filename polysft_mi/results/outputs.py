@@ -7,8 +7,6 @@ import dataclasses
 import json
 import os
 import platform
-import shlex
-import sys
 import time
 import xml.etree.ElementTree as ET
 
@@ -163,7 +161,3 @@ def write_beginning(out, scene, camera, command, fps):
         "versions": versions(),
     }
     write_json(os.path.join(out, RUN), about)
-
-
-def command_line():
-    return f"python -m polysft_mi.run {shlex.join(sys.argv[1:])}"

@@ -11,14 +11,10 @@ import numpy as np
 
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError
-from polysft_mi.evaluate import read_surface
-from polysft_mi.pictures.video import read_video
 from polysft_mi.scene.defaults import known_defaults, located
 from polysft_mi.surface.template import matrix
 
-from .metrics import load_npz
-
-PEAK = 0.25  # the error that is white in the pictures of a run
+from .truth import load_npz, read_surface
 
 
 @dataclass(frozen=True)
@@ -150,43 +146,6 @@ class Run:
                 2 * (1 + zu**2 + zv**2) ** 1.5
             )
         return np.sign(up[2]) * out / float(p["scale"])
-
-    def panels(self):
-        """For each frame in turn the pictures of the comparison video: target, rendering and error,
-        each (h, w, 3) uint8 RGB.
-
-        The error picture runs from black (0) through red and yellow to white (:data:`PEAK`); the
-        sum of its channels is proportional to the error.
-        """
-        count = 0
-        for picture in self._comparison():
-            width = picture.shape[1] // 4
-            yield tuple(picture[:, k * width : (k + 1) * width] for k in range(3))
-            count += 1
-        if count != len(self.frames):
-            raise InputError(
-                f"{self.path('comparison.mp4')}: shows {count} frames; the run has"
-                f" {len(self.frames)}"
-            )
-
-    def _comparison(self):
-        path = self.path("comparison.mp4")
-        if os.path.isfile(path):
-            yield from read_video(path)
-            return
-        names = [self.path("comparison", f"{k:03d}.png") for k in range(len(self.frames))]
-        if not os.path.isfile(names[0]):
-            raise InputError(
-                f"{path}: no such file, nor numbered PNGs in {self.path('comparison')}; the run's"
-                " pictures are needed"
-            )
-        import cv2
-
-        for name in names:
-            image = cv2.imread(name)
-            if image is None:
-                raise InputError(f"{name}: not a readable image")
-            yield image[..., ::-1]
 
 
 def read_json(path):

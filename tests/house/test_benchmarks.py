@@ -10,7 +10,7 @@ import pytest
 from places import ROOT
 from scripts import load
 
-from polysft_mi.results import metrics
+from polysft_mi.results.truth import load_npz
 from polysft_mi.scene import plugins
 
 SIZE, POINTS = (64, 48), 9
@@ -110,7 +110,7 @@ def test_stability_writes_figures_and_picture(tmp_path, capsys):
     report = json.loads((tmp_path / "stability.json").read_text())
     assert report["frame"] == 3 and list(report["counts"]) == ["2", "6"]
     assert report["counts"]["6"]["change_rms_mm"] == 0 < report["counts"]["2"]["change_rms_mm"]
-    truth = metrics.load_npz(ROOT / "scenes" / "demo" / "gt.npz")["vertices"][3]
+    truth = load_npz(ROOT / "scenes" / "demo" / "gt.npz")["vertices"][3]
     assert report["counts"]["2"]["rmse_mm"] == pytest.approx(
         1e3 * np.linalg.norm(truth) / np.sqrt(len(truth)) * report["counts"]["2"]["e3d"], rel=1e-5
     )

@@ -113,11 +113,11 @@ def test_order_of_the_coefficients():
 
 
 def test_files_of_a_run_are_described():
-    from polysft_mi import run
+    from polysft_mi.results import folder
 
     text = (ROOT / "docs" / "conventions.md").read_text(encoding="utf-8")
-    assert [n for n in (*run._OURS, *run._PICTURES) if f"`{n}`" not in text] == []
-    assert [n for n in run._FOLDERS if f"`{n}/NNN" not in text] == []
+    assert [n for n in folder.FILES if f"`{n}`" not in text] == []
+    assert [n for n in folder.FOLDERS if f"`{n}/NNN" not in text] == []
 
 
 def test_options_of_the_command_are_described():

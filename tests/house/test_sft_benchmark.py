@@ -13,9 +13,9 @@ import synthetic
 from scipy.spatial.transform import Rotation
 from scripts import load
 
-from polysft_mi import evaluate, prepare
+from polysft_mi import prepare
 from polysft_mi.errors import InputError
-from polysft_mi.results import metrics
+from polysft_mi.results import evaluation, metrics, truth
 
 sft, per_vertex = load("benchmarks/sft.py"), load("benchmarks/per_vertex.py")
 SETUP = {"frames": None, "threads": None, "define": [], "mode": None, "iterations": None}
@@ -79,7 +79,7 @@ def test_baseline_descends_towards_the_truth(sheet, large_steps, tmp_path):
     assert not per_vertex.main(arguments)
     first, second = json.loads((out / "metrics.json").read_text())["per_frame"]
     assert second["loss"] < 0.5 * second["first_loss"] and second["iterations"] == 60
-    surface = evaluate.read_surface(str(out))
+    surface = truth.read_surface(str(out))
     assert surface["vertices"].shape == sheet.vertices.shape and surface["uv"].shape == (
         len(sheet.uv),
         2,
@@ -309,7 +309,7 @@ def test_one_command_is_run_timed_and_scored(sheet, tmp_path, monkeypatch):
     assert r["seconds_a_frame"] == r["seconds"] / 2 > 0
     assert (
         r["figures"]["e3d_proc"]
-        == evaluate.evaluate(str(tmp_path / "runs" / "flag-adam"), str(sheet.folder))["e3d_proc"]
+        == evaluation.evaluate(str(tmp_path / "runs" / "flag-adam"), str(sheet.folder))["e3d_proc"]
     )
     assert r["versions"]["variant"] == "llvm_ad_rgb" and "core" in r["machine"]
     broken = sft.run(

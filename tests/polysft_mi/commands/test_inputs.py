@@ -20,7 +20,7 @@ import trimesh
 from places import ROOT
 
 from polysft_mi import errors, prepare, run
-from polysft_mi.results import exr
+from polysft_mi.pictures import exr
 from polysft_mi.surface import meshio
 
 SIZE = (48, 36)

@@ -16,8 +16,10 @@ import synthetic
 import trimesh
 from places import ROOT
 
-from polysft_mi import evaluate, prepare, run, tracker
-from polysft_mi.results import exr, metrics
+from polysft_mi import prepare, run, tracker
+from polysft_mi.pictures import exr
+from polysft_mi.results import metrics
+from polysft_mi.results.evaluation import evaluate, score
 from polysft_mi.scene import experiment as scene
 
 QUICK = ["-D", "solver=adam", "-D", "period=30", "-D", "patience=30"]
@@ -48,13 +50,13 @@ def surface(out):
 
 
 def test_reconstruction_is_right(sequence, result):
-    figures = evaluate.evaluate(str(result), str(sequence.folder))
+    figures = evaluate(str(result), str(sequence.folder))
     still = {
         "vertices": np.repeat(sequence.vertices[:1], 6, 0),
         "faces": sequence.faces,
         "frames": np.arange(6),
     }
-    start = metrics.score(still, str(sequence.folder / "gt.npz"))
+    start = score(still, str(sequence.folder / "gt.npz"))
     assert figures["frames"] == 6
     assert figures["e3d_proc"] < 0.5 * start["e3d_proc"]
     assert figures["rmse_mm"] < 3.0 and figures["en_deg"] < 0.7 * start["en_deg"]
@@ -309,7 +311,7 @@ def test_no_masks(tmp_path):
         run.main([str(truth.folder / "scene.xml"), "-o", str(out), "-q", "-D", "brightness=none"])
         == 0
     )
-    figures = metrics.score(surface(out), str(truth.folder / "gt.npz"))
+    figures = score(surface(out), str(truth.folder / "gt.npz"))
     assert figures["rmse_mm"] < 4
 
 

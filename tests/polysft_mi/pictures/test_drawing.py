@@ -17,10 +17,10 @@ from places import ROOT
 
 from polysft_mi import prepare
 from polysft_mi.objective.problem import Problem
-from polysft_mi.pictures import drawing, video
-from polysft_mi.pictures.album import Album, chosen
+from polysft_mi.pictures import drawing, exr, video
+from polysft_mi.pictures.album import Album
 from polysft_mi.pictures.drawing import Drawing
-from polysft_mi.results import exr
+from polysft_mi.pictures.panels import spread
 from polysft_mi.scene import experiment as scene
 from polysft_mi.scene.sequence import Sequence
 
@@ -202,7 +202,7 @@ def test_a_surface_that_leaves_the_view_of_the_first_is_shown_whole(sheet, tmp_p
         album.draw(k, problem.camera.origin + v @ problem.camera.axes)
     assert len(album.finish(surfaces)) == 9
     assert album._view.holds(surfaces) and [row["label"] for row in album.rows] == [
-        f"frame {k}" for k in chosen(9, 5)
+        f"frame {k}" for k in spread(9, 5)
     ]
     for row in album.rows:
         background = row["surface"][0, 0]

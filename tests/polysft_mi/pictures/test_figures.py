@@ -171,7 +171,7 @@ def test_a_picture_that_fails_is_a_warning(tmp_path, monkeypatch):
 
 def test_importing_loads_no_heavy_module():
     script = (
-        "import sys, polysft_mi.pictures.figures, polysft_mi.results.metrics, polysft_mi.evaluate, polysft_mi.results.exr,"
+        "import sys, polysft_mi.pictures.figures, polysft_mi.results.metrics, polysft_mi.evaluate, polysft_mi.pictures.exr,"
         " polysft_mi.pictures.video, polysft_mi.surface.meshio\nprint([m for m in ('matplotlib', 'OpenEXR',"
         " 'trimesh', 'skimage', 'scipy', 'rich', 'mitsuba', 'torch', 'cv2') if m in sys.modules])"
     )

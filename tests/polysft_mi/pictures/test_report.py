@@ -19,7 +19,10 @@ from polysft_mi import report
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError
 from polysft_mi.pictures import video
-from polysft_mi.results.run import PEAK, Run
+from polysft_mi.pictures.panels import PEAK, spread
+from polysft_mi.pictures.report.images import _error_at_vertices
+from polysft_mi.pictures.report.page import write_report
+from polysft_mi.results.run import Run
 
 BROWSER = next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))),
@@ -188,7 +191,7 @@ def test_error_where_each_vertex_is_seen():
     heat = np.zeros((80, 80, 3), np.uint8)  # the picture has twice the size of the film
     heat[:, 40:, 0] = 255  # a third of the way from black to white, right of the middle
     vertices = np.array([[-0.1, 0, 1], [0.1, 0, 1], [0.5, 0, 1], [0.1, 0, -1]])
-    error = report._error_at_vertices(camera, vertices, heat)
+    error = _error_at_vertices(camera, vertices, heat)
     np.testing.assert_allclose(error, [0, PEAK / 3, np.nan, np.nan], atol=1e-6)
 
 
@@ -197,7 +200,7 @@ def test_fewer_frames_and_odd_names(finished_run, tmp_path):
     shutil.copytree(finished_run[1], out)
     about = json.loads((out / "run.json").read_text())
     (out / "run.json").write_text(json.dumps({**about, "command": "</script><!-- x"}))
-    report.write(out, frames=2)
+    write_report(out, frames=2)
     data = data_of(out / "report.html")
     assert (
         data["shown"] == [0, 3]
@@ -206,11 +209,7 @@ def test_fewer_frames_and_odd_names(finished_run, tmp_path):
     )
     assert data["command"] == "</script><!-- x" and data["title"] == out.name
     assert "<title>a &lt;b> &amp; 'ü'</title>" in (out / "report.html").read_text(encoding="utf-8")
-    assert (
-        report.spread(5, 3) == [0, 2, 4]
-        and report.spread(2, 9) == [0, 1]
-        and report.spread(9, 1) == [0]
-    )
+    assert spread(5, 3) == [0, 2, 4] and spread(2, 9) == [0, 1] and spread(9, 1) == [0]
 
 
 def test_pngs_stand_in_for_the_video(finished_run, tmp_path):
@@ -220,14 +219,14 @@ def test_pngs_stand_in_for_the_video(finished_run, tmp_path):
     for k, frame in enumerate(video.read_video(out / "comparison.mp4")):
         Image.fromarray(frame).save(out / "comparison" / f"{k:03d}.png")
     (out / "comparison.mp4").unlink()
-    report.write(out)
+    write_report(out)
     assert (
         data_of(out / "report.html")["images"] == data_of(finished_run[1] / "report.html")["images"]
     )
     metrics = json.loads((out / "metrics.json").read_text())
     lost = {"frames_wanted": 9, "lost": {"2": "left the image"}}
     (out / "metrics.json").write_text(json.dumps({**metrics, **lost}))
-    report.write(out)
+    write_report(out)
     assert (
         data_of(out / "report.html")["warning"]
         == "Interrupted: 4 of 9 frames. Frame 2: left the image."
@@ -240,15 +239,15 @@ def test_refusals_leave_nothing(finished_run, tmp_path):
     (out / "report.html").unlink()
     (out / "comparison.mp4").write_bytes(b"no video")
     with pytest.raises(InputError, match="comparison.mp4: not a readable video"):
-        report.write(out)
+        write_report(out)
     (out / "comparison.mp4").unlink()
     with pytest.raises(InputError, match="pictures are needed"):
-        report.write(out)
+        write_report(out)
     shutil.copy(finished_run[1] / "comparison.mp4", out)
     with pytest.raises(InputError, match="holds no ground truth"):
-        report.write(out, truth=tmp_path)
+        write_report(out, truth=tmp_path)
     with pytest.raises(InputError, match="not a file in a folder"):
-        report.write(out, tmp_path / "nowhere" / "a.html")
+        write_report(out, tmp_path / "nowhere" / "a.html")
     with pytest.raises(InputError, match="--frames 0"):
         report.main([str(out), "--frames", "0"])
     assert (

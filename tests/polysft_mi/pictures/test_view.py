@@ -15,14 +15,14 @@ from polysft_mi.errors import InputError
 SCRIPT = """
 import sys
 import polyscope
-from polysft_mi import view
 from polysft_mi.errors import cli
+from polysft_mi.pictures import viewer
 from polysft_mi.results import Run
 
 def main():
-    viewer = view.Viewer(Run.open(sys.argv[1]), view._polyscope(True))
+    window = viewer.Viewer(Run.open(sys.argv[1]), viewer._polyscope(True))
     for k in (0, 3):
-        viewer.show(k)
+        window.show(k)
         polyscope.screenshot(f"{sys.argv[2]}/{k}.png", transparent_bg=False)
 
 cli(main)

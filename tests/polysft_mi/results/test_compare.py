@@ -9,12 +9,15 @@ import OpenEXR
 import pytest
 from test_metrics import slow_ray_depth
 
-from polysft_mi import compare, evaluate
+from polysft_mi import compare
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError
+from polysft_mi.pictures import comparison as drawn
 from polysft_mi.pictures import figures
+from polysft_mi.pictures.exr import read_exr
 from polysft_mi.pictures.shading import seen
-from polysft_mi.results.exr import read_exr
+from polysft_mi.results import comparison
+from polysft_mi.results.evaluation import evaluate
 from polysft_mi.results.run import Run
 
 
@@ -67,8 +70,8 @@ def test_what_the_camera_sees_agrees_with_rays(finished_run):
 def test_a_run_against_the_truth_has_the_figures_of_evaluate(finished_run):
     truth, out = finished_run
     ours, theirs = (
-        compare.compare(str(out), str(truth.folder))[0],
-        evaluate.evaluate(str(out), str(truth.folder)),
+        comparison.compare(str(out), str(truth.folder)).figures,
+        evaluate(str(out), str(truth.folder)),
     )
     for name in ("rmse_mm", "rmse_mm_worst", "e3d", "e3d_proc", "en_deg"):
         assert ours["difference"][name] == pytest.approx(theirs[name])
@@ -168,30 +171,32 @@ def test_surfaces_of_other_vertices_are_compared_in_depth(finished_run, moved):
     run = Run.open(b)
     half = run.faces[: len(run.faces) // 2]
     change(faces=half)
-    ours, other = compare.compare(str(out), str(b))
+    made = comparison.compare(str(out), str(b))
+    ours = made.figures
     assert set(ours["difference"]) == {"depth_difference_mm", "depth_difference_mm_worst", "shared"}
     assert ours["difference"]["depth_difference_mm"] == pytest.approx(
         2, rel=0.1
-    ) and "distance" not in other.maps(0, run.camera)
+    ) and "distance" not in drawn.difference_maps(made, 0)
 
 
 def test_against_points_and_clouds(finished_run, tmp_path):
     run = Run.open(finished_run[1])
     points = run.vertices[2:3, ::5] * np.float32(1.01)
     np.savez(tmp_path / "points.npz", points=points, frames=[2])
-    ours, other = compare.compare(run.folder, str(tmp_path / "points.npz"))
+    made = comparison.compare(run.folder, str(tmp_path / "points.npz"))
+    ours = made.figures
     assert ours["difference"]["depth_rmse_mm"] == pytest.approx(
         1e3 * np.sqrt(((0.01 * run.vertices[2, ::5, 2]) ** 2).mean()), rel=0.05
     )
-    map_ = other.maps(2, run.camera)["depth_difference"]
+    map_ = drawn.difference_maps(made, 2)["depth_difference"]
     assert 5 < np.isfinite(map_).sum() <= points.shape[1] and np.nanmedian(map_) == pytest.approx(
         -0.01 * np.median(run.vertices[2, :, 2]), rel=0.2
     )
-    dots = compare._dots(map_)
+    dots = drawn._dots(map_)
     assert np.isfinite(dots).sum() > 3 * np.isfinite(map_).sum() and set(
         dots[np.isfinite(dots)]
     ) <= set(map_[np.isfinite(map_)])
-    compare.write(ours, other, tmp_path / "p")
+    drawn.write_comparison(made, tmp_path / "p")
     assert sorted(p.name for p in (tmp_path / "p").iterdir()) == [
         "002.exr",
         "002.png",
@@ -202,8 +207,9 @@ def test_against_points_and_clouds(finished_run, tmp_path):
     np.savez(
         tmp_path / "clouds" / "cloud_1.npz", points=run.vertices[1] + np.float32([0, 0, 0.003])
     )
-    ours, other = compare.compare(run.folder, str(tmp_path / "clouds"))
-    distance = other.maps(1, run.camera)["distance"]
+    made = comparison.compare(run.folder, str(tmp_path / "clouds"))
+    ours = made.figures
+    distance = drawn.difference_maps(made, 1)["distance"]
     assert np.nanmax(distance) <= 0.003 + 1e-6 and ours["difference"]["chamfer_1e4"] > 0
 
 

@@ -14,6 +14,8 @@ from places import ROOT
 
 from polysft_mi import evaluate
 from polysft_mi.errors import InputError
+from polysft_mi.results import evaluation
+from polysft_mi.results.truth import find_truth, read_surface
 
 SHARED = os.path.join(os.path.dirname(ROOT), "shared")
 SCORER = os.path.join(SHARED, "tools", "score_sft.py")
@@ -87,7 +89,9 @@ def test_agrees_with_the_scorer_on_depth_points(tmp_path):
     surface = {"vertices": V, "faces": sheets[0][1], "frames": gt["frames"][:5]}
     ours = agree(surface, os.path.join(folder, "gt_points.npz"), tmp_path)
     assert ours["frames"] == 5 and 0.3 < ours["hit"] < 0.95 and "depth_rmse_allpix_mm" in ours
-    assert evaluate.evaluate(tmp_path, folder) == ours  # the sequence's folder names the same truth
+    assert (
+        evaluation.evaluate(tmp_path, folder) == ours
+    )  # the sequence's folder names the same truth
 
 
 @needs_scorer
@@ -143,7 +147,7 @@ def test_table_and_json_with_image_figures(run_folder):
         and "psnr_frames" not in figures
     )
     assert figures["frames"] == 2 and figures["rmse_mm"] == pytest.approx(10, rel=1e-4)
-    without = evaluate.evaluate(run_folder / "out" / "surface.npz", run_folder / "seq")
+    without = evaluation.evaluate(run_folder / "out" / "surface.npz", run_folder / "seq")
     assert "psnr" not in without
 
 
@@ -157,15 +161,15 @@ def test_a_terminal_gets_a_drawn_table(run_folder, monkeypatch, capsys):
 def test_finds_the_truth_of_a_folder(tmp_path):
     (tmp_path / "clouds").mkdir()
     (tmp_path / "clouds" / "cloud_004.npz").write_bytes(b"")
-    assert evaluate.find_truth(str(tmp_path)) == str(tmp_path / "clouds")
-    assert evaluate.find_truth(str(tmp_path / "clouds")) == str(tmp_path / "clouds")
+    assert find_truth(str(tmp_path)) == str(tmp_path / "clouds")
+    assert find_truth(str(tmp_path / "clouds")) == str(tmp_path / "clouds")
     (tmp_path / "gt_points.npz").write_bytes(b"")
-    assert evaluate.find_truth(str(tmp_path)) == str(tmp_path / "gt_points.npz")
+    assert find_truth(str(tmp_path)) == str(tmp_path / "gt_points.npz")
     (tmp_path / "gt.npz").write_bytes(b"")
-    assert evaluate.find_truth(str(tmp_path)) == str(tmp_path / "gt.npz")
+    assert find_truth(str(tmp_path)) == str(tmp_path / "gt.npz")
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="no ground truth"):
-        evaluate.find_truth(str(tmp_path / "empty"))
+        find_truth(str(tmp_path / "empty"))
 
 
 GOOD = dict(vertices=np.ones((2, 3, 3)), faces=np.array([[0, 1, 2]]), frames=np.arange(2))
@@ -187,7 +191,7 @@ def test_refuses_a_surface_of_another_form(tmp_path, change, words):
     arrays = {k: v for k, v in {**GOOD, **change}.items() if v is not None}
     np.savez(tmp_path / "surface.npz", **arrays)
     with pytest.raises(InputError, match=words):
-        evaluate.read_surface(str(tmp_path))
+        read_surface(str(tmp_path))
 
 
 def test_bad_input_is_one_line_and_status_2(run_folder):

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from polysft_mi.errors import InputError
-from polysft_mi.results import metrics
+from polysft_mi.results import evaluation, metrics
+from polysft_mi.results.truth import Truth
 
 
 def grid(n=9, m=7, size=0.3, depth=0.6):
@@ -219,12 +220,12 @@ def test_score_refuses_what_cannot_be_compared(tmp_path):
         "other.npz": "vertices and faces, or points and frames",
         "noise.npz": "not a readable",
         "missing.npz": "no such file",
-        "folder": "no frame in common",
+        "folder": "holds no ground truth",
     }.items():
         with pytest.raises(InputError, match=words):
-            metrics.score(surface, str(tmp_path / name))
+            evaluation.score(surface, str(tmp_path / name))
     with pytest.raises(InputError, match="not finite"):
-        metrics.score(
+        evaluation.score(
             {**surface, "vertices": surface["vertices"] * np.nan}, str(tmp_path / "short.npz")
         )
 
@@ -236,17 +237,23 @@ def test_confidence_says_how_far_sigma_is_off():
     ray = truth / np.linalg.norm(truth, axis=2, keepdims=True)
     found = truth + (3 * sigma * rng.normal(size=(4, 500)))[..., None] * ray
     surface = {"vertices": found, "frames": np.arange(4), "sigma": sigma}
-    figures = metrics.confidence(surface, {"vertices": truth})
+    figures = evaluation.confidence(surface, Truth("", "mesh", dict(enumerate(truth))))
     assert (
         abs(figures["sigma_factor"] - 3) < 0.2
         and abs(figures["sigma_two"] - 0.954) < 0.02
         and figures["sigma_rank"] > 0.7
     )
     assert (
-        metrics.confidence({**surface, "sigma": np.full((4, 500), np.nan)}, {"vertices": truth})
+        evaluation.confidence(
+            {**surface, "sigma": np.full((4, 500), np.nan)},
+            Truth("", "mesh", dict(enumerate(truth))),
+        )
         == {}
     )
     assert (
-        metrics.confidence({k: v for k, v in surface.items() if k != "sigma"}, {"vertices": truth})
+        evaluation.confidence(
+            {k: v for k, v in surface.items() if k != "sigma"},
+            Truth("", "mesh", dict(enumerate(truth))),
+        )
         == {}
     )

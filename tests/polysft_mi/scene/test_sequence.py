@@ -8,7 +8,7 @@ import pytest
 import synthetic
 
 from polysft_mi.errors import InputError
-from polysft_mi.results.exr import write_exr
+from polysft_mi.pictures.exr import write_exr
 from polysft_mi.scene.sequence import Sequence, drop_stray_components, image_size, list_images
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from polysft_mi.results.exr import read_exr, write_exr
+from polysft_mi.pictures.exr import read_exr, write_exr
 
 
 @pytest.fixture

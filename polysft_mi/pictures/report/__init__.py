@@ -1,0 +1,11 @@
+"""The report: a run's folder in, one HTML page out.
+
+:mod:`page` puts it together; :mod:`content` has its figures and texts, :mod:`images` its pictures,
+:mod:`surface` what it draws in 3D.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach(
+    __name__, submod_attrs={"page": ["write_report"]}
+)

@@ -1,0 +1,84 @@
+"""The pictures of a report, small enough to be mailed."""
+
+import base64
+import io
+from collections import deque
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+
+from ..panels import PEAK, panels
+
+# pictures are as large as the budget allows: width [pixels] and quality, the first that fits
+_SIZES = ((640, 80), (640, 70), (480, 75), (480, 60), (360, 60), (240, 50))
+
+
+def images(run, shown, budget=9_000_000, threads=2):
+    """The pictures of the frames ``shown`` (S,) of a run, base64 by name, and the error (S, N) at
+    each vertex, or None where the camera is not known.
+
+    ``budget``: bytes of all pictures together, before base64.
+    """
+    wanted, each = set(shown), budget / len(shown)
+    size = None
+    encoded, errors = [], []
+    with ThreadPoolExecutor(threads) as pool:
+        waiting = deque()
+        for k, pictures in enumerate(panels(run)):
+            if k not in wanted:
+                continue
+            if size is None or len(encoded) == 1:  # the first frames tell how large they may be
+                size = next(
+                    (
+                        s
+                        for s in _SIZES[_SIZES.index(size) if size else 0 :]
+                        if sum(map(len, _encoded(pictures, *s))) <= each
+                    ),
+                    _SIZES[-1],
+                )
+            if run.camera is not None:
+                errors.append(_error_at_vertices(run.camera, run.vertices[k], pictures[2]))
+            waiting.append(pool.submit(_encoded, pictures, *size))
+            if len(waiting) > 2 * threads:
+                encoded.append(waiting.popleft().result())
+        encoded += [w.result() for w in waiting]
+    named = {
+        name: [base64.b64encode(i[c]).decode("ascii") for i in encoded]
+        for c, name in enumerate(("target", "render", "error"))
+    }
+    return {"kind": "webp", **named}, np.stack(errors) if errors else None
+
+
+def _encoded(panels, width, quality):
+    """Pictures (h, w, 3) uint8 as WebP, at most ``width`` pixels wide: a list of bytes."""
+    import cv2
+    from PIL import Image
+
+    out = []
+    for panel in panels:
+        if width < panel.shape[1]:
+            size = width, max(1, round(panel.shape[0] * width / panel.shape[1]))
+            panel = cv2.resize(panel, size, interpolation=cv2.INTER_AREA)
+        data = io.BytesIO()
+        # method 2: half the time of the default for 3 % more bytes
+        Image.fromarray(np.ascontiguousarray(panel)).save(data, "WEBP", quality=quality, method=2)
+        out.append(data.getvalue())
+    return out
+
+
+def _error_at_vertices(camera, vertices, panel):
+    """The error (N,) where each vertex is seen, read off the picture of the error (a mean over 3x3
+    of its pixels); NaN outside the image.
+    """
+    import cv2
+
+    red, green, blue = (
+        panel[..., c].astype(np.float32) for c in range(3)
+    )  # a fifth of the time of a sum over the axis
+    error = cv2.blur((red + green + blue) * (PEAK / 765), (3, 3))
+    before = vertices[:, 2] > 0
+    x, y = (camera.project(vertices) * (panel.shape[1] / camera.width)).T
+    inside = before & (x >= 0) & (y >= 0) & (x < error.shape[1]) & (y < error.shape[0])
+    out = np.full(len(vertices), np.nan, np.float32)
+    out[inside] = error[y[inside].astype(int), x[inside].astype(int)]
+    return out

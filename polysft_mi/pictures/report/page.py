@@ -1,0 +1,84 @@
+"""One page, in one file, that shows a run in any browser and without a network."""
+
+import json
+import os
+from importlib import resources
+
+import numpy as np
+
+from polysft_mi.errors import InputError
+from polysft_mi.files import aside
+from polysft_mi.results.run import Run
+
+from ..panels import PEAK, spread
+from .content import LABELS, about, figures, loss, subtitle, warning
+from .images import images
+from .surface import mesh, scalars
+
+
+def write_report(out, path=None, *, truth=None, frames=200, positions=450_000):
+    """Write the report of the run in the folder ``out`` to ``path`` (default: ``report.html`` in
+    it); returns the path.
+
+    At most ``frames`` frames are shown, spread evenly, and fewer where they have more than
+    ``positions`` vertices together.
+
+    ``truth``: ground truth as :meth:`polysft_mi.results.truth.Truth.open` takes it. Raises
+    InputError.
+    """
+    run = Run.open(out)
+    path = run.path("report.html") if path is None else path
+    if os.path.isdir(path) or not os.path.isdir(os.path.dirname(os.path.abspath(path))):
+        raise InputError(f"{path}: is not a file in a folder that exists")
+    count, vertices = run.vertices.shape[:2]
+    shown = spread(count, min(frames, max(1, positions // vertices)))
+    columns, cards, distance = figures(run, truth)
+    pictures, errors = images(run, shown)
+    data = {
+        "title": os.path.basename(os.path.abspath(out)),
+        "subtitle": subtitle(run, shown),
+        "warning": warning(run),
+        "cards": cards,
+        "command": run.about.get("command", ""),
+        "settings": [[name, value or ""] for name, value in run.settings.items()],
+        "about": about(run),
+        "footer": (
+            f"polysft_mi {run.about.get('versions', {}).get('polysft_mi', '')}. Lengths in metres,"
+            " camera frame turned to z up."
+        ),
+        "shown": shown,
+        "fps": run.fps,
+        "peak": f"{PEAK:g} or more",
+        "columns": columns,
+        "labels": LABELS,
+        "images": pictures,
+        "mesh": mesh(run, shown),
+        "scalars": scalars(run, shown, errors, distance),
+        "loss": loss(run.log()),
+    }
+    from plotly.offline import get_plotlyjs
+
+    page = resources.files("polysft_mi").joinpath("data/report.html").read_text(encoding="utf-8")
+    text = (
+        json.dumps(_finite(data), separators=(",", ":"), allow_nan=False)
+        .replace("</", "<\\/")
+        .replace("<!--", "<\\u0021--")
+    )
+    title = data["title"].replace("&", "&amp;").replace("<", "&lt;")
+    for name, value in (("title", title), ("plotly", get_plotlyjs()), ("data", text)):
+        before, mark, after = page.partition("{{" + name + "}}")
+        page = before + value + after
+    with aside(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
+        file.write(page)
+    return path
+
+
+def _finite(value):
+    """The same for JSON: numbers that are not finite become null."""
+    if isinstance(value, dict):
+        return {k: _finite(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(v) for v in value]
+    if isinstance(value, (float, np.floating)):
+        return float(value) if np.isfinite(value) else None
+    return value.item() if isinstance(value, np.generic) else value

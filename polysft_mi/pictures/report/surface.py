@@ -1,0 +1,122 @@
+"""The surface of a report, which the page draws in 3D: a mesh, and what colours it."""
+
+import base64
+import os
+
+import numpy as np
+
+
+def mesh(run, shown, triangles=24_000):
+    """The surface for the page: coarse positions, z up, as 16 bit numbers, and a finer mesh on it
+    whose vertices have the texture's colours.
+    """
+    from polyfit.animation import from_camera
+    from polyfit.mesh import refined
+
+    V = from_camera(run.vertices[shown], "z").astype(np.float64)
+    low, high = V.reshape(-1, 3).min(0), V.reshape(-1, 3).max(0)
+    positions = np.round((V - low) / np.maximum(high - low, 1e-12) * 65535).astype("<u2")
+    faces = run.faces.astype(np.int64)
+    parts = max(1, min(8, int(np.sqrt(triangles / len(faces)))))
+    fine, face, weights = refined(faces, parts)
+    corners = faces[face]
+    mesh = {
+        "vertices": run.vertices.shape[1], "low": low.tolist(), "high": np.maximum(high, low + 1e-9).tolist(),
+        "positions": _base64(positions), "corners": _base64(corners.astype("<u4")),
+        "weights": _base64(weights.astype("<f4")), "faces": _base64(fine.astype("<u4")),
+    }  # fmt: skip
+    colours = _texture_colours(
+        run.texture,
+        np.einsum("nk,nkc->nc", weights, run.uv[corners].astype(np.float64)),
+        run.uv,
+        fine,
+    )
+    return mesh if colours is None else {**mesh, "colours": _base64(colours)}
+
+
+def _texture_colours(path, uv, coarse_uv, fine):
+    """Colours (M, 3) uint8 of the texture at uv (M, 2), averaged over about a triangle's size; None
+    where there is no readable texture.
+    """
+    import cv2
+
+    image = cv2.imread(path) if path is not None and os.path.isfile(path) else None
+    if image is None:
+        return None
+    side = np.linalg.norm(uv[fine[:, 0]] - uv[fine[:, 1]], axis=1)
+    texels = float(np.median(side)) * max(image.shape[:2])  # from vertex to vertex
+    if texels > 1:
+        smaller = [max(1, round(s / texels)) for s in image.shape[1::-1]]
+        image = cv2.resize(image, smaller, interpolation=cv2.INTER_AREA)
+    height, width = image.shape[:2]
+    x, y = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
+    sampled = cv2.remap(
+        image,
+        x.astype(np.float32)[:, None],
+        y.astype(np.float32)[:, None],
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    return sampled.reshape(-1, 3)[:, ::-1]
+
+
+def scalars(run, shown, errors, distance):
+    """What the surface may be coloured by: for each its texts, its range and scale, and the values
+    (S, N) as bytes, 255 for what is not known.
+    """
+    out = []
+    if distance is not None:
+        out.append(
+            _scalar(
+                "distance to the truth",
+                "Distance of each vertex from the true one.",
+                "mm",
+                distance[shown],
+                "viridis",
+            )
+        )
+    if errors is not None:
+        meaning = (
+            "Root mean square over the channels of rendering minus image, in linear colour, where"
+            " each vertex is seen."
+        )
+        out.append(_scalar("error", meaning, "linear colour", errors, "inferno"))
+    curvature = run.mean_curvature()[shown]
+    meaning = (
+        "Mean curvature of the jet, without its relief: red where the surface bulges towards the"
+        " first frame's camera, blue where it is hollow."
+    )
+    out.append(_scalar("curvature", meaning, "1/m", curvature, "RdBu_r", signed=True))
+    if run.sigma is not None and np.isfinite(run.sigma[shown]).any():
+        meaning = (
+            "Standard deviation of each vertex along its ray, as the solver estimates it; grey"
+            " where it is not known."
+        )
+        out.append(_scalar("sigma", meaning, "mm", 1e3 * run.sigma[shown], "viridis"))
+    return out
+
+
+def _scalar(label, meaning, unit, values, colours, *, signed=False):
+    import matplotlib
+    from matplotlib.colors import to_hex
+
+    known = np.isfinite(values)
+    top = float(np.quantile(np.abs(values[known]), 0.99) if known.any() else 1) or 1.0
+    low = -top if signed else 0.0
+    raw = np.round(np.clip((np.where(known, values, 0) - low) / (top - low), 0, 1) * 254).astype(
+        np.uint8
+    )
+    scale = [to_hex(c) for c in matplotlib.colormaps[colours](np.linspace(0, 1, 17))]
+    return {
+        "label": label,
+        "meaning": meaning,
+        "unit": unit,
+        "low": low,
+        "high": top,
+        "scale": scale,
+        "values": _base64(np.where(known, raw, 255).astype(np.uint8)),
+    }
+
+
+def _base64(array):
+    return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode("ascii")

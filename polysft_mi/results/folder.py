@@ -1,0 +1,75 @@
+"""The folder that a run writes to: whether it may be used, and what of an earlier run goes."""
+
+import os
+import shutil
+
+from polysft_mi.errors import InputError
+
+FILES = (
+    "scene.xml",
+    "camera.json",
+    "run.json",
+    "checkpoint.npz",
+    "log.jsonl",
+    "surface.npz",
+    "params.npz",
+    "metrics.json",
+    "loss.png",
+    "comparison.png",
+    "comparison.mp4",
+    "report.html",
+)
+FOLDERS = ("meshes", "comparison")
+
+
+def check_output(out, *, resume=False, overwrite=False):
+    """Raise InputError where a run cannot write to the folder ``out``: before anything is
+    computed.
+    """
+    if os.path.exists(out) and not os.path.isdir(out):
+        raise InputError(f"{out}: is a file; OUT must be a folder")
+    existing = os.path.abspath(out)
+    while not os.path.lexists(existing):
+        existing = os.path.dirname(existing)
+    if not out or not os.path.isdir(existing) or not os.access(existing, os.W_OK | os.X_OK):
+        raise InputError(
+            f"-o '{out}': {existing} is not a folder that can be written to; OUT must be a folder"
+            " there, or a new one"
+        )
+    holds_run = os.path.exists(os.path.join(out, "run.json"))
+    if resume and not holds_run:
+        raise InputError(f"{out}: holds no run to resume; leave out --resume to start one")
+    if holds_run and not (overwrite or resume):
+        raise InputError(
+            f"{out}: holds another run; give --overwrite to replace it or --resume to go on with it"
+        )
+    if os.path.isdir(out) and os.listdir(out) and not holds_run:
+        raise InputError(f"{out}: is not empty and holds no run; give an empty or new folder")
+
+
+def clear(out):
+    """Remove what an earlier run left in the folder ``out``; nothing else."""
+    for name in FILES:
+        if os.path.exists(os.path.join(out, name)):
+            os.remove(os.path.join(out, name))
+    for name in (*FOLDERS, "comparison.mp4", "export"):
+        shutil.rmtree(os.path.join(out, name), ignore_errors=True)
+
+
+def check_same(out, scene):
+    """Raise InputError where the run in ``out`` had another resolved scene (text) than ``scene``:
+    resumed, it would give a result that no scene describes.
+    """
+    path = os.path.join(out, "scene.xml")
+    try:
+        with open(path, encoding="utf-8") as file:
+            same = file.read() == scene
+    except OSError:
+        raise InputError(
+            f"{path}: missing; the run cannot be resumed, give --overwrite to start again"
+        ) from None
+    if not same:
+        raise InputError(
+            f"{out}: was run with another scene or other settings (see {path}); resume with those,"
+            " or give --overwrite"
+        )

@@ -1,0 +1,80 @@
+"""Where a run is, told on the terminal."""
+
+import sys
+import time
+
+
+class Progress:
+    """The progress of a run: a bar on a terminal, a line every ten seconds elsewhere, nothing with
+    ``quiet``.
+
+    ``frames``: their number; ``settings``: :class:`polysft_mi.scene.settings.Settings`.
+    """
+
+    def __init__(self, frames, settings, quiet):
+        self.windows = frames - min(settings.width, frames) + 1
+        self.first = min(settings.width, frames) - 1  # newest frame of the first window
+        self.period, self.quiet, self.terminal = settings.period, quiet, sys.stderr.isatty()
+        self._frame, self._began, self._done, self._shown = None, time.perf_counter(), 0, 0.0
+
+    def __enter__(self):
+        if self.terminal and not self.quiet:
+            from rich.console import Console
+            from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
+            from rich.progress import Progress as Bar
+
+            self._bar = Bar(
+                TextColumn("{task.description}"),
+                BarColumn(),
+                TextColumn("{task.fields[state]}"),
+                TimeRemainingColumn(),
+                console=Console(stderr=True),
+            )
+            self._bar.start()
+            self._task = self._bar.add_task("tracking", total=self.windows, state="")
+        return self
+
+    def __exit__(self, *_):
+        if self.terminal and not self.quiet:
+            self._bar.stop()
+
+    def __call__(self, frame, iteration, total, terms):
+        if self.quiet:
+            return
+        now = time.perf_counter()
+        if self._frame is None:
+            self._start_window, self._began = frame - self.first, now
+        if frame != self._frame:
+            self._frame, self._done = frame, frame - self.first
+        elif now - self._shown < (0.2 if self.terminal else 10):
+            return
+        self._shown = now
+        state = f"frame {frame + 1}/{self.windows + self.first} it {iteration} loss {total:.4g}"
+        detail = " ".join(f"{name[:3]} {value:.2g}" for name, value in terms.items() if value)
+        if self.terminal:
+            self._bar.update(
+                self._task,
+                completed=self._done + iteration / self.period,
+                state=f"{state} ({detail})",
+            )
+        else:
+            solved = self._done - self._start_window
+            left = (
+                f", {(now - self._began) / solved * (self.windows - self._done):.0f} s left"
+                if solved
+                else ""
+            )
+            print(f"{state} ({detail}){left}", file=sys.stderr)
+
+    def say(self, text):
+        if self.quiet:
+            return
+        if self.terminal:
+            self._bar.console.print(text, highlight=False)
+        else:
+            print(text, file=sys.stderr)
+
+    def stage(self, name):
+        """What is being written after the tracking."""
+        if self.terminal and not self.quiet:
+            self._bar.update(self._task, completed=self.windows, state=f"writing {name}")

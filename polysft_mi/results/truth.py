@@ -1,0 +1,143 @@
+"""What a reconstruction is compared with: surfaces and ground truth, read and checked.
+
+Ground truth is ``gt.npz`` (vertices of every frame), an .npz of depth points, a folder of
+``cloud_*.npz``, or a sequence's folder that holds one of them.
+"""
+
+import glob
+import os
+import re
+from dataclasses import dataclass
+
+import numpy as np
+
+from polysft_mi.errors import InputError
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Ground truth of some frames, [m, camera frame].
+
+    ``kind``: "mesh" (vertices (N, 3) in each frame, with common ``faces`` (F, 3)), "points" (depth
+    points (P, 3), with ``K`` (3, 3) or None) or "clouds" (points (P, 3) without an order).
+    ``places``: what each frame holds; for clouds the path of its file. ``path``: where all of it
+    was read.
+    """
+
+    path: str
+    kind: str
+    places: dict
+    faces: np.ndarray = None
+    K: np.ndarray = None
+
+    @classmethod
+    def open(cls, path):
+        """The truth in ``path``, a file or a folder as :func:`find_truth` takes it. Raises
+        InputError.
+        """
+        path = find_truth(path)
+        if os.path.isdir(path):
+            clouds = {}
+            for name in sorted(os.listdir(path)):
+                if number := re.fullmatch(r"cloud_(\d+)\.npz", name):
+                    clouds[int(number[1])] = os.path.join(path, name)
+            return cls(path, "clouds", clouds)
+        arrays = load_npz(path)
+        if "points" in arrays and "frames" in arrays:
+            places = {int(k): points for k, points in zip(arrays["frames"], arrays["points"])}
+            return cls(path, "points", places, K=arrays.get("K"))
+        if "vertices" in arrays and "faces" in arrays:
+            places = dict(enumerate(arrays["vertices"]))
+            return cls(path, "mesh", places, arrays["faces"].astype(np.int64))
+        raise InputError(
+            f"{path}: holds {', '.join(arrays)}; vertices and faces, or points and frames, are"
+            " needed"
+        )
+
+    def at(self, frame):
+        """The vertices or points (N, 3) [m] of a frame, float64."""
+        place = self.places[frame]
+        if self.kind == "clouds":
+            arrays = load_npz(place)
+            if "points" not in arrays:
+                raise InputError(f"{place}: holds {', '.join(arrays)}; points are needed")
+            place = arrays["points"]
+        return place.astype(np.float64)
+
+
+def find_truth(path):
+    """The ground truth in ``path``: a file as it is, a folder of clouds as it is, else what a
+    sequence's folder holds.
+    """
+    if not os.path.isdir(path):
+        return path
+    if glob.glob(os.path.join(glob.escape(path), "cloud_*.npz")):
+        return path
+    for name in ("gt.npz", "gt_points.npz", "points.npz"):
+        if os.path.exists(os.path.join(path, name)):
+            return os.path.join(path, name)
+    clouds = os.path.join(path, "clouds")
+    if glob.glob(os.path.join(glob.escape(clouds), "cloud_*.npz")):
+        return clouds
+    raise InputError(
+        f"{path}: holds no ground truth; gt.npz, gt_points.npz or clouds/cloud_*.npz is needed"
+    )
+
+
+def read_surface(path):
+    """The arrays of a ``surface.npz``, or of a run's folder that holds one. Raises InputError where
+    it is not of that form.
+    """
+    if os.path.isdir(path):
+        if not os.path.exists(os.path.join(path, "surface.npz")):
+            raise InputError(
+                f"{path}: holds no surface.npz; the folder of a run, or a surface.npz, is needed"
+            )
+        path = os.path.join(path, "surface.npz")
+    surface = load_npz(path)
+    missing = [name for name in ("vertices", "faces", "frames") if name not in surface]
+    if missing:
+        raise InputError(
+            f"{path}: holds no {', '.join(missing)}; vertices (T,N,3), faces (F,3) and frames (T,)"
+            " are needed"
+        )
+    V, F, frames = (surface[name] for name in ("vertices", "faces", "frames"))
+    if (
+        V.ndim != 3
+        or V.shape[2] != 3
+        or F.ndim != 2
+        or F.shape[1] != 3
+        or frames.shape != V.shape[:1]
+        or not len(frames)
+    ):
+        raise InputError(
+            f"{path}: vertices {V.shape}, faces {F.shape}, frames {frames.shape}; (T,N,3), (F,3)"
+            " and (T,) with T > 0 are needed"
+        )
+    if V.dtype.kind not in "fiu" or F.dtype.kind not in "iu" or frames.dtype.kind not in "iu":
+        raise InputError(
+            f"{path}: types {V.dtype}, {F.dtype}, {frames.dtype} of vertices, faces, frames; a"
+            " float and two integers are needed"
+        )
+    if F.size and not 0 <= F.min() <= F.max() < V.shape[1]:
+        raise InputError(
+            f"{path}: faces name vertices {F.min()} to {F.max()}; 0 to {V.shape[1] - 1} exist"
+        )
+    if not np.isfinite(V).all():
+        raise InputError(f"{path}: vertices hold values that are not finite")
+    return surface
+
+
+def load_npz(path):
+    """The arrays of an .npz file, a dict. Raises InputError where it is missing or not such a
+    file.
+    """
+    try:
+        with np.load(path) as file:
+            return {name: file[name] for name in file.files}
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; an .npz file is needed") from None
+    except Exception as error:  # zipfile, zlib and numpy each have their own for a damaged file
+        raise InputError(
+            f"{path}: not a readable .npz file ({type(error).__name__}: {error})"
+        ) from None
