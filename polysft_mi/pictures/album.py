@@ -1,40 +1,48 @@
 """The pictures of a run: each frame's rendering beside its image, as layers, EXRs, a video and a
 sheet; and the curves of its losses.
 
-Import only after a Mitsuba variant is set. :mod:`polysft_mi.pictures.drawing` has this done by a process of
-its own.
+Import only after a Mitsuba variant is set. :mod:`polysft_mi.pictures.drawing` has this done by a
+process of its own.
 """
 
 import json
 import os
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
 import cv2
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from polysft_mi.images.pyramid import compared
 from polysft_mi.render.raster import RasterIntegrator
 from polysft_mi.results import metrics
 
 from . import figures
 from .exr import write_exr
-from .panels import PEAK, spread
+from .panels import COLUMNS, PEAKS, Box, heat, heat_values, spread
 from .video import write_video
 
-_WIDTH = 640  # pixels across of a picture in the video, at most
-_ROWS = 5  # of the contact sheet
-_MARGIN = 1.25  # of the view of the surface, for what may move
-_THREADS = 2  # that draw and write what has been rendered
-_WAITING = 4  # renderings that may wait for them
-_PNG = [
-    cv2.IMWRITE_PNG_COMPRESSION,
-    1,
-    cv2.IMWRITE_PNG_STRATEGY,
-    cv2.IMWRITE_PNG_STRATEGY_RLE,
-]  # of what lies aside until the end
-if hasattr(cv2, "IMWRITE_PNG_FILTER"):  # of newer OpenCVs: half the time, and as small
-    _PNG += [cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP]
+
+@dataclass(frozen=True)
+class AlbumSettings:
+    """How a run is drawn.
+
+    ``width``: pixels across of a picture in the video, at most. ``rows``: of the contact sheet, at
+    most. ``margin``: around the sheet in the pictures, over the longer side of its box.
+    ``room``: likewise, what is kept until it is known where the sheet goes. ``view``: how much
+    more the view from the side shows than the first surface. ``threads``: that draw and write;
+    ``waiting``: renderings that may wait for them.
+    """
+
+    width: int = 640
+    rows: int = 5
+    margin: float = 0.1
+    room: float = 1.0
+    view: float = 1.25
+    threads: int = 2
+    waiting: int = 4
 
 
 def srgb(linear):
@@ -92,23 +100,60 @@ class Renderings:
         return {"depth": geometry[..., 0], "normal": normal, "uv": uv}
 
 
+def residual(layers, masked, *, blur=1.0, window=8.0, side=225.0):
+    """The misfit (H, W) of a rendering without what lighting does: the root mean square over the
+    channels of rendering minus image, both freed from lighting by local normalisation as in the
+    objective, in local standard deviations. 0 beyond the sheet.
+
+    ``layers``: as :class:`Renderings` makes them; ``masked``: whether the frames have masks.
+    ``blur``, ``window``: standard deviations [pixels] of the blur before, and of the window of the
+    local statistics, on a sheet that is ``side`` pixels wide; on a larger one they grow with it.
+    """
+    inside = np.where(layers["mask_render"] > 0.999, np.float32(1), np.float32(0))
+    weights = (layers["mask_target"], layers["mask_render"]) if masked else (inside, inside)
+    out = np.zeros_like(inside)
+    area = float(weights[1].sum())
+    if area == 0:
+        return out
+    unit = max(1.0, area**0.5 / side)
+    rows, columns = (np.flatnonzero((weights[0] + weights[1]).any(axis=k)) for k in (1, 0))
+    room = int(4 * window * unit)
+    near = (
+        slice(max(0, rows[0] - room), rows[-1] + room + 1),
+        slice(max(0, columns[0] - room), columns[-1] + room + 1),
+    )
+    target, render = (
+        compared(layers[name][near], w[near], blur * unit, window * unit, True) * w[near][..., None]
+        for name, w in zip(("target", "render"), weights, strict=True)
+    )
+    out[near] = np.sqrt(((render - target) ** 2).mean(axis=-1))
+    return out
+
+
 class Album:
     """The pictures of a run in the making: frames are drawn one by one, in any order and as often
     as need be, and bound into a video at the end.
 
     ``out``: folder of the run; ``about``: what the EXRs' headers say of it; ``folder``: where the
-    frames' pictures lie until the end. ``rows``: of the contact sheet
-    (:func:`polysft_mi.pictures.figures.contact_sheet`), once :meth:`finish` has chosen them.
+    frames' pictures lie until the end; ``settings``: :class:`AlbumSettings`. Once :meth:`finish`
+    has chosen them, ``rows`` are those of the contact sheet
+    (:func:`polysft_mi.pictures.figures.contact_sheet`), and ``box`` is the part of the video that
+    the pictures show, a :class:`~polysft_mi.pictures.panels.Box`.
     """
 
-    def __init__(self, problem, out, about, folder):
+    def __init__(self, problem, out, about, folder, settings=None):
         self.problem, self.out, self.about, self.folder = problem, out, about, folder
+        self.settings = settings or AlbumSettings()
         self._renderings, self._texcoords, self._view = Renderings(problem), None, None
         self._masked = problem.sequence.mask(0) is not None
-        self._pool = ThreadPoolExecutor(_THREADS)
+        self._pool = ThreadPoolExecutor(self.settings.threads)
         self._drawn = {}  # frame: future of its figures
+        self._boxes = {}  # frame: where its surface is
+        self._window = None  # what pictures show until they are cropped
+        self._windows = {}  # the same of each frame
+        self._scale = None  # of the pictures
         self._plots = None  # future of the sheet and the curves
-        self.rows = []
+        self.rows, self.box = [], None
 
     def draw(self, frame, vertices, texcoords=None, exr=False):
         """Draw a frame whose surface has ``vertices`` (N, 3) [m, world], and ``texcoords`` (2V,)
@@ -119,85 +164,134 @@ class Album:
             self.problem.set_texcoords(mi.Float(texcoords))
         surface = self.problem.camera.to_camera(vertices)
         if self._view is None:
-            self._view = figures.View.around(surface).wider(_MARGIN)
+            self._view = figures.View.around(surface).wider(self.settings.view)
         layers = self._renderings(vertices, frame, geometry=exr)
         waiting = [f for f in self._drawn.values() if not f.done()]
-        if len(waiting) >= _WAITING:
+        if len(waiting) >= self.settings.waiting:
             waiting[0].result()
         if frame in self._drawn:
             self._drawn[frame].result()
+        self._place_of(frame, vertices)
         self._drawn[frame] = self._pool.submit(self._draw, frame, surface, layers, exr)
+
+    def _place_of(self, frame, vertices):
+        """Set what the pictures of a frame show. Where the sheet will go is not known yet: room
+        around it is kept, and more from the frame on in which it leaves that.
+        """
+        position, before = self.problem.camera.project(vertices)
+        size = self.problem.width, self.problem.height
+        visible = position[before] if before.any() else np.zeros((1, 2))
+        box = Box.around(visible, self.settings.margin, size)
+        roomy = Box.around(visible, self.settings.margin + self.settings.room, size)
+        if self._window is None or not self._window.holds(box):
+            self._window = roomy if self._window is None else self._window.union(roomy)
+        self._boxes[frame], self._windows[frame] = box, self._window
+        if self._scale is None:
+            self._scale = min(1.0, self.settings.width / box.size[0])
 
     def _draw(self, frame, surface, layers, exr):
         index = self.problem.sequence.indices[frame]
+        layers["residual"] = residual(layers, self._masked)
         if exr:
             os.makedirs(os.path.join(self.out, "comparison"), exist_ok=True)
-            write_exr(
-                os.path.join(self.out, "comparison", f"{index:03d}.exr"),
-                layers,
-                {"frame": int(index), **self.about},
-            )
-        target, render, error = (_panel(layers[n]) for n in ("target", "render", "error"))
-        target, render = (np.round(255 * srgb(x)).astype(np.uint8) for x in (target, render))
-        self._write(frame, "images", np.concatenate([target, render, _heat(error)], axis=1))
-        self._write(frame, "surface", self._shaded(surface, target.shape))
+            path = os.path.join(self.out, "comparison", f"{index:03d}.exr")
+            write_exr(path, layers, {"frame": int(index), **self.about})
+        window = self._windows[frame]
+        parts = {n: _resized(layers[n][window.slices], self._scale) for n in COLUMNS[:-1]}
+        for name in ("target", "render"):
+            parts[name] = np.round(255 * srgb(parts[name])).astype(np.uint8)
+        for name, peak in PEAKS.items():
+            parts[name] = heat(parts[name], peak)
+        self._write(frame, "images", np.concatenate([parts[n] for n in COLUMNS[:-1]], axis=1))
+        self._write(frame, "surface", self._shaded(surface))
         return {"frame": int(index), **_figures(layers, self._masked)}
 
-    def _shaded(self, surface, shape):
-        template = self.problem.template
+    def _shaded(self, surface):
+        """The surface from the side, a square picture as large as the shorter side of the first
+        frame's others.
+        """
+        template, first = self.problem.template, next(iter(self._boxes.values()))
+        side = max(16, round(min(first.size) * self._scale))
         return figures.shade_surface(
-            surface, template.faces, self._view, uv=template.uv, size=(shape[1], shape[0])
+            surface, template.faces, self._view, uv=template.uv, size=(side, side)
         )
 
     def _place(self, frame, name):
         return os.path.join(self.folder, f"{frame}-{name}.png")
 
     def _write(self, frame, name, picture):
-        cv2.imwrite(self._place(frame, name), picture, _PNG)
+        # what lies aside until the end is compressed as fast as can be
+        options = [cv2.IMWRITE_PNG_COMPRESSION, 1]
+        options += [cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
+        if hasattr(cv2, "IMWRITE_PNG_FILTER"):  # of newer OpenCVs: half the time, and as small
+            options += [cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP]
+        cv2.imwrite(self._place(frame, name), picture, options)
 
     def _panels(self, frame):
-        """Target, rendering, error and surface of a frame, each (h, w, 3) uint8."""
+        """The pictures of a frame by their column, each (h, w, 3) uint8, cropped to ``box``."""
         images = cv2.imread(self._place(frame, "images"))
-        return [*np.split(images, 3, axis=1), cv2.imread(self._place(frame, "surface"))]
+        parts = np.split(images, len(COLUMNS) - 1, axis=1)
+        panels = [self._cropped(part, self._windows[frame]) for part in parts]
+        height, width = panels[0].shape[:2]
+        square = cv2.imread(self._place(frame, "surface"))
+        side = min(height, width)
+        square = cv2.resize(square, (side, side), interpolation=cv2.INTER_AREA)
+        across, down = width - side, height - side
+        surface = cv2.copyMakeBorder(
+            square, down // 2, down - down // 2, across // 2, across - across // 2,
+            cv2.BORDER_REPLICATE,
+        )  # fmt: skip
+        return dict(zip(COLUMNS, [*panels, surface], strict=True))
+
+    def _cropped(self, picture, window):
+        """What a picture of ``window`` shows of ``box``, black where it shows nothing of it, at
+        most ``width`` pixels wide.
+        """
+        left, top = (round((b - w) * self._scale) for b, w in zip(self.box, window[:2]))
+        width, height = (max(1, round(x * self._scale)) for x in self.box.size)
+        out = np.zeros((height, width, 3), np.uint8)
+        part = picture[max(0, top) : top + height, max(0, left) : left + width]
+        y, x = max(0, -top), max(0, -left)
+        out[y : y + part.shape[0], x : x + part.shape[1]] = part
+        return _resized(out, min(1.0, self.settings.width / width))
 
     def finish(self, surfaces):
-        """Once all frames are drawn and the log is whole: the figures of each. Plots are begun,
-        beside whatever comes next.
+        """Once all frames are drawn and the log is whole: the figures of each, and ``box``. Plots
+        are begun, beside whatever comes next.
 
         ``surfaces`` (T, N, 3) [m, camera frame]. Where some leave the view of the first one, all
         are shaded again in one that holds them.
         """
-        found = [self._drawn[k].result() for k in range(len(surfaces))]
+        count = len(surfaces)
+        found = [self._drawn[k].result() for k in range(count)]
+        self.box = self._boxes[0]
+        for k in range(1, count):
+            self.box = self.box.union(self._boxes[k])
         if not self._view.holds(surfaces):
             self._view = figures.View.around(surfaces)
-            shape = self._panels(0)[0].shape
-            list(
-                self._pool.map(
-                    lambda k: self._write(k, "surface", self._shaded(surfaces[k], shape)),
-                    range(len(surfaces)),
-                )
-            )
+
+            def shade(k):
+                self._write(k, "surface", self._shaded(surfaces[k]))
+
+            list(self._pool.map(shade, range(count)))
         self.rows = []
-        for k in spread(len(surfaces), _ROWS):
-            target, render, heat, surface = self._panels(k)
-            error = heat.sum(axis=2, dtype=np.float32) * (PEAK / 765)
-            self.rows.append(
-                {
-                    "target": target,
-                    "render": render,
-                    "error": error,
-                    "surface": surface,
-                    "label": f"frame {found[k]['frame']}",
-                }
-            )
+        for k in spread(count, self.settings.rows):
+            row = self._panels(k)
+            for name, peak in PEAKS.items():
+                row[name] = heat_values(row[name], peak)
+            self.rows.append({**row, "label": f"frame {found[k]['frame']}"})
         self._plots = self._pool.submit(self._plot)
-        return found
+        return found, self.box
 
     def bind(self, count, fps):
         """Write comparison.mp4 of the first ``count`` frames, ``fps`` a second; returns its path,
         or its folder where no encoder is.
         """
-        pictures = self._pool.map(lambda k: np.concatenate(self._panels(k), axis=1), range(count))
+
+        def whole(k):
+            return np.concatenate(list(self._panels(k).values()), axis=1)
+
+        pictures = self._pool.map(whole, range(count))
         return write_video(os.path.join(self.out, "comparison.mp4"), pictures, fps)
 
     def plot(self):
@@ -209,7 +303,14 @@ class Album:
         self._pool.shutdown(cancel_futures=True)
 
     def _plot(self):
-        figures.contact_sheet(os.path.join(self.out, "comparison.png"), self.rows)
+        b, size = self.box, (self.problem.width, self.problem.height)
+        part = f"x {b.left} to {b.right}, y {b.top} to {b.bottom}" if b.size != size else "all"
+        caption = (
+            f"shown: {part} of {size[0]}x{size[1]} pixels; error: render minus target in linear"
+            " colour, lighting included; residual: the same freed from lighting, over the local"
+            " contrast"
+        )
+        figures.contact_sheet(os.path.join(self.out, "comparison.png"), self.rows, caption)
         with open(os.path.join(self.out, "log.jsonl"), encoding="utf-8") as file:
             figures.loss_plot(
                 os.path.join(self.out, "loss.png"), [json.loads(line) for line in file]
@@ -232,17 +333,9 @@ def _figures(layers, masked):
     return {"psnr_mask": metrics.psnr(a, b, inside), "ssim_mask": metrics.ssim(a, b, inside)}
 
 
-def _panel(image):
-    """An image shrunk to at most _WIDTH pixels across, for the video and the contact sheet."""
-    scale = _WIDTH / image.shape[1]
-    return (
-        image
-        if scale >= 1
-        else cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    )
-
-
-def _heat(error, peak=PEAK):
-    """An error (H, W) in [0, peak] as a picture, black to white through red and yellow."""
-    x = np.clip(np.nan_to_num(error) / peak, 0, 1)[..., None]
-    return np.round(255 * np.clip(x * 3 - np.array([0, 1, 2]), 0, 1)).astype(np.uint8)
+def _resized(image, scale):
+    """An image, shrunk where ``scale`` is below 1."""
+    if scale >= 1:
+        return image
+    size = [max(1, round(x * scale)) for x in image.shape[1::-1]]
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)

@@ -13,7 +13,7 @@ from polysft_mi.files import folder_aside
 from polysft_mi.results.comparison import LABELS
 
 from . import exr, figures
-from .panels import panels, spread
+from .panels import box_of, panels, spread
 from .shading import seen
 
 
@@ -31,19 +31,21 @@ def write_comparison(comparison, out, *, count=20, scale=None):
     shown = [comparison.frames[i] for i in spread(len(comparison.frames), count)]
     maps = {k: difference_maps(comparison, k) for k in shown}
     scale = max(_scale_of(maps.values()) if scale is None else scale, 1e-3)
-    drawn = [_panels_of(r, set(shown)) for r in (run, comparison.other) if r]
+    runs = [r for r in (run, comparison.other) if r]
+    drawn, boxes = [_panels_of(r, set(shown)) for r in runs], [box_of(r) for r in runs]
     sides = [(side, comparison.figures[side.lower()]) for side in "AB"]
     title = "   ".join(f"{s}: {'/'.join(os.path.normpath(p).split(os.sep)[-2:])}" for s, p in sides)
     with folder_aside(out, _is_ours) as folder:
         for k in shown:
-            images = [("frame", drawn[0][k][0])]
-            images += [(side, own[k][1]) for side, own in zip("AB", drawn) if k in own]
+            images = [("frame", drawn[0][k]["target"], boxes[0])]
+            for side, own, box in zip("AB", drawn, boxes, strict=False):
+                images += [(side, own[k]["render"], box)] if k in own else []
             values = _millimetres(maps[k], dots=comparison.truth.kind == "points")
             path = os.path.join(folder, f"{k:03d}.png")
-            figures.false_colours(path, f"frame {k}      {title}", images, values, scale)
+            figures.false_colours(path, f"frame {k}      {title}", images, values, scale, boxes[0])
             layers = _images_of_runs(comparison, k) | maps[k]
             layers["false_colour"] = figures.false_colour(*values[0], scale)
-            about = {"frame": k, **dict((s.lower(), p) for s, p in sides), "false_colour_mm": scale}
+            about = {"frame": k, **{s.lower(): p for s, p in sides}, "false_colour_mm": scale}
             about["scene"] = os.path.abspath(run.path("scene.xml"))
             about |= run.about.get("versions", {})
             exr.write_exr(os.path.join(folder, f"{k:03d}.exr"), layers, about, plain="false_colour")

@@ -121,9 +121,9 @@ class Drawing:
         return "draw", k, vertices, self.problem.texcoords, k in self._exr
 
     def finish(self, vertices, surfaces, fps):
-        """Have the rest drawn, all bound, and plots made: what
-        :meth:`polysft_mi.pictures.album.Album.finish`, ``bind`` and ``plot`` return, each as a function
-        to call for it, in this order.
+        """Have the rest drawn, all bound, and plots made: what ``finish``, ``bind`` and ``plot`` of
+        :class:`polysft_mi.pictures.album.Album` return, each as a function to call for it, in this
+        order.
 
         ``vertices``, ``surfaces`` (T, N, 3) [m]: of all frames, in the world and in the camera
         frame.

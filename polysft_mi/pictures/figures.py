@@ -7,12 +7,14 @@ pictures.
 
 import functools
 import os
+import textwrap
 import warnings
 
 import numpy as np
 
 from polysft_mi.files import FULL, aside
 
+from .panels import PEAKS
 from .shading import View, shade_surface
 
 __all__ = ["View", "contact_sheet", "frame_plot", "loss_plot", "shade_surface"]
@@ -89,7 +91,7 @@ def loss_plot(path, log_records):
     axes.set_ylabel("loss")
     starts = [
         (s, r["frame"])
-        for s, r, before in zip(step, records, [None] + records)
+        for s, r, before in zip(step, records, [None, *records])
         if before is None or before["frame"] != r["frame"]
     ]
     if len(starts) <= 200:
@@ -122,7 +124,7 @@ def loss_curves(log_records):
     records = [r for r in log_records if "loss" in r and "frame" in r]
     if not records:
         raise ValueError("no record holds a loss")
-    step = np.cumsum([_advance(a, b) for a, b in zip([None] + records, records)])
+    step = np.cumsum([_advance(a, b) for a, b in zip([None, *records], records)])
     curves = {}
     for term in TERMS:
         values = np.array([_number(r.get(term)) for r in records])
@@ -180,72 +182,71 @@ def frame_plot(path, per_frame, labels=None):
 
 
 @_kept_safe
-def contact_sheet(path, rows):
-    """A row for each chosen frame: target, render, error as a heat map, the surface seen from the
-    side.
+def contact_sheet(path, rows, caption=""):
+    """A row for each chosen frame: target, render, error and residual as heat maps, the surface
+    seen from the side; ``caption`` below.
 
     ``rows``: dicts of ``target``, ``render`` and ``surface`` (H, W, 3), sRGB, uint8 or float in [0,
-    1], ``error`` (H, W) float in one unit for all rows, and ``label``, a short text such as "frame
-    12". A picture that is missing leaves its place empty.
+    1]; ``error`` and ``residual`` (H, W) float, each in one unit for all rows; and ``label``, a
+    short text such as "frame 12". A picture that is missing leaves its place empty. The colours of
+    the error end where 99.5 % of its values lie below, those of the residual at
+    ``panels.PEAKS``.
     """
     rows = list(rows)
-    first = next(
-        np.asarray(r[k])
-        for r in rows
-        for k in ("target", "render", "surface")
-        if r.get(k) is not None
-    )
+    pictures = [r[k] for r in rows for k in _SHEET if r.get(k) is not None]
+    height, width = np.asarray(pictures[0]).shape[:2]
     columns = [k for k in _SHEET if any(r.get(k) is not None for r in rows)]
-    errors = [np.asarray(r["error"], dtype=np.float64) for r in rows if r.get("error") is not None]
-    finite = np.concatenate([e[np.isfinite(e)] for e in errors]) if errors else np.zeros(0)
-    peak = max(float(np.quantile(finite, 0.995)), 1e-6) if finite.size else 1.0
-    # places in inches, by hand: finding them takes matplotlib longer than all the rest
-    wide, high, left, top, bottom, gap = (
-        2.6,
-        2.6 * first.shape[0] / first.shape[1],
-        0.25,
-        0.25,
-        0.45 if errors else 0.05,
-        0.04,
-    )
-    whole = left + len(columns) * (wide + gap), bottom + top + len(rows) * (high + gap)
+    peaks = {"error": _quantile(rows, "error"), "residual": PEAKS["residual"]}
+    maps = [name for name in columns if name in peaks]
+    wide, left, top, gap = 2.6, 0.25, 0.25, 0.04  # inches
+    high, below = wide * height / width, 0.45 if maps else 0.05
+    whole = left + len(columns) * (wide + gap), top + len(rows) * (high + gap) + below
+    lines = textwrap.wrap(caption, int(17 * whole[0]))
+    bottom = below + 0.16 * len(lines)
+    whole = whole[0], whole[1] + bottom - below
     figure = _figure(*whole)
 
+    # places in inches, by hand: finding them takes matplotlib longer than all the rest
     def axes_at(x, y, w, h):
         return figure.add_axes((x / whole[0], y / whole[1], w / whole[0], h / whole[1]))
 
-    heat = None
+    shown = {}
     for i, row in enumerate(rows):
         for j, name in enumerate(columns):
-            axes = axes_at(
-                left + j * (wide + gap), bottom + (len(rows) - 1 - i) * (high + gap), wide, high
-            )
-            axes.set_xticks([]), axes.set_yticks([])
-            for spine in axes.spines.values():
-                spine.set_visible(False)
+            y = bottom + (len(rows) - 1 - i) * (high + gap)
+            axes = axes_at(left + j * (wide + gap), y, wide, high)
+            _frameless(axes)
             image = row.get(name)
-            if image is not None and name == "error":
-                heat = axes.imshow(
-                    np.asarray(image, dtype=np.float64), cmap="inferno", vmin=0, vmax=peak
-                )
+            if image is not None and name in peaks:
+                image = np.asarray(image, dtype=np.float64)
+                shown[name] = axes.imshow(image, cmap="inferno", vmin=0, vmax=peaks[name])
             elif image is not None:
                 image = np.asarray(image)
-                axes.imshow(
-                    image if image.dtype == np.uint8 else np.clip(np.nan_to_num(image), 0, 1)
-                )
+                image = image if image.dtype == np.uint8 else np.clip(np.nan_to_num(image), 0, 1)
+                axes.imshow(image)
             if i == 0:
                 axes.set_title(_SHEET[name], fontsize=9)
-            if name == columns[0]:
+            if j == 0:
                 axes.set_ylabel(row.get("label", ""), fontsize=9)
-    if heat is not None:
-        below = axes_at(
-            left + columns.index("error") * (wide + gap) + 0.1 * wide,
-            bottom - 0.15,
-            0.8 * wide,
-            0.08,
-        )
-        figure.colorbar(heat, cax=below, orientation="horizontal").ax.tick_params(labelsize=7)
+    for name, drawn in shown.items():
+        x = left + columns.index(name) * (wide + gap)
+        scale = axes_at(x + 0.1 * wide, bottom - 0.15, 0.8 * wide, 0.08)
+        figure.colorbar(drawn, cax=scale, orientation="horizontal").ax.tick_params(labelsize=7)
+    figure.text(left / whole[0], 0.05 / whole[1], "\n".join(lines), fontsize=8, va="bottom")
     return figure
+
+
+def _quantile(rows, name, share=0.995):
+    """The value that this share of the pictures' pixels lies below; 1 where there are none."""
+    values = [np.asarray(r[name], dtype=np.float64).ravel() for r in rows if name in r]
+    finite = np.concatenate([v[np.isfinite(v)] for v in values]) if values else np.zeros(0)
+    return max(float(np.quantile(finite, share)), 1e-6) if finite.size else 1.0
+
+
+def _frameless(axes):
+    axes.set_xticks([]), axes.set_yticks([])
+    for spine in axes.spines.values():
+        spine.set_visible(False)
 
 
 _MAPS = {
@@ -267,25 +268,32 @@ def false_colour(name, values, scale):
     return np.where(np.isfinite(values)[..., None], linear, 0)
 
 
-def false_colours(path, title, images, maps, scale):
-    """Pictures side by side, and differences in false colours with their scale: ``images`` are
-    (title, (h, w, 3) uint8), ``maps`` (name, (H, W) [mm], NaN where unknown), the name one of
-    "distance" and "depth_difference"; colours end at ``scale`` [mm]. Raises OSError where it cannot
-    be written.
+def false_colours(path, title, images, maps, scale, box):
+    """Pictures side by side, and differences in false colours with their scale, of a part of the
+    image.
+
+    ``images``: (title, (h, w, 3) uint8, the :class:`~polysft_mi.pictures.panels.Box` that it
+    shows); ``maps``: (name, (H, W) [mm] of the whole image, NaN where unknown), the name one of
+    "distance" and "depth_difference"; colours end at ``scale`` [mm]. ``box``: the part to show.
+    Raises OSError where it cannot be written.
     """
-    height, width = images[0][1].shape[:2]
-    columns, wide = len(images) + len(maps), 3.2
+    (width, height), columns, wide = box.size, len(images) + len(maps), 3.2
     figure = _figure(wide * columns, wide * height / width + 0.75, layout="constrained")
     figure.get_layout_engine().set(w_pad=0.03, h_pad=0.03, wspace=0, hspace=0)
-    grid = figure.subplots(1, columns, squeeze=False)[0]
-    for axes, (label, image) in zip(grid, images):
-        axes.imshow(image)
+    grid = list(figure.subplots(1, columns, squeeze=False)[0])
+    for axes, (label, image, part) in zip(grid, images, strict=False):
+        axes.imshow(image, extent=(part.left, part.right, part.bottom, part.top))
         axes.set_title(label, fontsize=9)
-    for axes, (name, values) in zip(grid[len(images) :], maps):
+    for axes, (name, values) in zip(grid[len(images) :], maps, strict=True):
         label, colours, low = _MAPS[name]
         axes.set_facecolor("0.93")
         shown = axes.imshow(
-            values, cmap=colours, vmin=low * scale, vmax=scale, interpolation="nearest"
+            values,
+            cmap=colours,
+            vmin=low * scale,
+            vmax=scale,
+            interpolation="nearest",
+            extent=(0, values.shape[1], values.shape[0], 0),
         )
         axes.set_title(label, fontsize=9)
         ends = "max" if low == 0 else "both"
@@ -294,9 +302,8 @@ def false_colours(path, title, images, maps, scale):
         ).ax.tick_params(labelsize=7)
     for axes in grid:
         axes.set_anchor("N")
-        axes.set_xticks([]), axes.set_yticks([])
-        for spine in axes.spines.values():
-            spine.set_visible(False)
+        axes.set_xlim(box.left, box.right), axes.set_ylim(box.bottom, box.top)
+        _frameless(axes)
     figure.suptitle(title, fontsize=10)
     with aside(path) as temporary:
         figure.savefig(temporary, facecolor="white")
@@ -306,5 +313,6 @@ _SHEET = {
     "target": "target",
     "render": "render",
     "error": "error",
+    "residual": "residual, without lighting",
     "surface": "surface from the side",
 }

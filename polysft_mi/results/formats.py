@@ -21,8 +21,8 @@ _PACKAGES = {"usd": ("pxr", "usd-core"), "glb": ("pygltflib", "pygltflib")}
 
 
 def export(run, kind, path=None, *, up="y", fps=None, texture=None):
-    """Write the surface of a :class:`polysft_mi.results.run.Run` in the format ``kind``; returns the
-    path written.
+    """Write the surface of a :class:`~polysft_mi.results.run.Run` in the format ``kind``; returns
+    the path written.
 
     ``path``: the file, for "obj" and "ply" the folder, by default in the run's ``export`` folder.
     ``up``: "y", "z", or "camera" for the OpenCV camera frame as it is (which USD and glTF do not

@@ -82,7 +82,10 @@ def ray_depth(V, F, points):
     )  # a point that is missing, or lies at z = 0, has no ray
     triangle, ray = _close_pairs(V[F], rays[directed, :2])
     ray = directed[ray]
-    dot = lambda a, b: np.einsum("ij,ij->i", a, b)
+
+    def dot(a, b):
+        return np.einsum("ij,ij->i", a, b)
+
     det = dot(rays[ray], normal[triangle])
     usable = np.abs(det) > 1e-18
     inverse = np.divide(1.0, det, out=np.zeros_like(det), where=usable)

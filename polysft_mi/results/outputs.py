@@ -98,9 +98,15 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
     arrays = {name: np.stack([s[name] for s in track.states]) for name in Unknowns.NAMES}
     with aside(os.path.join(out, "params.npz")) as temporary:
         np.savez_compressed(
-            temporary, frames=indices, alpha=template.alpha, chart=template.chart, scale=template.scale,
-            frame_rotation=problem.camera.axes @ template.rotation, frame_origin=problem.camera.to_camera(template.origin), **arrays,
-        )  # fmt: skip
+            temporary,
+            frames=indices,
+            alpha=template.alpha,
+            chart=template.chart,
+            scale=template.scale,
+            frame_rotation=problem.camera.axes @ template.rotation,
+            frame_origin=problem.camera.to_camera(template.origin),
+            **arrays,
+        )
     say("meshes")
     os.makedirs(os.path.join(out, "meshes"), exist_ok=True)
     for index, v in zip(indices, vertices):
@@ -108,7 +114,7 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
             os.path.join(out, "meshes", f"{index:03d}.ply"), v, template.faces, template.uv
         )
     say("pictures")
-    per_frame, video = drawn(), bound()
+    (per_frame, box), video = drawn(), bound()
 
     finite = {
         name: [p[name] for p in per_frame if np.isfinite(p[name])]
@@ -136,6 +142,7 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
         {
             **summary,
             "versions": versions(),
+            "pictures": {"box": list(box)},
             "per_frame": per_frame,
             "windows": windows,
             "command": command,

@@ -57,14 +57,13 @@ class Run:
                 f"{os.path.join(folder, 'surface.npz')}: holds no uv of"
                 f" ({surface['vertices'].shape[1]}, 2)"
             )
-        read = lambda name: read_json(os.path.join(folder, name))
         names = ("vertices", "faces", "uv", "frames")
         return cls(
             folder,
             *(surface[n] for n in names),
             surface.get("sigma"),
-            read("metrics.json"),
-            read("run.json"),
+            read_json(os.path.join(folder, "metrics.json")),
+            read_json(os.path.join(folder, "run.json")),
         )
 
     def path(self, *names):

@@ -78,14 +78,8 @@ def figures(run, truth):
         if name in metric
     ]
     if "sigma_mm" in columns:
-        cards.append(
-            (
-                "sigma along the ray, median",
-                (
-                    f"{np.median([s for s in columns['sigma_mm'] if s is not None] or [np.nan]):.2f} mm"
-                ),
-            )
-        )
+        known = [s for s in columns["sigma_mm"] if s is not None] or [np.nan]
+        cards.append(("sigma along the ray, median", f"{np.median(known):.2f} mm"))
     lost = metric.get("lost", {})
     cards.append(("lost frames", str(len(lost))))
     return columns, cards, distance

@@ -7,21 +7,21 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from ..panels import PEAK, panels
+from ..panels import COLUMNS, PEAKS, box_of, heat_values, panels
 
 # pictures are as large as the budget allows: width [pixels] and quality, the first that fits
 _SIZES = ((640, 80), (640, 70), (480, 75), (480, 60), (360, 60), (240, 50))
 
 
 def images(run, shown, budget=9_000_000, threads=2):
-    """The pictures of the frames ``shown`` (S,) of a run, base64 by name, and the error (S, N) at
-    each vertex, or None where the camera is not known.
+    """The pictures of the frames ``shown`` (S,) of a run, base64 by name; and error and residual
+    where each vertex is seen, (S, N) by name, none where the camera is not known.
 
     ``budget``: bytes of all pictures together, before base64.
     """
     wanted, each = set(shown), budget / len(shown)
     size = None
-    encoded, errors = [], []
+    encoded, seen, box = [], {name: [] for name in PEAKS}, box_of(run)
     with ThreadPoolExecutor(threads) as pool:
         waiting = deque()
         for k, pictures in enumerate(panels(run)):
@@ -32,21 +32,22 @@ def images(run, shown, budget=9_000_000, threads=2):
                     (
                         s
                         for s in _SIZES[_SIZES.index(size) if size else 0 :]
-                        if sum(map(len, _encoded(pictures, *s))) <= each
+                        if sum(map(len, _encoded(pictures.values(), *s))) <= each
                     ),
                     _SIZES[-1],
                 )
-            if run.camera is not None:
-                errors.append(_error_at_vertices(run.camera, run.vertices[k], pictures[2]))
-            waiting.append(pool.submit(_encoded, pictures, *size))
+            for name, peak in PEAKS.items() if run.camera is not None else ():
+                values = heat_values(pictures[name], peak)
+                seen[name].append(_at_vertices(run.camera, run.vertices[k], values, box))
+            waiting.append(pool.submit(_encoded, pictures.values(), *size))
             if len(waiting) > 2 * threads:
                 encoded.append(waiting.popleft().result())
         encoded += [w.result() for w in waiting]
     named = {
         name: [base64.b64encode(i[c]).decode("ascii") for i in encoded]
-        for c, name in enumerate(("target", "render", "error"))
+        for c, name in enumerate(COLUMNS[:-1])
     }
-    return {"kind": "webp", **named}, np.stack(errors) if errors else None
+    return {"kind": "webp", **named}, {n: np.stack(v) for n, v in seen.items() if v}
 
 
 def _encoded(panels, width, quality):
@@ -66,19 +67,16 @@ def _encoded(panels, width, quality):
     return out
 
 
-def _error_at_vertices(camera, vertices, panel):
-    """The error (N,) where each vertex is seen, read off the picture of the error (a mean over 3x3
-    of its pixels); NaN outside the image.
+def _at_vertices(camera, vertices, values, box):
+    """The values (N,) where each vertex is seen, in a picture (h, w) of what ``box`` shows of the
+    image (a mean over 3x3 of its pixels); NaN outside it.
     """
     import cv2
 
-    red, green, blue = (
-        panel[..., c].astype(np.float32) for c in range(3)
-    )  # a fifth of the time of a sum over the axis
-    error = cv2.blur((red + green + blue) * (PEAK / 765), (3, 3))
+    values = cv2.blur(values, (3, 3))
     before = vertices[:, 2] > 0
-    x, y = (camera.project(vertices) * (panel.shape[1] / camera.width)).T
-    inside = before & (x >= 0) & (y >= 0) & (x < error.shape[1]) & (y < error.shape[0])
+    x, y = ((camera.project(vertices) - box[:2]) * (values.shape[1] / box.size[0])).T
+    inside = before & (x >= 0) & (y >= 0) & (x < values.shape[1]) & (y < values.shape[0])
     out = np.full(len(vertices), np.nan, np.float32)
-    out[inside] = error[y[inside].astype(int), x[inside].astype(int)]
+    out[inside] = values[y[inside].astype(int), x[inside].astype(int)]
     return out

@@ -10,7 +10,7 @@ from polysft_mi.errors import InputError
 from polysft_mi.files import aside
 from polysft_mi.results.run import Run
 
-from ..panels import PEAK, spread
+from ..panels import PEAKS, box_of, spread
 from .content import LABELS, about, figures, loss, subtitle, warning
 from .images import images
 from .surface import mesh, scalars
@@ -48,7 +48,8 @@ def write_report(out, path=None, *, truth=None, frames=200, positions=450_000):
         ),
         "shown": shown,
         "fps": run.fps,
-        "peak": f"{PEAK:g} or more",
+        "peaks": {name: f"{peak:g} or more" for name, peak in PEAKS.items()},
+        "shows": _shows(run),
         "columns": columns,
         "labels": LABELS,
         "images": pictures,
@@ -66,11 +67,22 @@ def write_report(out, path=None, *, truth=None, frames=200, positions=450_000):
     )
     title = data["title"].replace("&", "&amp;").replace("<", "&lt;")
     for name, value in (("title", title), ("plotly", get_plotlyjs()), ("data", text)):
-        before, mark, after = page.partition("{{" + name + "}}")
+        before, _, after = page.partition("{{" + name + "}}")
         page = before + value + after
     with aside(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
         file.write(page)
     return path
+
+
+def _shows(run):
+    """What part of the video the pictures show, in words."""
+    box, camera = box_of(run), run.camera
+    if camera is None or box.size == (camera.width, camera.height):
+        return ""
+    return (
+        f"The pictures are cropped to the sheet: x {box.left} to {box.right}, y {box.top} to"
+        f" {box.bottom} of {camera.width}×{camera.height} pixels."
+    )
 
 
 def _finite(value):

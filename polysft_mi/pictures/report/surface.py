@@ -21,10 +21,14 @@ def mesh(run, shown, triangles=24_000):
     fine, face, weights = refined(faces, parts)
     corners = faces[face]
     mesh = {
-        "vertices": run.vertices.shape[1], "low": low.tolist(), "high": np.maximum(high, low + 1e-9).tolist(),
-        "positions": _base64(positions), "corners": _base64(corners.astype("<u4")),
-        "weights": _base64(weights.astype("<f4")), "faces": _base64(fine.astype("<u4")),
-    }  # fmt: skip
+        "vertices": run.vertices.shape[1],
+        "low": low.tolist(),
+        "high": np.maximum(high, low + 1e-9).tolist(),
+        "positions": _base64(positions),
+        "corners": _base64(corners.astype("<u4")),
+        "weights": _base64(weights.astype("<f4")),
+        "faces": _base64(fine.astype("<u4")),
+    }
     colours = _texture_colours(
         run.texture,
         np.einsum("nk,nkc->nc", weights, run.uv[corners].astype(np.float64)),
@@ -60,6 +64,20 @@ def _texture_colours(path, uv, coarse_uv, fine):
     return sampled.reshape(-1, 3)[:, ::-1]
 
 
+_ERRORS = {
+    "residual": (
+        "local contrast",
+        "Rendering minus image where each vertex is seen, both freed from lighting: what is bright"
+        " is out of place.",
+    ),
+    "error": (
+        "linear colour",
+        "Rendering minus image in linear colour where each vertex is seen, light and shade included"
+        " (root mean square over the channels).",
+    ),
+}
+
+
 def scalars(run, shown, errors, distance):
     """What the surface may be coloured by: for each its texts, its range and scale, and the values
     (S, N) as bytes, 255 for what is not known.
@@ -75,12 +93,9 @@ def scalars(run, shown, errors, distance):
                 "viridis",
             )
         )
-    if errors is not None:
-        meaning = (
-            "Root mean square over the channels of rendering minus image, in linear colour, where"
-            " each vertex is seen."
-        )
-        out.append(_scalar("error", meaning, "linear colour", errors, "inferno"))
+    for name, (unit, meaning) in _ERRORS.items():
+        if name in errors:
+            out.append(_scalar(name, meaning, unit, errors[name], "inferno"))
     curvature = run.mean_curvature()[shown]
     meaning = (
         "Mean curvature of the jet, without its relief: red where the surface bulges towards the"

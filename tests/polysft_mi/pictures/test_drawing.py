@@ -18,9 +18,9 @@ from places import ROOT
 from polysft_mi import prepare
 from polysft_mi.objective.problem import Problem
 from polysft_mi.pictures import drawing, exr, video
-from polysft_mi.pictures.album import Album
+from polysft_mi.pictures.album import Album, AlbumSettings, residual
 from polysft_mi.pictures.drawing import Drawing
-from polysft_mi.pictures.panels import spread
+from polysft_mi.pictures.panels import Box, spread
 from polysft_mi.scene import experiment as scene
 from polysft_mi.scene.sequence import Sequence
 
@@ -56,7 +56,7 @@ def drawn(sheet, out, during=lambda drawing: None, *, problem=None, frames=9, ex
         during(made)
         (out / "log.jsonl").write_text('{"frame": 0, "iteration": 0, "loss": 1.0}\n')
         finished, bound, plotted = made.finish(vertices, surfaces, 15)
-        figures, path = finished(), bound()
+        (figures, _box), path = finished(), bound()
         plotted()
         folder = Path(made._folder.name)
     assert (
@@ -200,7 +200,7 @@ def test_a_surface_that_leaves_the_view_of_the_first_is_shown_whole(sheet, tmp_p
     surfaces = sheet.vertices[:9] + np.linspace(0, 0.4, 9)[:, None, None] * np.array([1, 0.3, 0])
     for k, v in enumerate(surfaces):
         album.draw(k, problem.camera.origin + v @ problem.camera.axes)
-    assert len(album.finish(surfaces)) == 9
+    assert len(album.finish(surfaces)[0]) == 9
     assert album._view.holds(surfaces) and [row["label"] for row in album.rows] == [
         f"frame {k}" for k in spread(9, 5)
     ]
@@ -208,6 +208,69 @@ def test_a_surface_that_leaves_the_view_of_the_first_is_shown_whole(sheet, tmp_p
         background = row["surface"][0, 0]
         shown = (row["surface"] != background).any(-1)
         assert shown.mean() > 0.02 and not shown[[0, -1]].any() and not shown[:, [0, -1]].any()
+
+
+def test_pictures_are_cropped_to_the_sheet_wherever_it_goes(sheet, tmp_path):
+    """Each picture shows the same part of its frame: where its surface is in any frame."""
+    problem = problem_of(sheet)
+    settings = AlbumSettings(margin=0.02, room=0.0)  # so that it leaves the room that was kept
+    album = Album(problem, str(tmp_path), {}, str(tmp_path), settings)
+    surfaces = sheet.vertices[:3] * (0.5, 0.5, 1)  # smaller, so that there is something to crop
+    surfaces[2] += (0.05, 0.03, 0)
+    vertices = [problem.camera.origin + v @ problem.camera.axes for v in surfaces]
+    for k, v in enumerate(vertices):
+        album.draw(k, v)
+    _, box = album.finish(surfaces)
+    seen = np.concatenate([problem.camera.project(v)[0] for v in vertices])
+    low, high = seen.min(0), seen.max(0)
+    assert (box[:2] <= low).all() and (high <= box[2:]).all()
+    assert (np.subtract(low, box[:2]) < 4).all() and (np.subtract(box[2:], high) < 4).all()
+    assert box.size[0] < 0.9 * problem.width
+    for k in range(3):
+        panels = album._panels(k)
+        assert {p.shape for p in panels.values()} == {(box.size[1], box.size[0], 3)}
+        rgb = album._renderings(vertices[k], k, geometry=False)["render"][box.slices]
+        drawn = (panels["render"] > 30).any(-1)
+        assert (drawn == (rgb > (30 / 255 / 12.92)).any(-1)).mean() > 0.9
+        assert drawn.sum() > 100
+    album.close()
+
+
+def test_residual_shows_misfit_and_not_lighting():
+    rng = np.random.default_rng(0)
+    size, inside = (120, 160), np.zeros((120, 160), np.float32)
+    inside[20:100, 30:130] = 1
+    texture = np.repeat(np.kron(rng.random((30, 40)), np.ones((4, 4)))[..., None], 3, -1)
+    texture = (0.2 + 0.5 * texture).astype(np.float32)
+    light = np.linspace(0.6, 1.3, size[1], dtype=np.float32)[None, :, None]
+
+    def found(target, masked):
+        layers = {
+            "target": target,
+            "render": texture * inside[..., None],
+            "mask_render": inside,
+            "mask_target": inside if masked else np.ones_like(inside),
+        }
+        return residual(layers, masked)
+
+    for masked in (True, False):
+        lit, moved = found(texture * light, masked), found(np.roll(texture, 4, axis=1), masked)
+        where = inside > 0
+        assert np.median(lit[where]) < 0.1 and np.median(moved[where]) > 0.5
+        assert lit[~where].max() == moved[~where].max() == 0
+        # what cannot be told from the rendering at all
+        other = 0.2 + 0.5 * np.repeat(rng.random(size)[..., None], 3, -1).astype(np.float32)
+        assert 0.8 < np.sqrt((found(other, masked)[where] ** 2).mean()) < 1.6
+
+
+def test_boxes():
+    points = np.array([[10.0, 20.0], [30.0, 60.0]])
+    box = Box.around(points, 0.1, (100, 62))
+    assert box == (6, 16, 34, 62) and box.size == (28, 46)
+    assert box.holds(Box(6, 20, 10, 30)) and not box.holds(Box(5, 20, 10, 30))
+    assert box.union(Box(0, 30, 10, 70)) == (0, 16, 34, 70)
+    assert Box.around(points - 1000, 0.1, (100, 62)) == (0, 0, 100, 62)
+    assert np.zeros((62, 100))[box.slices].shape == (46, 28)
 
 
 @pytest.mark.skipif(not os.path.isdir("/proc"), reason="children are found in /proc")

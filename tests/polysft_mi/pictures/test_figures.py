@@ -153,7 +153,7 @@ def test_contact_sheet_holds_its_pictures(tmp_path):
         for k in range(3)
     ]
     rows[1]["render"] = None
-    assert contact_sheet(tmp_path / "sheet.png", rows)
+    assert contact_sheet(tmp_path / "sheet.png", rows, "where it was taken " * 20)
     image = image_of(tmp_path / "sheet.png").astype(int)
     count = lambda bgr: (np.abs(image - bgr).max(-1) < 20).sum()
     assert count((0, 0, 255)) / count((0, 255, 0)) == pytest.approx(6 / 2, rel=0.1)
@@ -171,8 +171,9 @@ def test_a_picture_that_fails_is_a_warning(tmp_path, monkeypatch):
 
 def test_importing_loads_no_heavy_module():
     script = (
-        "import sys, polysft_mi.pictures.figures, polysft_mi.results.metrics, polysft_mi.evaluate, polysft_mi.pictures.exr,"
-        " polysft_mi.pictures.video, polysft_mi.surface.meshio\nprint([m for m in ('matplotlib', 'OpenEXR',"
+        "import sys, polysft_mi.pictures.figures, polysft_mi.results.metrics,"
+        " polysft_mi.evaluate, polysft_mi.pictures.exr, polysft_mi.pictures.video,"
+        " polysft_mi.surface.meshio\nprint([m for m in ('matplotlib', 'OpenEXR',"
         " 'trimesh', 'skimage', 'scipy', 'rich', 'mitsuba', 'torch', 'cv2') if m in sys.modules])"
     )
     done = subprocess.run(

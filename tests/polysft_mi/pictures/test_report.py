@@ -19,8 +19,8 @@ from polysft_mi import report
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError
 from polysft_mi.pictures import video
-from polysft_mi.pictures.panels import PEAK, spread
-from polysft_mi.pictures.report.images import _error_at_vertices
+from polysft_mi.pictures.panels import PEAKS, Box, box_of, heat, heat_values, spread
+from polysft_mi.pictures.report.images import _at_vertices
 from polysft_mi.pictures.report.page import write_report
 from polysft_mi.results.run import Run
 
@@ -108,15 +108,16 @@ def test_surface_and_pictures_are_those_of_the_run(finished_run, page):
     assert (
         np.abs(colours - texture[at[:, 0], at[:, 1]]).mean() < 12
     )  # one end of the texture differs from the other by 150
-    target, render, error = (
+    target, *others = (
         np.asarray(Image.open(io.BytesIO(base64.b64decode(data["images"][n][2]))))
-        for n in ("target", "render", "error")
+        for n in ("target", "render", "error", "residual")
     )
     expected = np.asarray(
         Image.open(finished_run[0].folder / "frames" / "002.png").convert("RGB")
     ).astype(float)
+    expected = expected[box_of(run).slices]
     assert np.abs(target.astype(float) - expected).mean() < 6
-    assert render.shape == error.shape == target.shape and len(data["images"]["error"]) == 4
+    assert all(p.shape == target.shape for p in others) and len(data["images"]["error"]) == 4
 
 
 def test_figures_and_colours(finished_run, page):
@@ -135,6 +136,8 @@ def test_figures_and_colours(finished_run, page):
     )
     error, _ = scalar(data, "error", shape)
     assert np.isfinite(error).all() and 0 < error.mean() < 0.1
+    residual, _ = scalar(data, "residual", shape)
+    assert np.isfinite(residual).all() and 0 < residual.mean() < 0.5
     sigma, found = scalar(data, "sigma", shape)
     known = np.isfinite(run.sigma)
     assert np.array_equal(np.isfinite(sigma), known)
@@ -188,11 +191,21 @@ def _turning(a, b, c, normal):
 
 def test_error_where_each_vertex_is_seen():
     camera = Intrinsics(100, 100, 20, 20, 40, 40)
-    heat = np.zeros((80, 80, 3), np.uint8)  # the picture has twice the size of the film
-    heat[:, 40:, 0] = 255  # a third of the way from black to white, right of the middle
-    vertices = np.array([[-0.1, 0, 1], [0.1, 0, 1], [0.5, 0, 1], [0.1, 0, -1]])
-    error = _error_at_vertices(camera, vertices, heat)
-    np.testing.assert_allclose(error, [0, PEAK / 3, np.nan, np.nan], atol=1e-6)
+    picture = np.zeros((60, 60, 3), np.uint8)  # of a part of the image, at twice its size
+    picture[:, 30:, 0] = 255  # a third of the way from black to white, right of the middle
+    vertices = np.array(
+        [[-0.1, 0, 1], [0.1, 0, 1], [0.5, 0, 1], [0.1, 0, -1], [-0.18, 0, 1], [0, 0.14, 1]]
+    )
+    values = heat_values(picture, PEAKS["error"])
+    error = _at_vertices(camera, vertices, values, Box(5, 3, 35, 33))
+    wanted = [0, PEAKS["error"] / 3, np.nan, np.nan, np.nan, np.nan]
+    np.testing.assert_allclose(error, wanted, atol=1e-6)
+
+
+def test_heat_is_read_back():
+    values = np.linspace(0, 1.5, 60).reshape(6, 10)
+    np.testing.assert_allclose(heat_values(heat(values, 1.5), 1.5), values, atol=0.51 * 1.5 / 765)
+    assert (heat(np.array([[9.0, np.nan]]), 1.5) == [[[255] * 3, [0] * 3]]).all()
 
 
 def test_fewer_frames_and_odd_names(finished_run, tmp_path):
@@ -267,23 +280,32 @@ console.error = (...a) => problems.push(a.join(" "));
 _ACT = """<script>
 (async () => {
   const wait = () => new Promise(done => setTimeout(done, 300)), seen = {};
-  const note = name => { seen[name] = {now, target: $("target").src.length, label: $("now").textContent,
-                                       drawn: $("target").naturalWidth, row: document.querySelector("tr.now").rowIndex,
-                                       z: $("surface").data[0].z.reduce((a, b) => a + b, 0),
-                                       kind: Object.keys($("surface").data[0]).includes("intensity")}; };
+  const note = name => {
+    const surface = $("surface").data[0];
+    seen[name] = {
+      now, target: $("target").src.length, label: $("now").textContent,
+      drawn: $("target").naturalWidth, row: document.querySelector("tr.now").rowIndex,
+      z: surface.z.reduce((a, b) => a + b, 0), kind: Object.keys(surface).includes("intensity")
+    };
+  };
   await wait(); note("start");
   STEPS
   const boxes = ["target", "surface"].map(id => $(id).getBoundingClientRect()).map(
     b => [b.top, Math.min(b.bottom, innerHeight), b.left, b.right].map(Math.round));
-  const fetched = performance.getEntriesByType("resource").map(r => r.name).filter(name => !/^(data|blob):/.test(name));
+  const fetched = performance.getEntriesByType("resource").map(r => r.name).filter(
+    name => !/^(data|blob):/.test(name));
   console.log("SEEN " + JSON.stringify({...seen, problems, boxes, fetched}));
 })();
 </script></body>"""
 _STEPS = """
   $("time").value = 2; $("time").dispatchEvent(new Event("input")); await wait(); note("slid");
-  const key = k => document.dispatchEvent(new KeyboardEvent("keydown", {key: k, bubbles: true}));
-  key("ArrowRight"); await wait(); note("right"); key("Home"); await wait(); note("home"); key("End"); await wait(); note("end");
-  [...$("choices").children].find(b => b.textContent === "curvature").click(); await wait(); note("curvature");
+  const key = async (k, name) => {
+    document.dispatchEvent(new KeyboardEvent("keydown", {key: k, bubbles: true}));
+    await wait(); note(name);
+  };
+  await key("ArrowRight", "right"); await key("Home", "home"); await key("End", "end");
+  [...$("choices").children].find(b => b.textContent === "curvature").click();
+  await wait(); note("curvature");
 """
 
 
