@@ -1,9 +1,38 @@
 """PolySfT on Mitsuba 3: the surface of a textured template in every frame of a video, by
 differentiable rendering.
 
-Run as ``python -m polysft_mi.run scene.xml -o OUT``. Importing the package imports neither Mitsuba
-nor Dr.Jit and sets no variant: :func:`polysft_mi.backend.set_variant` does both, once, in an entry
-point.
+A scene file goes in, the folder of a run comes out::
+
+    import polysft_mi
+
+    outcome = polysft_mi.reconstruct("scene.xml", "out")
+    vertices = polysft_mi.Run.open("out").vertices  # (T, N, 3), metres
+
+On the command line that is ``python -m polysft_mi.run scene.xml -o out``. Importing the package
+imports neither Mitsuba nor Dr.Jit and sets no variant: :func:`set_variant` does both, once.
+``docs/api.md`` lists the public names; other packages may change without notice.
 """
 
+import lazy_loader
+
 __version__ = "0.1.0"
+
+__getattr__, __dir__, __all__ = lazy_loader.attach(
+    __name__,
+    submodules=["bridge", "solvers"],
+    submod_attrs={
+        "backend": ["set_variant"],
+        "camera": ["Intrinsics"],
+        "errors": ["InputError"],
+        "objective.problem": ["Problem"],
+        "results.evaluation": ["score"],
+        "results.run": ["Run"],
+        "results.truth": ["Truth"],
+        "run": ["Outcome", "reconstruct"],
+        "scene.experiment": ["Experiment", "load"],
+        "scene.plugins": ["register"],
+        "scene.sequence": ["Sequence"],
+        "scene.settings": ["Settings"],
+        "tracker": ["Track", "track"],
+    },
+)
