@@ -215,7 +215,8 @@ from polysft_mi.backend import set_variant
 first = set_variant("llvm_ad_rgb")
 import mitsuba as mi, drjit as dr, os
 x = mi.Float(3)
-print(first, set_variant("llvm_ad_rgb"), set_variant(), dr.detail.llvm_version()[0] >= 16, os.path.isfile(os.environ["DRJIT_LIBLLVM_PATH"]), (x + 1)[0])
+print(first, set_variant("llvm_ad_rgb"), set_variant(), dr.detail.llvm_version()[0] >= 16)
+print(os.path.isfile(os.environ["DRJIT_LIBLLVM_PATH"]), (x + 1)[0])
 """
     assert python(code, DRJIT_LIBLLVM_PATH=None).stdout.split() == ["llvm_ad_rgb"] * 3 + [
         "True",

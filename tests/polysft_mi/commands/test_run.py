@@ -106,9 +106,16 @@ def test_files_of_a_run(sequence, result):
     ]
     layers, header = exr.read_exr(result / "comparison" / "005.exr")
     assert {k: v.shape for k, v in layers.items()} == {
-        "target": (72, 96, 3), "render": (72, 96, 3), "error": (72, 96, 1), "mask_target": (72, 96, 1),
-        "mask_render": (72, 96, 1), "depth": (72, 96, 1), "normal": (72, 96, 3), "uv": (72, 96, 2),
-    }  # fmt: skip
+        "target": (72, 96, 3),
+        "render": (72, 96, 3),
+        "error": (72, 96, 1),
+        "residual": (72, 96, 1),
+        "mask_target": (72, 96, 1),
+        "mask_render": (72, 96, 1),
+        "depth": (72, 96, 1),
+        "normal": (72, 96, 3),
+        "uv": (72, 96, 2),
+    }
     inside = layers["mask_render"][..., 0] > 0.999
     V = surface(result)["vertices"][5]
     assert np.abs(layers["depth"][inside].ravel() - V[:, 2].mean()).max() < np.ptp(V[:, 2])
@@ -184,19 +191,22 @@ def test_resume_ends_with_the_same_result(sequence, tmp_path, monkeypatch, solve
 
 
 def test_ctrl_c_leaves_a_valid_shorter_result(sequence, tmp_path):
-    out = tmp_path / "out"
+    out, long = tmp_path / "out", ["-D", "patience=100000", "-D", "period=60"]
     process = subprocess.Popen(
-        command(sequence.folder / "scene.xml", "-o", out, *QUICK, "-D", "patience=100000", "-D", "period=60"),
-        cwd=ROOT, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        command(sequence.folder / "scene.xml", "-o", out, *QUICK, *long),
+        cwd=ROOT,
+        stderr=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
         # a shell's background jobs inherit that it is ignored
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )  # fmt: skip
+    )
     checkpoint = out / "checkpoint.npz"
     deadline = time.time() + 120
     while not checkpoint.exists() and time.time() < deadline and process.poll() is None:
         time.sleep(0.05)
     process.send_signal(signal.SIGINT)
-    stdout, stderr = process.communicate(timeout=120)
+    _, stderr = process.communicate(timeout=120)
     assert process.returncode == 130, stderr
     assert "frames are kept; --resume goes on" in stderr and "Traceback" not in stderr
     assert 3 <= surface(out)["vertices"].shape[0] < 6

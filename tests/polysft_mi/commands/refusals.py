@@ -1,0 +1,67 @@
+"""What the tests of bad input share: edits of a scene, and what a refusal must look like."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from places import ROOT
+
+from polysft_mi import errors, run
+
+SIZE = (48, 36)
+QUICK = ["-q", "--exr", "2", "-D", "period=2", "-D", "last=1", "-D", "window=2"]
+
+
+def contents(out):
+    return {p.relative_to(out): p.read_bytes() for p in sorted(Path(out).rglob("*")) if p.is_file()}
+
+
+def refused(scene, *options, out=None):
+    """The line that ``run`` refuses with; OUT is afterwards as it was before."""
+    out = Path(out) if out else Path(scene).parent / "out"
+    before = contents(out) if out.is_dir() else out.exists()
+    with pytest.raises(errors.InputError) as caught:
+        run.main([str(scene), "-o", str(out), *options])
+    assert (contents(out) if out.is_dir() else out.exists()) == before
+    message = str(caught.value)
+    assert (
+        "\n" not in message
+        and "Traceback" not in message
+        and ".cpp" not in message
+        and len(message) < 700
+    )
+    return message
+
+
+def edited(folder, old, new, *, pattern=False):
+    """The folder's scene with ``old`` (a text, or a regular expression) replaced, as another file
+    beside it.
+    """
+    text = (folder / "scene.xml").read_text()
+    changed = re.sub(old, new, text, flags=re.S) if pattern else text.replace(old, new)
+    assert changed != text
+    path = folder / "changed.xml"
+    path.write_text(changed)
+    return path
+
+
+def has(message, *words):
+    assert all(word in message for word in words), message
+
+
+def process(*arguments, module="run", **options):
+    """Exit status 2 and one line; returns it."""
+    done = subprocess.run(
+        [sys.executable, "-m", f"polysft_mi.{module}", *map(str, arguments)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        **options,
+    )
+    assert done.returncode == 2, done.stderr
+    assert (
+        done.stderr.startswith("error: ") and done.stderr.count("\n") == 1 and done.stdout == ""
+    ), done.stderr
+    return done.stderr

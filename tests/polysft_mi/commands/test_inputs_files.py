@@ -1,0 +1,188 @@
+"""Bad input as a user meets it: images and templates.
+
+One line names the file, property or value and says what is accepted; the exit status is 2; OUT is
+untouched.
+"""
+
+import re
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+import synthetic
+import trimesh
+from refusals import SIZE, edited, has, refused
+
+
+@pytest.mark.parametrize("name", ["texture.png", "frames/001.png", "masks/001.png"])
+@pytest.mark.parametrize("kind", ["truncated", "garbage", "empty"])
+def test_image_that_cannot_be_read(sheet, name, kind):
+    path = sheet / name
+    data = path.read_bytes()
+    path.write_bytes({"truncated": data[: len(data) // 2], "garbage": b"hello", "empty": b""}[kind])
+    has(
+        refused(sheet / "scene.xml"),
+        name,
+        "line 99: " if name == "texture.png" else "not a readable image",
+    )
+
+
+@pytest.mark.parametrize(
+    "name, words", [("frames", "3 masks for the 2 images"), ("masks", "2 masks for the 3 images")]
+)
+def test_an_image_is_missing(sheet, name, words):
+    (sheet / name / "001.png").unlink()
+    has(refused(sheet / "scene.xml"), str(sheet / "masks"), words, "one mask an image is needed")
+
+
+@pytest.mark.parametrize("name", ["texture.png", "frames", "masks"])
+def test_files_are_missing(sheet, name):
+    if name == "texture.png":
+        (sheet / name).unlink()
+    else:
+        shutil.rmtree(sheet / name)
+    has(
+        refused(sheet / "scene.xml"),
+        str(sheet / name) if name == "texture.png" else name,
+        "no such file" if name == "texture.png" else "no images",
+    )
+
+
+@pytest.mark.parametrize("name", ["frames", "masks"])
+def test_image_of_another_size(sheet, name):
+    assert cv2.imwrite(str(sheet / name / "002.png"), np.full((30, 40, 3), 99, np.uint8))
+    has(refused(sheet / "scene.xml"), f"{name}/002.png: 40x30 pixels", "48x36")
+
+
+def test_film_of_another_size(sheet):
+    message = refused(
+        edited(sheet, '<integer name="width" value="48"/>', '<integer name="width" value="64"/>')
+    )
+    has(message, "frames/000.png: 48x36 pixels; the camera's film has 64x36")
+
+
+def test_first_mask_is_empty(sheet):
+    assert cv2.imwrite(str(sheet / "masks" / "000.png"), np.zeros(SIZE[::-1], np.uint8))
+    has(refused(sheet / "scene.xml"), "masks/000.png: the mask is empty")
+
+
+def moved(truth, by=(0, 0, 0), scale=1.0):
+    return truth.vertices[0] * scale + by, truth.uv, truth.faces
+
+
+def with_extra(truth, points, faces):
+    V, uv, F = moved(truth)
+    points, faces = np.reshape(points, (-1, 3)), np.reshape(faces, (-1, 3)).astype(int)
+    return (
+        np.concatenate([V, points]),
+        np.concatenate([uv, np.zeros((len(points), 2))]),
+        np.concatenate([F, faces]),
+    )
+
+
+def with_nan(truth, which):
+    arrays = [a.copy() for a in moved(truth)]
+    arrays[which][5] = np.nan
+    return arrays
+
+
+def twice(truth):
+    V, uv, F = moved(truth)
+    return (
+        np.concatenate([V, V + (0, 0.3, 0)]),
+        np.concatenate([uv, uv]),
+        np.concatenate([F, F + len(V)]),
+    )
+
+
+def ball(_):
+    mesh = trimesh.creation.icosphere(2, 0.06)
+    return mesh.vertices + (0, 0, 0.5), mesh.vertices[:, :2] * 8 + 0.5, mesh.faces
+
+
+BAD_TEMPLATES = {
+    "nan": (
+        lambda t: with_nan(t, 0),
+        ["template.obj: 1 vertices have coordinates that are not finite (the first is vertex 5"],
+    ),
+    "uv nan": (
+        lambda t: with_nan(t, 1),
+        ["template.obj: 1 texture coordinates are not finite (the first is vertex 5"],
+    ),
+    "degenerate": (
+        lambda t: with_extra(t, [], [0, 0, 1]),
+        ["template.obj: 1 faces have no area (the first is face 160"],
+    ),
+    "non-manifold": (
+        lambda t: with_extra(t, [0, 0, 0.4], [1, 11, 99]),
+        ["template.obj: 1 edges have more than two faces (the first joins vertices 1 and 11)"],
+    ),
+    "unreferenced": (
+        lambda t: with_extra(t, [0, 0, 0.4], []),
+        ["template.obj: 1 vertices are in no face (the first is vertex 99"],
+    ),
+    "components": (twice, ["template.obj: 2 separate components; one connected mesh is needed"]),
+    "closed": (
+        ball,
+        [
+            "template.obj: one jet cannot hold it",
+            "triangles fold over",
+            "residual of the 8-jet is",
+            "mm RMS",
+        ],
+    ),
+    "behind": (
+        lambda t: moved(t, (0, 0, -1)),
+        ["99 of 99 vertices behind the camera; it must stand in its pose of the first frame"],
+    ),
+    "out of view": (
+        lambda t: moved(t, (5, 0, 0)),
+        ["out of view in the first frame: it projects to x 5", "an image of 48x36 pixels"],
+    ),
+    "off the mask": (
+        lambda t: moved(t, (0.15, 0.1, 0.5), 0.05),
+        ["does not meet the mask of the first frame: it projects to x"],
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", BAD_TEMPLATES)
+def test_bad_template(good, sheet, kind):
+    make, words = BAD_TEMPLATES[kind]
+    synthetic.write_obj(sheet / "template.obj", *make(good))
+    has(refused(sheet / "scene.xml"), *words)
+
+
+def test_template_without_uv(sheet):
+    path = sheet / "template.obj"
+    path.write_text(
+        "\n".join(
+            re.sub(r"/\d+", "", line)
+            for line in path.read_text().splitlines()
+            if not line.startswith("vt")
+        )
+    )
+    has(refused(sheet / "scene.xml"), f"{path}: it has no texture coordinates (uv)")
+
+
+def test_template_that_cannot_be_read(sheet):
+    path = sheet / "template.obj"
+    text = path.read_text()
+    for content, words in (
+        ("", "template.obj: 0 vertices; a template has at least 3"),
+        ("\x00garbage", "template.obj: 0 vertices"),
+        (text + "f 1/1 2/2 999/1\n", "template.obj: a face names number 999 of 99 vertices"),
+        (text + "v 1 two 3\n", "template.obj: line 359: 'v 1 two 3' is not OBJ"),
+    ):
+        path.write_text(content)
+        has(refused(sheet / "scene.xml"), words)
+    path.unlink()
+    has(
+        refused(sheet / "scene.xml"),
+        f"{path}: no such file (filename of <obj> in {sheet / 'scene.xml'})",
+    )
+    has(
+        refused(edited(sheet, "template.obj", "texture.png")),
+        "texture.png: template of type '.png'; .obj or .ply is needed",
+    )

@@ -1,0 +1,260 @@
+"""Bad input as a user meets it: scenes and settings.
+
+One line names the file, property or value and says what is accepted; the exit status is 2; OUT is
+untouched.
+"""
+
+import re
+
+import pytest
+import synthetic
+from refusals import SIZE, edited, has, refused
+
+from polysft_mi import prepare
+
+
+def test_no_scene(tmp_path):
+    has(refused(tmp_path / "nothing.xml"), f"{tmp_path / 'nothing.xml'}: no such scene file")
+    has(refused(tmp_path), str(tmp_path), "no such scene file")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "hello",
+        '<scene version="3.0.0"><integrator',
+        '<?xml version="1.0" encoding="klingon"?><scene/>',
+        "\x00\xff",
+    ],
+)
+def test_not_xml(tmp_path, text):
+    (tmp_path / "scene.xml").write_text(text)
+    has(refused(tmp_path / "scene.xml"), f"{tmp_path / 'scene.xml'}: not a readable XML scene")
+
+
+REFUSED_BY_MITSUBA = [
+    ('type="twosided"', 'type="twosidde"', ["line 97: ", "bsdf", '"twosidde" not found']),
+    (
+        'name="wrap_mode"',
+        'name="wrap_mod"',
+        ["line 99: unknown property", '"bitmap"', '"wrap_mod": "clamp"'],
+    ),
+    (
+        '<string name="masks"',
+        '<float name="k_foo" value="1"/><string name="masks"',
+        ["line 42: unknown property", '"polysft"', '"k_foo"'],
+    ),
+    ('<emitter type="constant"/>', '<emiter type="constant"/>', ["line 108: ", "<emiter>"]),
+    (
+        '<emitter type="constant"/>',
+        '<include filename="nope.xml"/>',
+        ["line 108: ", '"nope.xml" not found'],
+    ),
+    (
+        '<integrator type="$integrator"/>',
+        "",
+        ["line 42: polysft: 0 nested integrators", 'e.g. <integrator type="raster"/>'],
+    ),
+    (
+        '<string name="frames" value="$frames"/>',
+        "",
+        ["line 42: polysft: property 'frames' is missing; a folder of images"],
+    ),
+    ('value="$frames"', 'value="$framez"', ["line 43: undefined parameter: $framez"]),
+    (' version="3.0.0"', "", ["missing version attribute"]),
+    (
+        r'name="fov" value="[^"]*"',
+        'name="fov" value="abc"',
+        ["line 78: ", 'floating point value "abc"'],
+    ),
+    (
+        r'name="fov" value="[^"]*"',
+        'name="fov" value="200"',
+        ["line 77: ", '"perspective"', "field of view", "[0, 180]"],
+    ),
+]
+
+
+@pytest.mark.parametrize(
+    "old, new, words", REFUSED_BY_MITSUBA, ids=[w[-1] for _, _, w in REFUSED_BY_MITSUBA]
+)
+def test_xml_that_mitsuba_refuses(sheet, old, new, words):
+    path = edited(sheet, old, new, pattern=old.startswith("name="))
+    message = refused(path)
+    has(message, *words)
+    assert message.startswith(f"{path}: ") and message.count(str(path)) <= 2
+
+
+def test_integrator(sheet):
+    has(
+        refused(sheet / "scene.xml", "-D", "integrator=depth"),
+        "solver gauss-newton renders with raster",
+        "give solver=adam",
+    )
+    has(
+        refused(sheet / "scene.xml", "-D", "integrator=foo"),
+        "line 74: ",
+        "integrator",
+        '"foo" not found',
+    )
+    has(
+        refused(sheet / "scene.xml", "-D", "integrator=depth", "-D", "solver=adam"),
+        "DepthIntegrator gives no gradients; raster or prb_projective is needed",
+    )
+    message = refused(edited(sheet, '<integrator type="polysft">', '<integrator type="path">'))
+    has(message, 'its integrator is path; one <integrator type="polysft"> is needed')
+    message = refused(edited(sheet, "<integrator.*</integrator>", "", pattern=True))
+    has(message, 'its integrator is missing; one <integrator type="polysft"> is needed')
+
+
+def test_sensors_that_are_no_pinhole(sheet):
+    for kind, extra in (
+        ("thinlens", '<float name="aperture_radius" value="0.01"/>'),
+        ("orthographic", ""),
+    ):
+        message = refused(
+            edited(
+                sheet,
+                '<sensor type="perspective">.*?<transform',
+                f'<sensor type="{kind}">{extra}<transform',
+                pattern=True,
+            )
+        )
+        has(
+            message,
+            "line 77",
+            f"sensor '{kind}' is not a pinhole; perspective or pinhole is needed",
+        )
+    has(
+        refused(edited(sheet, "<sensor.*</sensor>", "", pattern=True)),
+        "0 sensors; exactly one is needed",
+    )
+
+
+def test_film_without_alpha(sheet):
+    message = refused(
+        edited(sheet, 'name="pixel_format" value="rgba"', 'name="pixel_format" value="rgb"')
+    )
+    has(message, "the film has no alpha", "pixel_format rgba is needed")
+
+
+def pinhole(folder, **values):
+    values = {"fx": 55, "fy": 50, "cx": 24, "cy": 18} | values
+    floats = "".join(f'<float name="{k}" value="{v}"/>' for k, v in values.items() if v is not None)
+    return edited(
+        folder,
+        '<sensor type="perspective">.*?<transform',
+        f'<sensor type="pinhole">{floats}<transform',
+        pattern=True,
+    )
+
+
+@pytest.mark.parametrize("value", [0, -50, "nan", "inf"])
+def test_focal_length_that_is_none(sheet, value):
+    has(
+        refused(pinhole(sheet, fy=value)),
+        "line 77: camera: ",
+        "is not a pinhole; finite values and positive focal lengths are needed",
+    )
+
+
+def test_focal_length_missing(sheet):
+    has(
+        refused(pinhole(sheet, fy=None)),
+        "line 77: pinhole: property 'fy' is missing; fx, fy, cx, cy are needed",
+    )
+
+
+@pytest.mark.parametrize("integrator", ["prb_projective", "path"])
+def test_pixels_that_are_not_square_with_path_replay(sheet, integrator):
+    message = refused(pinhole(sheet), "-D", f"integrator={integrator}")
+    has(message, "takes Mitsuba's perspective sensor only (fx = fy); use raster")
+
+
+def test_which_mesh_is_the_template(sheet):
+    shape = re.search("<shape.*</shape>", (sheet / "scene.xml").read_text(), re.S)[0]
+    anonymous = shape.replace(' id="template"', "")
+    has(
+        refused(edited(sheet, shape, anonymous + anonymous)),
+        '2 meshes; give the template\'s shape id="template"',
+    )
+    has(refused(edited(sheet, shape, "")), '0 meshes; give the template\'s shape id="template"')
+    has(refused(edited(sheet, shape, shape + shape)), 'duplicate ID: "template"')
+
+
+def test_unknown_setting_lists_the_known_ones_and_the_nearest(sheet):
+    message = refused(sheet / "scene.xml", "-D", "ordre=4")
+    has(
+        message,
+        "-D ordre: ",
+        "did you mean order?; known: blur, brightness, data,",
+        "k_mi",
+        "window",
+    )
+    has(refused(sheet / "scene.xml", "-D", "zzz=4"), "has no such setting; known: blur")
+
+
+@pytest.mark.parametrize("text", ["order", "=3", ""])
+def test_malformed_setting(sheet, text):
+    has(refused(sheet / "scene.xml", "-D", text), f"-D {text}: NAME=VALUE is needed")
+
+
+@pytest.mark.parametrize(
+    "setting, words",
+    [
+        ("k_mi=abc", "setting k_mi = 'abc'; a finite number is needed"),
+        ("k_mi=", "setting k_mi = ''; a finite number is needed"),
+        ("k_mi=nan", "k_mi = nan; a finite number, at least 0, is needed"),
+        ("k_mi=1e999", "k_mi = inf; a finite number, at least 0, is needed"),
+        *(
+            (f"{name}=-0.5", f"{name} = -0.5; a finite number, at least 0, is needed")
+            for name in ("k_rgb", "k_silhouette", "k_mi", "k_tc", "lr_uv")
+        ),
+        *((f"order={n}", f"order = {n}; a whole number, 0 to 10, is needed") for n in (-1, 11)),
+        *((f"order={n}", f"order = '{n}'; a whole number is needed") for n in ("four", "2.5", "")),
+        ("fit_tolerance=0", "fit_tolerance = 0.0; a finite number, above 0, is needed"),
+        ("window=-1", "window = -1; a whole number, at least 0, is needed"),
+        ("solver=newton", "solver = 'newton'; known values: gauss-newton, adam"),
+        ("rgb_norm=l3", "rgb_norm = 'l3'; known values: l1, l2, charbonnier"),
+        ("spp=3", "raster: spp = 3; a square number is needed"),
+        ("first=3", "first = 3; "),
+        ("last=3", "last = 3; it must lie in [0, 2]"),
+        ("data=/nowhere", "data = /nowhere: no such folder"),
+        ("frames=nothing", "nothing: no images"),
+        ("masks=nothing", "nothing: no images"),
+    ],
+)
+def test_bad_value(sheet, setting, words):
+    has(refused(sheet / "scene.xml", "-D", setting), words)
+
+
+@pytest.mark.parametrize(
+    "settings, words",
+    [
+        (["window=3", "smooth=1"], "window = 1, or smooth = 0, is needed"),
+        (
+            ["brightness=gain"],
+            "brightness = 'gain' with solver = gauss-newton; auto, local or none is needed",
+        ),
+    ],
+)
+def test_values_that_do_not_go_together(sheet, settings, words):
+    has(refused(sheet / "scene.xml", *(part for text in settings for part in ("-D", text))), words)
+
+
+def test_order_too_high_for_the_vertices(tmp_path):
+    truth = synthetic.cloth(tmp_path / "sheet", frames=1, size=SIZE, rows=4, columns=5)
+    prepare.prepare(str(truth.folder))
+    has(
+        refused(truth.folder / "scene.xml", "-D", "order=10"),
+        "template.obj: order = 10 is too high",
+        "66 coefficients, and the 20 vertices determine no more than order 3",
+    )
+
+
+@pytest.mark.parametrize(
+    "options", [["--fps", "0"], ["--fps", "nan"], ["--exr", "-1"], ["--exr", "some"]]
+)
+def test_bad_numbers_of_flags(sheet, options):
+    has(refused(sheet / "scene.xml", *options), " ".join(options), "are needed")
