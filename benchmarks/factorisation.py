@@ -7,9 +7,7 @@ unknowns and the gradient). Libraries that are not installed are left out.
 """
 
 import argparse
-import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import scipy.linalg
@@ -17,9 +15,7 @@ import scipy.sparse as sp
 import scipy.sparse.linalg
 from threadpoolctl import threadpool_limits
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-
-from polysft_mi.solvers.normal_equations import Blocks, Pattern  # noqa: E402
+from polysft_mi.solvers.normal_equations import Blocks, Pattern
 
 
 def grid(side):

@@ -9,16 +9,14 @@ alone makes.
 """
 
 import argparse
-import sys
 from pathlib import Path
+
+import onefit_accuracy as accuracy
 
 import onefit
 from onefit import train
 from onefit.losses import Weights
 from polyfit.errors import cli
-
-sys.path.insert(0, str(Path(__file__).resolve().parent))
-import onefit_accuracy as accuracy  # noqa: E402
 
 CASES = {
     "all losses": {},

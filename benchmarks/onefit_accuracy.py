@@ -1,10 +1,11 @@
 """Collisions, changes of size, energy and jitter of drapes, on motions and body shapes that no
 network was trained on.
 
-    python benchmarks/onefit_accuracy.py                       # the six garments by the networks of the package, and by skinning
-    python benchmarks/onefit_accuracy.py --garments jumpsuit shirt.obj --weights six-garments
-    runs/mine/weights.safetensors
+    python benchmarks/onefit_accuracy.py
+    python benchmarks/onefit_accuracy.py --garments jumpsuit shirt.obj \\
+        --weights six-garments runs/mine/weights.safetensors
 
+The first measures the six garments, by the networks of the package and by skinning.
 Every garment is draped in each held-out kind of motion, on bodies drawn at random with a seed that
 training does not use, and on the standard one. ``skinning`` is plain skinning of the template, the
 baseline; ``+ post`` pushes vertices out of the body after draping.

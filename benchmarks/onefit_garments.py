@@ -1,8 +1,8 @@
 """Measure the garment templates, their blend weights, grading and preprocessing.
 
-    python benchmarks/onefit_garments.py [more.obj ...] [--shapes 60] [-o out/benchmarks]        (two minutes)
+    python benchmarks/onefit_garments.py [more.obj ...] [--shapes 60] [-o out/benchmarks]
 
-For the eight templates, and for the garment files given, it prints
+For the eight templates, and for the garment files given, it prints (in two minutes)
 
 - the mesh: vertices, faces, openings, area, median edge, smallest angle, distance from the standard
   body;
@@ -22,7 +22,6 @@ and the grading to a body of another topology against that of the same body. Wri
 import argparse
 import json
 import os
-import sys
 import time
 from dataclasses import replace
 
@@ -30,18 +29,17 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
-sys.path.insert(0, ROOT)
+from onefit import fitting, generate, skeleton, skinning
+from onefit.binding import Binding, standard_body, standard_surface, surface_of
+from onefit.body import AnnyBody
+from onefit.garment import TEMPLATES, Garment
+from onefit.motion import Motion
+from onefit.remesh import loops
+from polyfit import mesh
+from polyfit.errors import cli
+from polyfit.files import aside
 
-from onefit import fitting, generate, skeleton, skinning  # noqa: E402
-from onefit.binding import Binding, standard_body, standard_surface, surface_of  # noqa: E402
-from onefit.body import AnnyBody  # noqa: E402
-from onefit.garment import TEMPLATES, Garment  # noqa: E402
-from onefit.motion import Motion  # noqa: E402
-from onefit.remesh import loops  # noqa: E402
-from polyfit import mesh  # noqa: E402
-from polyfit.errors import cli  # noqa: E402
-from polyfit.files import aside  # noqa: E402
+ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 
 
 def lengths(V, F):
@@ -66,8 +64,9 @@ def mesh_figures(garment):
     )
     d = 1e3 * standard_surface()(V).distance
     return {
-        "vertices": len(V), "faces": len(F), "openings": len(loops(F)), "area": mesh.areas(V, F).sum(),
-        "edge_mm": 1e3 * np.median(lengths(V, F)), "angle": angle.min(), "distance_mm": (d.min(), np.median(d), d.max()),
+        "vertices": len(V), "faces": len(F), "openings": len(loops(F)),
+        "area": mesh.areas(V, F).sum(), "edge_mm": 1e3 * np.median(lengths(V, F)),
+        "angle": angle.min(), "distance_mm": (d.min(), np.median(d), d.max()),
     }  # fmt: skip
 
 

@@ -1,7 +1,7 @@
 """How much skirts hang and swing: networks beside the minimum of the very objective that they are
 trained to lower.
 
-    python benchmarks/onefit_swing.py                                    # dress and skirt in two motions, four minutes on one core
+    python benchmarks/onefit_swing.py       # dress and skirt in two motions, 4 min on one core
     python benchmarks/onefit_swing.py --garments shirt.obj --motions dance
 
 *least* is no network: in each frame, after the two before it, the deformation of all patches is

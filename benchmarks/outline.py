@@ -7,19 +7,17 @@ by how much the outline missed and the vertices were off before, and after.
 
 import argparse
 import os
-import sys
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
-sys.path.insert(0, ROOT)
+from polysft_mi.camera import Intrinsics
+from polysft_mi.scene.images import read_rgb
+from polysft_mi.scene.outline import fitted
+from polysft_mi.scene.sequence import list_images
+from polysft_mi.surface import meshio
 
-from polysft_mi.camera import Intrinsics  # noqa: E402
-from polysft_mi.scene.images import read_rgb  # noqa: E402
-from polysft_mi.scene.outline import fitted  # noqa: E402
-from polysft_mi.scene.sequence import list_images  # noqa: E402
-from polysft_mi.surface import meshio  # noqa: E402
+ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 
 DATA = os.environ.get("POLYSFT_DATA") or os.path.join(os.path.dirname(ROOT), "shared", "data")
 SEQUENCES = "flag", "bend", "paper", "curtain", "corner"

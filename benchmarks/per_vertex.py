@@ -26,9 +26,6 @@ import time
 
 import numpy as np
 
-ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
-sys.path.insert(0, ROOT)
-
 from polysft_mi.backend import add_mode_argument, set_variant
 from polysft_mi.errors import InputError, cli
 from polysft_mi.files import aside

@@ -13,14 +13,15 @@ Kinds of patches, each sampled at 256 points:
 
     as made    cut at the paper's number K, as they are
     large      cut into 10 patches
-    posed      cut into 10, 25 and 100 patches, each then taken through a random smooth map of its own (polyfit.deformations: stretched,
-               bent, waved)
-    simulated  no garments, but nothing that resembles the training: the sheets of DATA/cloth, cut into 10 patches, in 8 frames each of
-               their simulations
-    folded     of large, posed and simulated: those that the PCA frame sees to more than 5 % from behind, so that they are no height graphs
-               over its plane, though they are over another: of 65 axes over the half sphere one at
-               least sees at most 1 % from behind. This is what a better frame can mend; the choice
-               asks the surfaces' normals alone, no fit. The difficult kind.
+    posed      cut into 10, 25 and 100 patches, each then taken through a random smooth map of its
+               own (polyfit.deformations: stretched, bent, waved)
+    simulated  no garments, but nothing that resembles the training: the sheets of DATA/cloth, cut
+               into 10 patches, in 8 frames each of their simulations
+    folded     of large, posed and simulated: those that the PCA frame sees to more than 5 % from
+               behind, so that they are no height graphs over its plane, though they are over
+               another: of 65 axes over the half sphere one at least sees at most 1 % from behind.
+               This is what a better frame can mend; the choice asks the surfaces' normals alone, no
+               fit. The difficult kind.
 
 Figures are means over patches, of the jets fitted to all 256 points: RMS of height in the chart's
 unit s (the paper's measure), of distance to the surface in s (which no frame can make small by
@@ -43,9 +44,6 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT))
-
 from polyfit import garments, jets, mesh
 from polyfit.baselines.atlasnet import AtlasNet, normalised
 from polyfit.baselines.regressors import DGCNN, PointNet
@@ -57,6 +55,8 @@ from polyfit.meshio import read_mesh
 from polyfit.patches import Patches
 from polyfit.stn import PatchFit, PolyFit, SpatialTransformer
 from polyfit.training_set import axes, rotations_to
+
+ROOT = Path(__file__).resolve().parent.parent
 
 TRAINED_ON = [
     f"garments_makehuman/{name}.obj"
@@ -310,7 +310,8 @@ def measure(data, runs):
 
     models = {"PolyFit without STN": PolyFit(ORDER), "PolyFit": main}
     for name, kind in (("pointnet", PointNet), ("dgcnn", DGCNN)):
-        models |= {kind.__name__: m for m in [trained(runs, name, kind.load)] if m}
+        if model := trained(runs, name, kind.load):
+            models[kind.__name__] = model
     report["networks"] = {name: on_all(m) | {"ms": milliseconds(m)} for name, m in models.items()}
     report["threads"] = torch.get_num_threads()
     rows = [

@@ -13,15 +13,12 @@ Chamfer distance, without an encoder: their decoders then have as many numbers a
 
 import argparse
 import json
-import sys
 import time
 from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-
-from polyfit import errors, mesh, read_mesh  # noqa: E402
+from polyfit import errors, mesh, read_mesh
 
 POINTS = 10_000
 PATCHES = (10, 25, 50, 100, 200, 400)

@@ -20,9 +20,6 @@ import time
 import cv2
 import numpy as np
 
-ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
-sys.path.insert(0, ROOT)
-
 from polysft_mi.capture.masks import iou
 from polysft_mi.errors import InputError, cli
 from polysft_mi.pictures.video import write_video
@@ -32,6 +29,8 @@ from polysft_mi.scene import kinect_paper
 from polysft_mi.scene.images import read_rgb
 from polysft_mi.scene.sequence import drop_stray_components, list_images
 from polysft_mi.surface import meshio
+
+ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 
 DATA = os.environ.get("POLYSFT_DATA") or os.path.join(os.path.dirname(ROOT), "shared", "data")
 FRAMES = 60

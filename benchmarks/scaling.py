@@ -26,15 +26,14 @@ import tempfile
 import time
 
 import numpy as np
+from cases import add_case_arguments, parse_size
 
-ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
-sys.path.insert(0, ROOT)
-
-from benchmarks.cases import add_case_arguments, parse_size
 from polysft_mi.backend import add_mode_argument, set_variant
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError, cli
 from polysft_mi.files import aside
+
+ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 
 GRIDS, SIZES, FRAMES = (33, 50, 71, 100), ("640x480", "1280x720", "1920x1080"), 8
 SHARE, SAMPLES = 1 / 3, 16  # of the image that the sheet covers; a pixel
@@ -188,9 +187,7 @@ def run_case(points, size, frames, mode):
                 "mode": mode,
             }
             command = [sys.executable, os.path.abspath(__file__), "--worker", json.dumps(job)]
-            done = subprocess.run(
-                command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-            )
+            done = subprocess.run(command, capture_output=True, text=True)
             if done.returncode:
                 why = done.stderr.strip()[-500:]
                 raise InputError(
@@ -225,22 +222,27 @@ def report(cases, docs, frames):
     started = np.median([c["started_mb"] for c in cases])
     text = f"""# How the tracker scales
 
-`python benchmarks/scaling.py` makes this page: a sheet that covers a third of the image bends and turns in front of the camera, rendered with its
-masks, tracked by default settings. Seconds a frame are the tracker's (median of {frames - 1} frames), without start-up and pictures, of all its
-threads together: on idle cores it takes less, for reading the next frame and the kernels run beside the rest. Memory is the process's peak, of which
-{started:.0f} MB are Python, Mitsuba, PyTorch and LLVM. Evaluations are those of the objective with its derivatives. {v["variant"]}, {v["machine"]}.
+`python benchmarks/scaling.py` makes this page: a sheet that covers a third of the image bends and
+turns in front of the camera, rendered with its masks, tracked by default settings. Seconds a frame
+are the tracker's (median of {frames - 1} frames), without start-up and pictures, of all its threads
+together: on idle cores it takes less, for reading the next frame and the kernels run beside the
+rest. Memory is the process's peak, of which {started:.0f} MB are Python, Mitsuba and LLVM.
+Evaluations are those of the objective with its derivatives. {v["variant"]}, {v["machine"]}.
 
-| vertices | image | seconds a frame | evaluations a frame | highest order | memory [MB] | RMS distance from the truth [mm] |
+| vertices | image | seconds a frame | evaluations a frame | order | memory [MB] | RMS [mm] |
 |---:|---|---:|---:|---:|---:|---:|
 {chr(10).join(rows)}
 
-![Seconds a frame and memory over the number of vertices, and over the number of pixels](scaling.png)
+![Seconds a frame and memory over the vertices, and over the pixels](scaling.png)
 
-With the image grow decoding, rays and residuals; only the finest of the three stages works on every pixel that sees the sheet. With the template
-grows above all the elimination of each vertex's (Δu, Δv): a sheet's block tridiagonal matrix is as wide as the sheet, so that its factorisation grows
-with the square of the number of vertices. Up to 3,000 vertices the relief moves too, which
-costs time, and on a sheet as smooth as this one its noise is to be seen in the distances. This sheet bends within a few frames, so that its mirror
-twin is tried in most of them: evaluations are up to twice those of a longer video.
+RMS is the distance from the truth, order the highest that was used. With the image grow decoding,
+rays and residuals; only the finest of the three stages works on every pixel that sees the sheet.
+With the template grows above all the elimination of each vertex's (Δu, Δv): a sheet's block
+tridiagonal matrix is as wide as the sheet, so that its factorisation grows with the square of the
+number of vertices. Up to 3,000 vertices the relief moves too, which costs time, and on a sheet as
+smooth as this one its noise is to be seen in the distances. This sheet bends within a few frames,
+so that its mirror twin is tried in most of them: evaluations are up to twice those of a longer
+video.
 """
     with (
         aside(os.path.join(docs, "scaling.md")) as temporary,

@@ -25,9 +25,6 @@ import time
 
 import numpy as np
 
-ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
-sys.path.insert(0, ROOT)
-
 from polysft_mi.backend import add_mode_argument
 from polysft_mi.errors import InputError, cli
 from polysft_mi.files import aside
@@ -35,6 +32,8 @@ from polysft_mi.results import metrics
 from polysft_mi.results.evaluation import LABELS, evaluate, score
 from polysft_mi.results.truth import find_truth, load_npz
 from polysft_mi.surface import meshio
+
+ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 
 SCENES = os.path.join(ROOT, "scenes")
 DATA = os.environ.get("POLYSFT_DATA") or os.path.join(os.path.dirname(ROOT), "shared", "data")

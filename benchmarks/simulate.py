@@ -1,10 +1,13 @@
 """Sequences that nobody has tuned anything on: cloth simulated by Newton, rendered by Mitsuba's
 path tracer.
 
-    pip install newton                                               # NVIDIA's simulator on Warp; on the CPU too
-    python benchmarks/simulate.py OUT --seed 3                       # OUT/flag, bend, paper, curtain; about two minutes each on one core
-    python benchmarks/sft.py --data OUT --only flag bend paper curtain --methods gauss-newton -o
-    RESULTS
+    pip install newton
+    python benchmarks/simulate.py OUT --seed 3
+    python benchmarks/sft.py --data OUT --only flag bend paper curtain \\
+        --methods gauss-newton -o RESULTS
+
+Newton is NVIDIA's simulator on Warp; it runs on the CPU too. OUT receives the folders flag, bend,
+paper and curtain, about two minutes each on one core.
 
 Each folder has the form that the scenes of those names expect: ``template.obj`` (metres, camera
 frame), ``texture.png``, ``camera.json``, ``frames``, ``masks`` (480x360) and ``gt.npz``, the true
@@ -19,19 +22,15 @@ vertices (T, N, 3). The seed decides motion, wind, light and texture.
 import argparse
 import json
 import os
-import sys
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
-sys.path.insert(0, ROOT)
-
-from polyfit.mesh import edges_of  # noqa: E402
-from polysft_mi.backend import set_variant  # noqa: E402
-from polysft_mi.errors import InputError, cli  # noqa: E402
-from polysft_mi.prepare import write_obj  # noqa: E402
+from polyfit.mesh import edges_of
+from polysft_mi.backend import set_variant
+from polysft_mi.errors import InputError, cli
+from polysft_mi.prepare import write_obj
 
 FRAMES, FPS = 45, 60.0
 SUBSTEPS, ITERATIONS = 10, 40  # of a frame, and of Newton's vertex block descent in each
@@ -83,7 +82,7 @@ def sheet(kind):
 
 def pinned(name, kind, rng):
     """Which vertices are held, (N,) bool."""
-    (nx, ny), each = kind.cells, np.arange((kind.cells[0] + 1) * (kind.cells[1] + 1))
+    (nx, _ny), each = kind.cells, np.arange((kind.cells[0] + 1) * (kind.cells[1] + 1))
     column, row = each % (nx + 1), each // (nx + 1)
     if name == "flag":
         return column == 0
@@ -175,8 +174,10 @@ def simulate(name, seed):
     builder = newton.ModelBuilder(up_axis=newton.Axis.Y, gravity=wp.vec3(0.0, kind.gravity, 0.0))
     (w, h), (nx, ny) = kind.size, kind.cells
     builder.add_cloth_grid(
-        pos=wp.vec3(*rest[0].tolist()), rot=wp.quat_identity(), vel=wp.vec3(0.0, 0.0, 0.0), dim_x=nx, dim_y=ny, cell_x=w / nx, cell_y=h / ny,
-        mass=DENSITY * w * h / len(rest), tri_ke=STRETCHING, tri_ka=STRETCHING, tri_kd=1e-6, edge_ke=kind.bending, edge_kd=1e-4, particle_radius=0.002,
+        pos=wp.vec3(*rest[0].tolist()), rot=wp.quat_identity(), vel=wp.vec3(0.0, 0.0, 0.0),
+        dim_x=nx, dim_y=ny, cell_x=w / nx, cell_y=h / ny, mass=DENSITY * w * h / len(rest),
+        tri_ke=STRETCHING, tri_ka=STRETCHING, tri_kd=1e-6, edge_ke=kind.bending, edge_kd=1e-4,
+        particle_radius=0.002,
     )  # fmt: skip
     for i in np.flatnonzero(held):
         builder.particle_mass[i] = 0.0
@@ -292,23 +293,34 @@ def render(folder, vertices, faces, uv, rng):
             indent=1,
         )
     scene = mi.load_dict({
-        "type": "scene",
-        "integrator": {"type": "path", "max_depth": 3},
+        "type": "scene", "integrator": {"type": "path", "max_depth": 3},
         "sensor": {
-            "type": "perspective", "fov": float(np.degrees(2 * np.arctan(width / 2 / FOCAL))), "fov_axis": "x",
+            "type": "perspective", "fov": float(np.degrees(2 * np.arctan(width / 2 / FOCAL))),
+            "fov_axis": "x",
             "to_world": mi.ScalarTransform4f().look_at([0, 0, 0], [0, 0, 1], [0, -1, 0]),
-            "film": {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}, "pixel_format": "rgb"},
+            "film": {
+                "type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"},
+                "pixel_format": "rgb"
+            },
+        }, "sky": {"type": "constant", "radiance": 0.35},
+        "lamp": {
+            "type": "sphere", "center": [rng.uniform(-0.9, 0.9), -0.9, -0.3], "radius": 0.18,
+            "emitter": {"type": "area", "radiance": 9.0}
         },
-        "sky": {"type": "constant", "radiance": 0.35},
-        "lamp": {"type": "sphere", "center": [rng.uniform(-0.9, 0.9), -0.9, -0.3], "radius": 0.18, "emitter": {"type": "area", "radiance": 9.0}},
-        "cloth": {"type": "obj", "filename": at("template.obj"), "bsdf": {
-            "type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {"type": "bitmap", "filename": at("texture.png")}}}},
+        "cloth": {
+            "type": "obj", "filename": at("template.obj"),
+            "bsdf": {
+                "type": "twosided",
+                "bsdf": {
+                    "type": "diffuse",
+                    "reflectance": {"type": "bitmap", "filename": at("texture.png")}
+                }
+            }
+        },
     })  # fmt: skip
     depth = mi.load_dict({"type": "aov", "aovs": "z:depth"})
     parameters = mi.traverse(scene)
-    key = next(
-        k for k in parameters.keys() if k.startswith("cloth") and k.endswith("vertex_positions")
-    )
+    key = next(k for k in parameters if k.startswith("cloth") and k.endswith("vertex_positions"))
     start = np.array(parameters[key]).reshape(-1, 3)
     corner = np.linalg.norm(start[:, None] - vertices[0], axis=-1).argmin(
         1

@@ -5,15 +5,12 @@ python docs/drapes.py [OUT.jpg] [--weights six-garments]
 """
 
 import argparse
-import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+import cv2
+import numpy as np
 
-import cv2  # noqa: E402
-import numpy as np  # noqa: E402
-
-from polysft_mi.backend import set_variant  # noqa: E402
+from polysft_mi.backend import set_variant
 
 set_variant()
 import onefit  # noqa: E402

@@ -6,12 +6,8 @@
 """
 
 import os
-import sys
 
-HERE = os.path.dirname(os.path.abspath(__file__))
-sys.path.insert(0, os.path.dirname(HERE))
-
-from polysft_mi.backend import set_variant  # noqa: E402
+from polysft_mi.backend import set_variant
 
 set_variant()
 
@@ -21,8 +17,10 @@ import numpy as np  # noqa: E402
 from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 
-from polysft_mi.scene import plugins  # noqa: E402
 from polysft_mi.camera import Intrinsics  # noqa: E402
+from polysft_mi.scene import plugins  # noqa: E402
+
+HERE = os.path.dirname(os.path.abspath(__file__))
 
 WIDTH, HEIGHT, FOCAL = 16, 12, 20.0
 TEXTURE = 0.55 + 0.4 * np.stack(
@@ -63,7 +61,7 @@ class Plane:
         ]
         self.scene = mi.load_dict({"type": "scene", "sensor": sensor, "mesh": mesh})
         self.params = mi.traverse(self.scene)
-        self.key = next(k for k in self.params.keys() if k.endswith("vertex_positions"))
+        self.key = next(k for k in self.params if k.endswith("vertex_positions"))
         self.rest = mi.Float(self.params[self.key])
 
     @staticmethod

@@ -8,20 +8,18 @@ training draws them)
 
 import argparse
 import os
-import sys
 import tempfile
 
+import numpy as np
+import pyvista
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from onefit.binding import standard_body
+from onefit.cuts import CUTS, cuts
+from onefit.garment import TEMPLATES, Garment
+
 HERE = os.path.dirname(os.path.abspath(__file__))
-sys.path.insert(0, os.path.dirname(HERE))
-
-import numpy as np  # noqa: E402
-import pyvista  # noqa: E402
-from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: E402
-from matplotlib.figure import Figure  # noqa: E402
-
-from onefit.binding import standard_body  # noqa: E402
-from onefit.cuts import CUTS, cuts  # noqa: E402
-from onefit.garment import TEMPLATES, Garment  # noqa: E402
 
 WIDTH, HEIGHT, ZOOM = 300, 460, 3
 SKIN, CLOTH = "#c9b29b", "#4d7ba8"

@@ -5,19 +5,17 @@ python docs/onefit_motions.py        (a minute)
 """
 
 import os
-import sys
+
+import numpy as np
+import pyvista
+from PIL import Image, ImageDraw
+
+from onefit import generate, skinning
+from onefit.body import AnnyBody
+from onefit.motion import Motion
+from polyfit.files import aside
 
 HERE = os.path.dirname(os.path.abspath(__file__))
-sys.path.insert(0, os.path.dirname(HERE))
-
-import numpy as np  # noqa: E402
-import pyvista  # noqa: E402
-from PIL import Image, ImageDraw  # noqa: E402
-
-from onefit import generate, skinning  # noqa: E402
-from onefit.body import AnnyBody  # noqa: E402
-from onefit.motion import Motion  # noqa: E402
-from polyfit.files import aside  # noqa: E402
 
 MOMENTS, SECONDS, SEED, COLUMNS = 8, 5.0, 3, 2
 WIDTH, HEIGHT = 118, 150

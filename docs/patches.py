@@ -9,12 +9,8 @@ The picture in the documentation is that of a CC0 shirt of the MakeHuman communi
 
 import argparse
 import os
-import sys
 
-HERE = os.path.dirname(os.path.abspath(__file__))
-sys.path.insert(0, os.path.dirname(HERE))
-
-from polysft_mi.backend import set_variant  # noqa: E402
+from polysft_mi.backend import set_variant
 
 set_variant()
 
@@ -25,6 +21,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 
 from polyfit import PatchedSurface, mesh, read_mesh  # noqa: E402
+
+HERE = os.path.dirname(os.path.abspath(__file__))
 
 WIDTH, HEIGHT = 480, 740
 CLOTH = np.array([0.35, 0.50, 0.68])

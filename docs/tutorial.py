@@ -10,18 +10,17 @@ import shlex
 import subprocess
 import sys
 
+import cv2
+import numpy as np
+
+from polysft_mi.capture.sheet import Sheet
+from polysft_mi.pictures.video import write_video
+from polysft_mi.scene.images import read_rgb
+from polysft_mi.scene.sequence import list_images
+from polysft_mi.surface import meshio
+
 HERE = os.path.dirname(os.path.abspath(__file__))
 ROOT = os.path.dirname(HERE)
-sys.path.insert(0, ROOT)
-
-import cv2  # noqa: E402
-import numpy as np  # noqa: E402
-
-from polysft_mi.surface import meshio  # noqa: E402
-from polysft_mi.scene.images import read_rgb  # noqa: E402
-from polysft_mi.capture.sheet import Sheet  # noqa: E402
-from polysft_mi.scene.sequence import list_images  # noqa: E402
-from polysft_mi.pictures.video import write_video  # noqa: E402
 
 OUT = "out/tutorial"
 PICTURES = {  # from: (to, pixels it is wide)
@@ -65,7 +64,7 @@ def errors():
     of the photo.
     """
     truth = np.load(os.path.join(ROOT, "scenes", "demo", "gt.npz"))["vertices"]
-    vertices, faces, uv = meshio.read_template(os.path.join(ROOT, "scenes", "demo", "template.obj"))
+    _, faces, uv = meshio.read_template(os.path.join(ROOT, "scenes", "demo", "template.obj"))
     found = np.load(os.path.join(ROOT, OUT, "run", "surface.npz"))
     true = [
         Sheet(v, faces, uv, "demo").at(found["uv"].clip(1e-6, 1 - 1e-6))

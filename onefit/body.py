@@ -79,9 +79,10 @@ class BodyModel:
 # Anny's bones that move with each joint, by the start of their names; left and right by the names'
 # ends. A bone that no name here starts moves with its parent.
 _BONES = {
-    "root": "pelvis", "upperleg01": "hip", "lowerleg01": "knee", "foot": "ankle", "toe": "foot", "spine04": "spine1", "spine02": "spine2",
-    "spine01": "spine3", "clavicle": "collar", "upperarm01": "shoulder", "lowerarm01": "elbow", "wrist": "wrist",
-    "finger2": "hand", "finger3": "hand", "finger4": "hand", "finger5": "hand", "neck01": "neck", "head": "head",
+    "root": "pelvis", "upperleg01": "hip", "lowerleg01": "knee", "foot": "ankle", "toe": "foot",
+    "spine04": "spine1", "spine02": "spine2", "spine01": "spine3", "clavicle": "collar",
+    "upperarm01": "shoulder", "lowerarm01": "elbow", "wrist": "wrist", "finger2": "hand",
+    "finger3": "hand", "finger4": "hand", "finger5": "hand", "neck01": "neck", "head": "head",
 }  # fmt: skip
 
 
@@ -163,8 +164,8 @@ class AnnyBody(BodyModel):
     # Ranges that random_shape draws from, uniformly: bodies from 1.4 to 1.95 m. Beyond them Anny
     # has children, giants and the very old.
     RANGES = {
-        "gender": (0.0, 1.0), "age": (0.5, 0.8), "muscle": (0.3, 0.7), "weight": (0.25, 0.85), "height": (0.3, 0.55),
-        "proportions": (0.25, 0.75),
+        "gender": (0.0, 1.0), "age": (0.5, 0.8), "muscle": (0.3, 0.7), "weight": (0.25, 0.85),
+        "height": (0.3, 0.55), "proportions": (0.25, 0.75),
     }  # fmt: skip
 
     def random_shape(self, rng):

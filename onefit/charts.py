@@ -324,7 +324,7 @@ class PatchedGarment:
         s, R, alpha = (x.to(deformation.alpha) for x in (self.frame.s, self.frame.R, self.alpha))
         grown = deformation.scale.exp()[..., None]
         height = grown * (alpha + deformation.alpha) - alpha
-        T, K, A = height.shape
+        _T, K, A = height.shape
         wide = (
             torch.nn.functional.pad((grown - 1), (1, A - 2)),
             torch.nn.functional.pad((grown - 1), (2, A - 3)),

@@ -24,25 +24,57 @@ from .tailor import Block, sewn
 # the first: little ease, to the ankles and wrists, where the body is hardest to follow. The wide
 # ones are fitted to the hips only, and swing.
 CUTS = {
-    "tshirt": ("tshirt", 4, dict(
-        waist_ease=(0, 0.03), sleeve_ease=(0, 0.03), sleeve=(0.23, 0.07),
-        hem=(-0.12, 0.10), front=(0.49, 0.41), back=(0.54, 0.48), narrow=(8, 3)
-    )),
-    "trousers": ("trousers", 3, dict(hip_ease=(0, 0.02), leg_ease=(0, 0.03), waist=(0.22, 0.04), hem=(-0.715, -0.35))),
-    "long_sleeve_top": ("long_sleeve_top", 4, dict(
-        waist_ease=(0, 0.03), sleeve_ease=(0, 0.02), sleeve=(0.24, 0.0),
-        hem=(-0.15, 0.08), front=(0.49, 0.42), back=(0.545, 0.49), narrow=(8, 3)
-    )),
-    "dress": ("dress", 4, dict(
-        hem=(-0.16, -0.62), waist=(0.11, 0.14), flare=(0.20, 0.38), front=(0.47, 0.38), back=(0.52, 0.44), narrow=(10, 4)
-    )),
-    "shorts": ("shorts", 3, dict(hip_ease=(0, 0.02), leg_ease=(0, 0.03), waist=(0.04, 0.20), hem=(-0.10, -0.40))),
-    "tank": ("tank", 4, dict(waist_ease=(0, 0.03), hem=(-0.12, 0.15), front=(0.46, 0.37), back=(0.52, 0.44), narrow=(10, 4))),
-    "skirt": ("dress", 2, dict(hem=(-0.14, -0.62), waist=(0.11, 0.14), flare=(0.20, 0.38), top=(0.06, 0.16))),
-    "wide_dress": ("dress", 4, dict(
-        hem=(-0.30, -0.60), waist=(0.11, 0.14), flare=(0.27, 0.40), front=(0.47, 0.38), back=(0.52, 0.44), narrow=(10, 4)
-    )),
-    "wide_skirt": ("dress", 2, dict(hem=(-0.25, -0.60), waist=(0.11, 0.14), flare=(0.27, 0.42), top=(0.06, 0.16))),
+    "tshirt": (
+        "tshirt", 4,
+        dict(
+            waist_ease=(0, 0.03), sleeve_ease=(0, 0.03), sleeve=(0.23, 0.07), hem=(-0.12, 0.10),
+            front=(0.49, 0.41), back=(0.54, 0.48), narrow=(8, 3)
+        )
+    ),
+    "trousers": (
+        "trousers", 3,
+        dict(hip_ease=(0, 0.02), leg_ease=(0, 0.03), waist=(0.22, 0.04), hem=(-0.715, -0.35))
+    ),
+    "long_sleeve_top": (
+        "long_sleeve_top", 4,
+        dict(
+            waist_ease=(0, 0.03), sleeve_ease=(0, 0.02), sleeve=(0.24, 0.0), hem=(-0.15, 0.08),
+            front=(0.49, 0.42), back=(0.545, 0.49), narrow=(8, 3)
+        )
+    ),
+    "dress": (
+        "dress", 4,
+        dict(
+            hem=(-0.16, -0.62), waist=(0.11, 0.14), flare=(0.20, 0.38), front=(0.47, 0.38),
+            back=(0.52, 0.44), narrow=(10, 4)
+        )
+    ),
+    "shorts": (
+        "shorts", 3,
+        dict(hip_ease=(0, 0.02), leg_ease=(0, 0.03), waist=(0.04, 0.20), hem=(-0.10, -0.40))
+    ),
+    "tank": (
+        "tank", 4,
+        dict(
+            waist_ease=(0, 0.03), hem=(-0.12, 0.15), front=(0.46, 0.37), back=(0.52, 0.44),
+            narrow=(10, 4)
+        )
+    ),
+    "skirt": (
+        "dress", 2,
+        dict(hem=(-0.14, -0.62), waist=(0.11, 0.14), flare=(0.20, 0.38), top=(0.06, 0.16))
+    ),
+    "wide_dress": (
+        "dress", 4,
+        dict(
+            hem=(-0.30, -0.60), waist=(0.11, 0.14), flare=(0.27, 0.40), front=(0.47, 0.38),
+            back=(0.52, 0.44), narrow=(10, 4)
+        )
+    ),
+    "wide_skirt": (
+        "dress", 2,
+        dict(hem=(-0.25, -0.60), waist=(0.11, 0.14), flare=(0.27, 0.42), top=(0.06, 0.16))
+    ),
 }  # fmt: skip
 EASE = 0.001, 0.020  # of all [m], drawn evenly in its logarithm: half of the cuts lie on the skin
 COUNT = 500, 5000  # vertices, likewise

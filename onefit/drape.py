@@ -1,12 +1,14 @@
 """Drapes a garment on a moving body, and writes the arrays, an animation and a rendering of it.
 
-    python -m onefit.drape dress walk -o OUT                         # a template, a generated motion
-    python -m onefit.drape shirt.obj motion.npz -o OUT --post        # a mesh, a motion of AMASS, NCS or BVH
+    python -m onefit.drape dress walk -o OUT                   # a template, a generated motion
+    python -m onefit.drape shirt.obj motion.npz -o OUT --post  # a mesh, a motion (AMASS, NCS, BVH)
     python -m onefit.drape tshirt dance -o OUT --shape weight=0.7 height=0.6 --skip render
 
 OUT receives
 
-    drape.npz               vertices (T, N, 3) [m, z up], faces, rest, the body's vertices and faces, fps, and figures.json beside it
+    drape.npz               vertices (T, N, 3) [m, z up], faces, rest, the body's vertices and
+                            faces, fps
+    figures.json            what was measured
     garment.usd, body.usd   animations that Blender and usdview open
     frames/NNN.png          path-traced by Mitsuba; drape.mp4 is their video
     meshes/NNN.obj          one mesh a frame, with --meshes obj (or ply)
@@ -89,8 +91,8 @@ def _render(drape, folder, size, spp, advance):
     set_variant()
     import cv2
 
-    from polysft_mi.render import stage
     from polysft_mi.pictures.video import write_video
+    from polysft_mi.render import stage
 
     parts = [
         (drape.body.numpy(), drape.body_faces.numpy(), BODY),

@@ -30,8 +30,8 @@ from . import skeleton
 from .motion import Motion
 
 CHANNELS = {
-    "pelvis": 3, "turn": 3, "spine": 3, "head": 3, "left_arm": 4, "right_arm": 4, "left_hand": 2, "right_hand": 2,
-    "left_foot": 3, "right_foot": 3, "left_foot_turn": 3, "right_foot_turn": 3,
+    "pelvis": 3, "turn": 3, "spine": 3, "head": 3, "left_arm": 4, "right_arm": 4, "left_hand": 2,
+    "right_hand": 2, "left_foot": 3, "right_foot": 3, "left_foot_turn": 3, "right_foot_turn": 3,
 }  # fmt: skip
 # hanging arms, a hand's breadth from the hips, elbows soft
 STAND = {
@@ -41,12 +41,7 @@ STAND = {
     "right_foot_turn": (0.0, 0.1, 0.0),
 }
 
-_J = {
-    name: place
-    for name, place in zip(
-        skeleton.JOINTS, skeleton.standard_joints().double().numpy(), strict=True
-    )
-}
+_J = dict(zip(skeleton.JOINTS, skeleton.standard_joints().double().numpy(), strict=True))
 BALL = _J["left_foot"]  # where the ball of the left foot is in the upright stand [m]
 _SPINE = (
     ("spine1", 0.3),

@@ -18,8 +18,8 @@ from polyfit.errors import InputError
 from . import skeleton, skinning
 from .binding import (
     Binding,
-    smoother,
     cotangent_laplacian,
+    smoother,
     standard_body,
     standard_surface,
     surface_of,

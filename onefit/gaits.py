@@ -56,11 +56,14 @@ def walk(t, rng):
     stride = (0.25 + 0.85 * speed**0.5) * rng.uniform(0.95, 1.05)
     push = rng.uniform(0.85, 1.05) * min(1.0, 0.55 + 0.35 * speed)
     c, phase = gait(
-        t, rng, stride=stride, rate=speed / stride, stance=0.62, sway=rng.uniform(0.015, 0.03), bob=0.008 + 0.005 * speed,
-        lift=[(0.0, 0.0), (0.59, 0.0), (0.71, 0.06 + 0.04 * speed), (0.84, 0.035), (0.97, 0.005)], narrow=rng.uniform(0.02, 0.05),
-        behind=0.05 + 0.02 * speed,
-        heel=[(0.0, -0.25), (0.1, 0.0), (0.3, 0.0), (0.5, 0.45 * push), (0.62, push), (0.7, 0.8 * push), (0.86, -0.1), (0.96, -0.3)],
-        curvature=rng.uniform(-0.25, 0.25),
+        t, rng, stride=stride, rate=speed / stride, stance=0.62, sway=rng.uniform(0.015, 0.03),
+        bob=0.008 + 0.005 * speed,
+        lift=[(0.0, 0.0), (0.59, 0.0), (0.71, 0.06 + 0.04 * speed), (0.84, 0.035), (0.97, 0.005)],
+        narrow=rng.uniform(0.02, 0.05), behind=0.05 + 0.02 * speed,
+        heel=[
+            (0.0, -0.25), (0.1, 0.0), (0.3, 0.0), (0.5, 0.45 * push), (0.62, push),
+            (0.7, 0.8 * push), (0.86, -0.1), (0.96, -0.3)
+        ], curvature=rng.uniform(-0.25, 0.25),
     )  # fmt: skip
     wave, beat = np.cos(2 * np.pi * phase), np.cos(2 * np.pi * (phase - 0.31))
     zero = np.zeros(len(t))
@@ -83,9 +86,15 @@ def run(t, rng):
     speed = rng.uniform(2.0, 3.6)
     rate = rng.uniform(1.35, 1.5)
     c, phase = gait(
-        t, rng, stride=speed / rate, rate=rate, stance=0.3, sway=0.01, bob=-0.03, narrow=0.06, behind=0.04 + 0.02 * speed,
-        lift=[(0.0, 0.0), (0.3, 0.0), (0.42, 0.16), (0.55, 0.16 + 0.07 * speed), (0.7, 0.28), (0.9, 0.07)],
-        heel=[(0.0, -0.1), (0.06, 0.0), (0.14, 0.1), (0.32, 0.9), (0.52, 1.4), (0.7, 0.5), (0.9, -0.1)], curvature=rng.uniform(-0.08, 0.08),
+        t, rng, stride=speed / rate, rate=rate, stance=0.3, sway=0.01, bob=-0.03, narrow=0.06,
+        behind=0.04 + 0.02 * speed,
+        lift=[
+            (0.0, 0.0), (0.3, 0.0), (0.42, 0.16), (0.55, 0.16 + 0.07 * speed), (0.7, 0.28),
+            (0.9, 0.07)
+        ],
+        heel=[
+            (0.0, -0.1), (0.06, 0.0), (0.14, 0.1), (0.32, 0.9), (0.52, 1.4), (0.7, 0.5), (0.9, -0.1)
+        ], curvature=rng.uniform(-0.08, 0.08),
     )  # fmt: skip
     wave, beat = np.cos(2 * np.pi * phase), np.cos(2 * np.pi * (phase - 0.15))
     zero = np.zeros(len(t))

@@ -59,9 +59,10 @@ def _alive(channels, t, rng):
 
 
 _TRAINING = (
-    postures.idle, gaits.walk, gaits.run, postures.squat, postures.reach, postures.twist, postures.arms_up, postures.arms_crossed,
-    postures.kick,
-    postures.sit, postures.turn, postures.side_step, postures.lunge, postures.bend, postures.stretch, postures.jump, postures.improvise,
+    postures.idle, gaits.walk, gaits.run, postures.squat, postures.reach, postures.twist,
+    postures.arms_up, postures.arms_crossed, postures.kick, postures.sit, postures.turn,
+    postures.side_step, postures.lunge, postures.bend, postures.stretch, postures.jump,
+    postures.improvise,
 )  # fmt: skip
 _HELD_OUT = (
     heldout.jumping_jack,

@@ -53,12 +53,13 @@ def box(t, rng):
         fast, hook = rng.uniform(0.22, 0.35), rng.random() < 0.35
         arm = (1.35, 0.75, 0.25, 1.4) if hook else (rng.uniform(1.4, 1.75), -0.08, 0.3, 0.15)
         s.move(
-            fast, pelvis=(0, -0.05, -0.07), turn=(0.12, 0, -0.25 - 0.3 * sign), spine=(0.08, 0, -0.3 * sign), head=(0.05, 0,
-            0.45 * sign + 0.2),
+            fast, pelvis=(0, -0.05, -0.07), turn=(0.12, 0, -0.25 - 0.3 * sign),
+            spine=(0.08, 0, -0.3 * sign), head=(0.05, 0, 0.45 * sign + 0.2),
             **{f"{one}_arm": arm, f"{one}_hand": (0, 0)},
         )  # fmt: skip
         s.move(
-            1.3 * fast, pelvis=(0, 0.02, -0.06), turn=(0.08, 0, -0.25), spine=(0.05, 0, 0), head=(0, 0, 0.2), **{f"{one}_arm": guards[one]},
+            1.3 * fast, pelvis=(0, 0.02, -0.06), turn=(0.08, 0, -0.25), spine=(0.05, 0, 0),
+            head=(0, 0, 0.2), **{f"{one}_arm": guards[one]},
         )  # fmt: skip
         s.hold(rng.choice([0.0, 0.1, 0.5, 0.9]))
     return s.channels(t)
@@ -207,9 +208,10 @@ def sneak(t, rng):
     speed = rng.uniform(0.35, 0.6)
     rate = rng.uniform(0.45, 0.6)
     c, phase = gait(
-        t, rng, stride=speed / rate, rate=rate, stance=0.62, sway=0.05, bob=0.02, narrow=0.03, behind=0.02, curvature=rng.uniform(-0.3,
-        0.3),
-        lift=[(0.0, 0.0), (0.6, 0.0), (0.78, 0.22), (0.9, 0.12)], heel=[(0.0, 0.45), (0.1, 0.2), (0.4, 0.1), (0.62, 0.8), (0.8, 0.5)],
+        t, rng, stride=speed / rate, rate=rate, stance=0.62, sway=0.05, bob=0.02, narrow=0.03,
+        behind=0.02, curvature=rng.uniform(-0.3, 0.3),
+        lift=[(0.0, 0.0), (0.6, 0.0), (0.78, 0.22), (0.9, 0.12)],
+        heel=[(0.0, 0.45), (0.1, 0.2), (0.4, 0.1), (0.62, 0.8), (0.8, 0.5)],
     )  # fmt: skip
     wave = np.cos(2 * np.pi * phase)
     zero = np.zeros(len(t))

@@ -80,7 +80,7 @@ def _without_slivers(V, F, where, told):
     e = mesh.edges_of(F)[0]
     short = e[np.linalg.norm(V[e[:, 0]] - V[e[:, 1]], axis=1) < COINCIDENT]
     V, G = _merged(V, F, short)
-    whole = (G != np.roll(G, 1, axis=1)).all(axis=1)
+    whole = (np.roll(G, 1, axis=1) != G).all(axis=1)
     _, first = np.unique(np.sort(G, axis=1), axis=0, return_index=True)
     once = np.zeros(len(G), dtype=bool)
     once[first] = True

@@ -50,7 +50,7 @@ def _warp():
         first: wp.array(dtype=int),
         around: wp.array(dtype=int),
     ):
-        most = int(0)
+        most = 0
         for k in range(3):
             if b[k] > b[most]:
                 most = k
@@ -68,7 +68,7 @@ def _warp():
                     wp.mesh_get_index(mesh, 3 * f + (k + 1) % 3),
                     wp.mesh_get_index(mesh, 3 * f + (k + 2) % 3),
                 )
-                weight = float(0.0)
+                weight = 0.0
                 if on_vertex:
                     weight = wp.acos(
                         wp.dot(

@@ -5,6 +5,7 @@ jets, orientations, places of the patches ─► PatchEncoder ─► Z_T ─┐
 poses, shape, root velocity ─► BodyEncoder ─────────────────► Z_B ┴─► Decoder ─► Deformation
 """
 
+import itertools
 import math
 
 import torch
@@ -26,7 +27,7 @@ UNIT = {"alpha": 0.2, "translation": 0.3, "scale": 0.05, "drift": 1.0}
 def layers(widths, bias=True, last=True):
     """Fully connected layers with LeakyReLU between them, and after the last one if ``last``."""
     out = []
-    for i, (a, b) in enumerate(zip(widths, widths[1:])):
+    for i, (a, b) in enumerate(itertools.pairwise(widths)):
         linear = nn.Linear(a, b, bias=bias)
         nn.init.kaiming_normal_(linear.weight, SLOPE, nonlinearity="leaky_relu")
         if bias:

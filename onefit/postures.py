@@ -2,6 +2,8 @@
 :mod:`onefit.generate`.
 """
 
+import itertools
+
 import numpy as np
 from scipy.interpolate import BPoly
 
@@ -18,10 +20,14 @@ def idle(t, rng):
         one, other, _ = sides(rng)
         lean = rng.uniform(-0.055, 0.055)
         s.move(
-            rng.uniform(1.2, 2.5), pelvis=(lean, rng.uniform(-0.02, 0.02), -0.2 * abs(lean)), turn=(0, -1.2 * lean, rng.uniform(-0.15,
-            0.15)),
-            spine=(rng.uniform(-0.03, 0.1), 1.6 * lean, rng.uniform(-0.15, 0.15)), head=(rng.uniform(-0.2, 0.3), 0, rng.uniform(-0.8, 0.8)),
-            **{f"{one}_arm": rng.uniform((-0.3, 0.2, 0, 0.1), (0.5, 0.5, 0.3, 1.2)), f"{other}_arm": hanging(rng)},
+            rng.uniform(1.2, 2.5), pelvis=(lean, rng.uniform(-0.02, 0.02), -0.2 * abs(lean)),
+            turn=(0, -1.2 * lean, rng.uniform(-0.15, 0.15)),
+            spine=(rng.uniform(-0.03, 0.1), 1.6 * lean, rng.uniform(-0.15, 0.15)),
+            head=(rng.uniform(-0.2, 0.3), 0, rng.uniform(-0.8, 0.8)),
+            **{
+                f"{one}_arm": rng.uniform((-0.3, 0.2, 0, 0.1), (0.5, 0.5, 0.3, 1.2)),
+                f"{other}_arm": hanging(rng)
+            },
         )  # fmt: skip
         s.hold(rng.uniform(0.0, 1.2))
     return s.channels(t)
@@ -47,13 +53,13 @@ def squat(t, rng):
             (rng.uniform(2.6, 2.9), 0.15, 0.0, 0.2),
         ][rng.choice(3)]
         s.move(
-            pace, pelvis=(0, 0.45 * deep, -deep), turn=(1.4 * deep + rng.uniform(0, 0.15), 0, 0), spine=(0.5 * deep, 0, 0),
-            head=(-1.2 * deep, 0, 0), left_arm=arm, right_arm=arm,
+            pace, pelvis=(0, 0.45 * deep, -deep), turn=(1.4 * deep + rng.uniform(0, 0.15), 0, 0),
+            spine=(0.5 * deep, 0, 0), head=(-1.2 * deep, 0, 0), left_arm=arm, right_arm=arm,
         )  # fmt: skip
         s.hold(rng.uniform(0.0, 0.5))
         s.move(
-            pace * rng.uniform(0.8, 1.1), pelvis=(0, 0, -0.02), turn=(0, 0, 0), spine=(0, 0, 0), head=(0, 0, 0),
-            left_arm=hanging(rng), right_arm=hanging(rng),
+            pace * rng.uniform(0.8, 1.1), pelvis=(0, 0, -0.02), turn=(0, 0, 0), spine=(0, 0, 0),
+            head=(0, 0, 0), left_arm=hanging(rng), right_arm=hanging(rng),
         )  # fmt: skip
         s.hold(rng.uniform(0.0, 0.5))
     return s.channels(t)
@@ -76,19 +82,25 @@ def reach(t, rng):
         high = max(0.0, height - 2.0)
         turned = (not both) * (0.35 - 0.5 * aside)
         s.move(
-            rng.uniform(0.8, 1.4), spine=(0.12 * (1.6 - height), -0.2 * sign * (not both) * high, -sign * turned), pelvis=(0.0, -0.03, 0.0),
-            turn=(0.1 * (height < 1.6), 0, -0.4 * sign * turned), head=(-0.35 * high, 0, sign * 0.3 * aside),
+            rng.uniform(0.8, 1.4),
+            spine=(0.12 * (1.6 - height), -0.2 * sign * (not both) * high, -sign * turned),
+            pelvis=(0.0, -0.03, 0.0), turn=(0.1 * (height < 1.6), 0, -0.4 * sign * turned),
+            head=(-0.35 * high, 0, sign * 0.3 * aside),
             **{
-                f"{one}_arm": arm, f"{other}_arm": arm if both else rng.uniform((-0.4, 0.25, 0, 0.2), (0.1, 0.45, 0.2, 0.6)),
-                f"{one}_foot_turn": (0.5 * high, 0.1, 0), f"{other}_foot_turn": (0.5 * high * both, 0.1, 0), f"{one}_hand": (-0.3 * high,
-                0),
+                f"{one}_arm": arm,
+                f"{other}_arm": arm if both else rng.uniform(
+                    (-0.4, 0.25, 0, 0.2), (0.1, 0.45, 0.2, 0.6)
+                ), f"{one}_foot_turn": (0.5 * high, 0.1, 0),
+                f"{other}_foot_turn": (0.5 * high * both, 0.1, 0), f"{one}_hand": (-0.3 * high, 0),
             },
         )  # fmt: skip
         s.hold(rng.uniform(0.1, 0.6))
         if rng.random() < 0.6:
             s.move(
-                rng.uniform(0.8, 1.3), left_arm=hanging(rng), right_arm=hanging(rng), spine=(0, 0, 0), pelvis=(0, 0, -0.01), turn=(0, 0, 0),
-                head=(0, 0, 0), left_foot_turn=(0, 0.1, 0), right_foot_turn=(0, 0.1, 0), left_hand=(0, 0), right_hand=(0, 0),
+                rng.uniform(0.8, 1.3), left_arm=hanging(rng), right_arm=hanging(rng),
+                spine=(0, 0, 0), pelvis=(0, 0, -0.01), turn=(0, 0, 0), head=(0, 0, 0),
+                left_foot_turn=(0, 0.1, 0), right_foot_turn=(0, 0.1, 0), left_hand=(0, 0),
+                right_hand=(0, 0),
             )  # fmt: skip
             s.hold(rng.uniform(0.0, 0.4))
     return s.channels(t)
@@ -111,8 +123,9 @@ def twist(t, rng):
     while s.clock < t[-1] + 1:
         far, lift, bent = rng.uniform(0.4, 0.9), rng.uniform(0.7, 1.5), rng.uniform(0.3, 1.2)
         s.move(
-            rng.uniform(0.6, 1.3), turn=(0, 0, 0.45 * sign * far), spine=(rng.uniform(0, 0.15), 0, 0.75 * sign * far),
-            head=(0, 0, 0.5 * sign * far), **{f"{one}_arm": (0.0, lift, 0.1, bent), f"{other}_arm": (0.9, 0.6 * lift, 0.1, bent)},
+            rng.uniform(0.6, 1.3), turn=(0, 0, 0.45 * sign * far),
+            spine=(rng.uniform(0, 0.15), 0, 0.75 * sign * far), head=(0, 0, 0.5 * sign * far),
+            **{f"{one}_arm": (0.0, lift, 0.1, bent), f"{other}_arm": (0.9, 0.6 * lift, 0.1, bent)},
         )  # fmt: skip
         s.hold(rng.uniform(0.0, 0.3))
         one, other, sign = other, one, -sign
@@ -171,9 +184,10 @@ def arms_crossed(t, rng):
         )
         for _ in range(rng.integers(1, 4)):
             s.move(
-                rng.uniform(0.7, 1.4), turn=(0, 0, rng.uniform(-0.2, 0.2)), spine=(rng.uniform(-0.1, 0.15), rng.uniform(-0.1, 0.1),
-                rng.uniform(-0.3, 0.3)),
-                head=(rng.uniform(-0.2, 0.2), 0, rng.uniform(-0.5, 0.5)), pelvis=(rng.uniform(-0.04, 0.04), 0, -0.01),
+                rng.uniform(0.7, 1.4), turn=(0, 0, rng.uniform(-0.2, 0.2)),
+                spine=(rng.uniform(-0.1, 0.15), rng.uniform(-0.1, 0.1), rng.uniform(-0.3, 0.3)),
+                head=(rng.uniform(-0.2, 0.2), 0, rng.uniform(-0.5, 0.5)),
+                pelvis=(rng.uniform(-0.04, 0.04), 0, -0.01),
             )  # fmt: skip
         s.move(0.6 * pace, **{f"{other}_arm": before, f"{other}_hand": (0, 0)}, after=0.3 * pace)
         s.move(
@@ -211,14 +225,15 @@ def kick(t, rng):
             **{f"{one}_swing": (-0.5, 0.06), turn: (0.7, 0.1, 0)},
         )
         s.move(
-            1.2 * pace, pelvis=(-0.085 * sign, 0.0, -0.02), turn=(-0.1 - 0.15 * high, -0.08 * sign, -0.15 * sign), spine=(0.2, 0,
-            0.2 * sign),
+            1.2 * pace, pelvis=(-0.085 * sign, 0.0, -0.02),
+            turn=(-0.1 - 0.15 * high, -0.08 * sign, -0.15 * sign), spine=(0.2, 0, 0.2 * sign),
             head=(0.15, 0, 0), **{f"{one}_swing": (high, 0.06), turn: (0.5 - high, 0.05, 0)},
             **{f"{other}_arm": (1.3, 0.4, 0.2, 0.8), f"{one}_arm": (-0.4, 0.7, 0.1, 0.5)},
         )  # fmt: skip
         s.move(
-            1.3 * pace, pelvis=(0, 0, -0.03), turn=(0, 0, 0), spine=(0.05, 0, 0), head=(0, 0, 0), left_arm=guard, right_arm=guard,
-            after=1.1 * pace, **{f"{one}_swing": (0.0, 0.06), turn: (0, 0.1, 0)},
+            1.3 * pace, pelvis=(0, 0, -0.03), turn=(0, 0, 0), spine=(0.05, 0, 0), head=(0, 0, 0),
+            left_arm=guard, right_arm=guard, after=1.1 * pace,
+            **{f"{one}_swing": (0.0, 0.06), turn: (0, 0.1, 0)},
         )  # fmt: skip
         s.move(0.5 * pace, **{f"{one}_swing": (0.0, 0.0)})
         s.hold(rng.uniform(0.1, 0.5))
@@ -261,8 +276,9 @@ def sit(t, rng):
             }
 
         s.move(
-            pace, pelvis=(0, 0.33, -0.75 * deep), turn=(0.55, 0, 0), spine=(0.25, 0, 0), head=(-0.4, 0, 0), left_arm=(0.7, 0.35, 0.1, 0.6),
-            right_arm=(0.7, 0.35, 0.1, 0.6), left_foot_turn=(0, 0.1, apart), right_foot_turn=(0, 0.1, apart), after=0.7 * pace,
+            pace, pelvis=(0, 0.33, -0.75 * deep), turn=(0.55, 0, 0), spine=(0.25, 0, 0),
+            head=(-0.4, 0, 0), left_arm=(0.7, 0.35, 0.1, 0.6), right_arm=(0.7, 0.35, 0.1, 0.6),
+            left_foot_turn=(0, 0.1, apart), right_foot_turn=(0, 0.1, apart), after=0.7 * pace,
         )  # fmt: skip
         s.move(pace, head=(0, 0, 0), **posture((0.12, 0, 0)))
         for _ in range(rng.integers(1, 4)):
@@ -312,9 +328,10 @@ def turn(t, rng):
             yaw += direction * part
             swing = (-1) ** k * 0.25
             s.move(
-                0.9 * pace, turn=(0.03, 0, yaw - 0.3 * direction * part), head=(0.05, 0, 0.35 * direction), spine=(0.03, 0,
-                0.2 * direction),
-                left_arm=(swing, arms, 0.1, 0.5), right_arm=(-swing, arms, 0.1, 0.5), after=0.05, pelvis=(0, 0, -0.03),
+                0.9 * pace, turn=(0.03, 0, yaw - 0.3 * direction * part),
+                head=(0.05, 0, 0.35 * direction), spine=(0.03, 0, 0.2 * direction),
+                left_arm=(swing, arms, 0.1, 0.5), right_arm=(-swing, arms, 0.1, 0.5), after=0.05,
+                pelvis=(0, 0, -0.03),
             )  # fmt: skip
             for foot in (first, second):
                 s.move(0.85 * pace, **step(foot, yaw), after=0.75 * pace)
@@ -346,13 +363,13 @@ def side_step(t, rng):
         for _ in range(rng.integers(1, 4)):
             x += sign * far
             s.move(
-                pace, pelvis=(x - 0.5 * sign * far, 0.03, -low), turn=(0.1, 0.05 * sign, 0), spine=(0.06, -0.1 * sign, 0), left_arm=(0.1,
-                lift, 0.1, 0.4),
+                pace, pelvis=(x - 0.5 * sign * far, 0.03, -low), turn=(0.1, 0.05 * sign, 0),
+                spine=(0.06, -0.1 * sign, 0), left_arm=(0.1, lift, 0.1, 0.4),
                 right_arm=(0.1, lift, 0.1, 0.4), **step(one, 0.0, (x, 0.0)),
             )  # fmt: skip
             s.move(
-                pace, pelvis=(x, 0, -0.02), turn=(0.03, 0, 0), spine=(0.02, 0, 0), left_arm=(0.3, 0.3, 0.2, 0.8), right_arm=(0.3, 0.3,
-                0.2, 0.8),
+                pace, pelvis=(x, 0, -0.02), turn=(0.03, 0, 0), spine=(0.02, 0, 0),
+                left_arm=(0.3, 0.3, 0.2, 0.8), right_arm=(0.3, 0.3, 0.2, 0.8),
                 **step(other, 0.0, (x, 0.0)),
             )  # fmt: skip
         s.hold(rng.uniform(0.0, 0.4))
@@ -372,14 +389,14 @@ def lunge(t, rng):
             (1.3, 0.2, 0.2, 0.3),
         ][rng.choice(4)]
         s.move(
-            pace, pelvis=(0, -0.48 * far, -deep), turn=(0.1, 0, rng.uniform(-0.1, 0.1)), spine=(0.02, 0, rng.uniform(-0.3, 0.3)),
-            left_arm=arm,
-            right_arm=arm, **{f"{one}_foot": (0, -far, 0), f"{other}_foot_turn": (rng.uniform(0.6, 0.9), 0.02, 0)},
+            pace, pelvis=(0, -0.48 * far, -deep), turn=(0.1, 0, rng.uniform(-0.1, 0.1)),
+            spine=(0.02, 0, rng.uniform(-0.3, 0.3)), left_arm=arm, right_arm=arm,
+            **{f"{one}_foot": (0, -far, 0), f"{other}_foot_turn": (rng.uniform(0.6, 0.9), 0.02, 0)},
         )  # fmt: skip
         s.hold(rng.uniform(0.1, 0.6))
         s.move(
-            pace, pelvis=(0, 0, -0.01), turn=(0, 0, 0), spine=(0, 0, 0), left_arm=hanging(rng), right_arm=hanging(rng),
-            **{f"{one}_foot": (0, 0, 0), f"{other}_foot_turn": (0, 0.1, 0)},
+            pace, pelvis=(0, 0, -0.01), turn=(0, 0, 0), spine=(0, 0, 0), left_arm=hanging(rng),
+            right_arm=hanging(rng), **{f"{one}_foot": (0, 0, 0), f"{other}_foot_turn": (0, 0.1, 0)},
         )  # fmt: skip
         s.hold(rng.uniform(0.0, 0.4))
     return s.channels(t)
@@ -399,16 +416,19 @@ def bend(t, rng):
                 0.8 * pace, left_arm=arm, right_arm=arm, after=0.05
             )  # arms first, clear of the thighs
             s.move(
-                pace, pelvis=(0, 0.11 * lean, -0.03 - 0.05 * rng.random()), turn=(lean, 0, 0), spine=(curl, 0, rng.uniform(-0.2, 0.2)),
-                head=(rng.uniform(-0.2, 0.4), 0, 0),
+                pace, pelvis=(0, 0.11 * lean, -0.03 - 0.05 * rng.random()), turn=(lean, 0, 0),
+                spine=(curl, 0, rng.uniform(-0.2, 0.2)), head=(rng.uniform(-0.2, 0.4), 0, 0),
             )  # fmt: skip
         else:
             one, other, sign = sides(rng)
             far = rng.uniform(0.3, 0.6)
             s.move(
-                pace, pelvis=(0.05 * sign, 0, -0.01), turn=(0, -0.25 * sign * far, 0), spine=(0, -sign * far, 0), head=(0,
-                -0.4 * sign * far, 0),
-                **{f"{one}_arm": (0.1, rng.uniform(2.4, 2.8), 0.0, 0.5), f"{other}_arm": (0.15, 0.3 + 1.2 * far, 0.1, 0.2)},
+                pace, pelvis=(0.05 * sign, 0, -0.01), turn=(0, -0.25 * sign * far, 0),
+                spine=(0, -sign * far, 0), head=(0, -0.4 * sign * far, 0),
+                **{
+                    f"{one}_arm": (0.1, rng.uniform(2.4, 2.8), 0.0, 0.5),
+                    f"{other}_arm": (0.15, 0.3 + 1.2 * far, 0.1, 0.2)
+                },
             )  # fmt: skip
         s.hold(rng.uniform(0.1, 0.6))
         s.move(
@@ -486,9 +506,10 @@ def improvise(t, rng):
                 changes[f"{side}_hand"] = rng.uniform((-0.4, -0.3), (0.4, 0.8))
         low = rng.uniform(0.0, 0.14)
         s.move(
-            rng.uniform(0.6, 1.3), after=rng.uniform(0.5, 1.1), pelvis=(rng.uniform(-0.08, 0.08), rng.uniform(-0.04, 0.06), -low),
-            turn=(rng.uniform(-0.05, 0.25), rng.uniform(-0.12, 0.12), rng.uniform(-0.3, 0.3)), head=rng.uniform((-0.3, -0.2, -0.6), (0.3,
-            0.2, 0.6)),
+            rng.uniform(0.6, 1.3), after=rng.uniform(0.5, 1.1),
+            pelvis=(rng.uniform(-0.08, 0.08), rng.uniform(-0.04, 0.06), -low),
+            turn=(rng.uniform(-0.05, 0.25), rng.uniform(-0.12, 0.12), rng.uniform(-0.3, 0.3)),
+            head=rng.uniform((-0.3, -0.2, -0.6), (0.3, 0.2, 0.6)),
             spine=rng.uniform((-0.15, -0.25, -0.4), (0.4, 0.25, 0.4)), **changes,
         )  # fmt: skip
         if rng.random() < 0.5:
@@ -561,9 +582,8 @@ def jump(t, rng):
             right_arm=(-0.7, 0.25, 0, 0.2),
         )
         s.move(
-            push + 0.5 * half, turn=(0, 0, 0), spine=(-0.05, 0, 0), head=(0, 0, 0), left_arm=up, right_arm=up, left_foot_turn=(0.75, 0.1,
-            0),
-            right_foot_turn=(0.75, 0.1, 0),
+            push + 0.5 * half, turn=(0, 0, 0), spine=(-0.05, 0, 0), head=(0, 0, 0), left_arm=up,
+            right_arm=up, left_foot_turn=(0.75, 0.1, 0), right_foot_turn=(0.75, 0.1, 0),
         )  # fmt: skip
         s.hold(0.5 * half)
         s.move(
@@ -588,9 +608,7 @@ def jump(t, rng):
         )
         s.hold(rng.uniform(0.1, 0.6))
     c = s.channels(t)
-    first = [
-        i for i, (a, b) in enumerate(zip(keys, keys[1:], strict=False)) if b > a
-    ]  # holds of no length
+    first = [i for i, (a, b) in enumerate(itertools.pairwise(keys)) if b > a]  # holds of no length
     keys, values = [keys[i] for i in first] + [keys[-1]], [values[i] for i in first] + [values[-1]]
     height = BPoly.from_derivatives(keys, values)(np.minimum(t, keys[-1]))
     fine, free = _flights(t, *zip(*flights, strict=True))

@@ -6,14 +6,16 @@ rotation relative to its parent as an axis-angle vector [rad] in these axes, cou
 T-pose: arms stretched out along x, palms down, legs straight down.
 """
 
+import itertools
 import math
 
 import torch
 
 JOINTS = (
-    "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle", "spine3",
-    "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head", "left_shoulder", "right_shoulder", "left_elbow",
-    "right_elbow", "left_wrist", "right_wrist", "left_hand", "right_hand",
+    "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle",
+    "right_ankle", "spine3", "left_foot", "right_foot", "neck", "left_collar", "right_collar",
+    "head", "left_shoulder", "right_shoulder", "left_elbow", "right_elbow", "left_wrist",
+    "right_wrist", "left_hand", "right_hand",
 )  # fmt: skip
 PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)
 INDEX = {name: j for j, name in enumerate(JOINTS)}
@@ -59,10 +61,13 @@ def standard_rest_pose():
 # Joints of the standard body in the T-pose [m], the right side mirrored. Generated motions are made
 # for them, and the size of others is told by them.
 _STANDARD_JOINTS = {
-    "pelvis": (0.0, -0.0108, 0.0504), "spine1": (0.0, 0.0223, 0.1178), "spine2": (0.0, 0.0076, 0.2612), "spine3": (0.0, 0.0319, 0.3939),
-    "neck": (0.0, -0.0075, 0.5597), "head": (0.0, -0.0419, 0.6567), "hip": (0.1019, -0.0079, 0.0389), "knee": (0.1019, -0.0402, -0.3515),
-    "ankle": (0.1019, -0.0039, -0.7522), "foot": (0.1132, -0.1361, -0.7981), "collar": (0.0220, -0.0256, 0.4930),
-    "shoulder": (0.1616, -0.0171, 0.4675), "elbow": (0.4141, -0.0171, 0.4675), "wrist": (0.6412, -0.0171, 0.4675),
+    "pelvis": (0.0, -0.0108, 0.0504), "spine1": (0.0, 0.0223, 0.1178),
+    "spine2": (0.0, 0.0076, 0.2612), "spine3": (0.0, 0.0319, 0.3939),
+    "neck": (0.0, -0.0075, 0.5597), "head": (0.0, -0.0419, 0.6567),
+    "hip": (0.1019, -0.0079, 0.0389), "knee": (0.1019, -0.0402, -0.3515),
+    "ankle": (0.1019, -0.0039, -0.7522), "foot": (0.1132, -0.1361, -0.7981),
+    "collar": (0.0220, -0.0256, 0.4930), "shoulder": (0.1616, -0.0171, 0.4675),
+    "elbow": (0.4141, -0.0171, 0.4675), "wrist": (0.6412, -0.0171, 0.4675),
     "hand": (0.7375, -0.0171, 0.4675),
 }  # fmt: skip
 
@@ -127,7 +132,7 @@ def rest_pose(joints):
         for side, x in (("left", 1.0), ("right", -1.0)):
             chain = [INDEX[f"{side}_{name}"] for name in ("shoulder", "elbow", "wrist", "hand")]
             axis, before = joints.new_tensor([x, 0.0, 0.0]), torch.eye(3, dtype=torch.float64)
-            for joint, end in zip(chain, chain[1:], strict=False):
+            for joint, end in itertools.pairwise(chain):
                 before = before @ smallest_rotation(axis, before.mT @ (joints[end] - joints[joint]))
                 world[joint] = before
             world[chain[-1]] = before

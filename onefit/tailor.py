@@ -318,9 +318,9 @@ def jumpsuit(b):
 # The pattern of each template, whose arguments are its measures [m], and how many vertices it is
 # sewn with
 PATTERNS = {
-    "tshirt": (tshirt, 4000), "dress": (dress, 6000), "tank": (tank, 3000), "long_sleeve_top": (long_sleeve_top, 5000),
-    "shorts": (shorts, 2500), "trousers": (trousers, 5000), "jumpsuit": (jumpsuit, 7500),
-    "skirt": (skirt, 4000),
+    "tshirt": (tshirt, 4000), "dress": (dress, 6000), "tank": (tank, 3000),
+    "long_sleeve_top": (long_sleeve_top, 5000), "shorts": (shorts, 2500),
+    "trousers": (trousers, 5000), "jumpsuit": (jumpsuit, 7500), "skirt": (skirt, 4000),
 }  # fmt: skip
 
 

@@ -9,7 +9,8 @@ any, the six templates of the paper. OUT receives
     weights.safetensors     the trained network, for ``onefit.load``, and weights.json: what made it
     log.jsonl               a line every 50 steps: the loss and each of its terms
     cuts/                   with --cuts: what was sewn, a file each
-    checkpoint.safetensors  every few minutes and at Ctrl-C; --resume goes on from it and ends where an uninterrupted run would have
+    checkpoint.safetensors  every few minutes and at Ctrl-C; --resume goes on from it and ends
+                            where an uninterrupted run would have
 """
 
 import argparse
@@ -193,8 +194,8 @@ def _data(settings, folder, progress):
         Motion.read(path, settings.fps, settings.motion_up) for path in settings.motions
     ] or None
     return TrainingData(
-        garments, motions=motions, seeds=settings.seeds, shapes=settings.shapes, order=settings.order, seed=settings.seed,
-        advance=partial(progress.advance, task),
+        garments, motions=motions, seeds=settings.seeds, shapes=settings.shapes,
+        order=settings.order, seed=settings.seed, advance=partial(progress.advance, task),
     )  # fmt: skip
 
 
@@ -248,9 +249,11 @@ def parser():
     for name, text in {
         "order": "of the jets", "batch": "patches of a step, all frames together", "epochs": "",
         "lr-epochs": "epochs with the full rate, a tenth of it after",
-        "epoch-steps": "steps of an epoch, 0: each window of the motions once", "seeds": "generated motions of each kind",
+        "epoch-steps": "steps of an epoch, 0: each window of the motions once",
+        "seeds": "generated motions of each kind",
         "shapes": "random bodies beside the standard one",
-        "cuts": "random cuts of the templates' patterns to train on beside the garments", "seed": "",
+        "cuts": "random cuts of the templates' patterns to train on beside the garments",
+        "seed": "",
     }.items():  # fmt: skip
         value = getattr(default, name.replace("-", "_"))
         p.add_argument(

@@ -333,8 +333,7 @@ def write_frames(folder, kind, vertices, faces, uv=None, texture=None, *, labels
     vertices, faces, uv = _checked(vertices, faces, uv, 1)
     ours = lambda name: (
         name in ("surface.mtl", "texture.png", "texture.jpg")
-        or name.endswith(f".{kind}")
-        and name[: -len(kind) - 1].isdigit()
+        or (name.endswith(f".{kind}") and name[: -len(kind) - 1].isdigit())
     )
     data, image = (
         encoded(texture)
@@ -363,8 +362,8 @@ def _write_obj(path, V, F, uv, up):
     corner = ("{0}/{0}" if uv is not None else "{0}").format
     with open(path, "w", encoding="ascii") as file:
         file.write(f"# metres, {up} up\nmtllib surface.mtl\no surface\n")
-        file.writelines("v %.9g %.9g %.9g\n" % tuple(p) for p in V.tolist())
+        file.writelines("v {:.9g} {:.9g} {:.9g}\n".format(*p) for p in V.tolist())
         if uv is not None:
-            file.writelines("vt %.9g %.9g\n" % tuple(t) for t in uv.tolist())
+            file.writelines("vt {:.9g} {:.9g}\n".format(*t) for t in uv.tolist())
         file.write("usemtl surface\ns 1\n")
         file.writelines("f " + " ".join(corner(k + 1) for k in face) + "\n" for face in F.tolist())

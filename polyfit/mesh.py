@@ -28,7 +28,7 @@ def checked(vertices, faces, where="mesh"):
             f"{where}: faces name vertices {F.min()} to {F.max()}; 0 to {len(V) - 1} exist"
         )
     _refuse(~np.isfinite(V).all(axis=1), where, "vertices have coordinates that are not finite")
-    F = F[(F != np.roll(F, 1, axis=1)).all(axis=1)]
+    F = F[(np.roll(F, 1, axis=1) != F).all(axis=1)]
     _, first = np.unique(np.sort(F, axis=1), axis=0, return_index=True)
     F = F[np.sort(first)]
     _refuse(np.bincount(F.ravel(), minlength=len(V)) == 0, where, "vertices are in no face")

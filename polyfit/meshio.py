@@ -65,7 +65,7 @@ def _read_obj(path):
     vertices, coordinates, triangles, corner_uv = [], [], [], []
     try:
         with open(path, encoding="utf-8", errors="replace") as file:
-            for number, line in enumerate(file, start=1):
+            for number, line in enumerate(file, start=1):  # noqa: B007 (named in an error below)
                 words = line.split()
                 if not words:
                     continue

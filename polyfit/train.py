@@ -6,10 +6,12 @@
 MESH are garments (.obj, .ply), cut into patches and deformed at random; without any, the analytic
 families are all there is. OUT receives
 
-    weights.safetensors     the trained network, for ``PolyFit.load``, and weights.json: what made it
+    weights.safetensors     the trained network, for ``PolyFit.load``
+    weights.json            what made it
     log.jsonl               a line every so many steps
-    checkpoint.safetensors  every few minutes and at Ctrl-C; --resume goes on from it and ends where an uninterrupted run would have
-    set.safetensors         the patches (polyfit.training_set), so that --resume need not make them again
+    checkpoint.safetensors  every few minutes and at Ctrl-C; --resume goes on from it and ends
+                            where an uninterrupted run would have
+    set.safetensors         the patches (polyfit.training_set), for --resume
 """
 
 import argparse
@@ -240,8 +242,9 @@ def _prepare(settings, folder, processes, progress):
         )
         task = progress.add_task("patches", total=settings.patches)
         made = training_set.build(
-            settings.patches, settings.points, settings.order, settings.seed,
-            garments=cut, names=settings.families, device=processes.device, advance=lambda done: progress.update(task, completed=done),
+            settings.patches, settings.points, settings.order, settings.seed, garments=cut,
+            names=settings.families, device=processes.device,
+            advance=lambda done: progress.update(task, completed=done),
         )  # fmt: skip
         write_weights(
             path,

@@ -199,9 +199,11 @@ class Training:
         """The JSON file that says what made the weights."""
         device = self.processes.device.type
         about = dict(
-            command=command, **{"steps": self.steps} | self.settings, processes=self.processes.count, minutes=round(self.seconds / 60, 2),
-            machine=f"{platform.machine()}, {device}, {torch.get_num_threads()} thread(s) a process", torch=torch.__version__,
-            date=time.strftime("%Y-%m-%d"), parameters=sum(p.numel() for p in self.network.parameters()),
+            command=command, **{"steps": self.steps} | self.settings,
+            processes=self.processes.count, minutes=round(self.seconds / 60, 2),
+            machine=f"{platform.machine()}, {device}, {torch.get_num_threads()} threads a process",
+            torch=torch.__version__, date=time.strftime("%Y-%m-%d"),
+            parameters=sum(p.numel() for p in self.network.parameters()),
         )  # fmt: skip
         with aside(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
             json.dump(about, file, indent=2)

@@ -2,10 +2,12 @@
 (``dr.wrap``).
 
     torch   points -> PolyFit -> alpha, O -> vertices -> loss
-                                                  \\-> :func:`rendering` -> image -> loss          a rendering loss reaches PolyFit's
-                                                  network
+                                                  \\-> :func:`rendering` -> image -> loss
     Dr.Jit  alpha -> surface -> image -> loss
-                 \\-> :func:`in_torch` -> any torch function -> loss                              a torch loss reaches Dr.Jit's alpha
+                 \\-> :func:`in_torch` -> any torch function -> loss
+
+By :func:`rendering` a loss of an image reaches PolyFit's network; by :func:`in_torch` a loss in
+torch reaches the alpha of Dr.Jit.
 
 Import only after a Mitsuba variant is set.
 """
@@ -22,8 +24,8 @@ from .surface.template import Template
 
 
 def template(polyfit, vertices, faces, uv, **options):
-    """The :class:`polysft_mi.surface.template.Template` of the mesh in the frame, and of the order, of
-    ``polyfit`` (:class:`polyfit.PolyFit`).
+    """The :class:`polysft_mi.surface.template.Template` of the mesh in the frame, and of the order,
+    of ``polyfit`` (:class:`polyfit.PolyFit`).
 
     ``vertices`` (N, 3) [m], ``faces`` (F, 3), ``uv`` (N, 2); ``options`` and errors are those of
     ``Template.fit``.
@@ -66,8 +68,8 @@ def in_torch(function):
 
 
 def rendering(problem, seed=0):
-    """The rendering of a :class:`polysft_mi.objective.problem.Problem` as a torch function: vertices (N, 3)
-    [m, camera frame] -> (rgb (H, W, 3) linear, alpha (H, W))."""
+    """The rendering of a :class:`polysft_mi.objective.problem.Problem` as a torch function:
+    vertices (N, 3) [m, camera frame] -> (rgb (H, W, 3) linear, alpha (H, W))."""
 
     @in_drjit
     def render(vertices):
@@ -78,9 +80,9 @@ def rendering(problem, seed=0):
 
 
 def deformed(patch):
-    """The surface of a :class:`polysft_mi.surface.patch.JetPatch` as a torch function of the unknowns:
-    delta_alpha (A,), delta_u, delta_v, delta_w (N,), rotation (4,), translation (3,) -> vertices
-    (N, 3) [m, camera frame]."""
+    """The surface of a :class:`polysft_mi.surface.patch.JetPatch` as a torch function of the
+    unknowns: delta_alpha (A,), delta_u, delta_v, delta_w (N,), rotation (4,), translation (3,) ->
+    vertices (N, 3) [m, camera frame]."""
 
     @in_drjit
     def vertices(*unknowns):

@@ -148,7 +148,7 @@ def scene_xml(layout, data, template=None, comment=""):
 
 {shape}
 
-    <!-- Radiance 1 from everywhere: on an unshadowed sheet, path replay sees the texture's own colour -->
+    <!-- Radiance 1 from everywhere: an unshadowed sheet shows its texture's own colour -->
     <emitter type="constant"/>
 </scene>
 """

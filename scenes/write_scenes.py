@@ -6,13 +6,11 @@ data=FOLDER``.
 """
 
 import os
-import sys
+
+from polysft_mi.camera import Intrinsics
+from polysft_mi.prepare import Layout, scene_xml
 
 HERE = os.path.dirname(os.path.abspath(__file__))
-sys.path.insert(0, os.path.dirname(HERE))
-
-from polysft_mi.camera import Intrinsics  # noqa: E402
-from polysft_mi.prepare import Layout, scene_xml  # noqa: E402
 
 
 def _cloth(**settings):

@@ -2,6 +2,8 @@
 PointNet encodes a surface, K small networks map a square each to a piece of it.
 """
 
+import itertools
+
 import torch
 
 from ..errors import InputError
@@ -25,7 +27,7 @@ class AtlasNet(torch.nn.Module):
         self.encoder = torch.nn.Sequential(pointwise((64, 128)), torch.nn.Linear(128, latent))
         self.code = torch.nn.Linear(latent, latent)
         sizes = [latent + 2, *widths, 3]
-        layers = list(zip(sizes, sizes[1:]))
+        layers = list(itertools.pairwise(sizes))
         self.weights = torch.nn.ParameterList(
             torch.randn(charts, i, o) * ((1 if o == 3 else 2) / i) ** 0.5 for i, o in layers
         )

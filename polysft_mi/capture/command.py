@@ -130,13 +130,13 @@ def from_video(args, command):
     quiet = args.quiet or args.json
     with _progress(quiet) as progress:
         return capture(
-            args.folder, args.output, texture=args.texture, size=args.size, template=args.template, resolution=args.resolution,
-            camera=args.camera, fov=args.fov,
-            calibrate=args.calibrate, board=args.board, corners="frame" if corners == ["frame"] else corners,
-            texture_corners=args.texture_corners and _points(args.texture_corners, "--texture-corners"),
-            pose_fit=args.pose_fit,
-            masks=args.masks or not args.no_masks, first=args.first, last=args.last, stride=args.stride, scale=args.scale,
-            overwrite=args.overwrite,
+            args.folder, args.output, texture=args.texture, size=args.size, template=args.template,
+            resolution=args.resolution, camera=args.camera, fov=args.fov, calibrate=args.calibrate,
+            board=args.board, corners="frame" if corners == ["frame"] else corners,
+            texture_corners=args.texture_corners and _points(
+                args.texture_corners, "--texture-corners"
+            ), pose_fit=args.pose_fit, masks=args.masks or not args.no_masks, first=args.first,
+            last=args.last, stride=args.stride, scale=args.scale, overwrite=args.overwrite,
             say=(lambda line: None) if quiet else print, progress=progress, command=command,
         )  # fmt: skip
 

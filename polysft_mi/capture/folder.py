@@ -44,9 +44,10 @@ _SHARPEST = 2048  # pixels of a texture's longer side; what is finer no frame sh
 
 
 def capture(
-    video, out=None, *, texture, size=None, template=None, resolution=33, camera=None, fov=None, calibrate=None, board="9x6",
-    corners=None, texture_corners=None, pose_fit="auto",
-    masks=True, first=0, last=-1, stride=1, scale=1.0, overwrite=False, say=lambda line: None, progress=lambda count: None, command="",
+    video, out=None, *, texture, size=None, template=None, resolution=33, camera=None, fov=None,
+    calibrate=None, board="9x6", corners=None, texture_corners=None, pose_fit="auto", masks=True,
+    first=0, last=-1, stride=1, scale=1.0, overwrite=False, say=lambda line: None,
+    progress=lambda count: None, command="",
 ):  # fmt: skip
     """Make the folder ``out`` of a sequence from ``video`` (a file, a folder of images, a pattern):
     frames, masks, template, texture, camera, ``scene.xml``.

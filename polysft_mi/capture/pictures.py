@@ -86,7 +86,7 @@ def matches(photo, frame, found):
     for agree, colour in ((False, RED), (True, GREEN)):
         lines = np.flatnonzero(found.agree == agree)
         for k in lines[:: max(1, len(lines) // _LINES)]:
-            p, q = (tuple(int(round(v)) for v in x) for x in (at[k], to[k]))
+            p, q = (tuple(round(v) for v in x) for x in (at[k], to[k]))
             cv2.line(canvas, p, q, colour, 1, cv2.LINE_AA)
             for x in (p, q):
                 cv2.circle(canvas, x, 3, colour, 1, cv2.LINE_AA)
@@ -107,7 +107,7 @@ def pose(frame, photo, sheet, placed, camera):
 
     def draw(edges, colour, width):
         for edge in edges:
-            a, b = (tuple(int(round(v)) for v in np.clip(x[k] * scale, -1e4, 1e4)) for k in edge)
+            a, b = (tuple(round(v) for v in np.clip(x[k] * scale, -1e4, 1e4)) for k in edge)
             cv2.line(wired, a, b, colour, width, cv2.LINE_AA)
 
     edges = np.sort(

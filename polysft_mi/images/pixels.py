@@ -2,9 +2,9 @@
 in closed form.
 
 Functions of Dr.Jit arrays alone: what an iteration needs of them is recorded
-(:func:`polysft_mi.render.device.frozen`), for regions of any size. Hence numbers that change are arrays of
-one entry, every kernel reads an array of its own size elementwise, and no array whose size depends
-on the pixels is made to be scattered to. Import only after a Mitsuba variant is set.
+(:func:`polysft_mi.render.device.frozen`), for regions of any size. Hence numbers that change are
+arrays of one entry, every kernel reads an array of its own size elementwise, and no array whose
+size depends on the pixels is made to be scattered to. Import only after a Mitsuba variant is set.
 """
 
 from dataclasses import dataclass

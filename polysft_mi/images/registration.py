@@ -43,10 +43,11 @@ class Evaluation:
     """A frame's images against a surface. Energies are weighted like the objective; a pixel is one
     of the level's grid.
 
-    ``photometric``, ``silhouette``: energies; ``images``: :class:`polysft_mi.objective.assembly.Images`, what
-    they say at the vertices; ``pixels``: how many were compared; ``outlying``: the mean of r^2 /
-    (r^2 + scale^2) over them, and ``misfit`` with a fixed scale; both 1 where no pixel is compared;
-    ``seen`` (F,): pixels of the video that see each triangle and are compared.
+    ``photometric``, ``silhouette``: energies; ``images``:
+    :class:`polysft_mi.objective.assembly.Images`, what they say at the vertices; ``pixels``: how
+    many were compared; ``outlying``: the mean of r^2 / (r^2 + scale^2) over them, and ``misfit``
+    with a fixed scale; both 1 where no pixel is compared; ``seen`` (F,): pixels of the video that
+    see each triangle and are compared.
     """
 
     photometric: float
@@ -64,8 +65,9 @@ class Appearance:
     texture on the template, blurred there, does not.
 
     ``excess``: the texture's colours less those of the sheet's image, a
-    :class:`polysft_mi.images.pixels.Image` on a part of the level's grid; ``luminance`` (F,): of the
-    triangles' texture as the image shows it, as :attr:`polysft_mi.images.light.Shade.texture`, or None."""
+    :class:`polysft_mi.images.pixels.Image` on a part of the level's grid; ``luminance`` (F,): of
+    the triangles' texture as the image shows it, as :attr:`polysft_mi.images.light.Shade.texture`,
+    or None."""
 
     excess: pixels.Image
     luminance: np.ndarray = None
@@ -90,8 +92,8 @@ def _packed(colour, fourth):
 
 
 class Registration:
-    """Frames of a :class:`polysft_mi.objective.problem.Problem` against its template's texture, level by
-    level.
+    """Frames of a :class:`polysft_mi.objective.problem.Problem` against its template's texture,
+    level by level.
     """
 
     def __init__(self, problem):
@@ -199,9 +201,9 @@ class Registration:
         return self._brightness
 
     def shade(self, vertices, frame, seen, appearance=None):
-        """The triangles' :class:`polysft_mi.images.light.Shade` in a frame; vertices (N, 3) [m, world],
-        ``seen`` as in :class:`Evaluation`; the texture's luminance is that of the ``appearance``,
-        where it has one.
+        """The triangles' :class:`polysft_mi.images.light.Shade` in a frame; vertices (N, 3) [m,
+        world], ``seen`` as in :class:`Evaluation`; the texture's luminance is that of the
+        ``appearance``, where it has one.
         """
         if (frame, SHADE) not in self._frames:
             self.expect([frame], [SHADE])
@@ -343,8 +345,8 @@ class Registration:
     # -- evaluation ---------------------------------------------------------
 
     def _look(self, vertices, level):
-        """The :class:`polysft_mi.render.raster.View` of the sheet with vertices (N, 3) [m, world] on a
-        level's grid; the last one is kept.
+        """The :class:`polysft_mi.render.raster.View` of the sheet with vertices (N, 3) [m, world]
+        on a level's grid; the last one is kept.
         """
         if (
             self._last is None
@@ -384,8 +386,8 @@ class Registration:
 
         A frame is blurred, and freed from lighting, in the image; the texture on the template, once
         for all. Where the sheet is seen at a slant, or hides a part of itself, these differ. So the
-        sheet is rendered, under the ``light`` (7,) of :class:`polysft_mi.images.light.Light` where it is
-        known, and made what the frame was made. ``shaded``: with the triangles' luminance.
+        sheet is rendered, under the ``light`` (7,) of :class:`polysft_mi.images.light.Light` where
+        it is known, and made what the frame was made. ``shaded``: with the triangles' luminance.
         """
         lit = (
             np.ones(len(self.faces))

@@ -1,12 +1,13 @@
 """Normal equations accumulated on the device: per triangle, per vertex and pair of neighbours, per
 unknown.
 
-What images say comes as sums over the pixels of each triangle (:mod:`polysft_mi.images.pixels`); gathered
-at the vertices, in the image plane, it is joined by the edges' lengths and by shading, in space,
-and turned into the unknowns of a jet patch. What is left is for the host's linear algebra
-(:mod:`polysft_mi.solvers.normal_equations`). Everything is a gather, in a fixed order: a thread a vertex,
-or a pair of neighbours, adds up what its triangles and edges have; double precision. Kernels are
-recorded once and launched again without tracing. Import only after a Mitsuba variant is set.
+What images say comes as sums over the pixels of each triangle (:mod:`polysft_mi.images.pixels`);
+gathered at the vertices, in the image plane, it is joined by the edges' lengths and by shading, in
+space, and turned into the unknowns of a jet patch. What is left is for the host's linear algebra
+(:mod:`polysft_mi.solvers.normal_equations`). Everything is a gather, in a fixed order: a thread a
+vertex, or a pair of neighbours, adds up what its triangles and edges have; double precision.
+Kernels are recorded once and launched again without tracing. Import only after a Mitsuba variant is
+set.
 """
 
 from dataclasses import dataclass, fields
@@ -34,7 +35,8 @@ _WIDTH = CURVATURES + SLOPES
 
 @dataclass
 class Tables:
-    """A :class:`polysft_mi.solvers.normal_equations.Pattern` on the device, UInt32 unless told otherwise.
+    """A :class:`polysft_mi.solvers.normal_equations.Pattern` on the device, UInt32 unless told
+    otherwise.
 
     Lists of a vertex or a pair of neighbours are the entries from ``*_start[k]`` to ``*_start[k +
     1]`` of another array. The U pairs i <= j, upper half of the pattern: ``i``, ``j``, and
@@ -134,8 +136,8 @@ def _numbers(array, index, count):
 
 def _projection(camera, vertices, index):
     """Derivatives, 2 rows of 3, of vertices' projections [pixels of the video] by their positions.
-    ``camera``: Float64 of 12, the inverse of :class:`polysft_mi.render.pinhole.Pinhole`'s basis row by
-    row, and its origin."""
+    ``camera``: Float64 of 12, the inverse of :class:`polysft_mi.render.pinhole.Pinhole`'s basis row
+    by row, and its origin."""
     numbers = [dr.gather(mi.Float64, camera, k) for k in range(12)]
     inverse, d = (
         (mi.Vector3d(*numbers[3 * k : 3 * k + 3]) for k in range(3)),
@@ -287,8 +289,8 @@ def in_unknowns(
 
     ``vertices`` Float64 of 3N [m]; ``lengths`` Float64 of E [m], ``numbers`` Float64: stiffness
     [1/m^2], give; ``by_offset`` Float64 of 9N, ``by_motion`` of 18N, ``basis`` of A N: of
-    :class:`polysft_mi.solvers.normal_equations.Surface`; ``entry``: 0, 1, ... of A N, and ``size``: A,
-    UInt32; ``triangles``: None, or Float64: r h of F, h of F and derivatives of 9F, as
+    :class:`polysft_mi.solvers.normal_equations.Surface`; ``entry``: 0, 1, ... of A N, and ``size``:
+    A, UInt32; ``triangles``: None, or Float64: r h of F, h of F and derivatives of 9F, as
     :meth:`Assembly.normal` takes them. Returns Float64: energies of the edges without their weight
     (E), gradient (3N) in space; by (Δu, Δv, Δw): gradient (3N), curvature (9U) of the pairs; with
     the motion, cross curvature (18N); and with the coefficients (3 of A N each); curvature of
@@ -322,7 +324,9 @@ def in_unknowns(
 
     # curvature in the positions, of each pair of neighbours: of the images by their projections
     left, right = (_projection(camera, vertices, k) for k in (tables.i, tables.j))
-    space = sum(_between(left, _rows(_numbers(images.second, pair, 4), 2), right), [])
+    space = [
+        x for row in _between(left, _rows(_numbers(images.second, pair, 4), 2), right) for x in row
+    ]
     same = tables.i == tables.j
     own = _numbers(around, tables.i, 6)
     other = [
@@ -346,7 +350,7 @@ def in_unknowns(
     # each vertex moves by its own (u, v), by a height, which is its own and that of all
     # coefficients there, and by the motion
     left, right = (_rows(_numbers(by_offset, k, 9), 3) for k in (tables.i, tables.j))
-    local = packed(sum(_between(left, _rows(space, 3), right), []), pair)
+    local = packed([x for row in _between(left, _rows(space, 3), right) for x in row], pair)
     space = packed(space, pair)
     own = _rows(_numbers(by_offset, vertex, 9), 3)
 
@@ -418,15 +422,15 @@ class Assembly:
         """:class:`polysft_mi.solvers.normal_equations.Normal` of the images, the edges and further
         residuals of triangles, and the edges' energy.
 
-        ``surface``: :class:`polysft_mi.solvers.normal_equations.Surface`; ``lengths`` (E,) [m]: of the
-        template's edges; ``stiffness`` [1/m^2]: weight of the squared differences to them;
-        ``wide``: a :class:`polysft_mi.solvers.normal_equations.Pattern` that holds this one, where the
-        relief is an unknown too (d = 3) and the local block is to have that pattern; ``give``: the
-        strain from which on a stretched edge hardly pulls harder. An excess e > 0 over the length L
-        costs 2 c^2 ((1 + e^2 / c^2)^1/2 - 1), c = give L (Charbonnier): cloth that hangs from a
-        point is stretched there by a tenth, and by squares that would turn the whole sheet. What is
-        compressed buckles; its costs are squares. ``triangles``: residuals r (F,), factors h (F,),
-        and derivatives (F, 3, 3) [1/m] of r by the corners; half the sum of h r^2 is added.
+        ``surface``: :class:`polysft_mi.solvers.normal_equations.Surface`; ``lengths`` (E,) [m]: of
+        the template's edges; ``stiffness`` [1/m^2]: weight of the squared differences to them;
+        ``wide``: a :class:`polysft_mi.solvers.normal_equations.Pattern` that holds this one, where
+        the relief is an unknown too (d = 3) and the local block is to have that pattern; ``give``:
+        the strain from which on a stretched edge hardly pulls harder. An excess e > 0 over the
+        length L costs 2 c^2 ((1 + e^2 / c^2)^1/2 - 1), c = give L (Charbonnier): cloth that hangs
+        from a point is stretched there by a tenth, and by squares that would turn the whole sheet.
+        What is compressed buckles; its costs are squares. ``triangles``: residuals r (F,), factors
+        h (F,), and derivatives (F, 3, 3) [1/m] of r by the corners; half the sum of h r^2 is added.
         """
         pattern, count, basis = self.pattern, self.pattern.count, surface.basis
         size, d = basis.shape[1], 2 if wide is None else 3
@@ -434,8 +438,9 @@ class Assembly:
             residual, factor, by_corner = triangles
             triangles = tuple(_flat(x) for x in (residual * factor, factor, by_corner))
         found = self._in_unknowns(
-            self.tables, images, _flat(surface.vertices), self._camera, _flat(lengths), _flat([stiffness, give]),
-            _flat(surface.by_offset), _flat(surface.by_motion), _flat(basis), dr.arange(mi.UInt32, basis.size), dr.opaque(mi.UInt32, size), triangles,
+            self.tables, images, _flat(surface.vertices), self._camera, _flat(lengths),
+            _flat([stiffness, give]), _flat(surface.by_offset), _flat(surface.by_motion),
+            _flat(basis), dr.arange(mi.UInt32, basis.size), dr.opaque(mi.UInt32, size), triangles,
         )  # fmt: skip
         energy, gradient, along, local, by_motion, *lifted, moved = (np.array(x) for x in found)
         gradient, by_motion = gradient.reshape(-1, 3), by_motion.reshape(-1, 3, 6)

@@ -17,6 +17,8 @@ What the paper leaves open is decided here and nowhere else (``docs/conventions.
 Import only after a Mitsuba variant is set.
 """
 
+import itertools
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -76,7 +78,7 @@ def temporal(window):
     0 where W = 1.
     """
     total = mi.Float(0)
-    for a, b in zip(window[:-1], window[1:]):
+    for a, b in itertools.pairwise(window):
         for name in ("delta_alpha", "delta_u", "delta_v"):
             total += dr.sum(dr.square(getattr(b, name) - getattr(a, name)))
     return total / max(1, len(window) - 1)

@@ -34,7 +34,7 @@ _CODEC = [
 ]
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def encoder():
     """Path of an ffmpeg that can encode H.264, or None. Found out once, by encoding two small
     frames.

@@ -48,7 +48,9 @@ def render(parts, *, size=(640, 480), spp=24, azimuth=25.0, elevation=8.0, follo
         target = (low[t] + high[t]) / 2 if follow else middle
         sensor = mi.load_dict({
             "type": "perspective", "fov": FOV, "fov_axis": "y", "near_clip": 0.05, "film": film,
-            "to_world": mi.ScalarTransform4f().look_at(origin=list(target + away), target=list(target), up=[0, 0, 1]),
+            "to_world": mi.ScalarTransform4f().look_at(
+                origin=list(target + away), target=list(target), up=[0, 0, 1]
+            ),
         })  # fmt: skip
         image = mi.render(scene, sensor=sensor, spp=spp, seed=t)
         yield np.array(
@@ -60,15 +62,18 @@ def render(parts, *, size=(640, 480), spp=24, azimuth=25.0, elevation=8.0, follo
 
 def _scene(parts, floor):
     stage = {
-        "type": "scene",
-        "integrator": {"type": "path", "max_depth": 4},
+        "type": "scene", "integrator": {"type": "path", "max_depth": 4},
         "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.55, 0.58, 0.62]}},
         "key": {
-            "type": "rectangle", "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [9.0, 8.6, 8.0]}},
-            "to_world": mi.ScalarTransform4f().look_at(origin=[2.5, -3.5, floor + 4.0], target=[0, 0, floor + 1.0], up=[0, 0, 1]),
+            "type": "rectangle",
+            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [9.0, 8.6, 8.0]}},
+            "to_world": mi.ScalarTransform4f().look_at(
+                origin=[2.5, -3.5, floor + 4.0], target=[0, 0, floor + 1.0], up=[0, 0, 1]
+            ),
         },
         "floor": {
-            "type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, float(floor)]).scale(40.0),
+            "type": "rectangle",
+            "to_world": mi.ScalarTransform4f().translate([0, 0, float(floor)]).scale(40.0),
             "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(FLOOR)}},
         },
     }  # fmt: skip

@@ -52,10 +52,10 @@ def template(folder, resolution=33, pose_fit="auto", say=lambda line: None):
     lists (from 0), and ``cam.ext`` the 3x4 matrix [R|T] [mm] that takes them to the camera; with
     ``pose_fit`` = ``auto`` the template is then moved, as a rigid body, until its outline lies on
     the edges in the first image that are near it, where these are clear
-    (:mod:`polysft_mi.scene.outline`); ``none`` leaves it. The grid is interpolated (cubic where it has
-    four points or more a side) at ``resolution`` points a side, evenly between the first and last
-    row and column, so that at 33 the 9 x 9 grid's own points are kept. ``say`` takes a line about
-    the pose.
+    (:mod:`polysft_mi.scene.outline`); ``none`` leaves it. The grid is interpolated (cubic where it
+    has four points or more a side) at ``resolution`` points a side, evenly between the first and
+    last row and column, so that at 33 the 9 x 9 grid's own points are kept. ``say`` takes a line
+    about the pose.
 
     Returns ``(vertices (N, 3) [m, camera frame], faces (F, 3), uv (N, 2))`` with N = resolution^2,
     vertex ``j * resolution + i`` for row j and column i; uv is the projection into the first image,
@@ -142,7 +142,7 @@ def _grid_shape(count, triangles, folder):
             and (np.ptp(j, axis=1) == 1).all()
             and (np.ptp(i, axis=1) == 1).all()
         ):
-            cells, uses = np.unique(j.min(axis=1) * columns + i.min(axis=1), return_counts=True)
+            _cells, uses = np.unique(j.min(axis=1) * columns + i.min(axis=1), return_counts=True)
             if (uses == 2).all():
                 return rows, columns
     raise InputError(
@@ -176,6 +176,6 @@ def _numbers(path, shape):
     if not np.isfinite(table).all():
         raise InputError(f"{path}: holds numbers that are not finite")
     whole = path.endswith(".tri")
-    if whole and (table != np.round(table)).any() or whole and table.min() < 0:
+    if (whole and (table != np.round(table)).any()) or (whole and table.min() < 0):
         raise InputError(f"{path}: holds numbers that are not indices of points, counted from 0")
     return table.astype(np.int64) if whole else table

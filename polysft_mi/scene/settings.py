@@ -148,7 +148,7 @@ class Settings:
                 )
             if f.type in ("int", "float", int, float):
                 inside = math.isfinite(value) and meta["low"] <= value <= meta["high"]
-                if not inside or meta["above"] is not None and value <= meta["above"]:
+                if not inside or (meta["above"] is not None and value <= meta["above"]):
                     raise InputError(
                         f"setting {f.name} = {value!r}; {_NOUN[_type_name(f)]}, {_accepted(meta)},"
                         " is needed"

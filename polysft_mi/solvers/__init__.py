@@ -1,8 +1,9 @@
 """Solvers, by the name that the setting ``solver`` takes.
 
 A solver is built from :class:`polysft_mi.scene.settings.Settings` and has ``solve(problem, window,
-frames, report=None, past=()) -> Solution``; it sees :class:`polysft_mi.objective.problem.Problem` only
-through its methods. To add one: a module here, its name in ``create`` and in the setting's choices.
+frames, report=None, past=()) -> Solution``; it sees :class:`polysft_mi.objective.problem.Problem`
+only through its methods. To add one: a module here, its name in ``create`` and in the setting's
+choices.
 """
 
 from dataclasses import dataclass, field

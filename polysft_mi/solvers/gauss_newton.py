@@ -300,7 +300,7 @@ class GaussNewton:
         for stage in STAGES[:2]:
             for _ in range(_TEXTURE_ITERATIONS):
                 try:
-                    normal, terms = self._linearise(
+                    normal, _terms = self._linearise(
                         state,
                         rest,
                         0,
@@ -657,8 +657,8 @@ class GaussNewton:
         return float(np.clip(scale * math.sqrt(m / (1 - m) / 0.44), *_SCALES))
 
     def _appearance(self, state, order, stage):
-        """The :class:`polysft_mi.images.registration.Appearance` of the sheet in a stage that begins at
-        ``state``; None where the sheet has yet to move far."""
+        """The :class:`polysft_mi.images.registration.Appearance` of the sheet in a stage that
+        begins at ``state``; None where the sheet has yet to move far."""
         if stage is FAR:
             return None
         lit = (

@@ -96,7 +96,7 @@ def test_snapshots_are_what_shorter_runs_return(tmp_path):
     long = stability.run(*DEMO, [3, 40], str(tmp_path), say=str)
     (tmp_path / "log.jsonl").unlink()
     short = stability.run(*DEMO, [3], str(tmp_path), say=str)
-    problem, frame, surfaces, _, losses = long
+    _problem, frame, surfaces, _, losses = long
     assert frame == 1
     assert np.abs(surfaces[3] - short[2][3]).max() < 1e-6
     assert np.abs(surfaces[40] - surfaces[3]).max() > 1e-5

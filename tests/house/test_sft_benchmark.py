@@ -77,7 +77,7 @@ def test_baseline_descends_towards_the_truth(sheet, large_steps, tmp_path):
         "-q",
     ]
     assert not per_vertex.main(arguments)
-    first, second = json.loads((out / "metrics.json").read_text())["per_frame"]
+    _first, second = json.loads((out / "metrics.json").read_text())["per_frame"]
     assert second["loss"] < 0.5 * second["first_loss"] and second["iterations"] == 60
     surface = truth.read_surface(str(out))
     assert surface["vertices"].shape == sheet.vertices.shape and surface["uv"].shape == (

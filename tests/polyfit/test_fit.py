@@ -37,7 +37,7 @@ def test_recovers_jets_of_its_order(order):
 
 
 def test_single_precision_at_order_8():
-    points, alpha, mask = patches(8, dtype=torch.float32)
+    points, _alpha, mask = patches(8, dtype=torch.float32)
     found = jets.fit(points, 8, mask=mask)
     assert found.alpha.dtype == torch.float32 and (found.order == 8).all()
     z = points[..., 2]
@@ -154,7 +154,7 @@ def test_a_second_derivative_is_refused_rather_than_wrong():
 
 
 def test_what_cannot_be_fitted_is_named():
-    points, _, mask = patches(2, counts=(20, 20))
+    points, _, _mask = patches(2, counts=(20, 20))
     empty = torch.tensor([[True], [False]]).expand(2, 20)
     for message, call in {
         "patch 1 has no points": lambda: jets.fit(points, 2, mask=empty),

@@ -46,7 +46,7 @@ def test_points_are_found_on_the_subdivided_mesh():
 
 
 def test_sheets_are_manifold_and_keep_their_places():
-    for V, F in (surfaces.with_fin(), surfaces.sheet(), surfaces.moebius()):
+    for _, F in (surfaces.with_fin(), surfaces.sheet(), surfaces.moebius()):
         split = mesh.sheets(F)
         _, side = mesh.edges_of(split)
         assert np.bincount(side.ravel()).max() <= 2
@@ -62,7 +62,7 @@ def test_sheets_are_manifold_and_keep_their_places():
 
 
 def test_a_vertex_where_two_cones_meet_is_split():
-    V, F = surfaces.joined(surfaces.sheet(n=3), surfaces.sheet(n=3))
+    _V, F = surfaces.joined(surfaces.sheet(n=3), surfaces.sheet(n=3))
     F = np.where(F == 9, 8, F)  # a corner of the one on a corner of the other
     assert len(np.unique(mesh.sheets(F))) == 18
 
@@ -122,7 +122,7 @@ def test_the_cut_is_a_partition_into_connected_patches(shape):
 
 
 def test_no_patch_goes_around_an_edge_of_three_faces_or_onto_another_part(shape):
-    V, F, _, p = shape
+    _V, _F, _, p = shape
     part = mesh.components(p.sheets.max() + 1, mesh.edges_of(p.sheets)[0])
     assert (np.bincount(np.unique(np.stack([p.label, part]), axis=1)[0]) == 1).all()
 

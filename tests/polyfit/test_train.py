@@ -23,7 +23,9 @@ from polyfit.training import Processes
 SMALL = train.Settings(
     families=("gaussian", "jet"), patches=120, points=40, reads=30, steps=8, batch=16, order=2
 )
-FLAGS = "--families gaussian jet --patches 120 --points 40 --reads 30 --steps 8 --batch 16 --order 2".split()
+FLAGS = (
+    "--families gaussian jet --patches 120 --points 40 --reads 30 --steps 8 --batch 16 --order 2"
+).split()
 
 
 @pytest.fixture(scope="module")

@@ -303,8 +303,10 @@ def smpl(standard):
     parents[0] = 2**32 - 1
     shapedirs = np.stack([0.05 * V, 0.05 * V * [1, 0, 0]], -1)
     return {
-        "v_template": V, "f": standard.faces.numpy().astype(np.uint32), "weights": standard.blend_weights.double().numpy(), "J_regressor":
-        regressor, "kintree_table": np.stack([parents.astype(np.uint32), np.arange(24, dtype=np.uint32)]), "shapedirs": shapedirs,
+        "v_template": V, "f": standard.faces.numpy().astype(np.uint32),
+        "weights": standard.blend_weights.double().numpy(), "J_regressor": regressor,
+        "kintree_table": np.stack([parents.astype(np.uint32), np.arange(24, dtype=np.uint32)]),
+        "shapedirs": shapedirs,
     }  # fmt: skip
 
 
@@ -444,8 +446,9 @@ def test_smpl_files_that_cannot_be_used(smpl, tmp_path, change, message):
 def plain(standard, **changes):
     """A body.npz's contents of the standard body at rest, in OneFit's axes."""
     data = {
-        "vertices": standard.vertices.numpy(), "faces": standard.faces.numpy(), "blend_weights": standard.blend_weights.numpy(),
-        "joints": standard.joints.numpy(), "rest_pose": standard.rest_pose.numpy(), "parents": np.array(skeleton.PARENTS),
+        "vertices": standard.vertices.numpy(), "faces": standard.faces.numpy(),
+        "blend_weights": standard.blend_weights.numpy(), "joints": standard.joints.numpy(),
+        "rest_pose": standard.rest_pose.numpy(), "parents": np.array(skeleton.PARENTS),
     }  # fmt: skip
     return data | changes
 

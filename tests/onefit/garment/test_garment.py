@@ -68,7 +68,7 @@ class TestTemplates:
     def test_is_one_clean_sheet_with_its_openings(self, garment):
         V, F = garment.vertices.double().numpy(), garment.faces.numpy()
         assert 2000 <= len(garment) <= 12000
-        W, G, told = mended(V, F)
+        _W, G, told = mended(V, F)
         assert told == () and np.array_equal(G, F)
         found = loops(F)
         assert len(found) == LOOPS[garment.name]
@@ -231,7 +231,7 @@ def test_smooth_union_is_the_minimum_away_from_the_fillet():
 
 
 def test_nearest_points_and_sides():
-    V, F = joined(sphere(0.2, 2), tuple([sphere(0.1, 2)[0] + [0.5, 0, 0], sphere(0.1, 2)[1]]))
+    V, F = joined(sphere(0.2, 2), (sphere(0.1, 2)[0] + [0.5, 0, 0], sphere(0.1, 2)[1]))
     rng = np.random.default_rng(0)
     x = np.concatenate([rng.uniform(-0.4, 0.8, (300, 3)), V[::9], V[F[::7]].mean(axis=1)])
     got = ClosestSurface(V, F)(x)
@@ -423,7 +423,7 @@ class TestRepairs:
         T, G = tube(0.03, 0.2, 12, 8)
         T = T + V[5] - T[0]
         T, G = joined((V, F), (T, G))
-        G[G == len(V)] = 5
+        G[len(V) == G] = 5
         _, _, told = mended(T, G)
         assert any("1 vertices where parts touch in a point" in s for s in told), told
 

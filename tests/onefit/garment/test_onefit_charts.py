@@ -306,7 +306,7 @@ def test_a_strip_follows_its_neighbours(body):
 
 def test_fields_of_the_vertices_and_their_derivatives(patched, garment):
     # the positions themselves are such a field: its derivatives are the template's tangents
-    value, du, dv = (patched.field @ garment.vertices).unflatten(0, (-1, 3)).unbind(1)
+    value, du, _dv = (patched.field @ garment.vertices).unflatten(0, (-1, 3)).unbind(1)
     patch = torch.arange(len(patched)).repeat_interleave(patched.metric_uv.shape[1])
     uv = patched.metric_uv.flatten(0, 1)
     points = points_of(patched, deformation(patched, 0.0), 0, uv, patch)
@@ -441,7 +441,7 @@ def test_gradient_of_the_whole_objective(patched, body, name):
         gravity="k_g",
         inertia="k_in",
     )
-    off = {k: 0.0 for k in ("k_c", "k_i", "k_b", "k_bn", "k_mi", "k_g", "k_in")}
+    off = dict.fromkeys(("k_c", "k_i", "k_b", "k_bn", "k_mi", "k_g", "k_in"), 0.0)
     on = {switches[name]: 1.0} | ({"k_bn": 1.0} if name == "boundary" else {})
     weights = losses.Weights(**off | on)
 

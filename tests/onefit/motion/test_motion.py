@@ -259,22 +259,48 @@ def test_motion_files_that_cannot_be_used(tmp_path):
 PARTS = ("hip", "knee", "ankle", "foot", "collar", "shoulder", "elbow", "wrist")
 # names of pelvis, spine, neck and head, and of a side's bones; Euler order; axes; units a metre
 STYLES = {
-    "mixamo": (["Hips", "Spine", "Spine1", "Spine2", "Neck", "Head"], ["{S}UpLeg", "{S}Leg", "{S}Foot", "{S}ToeBase", "{S}Shoulder",
-    "{S}Arm",
-               "{S}ForeArm", "{S}Hand"], "mixamorig:", "ZXY", "y", 100.0),
-    "cmu": (["Hips", "LowerBack", "Spine", "Spine1", "Neck", "Head"], ["{S}UpLeg", "{S}Leg", "{S}Foot", "{S}ToeBase", "{S}Shoulder",
-    "{S}Arm",
-            "{S}ForeArm", "{S}Hand"], "", "ZYX", "y", 17.7),
-    "rigify": (["spine", "spine.001", "spine.002", "spine.003", "spine.004", "head"], ["thigh.{s}", "shin.{s}", "foot.{s}", "toe.{s}",
-    "shoulder.{s}",
-               "upper_arm.{s}", "forearm.{s}", "hand.{s}"], "", "XYZ", "z", 1.0),
-    "poser": (["hip", "abdomen", "chest", "chest2", "neck", "head"], ["{l}Thigh", "{l}Shin", "{l}Foot", "{l}Toe", "{l}Collar", "{l}Shldr",
-              "{l}ForeArm", "{l}Hand"], "", "YZX", "y", 40.0),
-    "mocap": (["Hips", "Chest", "Chest2", "Chest3", "Neck", "Head"], ["{S}Hip", "{S}Knee", "{S}Ankle", "{S}Toe", "{S}Collar", "{S}Shoulder",
-              "{S}Elbow", "{S}Wrist"], "", "ZXY", "y", 100.0),
-    "unreal": (["pelvis", "spine_01", "spine_02", "spine_03", "neck_01", "head"], ["thigh_{l}", "calf_{l}", "foot_{l}", "ball_{l}",
-    "clavicle_{l}",
-               "upperarm_{l}", "lowerarm_{l}", "hand_{l}"], "", "ZYX", "z", 100.0),
+    "mixamo": (
+        ["Hips", "Spine", "Spine1", "Spine2", "Neck", "Head"],
+        [
+            "{S}UpLeg", "{S}Leg", "{S}Foot", "{S}ToeBase", "{S}Shoulder", "{S}Arm", "{S}ForeArm",
+            "{S}Hand"
+        ], "mixamorig:", "ZXY", "y", 100.0
+    ),
+    "cmu": (
+        ["Hips", "LowerBack", "Spine", "Spine1", "Neck", "Head"],
+        [
+            "{S}UpLeg", "{S}Leg", "{S}Foot", "{S}ToeBase", "{S}Shoulder", "{S}Arm", "{S}ForeArm",
+            "{S}Hand"
+        ], "", "ZYX", "y", 17.7
+    ),
+    "rigify": (
+        ["spine", "spine.001", "spine.002", "spine.003", "spine.004", "head"],
+        [
+            "thigh.{s}", "shin.{s}", "foot.{s}", "toe.{s}", "shoulder.{s}", "upper_arm.{s}",
+            "forearm.{s}", "hand.{s}"
+        ], "", "XYZ", "z", 1.0
+    ),
+    "poser": (
+        ["hip", "abdomen", "chest", "chest2", "neck", "head"],
+        [
+            "{l}Thigh", "{l}Shin", "{l}Foot", "{l}Toe", "{l}Collar", "{l}Shldr", "{l}ForeArm",
+            "{l}Hand"
+        ], "", "YZX", "y", 40.0
+    ),
+    "mocap": (
+        ["Hips", "Chest", "Chest2", "Chest3", "Neck", "Head"],
+        [
+            "{S}Hip", "{S}Knee", "{S}Ankle", "{S}Toe", "{S}Collar", "{S}Shoulder", "{S}Elbow",
+            "{S}Wrist"
+        ], "", "ZXY", "y", 100.0
+    ),
+    "unreal": (
+        ["pelvis", "spine_01", "spine_02", "spine_03", "neck_01", "head"],
+        [
+            "thigh_{l}", "calf_{l}", "foot_{l}", "ball_{l}", "clavicle_{l}", "upperarm_{l}",
+            "lowerarm_{l}", "hand_{l}"
+        ], "", "ZYX", "z", 100.0
+    ),
 }  # fmt: skip
 
 

@@ -26,8 +26,8 @@ def network(tmp_path_factory):
 def out(network, tmp_path_factory):
     folder = tmp_path_factory.mktemp("drapes") / "out"
     drape.main([
-        "shorts", "walk", "-o", str(folder), "--weights", network, "--seconds", "0.1", "--size", "90", "60", "--spp", "4",
-        "--meshes", "ply", "--shape", "height=0.6", "weight=0.4",
+        "shorts", "walk", "-o", str(folder), "--weights", network, "--seconds", "0.1", "--size",
+        "90", "60", "--spp", "4", "--meshes", "ply", "--shape", "height=0.6", "weight=0.4",
     ])  # fmt: skip
     return folder
 

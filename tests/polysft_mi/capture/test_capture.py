@@ -148,7 +148,7 @@ def test_folder_of_a_video(clip, tmp_path):
     )
     assert found["frames"] == 12 and found["in_view"] == 1 and found["pose"]["agree"] > 100
 
-    vertices, faces, uv = meshio.read_template(f"{out}/template.obj")
+    vertices, _faces, uv = meshio.read_template(f"{out}/template.obj")
     R, t = placed()
     flat = np.column_stack([(uv[:, 0] - 0.5) * WIDTH, (0.5 - uv[:, 1]) * HEIGHT, np.zeros(len(uv))])
     assert (
@@ -640,10 +640,10 @@ def test_views_of_a_board_that_tell_nothing(tmp_path):
 @pytest.mark.parametrize(
     "words, size",
     [
-        (["0.297", "0.210"], (0.297, 0.21)), (["297mm", "210mm"], (0.297, 0.21)), (["297", "210mm"], (0.297, 0.21)), (["29.7cm", "21cm"],
-        (0.297, 0.21)),
-        (["297x210mm"], (0.297, 0.21)), (["A4"], (0.297, 0.21)), (["a3"], (0.42, 0.297)), (["11in", "8.5in"], (0.2794, 0.2159)),
-        (["30cm"], (0.3, 0.3)), (["2", "1.5"], (2, 1.5)),
+        (["0.297", "0.210"], (0.297, 0.21)), (["297mm", "210mm"], (0.297, 0.21)),
+        (["297", "210mm"], (0.297, 0.21)), (["29.7cm", "21cm"], (0.297, 0.21)),
+        (["297x210mm"], (0.297, 0.21)), (["A4"], (0.297, 0.21)), (["a3"], (0.42, 0.297)),
+        (["11in", "8.5in"], (0.2794, 0.2159)), (["30cm"], (0.3, 0.3)), (["2", "1.5"], (2, 1.5)),
     ],
 )  # fmt: skip
 def test_sizes(words, size):
@@ -657,10 +657,11 @@ def test_size_of_a_standing_sheet():
 @pytest.mark.parametrize(
     "words, said",
     [
-        (["297", "210"], "297mm 210mm"), (["29.7", "21"], "29.7cm 21cm"), (["11", "8.5"], "11in 8.5in"), (["297m", "210m"], "20 m"),
-        (["0.1mm", "1m"], "5 mm"), (["0", "1"], "positive"),
-        (["-1", "1"], "not a length"), (["A9"], "not a length"), (["1", "2", "3"], "3 lengths"), (["297px", "210px"], "'297px'"), (["nan",
-        "1"], "not a length"), (["inf"], "not a length"),
+        (["297", "210"], "297mm 210mm"), (["29.7", "21"], "29.7cm 21cm"),
+        (["11", "8.5"], "11in 8.5in"), (["297m", "210m"], "20 m"), (["0.1mm", "1m"], "5 mm"),
+        (["0", "1"], "positive"), (["-1", "1"], "not a length"), (["A9"], "not a length"),
+        (["1", "2", "3"], "3 lengths"), (["297px", "210px"], "'297px'"),
+        (["nan", "1"], "not a length"), (["inf"], "not a length"),
     ],
 )  # fmt: skip
 def test_sizes_that_no_sheet_has(words, said):
@@ -869,7 +870,7 @@ def test_bent_first_frame_is_said(tmp_path):
     flat = sheet.grid(WIDTH, HEIGHT, 33)
     x = flat.vertices[:, 0]
     lines = []
-    for k, curvature in enumerate((0.3, 5.0)):  # 1/m
+    for _k, curvature in enumerate((0.3, 5.0)):  # 1/m
         bent = np.column_stack(
             [
                 np.sin(curvature * x) / curvature,

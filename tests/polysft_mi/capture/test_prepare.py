@@ -207,7 +207,7 @@ def test_kinect_paper_pose_fit(tmp_path, resolution):
 
 def test_real_kinect_paper(shared_data, tmp_path):
     folder = str(shared_data / "kinect_paper")
-    vertices, faces, uv = kinect_paper_template(folder, pose_fit="none")
+    vertices, _faces, uv = kinect_paper_template(folder, pose_fit="none")
     own = np.loadtxt(os.path.join(folder, "mesh.pts"))
     pose = np.loadtxt(os.path.join(folder, "cam.ext"))
     np.testing.assert_allclose(
@@ -333,7 +333,7 @@ def test_template_and_frames_are_checked(tmp_path):
 
 def test_files_that_are_there_stay(tmp_path):
     folder = synthetic.kinect_paper(tmp_path / "data", frames=1).folder
-    path, _ = prepare(str(folder), resolution=5)
+    _path, _ = prepare(str(folder), resolution=5)
     before = {name: (folder / name).read_bytes() for name in ("scene.xml", "template.obj")}
     assert "--overwrite" in refused(str(folder))
     (folder / "scene.xml").unlink()

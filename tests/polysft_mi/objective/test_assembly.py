@@ -195,7 +195,7 @@ def test_beyond_the_surroundings_of_the_mask_a_silhouette_is_as_far_as_counts(pr
             known.raster.crossings(view, outline=True),
             on_device(np.full(400, 2.0), mi.Float),
         )
-        _, (*_, ci, cj, excess, share) = pixels.outline(
+        _, (*_, ci, cj, _excess, share) = pixels.outline(
             view.seen(), crossings, mask, distance, known._corner_of
         )
     assert int(view.region[0][0]) > 2 + 20

@@ -262,7 +262,7 @@ def test_truth_is_nearly_a_minimum(tmp_path):
     p, truth = problem(tmp_path)
 
     def loss(vertices):
-        rgb, alpha = p.image(mi.Point3f(np.ascontiguousarray(vertices.T, dtype=np.float32)))
+        rgb, _alpha = p.image(mi.Point3f(np.ascontiguousarray(vertices.T, dtype=np.float32)))
         target = p.target(4)
         return float(np.mean((np.array(rgb) - np.array(target.rgb)) ** 2))
 
@@ -288,7 +288,7 @@ def test_padding_does_not_change_the_loss(tmp_path):
     in.
     """
     totals = []
-    for name, size in (("small", (96, 72)), ("large", (160, 120))):
+    for name, _size in (("small", (96, 72)), ("large", (160, 120))):
         truth = synthetic.cloth(tmp_path / name, size=(96, 72))
         if name == "large":
             import cv2

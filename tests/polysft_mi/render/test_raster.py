@@ -270,7 +270,7 @@ class Sheet:
             {"type": "scene", "sensor": sensor(), "sheet": {**mesh, "bsdf": bsdf}}
         )
         self.params = mi.traverse(self.scene)
-        self.key = next(k for k in self.params.keys() if k.endswith("vertex_positions"))
+        self.key = next(k for k in self.params if k.endswith("vertex_positions"))
         self.integrator = raster()
         rng = np.random.default_rng(3)
         rest = self.patch.rest().to_numpy()
@@ -317,8 +317,13 @@ def test_gradients_against_finite_differences(tmp_path, kind):
     sheet = Sheet(tmp_path, kind)
     rng = np.random.default_rng(5)
     goal = Unknowns.from_numpy(
-        {**sheet.arrays, "translation": sheet.arrays["translation"] + np.array([0.03, -0.02, 0.05], np.float32),
-         "delta_alpha": sheet.arrays["delta_alpha"] + (0.03 * rng.normal(size=15)).astype(np.float32)}
+        {
+            **sheet.arrays,
+            "translation": sheet.arrays["translation"] + np.array([0.03, -0.02, 0.05], np.float32),
+            "delta_alpha": sheet.arrays["delta_alpha"] + (0.03 * rng.normal(size=15)).astype(
+                np.float32
+            )
+        }
     )  # fmt: skip
     target = dr.detach(sheet.image(goal))
     covered = np.array(target)[..., 3]
@@ -431,7 +436,7 @@ def test_a_moved_camera_is_noticed(tmp_path):
     scene, integrator = triangles(tmp_path, corners), raster()
     before = np.array(mi.render(scene, integrator=integrator, spp=1))
     params = mi.traverse(scene)
-    key = next(k for k in params.keys() if k.endswith("to_world"))
+    key = next(k for k in params if k.endswith("to_world"))
     moved = mi.ScalarTransform4f().look_at(
         origin=[10 * pixel_size(), 0, 0], target=[10 * pixel_size(), 0, 1], up=[0, -1, 0]
     )

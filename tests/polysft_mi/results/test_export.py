@@ -8,6 +8,7 @@ import shutil
 import struct
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -103,7 +104,7 @@ def test_glb_plays_the_frames(run, expected, tmp_path):
     np.testing.assert_allclose(
         normals, by_area / np.linalg.norm(by_area, axis=1, keepdims=True), atol=1e-3
     )
-    assert image(0) == open(run.texture, "rb").read()
+    assert image(0) == Path(run.texture).read_bytes()
 
 
 def test_trimesh_sees_the_glb_textured_as_it_was(run, expected, tmp_path):
@@ -144,17 +145,23 @@ import sys, zipfile, io, numpy as np
 from pxr import Usd, UsdGeom, UsdShade, UsdValidation
 stage = Usd.Stage.Open(sys.argv[1])
 mesh = next(UsdGeom.Mesh(p) for p in stage.Traverse() if p.IsA(UsdGeom.Mesh))
-points = np.stack([np.array(mesh.GetPointsAttr().Get(k)) for k in mesh.GetPointsAttr().GetTimeSamples()])
+moving = mesh.GetPointsAttr()
+points = np.stack([np.array(moving.Get(k)) for k in moving.GetTimeSamples()])
 uv = np.array(UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st").Get())
 material, _ = UsdShade.MaterialBindingAPI(mesh).ComputeBoundMaterial()
-texture = next(UsdShade.Shader(p) for p in stage.Traverse() if UsdShade.Shader(p).GetIdAttr().Get() == "UsdUVTexture")
+shaders = [UsdShade.Shader(p) for p in stage.Traverse()]
+texture = next(s for s in shaders if s.GetIdAttr().Get() == "UsdUVTexture")
 asset = texture.GetInput("file").Get()
 inside = zipfile.ZipFile(sys.argv[1]).read(asset.path.lstrip("./"))
 registry = UsdValidation.ValidationRegistry()
-problems = [e.GetMessage() for e in UsdValidation.ValidationContext(registry.GetOrLoadAllValidators()).Validate(stage)]
+context = UsdValidation.ValidationContext(registry.GetOrLoadAllValidators())
+problems = [e.GetMessage() for e in context.Validate(stage)]
 assert not problems, problems
-np.savez(sys.argv[2], points=points, uv=uv, faces=np.array(mesh.GetFaceVertexIndicesAttr().Get()), up=UsdGeom.GetStageUpAxis(stage),
-         units=UsdGeom.GetStageMetersPerUnit(stage), image=np.frombuffer(inside, np.uint8), bound=bool(material))
+np.savez(
+    sys.argv[2], points=points, uv=uv, faces=np.array(mesh.GetFaceVertexIndicesAttr().Get()),
+    up=UsdGeom.GetStageUpAxis(stage), units=UsdGeom.GetStageMetersPerUnit(stage),
+    image=np.frombuffer(inside, np.uint8), bound=bool(material),
+)
 """
     subprocess.run([sys.executable, "-c", script, path, tmp_path / "a.npz"], check=True, timeout=60)
     seen = np.load(tmp_path / "a.npz")
@@ -163,7 +170,7 @@ np.savez(sys.argv[2], points=points, uv=uv, faces=np.array(mesh.GetFaceVertexInd
     np.testing.assert_allclose(seen["uv"], run.uv, atol=1e-6)
     assert np.array_equal(seen["faces"].reshape(-1, 3), run.faces) and seen["bound"]
     assert (str(seen["up"]), float(seen["units"])) == ("Z", 1.0)
-    assert seen["image"].tobytes() == open(run.texture, "rb").read()
+    assert seen["image"].tobytes() == Path(run.texture).read_bytes()
 
 
 @pytest.mark.parametrize("kind", ["obj", "ply"])

@@ -54,7 +54,7 @@ def picture(place, frame=None, paper=230, second=0.0, seed=0):
     size = [round(PIXELS_A_METRE * (s + 2 * margin)) for s in (WIDTH, HEIGHT)]
     flat = np.full((size[1], size[0], 3), paper, np.uint8)
     at = lambda p: tuple(
-        int(round(PIXELS_A_METRE * (v + s / 2 + margin) - 0.5)) for v, s in zip(p, (WIDTH, HEIGHT))
+        round(PIXELS_A_METRE * (v + s / 2 + margin) - 0.5) for v, s in zip(p, (WIDTH, HEIGHT))
     )
     for _ in range(250):
         a = rng.uniform(-0.47, 0.47, 2) * (WIDTH, HEIGHT)

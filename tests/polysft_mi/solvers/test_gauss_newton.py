@@ -3,6 +3,7 @@ against dense matrices, its frames against the truth.
 """
 
 import dataclasses
+import itertools
 import math
 import shutil
 
@@ -744,7 +745,9 @@ def test_a_sheet_that_bulges_the_wrong_way_is_turned_over(tmp_path, monkeypatch,
         for v in surfaces[:3]
     ]
 
-    def solved(terms={}):
+    def solved(terms=None):
+        if terms is None:
+            terms = {}
         solution = solvers.create(problem.settings).solve(
             problem,
             [Unknowns.from_numpy(past[-1][0])],
@@ -1013,7 +1016,7 @@ def test_the_least_misfit_goes_from_frame_to_frame(truth, tmp_path):
     problem = problem_of(truth.folder)
     done = track(problem, solvers.create(problem.settings), 4, str(tmp_path))
     misfit, least = ([t[name] for t in done.totals] for name in ("misfit", "least_misfit"))
-    assert least[0] is None and all(b <= a for a, b in zip(least[1:], least[2:])) and least[-1] > 0
+    assert least[0] is None and all(b <= a for a, b in itertools.pairwise(least)) and least[-1] > 0
     solver = gauss_newton.GaussNewton(problem.settings)
     solver._prepare(problem)
     level = solver.levels[gauss_newton.STAGES[-1]]
@@ -1123,7 +1126,7 @@ def test_a_windows_step_against_finite_differences_and_the_dense_system(truth):
     assert mine == pytest.approx(slope, rel=1e-4)
 
     damping, found = 1e-4, solver._window_step(models, 1e-4)
-    parts, right, sizes = zip(
+    parts, right, _sizes = zip(
         *[(*dense(solver.registration.pattern, n), len(n.gradient)) for n, _ in models]
     )
     n, start = 2 * solver.registration.pattern.count, np.cumsum([0] + [len(h) for h in parts])

@@ -1,5 +1,6 @@
 """What one jet can hold, and what is refused with the measured residual."""
 
+import itertools
 import subprocess
 import sys
 
@@ -115,7 +116,7 @@ def test_polynomial_surface_leaves_nothing():
 def test_higher_orders_leave_less():
     args = grid(height=lambda x, y: 0.01 * np.sin(40 * x))
     residuals = [Template.fit(*args, n, tolerance=1).residual_rms for n in range(1, 11)]
-    assert all(b <= a * (1 + 1e-9) for a, b in zip(residuals, residuals[1:]))
+    assert all(b <= a * (1 + 1e-9) for a, b in itertools.pairwise(residuals))
     assert residuals[-1] < 0.1 * residuals[3]
 
 
@@ -156,8 +157,8 @@ def test_a_run_does_without_torch():
     code = """
 import sys, numpy as np
 from polysft_mi import backend; backend.set_variant("llvm_ad_rgb")
-import polysft_mi.run, polysft_mi.scene, polysft_mi.solvers, polysft_mi.problem, polysft_mi.report, polysft_mi.results
-from polysft_mi.template import Template
+import polysft_mi.run, polysft_mi.scene.experiment, polysft_mi.solvers, polysft_mi.report
+from polysft_mi.surface.template import Template
 x, y = (a.ravel() for a in np.meshgrid(np.linspace(0, 1, 4), np.linspace(0, 2, 4)))
 faces = np.array([[4 * r + c, 4 * r + c + 1, 4 * r + c + 4] for r in range(3) for c in range(3)])
 Template.fit(np.stack([x, y, 0 * x], 1), faces, np.stack([x, y], 1), 2)
