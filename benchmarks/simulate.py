@@ -320,7 +320,9 @@ def render(folder, vertices, faces, uv, rng):
     })  # fmt: skip
     depth = mi.load_dict({"type": "aov", "aovs": "z:depth"})
     parameters = mi.traverse(scene)
-    key = next(k for k in parameters if k.startswith("cloth") and k.endswith("vertex_positions"))
+    key = next(
+        k for k in parameters.keys() if k.startswith("cloth") and k.endswith("vertex_positions")
+    )
     start = np.array(parameters[key]).reshape(-1, 3)
     corner = np.linalg.norm(start[:, None] - vertices[0], axis=-1).argmin(
         1

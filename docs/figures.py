@@ -61,7 +61,7 @@ class Plane:
         ]
         self.scene = mi.load_dict({"type": "scene", "sensor": sensor, "mesh": mesh})
         self.params = mi.traverse(self.scene)
-        self.key = next(k for k in self.params if k.endswith("vertex_positions"))
+        self.key = next(k for k in self.params.keys() if k.endswith("vertex_positions"))
         self.rest = mi.Float(self.params[self.key])
 
     @staticmethod

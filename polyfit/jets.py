@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from .errors import InputError
-from .monomials import exponents, order_of
+from .monomials import exponents, order_of, size_of  # noqa: F401 (read as jets.size_of)
 
 
 def matrix(alpha):

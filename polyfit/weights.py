@@ -26,7 +26,7 @@ def read_weights(path, model, version):
     try:
         with safe_open(path, "pt") as file:
             about = json.loads((file.metadata() or {}).get("about", "null"))
-            weights = {key: file.get_tensor(key) for key in file}
+            weights = {key: file.get_tensor(key) for key in file.keys()}
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except (SafetensorError, OSError, ValueError) as error:

@@ -27,7 +27,7 @@ def _positions_key(params, mesh):
     """The key of the mesh's vertex positions among a scene's parameters. (Mitsuba names meshes by
     id, or by address where they have none.)
     """
-    keys = [k for k in params if k.endswith("vertex_positions")]
+    keys = [k for k in params.keys() if k.endswith("vertex_positions")]
     for key in keys:
         if len(keys) == 1 or key.split(".")[0] == mesh.id():
             return key

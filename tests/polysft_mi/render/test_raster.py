@@ -270,7 +270,7 @@ class Sheet:
             {"type": "scene", "sensor": sensor(), "sheet": {**mesh, "bsdf": bsdf}}
         )
         self.params = mi.traverse(self.scene)
-        self.key = next(k for k in self.params if k.endswith("vertex_positions"))
+        self.key = next(k for k in self.params.keys() if k.endswith("vertex_positions"))
         self.integrator = raster()
         rng = np.random.default_rng(3)
         rest = self.patch.rest().to_numpy()
@@ -436,7 +436,7 @@ def test_a_moved_camera_is_noticed(tmp_path):
     scene, integrator = triangles(tmp_path, corners), raster()
     before = np.array(mi.render(scene, integrator=integrator, spp=1))
     params = mi.traverse(scene)
-    key = next(k for k in params if k.endswith("to_world"))
+    key = next(k for k in params.keys() if k.endswith("to_world"))
     moved = mi.ScalarTransform4f().look_at(
         origin=[10 * pixel_size(), 0, 0], target=[10 * pixel_size(), 0, 1], up=[0, -1, 0]
     )
