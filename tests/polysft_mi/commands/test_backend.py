@@ -28,8 +28,8 @@ def library(folder, name, version=None):
     and older, none.
     """
     function = (
-        "void LLVMGetVersion(unsigned *a, unsigned *b, unsigned *c) { *a = %d; *b = %d; *c = %d; }"
-        % version
+        "void LLVMGetVersion(unsigned *a, unsigned *b, unsigned *c)"
+        " {{ *a = {}; *b = {}; *c = {}; }}".format(*version)
         if version
         else "int unused;"
     )
