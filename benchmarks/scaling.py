@@ -79,7 +79,7 @@ def make(folder, points, size, frames):
 
     from polysft_mi import prepare
     from polysft_mi.objective.problem import Problem
-    from polysft_mi.pictures import album as pictures
+    from polysft_mi.pictures.shading import srgb
     from polysft_mi.scene import experiment as scene
     from polysft_mi.scene.sequence import Sequence
 
@@ -116,7 +116,7 @@ def make(folder, points, size, frames):
         rgb, alpha = problem.image(mi.Point3f(np.ascontiguousarray(vertices.T, dtype=np.float32)))
         alpha = np.array(alpha).reshape(size[1], size[0])
         linear = np.array(rgb) + 0.05 * (1 - alpha[..., None])
-        write("frames", k, np.round(255 * pictures.srgb(linear)).astype(np.uint8))
+        write("frames", k, np.round(255 * srgb(linear)).astype(np.uint8))
         write("masks", k, np.round(255 * alpha).astype(np.uint8))
 
 

@@ -170,7 +170,7 @@ def picture(path, problem, frame, surfaces, counts, rows, usual, truth):
     from matplotlib.figure import Figure
 
     from polysft_mi.pictures import shading
-    from polysft_mi.pictures.album import srgb
+    from polysft_mi.pictures.shading import srgb
 
     template, image = problem.template, srgb(problem.sequence.frame(frame))
     shown = [(f"{n} iterations", surfaces[n]) for n in counts] + (

@@ -22,6 +22,7 @@ from polysft_mi.results import metrics
 from . import figures
 from .exr import write_exr
 from .panels import COLUMNS, PEAKS, Box, heat, heat_values, spread
+from .shading import srgb
 from .video import write_video
 
 
@@ -43,12 +44,6 @@ class AlbumSettings:
     view: float = 1.25
     threads: int = 2
     waiting: int = 4
-
-
-def srgb(linear):
-    """Linear values (..., 3) as sRGB in [0, 1]."""
-    x = np.clip(np.nan_to_num(linear), 0, 1)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
 
 
 class Renderings:

@@ -18,8 +18,6 @@ import numpy as np
 
 from .panels import spread
 
-_WORTH = 8  # frames from which on another process is worth its start
-_NICE = 5  # below the tracker in rank
 _album = None  # of the drawing process
 
 
@@ -31,7 +29,7 @@ def _draw_in_background(variant, scene, overrides, template, sequence, album, ca
     if _album is None:
         threading.Thread(target=_end_with_parent, args=[album[-1]], daemon=True).start()
         if hasattr(os, "nice"):
-            os.nice(_NICE)
+            os.nice(5)  # below the tracker in rank
         from polysft_mi.backend import set_variant
 
         set_variant(variant)
@@ -62,18 +60,19 @@ class Drawing:
     solved, and :meth:`finish`.
 
     ``overrides``: of the scene's defaults; ``exr_frames``: how many comparison EXRs at most;
-    ``about``: for their headers. Runs of a few frames are drawn here, at the end, as is everything
-    where the drawing process fails.
+    ``about``: for their headers; ``worth``: frames from which on another process is worth its
+    start. Shorter runs are drawn here, at the end, as is everything where the drawing process
+    fails.
     """
 
-    def __init__(self, problem, overrides, out, *, exr_frames, about):
+    def __init__(self, problem, overrides, out, *, exr_frames, about, worth=8):
         self.problem, self.out, self.exr_frames = problem, out, exr_frames
         self._folder = tempfile.TemporaryDirectory(prefix="polysft_mi-", ignore_cleanup_errors=True)
         self._album = out, about, self._folder.name
         self._given, self._jobs, self._pool = {}, [], None
         self._here = None  # the album, where it must be drawn in this process
         self._exr = self._chosen(len(problem.sequence.indices))
-        if len(problem.sequence.indices) >= _WORTH:
+        if len(problem.sequence.indices) >= worth:
             import mitsuba as mi
 
             self._first = (

@@ -2,19 +2,40 @@
 values at its vertices, as the camera sees them.
 """
 
+import functools
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from polysft_mi.results.metrics import vertex_normals
 
-_BACKGROUND = 0.90  # linear
-_FRONT, _BACK = (0.80, 0.56, 0.33), (0.30, 0.47, 0.66)  # linear albedo of the two sides
-_KEY, _FILL = (-0.80, -0.50, -0.45), (0.60, -0.20, -0.80)  # towards the lights, in the view's frame
-_SUPERSAMPLE = 2
-_LINEAR = np.linspace(0, 1, 4096)
-_SRGB = np.where(_LINEAR <= 0.0031308, 12.92 * _LINEAR, 1.055 * _LINEAR ** (1 / 2.4) - 0.055)
-_SRGB = np.round(255 * _SRGB).astype(np.uint8)
+
+@dataclass(frozen=True)
+class ShadingLook:
+    """How a surface is shaded. Colours are linear RGB.
+
+    ``background``: grey; ``front``, ``back``: albedo of the two sides; ``key``, ``fill``: towards
+    the two lights, in the view's frame; ``supersample``: samples a pixel and axis.
+    """
+
+    background: float = 0.90
+    front: tuple = (0.80, 0.56, 0.33)
+    back: tuple = (0.30, 0.47, 0.66)
+    key: tuple = (-0.80, -0.50, -0.45)
+    fill: tuple = (0.60, -0.20, -0.80)
+    supersample: int = 2
+
+
+def srgb(linear):
+    """Linear values (...) as sRGB in [0, 1] (IEC 61966-2-1); not a number is 0."""
+    x = np.clip(np.nan_to_num(linear), 0, 1)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
+
+
+@functools.cache
+def _srgb_codes(steps=4096):
+    """The sRGB codes (``steps``,) uint8 of linear values from 0 to 1."""
+    return np.round(255 * srgb(np.linspace(0, 1, steps))).astype(np.uint8)
 
 
 @dataclass(frozen=True)
@@ -56,17 +77,19 @@ class View:
         return bool((np.abs(seen[:, :2]) <= self.radius).all())
 
 
-def shade_surface(vertices, faces, view=None, uv=None, size=(480, 480)):
+def shade_surface(vertices, faces, view=None, uv=None, size=(480, 480), look=None):
     """A matte picture (height, width, 3) uint8 sRGB of a mesh: vertices (N, 3) [m], faces (F, 3),
     ``size`` = (width, height).
 
     Lambert shading with smooth normals under a key light from the left and a weak fill, warm on the
     side from which the triangles' normals point to the viewer, cool on the other. With ``uv`` (N,
-    2) a thin grid of ten by ten cells is drawn.
+    2) a thin grid of ten by ten cells is drawn. ``look``: :class:`ShadingLook`.
     """
+    look = look or ShadingLook()
+    times, codes = look.supersample, _srgb_codes()
     V, F = np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64)
     view = View.around(V) if view is None else view
-    width, height = (s * _SUPERSAMPLE for s in size)
+    width, height = (s * times for s in size)
     seen = (V - view.centre) @ view.rotation.T
     scale = 0.5 * min(width, height) / view.radius
     corners = (seen[:, :2] * scale + (width / 2, height / 2))[F]
@@ -74,7 +97,10 @@ def shade_surface(vertices, faces, view=None, uv=None, size=(480, 480)):
     area = edge1[:, 0] * edge2[:, 1] - edge1[:, 1] * edge2[:, 0]
     away = area > 0  # the triangle's own normal points away from the viewer
     normals = vertex_normals(V, F) @ view.rotation.T
-    values = [seen[:, 2][F], np.where(away[:, None], _light(-normals)[F], _light(normals)[F])]
+    values = [
+        seen[:, 2][F],
+        np.where(away[:, None], _light(-normals, look)[F], _light(normals, look)[F]),
+    ]
     if uv is not None:
         uv = np.asarray(uv, dtype=np.float64)
         values += [
@@ -115,16 +141,18 @@ def shade_surface(vertices, faces, view=None, uv=None, size=(480, 480)):
         light *= 1 - 0.17 * np.clip(2 - np.abs(at - np.round(at)) / 0.03, 0, 1)
 
     # a pixel is the mean of its samples: of either side's light, and of the background
-    at, back = y // _SUPERSAMPLE * size[0] + x // _SUPERSAMPLE, away[triangle]
+    at, back = y // times * size[0] + x // times, away[triangle]
     shares = [
-        np.bincount(at, weights, size[0] * size[1]) / _SUPERSAMPLE**2
+        np.bincount(at, weights, size[0] * size[1]) / times**2
         for weights in (light * back, light * ~back, None)
     ]
     covered = np.flatnonzero(shares[2])
     of_back, of_front, sheet = (share[covered, None] for share in shares)
-    colour = np.clip(of_back * _BACK + of_front * _FRONT + (1 - sheet) * _BACKGROUND, 0, 1)
-    image = np.full((size[0] * size[1], 3), _SRGB[int(_BACKGROUND * (len(_SRGB) - 1))])
-    image[covered] = _SRGB[(colour * (len(_SRGB) - 1)).astype(np.int64)]
+    colour = np.clip(
+        of_back * look.back + of_front * look.front + (1 - sheet) * look.background, 0, 1
+    )
+    image = np.full((size[0] * size[1], 3), codes[int(look.background * (len(codes) - 1))])
+    image[covered] = codes[(colour * (len(codes) - 1)).astype(np.int64)]
     return image.reshape(size[1], size[0], 3)
 
 
@@ -166,9 +194,9 @@ def seen(vertices, faces, camera, values=()):
     return tuple(images.reshape(-1, camera.height, camera.width))
 
 
-def _light(normals):
+def _light(normals, look):
     """Light on unit normals (N, 3) of the view's frame: (N,)."""
-    key, fill = (np.asarray(d) / np.linalg.norm(d) for d in (_KEY, _FILL))
+    key, fill = (np.asarray(d) / np.linalg.norm(d) for d in (look.key, look.fill))
     return 0.10 + 0.95 * np.maximum(normals @ key, 0) + 0.20 * np.maximum(normals @ fill, 0)
 
 

@@ -22,14 +22,14 @@ OWN_LABELS = {
     "seconds_per_frame": "seconds a frame",
     "order": "order of the jet",
 }
-_MEANS = {
+LABELS = {
     **evaluation.LABELS,
     "depth_difference_mm": "difference in depth, RMS [mm]",
+    "depth_difference_mm_worst": "difference in depth, RMS, worst frame [mm]",
+    "en_deg_worst": "angle between normals, worst frame [deg]",
+    "depth_rmse_allpix_mm_worst": "depth RMSE over all pixels, worst frame [mm]",
     "shared": "vertices of B whose ray meets A",
 }
-LABELS = {
-    f"{name}_worst": label.replace(" [", ", worst frame [") for name, label in _MEANS.items()
-} | _MEANS
 
 
 @dataclass(frozen=True)

@@ -9,14 +9,11 @@ from polysft_mi.files import aside
 
 FORMATS = ("usd", "glb", "obj", "ply", "npz")
 # of each format that is one file, the first is the default; the others are folders
-
 EXTENSIONS = {
     "usd": (".usdz", ".usdc", ".usda", ".usd"),
     "glb": (".glb",),
     "npz": (".npz",),
 }
-
-
 _PACKAGES = {"usd": ("pxr", "usd-core"), "glb": ("pygltflib", "pygltflib")}
 
 

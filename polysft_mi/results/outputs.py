@@ -20,8 +20,6 @@ from polysft_mi.scene.defaults import located
 from polysft_mi.surface import meshio
 from polysft_mi.surface.patch import Unknowns
 
-RUN = "run.json"
-
 
 def versions():
     """What a result depends on besides its scene."""
@@ -167,4 +165,4 @@ def write_beginning(out, scene, camera, command, fps):
         "fps": fps,
         "versions": versions(),
     }
-    write_json(os.path.join(out, RUN), about)
+    write_json(os.path.join(out, "run.json"), about)

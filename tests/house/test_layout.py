@@ -113,7 +113,7 @@ NOT_YET = {
     "private names": {
         "onefit.bvh _finite",
     },
-    "constants": 245,
+    "constants": 232,
 }
 
 

@@ -17,7 +17,7 @@ from places import ROOT
 
 from polysft_mi import prepare
 from polysft_mi.objective.problem import Problem
-from polysft_mi.pictures import drawing, exr, video
+from polysft_mi.pictures import exr, video
 from polysft_mi.pictures.album import Album, AlbumSettings, residual
 from polysft_mi.pictures.drawing import Drawing
 from polysft_mi.pictures.panels import Box, spread
@@ -41,7 +41,7 @@ def problem_of(sheet):
     )
 
 
-def drawn(sheet, out, during=lambda drawing: None, *, problem=None, frames=9, exr_frames=3):
+def drawn(sheet, out, during=lambda drawing: None, *, problem=None, frames=9, **options):
     """(figures of each frame, the video's frames, names of the EXRs): of the true surfaces."""
     problem = problem or problem_of(sheet)
     surfaces = sheet.vertices[:frames].astype(np.float32)
@@ -50,7 +50,8 @@ def drawn(sheet, out, during=lambda drawing: None, *, problem=None, frames=9, ex
     )
     assert np.allclose(problem.camera.to_camera(vertices), surfaces, atol=1e-6)
     out.mkdir(exist_ok=True)
-    with Drawing(problem, {}, str(out), exr_frames=exr_frames, about={"scene": "sheet"}) as made:
+    options = {"exr_frames": 3, "about": {"scene": "sheet"}} | options
+    with Drawing(problem, {}, str(out), **options) as made:
         for k, v in enumerate(vertices):
             made.frame(k, v)
         during(made)
@@ -74,11 +75,7 @@ def drawn(sheet, out, during=lambda drawing: None, *, problem=None, frames=9, ex
 @pytest.fixture(scope="module")
 def here(sheet, tmp_path_factory):
     """Drawn in this process."""
-    before, drawing._WORTH = drawing._WORTH, 10**6
-    try:
-        return drawn(sheet, tmp_path_factory.mktemp("here"))
-    finally:
-        drawing._WORTH = before
+    return drawn(sheet, tmp_path_factory.mktemp("here"), worth=10**6)
 
 
 def assert_same(a, b):
@@ -170,11 +167,10 @@ def test_nothing_is_drawn_any_more_after_an_error(sheet, tmp_path, monkeypatch):
         time.sleep(0.5)
         done.append(True)
 
-    monkeypatch.setattr(drawing, "_WORTH", 10**6)
     monkeypatch.setattr("polysft_mi.pictures.album.write_video", fail)
     monkeypatch.setattr("polysft_mi.pictures.figures.contact_sheet", plot)
     with pytest.raises(OSError, match="no space"):
-        drawn(sheet, tmp_path / "out")
+        drawn(sheet, tmp_path / "out", worth=10**6)
     assert done
 
 
