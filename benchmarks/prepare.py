@@ -20,10 +20,9 @@ import time
 import cv2
 import numpy as np
 
-from polysft_mi.capture.masks import iou
+from polysft_mi.capture import iou
 from polysft_mi.errors import InputError, cli
 from polysft_mi.pictures.video import write_video
-from polysft_mi.prepare import write_obj
 from polysft_mi.results.evaluation import evaluate
 from polysft_mi.scene import kinect_paper
 from polysft_mi.scene.images import read_rgb
@@ -159,7 +158,7 @@ def upright(folder, out):
     photo, template = os.path.join(out, "phi_texture.png"), os.path.join(out, "phi_template.obj")
     cv2.imwrite(photo, cv2.imread(os.path.join(folder, "texture.png"))[::-1])
     vertices, faces, uv = meshio.read_template(os.path.join(folder, "0_R1_quad.obj"))
-    write_obj(template, vertices, faces, np.column_stack([uv[:, 0], 1 - uv[:, 1]]))
+    meshio.write_obj(template, vertices, faces, np.column_stack([uv[:, 0], 1 - uv[:, 1]]))
     return photo, template
 
 

@@ -30,7 +30,7 @@ import numpy as np
 from polyfit.mesh import edges_of
 from polysft_mi.backend import set_variant
 from polysft_mi.errors import InputError, cli
-from polysft_mi.prepare import write_obj
+from polysft_mi.surface.meshio import write_obj
 
 FRAMES, FPS = 45, 60.0
 SUBSTEPS, ITERATIONS = 10, 40  # of a frame, and of Newton's vertex block descent in each

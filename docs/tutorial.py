@@ -13,7 +13,7 @@ import sys
 import cv2
 import numpy as np
 
-from polysft_mi.capture.sheet import Sheet
+from polysft_mi.capture import Sheet
 from polysft_mi.pictures.video import write_video
 from polysft_mi.scene.images import read_rgb
 from polysft_mi.scene.sequence import list_images

@@ -1,5 +1,5 @@
 """Write the scene files of this folder: ``python scenes/write_scenes.py``, by the writer of
-``polysft_mi.prepare``.
+``polysft_mi.capture``.
 
 ``SCENES`` holds what differs between them. The data of a scene other than the demo is given by ``-D
 data=FOLDER``.
@@ -8,7 +8,7 @@ data=FOLDER``.
 import os
 
 from polysft_mi.camera import Intrinsics
-from polysft_mi.prepare import Layout, scene_xml
+from polysft_mi.capture import Layout, scene_xml
 
 HERE = os.path.dirname(os.path.abspath(__file__))
 

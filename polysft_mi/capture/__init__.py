@@ -1,8 +1,19 @@
-"""From a video and a photo to a sequence's folder: the steps of ``python -m polysft_mi.prepare
-VIDEO``, a module each.
+"""From a video and a photo of the sheet, or from a folder that is there, to a scene file.
 
-:mod:`command` is the command line; :mod:`frames` decodes, :mod:`images` reads single images,
-:mod:`lens` and :mod:`calibration` know the camera, :mod:`size` reads lengths, :mod:`sheet` makes
-the template, :mod:`pose` finds it in the first frame, :mod:`masks` follows its silhouette,
-:mod:`pictures` shows what each step found, and :mod:`folder` puts them together.
+In: what a person filmed, measured and photographed. Out: a folder with frames, masks, template,
+texture, camera and ``scene.xml``, which ``polysft run`` takes.
 """
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach(
+    __name__,
+    submod_attrs={
+        "known_folder": ["prepare_folder"],
+        "layouts": ["FORMS", "Layout", "recognise"],
+        "masks": ["iou"],
+        "scene_file": ["scene_xml"],
+        "sheet": ["Sheet"],
+        "video": ["prepare_video"],
+    },
+)

@@ -10,9 +10,6 @@ from polysft_mi.errors import InputError
 from polysft_mi.scene.images import focal_35mm, read_rgb
 from polysft_mi.scene.sequence import list_images
 
-_APPLE = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
-_MOST = 16384  # pixels a side
-
 
 def read_frames(path, first=0, last=-1, stride=1):
     """Yield (index, image (H, W, 3) uint8 sRGB) of the frames ``first`` to ``last`` (inclusive, -1
@@ -42,10 +39,8 @@ def read_frames(path, first=0, last=-1, stride=1):
                 f"{where}: {here[0]}x{here[1]} pixels, and those before have {size[0]}x{size[1]};"
                 " all frames must be of one size"
             )
-        if min(here) < 16 or max(here) > _MOST:
-            raise InputError(
-                f"{where}: {here[0]}x{here[1]} pixels; 16 to {_MOST} a side are needed"
-            )
+        if min(here) < 16 or max(here) > 16384:
+            raise InputError(f"{where}: {here[0]}x{here[1]} pixels; 16 to 16384 a side are needed")
         yield index, image
     if not seen:
         raise InputError(f"{path}: holds no frames; a video, or a folder of images, is needed")
@@ -77,7 +72,7 @@ def focal_length(path):
         return None, None
     for values in tags:
         try:
-            return float(values[_APPLE]), path
+            return float(values["com.apple.quicktime.camera.focal_length.35mm_equivalent"]), path
         except (KeyError, ValueError):
             continue
     return None, None

@@ -1,13 +1,25 @@
 """The sheet's silhouette in every frame: GrabCut around the template's projection in the first,
 then around where the optical flow carries the frame before's."""
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 
-_SIDE = 480  # pixels of the longer side at which the work is done
-_BAND = 0.035  # of the silhouette's size: how far its border may lie from where it is expected
-_FIRST_ITERATIONS = 5
-_ITERATIONS = 2
+
+@dataclass(frozen=True)
+class MaskSettings:
+    """How masks are found.
+
+    ``side`` [pixels]: the longer side at which the work is done; ``band``: how far the border may
+    lie from where it is expected, as a share of the silhouette's size; ``first_iterations``,
+    ``iterations`` of GrabCut in the first frame and in the others.
+    """
+
+    side: int = 480
+    band: float = 0.035
+    first_iterations: int = 5
+    iterations: int = 2
 
 
 class Masks:
@@ -15,10 +27,12 @@ class Masks:
     255, of images (H, W, 3) uint8 RGB.
     """
 
-    def __init__(self, size):
+    def __init__(self, size, settings=None):
         """``size``: (width, height) of the frames [pixels]."""
-        self._size = size
-        self._small = tuple(max(1, round(n * min(1.0, _SIDE / max(size)))) for n in size)
+        self._size, self._settings = size, settings or MaskSettings()
+        self._small = tuple(
+            max(1, round(n * min(1.0, self._settings.side / max(size)))) for n in size
+        )
         self._flow = cv2.DISOpticalFlow_create(cv2.DISOpticalFlow_PRESET_FAST)
         self._grey = self._mask = None
         self._models = np.zeros((1, 65)), np.zeros((1, 65))
@@ -32,7 +46,7 @@ class Masks:
         small = self._reduced(image)
         self._grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
         expected = (self._reduced(silhouette) > 127).astype(np.uint8)
-        self._mask = self._cut(small, expected, _FIRST_ITERATIONS)
+        self._mask = self._cut(small, expected, self._settings.first_iterations)
         self._colours = _histogram(small, self._mask)
         return self._enlarged()
 
@@ -42,7 +56,10 @@ class Masks:
         flow = self._flow.calc(grey, self._grey, None)
         y, x = np.mgrid[: grey.shape[0], : grey.shape[1]].astype(np.float32)
         moved = cv2.remap(255 * self._mask, x + flow[..., 0], y + flow[..., 1], cv2.INTER_LINEAR)
-        self._grey, self._mask = grey, self._cut(small, (moved > 127).astype(np.uint8), _ITERATIONS)
+        self._grey, self._mask = (
+            grey,
+            self._cut(small, (moved > 127).astype(np.uint8), self._settings.iterations),
+        )
         self.strangeness = cv2.compareHist(
             _histogram(small, self._mask), self._colours, cv2.HISTCMP_BHATTACHARYYA
         )
@@ -51,7 +68,7 @@ class Masks:
     def _cut(self, image, expected, iterations):
         if not expected.any():
             return expected
-        r = max(2, round(_BAND * np.sqrt(expected.sum())))
+        r = max(2, round(self._settings.band * np.sqrt(expected.sum())))
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * r + 1, 2 * r + 1))
         inner = cv2.erode(expected, disc, borderValue=1)
         outer = cv2.dilate(expected, disc)

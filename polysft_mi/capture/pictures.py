@@ -7,16 +7,11 @@ import numpy as np
 
 from polysft_mi.scene.outline import loops
 
-GREEN, RED, YELLOW, WHITE = (60, 220, 90), (235, 70, 60), (255, 210, 40), (255, 255, 255)
-_CELL = 320  # pixels of a contact sheet's picture
-_COLUMNS = 4
-_LINES = 60  # drawn of each kind of match
-_SIDE = 900  # pixels to which larger pictures are shrunk
-_HEIGHT = 480  # pixels of a picture that is drawn on
+GREEN, RED, YELLOW = (60, 220, 90), (235, 70, 60), (255, 210, 40)
 
 
-def shrunk(image, side=_SIDE):
-    """(image no larger than ``side``, what it was scaled by)."""
+def shrunk(image, side):
+    """(image whose longer side is at most ``side`` pixels, what it was scaled by)."""
     scale = min(1.0, side / max(image.shape[:2]))
     return (
         cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
@@ -26,8 +21,8 @@ def shrunk(image, side=_SIDE):
 
 
 def _canvas(image):
-    """(image of _HEIGHT rows, enlarged where it has fewer, what it was scaled by)."""
-    scale = _HEIGHT / image.shape[0]
+    """(image of 480 rows, enlarged where it has fewer, what it was scaled by)."""
+    scale = 480 / image.shape[0]
     return (
         cv2.resize(
             image,
@@ -40,15 +35,17 @@ def _canvas(image):
     )
 
 
-def contact_sheet(cells):
-    """Pictures in rows of four, each with its caption: ``cells`` are (caption, image)."""
+def contact_sheet(cells, columns=4, side=320):
+    """Pictures in rows of ``columns``, each with its caption: ``cells`` are (caption, image);
+    ``side`` [pixels]: the longer side of each picture.
+    """
     drawn = []
     for caption, image in cells:
-        cell, _ = shrunk(image, _CELL)
+        cell, _ = shrunk(image, side)
         label(cell, caption)
         drawn.append(cell)
     height, width = (max(cell.shape[k] for cell in drawn) for k in (0, 1))
-    columns = min(_COLUMNS, len(drawn))
+    columns = min(columns, len(drawn))
     rows = -(-len(drawn) // columns)
     sheet = np.full((rows * (height + 4) - 4, columns * (width + 4) - 4, 3), 255, np.uint8)
     for k, cell in enumerate(drawn):
@@ -75,17 +72,19 @@ def masked(image, mask):
     )
 
 
-def matches(photo, frame, found):
-    """Photo and frame side by side, :class:`polysft_mi.capture.pose.Matches` as lines: green where
-    they agree, red where not.
+def matches(photo, frame, found, most=60):
+    """Photo and frame side by side, :class:`polysft_mi.capture.sheet.Matches` as lines: green where
+    they agree, red where not, at most ``most`` of each.
     """
     (left, _), (right, b) = _canvas(photo), _canvas(frame)
-    canvas = np.hstack([left // 2 + 64, np.full((_HEIGHT, 8, 3), 255, np.uint8), right // 2 + 64])
+    canvas = np.hstack(
+        [left // 2 + 64, np.full((left.shape[0], 8, 3), 255, np.uint8), right // 2 + 64]
+    )
     at = np.column_stack([found.photo[:, 0], 1 - found.photo[:, 1]]) * left.shape[1::-1]
     to = found.frame * b + (left.shape[1] + 8, 0)
     for agree, colour in ((False, RED), (True, GREEN)):
         lines = np.flatnonzero(found.agree == agree)
-        for k in lines[:: max(1, len(lines) // _LINES)]:
+        for k in lines[:: max(1, len(lines) // most)]:
             p, q = (tuple(round(v) for v in x) for x in (at[k], to[k]))
             cv2.line(canvas, p, q, colour, 1, cv2.LINE_AA)
             for x in (p, q):
@@ -165,5 +164,12 @@ def label(image, text):
     (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
     cv2.rectangle(image, (0, 0), (width + 8, height + 10), (0, 0, 0), -1)
     cv2.putText(
-        image, text, (4, height + 5), cv2.FONT_HERSHEY_SIMPLEX, scale, WHITE, 1, cv2.LINE_AA
+        image,
+        text,
+        (4, height + 5),
+        cv2.FONT_HERSHEY_SIMPLEX,
+        scale,
+        (255, 255, 255),
+        1,
+        cv2.LINE_AA,
     )

@@ -1,0 +1,21 @@
+"""A whole experiment as one file.
+
+In: a Mitsuba scene file with the plugin ``polysft``, and the images that it names. Out: an
+:class:`Experiment` (scene, camera, template, settings) and its :class:`Sequence` of frames and
+masks. :func:`load` and :func:`register` need a Mitsuba variant that is set; the rest needs no
+Mitsuba.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach(
+    __name__,
+    submod_attrs={
+        "defaults": ["known_defaults", "located", "resolved_defaults"],
+        "experiment": ["Experiment", "load"],
+        "images": ["focal_35mm", "read_rgb"],
+        "plugins": ["register"],
+        "sequence": ["Sequence", "drop_stray_components", "image_size", "list_images"],
+        "settings": ["Settings"],
+    },
+)

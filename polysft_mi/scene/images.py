@@ -8,10 +8,6 @@ from polysft_mi.errors import InputError
 
 from .sequence import image_size, read_pixels
 
-_ORIENTATION = 0x0112  # Exif tags
-_EXIF_BLOCK = 0x8769
-_FOCAL_35MM = 0xA405
-
 
 def read_rgb(path):
     """The image (H, W, 3), uint8 sRGB, upright.
@@ -39,7 +35,7 @@ def read_rgb(path):
     if alpha is not None:
         a = alpha.astype(np.uint16)
         colour = ((colour * a + 255 * (255 - a) + 127) // 255).astype(np.uint8)
-    return np.ascontiguousarray(upright(colour, _exif(path).get(_ORIENTATION, 1)))
+    return np.ascontiguousarray(upright(colour, _exif(path).get(0x0112, 1)))
 
 
 def upright(image, orientation):
@@ -57,7 +53,8 @@ def focal_35mm(path):
     """The focal length [mm], for film of 36x24 mm, that an image's Exif data have; None where they
     have none.
     """
-    value = _exif(path).get_ifd(_EXIF_BLOCK).get(_FOCAL_35MM)
+    exif, focal_length_in_35mm_film = 0x8769, 0xA405  # tags
+    value = _exif(path).get_ifd(exif).get(focal_length_in_35mm_film)
     try:
         return float(value) if value and float(value) > 0 else None
     except (TypeError, ValueError):

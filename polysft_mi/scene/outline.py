@@ -10,8 +10,6 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from polysft_mi.images.light import areas
-
 # Lengths in an image are those for an outline as large as a square of _SIZE pixels; they grow with
 # it.
 _SIZE = 225.0
@@ -92,7 +90,7 @@ def fitted(vertices, faces, camera, image):
     if not around or vertices[:, 2].min() <= 0:
         return None
     position = camera.project(vertices)
-    size = math.sqrt(areas(position, faces).sum())
+    size = math.sqrt(_area(position[faces]))
     unit = max(1.0, size / _SIZE)
     grey = cv2.GaussianBlur(
         cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255, (0, 0), _BLUR * unit
@@ -106,6 +104,12 @@ def fitted(vertices, faces, camera, image):
             _Search(ends, camera, grey, unit, line).fit() for line in (None, "dark", "bright")
         ]
     return max(found, key=lambda fit: fit.clear)
+
+
+def _area(corner):
+    """Of triangles with corners (F, 3, 2) [pixels], their sum [pixels^2]."""
+    a, b = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+    return 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum()
 
 
 def _straight(loop, position, tolerance):

@@ -27,9 +27,6 @@ EXTENSIONS = (
     ".exr",
     ".hdr",
 )
-# an occluder may split the sheet into parts of some size; what is smaller than this share of the
-# largest is not the sheet
-STRAY_SHARE = 0.1
 
 
 class Sequence:
@@ -132,9 +129,9 @@ class Sequence:
         return drop_stray_components(mask) if self._drop_stray else mask
 
 
-def drop_stray_components(mask, share=STRAY_SHARE):
+def drop_stray_components(mask, share=0.1):
     """The mask (H, W) without its 8-connected components of less than ``share`` of the largest
-    one's area.
+    one's area. (Something before the sheet may split it into parts of some size.)
     """
     import cv2
 

@@ -9,12 +9,20 @@ import numpy as np
 from polyfit.meshio import read_mesh, write_ply
 from polysft_mi.errors import InputError
 
-__all__ = ["check_template", "read_template", "write_ply"]
+__all__ = ["check_template", "read_template", "write_obj", "write_ply"]
 
 
 def read_template(path):
     """:func:`polyfit.meshio.read_mesh` of a template."""
     return read_mesh(path, what="template")
+
+
+def write_obj(path, vertices, faces, uv):
+    """Write a mesh as OBJ: vertices (N, 3), faces (F, 3), uv (N, 2) with v up."""
+    with open(path, "w", encoding="utf-8") as file:
+        file.writelines("v {:.9g} {:.9g} {:.9g}\n".format(*p) for p in vertices)
+        file.writelines("vt {:.9g} {:.9g}\n".format(*t) for t in uv)
+        file.writelines("f {0}/{0} {1}/{1} {2}/{2}\n".format(*f) for f in np.asarray(faces) + 1)
 
 
 def check_template(vertices, faces, uv, where="template"):

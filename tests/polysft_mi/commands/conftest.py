@@ -6,14 +6,14 @@ import pytest
 import synthetic
 from refusals import QUICK, SIZE
 
-from polysft_mi import prepare, run
+from polysft_mi import capture, run
 
 
 @pytest.fixture(scope="session")
 def good(tmp_path_factory):
     """A sound sequence with its scene; not to be changed."""
     truth = synthetic.cloth(tmp_path_factory.mktemp("inputs") / "sheet", frames=3, size=SIZE)
-    prepare.prepare(str(truth.folder))
+    capture.prepare_folder(str(truth.folder))
     return truth
 
 

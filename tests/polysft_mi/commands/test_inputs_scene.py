@@ -10,7 +10,7 @@ import pytest
 import synthetic
 from refusals import SIZE, edited, has, refused
 
-from polysft_mi import prepare
+from polysft_mi import capture
 
 
 def test_no_scene(tmp_path):
@@ -245,7 +245,7 @@ def test_values_that_do_not_go_together(sheet, settings, words):
 
 def test_order_too_high_for_the_vertices(tmp_path):
     truth = synthetic.cloth(tmp_path / "sheet", frames=1, size=SIZE, rows=4, columns=5)
-    prepare.prepare(str(truth.folder))
+    capture.prepare_folder(str(truth.folder))
     has(
         refused(truth.folder / "scene.xml", "-D", "order=10"),
         "template.obj: order = 10 is too high",

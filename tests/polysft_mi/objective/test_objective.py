@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import synthetic
 
-from polysft_mi import prepare
+from polysft_mi import capture
 from polysft_mi.objective import terms as objective
 from polysft_mi.objective.problem import Problem
 from polysft_mi.scene import experiment as scene
@@ -195,9 +195,9 @@ def test_local_normalisation_takes_out_gain_and_offset():
 
 def problem(folder, masks=True, **overrides):
     truth = synthetic.cloth(folder / "sequence", masks=masks)
-    layout = prepare.recognise(str(truth.folder))
+    layout = capture.recognise(str(truth.folder))
     path = folder / "scene.xml"
-    path.write_text(prepare.scene_xml(layout, str(truth.folder)))
+    path.write_text(capture.scene_xml(layout, str(truth.folder)))
     experiment = scene.load(path, {"solver": "adam", **overrides})
     return (
         Problem(
@@ -317,7 +317,7 @@ def test_padding_does_not_change_the_loss(tmp_path):
                 )
             )
         path = tmp_path / f"{name}.xml"
-        path.write_text(prepare.scene_xml(prepare.recognise(str(truth.folder)), str(truth.folder)))
+        path.write_text(capture.scene_xml(capture.recognise(str(truth.folder)), str(truth.folder)))
         experiment = scene.load(path, {"solver": "adam"})
         p = Problem(
             experiment, Sequence.open(experiment.frames, experiment.masks, size=experiment.size)

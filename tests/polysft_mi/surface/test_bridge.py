@@ -12,7 +12,7 @@ import torch
 import polyfit
 from polyfit import jets
 from polyfit.stn import PolyFit, SpatialTransformer
-from polysft_mi import bridge, prepare
+from polysft_mi import bridge, capture
 from polysft_mi.objective.problem import Problem
 from polysft_mi.scene import experiment as scene
 from polysft_mi.scene.sequence import Sequence
@@ -40,7 +40,7 @@ def bent(tmp_path_factory):
     """
     folder = tmp_path_factory.mktemp("bridge")
     truth = synthetic.cloth(folder / "sequence", frames=2, bend=6.0)
-    path, _ = prepare.prepare(str(truth.folder), out=str(folder / "scene"))
+    path, _ = capture.prepare_folder(str(truth.folder), out=str(folder / "scene"))
     experiment = scene.load(path, {})
     sequence = Sequence.open(experiment.frames, experiment.masks, size=experiment.size)
     return Problem(experiment, sequence), torch.as_tensor(truth.vertices[1], dtype=torch.float32)

@@ -1,6 +1,4 @@
-"""The template before it is placed: a flat grid of the given size, or an OBJ of one's own; and
-where on it a place of the photo lies.
-"""
+"""The template before it is placed: a flat grid of the given size, or an OBJ of one's own."""
 
 from dataclasses import dataclass
 
@@ -9,8 +7,7 @@ import numpy as np
 from polysft_mi.errors import InputError
 from polysft_mi.surface import meshio
 
-_FLAT = 1e-3  # depth, of its extent, up to which a template counts as flat
-_SMALLEST, _LARGEST = 0.005, 20.0  # m
+from .size import LARGEST, SMALLEST
 
 
 @dataclass(frozen=True)
@@ -26,9 +23,9 @@ class Sheet:
 
     @property
     def flat(self):
-        """Whether one plane holds it."""
+        """Whether one plane holds it, up to a thousandth of its extent."""
         s = np.linalg.svd(self.vertices - self.vertices.mean(0), compute_uv=False)
-        return s[2] <= _FLAT * s[0]
+        return s[2] <= 1e-3 * s[0]
 
     def at(self, uv):
         """Points (K, 3) [m] of the surface whose photo has the coordinates uv (K, 2); NaN where the
@@ -98,10 +95,10 @@ def from_obj(path):
     vertices, faces, uv = meshio.read_template(path)
     meshio.check_template(vertices, faces, uv, path)
     extent = np.ptp(vertices, axis=0).max()
-    if not _SMALLEST <= extent <= _LARGEST:
-        hint = "in millimetres? write it in metres" if extent > _LARGEST else "write it in metres"
+    if not SMALLEST <= extent <= LARGEST:
+        hint = "in millimetres? write it in metres" if extent > LARGEST else "write it in metres"
         raise InputError(
-            f"{path}: a template of {extent:.4g} m; {1e3 * _SMALLEST:g} mm to {_LARGEST:g} m can be"
+            f"{path}: a template of {extent:.4g} m; {1e3 * SMALLEST:g} mm to {LARGEST:g} m can be"
             f" used ({hint})"
         )
     Template.fit(vertices, faces, uv, 4, where=path)  # raises where one patch cannot hold it

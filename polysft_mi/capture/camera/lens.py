@@ -1,7 +1,6 @@
 """The camera that took the frames: focal length, principal point, and the lens's distortion, which
 is removed before anything else looks at a frame."""
 
-import json
 import math
 from dataclasses import dataclass
 
@@ -10,10 +9,6 @@ import numpy as np
 
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError
-
-_FILM_DIAGONAL = math.hypot(36, 24)  # mm, of the film that Exif's focal length is for
-_COEFFICIENTS = (0, 4, 5, 8, 12, 14)  # numbers of distortion coefficients that OpenCV knows
-_ALIKE = 0.01  # relative difference of two aspect ratios that rounding the size in pixels explains
 
 
 @dataclass(frozen=True)
@@ -30,7 +25,10 @@ class Lens:
     source: str = ""
 
     def __post_init__(self):
-        if len(self.distortion) not in _COEFFICIENTS or not np.isfinite(self.distortion).all():
+        if (
+            len(self.distortion) not in (0, 4, 5, 8, 12, 14)
+            or not np.isfinite(self.distortion).all()
+        ):
             raise InputError(
                 f"{self.source}: {len(self.distortion)} distortion coefficients; 4, 5, 8, 12 or 14"
                 " finite numbers, in OpenCV's order, are needed"
@@ -53,28 +51,12 @@ class Lens:
         """A pinhole by the focal length [mm] that gives the same diagonal angle of view on film of
         36x24 mm.
         """
-        f = focal / _FILM_DIAGONAL * math.hypot(width, height)
+        f = focal / math.hypot(36, 24) * math.hypot(width, height)
         return cls(
             Intrinsics(f, f, width / 2, height / 2, width, height),
             (),
             f"{focal:g} mm on film, said by {source}",
         )
-
-    @classmethod
-    def from_json(cls, path, width, height):
-        """From a camera file (fx, fy, cx, cy, width, height, and ``distortion``, a list, or none),
-        for frames of this size. Raises InputError."""
-        camera = Intrinsics.from_json(path)
-        with open(path, encoding="utf-8") as file:
-            distortion = json.load(file).get("distortion") or ()
-        try:
-            distortion = tuple(float(x) for x in distortion)
-        except (TypeError, ValueError):
-            raise InputError(
-                f"{path}: distortion = {distortion!r}; a list of 4, 5, 8, 12 or 14 numbers, in"
-                " OpenCV's order, is needed"
-            ) from None
-        return cls(camera, distortion, str(path)).resized(width, height)
 
     def resized(self, width, height):
         """The same lens for frames of another size of the same aspect. Raises InputError where the
@@ -84,7 +66,7 @@ class Lens:
         if (width, height) == (c.width, c.height):
             return self
         x, y = width / c.width, height / c.height
-        if abs(x / y - 1) > _ALIKE:
+        if not same_aspect((width, height), (c.width, c.height)):
             raise InputError(
                 f"{self.source}: for pictures of {c.width}x{c.height}; the frames have"
                 f" {width}x{height}, which is no scaled version of them"
@@ -109,6 +91,11 @@ class Lens:
         return {**values, "distortion": list(self.distortion)} if self.distortion else values
 
 
+def same_aspect(a, b):
+    """Whether two sizes (width, height) are of one shape, but for rounding to whole pixels."""
+    return abs(a[0] * b[1] / (a[1] * b[0]) - 1) <= 0.01
+
+
 class Undistortion:
     """Frames as the pinhole ``camera`` (its attribute) would have taken them: distortion removed,
     then scaled by ``scale``.
@@ -128,16 +115,12 @@ class Undistortion:
                 f"--scale {scale:g}: makes frames of {size[0]}x{size[1]} pixels; at least 16 a side"
                 " are needed"
             )
-        self.camera = (
-            lens.resized(*size).camera
-            if abs(size[0] * c.height / (size[1] * c.width) - 1) < _ALIKE
-            else None
-        )
-        if self.camera is None:
+        if not same_aspect(size, self.size):
             raise InputError(
                 f"--scale {scale:g}: makes frames of {size[0]}x{size[1]} pixels, too small to keep"
                 f" the shape of {c.width}x{c.height}"
             )
+        self.camera = lens.resized(*size).camera
         self._distortion = np.array(lens.distortion) if any(lens.distortion) else None
         self._K = c.matrix()
         self._K[:2, 2] -= 0.5  # OpenCV counts from the centre of the first pixel

@@ -6,12 +6,18 @@ from polysft_mi.errors import InputError
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}
 SHEETS = {
-    "A0": (1.189, 0.841), "A1": (0.841, 0.594), "A2": (0.594, 0.420), "A3": (0.420, 0.297),
-    "A4": (0.297, 0.210), "A5": (0.210, 0.148), "A6": (0.148, 0.105), "LETTER": (0.2794, 0.2159),
-    "LEGAL": (0.3556, 0.2159), "TABLOID": (0.4318, 0.2794),
-}  # fmt: skip
-_SMALLEST, _LARGEST = 0.005, 20.0  # m
-_LARGEST_BARE = 3.0  # m, of a number without a unit: 8.5 11 is not metres
+    "A0": (1.189, 0.841),
+    "A1": (0.841, 0.594),
+    "A2": (0.594, 0.420),
+    "A3": (0.420, 0.297),
+    "A4": (0.297, 0.210),
+    "A5": (0.210, 0.148),
+    "A6": (0.148, 0.105),
+    "LETTER": (0.2794, 0.2159),
+    "LEGAL": (0.3556, 0.2159),
+    "TABLOID": (0.4318, 0.2794),
+}
+SMALLEST, LARGEST = 0.005, 20.0  # m, a side of a sheet
 _FORMS = "give --size WIDTH HEIGHT, as in 0.297 0.210 (metres), 297mm 210mm, or a name such as A4"
 
 
@@ -36,15 +42,15 @@ def parse_size(words, aspect=None):
     size = tuple(n * UNITS[u or "m"] for n, u in zip(numbers, units))
     if any(n <= 0 for n in size):
         raise InputError(f"--size {' '.join(words)}: a length must be positive")
-    if unit is None and max(size) > _LARGEST_BARE:
+    if unit is None and max(size) > 3:  # 8.5 11 is not metres
         raise InputError(
             f"--size {' '.join(words)}: metres, as numbers without a unit are, make a sheet of"
             f" {_text(size)}; {_suggestion(numbers)}"
         )
-    if not (min(size) >= _SMALLEST and max(size) <= _LARGEST):
+    if not (min(size) >= SMALLEST and max(size) <= LARGEST):
         raise InputError(
-            f"--size {' '.join(words)}: a sheet of {_text(size)}; {1e3 * _SMALLEST:g} mm to"
-            f" {_LARGEST:g} m a side can be used"
+            f"--size {' '.join(words)}: a sheet of {_text(size)}; {1e3 * SMALLEST:g} mm to"
+            f" {LARGEST:g} m a side can be used"
         )
     return size if len(size) == 2 else size * 2
 

@@ -2,6 +2,7 @@
 focal lengths, principal point, distortion."""
 
 import re
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -9,20 +10,28 @@ import numpy as np
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError
 
-from . import pictures
-from .frames import read_frames
+from .. import pictures
+from ..frames import read_frames
 from .lens import Lens
 
-_LOOKED_AT = 60  # frames of a video
-_USED = 25  # of those where the board is found
-_LEAST = 4
-_CORNERS = 8  # of a ChArUco board, in a frame
-_NOISE = 0.1  # pixels that a corner is off, at best
-_TILT = 15.0  # degrees between two views of the board, at least
-_SURE = (
-    0.02  # standard deviation of the focal length, of itself, above which a calibration is refused
-)
-_MISSED = 3.0  # pixels, likewise, RMS
+
+@dataclass(frozen=True)
+class CalibrationRules:
+    """Which views are used, and which calibrations are refused.
+
+    ``looked_at``: frames of a video; ``used``: views at most, of those that show the board;
+    ``least`` views that are needed; ``noise`` [pixels]: how far a corner is off at best; ``tilt``
+    [degrees]: least angle between two views; ``unsure``: largest standard deviation of the focal
+    length, as a share of it; ``missed`` [pixels, RMS]: largest distance of the corners.
+    """
+
+    looked_at: int = 60
+    used: int = 25
+    least: int = 4
+    noise: float = 0.1
+    tilt: float = 15.0
+    unsure: float = 0.02
+    missed: float = 3.0
 
 
 def parse_board(text):
@@ -83,7 +92,7 @@ class _Charuco:
 
     def __call__(self, grey):
         corners, names, _, _ = self._detector.detectBoard(grey)
-        if names is None or len(names) < _CORNERS:
+        if names is None or len(names) < 8:
             return None
         points = np.asarray(self._board.getChessboardCorners(), dtype=np.float32)[np.ravel(names)]
         spread = np.linalg.svd(points[:, :2] - points[:, :2].mean(0), compute_uv=False)
@@ -92,29 +101,30 @@ class _Charuco:
         )  # those on a line say little
 
 
-def calibrate(path, board="9x6"):
-    """(:class:`polysft_mi.capture.lens.Lens`, a picture of the boards that were found) from a
+def calibrate(path, board="9x6", rules=None):
+    """(:class:`Lens`, a picture of the boards that were found) from a
     video, a folder of images or a pattern.
 
     Four distortion coefficients (k1, k2, p1, p2; k3, which few views tell, is 0), by OpenCV's
     calibration over at most 25 views that differ. Raises InputError where the board is found in too
     few, or where the views do not tell the focal length.
     """
+    rules = rules or CalibrationRules()
     detect = parse_board(board)
     views, size = [], None
     count = sum(1 for _ in read_frames(path))
-    for index, image in read_frames(path, stride=max(1, count // _LOOKED_AT)):
+    for index, image in read_frames(path, stride=max(1, count // rules.looked_at)):
         size = image.shape[1::-1]
         found = detect(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
         if found is not None:
             views.append((index, image if len(views) < 200 else None, *found))
-    if len(views) < _LEAST:
+    if len(views) < rules.least:
         hint = "; --board says which board it is" if not views else ""
         raise InputError(
-            f"{path}: {detect.name} is found in {len(views)} frames; at least {_LEAST}, from"
+            f"{path}: {detect.name} is found in {len(views)} frames; at least {rules.least}, from"
             f" different sides, are needed{hint}"
         )
-    views = _different(views)
+    views = _different(views, rules.used)
     start = np.array(
         [[max(size), 0, size[0] / 2 - 0.5], [0, max(size), size[1] / 2 - 0.5], [0, 0, 1]],
         dtype=np.float64,
@@ -135,16 +145,16 @@ def calibrate(path, board="9x6"):
         ) from None
     f = float(K[0, 0])
     unsure = (
-        float(np.max(np.ravel(deviations)[:2])) / f * max(1.0, _NOISE / missed)
+        float(np.max(np.ravel(deviations)[:2])) / f * max(1.0, rules.noise / missed)
     )  # corners that fit better than they are seen promise too much
-    if not np.isfinite(K).all() or not np.isfinite(missed) or missed > _MISSED:
+    if not np.isfinite(K).all() or not np.isfinite(missed) or missed > rules.missed:
         raise InputError(
             f"{path}: the camera that fits best misses the board's corners by {missed:.2g} pixels;"
             " a flat board, sharp images and one zoom are needed"
         )
     normals = np.stack([cv2.Rodrigues(turn)[0][:, 2] for turn in turns])
     tilt = float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1)).max()))
-    if unsure > _SURE or tilt < _TILT:
+    if unsure > rules.unsure or tilt < rules.tilt:
         raise InputError(
             f"{path}: the views leave the focal length open: the board is tilted by {tilt:.0f}"
             f" degrees between them, and it is known to {100 * unsure:.1f} %; tilt the board by 30"
@@ -158,13 +168,13 @@ def calibrate(path, board="9x6"):
     return Lens(camera, tuple(np.ravel(distortion)[:4].tolist()), source), _picture(views)
 
 
-def _different(views):
-    """At most _USED of the views, by farthest-point sampling of where their corners lie."""
+def _different(views, most):
+    """At most ``most`` of the views, by farthest-point sampling of where their corners lie."""
     box = np.array(
         [[*pixels.min(0), *pixels.max(0), *pixels[0], *pixels[-1]] for _, _, _, pixels in views]
     )
     kept, distance = [0], np.linalg.norm(box - box[0], axis=1)
-    while len(kept) < min(_USED, len(views)):
+    while len(kept) < min(most, len(views)):
         kept.append(int(np.argmax(distance)))
         distance = np.minimum(distance, np.linalg.norm(box - box[kept[-1]], axis=1))
     return [views[k] for k in sorted(kept)]

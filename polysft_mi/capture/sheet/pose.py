@@ -1,5 +1,5 @@
-"""Where the sheet is in the first frame: features of its photo, or its corners, and the rigid pose
-that explains them.
+"""The rigid pose of the sheet in a frame: by the features that its photo shares with the frame, or
+by its corners.
 """
 
 from dataclasses import dataclass
@@ -11,16 +11,26 @@ from scipy.spatial.transform import Rotation
 
 from polysft_mi.errors import InputError
 
-LEAST = 10  # matches that must agree: four fix a plane's pose, and some agree by chance
-# of the distances to the best and the second match, above which a match counts as ambiguous
-_RATIO = 0.8
-_FEATURES = 5000
-_PHOTO_SIDE = 2000  # pixels to which a photo is shrunk before its features are sought
-_TOLERANCE = (
-    0.012  # of the frame's diagonal, by which a rigid pose may miss a match: the sheet may be bent
-)
-_SOFT = 1.5  # pixels at which a residual starts to count less
-_SMALLEST = 2e-4  # share of the frame that a sheet must cover
+
+@dataclass(frozen=True)
+class MatchRules:
+    """What counts as a match, and as a pose.
+
+    ``least``: matches that must agree (four fix a plane's pose, and some agree by chance);
+    ``ratio`` of the distances to the best and the second match, above which a match is ambiguous;
+    ``features`` of an image at most; ``photo_side`` [pixels]: the longer side to which a photo is
+    shrunk before; ``tolerance``: how far a rigid pose may miss a match, as a share of the frame's
+    diagonal (the sheet may be bent); ``soft`` [pixels]: a residual from which on it counts less;
+    ``smallest``: share of the frame that a sheet must cover.
+    """
+
+    least: int = 10
+    ratio: float = 0.8
+    features: int = 5000
+    photo_side: int = 2000
+    tolerance: float = 0.012
+    soft: float = 1.5
+    smallest: float = 2e-4
 
 
 @dataclass(frozen=True)
@@ -47,13 +57,15 @@ class Pose:
         return points @ self.rotation.T + self.translation
 
 
-def match(photo, frame):
-    """:class:`Matches` of SIFT features of two images (H, W, 3) uint8, each of the photo's best in
-    the frame, both ways; none agrees yet."""
-    shrink = min(1.0, _PHOTO_SIDE / max(photo.shape[:2]))
+def match(photo, frame, rules=None):
+    """:class:`Matches` of the SIFT features of two images (H, W, 3) uint8: pairs of which each is
+    the other's best. None of them agrees yet.
+    """
+    rules = rules or MatchRules()
+    shrink = min(1.0, rules.photo_side / max(photo.shape[:2]))
     if shrink < 1:
         photo = cv2.resize(photo, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
-    detector = cv2.SIFT_create(nfeatures=_FEATURES, contrastThreshold=0.02)
+    detector = cv2.SIFT_create(nfeatures=rules.features, contrastThreshold=0.02)
     (keys_a, a), (keys_b, b) = (
         detector.detectAndCompute(cv2.cvtColor(x, cv2.COLOR_RGB2GRAY), None) for x in (photo, frame)
     )
@@ -63,7 +75,7 @@ def match(photo, frame):
     good = [
         m
         for m, n in there
-        if m.distance < _RATIO * n.distance and back[m.trainIdx][0].trainIdx == m.queryIdx
+        if m.distance < rules.ratio * n.distance and back[m.trainIdx][0].trainIdx == m.queryIdx
     ]
     at = np.array([keys_a[m.queryIdx].pt for m in good]).reshape(-1, 2) + 0.5
     to = np.array([keys_b[m.trainIdx].pt for m in good]).reshape(-1, 2) + 0.5
@@ -72,16 +84,17 @@ def match(photo, frame):
     return Matches(uv, to, np.zeros(len(good), bool))
 
 
-def from_matches(matches, sheet, camera):
-    """(:class:`Pose`, the matches with those that agree) of a
+def from_matches(matches, sheet, camera, rules=None):
+    """(:class:`Pose` or None, the matches with those that agree) of a
     :class:`polysft_mi.capture.sheet.Sheet`.
 
-    A plane by a RANSAC homography and the two poses that it allows, other templates by RANSAC over
-    poses; then robust least squares over what agrees. Where it is not found, the pose is None.
+    A plane is found by a RANSAC homography and the two poses that it allows, other templates by
+    RANSAC over poses; then robust least squares over the matches that agree.
     """
+    rules = rules or MatchRules()
     points = sheet.at(matches.photo)
     on = np.isfinite(points).all(axis=1)
-    tolerance = _TOLERANCE * np.hypot(camera.width, camera.height)
+    tolerance = rules.tolerance * np.hypot(camera.width, camera.height)
     agree = np.zeros(len(on), bool)
     if on.sum() >= 4:
         starts, inliers = _starts(
@@ -89,10 +102,10 @@ def from_matches(matches, sheet, camera):
         )
         agree[np.flatnonzero(on)[inliers]] = True
     matches = Matches(matches.photo, matches.frame, agree)
-    if agree.sum() < LEAST or not starts:
+    if agree.sum() < rules.least or not starts:
         return None, matches
-    pose = _refined(starts, points[agree], matches.frame[agree], camera)
-    pose = pose if pose is not None and _sane(pose, sheet, camera) else None
+    pose = _refined(starts, points[agree], matches.frame[agree], camera, rules)
+    pose = pose if pose is not None and _sane(pose, sheet, camera, rules) else None
     return pose, matches
 
 
@@ -117,7 +130,7 @@ def from_corners(corners, sheet, camera):
         )
     points = sheet.corners()
     starts, _ = _starts(points, None, corners, sheet.flat, camera, np.inf)
-    pose = _refined(starts, points, corners, camera) if starts else None
+    pose = _refined(starts, points, corners, camera, MatchRules()) if starts else None
     if pose is None:
         raise InputError(
             "--corners: no pose of the sheet before the camera explains them; check their order,"
@@ -204,7 +217,7 @@ def _plane(points):
     return origin, axes * np.array([[1.0], [1.0], [np.linalg.det(axes)]])
 
 
-def _refined(starts, points, pixels, camera):
+def _refined(starts, points, pixels, camera, rules):
     """The best :class:`Pose` by robust least squares over the pixels, from each start; None where
     none is before the camera.
     """
@@ -217,7 +230,7 @@ def _refined(starts, points, pixels, camera):
         x = np.concatenate([turn.ravel(), shift.ravel()])
         if (Rotation.from_rotvec(x[:3]).apply(points) + x[3:])[:, 2].min() <= 0:
             continue
-        found.append(least_squares(missed, x, loss="soft_l1", f_scale=_SOFT, x_scale="jac"))
+        found.append(least_squares(missed, x, loss="soft_l1", f_scale=rules.soft, x_scale="jac"))
     if not found:
         return None
     x = min(found, key=lambda f: f.cost).x
@@ -228,9 +241,9 @@ def _refined(starts, points, pixels, camera):
     )
 
 
-def _sane(pose, sheet, camera):
-    """Whether the sheet lies before the camera, shows its front, and covers some pixels: what
-    matches by chance seldom does.
+def _sane(pose, sheet, camera, rules):
+    """Whether the sheet lies before the camera, shows its front, and covers some pixels. A pose by
+    chance seldom does.
     """
     placed = pose(sheet.vertices)
     if placed[:, 2].min() <= 0:
@@ -242,7 +255,7 @@ def _sane(pose, sheet, camera):
     facing = -_cross(uv[1] - uv[0], uv[2] - uv[0])  # v goes up, y down
     return (np.sign(area) == np.sign(facing)).mean() > 0.7 and 0.5 * np.abs(
         area
-    ).sum() > _SMALLEST * camera.width * camera.height
+    ).sum() > rules.smallest * camera.width * camera.height
 
 
 def _cross(a, b):

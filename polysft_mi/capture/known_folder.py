@@ -1,0 +1,93 @@
+"""A scene file for a sequence's folder that is there already, in one of the known forms."""
+
+import contextlib
+import os
+
+from polysft_mi.errors import InputError
+from polysft_mi.files import aside
+from polysft_mi.scene.kinect_paper import template as kinect_paper_template
+from polysft_mi.scene.sequence import Sequence, image_size
+from polysft_mi.surface import meshio
+
+from .layouts import recognise
+from .scene_file import scene_xml
+
+
+def prepare_folder(folder, out=None, resolution=33, overwrite=False, pose_fit="auto"):
+    """Write ``scene.xml`` for a sequence into ``out`` (default: the folder itself); for
+    Kinect-Paper also ``template.obj``, of that ``resolution``, in its pose of
+    :func:`polysft_mi.scene.kinect_paper.template`.
+
+    Everything that the scene names is read and checked first. Returns (path of the scene, what was
+    found, in lines). Raises InputError; then nothing is written.
+    """
+    folder = os.path.normpath(folder)
+    layout = recognise(folder)
+    camera = layout.camera
+    masks = os.path.join(folder, layout.masks) if layout.masks else ""
+    sequence = Sequence.open(
+        os.path.join(folder, layout.frames), masks, size=(camera.width, camera.height)
+    )
+    image_size(os.path.join(folder, layout.texture))
+    template, where, said = None, "template.obj", []
+    if layout.obj is None:
+        vertices, faces, uv = template = kinect_paper_template(
+            folder, resolution, pose_fit, said.append
+        )
+    else:
+        where = os.path.join(folder, layout.obj)
+        vertices, faces, uv = meshio.read_template(where)
+    meshio.check_template(vertices, faces, uv, where)
+    _check_view(vertices * ((-1, -1, 1) if layout.flip else 1), camera, where)
+
+    here = out is None or os.path.realpath(out) == os.path.realpath(folder)
+    target = folder if here else out
+    for name in ["scene.xml"] + (["template.obj"] if template else []):
+        if os.path.exists(os.path.join(target, name)) and not overwrite:
+            raise InputError(
+                f"{os.path.join(target, name)}: is there already; give --overwrite to replace it,"
+                " or another folder by -o"
+            )
+    text = scene_xml(
+        layout, "." if here else os.path.abspath(folder), "template.obj" if template else None
+    )
+    _write(target, text, template, "; give a folder that can be written by -o DIR" if here else "")
+    recognised = (
+        f"{folder}: a sequence in the form {layout.form}, {len(sequence)} frames of"
+        f" {camera.width}x{camera.height}, {'with' if masks else 'without'} masks, template of"
+        f" {len(vertices)} vertices ({layout.obj or f'subdivided to {resolution}x{resolution}'})"
+    )
+    return os.path.join(target, "scene.xml"), "\n".join([recognised, *said])
+
+
+def _write(target, text, template, hint):
+    """Write the scene, and the template where there is one, into a folder: both or neither."""
+    made = not os.path.isdir(target)
+    try:
+        os.makedirs(target, exist_ok=True)
+        with contextlib.ExitStack() as stack:
+            if template:
+                obj = stack.enter_context(aside(os.path.join(target, "template.obj")))
+                meshio.write_obj(obj, *template)
+            scene = stack.enter_context(aside(os.path.join(target, "scene.xml")))
+            with open(scene, "w", encoding="utf-8") as file:
+                file.write(text)
+    except OSError as error:
+        if made:
+            with contextlib.suppress(OSError):
+                os.rmdir(target)
+        raise InputError(f"{target}: {error.strerror or error}{hint}") from None
+
+
+def _check_view(vertices, camera, where):
+    if vertices[:, 2].min() <= 0:
+        raise InputError(
+            f"{where}: the template lies behind the camera (z down to {vertices[:, 2].min():.3g}"
+            " m); z must be positive in the camera frame"
+        )
+    x = camera.project(vertices)
+    if not ((x > 0) & (x < (camera.width, camera.height))).all(axis=1).any():
+        raise InputError(
+            f"{where}: the template is out of view: no vertex lies in the"
+            f" {camera.width}x{camera.height} image"
+        )

@@ -1,0 +1,25 @@
+"""Scene files, loaded and compared with the first frame of their video."""
+
+import numpy as np
+
+from polysft_mi.scene.sequence import Sequence
+
+
+def loaded(path, **overrides):
+    from polysft_mi.scene import experiment as scene
+
+    return scene.load(path, overrides)
+
+
+def difference(experiment):
+    """Mean absolute difference, inside the silhouette, of the rendered template and frame 0; and
+    the same for the two mirror images.
+    """
+    import mitsuba as mi
+
+    frame = Sequence.open(experiment.frames, experiment.masks, size=experiment.size).frame(0)
+    image = np.array(mi.render(experiment.scene, sensor=experiment.sensor, spp=1))
+    inside = image[..., 3] > 0.999
+    rgb = image[..., :3]
+    assert 0.02 < inside.mean() < 0.9
+    return [np.abs(x - frame)[inside].mean() for x in (rgb, rgb[::-1], rgb[:, ::-1])]

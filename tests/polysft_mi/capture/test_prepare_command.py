@@ -1,0 +1,222 @@
+"""The command line of the preparation, and what it refuses in one line."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from clips import (
+    DEMO,
+    given,
+    photo,
+    refused,
+    write_png,
+)
+from places import ROOT
+
+from polysft_mi import prepare
+from polysft_mi.capture import prepare_video
+from polysft_mi.scene.images import read_rgb
+from polysft_mi.surface import meshio
+
+
+def test_command_line(clip, tmp_path):
+    def command(*words):
+        return subprocess.run(
+            [sys.executable, "-m", "polysft_mi.prepare", *map(str, words)],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+        )
+
+    words = [
+        clip[0],
+        "--texture",
+        clip[1],
+        "--size",
+        "A4",
+        "--camera",
+        clip[2],
+        "-o",
+        tmp_path / "o ut",
+        "--last",
+        1,
+    ]
+    done = command(*words)
+    assert done.returncode == 0 and done.stderr == ""
+    assert f"python -m polysft_mi.run '{tmp_path / 'o ut' / 'scene.xml'}'" in done.stdout
+    again = command(*words)
+    assert (
+        again.returncode == 2
+        and again.stderr.startswith("error: ")
+        and again.stderr.count("\n") == 1
+        and "--overwrite" in again.stderr
+    )
+    assert (
+        "python -m polysft_mi.prepare clip.mp4 --texture photo.jpg"
+        in prepare.parser().format_help()
+    )
+
+
+def test_replacing_a_folder(clip, tmp_path, capsys):
+    words = [
+        clip[0],
+        "--texture",
+        clip[1],
+        "--size",
+        "A4",
+        "--camera",
+        clip[2],
+        "-o",
+        str(tmp_path / "out"),
+        "--no-masks",
+    ]
+    prepare.main([*words, "--last", "0", "-q"])
+    assert capsys.readouterr().out == ""
+    prepare.main([*words, "--last", "1", "--overwrite", "--json"])
+    assert (
+        json.loads(capsys.readouterr().out)["frames"] == 2
+        and len(os.listdir(tmp_path / "out" / "frames")) == 2
+    )
+    assert os.listdir(tmp_path) == ["out"]
+    (tmp_path / "out" / "prepare" / "prepare.json").unlink()
+    assert (
+        "not replaced" in refused(prepare.main, [*words, "--overwrite"])
+        and (tmp_path / "out" / "scene.xml").exists()
+    )
+
+
+def test_photo_that_is_not_in_the_video(clip, tmp_path):
+    other = write_png(tmp_path / "other.png", photo(seed=99))
+    plain = write_png(tmp_path / "plain.png", np.full((210, 297, 3), 200, np.uint8))
+    for k, path in enumerate((other, plain)):
+        message = refused(
+            prepare_video, clip[0], str(tmp_path / f"out{k}"), **given(clip, texture=path)
+        )
+        assert (
+            "--corners" in message
+            and f"out{k}.matches.png" in message
+            and os.path.isfile(tmp_path / f"out{k}.matches.png")
+        )
+        assert not (tmp_path / f"out{k}").exists()
+    flipped = write_png(tmp_path / "flipped.png", read_rgb(clip[1])[:, ::-1])
+    assert "mirror" in refused(
+        prepare_video, clip[0], str(tmp_path / "out2"), **given(clip, texture=flipped)
+    )
+    assert "not a readable image" in refused(
+        prepare_video, clip[0], str(tmp_path / "out3"), **given(clip, texture=clip[0])
+    )
+    assert (
+        "no such file"
+        in refused(
+            prepare_video,
+            clip[0],
+            str(tmp_path / "out3"),
+            **given(clip, texture=str(tmp_path / "none.jpg")),
+        ).lower()
+    )
+
+
+@pytest.mark.parametrize(
+    "corners, said",
+    [
+        ([(900, 10), (1100, 10), (1100, 150), (900, 150)], "0 % of the sheet is in view"),
+        ([(50, 40), (60, 160), (250, 170), (240, 30)], "against the clock"),
+        ([(50, 40), (240, 170), (240, 30), (60, 160)], "quadrangle"),
+        ([(50, 40), (60, 40), (70, 40), (80, 40)], "quadrangle"),
+    ],
+)
+def test_corners_that_cannot_be(corners, said, clip, tmp_path):
+    assert said in refused(
+        prepare_video, clip[0], str(tmp_path / "out"), corners=corners, **given(clip)
+    )
+    assert os.listdir(tmp_path) == []
+
+
+def test_what_does_not_go_together(clip, tmp_path):
+    call = lambda **o: refused(
+        prepare_video, clip[0], str(tmp_path / "out"), **{**given(clip), **o}
+    )
+    assert "one of them" in call(fov=60)
+    assert "--size" in call(template=str(DEMO / "template.obj"))
+    assert "--size" in call(size=None)
+    assert "--corners" in call(texture="first-frame")
+    assert "--size 0.297 0.21?" in call(size=["210mm", "297mm"])
+    assert "16" in call(scale=0.01)
+    assert "400" in call(resolution=1)
+    camera = tmp_path / "camera.json"
+    camera.write_text(json.dumps({"fx": 1, "fy": 1, "cx": 1, "cy": 1, "width": 100, "height": 100}))
+    assert "320x240" in call(camera=str(camera))
+    camera.write_text(
+        json.dumps(
+            {
+                "fx": 330,
+                "fy": 330,
+                "cx": 160,
+                "cy": 120,
+                "width": 320,
+                "height": 240,
+                "distortion": [1, 2],
+            }
+        )
+    )
+    assert "distortion" in call(camera=str(camera))
+    obj = tmp_path / "large.obj"
+    vertices, faces, uv = meshio.read_template(DEMO / "template.obj")
+    meshio.write_obj(obj, 1000 * vertices, faces, uv)
+    assert "millimetres" in call(size=None, template=str(obj))
+    assert sorted(os.listdir(tmp_path)) == ["camera.json", "large.obj"]
+
+
+def test_inputs_are_not_replaced(clip, tmp_path):
+    folder = str(Path(clip[0]).parent)
+    assert "lies in it" in refused(prepare_video, clip[0], folder, overwrite=True, **given(clip))
+    (tmp_path / "file").write_text("")
+    assert "is a file" in refused(prepare_video, clip[0], str(tmp_path / "file"), **given(clip))
+
+
+def test_nothing_is_left_of_an_interrupted_run(clip, tmp_path):
+    def stop(count):
+        if count == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        prepare_video(clip[0], str(tmp_path / "out"), progress=stop, **given(clip))
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    "words, said",
+    [
+        ([], "needs --texture"),
+        (
+            ["--texture", "first-frame", "--size", "A4", "--fov", "60", "--corners", "1,2", "3,4"],
+            "four points",
+        ),
+        (
+            [
+                "--texture",
+                "first-frame",
+                "--size",
+                "A4",
+                "--fov",
+                "60",
+                "--corners",
+                "a,b",
+                "1,2",
+                "3,4",
+                "5,6",
+            ],
+            "four points",
+        ),
+    ],
+)
+def test_words_of_the_command_line(words, said, clip):
+    assert said in refused(prepare.main, [clip[0], *words])
+
+
+def test_options_for_videos_are_refused_for_folders(tmp_path):
+    assert "--fov" in refused(prepare.main, [str(DEMO), "--fov", "60"])

@@ -1,0 +1,231 @@
+"""Scene files for the three forms of folders: recognised, complete, geometrically right, or refused
+in one line.
+"""
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import pytest
+import synthetic
+from loading import difference, loaded
+from places import ROOT
+
+from polysft_mi.capture import prepare_folder, recognise
+from polysft_mi.errors import InputError
+from polysft_mi.scene.sequence import Sequence
+from polysft_mi.scene.settings import Settings
+
+FORMS = {
+    "cloth": synthetic.cloth,
+    "phi-SfT": synthetic.phi_sft,
+    "Kinect-Paper": synthetic.kinect_paper,
+}
+
+
+def refused(*arguments, **options):
+    with pytest.raises(InputError) as caught:
+        prepare_folder(*arguments, **options)
+    message = str(caught.value)
+    assert "\n" not in message
+    return message
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_prepared_scene_shows_frame_0(form, tmp_path):
+    truth = FORMS[form](tmp_path / "a sequence", frames=3)
+    path, line = prepare_folder(str(truth.folder), pose_fit="none")
+    assert form in line and "3 frames of 96x72" in line
+    assert ("without masks" if form == "Kinect-Paper" else "with masks") in line
+    experiment = loaded(path)
+    right, *mirrored = difference(experiment)
+    assert right < 0.015 and min(mirrored) > 5 * right
+    if form == "Kinect-Paper":
+        # 33 points a side of a grid of 5 rows and 6 columns: every 8th row is one of its own, and
+        # so are the corners
+        grid = experiment.template.vertices.reshape(33, 33, 3)
+        np.testing.assert_allclose(
+            grid[::8, [0, -1]], truth.vertices[0].reshape(5, 6, 3)[:, [0, -1]], atol=1e-6
+        )
+    else:
+        np.testing.assert_allclose(experiment.template.vertices, truth.vertices[0], atol=1e-6)
+        np.testing.assert_allclose(experiment.template.uv, truth.uv, atol=1e-6)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_scene_beside_or_away_from_the_data(form, tmp_path, monkeypatch):
+    truth = FORMS[form](tmp_path / "data", frames=2)
+    monkeypatch.chdir(tmp_path)
+    beside, _ = prepare_folder("data")
+    away, _ = prepare_folder("data", "somewhere/else")
+    monkeypatch.chdir(tmp_path / "somewhere")
+    folders = [
+        ET.parse(tmp_path / p).find("default[@name='data']").get("value") for p in (beside, away)
+    ]
+    assert folders == [".", str(truth.folder)]
+    a, b = (loaded(str(tmp_path / p)) for p in (beside, away))
+    np.testing.assert_array_equal(a.template.vertices, b.template.vertices)
+    truth.folder.rename(tmp_path / "moved")
+    np.testing.assert_array_equal(
+        loaded(str(tmp_path / "moved" / "scene.xml")).template.vertices, b.template.vertices
+    )
+
+
+def test_every_setting_can_be_overridden(tmp_path):
+    path, _ = prepare_folder(str(synthetic.cloth(tmp_path / "data", frames=2).folder))
+    assert {f.name for f in dataclasses.fields(Settings)} <= {
+        e.get("name") for e in ET.parse(path).iter("default")
+    }
+    s = loaded(path, order=3, k_mi=0.25, rgb_norm="l1", masks="").settings
+    assert (s.order, s.k_mi, s.rgb_norm) == (3, 0.25, "l1")
+
+
+def test_other_names_and_no_masks(tmp_path):
+    truth = synthetic.phi_sft(tmp_path / "data", frames=2, masks=False, obj="cloth 7.obj")
+    (truth.folder / "texture.png").rename(truth.folder / "print.png")
+    layout = recognise(str(truth.folder))
+    assert (layout.obj, layout.texture, layout.masks, layout.flip) == (
+        "cloth 7.obj",
+        "print.png",
+        "",
+        True,
+    )
+    assert "without masks" in prepare_folder(str(truth.folder))[1]
+    synthetic.write_image(truth.folder / "preview.png", np.zeros((4, 4, 3), np.uint8))
+    assert "preview.png, print.png" in refused(str(truth.folder))
+    (truth.folder / "print.png").rename(truth.folder / "texture.png")
+    assert recognise(str(truth.folder)).texture == "texture.png"
+
+
+def test_paths_that_xml_must_quote(tmp_path):
+    truth = synthetic.cloth(tmp_path / 'a & b\'s "c" <d> [1]', frames=2)
+    path, _ = prepare_folder(str(truth.folder), str(tmp_path / "out"))
+    assert len(Sequence.open(loaded(path).frames)) == 2
+    truth.folder.rename(tmp_path / "cash $x")
+    assert "'$'" in refused(str(tmp_path / "cash $x"), str(tmp_path / "out2"))
+    assert not (tmp_path / "out2").exists()
+
+
+def test_unknown_folders(tmp_path):
+    (tmp_path / "empty").mkdir()
+    message = refused(str(tmp_path / "empty"))
+    assert all(name in message for name in ("frames/", "rgbs/", "mesh.pts", "camera.json"))
+    assert "nowhere: no such folder" in refused(str(tmp_path / "nowhere"))
+    assert "folder" in refused(__file__)
+
+
+@pytest.mark.parametrize(
+    "form, name",
+    [
+        ("cloth", "camera.json"),
+        ("cloth", "template.obj"),
+        ("cloth", "texture.png"),
+        ("phi-SfT", "0_S3_quad.obj"),
+        ("phi-SfT", "camera.json"),
+    ]
+    + [("Kinect-Paper", name) for name in ("cam.intr", "cam.ext", "mesh.pts", "mesh.tri")],
+)
+def test_missing_pieces_are_named(form, name, tmp_path):
+    folder = FORMS[form](tmp_path / "data", frames=2).folder
+    (folder / name).unlink()
+    message = refused(str(folder), str(tmp_path / "out"))
+    assert (
+        form in message
+        and {".obj": "an OBJ file", ".png": "texture"}.get(Path(name).suffix, name) in message
+    )
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    "name, text, said",
+    [
+        ("cam.intr", "100 2 48\n0 100 36\n0 0 1\n", "skew"),
+        ("cam.intr", "100 0 48\n0 100 36\n", "3x3"),
+        ("cam.intr", "100 0 x\n0 100 36\n0 0 1\n", "numbers"),
+        ("cam.ext", "2 0 0 0\n0 1 0 0\n0 0 1 500\n", "rotation"),
+        ("cam.ext", "1 0 0 0\n0 1 0 0\n0 0 1 -500\n", "behind the camera"),
+        ("cam.ext", "1 0 0 5000\n0 1 0 0\n0 0 1 500\n", "out of view"),
+        ("cam.ext", "1 0 0 nan\n0 1 0 0\n0 0 1 500\n", "finite"),
+        ("mesh.pts", "0 0 0\n1 0 0\n0 1 0\n", "grid"),
+        ("mesh.tri", "0 1 2\n", "grid"),
+        ("mesh.tri", "0 1 -6\n", "indices"),
+        ("mesh.pts", "", "Nx3"),
+    ],
+)
+def test_bad_kinect_paper_files(name, text, said, tmp_path):
+    folder = synthetic.kinect_paper(tmp_path / "data", frames=1).folder
+    (folder / name).write_text(text)
+    message = refused(str(folder))
+    assert said in message and ("mesh" in message or name in message)
+    assert not (folder / "scene.xml").exists() and not (folder / "template.obj").exists()
+
+
+def test_template_and_frames_are_checked(tmp_path):
+    truth = synthetic.cloth(tmp_path / "data", frames=2)
+    obj, camera = truth.folder / "template.obj", truth.folder / "camera.json"
+    good = obj.read_text()
+    synthetic.write_obj(obj, truth.vertices[0] * (1, 1, -1), truth.uv, truth.faces)
+    assert "behind the camera" in refused(str(truth.folder))
+    synthetic.write_obj(obj, truth.vertices[0] + (5, 0, 0), truth.uv, truth.faces)
+    assert "out of view" in refused(str(truth.folder))
+    obj.write_text(
+        "\n".join(
+            line.replace("/", " ") if line[0] == "f" else line
+            for line in good.splitlines()
+            if not line.startswith("vt")
+        )
+    )
+    assert "template.obj" in refused(str(truth.folder))
+    obj.write_text(good)
+    values = json.loads(camera.read_text())
+    camera.write_text(json.dumps({**values, "width": 100}))
+    assert "100x72" in refused(str(truth.folder))
+    camera.write_text(json.dumps({**values, "fx": 0}))
+    assert "camera.json" in refused(str(truth.folder))
+
+
+def test_files_that_are_there_stay(tmp_path):
+    folder = synthetic.kinect_paper(tmp_path / "data", frames=1).folder
+    _path, _ = prepare_folder(str(folder), resolution=5)
+    before = {name: (folder / name).read_bytes() for name in ("scene.xml", "template.obj")}
+    assert "--overwrite" in refused(str(folder))
+    (folder / "scene.xml").unlink()
+    assert "template.obj" in refused(str(folder)) and not (folder / "scene.xml").exists()
+    prepare_folder(str(folder), resolution=9, overwrite=True)
+    assert (folder / "scene.xml").read_bytes() == before["scene.xml"] and (
+        folder / "template.obj"
+    ).read_bytes() != before["template.obj"]
+
+
+def test_folder_that_cannot_be_written(tmp_path):
+    folder = synthetic.cloth(tmp_path / "data", frames=1).folder
+    (tmp_path / "file").write_text("")
+    assert "file" in refused(str(folder), str(tmp_path / "file" / "out"))
+    if os.geteuid() != 0:  # root writes everywhere
+        folder.chmod(0o555)
+        assert "-o DIR" in refused(str(folder))
+        folder.chmod(0o755)
+
+
+def test_command_line(tmp_path):
+    folder = synthetic.cloth(tmp_path / "data", frames=2).folder
+    command = lambda *a: subprocess.run(
+        [sys.executable, "-m", "polysft_mi.prepare", *map(str, a)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
+    done = command(folder, "-o", tmp_path / "out")
+    assert done.returncode == 0 and "template of 99 vertices" in done.stdout
+    assert f"python -m polysft_mi.run {tmp_path / 'out' / 'scene.xml'}" in done.stdout
+    again = command(folder, "-o", tmp_path / "out")
+    assert (
+        again.returncode == 2
+        and again.stderr.startswith("error: ")
+        and again.stderr.count("\n") == 1
+    )

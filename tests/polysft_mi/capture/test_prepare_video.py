@@ -1,0 +1,286 @@
+"""A sequence's folder from a video and a photo, against what is known of the video."""
+
+import json
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from clips import (
+    CAMERA,
+    DEMO,
+    HEIGHT,
+    WIDTH,
+    background,
+    given,
+    photo,
+    placed,
+    refused,
+    rendered,
+    write_png,
+)
+from scripts import load
+
+from polysft_mi import prepare
+from polysft_mi.camera import Intrinsics
+from polysft_mi.capture import iou, prepare_video
+from polysft_mi.pictures.video import write_video
+from polysft_mi.scene.images import read_rgb
+from polysft_mi.scene.sequence import Sequence
+from polysft_mi.surface import meshio
+
+
+def test_folder_of_a_video(clip, tmp_path):
+    lines, out = [], str(tmp_path / "aus gabe é")
+    scene_path, found = prepare_video(clip[0], out, say=lines.append, **given(clip))
+    assert sorted(os.listdir(out)) == [
+        "camera.json",
+        "frames",
+        "masks",
+        "prepare",
+        "scene.xml",
+        "template.obj",
+        "texture.png",
+    ]
+    assert sorted(os.listdir(tmp_path)) == ["aus gabe é"]  # nothing beside it
+    assert sorted(os.listdir(f"{out}/prepare")) == [
+        "frames.png",
+        "masks.png",
+        "matches.png",
+        "pose.png",
+        "prepare.json",
+    ]
+    assert json.loads(Path(out, "prepare", "prepare.json").read_text()) == json.loads(
+        json.dumps(found)
+    )
+    assert found["frames"] == 12 and found["in_view"] == 1 and found["pose"]["agree"] > 100
+
+    vertices, _faces, uv = meshio.read_template(f"{out}/template.obj")
+    R, t = placed()
+    flat = np.column_stack([(uv[:, 0] - 0.5) * WIDTH, (0.5 - uv[:, 1]) * HEIGHT, np.zeros(len(uv))])
+    assert (
+        np.abs(vertices - (flat @ R.T + t)).max() < 1e-3
+    )  # of 550 mm, by a compressed video of 320x240
+    assert len(vertices) == 33 * 24
+    for k, cover in enumerate(clip[3]):
+        mask = read_rgb(f"{out}/masks/{k:05d}.png")[..., 0]
+        assert iou(mask, cover) > 0.97
+
+    import mitsuba as mi
+
+    from polysft_mi.scene import experiment as scene
+
+    experiment = scene.load(scene_path)
+    image = np.array(mi.render(experiment.scene, sensor=experiment.sensor, spp=1))
+    frame = Sequence.open(experiment.frames, experiment.masks, size=experiment.size).frame(0)
+    inside = image[..., 3] > 0.999
+    right, upside_down, mirrored = (
+        np.abs(image[..., :3] - x)[inside].mean() for x in (frame, frame[::-1], frame[:, ::-1])
+    )
+    assert inside.mean() > 0.2 and right < 0.05 and min(upside_down, mirrored) > 3 * right
+
+
+def test_demo_is_found_by_its_texture(tmp_path):
+    """The demo's first frame is curved: its own mesh as the template."""
+    write_video(
+        tmp_path / "demo.mp4",
+        [read_rgb(p) for p in sorted((DEMO / "frames").glob("*.jpg"))[:3]],
+    )
+    prepare_video(
+        str(tmp_path / "demo.mp4"),
+        texture=str(DEMO / "texture.jpg"),
+        template=str(DEMO / "template.obj"),
+        camera=str(DEMO / "camera.json"),
+    )
+    vertices, _, _ = meshio.read_template(tmp_path / "demo" / "template.obj")
+    truth, _, _ = meshio.read_template(DEMO / "template.obj")
+    assert np.linalg.norm(vertices - truth, axis=1).max() < 3e-3
+    for k in range(3):
+        found, drawn = (
+            read_rgb(p)[..., 0]
+            for p in (tmp_path / "demo" / "masks" / f"{k:05d}.png", DEMO / "masks" / f"{k:03d}.png")
+        )
+        assert iou(found, drawn) > 0.97
+
+
+def test_corners_and_the_first_frame_as_texture(clip, tmp_path):
+    R, t = placed(2 / 11)
+    corners = CAMERA.project(
+        np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)])
+        * (WIDTH / 2, HEIGHT / 2, 0)
+        @ R.T
+        + t
+    )
+    _, found = prepare_video(
+        clip[0],
+        str(tmp_path / "out"),
+        texture="first-frame",
+        size=["A4"],
+        camera=clip[2],
+        corners=corners.tolist(),
+        first=2,
+        last=8,
+        stride=3,
+        scale=0.5,
+        masks=False,
+    )
+    assert found["indices"] == [2, 5, 8]
+    vertices, _, uv = meshio.read_template(tmp_path / "out" / "template.obj")
+    assert np.linalg.norm(vertices.mean(0) - t) < 2e-3
+    camera = Intrinsics.from_json(tmp_path / "out" / "camera.json")
+    assert (camera.width, camera.height, camera.fx, camera.cx) == (160, 120, 165, 81)
+    np.testing.assert_allclose(
+        uv * (160, -120) + (0, 120), camera.project(vertices), atol=1e-3
+    )  # the texture is the frame
+    assert not (tmp_path / "out" / "masks").exists() and read_rgb(
+        tmp_path / "out" / "texture.png"
+    ).shape == (120, 160, 3)
+
+
+def test_corners_by_hand_are_moved_to_the_edges(clip, tmp_path):
+    """Corners that miss by some pixels: the sheet is moved to its edges in the frame, and a line
+    says so; or it is not, where that is wanted.
+    """
+    R, t = placed(2 / 11)
+    sheet_corners = (
+        np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)])
+        * (WIDTH / 2, HEIGHT / 2, 0)
+        @ R.T
+        + t
+    )
+    corners = CAMERA.project(sheet_corners) + [(2, -1.5), (-1, 2), (1.5, 2), (2, -1)]
+    options = dict(
+        texture="first-frame",
+        size=["A4"],
+        camera=clip[2],
+        corners=corners.tolist(),
+        first=2,
+        last=2,
+        masks=False,
+    )
+    missed, found, lines = {}, {}, []
+    for fit in ("auto", "none"):
+        _, found[fit] = prepare_video(
+            clip[0], str(tmp_path / fit), pose_fit=fit, say=lines.append, **options
+        )
+        vertices, _, uv = meshio.read_template(tmp_path / fit / "template.obj")
+        camera = Intrinsics.from_json(tmp_path / fit / "camera.json")
+        np.testing.assert_allclose(uv * (320, -240) + (0, 240), camera.project(vertices), atol=1e-3)
+        ends = [
+            vertices[np.argmin(np.linalg.norm(vertices - corner, axis=1))]
+            for corner in sheet_corners
+        ]
+        missed[fit] = np.linalg.norm(
+            camera.project(np.array(ends)) - CAMERA.project(sheet_corners), axis=1
+        ).max()
+    assert missed["auto"] < 0.4 and missed["none"] > 1.5
+    assert 0.5 < found["auto"]["pose"]["moved_px"] < 4 and "moved_px" not in found["none"]["pose"]
+    moved = [line for line in lines if "to the edges of the frame" in line]
+    assert (
+        len(moved) == 1 and f"moved by {found['auto']['pose']['moved_px']:.2f} pixels" in moved[0]
+    )
+
+
+def test_sheet_that_fills_the_picture(clip, tmp_path):
+    words = [
+        "--texture",
+        "first-frame",
+        "--size",
+        "40cm",
+        "30cm",
+        "--fov",
+        "50",
+        "--corners",
+        "frame",
+        "--no-masks",
+        "--last",
+        "1",
+        "-q",
+    ]
+    prepare.main([clip[0], *words, "-o", str(tmp_path / "out")])
+    vertices, _, uv = meshio.read_template(tmp_path / "out" / "template.obj")
+    assert (uv.min(), uv.max()) == pytest.approx((0, 1), abs=1e-3)
+    assert np.ptp(vertices, axis=0) == pytest.approx((0.4, 0.3, 0), abs=1e-3)
+    assert vertices[:, 2].mean() == pytest.approx(0.2 / np.tan(np.radians(25)), rel=1e-3)
+
+
+def test_photo_that_shows_more_than_the_sheet(clip, tmp_path):
+    straight = read_rgb(clip[1])
+    corners = np.float32([(70, 60), (690, 95), (660, 520), (50, 480)])
+    H = cv2.getPerspectiveTransform(np.float32([(0, 0), (594, 0), (594, 420), (0, 420)]), corners)
+    wider = cv2.warpPerspective(straight, H, (760, 600), borderValue=(60, 60, 60))
+    prepare_video(
+        clip[0],
+        str(tmp_path / "out"),
+        last=1,
+        **given(clip, texture=write_png(tmp_path / "wider.png", wider), size=["A4"]),
+        texture_corners=corners,
+    )
+    texture = read_rgb(tmp_path / "out" / "texture.png")
+    assert abs(texture.shape[1] / texture.shape[0] - WIDTH / HEIGHT) < 0.01
+    assert np.abs(cv2.resize(texture, (594, 420)).astype(int) - straight).mean() < 12
+    vertices, _, _ = meshio.read_template(tmp_path / "out" / "template.obj")
+    assert np.linalg.norm(vertices.mean(0) - placed()[1]) < 2e-3
+
+
+def test_given_masks(clip, tmp_path):
+    for k, cover in enumerate(clip[3]):
+        write_png(tmp_path / "given" / f"{k}.png", np.round(255 * cover).astype(np.uint8))
+    prepare_video(
+        clip[0],
+        str(tmp_path / "out"),
+        masks=str(tmp_path / "given"),
+        first=4,
+        last=6,
+        **given(clip),
+    )
+    assert (
+        np.abs(read_rgb(tmp_path / "out" / "masks" / "00002.png")[..., 0] / 255 - clip[3][6]).max()
+        < 0.01
+    )
+    (tmp_path / "given" / "11.png").unlink()
+    assert "11 masks" in refused(
+        prepare_video, clip[0], str(tmp_path / "b"), masks=str(tmp_path / "given"), **given(clip)
+    )
+    assert "no such folder" in refused(
+        prepare_video,
+        clip[0],
+        str(tmp_path / "b"),
+        masks=str(tmp_path / "none" / "x"),
+        **given(clip),
+    )
+    assert not (tmp_path / "b").exists()
+
+
+def test_masks_that_cannot_be_believed_are_not_used(clip, tmp_path):
+    for k, image in enumerate([rendered(photo())[0], background()]):  # the sheet is gone
+        write_png(tmp_path / "in" / f"{k}.png", image)
+    lines = []
+    _, found = prepare_video(
+        str(tmp_path / "in"), str(tmp_path / "out"), say=lines.append, **given(clip)
+    )
+    assert not found["masks"]["used"] and any(
+        "not used, for what is inside in frame 1" in line for line in lines
+    )
+    assert (
+        not (tmp_path / "out" / "masks").exists()
+        and (tmp_path / "out" / "prepare" / "masks.png").exists()
+    )
+    assert 'name="masks" value=""' in (tmp_path / "out" / "scene.xml").read_text()
+
+
+def test_print_that_the_benchmark_rectifies(tmp_path):
+    import synthetic
+
+    truth = synthetic.kinect_paper(tmp_path / "data", frames=1, size=(320, 240))
+    got = load("benchmarks/prepare.py").rectified_print(str(truth.folder))
+    wanted = cv2.flip(
+        synthetic.texture_image(), 0
+    )  # there the template's first row is the print's highest, in Kinect-Paper its lowest
+    assert (
+        np.abs(cv2.resize(got, (64, 64), interpolation=cv2.INTER_AREA).astype(int) - wanted)[
+            2:-2, 2:-2
+        ].mean()
+        < 6
+    )
