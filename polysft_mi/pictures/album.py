@@ -37,10 +37,10 @@ class AlbumSettings:
     ``waiting``: renderings that may wait for them.
     """
 
-    width: int = 640
+    width: int = 512
     rows: int = 5
     margin: float = 0.1
-    room: float = 1.0
+    room: float = 0.2
     view: float = 1.25
     threads: int = 2
     waiting: int = 4
