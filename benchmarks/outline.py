@@ -12,9 +12,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from polysft_mi.camera import Intrinsics
-from polysft_mi.scene.images import read_rgb
+from polysft_mi.scene.images import list_images, read_rgb
 from polysft_mi.scene.outline import fitted
-from polysft_mi.scene.sequence import list_images
 from polysft_mi.surface import meshio
 
 ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))

@@ -25,8 +25,8 @@ from polysft_mi.errors import InputError, cli
 from polysft_mi.pictures.video import write_video
 from polysft_mi.results.evaluation import evaluate
 from polysft_mi.scene import kinect_paper
-from polysft_mi.scene.images import read_rgb
-from polysft_mi.scene.sequence import drop_stray_components, list_images
+from polysft_mi.scene.images import list_images, read_rgb
+from polysft_mi.scene.sequence import drop_stray_components
 from polysft_mi.surface import meshio
 
 ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))

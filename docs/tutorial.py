@@ -15,8 +15,7 @@ import numpy as np
 
 from polysft_mi.capture import Sheet
 from polysft_mi.pictures.video import write_video
-from polysft_mi.scene.images import read_rgb
-from polysft_mi.scene.sequence import list_images
+from polysft_mi.scene.images import list_images, read_rgb
 from polysft_mi.surface import meshio
 
 HERE = os.path.dirname(os.path.abspath(__file__))

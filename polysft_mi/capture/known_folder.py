@@ -5,8 +5,9 @@ import os
 
 from polysft_mi.errors import InputError
 from polysft_mi.files import aside
+from polysft_mi.scene.images import checked_size
 from polysft_mi.scene.kinect_paper import template as kinect_paper_template
-from polysft_mi.scene.sequence import Sequence, image_size
+from polysft_mi.scene.sequence import Sequence
 from polysft_mi.surface import meshio
 
 from .layouts import recognise
@@ -28,7 +29,7 @@ def prepare_folder(folder, out=None, resolution=33, overwrite=False, pose_fit="a
     sequence = Sequence.open(
         os.path.join(folder, layout.frames), masks, size=(camera.width, camera.height)
     )
-    image_size(os.path.join(folder, layout.texture))
+    checked_size(os.path.join(folder, layout.texture))
     template, where, said = None, "template.obj", []
     if layout.obj is None:
         vertices, faces, uv = template = kinect_paper_template(

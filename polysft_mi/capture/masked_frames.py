@@ -6,8 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 from polysft_mi.errors import InputError
-from polysft_mi.scene.images import read_rgb
-from polysft_mi.scene.sequence import list_images
+from polysft_mi.scene.images import list_images, read_rgb
 
 from . import pictures
 from .masks import Masks, iou

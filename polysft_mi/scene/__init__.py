@@ -13,9 +13,9 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     submod_attrs={
         "defaults": ["known_defaults", "located", "resolved_defaults"],
         "experiment": ["Experiment", "load"],
-        "images": ["focal_35mm", "read_rgb"],
+        "images": ["focal_35mm", "image_size", "list_images", "read_rgb"],
         "plugins": ["register"],
-        "sequence": ["Sequence", "drop_stray_components", "image_size", "list_images"],
+        "sequence": ["Sequence", "drop_stray_components"],
         "settings": ["Settings"],
     },
 )

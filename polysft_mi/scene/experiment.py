@@ -18,6 +18,7 @@ from polysft_mi.surface.template import Template
 
 from . import plugins
 from .defaults import located, resolved_defaults
+from .images import checked_size
 from .settings import Settings
 
 
@@ -160,6 +161,10 @@ def _check_nodes(path, overrides):
                     f"{name}: no such file (filename of <{props.plugin_name()}> in {path})"
                 )
             props["filename"] = name
+            if props.plugin_name() == "bitmap" and not name.lower().endswith(".exr"):
+                checked_size(
+                    name
+                )  # Mitsuba's libraries tell of a broken file in lines of their own
         if props.plugin_name() in ("obj", "ply", "serialized", "varol_template"):
             shapes.append(props)
     return next((p for p in shapes if p.id() == "template"), shapes[0] if shapes else None)

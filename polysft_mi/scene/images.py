@@ -1,12 +1,203 @@
-"""Single images as people have them: any orientation, bit depth and alpha, read as 8-bit sRGB."""
+"""Image files as people have them: found, checked, and read, of any orientation, bit depth and
+alpha.
+"""
 
+import contextlib
+import glob
 import os
+import re
+import threading
 
 import numpy as np
 
 from polysft_mi.errors import InputError
 
-from .sequence import image_size, read_pixels
+EXTENSIONS = (
+    ".png",
+    ".jpg",
+    ".jpeg",
+    ".jpe",
+    ".bmp",
+    ".tif",
+    ".tiff",
+    ".webp",
+    ".ppm",
+    ".pgm",
+    ".pnm",
+    ".exr",
+    ".hdr",
+)
+
+
+def list_images(pattern, what="images"):
+    """The image files of a folder or a glob pattern, sorted by name, numbers in names by value.
+    Raises InputError where there are none.
+    """
+    pattern = os.fspath(pattern)
+    if os.path.isdir(pattern):
+        found = [os.path.join(pattern, name) for name in os.listdir(pattern)]
+    else:
+        folder, name = os.path.split(pattern)
+        if os.path.isdir(
+            folder or "."
+        ):  # a folder's own name may hold the letters that a pattern uses
+            folder = glob.escape(folder)
+        elif not glob.has_magic(folder):
+            raise InputError(
+                f"{what}: {pattern}: no such folder; a folder of images or a glob pattern is needed"
+            )
+        found = glob.glob(os.path.join(folder, name))
+    images = [
+        p
+        for p in found
+        if p.lower().endswith(EXTENSIONS)
+        and not os.path.basename(p).startswith(".")
+        and os.path.isfile(p)
+    ]
+    if not images:
+        kind = "folder" if os.path.isdir(pattern) else "pattern"
+        raise InputError(
+            f"{what}: {pattern}: no images in this {kind}; PNG, JPEG, TIFF, EXR and the like are"
+            " read"
+        )
+    return sorted(images, key=natural_key)
+
+
+def natural_key(name):
+    """Sort key by which ``frame_2`` comes before ``frame_10``."""
+    return [
+        int(part) if part.isdigit() else part.lower() for part in re.split(r"([0-9]+)", name)
+    ], name
+
+
+def image_size(path):
+    """(width, height) of an image file, from its header. Raises InputError where it is not a
+    readable image.
+    """
+    return checked_size(path, decode=False)
+
+
+def checked_size(path, decode=True):
+    """(width, height) of an image file, which is read as a whole where ``decode``. Raises
+    InputError.
+
+    By Pillow, which reports a file that breaks off, unlike OpenCV: all pixels of most kinds, the
+    checksums of PNG.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    with _silent_decoders():
+        try:
+            with Image.open(path) as image:
+                size = image.size
+                if decode and image.format == "PNG":
+                    image.verify()  # a tenth of the time
+                elif decode:
+                    image.load()
+                return size
+        except UnidentifiedImageError:  # of another kind than Pillow knows, EXR among them
+            return read_pixels(path).shape[1::-1]
+        except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+            raise InputError(
+                f"{path}: not a readable image ({getattr(error, 'strerror', None) or error})"
+            ) from None
+
+
+class _SilentDecoders:
+    """While any thread is inside, what is written to the process's stderr is dropped: libtiff,
+    libpng, libjpeg and OpenCV tell there of a broken file, beside the error that we raise.
+    """
+
+    def __init__(self):
+        self._lock, self._inside, self._saved = threading.Lock(), 0, None
+
+    @contextlib.contextmanager
+    def __call__(self):
+        with self._lock:
+            self._inside += 1
+            if self._inside == 1:
+                self._saved = self._redirected()
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._inside -= 1
+                if not self._inside and self._saved is not None:
+                    os.dup2(self._saved, 2)
+                    os.close(self._saved)
+
+    @staticmethod
+    def _redirected():
+        """A copy of the descriptor of stderr, which now leads nowhere; None where it is closed."""
+        try:
+            saved = os.dup(2)
+        except OSError:
+            return None
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, 2)
+        os.close(nowhere)
+        return saved
+
+
+_silent_decoders = _SilentDecoders()
+
+
+def read_pixels(path):
+    """Pixels as the file has them: (H, W) or (H, W, C) in OpenCV's channel order, uint8, uint16 or
+    float32.
+    """
+    import cv2
+
+    if path.lower().endswith(".exr"):
+        return _read_exr(path)
+    try:
+        image = cv2.imread(path, cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise InputError(f"{path}: not a readable image ({error.err})") from None
+    if image is None:
+        raise InputError(
+            f"{path}: not a readable image" if os.path.isfile(path) else f"{path}: no such file"
+        )
+    if image.dtype == np.float64:
+        image = image.astype(np.float32)
+    if image.dtype not in (np.uint8, np.uint16, np.float32):
+        raise InputError(
+            f"{path}: pixels of type {image.dtype}; 8 or 16 bit unsigned, or float, is needed"
+        )
+    return image
+
+
+def _read_exr(path):
+    """Plain R, G, B (in OpenCV's order), or Y, or the only channel. Not by OpenCV, whose wheels
+    come without EXR.
+    """
+    import OpenEXR
+
+    try:
+        with OpenEXR.File(path, separate_channels=True) as file:
+            planes = {
+                name: np.asarray(channel.pixels, dtype=np.float32)
+                for name, channel in file.channels().items()
+            }
+    except (RuntimeError, ValueError) as error:
+        raise InputError(f"{path}: not a readable image ({error})") from None
+    names = (
+        "BGR"
+        if {"R", "G", "B"} <= set(planes)
+        else [n for n in planes if n == "Y" or len(planes) == 1]
+    )
+    if not names:
+        raise InputError(
+            f"{path}: has the channels {', '.join(sorted(planes))}; R, G and B, or Y, are needed"
+        )
+    return np.stack([planes[name] for name in names], axis=-1)
+
+
+def finite(image, path):
+    """The image itself. Raises InputError where it is of floats that are not all finite."""
+    if image.dtype.kind == "f" and not np.isfinite(image).all():
+        raise InputError(f"{path}: holds pixels that are not finite")
+    return image
 
 
 def read_rgb(path):
@@ -19,8 +210,9 @@ def read_rgb(path):
     if os.fspath(path).lower().endswith((".heic", ".heif", ".avif")):
         raise InputError(f"{path}: HEIC and AVIF are not read; export it as JPEG or PNG")
     path = os.fspath(path)
-    image_size(path)  # by Pillow, whose words on a broken file are clear
-    pixels = read_pixels(path)
+    checked_size(path)
+    with _silent_decoders():
+        pixels = read_pixels(path)
     if pixels.ndim == 2:
         pixels = pixels[..., None]
     if pixels.dtype == np.uint16:
@@ -65,7 +257,7 @@ def _exif(path):
     from PIL import Image
 
     try:
-        with Image.open(path) as image:
+        with _silent_decoders(), Image.open(path) as image:
             return image.getexif()
     except (
         OSError,

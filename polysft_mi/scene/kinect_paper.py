@@ -10,7 +10,7 @@ import numpy as np
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError
 
-from .sequence import image_size, list_images
+from .images import image_size, list_images
 
 FILES = ("cam.intr", "cam.ext", "mesh.pts", "mesh.tri")
 

@@ -3,30 +3,14 @@ frame at a time.
 """
 
 import functools
-import glob
 import os
-import re
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
 from polysft_mi.errors import InputError
 
-EXTENSIONS = (
-    ".png",
-    ".jpg",
-    ".jpeg",
-    ".jpe",
-    ".bmp",
-    ".tif",
-    ".tiff",
-    ".webp",
-    ".ppm",
-    ".pgm",
-    ".pnm",
-    ".exr",
-    ".hdr",
-)
+from .images import checked_size, finite, list_images, read_pixels
 
 
 class Sequence:
@@ -77,7 +61,7 @@ class Sequence:
 
         everything = files + (mask_files or [])
         with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
-            sizes = dict(zip(everything, pool.map(_checked_size, everything)))
+            sizes = dict(zip(everything, pool.map(checked_size, everything)))
         wanted, why = (
             (tuple(size), "the camera's film has") if size else (sizes[files[0]], f"{files[0]} has")
         )
@@ -125,7 +109,7 @@ class Sequence:
         if image.ndim == 3:
             image = image[..., :3].max(axis=2) if image.shape[2] >= 3 else image[..., 0]
         scale = 1 if image.dtype.kind == "f" or image.max() <= 1 else np.iinfo(image.dtype).max
-        mask = np.clip(_finite(image, path).astype(np.float32) / scale, 0, 1)
+        mask = np.clip(finite(image, path).astype(np.float32) / scale, 0, 1)
         return drop_stray_components(mask) if self._drop_stray else mask
 
 
@@ -145,142 +129,15 @@ def drop_stray_components(mask, share=0.1):
     return mask * (area >= share * area.max())[labels]
 
 
-def list_images(pattern, what="images"):
-    """The image files of a folder or a glob pattern, sorted by name, numbers in names by value.
-    Raises InputError where there are none.
-    """
-    pattern = os.fspath(pattern)
-    if os.path.isdir(pattern):
-        found = [os.path.join(pattern, name) for name in os.listdir(pattern)]
-    else:
-        folder, name = os.path.split(pattern)
-        if os.path.isdir(
-            folder or "."
-        ):  # a folder's own name may hold the letters that a pattern uses
-            folder = glob.escape(folder)
-        elif not glob.has_magic(folder):
-            raise InputError(
-                f"{what}: {pattern}: no such folder; a folder of images or a glob pattern is needed"
-            )
-        found = glob.glob(os.path.join(folder, name))
-    images = [
-        p
-        for p in found
-        if p.lower().endswith(EXTENSIONS)
-        and not os.path.basename(p).startswith(".")
-        and os.path.isfile(p)
-    ]
-    if not images:
-        kind = "folder" if os.path.isdir(pattern) else "pattern"
-        raise InputError(
-            f"{what}: {pattern}: no images in this {kind}; PNG, JPEG, TIFF, EXR and the like are"
-            " read"
-        )
-    return sorted(images, key=natural_key)
-
-
-def natural_key(name):
-    """Sort key by which ``frame_2`` comes before ``frame_10``."""
-    return [
-        int(part) if part.isdigit() else part.lower() for part in re.split(r"([0-9]+)", name)
-    ], name
-
-
-def image_size(path):
-    """(width, height) of an image file, from its header. Raises InputError where it is not a
-    readable image.
-    """
-    return _checked_size(path, decode=False)
-
-
-def _checked_size(path, decode=True):
-    """(width, height); reads the whole file by Pillow, which, other than OpenCV, reports one that
-    breaks off: the pixels of most kinds, the checksums of PNG.
-    """
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        with Image.open(path) as image:
-            size = image.size
-            if decode and image.format == "PNG":
-                image.verify()  # a tenth of the time
-            elif decode:
-                image.load()
-            return size
-    except UnidentifiedImageError:  # of another kind than Pillow knows, EXR among them
-        return read_pixels(path).shape[1::-1]
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise InputError(
-            f"{path}: not a readable image ({getattr(error, 'strerror', None) or error})"
-        ) from None
-
-
-def read_pixels(path):
-    """Pixels as the file has them: (H, W) or (H, W, C) in OpenCV's channel order, uint8, uint16 or
-    float32.
-    """
-    import cv2
-
-    if path.lower().endswith(".exr"):
-        return _read_exr(path)
-    try:
-        image = cv2.imread(path, cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
-        raise InputError(f"{path}: not a readable image ({error.err})") from None
-    if image is None:
-        raise InputError(
-            f"{path}: not a readable image" if os.path.isfile(path) else f"{path}: no such file"
-        )
-    if image.dtype == np.float64:
-        image = image.astype(np.float32)
-    if image.dtype not in (np.uint8, np.uint16, np.float32):
-        raise InputError(
-            f"{path}: pixels of type {image.dtype}; 8 or 16 bit unsigned, or float, is needed"
-        )
-    return image
-
-
-def _read_exr(path):
-    """Plain R, G, B (in OpenCV's order), or Y, or the only channel. Not by OpenCV, whose wheels
-    come without EXR.
-    """
-    import OpenEXR
-
-    try:
-        with OpenEXR.File(path, separate_channels=True) as file:
-            planes = {
-                name: np.asarray(channel.pixels, dtype=np.float32)
-                for name, channel in file.channels().items()
-            }
-    except (RuntimeError, ValueError) as error:
-        raise InputError(f"{path}: not a readable image ({error})") from None
-    names = (
-        "BGR"
-        if {"R", "G", "B"} <= set(planes)
-        else [n for n in planes if n == "Y" or len(planes) == 1]
-    )
-    if not names:
-        raise InputError(
-            f"{path}: has the channels {', '.join(sorted(planes))}; R, G and B, or Y, are needed"
-        )
-    return np.stack([planes[name] for name in names], axis=-1)
-
-
 def _linear(image, path):
     if image.dtype.kind == "f":
-        return np.clip(_finite(image, path), 0, 1)
+        return np.clip(finite(image, path), 0, 1)
     table = _srgb_table(np.iinfo(image.dtype).max)
     if image.dtype == np.uint8:
         import cv2
 
         return cv2.LUT(image, table)  # the same in a third of the time
     return table[image]
-
-
-def _finite(image, path):
-    if image.dtype.kind == "f" and not np.isfinite(image).all():
-        raise InputError(f"{path}: holds pixels that are not finite")
-    return image
 
 
 @functools.lru_cache(maxsize=2)

@@ -9,7 +9,8 @@ import synthetic
 
 from polysft_mi.errors import InputError
 from polysft_mi.pictures.exr import write_exr
-from polysft_mi.scene.sequence import Sequence, drop_stray_components, image_size, list_images
+from polysft_mi.scene.images import image_size, list_images
+from polysft_mi.scene.sequence import Sequence, drop_stray_components
 
 
 @pytest.fixture
