@@ -1,72 +1,24 @@
-"""Videos that browsers play (H.264), written and read back, and numbered PNGs where no encoder
-is.
+"""Videos that browsers play (H.264), written and read back by PyAV; and numbered PNGs where it was
+built without the encoder.
 """
 
 import functools
 import os
 import re
-import subprocess
+from fractions import Fraction
 
 import numpy as np
 
 from polysft_mi.errors import InputError
 from polysft_mi.files import aside
 
-# Rec.709, converted and marked: what is not marked, players take for Rec.601 or 709 by its size
-_MARKS = "range=tv:colorspace=bt709:color_primaries=bt709:color_trc=bt709"
-_WIDEST = 3840  # beyond it, browsers and graphics cards give up
-_SIZE = rf"w=min(iw\,{_WIDEST}):h=-2:flags=area"
-_FILTER = [
-    "-vf",
-    f"scale={_SIZE}:out_color_matrix=bt709:out_range=tv,format=yuv420p,setparams={_MARKS}",
-]
-_CODEC = [
-    "-c:v",
-    "libx264",
-    "-preset",
-    "veryfast",
-    "-crf",
-    "18",
-    "-pix_fmt",
-    "yuv420p",
-    "-movflags",
-    "+faststart",
-]
-
 
 @functools.cache
-def encoder():
-    """Path of an ffmpeg that can encode H.264, or None. Found out once, by encoding two small
-    frames.
-    """
-    try:
-        import imageio_ffmpeg
+def can_encode():
+    """Whether H.264 can be written here."""
+    import av
 
-        path = imageio_ffmpeg.get_ffmpeg_exe()
-        command = [
-            path,
-            "-v",
-            "error",
-            "-f",
-            "lavfi",
-            "-i",
-            "color=s=64x64:r=2:d=1",
-            *_FILTER,
-            *_CODEC,
-            "-f",
-            "mp4",
-            "-y",
-            os.devnull,
-        ]
-        command[command.index("+faststart")] = (
-            "+frag_keyframe"  # the null device cannot be read back
-        )
-        subprocess.run(
-            command, check=True, stdin=subprocess.DEVNULL, capture_output=True, timeout=60
-        )
-        return path
-    except (ImportError, RuntimeError, OSError, subprocess.SubprocessError):
-        return None
+    return "libx264" in av.codecs_available
 
 
 def write_video(path, frames, fps=25):
@@ -79,7 +31,7 @@ def write_video(path, frames, fps=25):
     Raises ValueError for no frames or frames of another form, OSError where they cannot be written.
     """
     frames = _checked(frames)
-    if encoder() is None:
+    if not can_encode():
         return _write_pngs(os.path.splitext(os.fspath(path))[0], frames)
     with aside(path) as temporary:
         _encode(temporary, frames, fps, os.fspath(path))
@@ -107,55 +59,51 @@ def _checked(frames):
 
 
 def _encode(temporary, frames, fps, path):
-    process = None
+    import av
+
+    container = stream = None
     try:
         for frame in frames:
-            frame = np.pad(
-                frame, ((0, frame.shape[0] % 2), (0, frame.shape[1] % 2), (0, 0)), mode="edge"
+            padding = ((0, frame.shape[0] % 2), (0, frame.shape[1] % 2), (0, 0))
+            picture = av.VideoFrame.from_ndarray(np.pad(frame, padding, mode="edge"), "rgb24")
+            if container is None:
+                # the index first, so that browsers can start before they have all of it
+                container = av.open(temporary, "w", format="mp4", options={"movflags": "faststart"})
+                stream = _stream(container, picture.width, picture.height, fps)
+            picture = picture.reformat(
+                stream.width,
+                stream.height,
+                "yuv420p",
+                dst_colorspace="ITU709",
+                dst_color_range="MPEG",
+                interpolation="AREA",
             )
-            if process is None:
-                source = [
-                    "-f",
-                    "rawvideo",
-                    "-pix_fmt",
-                    "rgb24",
-                    "-s",
-                    f"{frame.shape[1]}x{frame.shape[0]}",
-                    "-r",
-                    f"{fps:g}",
-                    "-i",
-                    "-",
-                ]
-                command = [
-                    encoder(),
-                    "-v",
-                    "error",
-                    *source,
-                    *_FILTER,
-                    *_CODEC,
-                    "-f",
-                    "mp4",
-                    "-y",
-                    temporary,
-                ]
-                process = subprocess.Popen(
-                    command,
-                    stdin=subprocess.PIPE,
-                    stdout=subprocess.DEVNULL,
-                    stderr=subprocess.PIPE,
-                )
-            process.stdin.write(frame.tobytes())
-        _, message = process.communicate()
-    except BrokenPipeError:  # ffmpeg ended first; it says why
-        _, message = process.communicate()
-    except BaseException:
-        if process is not None:
-            process.kill()
-            process.communicate()
-        raise
-    if process.returncode:
-        lines = message.decode(errors="replace").split("\n")
-        raise OSError(None, f"ffmpeg cannot write the video: {lines[0].strip()}", path)
+            container.mux(stream.encode(picture))
+        container.mux(stream.encode())
+        container.close()
+    except (av.FFmpegError, OSError) as error:
+        message = getattr(error, "strerror", None) or error
+        raise OSError(None, f"the video cannot be written: {message}", path) from None
+    finally:
+        if container is not None:
+            container.close()
+
+
+def _stream(container, width, height, fps):
+    """The stream of a container that holds pictures of this size, shrunk to 3840 columns: beyond,
+    browsers and graphics cards give up.
+    """
+    rate = Fraction(fps).limit_denominator(1000)
+    stream = container.add_stream("libx264", rate, {"preset": "veryfast", "crf": "18"})
+    stream.width = min(width, 3840)
+    stream.height = 2 * round(height * stream.width / width / 2)
+    stream.pix_fmt = "yuv420p"
+    # marked: players take what is not marked for Rec.601 or Rec.709 by its size
+    bt709, tv = 1, 1  # as FFmpeg numbers them
+    marks = stream.codec_context
+    marks.colorspace = marks.color_primaries = marks.color_trc = bt709
+    marks.color_range = tv
+    return stream
 
 
 def _write_pngs(folder, frames):
@@ -181,34 +129,13 @@ def read_video(path):
     """The frames of a video that :func:`write_video` wrote, one after the other, (H, W, 3) uint8
     sRGB. Raises InputError where it cannot be read.
     """
-    if encoder() is None:
-        raise InputError(
-            f"{path}: cannot be read without ffmpeg (the Python package imageio-ffmpeg)"
-        )
-    command = [
-        encoder(),
-        "-v",
-        "error",
-        "-i",
-        os.fspath(path),
-        "-f",
-        "image2pipe",
-        "-c:v",
-        "ppm",
-        "-",
-    ]
-    with subprocess.Popen(
-        command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    ) as process:
-        try:
-            while process.stdout.readline() == b"P6\n":
-                width, height = map(int, process.stdout.readline().split())
-                process.stdout.readline()  # the largest value, 255
-                data = process.stdout.read(3 * width * height)
-                if len(data) == 3 * width * height:
-                    yield np.frombuffer(data, np.uint8).reshape(height, width, 3)
-        finally:
-            process.kill()  # where the caller stops before the end
-        message = process.stderr.read().decode(errors="replace").strip().split("\n")[0]
-    if message:
-        raise InputError(f"{path}: not a readable video ({message[:200]})")
+    import av
+
+    try:
+        # "file:", for a colon in a name is not the end of a protocol's
+        with av.open("file:" + os.fspath(path)) as container:
+            for frame in container.decode(video=0):
+                yield frame.to_ndarray(format="rgb24")
+    except (av.FFmpegError, OSError, IndexError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{path}: not a readable video ({reason})") from None
