@@ -1,56 +1,94 @@
-# make demo, make drape, make test, make docs: each installs what is missing into .venv (seconds where nothing is) and runs.
-# PYTHON=python3.12 takes another Python for a new .venv.
+# make demo, make drape, make test, make docs, make lint: each installs into .venv what it needs and
+# is not there yet (seconds where nothing is missing), and runs.
+# PYTHON=python3.12 takes another Python for a new .venv; TORCH=any takes torch with CUDA too.
 
 PYTHON ?= python3
 PY := .venv/bin/python
 SHELL := /bin/bash
 .SHELLFLAGS := -o pipefail -c
-INSTALLED := .venv/installed
 
-.PHONY: demo drape test docs venv llvm clean
+# Extras of pyproject.toml; make demo needs none
+EXTRAS_demo :=
+EXTRAS_drape := learn,usd
+EXTRAS_test := test
+EXTRAS_docs := docs
+EXTRAS_lint := lint
 
-demo: venv
+.PHONY: demo drape test docs lint llvm clean
+.PRECIOUS: .venv/with-%
+.NOTPARALLEL:
+
+demo: .venv/with-demo llvm
 	$(PY) -m polysft_mi.run scenes/demo.xml -o out/demo --overwrite
 
-drape: venv
+drape: .venv/with-drape llvm
 	$(PY) -m onefit.drape dress dance --weights dress -o out/drape --seconds 2 --overwrite
 
-test: venv
+test: .venv/with-test llvm
 	$(PY) -m pytest -q
 
 # The pages of docs/ as HTML, in out/docs; a warning is an error
-docs: $(INSTALLED)
+docs: .venv/with-docs
 	$(PY) -m sphinx -W --keep-going -q -b html docs out/docs
 
-venv: $(INSTALLED) llvm
+lint: .venv/with-lint
+	$(PY) -m ruff check
+	$(PY) -m ruff format --check
+	$(PY) -m mypy
 
-# Debian keeps venv's own pip in a package of its own (python3-venv); without it the system's pip puts one into the environment.
-$(INSTALLED): pyproject.toml constraints.txt
-	@if $(PYTHON) -c 'import ensurepip' 2>/dev/null; then $(PYTHON) -m venv .venv; else \
-	    $(PYTHON) -m venv --without-pip .venv && $(PYTHON) -m pip --python $(PY) install -q pip || \
-	    { rm -rf .venv; echo 'error: no virtual environment can be made: install python3-venv (Debian, Ubuntu: apt-get install python3-venv)' >&2; exit 2; }; fi
-	@printf 'installing into .venv, a minute or so, more where the network is slow: '
-	@PYTHONWARNINGS=ignore PYTHONUNBUFFERED=1 $(PY) -m pip install --progress-bar off --disable-pip-version-check -c constraints.txt -e '.[test,docs]' \
-	    | awk '/^Collecting/ { printf "."; fflush() } /^Installing/ { printf " unpacking"; fflush() } END { print "" }'
+.venv/with-%: pyproject.toml constraints.txt | $(PY)
+	@$(if $(filter learn% test docs,$(EXTRAS_$*)),$(no_surprise))
+	@printf 'installing for make $*, into .venv, a minute or so: '
+	@PYTHONWARNINGS=ignore PYTHONUNBUFFERED=1 $(PY) -m pip install --progress-bar off \
+	    --disable-pip-version-check -c constraints.txt -e '.[$(EXTRAS_$*)]' \
+	    | awk '/^Collecting/ { printf "." } /^Installing/ { printf " unpacking" } \
+	        { fflush() } END { print "" }'
 	@touch $@
 
+# Debian keeps venv's own pip in a package of its own (python3-venv); without it the system's pip
+# puts one into the environment.
+$(PY):
+	@if $(PYTHON) -c 'import ensurepip' 2>/dev/null; then $(PYTHON) -m venv .venv; else \
+	    $(PYTHON) -m venv --without-pip .venv && $(PYTHON) -m pip --python $(PY) install -q pip || \
+	    { rm -rf .venv; echo 'error: no virtual environment can be made: install python3-venv' \
+	        '(Debian, Ubuntu: apt-get install python3-venv)' >&2; exit 2; }; fi
+
+# torch's default build for Linux needs several GB of CUDA libraries: not where no NVIDIA GPU is.
+# pip says what it would install; nothing where torch is already there.
+define no_surprise
+if [ "$$TORCH" != any ] && [ ! -e /dev/nvidiactl ] && \
+    $(PY) -m pip install -q --disable-pip-version-check --dry-run --no-deps --report - \
+        -c constraints.txt torch 2>/dev/null | $(PY) -c $(find_cuda); then \
+    echo 'error: pip would install torch with CUDA libraries of several GB, and here is no NVIDIA' \
+        'GPU: set PIP_EXTRA_INDEX_URL to the index of the CPU builds (PyTorch'\''s "Get started"' \
+        'page names it), or PIP_FIND_LINKS to the folder of a CPU wheel; TORCH=any takes it' \
+        'nevertheless' >&2; exit 2; fi
+endef
+find_cuda := 'import json, sys; \
+    found = json.load(sys.stdin)["install"]; \
+    needs = [r for p in found for r in p["metadata"].get("requires_dist", [])]; \
+    sys.exit(not any(r.startswith(("nvidia", "cuda")) for r in needs))'
+
 # Rendering on the CPU needs a libLLVM, which no Python package brings.
-llvm: $(INSTALLED)
+llvm: | $(PY)
 	@$(PY) -m polysft_mi.backend >/dev/null 2>&1 || { $(install_llvm); $(PY) -m polysft_mi.backend; }
 
-# 19 first, for it is tested most. Does nothing where apt-get is not there or may not be used: the line above then says what to install.
+# 19 first, for it is tested most. Does nothing where apt-get is not there or may not be used: the
+# line above then says what to install.
 define install_llvm
 if [ -z "$$DRJIT_LIBLLVM_PATH" ] && command -v apt-get >/dev/null; then \
     if [ "$$(id -u)" = 0 ]; then as_root='env DEBIAN_FRONTEND=noninteractive'; \
-    elif sudo -n true 2>/dev/null; then as_root='sudo -n env DEBIAN_FRONTEND=noninteractive'; else as_root=; fi; \
+    elif sudo -n true 2>/dev/null; then as_root='sudo -n env DEBIAN_FRONTEND=noninteractive'; \
+    else as_root=; fi; \
     if [ -n "$$as_root" ]; then \
         echo 'installing libLLVM with apt-get'; $$as_root apt-get update -qq; \
         for version in 19 20 18 17; do \
-            $$as_root apt-get install -qq -y --no-install-recommends -o DPkg::Lock::Timeout=300 libllvm$$version >/dev/null && break; \
+            $$as_root apt-get install -qq -y --no-install-recommends -o DPkg::Lock::Timeout=300 \
+                libllvm$$version >/dev/null && break; \
         done; \
     fi; \
 fi
 endef
 
 clean:
-	rm -rf .venv out build *.egg-info .pytest_cache
+	rm -rf .venv out build *.egg-info .pytest_cache .ruff_cache .mypy_cache

@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from polyfit.errors import InputError, cli
+from polyfit.errors import InputError, cli, require
 from polyfit.files import aside, folder_aside
 
 GARMENT, BODY = (0.08, 0.19, 0.42), (0.5, 0.48, 0.46)  # colours, linear RGB
@@ -245,6 +245,7 @@ def parser():
 
 def main(argv=None):
     args = parser().parse_args(argv)
+    require("torch", "anny", *(["pxr"] if "usd" not in args.skip else []))
     from rich.console import Console
     from rich.progress import (
         BarColumn,

@@ -17,14 +17,15 @@ from functools import cached_property
 import numpy as np
 
 from polyfit import mesh
-from polyfit.errors import InputError, cli
+from polyfit.errors import InputError, cli, optional_imports
 from polyfit.files import aside
 from polyfit.meshio import write_ply
 
-from .binding import standard_body
-from .garment import FOLDER
-from .nearest import ClosestSurface
-from .remesh import loops, remeshed
+with optional_imports(__name__):
+    from .binding import standard_body
+    from .garment import FOLDER
+    from .nearest import ClosestSurface
+    from .remesh import loops, remeshed
 
 SPACING = 0.008  # of the grid [m]
 LOW, HIGH = np.array([-0.536, -0.424, -0.80]), np.array([0.536, 0.36, 0.80])  # its corners [m]

@@ -22,13 +22,15 @@ import sys
 from dataclasses import asdict, dataclass, field, fields
 from functools import partial
 
-import torch
+from polyfit.errors import InputError, cli, optional_imports
 
-from polyfit.errors import InputError, cli
-from polyfit.training import Training, conduct, device_of
+with optional_imports(__name__):
+    import torch
 
-from .losses import Weights
-from .weights import load, save
+    from polyfit.training import Training, conduct, device_of
+
+    from .losses import Weights
+    from .weights import load, save
 
 STANDARD = ("tshirt", "dress", "trousers", "shorts", "long_sleeve_top", "tank")
 CLIP = 1.0  # of the gradient's norm

@@ -1,6 +1,7 @@
 """The one exception for a user's mistake, and how a command line ends on it."""
 
 import contextlib
+import importlib.util
 import os
 import signal
 import sys
@@ -13,16 +14,57 @@ class InputError(ValueError):
     """
 
 
+# What a plain `pip install polysft-mi` leaves out: module, and the extra that brings it
+EXTRAS = {
+    "anny": "learn",
+    "pyacvd": "learn",
+    "pyvista": "learn",
+    "roma": "learn",
+    "safetensors": "learn",
+    "skimage": "learn",
+    "torch": "learn",
+    "warp": "learn",
+    "pxr": "usd",
+    "polyscope": "view",
+}
+
+
+def require(*modules):
+    """Raise an :class:`InputError` that names the extra to install, unless all ``modules`` are
+    there. For the start of a command that would miss one of them only at its end.
+    """
+    for module in modules:
+        if importlib.util.find_spec(module) is None:
+            raise InputError(_advice(module))
+
+
+@contextlib.contextmanager
+def optional_imports(name):
+    """A block of imports that need an extra, at the head of a module called ``name``: where the
+    module is run as a command (``__main__``) and the extra is missing, it ends as :func:`cli` does.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if name != "__main__" or error.name not in EXTRAS:
+            raise
+        sys.exit(_fail(_advice(error.name)))
+
+
 def cli(main):
     """Run ``main()`` as a process: its return value is the exit status.
 
-    An :class:`InputError` or an ``OSError`` that names a file ends in one line on stderr and exit
-    status 2, Ctrl-C in 130.
+    An :class:`InputError`, a missing extra (``EXTRAS``) or an ``OSError`` that names a file ends in
+    one line on stderr and exit status 2, Ctrl-C in 130.
     """
     try:
         status = main()
     except InputError as error:
         status = _fail(str(error))
+    except ModuleNotFoundError as error:
+        if error.name not in EXTRAS:
+            raise
+        status = _fail(_advice(error.name))
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         status = 130
@@ -36,6 +78,12 @@ def cli(main):
             signal.SIGINT, signal.SIG_DFL
         )  # nothing is left but Python's own end, whose traceback would tell nobody anything
     sys.exit(status)
+
+
+def _advice(module):
+    return (
+        f"{module} is not installed, which this needs: pip install 'polysft-mi[{EXTRAS[module]}]'"
+    )
 
 
 def _fail(message):

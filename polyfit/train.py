@@ -22,17 +22,19 @@ import shlex
 import sys
 from dataclasses import asdict, dataclass, fields
 
-import torch
-
-from . import families, garments, training_set
-from .baselines.atlasnet import AtlasNet, chamfer, normalised
-from .baselines.regressors import DGCNN, PointNet
-from .errors import InputError, cli
-from .losses import discrepancy
+from .errors import InputError, cli, optional_imports
 from .meshio import read_mesh
-from .stn import PolyFit, SpatialTransformer
-from .training import Training, conduct, device_of
-from .weights import read_weights, write_weights
+
+with optional_imports(__name__):
+    import torch
+
+    from . import families, garments, training_set
+    from .baselines.atlasnet import AtlasNet, chamfer, normalised
+    from .baselines.regressors import DGCNN, PointNet
+    from .losses import discrepancy
+    from .stn import PolyFit, SpatialTransformer
+    from .training import Training, conduct, device_of
+    from .weights import read_weights, write_weights
 
 VERSION = 1  # of the training sets
 MODELS = ("polyfit", "pointnet", "dgcnn", "atlasnet")

@@ -23,6 +23,7 @@ from .errors import InputError, cli
 OLDEST_LLVM = 16  # the first that tells its version; an older one is not tried
 PROVEN_LLVM = (19, 22)  # what the tests passed with; any other is tried before it is used
 VARIABLE = "DRJIT_LIBLLVM_PATH"  # Dr.Jit's own
+DEFAULT = "llvm_ad_rgb"  # the one that the tests passed on
 # what the code needs of a variant: Dr.Jit arrays with derivatives, three colour channels
 SUFFIX = "_ad_rgb"
 
@@ -109,7 +110,7 @@ def set_variant(mode=None):
     ``import mitsuba``, which makes Dr.Jit choose an LLVM.
 
     ``mode``: a variant that ends in ``_ad_rgb``. None takes one that is already set and fits, else
-    ``cuda_ad_rgb`` where a GPU really works, else ``llvm_ad_rgb``.
+    ``llvm_ad_rgb``. ``cuda_ad_rgb`` is taken only where it is asked for: no test has run on it.
 
     Returns the variant's name. Raises :class:`InputError` where the mode is unknown or does not
     fit, a GPU is asked for and none works, or LLVM is missing.
@@ -119,7 +120,7 @@ def set_variant(mode=None):
     if current and (mode == current or mode is None) and current.endswith(SUFFIX):
         return current
     if mode is None:
-        mode = "cuda_ad_rgb" if gpu_works() else "llvm_ad_rgb"
+        mode = DEFAULT
     version = None
     try:  # before the import, which already starts Dr.Jit and makes it look for an LLVM
         os.environ[VARIABLE], version = find_libllvm()
@@ -136,6 +137,8 @@ def set_variant(mode=None):
             f"mode {mode!r}: no working GPU (NVIDIA, with its driver and OptiX) was found; leave"
             " the mode out, or give llvm_ad_rgb"
         )
+    if mode.startswith("cuda"):
+        print(f"note: {mode} is untested, {DEFAULT} is what the tests run on", file=sys.stderr)
     try:
         mi.set_variant(mode)
     except ImportError as error:
@@ -199,7 +202,7 @@ def add_mode_argument(parser):
         "-m",
         "--mode",
         metavar="VARIANT",
-        help="Mitsuba variant (default: cuda_ad_rgb where a GPU works, else llvm_ad_rgb)",
+        help=f"Mitsuba variant (default: {DEFAULT}; cuda_ad_rgb needs a GPU and is untested)",
     )
 
 

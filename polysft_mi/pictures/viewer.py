@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 
+from polyfit.errors import require
 from polysft_mi.errors import InputError
 
 
@@ -120,12 +121,9 @@ def _polyscope(screenshot):
     """polyscope, started. Raises InputError where it is not installed or finds no display."""
     if not screenshot and not _display():
         raise InputError(f"view: no display (DISPLAY={os.environ.get('DISPLAY', '')}); {_INSTEAD}")
-    try:
-        import polyscope as ps
-    except ImportError:
-        raise InputError(
-            "view: polyscope is not installed: python -m pip install 'polysft-mi[view]'"
-        ) from None
+    require("polyscope")
+    import polyscope as ps
+
     ps.set_program_name("polysft")
     ps.set_verbosity(0)
     ps.set_use_prefs_file(False)

@@ -4,6 +4,7 @@ import os
 
 import numpy as np
 
+from polyfit.errors import require
 from polysft_mi.errors import InputError
 from polysft_mi.files import aside
 
@@ -14,7 +15,6 @@ EXTENSIONS = {
     "glb": (".glb",),
     "npz": (".npz",),
 }
-_PACKAGES = {"usd": ("pxr", "usd-core"), "glb": ("pygltflib", "pygltflib")}
 
 
 def export(run, kind, path=None, *, up="y", fps=None, texture=None):
@@ -36,15 +36,8 @@ def export(run, kind, path=None, *, up="y", fps=None, texture=None):
             f"--up {up}: {'glTF has y up' if kind == 'glb' else 'USD has y or z up'}; leave it"
             f" out{' or give z' if kind == 'usd' else ''}"
         )
-    if kind in _PACKAGES:
-        module, package = _PACKAGES[kind]
-        try:
-            __import__(module)
-        except ImportError:
-            raise InputError(
-                f"--format {kind}: needs {package}, which is not installed: python -m pip install"
-                f" {package}"
-            ) from None
+    if kind == "usd":
+        require("pxr")
     path = _place(run, kind, path)
     vertices = run.vertices if up == "camera" else animation.from_camera(run.vertices, up)
     image = _texture(run, texture) if kind in ("usd", "glb", "obj") else None
