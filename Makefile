@@ -40,7 +40,7 @@ lint: .venv/with-lint
 	@$(if $(filter learn% test docs,$(EXTRAS_$*)),$(no_surprise))
 	@printf 'installing for make $*, into .venv, a minute or so: '
 	@PYTHONWARNINGS=ignore PYTHONUNBUFFERED=1 $(PY) -m pip install --progress-bar off \
-	    --disable-pip-version-check -c constraints.txt -e '.[$(EXTRAS_$*)]' \
+	    --disable-pip-version-check -c constraints.txt -e '.$(if $(EXTRAS_$*),[$(EXTRAS_$*)])' \
 	    | awk '/^Collecting/ { printf "." } /^Installing/ { printf " unpacking" } \
 	        { fflush() } END { print "" }'
 	@touch $@
