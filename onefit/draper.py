@@ -66,7 +66,10 @@ class Draper:
         self.trained, self.device = trained, torch.device(device)
         self.network = trained.network.to(self.device).eval()
         self.model = model or AnnyBody()
-        self._garments, self._patched, self._codes, self._ease = {}, {}, {}, {}
+        self._garments: dict = {}
+        self._patched: dict = {}
+        self._codes: dict = {}
+        self._ease: dict = {}
 
     @cached_property
     def standard(self):

@@ -316,7 +316,7 @@ def pushed_out(V, F, where="garment"):
     )
 
 
-_correspondences = {}
+_correspondences: dict = {}
 
 
 def standard_on(body):

@@ -44,7 +44,7 @@ class Garment:
     faces: torch.Tensor
     blend_weights: torch.Tensor
     repairs: tuple = ()
-    _binding: Binding = field(default=None, repr=False, compare=False)
+    _binding: Binding | None = field(default=None, repr=False, compare=False)
 
     @classmethod
     def template(cls, name):

@@ -24,7 +24,7 @@ class Trained:
     on, and the names of its ``garments``.
     """
 
-    network: object
+    network: torch.nn.Module
     body: str
     garments: tuple
 

@@ -157,7 +157,8 @@ def refined(F, parts):
     grid = np.array(
         [(i, j, parts - i - j) for i in range(parts, -1, -1) for j in range(parts - i, -1, -1)]
     )
-    count, edges, side = int(F.max()) + 1, *edges_of(F)
+    count = int(F.max()) + 1
+    edges, side = edges_of(F)
     forward = (
         edges[side][..., 0] == F
     )  # whether the side from corner k runs from the smaller vertex to the larger

@@ -114,7 +114,7 @@ class Outcome:
 
     out: str
     summary: dict = field(default_factory=dict)
-    report: str = None
+    report: str | None = None
     seconds: float = 0.0
     interrupted: bool = False
 

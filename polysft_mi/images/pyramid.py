@@ -35,8 +35,8 @@ class LevelImage:
 
     colour: np.ndarray
     inside: np.ndarray
-    mask: np.ndarray = None
-    distance: np.ndarray = None
+    mask: np.ndarray | None = None
+    distance: np.ndarray | None = None
     corner: tuple = (0, 0)
 
 

@@ -70,7 +70,7 @@ class Appearance:
     or None."""
 
     excess: pixels.Image
-    luminance: np.ndarray = None
+    luminance: np.ndarray | None = None
 
 
 @dataclass
@@ -80,10 +80,10 @@ class Frame:
     and sum of ``squares``."""
 
     image: pixels.Image
-    mask: pixels.Image = None
-    distance: mi.Float = None
-    area: float = None
-    squares: float = None
+    mask: pixels.Image | None = None
+    distance: mi.Float | None = None
+    area: float | None = None
+    squares: float | None = None
 
 
 def _packed(colour, fourth):

@@ -29,7 +29,7 @@ class Run:
     faces: np.ndarray
     uv: np.ndarray
     frames: np.ndarray
-    sigma: np.ndarray = None
+    sigma: np.ndarray | None = None
     metrics: dict = field(default_factory=dict)
     about: dict = field(default_factory=dict)
 

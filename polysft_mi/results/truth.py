@@ -27,8 +27,8 @@ class Truth:
     path: str
     kind: str
     places: dict
-    faces: np.ndarray = None
-    K: np.ndarray = None
+    faces: np.ndarray | None = None
+    K: np.ndarray | None = None
 
     @classmethod
     def open(cls, path):

@@ -21,7 +21,7 @@ class Solution:
     terms: dict
     iterations: int
     facts: dict = field(default_factory=dict)
-    sigma: list = None
+    sigma: list | None = None
 
 
 def create(settings):

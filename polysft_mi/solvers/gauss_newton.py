@@ -118,8 +118,8 @@ class Model:
     evaluation: Evaluation
     normal: Normal
     noise: float
-    appearance: Appearance = None
-    reduced: Reduced = None
+    appearance: Appearance | None = None
+    reduced: Reduced | None = None
 
 
 @dataclass(frozen=True)
