@@ -35,7 +35,7 @@ class Layout:
     frames: str
     masks: str
     texture: str
-    obj: str = None
+    obj: str | None = None
     flip: bool = False
     settings: dict = field(default_factory=dict)
 

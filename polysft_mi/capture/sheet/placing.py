@@ -20,9 +20,9 @@ class Placed:
     where features were matched; ``figures`` of it, and ``lines`` for a person.
     """
 
-    pose: Pose = None
-    matches: Matches = None
-    why: str = None
+    pose: Pose | None = None
+    matches: Matches | None = None
+    why: str | None = None
     figures: dict = field(default_factory=dict)
     lines: list = field(default_factory=list)
 
