@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from polysft_mi.render.raster import blend, point2
+from polysft_mi.render.silhouette import blend
+from polysft_mi.render.view import point2
 
 from .pyramid import FARTHEST
 
@@ -123,7 +124,7 @@ class Met:
 
 
 def met(seen, sheet):
-    """:class:`Met` of all pixels of a :class:`polysft_mi.render.raster.Seen`."""
+    """:class:`Met` of all pixels of a :class:`polysft_mi.render.view.Seen`."""
     hit = seen.hit
     triangle = mi.UInt32(dr.select(hit, seen.triangle, 0))
     index, flat, (ray, _) = sheet.corners(triangle, hit), mi.Float(seen.positions), seen.rays()

@@ -345,7 +345,7 @@ class Registration:
     # -- evaluation ---------------------------------------------------------
 
     def _look(self, vertices, level):
-        """The :class:`polysft_mi.render.raster.View` of the sheet with vertices (N, 3) [m, world]
+        """The :class:`polysft_mi.render.view.View` of the sheet with vertices (N, 3) [m, world]
         on a level's grid; the last one is kept.
         """
         if (

@@ -1,0 +1,17 @@
+"""The scene and the vertices of the surface go in; an image, what each pixel sees, and their
+gradients come out. Importing a name needs a Mitsuba variant.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach(
+    __name__,
+    submodules=["device", "pinhole", "projective", "silhouette", "stage", "topology", "view"],
+    submod_attrs={
+        "pinhole": ["NEAR", "Pinhole"],
+        "raster": ["RasterIntegrator"],
+        "silhouette": ["blend"],
+        "topology": ["Topology"],
+        "view": ["Seen", "View", "point2"],
+    },
+)

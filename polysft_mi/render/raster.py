@@ -2,18 +2,14 @@
 silhouettes.
 
 One ray a pixel finds the visible triangle (detached). Its hit point, texture coordinates and colour
-are then recomputed with gradients. Where two neighbouring pixels see different sheets, the
-silhouette edge between their centres is found by walking over the mesh from the nearer one, and the
-two colours are blended by where the edge crosses, which makes the image a continuous,
-differentiable function of the vertices (after Laine et al. 2020, "Modular Primitives for
-High-Performance Differentiable Rendering", section 3.5; here the edge need not belong to the
-triangles seen at the two centres). ``docs/raster.md`` explains it.
+are then recomputed with gradients. At silhouettes the colours of two neighbouring pixels are
+blended by where the edge crosses (:mod:`polysft_mi.render.silhouette`), which makes the image a
+continuous, differentiable function of the vertices. ``docs/raster.md`` explains it.
 
 Import only after a Mitsuba variant is set.
 """
 
 import math
-from dataclasses import dataclass, fields
 
 import drjit as dr
 import mitsuba as mi
@@ -22,61 +18,13 @@ import numpy as np
 from polysft_mi.errors import InputError
 
 from .pinhole import NEAR, Pinhole
+from .shading import interaction, unlit
+from .silhouette import blend, crossings
 from .topology import Topology
+from .view import View, gather_point, margin, point2, rays
 
-# pixels by which an edge through a centre may pass it: the ray and the projection round differently
-_TOLERANCE = 1e-3
-_MAX_STEPS = 64  # triangles crossed between two neighbouring pixel centres before the walk gives up
 _AOVS = {"depth": 1, "normal": 3, "uv": 2, "triangle": 1}
 _AOV_CHANNELS = {"depth": "Z", "normal": "XYZ", "uv": "UV", "triangle": "I"}
-
-
-def _cross2(a, b):
-    return a.x * b.y - a.y * b.x
-
-
-@dataclass
-class Seen:
-    """What the pixels of a region see, detached but for ``positions`` and ``screen``; region pixels
-    run row by row. Arrays alone, so that frozen functions take it.
-
-    ``region``: (x0, y0, width, height), opaque UInt32; ``basis``, ``origin``: the camera as
-    :meth:`Pinhole.device` gives it; ``positions`` Float64 of 3V [m], ``screen`` Point3d of V (x, y
-    [pixels], depth [m]): the vertices; ``triangle`` (-1 for none) and ``depth`` [m] of each pixel.
-    """
-
-    region: tuple
-    basis: mi.Matrix3f
-    origin: mi.Point3f
-    positions: mi.Float64
-    screen: mi.Point3d
-    triangle: mi.Int32
-    depth: mi.Float
-
-    @property
-    def hit(self):
-        return self.triangle >= 0
-
-    def rays(self):
-        """A ray through the centre of each pixel, and the length of its direction before it was
-        normalised (depth = t / length).
-        """
-        return _rays(self.region, self.basis, self.origin, dr.width(self.triangle))
-
-
-@dataclass
-class View(Seen):
-    """:class:`Seen`, and what it was found with: the region's ``size`` (width, height), ``ray`` and
-    ``length`` as of :meth:`Seen.rays`, and Mitsuba's preliminary ``intersection``."""
-
-    size: tuple
-    ray: mi.Ray3f
-    length: mi.Float
-    intersection: mi.PreliminaryIntersection3f
-
-    def seen(self):
-        """The :class:`Seen` part alone."""
-        return Seen(*(getattr(self, field.name) for field in fields(Seen)))
 
 
 class RasterIntegrator(mi.SamplingIntegrator):
@@ -230,7 +178,7 @@ class RasterIntegrator(mi.SamplingIntegrator):
         basis, inverse, origin = camera.device(scale)
 
         positions = topology.positions()
-        vertex = _gather_point(positions, dr.arange(mi.UInt32, topology.vertex_count))
+        vertex = gather_point(positions, dr.arange(mi.UInt32, topology.vertex_count))
         relative = inverse @ (vertex - origin)  # (x z, y z, z): pixels times depth
         screen = mi.Point3d(
             mi.Point3f(relative.x / relative.z, relative.y / relative.z, relative.z)
@@ -239,12 +187,12 @@ class RasterIntegrator(mi.SamplingIntegrator):
         x0, y0, w, h = (
             self._bounds(screen, width, height)
             if box is None
-            else _margin([scale * x for x in box], width, height)
+            else margin([scale * x for x in box], width, height)
         )
 
         with dr.suspend_grad():
             region = tuple(dr.opaque(mi.UInt32, k) for k in (x0, y0, w, h))
-            ray, length = _rays(region, basis, origin, w * h)
+            ray, length = rays(region, basis, origin, w * h)
             pi = scene.ray_intersect_preliminary(ray, coherent=True)
             hit = pi.is_valid()
             shape = dr.reinterpret_array(mi.UInt32, pi.shape)
@@ -269,7 +217,7 @@ class RasterIntegrator(mi.SamplingIntegrator):
             raise InputError(f"raster: spp = {spp}; a square number is needed (1, 4, 9, 16, ...)")
         view = self.look(scene, sensor, scale)
         topology, hit = self._topology, view.hit
-        si, z = self._interaction(
+        si, z = interaction(
             topology,
             view.positions,
             view.intersection.shape,
@@ -279,7 +227,7 @@ class RasterIntegrator(mi.SamplingIntegrator):
             hit,
         )
         colour = (
-            self._unlit(si, hit)
+            unlit(si, hit)
             if self.shading == "unlit"
             else self._lit(scene, view.intersection, view.ray, hit, seed)
         )
@@ -311,43 +259,7 @@ class RasterIntegrator(mi.SamplingIntegrator):
             xa, ya, xb, yb, near = (x[0] for x in box)
         if not near > NEAR or not all(map(math.isfinite, (xa, ya, xb, yb))):
             return 0, 0, width, height
-        return _margin((xa, ya, xb, yb), width, height)
-
-    def _interaction(self, topology, positions, shape, triangle, ray, length, hit):
-        """Surface interaction of rays with the planes of their triangles (attached), and depth
-        along the axis.
-        """
-        t = mi.UInt32(dr.select(hit, triangle, 0))
-        index = [dr.gather(mi.UInt32, topology.faces, 3 * t + k, hit) for k in range(3)]
-        p0, p1, p2 = (_gather_point(positions, i, hit) for i in index)
-        e1, e2 = p1 - p0, p2 - p0
-        # Moeller-Trumbore, without its tests: the ray is known to hit
-        pv = dr.cross(ray.d, e2)
-        inverse = dr.select(hit, dr.rcp(dr.dot(e1, pv)), 0)
-        tv = ray.o - p0
-        qv = dr.cross(tv, e1)
-        b1, b2 = dr.dot(tv, pv) * inverse, dr.dot(ray.d, qv) * inverse
-        distance = dr.dot(e2, qv) * inverse
-        texcoords = topology.texcoords()
-        c0, c1, c2 = (dr.gather(mi.Point2f, texcoords, i, hit) for i in index)
-
-        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(triangle))
-        si.t = dr.select(hit, distance, dr.inf)
-        si.p = ray.o + ray.d * distance
-        si.uv = c0 + (c1 - c0) * b1 + (c2 - c0) * b2
-        n = dr.normalize(dr.cross(e1, e2))
-        si.n = dr.mulsign(n, -dr.dot(n, ray.d))  # both sides face the camera
-        si.sh_frame.n = si.n
-        si.wi = mi.Vector3f(0, 0, 1)  # unlit: as seen from the front
-        si.shape = shape
-        return si, distance / length
-
-    @staticmethod
-    def _unlit(si, hit):
-        """The texture's own colour, from either side: 3 Floats, 0 where there is no surface."""
-        return [
-            dr.select(hit, c, 0) for c in mi.Color3f(si.bsdf().eval_diffuse_reflectance(si, hit))
-        ]
+        return margin((xa, ya, xb, yb), width, height)
 
     def _lit(self, scene, pi, ray, hit, seed):
         """Emitted and directly reflected radiance at the first hit; the environment where there is
@@ -380,46 +292,8 @@ class RasterIntegrator(mi.SamplingIntegrator):
         return [mi.Float(triangle)]
 
     def crossings(self, view, outline=False):
-        """The silhouette edges that run between neighbouring pixel centres of a :class:`View`:
-        detached (va, vb, near, far, horizontal), None where there are none. With ``outline`` only
-        those of which one centre sees no sheet at all.
-
-        Vertices of each edge, the region's pixel whose sheet ends there, the other pixel, and
-        whether the two lie side by side.
-        """
-        topology, (x0, y0, w_, _), (w, h) = self._topology, view.region, view.size
-        horizontal_count, count = (w - 1) * h, (w - 1) * h + w * (h - 1)
-        if count == 0:
-            return None
-        with dr.suspend_grad():
-            split, columns = dr.opaque(mi.UInt32, horizontal_count), w_ - 1
-
-            def pixels(k):
-                """The pair's pixels, and whether it is horizontal."""
-                horizontal = k < split
-                y = dr.select(horizontal, k // dr.maximum(columns, 1), 0)
-                a = dr.select(horizontal, y * w_ + (k - y * columns), k - split)
-                return a, a + dr.select(horizontal, 1, w_), horizontal
-
-            a, b, _ = pixels(dr.arange(mi.UInt32, count))
-            ta, tb = (dr.gather(mi.Int32, view.triangle, k) for k in (a, b))
-            pair = dr.compress((ta < 0) != (tb < 0) if outline else ta != tb)
-            if dr.width(pair) == 0:
-                return None
-            a, b, horizontal = pixels(pair)
-            swap = dr.gather(mi.Float, view.depth, b) < dr.gather(mi.Float, view.depth, a)
-            near, far = dr.select(swap, b, a), dr.select(swap, a, b)
-            found, va, vb, near, far = self._silhouette(
-                topology, view.screen, view.triangle, near, far, x0, y0, w_, horizontal
-            )
-            dr.eval(
-                found, va, vb, near, far, horizontal
-            )  # in one kernel: compress and gather would each walk again
-            kept = dr.compress(found)
-            if dr.width(kept) == 0:
-                return None
-            va, vb, near, far = (dr.gather(mi.UInt32, i, kept) for i in (va, vb, near, far))
-            return va, vb, near, far, dr.gather(mi.Bool, horizontal, kept)
+        """:func:`polysft_mi.render.silhouette.crossings` of a view of the scene seen last."""
+        return crossings(self._topology, view, outline)
 
     def _antialias(self, topology, view, rgba):
         """Blend the colours (packed, 4 w h) across the silhouettes that run between neighbouring
@@ -445,7 +319,7 @@ class RasterIntegrator(mi.SamplingIntegrator):
             )
             visible = dr.gather(mi.Int32, view.triangle, other)
             ray = mi.Ray3f(view.origin, direction / length)
-            si, _ = self._interaction(
+            si, _ = interaction(
                 topology,
                 view.positions,
                 dr.reinterpret_array(mi.ShapePtr, shape),
@@ -454,89 +328,11 @@ class RasterIntegrator(mi.SamplingIntegrator):
                 length,
                 visible >= 0,
             )
-            incoming = mi.Vector4d(*self._unlit(si, visible >= 0), incoming.w)
+            incoming = mi.Vector4d(*unlit(si, visible >= 0), incoming.w)
         difference = incoming - dr.gather(mi.Vector4d, rgba, target, mode=dr.ReduceMode.Local)
         out = rgba + 0
         dr.scatter_add(out, weight * difference, target, mode=dr.ReduceMode.Local)
         return out
-
-    def _silhouette(self, topology, screen, triangle, near, far, x0, y0, w, horizontal):
-        """Vertices (va, vb) of the silhouette edge between the centres of two pixels, and which
-        pixel it occludes.
-
-        Walks from the near pixel's triangle towards the far centre; where that sheet has no
-        silhouette in between, from the far one's.
-        """
-        found, va, vb, last = self._walk(
-            topology, screen, triangle, near, far, x0, y0, w, mi.Bool(True)
-        )
-        beyond = dr.gather(mi.Int32, triangle, far)
-        again = ~found & (beyond >= 0) & (last != beyond)  # else the two centres lie on one sheet
-        found2, va2, vb2, _ = self._walk(topology, screen, triangle, far, near, x0, y0, w, again)
-        near, far = dr.select(found2, far, near), dr.select(found2, near, far)
-        va, vb, found = dr.select(found2, va2, va), dr.select(found2, vb2, vb), found | found2
-        edge = point2(screen, vb, found) - point2(screen, va, found)
-        return found & (dr.select(horizontal, edge.y, edge.x) != 0), va, vb, near, far
-
-    def _walk(self, topology, screen, triangle, start, end, x0, y0, w, active):
-        """From the triangle seen at pixel ``start`` over the sheet towards the centre of ``end``:
-        whether a silhouette edge comes before that centre, its vertices, and the last triangle
-        reached."""
-        c0, c1 = _centre(start, x0, y0, w), _centre(end, x0, y0, w)
-
-        def corners(t, mask):
-            return [
-                dr.gather(mi.UInt32, topology.faces, 3 * mi.UInt32(t) + k, mask) for k in range(3)
-            ]
-
-        def area(points):
-            return _cross2(points[1] - points[0], points[2] - points[0])
-
-        flat = mi.Float(dr.ravel(dr.detach(screen)))
-        dr.eval(flat)
-
-        def step(active, current, found, va, vb, steps):
-            index = corners(current, active)
-            p = [dr.gather(mi.Point3f, flat, i, active) for i in index]
-            q = [mi.Point2f(x.x, x.y) for x in p]
-            sign = dr.sign(area(q))
-            # the segment leaves a convex triangle by the first edge behind which it gets
-            exit_at, exit_edge = mi.Float(dr.inf), mi.UInt32(0)
-            for k in range(3):
-                edge = q[(k + 1) % 3] - q[k]
-                at0, at1 = sign * _cross2(edge, c0 - q[k]), sign * _cross2(edge, c1 - q[k])
-                t = at0 / (at0 - at1)
-                first = (at1 < at0) & (t < exit_at)
-                exit_at, exit_edge = dr.select(first, t, exit_at), dr.select(first, k, exit_edge)
-            usable = (dr.minimum(dr.minimum(p[0].z, p[1].z), p[2].z) > NEAR) & (sign != 0)
-            leaves = active & usable & (exit_at < 1 + _TOLERANCE)
-            across = dr.gather(
-                mi.Int32, topology.neighbours, 3 * mi.UInt32(current) + exit_edge, leaves
-            )
-            inner = leaves & (across >= 0)
-            r = [dr.gather(mi.Point3f, flat, i, inner) for i in corners(across, inner)]
-            silhouette = leaves & ((across < 0) | (area(r) * sign <= 0))
-            ea = dr.select(exit_edge == 0, index[0], dr.select(exit_edge == 1, index[1], index[2]))
-            eb = dr.select(exit_edge == 0, index[1], dr.select(exit_edge == 1, index[2], index[0]))
-            va, vb = dr.select(silhouette, ea, va), dr.select(silhouette, eb, vb)
-            steps += 1
-            going = leaves & ~silhouette & (steps < _MAX_STEPS)
-            return going, dr.select(going, across, current), found | silhouette, va, vb, steps
-
-        current = dr.gather(mi.Int32, triangle, start, active)
-        n = dr.width(current)
-        state = (
-            active & (current >= 0) & dr.full(mi.Bool, True, n),
-            current,
-            dr.full(mi.Bool, False, n),
-            dr.zeros(mi.UInt32, n),
-            dr.zeros(mi.UInt32, n),
-            dr.zeros(mi.UInt32, n),
-        )
-        _, last, found, va, vb, _ = dr.while_loop(
-            state, lambda active, *_: active, step, label="walk"
-        )
-        return found, va, vb, last
 
     def _assemble(self, rgba, aovs, view, camera, scale, alpha):
         """Put the region into the full image and shape it (H, W, C): colours averaged over the
@@ -576,62 +372,3 @@ class RasterIntegrator(mi.SamplingIntegrator):
         for c, part in enumerate(aovs):
             dr.scatter(out, part, pixel * count + colours + c, middle)
         return mi.TensorXf(out, (height, width, count))
-
-
-def _rays(region, basis, origin, count):
-    """:meth:`Seen.rays` of a region of ``count`` pixels."""
-    centre = _centre(dr.arange(mi.UInt32, count), *region[:3])
-    direction = basis @ mi.Vector3f(centre.x, centre.y, 1)
-    length = dr.norm(direction)
-    return mi.Ray3f(origin, direction / length), length
-
-
-def _centre(pixel, x0, y0, w):
-    y = pixel // w
-    return mi.Point2f(mi.Float(pixel - y * w + x0) + 0.5, mi.Float(y + y0) + 0.5)
-
-
-def blend(seen, ea, eb, near, far, horizontal):
-    """How an edge between two pixel centres blends them: (pixel that changes, pixel whose colour
-    comes in, its weight, where the edge crosses).
-
-    ``ea``, ``eb``: the edge's ends [pixels], attached; the weight and the place are.
-    """
-    x0, y0, w_, _ = seen.region
-    cn, cf = (_centre(i, x0, y0, w_) for i in (near, far))
-    # where the edge crosses, from the near centre (0) to the far one (1)
-    step = eb - ea
-    along, across = dr.select(horizontal, step.x, step.y), dr.select(horizontal, step.y, step.x)
-    slope = along / across
-    crossing = dr.select(horizontal, ea.x + (cn.y - ea.y) * slope, ea.y + (cn.x - ea.x) * slope)
-    start, end = dr.select(horizontal, cn.x, cn.y), dr.select(horizontal, cf.x, cf.y)
-    t = (crossing - start) / (end - start)
-    place = mi.Point2f(dr.select(horizontal, crossing, cn.x), dr.select(horizontal, cn.y, crossing))
-    # the near sheet covers a part of the far pixel, or the far one a part of the near
-    beyond = dr.detach(t) > 0.5
-    # The pairs across either axis would account for the whole edge; sin^2 and cos^2 of its angle
-    # share it between them.
-    weight = dr.clip(dr.abs(t - 0.5), 0, 0.5) * across * across / (along * along + across * across)
-    return dr.select(beyond, far, near), dr.select(beyond, near, far), weight, place
-
-
-def _margin(box, width, height):
-    """(x, y, width, height) of the pixels around a box (x, y, x, y) within the image, with a margin
-    for the neighbours that antialiasing blends with.
-    """
-    xa, ya, xb, yb = box
-    xa, ya = max(0, math.floor(min(xa, width)) - 1), max(0, math.floor(min(ya, height)) - 1)
-    xb, yb = min(width, math.ceil(max(xb, 0)) + 1), min(height, math.ceil(max(yb, 0)) + 1)
-    return (xa, ya, xb - xa, yb - ya) if xb > xa and yb > ya else (0, 0, 1, 1)
-
-
-def _gather_point(positions, index, mask=True):
-    """Points of a flat Float64 array, attached to it."""
-    return mi.Point3f(dr.gather(mi.Point3d, positions, index, mask))
-
-
-def point2(screen, index, mask=True):
-    """Screen positions of the vertices ``index``, attached to ``screen``."""
-    return mi.Point2f(
-        *(mi.Float(dr.gather(mi.Float64, x, index, mask)) for x in (screen.x, screen.y))
-    )

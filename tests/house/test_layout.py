@@ -62,7 +62,6 @@ NOT_YET = {
         "onefit.tailor",
         "polysft_mi.images.registration",
         "polysft_mi.objective.assembly",
-        "polysft_mi.render.raster",
         "polysft_mi.solvers.gauss_newton",
         "polysft_mi.solvers.normal_equations",
     },
