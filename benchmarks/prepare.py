@@ -6,11 +6,13 @@
 ``pose``: Kinect-Paper's frames 1 to 60, encoded as a video, prepared by the rectified print of
 frame 1 and K, without masks, and run; beside it the run from the given pose. Figures are those of
 ``python -m polysft_mi.evaluate`` on the ground-truth frames among them. ``masks``: intersection
-over union of found and given masks. ``time``: seconds to prepare 200 frames of 640x480, start-up
+over union of found and given masks. ``corners``: a sheet that bends before dark grey, its print
+dark at the corners: how far the masks and the run's surface miss the corners. ``time``: seconds to prepare 200 frames of 640x480, start-up
 included. Prints one line a figure, and writes ``prepare.json``.
 """
 
 import argparse
+import dataclasses
 import json
 import os
 import subprocess
@@ -20,7 +22,10 @@ import time
 import cv2
 import numpy as np
 
+from polysft_mi.camera import Intrinsics
 from polysft_mi.capture import iou
+from polysft_mi.capture.pictures import laid
+from polysft_mi.capture.sheet import grid
 from polysft_mi.errors import InputError, cli
 from polysft_mi.pictures.video import write_video
 from polysft_mi.results.evaluation import evaluate
@@ -207,6 +212,78 @@ def measure_masks(data, out):
     return result
 
 
+def dark_print(size=(1188, 840)):
+    """Coloured noise (H, W, 3) uint8 RGB that is dark grey at its corners, but for little detail."""
+    random, (w, h) = np.random.default_rng(5), size
+    image = np.zeros((h, w, 3), np.float32)
+    for cell, share in ((110, 0.5), (40, 0.3), (12, 0.2)):
+        grains = random.random((h // cell + 2, w // cell + 2, 3)).astype(np.float32)
+        image += share * cv2.resize(grains, (w, h), interpolation=cv2.INTER_CUBIC)
+    image = (image - image.min()) / np.ptp(image)
+    image = np.clip(1.6 * image - 0.3, 0, 1) * 235 + 10
+    y, x = np.mgrid[:h, :w]
+    for corner in ((0, 0), (0, w - 1), (h - 1, 0), (h - 1, w - 1)):
+        dark = np.clip(1.6 - np.hypot(y - corner[0], x - corner[1]) / 110, 0, 1)[..., None]
+        image = (1 - dark) * image + dark * (38 + 0.12 * image)
+    return image.astype(np.uint8)
+
+
+def bending(uv, t):
+    """Points (N, 3) [m, camera frame] of an A4 sheet, that bends about a slanted axis, at places
+    uv (N, 2), at the time t from 0 to 1."""
+    c, s = np.cos(0.35), np.sin(0.35)
+    flat = np.column_stack([(uv[:, 0] - 0.5) * 0.297, (0.5 - uv[:, 1]) * 0.21])
+    u, v = (flat @ np.array([[c, -s], [s, c]])).T
+    k = 0.2 + 5 * t  # 1/m
+    bent = np.stack([np.sin(k * u) / k, v, (1 - np.cos(k * u)) / k], axis=-1)
+    points = bent @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+    turn = cv2.Rodrigues(np.array([0.35 - 0.1 * t, -0.3 + 0.25 * t, 0.1]))[0]
+    return points @ turn.T + (0.01 + 0.02 * t, 0.005, 0.55)
+
+
+def bending_frames(photo, camera, count, finer=3):
+    """Frames of the sheet before dark grey, with a camera's noise."""
+    mesh, random = grid(0.297, 0.21, 65), np.random.default_rng(0)
+    size = finer * camera.width, finer * camera.height
+    for k in range(count):
+        x = finer * camera.project(bending(mesh.uv, k / (count - 1)))
+        frame = laid(np.full((size[1], size[0], 3), 45, np.uint8), photo, mesh, x)
+        frame = cv2.resize(frame, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+        noisy = frame + random.normal(0, 2, frame.shape)
+        yield np.clip(noisy, 0, 255).astype(np.uint8)
+
+
+def measure_corners(data, out):
+    count, camera, photo = 30, Intrinsics(600.0, 600.0, 320.0, 240.0, 640, 480), dark_print()
+    clip, print_, target = (f"{out}/{name}" for name in ("corners.mp4", "dark.jpg", "corners"))
+    write_video(clip, bending_frames(photo, camera, count))
+    cv2.imwrite(print_, photo[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
+    with open(f"{out}/corners.json", "w", encoding="utf-8") as file:
+        json.dump(dataclasses.asdict(camera), file)
+    words = ["--texture", print_, "--size", "A4", "--camera", f"{out}/corners.json"]
+    python("-m", "polysft_mi.prepare", clip, *words, "-o", target, "--overwrite")
+    python("-m", "polysft_mi.run", f"{target}/scene.xml", "-o", f"{out}/corners_run", "--overwrite")
+    corners = np.array([(0.0, 0), (1, 0), (1, 1), (0, 1)])
+    misses = []
+    for k, path in enumerate(list_images(f"{target}/masks")):
+        seen = np.argwhere(read_rgb(path)[..., 0] > 127)[:, ::-1] + 0.5
+        at = camera.project(bending(corners, k / (count - 1)))
+        misses.append(np.linalg.norm(at[:, None] - seen, axis=2).min(1).max())
+    found = np.load(f"{out}/corners_run/surface.npz")
+    uv = found["uv"]
+    true = np.stack([bending(uv, k / (count - 1)) for k in range(count)])
+    error = 1e3 * np.linalg.norm(found["vertices"] - true, axis=2)
+    off = np.abs(uv - 0.5)
+    rms = lambda vertices: float(np.sqrt((error[:, vertices] ** 2).mean()))
+    result = {
+        "mask_misses_corner_px": float(np.max(misses)),
+        "inside_rms_mm": rms(off.max(1) < 0.4),
+        "corners_rms_mm": rms(off.min(1) > 0.42),
+    }
+    print("corners", json.dumps(result))
+    return result
+
+
 def measure_time(data, out):
     video, photo, camera = kinect_inputs(data, out, TIMED)
     seconds = python(
@@ -237,8 +314,8 @@ def main(argv=None):
     parser.add_argument(
         "--only",
         nargs="+",
-        choices=("pose", "masks", "time"),
-        default=("pose", "masks", "time"),
+        choices=("pose", "masks", "corners", "time"),
+        default=("pose", "masks", "corners", "time"),
         help="what to measure (default: all)",
     )
     parser.add_argument(
@@ -249,7 +326,12 @@ def main(argv=None):
     )
     args = parser.parse_args(argv)
     os.makedirs(args.output, exist_ok=True)
-    measures = {"pose": measure_pose, "masks": measure_masks, "time": measure_time}
+    measures = {
+        "pose": measure_pose,
+        "masks": measure_masks,
+        "corners": measure_corners,
+        "time": measure_time,
+    }
     result = {
         name: measures[name](os.path.abspath(args.data), os.path.abspath(args.output))
         for name in args.only

@@ -38,15 +38,16 @@ class Written:
     lines: list
 
 
-def write_frames(folder, frames, masks, expected, straight, progress):
+def write_frames(folder, frames, masks, expected, straight, progress, registration=None):
     """Write ``frames``, an iterable of (index in the video, image (H, W, 3) uint8 RGB), and masks.
 
     ``masks``: True to find them, from ``expected`` (H, W), the template's silhouette in the first
     frame; False for none; or :class:`GivenMasks`, which ``straight``, the
     :class:`polysft_mi.capture.camera.Undistortion` of the frames, makes fit to them. ``progress``
-    is given the number of frames done. Returns :class:`Written`. Raises InputError.
+    is given the number of frames done; ``registration`` as for
+    :class:`polysft_mi.capture.masks.Masks`. Returns :class:`Written`. Raises InputError.
     """
-    tracked = Masks(expected.shape[::-1]) if masks is True else None
+    tracked = Masks(expected.shape[::-1], registration) if masks is True else None
     if masks:
         os.makedirs(os.path.join(folder, "masks"))
     indices, areas, strange, overlap = [], [], [], None

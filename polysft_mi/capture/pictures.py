@@ -118,12 +118,13 @@ def pose(frame, photo, sheet, placed, camera):
     for loop in loops(sheet.faces):
         draw(np.stack([loop, np.roll(loop, -1)], axis=1), YELLOW, 2)
     label(wired, "the template in the first frame")
-    laid, _ = _canvas(_laid(frame, photo, sheet, x))
+    laid, _ = _canvas(laid(frame, photo, sheet, x))
     label(laid, "the photo, laid where the template is")
     return np.hstack([wired, np.full((wired.shape[0], 4, 3), 255, np.uint8), laid])
 
 
-def _laid(frame, photo, sheet, x):
+def laid(frame, photo, sheet, x):
+    """The frame (H, W, 3), and on it the photo where the vertices' pixels ``x`` (N, 2) have it."""
     from matplotlib.tri import Triangulation
 
     try:

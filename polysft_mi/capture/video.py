@@ -20,7 +20,7 @@ from .camera.calibration import calibrate as calibrate_camera
 from .frames import focal_length, read_frames
 from .layouts import Layout
 from .masked_frames import GivenMasks, write_frames
-from .masks import silhouette
+from .masks import Registration, silhouette
 from .output import REPORT, replace_folder, target_folder, write_json, write_png
 from .scene_file import scene_xml
 
@@ -133,11 +133,14 @@ def prepare_video(
         for k, image in stream:
             yield k, straight.image(image)
 
+    def registration(scale):
+        return Registration(photo, mesh.uv, mesh.faces, view.project(placed) * scale)
+
     with _folder(out) as partial:
         for name, image in shown.items():
             write_png(os.path.join(partial, REPORT, name), image)
         expected = silhouette(view.project(placed), mesh.faces, frame.shape[1::-1])
-        written = write_frames(partial, frames(), masks, expected, straight, progress)
+        written = write_frames(partial, frames(), masks, expected, straight, progress, registration)
         found |= {"frames": len(written.indices), "indices": written.indices}
         if written.figures:
             found["masks"] = written.figures

@@ -1,5 +1,6 @@
-"""The sheet's silhouette in every frame: GrabCut around the template's projection in the first,
-then around where the optical flow carries the frame before's."""
+"""Masks by colour: GrabCut around the template's projection in the first frame, then around where
+the optical flow carries the mask of the frame before.
+"""
 
 from dataclasses import dataclass
 
@@ -13,13 +14,15 @@ class MaskSettings:
 
     ``side`` [pixels]: the longer side at which the work is done; ``band``: how far the border may
     lie from where it is expected, as a share of the silhouette's size; ``first_iterations``,
-    ``iterations`` of GrabCut in the first frame and in the others.
+    ``iterations`` of GrabCut in the first frame and in the others; ``overlap``: least share of the
+    mask that the photo must explain for its word on the rest to count.
     """
 
     side: int = 480
     band: float = 0.035
     first_iterations: int = 5
     iterations: int = 2
+    overlap: float = 0.8
 
 
 class Masks:
@@ -27,8 +30,10 @@ class Masks:
     255, of images (H, W, 3) uint8 RGB.
     """
 
-    def __init__(self, size, settings=None):
-        """``size``: (width, height) of the frames [pixels]."""
+    def __init__(self, size, registration=None, settings=None):
+        """``size``: (width, height) of the frames [pixels]; ``registration``: makes of the factor
+        by which frames are shrunk the :class:`Registration` of the photo, or None.
+        """
         self._size, self._settings = size, settings or MaskSettings()
         self._small = tuple(
             max(1, round(n * min(1.0, self._settings.side / max(size)))) for n in size
@@ -36,6 +41,9 @@ class Masks:
         self._flow = cv2.DISOpticalFlow_create(cv2.DISOpticalFlow_PRESET_FAST)
         self._grey = self._mask = None
         self._models = np.zeros((1, 65)), np.zeros((1, 65))
+        self._registration = registration and registration(
+            np.array(self._small) / np.array(self._size)
+        )
         self._colours = None
         # of the last mask: 0 where its colours are those of the first, 1 where they share none
         # (Bhattacharyya)
@@ -47,6 +55,8 @@ class Masks:
         self._grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
         expected = (self._reduced(silhouette) > 127).astype(np.uint8)
         self._mask = self._cut(small, expected, self._settings.first_iterations)
+        if self._registration:
+            self._mask = self._completed(self._registration.first(small))
         self._colours = _histogram(small, self._mask)
         return self._enlarged()
 
@@ -60,10 +70,23 @@ class Masks:
             grey,
             self._cut(small, (moved > 127).astype(np.uint8), self._settings.iterations),
         )
+        if self._registration:
+            self._mask = self._completed(self._registration.next(small))
         self.strangeness = cv2.compareHist(
             _histogram(small, self._mask), self._colours, cv2.HISTCMP_BHATTACHARYYA
         )
         return self._enlarged()
+
+    def _completed(self, shown):
+        """The mask, and the part of the frame that shows the print: where that has the
+        background's colour, GrabCut takes it for background.
+        """
+        if shown is None:
+            return self._mask
+        found = self._mask > 0
+        if (shown & found).sum() < self._settings.overlap * max(found.sum(), 1):
+            return self._mask
+        return self._mask | shown.astype(np.uint8)
 
     def _cut(self, image, expected, iterations):
         if not expected.any():

@@ -1,0 +1,16 @@
+"""The sheet's silhouette in every frame.
+
+In: the frames, the photo, and the template's projection in the first frame. Out: masks (H, W)
+uint8, 0 or 255. GrabCut finds the border by colour (:class:`Masks`); where the print has the colour
+of the background, the photo tells where the sheet ends (:class:`Registration`).
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach(
+    __name__,
+    submod_attrs={
+        "grabcut": ["MaskSettings", "Masks", "iou", "silhouette"],
+        "registration": ["Registration"],
+    },
+)
