@@ -1,14 +1,15 @@
 """What a video prepared by ``python -m polysft_mi.prepare`` is worth, and what it costs.
 
-    python benchmarks/prepare.py [--data FOLDER] [--only pose masks time] [-o
+    python benchmarks/prepare.py [--data FOLDER] [--only pose masks corners time] [-o
     out/benchmarks/prepare]
 
 ``pose``: Kinect-Paper's frames 1 to 60, encoded as a video, prepared by the rectified print of
 frame 1 and K, without masks, and run; beside it the run from the given pose. Figures are those of
 ``python -m polysft_mi.evaluate`` on the ground-truth frames among them. ``masks``: intersection
 over union of found and given masks. ``corners``: a sheet that bends before dark grey, its print
-dark at the corners: how far the masks and the run's surface miss the corners. ``time``: seconds to prepare 200 frames of 640x480, start-up
-included. Prints one line a figure, and writes ``prepare.json``.
+dark at the corners: how far the masks and the run's surface miss the corners. ``time``: seconds to
+prepare 200 frames of 640x480, start-up included. Prints one line a figure, and writes
+``prepare.json``.
 """
 
 import argparse
@@ -213,7 +214,7 @@ def measure_masks(data, out):
 
 
 def dark_print(size=(1188, 840)):
-    """Coloured noise (H, W, 3) uint8 RGB that is dark grey at its corners, but for little detail."""
+    """Coloured noise (H, W, 3) uint8 RGB, dark grey with little detail at its corners."""
     random, (w, h) = np.random.default_rng(5), size
     image = np.zeros((h, w, 3), np.float32)
     for cell, share in ((110, 0.5), (40, 0.3), (12, 0.2)):

@@ -118,9 +118,9 @@ def pose(frame, photo, sheet, placed, camera):
     for loop in loops(sheet.faces):
         draw(np.stack([loop, np.roll(loop, -1)], axis=1), YELLOW, 2)
     label(wired, "the template in the first frame")
-    laid, _ = _canvas(laid(frame, photo, sheet, x))
-    label(laid, "the photo, laid where the template is")
-    return np.hstack([wired, np.full((wired.shape[0], 4, 3), 255, np.uint8), laid])
+    beside, _ = _canvas(laid(frame, photo, sheet, x))
+    label(beside, "the photo, laid where the template is")
+    return np.hstack([wired, np.full((wired.shape[0], 4, 3), 255, np.uint8), beside])
 
 
 def laid(frame, photo, sheet, x):
@@ -154,9 +154,9 @@ def laid(frame, photo, sheet, x):
     colours = cv2.remap(
         photo, whole[..., 0], whole[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )
-    laid = frame.copy()
-    laid[seen] = colours[seen]
-    return laid
+    result = frame.copy()
+    result[seen] = colours[seen]
+    return result
 
 
 def label(image, text):
