@@ -39,18 +39,24 @@ import time
 
 import numpy as np
 from cases import add_case_arguments, parse_size
+from raster_figures import (
+    CONTENDERS,
+    TARGET,
+    judge_long_run,
+    print_end,
+    print_table,
+    summarise,
+    write,
+)
 
 from polysft_mi.backend import add_mode_argument, set_variant
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError, cli
-from polysft_mi.files import aside
 
 ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 
 SIZES = ("160x120", "320x240", "640x480", "1280x720", "1920x1080")
 GRIDS = (33, 72, 225)  # vertices a side: 1,089 vertices, 10,082 and 100,352 triangles
-CONTENDERS = ("raster", "raster, mi", "prb_projective")
-TARGET = ("640x480", 33, 3.0)
 WARM_UP, LEAST_TURNS, MOST_TURNS = 2, 3, 60  # few where a turn takes seconds
 MEMORY_PASSES = 2
 
@@ -310,125 +316,6 @@ def in_process(measure, size, grid, mode, **options):
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def summarise(size, grid, times, memory):
-    """The figures of a case: medians, quartiles, ratios."""
-    passes = {name: np.array(values) for name, values in times["passes"].items()}
-    whole = {name: passes[name] + np.array(times["moves"][name]) for name in passes}
-    case = {
-        "size": size,
-        "vertices": grid * grid,
-        "triangles": 2 * (grid - 1) ** 2,
-        "turns": len(passes["raster"]),
-        "contenders": {},
-    }
-    for name in CONTENDERS:
-        low, middle, high = np.percentile(passes[name], [25, 50, 75])
-        case["contenders"][name] = {
-            "ms": middle,
-            "ms_quartiles": [low, high],
-            "move_ms": float(np.median(times["moves"][name])),
-            "ratio": float(np.median(passes[name] / passes["raster"])),
-            "ratio_quartiles": list(np.percentile(passes[name] / passes["raster"], [25, 75])),
-            "ratio_with_move": float(np.median(whole[name] / whole["raster"])),
-            **{k: v for k, v in memory[name].items() if k.endswith("_mb")},
-        }
-    return {
-        **case,
-        **{
-            k: times[k]
-            for k in ("coverage", "mean_colour", "mean_difference", "mean_absolute_difference")
-        },
-    }
-
-
-def print_table(cases):
-    from rich.console import Console
-    from rich.table import Table
-
-    console = Console(width=None if sys.stdout.isatty() else 120)
-    table = Table(
-        title=(
-            "One forward + backward pass in ms, how many times that of raster; peak memory of the"
-            " process in MB (of Dr.Jit)"
-        )
-    )
-    table.add_column("image")
-    table.add_column("triangles", justify="right")
-    for name in CONTENDERS:
-        table.add_column(name, justify="right")
-    table.add_column("move, ms", justify="right")
-    for case in cases:
-        cells = []
-        for name in CONTENDERS:
-            c = case["contenders"][name]
-            ratio = "" if name == "raster" else f"  [bold]{c['ratio']:.1f}x[/bold]"
-            cells.append(f"{c['ms']:.1f}{ratio}\n{c['peak_mb']:.0f} ({c['drjit_peak_mb']:.0f})")
-        table.add_row(
-            case["size"],
-            f"{case['triangles']:,}",
-            *cells,
-            f"{case['contenders']['raster']['move_ms']:.1f}",
-        )
-    console.print(table)
-
-
-def plot(path, cases):
-    from matplotlib.figure import Figure
-
-    triangles = sorted({case["triangles"] for case in cases})
-    figure = Figure(figsize=(4.2 * len(triangles) + 0.6, 4), dpi=110, layout="constrained")
-    rows = figure.subplots(1, len(triangles), sharey=True, squeeze=False)[0]
-    colours = ("#c4572e", "#e0a58c", "#3b6ea5")
-    for axes, count in zip(rows, triangles):
-        chosen = [case for case in cases if case["triangles"] == count]
-        at = [np.prod(parse_size(case["size"])) for case in chosen]
-        for name, colour in zip(CONTENDERS, colours):
-            ms = [case["contenders"][name]["ms"] for case in chosen]
-            axes.plot(at, ms, color=colour, marker="o", markersize=4, label=name)
-            if name == "prb_projective":
-                for x, y, case in zip(at, ms, chosen):
-                    axes.annotate(
-                        f"{case['contenders'][name]['ratio']:.1f}×",
-                        (x, y),
-                        (0, 7),
-                        textcoords="offset points",
-                        ha="center",
-                        fontsize=8,
-                    )
-        axes.set_xscale("log"), axes.set_yscale("log")
-        axes.set_xticks(
-            at, [case["size"].replace("x", "×") for case in chosen], fontsize=8, rotation=30
-        )
-        axes.minorticks_off()
-        axes.margins(y=0.12)
-        axes.set_title(f"{count:,} triangles", fontsize=10)
-        axes.grid(True, color="0.9", linewidth=0.6)
-        axes.spines[["top", "right"]].set_visible(False)
-    rows[0].set_ylabel("forward + backward [ms]")
-    rows[0].legend(frameon=False, fontsize=8)
-    with aside(path) as temporary:
-        figure.savefig(temporary, format="png", facecolor="white")
-
-
-def judge_long_run(growth, kernels):
-    """Memory between iteration 50 (or a sixth) and the end, and kernels that came new after the
-    second iteration.
-    """
-    held, new = growth["resident_mb"], kernels["new"]
-    early = min(50, len(held) // 6)
-    return {
-        "iterations": len(held),
-        "early_iteration": early,
-        "early_mb": held[early - 1],
-        "late_mb": held[-1],
-        "growth_mb": held[-1] - held[early - 1],
-        "kernels_an_iteration": float(np.median(kernels["launched"])),
-        "new_kernels_first_two": sum(new[:2]),
-        "new_kernels_later": sum(new[2:]),
-        "iterations_with_new_kernels": [k + 1 for k, n in enumerate(new) if n],
-    }
-
-
 def parser():
     p = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -502,41 +389,6 @@ def main(arguments=None):
             )
     print_table(cases)
     print_end(report, options.out)
-
-
-def write(report, out):
-    with (
-        aside(os.path.join(out, "raster.json")) as temporary,
-        open(temporary, "w", encoding="utf-8") as file,
-    ):
-        json.dump(report, file, indent=1)
-    plot(os.path.join(out, "raster.png"), report["cases"])
-
-
-def print_end(report, out):
-    size, grid, wanted = TARGET
-    for case in report["cases"]:
-        if (case["size"], case["vertices"]) == (size, grid * grid):
-            c = case["contenders"]["prb_projective"]
-            low, high = c["ratio_quartiles"]
-            print(
-                f"{size}, {grid * grid:,} vertices: raster, RGB and alpha, is {c['ratio']:.2f}"
-                f" times as fast as prb_projective, RGB (quartiles {low:.2f} to {high:.2f};"
-                f" {c['ratio_with_move']:.2f} with the time to move the sheet); wanted: at least"
-                f" {wanted:g}"
-            )
-    r = report["long_run"]
-    print(
-        f"{r['iterations']} iterations of raster at {r['size']}: {r['growth_mb']:+.1f} MB between"
-        f" iteration {r['early_iteration']} and the last ({r['late_mb']:.0f} MB);"
-        f" {r['kernels_an_iteration']:.0f} kernels an iteration, {r['new_kernels_later']} new after"
-        " the second"
-    )
-    load = report["load"]
-    print(
-        f"{report['versions']['variant']}, {report['versions']['machine']}, load {min(load):.1f} to"
-        f" {max(load):.1f}; in {out}: raster.json, raster.png"
-    )
 
 
 if __name__ == "__main__":

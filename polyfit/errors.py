@@ -5,6 +5,8 @@ import importlib.util
 import os
 import signal
 import sys
+from collections.abc import Callable, Iterator
+from typing import NoReturn
 
 
 class InputError(ValueError):
@@ -29,7 +31,7 @@ EXTRAS = {
 }
 
 
-def require(*modules):
+def require(*modules: str) -> None:
     """Raise an :class:`InputError` that names the extra to install, unless all ``modules`` are
     there. For the start of a command that would miss one of them only at its end.
     """
@@ -39,7 +41,7 @@ def require(*modules):
 
 
 @contextlib.contextmanager
-def optional_imports(name):
+def optional_imports(name: str) -> Iterator[None]:
     """A block of imports that need an extra, at the head of a module called ``name``: where the
     module is run as a command (``__main__``) and the extra is missing, it ends as :func:`cli` does.
     """
@@ -51,7 +53,7 @@ def optional_imports(name):
         sys.exit(_fail(_advice(error.name)))
 
 
-def cli(main):
+def cli(main: Callable[[], int | None]) -> NoReturn:
     """Run ``main()`` as a process: its return value is the exit status.
 
     An :class:`InputError`, a missing extra (``EXTRAS``) or an ``OSError`` that names a file ends in
@@ -80,13 +82,13 @@ def cli(main):
     sys.exit(status)
 
 
-def _advice(module):
+def _advice(module: str) -> str:
     return (
         f"{module} is not installed, which this needs: pip install 'polysft-mi[{EXTRAS[module]}]'"
     )
 
 
-def _fail(message):
+def _fail(message: str) -> int:
     coloured = sys.stderr.isatty() and not os.environ.get("NO_COLOR")
     print(
         ("\033[1;31merror:\033[0m " if coloured else "error: ") + " ".join(message.split()),

@@ -17,8 +17,12 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from argparse import ArgumentParser
+from collections.abc import Iterable
 
 from .errors import InputError, cli
+
+Version = tuple[int, ...]
 
 OLDEST_LLVM = 16  # the first that tells its version; an older one is not tried
 PROVEN_LLVM = (19, 22)  # what the tests passed with; any other is tried before it is used
@@ -71,7 +75,7 @@ print(list(area) == [4, 8] and list(dr.grad(distance)) == [4, 0])
 """
 
 
-def find_libllvm(folders=None):
+def find_libllvm(folders: Iterable[str] | None = None) -> tuple[str, Version]:
     """The newest libLLVM that Dr.Jit can use.
 
     ``DRJIT_LIBLLVM_PATH`` goes before everything, and must then hold; else the files of ``folders``
@@ -93,7 +97,7 @@ def find_libllvm(folders=None):
             versions[path] = version
         elif version:
             unusable.add(version[0])
-    for path in sorted(versions, key=versions.get, reverse=True):
+    for path in sorted(versions, key=versions.__getitem__, reverse=True):
         if _usable(path, versions[path]):
             return path, versions[path]
         unusable.add(versions[path][0])
@@ -105,7 +109,7 @@ def find_libllvm(folders=None):
     )
 
 
-def set_variant(mode=None):
+def set_variant(mode: str | None = None) -> str:
     """Set Mitsuba's variant; a second call with the same mode does nothing. Best called before
     ``import mitsuba``, which makes Dr.Jit choose an LLVM.
 
@@ -160,14 +164,14 @@ def set_variant(mode=None):
 
 
 @functools.cache
-def gpu_works():
+def gpu_works() -> bool:
     """Whether ``cuda_ad_rgb`` computes and traces rays here; costs nothing on a machine without an
     NVIDIA driver.
     """
     return _driver_sees_device() and variant_works("cuda_ad_rgb")
 
 
-def variant_works(mode, library=None, timeout=120.0):
+def variant_works(mode: str, library: str | None = None, timeout: float = 120.0) -> bool:
     """Whether a variant traces a ray and takes a derivative, in a process of its own so that a
     broken driver or compiler cannot end this one.
 
@@ -194,7 +198,7 @@ def variant_works(mode, library=None, timeout=120.0):
     return tried.returncode == 0 and tried.stdout.split()[-1:] == ["True"]
 
 
-def add_mode_argument(parser):
+def add_mode_argument(parser: ArgumentParser) -> None:
     """Give an ``argparse`` parser ``-m`` / ``--mode`` as Mitsuba's own command line has it; its
     value is for :func:`set_variant`.
     """
@@ -206,7 +210,7 @@ def add_mode_argument(parser):
     )
 
 
-def _driver_sees_device():
+def _driver_sees_device() -> bool:
     try:
         driver = ctypes.CDLL("libcuda.so.1")
         count = ctypes.c_int()
@@ -219,7 +223,7 @@ def _driver_sees_device():
         return False
 
 
-def _check_chosen(path):
+def _check_chosen(path: str) -> Version:
     accepted = "the file of a newer libLLVM (19, say) is needed; unset it to have one searched"
     if not os.path.isfile(path):
         raise InputError(f"{VARIABLE}={path}: no such file; {accepted}")
@@ -235,13 +239,13 @@ def _check_chosen(path):
     return version
 
 
-def _usable(path, version):
+def _usable(path: str, version: Version) -> bool:
     return version[0] >= OLDEST_LLVM and (
         version[0] in PROVEN_LLVM or variant_works("llvm_ad_rgb", library=path)
     )
 
 
-def _search_folders():
+def _search_folders() -> list[str]:
     prefixes = [os.environ.get("CONDA_PREFIX"), sys.prefix, sys.base_prefix]
     folders = [os.path.join(prefix, "lib") for prefix in prefixes if prefix]
     folders += [folder for folder in os.environ.get("LD_LIBRARY_PATH", "").split(":") if folder]
@@ -262,17 +266,17 @@ def _search_folders():
     return folders
 
 
-def _libraries(folders):
+def _libraries(folders: Iterable[str]) -> list[str]:
     """The libLLVM files in the folders, each real file once, in the folders' order."""
-    found = {}
+    found: dict[str, None] = {}
     for folder in folders:
         for path in sorted(glob.glob(os.path.join(glob.escape(folder), "libLLVM*"))):
             if _NAME.fullmatch(os.path.basename(path)) and os.path.isfile(path):
-                found.setdefault(os.path.realpath(path))
+                found.setdefault(os.path.realpath(path), None)
     return list(found)
 
 
-def _named_version(path):
+def _named_version(path: str) -> Version | None:
     """The version that a file's name tells, as a tuple of ints, or None: libLLVM-14.0.6.so.1 is
     (14, 0, 6), libLLVM.so.19.1 is (19, 1).
     """
@@ -281,7 +285,7 @@ def _named_version(path):
     return tuple(int(part) for part in text.split(".") if part) if text else None
 
 
-def _version(path):
+def _version(path: str) -> Version | None:
     """A library's version as a tuple of ints, told by its name if that is too old to be loaded,
     else by itself; None where it does not load or does not tell.
     """
@@ -303,7 +307,7 @@ def _version(path):
     )
 
 
-def main():
+def main() -> None:
     path, version = find_libllvm()
     print(f"LLVM {'.'.join(str(number) for number in version)}: {path}")
 

@@ -12,6 +12,11 @@ torch reaches the alpha of Dr.Jit.
 Import only after a Mitsuba variant is set.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -22,8 +27,16 @@ from polyfit import jets
 from .surface.patch import Unknowns
 from .surface.template import Template
 
+if TYPE_CHECKING:
+    from polyfit.stn import PolyFit
 
-def template(polyfit, vertices, faces, uv, **options):
+    from .objective.problem import Problem
+    from .surface.patch import JetPatch
+
+
+def template(
+    polyfit: PolyFit, vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, **options: Any
+) -> Template:
     """The :class:`polysft_mi.surface.template.Template` of the mesh in the frame, and of the order,
     of ``polyfit`` (:class:`polyfit.PolyFit`).
 
@@ -45,7 +58,7 @@ def template(polyfit, vertices, faces, uv, **options):
     )
 
 
-def surface(polyfit, points):
+def surface(polyfit: PolyFit, points: torch.Tensor) -> torch.Tensor:
     """The points (..., P, 3) [m] of patches, put onto the patches' jets along the frames' z;
     differentiable to the weights of ``polyfit``."""
     found = polyfit(points)
@@ -53,46 +66,48 @@ def surface(polyfit, points):
     return found.frame.from_chart(jets.point(found.jet.alpha, chart[..., :2]))
 
 
-def in_drjit(function):
+def in_drjit(function: Callable) -> Callable:
     """A Dr.Jit ``function`` as a torch function: of tensors, on tensors, torch's autograd runs
     through it.
     """
     return dr.wrap(source="torch", target="drjit")(function)
 
 
-def in_torch(function):
+def in_torch(function: Callable) -> Callable:
     """A torch ``function`` as a Dr.Jit function: of Dr.Jit tensors and arrays, Dr.Jit's AD runs
     through it.
     """
     return dr.wrap(source="drjit", target="torch")(function)
 
 
-def rendering(problem, seed=0):
+def rendering(
+    problem: Problem, seed: int = 0
+) -> Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor]]:
     """The rendering of a :class:`polysft_mi.objective.problem.Problem` as a torch function:
     vertices (N, 3) [m, camera frame] -> (rgb (H, W, 3) linear, alpha (H, W))."""
 
     @in_drjit
-    def render(vertices):
+    def render(vertices: mi.TensorXf) -> tuple[mi.TensorXf, mi.TensorXf]:
         rgb, alpha = problem.image(_points(vertices.array), seed)
         return rgb, mi.TensorXf(alpha, (problem.height, problem.width))
 
     return lambda vertices: render(vertices.to(torch.float32).contiguous())
 
 
-def deformed(patch):
+def deformed(patch: JetPatch) -> Callable[..., torch.Tensor]:
     """The surface of a :class:`polysft_mi.surface.patch.JetPatch` as a torch function of the
     unknowns: delta_alpha (A,), delta_u, delta_v, delta_w (N,), rotation (4,), translation (3,) ->
     vertices (N, 3) [m, camera frame]."""
 
     @in_drjit
-    def vertices(*unknowns):
+    def vertices(*unknowns: mi.TensorXf) -> mi.TensorXf:
         points = patch.vertices(Unknowns(*(x.array for x in unknowns)))
-        return mi.TensorXf(dr.ravel(points), (dr.width(points), 3))
+        return mi.TensorXf(dr.ravel(points), (dr.width(points), 3))  # type: ignore[call-overload]
 
     return lambda *unknowns: vertices(*(x.to(torch.float32).contiguous() for x in unknowns))
 
 
-def _points(flat):
+def _points(flat: mi.Float) -> mi.Point3f:
     """(3 N,) as a Point3f of N."""
     index = 3 * dr.arange(mi.UInt32, dr.width(flat) // 3)
     return mi.Point3f(*(dr.gather(mi.Float, flat, index + k) for k in range(3)))
