@@ -86,7 +86,7 @@ def checked_size(path, decode=True):
     """
     from PIL import Image, UnidentifiedImageError
 
-    with _silent_decoders():
+    with silent_decoders():
         try:
             with Image.open(path) as image:
                 size = image.size
@@ -139,7 +139,7 @@ class _SilentDecoders:
         return saved
 
 
-_silent_decoders = _SilentDecoders()
+silent_decoders = _SilentDecoders()
 
 
 def read_pixels(path):
@@ -211,7 +211,7 @@ def read_rgb(path):
         raise InputError(f"{path}: HEIC and AVIF are not read; export it as JPEG or PNG")
     path = os.fspath(path)
     checked_size(path)
-    with _silent_decoders():
+    with silent_decoders():
         pixels = read_pixels(path)
     if pixels.ndim == 2:
         pixels = pixels[..., None]
@@ -257,7 +257,7 @@ def _exif(path):
     from PIL import Image
 
     try:
-        with _silent_decoders(), Image.open(path) as image:
+        with silent_decoders(), Image.open(path) as image:
             return image.getexif()
     except (
         OSError,

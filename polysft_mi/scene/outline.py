@@ -10,33 +10,42 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-# Lengths in an image are those for an outline as large as a square of _SIZE pixels; they grow with
-# it.
-_SIZE = 225.0
-_REACH = 8.0  # how far from where it is given an outline is looked for
-_BLUR = 0.4  # of the image
-_ACROSS = 2.5, 1.25, 0.6  # of the edges' strength, across the outline: from afar first
-_LINE = 4.0  # width up to which two opposite edges are those of a drawn line
-_SPACING, _STEP = 2.0, 0.25  # between points along the outline, and between samples across it
-_STRAIGHT = 0.01  # of its size: how far an outline may leave the polygon that is tried in its place
-_PRIOR = (
-    0.1,
-    0.05,
-    # by which a pose that is given may be wrong, where edges do not tell: rotation [rad], shift
-    # over the distance
-)
-_HELD = 0.005  # of the prior's square, in the strength of edges
-_STARTS, _SPREAD = (
-    12,
-    1.0,
-)  # of the search, and by how much they differ in each of six ways [pixels, RMS along the outline]
-_CLEAR, _CLEAR_PART, _PARTS = (
-    1.7,
-    1.4,
-    8,
-    # times the strength of their surroundings that edges must have along the outline, and along
-    # each part
-)
+
+@dataclass(frozen=True)
+class OutlineSettings:
+    """How an outline is searched for. Lengths in pixels are for an outline as large as a square of
+    ``size`` pixels, and grow with it.
+
+    - ``reach``: how far from where it is given an outline is looked for; ``blur``: standard
+      deviation of the image's blur; ``across``: that of the edges' strength across the outline, in
+      the rounds of the search.
+    - ``spacing`` of points along the outline, ``step`` of samples across it; ``line``: width up to
+      which two opposite edges are those of a drawn line.
+    - ``straight``: how far an outline may leave the polygon that is tried in its place, as a share
+      of its size.
+    - ``turn`` [rad], ``shift`` [of the distance]: how wrong a pose that is given may be, where
+      edges do not tell; ``held``: weight of this prior's square.
+    - ``starts`` of the search, and ``spread``: how far they shift the outline [pixels, RMS].
+    - ``clear``, ``clear_part``: least ratio of the edges' strength along the outline to that
+      around it, for all of it and for each of ``parts`` parts.
+    """
+
+    size: float = 225.0
+    reach: float = 8.0
+    blur: float = 0.4
+    across: tuple = (2.5, 1.25, 0.6)
+    spacing: float = 2.0
+    step: float = 0.25
+    line: float = 4.0
+    straight: float = 0.01
+    turn: float = 0.1
+    shift: float = 0.05
+    held: float = 0.005
+    starts: int = 12
+    spread: float = 1.0
+    clear: float = 1.7
+    clear_part: float = 1.4
+    parts: int = 8
 
 
 @dataclass(frozen=True)
@@ -72,7 +81,7 @@ def loops(faces):
     return found
 
 
-def fitted(vertices, faces, camera, image):
+def fitted(vertices, faces, camera, image, settings=None):
     """The :class:`Fit` that takes a mesh's outline to the edges in an image that are near it; None
     where it has none before the camera.
 
@@ -85,23 +94,25 @@ def fitted(vertices, faces, camera, image):
     where a drift from the given pose costs a little. What is tried, either outline with edges
     alone, dark or bright lines, is judged by how clear it is.
     """
+    s = settings or OutlineSettings()
     vertices = np.asarray(vertices, dtype=np.float64)
     around = loops(np.asarray(faces))
     if not around or vertices[:, 2].min() <= 0:
         return None
     position = camera.project(vertices)
     size = math.sqrt(_area(position[faces]))
-    unit = max(1.0, size / _SIZE)
+    unit = max(1.0, size / s.size)
     grey = cv2.GaussianBlur(
-        cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255, (0, 0), _BLUR * unit
+        cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255, (0, 0), s.blur * unit
     )
     found = []
-    for corners in (around, [_straight(loop, position, _STRAIGHT * size) for loop in around]):
+    for corners in (around, [_straight(loop, position, s.straight * size) for loop in around]):
         ends = np.concatenate(
             [np.stack([vertices[loop], vertices[np.roll(loop, -1)]], 1) for loop in corners]
         )
         found += [
-            _Search(ends, camera, grey, unit, line).fit() for line in (None, "dark", "bright")
+            OutlineSearch(ends, camera, grey, unit, line, s).fit()
+            for line in (None, "dark", "bright")
         ]
     return max(found, key=lambda fit: fit.clear)
 
@@ -121,32 +132,34 @@ def _straight(loop, position, tolerance):
     return kept if len(kept) > 2 else loop
 
 
-class _Search:
+class OutlineSearch:
     """An outline with the edges (E, 2, 3) [m, camera frame] in a blurred image ``grey`` (H, W); its
     lengths there are in ``unit`` [pixels]. ``line``: "dark" or "bright" where it is taken for a
     line, else None."""
 
-    def __init__(self, ends, camera, grey, unit, line=None):
+    def __init__(self, ends, camera, grey, unit, line=None, settings=None):
+        s = self.settings = settings or OutlineSettings()
         self.camera, self.grey, self.unit, self.line = camera, grey, unit, line
         length = np.linalg.norm(camera.project(ends[:, 1]) - camera.project(ends[:, 0]), axis=1)
-        count = np.maximum(1, np.round(length / (_SPACING * unit))).astype(int)
+        count = np.maximum(1, np.round(length / (s.spacing * unit))).astype(int)
         edge = np.repeat(np.arange(len(ends)), count)
         at = (np.arange(len(edge)) - np.repeat(np.cumsum(count) - count, count) + 0.5) / count[edge]
         step = ends[edge, 1] - ends[edge, 0]
         self.points = ends[edge, 0] + at[:, None] * step
         self.beside = self.points + 1e-3 * step  # a little further along
         self.centre = self.points.mean(0)
-        self.sd = np.repeat([_PRIOR[0], _PRIOR[1] * self.centre[2]], 3)
-        self.across = unit * np.arange(-_REACH, _REACH + _STEP / 2, _STEP)
+        self.sd = np.repeat([s.turn, s.shift * self.centre[2]], 3)
+        self.across = unit * np.arange(-s.reach, s.reach + s.step / 2, s.step)
 
     def fit(self):
         """The :class:`Fit`, from coarse to fine."""
+        s = self.settings
         turn, shift = Rotation.identity(), np.zeros(3)
-        for sigma in _ACROSS:
-            spread = _SPREAD * self.unit if sigma == _ACROSS[0] else 0.0
+        for sigma in s.across:
+            spread = s.spread * self.unit if sigma == s.across[0] else 0.0
             cost, to_motion = self.costs(turn, shift, sigma)
             starts = (
-                spread * np.random.default_rng(0).normal(size=(_STARTS, 6))
+                spread * np.random.default_rng(0).normal(size=(s.starts, 6))
                 if spread
                 else np.zeros((1, 6))
             )
@@ -160,14 +173,14 @@ class _Search:
             )
             turn, shift = Rotation.from_rotvec(change[:3]) * turn, shift + change[3:]
         position, normal, _ = self._projected(turn, shift)
-        strength = _blurred(self._strength(position, normal), _ACROSS[-1])
-        parts = np.array_split(np.argsort(np.arctan2(*(position - position.mean(0)).T)), _PARTS)
+        strength = self._blurred(self._strength(position, normal), s.across[-1])
+        parts = np.array_split(np.argsort(np.arctan2(*(position - position.mean(0)).T)), s.parts)
         clear, *clear_parts = (
             float(s[:, len(self.across) // 2].mean() / max(s.mean(), 1e-12))
             for s in (strength, *(strength[k] for k in parts))
         )
         moved = np.sqrt(((position - self.camera.project(self.points)) ** 2).sum(1).mean())
-        sure = clear > _CLEAR and min(clear_parts) > _CLEAR_PART and moved <= _REACH * self.unit
+        sure = clear > s.clear and min(clear_parts) > s.clear_part and moved <= s.reach * self.unit
         rotation = turn.as_matrix()
         return Fit(
             rotation, self.centre + shift - rotation @ self.centre, float(moved), clear, bool(sure)
@@ -204,7 +217,7 @@ class _Search:
             np.maximum(sign * slope, 0) for sign in ((-1, 1) if self.line == "dark" else (1, -1))
         )
         last = len(self.across)
-        for half in range(1, int(_LINE / _STEP / 2) + 1):
+        for half in range(1, int(self.settings.line / self.settings.step / 2) + 1):
             line = strength[:, half : last - half]
             np.maximum(
                 line, 2 * np.minimum(before[:, : last - 2 * half], after[:, 2 * half :]), out=line
@@ -217,7 +230,7 @@ class _Search:
         makes of q the rotation [rad] and shift [m]; q is in pixels.
         """
         position, normal, points = self._projected(turn, shift)
-        smooth = _blurred(self._strength(position, normal), sigma)
+        smooth = self._blurred(self._strength(position, normal), sigma)
         scaled = normal * (self.camera.fx, self.camera.fy)
         inwards = ((position - (self.camera.cx, self.camera.cy)) * normal).sum(1)
         by_point = (
@@ -234,6 +247,7 @@ class _Search:
         before = np.concatenate([turn.as_rotvec(), shift]) / self.sd
         held = to_motion / self.sd[:, None]
         rows, last = np.arange(len(smooth)), smooth.shape[1] - 2
+        weight = self.settings.held
 
         def cost(q):
             at = (by_unit @ q - self.across[0]) / step
@@ -241,14 +255,13 @@ class _Search:
             low, high = smooth[rows, k], smooth[rows, k + 1]
             slope = np.where((at > 0) & (at < last + 1), high - low, 0) / step
             drift = before + held @ q
-            value = -(low + np.clip(at - k, 0, 1) * (high - low)).mean() + _HELD * float(
+            value = -(low + np.clip(at - k, 0, 1) * (high - low)).mean() + weight * float(
                 drift @ drift
             )
-            return value, -slope @ by_unit / len(smooth) + 2 * _HELD * drift @ held
+            return value, -slope @ by_unit / len(smooth) + 2 * weight * drift @ held
 
         return cost, to_motion
 
-
-def _blurred(strength, sigma):
-    """Strengths (K, D), blurred by ``sigma`` [pixels of an outline of _SIZE] across the outline."""
-    return cv2.GaussianBlur(strength, (0, 0), sigmaX=sigma / _STEP, sigmaY=1e-6)
+    def _blurred(self, strength, sigma):
+        """Strengths (K, D), blurred by ``sigma`` [pixels of an outline of the settings' size]."""
+        return cv2.GaussianBlur(strength, (0, 0), sigmaX=sigma / self.settings.step, sigmaY=1e-6)

@@ -13,6 +13,7 @@ import numpy as np
 
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError
+from polysft_mi.scene.images import silent_decoders
 
 from .lens import Lens
 
@@ -97,24 +98,22 @@ def _own(values):
 
 def _opencv(text, size):
     """A file as OpenCV's calibration program writes it."""
-    cv2.setLogLevel(0)  # it would tell of a broken file in lines of its own
-    try:
-        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-        K, distortion = (
-            storage.getNode(name).mat() for name in ("camera_matrix", "distortion_coefficients")
-        )
-        width, height = (storage.getNode(name) for name in ("image_width", "image_height"))
-        sizes = [int(n.real()) if n.isInt() else k for n, k in zip((width, height), size)]
-    except (cv2.error, SystemError) as error:
-        reason = getattr(error, "err", None) or "unreadable"
-        raise InputError(f"not a file of OpenCV's ({' '.join(str(reason).split())})") from None
+    with silent_decoders():
+        try:
+            storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+            K, distortion = (
+                storage.getNode(name).mat() for name in ("camera_matrix", "distortion_coefficients")
+            )
+            nodes = [storage.getNode(name) for name in ("image_width", "image_height")]
+            sizes = [int(n.real()) if n.isInt() else k for n, k in zip(nodes, size)]
+        except (cv2.error, SystemError) as error:
+            reason = " ".join(str(getattr(error, "err", None) or "unreadable").split())
+            raise InputError(f"not a file of OpenCV's FileStorage ({reason})") from None
     if K is None:
         raise InputError("no matrix camera_matrix; OpenCV's calibration writes one")
-    camera = Intrinsics.from_matrix(K, *sizes, where="camera_matrix")
-    half = Intrinsics(
-        camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5, camera.width, camera.height
-    )
-    return half, [] if distortion is None else np.ravel(distortion).astype(float).tolist()
+    c = Intrinsics.from_matrix(K, *sizes, where="camera_matrix")
+    camera = Intrinsics(c.fx, c.fy, c.cx + 0.5, c.cy + 0.5, c.width, c.height)
+    return camera, [] if distortion is None else np.ravel(distortion).astype(float).tolist()
 
 
 def _colmap(lines):

@@ -15,7 +15,8 @@ class MaskSettings:
     ``side`` [pixels]: the longer side at which the work is done; ``band``: how far the border may
     lie from where it is expected, as a share of the silhouette's size; ``first_iterations``,
     ``iterations`` of GrabCut in the first frame and in the others; ``overlap``: least share of the
-    mask that the photo must explain for its word on the rest to count.
+    mask that the photo must explain for its word on the rest to count; ``lost`` [pixels]: half the
+    width of a part that only the photo tells, at least.
     """
 
     side: int = 480
@@ -23,6 +24,7 @@ class MaskSettings:
     first_iterations: int = 5
     iterations: int = 2
     overlap: float = 0.8
+    lost: int = 2
 
 
 class Masks:
@@ -86,13 +88,16 @@ class Masks:
         found = self._mask > 0
         if (shown & found).sum() < self._settings.overlap * max(found.sum(), 1):
             return self._mask
-        return self._mask | shown.astype(np.uint8)
+        lost = (shown & ~found).astype(np.uint8)
+        # along the border colours tell better than the map: only what is wide has been lost
+        wide = cv2.morphologyEx(lost, cv2.MORPH_OPEN, _disc(self._settings.lost))
+        return self._mask | (lost & cv2.dilate(wide, _disc(self._settings.lost + 1)))
 
     def _cut(self, image, expected, iterations):
         if not expected.any():
             return expected
         r = max(2, round(self._settings.band * np.sqrt(expected.sum())))
-        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * r + 1, 2 * r + 1))
+        disc = _disc(r)
         inner = cv2.erode(expected, disc, borderValue=1)
         outer = cv2.dilate(expected, disc)
         trimap = np.where(
@@ -128,6 +133,10 @@ class Masks:
             return 255 * self._mask
         soft = cv2.resize(self._mask.astype(np.float32), self._size, interpolation=cv2.INTER_CUBIC)
         return np.where(soft > 0.5, 255, 0).astype(np.uint8)
+
+
+def _disc(radius):
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
 
 
 def _histogram(image, mask):

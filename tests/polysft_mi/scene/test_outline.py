@@ -179,7 +179,7 @@ def test_gradient_against_finite_differences():
     grey = cv2.GaussianBlur(
         cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255, (0, 0), 1.0
     )
-    search = outline._Search(ends, CAMERA, grey, 1.2, "dark")
+    search = outline.OutlineSearch(ends, CAMERA, grey, 1.2, "dark")
     turn, shift = Rotation.from_rotvec((0.01, -0.02, 0.005)), np.array([1e-3, -2e-3, 4e-3])
     cost, to_motion = search.costs(turn, shift, 2.5)
     for seed in range(5):
