@@ -157,7 +157,8 @@ def _add_camera(group):
         "--camera",
         metavar="FILE",
         help="fx, fy, cx, cy, width, height [pixels] as JSON, with distortion (OpenCV's"
-        " coefficients) or none",
+        " coefficients) or none; or OpenCV's YAML or XML, COLMAP's cameras.txt, nerfstudio's"
+        " transforms.json",
     )
     camera.add_argument(
         "--calibrate",
@@ -182,7 +183,12 @@ def main(argv=None):
         from .capture import prepare_folder
 
         scene, line = prepare_folder(
-            args.folder, args.output, args.resolution, args.overwrite, args.pose_fit
+            args.folder,
+            args.output,
+            args.resolution,
+            args.overwrite,
+            args.pose_fit,
+            warn=lambda line: print(line, file=sys.stderr),
         )
         found, lines = {"folder": args.folder}, [line]
     if args.json:

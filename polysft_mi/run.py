@@ -182,8 +182,12 @@ def reconstruct(
     from .results import outputs
     from .scene import experiment as experiments
     from .scene.sequence import Sequence
+    from .surface.meshio import size_note
 
     experiment = experiments.load(scene, overrides)
+    note = size_note(experiment.template.vertices, scene)
+    if note:
+        print(note, file=sys.stderr)
     s = experiment.settings
     sequence = Sequence.open(
         experiment.frames,

@@ -14,12 +14,15 @@ from .layouts import recognise
 from .scene_file import scene_xml
 
 
-def prepare_folder(folder, out=None, resolution=33, overwrite=False, pose_fit="auto"):
+def prepare_folder(
+    folder, out=None, resolution=33, overwrite=False, pose_fit="auto", warn=lambda line: None
+):
     """Write ``scene.xml`` for a sequence into ``out`` (default: the folder itself); for
     Kinect-Paper also ``template.obj``, of that ``resolution``, in its pose of
     :func:`polysft_mi.scene.kinect_paper.template`.
 
-    Everything that the scene names is read and checked first. Returns (path of the scene, what was
+    Everything that the scene names is read and checked first; ``warn`` is given a line about a
+    template whose size is unlikely. Returns (path of the scene, what was
     found, in lines). Raises InputError; then nothing is written.
     """
     folder = os.path.normpath(folder)
@@ -49,6 +52,9 @@ def prepare_folder(folder, out=None, resolution=33, overwrite=False, pose_fit="a
                 f"{os.path.join(target, name)}: is there already; give --overwrite to replace it,"
                 " or another folder by -o"
             )
+    note = meshio.size_note(vertices, where)
+    if note:
+        warn(note)
     text = scene_xml(
         layout, "." if here else os.path.abspath(folder), "template.obj" if template else None
     )

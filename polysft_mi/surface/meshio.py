@@ -9,7 +9,7 @@ import numpy as np
 from polyfit.meshio import read_mesh, write_ply
 from polysft_mi.errors import InputError
 
-__all__ = ["check_template", "read_template", "write_obj", "write_ply"]
+__all__ = ["check_template", "read_template", "size_note", "write_obj", "write_ply"]
 
 
 def read_template(path):
@@ -23,6 +23,24 @@ def write_obj(path, vertices, faces, uv):
         file.writelines("v {:.9g} {:.9g} {:.9g}\n".format(*p) for p in vertices)
         file.writelines("vt {:.9g} {:.9g}\n".format(*t) for t in uv)
         file.writelines("f {0}/{0} {1}/{1} {2}/{2}\n".format(*f) for f in np.asarray(faces) + 1)
+
+
+def size_note(vertices, where="template"):
+    """A line about a template whose size in metres is unlikely, with the factor that would make it
+    likely; None for one that lies between a grain of rice and a house. ``vertices`` (N, 3) [m].
+    """
+    extent, rice, house = float(np.ptp(vertices, axis=0).max()), 0.005, 30.0
+    if rice <= extent <= house:
+        return None
+    # in the order in which people use them
+    units = [("millimetres", 1e-3), ("centimetres", 1e-2), ("micrometres", 1e-6)]
+    units = units if extent > house else [("kilometres", 1e3)]
+    likely = [(unit, factor) for unit, factor in units if 0.02 <= factor * extent <= house]
+    unit, factor = likely[0] if likely else ("another unit", 1 / extent)
+    return (
+        f"note: {where}: the template is {extent:.4g} m large, for lengths are taken for metres; if"
+        f" it is in {unit}, scale it by {factor:g}, to {factor * extent:.3g} m"
+    )
 
 
 def check_template(vertices, faces, uv, where="template"):
