@@ -5,6 +5,8 @@ import shutil
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
+from threadpoolctl import threadpool_limits
+
 from polysft_mi.errors import InputError
 from polysft_mi.scene.images import list_images, read_rgb
 
@@ -51,7 +53,8 @@ def write_frames(folder, frames, masks, expected, straight, progress, registrati
     if masks:
         os.makedirs(os.path.join(folder, "masks"))
     indices, areas, strange, overlap = [], [], [], None
-    with ThreadPoolExecutor(2) as pool:
+    # small matrices: several threads of BLAS would only wait for each other
+    with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(2) as pool:
         pending = []
 
         def write(name, image):
