@@ -15,7 +15,8 @@ import scipy.sparse as sp
 import scipy.sparse.linalg
 from threadpoolctl import threadpool_limits
 
-from polysft_mi.solvers.normal_equations import Blocks, Pattern
+from polysft_mi.solvers.linear import Blocks
+from polysft_mi.surface.pattern import Pattern
 
 
 def grid(side):

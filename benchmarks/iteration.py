@@ -2,8 +2,8 @@
 milliseconds, and what the one whose kernels are recorded (``dr.freeze``) would take if they were
 traced anew each time, in turns.
 
-The template as the scene has it, moved a little, in the video's second frame, at the last stage and
-the lowest order. Each time is a median.
+The template as the scene has it, moved a little, in the video's second frame, at the last stage.
+Each time is a median.
 """
 
 import argparse
@@ -45,62 +45,48 @@ def measured(path, overrides, turns):
     """{part: milliseconds}."""
     import drjit as dr
     import mitsuba as mi
+    from threadpoolctl import threadpool_limits
 
-    from polysft_mi import solvers
     from polysft_mi.objective.problem import Problem
+    from polysft_mi.objective.second_order import SecondOrder
     from polysft_mi.scene import experiment as scene
     from polysft_mi.scene.sequence import Sequence
-    from polysft_mi.solvers.gauss_newton import STAGES
+    from polysft_mi.solvers.gauss_newton.descent import Descent
 
     experiment = scene.load(path, {**overrides, "solver": "gauss-newton"})
     s = experiment.settings
-    problem = Problem(
-        experiment,
-        Sequence.open(
-            experiment.frames,
-            experiment.masks,
-            first=s.first,
-            last=s.last,
-            stride=s.stride,
-            size=experiment.size,
-        ),
-    )
-    solver = solvers.create(s)
-    solver._prepare(problem)
-    known, chart, stage, order = solver.registration, solver.chart, STAGES[-1], solver.least
-    level, system, assembly = (
-        solver.levels[stage],
-        solver.systems[3 if solver._has_relief else 2],
-        known.assembly,
-    )
+    chosen = {"first": s.first, "last": s.last, "stride": s.stride, "size": experiment.size}
+    problem = Problem(experiment, Sequence.open(experiment.frames, experiment.masks, **chosen))
+    objective = SecondOrder(problem)
+    descent, chart, images = Descent(objective), objective.chart, objective.images
+    level = images._level(descent.usual[-1].blur)
+    wide = objective.patterns[3] if objective.has_relief else None
     rest = chart.state(problem.patch.rest().to_numpy())
     rest.translation += 0.005
-    surface = chart.surface(rest, order)
-    vertices, wide = surface.vertices, system.pattern if solver._has_relief else None
-    at = known._frame_level(1, level)
+    surface = chart.surface(rest)
+    vertices, at = surface.vertices, images._frames.level(1, level)
     with dr.suspend_grad():
-        view = known._look(vertices, level)
+        view = images._look(vertices, level)
         given = (
-            *known._compared(view, 1, level, known.appearance(vertices, level)),
+            *images._compared(view, 1, level, images.appearance(vertices, level)),
             dr.opaque(mi.Float, 0.3),
         )
-        table, figures = known._sums(*given)
-        crossings = known.raster.crossings(view, outline=True)
-        outline = (
-            (view.seen(), crossings, at.mask, at.distance, known._corner_of)
-            if at.mask is not None
-            else None
-        )
-        pairs = known._outline(*outline)[1] if outline else None
+        table, figures = images._sums(*given)
+        outline = None
+        if at.mask is not None:
+            crossings = images._raster.crossings(view, outline=True)
+            outline = view.seen(), crossings, at.mask, at.distance, images._corner_of
+        pairs = images._outline(*outline)[1] if outline else None
         sums = table, figures, vertices, 1.0, 1.0, at.area, level.stride, pairs
-        images = assembly.images(*sums)
-        normal, _ = assembly.normal(surface, images, solver.lengths, 1.0, wide)
-        reduced = solver._reduced(normal, 1e-3, np.float32)
+        gathered = images.gather.images(*sums)
+        assembly, lengths = objective._assembly, objective._lengths
+        normal, _ = assembly.normal(surface, gathered, lengths, 1.0, wide)
+        reduced = descent.reduced(normal, 1e-3, np.float32)
     recorded = assembly._in_unknowns
 
     def look():
-        known._last = None
-        known._look(vertices, level)
+        images._last = None
+        images._look(vertices, level)
 
     def traced():
         assembly._in_unknowns = recorded.__wrapped__
@@ -108,25 +94,26 @@ def measured(path, overrides, turns):
         assembly._in_unknowns = recorded
 
     def equations():
-        return assembly.normal(surface, images, solver.lengths, 1.0, wide)
+        return assembly.normal(surface, gathered, lengths, 1.0, wide)
+
+    def silhouette():
+        if outline:
+            images._raster.crossings(view, outline=True)
+            dr.eval(images._outline(*outline))
 
     parts = {
-        "surface of the unknowns": lambda: chart.surface(rest, order),
+        "surface of the unknowns": lambda: chart.surface(rest),
         "visibility: the mesh put into the scene, a ray a pixel": look,
-        "residuals, derivatives, sums over triangles": lambda: dr.eval(known._sums(*given)),
-        "silhouette": lambda: (
-            known.raster.crossings(view, outline=True)
-            and outline
-            and dr.eval(known._outline(*outline))
-        ),
-        "sums at the vertices": lambda: dr.eval(assembly.images(*sums)),
+        "residuals, derivatives, sums over triangles": lambda: dr.eval(images._sums(*given)),
+        "silhouette": silhouette,
+        "sums at the vertices": lambda: dr.eval(images.gather.images(*sums)),
         "normal equations": equations,
         "normal equations, traced": traced,
-        "elimination": lambda: solver._reduced(normal, 1e-3, np.float32),
+        "elimination": lambda: descent.reduced(normal, 1e-3, np.float32),
         "step": reduced.step,
     }
     times = {name: [] for name in parts}
-    with dr.suspend_grad(), solver._blas.limit(limits=1, user_api="blas"):  # as the tracker does
+    with dr.suspend_grad(), threadpool_limits(limits=1, user_api="blas"):  # as the tracker does
         for turn in range(turns + 3):
             for name, run in parts.items():
                 dr.sync_thread()

@@ -103,7 +103,7 @@ def solve(problem, frame, start, iterations, step):
     """
     import mitsuba as mi
 
-    from polysft_mi.objective.problem import BadFrame
+    from polysft_mi.errors import BadFrame
 
     optimizer = mi.ad.Adam(lr=step, uniform=True)
     optimizer["u"] = start

@@ -147,14 +147,12 @@ def measure(folder):
     with np.load(os.path.join(folder, "gt.npz")) as truth:
         found = np.stack([problem.surface(Unknowns.from_numpy(s)) for s in done.states])
         error = 1e3 * np.sqrt(((found - truth["vertices"]) ** 2).sum(2).mean(1))
-    order = max(t["order"] for t in done.totals)
     cpu = np.diff(list(ticks.values())).tolist()
     figures = {
         "seconds": done.seconds[1:],
         "cpu": cpu,
         "evaluations": done.iterations[1:],
         "rmse_mm": error.tolist(),
-        "order": order,
     }
     return {**figures, "started_mb": started, "peak_mb": peak}
 
@@ -203,7 +201,6 @@ def summarise(points, size, found):
         "size": size,
         **{name: float(np.median(found[name])) for name in ("seconds", "cpu")},
         "evaluations": float(np.mean(found["evaluations"])),
-        "order": found["order"],
         "peak_mb": found["peak_mb"],
         "started_mb": found["started_mb"],
         "rmse_mm": float(np.mean(found["rmse_mm"][1:])),
@@ -216,7 +213,7 @@ def report(cases, docs, frames):
     v = cases[0]["versions"]
     rows = [
         f"| {c['vertices']:,} | {c['size'].replace('x', '×')} | {c['cpu']:.2f} |"
-        f" {c['evaluations']:.0f} | {c['order']} | {c['peak_mb']:.0f} | {c['rmse_mm']:.2f} |"
+        f" {c['evaluations']:.0f} | {c['peak_mb']:.0f} | {c['rmse_mm']:.2f} |"
         for c in cases
     ]
     started = np.median([c["started_mb"] for c in cases])
@@ -229,13 +226,13 @@ together: on idle cores it takes less, for reading the next frame and the kernel
 rest. Memory is the process's peak, of which {started:.0f} MB are Python, Mitsuba and LLVM.
 Evaluations are those of the objective with its derivatives. {v["variant"]}, {v["machine"]}.
 
-| vertices | image | seconds a frame | evaluations a frame | order | memory [MB] | RMS [mm] |
-|---:|---|---:|---:|---:|---:|---:|
+| vertices | image | seconds a frame | evaluations a frame | memory [MB] | RMS [mm] |
+|---:|---|---:|---:|---:|---:|
 {chr(10).join(rows)}
 
 ![Seconds a frame and memory over the vertices, and over the pixels](scaling.png)
 
-RMS is the distance from the truth, order the highest that was used. With the image grow decoding,
+RMS is the distance from the truth. With the image grow decoding,
 rays and residuals; only the finest of the three stages works on every pixel that sees the sheet.
 With the template grows above all the elimination of each vertex's (Δu, Δv): a sheet's block
 tridiagonal matrix is as wide as the sheet, so that its factorisation grows with the square of the

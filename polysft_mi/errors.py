@@ -1,7 +1,15 @@
-"""The exception for a user's mistake, and how a command line ends on it: those of
-:mod:`polyfit.errors`, by the same names.
+"""The exceptions of the package, and how a command line ends on them. Those for a user's mistake
+are :mod:`polyfit.errors`', by the same names.
 """
 
 from polyfit.errors import InputError, cli
 
-__all__ = ["InputError", "cli"]
+__all__ = ["BadFrame", "InputError", "cli"]
+
+
+class BadFrame(FloatingPointError):
+    """The objective of ``frame`` is not finite."""
+
+    def __init__(self, frame, value):
+        super().__init__(f"the loss is {value}")
+        self.frame = frame

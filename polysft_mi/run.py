@@ -19,7 +19,7 @@ from .results.progress import Progress
 _EXAMPLES = [
     ("scenes/demo.xml -o out/demo", "the demo; then open out/demo/report.html"),
     (
-        "scenes/flag.xml -D data=/data/flag -o out/flag -D order_max=10 -D last=19",
+        "scenes/flag.xml -D data=/data/flag -o out/flag -D order=6 -D last=19",
         "another place of the data, other settings, 20 frames",
     ),
     ("scenes/flag.xml -D data=/data/flag -o out/flag --resume", "go on after an interruption"),
@@ -234,7 +234,7 @@ def _beginning(problem):
     experiment, template = problem.experiment, problem.template
     return (
         f"template: {len(template.vertices)} vertices\n"
-        f"its jet: order {template.fitted}, residual {1e3 * template.residual_rms:.3g} mm RMS\n"
+        f"its jet: order {template.order}, residual {1e3 * template.residual_rms:.3g} mm RMS\n"
         f"video: {len(problem.sequence.indices)} frames of"
         f" {experiment.size[0]}x{experiment.size[1]},"
         f" {'with' if experiment.masks else 'without'} masks"

@@ -13,9 +13,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from .errors import InputError
+from .errors import BadFrame, InputError
 from .files import aside, naming
-from .objective.problem import TERMS, BadFrame
+from .objective.problem import TERMS
 from .render.device import interruptible
 from .surface.patch import Unknowns
 
@@ -24,12 +24,6 @@ _VISIBLE = (
     0.02  # share of the vertices inside the image below which the surface is said to have left it
 )
 _PAST = 20  # frames that a solver is told of
-_AROUND, _SUSPECT, _SUSPECT_MARGIN = (
-    5,
-    1.25,
-    0.05,
-)  # frames, and how far above their median misfit one is solved again
-_HOLD = 0.1  # weight that then holds it to the middle of its neighbours
 _LOG_EVERY = 10  # iterations between records of the log
 
 
@@ -128,29 +122,21 @@ def track(problem, solver, frames, out, *, resume=False, progress=None, solved=N
             done.save(checkpoint)
             if solved:
                 solved(start, problem.surface(Unknowns.from_numpy(done.states[start])))
-    if hasattr(solver, "revisit") and len(done.totals) == frames and not done.finished:
+    smooth = problem.settings.smooth > 0 and hasattr(solver, "revisit")
+    if smooth and len(done.totals) == frames and not done.finished:
         with interruptible():
-            _look_back(problem, solver, done)
+            _smooth(problem, solver, done)
         done.finished = True
         done.save(checkpoint)
     return done
 
 
-def _look_back(problem, solver, done):
-    """Solve again, now that both neighbours are known: the frames that explain their image far
-    worse than those around them; with ``smooth``, all.
+def _smooth(problem, solver, done):
+    """Solve every frame again, from the last to the first and back, held to the middle of its
+    neighbours by the setting ``smooth``.
     """
-    misfit = np.array([t.get("misfit") or math.nan for t in done.totals])
-    count, smooth = len(misfit), problem.settings.smooth
-    suspect = []
-    for k in range(1, count - 1):
-        around = np.r_[misfit[max(0, k - _AROUND) : k], misfit[k + 1 : k + 1 + _AROUND]]
-        if not misfit[k] <= _SUSPECT * np.nanmedian(around) + _SUSPECT_MARGIN:
-            suspect.append(k)
-    again = [(k, _HOLD) for k in suspect]
-    if smooth > 0:
-        again += [(k, smooth) for k in (*range(count - 2, 0, -1), *range(1, count - 1))]
-    for k, weight in again:
+    count, weight = len(done.totals), problem.settings.smooth
+    for k in (*range(count - 2, 0, -1), *range(1, count - 1)):
         if k in done.unusable:
             continue
         began = time.perf_counter()
@@ -160,10 +146,8 @@ def _look_back(problem, solver, done):
             )
         except BadFrame:
             continue
-        done.states[k], done.totals[k] = (
-            solution.window[0].to_numpy(),
-            _numbers({**solution.terms, **solution.facts}),
-        )
+        done.states[k] = solution.window[0].to_numpy()
+        done.totals[k] = _numbers({**solution.terms, **solution.facts})
         done.sigma[k] = solution.sigma[0]
         done.seconds[k] += time.perf_counter() - began
         done.lost.pop(k, None)

@@ -3,15 +3,18 @@ equations written out. Import only where a Mitsuba variant is set."""
 
 import numpy as np
 import synthetic
+from scipy.spatial.transform import Rotation
 
 from polysft_mi import prepare
 from polysft_mi.objective.problem import Problem
 from polysft_mi.scene import experiment as scene
 from polysft_mi.scene.sequence import Sequence
+from polysft_mi.surface.chart import State
 from polysft_mi.surface.template import Template
 
 
-def problem_of(folder, **settings):
+def problem_of(folder, rules=None, **settings):
+    """The problem of a folder of :mod:`synthetic`, under ``rules`` and settings."""
     prepare.main([str(folder), "--overwrite"])
     experiment = scene.load(str(folder / "scene.xml"), settings)
     s = experiment.settings
@@ -20,10 +23,11 @@ def problem_of(folder, **settings):
         Sequence.open(
             experiment.frames, experiment.masks, first=s.first, last=s.last, size=experiment.size
         ),
+        rules,
     )
 
 
-def grid_template(rows=6, columns=7, order=4, capacity=None, bend=4.0):
+def grid_template(rows=6, columns=7, order=4, bend=4.0):
     vertices = synthetic.sheet(0.7, rows, columns, bend=bend)
     v, u = np.meshgrid(np.linspace(1, 0, rows), np.linspace(0, 1, columns), indexing="ij")
     return Template.fit(
@@ -31,8 +35,16 @@ def grid_template(rows=6, columns=7, order=4, capacity=None, bend=4.0):
         synthetic.grid_faces(rows, columns),
         np.stack([u, v], -1).reshape(-1, 2),
         order,
-        capacity=capacity,
         tolerance=1,
+    )
+
+
+def some_state(chart, rng, size=0.05):
+    """A state of random unknowns of about ``size``."""
+    n, a = len(chart.template.chart), len(chart.bending)
+    turn = Rotation.from_rotvec(rng.normal(size=3) * size)
+    return State(
+        rng.normal(size=a) * size, rng.normal(size=(n, 3)) * size, turn, rng.normal(size=3) * size
     )
 
 

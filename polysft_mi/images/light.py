@@ -14,35 +14,15 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from polysft_mi.scene.rules import Rules
+
 from .pyramid import blur, shrink
 
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # of linear RGB
-# standard deviation of the blur of texture and frames, over the side of a square as large as a
-# triangle is on average
-_BLUR = 0.45
-_COVERED = 0.7  # share of a triangle's pixels that must be seen
-_INSIDE = {
-    True: 0.3,
-    False: 0.97,
-}  # share of a triangle's surroundings that must be texture, by whether frames have masks
-_FRONTAL = 0.3  # cosine between normal and ray from which on a triangle counts
-_DARK = 0.01  # texture's luminance, over its mean, below which it says nothing
-_RIDGE = 3e-3  # what the light is held to be the same from all sides by, in observations a triangle
-_DIMMEST = 0.1  # how bright a triangle is at least, over the light that comes from all sides alike
-_REFITS = 3  # of a frame's robust regression
-# of what the frames before say, from one frame to the next: their surfaces were found under a light
-# that was less well known
-_KEPT = 0.8
 _SIZE = 7  # of the unknowns (l_0, l, g)
 _UPPER = np.triu_indices(_SIZE)
-_FIRST_SCALE, _SCALE, _SCALES = (
-    0.05,
-    8.0,
-    (0.005, 0.05),
-)  # of the robust norm; then so many standard deviations, within bounds, over the texture's mean
-_NORMAL_DEVIATION = (
-    1.4826  # standard deviation of a normal distribution over the median of its absolute values
-)
+# standard deviation of a normal distribution over the median of its absolute values
+_NORMAL_DEVIATION = 1.4826
 
 
 @dataclass
@@ -73,20 +53,23 @@ class Light:
     right: np.ndarray
     deviations: float
     frames: int
+    rules: Rules
 
     @classmethod
-    def unknown(cls):
-        return cls(np.zeros((_SIZE, _SIZE)), np.zeros(_SIZE), 0.0, 0)
+    def unknown(cls, rules):
+        return cls(np.zeros((_SIZE, _SIZE)), np.zeros(_SIZE), 0.0, 0, rules)
 
     @classmethod
-    def of(cls, numbers):
+    def of(cls, numbers, rules):
         """The light that :meth:`numbers` tell of; unknown where they are None."""
         if numbers is None:
-            return cls.unknown()
+            return cls.unknown(rules)
         matrix = np.zeros((_SIZE, _SIZE))
         *upper, deviations, frames = numbers
         matrix[_UPPER] = upper[:-_SIZE]
-        return cls(matrix + np.triu(matrix, 1).T, np.array(upper[-_SIZE:]), deviations, int(frames))
+        return cls(
+            matrix + np.triu(matrix, 1).T, np.array(upper[-_SIZE:]), deviations, int(frames), rules
+        )
 
     def numbers(self):
         """All of it as a list of numbers."""
@@ -96,9 +79,14 @@ class Light:
     def scale(self):
         """The residual, over the texture's mean luminance, from which on one hardly counts."""
         return (
-            float(np.clip(_SCALE * self.deviations / self.frames, *_SCALES))
+            float(
+                np.clip(
+                    self.rules.light_scale * self.deviations / self.frames,
+                    *self.rules.light_scale_bounds,
+                )
+            )
             if self.frames
-            else _FIRST_SCALE
+            else self.rules.light_first_scale
         )
 
     def coefficients(self, triangles):
@@ -113,7 +101,7 @@ class Light:
         """The curvature (7, 7) that holds the coefficients where they are, in squared residuals of
         a triangle.
         """
-        return self.matrix + np.diag([1e-9] + [_RIDGE * triangles] * (_SIZE - 1))
+        return self.matrix + np.diag([1e-9] + [self.rules.light_ridge * triangles] * (_SIZE - 1))
 
     def explaining(self, shade):
         """The light that explains a frame and the frames before it best, where its surface has the
@@ -129,7 +117,7 @@ class Light:
             shade.luminance[shade.seen], (rows @ before)[shade.seen]
         )
         found = before
-        for _ in range(_REFITS):
+        for _ in range(self.rules.light_refits):
             weighted = (area / (1 + ((value - rows @ found) / self.scale) ** 2))[:, None] * rows
             matrix, right = weighted.T @ rows, weighted.T @ value
             found = np.linalg.solve(held + matrix, held @ before + right)
@@ -143,10 +131,11 @@ class Light:
         fit = self.explaining(shade)
         deviation = _NORMAL_DEVIATION * float(np.median(np.abs(fit.residual[shade.seen])))
         return Light(
-            _KEPT * (self.matrix + fit.matrix),
-            _KEPT * (self.right + fit.right),
+            self.rules.light_kept * (self.matrix + fit.matrix),
+            self.rules.light_kept * (self.right + fit.right),
             self.deviations + deviation,
             self.frames + 1,
+            self.rules,
         )
 
 
@@ -174,24 +163,22 @@ class Brightness:
     3).
 
     ``vertices`` (N, 3) [m], ``position`` (N, 2) [pixels]: of the template, and in the image;
-    ``texture`` (H, W, 3), ``inside`` (H, W): reflectance and where the template has it; ``texels``
-    (F, 2): the triangles' centroids there [texels, whole at their centres]; ``density``: texels a
-    pixel; ``masked``: whether the frames have masks. Without them, what lies close to the border is
-    left out, for the background is in it.
+    ``texture``: :class:`polysft_mi.images.texture.Texture`; ``masked``: whether the frames have
+    masks. Without them, what lies close to the border is left out, for the background is in it.
     """
 
-    def __init__(self, faces, vertices, position, texture, inside, texels, density, masked):
-        self.faces, self.centre = faces, vertices.mean(0)
+    def __init__(self, faces, vertices, position, texture, masked, rules):
+        self.faces, self.centre, self.rules = faces, vertices.mean(0), rules
         self.unit = float(np.abs(vertices - self.centre).max())
-        self.sigma = _BLUR * math.sqrt(max(areas(position, faces).mean(), 1.0))
-        sigma = density * self.sigma
+        self.sigma = rules.shading_blur * math.sqrt(max(areas(position, faces).mean(), 1.0))
+        sigma, inside, centroids = texture.density * self.sigma, texture.inside, texture.centroids()
         covered = cv2.GaussianBlur(inside, (0, 0), sigma)
-        luminance = blur(texture @ _LUMINANCE, sigma, inside if masked else None)
-        found = _sampled(luminance, texels)
-        self.trusted = _sampled(covered, texels) > _INSIDE[masked]
+        luminance = blur(texture.image @ _LUMINANCE, sigma, inside if masked else None)
+        found = _sampled(luminance, centroids)
+        self.trusted = _sampled(covered, centroids) > rules.shading_inside[not masked]
         self.mean = max(float(found[self.trusted].mean()) if self.trusted.any() else 0.0, 1e-6)
         self.texture = found / self.mean
-        self.trusted &= self.texture > _DARK
+        self.trusted &= self.texture > rules.shading_dark
 
     def prepared(self, colour, mask):
         """A frame ``colour`` (H, W, 3) [linear RGB] with its ``mask`` (H, W) or None, as :meth:`of`
@@ -220,7 +207,7 @@ class Brightness:
         centre = corner.sum(1) / 3
         normal *= -np.sign(np.einsum("fk,fk->f", normal, centre - origin))[:, None]
         value = light[0] + normal @ light[1:4] + (centre - self.centre) @ light[4:] / self.unit
-        value = np.maximum(value, _DIMMEST * abs(light[0]))
+        value = np.maximum(value, self.rules.light_dimmest * abs(light[0]))
         total, count = (
             sum(np.bincount(k, w, len(vertices)) for k in self.faces.T)
             for w in (value, np.ones(len(value)))
@@ -241,12 +228,20 @@ class Brightness:
         towards = -np.einsum("fk,fk->f", cross, ray)
         facing = np.sign(towards)
         normal = cross * (facing / double)[:, None]
-        frontal = np.abs(towards) > _FRONTAL * double * np.sqrt(np.einsum("fk,fk->f", ray, ray))
+        frontal = np.abs(towards) > self.rules.shading_frontal * double * np.sqrt(
+            np.einsum("fk,fk->f", ray, ray)
+        )
         luminance = _sampled(image, (position[self.faces].sum(1) / 3) / pool - 0.5)
         texture = (
-            self.texture if texture is None else np.where(texture > _DARK, texture, self.texture)
+            self.texture
+            if texture is None
+            else np.where(texture > self.rules.shading_dark, texture, self.texture)
         )
-        seen = self.trusted & frontal & (pixels > _COVERED * areas(position, self.faces))
+        seen = (
+            self.trusted
+            & frontal
+            & (pixels > self.rules.shading_covered * areas(position, self.faces))
+        )
         centre = (corner.sum(1) / 3 - self.centre) / self.unit
         return Shade(
             normal, centre, self.unit, texture, luminance, seen, (a, b), double / 2, facing

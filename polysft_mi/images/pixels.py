@@ -30,7 +30,6 @@ CURVATURES, SLOPES, FIGURES = 18, 9, 4  # sums over the pixels of a triangle
 TAPS = 2  # across a pixel's footprint on the texture, and along it
 # pixels by which a ray may pass the triangle that it meets: it and the projection round differently
 _BEYOND = 0.01
-_LONGEST_FOOTPRINT = 12.0  # of a pixel, beyond which it is cut [pixels of the first frame]
 
 
 @dataclass
@@ -93,7 +92,7 @@ class Sheet:
 
 
 @dataclass
-class Met:
+class RayHit:
     """What the ray ``ray`` of a pixel meets: the ``triangle``, its barycentric coordinates ``b1``,
     ``b2``, its edges ``e1``, ``e2`` [m], the place ``at`` on the texture [texels], and that's
     derivatives ``c1``, ``c2`` by b1 and b2 [texture coordinates].
@@ -123,8 +122,8 @@ class Met:
         )
 
 
-def met(seen, sheet):
-    """:class:`Met` of all pixels of a :class:`polysft_mi.render.view.Seen`."""
+def ray_hits(seen, sheet):
+    """:class:`RayHit` of all pixels of a :class:`polysft_mi.render.view.Seen`."""
     hit = seen.hit
     triangle = mi.UInt32(dr.select(hit, seen.triangle, 0))
     index, flat, (ray, _) = sheet.corners(triangle, hit), mi.Float(seen.positions), seen.rays()
@@ -137,7 +136,7 @@ def met(seen, sheet):
     b1 = dr.dot(tv, pv) * inverse
     b2 = dr.dot(ray.d, dr.cross(tv, e1)) * inverse
     at = (c0 + (c1 - c0) * b1 + (c2 - c0) * b2) * sheet.scale + sheet.shift
-    return Met(ray, triangle, b1, b2, e1, e2, at, c1 - c0, c2 - c0)
+    return RayHit(ray, triangle, b1, b2, e1, e2, at, c1 - c0, c2 - c0)
 
 
 def places(seen):
@@ -160,7 +159,7 @@ def compared(seen, sheet, texture, frame, excess):
     ``texture``: an :class:`Image` whose fourth channel tells where it is trusted; ``frame``: one
     with the weights in its fourth, which has the ``excess``, or None, beyond the texture.
     """
-    hit, found = seen.hit, met(seen, sheet)
+    hit, found = seen.hit, ray_hits(seen, sheet)
     colour, by_x, by_y = texture.bilinear(found.at, hit)
     x, y = places(seen)
     pixel, known = frame.at(x, y)
@@ -301,7 +300,7 @@ def packed(columns, index):
     return out
 
 
-def rendered(seen, sheet, texture, fine, lit, stride):
+def rendered(seen, sheet, texture, fine, lit, stride, footprint_limit):
     """The sheet as the camera has it before any blur: colour and, in the fourth channel, the light
     on it (0 where there is no sheet), Vector4f of n; and the ``texture``, an :class:`Image`, as
     :func:`compared` takes it, likewise.
@@ -310,14 +309,14 @@ def rendered(seen, sheet, texture, fine, lit, stride):
     light on the triangles; ``stride`` Float: pixels of the video to one of the grid, times the
     texels to a pixel.
     """
-    hit, found = seen.hit, met(seen, sheet)
+    hit, found = seen.hit, ray_hits(seen, sheet)
     template = texture.bilinear(found.at, hit)[0]
     grad1, grad2, slide = found.plane()
     footprint = []
     for pixel in across(seen):
         pixel -= found.ray.d * dr.dot(slide, pixel)
         step = (found.c1 * dr.dot(grad1, pixel) + found.c2 * dr.dot(grad2, pixel)) * sheet.scale
-        footprint.append(step * dr.minimum(1, _LONGEST_FOOTPRINT * stride * dr.rcp(dr.norm(step))))
+        footprint.append(step * dr.minimum(1, footprint_limit * stride * dr.rcp(dr.norm(step))))
     colour = mi.Vector4f(0)
     for i in range(TAPS):
         for j in range(TAPS):

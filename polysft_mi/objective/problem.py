@@ -11,10 +11,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from polysft_mi.errors import InputError
+from polysft_mi.errors import BadFrame, InputError
 from polysft_mi.render.device import interruptible
 from polysft_mi.render.pinhole import Pinhole
 from polysft_mi.render.raster import RasterIntegrator
+from polysft_mi.scene.rules import Rules
 from polysft_mi.surface.patch import JetPatch
 
 from . import terms as objective
@@ -48,14 +49,6 @@ class Target:
     area: mi.Float
 
 
-class BadFrame(FloatingPointError):
-    """The objective of ``frame`` is not finite."""
-
-    def __init__(self, frame, value):
-        super().__init__(f"the loss is {value}")
-        self.frame = frame
-
-
 class Problem:
     """Shape from template on one video.
 
@@ -63,7 +56,8 @@ class Problem:
     :class:`polysft_mi.scene.sequence.Sequence`.
     """
 
-    def __init__(self, experiment, sequence):
+    def __init__(self, experiment, sequence, rules=None):
+        self.rules = rules or Rules()
         self.experiment, self.sequence, self.settings = experiment, sequence, experiment.settings
         self.template = experiment.template
         self.patch = JetPatch(self.template)

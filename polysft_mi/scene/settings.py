@@ -30,13 +30,10 @@ class Settings:
     stride: int = _setting(1, "use every stride-th image", low=1)
     order: int = _setting(
         0,
-        "order n of the jet, the lowest for gauss-newton; 0: 8 for gauss-newton, 4 (the paper's)"
+        "order n of the jet; 0: 8 for gauss-newton, 4 (the paper's)"
         " for adam, or less where the template's vertices determine no more",
         low=0,
         high=10,
-    )
-    order_max: int = _setting(
-        14, "order up to which gauss-newton may raise the jet; at least ``order``", low=1, high=14
     )
     fit_tolerance: float = _setting(
         0.05,
@@ -130,14 +127,9 @@ class Settings:
         )
 
     @property
-    def least(self):
-        """The order of the template's jet, and the lowest of a frame's."""
-        return self.order or {"gauss-newton": min(8, self.order_max), "adam": 4}[self.solver]
-
-    @property
-    def capacity(self):
-        """The highest order that the solver may use."""
-        return max(self.least, self.order_max) if self.solver == "gauss-newton" else self.least
+    def jet_order(self):
+        """The order of the jet, where the template's vertices determine it."""
+        return self.order or {"gauss-newton": 8, "adam": 4}[self.solver]
 
     def __post_init__(self):
         for f in dataclasses.fields(self):

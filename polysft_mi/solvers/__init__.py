@@ -1,27 +1,14 @@
-"""Solvers, by the name that the setting ``solver`` takes.
+"""Solvers, by the name that the setting ``solver`` takes: images of a window of frames in, unknowns
+that explain them out.
 
-A solver is built from :class:`polysft_mi.scene.settings.Settings` and has ``solve(problem, window,
-frames, report=None, past=()) -> Solution``; it sees :class:`polysft_mi.objective.problem.Problem`
-only through its methods. To add one: a module here, its name in ``create`` and in the setting's
-choices.
+A solver is built from :class:`polysft_mi.scene.settings.Settings`. It has ``solve(problem, window,
+frames, report=None, past=())``, which returns a :class:`polysft_mi.solvers.solution.Solution`. To
+add one, write a module here, and put its name into :func:`create` and the setting's choices.
 """
 
-from dataclasses import dataclass, field
+from .solution import Solution
 
-
-@dataclass
-class Solution:
-    """``window``: list of Unknowns; ``total`` and ``terms``: the objective there; ``iterations``:
-    evaluations that it took; ``facts``: other numbers, and lists of them, that the solver wants to
-    see again in ``past``; ``sigma``: for each frame of the window the standard deviation (N,) [m]
-    of each vertex along its ray, or None where the solver has none."""
-
-    window: list
-    total: float
-    terms: dict
-    iterations: int
-    facts: dict = field(default_factory=dict)
-    sigma: list | None = None
+__all__ = ["Solution", "create"]
 
 
 def create(settings):

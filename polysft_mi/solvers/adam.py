@@ -7,7 +7,7 @@ import math
 
 import mitsuba as mi
 
-from . import Solution
+from .solution import Solution
 
 
 class Adam:

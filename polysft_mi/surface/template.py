@@ -22,9 +22,8 @@ class Template:
     ``vertices`` (N, 3) [m, camera frame] and ``faces`` (F, 3) as in the file; ``uv`` (N, 2) texture
     coordinates, v up; ``scale`` [m], ``rotation`` (3, 3), ``origin`` (3,) [m]: the orientation O =
     (s, R, T), p = s R x + T; ``chart`` (N, 2): (u, v) of each vertex, at most 1 in norm; ``alpha``
-    (A,): the jet, in the chart's unit, zero beyond the order that was fitted; ``residual`` (N,)
-    [m]: signed distance along the chart's normal that the jet leaves; ``fitted``: the order that
-    was fitted.
+    (A,): the jet, in the chart's unit; ``residual`` (N,) [m]: signed distance along the chart's
+    normal that the jet leaves.
     """
 
     vertices: np.ndarray
@@ -36,11 +35,10 @@ class Template:
     chart: np.ndarray
     alpha: np.ndarray
     residual: np.ndarray
-    fitted: int
 
     @property
     def order(self):
-        """The order that the coefficients are for."""
+        """The order of the jet."""
         return order_of(len(self.alpha))
 
     @property
@@ -70,16 +68,14 @@ class Template:
         uv,
         order,
         *,
-        capacity=None,
         exact=True,
         frame=None,
         tolerance=0.05,
         where="template",
     ):
         """Fit a jet of ``order`` to the mesh, in ``frame``, a
-        :class:`polyfit.frames.CanonicalFrame` in float64, or else in its PCA frame; it has the
-        coefficients of order ``capacity`` (default: the same), those beyond ``order`` zero. Where
-        not ``exact``, vertices that determine less get the highest order that they do.
+        :class:`polyfit.frames.CanonicalFrame` in float64, or else in its PCA frame. Where not
+        ``exact``, vertices that determine less get the highest order that they do.
 
         Raises InputError where the order is too high for the vertices (if ``exact``), where the
         surface folds over in its chart (a closed surface does), or where the largest residual
@@ -106,12 +102,11 @@ class Template:
             rotation,
             origin,
             x[:, :2],
-            np.pad(alpha, (0, size_of(max(order, capacity or order)) - len(alpha))),
+            alpha[: size_of(fitted)],
             (x[:, 2] - height) * float(scale),
-            fitted,
         )
         measured = (
-            f"the residual of the {template.fitted}-jet is {1e3 * template.residual_rms:.3g} mm"
+            f"the residual of the {template.order}-jet is {1e3 * template.residual_rms:.3g} mm"
             f" RMS, {1e3 * template.residual_max:.3g} mm at most, of a radius of"
             f" {1e3 * template.scale:.3g} mm"
         )

@@ -7,6 +7,7 @@ import math
 import shutil
 from pathlib import Path
 
+import best_jets
 import numpy as np
 import pytest
 import synthetic
@@ -332,7 +333,7 @@ def template_of(sheet, order):
 
 
 def test_a_jet_that_was_turned_is_found_again(sheet):
-    from polysft_mi.solvers.normal_equations import Chart
+    from polysft_mi.surface.chart import Chart
 
     template, rng = template_of(sheet, 4), np.random.default_rng(0)
     chart = Chart(template)
@@ -344,9 +345,9 @@ def test_a_jet_that_was_turned_is_found_again(sheet):
     truth = chart.surface(
         chart.state({**arrays, "rotation": turn, "translation": [0.1, 0, 0.2]})
     ).vertices
-    found = sft.best_jets(template, truth[None])
+    found = best_jets.best_jets(template, truth[None])
     heights = chart.surface(
-        chart.state(sft._standing_in(template, truth, template.rotation))
+        chart.state(best_jets._standing_in(template, truth, template.rotation))
     ).vertices
     assert (
         metrics.rmse(heights, truth) > 1e-4
@@ -359,7 +360,7 @@ def test_best_jets_get_better_with_their_order_and_than_heights(sheet):
     distance = {}
     for order in (2, 4, 6):
         template = template_of(sheet, order)
-        distance[order] = metrics.rmse(sft.best_jets(template, truth[None])[0], truth)
+        distance[order] = metrics.rmse(best_jets.best_jets(template, truth[None])[0], truth)
     assert distance[6] < distance[4] < distance[2]
     assert distance[2] > 1e-4
 

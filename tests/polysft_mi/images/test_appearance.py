@@ -2,6 +2,7 @@
 slanted, lit sheets against their own images.
 """
 
+import dataclasses
 import math
 
 import drjit as dr
@@ -14,9 +15,11 @@ from scipy.spatial.transform import Rotation
 
 from polysft_mi import solvers
 from polysft_mi.images import pixels
+from polysft_mi.images.light import Light
 from polysft_mi.images.pyramid import Level, level_image
 from polysft_mi.images.registration import Registration
-from polysft_mi.solvers import gauss_newton
+from polysft_mi.objective.second_order import Context, SecondOrder
+from polysft_mi.solvers.gauss_newton.descent import Descent
 from polysft_mi.surface.patch import Unknowns
 from polysft_mi.tracker import track
 
@@ -70,13 +73,13 @@ def compared(known, vertices, frame, level, appearance):
     """
     with dr.suspend_grad():
         view = known._look(vertices, level)
-        at = known._frame_level(frame, level).image
+        at = known._frames.level(frame, level).image
         residual, weight, *_ = pixels.compared(*known._compared(view, frame, level, appearance))
         pixel, inside = at.at(*pixels.places(view))
         seen = residual + dr.gather(mi.Vector4f, at.texels, pixel, inside)
     x0, y0, *_ = (int(k[0]) for k in view.region)
     w, h = view.size
-    rows, columns = known.problem.height // level.stride, known.problem.width // level.stride
+    rows, columns = known._problem.height // level.stride, known._problem.width // level.stride
     colour, where = np.zeros((rows, columns, 3)), np.zeros((rows, columns), bool)
     colour[y0 : y0 + h, x0 : x0 + w] = np.array(seen).T[:, :3].reshape(h, w, 3)
     where[y0 : y0 + h, x0 : x0 + w] = np.array(weight).reshape(h, w) > 0
@@ -90,7 +93,7 @@ def test_it_is_a_rendering_made_what_frames_are_made(problem, level):
     appearance = known.appearance(vertices, level)
     with dr.suspend_grad():
         known._look(vertices, Level(1.0))
-        image = np.array(known.raster.image(known.scene, known.sensor, spp=36))
+        image = np.array(known._raster.image(known._scene, known._sensor, spp=36))
     cover = (image[..., 3] > 0.5).astype(np.float32)
     colour = (image[..., :3] / np.maximum(image[..., 3:], 1e-3) * cover[..., None]).astype(
         np.float32
@@ -134,7 +137,7 @@ def test_gradient_and_curvature_are_those_of_a_frame_that_has_the_excess(problem
     vertices = truth.vertices[2]
     appearance = known.appearance(vertices + [0.001, 0, 0.002], level)
     mine = known.evaluate(vertices, frame, level, 0.3, appearance)
-    at, extra = known._frame_level(frame, level), appearance.excess
+    at, extra = known._frames.level(frame, level), appearance.excess
     h, w, rows, columns = (
         int(k[0]) for k in (extra.height, extra.width, at.image.height, at.image.width)
     )
@@ -189,31 +192,25 @@ def test_the_last_view_is_kept_and_no_other(problem, truth):
     assert known.evaluate(moved, 1, level, 0.3).photometric != values[0]
 
 
-def test_each_stage_begins_with_what_the_sheet_looks_like(problem, truth, monkeypatch):
-    solver = gauss_newton.GaussNewton(problem.settings)
-    solver._prepare(problem)
-    rest = solver.chart.state(problem.patch.rest().to_numpy())
-    known, levels = solver.registration, []
-    original = known.appearance
-    monkeypatch.setattr(
-        known,
-        "appearance",
-        lambda vertices, level, light, shaded: (
-            levels.append((level, shaded)) or original(vertices, level, light, shaded)
-        ),
-    )
-    solver._expect(1)
-    solver._noise = 1.0  # whatever is left is noise
-    solver._descend(rest, rest, 1, 4, (gauss_newton.FAR, *gauss_newton.STAGES))
-    usual = [
-        (solver.levels[stage], stage is gauss_newton.STAGES[-1]) for stage in gauss_newton.STAGES
-    ]
-    assert levels == usual
-    levels.clear()
-    solver._noise = 0.0
-    monkeypatch.setattr(gauss_newton, "_UNEXPLAINED", 0.0)
-    solver._descend(rest, rest, 1, 4, gauss_newton.STAGES)
-    assert levels[:5] == [*usual, *usual[1:]]  # what is not explained is looked at again
+def test_each_stage_begins_with_what_the_sheet_looks_like(problem, monkeypatch):
+    descent = Descent(SecondOrder(problem))
+    chart, images, seen = descent.objective.chart, descent.objective.images, []
+    rest, original = chart.state(problem.patch.rest().to_numpy()), images.appearance
+
+    def appearance(vertices, blur, light, shaded):
+        seen.append((blur, shaded))
+        return original(vertices, blur, light, shaded)
+
+    monkeypatch.setattr(images, "appearance", appearance)
+    blurs = problem.rules.blurs
+    usual = [(blur, blur == blurs[-1]) for blur in blurs]
+    context = Context(1, rest, 1.0, Light.unknown(problem.rules), {})  # all that is left is noise
+    descent.descend(rest, context, (descent.far, *descent.usual))
+    assert seen == usual
+    seen.clear()
+    monkeypatch.setattr(descent, "rules", dataclasses.replace(problem.rules, explained=0.0))
+    descent.descend(rest, dataclasses.replace(context, noise=0.0), descent.usual)
+    assert seen[:5] == [*usual, *usual[1:]]  # what is not explained is looked at again
 
 
 def test_slanted_and_lit_sheets_are_followed(truth, tmp_path):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import LinAlgError
 
-from polysft_mi.solvers import lapack
+from polysft_mi.solvers.linear import lapack
 
 RNG = np.random.default_rng(8)
 TOLERANCE = {np.float32: 1e-4, np.float64: 1e-11}

@@ -48,12 +48,12 @@ def test_frame_and_jet_are_those_of_polyfit(narrow):
         vertices = (
             vertices * [1, narrow, narrow] + 1e-3 * narrow * rng.normal(size=vertices.shape)
         ) @ turn.T
-        t = Template.fit(vertices, faces, uv, order, capacity=10, exact=False, tolerance=np.inf)
+        t = Template.fit(vertices, faces, uv, order, exact=False, tolerance=np.inf)
         points = torch.as_tensor(vertices)
         frame = CanonicalFrame.from_points(points)
         x = frame.to_chart(points)
         jet = jets.fit(x, order)
-        assert t.fitted == jet.order and t.scale == pytest.approx(float(frame.s), rel=1e-12)
+        assert t.order == jet.order and t.scale == pytest.approx(float(frame.s), rel=1e-12)
         np.testing.assert_allclose(t.rotation, frame.R, atol=1e-9)
         np.testing.assert_allclose(t.origin, frame.T, atol=1e-12)
         np.testing.assert_allclose(t.chart, x[:, :2], atol=1e-9)
@@ -81,7 +81,7 @@ def test_what_the_vertices_hardly_determine_is_as_in_polyfit(jitter):
     t = Template.fit(vertices, faces, uv, 5, exact=False, tolerance=np.inf)
     points = torch.as_tensor(vertices)
     assert (
-        t.fitted
+        t.order
         == jets.fit(CanonicalFrame.from_points(points).to_chart(points), 5).order
         == {1e-8: 3, 1e-4: 4}[jitter]
     )
@@ -101,9 +101,9 @@ def test_vertices_that_coincide_are_refused():
 
 
 def test_vertices_that_determine_less_get_less():
-    t = Template.fit(*grid(5, 4), 8, capacity=10, exact=False)
-    assert t.fitted == 3 and t.order == 10 and t.residual_max < 1e-12
-    assert Template.fit(*grid(), 8).fitted == 8
+    t = Template.fit(*grid(5, 4), 8, exact=False)
+    assert t.order == 3 and t.residual_max < 1e-12
+    assert Template.fit(*grid(), 8).order == 8
 
 
 def test_polynomial_surface_leaves_nothing():

@@ -25,8 +25,8 @@ class Relocator:
     def __init__(self, registration):
         self.camera = registration.camera
         self._detector = cv2.SIFT_create(nfeatures=2000, contrastThreshold=0.02)
-        texture = registration.texture
-        inside = registration.texture_inside.astype(np.uint8)
+        texture = registration.texture.image
+        inside = registration.texture.inside.astype(np.uint8)
         keys, self._descriptors = self._detector.detectAndCompute(grey(texture), inside)
         self._points = (
             registration.on_template(np.array([k.pt for k in keys]).reshape(-1, 2))

@@ -1,0 +1,115 @@
+"""The best that one jet can do: jets fitted to the true vertices of each frame."""
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from polyfit import jets
+from polyfit.frames import CanonicalFrame
+from polysft_mi.results import metrics
+from polysft_mi.surface.chart import Chart
+from polysft_mi.surface.template import Template
+
+
+def best_jets(template, truth):
+    """The jets of the template's order that come closest to the true vertices (T, N, 3) [m], at the
+    vertices: (T, N, 3) [m].
+
+    A jet may turn and move, and each vertex may slide on it. What comes closest in the end, by
+    least squares, is kept of three starts: the template's orientation laid over the truth, the
+    truth's own principal axes, and the jet of the frame before. From the first two the order rises
+    by and by; at once, it ends farther off. The search is local all the same.
+    """
+    orders = [*range(2, template.order, 2), template.order]
+    parts = (template.vertices, template.faces, template.uv)
+    charts = [
+        Chart(template if n == template.order else Template.fit(*parts, n, tolerance=np.inf))
+        for n in orders
+    ]
+    previous, surfaces = None, []
+    for V in np.asarray(truth, dtype=np.float64):
+        over = _rotation_onto(template.vertices, V) @ template.rotation
+        axes = CanonicalFrame.from_points(torch.as_tensor(V)).R.numpy()
+        found = [
+            _risen(charts, _standing_in(charts[0].template, V, turn), V)
+            for turn in (over, _turned_to(over, axes[:, 2]))
+        ]
+        if previous is not None:
+            found.append(_refined(charts[-1], previous, V))
+        previous = min(found, key=lambda x: x[1])[0]
+        surfaces.append(charts[-1].surface(previous).vertices)
+    return np.stack(surfaces)
+
+
+def _risen(charts, arrays, V):
+    """(state, distance [m]) as of :func:`_refined` in the last chart, by way of those before it;
+    ``arrays`` are unknowns of the first.
+    """
+    for k, chart in enumerate(charts):
+        if k:  # the same jet in the higher order
+            lower = charts[k - 1].template.alpha + arrays["delta_alpha"]
+            alpha = np.pad(lower, (0, len(chart.template.alpha) - len(lower)))
+            arrays = {**arrays, "delta_alpha": alpha - chart.template.alpha}
+        state, distance = _refined(chart, chart.state(arrays), V)
+        arrays = chart.arrays(state)
+    return state, distance
+
+
+def _rotation_onto(A, B):
+    """The rotation (3, 3) that, with a translation, takes points A (N, 3) closest to B (N, 3)."""
+    left, _, right = np.linalg.svd((B - B.mean(0)).T @ (A - A.mean(0)))
+    return left @ np.diag([1, 1, np.linalg.det(left) * np.linalg.det(right)]) @ right
+
+
+def _turned_to(rotation, axis):
+    """The rotation (3, 3), turned the shortest way so that its third column lies along ``axis``
+    (3,) or against it.
+    """
+    z = rotation[:, 2]
+    axis = axis * (1 if axis @ z >= 0 else -1)
+    v, c = np.cross(z, axis), z @ axis
+    K = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+    return (np.eye(3) + K + K @ K / (1 + c)) @ rotation
+
+
+def _standing_in(template, V, axes):
+    """Unknowns, as ``params.npz`` names them: the least-squares jet of the heights of V (N, 3) over
+    the first two columns of ``axes``.
+    """
+    y = (V - template.origin) @ template.rotation / template.scale
+    turn = template.rotation.T @ axes
+    x = (y - y.mean(0)) @ turn
+    alpha = jets.fit(torch.as_tensor(x), template.order).alpha.numpy()
+    return {
+        "delta_alpha": alpha - template.alpha,
+        "delta_u": x[:, 0] - template.chart[:, 0],
+        "delta_v": x[:, 1] - template.chart[:, 1],
+        "delta_w": np.zeros(len(x)),
+        "rotation": Rotation.from_matrix(turn).as_quat(),
+        "translation": y.mean(0),
+    }
+
+
+def _refined(chart, state, V, steps=60):
+    """(state, distance [m]): Gauss-Newton from a state towards the vertices V (N, 3), with steps
+    shortened where they gain more so.
+    """
+    distance = lambda s: metrics.rmse(chart.surface(s).vertices, V)
+    least = distance(state)
+    for _ in range(steps):
+        try:
+            whole = chart.fitted(state, V, iterations=1, bending=1e-9)
+            tried = [
+                (distance(x), x)
+                for x in (state.towards(whole, -back) for back in (0, 0.5, 0.75, 0.9, 0.97))
+            ]
+        except (np.linalg.LinAlgError, ValueError):
+            break
+        now, there = min(tried, key=lambda x: x[0] if np.isfinite(x[0]) else np.inf)
+        if not now < least:
+            break
+        gained = 1 - now / max(least, 1e-30)
+        state, least = there, now
+        if gained < 1e-4:
+            break
+    return state, least

@@ -1,0 +1,101 @@
+"""The video's frames as the tracker compares them: read ahead, level by level, kept while needed.
+
+Import only after a Mitsuba variant is set.
+"""
+
+import math
+from collections import OrderedDict
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+
+import mitsuba as mi
+import numpy as np
+
+from polysft_mi.errors import BadFrame
+from polysft_mi.render.device import on_device
+
+from . import pixels
+from .pyramid import level_image
+from .texture import packed_image
+
+_CACHED = 4  # frames a level
+
+
+@dataclass
+class Frame:
+    """A frame at a level, on the device.
+
+    ``image``: its colours, with the pixels' weights in the fourth channel. Where it has a mask:
+    ``mask``, the ``distance`` to its contour, its ``area`` [pixels of the grid], and the sum of its
+    ``squares``.
+    """
+
+    image: pixels.Image
+    mask: pixels.Image | None = None
+    distance: mi.Float | None = None
+    area: float | None = None
+    squares: float | None = None
+
+    @classmethod
+    def of(cls, level_image):
+        """From a :class:`polysft_mi.images.pyramid.LevelImage`."""
+        shape, corner, mask = level_image.inside.shape, level_image.corner, level_image.mask
+        packed = packed_image(level_image.colour, level_image.inside)
+        frame = cls(pixels.Image.of(packed, shape, corner))
+        if mask is not None:
+            frame.mask = pixels.Image.of(on_device(mask, mi.Float), shape, corner)
+            frame.distance = on_device(level_image.distance, mi.Float)
+            frame.area = max(1.0, float(mask.sum()))
+            frame.squares = float((mask.astype(np.float64) ** 2).sum())
+        return frame
+
+
+class Frames:
+    """Frames of a :class:`polysft_mi.scene.sequence.Sequence`, decoded by a second thread before
+    they are asked for.
+    """
+
+    def __init__(self, sequence, normalise):
+        self._count, self._normalise = len(sequence), normalise
+        self._reader, self._kept = ThreadPoolExecutor(1), OrderedDict()
+        # all levels are made of one decoding
+        self._decoded = lru_cache(2)(lambda frame: (sequence.frame(frame), sequence.mask(frame)))
+
+    def expect(self, frames, levels, brightness=None):
+        """Read ``frames`` ahead at ``levels`` and, with a
+        :class:`polysft_mi.images.light.Brightness`, their luminance.
+        """
+        jobs = [(level, self._level_image, (level,)) for level in levels]
+        if brightness is not None:
+            jobs.append(("luminance", self._luminance, (brightness,)))
+        for frame in frames:
+            for key, read, arguments in jobs:
+                if frame < self._count and (frame, key) not in self._kept:
+                    self._kept[frame, key] = self._reader.submit(read, frame, *arguments)
+        while len(self._kept) > _CACHED * max(1, len(jobs)):
+            self._kept.popitem(last=False)
+
+    def _level_image(self, frame, level):
+        return level_image(*self._decoded(frame), level, self._normalise)
+
+    def _luminance(self, frame, brightness):
+        return brightness.prepared(*self._decoded(frame))
+
+    def luminance(self, frame, brightness):
+        """What :meth:`polysft_mi.images.light.Brightness.prepared` makes of a frame."""
+        if (frame, "luminance") not in self._kept:
+            self.expect([frame], [], brightness)
+        return self._kept[frame, "luminance"].result()
+
+    def level(self, frame, level):
+        """A :class:`Frame` at a level. Raises BadFrame where it is not finite."""
+        if (frame, level) not in self._kept:
+            self.expect([frame], [level])
+        entry = self._kept[frame, level]
+        if not isinstance(entry, Frame):
+            image = entry.result()
+            if not np.isfinite(image.colour).all():
+                raise BadFrame(frame, math.nan)
+            entry = self._kept[frame, level] = Frame.of(image)
+        return entry

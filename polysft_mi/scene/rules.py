@@ -1,0 +1,153 @@
+"""The numbers that the second-order tracker decides by: one immutable object, with what each means.
+
+A scene file has no say in them; :class:`polysft_mi.scene.settings.Settings` holds what a user
+chooses. They are the same for every sequence. ``benchmarks/ablation.py`` switches each rule off
+alone and measures what that costs. ``python -m polysft_mi.scene.rules`` prints them as the table in
+``docs/tracker.md``.
+"""
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+
+
+def _rule(default, unit, doc):
+    return field(default=default, metadata={"unit": unit, "doc": doc})
+
+
+@dataclass(frozen=True)
+class Rules:
+    """Every number that the tracker decides by. The metadata of a field holds its unit and meaning.
+
+    A "share" is a fraction of one. A field without a unit is a factor, a count, or a switch.
+    """
+
+    # stages: coarse to fine
+    blurs: tuple = _rule(
+        (2.5, 1.5, 1.0),
+        "pixels",
+        "blur of the images at the three stages, on a sheet of 225 pixels; it grows with the sheet",
+    )
+    far_blur: float = _rule(6.0, "pixels", "blur of the stage for a sheet that moved far, likewise")
+    stiffness: tuple = _rule(
+        (1e2, 3e2, 1e3), "", "factor of `k_mi` at the three stages: soft edges register first"
+    )
+    iterations: tuple = _rule((6, 4, 3), "", "iterations of the three stages")
+    window: float = _rule(
+        8.0, "pixels", "standard deviation of the window of local brightness, likewise"
+    )
+    # the step
+    small_step: float = _rule(
+        2e-3, "share", "of the objective that a step must promise for another one to follow"
+    )
+    damping: tuple = _rule(
+        (1e-4, 3e-3), "", "Levenberg-Marquardt damping at a stage's start, without and with relief"
+    )
+    shown: float = _rule(
+        0.7, "share", "of the pixels that see the sheet, below which no step or start may lead"
+    )
+    first_scale: float = _rule(
+        0.3, "deviations", "robust scale of the first frame's residuals, in local deviations"
+    )
+    scale_bounds: tuple = _rule((0.2, 1.0), "deviations", "bounds of the robust scale")
+    # frames that the stages do not explain
+    fine_passes: int = _rule(
+        8, "", "further passes of the fine stages for a frame that is not explained"
+    )
+    fine_misfit: float = _rule(
+        1.3, "", "a frame is not explained above so many times the least misfit so far"
+    )
+    fine_gain: float = _rule(0.01, "share", "of its cost that a pass must gain for another one")
+    fine_start: float = _rule(
+        1.0, "", "how far beyond the last pass, in its own steps, the next pass starts"
+    )
+    explained: float = _rule(0.02, "misfit", "below this misfit a frame counts as explained")
+    # other starts
+    suspect_factor: float = _rule(
+        1.25, "", "a frame is suspect whose misfit exceeds the noise by so many times the usual"
+    )
+    suspect_margin: float = _rule(0.03, "misfit", "and by this much more")
+    suspect_memory: int = _rule(5, "frames", "over which the usual misfit is a median")
+    far_iterations: int = _rule(18, "", "iterations a stage when a suspect frame is started anew")
+    # the relief, and caution with noise
+    relief_vertices: int = _rule(
+        3000, "vertices", "of the template, above which there is no relief: it costs too much time"
+    )
+    relief_bend: float = _rule(3e-3, "share", "of the relief's weight, for its bending")
+    relief_clean: float = _rule(
+        0.08, "misfit", "least misfit so far below which the relief moves in the second stage too"
+    )
+    noise_misfit: float = _rule(
+        0.05, "misfit", "of noise, at which the relief's weight and `give` have doubled"
+    )
+    noise_power: float = _rule(8.0, "", "with which they grow with the noise")
+    noise_most: float = _rule(1e3, "", "factor by which the relief's weight grows at most")
+    strain_caution: bool = _rule(True, "", "whether `give` grows with noise as well")
+    give: float = _rule(
+        0.002, "strain", "from which on a stretched edge hardly pulls harder (Charbonnier)"
+    )
+    # the texture
+    texels: float = _rule(1.5, "texels", "of the baked texture to a pixel of the first frame")
+    texture_misfit: float = _rule(
+        0.15, "misfit", "of the first frame, above which the texture is fitted to it"
+    )
+    texture_gain: float = _rule(0.6, "share", "of that misfit that may be left, for it to be taken")
+    texture_farthest: float = _rule(
+        0.08, "chart units", "farthest that the texture may move, for it to be taken"
+    )
+    appearance: bool = _rule(
+        True, "", "whether the sheet's own image takes the place of its blurred texture"
+    )
+    border: float = _rule(
+        2.0, "windows", "from the sheet's border where images without masks are not corrected so"
+    )
+    footprint: float = _rule(
+        12.0, "pixels", "longest footprint of a pixel on the texture [of the first frame]"
+    )
+    # the silhouette
+    silhouette: float = _rule(
+        0.1, "share", "of `k_silhouette`: masks are ragged, and normalised residuals small"
+    )
+    # time
+    temporal: float = _rule(1e-3, "share", "of `k_tc`, here in a stiffer basis than monomials")
+    # shading
+    shading_blur: float = _rule(0.45, "triangles", "blur of texture and frames, in triangle sides")
+    shading_covered: float = _rule(0.7, "share", "of a triangle's pixels that must be seen")
+    shading_inside: tuple = _rule(
+        (0.3, 0.97),
+        "share",
+        "of a triangle's surroundings that must be texture, with and without masks",
+    )
+    shading_frontal: float = _rule(0.3, "cosine", "between normal and ray, below which none counts")
+    shading_dark: float = _rule(
+        0.01, "share", "of the texture's mean luminance, below which a triangle says nothing"
+    )
+    light_ridge: float = _rule(
+        3e-3, "observations", "a triangle, that hold the light to be the same from all sides"
+    )
+    light_dimmest: float = _rule(0.1, "share", "of the ambient light that a triangle has at least")
+    light_refits: int = _rule(3, "", "of a frame's robust regression")
+    light_kept: float = _rule(0.8, "share", "of what earlier frames say of light, a frame later")
+    light_scale: float = _rule(8.0, "deviations", "at which a triangle's residual is an outlier")
+    light_first_scale: float = _rule(0.05, "share", "of the mean luminance, before any is known")
+    light_scale_bounds: tuple = _rule((0.005, 0.05), "share", "bounds of that scale, likewise")
+
+    def caution(self, noise):
+        """The factor by which weights grow with the ``noise`` (a misfit; NaN: none is known)."""
+        noise = 0.0 if math.isnan(noise) else noise
+        return 1 + min((noise / self.noise_misfit) ** self.noise_power, self.noise_most)
+
+
+def table():
+    """All rules as a Markdown table."""
+    rows = ["| rule | value | unit | meaning |", "|---|---|---|---|"]
+    for f in dataclasses.fields(Rules):
+        value = (
+            ", ".join(f"{x:g}" for x in f.default) if isinstance(f.default, tuple) else f.default
+        )
+        rows.append(f"| `{f.name}` | {value} | {f.metadata['unit']} | {f.metadata['doc']} |")
+    return "\n".join(rows)
+
+
+if __name__ == "__main__":
+    print(table())

@@ -1,0 +1,89 @@
+"""Where the descent of a frame begins: at the frame before, where its motion leads, or, where that
+does not explain the image, farther away or at the pose that features tell.
+"""
+
+import math
+
+import numpy as np
+
+from polysft_mi.surface.chart import State
+
+from .relocate import Relocator
+
+
+def motion_starts(start, history):
+    """``start``, and where the motion from the last but one to the last state of ``history`` leads:
+    half as far again, and as far again.
+    """
+    if len(history) < 2:
+        return [start]
+    return [start, *(history[-2].towards(history[-1], factor) for factor in (0.5, 1.0))]
+
+
+class Starts:
+    """Chooses starts for a :class:`polysft_mi.solvers.gauss_newton.descent.Descent`."""
+
+    def __init__(self, problem, descent):
+        self._problem, self._descent, self._rules = problem, descent, descent.rules
+        self._relocator = None
+
+    def nearest(self, starts, frame, stage):
+        """The start that explains the frame best at a stage."""
+        objective = self._descent.objective
+        misfits = [
+            objective.images.misfit(objective.chart.surface(state).vertices, frame, stage.blur)
+            for state in starts
+        ]
+        return starts[int(np.argmin(misfits))]
+
+    def solve(self, start, context, history, usual_misfits):
+        """The frame from the nearest start; where it ends suspect, also from others:
+        :class:`polysft_mi.solvers.gauss_newton.descent.Found`.
+
+        ``history``: states of the one or two frames before; ``usual_misfits``: of the frames
+        before, oldest first.
+        """
+        descent, rules, frame = self._descent, self._rules, context.frame
+        starts = motion_starts(start, history)
+        best = descent.descend(
+            self.nearest(starts, frame, descent.usual[0]), context, descent.usual
+        )
+        limit = self._suspect_above(usual_misfits, context.noise)
+        stages = descent.far, *descent.usual
+        if best.misfit > limit:
+            descent.objective.images.expect([frame], [descent.far.blur])
+        for other in (lambda: self.nearest(starts, frame, descent.far), lambda: self._rigid(frame)):
+            if best.misfit <= limit:
+                break
+            if (other := other()) is None:
+                continue
+            found = descent.descend(other, context, stages, rules.far_iterations)
+            # what no pixel sees costs nothing
+            if found.pixels > rules.shown * best.pixels and found.cost < best.cost:
+                best = found
+        return best
+
+    def _suspect_above(self, usual, noise):
+        """The misfit above which a frame is suspect: infinite while those of the frames before are
+        too few to tell.
+        """
+        rules = self._rules
+        usual = usual[-rules.suspect_memory :]
+        if len(usual) < 3:
+            return math.inf
+        noise = min(noise, *usual)
+        above = rules.suspect_factor * (np.median(usual) - noise)
+        return noise + above + rules.suspect_margin
+
+    def _rigid(self, frame):
+        """The undeformed template in the pose that its features have in the frame; None where too
+        few are found.
+        """
+        objective = self._descent.objective
+        if self._relocator is None:
+            self._relocator = Relocator(objective.images)
+        motion = self._relocator.pose(self._problem.sequence.frame(frame))
+        if motion is None:
+            return None
+        rest = objective.chart.state(self._problem.patch.rest().to_numpy())
+        return State(rest.alpha, rest.offset, *objective.chart.rigid(*motion))

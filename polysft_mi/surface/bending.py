@@ -1,0 +1,52 @@
+"""How much a height over the chart bends at the edges of a mesh. NumPy and SciPy only."""
+
+import numpy as np
+import scipy.sparse as sp
+
+
+def hinges(chart, faces):
+    """What a height over the chart (N, 2), both in the chart's unit, bends at the H inner edges of
+    the mesh with ``faces`` (F, 3): the pairs (H, 2) of vertices that lie across each, and the
+    sparse J (H, N) that makes the bends. The sum of their squares is the integral of the squared
+    curvature of a roll along the mesh's rows, up to three times that of others; no plane has any.
+
+    After Bergou et al., "A Quadratic Bending Model for Inextensible Surfaces" (SGP 2006).
+    """
+    start, end, apex = (np.concatenate([faces[:, (k + j) % 3] for k in range(3)]) for j in range(3))
+    low, high = np.minimum(start, end), np.maximum(start, end)
+    order = np.lexsort((high, low))
+    low, high, apex = low[order], high[order], apex[order]
+    first = np.flatnonzero((low[1:] == low[:-1]) & (high[1:] == high[:-1]))
+    quads = np.stack([low[first], high[first], apex[first], apex[first + 1]], 1)
+    x = chart[quads]
+
+    def across(i, j, k):  # sine and cosine, times the lengths, of the angle at i
+        a, b = x[:, j] - x[:, i], x[:, k] - x[:, i]
+        return np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), (a * b).sum(1)
+
+    (s2, c2), (s3, c3), (t2, d2), (t3, d3) = (
+        across(0, 1, 2),
+        across(0, 1, 3),
+        across(1, 0, 2),
+        across(1, 0, 3),
+    )
+    area = np.maximum(0.5 * (s2 + s3), 1e-12)
+    from_0, from_1 = (
+        [c / np.maximum(s, 1e-12) for s, c in pair]
+        for pair in (((s2, c2), (s3, c3)), ((t2, d2), (t3, d3)))
+    )
+    rows = np.stack(
+        [
+            from_1[0] + from_1[1],
+            from_0[0] + from_0[1],
+            -from_0[0] - from_1[0],
+            -from_0[1] - from_1[1],
+        ],
+        1,
+    )
+    rows /= np.sqrt(area)[:, None]
+    matrix = sp.csr_matrix(
+        (rows.ravel(), (np.repeat(np.arange(len(quads)), 4), quads.ravel())),
+        shape=(len(quads), len(chart)),
+    )
+    return quads[:, 2:], matrix

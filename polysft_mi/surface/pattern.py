@@ -1,0 +1,74 @@
+"""Which vertices of a mesh are neighbours: the sparsity of every matrix over its vertices, and a
+narrow ordering of them. NumPy and SciPy only.
+"""
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+
+class Pattern:
+    """Which vertices of the mesh share an edge, or are one of the ``further`` pairs (P, 2): the
+    blocks of every matrix here, in the order of (row, column), and a narrow ordering.
+    """
+
+    def __init__(self, faces, edges, count, further=None):
+        self.count, self.faces, self.edges = count, faces, edges
+        a, b = (edges if further is None else np.concatenate([edges, further])).T
+        each = np.arange(count)
+        self._keys = np.unique(
+            np.concatenate([each * count + each, a * count + b, b * count + a])
+        )  # at a vertex of four triangles, pairs repeat
+        self.row, self.column = np.divmod(self._keys, count)
+        self.start = np.searchsorted(self.row, np.arange(count + 1))
+        self.diagonal = self.find(each, each)
+        # the U blocks on the diagonal of a symmetric matrix and above it, the others, and of which
+        # of the first these are the transposed
+        self.upper, self.lower = (
+            np.flatnonzero(self.row <= self.column),
+            np.flatnonzero(self.row > self.column),
+        )
+        self._half_keys = self._keys[self.upper]
+        self.mirrored = self.find_half(self.column[self.lower], self.row[self.lower])
+        self.half_edges = self.find_half(*edges.T)
+        self.difference = sp.csr_matrix(  # of the edges' ends, (E, N)
+            (
+                np.tile([1.0, -1.0], len(edges)),
+                (np.repeat(np.arange(len(edges)), 2), edges.ravel()),
+            ),
+            shape=(len(edges), count),
+        )
+        self.to_ends = self.difference.T.tocsr()  # sums over the edges at a vertex, with signs
+        graph = sp.csr_matrix(
+            (np.ones(len(self._keys)), (self.row, self.column)), shape=(count, count)
+        )
+        order = reverse_cuthill_mckee(graph, symmetric_mode=True)
+        self.place = np.empty(count, dtype=np.int64)  # of each vertex in the narrow ordering
+        self.place[order] = each
+        self.order = order
+        self.laplacian = self.blocks_of(
+            self.to_ends @ self.difference
+        )  # sum over edges of (x_a - x_b)^2
+
+    def blocks_of(self, matrix):
+        """A sparse matrix (N, N) within the pattern as one number a block, (B,)."""
+        matrix, out = matrix.tocoo(), np.zeros(len(self._keys))
+        out[self.find(matrix.row, matrix.col)] = matrix.data
+        return out
+
+    def find(self, i, j):
+        """Indices of the blocks (i, j)."""
+        return np.searchsorted(self._keys, i * self.count + j)
+
+    def find_half(self, i, j):
+        """Indices in the half, (K,), of the blocks (i, j) or, where these lie below the diagonal,
+        (j, i).
+        """
+        return np.searchsorted(self._half_keys, np.minimum(i, j) * self.count + np.maximum(i, j))
+
+    def whole(self, half):
+        """All blocks (B, d, d) of the symmetric matrix whose upper ``half`` (U, d, d) is given."""
+        out = np.empty((len(self._keys), *half.shape[1:]))
+        out[self.upper] = half
+        out[self.lower] = half[self.mirrored].transpose(0, 2, 1)
+        return out

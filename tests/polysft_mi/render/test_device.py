@@ -1,0 +1,96 @@
+"""Arrays on the device, recorded functions, and Ctrl-C in the middle of them."""
+
+import gc
+from types import SimpleNamespace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import synthetic
+from problems import problem_of
+
+from polysft_mi import solvers
+from polysft_mi.render.device import frozen, interruptible, on_device
+from polysft_mi.render.raster import RasterIntegrator
+from polysft_mi.tracker import Track, track
+
+
+@pytest.fixture(scope="module")
+def problem(tmp_path_factory):
+    return problem_of(
+        synthetic.cloth(
+            tmp_path_factory.mktemp("assembly") / "cloth",
+            frames=3,
+            size=(160, 120),
+            rows=9,
+            columns=12,
+        ).folder
+    )
+
+
+@pytest.mark.parametrize("kind", ["Float", "Float64", "UInt32", "Int32"])
+def test_arrays_reach_the_device_as_copies(kind):
+    for start in range(5):  # at any place in memory
+        values = np.arange(40)[start:].reshape(-1, 1) * 3
+        found = on_device(values[:, 0], getattr(mi, kind))
+        values[:] = -1
+        assert np.array_equal(np.array(found), np.arange(40)[start:] * 3) and isinstance(
+            found, getattr(mi, kind)
+        )
+
+
+@pytest.mark.parametrize("where", ["loop", "record"])
+@pytest.mark.parametrize("kind", [KeyboardInterrupt, ZeroDivisionError])
+def test_ctrl_c_in_the_middle_of_a_loop_or_a_recording(where, kind):
+    """Dr.Jit makes a RuntimeError of whatever is raised there."""
+
+    def stop(*_):
+        raise kind
+
+    def work():
+        if where == "loop":
+            dr.while_loop((mi.Float([1.0, 2.0]),), lambda x: x < 3, stop)
+        else:
+            frozen(stop)(mi.Float([1.0, 2.0]))
+
+    with (
+        pytest.raises(KeyboardInterrupt if kind is KeyboardInterrupt else RuntimeError),
+        interruptible(),
+    ):
+        work()
+    assert np.array_equal(
+        np.array(frozen(lambda x: x + 1)(mi.Float([1.0, 2.0]))), [2, 3]
+    )  # what comes after works
+
+
+def test_ctrl_c_in_the_middle_of_an_evaluation_ends_the_track_as_anywhere(
+    problem, tmp_path, monkeypatch
+):
+    solver, solved, original = solvers.create(problem.settings), [], RasterIntegrator.crossings
+
+    def crossings(self, view, outline=False):
+        if len(solved) == 2:
+            return dr.while_loop((mi.Float([1.0]),), lambda x: x < 3, stop)
+        return original(self, view, outline)
+
+    def stop(x):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(RasterIntegrator, "crossings", crossings)
+    with pytest.raises(KeyboardInterrupt):
+        track(
+            problem, solver, 3, str(tmp_path), solved=lambda frame, vertices: solved.append(frame)
+        )
+    assert len(Track.load(str(tmp_path / "checkpoint.npz")).states) == 2
+
+
+def test_nothing_is_collected_while_a_function_is_recorded():
+    state = SimpleNamespace(collecting=None)
+
+    def work(x):
+        state.collecting = gc.isenabled()
+        return x + 1
+
+    frozen(work)(mi.Float([1.0, 2.0]))
+    assert state.collecting is False and gc.isenabled()

@@ -1,0 +1,122 @@
+"""Several frames together, and looking both ways."""
+
+import numpy as np
+import pytest
+import synthetic
+from problems import dense, problem_of, some_state
+from scipy.linalg import block_diag
+
+from polysft_mi import solvers
+from polysft_mi.images.light import Light
+from polysft_mi.objective.second_order import Context, SecondOrder
+from polysft_mi.solvers.gauss_newton.descent import Descent
+from polysft_mi.solvers.gauss_newton.window import Window
+from polysft_mi.surface.patch import Unknowns
+from polysft_mi.tracker import track
+
+RNG = np.random.default_rng(4)
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory):
+    return synthetic.cloth(
+        tmp_path_factory.mktemp("gauss_newton") / "cloth",
+        frames=4,
+        size=(160, 120),
+        rows=9,
+        columns=12,
+    )
+
+
+def test_a_windows_step_against_finite_differences_and_the_dense_system(truth):
+    """Without the image, which jumps, differences are sharp: of the whole window's objective; the
+    step is that of all unknowns of all frames together.
+    """
+    problem = problem_of(
+        truth.folder, k_rgb=0.0, k_silhouette=0.0, k_tc=500.0, k_bend=1e-2, window=3, k_shading=0.0
+    )
+    descent = Descent(SecondOrder(problem))
+    objective, light = descent.objective, Light.unknown(problem.rules)
+    before, *states = [some_state(objective.chart, RNG, 0.01) for _ in range(4)]
+    anchors = before, None, None
+    contexts = [Context(k, anchors[k], np.nan, light, {}) for k in range(3)]
+    window = Window(descent, contexts)
+
+    def moved(steps, factor):
+        return [s.moved(d, factor) for s, d in zip(states, steps, strict=True)]
+
+    def total(at):
+        return sum(model.total for model in window._models(at, [None] * 3))
+
+    models = window._models(states, [None] * 3)
+    normals = [model.normal for model in models]
+    steps = [
+        (RNG.normal(size=len(n.gradient)) * 1e-6, RNG.normal(size=n.local_gradient.shape) * 1e-6)
+        for n in normals
+    ]
+    slope = (total(moved(steps, 1)) - total(moved(steps, -1))) / 2
+    mine = sum(
+        g @ n.gradient + (uv * n.local_gradient).sum()
+        for (g, uv), n in zip(steps, normals, strict=True)
+    )
+    assert mine == pytest.approx(slope, rel=1e-4)
+
+    damping, found = 1e-4, window._steps(models, 1e-4)
+    pattern = objective.images.pattern
+    parts, right = zip(*[dense(pattern, n) for n in normals], strict=True)
+    n, start = 2 * pattern.count, np.cumsum([0] + [len(h) for h in parts])
+    # no edge holds a translation
+    floor = [np.where(np.arange(len(h)) < n, 0, 1e-9 * np.diag(h)[n:].mean()) for h in parts]
+    whole = block_diag(
+        *[h + np.diag(np.diag(h) * damping + x) for h, x in zip(parts, floor, strict=True)]
+    )
+    for k in range(2):
+        jet = np.arange(len(states[k].alpha))
+        i, j = start[k] + n + jet, start[k + 1] + n + jet
+        whole[i, j] = whole[j, i] = -2 * objective.temporal
+    expected = np.split(-np.linalg.solve(whole, np.concatenate(right)), start[1:-1])
+    for (g, uv), x in zip(found[0], expected, strict=True):
+        assert np.allclose(
+            np.concatenate([uv.ravel(), g]), x, rtol=1e-3, atol=1e-4 * np.abs(x).max()
+        )
+
+
+@pytest.mark.parametrize("k_tc", [0.05, 1000.0])
+def test_a_window_follows_the_sheet_and_couples_its_frames(truth, tmp_path, k_tc):
+    """More coupling means less motion between frames; the default follows the truth as single
+    frames do.
+    """
+    problem = problem_of(truth.folder, window=3, k_tc=k_tc)
+    done = track(problem, solvers.create(problem.settings), 4, str(tmp_path))
+    assert len(done.states) == 4 and len(done.totals) == 2 and set(done.sigma) == {0, 1, 2, 3}
+    error = [
+        np.linalg.norm(problem.surface(Unknowns.from_numpy(s)) - t, axis=1).mean()
+        for s, t in zip(done.states, truth.vertices)
+    ]
+    if k_tc < 1:
+        assert max(error) < 0.003
+        return
+    single = problem_of(truth.folder, window=1, k_tc=0.05)
+    loose = track(single, solvers.create(single.settings), 4, str(tmp_path / ".."))
+    moved = [
+        sum(((b["delta_u"] - a["delta_u"]) ** 2).sum() for a, b in zip(x.states, x.states[1:]))
+        for x in (done, loose)
+    ]
+    assert moved[0] < 0.5 * moved[1]
+
+
+def test_looking_back_smooths_and_keeps_what_frames_know(truth, tmp_path):
+    """``smooth`` holds every inner frame to the middle of its neighbours, and loses none of the
+    facts that later frames go by.
+    """
+    rough = lambda surfaces: np.abs(np.diff(surfaces, n=2, axis=0)).mean()
+    found, least = {}, rough(truth.vertices)
+    for smooth in (0.0, 10.0):
+        problem = problem_of(truth.folder, smooth=smooth)
+        (tmp_path / str(smooth)).mkdir()
+        done = track(problem, solvers.create(problem.settings), 4, str(tmp_path / str(smooth)))
+        assert done.finished == (smooth > 0) and len(done.totals) == len(done.sigma) == 4
+        assert all(t["least_misfit"] > 0 and t["light"] for t in done.totals[1:])
+        surfaces = np.stack([problem.surface(Unknowns.from_numpy(s)) for s in done.states])
+        found[smooth] = rough(surfaces)
+    assert least < found[10.0] and found[10.0] - least < 0.9 * (found[0.0] - least)
