@@ -42,7 +42,7 @@ def test_prepare_and_run_tell(tmp_path, capsys):
     (line,) = capsys.readouterr().err.splitlines()
     assert "template.obj: the template is " in line and "scale it by 0.001" in line
     out = tmp_path / "out"
-    words = [str(folder / "scene.xml"), "-o", str(out), "-q", "--no-report", "-D", "order_max=8"]
+    words = [str(folder / "scene.xml"), "-o", str(out), "-q", "--no-report", "-D", "order=4"]
     assert run.main(words) == 0
     (line,) = capsys.readouterr().err.splitlines()
     assert "scene.xml: the template is " in line and "scale it by 0.001" in line
