@@ -13,8 +13,6 @@ WIDE = {
     "CHANGELOG.md",
     "CONTRIBUTING.md",
     "README.md",
-    "docs/cite.md",
-    "docs/commands.md",
     "docs/conventions.md",
     "docs/index.md",
     "docs/onefit.md",
