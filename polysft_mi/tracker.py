@@ -105,11 +105,11 @@ def track(problem, solver, frames, out, *, resume=False, progress=None, solved=N
     :class:`Track`.
 
     ``frames``: number of frames. ``progress(frame, iteration, total, terms)`` is called after each
-    evaluation, ``solved(frame, vertices)`` with the surface (N, 3) [m, world] of each frame that no
-    later window moves, as soon as it stands; the look back may still change some. Where the
-    objective stops being finite, or the surface leaves the image, the new frame keeps the state of
-    the one before, and the run goes on. KeyboardInterrupt passes through; the checkpoint on disk is
-    then that of the last whole window.
+    evaluation. ``solved(frame, vertices)`` is called with the surface (N, 3) [m, world] of each
+    frame as soon as no later window moves it; only the last pass of the setting ``smooth`` may
+    still change it. If the objective stops being finite, or the surface leaves the image, the new
+    frame keeps the state of the one before, and the run goes on. KeyboardInterrupt passes through;
+    the checkpoint on disk is then that of the last complete window.
     """
     width = min(problem.settings.width, frames)
     checkpoint, log_path = os.path.join(out, CHECKPOINT), os.path.join(out, LOG)

@@ -30,23 +30,22 @@ class Settings:
     stride: int = _setting(1, "use every stride-th image", low=1)
     order: int = _setting(
         0,
-        "order n of the jet; 0: 8 for gauss-newton, 4 (the paper's)"
-        " for adam, or less where the template's vertices determine no more",
+        "order n of the jet; 0: 8 for gauss-newton, 4 (the paper's) for adam, or less if the"
+        " template has too few vertices",
         low=0,
         high=10,
     )
     fit_tolerance: float = _setting(
         0.05,
-        "largest distance of the template from its jet, as a share of the template's radius, before"
-        " it is refused",
+        "a template farther from its jet than this share of its radius is refused",
         above=0,
     )
     k_rgb: float = _setting(1.0, "weight of the photometric loss", low=0)
     k_silhouette: float = _setting(1.0, "weight of the silhouette loss (needs masks)", low=0)
     k_shading: float = _setting(
         9.0,
-        "weight of the triangles' brightness under a light that is learned along with the video"
-        " (gauss-newton); 0: shading is no cue",
+        "weight of shading: the triangles' brightness under a light that is learned along with the"
+        " video (gauss-newton); 0: off",
         low=0,
     )
     k_mi: float = _setting(0.1, "weight of mesh inextensibility", low=0)
@@ -59,8 +58,8 @@ class Settings:
     )
     k_relief: float = _setting(
         1e-3,
-        "weight of the slopes of the relief, heights of the vertices over the jet, and a few"
-        " thousandths of it of its bends (gauss-newton, templates of at most 3,000 vertices); 0: no"
+        "weight of the slopes of the relief, the vertices' heights over the jet; its bending has a"
+        " few thousandths of this weight (gauss-newton, templates of at most 3,000 vertices); 0: no"
         " relief",
         low=0,
     )
@@ -72,14 +71,14 @@ class Settings:
     )
     brightness: str = _setting(
         "auto",
-        "compensation of lighting before images are compared; auto: local for gauss-newton, none"
+        "lighting compensation before images are compared; auto: local for gauss-newton, none"
         " for adam",
         choices=("auto", "none", "gain", "local"),
     )
     texture_fit: str = _setting(
         "auto",
-        "auto: where the texture lies elsewhere on the template than the first image shows,"
-        " gauss-newton moves it",
+        "auto: gauss-newton moves the texture on the template if the first image shows it"
+        " elsewhere",
         choices=("auto", "none"),
     )
     blur: float = _setting(
@@ -94,14 +93,13 @@ class Settings:
     )
     window: int = _setting(
         0,
-        "frames W that are solved together in the sliding window; 0: 1 for gauss-newton, 3 for"
-        " adam",
+        "frames W of the sliding window, solved together; 0: 1 for gauss-newton, 3 for adam",
         low=0,
     )
     smooth: float = _setting(
         0.0,
-        "weight that holds each frame to the middle of its neighbours in a last pass over the"
-        " video, both ways (gauss-newton); 0 for none",
+        "weight that holds each frame to the mean of its neighbours, in a last pass over the video,"
+        " back and forth (gauss-newton); 0: no such pass",
         low=0,
     )
     patience: int = _setting(

@@ -255,7 +255,7 @@ def test_gradient_of_the_whole_objective(tmp_path, masks, overrides):
 
 def test_truth_is_nearly_a_minimum(tmp_path):
     """The bent sheet's own surface explains the image better than the flat template and than its
-    mirror twin.
+    mirror image in depth.
     """
     from polysft_mi.surface.template import Template
 
