@@ -5,7 +5,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from polyfit import jets
-from polyfit.frames import CanonicalFrame
+from polyfit.jets import CanonicalFrame
 from polysft_mi.results import metrics
 from polysft_mi.surface.chart import Chart
 from polysft_mi.surface.template import Template

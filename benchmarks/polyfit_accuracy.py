@@ -14,7 +14,7 @@ Kinds of patches, each sampled at 256 points:
     as made    cut at the paper's number K, as they are
     large      cut into 10 patches
     posed      cut into 10, 25 and 100 patches, each then taken through a random smooth map of its
-               own (polyfit.deformations: stretched, bent, waved)
+               own (polyfit.training.deformations: stretched, bent, waved)
     simulated  no garments, but nothing that resembles the training: the sheets of DATA/cloth, cut
                into 10 patches, in 8 frames each of their simulations
     folded     of large, posed and simulated: those that the PCA frame sees to more than 5 % from
@@ -44,17 +44,16 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from polyfit import garments, jets, mesh
-from polyfit.baselines.atlasnet import AtlasNet, normalised
-from polyfit.baselines.regressors import DGCNN, PointNet
+from polyfit import jets, mesh
+from polyfit.baselines import DGCNN, AtlasNet, PointNet, normalised
 from polyfit.errors import InputError, cli
 from polyfit.files import aside
-from polyfit.frames import CanonicalFrame
-from polyfit.losses import behind, discrepancy
-from polyfit.meshio import read_mesh
+from polyfit.jets import CanonicalFrame
+from polyfit.mesh import read_mesh
+from polyfit.network import PatchFit, PolyFit, SpatialTransformer
 from polyfit.patches import Patches
-from polyfit.stn import PatchFit, PolyFit, SpatialTransformer
-from polyfit.training_set import axes, rotations_to
+from polyfit.training import behind, discrepancy, garments
+from polyfit.training.training_set import axes, rotations_to
 
 ROOT = Path(__file__).resolve().parent.parent
 

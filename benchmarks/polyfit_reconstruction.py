@@ -110,7 +110,7 @@ def atlasnet(V, F, charts, widths, iterations, points=1000):
     """
     import torch
 
-    from polyfit.baselines.atlasnet import AtlasNet, chamfer, normalised
+    from polyfit.baselines import AtlasNet, chamfer, normalised
 
     torch.manual_seed(0)
     model = AtlasNet(charts, latent=1, widths=widths)

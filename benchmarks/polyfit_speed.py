@@ -49,7 +49,7 @@ def batches(device):
     import torch
 
     from polyfit import CanonicalFrame, jets
-    from polyfit.stn import PolyFit, SpatialTransformer
+    from polyfit.network import PolyFit, SpatialTransformer
 
     generator = torch.Generator().manual_seed(0)
     uv = 2 * torch.rand(BATCH, POINTS, 2, generator=generator) - 1

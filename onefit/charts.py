@@ -18,8 +18,8 @@ import scipy.sparse as sp
 import torch
 
 from polyfit import jets, mesh
-from polyfit.frames import CanonicalFrame
-from polyfit.surface import PatchedSurface
+from polyfit.jets import CanonicalFrame
+from polyfit.patches import PatchedSurface
 
 from .binding import surface_of
 from .waistband import held

@@ -10,7 +10,7 @@ import torch
 
 from polyfit import mesh
 from polyfit.errors import InputError
-from polyfit.meshio import read_mesh
+from polyfit.mesh import read_mesh
 
 from . import fitting, remesh
 from .binding import Binding, standard_body, standard_surface, vertex_normals

@@ -19,7 +19,7 @@ import numpy as np
 from polyfit import mesh
 from polyfit.errors import InputError, cli, optional_imports
 from polyfit.files import aside
-from polyfit.meshio import write_ply
+from polyfit.mesh import write_ply
 
 with optional_imports(__name__):
     from .binding import standard_body

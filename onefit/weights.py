@@ -6,7 +6,7 @@ from pathlib import Path
 import torch
 
 from polyfit.errors import InputError
-from polyfit.weights import load_into, read_weights, write_weights
+from polyfit.network import load_into, read_weights, write_weights
 
 VERSION = 3  # of the network's shape and the meaning of its weights
 SCALE = ":scale"  # after the name of a matrix: its rows' scales

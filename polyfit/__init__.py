@@ -1,44 +1,40 @@
 """PolyFit: surfaces as patches, each a jet in a canonical frame (paper, section "PolyFit"), in
 torch.
+
+A mesh goes in, its patches and a surface of any resolution come out::
+
+    import polyfit
+
+    vertices, faces, _ = polyfit.read_mesh("garment.obj")  # metres
+    surface = polyfit.PatchedSurface.from_mesh(vertices, faces)
+    fine, fine_faces = surface.resampled(4)
+
+``docs/api.md`` lists the public names; torch is loaded when the first of them is used.
 """
 
-_EXPORTS = {
-    "CanonicalFrame": "frames",
-    "rotation_matrix": "frames",
-    "exponents": "monomials",
-    "height": "jets",
-    "height_derivatives": "jets",
-    "point": "jets",
-    "tangents": "jets",
-    "normal": "jets",
-    "metric": "jets",
-    "second_fundamental_form": "jets",
-    "principal_curvatures": "jets",
-    "turned_over": "jets",
-    "fit": "jets",
-    "JetFit": "jets",
-    "Patches": "patches",
-    "patch_count": "patches",
-    "PatchedSurface": "surface",
-    "smoothed": "surface",
-    "read_mesh": "meshio",
-    "write_ply": "meshio",
-    "InputError": "errors",
-    "PolyFit": "stn",
-    "SpatialTransformer": "stn",
-}
+import lazy_loader
 
-__all__ = sorted(_EXPORTS)
-
-
-def __getattr__(name):
-    # torch is loaded on first use, so that `import polyfit` stays instant
-    if name in _EXPORTS:
-        from importlib import import_module
-
-        return getattr(import_module(f".{_EXPORTS[name]}", __name__), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
-def __dir__():
-    return sorted(list(globals()) + __all__)
+__getattr__, __dir__, __all__ = lazy_loader.attach(
+    __name__,
+    submod_attrs={
+        "errors": ["InputError"],
+        "jets.frames": ["CanonicalFrame", "rotation_matrix"],
+        "jets.jet": [
+            "height",
+            "height_derivatives",
+            "metric",
+            "normal",
+            "point",
+            "principal_curvatures",
+            "second_fundamental_form",
+            "tangents",
+            "turned_over",
+        ],
+        "jets.least_squares": ["JetFit", "fit"],
+        "jets.monomials": ["exponents"],
+        "mesh.meshio": ["read_mesh", "write_ply"],
+        "network.stn": ["PolyFit", "SpatialTransformer"],
+        "patches.patches": ["Patches", "patch_count"],
+        "patches.surface": ["PatchedSurface", "smoothed"],
+    },
+)

@@ -28,7 +28,7 @@ from .surface.patch import Unknowns
 from .surface.template import Template
 
 if TYPE_CHECKING:
-    from polyfit.stn import PolyFit
+    from polyfit.network import PolyFit
 
     from .objective.problem import Problem
     from .surface.patch import JetPatch

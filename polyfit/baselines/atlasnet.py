@@ -6,9 +6,8 @@ import itertools
 
 import torch
 
-from ..errors import InputError
-from ..stn import pointwise
-from ..weights import load_into, read_weights, write_weights
+from polyfit.errors import InputError
+from polyfit.network import load_into, pointwise, read_weights, write_weights
 
 VERSION = 1
 

@@ -7,11 +7,19 @@ PolyFit solves for it.
 
 import torch
 
-from .. import jets
-from ..errors import InputError
-from ..frames import CanonicalFrame
-from ..stn import PatchFit, linear, normalised_layer, pointwise, thinned
-from ..weights import load_into, read_weights, write_weights
+from polyfit import jets
+from polyfit.errors import InputError
+from polyfit.jets import CanonicalFrame
+from polyfit.network import (
+    PatchFit,
+    linear,
+    load_into,
+    normalised_layer,
+    pointwise,
+    read_weights,
+    thinned,
+    write_weights,
+)
 
 VERSION = 1
 

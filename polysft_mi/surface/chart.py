@@ -11,7 +11,7 @@ import numpy as np
 from numpy.polynomial import legendre
 from scipy.spatial.transform import Rotation
 
-from polyfit.monomials import exponents
+from polyfit.jets import exponents
 
 
 @dataclass

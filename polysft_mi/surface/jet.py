@@ -1,14 +1,14 @@
 """n-jets in Dr.Jit: the functions of ``polyfit.jets``, by the same names, on Mitsuba's types.
 
 Arrays: ``alpha`` is a Float of A = (n+1)(n+2)/2 coefficients in the paper's order
-(``polyfit.monomials.exponents``), shared by all points; ``u`` and ``v`` are Floats of N chart
+(``polyfit.exponents``), shared by all points; ``u`` and ``v`` are Floats of N chart
 coordinates. Lengths are in the chart's unit. Import only after a Mitsuba variant is set.
 """
 
 import drjit as dr
 import mitsuba as mi
 
-from polyfit.monomials import exponents, order_of
+from polyfit.jets import exponents, order_of
 
 
 def _powers(x, order):

@@ -1,19 +1,19 @@
 """Templates in (OBJ and PLY, in the file's own vertex order) and what a template must be;
-:mod:`polyfit.meshio` reads and writes the files.
+:mod:`polyfit.mesh` reads and writes the files.
 
 Texture coordinates are those of OBJ files: (0, 0) is the texture's bottom left, v goes up.
 """
 
 import numpy as np
 
-from polyfit.meshio import read_mesh, write_ply
+from polyfit.mesh import read_mesh, write_ply
 from polysft_mi.errors import InputError
 
 __all__ = ["check_template", "read_template", "size_note", "write_obj", "write_ply"]
 
 
 def read_template(path):
-    """:func:`polyfit.meshio.read_mesh` of a template."""
+    """:func:`polyfit.read_mesh` of a template."""
     return read_mesh(path, what="template")
 
 

@@ -1,7 +1,7 @@
 """The template: a mesh held by one jet in its canonical frame (paper, sections "PolyFit" and
 "PolySfT"). NumPy.
 
-The frame and the fit are those of :class:`polyfit.frames.CanonicalFrame` and
+The frame and the fit are those of :class:`polyfit.CanonicalFrame` and
 :func:`polyfit.jets.fit`, for one patch: to load torch would take longer than the rest of a run's
 start.
 """
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial import Chebyshev, Polynomial, chebyshev
 
-from polyfit.monomials import DETERMINED, NARROWEST, exponents, order_of, size_of
+from polyfit.jets import DETERMINED, NARROWEST, exponents, order_of, size_of
 from polysft_mi.errors import InputError
 
 
@@ -74,7 +74,7 @@ class Template:
         where="template",
     ):
         """Fit a jet of ``order`` to the mesh, in ``frame``, a
-        :class:`polyfit.frames.CanonicalFrame` in float64, or else in its PCA frame. Where not
+        :class:`polyfit.CanonicalFrame` in float64, or else in its PCA frame. Where not
         ``exact``, vertices that determine less get the highest order that they do.
 
         Raises InputError where the order is too high for the vertices (if ``exact``), where the

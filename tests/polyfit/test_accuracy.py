@@ -14,8 +14,8 @@ from places import ROOT
 from scripts import load
 
 from polyfit import InputError, PolyFit
-from polyfit.garments import GarmentPatches
-from polyfit.stn import SpatialTransformer
+from polyfit.network import SpatialTransformer
+from polyfit.training import GarmentPatches
 
 accuracy = load("benchmarks/polyfit_accuracy.py")
 

@@ -5,10 +5,10 @@ import torch
 from scipy.spatial import cKDTree
 
 from polyfit import InputError
-from polyfit.baselines.atlasnet import AtlasNet, chamfer, normalised
-from polyfit.baselines.regressors import DGCNN, PointNet, edge_convolution, nearest
-from polyfit.frames import rotation_matrix
-from polyfit.weights import write_weights
+from polyfit.baselines import DGCNN, AtlasNet, PointNet, chamfer, normalised
+from polyfit.baselines.regressors import edge_convolution, nearest
+from polyfit.jets import rotation_matrix
+from polyfit.network import write_weights
 
 
 @pytest.fixture(autouse=True)

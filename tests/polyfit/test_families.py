@@ -6,8 +6,9 @@ import torch
 import trimesh
 from scipy.special import j0
 
-from polyfit import InputError, deformations, families, garments
-from polyfit.frames import CanonicalFrame
+from polyfit import InputError
+from polyfit.jets import CanonicalFrame
+from polyfit.training import deformations, families, garments
 
 
 def generator(seed=0):

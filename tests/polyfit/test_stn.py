@@ -7,10 +7,9 @@ import pytest
 import torch
 
 from polyfit import InputError, PolyFit, jets
-from polyfit.frames import CanonicalFrame, rotation_matrix
-from polyfit.losses import behind, discrepancy
-from polyfit.stn import SpatialTransformer, thinned
-from polyfit.weights import read_weights, write_weights
+from polyfit.jets import CanonicalFrame, rotation_matrix
+from polyfit.network import SpatialTransformer, read_weights, thinned, write_weights
+from polyfit.training import behind, discrepancy
 
 
 def bent_sheets(count, points=200, dtype=torch.float64, depth=(0.9, 1.6), width=(0.5, 0.9)):
@@ -221,7 +220,7 @@ def test_shipped_weights_turn_narrow_valleys_the_right_way_up(model):
 
 
 def test_what_made_the_shipped_weights_is_beside_them(model):
-    from polyfit.stn import PRETRAINED
+    from polyfit.network import PRETRAINED
 
     about = json.loads(PRETRAINED.with_suffix(".json").read_text(encoding="utf-8"))
     assert about["command"].startswith("python -m polyfit.train ")

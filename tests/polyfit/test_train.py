@@ -14,13 +14,11 @@ import trimesh
 from places import ROOT
 from safetensors.torch import load_file
 
-from polyfit import InputError, PolyFit, jets, train, training_set
-from polyfit.baselines.atlasnet import AtlasNet
-from polyfit.baselines.regressors import DGCNN, PointNet
-from polyfit.losses import discrepancy
-from polyfit.training import Processes
+from polyfit import InputError, PolyFit, jets, train
+from polyfit.baselines import DGCNN, AtlasNet, PointNet
+from polyfit.training import Processes, Settings, Training, discrepancy, trainer, training_set
 
-SMALL = train.Settings(
+SMALL = Settings(
     families=("gaussian", "jet"), patches=120, points=40, reads=30, steps=8, batch=16, order=2
 )
 FLAGS = (
@@ -82,8 +80,8 @@ def test_axes_cover_the_half_sphere():
 
 def test_training_lowers_the_loss(tmp_path):
     settings = replace(SMALL, steps=60, batch=64)
-    data = train._Patches(training_set.build(300, 40, 2, 0, names=("gaussian", "jet")))
-    training = train.PolyFitTraining(settings, data, Processes("cpu"))
+    data = trainer.PatchBatches(training_set.build(300, 40, 2, 0, names=("gaussian", "jet")))
+    training = trainer.PolyFitTraining(settings, data, Processes("cpu"))
 
     def loss():
         with torch.no_grad():
@@ -119,32 +117,32 @@ def test_command_leaves_weights_their_making_and_a_log(tmp_path, capsys):
 @pytest.mark.parametrize("model", ["polyfit", "pointnet", "dgcnn"])
 def test_resumed_training_ends_where_an_uninterrupted_one_does(tmp_path, model):
     settings = replace(SMALL, model=model)
-    whole = train.train(settings, tmp_path / "whole")
-    assert train.train(settings, tmp_path / "parts", until=3) is None
+    whole = trainer.train(settings, tmp_path / "whole")
+    assert trainer.train(settings, tmp_path / "parts", until=3) is None
     assert not (tmp_path / "parts" / "weights.safetensors").exists()
-    resumed = train.train(settings, tmp_path / "parts", resume=True)
+    resumed = trainer.train(settings, tmp_path / "parts", resume=True)
     a, b = load_file(whole), load_file(resumed)
     assert a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a)
-    short = train.train(replace(settings, steps=3), tmp_path / "short")
+    short = trainer.train(replace(settings, steps=3), tmp_path / "short")
     assert any(
         (load_file(short)[k] - a[k]).abs().max() > 1e-5 for k in a
     )  # the later steps did something
 
 
 def test_ctrl_c_leaves_a_checkpoint(tmp_path, monkeypatch):
-    step = train.Training.step
+    step = Training.step
 
     def interrupted(self):
         if self.done == 4:
             raise KeyboardInterrupt
         return step(self)
 
-    monkeypatch.setattr(train.Training, "step", interrupted)
+    monkeypatch.setattr(Training, "step", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        train.train(SMALL, tmp_path)
+        trainer.train(SMALL, tmp_path)
     monkeypatch.undo()
-    resumed = load_file(train.train(SMALL, tmp_path, resume=True))
-    whole = load_file(train.train(SMALL, tmp_path / "whole"))
+    resumed = load_file(trainer.train(SMALL, tmp_path, resume=True))
+    whole = load_file(trainer.train(SMALL, tmp_path / "whole"))
     assert all(torch.equal(resumed[k], whole[k]) for k in whole)
 
 
@@ -178,9 +176,9 @@ def test_two_processes_of_torchrun_do_what_one_does(tmp_path):
     assert json.loads((tmp_path / "two" / "weights.json").read_text())["processes"] == 2
     two, one = (
         load_file(tmp_path / "two" / "weights.safetensors"),
-        load_file(train.train(SMALL, tmp_path / "one")),
+        load_file(trainer.train(SMALL, tmp_path / "one")),
     )
-    fresh = train.PolyFitTraining(SMALL, None, Processes("cpu")).network.state_dict()
+    fresh = trainer.PolyFitTraining(SMALL, None, Processes("cpu")).network.state_dict()
     for k in one:
         assert (two[k] - one[k]).abs().max() <= 1e-4, k
     assert max((one[k] - fresh[k]).abs().max() for k in one) > 1e-3
@@ -189,13 +187,13 @@ def test_two_processes_of_torchrun_do_what_one_does(tmp_path):
 def test_networks_of_others_train_on_the_same_patches(tmp_path, mesh):
     settings = replace(SMALL, meshes=(mesh,), cuts=(4, 8), families=())
     for model, kind in (("pointnet", PointNet), ("dgcnn", DGCNN)):
-        path = train.train(replace(settings, model=model, steps=2), tmp_path / model)
+        path = trainer.train(replace(settings, model=model, steps=2), tmp_path / model)
         assert kind.load(path, 2)(torch.rand(2, 30, 3)).jet.alpha.shape == (2, 6)
         with pytest.raises(InputError, match=f"weights of {model}, not of polyfit"):
             PolyFit.load(path)
     sets = [load_file(tmp_path / model / "set.safetensors") for model in ("pointnet", "dgcnn")]
     assert all(torch.equal(sets[0][k], sets[1][k]) for k in sets[0])
-    path = train.train(
+    path = trainer.train(
         replace(settings, model="atlasnet", charts=3, steps=2, batch=2), tmp_path / "atlasnet"
     )
     assert AtlasNet.load(path).charts == 3
@@ -236,27 +234,27 @@ class TestRefused:
 
     def test_checkpoints_of_other_settings_and_none(self, tmp_path):
         with pytest.raises(InputError, match="nothing to resume"):
-            train.train(SMALL, tmp_path, resume=True)
-        train.train(SMALL, tmp_path, until=1)
+            trainer.train(SMALL, tmp_path, resume=True)
+        trainer.train(SMALL, tmp_path, until=1)
         with pytest.raises(InputError, match="checkpoint of other settings"):
-            train.train(replace(SMALL, seed=1), tmp_path, resume=True)
+            trainer.train(replace(SMALL, seed=1), tmp_path, resume=True)
         (tmp_path / "checkpoint.safetensors").write_bytes(b"half of it")
         with pytest.raises(InputError, match="checkpoint.safetensors: not a file of weights"):
-            train.train(SMALL, tmp_path, resume=True)
+            trainer.train(SMALL, tmp_path, resume=True)
 
     def test_folders_that_hold_a_result(self, tmp_path):
-        train.train(replace(SMALL, steps=1), tmp_path)
+        trainer.train(replace(SMALL, steps=1), tmp_path)
         before = (tmp_path / "weights.safetensors").read_bytes()
         with pytest.raises(InputError, match="exists; give another -o, or --resume"):
-            train.train(SMALL, tmp_path)
+            trainer.train(SMALL, tmp_path)
         assert (tmp_path / "weights.safetensors").read_bytes() == before
 
     def test_a_loss_that_is_not_finite(self, tmp_path, monkeypatch):
         monkeypatch.setattr(
-            train._Patches,
+            trainer.PatchBatches,
             "loss",
             lambda self, network, *_: next(network.parameters()).sum() * torch.nan,
         )
         with pytest.raises(InputError, match="the loss is nan at step 1"):
-            train.train(SMALL, tmp_path)
+            trainer.train(SMALL, tmp_path)
         assert not (tmp_path / "weights.safetensors").exists()

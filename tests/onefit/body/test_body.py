@@ -14,8 +14,7 @@ from onefit.body import AnnyBody
 from onefit.skeleton import INDEX
 from onefit.smpl import FROM_SMPL, PlainBody, SmplBody
 from polyfit.errors import InputError
-from polyfit.mesh import edges_of
-from polyfit.meshio import read_mesh
+from polyfit.mesh import edges_of, read_mesh
 
 HEAD, FRONT = (0.0, 0.0, 1.0), (0.0, -1.0, 0.0)
 

@@ -150,7 +150,7 @@ def test_what_a_motion_file_does_not_say_is_said_by_flags(network, tmp_path):
 
 def test_a_mesh_in_centimetres_with_y_up(network, tmp_path):
     from onefit.garment import Garment
-    from polyfit.meshio import write_ply
+    from polyfit.mesh import write_ply
 
     shorts = Garment.template("shorts")
     x, y, z = 100 * shorts.vertices.double().numpy().T

@@ -11,7 +11,7 @@ import torch
 
 import polyfit
 from polyfit import jets
-from polyfit.stn import PolyFit, SpatialTransformer
+from polyfit.network import PolyFit, SpatialTransformer
 from polysft_mi import bridge, capture
 from polysft_mi.objective.problem import Problem
 from polysft_mi.scene import experiment as scene

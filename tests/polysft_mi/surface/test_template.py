@@ -11,7 +11,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from polyfit import jets
-from polyfit.frames import CanonicalFrame
+from polyfit.jets import CanonicalFrame
 from polysft_mi.errors import InputError
 from polysft_mi.surface.template import Template
 

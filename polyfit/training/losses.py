@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import torch
 
-from . import jets
+from polyfit import jets
 
 
 @dataclass(frozen=True)

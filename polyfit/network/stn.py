@@ -16,13 +16,14 @@ from pathlib import Path
 
 import torch
 
-from . import jets
-from .errors import InputError
-from .frames import CanonicalFrame, rotation_matrix
+from polyfit import jets
+from polyfit.errors import InputError
+from polyfit.jets import CanonicalFrame, rotation_matrix
+
 from .weights import load_into, read_weights, write_weights
 
 VERSION = 1  # of the network's shape and the meaning of its weights
-PRETRAINED = Path(__file__).parent / "data" / "polyfit.safetensors"
+PRETRAINED = Path(__file__).parents[1] / "data" / "polyfit.safetensors"
 TILT = math.radians(55)  # between the PCA frame's z and the first guesses'
 
 

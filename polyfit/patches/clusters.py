@@ -14,7 +14,7 @@ import warnings
 
 import numpy as np
 
-from . import mesh
+from polyfit import mesh
 
 # Weights w of the normals against positions, tried in this order until no more than this share of
 # the area is folded over.

@@ -15,8 +15,8 @@ import math
 
 import torch
 
-from . import jets
-from .errors import InputError
+from polyfit import jets
+from polyfit.errors import InputError
 
 FAMILIES = ("jet", "trigonometric", "gaussian", "bessel")
 

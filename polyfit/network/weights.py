@@ -2,8 +2,8 @@
 
 import json
 
-from .errors import InputError
-from .files import aside
+from polyfit.errors import InputError
+from polyfit.files import aside
 
 
 def write_weights(path, weights, about):

@@ -7,10 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from . import deformations, mesh
-from .frames import CanonicalFrame
-from .meshio import read_mesh
-from .patches import Patches
+from polyfit import mesh
+from polyfit.jets import CanonicalFrame
+from polyfit.mesh import read_mesh
+from polyfit.patches import Patches
+
+from . import deformations
 
 
 @dataclass(frozen=True)

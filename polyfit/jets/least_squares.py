@@ -1,5 +1,5 @@
-"""The solve behind :func:`polyfit.jets.fit`: weighted least squares for batches of patches (Cazals
-& Pouget 2003).
+"""The jets that fit points best: weighted least squares for batches of patches (Cazals & Pouget
+2003).
 
 Each patch is fitted in the box of its own points, in a basis of products of Chebyshev polynomials,
 whose Gram matrix follows from the products' moments: T_a T_c = (T_{a+c} + T_{|a-c|}) / 2. So no
@@ -15,12 +15,60 @@ import torch
 from numpy.polynomial import chebyshev
 from scipy.special import binom
 
-from . import jets
-from .errors import InputError
-from .monomials import DETERMINED, NARROWEST
+from polyfit.errors import InputError
+
+from . import jet
+from .monomials import DETERMINED, NARROWEST, exponents, size_of
 
 
-class LeastSquares(torch.autograd.Function):
+@dataclass(frozen=True)
+class JetFit:
+    """``alpha`` (..., A): the coefficients, zero beyond the order fitted. ``order`` (...,) int64:
+    the order that the points determine, at most the one asked for; 0 is a constant."""
+
+    alpha: torch.Tensor
+    order: torch.Tensor
+
+
+def fit(points, order, *, weights=None, mask=None):
+    """Least-squares n-jets through ``points`` (..., P, 3), in charts with |u|, |v| of about 1: a
+    :class:`JetFit`.
+
+    ``weights`` (..., P) not negative; ``mask`` (..., P) bool: the points that exist, the others are
+    padding of any value. Where the points are too few for ``order``, or lie such (on a line, on a
+    small grid) that they do not determine it, the patch is fitted by the highest order that they do
+    determine. Differentiable once in points and weights, at the cost of evaluating two jets. Raises
+    InputError where a patch has no points or weight, or where numbers are not finite.
+    """
+    if not 1 <= order <= 10:
+        raise InputError(f"order = {order}; the order of a jet is 1 to 10")
+    if points.ndim < 2 or points.shape[-1] != 3:
+        raise InputError(f"points of shape {tuple(points.shape)}; (..., points, 3) is needed")
+    shape = points.shape[:-1]
+    if shape[-1] == 0:
+        raise InputError("patch 0 has no points")
+    flat = points.reshape(-1, *points.shape[-2:])
+    if mask is not None:
+        mask = mask.expand(shape).reshape(flat.shape[:2])
+    if weights is None:
+        weights = flat.new_ones(1, 1) if mask is None else mask.to(flat.dtype)
+        weights = weights.expand(flat.shape[:2])
+    else:
+        weights = weights.expand(shape).reshape(flat.shape[:2])
+        if mask is not None:
+            weights = torch.where(mask, weights, 0)
+    if (
+        mask is not None
+    ):  # padding is moved onto a point of the patch, where it changes neither box nor sums
+        first = mask.to(torch.uint8).argmax(1)
+        flat = torch.where(
+            mask[..., None], flat, flat[torch.arange(len(flat), device=flat.device), first][:, None]
+        )
+    alpha, fitted = _LeastSquares.apply(flat, weights, order)
+    return JetFit(alpha.reshape(*shape[:-1], -1), fitted.reshape(shape[:-1]))
+
+
+class _LeastSquares(torch.autograd.Function):
     """points (B, P, 3), weights (B, P), order -> alpha (B, A), order (B,)."""
 
     @staticmethod
@@ -37,7 +85,7 @@ class LeastSquares(torch.autograd.Function):
         scale = 1 / points.shape[1] if w is None else 1
         gram = _gram(tx @ wty.mT * scale, order)
         right = (tx[:, : order + 1] * x[2, :, None]) @ wty[:, : order + 1].mT * scale
-        right = jets.from_matrix(right)
+        right = jet.from_matrix(right)
         _check(box, right)
         factor, fitted, kept = _factorise(gram, order)
         solution = torch.cholesky_solve((right * kept)[..., None], factor)[..., 0]
@@ -60,8 +108,8 @@ class LeastSquares(torch.autograd.Function):
         )
         dtype, uv = points.dtype, points[..., :2]
         which = (0, 0), (1, 0), (0, 1)
-        c, cu, cv = jets.derivatives(alpha.to(dtype), uv, *which)
-        y, yu, yv = jets.derivatives(y.to(dtype), uv, *which)
+        c, cu, cv = jet.derivatives(alpha.to(dtype), uv, *which)
+        y, yu, yv = jet.derivatives(y.to(dtype), uv, *which)
         residual = points[..., 2] - c
         w = weights / total.to(dtype)
         to_points = torch.stack(
@@ -93,18 +141,18 @@ class _Box:
     def to_monomials(self, coefficients, order):
         """Coefficients (B, A) of T_a(x) T_b(y) turned into those of u^a v^b."""
         U, V = self._axes(order)
-        return jets.from_matrix(U.mT @ jets.matrix(coefficients) @ V)
+        return jet.from_matrix(U.mT @ jet.matrix(coefficients) @ V)
 
     def to_monomials_transposed(self, coefficients, order):
         """The transposed map of :meth:`to_monomials`, for gradients."""
         U, V = self._axes(order)
-        return jets.from_matrix(U @ jets.matrix(coefficients) @ V.mT)
+        return jet.from_matrix(U @ jet.matrix(coefficients) @ V.mT)
 
     def _axes(self, order):
         """For u and for v (B, n+1, n+1): row a holds T_a((u - centre) / half) in powers of u."""
         chebyshev, binomial, power = _chebyshev_in_powers(order, self.centre.device)
-        shifted = jets.powers(-self.centre.T, order)[..., power] * binomial
-        scaled = shifted * jets.powers(1 / self.half.T, order)[..., None]
+        shifted = jet.powers(-self.centre.T, order)[..., power] * binomial
+        scaled = shifted * jet.powers(1 / self.half.T, order)[..., None]
         return chebyshev @ scaled
 
 
@@ -161,7 +209,7 @@ def _products(order, device):
     """Indices (4, A^2) into the flat moments (2n+1)^2, whose mean are the moments of the products
     of two basis functions.
     """
-    e = jets.exponents(order)
+    e = exponents(order)
     a, b = e[:, None, :], e[None, :, :]
     n = 2 * order + 1
     index = [
@@ -174,14 +222,14 @@ def _gram(moments, order):
     """Gram matrices (B, A, A) of the products T_a(x) T_b(y), from the moments (B, 2n+1, 2n+1)."""
     flat = moments.flatten(1).T.contiguous()  # whole rows of a moment each are gathered
     total = sum(flat.index_select(0, index) for index in _products(order, moments.device)) / 4
-    return total.T.unflatten(1, (jets.size_of(order),) * 2)
+    return total.T.unflatten(1, (size_of(order),) * 2)
 
 
 def _factorise(gram, order):
     """Cholesky factors (B, A, A) of the leading blocks that the points determine, the orders (B,),
     and the coefficients kept (B, A).
     """
-    degree = torch.as_tensor(jets.exponents(order).sum(1), device=gram.device)
+    degree = torch.as_tensor(exponents(order).sum(1), device=gram.device)
     fitted = torch.full((len(gram),), order, device=gram.device)
     eye = torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)
     factor, info = torch.linalg.cholesky_ex(gram)

@@ -12,8 +12,10 @@ from dataclasses import dataclass, fields
 
 import torch
 
-from . import families, jets
-from .frames import CanonicalFrame
+from polyfit import jets
+from polyfit.jets import CanonicalFrame
+
+from . import families
 from .garments import GarmentPatches
 from .losses import discrepancy
 

@@ -9,8 +9,8 @@ import warnings
 
 import numpy as np
 
-from .errors import InputError
-from .files import aside
+from polyfit.errors import InputError
+from polyfit.files import aside
 
 
 def write_ply(path, vertices, faces, uv=None):

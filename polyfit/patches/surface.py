@@ -9,9 +9,11 @@ from functools import cached_property
 import numpy as np
 import torch
 
-from . import jets, mesh
-from .frames import CanonicalFrame
+from polyfit import jets, mesh
+from polyfit.jets import CanonicalFrame
+
 from .patches import Patches
+from .refine import refined
 
 
 @dataclass(frozen=True)
@@ -76,10 +78,8 @@ class PatchedSurface:
     def from_mesh(cls, vertices, faces, count=None, order=4, *, rounds=5, where="mesh", **options):
         """Cut the mesh (N, 3) [m], (F, 3) into patches (:meth:`polyfit.patches.Patches.cut`),
         :meth:`fit` them with ``options``, and let the boundaries move to where the jets fit best,
-        ``rounds`` times (:func:`polyfit.refine.refined`).
+        ``rounds`` times (:func:`polyfit.patches.refine.refined`).
         """
-        from .refine import refined
-
         return refined(
             cls.fit(Patches.cut(vertices, faces, count, where=where), order, **options),
             rounds,

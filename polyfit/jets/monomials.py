@@ -6,11 +6,11 @@ from functools import lru_cache
 
 import numpy as np
 
-# Of the least squares of jets, in polyfit.least_squares and for a tracker's template: A coefficient
-# counts as determined where its basis function, over the weighted points, keeps this RMS beyond
-# those before it.
+# Facts of the jets' least squares, here and for a tracker's template.
+# A coefficient counts as determined where its basis function, over the weighted points, keeps this
+# RMS after those before it are projected out.
 DETERMINED = 1e-5
-# A box is taken to be at least this share of its longer side wide, so that rounding across a
+# The box of the points is at least this wide, as a share of its longer side: rounding across a
 # straight line is not stretched into a patch.
 NARROWEST = 1e-2
 

@@ -7,9 +7,10 @@ from functools import cached_property
 
 import numpy as np
 
-from . import mesh
+from polyfit import mesh
+from polyfit.errors import InputError
+
 from .clusters import clusters, halved
-from .errors import InputError
 
 # Vertices that a mesh should have before it is cut, for each patch and altogether: enough for the
 # patches' outlines and for their jets' fit.

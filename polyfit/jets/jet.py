@@ -4,19 +4,17 @@
 ``alpha`` (..., A) has A = (n+1)(n+2)/2 entries, in the paper's order: i = 0..n, and j = 0..i within
 each i, that is 1, u, v, u^2, uv, v^2, u^3, ... ``uv`` (..., P, 2) are P chart coordinates of each
 jet; leading dimensions broadcast, so that one jet (A,) takes (P, 2) and a batch (B, A) takes (B, P,
-2). All lengths are in the canonical unit (:class:`polyfit.frames.CanonicalFrame`), curvatures in
+2). All lengths are in the canonical unit (:class:`polyfit.CanonicalFrame`), curvatures in
 its inverse. Everything is differentiable in ``alpha`` and ``uv``. The same functions stand in
-Dr.Jit in ``polysft_mi.jet``, by the same names.
+Dr.Jit in ``polysft_mi.surface.jet``, by the same names.
 """
 
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 import torch
 
-from .errors import InputError
-from .monomials import exponents, order_of, size_of  # noqa: F401 (read as jets.size_of)
+from .monomials import exponents, order_of
 
 
 def matrix(alpha):
@@ -163,52 +161,3 @@ def nearest(alpha, x, steps=4):
 
 def _symmetric(a, b, c):
     return torch.stack([torch.stack([a, b], -1), torch.stack([b, c], -1)], -2)
-
-
-@dataclass(frozen=True)
-class JetFit:
-    """``alpha`` (..., A): the coefficients, zero beyond the order fitted. ``order`` (...,) int64:
-    the order that the points determine, at most the one asked for; 0 is a constant."""
-
-    alpha: torch.Tensor
-    order: torch.Tensor
-
-
-def fit(points, order, *, weights=None, mask=None):
-    """Least-squares n-jets through ``points`` (..., P, 3), in charts with |u|, |v| of about 1: a
-    :class:`JetFit`.
-
-    ``weights`` (..., P) not negative; ``mask`` (..., P) bool: the points that exist, the others are
-    padding of any value. Where the points are too few for ``order``, or lie such (on a line, on a
-    small grid) that they do not determine it, the patch is fitted by the highest order that they do
-    determine. Differentiable once in points and weights, at the cost of evaluating two jets. Raises
-    InputError where a patch has no points or weight, or where numbers are not finite.
-    """
-    from .least_squares import LeastSquares
-
-    if not 1 <= order <= 10:
-        raise InputError(f"order = {order}; the order of a jet is 1 to 10")
-    if points.ndim < 2 or points.shape[-1] != 3:
-        raise InputError(f"points of shape {tuple(points.shape)}; (..., points, 3) is needed")
-    shape = points.shape[:-1]
-    if shape[-1] == 0:
-        raise InputError("patch 0 has no points")
-    flat = points.reshape(-1, *points.shape[-2:])
-    if mask is not None:
-        mask = mask.expand(shape).reshape(flat.shape[:2])
-    if weights is None:
-        weights = flat.new_ones(1, 1) if mask is None else mask.to(flat.dtype)
-        weights = weights.expand(flat.shape[:2])
-    else:
-        weights = weights.expand(shape).reshape(flat.shape[:2])
-        if mask is not None:
-            weights = torch.where(mask, weights, 0)
-    if (
-        mask is not None
-    ):  # padding is moved onto a point of the patch, where it changes neither box nor sums
-        first = mask.to(torch.uint8).argmax(1)
-        flat = torch.where(
-            mask[..., None], flat, flat[torch.arange(len(flat), device=flat.device), first][:, None]
-        )
-    alpha, fitted = LeastSquares.apply(flat, weights, order)
-    return JetFit(alpha.reshape(*shape[:-1], -1), fitted.reshape(shape[:-1]))

@@ -5,7 +5,9 @@
 import numpy as np
 import torch
 
-from . import clusters, mesh
+from polyfit import mesh
+
+from . import clusters
 
 # Weight of a vertex's squared distance from its patch's centroid against its squared distance from
 # the jet, each divided by its mean: keeps patches compact.
@@ -15,7 +17,7 @@ SWEEPS = 4
 
 
 def refined(surface, rounds, **options):
-    """The :class:`polyfit.surface.PatchedSurface` after ``rounds`` times giving vertices at
+    """The :class:`polyfit.PatchedSurface` after ``rounds`` times giving vertices at
     boundaries to the neighbouring patch whose jet is nearer, and fitting the jets again with
     ``options``. The number of patches and their connectedness stay; the best round is returned.
     """

@@ -1,0 +1,54 @@
+"""A moving mesh as a folder with one OBJ or PLY file a frame."""
+
+import os
+
+from polyfit.files import folder_aside
+from polyfit.mesh import write_ply
+
+from .moving import checked, encoded
+
+
+def write_frames(folder, kind, vertices, faces, uv=None, texture=None, *, labels=None, up="y"):
+    """Write one mesh a frame into a new or empty ``folder``: ``kind`` "obj", with a material file
+    and the texture, or "ply", with uv as ``s``, ``t``.
+
+    ``labels`` (T,): the frames' numbers in the file names, by default 0 to T - 1. A folder that
+    holds nothing but such files is replaced.
+    """
+    vertices, faces, uv = checked(vertices, faces, uv, 1)
+    ours = lambda name: (
+        name in ("surface.mtl", "texture.png", "texture.jpg")
+        or (name.endswith(f".{kind}") and name[: -len(kind) - 1].isdigit())
+    )
+    data, image = (
+        encoded(texture)
+        if kind == "obj" and texture is not None and uv is not None
+        else (None, None)
+    )
+    with folder_aside(folder, ours) as place:
+        if data:
+            with open(os.path.join(place, f"texture.{image}"), "wb") as file:
+                file.write(data)
+        if kind == "obj":
+            with open(os.path.join(place, "surface.mtl"), "w", encoding="ascii") as file:
+                file.write(
+                    "newmtl surface\nKd 1 1 1\nKs 0 0 0\nillum 1\n"
+                    + (f"map_Kd texture.{image}\n" if data else "")
+                )
+        for label, V in zip(range(len(vertices)) if labels is None else labels, vertices):
+            name = os.path.join(place, f"{int(label):03d}.{kind}")
+            if kind == "ply":
+                write_ply(name, V, faces, uv)
+            else:
+                _write_obj(name, V, faces, uv, up)
+
+
+def _write_obj(path, V, F, uv, up):
+    corner = ("{0}/{0}" if uv is not None else "{0}").format
+    with open(path, "w", encoding="ascii") as file:
+        file.write(f"# metres, {up} up\nmtllib surface.mtl\no surface\n")
+        file.writelines("v {:.9g} {:.9g} {:.9g}\n".format(*p) for p in V.tolist())
+        if uv is not None:
+            file.writelines("vt {:.9g} {:.9g}\n".format(*t) for t in uv.tolist())
+        file.write("usemtl surface\ns 1\n")
+        file.writelines("f " + " ".join(corner(k + 1) for k in face) + "\n" for face in F.tolist())

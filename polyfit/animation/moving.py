@@ -1,0 +1,87 @@
+"""What all writers of a moving mesh need: axes, normals, checks, and the texture's image.
+
+Shapes and units are those of :mod:`polyfit.animation`.
+"""
+
+import io
+
+import numpy as np
+
+from polyfit.errors import InputError
+from polyfit.mesh import face_vectors
+
+UP = {"y": np.diag([1.0, -1.0, -1.0]), "z": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])}
+
+
+def from_camera(points, up="y"):
+    """Points (..., 3) of an OpenCV camera frame (x right, y down, z forward) in a frame with y up,
+    (x, -y, -z), or with z up, (x, z, -y).
+
+    Both are rotations about x: nothing is mirrored. The camera stays at the origin; with y up it
+    looks along -z, as the cameras of glTF and USD do.
+    """
+    return np.asarray(points) @ UP[up].T.astype(np.asarray(points).dtype)
+
+
+def normals(vertices, faces):
+    """Unit normals (T, N, 3) of the vertices, each the mean of its faces' normals by area; zero
+    where there is none.
+    """
+    out = np.zeros(np.shape(vertices), np.float64)
+    for V, n in zip(np.asarray(vertices, np.float64), out):
+        across = face_vectors(V, faces)
+        for k in range(3):
+            np.add.at(n, faces[:, k], across)
+        n /= np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-30)
+    return out.astype(np.float32)
+
+
+def checked(vertices, faces, uv, fps):
+    V, F = np.asarray(vertices, np.float32), np.asarray(faces, np.int64)
+    if (
+        V.ndim != 3
+        or V.shape[2] != 3
+        or not V.size
+        or F.ndim != 2
+        or F.shape[1:] != (3,)
+        or not F.size
+    ):
+        raise InputError(
+            f"animation: vertices {V.shape}, faces {F.shape}; (T, N, 3) and (F, 3), neither empty,"
+            " are needed"
+        )
+    if not np.isfinite(V).all() or not 0 <= F.min() <= F.max() < V.shape[1]:
+        raise InputError(
+            f"animation: positions that are not finite, or faces beyond the {V.shape[1]} vertices"
+        )
+    if not (np.isfinite(fps) and fps > 0):
+        raise InputError(f"animation: {fps} frames a second; a positive number is needed")
+    if uv is not None:
+        uv = np.asarray(uv, np.float32)
+        if uv.shape != (V.shape[1], 2):
+            raise InputError(f"animation: uv {uv.shape}; ({V.shape[1]}, 2) is needed")
+        uv = np.nan_to_num(uv)
+    return V, F, uv
+
+
+def encoded(texture):
+    """``(bytes, extension)`` of an image file as PNG or JPEG, which is what USD and glTF take: as
+    it is where it is one, else as PNG.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(texture) as image:
+            if image.format in ("PNG", "JPEG"):
+                with open(texture, "rb") as file:
+                    return file.read(), {"PNG": "png", "JPEG": "jpg"}[image.format]
+            data = io.BytesIO()
+            image.convert("RGB").save(data, "PNG")
+            return data.getvalue(), "png"
+    except FileNotFoundError:
+        raise InputError(f"{texture}: no such file; the image of the texture is needed") from None
+    except (UnidentifiedImageError, SyntaxError, ValueError) as error:
+        raise InputError(
+            f"{texture}: not an image that can be embedded ({error}); PNG, JPEG, TIFF, BMP or WebP"
+            " is needed"
+        ) from None

@@ -1,0 +1,115 @@
+"""A moving mesh as a USD scene."""
+
+import os
+import tempfile
+
+import numpy as np
+
+from polyfit.errors import InputError
+from polyfit.files import aside
+
+from .moving import checked, encoded, normals
+
+
+def write_usd(path, vertices, faces, uv=None, texture=None, *, fps=24.0, up="y", name="surface"):
+    """Write a USD scene, its format by the extension: ``.usdz`` (one file with the texture in it),
+    ``.usdc``, ``.usda``, or ``.usd``, for which the texture is written beside as NAME_texture.png
+    or .jpg.
+
+    A Mesh ``/name/mesh`` with ``points``, ``normals`` and ``extent`` at the time codes 0 to T - 1,
+    ``fps`` time codes a second, metersPerUnit 1, no subdivision, and a UsdPreviewSurface with the
+    texture. Needs usd-core.
+    """
+    vertices, faces, uv = checked(vertices, faces, uv, fps)
+    stem, extension = os.path.splitext(os.fspath(path))
+    if extension.lower() not in (".usd", ".usda", ".usdc", ".usdz"):
+        raise InputError(f"{path}: .usdz, .usdc, .usda or .usd is needed")
+    data, kind = encoded(texture) if texture is not None and uv is not None else (None, None)
+    if extension.lower() == ".usdz":
+        _write_usdz(path, vertices, faces, uv, data, kind, fps, up, name)
+        return
+    image = f"{os.path.basename(stem)}_texture.{kind}" if data else None
+    stage = _stage(vertices, faces, uv, image and f"./{image}", fps, up, name)
+    if data:
+        with (
+            aside(os.path.join(os.path.dirname(stem), image)) as temporary,
+            open(temporary, "wb") as file,
+        ):
+            file.write(data)
+    with aside(path) as temporary:
+        stage.GetRootLayer().Export(temporary)
+
+
+def _write_usdz(path, vertices, faces, uv, data, kind, fps, up, name):
+    from pxr import Sdf, UsdUtils
+
+    with aside(path) as temporary, tempfile.TemporaryDirectory() as folder:
+        if data:
+            with open(os.path.join(folder, f"texture.{kind}"), "wb") as file:
+                file.write(data)
+        inner = os.path.join(folder, "surface.usdc")
+        stage = _stage(vertices, faces, uv, f"./texture.{kind}" if data else None, fps, up, name)
+        stage.GetRootLayer().Export(inner)  # the stage must live on: layers are held weakly
+        UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(inner), temporary)
+
+
+def _stage(vertices, faces, uv, image, fps, up, name):
+    """The scene, in memory; ``image``: the texture's path as the file shall name it."""
+    from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdShade, Vt
+
+    stage = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageUpAxis(stage, up.upper())
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    stage.SetTimeCodesPerSecond(fps)
+    stage.SetFramesPerSecond(fps)
+    stage.SetStartTimeCode(0)
+    stage.SetEndTimeCode(len(vertices) - 1)
+    root = UsdGeom.Xform.Define(stage, f"/{Tf.MakeValidIdentifier(name)}")
+    stage.SetDefaultPrim(root.GetPrim())
+    Usd.ModelAPI(root).SetKind(Kind.Tokens.component)
+    mesh = UsdGeom.Mesh.Define(stage, root.GetPath().AppendChild("mesh"))
+    mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    mesh.CreateDoubleSidedAttr(True)
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32)))
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.astype(np.int32).ravel()))
+    points, normal, extent = (
+        mesh.CreatePointsAttr(),
+        mesh.CreateNormalsAttr(),
+        mesh.CreateExtentAttr(),
+    )
+    mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    for k, (V, n) in enumerate(zip(vertices, normals(vertices, faces))):
+        points.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(V)), k)
+        normal.Set(Vt.Vec3fArray.FromNumpy(n), k)
+        extent.Set([Gf.Vec3f(*map(float, V.min(0))), Gf.Vec3f(*map(float, V.max(0)))], k)
+    material = UsdShade.Material.Define(stage, root.GetPath().AppendChild("material"))
+    shader = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("preview"))
+    shader.CreateIdAttr("UsdPreviewSurface")
+    shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(0.9)
+    shader.CreateInput("metallic", Sdf.ValueTypeNames.Float).Set(0.0)
+    colour = shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f)
+    if uv is not None:
+        st = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(
+            "st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.vertex
+        )
+        st.Set(Vt.Vec2fArray.FromNumpy(uv))
+    if image:
+        reader = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("uv"))
+        reader.CreateIdAttr("UsdPrimvarReader_float2")
+        reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("st")
+        bitmap = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("texture"))
+        bitmap.CreateIdAttr("UsdUVTexture")
+        bitmap.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(Sdf.AssetPath(image))
+        bitmap.CreateInput("sourceColorSpace", Sdf.ValueTypeNames.Token).Set("sRGB")
+        for axis in ("wrapS", "wrapT"):
+            bitmap.CreateInput(axis, Sdf.ValueTypeNames.Token).Set("clamp")
+        place = reader.CreateOutput("result", Sdf.ValueTypeNames.Float2)
+        bitmap.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(place)
+        colour.ConnectToSource(bitmap.CreateOutput("rgb", Sdf.ValueTypeNames.Float3))
+    else:
+        colour.Set(Gf.Vec3f(0.72, 0.72, 0.72))
+    material.CreateSurfaceOutput().ConnectToSource(
+        shader.CreateOutput("surface", Sdf.ValueTypeNames.Token)
+    )
+    UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material)
+    return stage

@@ -1,0 +1,22 @@
+"""Files or arrays of triangles go in; checked arrays, their edges, manifold sheets and finer meshes
+come out, and mesh files again.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach(
+    __name__,
+    submod_attrs={
+        "meshio": ["read_mesh", "write_ply"],
+        "subdivision": ["child", "refined", "subdivided"],
+        "triangles": [
+            "areas",
+            "checked",
+            "components",
+            "edges_of",
+            "face_vectors",
+            "sheets",
+            "winding",
+        ],
+    },
+)

@@ -1,0 +1,82 @@
+"""Finer meshes of the same surface, and where a point of the coarse mesh lies on the fine one.
+
+``F`` (F, 3) int are faces; barycentric coordinates are in the order of a face's corners.
+"""
+
+import numpy as np
+
+from .triangles import edges_of
+
+
+def subdivided(F):
+    """Every face cut in four at the middles of its sides: ``(faces (4 F, 3), edges (E, 2))``.
+
+    The middle of ``edges[e]`` is the vertex n + e, n the number of vertices of F. The children of
+    face f are the rows 4 f + k: k = 0, 1, 2 at corner k and 3 in the middle, each with its corners
+    in the order of the parent's (the middle one: opposite to them).
+    """
+    edges, side = edges_of(F)
+    (a, b, c), (ab, bc, ca) = F.T, (side + int(F.max()) + 1).T
+    children = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (bc, ca, ab)]
+    return np.stack([np.stack(child, axis=1) for child in children], axis=1).reshape(-1, 3), edges
+
+
+def child(face, barycentric, levels):
+    """Where points on a mesh lie after ``levels`` subdivisions: (face (...,), barycentric (..., 3))
+    turned into those of the finer mesh.
+    """
+    face, b = np.asarray(face, dtype=np.int64), np.asarray(barycentric, dtype=np.float64)
+    for _ in range(levels):
+        corner = b.argmax(axis=-1)
+        outer = np.take_along_axis(b, corner[..., None], -1)[..., 0] >= 0.5
+        near = 2 * b - (np.arange(3) == corner[..., None])
+        b = np.where(outer[..., None], near, 1 - 2 * b)
+        face = 4 * face + np.where(outer, corner, 3)
+    return face, b
+
+
+def refined(F, parts):
+    """The faces with every side cut in ``parts``: ``(faces (parts^2 F, 3), face (N',), barycentric
+    (N', 3))``, where the new vertex k lies at ``barycentric[k]`` on the face ``face[k]`` of F. The
+    vertices of F come first, in their order; neighbours share the new ones.
+    """
+    grid = np.array(
+        [(i, j, parts - i - j) for i in range(parts, -1, -1) for j in range(parts - i, -1, -1)]
+    )
+    count = int(F.max()) + 1
+    edges, side = edges_of(F)
+    forward = (
+        edges[side][..., 0] == F
+    )  # whether the side from corner k runs from the smaller vertex to the larger
+    inner = np.cumsum((grid > 0).all(axis=1)) - 1
+    index = np.empty((len(F), len(grid)), dtype=np.int64)
+    for n, b in enumerate(grid):
+        zero = np.flatnonzero(b == 0)
+        if len(zero) == 2:
+            index[:, n] = F[:, b.argmax()]
+        elif len(zero) == 1:
+            k = (int(zero[0]) + 1) % 3  # the side from corner k to the next
+            step = np.where(forward[:, k], b[(k + 1) % 3], b[k])
+            index[:, n] = count + side[:, k] * (parts - 1) + step - 1
+        else:
+            index[:, n] = (
+                count
+                + len(edges) * (parts - 1)
+                + np.arange(len(F)) * ((parts - 1) * (parts - 2) // 2)
+                + inner[n]
+            )
+    at = {tuple(b): n for n, b in enumerate(grid)}
+    small = [[at[i, j, k], at[i - 1, j + 1, k], at[i - 1, j, k + 1]] for i, j, k in at if i > 0]
+    small += [
+        [at[i - 1, j + 1, k], at[i - 2, j + 1, k + 1], at[i - 1, j, k + 1]]
+        for i, j, k in at
+        if i > 1
+    ]
+    total = count + len(edges) * (parts - 1) + len(F) * ((parts - 1) * (parts - 2) // 2)
+    first = np.empty(total, dtype=np.int64)
+    first[index.ravel()[::-1]] = np.arange(index.size)[::-1]
+    return (
+        index[:, np.array(small)].reshape(-1, 3),
+        first // len(grid),
+        grid[first % len(grid)] / parts,
+    )
