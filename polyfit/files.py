@@ -4,6 +4,7 @@ import contextlib
 import errno
 import os
 import shutil
+from pathlib import Path
 
 from .errors import InputError
 
@@ -56,6 +57,24 @@ def aside(path):
             error.filename = os.fspath(
                 path
             )  # the name that the user knows; a full disk comes with none
+        raise
+
+
+@contextlib.contextmanager
+def folder_for(path):
+    """``with folder_for(path):`` the folder ``path`` and its parents exist inside the block.
+
+    Where the block ends by an exception, those of them that it made and left empty are removed.
+    """
+    path = Path(path)
+    made = [folder for folder in (path, *path.parents) if not folder.exists()]
+    path.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    except BaseException:
+        with contextlib.suppress(OSError):  # the first that is not empty ends it
+            for folder in made:
+                folder.rmdir()
         raise
 
 

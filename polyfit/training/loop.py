@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 
 from polyfit.errors import InputError
-from polyfit.files import aside
+from polyfit.files import aside, folder_for
 from polyfit.network import load_into, read_weights, write_weights
 
 from .processes import Processes
@@ -187,16 +187,15 @@ def conduct(make, folder, *, device="cpu", resume=False, until=None, every=120.0
         raise InputError(f"{checkpoint}: no such file, nothing to resume")
     if not resume and weights.exists():
         raise InputError(f"{weights}: exists; give another -o, or --resume")
-    folder.mkdir(parents=True, exist_ok=True)
-    processes = Processes(device)
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
         TimeRemainingColumn(),
     )
+    processes = Processes(device)
     try:
-        with Progress(*columns, disable=processes.rank > 0) as progress:
+        with folder_for(folder), Progress(*columns, disable=processes.rank > 0) as progress:
             training = make(folder, processes, progress)
             if resume:
                 training.restore(checkpoint)

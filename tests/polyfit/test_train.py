@@ -209,11 +209,16 @@ class TestRefused:
         )
 
     def test_on_the_command_line_in_one_line(self, tmp_path):
-        done = self.run("none.obj", "-o", str(tmp_path / "out"))
+        done = self.run("none.obj", "-o", str(tmp_path / "new" / "out"))
         assert done.returncode == 2
         assert done.stderr.strip().splitlines()[-1].startswith("error: none.obj: no such file")
         assert "Traceback" not in done.stderr
-        assert not (tmp_path / "out" / "weights.safetensors").exists()
+        assert list(tmp_path.iterdir()) == []
+
+    def test_a_folder_of_the_user_stays(self, tmp_path):
+        with pytest.raises(InputError, match="no such file"):
+            trainer.train(replace(SMALL, meshes=("none.obj",)), tmp_path)
+        assert tmp_path.is_dir()
 
     @pytest.mark.parametrize(
         "change, message",
