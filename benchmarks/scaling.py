@@ -219,12 +219,18 @@ def report(cases, docs, frames):
     started = np.median([c["started_mb"] for c in cases])
     text = f"""# How the tracker scales
 
-`python benchmarks/scaling.py` makes this page: a sheet that covers a third of the image bends and
-turns in front of the camera, rendered with its masks, tracked by default settings. Seconds a frame
-are the tracker's (median of {frames - 1} frames), without start-up and pictures, of all its threads
-together: on idle cores it takes less, for reading the next frame and the kernels run beside the
-rest. Memory is the process's peak, of which {started:.0f} MB are Python, Mitsuba and LLVM.
-Evaluations are those of the objective with its derivatives. {v["variant"]}, {v["machine"]}.
+This page shows how time and memory of the second-order tracker grow with the number of vertices
+and with the image. `python benchmarks/scaling.py` makes it. A sheet that covers a third of the
+image bends and turns in front of the camera. It is rendered with its masks, and tracked with
+default settings.
+
+- Seconds a frame are the tracker's: the median of {frames - 1} frames, the sum over all threads,
+  without start-up and pictures. On idle cores a frame takes less, since the next frame is read and
+  kernels run in parallel.
+- Evaluations are those of the objective with its derivatives.
+- Memory is the process's peak. {started:.0f} MB of it are Python, Mitsuba and LLVM.
+- RMS is the distance from the true surface.
+- Measured on {v["variant"]}, {v["machine"]}.
 
 | vertices | image | seconds a frame | evaluations a frame | memory [MB] | RMS [mm] |
 |---:|---|---:|---:|---:|---:|
@@ -232,14 +238,13 @@ Evaluations are those of the objective with its derivatives. {v["variant"]}, {v[
 
 ![Seconds a frame and memory over the vertices, and over the pixels](scaling.png)
 
-RMS is the distance from the truth. With the image grow decoding,
-rays and residuals; only the finest of the three stages works on every pixel that sees the sheet.
-With the template grows above all the elimination of each vertex's (Δu, Δv): a sheet's block
-tridiagonal matrix is as wide as the sheet, so that its factorisation grows with the square of the
-number of vertices. Up to 3,000 vertices the relief moves too, which costs time, and on a sheet as
-smooth as this one its noise is to be seen in the distances. This sheet bends within a few frames,
-so that its mirror twin is tried in most of them: evaluations are up to twice those of a longer
-video.
+With the image grow decoding, rays and residuals. Only the finest of the three stages works on every
+pixel that sees the sheet.
+
+With the template grows the elimination of each vertex's (Δu, Δv). A sheet's block tridiagonal
+matrix is as wide as the sheet, so its factorisation grows with the square of the number of
+vertices. Up to 3,000 vertices the relief moves too. It costs time, and on such a smooth sheet its
+noise shows in the distances.
 """
     with (
         aside(os.path.join(docs, "scaling.md")) as temporary,

@@ -21,6 +21,7 @@ import json
 import os
 import subprocess
 import sys
+import textwrap
 import time
 
 import numpy as np
@@ -348,21 +349,24 @@ def page(results, picture):
     text = [
         "# Accuracy and time of the solvers",
         (
-            "Made by `python benchmarks/sft.py`. The time is the whole command's, start-up and"
-            " outputs included, over the number of frames. Measured on"
-            f" {'; '.join(machines) or 'no machine yet'}."
+            "`python benchmarks/sft.py` makes this page. It compares the accuracy and the time of"
+            " the solvers on every sequence. The time a frame is that of the whole command, start-up"
+            " and outputs included, divided by the number of frames. Measured on:"
         ),
+        *(f"- {machine}" for machine in machines or ["no machine yet"]),
+        "The methods and figures:",
+        "- `gauss-newton` is our solver, the default. `adam` is the paper's.",
         (
-            "`per-vertex` is what a Mitsuba user would write without jets"
-            " (`benchmarks/per_vertex.py`): the same renderer and objective, the template's"
-            " vertices as unknowns through `mi.ad.LargeSteps`; it writes no pictures."
+            "- `per-vertex` is what a Mitsuba user would write without jets"
+            " (`benchmarks/per_vertex.py`): the same renderer and objective, with the template's"
+            " vertices as unknowns through `mi.ad.LargeSteps`. It writes no pictures."
         ),
     ]
     if jets:
         text.append(
-            "*Best jet* is the jet that comes closest to the true vertices of each frame, found by"
-            " a local search: about the least distance that its order can leave. Its normals are"
-            " what they are then, not the best possible."
+            "- *Best jet* is the jet that comes closest to the true vertices of each frame, found"
+            " by a local search: about the least distance that its order can reach. Its normals"
+            " belong to that jet; they are not the best possible."
         )
     if any(
         np.isinf(value)
@@ -371,9 +375,15 @@ def page(results, picture):
         if isinstance(value, float)
     ):
         text.append(
-            "*inf*: there is a frame whose surface none of the truth's rays meets; the plot leaves"
-            " it out."
+            "- *inf*: in some frame no ray of the ground truth meets the surface. The plot leaves"
+            " these out."
         )
+    text = [
+        textwrap.fill(
+            t, 100, subsequent_indent="  " if t[:2] == "- " else "", break_on_hyphens=False
+        )
+        for t in text
+    ]
     if any(r.get("seconds_a_frame") for r in results):
         text.append(f"![Accuracy against seconds a frame, one marker a method]({picture})")
     return "\n\n".join([*text, table(results)]) + "\n"

@@ -14,8 +14,6 @@ WIDE = {
     "CONTRIBUTING.md",
     "README.md",
     "docs/index.md",
-    "docs/scaling.md",
-    "docs/sft.md",
     "docs/tracker.md",
     "docs/tutorial.md",
 }
