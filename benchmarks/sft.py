@@ -350,8 +350,8 @@ def page(results, picture):
         "# Accuracy and time of the solvers",
         (
             "`python benchmarks/sft.py` makes this page. It compares the accuracy and the time of"
-            " the solvers on every sequence. The time a frame is that of the whole command, start-up"
-            " and outputs included, divided by the number of frames. Measured on:"
+            " the solvers on every sequence. The time a frame is that of the whole command,"
+            " start-up and outputs included, divided by the number of frames. Measured on:"
         ),
         *(f"- {machine}" for machine in machines or ["no machine yet"]),
         "The methods and figures:",
