@@ -28,7 +28,7 @@ SCENES = {
         "masks",
         "texture.jpg",
         "template.obj",
-        settings={"period": 150, "patience": 50},
+        settings={"last": 11, "period": 150, "patience": 50},
     ),
     "flag": _cloth(),
     "bend": _cloth(),
@@ -61,7 +61,8 @@ def text(name):
             SCENES[name],
             "demo",
             comment=(
-                "A cloth that swings to the side: python -m polysft_mi.run scenes/demo.xml -o OUT"
+                "A poster that bends, frames 0 to 11 of 45 (-D last=-1: all):"
+                " python -m polysft_mi.run scenes/demo.xml -o OUT"
             ),
         )
     comment = (

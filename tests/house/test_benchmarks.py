@@ -2,11 +2,13 @@
 tests.
 """
 
+import dataclasses
 import json
 
 import drjit as dr
 import numpy as np
 import pytest
+from clips import CAMERA, HEIGHT, WIDTH, photo, placed, rendered, write_png
 from places import ROOT
 from scripts import load
 
@@ -147,8 +149,18 @@ def test_scaling_tracks_the_sheet_that_it_makes(tmp_path):
     )
 
 
-def test_poses_of_the_demo_are_found_again():
-    rows, sure = outline.measure(str(ROOT / "scenes" / "demo"), 3)
+def test_poses_of_a_print_are_found_again(tmp_path):
+    write_png(tmp_path / "frames" / "000.png", rendered(photo())[0])
+    (tmp_path / "camera.json").write_text(json.dumps(dataclasses.asdict(CAMERA)))
+    u, v = (x.ravel() for x in np.meshgrid(np.linspace(-0.5, 0.5, 9), np.linspace(-0.5, 0.5, 9)))
+    R, shift = placed()
+    points = np.column_stack([u * WIDTH, v * HEIGHT, 0 * u]) @ R.T + shift
+    faces = [(k, k + 1, k + 10, k + 9) for k in range(71) if k % 9 != 8]
+    lines = ["v {:.6f} {:.6f} {:.6f}".format(*p) for p in points]
+    lines += [f"vt {a + 0.5:.6f} {0.5 - b:.6f}" for a, b in zip(u, v, strict=True)]
+    lines += ["f " + " ".join(f"{k + 1}/{k + 1}" for k in face) for face in faces]
+    (tmp_path / "template.obj").write_text("\n".join(lines) + "\n")
+    rows, sure = outline.measure(str(tmp_path), 3)
     assert rows.shape == (3, 4) and sure == 3
     assert (
         rows[:, 0].min() > 1 and rows[:, 2].max() < 0.2 and (rows[:, 3] < 0.25 * rows[:, 1]).all()

@@ -82,7 +82,7 @@ def test_folder_of_a_video(clip, tmp_path):
 
 
 def test_demo_is_found_by_its_texture(tmp_path):
-    """The demo's first frame is curved: its own mesh as the template."""
+    """With the demo's own mesh as the template."""
     write_video(
         tmp_path / "demo.mp4",
         [read_rgb(p) for p in sorted((DEMO / "frames").glob("*.jpg"))[:3]],
