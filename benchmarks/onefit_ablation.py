@@ -15,7 +15,7 @@ import onefit_accuracy as accuracy
 
 import onefit
 from onefit import train
-from onefit.losses import Weights
+from onefit.objective import Weights
 from polyfit.errors import cli
 
 CASES = {

@@ -19,11 +19,11 @@ import numpy as np
 import torch
 
 import onefit
-from onefit import generate
+from onefit.motion import generate
 from onefit.train import STANDARD
 from polyfit.errors import cli
 
-SEED = 1_000_000  # of shapes and motions, see onefit.generate.HELD_OUT_SEEDS
+SEED = 1_000_000  # of shapes and motions, see onefit.motion.generate.HELD_OUT_SEEDS
 
 
 def drapes(draper, garment, seconds, shapes, seed=SEED, **options):

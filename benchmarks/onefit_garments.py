@@ -29,12 +29,11 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from onefit import fitting, generate, skeleton, skinning
-from onefit.binding import Binding, standard_body, standard_surface, surface_of
-from onefit.body import AnnyBody
-from onefit.garment import TEMPLATES, Garment
-from onefit.motion import Motion
-from onefit.remesh import loops
+from onefit.body import AnnyBody, skeleton, skinning
+from onefit.garment import TEMPLATES, Garment, fitting, standard_body, standard_surface
+from onefit.garment.binding import Binding, surface_of
+from onefit.garment.remesh import loops
+from onefit.motion import Motion, generate
 from polyfit import mesh
 from polyfit.errors import cli
 from polyfit.files import aside

@@ -18,9 +18,8 @@ import pyvista
 import torch
 from vtkmodules.vtkFiltersModeling import vtkSelectEnclosedPoints
 
-from onefit import generate, skeleton, skinning
-from onefit.body import AnnyBody
-from onefit.motion import Motion
+from onefit.body import AnnyBody, skeleton, skinning
+from onefit.motion import Motion, generate
 
 FOREARMS = [
     skeleton.INDEX[f"{side}_{part}"]

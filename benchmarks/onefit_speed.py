@@ -19,8 +19,8 @@ import time
 import torch
 
 import onefit
-from onefit.draper import FPS
-from onefit.post import pushed_out
+from onefit.draping.draper import FPS
+from onefit.draping.post import pushed_out
 from polyfit.errors import cli
 
 FRAMES = 90

@@ -10,7 +10,8 @@ third of the garment is, in the mean over time, from where plain skinning has it
 root joint; ``swing``: the root mean square of what is left without that mean. ``of it``: how much
 of the least's hang and swing a network explains, 1 - |network - least|² / |least|²; 0 for plain
 skinning. ``rim``: how far the highest rim is from where skinning has it, in the mean: what has
-slipped. A garment that does not hang from the shoulders is held there (:mod:`onefit.waistband`).
+slipped. A garment that does not hang from the shoulders is held there
+(:mod:`onefit.garment.waistband`).
 """
 
 import argparse
@@ -19,11 +20,11 @@ import torch
 from rich.progress import Progress
 
 import onefit
-from onefit import losses, objective, skinning, waistband
-from onefit.charts import Deformation
-from onefit.measures import measure
-from onefit.nearest import ClosestSurface
-from onefit.network import UNIT
+from onefit.body import ClosestSurface, skinning
+from onefit.garment import waistband
+from onefit.garment.charts import Deformation
+from onefit.network.network import UNIT
+from onefit.objective import losses, measure, objective
 from polyfit.errors import cli
 
 SEED = 1_000_000  # of motions, that no training uses

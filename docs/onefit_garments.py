@@ -15,9 +15,8 @@ import pyvista
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from onefit.binding import standard_body
-from onefit.cuts import CUTS, cuts
-from onefit.garment import TEMPLATES, Garment
+from onefit.garment import TEMPLATES, Garment, standard_body
+from onefit.garment.sewing.cuts import CUTS, cuts
 
 HERE = os.path.dirname(os.path.abspath(__file__))
 

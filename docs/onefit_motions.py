@@ -10,9 +10,8 @@ import numpy as np
 import pyvista
 from PIL import Image, ImageDraw
 
-from onefit import generate, skinning
-from onefit.body import AnnyBody
-from onefit.motion import Motion
+from onefit.body import AnnyBody, skinning
+from onefit.motion import Motion, generate
 from polyfit.files import aside
 
 HERE = os.path.dirname(os.path.abspath(__file__))

@@ -1,39 +1,30 @@
 """OneFit: one network that drapes any garment on a moving body (paper, section "OneFit"), in torch,
-on PolyFit's patches.
+on PolyFit's patches::
 
-import onefit
-drape = onefit.load("six-garments").drape("shirt.obj", onefit.Motion.generate("walk"))
-drape.vertices  # (T, N, 3), metres
+    import onefit
+
+    drape = onefit.load("six-garments").drape("shirt.obj", onefit.Motion.generate("walk"))
+    drape.vertices  # (T, N, 3), metres
+
+A garment goes through these packages in this order: ``body`` and ``motion`` (what it is worn on),
+``garment`` (its mesh, cut into patches), ``network`` (how its patches deform), ``draping`` (all
+frames); ``objective`` and ``training`` make the network. Importing the package loads neither torch
+nor Mitsuba. ``docs/api.md`` lists the public names; other packages may change without notice.
 """
 
-_EXPORTS = {
-    "load": "draper",
-    "Draper": "draper",
-    "Drape": "draper",
-    "pretrained": "weights",
-    "Garment": "garment",
-    "TEMPLATES": "garment",
-    "Motion": "motion",
-    "Body": "body",
-    "AnnyBody": "body",
-    "SmplBody": "smpl",
-    "PlainBody": "smpl",
-    "OneFit": "network",
-    "PatchedGarment": "charts",
-    "Weights": "losses",
-}
+import lazy_loader
 
-__all__ = sorted(_EXPORTS)
-
-
-def __getattr__(name):
-    # torch is loaded on first use, so that `import onefit` stays instant
-    if name in _EXPORTS:
-        from importlib import import_module
-
-        return getattr(import_module(f".{_EXPORTS[name]}", __name__), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
-def __dir__():
-    return sorted(list(globals()) + __all__)
+__getattr__, __dir__, __all__ = lazy_loader.attach(
+    __name__,
+    submod_attrs={
+        "body.body": ["AnnyBody", "Body"],
+        "body.smpl": ["PlainBody", "SmplBody"],
+        "draping.draper": ["Drape", "Draper", "load"],
+        "garment.charts.patched": ["PatchedGarment"],
+        "garment.garment": ["TEMPLATES", "Garment"],
+        "motion.motion": ["Motion"],
+        "network.network": ["OneFit"],
+        "network.weights": ["pretrained"],
+        "objective.losses": ["Weights"],
+    },
+)

@@ -44,8 +44,8 @@ def _shape(model, pairs):
 
 
 def _motion(name, seconds, seed, fps, up):
-    from .generate import KINDS
-    from .motion import Motion
+    from onefit.motion import Motion
+    from onefit.motion.generate import KINDS
 
     if name in KINDS:
         return Motion.generate(name, seconds=seconds, seed=seed)
@@ -57,8 +57,7 @@ def _motion(name, seconds, seed, fps, up):
 
 
 def _model(name):
-    from .body import AnnyBody
-    from .smpl import PlainBody, SmplBody
+    from onefit.body import AnnyBody, PlainBody, SmplBody
 
     if name == "anny":
         return AnnyBody()
@@ -69,7 +68,7 @@ def _model(name):
 
 
 def _garment(args):
-    from .garment import TEMPLATES, Garment
+    from onefit.garment import TEMPLATES, Garment
 
     if args.garment in TEMPLATES:
         return Garment.template(args.garment)
@@ -255,9 +254,8 @@ def main(argv=None):
         TimeRemainingColumn,
     )
 
+    from onefit.draping import load
     from polyfit.training import device_of
-
-    from .draper import load
 
     folder = Path(args.output)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):

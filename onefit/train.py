@@ -27,10 +27,9 @@ from polyfit.errors import InputError, cli, optional_imports
 with optional_imports(__name__):
     import torch
 
+    from onefit.network.weights import load, save
+    from onefit.objective import Weights
     from polyfit.training import Training, conduct, device_of
-
-    from .losses import Weights
-    from .weights import load, save
 
 STANDARD = ("tshirt", "dress", "trousers", "shorts", "long_sleeve_top", "tank")
 CLIP = 1.0  # of the gradient's norm
@@ -41,10 +40,10 @@ HIDDEN = 0.1  # standard deviation of the encoder's memory at the start of a win
 @dataclass(frozen=True)
 class Settings:
     """What decides the result. ``fps`` and ``motion_up``: of the files of ``motions``, as
-    :meth:`onefit.motion.Motion.read` takes them; ``batch``: patches of a step, all frames together
+    :meth:`onefit.Motion.read` takes them; ``batch``: patches of a step, all frames together
     (the paper's 20,000); ``lr`` for the first ``lr_epochs`` epochs, a tenth of it for the rest; an
     epoch has ``epoch_steps`` steps (0: as many as show each window of the motions once); ``cuts``:
-    how many random cuts (:mod:`onefit.cuts`) are trained on beside the garments.
+    how many random cuts (:mod:`onefit.garment.sewing.cuts`) are trained on beside the garments.
     """
 
     garments: tuple = STANDARD
@@ -110,8 +109,8 @@ class OneFitTraining(Training):
         """The objective's terms on a batch of the random numbers of ``generator``: this process's
         share of it.
         """
-        from . import objective
-        from .training_data import FPS
+        from onefit.objective import objective
+        from onefit.training.data import FPS
 
         garment, rest, field = self.data.garments[
             self.done % len(self.data.garments) if garment is None else garment
@@ -168,16 +167,16 @@ class OneFitTraining(Training):
 
 
 def _network(settings, data):
-    from .network import OneFit
+    from onefit.network import OneFit
 
     return OneFit(settings.order, len(data.standard.joints), data.shapes.shape[1])
 
 
 def _data(settings, folder, progress):
-    from .cuts import cuts
-    from .garment import TEMPLATES, Garment
-    from .motion import Motion
-    from .training_data import TrainingData
+    from onefit.garment import TEMPLATES, Garment
+    from onefit.garment.sewing.cuts import cuts
+    from onefit.motion import Motion
+    from onefit.training import TrainingData
 
     garments = [
         Garment.template(name) if name in TEMPLATES else Garment.read(name)

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from onefit import skeleton, skinning
-from onefit.body import AnnyBody
-from onefit.skeleton import INDEX
-from onefit.smpl import FROM_SMPL, PlainBody, SmplBody
+from onefit.body import AnnyBody, PlainBody, SmplBody, skeleton, skinning
+from onefit.body.skeleton import INDEX
+from onefit.body.smpl import FROM_SMPL
 from polyfit.errors import InputError
 from polyfit.mesh import edges_of, read_mesh
 

@@ -7,13 +7,14 @@ import pytest
 import torch
 from surfaces import joined, sphere, tube
 
-from onefit import fitting, skeleton, skinning, tailor
-from onefit.binding import Binding, standard_body, standard_surface, surface_of, vertex_normals
-from onefit.body import AnnyBody
-from onefit.garment import TEMPLATES, Garment
-from onefit.mending import mended
-from onefit.nearest import ClosestSurface
-from onefit.remesh import loops
+from onefit.body import AnnyBody, ClosestSurface, skeleton, skinning
+from onefit.garment import TEMPLATES, Garment, fitting, standard_body, standard_surface
+from onefit.garment.binding import Binding, surface_of, vertex_normals
+from onefit.garment.mending import mended
+from onefit.garment.remesh import loops
+from onefit.garment.sewing.block import Block
+from onefit.garment.sewing.patterns import ramp, smooth_union
+from onefit.garment.sewing.sew import sewn
 from polyfit import mesh, write_ply
 from polyfit.errors import InputError
 
@@ -210,10 +211,10 @@ def test_unknown_template():
 
 def test_shorts_are_sewn_as_the_template_was(templates):
     body = standard_body()
-    block = tailor.Block(
+    block = Block(
         body.vertices.numpy(), body.faces.numpy(), spacing=0.016
     )  # twice as coarse, several times as fast
-    V, F = tailor.sewn(block, "shorts")
+    V, F = sewn(block, "shorts")
     assert abs(len(V) - len(templates["shorts"])) <= 5 and len(loops(F)) == 3
     far = np.abs(ClosestSurface(V, F)(templates["shorts"].vertices.numpy()).distance)
     assert far.mean() < 0.001 and np.percentile(far, 99) < 0.005 and far.max() < 0.016
@@ -221,13 +222,13 @@ def test_shorts_are_sewn_as_the_template_was(templates):
 
 def test_smooth_union_is_the_minimum_away_from_the_fillet():
     a, b = np.array([0.1, 0.0, 0.3, 0.2]), np.array([0.2, 0.1, 0.3, 0.21])
-    got = tailor.smooth_union(a, b, 0.05)
+    got = smooth_union(a, b, 0.05)
     assert (
         got[:2] == pytest.approx([0.1, 0.0])
         and got[2] == pytest.approx(0.3 - 0.05 / 4)
         and 0.2 - 0.0125 < got[3] < 0.2
     )
-    assert tailor.ramp(np.array([-1, 0, 0.5, 1, 2.0]), 0, 1) == pytest.approx([0, 0, 0.5, 1, 1])
+    assert ramp(np.array([-1, 0, 0.5, 1, 2.0]), 0, 1) == pytest.approx([0, 0, 0.5, 1, 1])
 
 
 def test_nearest_points_and_sides():

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 import torch
 
-from onefit import losses, objective, skinning
-from onefit.binding import standard_surface
-from onefit.body import AnnyBody
-from onefit.charts import AROUND, LEVEL, Deformation, PatchedGarment, SparseMatrix, _steady_jets
-from onefit.garment import TEMPLATES, Garment
-from onefit.nearest import FAR, ClosestSurface
-from onefit.remesh import loops
-from onefit.waistband import BAND, held
+from onefit.body import AnnyBody, ClosestSurface, skinning
+from onefit.body.nearest import FAR
+from onefit.garment import TEMPLATES, Garment, standard_surface
+from onefit.garment.charts import Deformation, PatchedGarment, SparseMatrix
+from onefit.garment.charts.patched import AROUND, LEVEL, _steady_jets
+from onefit.garment.remesh import loops
+from onefit.garment.waistband import BAND, held
+from onefit.objective import losses, objective
 from polyfit import jets
 
 T = 6

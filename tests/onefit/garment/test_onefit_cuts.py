@@ -7,10 +7,11 @@ import pytest
 import torch
 from places import ROOT
 
-from onefit import cuts, tailor, train
-from onefit.binding import standard_body, standard_surface
-from onefit.garment import Garment
-from onefit.remesh import loops
+from onefit import train
+from onefit.garment import Garment, standard_body, standard_surface
+from onefit.garment.remesh import loops
+from onefit.garment.sewing import cuts, patterns
+from onefit.garment.sewing.block import Block
 from polyfit import mesh
 from polyfit.errors import InputError
 
@@ -20,7 +21,7 @@ NAMES = list(cuts.CUTS)
 @pytest.fixture(scope="module")
 def block():
     body = standard_body()
-    return tailor.Block(
+    return Block(
         body.vertices.numpy(), body.faces.numpy(), spacing=0.016
     )  # twice as coarse, several times as fast
 
@@ -33,17 +34,17 @@ def sewn(block):
 
 
 def test_a_cut_is_the_pattern_where_its_measures_are(block):
-    field, inside = tailor.shorts(block)
-    shorter = tailor.shorts(block, hem=-0.2, ease=0.007)
+    field, inside = patterns.shorts(block)
+    shorter = patterns.shorts(block, hem=-0.2, ease=0.007)
     assert np.abs(field - shorter[0] - 0.002).max() < 1e-6  # 2 mm looser everywhere
     p = [np.array([0.1]), np.array([0.0]), np.array([-0.25])]
     assert inside(*p) > 0 > shorter[1](*p)
-    snug = tailor.shorts(block, snug=1)[0]
+    snug = patterns.shorts(block, snug=1)[0]
     near = (np.abs(field) < 0.02) & (block.z > -0.27) & (block.z < 0.1)
     assert (snug - field)[near].min() > 0 and (snug - field)[
         near
     ].max() > 0.01  # hollows are no longer spanned
-    long = tailor.dress(block, hem=-0.5, top=0.1)[1]
+    long = patterns.dress(block, hem=-0.5, top=0.1)[1]
     assert long(p[0], p[1], np.array([0.2])) < 0 < long(p[0], p[1], np.array([-0.45]))
 
 

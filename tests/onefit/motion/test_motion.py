@@ -8,10 +8,9 @@ import torch
 from scipy.spatial.transform import Rotation
 from scripts import load
 
-from onefit import generate, skeleton, skinning
-from onefit.body import AnnyBody
-from onefit.motion import Motion
-from onefit.skeleton import INDEX
+from onefit.body import AnnyBody, skeleton, skinning
+from onefit.body.skeleton import INDEX
+from onefit.motion import Motion, generate
 from polyfit.errors import InputError
 
 T_POSE = skeleton.standard_joints()

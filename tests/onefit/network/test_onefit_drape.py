@@ -8,9 +8,9 @@ import pytest
 import torch
 from places import ROOT
 
-from onefit import drape, weights
+from onefit import drape
 from onefit.body import AnnyBody
-from onefit.network import OneFit
+from onefit.network import OneFit, weights
 from polyfit.errors import InputError
 
 

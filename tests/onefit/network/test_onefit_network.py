@@ -5,16 +5,15 @@ import pytest
 import torch
 
 import onefit
-import onefit.post
-from onefit import ease, weights
-from onefit.body import AnnyBody
-from onefit.charts import PatchedGarment
-from onefit.draper import Draper
+import onefit.draping.post
+from onefit.body import AnnyBody, ClosestSurface
+from onefit.draping import Draper, ease
+from onefit.draping.post import pushed_out
 from onefit.garment import Garment
+from onefit.garment.charts import PatchedGarment
 from onefit.motion import Motion
-from onefit.nearest import ClosestSurface
-from onefit.network import SLOPE, Decoder, OneFit, descriptors, encoded
-from onefit.post import pushed_out
+from onefit.network import OneFit, weights
+from onefit.network.network import SLOPE, Decoder, descriptors, encoded
 from polyfit.errors import InputError
 
 
@@ -170,7 +169,7 @@ def test_an_untrained_network_is_plain_skinning(model, walk):
 def test_draping_in_batches_is_draping_at_once(draper, walk, monkeypatch):
     whole = draper.drape("tank", walk).vertices
     assert whole.shape == (len(walk), len(Garment.template("tank")), 3)
-    monkeypatch.setattr(onefit.draper, "POINTS", 5 * whole.shape[1])
+    monkeypatch.setattr(onefit.draping.draper, "POINTS", 5 * whole.shape[1])
     assert torch.allclose(draper.drape("tank", walk).vertices, whole, atol=1e-5)
     assert (whole - draper.drape("tank", walk, skinning_only=True).vertices).abs().max() > 1e-3
 
@@ -313,7 +312,7 @@ def test_pushing_out_finds_deep_vertices_from_their_neighbours(monkeypatch):
     monkeypatch.setattr(
         ClosestSurface,
         "__call__",
-        lambda self, points, reach: query(self, points, onefit.post.REACH),
+        lambda self, points, reach: query(self, points, onefit.draping.post.REACH),
     )
     assert torch.allclose(pushed_out(x, torch.as_tensor(cloth.faces), body, faces), out, atol=1e-5)
 

@@ -5,9 +5,9 @@ import torch
 from scripts import load
 
 import onefit
-from onefit import measures
+from onefit.body import ClosestSurface
 from onefit.garment import Garment
-from onefit.nearest import ClosestSurface
+from onefit.objective import measures
 
 swing = load("benchmarks/onefit_swing.py")
 

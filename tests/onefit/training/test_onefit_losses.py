@@ -1,8 +1,7 @@
 import pytest
 import torch
 
-from onefit import losses
-from onefit.losses import Weights
+from onefit.objective import Weights, losses
 from polyfit.errors import InputError
 
 G = torch.Generator().manual_seed(3)

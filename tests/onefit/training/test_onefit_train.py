@@ -12,8 +12,8 @@ from safetensors.torch import load_file
 
 import onefit
 from onefit import train
-from onefit.losses import Weights
-from onefit.training_data import LENGTH
+from onefit.objective import Weights
+from onefit.training.data import LENGTH
 from polyfit.errors import InputError
 from polyfit.training import Processes
 
@@ -51,7 +51,7 @@ def small(motion):
 def data(small):
     from onefit.garment import Garment
     from onefit.motion import Motion
-    from onefit.training_data import TrainingData
+    from onefit.training import TrainingData
 
     return TrainingData(
         [Garment.template("shorts")], motions=[Motion.read(small.motions[0])], shapes=1

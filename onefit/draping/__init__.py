@@ -1,0 +1,10 @@
+"""Draping: a garment, a body and a motion go in, the garment's vertices in every frame come out."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach(
+    __name__,
+    submod_attrs={
+        "draper": ["Drape", "Draper", "load"],
+    },
+)

@@ -1,0 +1,218 @@
+"""Draping: a trained network, a garment, a motion and a shape make moving cloth;
+:func:`onefit.load` is the way in.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+
+from onefit.body import AnnyBody, ClosestSurface, skinning
+from onefit.garment import TEMPLATES, Garment, standard_body
+from onefit.garment.charts import PatchedGarment
+from onefit.motion import Motion
+from onefit.network.weights import Trained
+from onefit.network.weights import load as load_weights
+from onefit.objective.objective import posed
+
+from . import ease
+from .post import pushed_out
+
+FPS = 30.0  # that the networks know
+WARM_UP = 10  # frames in which the first pose is held, for the network's memory to settle
+POINTS = 400_000  # vertices times frames that are draped at once
+
+
+@dataclass(frozen=True)
+class Drape:
+    """A draped garment: ``vertices`` (T, N, 3) [m] in the world, ``faces`` (F, 3), ``rest`` (N, 3)
+    [m], the garment graded to the shape; the ``body``'s vertices (T, V, 3) [m], its ``body_faces``
+    and the root's place ``root`` (T, 3) [m]; ``fps`` frames a second.
+    """
+
+    vertices: torch.Tensor
+    faces: torch.Tensor
+    rest: torch.Tensor
+    body: torch.Tensor
+    body_faces: torch.Tensor
+    root: torch.Tensor
+    fps: float
+
+    def measures(self):
+        """The :class:`onefit.objective.measures.Measures` of this drape."""
+        from onefit.objective import measure
+
+        return measure(
+            self.vertices,
+            self.faces,
+            self.rest,
+            self.body,
+            ClosestSurface(self.body[0], self.body_faces),
+            self.root,
+            self.fps,
+        )
+
+
+class Draper:
+    """A trained network and a body model, ready to drape any garment. Made by :func:`onefit.load`.
+
+    Garments are cut into patches once and kept; frames go through in batches. ``device``: where it
+    runs. On a body model of another kind than the network was trained on, garments are graded to
+    its shapes and the network is told the standard shape.
+    """
+
+    def __init__(self, trained: Trained, model=None, device="cpu"):
+        self.trained, self.device = trained, torch.device(device)
+        self.network = trained.network.to(self.device).eval()
+        self.model = model or AnnyBody()
+        self._garments: dict = {}
+        self._patched: dict = {}
+        self._codes: dict = {}
+        self._ease: dict = {}
+
+    @cached_property
+    def standard(self):
+        """The standard body, which garments are made around."""
+        return standard_body()
+
+    def garment(self, garment):
+        """A :class:`Garment` of one, of a template's name, or of a mesh file; names and files are
+        read once.
+        """
+        if isinstance(garment, Garment):
+            return garment
+        if str(garment) not in self._garments:
+            self._garments[str(garment)] = (
+                Garment.template(garment) if garment in TEMPLATES else Garment.read(garment)
+            )
+        return self._garments[str(garment)]
+
+    def patched(self, garment):
+        """The :class:`onefit.PatchedGarment` of a garment, cut once."""
+        key = id(garment)
+        if key not in self._patched:
+            self._patched[key] = PatchedGarment(
+                garment, self.standard, order=self.network.order
+            ).to(self.device)
+        return self._patched[key]
+
+    def drape(self, garment, motion, shape=None, *, post=False, eased=True, skinning_only=False):
+        """A :class:`Drape`: ``garment`` (as :meth:`garment` takes it) on the body of ``shape`` (S,)
+        in each frame of ``motion`` (a :class:`Motion` or a file of one), at 30 frames a second.
+        With a shape, the way is scaled by the length of its legs.
+
+        ``post``: vertices are pushed out of the body and the pushes are smoothed. ``eased``: with
+        the garment's :meth:`ease`, which costs seconds once, and nothing a frame; without it a
+        drape is what the network alone makes. ``skinning_only``: plain skinning of the template,
+        what OneFit is held against. Raises InputError for a garment, motion or shape that cannot be
+        used.
+        """
+        garment = self.garment(garment)
+        motion = (
+            (motion if isinstance(motion, Motion) else Motion.read(motion))
+            .resampled(FPS)
+            .to(self.device)
+        )
+        body = self.model.body(shape)
+        motion = motion if shape is None else motion.fitted(body.to(self.device))
+        rest = garment.graded(body).to(self.device)
+        offset = self.ease(garment) if eased and not skinning_only else 0
+        body = body.to(self.device)
+        weights = garment.blend_weights.to(self.device)
+        transforms = skinning.transforms(body, motion.poses, motion.translation)
+        with torch.inference_mode():
+            embedding = None if skinning_only else self.embedding(motion, body)
+            step = max(1, POINTS // len(rest))
+            parts = []
+            for first in range(0, len(motion.poses), step):
+                frames = slice(first, first + step)
+                points = (rest + offset)[:, None]
+                if not skinning_only:
+                    points = points + self._displacement(garment, embedding[frames])
+                parts.append(posed(points, weights, transforms[frames]).transpose(0, 1))
+            bodies = torch.cat(
+                [
+                    skinning.skin(body.vertices, body.blend_weights, part)
+                    for part in transforms.split(64)
+                ]
+            )
+            vertices = torch.cat(parts)
+        root = skinning.posed_joints(body, transforms)[:, 0]
+        if post:
+            vertices = pushed_out(vertices, garment.faces.to(self.device), bodies, body.faces)
+        return Drape(
+            *(x.cpu() for x in (vertices, garment.faces, rest, bodies, body.faces, root)), FPS
+        )
+
+    def codes(self, garment):
+        """Z_T (K, width) of the garment's patches, found once."""
+        key = id(garment)
+        if key not in self._codes:
+            with torch.no_grad():
+                self._codes[key] = self.network.patches(
+                    *self.patched(garment).features, self.standard.joints.to(self.device)
+                )
+        return self._codes[key]
+
+    def _displacement(self, garment, embedding):
+        """Displacements of the vertices in the rest space, (N, T, 3) [m], for embeddings (T,
+        width).
+        """
+        patched = self.patched(garment)
+        return patched.displacement(
+            patched.changes(self.network.decoder(self.codes(garment), embedding))
+        )
+
+    def ease(self, garment):
+        """The offset of the garment's vertices in the rest space, (N, 3) [m], found once:
+        :func:`onefit.draping.ease.ease`.
+        """
+        key = id(garment)
+        if key not in self._ease:
+            with torch.no_grad():
+                rest, faces, body = (
+                    garment.vertices.to(self.device),
+                    garment.faces,
+                    self.standard.to(self.device),
+                )
+                self._ease[key] = ease.ease(rest, faces, body, self._trial(garment, rest, body))
+        return self._ease[key]
+
+    def _trial(self, garment, rest, body):
+        """The frames that :func:`onefit.draping.ease.ease` looks at, of ``rest`` (N, 3) [m] on the
+        standard ``body``: vertices as the network drapes them and as plain skinning does (N, 3),
+        and the body's (V, 3) [m].
+        """
+        weights = garment.blend_weights.to(self.device)
+        for kind in ease.MOTIONS:
+            motion = Motion.generate(kind, seconds=ease.SECONDS, fps=FPS).to(self.device)
+            transforms = skinning.transforms(body, motion.poses, motion.translation)[:: ease.EVERY]
+            displacement = self._displacement(garment, self.embedding(motion, body)[:: ease.EVERY])
+            draped, skinned = (
+                posed(x, weights, transforms).transpose(0, 1)
+                for x in (rest[:, None] + displacement, rest[:, None])
+            )
+            yield from zip(
+                draped, skinned, skinning.skin(body.vertices, body.blend_weights, transforms)
+            )
+
+    def embedding(self, motion, body):
+        """Z_B (T, width) of the motion, after the first pose was held for a while."""
+        hold = lambda x: torch.cat([x[:1].expand(WARM_UP, *x.shape[1:]), x])[None]
+        known = body.kind == self.trained.body == self.model.kind
+        shape = (
+            body.shape - self.model.standard_shape.to(self.device)
+            if known
+            else torch.zeros(self.network.shape["shape"], device=self.device)
+        )
+        return self.network.body(hold(motion.poses), hold(motion.translation), shape[None], FPS)[0][
+            0, WARM_UP:
+        ]
+
+
+def load(name="six-garments", *, model=None, device="cpu"):
+    """The :class:`Draper` of a network: ``name`` of one that comes with the package
+    (:func:`onefit.pretrained`), or a file of weights.
+
+    ``model``: a body model, by default :class:`onefit.AnnyBody`. Raises InputError."""
+    return Draper(load_weights(name), model, device)

@@ -1,0 +1,13 @@
+"""Garments: a mesh around the standard body goes in; the same garment, mended, bound to the body
+and graded to its shapes, comes out.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach(
+    __name__,
+    submod_attrs={
+        "binding": ["standard_body", "standard_surface"],
+        "garment": ["Garment", "TEMPLATES"],
+    },
+)

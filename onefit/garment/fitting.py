@@ -1,0 +1,339 @@
+"""A garment's place on the standard body: units, axes and stand found by the distance to it, other
+bodies and stands turned into it.
+
+The paper's "Garment preprocessing" (supplement). Distances to the body tell whether a garment lies
+on it; where it does not, other units, axes, places and the T-pose are tried on a few hundred of its
+vertices, and the error names the one with which it would.
+"""
+
+from dataclasses import replace
+from functools import lru_cache
+from itertools import product
+
+import numpy as np
+import torch
+
+from onefit.body import skeleton, skinning
+from polyfit.errors import InputError
+
+from .binding import (
+    Binding,
+    cotangent_laplacian,
+    smoother,
+    standard_body,
+    standard_surface,
+    surface_of,
+    vertex_normals,
+)
+from .remesh import neighbour_mean
+
+DEEP = 0.03  # vertices inside the body by less than this are pushed out [m]
+CLEARANCE, SPREAD = (
+    0.004,
+    0.02,
+)  # that a vertex pushed out is left with, and how far it takes its neighbours with it [m]
+UNITS = {
+    1.0: "metres",
+    0.01: "centimetres",
+    0.001: "millimetres",
+    0.1: "decimetres",
+    0.0254: "inches",
+    100.0: "hundreds of metres",
+}
+T_POSE = "T-pose"
+ON_GROUND = np.array([0.0, 0.0, -0.82])  # from a world in which the body stands at z = 0 [m]
+SEEN = 400  # vertices that places are tried on
+
+
+def placed(V, scale=1.0, up="z", turn=0.0, offset=(0.0, 0.0, 0.0)):
+    """Vertices (N, 3) scaled to metres, turned from ``up`` ("z" or "y") to z up and by ``turn``
+    [degrees] about z, then moved by ``offset`` [m].
+    """
+    if up not in ("y", "z"):
+        raise InputError(f"up={up!r}; 'z' or 'y' is needed")
+    x, y, z = scale * np.asarray(V, dtype=np.float64).T
+    if up == "y":
+        y, z = -z, y
+    c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
+    return np.stack([c * x - s * y, s * x + c * y, z], axis=1) + np.asarray(
+        offset, dtype=np.float64
+    )
+
+
+def in_pose(body, pose):
+    """``body`` standing in ``pose`` (24, 3) [rad]: its vertices, joints and rest pose."""
+    maps = skinning.transforms(body, pose[None].to(body.vertices), body.vertices.new_zeros(1, 3))
+    vertices, joints = (
+        skinning.skin(body.vertices, body.blend_weights, maps)[0],
+        skinning.posed_joints(body, maps)[0],
+    )
+    return replace(body, vertices=vertices, joints=joints, rest_pose=pose.to(body.rest_pose))
+
+
+@lru_cache(maxsize=1)
+def t_posed():
+    """The standard body in the T-pose."""
+    return in_pose(standard_body(), torch.zeros(len(skeleton.JOINTS), 3))
+
+
+@lru_cache(maxsize=1)
+def _t_surface():
+    return surface_of(t_posed())
+
+
+def misfit(surface, V):
+    """How far vertices (N, 3) are from lying on the body [m]: the mean distance, and five times the
+    mean depth of those inside.
+    """
+    d = surface(V, 1.0).distance
+    return np.abs(d).mean() + 5 * np.maximum(-d, 0).mean()
+
+
+def check_place(V, surface, where, tell_pose=True):
+    """Raises InputError, with a suggestion, where vertices (N, 3) [m] do not lie on the body of
+    ``surface``.
+
+    They do if they are 15 cm from it on average at most, at most 2 % of them more than 3 cm inside,
+    and no other place or stand would fit much better: half the misfit where it is above 4 cm, 0.87
+    times of it for the T-pose (with ``tell_pose``).
+    """
+    seen = V[np.linspace(0, len(V) - 1, min(SEEN, len(V))).astype(int)]
+    d, own = surface(V, 1e9).distance, misfit(surface, seen)
+    lies = np.abs(d).mean() < 0.15 and (d < -DEEP).mean() <= 0.02
+    if lies and tell_pose:
+        other = misfit(_t_surface(), seen)
+        if other < 0.87 * own and own - other > 0.005:
+            fits = f"{_mm(other)} from it, {_mm(own)} from the stand with lowered arms"
+            raise InputError(
+                f"{where}: looks made for the T-pose ({fits}): give made_for='{T_POSE}'"
+            )
+    if lies and own < 0.04:
+        return
+    best = _best_place(seen, surface, [1.0] if lies else list(UNITS), tell_pose)
+    if lies and not (best and best[0] < 0.5 * own):
+        return
+    size = " x ".join(f"{s:.3g}" for s in np.ptp(V, axis=0))
+    deep = 100 * (d < -DEEP).mean()
+    found = (
+        f"{where}: does not lie on the body: {_mm(np.abs(d).mean())} from it on average, {deep:.0f}"
+        " % of the vertices deep inside"
+    )
+    if best is None:
+        raise InputError(
+            f"{found}; it spans {size} m; the body is 1.63 m tall (z from -0.82 to 0.81), z up, and"
+            " faces -y"
+        )
+    raise InputError(f"{found}; it looks like {best[1]}: give {best[2]}")
+
+
+def _mm(distance):
+    return (
+        f"{1000 * distance:.0f} mm"
+        if distance < 0.1
+        else f"{distance:.2f} m"
+        if distance < 1
+        else f"{distance:,.0f} m"
+    )
+
+
+def _best_place(seen, surface, scales, tell_pose):
+    """``(misfit [m], what it looks like, what to give)`` of the plainest place in which the
+    vertices lie on a body, or None.
+    """
+    bodies = [(surface, None)] + ([(_t_surface(), T_POSE)] if tell_pose else [])
+    found = []
+    for scale, up, turn in product(scales, ("z", "y"), (0, 180)):
+        V = placed(seen, scale, up, turn)
+        if not 0.15 < np.ptp(V, axis=0).max() < 2.3:
+            continue
+        for (at, pose), moved in product(bodies, range(3)):
+            offset = _offset(V, at) if moved == 2 else moved * ON_GROUND
+            worse = (scale != 1) + (up != "z") + (turn != 0) + 0.5 * (pose is not None) + moved
+            found.append(
+                (
+                    misfit(at, V + offset) * 1.25**worse,
+                    misfit(at, V + offset),
+                    scale,
+                    up,
+                    turn,
+                    pose,
+                    offset,
+                )
+            )
+    if not found:
+        return None
+    _, value, scale, up, turn, pose, offset = min(found, key=lambda f: f[0])
+    if value > 0.12:
+        return None
+    looks, give = [], []
+    if scale != 1:
+        looks.append(UNITS[scale])
+        give.append(f"scale={scale:g}")
+    if up != "z":
+        looks.append("y up")
+        give.append(f"up='{up}'")
+    if turn:
+        looks.append("facing backwards")
+        give.append(f"turn={turn}")
+    if pose:
+        looks.append("made for the T-pose")
+        give.append(f"made_for='{pose}'")
+    if offset.any():
+        looks.append(
+            "on a body that stands on the ground"
+            if (offset == ON_GROUND).all()
+            else "in another place"
+        )
+        give.append(f"offset=({', '.join(f'{o:g}' for o in offset)})")
+    return (value, ", ".join(looks), ", ".join(give)) if give else None
+
+
+def _offset(V, surface):
+    """The translation (3,) [m], in centimetres, with which vertices fit the body best."""
+    low, high = surface.vertices[:, 2].min(), surface.vertices[:, 2].max()
+    centre = (V.min(axis=0) + V.max(axis=0)) / 2
+    start = np.array([-centre[0], -0.03 - centre[1], 0])
+    half = np.ptp(V[:, 2]) / 2
+    heights = np.arange(low + half, max(high - half, low + half) + 0.04, 0.04) - centre[2]
+    best = min((misfit(surface, V + start + [0, 0, h]), h) for h in heights)[1]
+    offset = np.round(start + [0, 0, best], 2)
+    step, value = 0.02, misfit(surface, V + offset)
+    while step >= 0.01:
+        tried = [
+            (misfit(surface, V + offset + step * sign * e), sign, k)
+            for k, e in enumerate(np.eye(3))
+            for sign in (-1, 1)
+            if k
+        ]
+        least, sign, k = min(tried)
+        if least < value:
+            offset, value = np.round(offset + step * sign * np.eye(3)[k], 2), least
+        else:
+            step /= 2
+    return offset + 0.0
+
+
+def to_standard(V, F, made_for, loose=False):
+    """Vertices (N, 3) [m] of a garment made on the body ``made_for``, in the stand and shape of the
+    standard body.
+
+    The paper displaces each vertex by the difference of its nearest body vertex between the two
+    bodies. That shears sleeves where the stand differs, so the stand is changed by skinning with
+    the garment's smoothed blend weights, and the rest, the difference in shape, by the displacement
+    (smoothed too); one step of Laplacian smoothing follows. Of ``loose`` garments, which do not
+    follow the legs, the legs' pose is left as it is.
+    """
+    standard = standard_body()
+    pose = standard.rest_pose.clone()
+    if loose:
+        legs = [
+            skeleton.INDEX[f"{side}_{joint}"]
+            for side in ("left", "right")
+            for joint in ("hip", "knee", "ankle", "foot")
+        ]
+        pose[legs] = made_for.rest_pose[legs]
+    weights = Binding(V, F, surface_of(made_for)).blend_weights(made_for.blend_weights.numpy())
+    maps = skinning.transforms(made_for, pose[None], torch.zeros(1, 3))
+    V = (
+        skinning.skin(
+            torch.as_tensor(V, dtype=torch.float32),
+            torch.as_tensor(weights, dtype=torch.float32),
+            maps,
+        )[0]
+        .double()
+        .numpy()
+    )
+    stands = in_pose(made_for, pose)
+    target = standard if not loose else in_pose(standard, pose)
+    difference = counterpart(stands, target) - stands.vertices.numpy()
+    V = V + Binding(V, F, surface_of(stands)).displacement(difference)
+    return 0.5 * (V + neighbour_mean(F, len(V), boundary_apart=True) @ V)
+
+
+def counterpart(source, target):
+    """Where the vertices of the body ``source`` (V, 3) lie on the body ``target``, in the same
+    stand [m].
+
+    Bodies of the same kind have the same vertices. Otherwise the source is warped through the
+    joints (thin-plate spline), then drawn to the nearest points of the target that face the same
+    way, over shorter and shorter lengths.
+    """
+    if source.kind == target.kind and source.vertices.shape == target.vertices.shape:
+        return target.vertices.numpy().astype(np.float64)
+    from scipy.interpolate import RBFInterpolator
+
+    F = source.faces.numpy()
+    rest = source.vertices.numpy().astype(np.float64)
+    a, b = source.joints.numpy().astype(np.float64), target.joints.numpy().astype(np.float64)
+    x = rest + RBFInterpolator(a, b - a, kernel="thin_plate_spline", smoothing=1e-4)(rest)
+    surface = surface_of(target)
+    for length in (0.08, 0.04, 0.02, 0.01):
+        found = surface(x)
+        area, stiffness = cotangent_laplacian(x, F)
+        facing = (found.normal * vertex_normals(x, F)).sum(axis=1)
+        x = x + smoother(area * np.clip(facing, 1e-3, 1), stiffness, length)(found.point - x)
+    return surface(x).point.astype(np.float64)
+
+
+def pushed_out(V, F, where="garment"):
+    """``(vertices (N, 3), sentences)``: vertices up to 3 cm inside the standard body are taken out
+    of it, with the faces that it pokes through and their neighbours. Raises InputError for more
+    than 2 % deeper ones.
+    """
+    surface = standard_surface()
+    d = surface(V).distance
+    if (d >= 0).all():
+        return V, ()
+    if (deep := (d < -DEEP).mean()) > 0.02:
+        raise InputError(
+            f"{where}: {100 * deep:.0f} % of the vertices are more than {100 * DEEP:.0f} cm inside"
+            " the body"
+        )
+    area, stiffness = cotangent_laplacian(V, F)
+    out = V
+    for _ in range(8):
+        found, middle = surface(out), surface(out[F].mean(axis=1))
+        move = np.where(
+            found.distance[:, None] < 0, (CLEARANCE - found.distance)[:, None] * found.normal, 0
+        )
+        poked = np.flatnonzero(middle.distance < 0)
+        if not move.any() and not len(poked):
+            break
+        move[F[poked].ravel()] += (
+            np.repeat(
+                (CLEARANCE - middle.distance[poked])[:, None] * middle.normal[poked], 3, axis=0
+            )
+            / 2
+        )
+        out = out + smoother(area * np.where(move.any(axis=1), 1.0, 0.1), stiffness, SPREAD)(move)
+    for _ in range(8):
+        found = surface(out)
+        out = np.where(
+            (found.distance < CLEARANCE / 4)[:, None], found.point + CLEARANCE * found.normal, out
+        )
+    return out, (
+        f"pushed {(d < 0).sum()} vertices out of the body, by up to {-1000 * d.min():.1f} mm",
+    )
+
+
+_correspondences: dict = {}
+
+
+def standard_on(body):
+    """Where the standard body's vertices (V, 3) [m] lie on ``body``, which rests in the standard
+    stand.
+
+    For bodies of another kind the correspondence is found on the first body of that kind seen, and
+    kept for its other shapes.
+    """
+    standard = standard_body()
+    vertices = body.vertices.detach().cpu().double().numpy()
+    if body.kind == standard.kind and body.vertices.shape == standard.vertices.shape:
+        return vertices
+    key = body.kind, len(vertices), int(body.faces.sum()), int(body.faces[:, 0].sum())
+    if key not in _correspondences:
+        body = body.to("cpu")
+        found = surface_of(body)(counterpart(standard, body))
+        _correspondences[key] = body.faces.numpy()[found.face], found.barycentric.astype(np.float64)
+    corners, barycentric = _correspondences[key]
+    return np.einsum("nk,nkd->nd", barycentric, vertices[corners])

@@ -1,0 +1,189 @@
+"""Garments in the rest space of the standard body: templates and files, with blend weights, graded
+to the body's shapes.
+"""
+
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from onefit.body import Body
+from polyfit import mesh
+from polyfit.errors import InputError
+from polyfit.mesh import read_mesh
+
+from . import fitting, remesh
+from .binding import Binding, standard_body, standard_surface, vertex_normals
+from .mending import check, mended, parts
+
+TEMPLATES = (
+    "tshirt",
+    "dress",
+    "tank",
+    "long_sleeve_top",
+    "shorts",
+    "trousers",
+    "jumpsuit",
+    "skirt",
+)
+FOLDER = Path(__file__).parents[1] / "data" / "garments"
+
+
+@dataclass(frozen=True)
+class Garment:
+    """A garment at rest on the standard body.
+
+    ``name``; ``vertices`` (N, 3) float32 [m], in OneFit's axes; ``faces`` (F, 3) int64, wound
+    outwards; ``blend_weights`` (N, 24), rows that sum to one; ``repairs``, sentences on what was
+    changed when it was read.
+    """
+
+    name: str
+    vertices: torch.Tensor
+    faces: torch.Tensor
+    blend_weights: torch.Tensor
+    repairs: tuple = ()
+    _binding: Binding | None = field(default=None, repr=False, compare=False)
+
+    @classmethod
+    def template(cls, name):
+        """One of :data:`TEMPLATES`, which :mod:`onefit.tailor` made."""
+        if name not in TEMPLATES:
+            raise InputError(
+                f"garment '{name}': no such template; there are {', '.join(TEMPLATES)}"
+            )
+        with np.load(FOLDER / f"{name}.npz") as file:
+            return cls.bound(name, file["vertices"], file["faces"])
+
+    @classmethod
+    def read(
+        cls,
+        path,
+        *,
+        name=None,
+        made_for=None,
+        loose=False,
+        scale=1.0,
+        up="z",
+        turn=0.0,
+        offset=(0.0, 0.0, 0.0),
+    ):
+        """The garment of an OBJ or PLY file of triangles or quads, repaired by the rules of
+        :mod:`onefit.garment.mending`.
+
+        ``scale``, ``up``, ``turn`` [degrees], ``offset`` [m]: as in
+        :func:`onefit.garment.fitting.placed`, from the file's units and axes to metres and
+        OneFit's. ``made_for``: the :class:`~onefit.Body` on which it lies, if that is not the
+        standard body, or "T-pose" for the standard body in the T-pose; the garment is brought to
+        the standard body as :func:`onefit.garment.fitting.to_standard` says, and ``loose`` (skirts,
+        dresses) leaves the legs' pose out. Raises InputError, in one line, for a mesh that is no
+        garment or does not lie on the body.
+        """
+        V, F, _ = read_mesh(path, "garment")
+        return cls.of_mesh(
+            name or Path(path).stem,
+            fitting.placed(V, scale, up, turn, offset),
+            F,
+            made_for=made_for,
+            loose=loose,
+            where=str(path),
+        )
+
+    @classmethod
+    def of_mesh(cls, name, vertices, faces, *, made_for=None, loose=False, where="garment"):
+        """The garment of any triangle mesh (N, 3) [m], (F, 3) in OneFit's axes; otherwise as
+        :meth:`read`.
+        """
+        made_for = (
+            fitting.t_posed()
+            if isinstance(made_for, str) and made_for == fitting.T_POSE
+            else made_for
+        )
+        if made_for is not None and not isinstance(made_for, Body):
+            raise InputError(
+                f"{where}: made_for={made_for!r}; a Body or '{fitting.T_POSE}' is needed"
+            )
+        surface = standard_surface() if made_for is None else fitting.surface_of(made_for)
+        check(vertices, faces, where)
+        fitting.check_place(vertices[np.unique(faces)], surface, where, tell_pose=made_for is None)
+        V, F, told = mended(vertices, faces, where)
+        if made_for is not None:
+            F, turned = _outward(V, F, surface)
+            V, told = fitting.to_standard(V, F, made_for.to("cpu"), loose), told + turned
+        F, turned = _outward(V, F, standard_surface())
+        V, pushed = fitting.pushed_out(V, F, where)
+        return cls.bound(name, V, F, told + turned + pushed)
+
+    @classmethod
+    def bound(cls, name, vertices, faces, repairs=()):
+        """The garment of a clean mesh (N, 3) [m], (F, 3) around the standard body, with blend
+        weights from there.
+        """
+        V, F = np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64)
+        binding = Binding(V, F)
+        weights = torch.as_tensor(
+            binding.blend_weights(standard_body().blend_weights.numpy()), dtype=torch.float32
+        )
+        return cls(
+            name,
+            torch.as_tensor(V, dtype=torch.float32),
+            torch.as_tensor(F),
+            weights,
+            tuple(repairs),
+            binding,
+        )
+
+    def __len__(self):
+        return len(self.vertices)
+
+    def to(self, device):
+        """The same garment with its tensors on ``device``."""
+        return replace(
+            self,
+            **{
+                f.name: v.to(device)
+                for f in fields(self)
+                if isinstance(v := getattr(self, f.name), torch.Tensor)
+            },
+        )
+
+    def graded(self, body):
+        """Rest vertices (N, 3) [m] moved with the shape of ``body``: a Body in the standard stand.
+        The standard shape leaves them where they are.
+        """
+        rest = self.vertices.cpu().double().numpy()
+        moved = self._binding.moved(
+            rest, standard_body().vertices.double().numpy(), fitting.standard_on(body)
+        )
+        return torch.as_tensor(moved, dtype=torch.float32, device=self.vertices.device)
+
+    def remeshed(self, count):
+        """The same garment with about ``count`` vertices: every face is cut in four as often as is
+        needed for 0.7 times as many; where there are more than 1.4 times as many, even triangles
+        are made anew (ACVD).
+        """
+        V, F = self.vertices.cpu().double().numpy(), self.faces.cpu().numpy()
+        while len(V) < 0.7 * count:
+            F, edges = mesh.subdivided(F)
+            V = np.concatenate([V, V[edges].mean(axis=1)])
+        if len(V) > 1.4 * count:
+            V, F = remesh.remeshed(V, F, count)
+        V, pushed = fitting.pushed_out(V, F, self.name)
+        return Garment.bound(self.name, V, F, self.repairs + pushed)
+
+
+def _outward(V, F, surface):
+    """``(faces, sentences)`` with each part wound so that its normals agree with those of the
+    nearest points of the body.
+    """
+    part = parts(F)
+    found = surface(V)
+    agree = (found.normal * vertex_normals(V, F)).sum(axis=1) / (1 + (found.distance / 0.02) ** 2)
+    votes = np.bincount(part, mesh.areas(V, F) * agree[F].mean(axis=1))
+    turned = votes[part] < 0
+    if not turned.any():
+        return F, ()
+    return np.where(turned[:, None], F[:, ::-1], F), (
+        f"turned {turned.sum()} faces that were wound inwards",
+    )

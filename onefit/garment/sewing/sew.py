@@ -1,0 +1,59 @@
+"""From a pattern to a garment's mesh: the level set is cut open at neck, hem and cuffs, remeshed by
+clusters (ACVD), and its triangles are evened out by sliding along the surface and along the loops.
+Everything is deterministic.
+"""
+
+import os
+
+import numpy as np
+
+from onefit.garment.binding import standard_body
+from onefit.garment.remesh import loops, remeshed
+from polyfit import mesh
+from polyfit.files import aside
+
+from .block import Block
+from .patterns import PATTERNS
+
+
+def sewn(block, name, count=None, bumps=0.0, stretch=(1.0, 1.0, 1.0), **measures):
+    """``(vertices (N, 3), faces (F, 3))`` of the pattern ``name``, with its own measures [m] but
+    for those given.
+
+    ``count`` of the vertices; ``bumps``: a field [m] on the block's grid that is added to the ease;
+    ``stretch`` (3,): triangles are even in a space stretched so.
+    """
+    pattern, own = PATTERNS[name]
+    field, inside = pattern(block, **measures)
+    V, F = _clipped(*block.mesh(field - bumps), inside)
+    V, F = remeshed(V * stretch, F, count or own)
+    return V / stretch, F
+
+
+def _clipped(V, F, inside):
+    """The largest part of the surface where ``inside`` (x, y, z) is positive, cut along its
+    zeros.
+    """
+    import pyvista
+
+    surface = pyvista.PolyData.from_regular_faces(V, F)
+    surface["inside"] = inside(*V.T)
+    part = surface.clip_scalar(scalars="inside", value=0.0, invert=False).triangulate()
+    part = part.clean(tolerance=1e-6, absolute=True).extract_largest()
+    return np.array(part.points, dtype=np.float64), part.regular_faces.astype(np.int64)
+
+
+def write(names, folder):
+    """Sew the named templates into ``folder``."""
+    body = standard_body()
+    block = Block(body.vertices.numpy(), body.faces.numpy())
+    os.makedirs(folder, exist_ok=True)
+    for name in names:
+        V, F = sewn(block, name)
+        path = os.path.join(folder, f"{name}.npz")
+        with aside(path) as temporary:
+            np.savez_compressed(temporary, vertices=V.astype(np.float32), faces=F.astype(np.int32))
+        print(
+            f"{path}: {len(V)} vertices, {len(F)} faces, {mesh.areas(V, F).sum():.3f} m^2,"
+            f" {len(loops(F))} loops"
+        )

@@ -1,0 +1,44 @@
+"""Where a garment is held on the body: at the band of its upper rim, unless it hangs from the
+shoulders. NumPy.
+
+The paper's objective has neither friction nor bands, so that its least lets trousers slide down and
+wide skirts fall. Others pin the upper vertices of lower garments by hand (Bertiche et al. 2021,
+2022); here the band is found.
+"""
+
+import numpy as np
+
+from onefit.body import skeleton
+
+from .remesh import loops, nearest_on_segments
+
+SHOULDERS = [skeleton.INDEX["left_shoulder"], skeleton.INDEX["right_shoulder"]]
+BAND = 0.02, 0.05  # [m]; cloth so near to the rim is held, farther away it is free
+
+
+def highest_rim(vertices, faces):
+    """The loop of the boundary that lies highest in the mean, vertex indices (R,); None without a
+    boundary. ``vertices`` (N, 3) [m], NumPy, ``faces`` (F, 3)."""
+    return max(loops(faces), key=lambda loop: vertices[loop, 2].mean(), default=None)
+
+
+def held(vertices, faces, joints):
+    """How firmly each of the vertices (N, 3) [m] of a garment with ``faces`` (F, 3) is held, 0 to
+    1, (N,); ``joints`` (J, 3) [m] of the body.
+
+    A garment that reaches as high as the shoulder joints hangs from them, and nothing of it is
+    held. Of any other one it is what lies along the highest loop of its boundary.
+    """
+    out, rim = np.zeros(len(vertices)), highest_rim(vertices, faces)
+    if rim is None or vertices[:, 2].max() > joints[SHOULDERS, 2].mean():
+        return out
+    rim = vertices[rim]
+    near = np.flatnonzero(
+        (vertices[:, 2] > rim[:, 2].min() - BAND[1]) & (vertices[:, 2] < rim[:, 2].max() + BAND[1])
+    )
+    distance = np.linalg.norm(
+        vertices[near] - nearest_on_segments(vertices[near], rim, np.roll(rim, -1, axis=0)), axis=1
+    )
+    x = np.clip((BAND[1] - distance) / (BAND[1] - BAND[0]), 0, 1)
+    out[near] = x * x * (3 - 2 * x)
+    return out

@@ -1,0 +1,270 @@
+"""Motions from BVH files, whatever their skeleton's names, unit and axes, as far as these can be
+told.
+"""
+
+import re
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from onefit.body import skeleton
+from polyfit.errors import InputError
+
+from .files import _finite, placed
+
+# Names of bones, without case, separators, prefixes as in "mixamorig:", and sides, for each joint:
+# the first that a file has counts. Mixamo, CMU and MotionBuilder; Blender's Rigify; Poser and Daz;
+# Unreal; others. The spine, the neck and what lies between are found by their place.
+_NAMES = {
+    "hip": ("upleg", "thigh", "upperleg", "hip", "femur"),
+    "knee": ("leg", "shin", "calf", "lowerleg", "lowleg", "knee", "tibia"),
+    "ankle": ("foot", "ankle"),
+    "foot": ("toebase", "toe", "toes", "ball"),
+    "collar": ("collar", "clavicle", "shoulder"),
+    "shoulder": ("arm", "upperarm", "uparm", "shldr", "shoulder", "humerus"),
+    "elbow": ("forearm", "lowerarm", "lowarm", "elbow", "radius"),
+    "wrist": ("hand", "wrist"),
+}
+_OPTIONAL = ("foot", "collar", "wrist")
+
+
+def read_bvh(path, name, fps=None, up=None):
+    """The :class:`~onefit.Motion` of a BVH file.
+
+    The file's zero pose has to be a stand (T-pose, A-pose, arms down): how it is turned from the
+    T-pose is found as for bodies (:func:`onefit.body.skeleton.rest_pose`), and rotations are
+    counted from the T-pose from then on. Lengths are scaled by the legs', so that any unit will do.
+    A rotation of a bone that the 24 joints do not have goes to the next joint outwards; fingers and
+    faces are left out; up is where the head is in the zero pose. Raises InputError where the file
+    cannot be read, a limb is not found, or the zero pose is no stand.
+    """
+    names, parents, offsets, channels, frames, period = _parse(path)
+    joint_of = _joints(path, names, parents, offsets)
+    rest = _places(parents, offsets)
+    turn = _axes(path, rest, joint_of, up)
+    rest = rest @ turn.T
+    joints = _standing(path, rest, joint_of)
+    if fps is None:
+        if not period > 0:
+            raise InputError(f"{path}: a frame time of {period}; say the rate: fps=30, or --fps 30")
+        fps = 1 / period
+        fps = round(fps) if abs(fps - round(fps)) < 0.01 else fps
+
+    world, root = _posed(
+        path, parents, channels, frames
+    )  # rotations of bones (bones, T) and places (T, 3), in the file's axes
+    C = Rotation.from_matrix(turn)
+    stand = skeleton.chained_rotations(skeleton.rest_pose(joints)).numpy()
+    target = [None] * 24
+    for j, parent in enumerate(skeleton.PARENTS):
+        bone = joint_of.get(skeleton.JOINTS[j])
+        if bone is None:
+            target[j] = target[parent]
+        else:
+            target[j] = C * world[bone] * C.inv() * Rotation.from_matrix(stand[j])
+    poses = np.stack(
+        [
+            (r if p < 0 else target[p].inv() * r).as_rotvec()
+            for r, p in zip(target, skeleton.PARENTS, strict=True)
+        ],
+        1,
+    )
+    scale = skeleton.leg_length(skeleton.standard_joints()) / skeleton.leg_length(joints)
+    return placed(poses, root @ turn.T * scale, fps, name)
+
+
+def _parse(path):
+    """(names, parents, offsets (B, 3), channels, frames (T, C), frame time) of a BVH file; end
+    sites are bones named ``None``.
+    """
+    try:
+        with open(path, encoding="utf-8", errors="replace") as file:
+            text = file.read()
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    head, motion, tail = text.partition("MOTION")
+    if not motion or "HIERARCHY" not in head:
+        raise InputError(f"{path}: no BVH file (HIERARCHY and MOTION are needed)")
+    names, parents, offsets, channels, open_bones = [], [], [], [], []
+    try:
+        words = iter(head.split("HIERARCHY", 1)[1].split("\n"))
+        for line in words:
+            word = line.split()
+            if not word:
+                continue
+            if word[0] in ("ROOT", "JOINT", "End"):
+                names.append(None if word[0] == "End" else " ".join(word[1:]))
+                parents.append(open_bones[-1] if open_bones else -1)
+                offsets.append(np.zeros(3))
+                channels.append([])
+                if "{" in word:
+                    names[-1] = names[-1] and names[-1].replace("{", "").strip()
+                    open_bones.append(len(names) - 1)
+            elif word[0] == "{":
+                open_bones.append(len(names) - 1)
+            elif word[0] == "}":
+                open_bones.pop()
+            elif word[0] == "OFFSET":
+                offsets[open_bones[-1]] = np.array(word[1:4], dtype=float)
+            elif word[0] == "CHANNELS":
+                channels[open_bones[-1]] = word[2 : 2 + int(word[1])]
+            else:
+                raise ValueError(f"{word[0]!r} in the hierarchy")
+        found = re.match(r"\s*Frames:\s*(\d+)\s*Frame Time:\s*(\S+)(.*)", tail, re.S)
+        if not found:
+            raise ValueError("Frames: and Frame Time: are needed after MOTION")
+        values = np.array(found[3].split(), dtype=float)
+        count = sum(map(len, channels))
+        if count == 0 or len(values) == 0 or len(values) % count:
+            raise ValueError(f"{len(values)} numbers for {count} channels")
+        frames = values.reshape(-1, count)
+        if len(frames) != int(found[1]):
+            raise ValueError(f"{found[1]} frames are announced, {len(frames)} are there")
+        if parents.count(-1) != 1 or not np.isfinite(offsets).all():
+            raise ValueError("one root and finite offsets are needed")
+        return names, parents, np.array(offsets), channels, frames, float(found[2])
+    except (ValueError, IndexError) as error:
+        raise InputError(f"{path}: no BVH file that can be read ({error})") from None
+
+
+def _joints(path, names, parents, offsets):
+    """Bones (numbers) by the names of our joints. Raises InputError where a limb is not found."""
+    by_side = {"left": {}, "right": {}}
+    for bone, name in enumerate(names):
+        side, base = _side(name)
+        if side:
+            by_side[side].setdefault(base, bone)
+    found = {}
+    for side, bones in by_side.items():
+        taken = set()
+        for joint, bases in reversed(
+            _NAMES.items()
+        ):  # from the hand inwards: a shoulder is an arm only where no arm is
+            bone = next((bones[b] for b in bases if b in bones and bones[b] not in taken), None)
+            if bone is None and joint not in _OPTIONAL:
+                raise InputError(
+                    f"{path}: no {side} {joint} among its bones"
+                    f" ({', '.join(n for n in names if n)[:200]})"
+                )
+            if bone is not None:
+                found[f"{side}_{joint}"] = bone
+                taken.add(bone)
+    above = lambda bone: [bone, *above(parents[bone])] if bone >= 0 else []
+    hips = [above(found[f"{side}_hip"]) for side in ("left", "right")]
+    pelvis = next((b for b in hips[0][1:] if b in hips[1]), None)
+    arms = [above(found[f"{side}_shoulder"]) for side in ("left", "right")]
+    chest = next((b for b in arms[0][1:] if b in arms[1]), None)
+    if pelvis is None or chest is None or pelvis not in above(chest):
+        raise InputError(f"{path}: its legs and arms do not hang on one spine")
+    found["pelvis"] = pelvis
+    spine = above(chest)[: above(chest).index(pelvis)][::-1]
+    for k, joint in enumerate(
+        ("spine1", "spine2", "spine3")
+    ):  # a joint turns as the last of its third of the bones does
+        if spine:
+            found[joint] = spine[max(0, round((k + 1) * len(spine) / 3) - 1)]
+    head = next(
+        (b for b, n in enumerate(names) if n and re.fullmatch(r"(.*[^a-z])?head\d*", n.lower())),
+        None,
+    )
+    if head is not None and chest in above(head):
+        found["head"] = head
+        neck = above(head)[1 : above(head).index(chest)]
+        if neck:
+            found["neck"] = neck[0]
+    return found
+
+
+def _side(name):
+    """('left', 'right' or None, the rest of a bone's name without case, prefix and separators)."""
+    if not name:
+        return None, ""
+    base = name.rpartition(":")[2]
+    for side, letter in (("left", "l"), ("right", "r")):
+        for pattern in (
+            rf"(?i){side}",
+            rf"^(?i:{letter})[._\- ]+",
+            rf"[._\- ]+(?i:{letter})(?=$|[._\- ])",
+            rf"^{letter}(?=[A-Z])",
+            rf"^{letter.upper()}(?=[A-Z][a-z])",
+        ):
+            rest, count = re.subn(pattern, "", base, count=1)
+            if count:
+                return side, re.sub(
+                    r"[^a-z]|^(def|org)[._\-]",
+                    "",
+                    re.sub(r"(?i)^(def|org|bip\d*|character\d*)[._\- ]+", "", rest).lower(),
+                )
+    return None, ""
+
+
+def _places(parents, offsets):
+    places = np.zeros_like(offsets)
+    for bone, parent in enumerate(parents):
+        places[bone] = offsets[bone] * 0 if parent < 0 else places[parent] + offsets[bone]
+    return places
+
+
+def _axes(path, places, joint_of, up):
+    """The rotation (3, 3) from the file's axes to OneFit's, its axes along the file's, told from
+    the zero pose.
+    """
+    head = places[joint_of.get("head", joint_of.get("neck", joint_of["left_shoulder"]))]
+    hips = 0.5 * (places[joint_of["left_hip"]] + places[joint_of["right_hip"]])
+    nearest = lambda v: np.sign(v[np.abs(v).argmax()]) * np.eye(3)[np.abs(v).argmax()]
+    z = nearest(head - hips) if up is None else np.eye(3)["xyz".index(up)]
+    x = places[joint_of["left_hip"]] - places[joint_of["right_hip"]]
+    x = nearest(x - (x @ z) * z)
+    return np.stack([x, np.cross(z, x), z])
+
+
+def _standing(path, rest, joint_of):
+    """Joints (24, 3) of the zero pose, in OneFit's axes. Raises InputError where it is no stand."""
+    joints = torch.zeros(24, 3, dtype=torch.float64)
+    for j, (name, parent) in enumerate(zip(skeleton.JOINTS, skeleton.PARENTS, strict=True)):
+        if name in joint_of:
+            joints[j] = torch.as_tensor(rest[joint_of[name]])
+        else:  # beyond what the file has: on, the way the bone before it goes
+            joints[j] = joints[parent] + 0.3 * (
+                joints[parent] - joints[skeleton.PARENTS[parent]] if parent > 0 else 0.0
+            )
+    trunk = joints[skeleton.INDEX["head"]] - joints[0]
+    down = [
+        joints[skeleton.INDEX[f"{s}_hip"], 2] - joints[skeleton.INDEX[f"{s}_ankle"], 2]
+        for s in ("left", "right")
+    ]
+    if not (trunk[2] > 0.8 * trunk.norm() and min(down) > 0.8 * skeleton.leg_length(joints)):
+        raise InputError(
+            f"{path}: its zero pose is no upright stand with the legs down; export the motion with"
+            " a T-pose as rest pose"
+        )
+    return joints
+
+
+def _posed(path, parents, channels, frames):
+    """Rotations of the bones in the file's world, a list of Rotation (T,), and the root's places
+    (T, 3).
+    """
+    _finite(path, frames=frames)
+    world, column, root = [], 0, np.zeros((len(frames), 3))
+    for bone, names in enumerate(channels):
+        values = frames[:, column : column + len(names)]
+        column += len(names)
+        axes = [
+            (name[0].upper(), values[:, k])
+            for k, name in enumerate(names)
+            if name.lower().endswith("rotation")
+        ]
+        order = "".join(axis for axis, _ in axes)
+        local = (
+            Rotation.from_euler(order, np.stack([v for _, v in axes], -1), degrees=True)
+            if axes
+            else Rotation.identity(len(frames))
+        )
+        world.append(local if parents[bone] < 0 else world[parents[bone]] * local)
+        if parents[bone] < 0:
+            for k, name in enumerate(names):
+                if name.lower().endswith("position"):
+                    root[:, "xyz".index(name[0].lower())] = values[:, k]
+    return world, root

@@ -1,0 +1,149 @@
+"""Motions from files: AMASS's and Neural Cloth Simulation's ``.npz``, and BVH
+(:mod:`onefit.motion.bvh`).
+
+SMPL's joint rotations are taken over as they are: SMPL's zero pose is OneFit's T-pose, and a joint
+here is the joint of the same name there; only the axes are turned. With C from SMPL's body axes (y
+up, facing +z) to OneFit's (z up, facing -y), a joint's rotation R becomes C R C^T. The root's leads
+into the file's world: with W from that world's axes to OneFit's it becomes W R C^T, the translation
+W t. AMASS's world has z up (W = 1), Neural Cloth Simulation's y up (W = C).
+"""
+
+import os
+import zipfile
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from onefit.body import skeleton, skinning
+from polyfit.errors import InputError
+
+from .motion import Motion
+
+_C = Rotation.from_euler("x", 90, degrees=True)  # from SMPL's body axes, or any world with y up
+_RATES = ("mocap_framerate", "mocap_frame_rate", "fps", "frame_rate", "framerate")
+_COUNTS = {22: 22, 24: 24, 52: 22, 55: 22}  # joints in a file, and how many of them are the body's
+_FASTEST = 25.0  # [m/s]: no one's root moves faster
+
+
+def read(path, fps=None, up=None):
+    """The :class:`~onefit.Motion` of a file; see :meth:`onefit.Motion.read`."""
+    path = str(path)
+    name = os.path.splitext(os.path.basename(path))[0]
+    if up not in (None, "y", "z"):
+        raise InputError(f"up = {up!r}; y or z is needed")
+    if path.lower().endswith(".npz"):
+        return _read_npz(path, name, fps, up)
+    if path.lower().endswith(".bvh"):
+        from .bvh import read_bvh
+
+        return read_bvh(path, name, fps, up)
+    raise InputError(f"{path}: a motion is read from .npz (AMASS, Neural Cloth Simulation) or .bvh")
+
+
+def _read_npz(path, name, fps, up):
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            data = {key: file[key] for key in ("poses", "trans", *_RATES) if key in file.files}
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except (ValueError, EOFError, OSError, zipfile.BadZipFile) as error:
+        raise InputError(
+            f"{path}: cannot be read as .npz ({' '.join(str(error).split())[:200]})"
+        ) from None
+    for key in ("poses", "trans"):
+        if key not in data:
+            raise InputError(
+                f"{path}: misses {key}; a motion file has poses, trans and a frame rate"
+            )
+    poses, trans = (
+        np.asarray(data["poses"], dtype=np.float64),
+        np.asarray(data["trans"], dtype=np.float64),
+    )
+    rate = next((key for key in _RATES if key in data), None)
+    if fps is None:
+        if rate is None:
+            raise InputError(
+                f"{path}: no frame rate ({', '.join(_RATES)}); say it: fps=30, or --fps 30"
+            )
+        fps = float(np.asarray(data[rate]).ravel()[0])
+    if up is None:  # AMASS names its rate after its motion capture
+        up = "z" if rate is None or rate.startswith("mocap") else "y"
+    quaternions = poses.ndim == 3 and poses.shape[2] == 4
+    count = poses.shape[1] if poses.ndim == 3 else poses.shape[1] / 3 if poses.ndim == 2 else None
+    if count not in _COUNTS or quaternions:
+        raise InputError(
+            f"{path}: poses of shape {poses.shape}; axis-angle vectors of 22, 24 (SMPL), 52"
+            " (SMPL-H) or 55 (SMPL-X) joints are needed"
+        )
+    if len(poses) == 0 or trans.shape != (len(poses), 3):
+        raise InputError(
+            f"{path}: {len(poses)} frames of poses and a translation of shape {trans.shape}"
+        )
+    _finite(path, poses=poses, trans=trans)
+    local = np.zeros((len(poses), 24, 3))
+    body = _COUNTS[int(count)]
+    local[:, :body] = poses.reshape(len(poses), -1, 3)[:, :body]
+    world = _C if up == "y" else Rotation.identity()
+    root = world * Rotation.from_rotvec(local[:, 0]) * _C.inv()
+    local = _C.apply(local.reshape(-1, 3)).reshape(local.shape)
+    local[:, 0] = root.as_rotvec()
+    _upright(path, root, up)
+    trans = world.apply(trans)
+    fastest = (
+        np.percentile(np.linalg.norm(np.diff(trans, axis=0), axis=1), 90) * fps
+        if len(trans) > 1
+        else 0.0
+    )
+    if fastest > _FASTEST:
+        unit = "; in centimetres? then divide trans by 100" if fastest < 100 * _FASTEST else ""
+        raise InputError(
+            f"{path}: its root moves at {fastest:.3g} m/s; metres and frames a second are"
+            f" needed{unit}"
+        )
+    return placed(local, trans, fps, name)
+
+
+def _finite(path, **arrays):
+    for key, array in arrays.items():
+        bad = ~np.isfinite(array).reshape(len(array), -1).all(1)
+        if bad.any():
+            where = f"{bad.sum()} of {len(bad)} frames, the first is frame {bad.argmax()}"
+            raise InputError(
+                f"{path}: {key} are not finite in {where}; cut them out or fill them in"
+            )
+
+
+def _upright(path, root, up):
+    """Refuses a motion whose body lies on its side all the time, and would stand with the other
+    axis up.
+    """
+    mean = root.apply([0.0, 0.0, 1.0]).mean(0)
+    if abs(mean[2]) < 0.3 and abs(mean[1]) > 0.85:
+        other = "z" if up == "y" else "y"
+        raise InputError(
+            f"{path}: its body lies down throughout if {up} is up; say that {other} is:"
+            f" up={other!r}, or --motion-up {other}"
+        )
+
+
+def placed(poses, translation, fps, name):
+    """The Motion of arrays (T, 24, 3) and (T, 3), moved as a whole: it starts at x = y = 0, and its
+    lowest foot stands where the standard body's feet do. Where a file's floor is, and how tall its
+    person was, seldom is told."""
+    at = skeleton.INDEX["left_foot"], skeleton.INDEX["right_foot"]
+    poses = torch.as_tensor(poses, dtype=torch.float32)
+    feet = (
+        skinning.joint_places(skeleton.standard_joints(), poses, torch.zeros(len(poses), 3))[
+            :, at, 2
+        ]
+        .amin(1)
+        .double()
+        .numpy()
+    )
+    translation = translation - [
+        translation[0, 0],
+        translation[0, 1],
+        (feet + translation[:, 2]).min() - skeleton.standard_joints()[at[0], 2].item(),
+    ]
+    return Motion(poses, torch.as_tensor(translation, dtype=torch.float32), float(fps), name)

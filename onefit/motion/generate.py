@@ -1,0 +1,76 @@
+"""Motions made from nothing: walking, squatting, reaching and so on, each sequence different by its
+seed.
+
+A kind is a function of times (T,) [s] and a random generator to the channels of
+:mod:`onefit.motion.figures.figure`. Kinds in :data:`HELD_OUT` are for tests only: no network of
+ours is trained on them, nor on seeds from :data:`HELD_OUT_SEEDS` up.
+"""
+
+import zlib
+
+import numpy as np
+
+from onefit.motion.figures import figure, gaits, heldout, postures
+from onefit.motion.figures.script import wander
+from polyfit.errors import InputError
+
+HELD_OUT_SEEDS = 1_000_000  # seeds from here up are never trained on
+
+
+def generate(name, seconds=10.0, seed=0, fps=30.0):
+    """The :class:`~onefit.Motion` of the kind ``name``; the same seed gives the same motion,
+    at any rate and for any length.
+
+    Raises InputError for a kind that does not exist, or a length that has no two frames.
+    """
+    if name not in KINDS:
+        raise InputError(f"no kind of motion {name!r}; there are {', '.join(KINDS)}")
+    if not (0 < fps < 10_000 and 1 <= seconds * fps <= 1e6):
+        raise InputError(
+            f"a motion of {seconds} s at {fps} frames a second; at least one frame, at most a"
+            " million are needed"
+        )
+    rng = np.random.default_rng([zlib.crc32(name.encode()), seed])
+    flipped = rng.random() < 0.5
+    t = np.arange(round(seconds * fps)) / fps
+    channels = KINDS[name](t, rng)
+    alive = np.random.default_rng([zlib.crc32(name.encode()), seed, 1])
+    channels = _alive(channels, t, alive)
+    motion = figure.motion(channels, fps, f"{name}-{seed}")
+    return motion.mirrored() if flipped else motion
+
+
+def _alive(channels, t, rng):
+    """Breath and sway, so that nothing ever stands quite still."""
+    breath = np.sin(2 * np.pi * t / rng.uniform(3.0, 4.5) + rng.uniform(0, 6))
+    c = dict(channels)
+    c["spine"] = (
+        c["spine"] + wander(t, rng, (0.012, 0.012, 0.02), 5.0) - 0.012 * breath[:, None] * [1, 0, 0]
+    )
+    c["head"] = c["head"] + wander(t, rng, (0.04, 0.03, 0.08), 4.0)
+    for side in ("left", "right"):
+        c[f"{side}_arm"] = (
+            c[f"{side}_arm"]
+            + wander(t, rng, (0.025, 0.015, 0.02, 0.03), 4.0)
+            + 0.008 * breath[:, None] * [0, 1, 0, 0]
+        )
+    return c
+
+
+_TRAINING = (
+    postures.idle, gaits.walk, gaits.run, postures.squat, postures.reach, postures.twist,
+    postures.arms_up, postures.arms_crossed, postures.kick, postures.sit, postures.turn,
+    postures.side_step, postures.lunge, postures.bend, postures.stretch, postures.jump,
+    postures.improvise,
+)  # fmt: skip
+_HELD_OUT = (
+    heldout.jumping_jack,
+    heldout.box,
+    heldout.sneak,
+    heldout.wave,
+    heldout.pick_up,
+    heldout.dance,
+)
+TRAINING = tuple(kind.__name__ for kind in _TRAINING)
+HELD_OUT = tuple(kind.__name__ for kind in _HELD_OUT)
+KINDS = {kind.__name__: kind for kind in _TRAINING + _HELD_OUT}

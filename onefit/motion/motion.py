@@ -1,0 +1,154 @@
+"""Motions: poses and places of the root over time, read from files, generated, resampled."""
+
+from dataclasses import dataclass, replace
+
+import torch
+
+from onefit.body import skeleton
+from polyfit.errors import InputError
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A sequence of poses of the 24 joints, in OneFit's world (metres, z up, facing -y).
+
+    ``poses`` (T, 24, 3) axis-angle vectors [rad], each joint relative to its parent and counted
+    from the T-pose; ``translation`` (T, 3) [m], added to the rest position of the root joint;
+    ``fps`` frames a second; ``name``. Raises InputError where shapes do not fit or a number is not
+    finite.
+    """
+
+    poses: torch.Tensor
+    translation: torch.Tensor
+    fps: float
+    name: str = "motion"
+
+    def __post_init__(self):
+        T = len(self.poses)
+        if (
+            self.poses.ndim != 3
+            or self.poses.shape[2] != 3
+            or self.poses.shape[1] != len(skeleton.JOINTS)
+        ):
+            raise InputError(
+                f"motion {self.name}: poses of shape {tuple(self.poses.shape)}; (frames,"
+                f" {len(skeleton.JOINTS)}, 3) is needed"
+            )
+        if T == 0:
+            raise InputError(f"motion {self.name}: no frames")
+        if self.translation.shape != (T, 3):
+            raise InputError(
+                f"motion {self.name}: translation of shape {tuple(self.translation.shape)}; ({T},"
+                " 3) is needed"
+            )
+        for what, values in (("poses", self.poses), ("translation", self.translation)):
+            bad = ~torch.isfinite(values).flatten(1).all(1)
+            if bad.any():
+                where = (
+                    f"{int(bad.sum())} of {T} frames, the first is frame {int(bad.nonzero()[0, 0])}"
+                )
+                raise InputError(
+                    f"motion {self.name}: {what} are not finite in {where}; cut them out or fill"
+                    " them in"
+                )
+        if not 0 < self.fps < 10_000:
+            raise InputError(
+                f"motion {self.name}: {self.fps} frames a second; a positive number is needed"
+            )
+
+    def __len__(self):
+        return len(self.poses)
+
+    def __getitem__(self, frames):
+        """The motion of a slice of the frames."""
+        return replace(self, poses=self.poses[frames], translation=self.translation[frames])
+
+    def to(self, device):
+        """The same motion on ``device``."""
+        return replace(self, poses=self.poses.to(device), translation=self.translation.to(device))
+
+    @classmethod
+    def read(cls, path, fps=None, up=None):
+        """A motion from a file: AMASS's ``.npz`` (``poses``, ``trans``, ``mocap_framerate``; z up),
+        Neural Cloth Simulation's (``fps``; y up), or BVH.
+
+        ``fps`` and ``up`` ("y" or "z") take the place of what the file says. SMPL's rotations are
+        taken over joint by joint, in OneFit's axes (:mod:`onefit.motion.files`); a BVH skeleton is
+        retargeted (:mod:`onefit.motion.bvh`). The motion starts at x = y = 0 with its lowest foot
+        on the standard body's ground. Raises InputError for what cannot be used: not finite,
+        another number of joints, no frame rate, another unit.
+        """
+        from .files import read
+
+        return read(path, fps, up)
+
+    @classmethod
+    def generate(cls, name, seconds=10.0, seed=0, fps=30.0):
+        """A generated motion of the kind ``name``, one of :data:`onefit.motion.generate.KINDS`; see
+        :mod:`onefit.motion.generate`.
+        """
+        from .generate import generate
+
+        return generate(name, seconds=seconds, seed=seed, fps=fps)
+
+    def fitted(self, body):
+        """The motion for a :class:`~onefit.Body` with longer or shorter legs than the standard
+        body's: its way is scaled by their length, so that feet which stood still on the standard
+        body nearly do on this one.
+        """
+        return replace(
+            self,
+            translation=self.translation
+            * (skeleton.leg_length(body.joints) / skeleton.leg_length(skeleton.standard_joints())),
+        )
+
+    def mirrored(self):
+        """The motion seen in a mirror: left is right, and x is -x."""
+        other = [skeleton.INDEX[_other_side(name)] for name in skeleton.JOINTS]
+        turned = self.poses.new_tensor([1.0, -1.0, -1.0])
+        return replace(
+            self, poses=self.poses[:, other] * turned, translation=self.translation * -turned
+        )
+
+    def resampled(self, fps=30.0):
+        """The same motion at ``fps`` frames a second from the same start to (at most) the same end.
+
+        Rotations go along great arcs (slerp) between the two frames beside each new one, places
+        along straight lines. Where the old rate is a multiple of the new one, frames are taken as
+        they are.
+        """
+        import numpy as np
+        from scipy.spatial.transform import Rotation
+
+        if not 0 < fps < 10_000:
+            raise InputError(f"{fps} frames a second; a positive number is needed")
+        if fps == self.fps or len(self) == 1:
+            return replace(self, fps=float(fps))
+        count = int(np.floor((len(self) - 1) / self.fps * fps + 1e-6)) + 1
+        at = np.arange(count) * (self.fps / fps)
+        at = np.where(np.abs(at - np.round(at)) < 1e-6, np.round(at), at)
+        first = np.minimum(at.astype(int), len(self) - 2)
+        part = (at - first)[:, None]
+        poses, places = (
+            self.poses.detach().cpu().double().numpy(),
+            self.translation.detach().cpu().double().numpy(),
+        )
+        before, after = (
+            Rotation.from_rotvec(poses[first].reshape(-1, 3)),
+            Rotation.from_rotvec(poses[first + 1].reshape(-1, 3)),
+        )
+        step = (before.inv() * after).as_rotvec() * np.repeat(part, poses.shape[1], 0)
+        new = (before * Rotation.from_rotvec(step)).as_rotvec().reshape(count, -1, 3)
+        place = places[first] * (1 - part) + places[first + 1] * part
+        return replace(
+            self,
+            poses=torch.as_tensor(new).to(self.poses),
+            translation=torch.as_tensor(place).to(self.translation),
+            fps=float(fps),
+        )
+
+
+def _other_side(name):
+    if name.startswith("left_"):
+        return "right_" + name[5:]
+    return "left_" + name[6:] if name.startswith("right_") else name

@@ -1,0 +1,171 @@
+"""The network: patches and the body's motion in, the patches' deformation out (paper, section
+"OneFit", and supplement).
+
+jets, orientations, places of the patches ─► PatchEncoder ─► Z_T ─┐
+poses, shape, root velocity ─► BodyEncoder ─────────────────► Z_B ┴─► Decoder ─► Deformation
+"""
+
+import itertools
+import math
+
+import torch
+from torch import nn
+
+from onefit.body import skeleton
+from onefit.garment.charts import Deformation
+from polyfit import jets
+
+GRAVITY = (0.0, 0.0, -1.0)  # unit, world
+SLOPE = 0.1  # of the leaky ReLUs
+HANG = 4  # numbers that tell how a patch hangs: how far from the body, and how much of it is held
+# Deformations that a unit of the decoder's output stands for: coefficients and translation in units
+# of the patch's radius, scale as a logarithm, drift in units of the patch's room.
+UNIT = {"alpha": 0.2, "translation": 0.3, "scale": 0.05, "drift": 1.0}
+
+
+def layers(widths, bias=True, last=True):
+    """Fully connected layers with LeakyReLU between them, and after the last one if ``last``."""
+    out = []
+    for i, (a, b) in enumerate(itertools.pairwise(widths)):
+        linear = nn.Linear(a, b, bias=bias)
+        nn.init.kaiming_normal_(linear.weight, SLOPE, nonlinearity="leaky_relu")
+        if bias:
+            nn.init.zeros_(linear.bias)
+        out.append(linear)
+        if last or i + 2 < len(widths):
+            out.append(nn.LeakyReLU(SLOPE, inplace=True))
+    return nn.Sequential(*out)
+
+
+def encoded(x, octaves):
+    """Positional encoding (Mildenhall et al. 2020) of x (..., D) [m]: x and its sines and cosines
+    at wavelengths of 2 m / 2^i, (..., D (1 + 2 octaves))."""
+    waves = x[..., None] * (math.pi * 2.0 ** torch.arange(octaves, dtype=x.dtype, device=x.device))
+    return torch.cat([x, waves.sin().flatten(-2), waves.cos().flatten(-2)], -1)
+
+
+class PatchEncoder(nn.Module):
+    """Z_T (K, width) of a garment's patches: an MLP, with skip connections, of the jet, the
+    orientation, the encoded centre and its encoded offsets from the joints (the paper's), of how
+    the patch hangs on the body, and of all patches together: a skirt is no trouser leg.
+    """
+
+    def __init__(self, order, joints, width=128, hidden=256, octaves=(6, 3)):
+        super().__init__()
+        self.octaves = octaves
+        size = (
+            jets.size_of(order)
+            + 7
+            + 3 * (1 + 2 * octaves[0])
+            + 3 * joints * (1 + 2 * octaves[1])
+            + HANG
+            + joints
+        )
+        self.first = layers([size, hidden, hidden])
+        self.second = layers([size + hidden, hidden, hidden])
+        self.last = layers([size + hidden, width], last=False)
+        self.whole = layers([hidden, hidden, width], last=False)
+        nn.init.zeros_(self.whole[-1].weight)
+
+    def forward(self, alpha, orientation, centre, looseness, held, blend_weights, joints):
+        """Of jets (K, A), orientations (K, 7), centres (K, 3) [m], looseness (K, 3), held (K, 1),
+        blend weights (K, J), as :attr:`onefit.PatchedGarment.features` has them, and joints
+        (J, 3) [m] of the standard body.
+        """
+        offsets = centre[:, None] - joints
+        places = encoded(centre, self.octaves[0]), encoded(offsets, self.octaves[1]).flatten(1)
+        x = torch.cat([alpha, orientation, *places, looseness, held, blend_weights], -1)
+        y = self.second(torch.cat([x, self.first(x)], -1))
+        return self.last(torch.cat([x, y], -1)) + self.whole(y.mean(0))
+
+
+def descriptors(poses):
+    """Of poses (..., J, 3) with parents ``skeleton.PARENTS``: each joint's rotation from its parent
+    as 6 numbers (Zhou et al. 2019) and gravity's direction in its own frame, (..., J, 9)."""
+    local = _matrices(poses)
+    everywhere = skeleton.chained(local)
+    gravity = everywhere.new_tensor(GRAVITY)
+    return torch.cat([local[..., :2].transpose(-1, -2).flatten(-2), gravity @ everywhere], -1)
+
+
+def _matrices(rotvec):
+    """Rotations (..., 3, 3) of axis-angle vectors (..., 3) [rad]."""
+    import roma
+
+    return roma.rotvec_to_rotmat(rotvec)
+
+
+class BodyEncoder(nn.Module):
+    """Z_B (..., width) of a moving body: static and dynamic encodings of its poses (Bertiche et al.
+    2022), shape and root velocity, and the five layers that join them."""
+
+    def __init__(self, joints, shape, width=256):
+        super().__init__()
+        self.static = layers([9 * joints, 64, 128, 256, 512])
+        self.local = layers([9, 32, 32], bias=False)
+        self.moving = layers([32 * joints, 512, 512], bias=False)
+        self.memory = nn.GRU(512, 512, bias=False, batch_first=True)
+        self.join = layers([512 + 512 + shape + 3, 256, 256, 256, 256, width], last=False)
+
+    def forward(self, poses, translation, shape, fps, hidden=None):
+        """Of windows of poses (B, L, J, 3), root translations (B, L, 3) [m], shapes (B, S) less the
+        standard one, frames a second.
+
+        Returns Z_B (B, L, width) and the memory to go on with. ``hidden``: that memory; None starts
+        from rest. In the first frame of a window without memory the body is taken to be at rest.
+        """
+        x = descriptors(poses)
+        change = torch.cat([torch.zeros_like(x[:, :1]), x[:, 1:] - x[:, :-1]], 1) * (fps / 30)
+        velocity = (
+            torch.cat(
+                [torch.zeros_like(translation[:, :1]), translation[:, 1:] - translation[:, :-1]], 1
+            )
+            * fps
+        )
+        root = _matrices(poses[..., 0, :])
+        velocity = (velocity[..., None, :] @ root)[..., 0, :]
+        moving, memory = self.memory(self.moving(self.local(change).flatten(-2)), hidden)
+        shape = shape[:, None].expand(*x.shape[:2], -1)
+        return (
+            self.join(torch.cat([self.static(x.flatten(-2)), moving, shape, velocity], -1)),
+            memory,
+        )
+
+
+class Decoder(nn.Module):
+    """Z_T and Z_B to a :class:`Deformation`: layers of 512, 512, 512 and 256, and heads (128,
+    64).
+    """
+
+    def __init__(self, order, patch=128, body=256):
+        super().__init__()
+        self.of_patch, self.of_body = nn.Linear(patch, 512), nn.Linear(body, 512, bias=False)
+        self.trunk = layers([512, 512, 512, 256])
+        sizes = {"alpha": jets.size_of(order), "translation": 3, "scale": 1, "drift": 3}
+        self.heads = nn.ModuleDict(
+            {name: layers([256, 128, 64, size], last=False) for name, size in sizes.items()}
+        )
+        for head in self.heads.values():  # an untrained network is plain skinning
+            nn.init.zeros_(head[-1].weight)
+
+    def forward(self, Z_T, Z_B):
+        """Of patches Z_T (K, patch) and frames Z_B (T, body)."""
+        # the first layer is linear in both: no concatenation of each patch with each frame is
+        # needed
+        x = nn.functional.leaky_relu(self.of_patch(Z_T) + self.of_body(Z_B)[:, None], SLOPE)
+        x = self.trunk(x)
+        out = {name: head(x) * UNIT[name] for name, head in self.heads.items()}
+        return Deformation(out["alpha"], out["translation"], out["scale"][..., 0], out["drift"])
+
+
+class OneFit(nn.Module):
+    """One network for any garment: ``patches``, ``body`` and ``decoder``. ``order`` of the jets,
+    ``joints`` and ``shape``: how many of both the body has."""
+
+    def __init__(self, order=4, joints=24, shape=6):
+        super().__init__()
+        self.shape = dict(order=order, joints=joints, shape=shape)
+        self.order = order
+        self.patches = PatchEncoder(order, joints)
+        self.body = BodyEncoder(joints, shape)
+        self.decoder = Decoder(order)
