@@ -10,6 +10,9 @@ from pathlib import Path
 import best_jets
 import numpy as np
 import pytest
+import sft_report
+import sft_results
+import sft_runs
 import synthetic
 from scipy.spatial.transform import Rotation
 from scripts import load
@@ -125,7 +128,7 @@ def test_table_shows_each_kind_of_truth_apart():
     }
     mesh = {"e3d": 0.002, "e3d_proc": 0.001, "en_deg": 2.0}
     best = result(
-        method=sft.JET, orders=[6, 6], figures=mesh, seconds_a_frame=None, iterations=None
+        method=sft_results.JET, orders=[6, 6], figures=mesh, seconds_a_frame=None, iterations=None
     )
     rows = [
         best,
@@ -133,7 +136,7 @@ def test_table_shows_each_kind_of_truth_apart():
         result(),
         result("corner", "adam", figures={}, error="error: it broke"),
     ]
-    meshes, points, failed = sft.table(rows).split("\n\n## ")
+    meshes, points, failed = sft_report.table(rows).split("\n\n## ")
     assert meshes.startswith("## True vertices")
     cells = [[x.strip() for x in line.strip("|").split("|")] for line in meshes.splitlines()[2:]]
     assert {len(row) for row in cells} == {9}
@@ -154,8 +157,8 @@ def test_what_has_no_truth_is_said(sheet, tmp_path, monkeypatch):
     shutil.copytree(sheet.folder, data)
     np.savez(data / "gt_points.npz", points=np.ones((1, 4, 3)), frames=[7])
     (data / "gt.npz").unlink()
-    monkeypatch.setattr(sft, "SCENES", str(scenes))
-    r = sft.run(
+    monkeypatch.setattr(sft_runs, "SCENES", str(scenes))
+    r = sft_runs.run(
         "flag",
         "adam",
         str(data),
@@ -164,11 +167,13 @@ def test_what_has_no_truth_is_said(sheet, tmp_path, monkeypatch):
     )
     assert r["seconds_a_frame"] > 0 and r["figures"] == {} and "no frame in common" in r["unscored"]
     assert r["unscored"].startswith("flag/gt_points.npz")
-    assert "## Without figures" in sft.table([r]) and "no frame in common" in sft.table([r])
+    assert "## Without figures" in sft_report.table(
+        [r]
+    ) and "no frame in common" in sft_report.table([r])
 
 
 def test_report_writes_page_and_plot(tmp_path):
-    text = sft.report(
+    text = sft_report.report(
         [result(), result(method="gauss-newton", seconds_a_frame=0.5)], str(tmp_path / "docs")
     )
     page = (tmp_path / "docs" / "sft.md").read_text()
@@ -185,29 +190,29 @@ def test_a_sheet_that_was_lost_is_told_and_not_plotted(tmp_path):
             "depth_rmse_allpix_mm": math.inf,
         },
     )
-    assert "| inf | inf | inf |" in sft.report([result(), lost], str(tmp_path))
+    assert "| inf | inf | inf |" in sft_report.report([result(), lost], str(tmp_path))
     assert "*inf*:" in (tmp_path / "sft.md").read_text() and (tmp_path / "sft.png").exists()
-    sft.report([result()], str(tmp_path))
+    sft_report.report([result()], str(tmp_path))
     assert "*inf*:" not in (tmp_path / "sft.md").read_text()
 
 
 def test_an_empty_report_has_no_plot(tmp_path):
-    sft.report([], str(tmp_path))
+    sft_report.report([], str(tmp_path))
     assert [p.name for p in tmp_path.iterdir()] == ["sft.md"]
 
 
 def test_results_replace_those_of_the_same_setup_only(tmp_path):
     path = str(tmp_path / "sft.json")
     short = {**SETUP, "frames": 3}
-    jets = [result(method=sft.JET, orders=[n, n]) for n in (4, 10)]
+    jets = [result(method=sft_results.JET, orders=[n, n]) for n in (4, 10)]
     for r in (result(seconds_a_frame=9.0), result(setup=short), *jets, result()):
-        sft.add(path, r)
-    kept = sft.read(path)
+        sft_results.add(path, r)
+    kept = sft_results.read(path)
     assert len(kept) == 4
-    assert sft.find(kept, "flag", "adam", SETUP)["seconds_a_frame"] == 5.25
-    assert sft.find(kept, "flag", "adam", short)["setup"] == short
-    assert sft.find(kept, "flag", sft.JET, SETUP, 10)["orders"] == [10, 10]
-    assert sft.find(kept, "flag", "per-vertex", SETUP) is None
+    assert sft_results.find(kept, "flag", "adam", SETUP)["seconds_a_frame"] == 5.25
+    assert sft_results.find(kept, "flag", "adam", short)["setup"] == short
+    assert sft_results.find(kept, "flag", sft_results.JET, SETUP, 10)["orders"] == [10, 10]
+    assert sft_results.find(kept, "flag", "per-vertex", SETUP) is None
 
 
 def test_what_is_done_is_not_run_again_but_what_failed_is(sheet, tmp_path, monkeypatch, capsys):
@@ -225,7 +230,7 @@ def test_what_is_done_is_not_run_again_but_what_failed_is(sheet, tmp_path, monke
             }
         return result(sequence, method, setup, orders=None)
 
-    monkeypatch.setattr(sft, "run", run)
+    monkeypatch.setattr(sft_runs, "run", run)
     places = [
         "--data",
         str(sheet.folder.parent),
@@ -251,7 +256,7 @@ def test_what_is_done_is_not_run_again_but_what_failed_is(sheet, tmp_path, monke
 
 def test_commands_are_those_of_a_user():
     setup = {**SETUP, "frames": 5, "define": ["period=7"], "mode": "llvm_ad_rgb", "iterations": 9}
-    line = sft.command("bend", "gauss-newton", "/data/bend", "out/x", setup)
+    line = sft_runs.command("bend", "gauss-newton", "/data/bend", "out/x", setup)
     assert (
         line[1:3] == ["-m", "polysft_mi.run"]
         and line[3].endswith("scenes/bend.xml")
@@ -263,28 +268,28 @@ def test_commands_are_those_of_a_user():
         "last=4",
         "solver=gauss-newton",
     ]
-    line = sft.command("bend", "per-vertex", "/data/bend", "out/x", setup)
+    line = sft_runs.command("bend", "per-vertex", "/data/bend", "out/x", setup)
     assert line[1].endswith("per_vertex.py") and line[line.index("--iterations") + 1] == "9"
     assert [line[k + 1] for k, x in enumerate(line) if x == "-D"] == [
         "data=/data/bend",
         "period=7",
         "last=4",
     ]
-    for sequence in sft.SEQUENCES:
-        assert Path(sft.command(sequence, "adam", "/data", "out", SETUP)[3]).is_file()
+    for sequence in sft_results.SEQUENCES:
+        assert Path(sft_runs.command(sequence, "adam", "/data", "out", SETUP)[3]).is_file()
 
 
 def test_a_shortened_run_leaves_the_documentation_alone():
-    assert sft.is_whole(SETUP) and sft.is_whole({**SETUP, "mode": "cuda_ad_rgb"})
+    assert sft_runs.is_whole(SETUP) and sft_runs.is_whole({**SETUP, "mode": "cuda_ad_rgb"})
     for name, value in {"frames": 3, "threads": 1, "define": ["period=3"], "iterations": 5}.items():
-        assert not sft.is_whole({**SETUP, name: value})
+        assert not sft_runs.is_whole({**SETUP, name: value})
 
 
 def test_the_documentation_is_drawn_from_the_results_beside_it():
     docs = Path(sft.ROOT) / "docs"
-    results = sft.read(docs / "sft.json")
-    assert all(sft.is_whole(r["setup"]) for r in results)
-    assert sft.page(results, "sft.png") == (docs / "sft.md").read_text(encoding="utf-8")
+    results = sft_results.read(docs / "sft.json")
+    assert all(sft_runs.is_whole(r["setup"]) for r in results)
+    assert sft_report.page(results, "sft.png") == (docs / "sft.md").read_text(encoding="utf-8")
 
 
 def test_a_damaged_file_of_results_is_told(tmp_path):
@@ -295,17 +300,17 @@ def test_a_damaged_file_of_results_is_told(tmp_path):
 
 def test_a_sequence_is_found_one_folder_down(tmp_path):
     (tmp_path / "cloth" / "flag").mkdir(parents=True)
-    assert sft.folder_of(str(tmp_path), "flag") == str(tmp_path / "cloth" / "flag")
-    assert sft.folder_of(str(tmp_path), "bend") is None
+    assert sft_runs.folder_of(str(tmp_path), "flag") == str(tmp_path / "cloth" / "flag")
+    assert sft_runs.folder_of(str(tmp_path), "bend") is None
 
 
 def test_one_command_is_run_timed_and_scored(sheet, tmp_path, monkeypatch):
     scenes = tmp_path / "scenes"
     scenes.mkdir()
     shutil.copy(sheet.folder / "scene.xml", scenes / "flag.xml")
-    monkeypatch.setattr(sft, "SCENES", str(scenes))
+    monkeypatch.setattr(sft_runs, "SCENES", str(scenes))
     setup = {**SETUP, "threads": 1, "define": ["period=3"], "mode": "llvm_ad_rgb"}
-    r = sft.run("flag", "adam", str(sheet.folder), str(tmp_path / "runs" / "flag-adam"), setup)
+    r = sft_runs.run("flag", "adam", str(sheet.folder), str(tmp_path / "runs" / "flag-adam"), setup)
     assert "error" not in r and r["frames"] == 2 and r["iterations"] == 3 and r["orders"] == [4, 4]
     assert r["seconds_a_frame"] == r["seconds"] / 2 > 0
     assert (
@@ -313,7 +318,7 @@ def test_one_command_is_run_timed_and_scored(sheet, tmp_path, monkeypatch):
         == evaluation.evaluate(str(tmp_path / "runs" / "flag-adam"), str(sheet.folder))["e3d_proc"]
     )
     assert r["versions"]["variant"] == "llvm_ad_rgb" and "core" in r["machine"]
-    broken = sft.run(
+    broken = sft_runs.run(
         "flag",
         "adam",
         str(sheet.folder),
@@ -366,9 +371,9 @@ def test_best_jets_get_better_with_their_order_and_than_heights(sheet):
 
 
 def test_best_jet_of_a_sequence_is_scored_like_a_run(sheet):
-    r = sft.jet_result("flag", str(sheet.folder), 4, {**SETUP, "frames": 1})
+    r = sft_runs.jet_result("flag", str(sheet.folder), 4, {**SETUP, "frames": 1})
     assert r["frames"] == 1 and r["orders"] == [4, 4] and r["figures"]["e3d_proc"] < 1e-5
-    whole = sft.jet_result("flag", str(sheet.folder), 4, SETUP)
+    whole = sft_runs.jet_result("flag", str(sheet.folder), 4, SETUP)
     assert whole["frames"] == 2 and whole["figures"]["e3d_proc"] < 1e-3
 
 
@@ -376,4 +381,4 @@ def test_without_true_meshes_there_is_no_best_jet(tmp_path):
     truth = synthetic.cloth(tmp_path / "flag", frames=1)
     np.savez(truth.folder / "points.npz", points=np.ones((1, 4, 3)), frames=np.zeros(1, int))
     (truth.folder / "gt.npz").unlink()
-    assert sft.jet_result("flag", str(truth.folder), 4, SETUP) is None
+    assert sft_runs.jet_result("flag", str(truth.folder), 4, SETUP) is None
