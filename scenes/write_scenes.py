@@ -35,6 +35,8 @@ SCENES = {
     "paper": _cloth(),
     "curtain": _cloth(),
     "corner": _cloth(),
+    "hand": _cloth(),
+    "poster": _cloth(),
     "kinect_paper": Layout(
         "Kinect-Paper",
         Intrinsics(528.0144, 528.0144, 320, 240, 640, 480),

@@ -113,9 +113,9 @@ class Light:
         area = np.where(shade.seen, shade.area, 0.0)
         area *= shade.seen.sum() / max(area.sum(), 1e-30)  # 1 on average
         held, before = self._held(len(shade.seen)), self.coefficients(len(shade.seen))
-        value = shade.luminance / _exposure(
-            shade.luminance[shade.seen], (rows @ before)[shade.seen]
-        )
+        value = shade.luminance
+        if self.rules.exposure:
+            value = value / _exposure(value[shade.seen], (rows @ before)[shade.seen])
         found = before
         for _ in range(self.rules.light_refits):
             weighted = (area / (1 + ((value - rows @ found) / self.scale) ** 2))[:, None] * rows
@@ -178,7 +178,7 @@ class Brightness:
         self.trusted = _sampled(covered, centroids) > rules.shading_inside[not masked]
         self.mean = max(float(found[self.trusted].mean()) if self.trusted.any() else 0.0, 1e-6)
         self.texture = found / self.mean
-        self.trusted &= self.texture > rules.shading_dark
+        self.trusted &= self.texture > 0
 
     def prepared(self, colour, mask):
         """A frame ``colour`` (H, W, 3) [linear RGB] with its ``mask`` (H, W) or None, as :meth:`of`
@@ -232,16 +232,8 @@ class Brightness:
             np.einsum("fk,fk->f", ray, ray)
         )
         luminance = _sampled(image, (position[self.faces].sum(1) / 3) / pool - 0.5)
-        texture = (
-            self.texture
-            if texture is None
-            else np.where(texture > self.rules.shading_dark, texture, self.texture)
-        )
-        seen = (
-            self.trusted
-            & frontal
-            & (pixels > self.rules.shading_covered * areas(position, self.faces))
-        )
+        texture = self.texture if texture is None else np.where(texture > 0, texture, self.texture)
+        seen = self.trusted & frontal & (pixels > 0)
         centre = (corner.sum(1) / 3 - self.centre) / self.unit
         return Shade(
             normal, centre, self.unit, texture, luminance, seen, (a, b), double / 2, facing

@@ -24,15 +24,14 @@ from .assembly import Assembly, Normal
 @dataclass(frozen=True)
 class Stage:
     """How strictly a frame is compared: the ``blur`` [pixels, on a sheet of 225 pixels] of the
-    images, the ``stiffness`` (a factor of k_mi), how many ``iterations`` are usual, the least
-    misfit so far below which the ``relief`` moves, and whether the stage is the ``last``, where
-    shading counts.
+    images, the ``stiffness`` (a factor of k_mi), how many ``iterations`` are usual, whether the
+    ``relief`` moves, and whether the stage is the ``last``, where shading counts.
     """
 
     blur: float
     stiffness: float
     iterations: int
-    relief: float = 0.0
+    relief: bool = False
     last: bool = False
 
 
@@ -43,11 +42,8 @@ def stages_of(rules):
     enforced: in a stiff flat sheet that is compressed in the image, height has no first-order
     effect, and the sheet would drift in depth instead of bending.
     """
-    reliefs = 0.0, rules.relief_clean, math.inf
-    usual = tuple(
-        Stage(*numbers)
-        for numbers in zip(rules.blurs, rules.stiffness, rules.iterations, reliefs, strict=True)
-    )
+    numbers = zip(rules.blurs, rules.stiffness, rules.iterations, strict=True)
+    usual = tuple(Stage(*three, relief=k > 0) for k, three in enumerate(numbers))
     usual = (*usual[:-1], replace(usual[-1], last=True))
     return Stage(rules.far_blur, rules.stiffness[0], rules.iterations[0]), usual
 
@@ -68,6 +64,13 @@ class Context:
     light: Light
     scales: dict
     hold: float = 0.0
+
+    @property
+    def is_first(self):
+        """Whether nothing is known of the noise: the first frame, where the template has its
+        shape.
+        """
+        return math.isnan(self.noise)
 
     def anchored(self, anchor):
         """The same, held to another state."""
@@ -146,7 +149,7 @@ class SecondOrder:
         if stiffness is not None:
             give = math.inf
         stiffness = s.k_mi * (stiffness or stage.stiffness) / chart.template.scale**2
-        d = 3 if self.has_relief and context.noise < stage.relief else 2
+        d = 3 if self.has_relief and stage.relief and not context.is_first else 2
         shading, rows = self._shading(surface, context, stage, seen, appearance)
         normal, inextensibility = self._assembly.normal(
             surface,
@@ -158,7 +161,8 @@ class SecondOrder:
             rows,
         )
         held = self._hold(normal, state, context)
-        smoothness, temporal = self._smooth(normal, state, context, d, s.k_relief * caution)
+        relief = s.k_relief * (caution if rules.relief_caution else 1.0)
+        smoothness, temporal = self._smooth(normal, state, context, d, relief)
         terms = {
             "rgb": seen.photometric,
             "silhouette": seen.silhouette,

@@ -62,7 +62,10 @@ class Rules:
         1.0, "", "how far beyond the last pass, in its own steps, the next pass starts"
     )
     explained: float = _rule(0.02, "misfit", "below this misfit a frame counts as explained")
-    # other starts
+    # starts
+    motion_starts: bool = _rule(
+        True, "", "whether a frame may start where the motion of the two before leads"
+    )
     suspect_factor: float = _rule(
         1.25, "", "a frame is suspect whose misfit exceeds the noise by so many times the usual"
     )
@@ -74,15 +77,13 @@ class Rules:
         3000, "vertices", "of the template, above which there is no relief: it costs too much time"
     )
     relief_bend: float = _rule(3e-3, "share", "of the relief's weight, for its bending")
-    relief_clean: float = _rule(
-        0.08, "misfit", "least misfit so far below which the relief moves in the second stage too"
-    )
     noise_misfit: float = _rule(
         0.05, "misfit", "of noise, at which the relief's weight and `give` have doubled"
     )
     noise_power: float = _rule(8.0, "", "with which they grow with the noise")
     noise_most: float = _rule(1e3, "", "factor by which the relief's weight grows at most")
-    strain_caution: bool = _rule(True, "", "whether `give` grows with noise as well")
+    relief_caution: bool = _rule(True, "", "whether the relief's weight grows with noise")
+    strain_caution: bool = _rule(True, "", "whether `give` grows with noise")
     give: float = _rule(
         0.002, "strain", "from which on a stretched edge hardly pulls harder (Charbonnier)"
     )
@@ -112,16 +113,13 @@ class Rules:
     temporal: float = _rule(1e-3, "share", "of `k_tc`, here in a stiffer basis than monomials")
     # shading
     shading_blur: float = _rule(0.45, "triangles", "blur of texture and frames, in triangle sides")
-    shading_covered: float = _rule(0.7, "share", "of a triangle's pixels that must be seen")
     shading_inside: tuple = _rule(
         (0.3, 0.97),
         "share",
         "of a triangle's surroundings that must be texture, with and without masks",
     )
     shading_frontal: float = _rule(0.3, "cosine", "between normal and ray, below which none counts")
-    shading_dark: float = _rule(
-        0.01, "share", "of the texture's mean luminance, below which a triangle says nothing"
-    )
+    exposure: bool = _rule(True, "", "whether a frame's overall brightness is its own")
     light_ridge: float = _rule(
         3e-3, "observations", "a triangle, that hold the light to be the same from all sides"
     )

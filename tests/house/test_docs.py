@@ -15,7 +15,7 @@ from scripts import load
 from polysft_mi.objective.problem import Problem
 from polysft_mi.prepare import parser as prepare_parser
 from polysft_mi.scene import experiment as scene
-from polysft_mi.scene import plugins, settings
+from polysft_mi.scene import plugins, rules, settings
 from polysft_mi.scene.sequence import Sequence
 
 PAGES = [
@@ -71,6 +71,11 @@ class TestPage:
 def test_table_of_settings_is_the_generated_one():
     shown = re.search(r"<!-- settings -->\n(.*?)\n<!-- /settings -->", SCENE, re.S)
     assert shown[1] == settings.table()
+
+
+def test_table_of_the_trackers_rules_is_the_generated_one():
+    text = (ROOT / "docs" / "tracker.md").read_text(encoding="utf-8")
+    assert re.search(r"<!-- rules -->\n(.*?)\n<!-- /rules -->", text, re.S)[1] == rules.table()
 
 
 def test_every_plugin_and_parameter_is_described():

@@ -13,7 +13,6 @@ WIDE = {
     "CONTRIBUTING.md",
     "README.md",
     "docs/index.md",
-    "docs/tracker.md",
     "docs/tutorial.md",
 }
 

@@ -93,10 +93,10 @@ class Descent:
         return best
 
     def _is_unexplained(self, found, context):
-        """Whether images are clean, and yet the misfit is more than their noise."""
+        """Whether the misfit is more than the noise of the images."""
         rules = self.rules
         least = max(rules.explained, rules.fine_misfit * context.noise)
-        return context.noise < rules.relief_clean and found.misfit > least
+        return not context.is_first and found.misfit > least
 
     def _stages(self, state, context, stages, iterations):
         scales, found = {}, None

@@ -44,7 +44,7 @@ class Starts:
         before, oldest first.
         """
         descent, rules, frame = self._descent, self._rules, context.frame
-        starts = motion_starts(start, history)
+        starts = motion_starts(start, history) if rules.motion_starts else [start]
         best = descent.descend(
             self.nearest(starts, frame, descent.usual[0]), context, descent.usual
         )

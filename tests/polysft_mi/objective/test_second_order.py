@@ -195,9 +195,7 @@ def test_gradient_and_curvature_of_what_holds_the_relief(truth):
         assert change == pytest.approx(promised, rel=1e-6)
 
 
-@pytest.mark.parametrize(
-    "noise, moves", [(math.nan, [0, 0, 0]), (0.01, [0, 1, 1]), (0.2, [0, 0, 1])]
-)
+@pytest.mark.parametrize("noise, moves", [(math.nan, [0, 0, 0]), (0.2, [0, 1, 1])])
 def test_stages_in_which_the_relief_moves(problem, noise, moves):
     whole = SecondOrder(problem)
     rest = whole.chart.state(problem.patch.rest().to_numpy())

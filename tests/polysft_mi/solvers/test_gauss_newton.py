@@ -111,7 +111,6 @@ def test_a_sheet_that_jumps_is_found_again(tmp_path, monkeypatch):
         (0.03, [0.1, 0.11, 0.01], 2, 0),  # what is worse is not kept
         (0.03, [0.035, 0.01], 1, 0),
         (0.005, [0.015, 0.01], 1, 0),
-        (0.12, [0.3, 0.01], 1, 0),  # noisy images
         (math.nan, [0.3, 0.01], 1, 0),  # the first frame
     ],
 )

@@ -1,0 +1,65 @@
+"""The table of what each rule is worth: rules are switched off, results are kept and read right."""
+
+import dataclasses
+import json
+
+import pytest
+import synthetic
+from scripts import load
+
+from polysft_mi import prepare
+from polysft_mi.scene.rules import Rules
+from polysft_mi.scene.settings import Settings
+
+ablation = load("benchmarks/ablation.py")
+
+
+def results(**errors):
+    """Results of rules on sequences 0, 1, ...: rule = errors."""
+    return {
+        (rule, k): {"figures": {"e3d_proc": error}, "lost": 0, "cpu": 1.0}
+        for rule, values in errors.items()
+        for k, error in enumerate(values)
+    }
+
+
+@pytest.mark.parametrize("switch", ablation.SWITCHES[1:], ids=lambda s: s.rule)
+def test_every_switch_changes_what_is_there(switch):
+    for values, defaults in ((switch.fields, Rules()), (switch.settings, Settings())):
+        for name, value in values.items():
+            assert getattr(defaults, name) != value
+    assert switch.fields or switch.settings
+
+
+def test_a_rule_that_pays_on_two_sequences_stays():
+    found = results(on=(1.0, 1.0, 1.0), twice=(1.2, 1.06, 0.9), once=(1.2, 1.04, 1.0))
+    verdict = lambda rule: ablation.verdict(found, rule, (0, 1, 2), "on")
+    assert verdict("twice") == "pays on 2 of 3; stays"
+    assert verdict("once") == "pays on 1 of 3; goes"
+    del found["twice", 2]
+    assert verdict("twice") == "pays on 2 of 2"
+
+
+def test_the_switch_reaches_the_tracker(tmp_path):
+    truth = synthetic.cloth(tmp_path / "flag", frames=2, bend=1.0, turn=0.02, shift=0.002)
+    prepare.main([str(truth.folder)])
+    scene = str(truth.folder / "scene.xml")
+    figures = lambda *switch: ablation.run(ablation.Switch(*switch), scene, str(truth.folder))
+    usual = figures("usual")["figures"]
+    assert figures("again")["figures"] == usual
+    assert figures("a rule", {"iterations": (1, 1, 1)})["figures"] != usual
+    assert figures("a setting", {}, {"k_relief": 0})["figures"] != usual
+
+
+def test_page_is_made_from_the_file(tmp_path):
+    found = [
+        {"rule": rule, "sequence": "flag", "figures": {"e3d_proc": e}, "lost": 0, "cpu": 1.0}
+        for rule, e in ((ablation.BASELINE, 0.001), ("relief", 0.002))
+    ]
+    (tmp_path / "ablation.json").write_text(json.dumps({"results": found}))
+    known = ablation.read(str(tmp_path / "ablation.json"))
+    assert "| relief | +100 | +0 | pays on 1 of 1; goes |" in ablation.page(known, {})
+
+
+def test_rules_are_replaced_not_changed():
+    assert dataclasses.replace(Rules(), give=1.0) != Rules()
