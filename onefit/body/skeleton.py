@@ -166,3 +166,16 @@ def smallest_rotation(a, b):
 def _about_y(angle):
     c, s = math.cos(angle), math.sin(angle)
     return torch.tensor([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]], dtype=torch.float64)
+
+
+def mirrored(poses, translation):
+    """Poses (T, 24, 3) and translation (T, 3) seen in a mirror: left is right, and x is -x."""
+    other = [INDEX[_other_side(name)] for name in JOINTS]
+    turned = poses.new_tensor([1.0, -1.0, -1.0])
+    return poses[:, other] * turned, translation * -turned
+
+
+def _other_side(name):
+    if name.startswith("left_"):
+        return "right_" + name[5:]
+    return "left_" + name[6:] if name.startswith("right_") else name

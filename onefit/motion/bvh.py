@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from onefit.body import skeleton
 from polyfit.errors import InputError
 
-from .files import _finite, placed
+from .placing import placed, require_finite
 
 # Names of bones, without case, separators, prefixes as in "mixamorig:", and sides, for each joint:
 # the first that a file has counts. Mixamo, CMU and MotionBuilder; Blender's Rigify; Poser and Daz;
@@ -29,8 +29,8 @@ _NAMES = {
 _OPTIONAL = ("foot", "collar", "wrist")
 
 
-def read_bvh(path, name, fps=None, up=None):
-    """The :class:`~onefit.Motion` of a BVH file.
+def read_bvh(path, fps=None, up=None):
+    """``(poses (T, 24, 3) [rad], translation (T, 3) [m], fps)`` of a BVH file.
 
     The file's zero pose has to be a stand (T-pose, A-pose, arms down): how it is turned from the
     T-pose is found as for bodies (:func:`onefit.body.skeleton.rest_pose`), and rotations are
@@ -71,7 +71,7 @@ def read_bvh(path, name, fps=None, up=None):
         1,
     )
     scale = skeleton.leg_length(skeleton.standard_joints()) / skeleton.leg_length(joints)
-    return placed(poses, root @ turn.T * scale, fps, name)
+    return *placed(poses, root @ turn.T * scale), float(fps)
 
 
 def _parse(path):
@@ -246,7 +246,7 @@ def _posed(path, parents, channels, frames):
     """Rotations of the bones in the file's world, a list of Rotation (T,), and the root's places
     (T, 3).
     """
-    _finite(path, frames=frames)
+    require_finite(path, frames=frames)
     world, column, root = [], 0, np.zeros((len(frames), 3))
     for bone, names in enumerate(channels):
         values = frames[:, column : column + len(names)]

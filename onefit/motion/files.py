@@ -12,13 +12,12 @@ import os
 import zipfile
 
 import numpy as np
-import torch
 from scipy.spatial.transform import Rotation
 
-from onefit.body import skeleton, skinning
 from polyfit.errors import InputError
 
-from .motion import Motion
+from .bvh import read_bvh
+from .placing import placed, require_finite
 
 _C = Rotation.from_euler("x", 90, degrees=True)  # from SMPL's body axes, or any world with y up
 _RATES = ("mocap_framerate", "mocap_frame_rate", "fps", "frame_rate", "framerate")
@@ -27,21 +26,21 @@ _FASTEST = 25.0  # [m/s]: no one's root moves faster
 
 
 def read(path, fps=None, up=None):
-    """The :class:`~onefit.Motion` of a file; see :meth:`onefit.Motion.read`."""
+    """``(poses (T, 24, 3) [rad], translation (T, 3) [m], fps, name)`` of a file, as
+    :class:`onefit.Motion` takes them; see :meth:`onefit.Motion.read`.
+    """
     path = str(path)
     name = os.path.splitext(os.path.basename(path))[0]
     if up not in (None, "y", "z"):
         raise InputError(f"up = {up!r}; y or z is needed")
     if path.lower().endswith(".npz"):
-        return _read_npz(path, name, fps, up)
+        return *_read_npz(path, fps, up), name
     if path.lower().endswith(".bvh"):
-        from .bvh import read_bvh
-
-        return read_bvh(path, name, fps, up)
+        return *read_bvh(path, fps, up), name
     raise InputError(f"{path}: a motion is read from .npz (AMASS, Neural Cloth Simulation) or .bvh")
 
 
-def _read_npz(path, name, fps, up):
+def _read_npz(path, fps, up):
     try:
         with np.load(path, allow_pickle=False) as file:
             data = {key: file[key] for key in ("poses", "trans", *_RATES) if key in file.files}
@@ -80,7 +79,7 @@ def _read_npz(path, name, fps, up):
         raise InputError(
             f"{path}: {len(poses)} frames of poses and a translation of shape {trans.shape}"
         )
-    _finite(path, poses=poses, trans=trans)
+    require_finite(path, poses=poses, trans=trans)
     local = np.zeros((len(poses), 24, 3))
     body = _COUNTS[int(count)]
     local[:, :body] = poses.reshape(len(poses), -1, 3)[:, :body]
@@ -101,17 +100,7 @@ def _read_npz(path, name, fps, up):
             f"{path}: its root moves at {fastest:.3g} m/s; metres and frames a second are"
             f" needed{unit}"
         )
-    return placed(local, trans, fps, name)
-
-
-def _finite(path, **arrays):
-    for key, array in arrays.items():
-        bad = ~np.isfinite(array).reshape(len(array), -1).all(1)
-        if bad.any():
-            where = f"{bad.sum()} of {len(bad)} frames, the first is frame {bad.argmax()}"
-            raise InputError(
-                f"{path}: {key} are not finite in {where}; cut them out or fill them in"
-            )
+    return *placed(local, trans), float(fps)
 
 
 def _upright(path, root, up):
@@ -125,25 +114,3 @@ def _upright(path, root, up):
             f"{path}: its body lies down throughout if {up} is up; say that {other} is:"
             f" up={other!r}, or --motion-up {other}"
         )
-
-
-def placed(poses, translation, fps, name):
-    """The Motion of arrays (T, 24, 3) and (T, 3), moved as a whole: it starts at x = y = 0, and its
-    lowest foot stands where the standard body's feet do. Where a file's floor is, and how tall its
-    person was, seldom is told."""
-    at = skeleton.INDEX["left_foot"], skeleton.INDEX["right_foot"]
-    poses = torch.as_tensor(poses, dtype=torch.float32)
-    feet = (
-        skinning.joint_places(skeleton.standard_joints(), poses, torch.zeros(len(poses), 3))[
-            :, at, 2
-        ]
-        .amin(1)
-        .double()
-        .numpy()
-    )
-    translation = translation - [
-        translation[0, 0],
-        translation[0, 1],
-        (feet + translation[:, 2]).min() - skeleton.standard_joints()[at[0], 2].item(),
-    ]
-    return Motion(poses, torch.as_tensor(translation, dtype=torch.float32), float(fps), name)

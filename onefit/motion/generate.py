@@ -10,7 +10,8 @@ import zlib
 
 import numpy as np
 
-from onefit.motion.figures import figure, gaits, heldout, postures
+from onefit.body import skeleton
+from onefit.motion.figures import figure, footwork, gaits, heldout, postures
 from onefit.motion.figures.script import wander
 from polyfit.errors import InputError
 
@@ -18,8 +19,9 @@ HELD_OUT_SEEDS = 1_000_000  # seeds from here up are never trained on
 
 
 def generate(name, seconds=10.0, seed=0, fps=30.0):
-    """The :class:`~onefit.Motion` of the kind ``name``; the same seed gives the same motion,
-    at any rate and for any length.
+    """``(poses (T, 24, 3) [rad], translation (T, 3) [m])`` of the kind ``name``. The same seed
+    gives the same motion, at any rate and for any length. :meth:`onefit.Motion.generate` makes a
+    motion of them.
 
     Raises InputError for a kind that does not exist, or a length that has no two frames.
     """
@@ -36,8 +38,8 @@ def generate(name, seconds=10.0, seed=0, fps=30.0):
     channels = KINDS[name](t, rng)
     alive = np.random.default_rng([zlib.crc32(name.encode()), seed, 1])
     channels = _alive(channels, t, alive)
-    motion = figure.motion(channels, fps, f"{name}-{seed}")
-    return motion.mirrored() if flipped else motion
+    poses, translation = figure.poses_of(channels, fps)
+    return skeleton.mirrored(poses, translation) if flipped else (poses, translation)
 
 
 def _alive(channels, t, rng):
@@ -58,9 +60,9 @@ def _alive(channels, t, rng):
 
 
 _TRAINING = (
-    postures.idle, gaits.walk, gaits.run, postures.squat, postures.reach, postures.twist,
-    postures.arms_up, postures.arms_crossed, postures.kick, postures.sit, postures.turn,
-    postures.side_step, postures.lunge, postures.bend, postures.stretch, postures.jump,
+    postures.idle, gaits.walk, gaits.run, footwork.squat, postures.reach, postures.twist,
+    postures.arms_up, postures.arms_crossed, footwork.kick, footwork.sit, footwork.turn,
+    footwork.side_step, footwork.lunge, postures.bend, postures.stretch, footwork.jump,
     postures.improvise,
 )  # fmt: skip
 _HELD_OUT = (

@@ -2,10 +2,14 @@
 
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from onefit.body import skeleton
 from polyfit.errors import InputError
+
+from . import files, generate
 
 
 @dataclass(frozen=True)
@@ -78,18 +82,15 @@ class Motion:
         on the standard body's ground. Raises InputError for what cannot be used: not finite,
         another number of joints, no frame rate, another unit.
         """
-        from .files import read
-
-        return read(path, fps, up)
+        return cls(*files.read(path, fps, up))
 
     @classmethod
     def generate(cls, name, seconds=10.0, seed=0, fps=30.0):
         """A generated motion of the kind ``name``, one of :data:`onefit.motion.generate.KINDS`; see
         :mod:`onefit.motion.generate`.
         """
-        from .generate import generate
-
-        return generate(name, seconds=seconds, seed=seed, fps=fps)
+        poses, translation = generate.generate(name, seconds, seed, fps)
+        return cls(poses, translation, float(fps), f"{name}-{seed}")
 
     def fitted(self, body):
         """The motion for a :class:`~onefit.Body` with longer or shorter legs than the standard
@@ -104,11 +105,8 @@ class Motion:
 
     def mirrored(self):
         """The motion seen in a mirror: left is right, and x is -x."""
-        other = [skeleton.INDEX[_other_side(name)] for name in skeleton.JOINTS]
-        turned = self.poses.new_tensor([1.0, -1.0, -1.0])
-        return replace(
-            self, poses=self.poses[:, other] * turned, translation=self.translation * -turned
-        )
+        poses, translation = skeleton.mirrored(self.poses, self.translation)
+        return replace(self, poses=poses, translation=translation)
 
     def resampled(self, fps=30.0):
         """The same motion at ``fps`` frames a second from the same start to (at most) the same end.
@@ -117,9 +115,6 @@ class Motion:
         along straight lines. Where the old rate is a multiple of the new one, frames are taken as
         they are.
         """
-        import numpy as np
-        from scipy.spatial.transform import Rotation
-
         if not 0 < fps < 10_000:
             raise InputError(f"{fps} frames a second; a positive number is needed")
         if fps == self.fps or len(self) == 1:
@@ -146,9 +141,3 @@ class Motion:
             translation=torch.as_tensor(place).to(self.translation),
             fps=float(fps),
         )
-
-
-def _other_side(name):
-    if name.startswith("left_"):
-        return "right_" + name[5:]
-    return "left_" + name[6:] if name.startswith("right_") else name

@@ -16,9 +16,7 @@ sign on both sides of the body:
 - ``left_foot``, ``right_foot`` (T, 3): where the ball of the foot is, from its place in the upright
   stand [m], in the world: the leg follows, bent at the knee as it has to be;
 - ``left_foot_turn``, ``right_foot_turn`` (T, 3): the foot's heel lifted (toes, where negative), the
-  foot turned outwards, and the knee
-outwards
-  from the foot.
+  foot turned outwards, and the knee outwards from the foot.
 """
 
 import numpy as np
@@ -27,7 +25,6 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from onefit.body import skeleton
-from onefit.motion import Motion
 
 CHANNELS = {
     "pelvis": 3, "turn": 3, "spine": 3, "head": 3, "left_arm": 4, "right_arm": 4, "left_hand": 2,
@@ -65,8 +62,8 @@ def stand(frames):
     }
 
 
-def motion(channels, fps, name):
-    """The :class:`~onefit.Motion` of a figure's channels.
+def poses_of(channels, fps):
+    """``(poses (T, 24, 3) [rad], translation (T, 3) [m])``, float32, of a figure's channels.
 
     The pelvis is lowered, smoothly in time, where a foot would be out of its leg's reach.
     """
@@ -87,9 +84,7 @@ def motion(channels, fps, name):
     poses = np.zeros((len(c["pelvis"]), len(skeleton.JOINTS), 3))
     for joint, rotation in local.items():
         poses[:, skeleton.INDEX[joint]] = rotation.as_rotvec()
-    return Motion(
-        torch.from_numpy(poses).float(), torch.from_numpy(c["pelvis"]).float(), float(fps), name
-    )
+    return torch.from_numpy(poses).float(), torch.from_numpy(c["pelvis"]).float()
 
 
 def mirror(rotation):
