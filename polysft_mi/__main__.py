@@ -19,12 +19,12 @@ commands:
 examples:
   polysft run scenes/demo.xml -o out/demo        reconstruct; then open out/demo/report.html
   polysft evaluate out/demo scenes/demo          how far the surface is from the truth
-  polysft compare out/demo scenes/demo -o errors   and where, in false colours
+  polysft compare out/demo scenes/demo -o errors where it is, in false colours
   polysft export out/demo --format glb           for browsers and Blender
   polysft COMMAND --help                         the options of a command, with examples
 
 Each command is also a module: python -m polysft_mi.run ...
-Exit status: 0 done, 2 a mistake in what was given (one line on stderr says which), 130 interrupted.
+Exit status: 0 for success, 2 for a bad input (one line on stderr names it), 130 for Ctrl-C.
 Colours only on a terminal, and not where NO_COLOR is set.
 """
 

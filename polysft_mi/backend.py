@@ -142,7 +142,7 @@ def set_variant(mode: str | None = None) -> str:
             " the mode out, or give llvm_ad_rgb"
         )
     if mode.startswith("cuda"):
-        print(f"note: {mode} is untested, {DEFAULT} is what the tests run on", file=sys.stderr)
+        print(f"note: {mode} is untested; the tests run on {DEFAULT}", file=sys.stderr)
     try:
         mi.set_variant(mode)
     except ImportError as error:
@@ -224,7 +224,7 @@ def _driver_sees_device() -> bool:
 
 
 def _check_chosen(path: str) -> Version:
-    accepted = "the file of a newer libLLVM (19, say) is needed; unset it to have one searched"
+    accepted = "give the file of a newer libLLVM (19, say), or unset it to have one searched"
     if not os.path.isfile(path):
         raise InputError(f"{VARIABLE}={path}: no such file; {accepted}")
     version = _version(path)

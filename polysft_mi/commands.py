@@ -7,7 +7,7 @@ from .errors import InputError
 
 # name: what it is for, in a line of `polysft --help`
 COMMANDS = {
-    "prepare": "make a scene of a video or of a sequence's folder",
+    "prepare": "make a scene from a video or from a sequence's folder",
     "run": "reconstruct the surface in every frame",
     "evaluate": "figures against ground truth",
     "report": "one page that shows a run: video, errors, surface in 3D, figures",
@@ -21,7 +21,7 @@ class Parser(argparse.ArgumentParser):
     """An ``argparse`` parser whose complaints are one line, as all others are."""
 
     def error(self, message):
-        raise InputError(f"{message}; {self.prog} --help shows what is taken")
+        raise InputError(f"{message}; {self.prog} --help lists the options")
 
 
 def parser(name, description, examples):

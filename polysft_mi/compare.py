@@ -52,8 +52,8 @@ def parser():
         type=float,
         metavar="MM",
         help=(
-            "difference at which the false colours end (default: that which 98 %% of the pixels lie"
-            " below)"
+            "difference at which the false colours end (default: the one that 98 %% of the pixels"
+            " stay below)"
         ),
     )
     p.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")

@@ -24,8 +24,7 @@ _EXAMPLES = [
 def parser():
     p = commands.parser(
         "export",
-        "Write the moving surface of a run for other programs: metres, y up unless asked otherwise,"
-        " textured.",
+        "Write the moving, textured surface of a run for other programs, in metres.",
         _EXAMPLES,
     )
     p.add_argument("out", metavar="OUT", help="folder of a run")
@@ -43,9 +42,7 @@ def parser():
         help="which way is up; camera: x right, y down, z forward, as in surface.npz (default: y)",
     )
     p.add_argument("--fps", type=float, help="frames a second (default: that of the run)")
-    p.add_argument(
-        "--texture", metavar="IMAGE", help="another image than the one that the scene names"
-    )
+    p.add_argument("--texture", metavar="IMAGE", help="an image instead of the scene's texture")
     p.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
     return p
 

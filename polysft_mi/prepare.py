@@ -14,11 +14,11 @@ from . import commands
 from .errors import InputError, cli
 
 _EXAMPLES = [
-    ("FOLDER", "a folder in a form that is known: writes FOLDER/scene.xml"),
+    ("FOLDER", "a folder in a known form: writes FOLDER/scene.xml"),
     (
         "clip.mp4 --texture photo.jpg --size 297mm 210mm --fov 65 -o OUT",
-        "a video of a printed sheet, and a straight photo of it that shows nothing else; then"
-        " look at OUT/prepare, and: polysft run OUT/scene.xml",
+        "a video of a printed sheet, and a straight photo of the sheet alone; then look at"
+        " OUT/prepare, and: polysft run OUT/scene.xml",
     ),
     (
         "clip.mp4 --texture photo.jpg --size A4 --calibrate chessboard.mp4 --board 9x6 -o OUT",
@@ -58,7 +58,7 @@ def parser():
         metavar="DIR",
         help="the folder to write (default: FOLDER; for a video, its name without the extension)",
     )
-    p.add_argument("--overwrite", action="store_true", help="replace what is there")
+    p.add_argument("--overwrite", action="store_true", help="replace an existing folder or scene")
     p.add_argument(
         "--resolution",
         type=int,
@@ -71,16 +71,16 @@ def parser():
         "--pose-fit",
         choices=("auto", "none"),
         default="auto",
-        help="move a pose that is given, by --corners or Kinect-Paper's cam.ext, to the edges of"
-        " the first frame that are near the template's outline, where these are clear; none: take"
-        " it as it is (default: auto)",
+        help="auto: move a given pose (--corners, or Kinect-Paper's cam.ext) to the edges near the"
+        " template's outline in the first frame, if they are clear; none: take it as it is"
+        " (default: auto)",
     )
     p.add_argument("-q", "--quiet", action="store_true", help="no progress, only errors")
-    p.add_argument("--json", action="store_true", help="print what was found as JSON")
+    p.add_argument("--json", action="store_true", help="the result as one JSON object on stdout")
     _add_video(p.add_argument_group("from a video"))
     _add_camera(
         p.add_argument_group(
-            "the camera of a video (default: what the video or the photo says of itself)"
+            "the camera of a video (default: from the metadata of the video or the photo)"
         )
     )
     return p
@@ -108,14 +108,14 @@ def _add_video(group):
         nargs="+",
         metavar="X,Y",
         help="the sheet's corners in the first frame [pixels]: top left, top right, bottom right,"
-        " bottom left of the print; instead of looking for the photo. Or: frame, where the sheet"
-        " fills the picture",
+        " bottom left of the print; the photo is then not searched. Or: frame, if the sheet fills"
+        " the picture",
     )
     group.add_argument(
         "--texture-corners",
         nargs=4,
         metavar="X,Y",
-        help="the sheet's corners in the photo [pixels], where it shows more than the sheet",
+        help="the sheet's corners in the photo [pixels], if it shows more than the sheet",
     )
     for name, default, what in (
         ("first", 0, "first frame to use, counted from 0; the template is placed in it"),
@@ -136,9 +136,9 @@ def _add_video(group):
     masks.add_argument(
         "--masks",
         metavar="FOLDER",
-        help="masks that are there, one a frame, instead of finding them",
+        help="use these masks, one a frame",
     )
-    masks.add_argument("--no-masks", action="store_true", help="go without")
+    masks.add_argument("--no-masks", action="store_true", help="use no masks")
 
 
 def _add_camera(group):
@@ -146,8 +146,8 @@ def _add_camera(group):
         "--board",
         default="9x6",
         metavar="BOARD",
-        help="its inner corners (default: 9x6), or charuco:7x5:4X4_50:0.75 (squares, dictionary,"
-        " marker by square)",
+        help="the board of --calibrate: inner corners of a chessboard (default: 9x6), or"
+        " charuco:7x5:4X4_50:0.75 (squares, dictionary, marker by square)",
     )
     camera = group.add_mutually_exclusive_group()
     camera.add_argument(
@@ -177,8 +177,8 @@ def main(argv=None):
         for name in ("size", "template", "corners", "fov", "camera"):
             if getattr(args, name) is not None:
                 raise InputError(
-                    f"{args.folder}: --{name} is for a video, or a folder of images, which also"
-                    " needs --texture"
+                    f"{args.folder}: --{name} is for a video or a folder of images; these also need"
+                    " --texture"
                 )
         from .capture import prepare_folder
 

@@ -16,7 +16,7 @@ _EXAMPLES = [
     ),
     (
         "out/demo -o page.html --frames 50",
-        "elsewhere, and smaller: 50 frames spread over the video",
+        "another file, and a smaller one: 50 frames spread over the video",
     ),
 ]
 
@@ -24,7 +24,7 @@ _EXAMPLES = [
 def parser():
     p = commands.parser(
         "report",
-        "Write one page, in one file, that shows a run in any browser and without a network.",
+        "Write the report of a run: one HTML file for any browser, without a network.",
         _EXAMPLES,
     )
     p.add_argument("out", metavar="OUT", help="folder of a run")

@@ -20,9 +20,9 @@ _EXAMPLES = [
     ("scenes/demo.xml -o out/demo", "the demo; then open out/demo/report.html"),
     (
         "scenes/flag.xml -D data=/data/flag -o out/flag -D order=6 -D last=19",
-        "another place of the data, other settings, 20 frames",
+        "with your own data folder, order 6, and the first 20 frames",
     ),
-    ("scenes/flag.xml -D data=/data/flag -o out/flag --resume", "go on after an interruption"),
+    ("scenes/flag.xml -D data=/data/flag -o out/flag --resume", "continue after an interruption"),
     ("scenes/demo.xml -o out/demo --overwrite -q --json", "for scripts: one JSON object on stdout"),
 ]
 
@@ -50,7 +50,7 @@ def parser():
     add_mode_argument(p)
     again = p.add_mutually_exclusive_group()
     again.add_argument("--overwrite", action="store_true", help="replace the run that OUT holds")
-    again.add_argument("--resume", action="store_true", help="go on with the run that OUT holds")
+    again.add_argument("--resume", action="store_true", help="continue the run that OUT holds")
     p.add_argument(
         "--exr",
         metavar="N",
@@ -255,7 +255,7 @@ def _track(problem, solver, out, resume, progress, drawing):
         path = os.path.join(out, "checkpoint.npz")
         done = Track.load(path) if os.path.exists(path) else Track()
         progress.say(
-            f"interrupted: {len(done.states)} of {count} frames are kept; --resume goes on"
+            f"interrupted: {len(done.states)} of {count} frames are kept; --resume continues"
         )
         return done, True
 

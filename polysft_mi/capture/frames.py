@@ -35,8 +35,8 @@ def read_frames(path, first=0, last=-1, stride=1):
         size = size or here
         if here != size:
             raise InputError(
-                f"{where}: {here[0]}x{here[1]} pixels, and those before have {size[0]}x{size[1]};"
-                " all frames must be of one size"
+                f"{where}: {here[0]}x{here[1]} pixels, but the frames before have"
+                f" {size[0]}x{size[1]}; all frames must be of one size"
             )
         if min(here) < 16 or max(here) > 16384:
             raise InputError(f"{where}: {here[0]}x{here[1]} pixels; 16 to 16384 a side are needed")

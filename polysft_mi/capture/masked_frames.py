@@ -84,11 +84,11 @@ def write_frames(folder, frames, masks, expected, straight, progress, registrati
         result.figures = {"first_iou": overlap, "strangeness": max(strange), "used": why is None}
         if why is None:
             result.lines.append(
-                f"masks: by GrabCut, the first overlaps with the template by {100 * overlap:.0f} %"
+                f"masks: by GrabCut; the first and the template overlap by {100 * overlap:.0f} %"
             )
         else:
             result.figures["why"] = why
-            result.lines.append(f"masks: not used, for {why}; prepare/masks.png shows them")
+            result.lines.append(f"masks: not used: {why}; prepare/masks.png shows them")
     _write_contact_sheets(folder, indices, bool(masks))
     if masks and not result.masked:
         shutil.rmtree(os.path.join(folder, "masks"))
@@ -116,15 +116,17 @@ def _why_not_used(overlap, areas, strange, indices, checks=None):
     checks = checks or MaskChecks()
     if overlap < checks.overlap:
         return (
-            f"in the first frame they overlap with the template by {100 * overlap:.0f} % only: the"
-            " sheet does not stand out from what is behind it"
+            f"in the first frame mask and template overlap by only {100 * overlap:.0f} %, the sheet"
+            " does not stand out from its background"
         )
     for before, after, index in zip(areas, areas[1:], indices[1:]):
         if after == 0 or max(before / after, after / before) > checks.area_ratio:
             return f"in frame {index} their area jumps from {before} to {after} pixels"
     for index, value in zip(indices, strange):
         if value > checks.strangeness:
-            return f"what is inside in frame {index} has other colours than the sheet in the first"
+            return (
+                f"in frame {index} the colours inside are not those of the sheet in the first frame"
+            )
     return None
 
 

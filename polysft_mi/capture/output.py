@@ -23,7 +23,7 @@ def target_folder(video, out, inputs, overwrite):
     if out is None:
         if not is_video(video):
             raise InputError(
-                f"{video}: -o DIR, the folder to write, is needed beside a folder of images"
+                f"{video}: -o DIR, the folder to write, is needed for a folder of images"
             )
         out = os.path.splitext(video)[0]
     out = os.path.normpath(out)
@@ -31,7 +31,7 @@ def target_folder(video, out, inputs, overwrite):
         a, b = os.path.realpath(path), os.path.realpath(out)
         if a == b or a.startswith(b + os.sep):
             raise InputError(
-                f"{out}: {path} lies in it, and would be replaced; give another folder by -o"
+                f"{out}: holds {path}, which would be replaced; give another folder by -o"
             )
     if os.path.isdir(out) and os.listdir(out):
         if not overwrite:

@@ -119,7 +119,7 @@ def pose(frame, photo, sheet, placed, camera):
         draw(np.stack([loop, np.roll(loop, -1)], axis=1), YELLOW, 2)
     label(wired, "the template in the first frame")
     beside, _ = _canvas(laid(frame, photo, sheet, x))
-    label(beside, "the photo, laid where the template is")
+    label(beside, "the photo, placed on the template")
     return np.hstack([wired, np.full((wired.shape[0], 4, 3), 255, np.uint8), beside])
 
 

@@ -73,7 +73,7 @@ def prepare_video(
     frame, a picture of the matches is written, and the message names it.
     """
     if sum(x is not None for x in (camera, fov, calibrate)) > 1:
-        raise InputError("--camera, --fov and --calibrate: one of them is needed, not several")
+        raise InputError("--camera, --fov and --calibrate: give only one of them")
     if (size is None) == (template is None):
         raise InputError("give either --size WIDTH HEIGHT, of a flat sheet, or --template mesh.obj")
     inputs = [
@@ -198,7 +198,7 @@ def _lens(video, texture, camera, fov, calibrate, board, size):
         return lens.resized(*size), picture
     focal, where = focal_length(video)
     if focal is None and texture != FIRST_FRAME:
-        focal, where = focal_35mm(texture), f"{texture}, taken for the same camera and zoom"
+        focal, where = focal_35mm(texture), f"{texture}, if it has the same camera and zoom"
     if focal is None:
         raise InputError(
             f"{video}: does not say its camera; give --fov DEGREES (across the picture), --camera"
@@ -214,7 +214,7 @@ def _photo(texture, corners, size):
         return photo
     if photo is None:
         raise InputError(
-            "--texture-corners: for a photo; --corners says where the sheet lies in the first frame"
+            "--texture-corners needs a photo; --corners says where the sheet is in the first frame"
         )
     return _cut_out(photo, corners, size)
 

@@ -90,8 +90,8 @@ def box_of(run):
         return Box(*map(int, run.metrics["pictures"]["box"]))
     except (KeyError, TypeError, ValueError):
         raise InputError(
-            f"{run.path('metrics.json')}: does not tell what the pictures show (pictures.box); an"
-            " older version wrote it, run the scene again"
+            f"{run.path('metrics.json')}: holds no pictures.box, since an older version wrote it;"
+            " run the scene again"
         ) from None
 
 

@@ -79,7 +79,7 @@ class Viewer:
             self.show((self.frame + 1) % len(self.vertices))
 
 
-_INSTEAD = "report.html in the run's folder needs none, and --screenshot FILE writes a picture"
+_INSTEAD = "open report.html in the run's folder, or write a picture by --screenshot FILE"
 
 
 def _display():
@@ -106,7 +106,7 @@ def show(run, frame=None, screenshot=None):
     if frame is not None and frame not in order:
         raise InputError(f"--frame {frame}: the run has frames {min(order)} to {max(order)}")
     if screenshot is not None and not screenshot.lower().endswith(".png"):
-        raise InputError(f"--screenshot {screenshot}: a .png file is written")
+        raise InputError(f"--screenshot {screenshot}: a .png file is needed")
     ps = _polyscope(screenshot is not None)
     viewer = Viewer(run, ps)
     viewer.show(order[frame] if frame is not None else 0)
@@ -132,6 +132,6 @@ def _polyscope(screenshot):
         ps.init()
     except RuntimeError:
         raise InputError(
-            f"view: no window can be opened here, for want of OpenGL or of a display; {_INSTEAD}"
+            f"view: cannot open a window, OpenGL or a display is missing; {_INSTEAD}"
         ) from None
     return ps

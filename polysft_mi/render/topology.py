@@ -19,8 +19,8 @@ class Topology:
         for shape in self.shapes:
             if not shape.is_mesh():
                 raise InputError(
-                    f"shape {shape.id()!r}: raster renders triangle meshes only;"
-                    f" {type(shape).__name__} is none"
+                    f"shape {shape.id()!r} is a {type(shape).__name__}; raster renders triangle"
+                    " meshes only"
                 )
         self._key = _key(self.shapes)
         faces, neighbours, face_offset, vertex_offset = [], [], [0], [0]

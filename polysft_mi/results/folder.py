@@ -33,15 +33,14 @@ def check_output(out, *, resume=False, overwrite=False):
         existing = os.path.dirname(existing)
     if not out or not os.path.isdir(existing) or not os.access(existing, os.W_OK | os.X_OK):
         raise InputError(
-            f"-o '{out}': {existing} is not a folder that can be written to; OUT must be a folder"
-            " there, or a new one"
+            f"-o '{out}': {existing} is not a folder that can be written to; another one is needed"
         )
     holds_run = os.path.exists(os.path.join(out, "run.json"))
     if resume and not holds_run:
         raise InputError(f"{out}: holds no run to resume; leave out --resume to start one")
     if holds_run and not (overwrite or resume):
         raise InputError(
-            f"{out}: holds another run; give --overwrite to replace it or --resume to go on with it"
+            f"{out}: holds another run; give --overwrite to replace it or --resume to continue it"
         )
     if os.path.isdir(out) and os.listdir(out) and not holds_run:
         raise InputError(f"{out}: is not empty and holds no run; give an empty or new folder")

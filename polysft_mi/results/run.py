@@ -48,7 +48,7 @@ class Run:
             raise InputError(f"{folder}: is not the folder of a run (it holds no run.json)")
         if not os.path.isfile(os.path.join(folder, "metrics.json")):  # which a run writes last
             raise InputError(
-                f"{folder}: the run has not ended; go on with it by the command in its run.json and"
+                f"{folder}: the run has not ended; continue it with the command in its run.json and"
                 " --resume"
             )
         surface = read_surface(folder)

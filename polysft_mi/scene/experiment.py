@@ -73,10 +73,7 @@ def load(path, overrides=None, template=None):
     if len(scene.sensors()) != 1:
         raise InputError(f"{path}: {len(scene.sensors())} sensors; exactly one is needed")
     if not mi.has_flag(scene.sensors()[0].film().flags(), mi.FilmFlags.Alpha):
-        raise InputError(
-            f"{path}: the film has no alpha, which the silhouette is read from; pixel_format rgba"
-            " is needed"
-        )
+        raise InputError(f"{path}: the film has no alpha channel; pixel_format rgba is needed")
     meshes = [s for s in scene.shapes() if s.is_mesh() and s.id() == "template"] or [
         s for s in scene.shapes() if s.is_mesh()
     ]

@@ -28,8 +28,7 @@ def images(folder):
     if len(kinds) != 1:
         raise InputError(
             f"{folder}: images frame_* of {len(kinds)}"
-            f" types{' (' + ', '.join(kinds) + ')' if kinds else ''}; a Kinect-Paper sequence has"
-            " them of one"
+            f" types{' (' + ', '.join(kinds) + ')' if kinds else ''}; one type is needed"
         )
     return found
 
@@ -95,11 +94,11 @@ def template(folder, resolution=33, pose_fit="auto", say=lambda line: None):
     if fit is not None and fit.sure:
         points = fit(points)
         say(
-            f"pose: cam.ext's, moved by {fit.moved:.1f} pixels to the edges of"
+            f"pose: from cam.ext, moved by {fit.moved:.1f} pixels to the edges of"
             f" {os.path.basename(images(folder)[0])}"
         )
     else:
-        say("pose: cam.ext's")
+        say("pose: from cam.ext")
     grid = points.reshape(rows, columns, 3)
     at = np.linspace(0, 1, resolution)
     spline = lambda z: RectBivariateSpline(

@@ -38,7 +38,7 @@ def size_note(vertices, where="template"):
     likely = [(unit, factor) for unit, factor in units if 0.02 <= factor * extent <= house]
     unit, factor = likely[0] if likely else ("another unit", 1 / extent)
     return (
-        f"note: {where}: the template is {extent:.4g} m large, for lengths are taken for metres; if"
+        f"note: {where}: the template is {extent:.4g} m large, since lengths are read as metres; if"
         f" it is in {unit}, scale it by {factor:g}, to {factor * extent:.3g} m"
     )
 

@@ -119,7 +119,7 @@ class Template:
         if template.residual_max > tolerance * template.scale:
             raise InputError(
                 f"{where}: one jet cannot hold it: {measured}; at most fit_tolerance ="
-                f" {tolerance:g} of the radius is accepted, a higher order may do"
+                f" {tolerance:g} of the radius is accepted; a higher order may help"
             )
         return template
 

@@ -140,8 +140,8 @@ def calibrate(path, board="9x6", rules=None):
         )
     except cv2.error as error:
         raise InputError(
-            f"{path}: the boards do not tell the camera ({error.err}); views from different sides"
-            " are needed"
+            f"{path}: the boards do not determine the camera ({error.err}); views from different"
+            " sides are needed"
         ) from None
     f = float(K[0, 0])
     unsure = (
@@ -156,9 +156,9 @@ def calibrate(path, board="9x6", rules=None):
     tilt = float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1)).max()))
     if unsure > rules.unsure or tilt < rules.tilt:
         raise InputError(
-            f"{path}: the views leave the focal length open: the board is tilted by {tilt:.0f}"
-            f" degrees between them, and it is known to {100 * unsure:.1f} %; tilt the board by 30"
-            " degrees and more, to different sides"
+            f"{path}: the views do not determine the focal length: it is known to"
+            f" {100 * unsure:.1f} %, and the board is tilted by {tilt:.0f} degrees between them;"
+            " tilt the board by 30 degrees and more, to different sides"
         )
     camera = Intrinsics(f, float(K[1, 1]), float(K[0, 2]) + 0.5, float(K[1, 2]) + 0.5, *size)
     source = (

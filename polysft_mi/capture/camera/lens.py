@@ -55,7 +55,7 @@ class Lens:
         return cls(
             Intrinsics(f, f, width / 2, height / 2, width, height),
             (),
-            f"{focal:g} mm on film, said by {source}",
+            f"{focal:g} mm on 35 mm film, as in {source}",
         )
 
     def resized(self, width, height):
@@ -69,7 +69,7 @@ class Lens:
         if not same_aspect((width, height), (c.width, c.height)):
             raise InputError(
                 f"{self.source}: for pictures of {c.width}x{c.height}; the frames have"
-                f" {width}x{height}, which is no scaled version of them"
+                f" {width}x{height}, another shape"
             )
         return Lens(
             Intrinsics(c.fx * x, c.fy * y, c.cx * x, c.cy * y, width, height),

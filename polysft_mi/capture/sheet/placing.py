@@ -47,11 +47,11 @@ def place(sheet, photo, frame, camera, corners=None, pose_fit="auto"):
     residual = float(np.sqrt((pose.residual**2).mean()))
     agree, count = int(matches.agree.sum()), len(matches.agree)
     figures = {"by": "features", "matches": count, "agree": agree, "residual_px": residual}
-    lines = [f"pose: {agree} of {count} matches agree, missed by {residual:.2f} pixels RMS"]
+    lines = [f"pose: {agree} of {count} matches agree, {residual:.2f} pixels RMS"]
     if residual > BENT * np.hypot(camera.width, camera.height):
         lines.append(
-            "note: the sheet is bent in the first frame, and the template is not; a run may start"
-            " wrongly there: see pose.png, or choose another --first"
+            "note: the sheet is bent in the first frame, but the template is flat; a run may start"
+            " wrongly: see pose.png, or choose another --first"
         )
     return Placed(pose, matches, None, figures, lines)
 
@@ -60,7 +60,7 @@ def _by_corners(corners, sheet, frame, camera, pose_fit):
     pose = from_corners(corners, sheet, camera)
     residual = float(np.sqrt((pose.residual**2).mean()))
     figures = {"by": "corners", "residual_px": residual}
-    line = f"pose: by its corners, missed by {residual:.2f} pixels"
+    line = f"pose: from the corners, {residual:.2f} pixels RMS"
     fit = fitted(pose(sheet.vertices), sheet.faces, camera, frame) if pose_fit == "auto" else None
     if fit is not None and fit.sure:
         pose = Pose(fit.rotation @ pose.rotation, fit(pose.translation[None])[0], pose.residual)

@@ -120,12 +120,12 @@ def from_corners(corners, sheet, camera):
     )
     if (turns < 0).all():
         raise InputError(
-            "--corners: they run against the clock; top left, top right, bottom right, bottom left"
+            "--corners: the order is anticlockwise; top left, top right, bottom right, bottom left"
             " of the print are needed"
         )
     if not (turns > 0).all():
         raise InputError(
-            "--corners: they make no convex quadrangle; top left, top right, bottom right, bottom"
+            "--corners: not a convex quadrangle; top left, top right, bottom right, bottom"
             " left of the print are needed"
         )
     points = sheet.corners()
@@ -133,7 +133,7 @@ def from_corners(corners, sheet, camera):
     pose = _refined(starts, points, corners, camera, MatchRules()) if starts else None
     if pose is None:
         raise InputError(
-            "--corners: no pose of the sheet before the camera explains them; check their order,"
+            "--corners: no pose of the sheet in front of the camera fits them; check their order,"
             " --size and the camera"
         )
     return pose

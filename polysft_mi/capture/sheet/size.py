@@ -44,7 +44,7 @@ def parse_size(words, aspect=None):
         raise InputError(f"--size {' '.join(words)}: a length must be positive")
     if unit is None and max(size) > 3:  # 8.5 11 is not metres
         raise InputError(
-            f"--size {' '.join(words)}: metres, as numbers without a unit are, make a sheet of"
+            f"--size {' '.join(words)}: numbers without a unit are metres, a sheet of"
             f" {_text(size)}; {_suggestion(numbers)}"
         )
     if not (min(size) >= SMALLEST and max(size) <= LARGEST):

@@ -37,8 +37,8 @@ class Sheet:
             finder = Triangulation(*self.uv.T, triangles=self.faces).get_trifinder()
         except (RuntimeError, ValueError):
             raise InputError(
-                f"{self.name}: its texture coordinates overlap; each place of the photo may lie on"
-                " one place of the template only"
+                f"{self.name}: its texture coordinates overlap; each place of the photo must belong"
+                " to one place of the template"
             ) from None
         face = finder(*np.asarray(uv, dtype=float).T)
         found = self.faces[face]

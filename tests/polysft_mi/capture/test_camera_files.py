@@ -133,7 +133,7 @@ def test_our_own_form(tmp_path):
         ("1 PINHOLE 640 480 1 1 1 x\n", "not a number"),
         ("1 PINHOLE 640 480 nan 1 1 1\n", "finite"),
         ("1 PINHOLE 640 480 1 1 1 1\n2 PINHOLE 640 480 2 2 1 1\n", "2 cameras that differ"),
-        ("1 PINHOLE 100 480 1 1 1 1\n", "no scaled version"),
+        ("1 PINHOLE 100 480 1 1 1 1\n", "another shape"),
         ('{"camera_model": "OPENCV_FISHEYE", "fl_x": 1}', "OPENCV_FISHEYE"),
         ('{"fl_x": 1, "is_fisheye": true}', "FISHEYE"),
         ('{"frames": [{"fl_x": 1}]}', "no fl_x"),

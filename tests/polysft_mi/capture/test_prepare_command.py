@@ -124,7 +124,7 @@ def test_photo_that_is_not_in_the_video(clip, tmp_path):
     "corners, said",
     [
         ([(900, 10), (1100, 10), (1100, 150), (900, 150)], "0 % of the sheet is in view"),
-        ([(50, 40), (60, 160), (250, 170), (240, 30)], "against the clock"),
+        ([(50, 40), (60, 160), (250, 170), (240, 30)], "anticlockwise"),
         ([(50, 40), (240, 170), (240, 30), (60, 160)], "quadrangle"),
         ([(50, 40), (60, 40), (70, 40), (80, 40)], "quadrangle"),
     ],
@@ -173,7 +173,9 @@ def test_what_does_not_go_together(clip, tmp_path):
 
 def test_inputs_are_not_replaced(clip, tmp_path):
     folder = str(Path(clip[0]).parent)
-    assert "lies in it" in refused(prepare_video, clip[0], folder, overwrite=True, **given(clip))
+    assert "would be replaced" in refused(
+        prepare_video, clip[0], folder, overwrite=True, **given(clip)
+    )
     (tmp_path / "file").write_text("")
     assert "is a file" in refused(prepare_video, clip[0], str(tmp_path / "file"), **given(clip))
 

@@ -262,7 +262,7 @@ def test_masks_that_cannot_be_believed_are_not_used(clip, tmp_path):
         str(tmp_path / "in"), str(tmp_path / "out"), say=lines.append, **given(clip)
     )
     assert not found["masks"]["used"] and any(
-        "not used, for what is inside in frame 1" in line for line in lines
+        "not used: in frame 1 the colours inside are not" in line for line in lines
     )
     assert (
         not (tmp_path / "out" / "masks").exists()

@@ -208,7 +208,7 @@ def test_ctrl_c_leaves_a_valid_shorter_result(sequence, tmp_path):
     process.send_signal(signal.SIGINT)
     _, stderr = process.communicate(timeout=120)
     assert process.returncode == 130, stderr
-    assert "frames are kept; --resume goes on" in stderr and "Traceback" not in stderr
+    assert "frames are kept; --resume continues" in stderr and "Traceback" not in stderr
     assert 3 <= surface(out)["vertices"].shape[0] < 6
     assert np.isfinite(surface(out)["vertices"]).all()
 

@@ -39,7 +39,7 @@ def test_draws_the_textured_surface_of_a_frame(finished_run, tmp_path):
         cwd=ROOT,
         timeout=120,
     )
-    if "for want of OpenGL" in done.stderr:
+    if "cannot open a window" in done.stderr:
         pytest.skip("polyscope finds no OpenGL here (EGL, or a display)")
     assert done.returncode == 0, done.stderr
     first, last = (cv2.imread(str(tmp_path / f"{k}.png")).astype(int) for k in (0, 3))

@@ -66,8 +66,8 @@ def test_kinect_paper_pose_fit(tmp_path, resolution):
     vertices, _, uv = kinect_paper_template(folder, resolution, say=said.append)
     assert missed(vertices) < 0.2
     np.testing.assert_allclose(uv * (384, -288) + (0, 288), camera.project(vertices))
-    assert said[0] == "pose: cam.ext's" and re.fullmatch(
-        r"pose: cam.ext's, moved by [34]\.\d pixels to the edges of frame_001.png", said[1]
+    assert said[0] == "pose: from cam.ext" and re.fullmatch(
+        r"pose: from cam.ext, moved by [34]\.\d pixels to the edges of frame_001.png", said[1]
     )
     experiment = loaded(prepare_folder(folder, resolution=resolution)[0])
     np.testing.assert_allclose(experiment.template.vertices, vertices, atol=1e-6)
