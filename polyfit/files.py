@@ -4,6 +4,7 @@ import contextlib
 import errno
 import os
 import shutil
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from .errors import InputError
@@ -16,7 +17,7 @@ FULL = (
 
 
 @contextlib.contextmanager
-def naming(path):
+def naming(path: str | os.PathLike[str]) -> Iterator[None]:
     """An OSError of the block that names no file, as a full disk's does where a file is flushed,
     names ``path``.
     """
@@ -29,7 +30,7 @@ def naming(path):
 
 
 @contextlib.contextmanager
-def aside(path):
+def aside(path: str | os.PathLike[str]) -> Iterator[str]:
     """``with aside(path) as temporary:`` write the file ``temporary``; it becomes ``path`` at the
     end of the block.
 
@@ -61,7 +62,7 @@ def aside(path):
 
 
 @contextlib.contextmanager
-def folder_for(path):
+def folder_for(path: str | os.PathLike[str]) -> Iterator[None]:
     """``with folder_for(path):`` the folder ``path`` and its parents exist inside the block.
 
     Where the block ends by an exception, those of them that it made and left empty are removed.
@@ -79,7 +80,7 @@ def folder_for(path):
 
 
 @contextlib.contextmanager
-def folder_aside(path, ours):
+def folder_aside(path: str | os.PathLike[str], ours: Callable[[str], bool]) -> Iterator[str]:
     """``with folder_aside(path, ours) as temporary:`` fill the folder ``temporary``; it becomes
     ``path`` at the end of the block, or is removed on any exception.
 

@@ -10,6 +10,6 @@ __all__ = ["BadFrame", "InputError", "cli"]
 class BadFrame(FloatingPointError):
     """The objective of ``frame`` is not finite."""
 
-    def __init__(self, frame, value):
+    def __init__(self, frame: int, value: float) -> None:
         super().__init__(f"the loss is {value}")
         self.frame = frame

@@ -3,8 +3,10 @@
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
+from torch import Tensor
 
 from polyfit.errors import InputError
 
@@ -17,12 +19,14 @@ class CanonicalFrame:
     the charts' origins [m]: one frame, or a batch of them.
     """
 
-    s: torch.Tensor
-    R: torch.Tensor
-    T: torch.Tensor
+    s: Tensor
+    R: Tensor
+    T: Tensor
 
     @classmethod
-    def from_points(cls, points, mask=None, *, weights=None):
+    def from_points(
+        cls, points: Tensor, mask: Tensor | None = None, *, weights: Tensor | None = None
+    ) -> "CanonicalFrame":
         """By principal components of points (..., P, 3): T is their mean, s their largest distance
         from it, z the direction of least spread.
 
@@ -64,36 +68,36 @@ class CanonicalFrame:
             R = torch.stack([u, v, torch.linalg.cross(u, v)], -1)
             return cls(s.to(dtype), R.to(dtype), T.to(dtype))
 
-    def to_chart(self, points):
+    def to_chart(self, points: Tensor) -> Tensor:
         """Chart coordinates (..., P, 3) of points (..., P, 3) [m]."""
         return (points - self.T[..., None, :]) @ self.R / self.s[..., None, None]
 
-    def from_chart(self, x):
+    def from_chart(self, x: Tensor) -> Tensor:
         """Points (..., P, 3) [m] of chart coordinates (..., P, 3)."""
         return self.s[..., None, None] * x @ self.R.mT + self.T[..., None, :]
 
-    def rotated(self, quaternion):
+    def rotated(self, quaternion: Tensor) -> "CanonicalFrame":
         """The frame whose chart is turned by the unit quaternion (..., 4) in the order (x, y, z,
         w): R Q, so that a point of chart coordinates x has Q^T x in the new chart. Differentiable;
         the quaternion is divided by its norm.
         """
         return CanonicalFrame(self.s, self.R @ rotation_matrix(quaternion), self.T)
 
-    def turned_over(self):
+    def turned_over(self) -> "CanonicalFrame":
         """The frame with v and z pointing the other way: a half turn about u.
         :func:`polyfit.jets.turned_over` does it to a jet.
         """
         return CanonicalFrame(self.s, self.R * self.R.new_tensor([1, -1, -1]), self.T)
 
-    def __getitem__(self, index):
+    def __getitem__(self, index: Any) -> "CanonicalFrame":
         return CanonicalFrame(self.s[index], self.R[index], self.T[index])
 
-    def to(self, *args, **kwargs):
+    def to(self, *args: Any, **kwargs: Any) -> "CanonicalFrame":
         """The frame with another dtype or on another device."""
         return CanonicalFrame(*(x.to(*args, **kwargs) for x in (self.s, self.R, self.T)))
 
 
-def rotation_matrix(quaternion):
+def rotation_matrix(quaternion: Tensor) -> Tensor:
     """Rotations (..., 3, 3) of quaternions (..., 4) in the order (x, y, z, w), which are divided by
     their norm.
     """
@@ -106,7 +110,7 @@ def rotation_matrix(quaternion):
     return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
 
-def _side(x, axis, w, mask, level):
+def _side(x: Tensor, axis: Tensor, w: Tensor, mask: Tensor | None, level: float) -> Tensor:
     """1 or -1, (..., 1): the side of ``axis`` (..., 3) that it should point to."""
     along = (x @ axis[..., None])[..., 0]
     if mask is not None:
@@ -118,7 +122,7 @@ def _side(x, axis, w, mask, level):
     return torch.where(side < 0, -1.0, 1.0).to(axis.dtype)[..., None]
 
 
-def _check(points, mask, s):
+def _check(points: Tensor, mask: Tensor | None, s: Tensor) -> None:
     bad = ~(s > 1e-12 * points.abs().amax((-1, -2))) | ~s.isfinite()
     if not bad.any():
         return

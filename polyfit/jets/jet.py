@@ -13,11 +13,12 @@ from functools import lru_cache
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from .monomials import exponents, order_of
 
 
-def matrix(alpha):
+def matrix(alpha: Tensor) -> Tensor:
     """alpha (..., A) as the matrix m (..., n+1, n+1) of z = sum_ab m_ab u^a v^b; zero where a + b >
     n.
     """
@@ -28,17 +29,17 @@ def matrix(alpha):
 
 
 @lru_cache
-def _places(order, device):
+def _places(order: int, device: torch.device) -> Tensor:
     """Where the coefficients stand in the flattened matrix, (A,)."""
     return torch.as_tensor(exponents(order) @ (order + 1, 1), device=device)
 
 
-def from_matrix(m):
+def from_matrix(m: Tensor) -> Tensor:
     """The coefficients (..., A) of a matrix (..., n+1, n+1)."""
     return m.flatten(-2)[..., _places(m.shape[-1] - 1, m.device)]
 
 
-def powers(x, order, derivative=0):
+def powers(x: Tensor, order: int, derivative: int = 0) -> Tensor:
     """The derivatives of x^0 .. x^n, (..., n+1)."""
     out = [torch.zeros_like(x)] * min(derivative, order + 1)
     power = torch.ones_like(x)
@@ -48,13 +49,13 @@ def powers(x, order, derivative=0):
     return torch.stack(out, -1)
 
 
-def basis(uv, order, du=0, dv=0):
+def basis(uv: Tensor, order: int, du: int = 0, dv: int = 0) -> Tensor:
     """The monomials' derivatives d^(du+dv) / du^du dv^dv at uv (..., 2): (..., A)."""
     e = exponents(order)
     return powers(uv[..., 0], order, du)[..., e[:, 0]] * powers(uv[..., 1], order, dv)[..., e[:, 1]]
 
 
-def derivatives(alpha, uv, *which):
+def derivatives(alpha: Tensor, uv: Tensor, *which: tuple[int, int]) -> tuple[Tensor, ...]:
     """For each (du, dv) in ``which`` the derivative d^(du+dv) z / du^du dv^dv at uv, (..., P)."""
     m, order = matrix(alpha), order_of(alpha.shape[-1])
     along_v = {du: powers(uv[..., 0], order, du) @ m for du in {du for du, _ in which}}
@@ -62,42 +63,42 @@ def derivatives(alpha, uv, *which):
     return tuple((along_v[du] * of_v[dv]).sum(-1) for du, dv in which)
 
 
-def height(alpha, uv):
+def height(alpha: Tensor, uv: Tensor) -> Tensor:
     """z, (..., P)."""
     return derivatives(alpha, uv, (0, 0))[0]
 
 
-def height_derivatives(alpha, uv):
+def height_derivatives(alpha: Tensor, uv: Tensor) -> tuple[Tensor, ...]:
     """(z_u, z_v), each (..., P)."""
     return derivatives(alpha, uv, (1, 0), (0, 1))
 
 
-def point(alpha, uv):
+def point(alpha: Tensor, uv: Tensor) -> Tensor:
     """phi(u, v) = (u, v, z(u, v)), (..., P, 3)."""
     z = height(alpha, uv)
     return torch.cat([uv.expand(*z.shape, 2), z[..., None]], -1)
 
 
-def tangents(alpha, uv):
+def tangents(alpha: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
     """phi_u = (1, 0, z_u) and phi_v = (0, 1, z_v), each (..., P, 3)."""
     zu, zv = height_derivatives(alpha, uv)
     one, zero = torch.ones_like(zu), torch.zeros_like(zu)
     return torch.stack([one, zero, zu], -1), torch.stack([zero, one, zv], -1)
 
 
-def normal(alpha, uv):
+def normal(alpha: Tensor, uv: Tensor) -> Tensor:
     """Unit normal (-z_u, -z_v, 1) / |.|, (..., P, 3)."""
     zu, zv = height_derivatives(alpha, uv)
     return torch.nn.functional.normalize(torch.stack([-zu, -zv, torch.ones_like(zu)], -1), dim=-1)
 
 
-def metric(alpha, uv):
+def metric(alpha: Tensor, uv: Tensor) -> Tensor:
     """First fundamental form J^T J, (..., P, 2, 2)."""
     zu, zv = height_derivatives(alpha, uv)
     return _symmetric(1 + zu * zu, zu * zv, 1 + zv * zv)
 
 
-def turned_over(alpha):
+def turned_over(alpha: Tensor) -> Tensor:
     """The jets alpha (..., A) in charts with v and z pointing the other way: z'(u, v) = -z(u,
     -v).
     """
@@ -105,7 +106,7 @@ def turned_over(alpha):
     return torch.where(odd == 1, alpha, -alpha)
 
 
-def second_fundamental_form(alpha, uv):
+def second_fundamental_form(alpha: Tensor, uv: Tensor) -> Tensor:
     """(z_uu, z_uv, z_vv) / sqrt(1 + z_u^2 + z_v^2) as a matrix, (..., P, 2, 2); positive where the
     surface bends towards +z.
     """
@@ -114,7 +115,7 @@ def second_fundamental_form(alpha, uv):
     return _symmetric(zuu / n, zuv / n, zvv / n)
 
 
-def principal_curvatures(alpha, uv):
+def principal_curvatures(alpha: Tensor, uv: Tensor) -> Tensor:
     """Eigenvalues of the shape operator, the smaller first, (..., P, 2); positive where the surface
     bends towards +z.
 
@@ -132,7 +133,7 @@ def principal_curvatures(alpha, uv):
     return torch.stack([mean - half, mean + half], -1)
 
 
-def nearest(alpha, x, steps=4):
+def nearest(alpha: Tensor, x: Tensor, steps: int = 4) -> Tensor:
     """Chart coordinates uv (..., P, 2) of the jets' points nearest to points x (..., P, 3) of their
     charts, found from the points' own (u, v) by Gauss and Newton.
 
@@ -159,5 +160,5 @@ def nearest(alpha, x, steps=4):
         return uv
 
 
-def _symmetric(a, b, c):
+def _symmetric(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
     return torch.stack([torch.stack([a, b], -1), torch.stack([b, c], -1)], -2)

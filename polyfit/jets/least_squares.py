@@ -8,12 +8,14 @@ matrix of points times coefficients is ever made, and the systems stay well cond
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, reduce
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.polynomial import chebyshev
 from scipy.special import binom
+from torch import Tensor
 
 from polyfit.errors import InputError
 
@@ -26,11 +28,13 @@ class JetFit:
     """``alpha`` (..., A): the coefficients, zero beyond the order fitted. ``order`` (...,) int64:
     the order that the points determine, at most the one asked for; 0 is a constant."""
 
-    alpha: torch.Tensor
-    order: torch.Tensor
+    alpha: Tensor
+    order: Tensor
 
 
-def fit(points, order, *, weights=None, mask=None):
+def fit(
+    points: Tensor, order: int, *, weights: Tensor | None = None, mask: Tensor | None = None
+) -> JetFit:
     """Least-squares n-jets through ``points`` (..., P, 3), in charts with |u|, |v| of about 1: a
     :class:`JetFit`.
 
@@ -72,7 +76,7 @@ class _LeastSquares(torch.autograd.Function):
     """points (B, P, 3), weights (B, P), order -> alpha (B, A), order (B,)."""
 
     @staticmethod
-    def forward(ctx, points, weights, order):
+    def forward(ctx: Any, points: Tensor, weights: Tensor, order: int) -> tuple[Tensor, Tensor]:
         x = points.movedim(-1, 0).to(
             torch.float64, memory_format=torch.contiguous_format, copy=True
         )  # (3, B, P)
@@ -97,7 +101,7 @@ class _LeastSquares(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, grad, _):
+    def backward(ctx: Any, grad: Tensor, _: Any) -> tuple[Tensor, Tensor | None, None]:
         # At the minimum sum w (z - c.b) b = 0 holds for the points' basis values b. Differentiated:
         # dc = G^-1 d(sum w (z - c.b) b) at fixed c, and the gradient contracts it with y = G^-1
         # grad, a jet like c itself.
@@ -123,32 +127,32 @@ class _LeastSquares(torch.autograd.Function):
 class _Box:
     """Centre and half extent (B, 2) of the points' u and v, float64."""
 
-    centre: torch.Tensor
-    half: torch.Tensor
+    centre: Tensor
+    half: Tensor
 
     @classmethod
-    def of(cls, uv):
+    def of(cls, uv: Tensor) -> "_Box":
         """Of coordinates (2, B, P)."""
         low, high = torch.aminmax(uv, dim=2)
         half = ((high - low) / 2).T
         half = torch.maximum(half, NARROWEST * half.amax(1, keepdim=True))
         return cls(((low + high) / 2).T, torch.where(half > 0, half, 1))
 
-    def normalised(self, uv):
+    def normalised(self, uv: Tensor) -> Tensor:
         """The coordinates (2, B, P) in the box, from -1 to 1."""
         return (uv - self.centre.T[..., None]) * (1 / self.half.T[..., None])
 
-    def to_monomials(self, coefficients, order):
+    def to_monomials(self, coefficients: Tensor, order: int) -> Tensor:
         """Coefficients (B, A) of T_a(x) T_b(y) turned into those of u^a v^b."""
         U, V = self._axes(order)
         return jet.from_matrix(U.mT @ jet.matrix(coefficients) @ V)
 
-    def to_monomials_transposed(self, coefficients, order):
+    def to_monomials_transposed(self, coefficients: Tensor, order: int) -> Tensor:
         """The transposed map of :meth:`to_monomials`, for gradients."""
         U, V = self._axes(order)
         return jet.from_matrix(U @ jet.matrix(coefficients) @ V.mT)
 
-    def _axes(self, order):
+    def _axes(self, order: int) -> Tensor:
         """For u and for v (B, n+1, n+1): row a holds T_a((u - centre) / half) in powers of u."""
         chebyshev, binomial, power = _chebyshev_in_powers(order, self.centre.device)
         shifted = jet.powers(-self.centre.T, order)[..., power] * binomial
@@ -157,7 +161,7 @@ class _Box:
 
 
 @lru_cache
-def _chebyshev_in_powers(order, device):
+def _chebyshev_in_powers(order: int, device: torch.device) -> tuple[Tensor, ...]:
     """Chebyshev polynomials in powers of x; and of (x - c)^m, for each power x^i, the binomial
     coefficient and the power of -c: (n+1, n+1) each."""
     rows = np.zeros((order + 1, order + 1))
@@ -168,7 +172,7 @@ def _chebyshev_in_powers(order, device):
     return tuple(torch.as_tensor(x, device=device) for x in (rows, binom(m, i), power))
 
 
-def _chebyshev(x, order):
+def _chebyshev(x: Tensor, order: int) -> Tensor:
     """T_0 .. T_n of x (...): (n+1, ...)."""
     out = x.new_empty(order + 1, *x.shape)
     out[0], out[1] = 1, x
@@ -178,7 +182,7 @@ def _chebyshev(x, order):
     return out
 
 
-def _normalised(weights, points):
+def _normalised(weights: Tensor, points: Tensor) -> tuple[Tensor | None, Tensor]:
     """The weights divided by their sum, float64, or None where all are 1; and the sum, (B, 1)."""
     if weights.stride() == (0, 0) and weights.numel():
         return None, weights.new_full((len(points), 1), points.shape[1], dtype=torch.float64)
@@ -196,7 +200,7 @@ def _normalised(weights, points):
     return weights / total, total
 
 
-def _check(box, right):
+def _check(box: "_Box", right: Tensor) -> None:
     good = box.centre.isfinite().all(1) & box.half.isfinite().all(1) & right.isfinite().all(1)
     if not good.all():
         raise InputError(
@@ -205,7 +209,7 @@ def _check(box, right):
 
 
 @lru_cache
-def _products(order, device):
+def _products(order: int, device: torch.device) -> Tensor:
     """Indices (4, A^2) into the flat moments (2n+1)^2, whose mean are the moments of the products
     of two basis functions.
     """
@@ -218,14 +222,15 @@ def _products(order, device):
     return torch.as_tensor(np.stack(index).reshape(4, -1), device=device)
 
 
-def _gram(moments, order):
+def _gram(moments: Tensor, order: int) -> Tensor:
     """Gram matrices (B, A, A) of the products T_a(x) T_b(y), from the moments (B, 2n+1, 2n+1)."""
     flat = moments.flatten(1).T.contiguous()  # whole rows of a moment each are gathered
-    total = sum(flat.index_select(0, index) for index in _products(order, moments.device)) / 4
+    parts = (flat.index_select(0, index) for index in _products(order, moments.device))
+    total = reduce(torch.add, parts) / 4
     return total.T.unflatten(1, (size_of(order),) * 2)
 
 
-def _factorise(gram, order):
+def _factorise(gram: Tensor, order: int) -> tuple[Tensor, Tensor, Tensor]:
     """Cholesky factors (B, A, A) of the leading blocks that the points determine, the orders (B,),
     and the coefficients kept (B, A).
     """

@@ -16,19 +16,19 @@ NARROWEST = 1e-2
 
 
 @lru_cache
-def exponents(order):
+def exponents(order: int) -> np.ndarray:
     """Exponents (of u, of v) of the coefficients, shape (A, 2); the same array each time, not to be
     written to.
     """
     return np.array([(i - j, j) for i in range(order + 1) for j in range(i + 1)], dtype=np.int64)
 
 
-def size_of(order):
+def size_of(order: int) -> int:
     """Number of coefficients A of a jet of ``order``."""
     return (order + 1) * (order + 2) // 2
 
 
-def order_of(size):
+def order_of(size: int) -> int:
     """Order n of a jet with ``size`` coefficients. Raises ValueError where there is none."""
     order = int((np.sqrt(8 * size + 1) - 3) / 2 + 0.5)
     if size_of(order) != size:

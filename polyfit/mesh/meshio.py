@@ -8,12 +8,17 @@ import os
 import warnings
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from polyfit.errors import InputError
 from polyfit.files import aside
 
+MeshArrays = tuple[np.ndarray, np.ndarray, np.ndarray | None]  # vertices, faces, uv
 
-def write_ply(path, vertices, faces, uv=None):
+
+def write_ply(
+    path: str | os.PathLike[str], vertices: ArrayLike, faces: ArrayLike, uv: ArrayLike | None = None
+) -> None:
     """Write a triangle mesh as binary PLY: vertices (N, 3) as float32, faces (F, 3), uv (N, 2) as
     the properties ``s``, ``t``.
 
@@ -24,8 +29,9 @@ def write_ply(path, vertices, faces, uv=None):
     names = ["x", "y", "z"]
     if uv is not None:
         columns, names = np.hstack([columns, np.asarray(uv, dtype="<f4")]), names + ["s", "t"]
-    corners = np.empty(len(faces), dtype=[("count", "u1"), ("vertices", "<i4", 3)])
-    corners["count"], corners["vertices"] = 3, faces
+    F = np.asarray(faces)
+    corners = np.empty(len(F), dtype=[("count", "u1"), ("vertices", "<i4", 3)])
+    corners["count"], corners["vertices"] = 3, F
     header = ["ply", "format binary_little_endian 1.0"]
     header += [f"element vertex {len(columns)}"] + [f"property float {name}" for name in names]
     header += [
@@ -40,7 +46,7 @@ def write_ply(path, vertices, faces, uv=None):
         file.write(corners.tobytes())
 
 
-def read_mesh(path, what="mesh"):
+def read_mesh(path: str | os.PathLike[str], what: str = "mesh") -> MeshArrays:
     """``(vertices (N, 3) float64, faces (F, 3) int64, uv (N, 2) float64 or None)`` of an OBJ or PLY
     file.
 
@@ -58,7 +64,7 @@ def read_mesh(path, what="mesh"):
     return _read_obj(path) if extension == ".obj" else _read_ply(path)
 
 
-def _read_obj(path):
+def _read_obj(path: str) -> MeshArrays:
     """By hand, because trimesh reorders the triangles of quads, drops loose vertices, and loses uv
     beside normals.
     """
@@ -100,21 +106,22 @@ def _read_obj(path):
     return V, F, _uv_of_vertices(len(V), F, VT, T)
 
 
-def _corner(word, vertices, coordinates):
+def _corner(word: str, vertices: int, coordinates: int) -> tuple[int, int]:
     """(vertex, texture coordinate or -1) of ``v``, ``v/vt``, ``v//vn`` or ``v/vt/vn``, counted from
     0.
     """
     v, t = (word.split("/") + [""])[:2]
-    out = []
-    for text, count in ((v, vertices), (t, coordinates)):
-        index = int(text) if text or text is v else None
-        if index is not None and (index == 0 or index < -count):
-            raise ValueError(f"index {index}")
-        out.append(-1 if index is None else index - 1 if index > 0 else count + index)
-    return tuple(out)
+    return _from_zero(int(v), vertices), _from_zero(int(t), coordinates) if t else -1
 
 
-def _uv_of_vertices(count, F, VT, T):
+def _from_zero(index: int, count: int) -> int:
+    """An OBJ file's index, counted from 1 or backwards from the ``count``-th, counted from 0."""
+    if index == 0 or index < -count:
+        raise ValueError(f"index {index}")
+    return index - 1 if index > 0 else count + index
+
+
+def _uv_of_vertices(count: int, F: np.ndarray, VT: np.ndarray, T: np.ndarray) -> np.ndarray | None:
     """uv (N, 2) where every corner of a vertex agrees, else None. Vertices without a face get
     NaN.
     """
@@ -125,7 +132,7 @@ def _uv_of_vertices(count, F, VT, T):
     return uv if np.allclose(uv[F], VT[T], rtol=0, atol=1e-9, equal_nan=True) else None
 
 
-def _read_ply(path):
+def _read_ply(path: str) -> MeshArrays:
     import trimesh
 
     log = logging.getLogger("trimesh")

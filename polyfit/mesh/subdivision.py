@@ -4,11 +4,12 @@
 """
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .triangles import edges_of
 
 
-def subdivided(F):
+def subdivided(F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Every face cut in four at the middles of its sides: ``(faces (4 F, 3), edges (E, 2))``.
 
     The middle of ``edges[e]`` is the vertex n + e, n the number of vertices of F. The children of
@@ -21,7 +22,7 @@ def subdivided(F):
     return np.stack([np.stack(child, axis=1) for child in children], axis=1).reshape(-1, 3), edges
 
 
-def child(face, barycentric, levels):
+def child(face: ArrayLike, barycentric: ArrayLike, levels: int) -> tuple[np.ndarray, np.ndarray]:
     """Where points on a mesh lie after ``levels`` subdivisions: (face (...,), barycentric (..., 3))
     turned into those of the finer mesh.
     """
@@ -35,7 +36,7 @@ def child(face, barycentric, levels):
     return face, b
 
 
-def refined(F, parts):
+def refined(F: np.ndarray, parts: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The faces with every side cut in ``parts``: ``(faces (parts^2 F, 3), face (N',), barycentric
     (N', 3))``, where the new vertex k lies at ``barycentric[k]`` on the face ``face[k]`` of F. The
     vertices of F come first, in their order; neighbours share the new ones.

@@ -3,14 +3,19 @@
 ``vertices`` (N, 3) float [m], ``faces`` (F, 3) int.
 """
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from polyfit.errors import InputError
 
 
-def checked(vertices, faces, where="mesh"):
+def checked(
+    vertices: ArrayLike, faces: ArrayLike, where: str = "mesh"
+) -> tuple[np.ndarray, np.ndarray]:
     """``(vertices float64, faces int64)`` of a mesh that can be cut. Faces that name a vertex
     twice, and those that repeat another's vertices, are dropped. Raises InputError, in one line
     that starts with ``where``, for anything else that is wrong.
@@ -37,7 +42,7 @@ def checked(vertices, faces, where="mesh"):
     return V, F
 
 
-def _refuse(bad, where, what):
+def _refuse(bad: Any, where: str, what: str) -> None:
     if bad.any():
         raise InputError(
             f"{where}: {bad.sum()} {what} (the first is vertex {int(np.argmax(bad))}, counted"
@@ -45,17 +50,17 @@ def _refuse(bad, where, what):
         )
 
 
-def face_vectors(V, F):
+def face_vectors(V: np.ndarray, F: np.ndarray) -> np.ndarray:
     """Normals of the faces, as long as twice their area, (F, 3) [m^2]."""
     return np.cross(V[F[:, 1]] - V[F[:, 0]], V[F[:, 2]] - V[F[:, 0]])
 
 
-def areas(V, F):
+def areas(V: np.ndarray, F: np.ndarray) -> np.ndarray:
     """Areas of the faces, (F,) [m^2]."""
     return 0.5 * np.linalg.norm(face_vectors(V, F), axis=1)
 
 
-def edges_of(F):
+def edges_of(F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Edges of the faces, each once and the smaller vertex first, (E, 2); and of which edge the
     side from corner k to the next is, (F, 3)."""
     side = np.stack([F, np.roll(F, -1, axis=1)], axis=-1)
@@ -65,7 +70,7 @@ def edges_of(F):
     return np.stack([key // size, key % size], axis=1), index.reshape(F.shape)
 
 
-def sheets(F):
+def sheets(F: np.ndarray) -> np.ndarray:
     """Faces (F, 3) whose vertices are those of F, split where the surface is no manifold.
 
     At an edge of three or more faces, and at a vertex where parts meet that share no edge there,
@@ -82,7 +87,7 @@ def sheets(F):
     return components(F.size, np.concatenate([np.stack(p, axis=1) for p in pairs])).reshape(F.shape)
 
 
-def winding(F):
+def winding(F: np.ndarray) -> np.ndarray:
     """1 or -1 for each face (F,): -1 where it is wound against most faces of its component, so that
     all agree after it is turned round.
 
@@ -101,7 +106,7 @@ def winding(F):
     return np.where(more, 1, -1)
 
 
-def _across(F):
+def _across(F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The edges of two faces: the corners (of F.ravel()) from which the one and the other walk
     along them.
     """
@@ -112,7 +117,7 @@ def _across(F):
     return order[start], order[start + 1]
 
 
-def components(count, pairs):
+def components(count: int, pairs: np.ndarray) -> np.ndarray:
     """Numbers (count,) from 0 of the connected components of a graph with the edges ``pairs`` (E,
     2).
     """

@@ -11,10 +11,14 @@ where z points.
 """
 
 import math
+import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
+from torch import Tensor
 
 from polyfit import jets
 from polyfit.errors import InputError
@@ -35,17 +39,24 @@ class SpatialTransformer(torch.nn.Module):
     order. ``turns`` quaternions are learned; they start as tilts to all sides.
     """
 
-    def __init__(self, widths=(32, 64, 128), hidden=64, points=64, turns=5):
+    def __init__(
+        self,
+        widths: Sequence[int] = (32, 64, 128),
+        hidden: int = 64,
+        points: int = 64,
+        turns: int = 5,
+    ) -> None:
         super().__init__()
         self.shape = dict(widths=list(widths), hidden=hidden, points=points, turns=turns)
         self.points = points
         self.local = pointwise(widths)
-        self.head = torch.nn.Sequential(
+        layers = [
             torch.nn.LayerNorm(widths[-1]),
             *normalised_layer(widths[-1], hidden),
             *normalised_layer(hidden, hidden),
-            torch.nn.Linear(hidden, 4 * turns),
-        )
+        ]
+        last = torch.nn.Linear(hidden, 4 * turns)
+        self.head = torch.nn.Sequential(*layers, last)
         side = torch.arange(turns) * 2 * math.pi / turns
         first = torch.stack(
             [
@@ -57,23 +68,23 @@ class SpatialTransformer(torch.nn.Module):
             -1,
         )
         with torch.no_grad():
-            self.head[-1].weight.mul_(0.1)
-            self.head[-1].bias.copy_(first.flatten())
+            last.weight.mul_(0.1)
+            last.bias.copy_(first.flatten())
 
-    def forward(self, x, mask=None):
+    def forward(self, x: Tensor, mask: Tensor | None = None) -> Tensor:
         """Unit quaternions (B, turns + 1, 4) in the order (x, y, z, w), the first the identity, for
         patches x (B, P, 3) in the chart of their PCA frame.
 
         ``mask`` (B, P) marks the points that count.
         """
-        x = thinned(x.to(self.head[-1].weight.dtype), self.points, mask)
+        x = thinned(x.to(next(self.parameters()).dtype), self.points, mask)
         turns = torch.nn.functional.normalize(
             self.head(self.local(x).amax(1)).unflatten(-1, (-1, 4)), dim=-1
         )
         return torch.cat([turns.new_tensor([0, 0, 0, 1]).expand(len(x), 1, 4), turns], 1)
 
 
-def pointwise(widths, entries=3):
+def pointwise(widths: Sequence[int], entries: int = 3) -> torch.nn.Sequential:
     """Linear layers with ReLU that see each point alone."""
     layers = []
     for width in widths:
@@ -82,7 +93,7 @@ def pointwise(widths, entries=3):
     return torch.nn.Sequential(*layers)
 
 
-def linear(entries, exits):
+def linear(entries: int, exits: int) -> torch.nn.Linear:
     """A linear layer that keeps the size of what passes through it and a ReLU (He et al. 2015)."""
     layer = torch.nn.Linear(entries, exits)
     torch.nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
@@ -90,11 +101,11 @@ def linear(entries, exits):
     return layer
 
 
-def normalised_layer(entries, exits):
+def normalised_layer(entries: int, exits: int) -> tuple[torch.nn.Module, ...]:
     return linear(entries, exits), torch.nn.LayerNorm(exits), torch.nn.ReLU()
 
 
-def thinned(x, count, mask=None):
+def thinned(x: Tensor, count: int, mask: Tensor | None = None) -> Tensor:
     """At most ``count`` of the points x (B, P, 3), evenly through the order of those that ``mask``
     (B, P) leaves: (B, count, 3).
 
@@ -127,14 +138,16 @@ class PolyFit(torch.nn.Module):
     alone. ``PolyFit.pretrained()`` has the weights of the package.
     """
 
-    def __init__(self, order=4, stn=None):
+    def __init__(self, order: int = 4, stn: SpatialTransformer | None = None) -> None:
         super().__init__()
         if not 1 <= order <= 10:
             raise InputError(f"order = {order}; the order of a jet is 1 to 10")
         self.order = order
         self.stn = stn
 
-    def frame(self, points, mask=None, *, weights=None):
+    def frame(
+        self, points: Tensor, mask: Tensor | None = None, *, weights: Tensor | None = None
+    ) -> CanonicalFrame:
         """The :class:`CanonicalFrame` of patches ``points`` (B, P, 3), of which ``mask`` (B, P)
         counts; ``weights`` (B, P) for mean and spread.
 
@@ -154,7 +167,7 @@ class PolyFit(torch.nn.Module):
         )
 
     @torch.no_grad()
-    def least_height(self, x, turns):
+    def least_height(self, x: Tensor, turns: Tensor) -> Tensor:
         """Which of the ``turns`` (B, H, 4) leaves the jets through x (B, P, 3) the least RMS of
         height, (B,).
         """
@@ -162,7 +175,9 @@ class PolyFit(torch.nn.Module):
         alpha = jets.fit(y, self.order).alpha
         return (jets.height(alpha, y[..., :2]) - y[..., 2]).square().mean(-1).argmin(-1)
 
-    def forward(self, points, *, weights=None, mask=None):
+    def forward(
+        self, points: Tensor, *, weights: Tensor | None = None, mask: Tensor | None = None
+    ) -> PatchFit:
         """:class:`PatchFit` of patches ``points`` (B, P, 3) in any unit and frame; ``weights`` and
         ``mask`` (B, P) as in :func:`polyfit.jets.fit`.
         """
@@ -172,7 +187,7 @@ class PolyFit(torch.nn.Module):
         )
 
     @classmethod
-    def pretrained(cls, order=4):
+    def pretrained(cls, order: int = 4) -> "PolyFit":
         """PolyFit with the weights that ship in the package (``polyfit/data``; the JSON file there
         says what made them).
 
@@ -181,7 +196,7 @@ class PolyFit(torch.nn.Module):
         return cls.load(PRETRAINED, order)
 
     @classmethod
-    def load(cls, path, order=None):
+    def load(cls, path: str | os.PathLike[str], order: int | None = None) -> "PolyFit":
         """PolyFit with the weights of the file ``path``, as ``polyfit.train`` writes them. Raises
         InputError where they are no such, of another version, or not for ``order``.
         """
@@ -192,10 +207,12 @@ class PolyFit(torch.nn.Module):
         load_into(model, weights, path)
         return model.eval()
 
-    def save(self, path, **about):
-        """Writes the weights to ``path`` (safetensors), with what they are for, and ``about``,
-        inside.
+    def save(self, path: str | os.PathLike[str], **about: Any) -> None:
+        """Writes the weights to ``path`` (safetensors), with what they are for and ``about``.
+        Raises ValueError where there is no transformer, and so no weights.
         """
+        if self.stn is None:
+            raise ValueError("without a transformer there are no weights to save")
         write_weights(
             path,
             self.state_dict(),

@@ -1,12 +1,20 @@
 """Files of weights: safetensors with a description, a JSON object, in their header."""
 
 import json
+import os
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
 
 from polyfit.errors import InputError
 from polyfit.files import aside
 
 
-def write_weights(path, weights, about):
+def write_weights(
+    path: str | os.PathLike[str], weights: Mapping[str, Tensor], about: dict[str, Any]
+) -> None:
     """Tensors by name, and what they are for; written aside and then renamed."""
     from safetensors.torch import save
 
@@ -17,7 +25,9 @@ def write_weights(path, weights, about):
         file.write(data)
 
 
-def read_weights(path, model, version):
+def read_weights(
+    path: str | os.PathLike[str], model: str, version: int
+) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """(tensors, description) of a file of :func:`write_weights`. Raises InputError where it cannot
     be read, or is of another model or version.
     """
@@ -41,7 +51,9 @@ def read_weights(path, model, version):
     return weights, about
 
 
-def load_into(module, weights, path):
+def load_into(
+    module: torch.nn.Module, weights: Mapping[str, Tensor], path: str | os.PathLike[str]
+) -> None:
     """``module.load_state_dict`` that ends in one line where shapes or names do not match."""
     try:
         module.load_state_dict(weights)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from polyfit import mesh
 from polyfit.errors import InputError
@@ -18,7 +19,7 @@ DENSITY = 100
 LEAST = 10_000
 
 
-def patch_count(area):
+def patch_count(area: float) -> int:
     """The paper's number of patches K for a surface of ``area`` [m^2]: max(100, min(400, floor(area
     / 0.008))).
     """
@@ -52,12 +53,20 @@ class Patches:
     entry_vertex: np.ndarray
     face_entries: np.ndarray
 
-    def __len__(self):
+    def __len__(self) -> int:
         """K, the number of patches."""
         return int(self.entry_patch[-1]) + 1
 
     @classmethod
-    def cut(cls, vertices, faces, count=None, *, density=DENSITY, where="mesh"):
+    def cut(
+        cls,
+        vertices: ArrayLike,
+        faces: ArrayLike,
+        count: int | None = None,
+        *,
+        density: int = DENSITY,
+        where: str = "mesh",
+    ) -> "Patches":
         """Cut the mesh (N, 3) [m], (F, 3) into ``count`` connected patches; by default
         :func:`patch_count` of them.
 
@@ -92,7 +101,7 @@ class Patches:
         label = _cluster(V, F, split, part, side, count)
         return cls(V, F, given, levels, split, label, side, *_entries(len(V), F, label[split]))
 
-    def relabelled(self, label):
+    def relabelled(self, label: np.ndarray) -> "Patches":
         """The same mesh cut otherwise: ``label`` (S,), each of 0 .. K - 1 used and connected."""
         entries = _entries(len(self.vertices), self.faces, label[self.sheets])
         return Patches(
@@ -107,12 +116,12 @@ class Patches:
         )
 
     @cached_property
-    def corner_patch(self):
+    def corner_patch(self) -> np.ndarray:
         """The patch of each corner of each face, (G, 3)."""
         return self.label[self.sheets]
 
     @cached_property
-    def vertex_entry(self):
+    def vertex_entry(self) -> np.ndarray:
         """The entry of each vertex in its own patch, (M,). Where sheets meet, the first of them has
         the vertex.
         """
@@ -122,17 +131,17 @@ class Patches:
         return out
 
     @property
-    def vertex_patch(self):
+    def vertex_patch(self) -> np.ndarray:
         """The patch of each vertex, (M,)."""
         return self.entry_patch[self.vertex_entry]
 
     @cached_property
-    def mixed(self):
+    def mixed(self) -> np.ndarray:
         """Which faces touch several patches, (G,) bool."""
         return (self.corner_patch != self.corner_patch[:, :1]).any(axis=1)
 
     @cached_property
-    def entry_weight(self):
+    def entry_weight(self) -> np.ndarray:
         """The area around each entry that its patch has a share in, (E,) [m^2]; all together they
         are the surface's area.
 
@@ -142,7 +151,7 @@ class Patches:
         return np.bincount(self.face_entries.ravel(), share, minlength=len(self.entry_patch))
 
     @cached_property
-    def direction(self):
+    def direction(self) -> np.ndarray:
         """Mean normals of the patches by the winding of most faces, as long as the area they speak
         for, (K, 3) [m^2].
         """
@@ -158,7 +167,7 @@ class Patches:
         )
 
     @cached_property
-    def boundary(self):
+    def boundary(self) -> np.ndarray:
         """Pairs of entries (B, 2) that are the same point of the surface in the charts of two
         patches, the lower patch first.
         """
@@ -175,12 +184,12 @@ class Patches:
         return np.concatenate(pairs) if pairs else np.zeros((0, 2), dtype=np.int64)
 
     @cached_property
-    def neighbours(self):
+    def neighbours(self) -> np.ndarray:
         """Pairs of patches (N, 2) that meet, each once, the lower first."""
         return np.unique(self.entry_patch[self.boundary], axis=0)
 
     @cached_property
-    def padded(self):
+    def padded(self) -> tuple[np.ndarray, np.ndarray]:
         """The entries of each patch, (K, P), padded with the patch's first entry, and which of them
         exist, (K, P) bool.
         """
@@ -190,20 +199,20 @@ class Patches:
         exists = column < counts[:, None]
         return np.where(exists, first[:, None] + column, first[:, None]), exists
 
-    def locate(self, face, barycentric):
+    def locate(self, face: np.ndarray, barycentric: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Points on the given mesh, by face (P,) and barycentric coordinates (P, 3), as points on
         ``faces``.
         """
         return mesh.child(face, barycentric, self.levels)
 
 
-def _components_of_faces(F):
+def _components_of_faces(F: np.ndarray) -> np.ndarray:
     """Number of the connected component of each face, (F,)."""
     edges, _ = mesh.edges_of(F)
     return mesh.components(int(F.max()) + 1, edges)[F[:, 0]]
 
 
-def _levels(vertices, area, count, density):
+def _levels(vertices: int, area: np.ndarray, count: int, density: int) -> int:
     """Subdivisions until there are vertices enough, and no face is larger than a tenth of a patch
     (or until there are some million faces)."""
     few = np.log(max(density * count, LEAST) / vertices) / np.log(4)
@@ -212,7 +221,9 @@ def _levels(vertices, area, count, density):
     return max(0, min(int(np.ceil(max(few, large))), int(most)))
 
 
-def _cluster(V, F, split, part, side, count):
+def _cluster(
+    V: np.ndarray, F: np.ndarray, split: np.ndarray, part: np.ndarray, side: np.ndarray, count: int
+) -> np.ndarray:
     """The patch of each vertex of ``split`` (G, 3): clusters of each part of the surface, ``part``
     (G,), as many as its share of the area."""
     size = int(split.max()) + 1
@@ -223,7 +234,7 @@ def _cluster(V, F, split, part, side, count):
         [np.bincount(split.ravel(), np.repeat(x, 3), minlength=size) for x in vectors.T], axis=1
     )
     area = np.bincount(split.ravel(), np.repeat(mesh.areas(points, split) / 3, 3), minlength=size)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
     area = np.maximum(area, 1e-9 * area.mean())
     edges = mesh.edges_of(split)[0]
     shares = _shares(np.bincount(of_vertex, area), np.bincount(of_vertex), count)
@@ -259,7 +270,7 @@ def _cluster(V, F, split, part, side, count):
     return label
 
 
-def _shares(area, vertices, count):
+def _shares(area: np.ndarray, vertices: np.ndarray, count: int) -> np.ndarray:
     """``count`` patches dealt out to the parts, by area, at least one and at most as many as it has
     vertices each.
     """
@@ -276,7 +287,9 @@ def _shares(area, vertices, count):
     return share
 
 
-def _entries(size, F, corner_patch):
+def _entries(
+    size: int, F: np.ndarray, corner_patch: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """``entry_patch``, ``entry_vertex`` and ``face_entries`` of :class:`Patches`."""
     keys = corner_patch[:, :, None] * size + F[:, None, :]
     mixed = (corner_patch != corner_patch[:, :1]).any(axis=1)

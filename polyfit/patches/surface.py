@@ -3,11 +3,15 @@ resolution (paper, section "PolyFit").
 """
 
 import dataclasses
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
 
 from polyfit import jets, mesh
 from polyfit.jets import CanonicalFrame
@@ -31,23 +35,31 @@ class PatchedSurface:
 
     patches: Patches
     frame: CanonicalFrame
-    alpha: torch.Tensor
-    order: torch.Tensor
-    uv: torch.Tensor
+    alpha: Tensor
+    order: Tensor
+    uv: Tensor
 
-    def __len__(self):
+    def __len__(self) -> int:
         """K, the number of patches."""
         return len(self.alpha)
 
     @property
-    def parameters(self):
+    def parameters(self) -> int:
         """How many numbers hold the surface: the coefficients, and scale, rotation (3) and
         translation (3) of each patch.
         """
         return len(self) * (self.alpha.shape[1] + 7)
 
     @classmethod
-    def fit(cls, patches, order=4, *, polyfit=None, dtype=torch.float32, device=None):
+    def fit(
+        cls,
+        patches: Patches,
+        order: int = 4,
+        *,
+        polyfit: Callable[..., Any] | None = None,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str | None = None,
+    ) -> "PatchedSurface":
         """Fit a jet to each of the :class:`polyfit.patches.Patches`, weighted by area, in its PCA
         frame.
 
@@ -75,7 +87,17 @@ class PatchedSurface:
         return cls(patches, frame, alpha, jet.order, uv)
 
     @classmethod
-    def from_mesh(cls, vertices, faces, count=None, order=4, *, rounds=5, where="mesh", **options):
+    def from_mesh(
+        cls,
+        vertices: ArrayLike,
+        faces: ArrayLike,
+        count: int | None = None,
+        order: int = 4,
+        *,
+        rounds: int = 5,
+        where: str = "mesh",
+        **options: Any,
+    ) -> "PatchedSurface":
         """Cut the mesh (N, 3) [m], (F, 3) into patches (:meth:`polyfit.patches.Patches.cut`),
         :meth:`fit` them with ``options``, and let the boundaries move to where the jets fit best,
         ``rounds`` times (:func:`polyfit.patches.refine.refined`).
@@ -87,7 +109,7 @@ class PatchedSurface:
         )
 
     @property
-    def residual(self):
+    def residual(self) -> Tensor:
         """Distance of each entry's vertex from its chart's jet, (E,) [m], to first order: along z,
         divided by the slope.
         """
@@ -100,7 +122,7 @@ class PatchedSurface:
 
     # ---- patches and chart coordinates -> the surface --------------------------------------------
 
-    def points(self, patch, uv):
+    def points(self, patch: Tensor, uv: Tensor) -> Tensor:
         """Points (..., 3) [m] at uv (..., 2) of the patches ``patch`` (...,)."""
         z = self._of(jets.height, patch, uv)
         return (
@@ -108,7 +130,7 @@ class PatchedSurface:
             + self.frame.T[patch]
         )
 
-    def distance(self, patch, points):
+    def distance(self, patch: Tensor, points: Tensor) -> Tensor:
         """Distances (...,) [m] of points (..., 3) [m] from the jets of the patches ``patch``
         (...,), to first order: along z, divided by the slope."""
         frame = self.frame[patch]
@@ -119,55 +141,55 @@ class PatchedSurface:
         )
         return frame.s * (z - x[..., 0, 2]).abs() / (1 + zu * zu + zv * zv).sqrt()
 
-    def tangents(self, patch, uv):
+    def tangents(self, patch: Tensor, uv: Tensor) -> tuple[Tensor, ...]:
         """Derivatives of the points along u and v, each (..., 3) [m]."""
         return tuple(
             self._turned(patch, t) * self.frame.s[patch][..., None]
             for t in self._of(jets.tangents, patch, uv)
         )
 
-    def normals(self, patch, uv):
+    def normals(self, patch: Tensor, uv: Tensor) -> Tensor:
         """Unit normals (..., 3), to the side of the faces' normals."""
         return self._turned(patch, self._of(jets.normal, patch, uv))
 
-    def metric(self, patch, uv):
+    def metric(self, patch: Tensor, uv: Tensor) -> Tensor:
         """First fundamental forms (..., 2, 2) [m^2]."""
         return self._of(jets.metric, patch, uv) * self.frame.s[patch][..., None, None] ** 2
 
-    def principal_curvatures(self, patch, uv):
+    def principal_curvatures(self, patch: Tensor, uv: Tensor) -> Tensor:
         """Principal curvatures (..., 2) [1/m], the smaller first; positive where the surface bends
         towards its normal.
         """
         return self._of(jets.principal_curvatures, patch, uv) / self.frame.s[patch][..., None]
 
-    def _of(self, function, patch, uv):
+    def _of(self, function: Callable[[Tensor, Tensor], Any], patch: Tensor, uv: Tensor) -> Any:
         """``function`` of jets at single points."""
         found = function(self.alpha[patch], uv[..., None, :])
         squeeze = lambda x: x.squeeze(patch.ndim)
         return tuple(map(squeeze, found)) if isinstance(found, tuple) else squeeze(found)
 
-    def _turned(self, patch, x):
+    def _turned(self, patch: Tensor, x: Tensor) -> Tensor:
         return (self.frame.R[patch] @ x[..., None])[..., 0]
 
     # ---- points of the mesh -> patches and chart coordinates -------------------------------------
 
     @cached_property
-    def vertex_patch(self):
+    def vertex_patch(self) -> Tensor:
         """The patch of each vertex of ``patches.vertices``, (M,); those of the given mesh come
         first.
         """
         return self._index(self.patches.vertex_patch)
 
     @property
-    def vertex_uv(self):
+    def vertex_uv(self) -> Tensor:
         """The chart coordinates of each vertex in its patch, (M, 2)."""
         return self.uv[self._index(self.patches.vertex_entry)]
 
-    def vertices(self):
+    def vertices(self) -> Tensor:
         """The vertices on the surface, (M, 3) [m], in the order of ``patches.vertices``."""
         return self.points(self.vertex_patch, self.vertex_uv)
 
-    def at(self, face, barycentric, what="points"):
+    def at(self, face: ArrayLike, barycentric: ArrayLike, what: str = "points") -> Tensor:
         """The surface at points of the given mesh, by face (P,) and barycentric coordinates (P, 3):
         (P, 3) [m].
 
@@ -178,7 +200,9 @@ class PatchedSurface:
         face, barycentric = self.patches.locate(np.asarray(face), np.asarray(barycentric))
         return self._blended(face, barycentric, what)
 
-    def sample(self, count, seed=0, what=("points",)):
+    def sample(
+        self, count: int, seed: int = 0, what: Sequence[str] = ("points",)
+    ) -> tuple[Tensor, ...]:
         """``count`` points drawn evenly from the mesh's area, on the surface: a tuple of what
         ``what`` names, as in :meth:`at`.
         """
@@ -188,7 +212,7 @@ class PatchedSurface:
         barycentric = rng.dirichlet((1, 1, 1), count)
         return tuple(self._blended(face, barycentric, w) for w in what)
 
-    def resampled(self, parts=4, smoothing=0):
+    def resampled(self, parts: int = 4, smoothing: int = 0) -> tuple[Tensor, Tensor]:
         """A mesh of the surface with every side of the given mesh's faces cut in ``parts``:
         ``(vertices (N', 3) [m], faces (parts^2 F, 3) int64)``.
 
@@ -200,7 +224,7 @@ class PatchedSurface:
         faces = self._index(faces)
         return smoothed(vertices, faces, self._index(seam), smoothing), faces
 
-    def _blended(self, face, barycentric, what):
+    def _blended(self, face: np.ndarray, barycentric: np.ndarray, what: str) -> Tensor:
         value = {"points": self.points, "normals": self.normals}[what]
         mixed = self.patches.mixed[face]
         entries, patch = self.patches.face_entries[face], self.patches.corner_patch[face]
@@ -218,30 +242,30 @@ class PatchedSurface:
     # ---- boundaries ------------------------------------------------------------------------------
 
     @cached_property
-    def boundary_patch(self):
+    def boundary_patch(self) -> Tensor:
         """The patches (B, 2) that hold each boundary point, the lower first. ``patches.neighbours``
         lists which patches meet.
         """
         return self._index(self.patches.entry_patch[self.patches.boundary])
 
     @property
-    def boundary_uv(self):
+    def boundary_uv(self) -> Tensor:
         """Each boundary point's chart coordinates in the two patches, (B, 2, 2)."""
         return self.uv[self._index(self.patches.boundary)]
 
-    def boundary(self):
+    def boundary(self) -> tuple[Tensor, Tensor]:
         """The boundary points by their two patches, ``(points (B, 2, 3) [m], normals (B, 2, 3))``:
         what a boundary loss compares.
         """
         patch, uv = self.boundary_patch, self.boundary_uv
         return self.points(patch, uv), self.normals(patch, uv)
 
-    def _index(self, array):
+    def _index(self, array: np.ndarray) -> Tensor:
         return torch.as_tensor(np.ascontiguousarray(array), device=self.uv.device)
 
     # ---- as a whole ------------------------------------------------------------------------------
 
-    def to(self, *args, **kwargs):
+    def to(self, *args: Any, **kwargs: Any) -> "PatchedSurface":
         """The surface in another dtype or on another device."""
         move = lambda x: x.to(*args, **kwargs)
         order = self.order.to(move(self.alpha).device)
@@ -254,7 +278,7 @@ class PatchedSurface:
         )
 
 
-def smoothed(vertices, faces, where, times=1):
+def smoothed(vertices: Tensor, faces: Tensor, where: Tensor, times: int = 1) -> Tensor:
     """Vertices (N, 3) with those of ``where`` (N,) bool moved ``times`` times halfway to the mean
     of their neighbours (Laplacian smoothing).
 

@@ -91,7 +91,7 @@ class Model:
     normal: Normal
     terms: dict
     total: float
-    appearance: Appearance = None
+    appearance: Appearance | None = None
 
     @property
     def cost(self):
