@@ -27,7 +27,7 @@ import time
 from dataclasses import dataclass, field
 
 import numpy as np
-from sft import DATA, ROOT, SCENES, folder_of
+from sequences import DATA, ROOT, SCENES, folder_of
 
 from polysft_mi.backend import add_mode_argument, set_variant
 from polysft_mi.errors import InputError, cli

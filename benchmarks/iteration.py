@@ -7,19 +7,18 @@ Each time is a median.
 """
 
 import argparse
+import os
 import time
-from pathlib import Path
 
 import numpy as np
-
-ROOT = Path(__file__).resolve().parent.parent
+from sequences import SCENES
 
 
 def main(arguments=None):
     p = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    p.add_argument("scene", nargs="?", default=str(ROOT / "scenes" / "demo.xml"))
+    p.add_argument("scene", nargs="?", default=os.path.join(SCENES, "demo.xml"))
     p.add_argument(
         "-D",
         dest="defines",

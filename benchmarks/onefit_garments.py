@@ -28,6 +28,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
+from sequences import ROOT
 
 from onefit.body import AnnyBody, skeleton, skinning
 from onefit.garment import TEMPLATES, Garment, fitting, standard_body, standard_surface
@@ -37,8 +38,6 @@ from onefit.motion import Motion, generate
 from polyfit import mesh
 from polyfit.errors import cli
 from polyfit.files import aside
-
-ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 
 
 def lengths(V, F):

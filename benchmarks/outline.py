@@ -10,15 +10,13 @@ import os
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from sequences import DATA
 
 from polysft_mi.camera import Intrinsics
 from polysft_mi.scene.images import list_images, read_rgb
 from polysft_mi.scene.outline import fitted
 from polysft_mi.surface import meshio
 
-ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
-
-DATA = os.environ.get("POLYSFT_DATA") or os.path.join(os.path.dirname(ROOT), "shared", "data")
 SEQUENCES = "flag", "bend", "paper", "curtain", "corner"
 _ROTATION, _SHIFT = (
     (0.03, 0.03, 0.015),

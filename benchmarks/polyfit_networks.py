@@ -9,14 +9,13 @@ from pathlib import Path
 
 import torch
 from polyfit_held_out import HELD_OUT
+from sequences import ROOT
 
 from polyfit import jets
 from polyfit.errors import InputError
 from polyfit.jets import CanonicalFrame
 from polyfit.network import PatchFit, SpatialTransformer
 from polyfit.training.training_set import axes, rotations_to
-
-ROOT = Path(__file__).resolve().parent.parent
 
 TRAINED_ON = [
     f"garments_makehuman/{name}.obj"

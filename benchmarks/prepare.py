@@ -22,6 +22,7 @@ import time
 
 import cv2
 import numpy as np
+from sequences import DATA, ROOT
 
 from polysft_mi.camera import Intrinsics
 from polysft_mi.capture import iou
@@ -35,9 +36,6 @@ from polysft_mi.scene.images import list_images, read_rgb
 from polysft_mi.scene.sequence import drop_stray_components
 from polysft_mi.surface import meshio
 
-ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
-
-DATA = os.environ.get("POLYSFT_DATA") or os.path.join(os.path.dirname(ROOT), "shared", "data")
 FRAMES = 60
 PRINT = 0.2975, 0.252  # m, the printed area that Kinect-Paper's template covers
 DENSITY = 2000  # pixels a metre of the rectified print, about twice the frame's

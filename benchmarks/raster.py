@@ -48,12 +48,11 @@ from raster_figures import (
     summarise,
     write,
 )
+from sequences import ROOT
 
 from polysft_mi.backend import add_mode_argument, set_variant
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError, cli
-
-ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 
 SIZES = ("160x120", "320x240", "640x480", "1280x720", "1920x1080")
 GRIDS = (33, 72, 225)  # vertices a side: 1,089 vertices, 10,082 and 100,352 triangles

@@ -23,14 +23,12 @@ import sys
 
 import sft_results
 import sft_runs
+from sequences import DATA, ROOT, folder_of
 from sft_report import report
 from sft_results import JET, METHODS, SEQUENCES
-from sft_runs import ROOT
 
 from polysft_mi.backend import add_mode_argument
 from polysft_mi.errors import InputError, cli
-
-DATA = os.environ.get("POLYSFT_DATA") or os.path.join(os.path.dirname(ROOT), "shared", "data")
 
 
 def parser():
@@ -109,7 +107,7 @@ def main(arguments=None):
     os.makedirs(docs, exist_ok=True)
     sft_results.read(path)  # a damaged file is told before anything runs
     for sequence in options.only:
-        folder = sft_runs.folder_of(options.data, sequence)
+        folder = folder_of(options.data, sequence)
         if folder is None:
             print(f"{sequence}: not in {options.data}, left out", file=sys.stderr)
             continue

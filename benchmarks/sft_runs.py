@@ -10,32 +10,13 @@ import time
 
 import numpy as np
 from best_jets import best_jets
+from sequences import ROOT, SCENES
 from sft_results import JET
 
 from polysft_mi.errors import InputError
 from polysft_mi.results.evaluation import evaluate, score
 from polysft_mi.results.truth import find_truth, load_npz
 from polysft_mi.surface import meshio
-
-ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
-SCENES = os.path.join(ROOT, "scenes")
-
-
-def folder_of(data, sequence):
-    """The folder of a sequence in ``data`` or one folder further down; None where there is none."""
-    places = (
-        [data] + sorted(entry.path for entry in os.scandir(data) if entry.is_dir())
-        if os.path.isdir(data)
-        else []
-    )
-    return next(
-        (
-            path
-            for path in (os.path.join(place, sequence) for place in places)
-            if os.path.isdir(path)
-        ),
-        None,
-    )
 
 
 def command(sequence, method, folder, out, setup):

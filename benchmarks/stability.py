@@ -19,12 +19,11 @@ import os
 import tempfile
 
 import numpy as np
+from sequences import ROOT
 
 from polysft_mi.backend import add_mode_argument, set_variant
 from polysft_mi.errors import InputError, cli
 from polysft_mi.files import aside
-
-ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 
 COUNTS = (50, 300, 1000, 5000)
 USUAL = 300  # iterations that the paper evaluates at

@@ -10,6 +10,7 @@ from pathlib import Path
 import best_jets
 import numpy as np
 import pytest
+import sequences
 import sft_report
 import sft_results
 import sft_runs
@@ -300,8 +301,8 @@ def test_a_damaged_file_of_results_is_told(tmp_path):
 
 def test_a_sequence_is_found_one_folder_down(tmp_path):
     (tmp_path / "cloth" / "flag").mkdir(parents=True)
-    assert sft_runs.folder_of(str(tmp_path), "flag") == str(tmp_path / "cloth" / "flag")
-    assert sft_runs.folder_of(str(tmp_path), "bend") is None
+    assert sequences.folder_of(str(tmp_path), "flag") == str(tmp_path / "cloth" / "flag")
+    assert sequences.folder_of(str(tmp_path), "bend") is None
 
 
 def test_one_command_is_run_timed_and_scored(sheet, tmp_path, monkeypatch):

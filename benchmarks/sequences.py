@@ -1,0 +1,24 @@
+"""Where the repository, its scenes, and the sequences that are not in it lie."""
+
+import os
+
+ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+SCENES = os.path.join(ROOT, "scenes")
+DATA = os.environ.get("POLYSFT_DATA") or os.path.join(os.path.dirname(ROOT), "shared", "data")
+
+
+def folder_of(data, sequence):
+    """The folder of a sequence in ``data`` or one folder further down; None where there is none."""
+    places = (
+        [data] + sorted(entry.path for entry in os.scandir(data) if entry.is_dir())
+        if os.path.isdir(data)
+        else []
+    )
+    return next(
+        (
+            path
+            for path in (os.path.join(place, sequence) for place in places)
+            if os.path.isdir(path)
+        ),
+        None,
+    )
