@@ -29,7 +29,7 @@ def registered():
 
 def test_contenders_show_the_same_sheet_on_half_of_the_image(tmp_path):
     result = raster.measure_times(
-        (320, 240), POINTS, str(tmp_path), seconds=0
+        (640, 480), POINTS, str(tmp_path), seconds=0
     )  # large enough for the texture's detail
     assert {len(ms) for ms in result["passes"].values()} == {raster.LEAST_TURNS}
     assert result["coverage"] == pytest.approx(0.5, abs=0.03)
