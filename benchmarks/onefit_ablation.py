@@ -14,7 +14,7 @@ from pathlib import Path
 import onefit_accuracy as accuracy
 
 import onefit
-from onefit import train
+from onefit import training
 from onefit.objective import Weights
 from polyfit.errors import cli
 
@@ -49,7 +49,7 @@ def main(argv=None):
     for case in args.cases:
         folder = Path(args.output) / case.replace(" ", "-")
         weights = Weights(**CASES[case])
-        settings = train.Settings(
+        settings = training.Settings(
             garments=(args.garment,),
             batch=args.batch,
             epochs=12,
@@ -57,7 +57,7 @@ def main(argv=None):
             weights=weights,
         )
         if not (folder / "weights.safetensors").exists():
-            train.train(
+            training.train(
                 settings,
                 folder,
                 resume=(folder / "checkpoint.safetensors").exists(),

@@ -20,7 +20,7 @@ import torch
 
 import onefit
 from onefit.motion import generate
-from onefit.train import STANDARD
+from onefit.training import STANDARD
 from polyfit.errors import cli
 
 SEED = 1_000_000  # of shapes and motions, see onefit.motion.generate.HELD_OUT_SEEDS

@@ -15,134 +15,9 @@ OUT receives
 """
 
 import argparse
-import json
-import time
-import zipfile
-from pathlib import Path
+import sys
 
-import numpy as np
-
-from polyfit.errors import InputError, cli, require
-from polyfit.files import aside, folder_aside
-
-GARMENT, BODY = (0.08, 0.19, 0.42), (0.5, 0.48, 0.46)  # colours, linear RGB
-
-
-def _shape(model, pairs):
-    shape = model.standard_shape.clone()
-    for pair in pairs:
-        name, _, value = pair.partition("=")
-        if name not in model.shape_names:
-            raise InputError(
-                f"--shape {pair}: choose among {', '.join(model.shape_names)}, as in weight=0.6"
-            )
-        try:
-            shape[model.shape_names.index(name)] = float(value)
-        except ValueError:
-            raise InputError(f"--shape {pair}: a number is needed, as in {name}=0.6") from None
-    return shape
-
-
-def _motion(name, seconds, seed, fps, up):
-    from onefit.motion import Motion
-    from onefit.motion.generate import KINDS
-
-    if name in KINDS:
-        return Motion.generate(name, seconds=seconds, seed=seed)
-    if not Path(name).exists():
-        raise InputError(
-            f"motion {name}: no such file, and no kind of motion; there are {', '.join(KINDS)}"
-        )
-    return Motion.read(name, fps, up)
-
-
-def _model(name):
-    from onefit.body import AnnyBody, PlainBody, SmplBody
-
-    if name == "anny":
-        return AnnyBody()
-    if not Path(name).exists():
-        raise InputError(f"--body {name}: no such file; anny needs none")
-    plain = zipfile.is_zipfile(name) and "blend_weights.npy" in zipfile.ZipFile(name).namelist()
-    return PlainBody(name) if plain else SmplBody(name)
-
-
-def _garment(args):
-    from onefit.garment import TEMPLATES, Garment
-
-    if args.garment in TEMPLATES:
-        return Garment.template(args.garment)
-    return Garment.read(
-        args.garment,
-        made_for=args.made_for,
-        loose=args.loose,
-        scale=args.scale,
-        up=args.up,
-        turn=args.turn,
-        offset=tuple(args.offset),
-    )
-
-
-def _render(drape, folder, size, spp, advance):
-    """PNG frames and a video; Mitsuba is loaded here alone."""
-    from polysft_mi.backend import set_variant
-
-    set_variant()
-    import cv2
-
-    from polysft_mi.pictures.video import write_video
-    from polysft_mi.render import stage
-
-    parts = [
-        (drape.body.numpy(), drape.body_faces.numpy(), BODY),
-        (drape.vertices.numpy(), drape.faces.numpy(), GARMENT),
-    ]
-    frames = folder / "frames"
-    frames.mkdir()
-
-    def pictures():
-        for k, image in enumerate(stage.render(parts, size=size, spp=spp)):
-            cv2.imwrite(str(frames / f"{k:03d}.png"), image[..., ::-1])
-            advance()
-            yield image
-
-    write_video(folder / "drape.mp4", pictures(), drape.fps)
-
-
-def write(drape, folder, *, skip=(), meshes=None, size=(480, 360), spp=32, advance=lambda: None):
-    """The files of a :class:`onefit.Drape` in the empty ``folder``; ``skip``: any of "usd",
-    "render".
-    """
-    from polyfit.animation import write_frames, write_usd
-
-    folder = Path(folder)
-    arrays = {
-        name: getattr(drape, name).numpy()
-        for name in ("vertices", "faces", "rest", "body", "body_faces", "root")
-    }
-    with aside(folder / "drape.npz") as temporary:
-        np.savez_compressed(temporary, fps=drape.fps, **arrays)
-    if "usd" not in skip:
-        write_usd(
-            folder / "garment.usd",
-            arrays["vertices"],
-            arrays["faces"],
-            fps=drape.fps,
-            up="z",
-            name="garment",
-        )
-        write_usd(
-            folder / "body.usd",
-            arrays["body"],
-            arrays["body_faces"],
-            fps=drape.fps,
-            up="z",
-            name="body",
-        )
-    if meshes:
-        write_frames(folder / "meshes", meshes, arrays["vertices"], arrays["faces"], up="z")
-    if "render" not in skip:
-        _render(drape, folder, size, spp, advance)
+from polyfit.errors import cli, require
 
 
 def parser():
@@ -245,75 +120,45 @@ def parser():
 def main(argv=None):
     args = parser().parse_args(argv)
     require("torch", "anny", *(["pxr"] if "usd" not in args.skip else []))
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeRemainingColumn,
-    )
 
-    from onefit.draping import load
     from polyfit.training import device_of
 
-    folder = Path(args.output)
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        if not args.overwrite:
-            raise InputError(f"{folder}: not empty; give another -o, or --overwrite")
-        if not (folder / "drape.npz").exists():
-            raise InputError(f"{folder}: holds no drape; --overwrite replaces nothing else")
-    draper = load(args.weights, model=_model(args.body), device=device_of(args.device))
-    garment = _garment(args)
-    motion = _motion(args.motion, args.seconds, args.seed, args.fps, args.motion_up)
-    shape = _shape(draper.model, args.shape)
-    console = Console(stderr=True)
+    from .draping import inputs, load, output
+    from .garment import Garment
+
+    output.check_folder(args.output, args.overwrite)
+    model = inputs.body_model(args.body)
+    draper = load(args.weights, model=model, device=device_of(args.device))
+    garment = Garment.named(
+        args.garment,
+        made_for=args.made_for,
+        loose=args.loose,
+        scale=args.scale,
+        up=args.up,
+        turn=args.turn,
+        offset=tuple(args.offset),
+    )
+    motion = inputs.motion_of(
+        args.motion, seconds=args.seconds, seed=args.seed, fps=args.fps, up=args.motion_up
+    )
+    shape = inputs.shape_of(model, args.shape)
     for repair in garment.repairs:
-        console.print(f"{args.garment}: {repair}")
-    draper.ease(garment)  # cut and tried on once for all motions, so it does not count
-    start = time.perf_counter()
-    drape = draper.drape(garment, motion, shape, post=args.post)
-    seconds = time.perf_counter() - start
-    figures = drape.measures().as_dict()
-    T, N = drape.vertices.shape[:2]
-    console.print(
-        f"{N} vertices in {T} frames: {1e3 * seconds / T:.1f} ms a frame,"
-        f" {figures['collision']:.2f} % of the vertices inside the body"
-    )
-    about = dict(
-        garment=args.garment,
-        motion=motion.name,
-        weights=args.weights,
-        shape=shape.tolist(),
+        print(f"{args.garment}: {repair}", file=sys.stderr)
+    outcome = output.drape_into(
+        args.output,
+        draper,
+        garment,
+        motion,
+        shape,
+        about=dict(garment=args.garment, motion=motion.name, weights=args.weights),
         post=args.post,
-        vertices=N,
-        frames=T,
+        skip=args.skip,
+        meshes=args.meshes,
+        size=args.size,
+        spp=args.spp,
     )
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-    )
-    with (
-        Progress(*columns, console=console) as progress,
-        folder_aside(folder, lambda name: True) as temporary,
-    ):
-        task = progress.add_task("rendering", total=T, visible="render" not in args.skip)
-        write(
-            drape,
-            temporary,
-            skip=args.skip,
-            meshes=args.meshes,
-            size=args.size,
-            spp=args.spp,
-            advance=lambda: progress.advance(task),
-        )
-        (Path(temporary) / "figures.json").write_text(
-            json.dumps(about | figures, indent=2) + "\n", encoding="utf-8"
-        )
-    print(folder)
+    print(outcome.as_text(), end="", file=sys.stderr)
+    print(outcome.folder)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from functools import cached_property
 import torch
 
 from onefit.body import AnnyBody, ClosestSurface, skinning
-from onefit.garment import TEMPLATES, Garment, standard_body
+from onefit.garment import Garment, standard_body
 from onefit.garment.charts import PatchedGarment
 from onefit.motion import Motion
 from onefit.network.weights import Trained
@@ -82,9 +82,7 @@ class Draper:
         if isinstance(garment, Garment):
             return garment
         if str(garment) not in self._garments:
-            self._garments[str(garment)] = (
-                Garment.template(garment) if garment in TEMPLATES else Garment.read(garment)
-            )
+            self._garments[str(garment)] = Garment.named(garment)
         return self._garments[str(garment)]
 
     def patched(self, garment):

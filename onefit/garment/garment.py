@@ -57,6 +57,20 @@ class Garment:
             return cls.bound(name, file["vertices"], file["faces"])
 
     @classmethod
+    def named(cls, name, **options):
+        """A template by its name, or else the garment of a mesh file, with the ``options`` of
+        :meth:`read`. Raises InputError.
+        """
+        if name in TEMPLATES:
+            return cls.template(name)
+        if not Path(name).suffix and not Path(name).exists():
+            raise InputError(
+                f"garment '{name}': no such template; there are {', '.join(TEMPLATES)}; or give an"
+                " .obj or .ply file"
+            )
+        return cls.read(name, **options)
+
+    @classmethod
     def read(
         cls,
         path,

@@ -6,5 +6,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
         "data": ["TrainingData"],
+        "loop": ["OneFitTraining", "data_of", "train"],
+        "settings": ["STANDARD", "Settings"],
     },
 )

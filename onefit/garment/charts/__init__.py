@@ -7,6 +7,8 @@ import lazy_loader
 __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
-        "patched": ["Deformation", "PatchedGarment", "SparseMatrix"],
+        "deformation": ["Deformation"],
+        "patched": ["PatchedGarment"],
+        "sparse": ["SparseMatrix"],
     },
 )

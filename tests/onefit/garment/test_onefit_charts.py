@@ -8,7 +8,8 @@ from onefit.body import AnnyBody, ClosestSurface, skinning
 from onefit.body.nearest import FAR
 from onefit.garment import TEMPLATES, Garment, standard_surface
 from onefit.garment.charts import Deformation, PatchedGarment, SparseMatrix
-from onefit.garment.charts.patched import AROUND, LEVEL, _steady_jets
+from onefit.garment.charts.blending import DRIFT_WIDTH, SLOPE_RIDGE
+from onefit.garment.charts.frames import steady_jets
 from onefit.garment.remesh import loops
 from onefit.garment.waistband import BAND, held
 from onefit.objective import losses, objective
@@ -55,7 +56,7 @@ def points_of(patched, d, t, uv, patch):
 
 
 def room(patched):
-    return torch.as_tensor(patched.room, dtype=torch.float32)[:, None]
+    return torch.as_tensor(patched.drift_scale, dtype=torch.float32)[:, None]
 
 
 def drifted(patched, drift, uv, patch):
@@ -72,9 +73,11 @@ def drifted(patched, drift, uv, patch):
     for k in range(len(T)):
         around = (meet[meet[k]].any(0)).nonzero()[:, 0]
         away = T[around] - T[k]
-        w = (-(away.square().sum(1)) / (AROUND * length) ** 2 / 2).exp()  # the root of the weights
+        w = (
+            -(away.square().sum(1)) / (DRIFT_WIDTH * length) ** 2 / 2
+        ).exp()  # the root of the weights
         b = torch.cat([torch.ones(len(around), 1), (away @ R[k])[:, :2] / s[k]], 1)
-        held = torch.diag(torch.tensor([0.0, LEVEL, LEVEL]).sqrt()) * w.norm()
+        held = torch.diag(torch.tensor([0.0, SLOPE_RIDGE, SLOPE_RIDGE]).sqrt()) * w.norm()
         planes.append(
             torch.linalg.lstsq(
                 torch.cat([w[:, None] * b, held]),
@@ -345,7 +348,7 @@ def test_jets_of_strips_stay_within_reason():
     )
     patch = torch.arange(2).repeat_interleave(200)
     alone = jets.fit(x[:200], 4).alpha
-    strip, whole = _steady_jets(x, patch, torch.ones(400, dtype=torch.float64), 2, 4)
+    strip, whole = steady_jets(x, patch, torch.ones(400, dtype=torch.float64), 2, 4)
     assert alone.abs().max() > 10 > 1 > strip.abs().max()
     assert (jets.height(strip, uv) - z).square().mean().sqrt() < 0.012
     # cloth on all of the chart is fitted as it is

@@ -7,7 +7,7 @@ import pytest
 import torch
 from places import ROOT
 
-from onefit import train
+from onefit import training
 from onefit.garment import Garment, standard_body, standard_surface
 from onefit.garment.remesh import loops
 from onefit.garment.sewing import cuts, patterns
@@ -118,15 +118,15 @@ def test_what_was_sewn_is_read_again_and_trained_on(block, sewn, tmp_path, monke
     assert torch.equal(first[0].vertices, again[0].vertices) and torch.equal(
         first[0].faces, again[0].faces
     )
-    settings = train.Settings(
+    settings = training.Settings(
         garments=("tank",), batch=300, epochs=1, epoch_steps=2, shapes=1, seeds=1, cuts=1
     )
-    assert train.train(settings, tmp_path / "out").exists()
+    assert training.train(settings, tmp_path / "out").exists()
 
 
 def test_a_negative_number_of_cuts_is_refused(tmp_path):
     with pytest.raises(InputError, match="cuts = -1: 0 at least"):
-        replace(train.Settings(), cuts=-1)
+        replace(training.Settings(), cuts=-1)
     flags = [sys.executable, "-m", "onefit.train", "--cuts", "-1", "-o", str(tmp_path / "out")]
     done = subprocess.run(flags, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 2 and not (tmp_path / "out").exists()

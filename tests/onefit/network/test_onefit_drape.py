@@ -1,4 +1,5 @@
 import json
+import os
 import subprocess
 import sys
 
@@ -95,6 +96,7 @@ def test_what_is_there_is_not_lost(out, network):
             "motion tango: no such file, and no kind of motion; there are idle, walk",
         ),
         (("tuxedo.obj", "walk"), "tuxedo.obj: no such file"),
+        (("tuxedo", "walk"), "garment 'tuxedo': no such template; there are tshirt, dress, tank"),
         (("shorts", "walk", "--shape", "girth=3"), "--shape girth=3: choose among gender, age"),
         (("shorts", "walk", "--shape", "weight=heavy"), "--shape weight=heavy: a number is needed"),
         (("shorts", "walk", "--shape", "weight=2"), "weight = 2; phenotypes go from 0 to 1"),
@@ -106,6 +108,29 @@ def test_refused_in_one_line(arguments, message, network, tmp_path):
         drape.main([*arguments, "-o", str(tmp_path / "out"), "--weights", network])
     assert message in str(caught.value)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_name_of_no_garment_ends_in_one_line_with_the_templates(tmp_path):
+    command = [sys.executable, "-m", "onefit.drape", "tuxedo", "dance", "-o", str(tmp_path / "out")]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 2 and done.stdout == ""
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("error: garment 'tuxedo': no such template; there are tshirt, dress")
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_summary_is_in_lines_that_fit_a_terminal(network, tmp_path):
+    command = [
+        sys.executable, "-m", "onefit.drape", "shorts", "walk", "-o", str(tmp_path / "out"),
+        "--weights", network, "--seconds", "0.1", "--skip", "usd", "render",
+    ]  # fmt: skip
+    done = subprocess.run(
+        command, capture_output=True, text=True, cwd=ROOT, env=os.environ | {"COLUMNS": "80"}
+    )
+    assert done.stdout.strip() == str(tmp_path / "out")
+    lines = [line for line in done.stderr.splitlines() if line.strip()]
+    assert [line.partition(":")[0] for line in lines] == ["frames", "speed", "inside the body"]
+    assert max(map(len, lines)) < 80
 
 
 def test_importing_onefit_is_quick_and_loads_nothing_heavy():

@@ -13,6 +13,7 @@ from safetensors.torch import load_file
 import onefit
 from onefit import train
 from onefit.objective import Weights
+from onefit.training import OneFitTraining, Settings, data_of, loop
 from onefit.training.data import LENGTH
 from polyfit.errors import InputError
 from polyfit.training import Processes
@@ -36,7 +37,7 @@ def motion(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def small(motion):
-    return train.Settings(
+    return Settings(
         garments=("shorts",),
         motions=(motion,),
         batch=600,
@@ -72,19 +73,17 @@ def test_motions_are_read_as_the_flags_say(motion, tmp_path):
 
     args = ["shorts", "--motions", motion, "--fps", "20", "--motion-up", "z", "--shapes", "1"]
     args = train.parser().parse_args([*args, "-o", str(tmp_path)])
-    settings = train.Settings(
+    settings = Settings(
         garments=("shorts",), motions=(motion,), fps=args.fps, motion_up=args.motion_up, shapes=1
     )
-    (read,) = train._data(settings, str(tmp_path), Progress()).motions
+    (read,) = data_of(settings, str(tmp_path), Progress()).motions
     assert len(read.poses) == 46  # 31 frames at 20 a second last 1.5 s
     with pytest.raises(InputError, match="lies down throughout"):
-        train._data(replace(settings, motion_up="y"), str(tmp_path), Progress())
+        data_of(replace(settings, motion_up="y"), str(tmp_path), Progress())
 
 
 def test_training_lowers_the_loss(small, data):
-    training = train.OneFitTraining(
-        replace(small, epochs=1, epoch_steps=60), data, Processes("cpu")
-    )
+    training = OneFitTraining(replace(small, epochs=1, epoch_steps=60), data, Processes("cpu"))
 
     def loss():
         with torch.no_grad():
@@ -111,13 +110,13 @@ def test_each_loss_has_a_switch(small, data):
         k_in="inertia",
     )
     for switch, name in names.items():
-        training = train.OneFitTraining(
+        training = OneFitTraining(
             replace(small, weights=Weights(**{switch: 0.0})), data, Processes("cpu")
         )
         with torch.no_grad():
             terms = training.loss(torch.Generator().manual_seed(0))
         assert set(terms) == (set(names.values()) | {"boundary"}) - {name}
-    training = train.OneFitTraining(
+    training = OneFitTraining(
         replace(small, weights=Weights(k_b=0.0, k_bn=0.0)), data, Processes("cpu")
     )
     with torch.no_grad():
@@ -125,7 +124,7 @@ def test_each_loss_has_a_switch(small, data):
 
 
 def test_the_rate_falls_to_a_tenth(small, data):
-    training = train.OneFitTraining(small, data, Processes("cpu"))
+    training = OneFitTraining(small, data, Processes("cpu"))
     rates = []
     for _ in range(5):
         training.step()
@@ -134,12 +133,12 @@ def test_the_rate_falls_to_a_tenth(small, data):
 
 
 def test_a_step_that_is_not_finite_is_stepped_over(small, data, monkeypatch, capsys):
-    training = train.OneFitTraining(small, data, Processes("cpu"))
+    training = OneFitTraining(small, data, Processes("cpu"))
     training.step()
     before = {k: v.clone() for k, v in training.network.state_dict().items()}
-    loss = train.OneFitTraining.loss
+    loss = OneFitTraining.loss
     monkeypatch.setattr(
-        train.OneFitTraining,
+        OneFitTraining,
         "loss",
         lambda self, g: {
             k: v * float("nan") if k == "gravity" else v for k, v in loss(self, g).items()
@@ -166,9 +165,9 @@ def one_thread():
 
 
 def test_a_resumed_training_ends_where_an_uninterrupted_one_does(small, tmp_path, one_thread):
-    whole = train.train(small, tmp_path / "whole", command="python -m onefit.train ...")
-    assert train.train(small, tmp_path / "parts", until=3) is None
-    resumed = train.train(small, tmp_path / "parts", resume=True)
+    whole = loop.train(small, tmp_path / "whole", command="python -m onefit.train ...")
+    assert loop.train(small, tmp_path / "parts", until=3) is None
+    resumed = loop.train(small, tmp_path / "parts", resume=True)
     a, b = load_file(whole), load_file(resumed)
     assert a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a)
     about = json.loads(whole.with_suffix(".json").read_text())
@@ -183,9 +182,9 @@ def test_a_resumed_training_ends_where_an_uninterrupted_one_does(small, tmp_path
     ]
     assert lines[-1]["step"] == 8 and {"loss", "collision", "inertia", "lr"} <= set(lines[-1])
     with pytest.raises(InputError, match="a checkpoint of other settings"):
-        train.train(replace(small, seed=5), tmp_path / "parts", resume=True)
+        loop.train(replace(small, seed=5), tmp_path / "parts", resume=True)
     # and it can be gone on from, with another garment
-    tuned = train.train(
+    tuned = loop.train(
         replace(small, garments=("tank",), start=str(whole), epochs=1, epoch_steps=1),
         tmp_path / "tuned",
     )
@@ -244,7 +243,7 @@ def test_two_processes_of_torchrun_have_the_curve_of_one(small, tmp_path):
     # three steps of 1e-3 at most; where a gradient is nearly zero, Adam makes much of its rounding
     apart = torch.cat([(two[k] - one[k]).abs().flatten() for k in one if k.startswith("network.")])
     assert apart.max() < 1e-3 and apart.mean() < 1e-5
-    fresh = train.OneFitTraining(
+    fresh = OneFitTraining(
         replace(small, epochs=1, epoch_steps=3), _Nothing(), Processes("cpu")
     ).network.state_dict()
     moved = torch.cat([(one[f"network.{k}"] - v).abs().flatten() for k, v in fresh.items()])
@@ -273,7 +272,7 @@ class _Nothing:
 )
 def test_settings_are_checked(change, message):
     with pytest.raises(InputError, match=message):
-        train.Settings(**change)
+        Settings(**change)
 
 
 def test_a_wrong_name_ends_in_one_line(tmp_path):
@@ -286,3 +285,4 @@ def test_a_wrong_name_ends_in_one_line(tmp_path):
     assert done.returncode == 2
     assert done.stderr.strip().splitlines()[-1].startswith("error: tuxedo.obj: no such file")
     assert "Traceback" not in done.stderr
+    assert not (tmp_path / "out").exists()

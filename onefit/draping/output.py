@@ -1,0 +1,143 @@
+"""The files of a drape: arrays, animations, meshes, pictures, a video."""
+
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from polyfit.animation import write_frames, write_usd
+from polyfit.errors import InputError
+from polyfit.files import aside, folder_aside
+
+GARMENT_COLOUR, BODY_COLOUR = (0.08, 0.19, 0.42), (0.5, 0.48, 0.46)  # linear RGB
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a drape took and how good it is. ``folder``: where it lies; ``frames``, ``vertices``:
+    how many; ``seconds``: what draping took; ``figures``: its measures by name.
+    """
+
+    folder: Path
+    frames: int
+    vertices: int
+    seconds: float
+    figures: dict
+
+    def as_text(self):
+        """One fact a line."""
+        return (
+            f"frames: {self.frames}, of {self.vertices} vertices\n"
+            f"speed: {1e3 * self.seconds / self.frames:.1f} ms a frame\n"
+            f"inside the body: {self.figures['collision']:.2f} % of the vertices\n"
+        )
+
+
+def check_folder(folder, overwrite):
+    """Raises InputError where ``folder`` holds something that a drape must not replace."""
+    folder = Path(folder)
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        if not overwrite:
+            raise InputError(f"{folder}: not empty; give another -o, or --overwrite")
+        if not (folder / "drape.npz").exists():
+            raise InputError(f"{folder}: holds no drape; --overwrite replaces nothing else")
+
+
+def drape_into(folder, draper, garment, motion, shape, *, about, post=False, **files):
+    """Drape and write all files; returns the :class:`Outcome`.
+
+    ``folder``: new, empty or holding a drape, which is replaced at the end. ``draper``,
+    ``garment``, ``motion``, ``shape``, ``post``: as :meth:`onefit.Draper.drape` takes them.
+    ``about``: names for figures.json; ``files``: options of :func:`write`. Progress goes to
+    stderr.
+    """
+    folder = Path(folder)
+    draper.ease(garment)  # cut and tried on once for all motions, so it does not count
+    start = time.perf_counter()
+    drape = draper.drape(garment, motion, shape, post=post)
+    seconds = time.perf_counter() - start
+    T, N = drape.vertices.shape[:2]
+    outcome = Outcome(folder, T, N, seconds, drape.measures().as_dict())
+    about = about | dict(shape=shape.tolist(), post=post, vertices=N, frames=T) | outcome.figures
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+    )
+    with (
+        Progress(*columns, console=Console(stderr=True)) as progress,
+        folder_aside(folder, lambda name: True) as temporary,
+    ):
+        visible = "render" not in files.get("skip", ())
+        task = progress.add_task("rendering", total=T, visible=visible)
+        write(drape, temporary, advance=lambda: progress.advance(task), **files)
+        (Path(temporary) / "figures.json").write_text(
+            json.dumps(about, indent=2) + "\n", encoding="utf-8"
+        )
+    return outcome
+
+
+def _render(drape, folder, size, spp, advance):
+    """PNG frames and a video; Mitsuba is loaded here alone."""
+    from polysft_mi.backend import set_variant
+
+    set_variant()
+    import cv2
+
+    from polysft_mi.pictures.video import write_video
+    from polysft_mi.render import stage
+
+    parts = [
+        (drape.body.numpy(), drape.body_faces.numpy(), BODY_COLOUR),
+        (drape.vertices.numpy(), drape.faces.numpy(), GARMENT_COLOUR),
+    ]
+    frames = folder / "frames"
+    frames.mkdir()
+
+    def pictures():
+        for k, image in enumerate(stage.render(parts, size=size, spp=spp)):
+            cv2.imwrite(str(frames / f"{k:03d}.png"), image[..., ::-1])
+            advance()
+            yield image
+
+    write_video(folder / "drape.mp4", pictures(), drape.fps)
+
+
+def write(drape, folder, *, skip=(), meshes=None, size=(480, 360), spp=32, advance=lambda: None):
+    """The files of a :class:`onefit.Drape` in the empty ``folder``; ``skip``: any of "usd",
+    "render".
+    """
+    folder = Path(folder)
+    arrays = {
+        name: getattr(drape, name).numpy()
+        for name in ("vertices", "faces", "rest", "body", "body_faces", "root")
+    }
+    with aside(folder / "drape.npz") as temporary:
+        np.savez_compressed(temporary, fps=drape.fps, **arrays)
+    if "usd" not in skip:
+        write_usd(
+            folder / "garment.usd",
+            arrays["vertices"],
+            arrays["faces"],
+            fps=drape.fps,
+            up="z",
+            name="garment",
+        )
+        write_usd(
+            folder / "body.usd",
+            arrays["body"],
+            arrays["body_faces"],
+            fps=drape.fps,
+            up="z",
+            name="body",
+        )
+    if meshes:
+        write_frames(folder / "meshes", meshes, arrays["vertices"], arrays["faces"], up="z")
+    if "render" not in skip:
+        _render(drape, folder, size, spp, advance)

@@ -1,0 +1,48 @@
+"""What decides the result of a training."""
+
+from dataclasses import dataclass, field
+
+from onefit.objective import Weights
+from polyfit.errors import InputError
+
+# the paper's six garments
+STANDARD = ("tshirt", "dress", "trousers", "shorts", "long_sleeve_top", "tank")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What decides the result. ``fps`` and ``motion_up``: of the files of ``motions``, as
+    :meth:`onefit.Motion.read` takes them; ``batch``: patches of a step, all frames together
+    (the paper's 20,000); ``lr`` for the first ``lr_epochs`` epochs, a tenth of it for the rest; an
+    epoch has ``epoch_steps`` steps (0: as many as show each window of the motions once); ``cuts``:
+    how many random cuts (:mod:`onefit.garment.sewing.cuts`) are trained on beside the garments.
+    """
+
+    garments: tuple = STANDARD
+    motions: tuple = ()
+    fps: float | None = None
+    motion_up: str | None = None
+    start: str = ""
+    order: int = 4
+    batch: int = 20_000
+    epochs: int = 30
+    lr_epochs: int = 10
+    epoch_steps: int = 0
+    lr: float = 1e-3
+    seeds: int = 4
+    shapes: int = 48
+    cuts: int = 0
+    seed: int = 0
+    weights: Weights = field(default_factory=Weights)
+
+    def __post_init__(self):
+        for name in ("batch", "epochs", "seeds"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name} = {getattr(self, name)}: 1 at least")
+        for name in ("epoch_steps", "lr_epochs", "shapes", "cuts"):
+            if getattr(self, name) < 0:
+                raise InputError(f"{name} = {getattr(self, name)}: 0 at least")
+        if not 2 <= self.order <= 10:
+            raise InputError(f"order = {self.order}; the order of OneFit's jets is 2 to 10")
+        if not self.lr > 0:
+            raise InputError(f"lr = {self.lr}: more than 0")
