@@ -1,7 +1,10 @@
 """The pinhole camera: intrinsics K in pixels, read, checked, and written as a Mitsuba sensor."""
 
+from __future__ import annotations
+
 import json
 import math
+import os
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +28,7 @@ class Intrinsics:
     width: int
     height: int
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         values = (self.fx, self.fy, self.cx, self.cy)
         if not all(math.isfinite(v) for v in values) or min(self.fx, self.fy) <= 0:
             raise InputError(
@@ -37,17 +40,19 @@ class Intrinsics:
                 f"camera: image size {self.width}x{self.height}; both must be positive"
             )
 
-    def matrix(self):
+    def matrix(self) -> np.ndarray:
         """K, shape (3, 3)."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=np.float64)
 
-    def project(self, points):
+    def project(self, points: np.ndarray) -> np.ndarray:
         """Pixels (N, 2) of the points (N, 3) [m, camera frame]."""
         points = np.asarray(points, dtype=np.float64)
         return points[:, :2] / points[:, 2:] * (self.fx, self.fy) + (self.cx, self.cy)
 
     @classmethod
-    def from_matrix(cls, K, width, height, where="camera"):
+    def from_matrix(
+        cls, K: np.ndarray, width: int, height: int, where: str = "camera"
+    ) -> Intrinsics:
         """From K (3, 3). Raises InputError where K is not that of a pinhole without skew."""
         K = np.asarray(K, dtype=np.float64)
         if K.shape != (3, 3) or not np.isfinite(K).all():
@@ -67,7 +72,7 @@ class Intrinsics:
         return cls(K[0, 0], K[1, 1], K[0, 2], K[1, 2], int(width), int(height))
 
     @classmethod
-    def from_json(cls, path):
+    def from_json(cls, path: str | os.PathLike[str]) -> Intrinsics:
         """From a JSON file with the keys fx, fy, cx, cy, width, height."""
         try:
             with open(path, encoding="utf-8") as file:
@@ -79,11 +84,8 @@ class Intrinsics:
         except (json.JSONDecodeError, UnicodeDecodeError) as error:
             raise InputError(f"{path}: not JSON ({error})") from None
         try:
-            return cls(
-                *(float(data[k]) for k in ("fx", "fy", "cx", "cy")),
-                int(data["width"]),
-                int(data["height"]),
-            )
+            fx, fy, cx, cy = (float(data[k]) for k in ("fx", "fy", "cx", "cy"))
+            return cls(fx, fy, cx, cy, int(data["width"]), int(data["height"]))
         except (KeyError, TypeError, ValueError) as error:
             if isinstance(error, InputError):
                 raise InputError(f"{path}: {error}") from None
@@ -91,7 +93,7 @@ class Intrinsics:
                 f"{path}: {error} missing or not a number; fx, fy, cx, cy, width, height are needed"
             ) from None
 
-    def sensor_xml(self, indent="    "):
+    def sensor_xml(self, indent: str = "    ") -> str:
         """The ``<sensor>`` element: Mitsuba's ``perspective`` where the pixels are square, else our
         ``pinhole``.
 

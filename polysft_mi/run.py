@@ -2,6 +2,8 @@
 video.
 """
 
+from __future__ import annotations
+
 import contextlib
 import gc
 import json
@@ -9,6 +11,7 @@ import os
 import shlex
 import sys
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from . import commands
@@ -118,11 +121,11 @@ class Outcome:
     seconds: float = 0.0
     interrupted: bool = False
 
-    def as_json(self):
+    def as_json(self) -> dict:
         """The summary as one object, with ``out``, ``seconds`` and ``report``."""
         return {"out": self.out, "seconds": self.seconds, "report": self.report, **self.summary}
 
-    def as_text(self):
+    def as_text(self) -> str:
         """What the command prints: one fact a line, last the file to open."""
         if not self.summary:
             return ""
@@ -142,19 +145,19 @@ class Outcome:
 
 
 def reconstruct(
-    scene,
-    out,
-    overrides=None,
+    scene: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    overrides: Mapping[str, object] | None = None,
     *,
-    variant=None,
-    resume=False,
-    overwrite=False,
-    exr_frames=20,
-    fps=15,
-    report=True,
-    quiet=True,
-    command="polysft_mi.reconstruct",
-):
+    variant: str | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+    exr_frames: int = 20,
+    fps: float = 15,
+    report: bool = True,
+    quiet: bool = True,
+    command: str | None = "polysft_mi.reconstruct",
+) -> Outcome:
     """Reconstruct the surface in every frame of a scene's video: what ``polysft run`` does.
 
     ``scene``: the path of the scene; ``out``: the folder for the results; ``overrides``: name to
@@ -167,6 +170,7 @@ def reconstruct(
     Returns the :class:`Outcome`; Ctrl-C ends the run early and keeps the frames that are done.
     Raises InputError.
     """
+    scene, out = os.fspath(scene), os.fspath(out)
     from .backend import set_variant
     from .scene.defaults import resolved_defaults
 

@@ -4,19 +4,24 @@ checkpoints.
 Import only after a Mitsuba variant is set.
 """
 
+from __future__ import annotations
+
 import json
 import math
 import os
 import time
 import zipfile
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from .errors import BadFrame, InputError
 from .files import aside, naming
-from .objective.problem import TERMS
+from .objective.problem import TERMS, Problem
 from .render.device import interruptible
+from .solvers import Solver
 from .surface.patch import Unknowns
 
 CHECKPOINT, LOG = "checkpoint.npz", "log.jsonl"
@@ -49,8 +54,10 @@ class Track:
     sigma: dict = field(default_factory=dict)
     finished: bool = False
 
-    def save(self, path):
-        arrays = {name: np.stack([s[name] for s in self.states]) for name in Unknowns.NAMES}
+    def save(self, path: str | os.PathLike[str]) -> None:
+        arrays: dict[str, Any] = {
+            name: np.stack([s[name] for s in self.states]) for name in Unknowns.NAMES
+        }
         meta = {
             k: getattr(self, k)
             for k in (
@@ -64,7 +71,7 @@ class Track:
             )
         }
         known = sorted(self.sigma)
-        sigma = (
+        sigma: dict[str, Any] = (
             {
                 "sigma_frames": np.array(known, dtype=np.int64),
                 "sigma": np.stack([self.sigma[k] for k in known]),
@@ -76,7 +83,7 @@ class Track:
             np.savez(temporary, meta=json.dumps(meta), **arrays, **sigma)
 
     @classmethod
-    def load(cls, path):
+    def load(cls, path: str | os.PathLike[str]) -> Track:
         try:
             with np.load(path) as data:
                 meta = json.loads(str(data["meta"]))
@@ -100,7 +107,16 @@ class Track:
         )
 
 
-def track(problem, solver, frames, out, *, resume=False, progress=None, solved=None):
+def track(
+    problem: Problem,
+    solver: Solver,
+    frames: int,
+    out: str | os.PathLike[str],
+    *,
+    resume: bool = False,
+    progress: Callable[[int, int, float, dict], None] | None = None,
+    solved: Callable[[int, np.ndarray], None] | None = None,
+) -> Track:
     """Solve window after window; checkpoints and the log go to the folder ``out``. Returns the
     :class:`Track`.
 

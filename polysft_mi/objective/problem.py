@@ -4,8 +4,11 @@ It knows the scene, the template's patch, the images and the weights; it knows n
 minimised. Import only after a Mitsuba variant is set.
 """
 
+from __future__ import annotations
+
 from collections import OrderedDict
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -16,9 +19,13 @@ from polysft_mi.render.device import interruptible
 from polysft_mi.render.pinhole import Pinhole
 from polysft_mi.render.raster import RasterIntegrator
 from polysft_mi.scene.rules import Rules
-from polysft_mi.surface.patch import JetPatch
+from polysft_mi.surface.patch import JetPatch, Unknowns
 
 from . import terms as objective
+
+if TYPE_CHECKING:
+    from polysft_mi.scene.experiment import Experiment
+    from polysft_mi.scene.sequence import Sequence
 
 TERMS = ("rgb", "silhouette", "inextensibility", "temporal")
 _CACHED_FRAMES = 8
@@ -45,8 +52,8 @@ class Target:
     """
 
     rgb: mi.TensorXf
-    mask: mi.Float
-    area: mi.Float
+    mask: mi.Float | None
+    area: mi.Float | None
 
 
 class Problem:
@@ -56,7 +63,9 @@ class Problem:
     :class:`polysft_mi.scene.sequence.Sequence`.
     """
 
-    def __init__(self, experiment, sequence, rules=None):
+    def __init__(
+        self, experiment: Experiment, sequence: Sequence, rules: Rules | None = None
+    ) -> None:
         self.rules = rules or Rules()
         self.experiment, self.sequence, self.settings = experiment, sequence, experiment.settings
         self.template = experiment.template
@@ -78,15 +87,15 @@ class Problem:
         # with
         self._params = mi.traverse(experiment.scene)
         self._key = _positions_key(self._params, experiment.mesh)
-        self._targets = OrderedDict()
-        self.texcoords = None
+        self._targets: OrderedDict[int, Target] = OrderedDict()
+        self.texcoords: np.ndarray | None = None
         self.camera = Pinhole(experiment.sensor)
         self._setup_renderer()
 
     # -- rendering ----------------------------------------------------------
 
     def _setup_renderer(self):
-        renderer = self.experiment.renderer
+        renderer: Any = self.experiment.renderer
         renderer.hide_emitters = (
             True  # what is behind the surface is black, with a silhouette's gradient towards black
         )
@@ -100,7 +109,7 @@ class Problem:
                 )
             self._mask_renderer = mi.load_dict({"type": "silhouette_projective"})
 
-    def place(self, vertices):
+    def place(self, vertices: mi.Point3f) -> None:
         """Put the surface (Point3f of N, attached or not) into the scene."""
         points = vertices
         if (
@@ -110,7 +119,7 @@ class Problem:
         self._params[self._key] = dr.ravel(points)
         self._params.update()
 
-    def set_texcoords(self, texcoords):
+    def set_texcoords(self, texcoords: mi.Float) -> None:
         """Replace the template's texture coordinates (Float of 2V, in the order of the rendered
         mesh); ``texcoords`` (NumPy) tells them.
         """
@@ -119,14 +128,15 @@ class Problem:
         self._params[key] = texcoords
         self._params.update()
 
-    def image(self, vertices, seed=0):
+    def image(self, vertices: mi.Point3f, seed: int = 0) -> tuple[mi.TensorXf, mi.Float]:
         """Render the surface: (rgb tensor (H, W, 3), alpha Float of P), attached to the
         vertices.
         """
         self.place(vertices)
+        renderer: Any = self.experiment.renderer
         scene, sensor, spp = self.experiment.scene, self.experiment.sensor, self.settings.spp
         if self._raster:
-            image = self.experiment.renderer.image(scene, sensor, seed, spp)
+            image = renderer.image(scene, sensor, seed, spp)
             alpha = None
         else:
             image = mi.render(
@@ -164,7 +174,7 @@ class Problem:
 
     # -- images -------------------------------------------------------------
 
-    def target(self, frame):
+    def target(self, frame: int) -> Target:
         """The image of the frame (counted in the selection), as the objective wants it."""
         if frame not in self._targets:
             rgb, mask = self.sequence.frame(frame), self.sequence.mask(frame)
@@ -192,7 +202,7 @@ class Problem:
 
     # -- objective ----------------------------------------------------------
 
-    def frame_terms(self, unknowns, frame, seed=0):
+    def frame_terms(self, unknowns: Unknowns, frame: int, seed: int = 0) -> dict[str, mi.Float]:
         """The weighted per-frame terms of the objective, name to Float of 1, attached."""
         s = self.settings
         vertices = self.patch.vertices(unknowns)
@@ -240,11 +250,13 @@ class Problem:
             for c in range(3)
         ]
 
-    def temporal_term(self, window):
+    def temporal_term(self, window: list[Unknowns]) -> mi.Float:
         """The weighted temporal consistency of a list of Unknowns, a Float of 1, attached."""
         return self.settings.k_tc * objective.temporal(window)
 
-    def evaluate(self, window, frames, *, backward=False, seed=0):
+    def evaluate(
+        self, window: list[Unknowns], frames: list[int], *, backward: bool = False, seed: int = 0
+    ) -> tuple[float, dict[str, float]]:
         """The objective over a window: (total, terms), numbers; with ``backward``, the gradients
         are added to the unknowns.
 
@@ -281,7 +293,7 @@ class Problem:
         dr.eval()
         return values
 
-    def check_start(self):
+    def check_start(self) -> None:
         """Raise InputError where the template, as the scene places it, cannot be seen in the first
         frame.
         """
@@ -337,13 +349,13 @@ class Problem:
                 f" prb_projective is needed ({cause[:120]})"
             ) from None
 
-    def visible_share(self, unknowns):
+    def visible_share(self, unknowns: Unknowns) -> float:
         """Share of the vertices that are before the camera and inside the image."""
         position, inside = self.camera.project(self.surface(unknowns))
         inside &= (position >= 0).all(1) & (position <= (self.width, self.height)).all(1)
         return float(inside.mean())
 
-    def surface(self, unknowns):
+    def surface(self, unknowns: Unknowns) -> np.ndarray:
         """Vertices (N, 3) [m, camera frame] as float32 NumPy."""
         with dr.suspend_grad():
             return np.array(self.patch.vertices(unknowns)).T.astype(np.float32).copy()

@@ -4,8 +4,11 @@
 sequence are.
 """
 
+from __future__ import annotations
+
 import json
 import os
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -75,7 +78,7 @@ def image_figures(out):
     }
 
 
-def score(surface, truth):
+def score(surface: Mapping[str, np.ndarray], truth: Truth | str | os.PathLike[str]) -> dict:
     """The figures of a reconstruction: a dict of numbers, its keys by the kind of truth.
 
     ``surface`` maps ``vertices`` (T, N, 3) [m], ``faces`` (F, 3), ``frames`` (T,), and perhaps
@@ -85,7 +88,7 @@ def score(surface, truth):
     """
     truth = truth if isinstance(truth, Truth) else Truth.open(truth)
     columns = per_frame(surface, truth)
-    summary = {"frames": len(columns["frame"])}
+    summary: dict = {"frames": len(columns["frame"])}
     for name, values in columns.items():
         if name != "frame":
             summary[name] = float(np.mean(values))

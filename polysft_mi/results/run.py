@@ -1,5 +1,7 @@
 """What a run left in its folder, read back without Mitsuba."""
 
+from __future__ import annotations
+
 import json
 import os
 import re
@@ -34,7 +36,7 @@ class Run:
     about: dict = field(default_factory=dict)
 
     @classmethod
-    def open(cls, folder):
+    def open(cls, folder: str | os.PathLike[str]) -> Run:
         """Read a run's folder. Raises InputError where it is not one, or where the run has not
         ended.
         """
@@ -57,26 +59,25 @@ class Run:
                 f"{os.path.join(folder, 'surface.npz')}: holds no uv of"
                 f" ({surface['vertices'].shape[1]}, 2)"
             )
-        names = ("vertices", "faces", "uv", "frames")
         return cls(
             folder,
-            *(surface[n] for n in names),
-            surface.get("sigma"),
-            read_json(os.path.join(folder, "metrics.json")),
-            read_json(os.path.join(folder, "run.json")),
+            **{name: surface[name] for name in ("vertices", "faces", "uv", "frames")},
+            sigma=surface.get("sigma"),
+            metrics=read_json(os.path.join(folder, "metrics.json")),
+            about=read_json(os.path.join(folder, "run.json")),
         )
 
-    def path(self, *names):
+    def path(self, *names: str) -> str:
         """A path in the run's folder."""
         return os.path.join(self.folder, *names)
 
     @property
-    def fps(self):
+    def fps(self) -> float:
         """Frames a second that the run was given."""
         return float(self.about.get("fps", 15))
 
     @cached_property
-    def camera(self):
+    def camera(self) -> Intrinsics | None:
         """The :class:`polysft_mi.camera.Intrinsics` of the images, None in a folder of an older
         version, which has no camera.json.
         """
@@ -84,12 +85,12 @@ class Run:
         return Intrinsics.from_json(path) if os.path.exists(path) else None
 
     @cached_property
-    def settings(self):
+    def settings(self) -> dict[str, str]:
         """Name to value of every ``<default>`` in force."""
         return known_defaults(self.path("scene.xml"))
 
     @cached_property
-    def texture(self):
+    def texture(self) -> str | None:
         """The path of the template's texture as the scene names it, or None where it names none.
         The file may be gone.
         """
@@ -102,16 +103,16 @@ class Run:
         for texture in (t for place in places for t in place.iter("texture")):
             name = texture.find("string[@name='filename']")
             if name is not None:
-                text = re.sub(r"\$(\w+)", lambda m: defaults.get(m[1], m[0]), name.get("value"))
+                text = re.sub(r"\$(\w+)", lambda m: defaults.get(m[1], m[0]), name.get("value", ""))
                 return located(path, text)
         return None
 
     @cached_property
-    def params(self):
+    def params(self) -> dict[str, np.ndarray]:
         """The arrays of params.npz."""
         return load_npz(self.path("params.npz"))
 
-    def log(self):
+    def log(self) -> list[dict]:
         """The records of log.jsonl."""
         path = self.path("log.jsonl")
         if not os.path.exists(path):
@@ -122,7 +123,7 @@ class Run:
             except ValueError as error:
                 raise InputError(f"{path}: not JSON lines ({error})") from None
 
-    def mean_curvature(self):
+    def mean_curvature(self) -> np.ndarray:
         """Mean curvature (T, N) [1/m] of the jets, without relief, at the vertices, positive where
         the surface bulges towards the camera (by its pose in the first frame).
         """
@@ -147,7 +148,7 @@ class Run:
         return np.sign(up[2]) * out / float(p["scale"])
 
 
-def read_json(path):
+def read_json(path: str) -> dict:
     """The object that a JSON file holds. Raises InputError."""
     try:
         with open(path, encoding="utf-8") as file:

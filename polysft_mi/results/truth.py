@@ -4,6 +4,8 @@ Ground truth is ``gt.npz`` (vertices of every frame), an .npz of depth points, a
 ``cloud_*.npz``, or a sequence's folder that holds one of them.
 """
 
+from __future__ import annotations
+
 import glob
 import os
 import re
@@ -31,7 +33,7 @@ class Truth:
     K: np.ndarray | None = None
 
     @classmethod
-    def open(cls, path):
+    def open(cls, path: str | os.PathLike[str]) -> Truth:
         """The truth in ``path``, a file or a folder as :func:`find_truth` takes it. Raises
         InputError.
         """
@@ -54,7 +56,7 @@ class Truth:
             " needed"
         )
 
-    def at(self, frame):
+    def at(self, frame: int) -> np.ndarray:
         """The vertices or points (N, 3) [m] of a frame, float64."""
         place = self.places[frame]
         if self.kind == "clouds":
@@ -65,10 +67,11 @@ class Truth:
         return place.astype(np.float64)
 
 
-def find_truth(path):
+def find_truth(path: str | os.PathLike[str]) -> str:
     """The ground truth in ``path``: a file as it is, a folder of clouds as it is, else what a
     sequence's folder holds.
     """
+    path = os.fspath(path)
     if not os.path.isdir(path):
         return path
     if glob.glob(os.path.join(glob.escape(path), "cloud_*.npz")):
@@ -84,7 +87,7 @@ def find_truth(path):
     )
 
 
-def read_surface(path):
+def read_surface(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     """The arrays of a ``surface.npz``, or of a run's folder that holds one. Raises InputError where
     it is not of that form.
     """
@@ -128,7 +131,7 @@ def read_surface(path):
     return surface
 
 
-def load_npz(path):
+def load_npz(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     """The arrays of an .npz file, a dict. Raises InputError where it is missing or not such a
     file.
     """

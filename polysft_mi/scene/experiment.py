@@ -4,9 +4,13 @@ defaults.
 Import only after a Mitsuba variant is set.
 """
 
+from __future__ import annotations
+
 import os
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -44,12 +48,17 @@ class Experiment:
     defaults: dict = field(default_factory=dict)
 
     @property
-    def size(self):
+    def size(self) -> tuple[int, int]:
         """(width, height) of the film's crop window, pixels."""
-        return tuple(int(x) for x in self.sensor.film().crop_size())
+        width, height = self.sensor.film().crop_size()
+        return int(width), int(height)
 
 
-def load(path, overrides=None, template=None):
+def load(
+    path: str | os.PathLike[str],
+    overrides: Mapping[str, object] | None = None,
+    template: Template | None = None,
+) -> Experiment:
     """Load a scene file as an :class:`Experiment`; ``overrides`` maps names of its defaults to
     text, ``template`` is the :class:`Template` of the same scene where it is known already.
 
@@ -57,6 +66,7 @@ def load(path, overrides=None, template=None):
     """
     path = os.fspath(path)
     overrides = {k: str(v) for k, v in (overrides or {}).items()}
+    given: dict[str, Any] = dict(overrides)
     defaults = resolved_defaults(path, overrides)
     plugins.register()
     if defaults.get("data") and not os.path.isdir(located(path, defaults["data"])):
@@ -66,7 +76,7 @@ def load(path, overrides=None, template=None):
         )
     source = _source(_check_nodes(path, overrides))
     try:
-        scene = mi.load_file(path, optimize=False, **overrides)
+        scene = mi.load_file(path, optimize=False, **given)
     except Exception as error:  # whatever a plugin raised reaches us wrapped by the parser
         raise InputError(_told(error, path)) from None
 

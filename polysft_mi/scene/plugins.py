@@ -4,6 +4,8 @@
 Import only after a Mitsuba variant is set; :func:`register` may be called any number of times.
 """
 
+from __future__ import annotations
+
 import os
 
 import drjit as dr
@@ -199,7 +201,7 @@ def _varol_template(props):
     return mesh
 
 
-def register():
+def register() -> None:
     """Register every plugin of ours with Mitsuba's current variant."""
     mi.register_integrator("raster", RasterIntegrator)
     mi.register_integrator("silhouette_projective", SilhouetteProjective)

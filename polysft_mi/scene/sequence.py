@@ -2,6 +2,8 @@
 frame at a time.
 """
 
+from __future__ import annotations
+
 import functools
 import os
 from concurrent.futures import ThreadPoolExecutor
@@ -21,12 +23,28 @@ class Sequence:
     selected frame its index in the sorted list of all images; ``size``: (width, height) [pixels].
     """
 
-    def __init__(self, files, mask_files, indices, size, drop_stray):
+    def __init__(
+        self,
+        files: list[str],
+        mask_files: list[str] | None,
+        indices: list[int],
+        size: tuple[int, int],
+        drop_stray: bool,
+    ) -> None:
         self.files, self.mask_files, self.indices, self.size = files, mask_files, indices, size
         self._drop_stray = drop_stray
 
     @classmethod
-    def open(cls, frames, masks="", first=0, last=-1, stride=1, size=None, drop_stray=True):
+    def open(
+        cls,
+        frames: str,
+        masks: str = "",
+        first: int = 0,
+        last: int = -1,
+        stride: int = 1,
+        size: tuple[int, int] | None = None,
+        drop_stray: bool = True,
+    ) -> Sequence:
         """Find, select and check the images.
 
         ``frames``, ``masks``: a folder of images or a glob pattern, sorted by name, numbers in
@@ -63,7 +81,9 @@ class Sequence:
         with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
             sizes = dict(zip(everything, pool.map(checked_size, everything)))
         wanted, why = (
-            (tuple(size), "the camera's film has") if size else (sizes[files[0]], f"{files[0]} has")
+            ((size[0], size[1]), "the camera's film has")
+            if size
+            else (sizes[files[0]], f"{files[0]} has")
         )
         for path in everything:
             if sizes[path] != wanted:
@@ -72,16 +92,17 @@ class Sequence:
                     " must be of that size"
                 )
         sequence = cls(files, mask_files, indices, wanted, drop_stray)
-        if mask_files and not sequence.mask(0).any():
+        first_mask = sequence.mask(0)
+        if mask_files and first_mask is not None and not first_mask.any():
             raise InputError(
                 f"{mask_files[0]}: the mask is empty; the template must be seen in the first frame"
             )
         return sequence
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.files)
 
-    def frame(self, i):
+    def frame(self, i: int) -> np.ndarray:
         """Image i, (H, W, 3) float32, linear RGB in [0, 1].
 
         8 and 16 bit images are taken as sRGB and decoded; float images (EXR, HDR, TIFF) as linear.
@@ -95,7 +116,7 @@ class Sequence:
         )  # OpenCV's order is BGR
         return _linear(image, self.files[i])
 
-    def mask(self, i):
+    def mask(self, i: int) -> np.ndarray | None:
         """Silhouette i, (H, W) float32 in [0, 1]; None without masks.
 
         The largest of the colour channels, in parts of the type's maximum (an 8 or 16 bit mask with

@@ -5,6 +5,8 @@ name=value`` overrides it. ``python -m polysft_mi.scene.settings`` prints them a
 ``docs/scene.md``.
 """
 
+from __future__ import annotations
+
 import dataclasses
 import math
 from dataclasses import dataclass, field
@@ -111,12 +113,12 @@ class Settings:
     lr_rigid: float = _setting(1e-4, "Adam's step size of rotation and translation", low=0)
 
     @property
-    def width(self):
+    def width(self) -> int:
         """Frames that are solved together."""
         return self.window or {"gauss-newton": 1, "adam": 3}[self.solver]
 
     @property
-    def lighting(self):
+    def lighting(self) -> str:
         """The compensation of lighting: none, gain or local."""
         return (
             self.brightness
@@ -125,7 +127,7 @@ class Settings:
         )
 
     @property
-    def jet_order(self):
+    def jet_order(self) -> int:
         """The order of the jet, where the template's vertices determine it."""
         return self.order or {"gauss-newton": 8, "adam": 4}[self.solver]
 

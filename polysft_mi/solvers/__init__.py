@@ -6,12 +6,38 @@ frames, report=None, past=())``, which returns a :class:`polysft_mi.solvers.solu
 add one, write a module here, and put its name into :func:`create` and the setting's choices.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Protocol
+
 from .solution import Solution
 
-__all__ = ["Solution", "create"]
+if TYPE_CHECKING:
+    from polysft_mi.objective.problem import Problem
+    from polysft_mi.scene.settings import Settings
+    from polysft_mi.surface.patch import Unknowns
+
+__all__ = ["Solution", "Solver", "create"]
 
 
-def create(settings):
+class Solver(Protocol):
+    """What minimises a :class:`polysft_mi.objective.problem.Problem` over a window of frames."""
+
+    def solve(
+        self,
+        problem: Problem,
+        window: list[Unknowns],
+        frames: list[int],
+        report: Callable[[int, float, dict], None] | None = None,
+        past: Sequence[tuple[dict, dict]] = (),
+    ) -> Solution:
+        """From the Unknowns ``window`` of ``frames``; ``past``: arrays, and facts, of the frames
+        before. ``report(iteration, total, terms)`` is called after each evaluation.
+        """
+
+
+def create(settings: Settings) -> Solver:
     """The solver that ``settings.solver`` names. Import only after a Mitsuba variant is set."""
     if settings.solver == "gauss-newton":
         from .gauss_newton import GaussNewton
