@@ -95,7 +95,7 @@ class Problem:
     # -- rendering ----------------------------------------------------------
 
     def _setup_renderer(self):
-        renderer: Any = self.experiment.renderer
+        renderer = self.experiment.renderer
         renderer.hide_emitters = (
             True  # what is behind the surface is black, with a silhouette's gradient towards black
         )
