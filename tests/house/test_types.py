@@ -5,7 +5,7 @@ import inspect
 
 import pytest
 
-PACKAGES = ("polysft_mi",)
+PACKAGES = ("polysft_mi", "polyfit")
 
 
 def untyped(function):
