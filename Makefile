@@ -27,8 +27,8 @@ drape: .venv/with-drape llvm
 test: .venv/with-test llvm
 	$(PY) -m pytest -q
 
-# The pages of docs/ as HTML, in out/docs; a warning is an error
-docs: .venv/with-docs
+# The pages of docs/ as HTML, in out/docs, with the API reference; a warning is an error
+docs: .venv/with-docs llvm
 	$(PY) -m sphinx -W --keep-going -q -b html docs out/docs
 
 lint: .venv/with-lint

@@ -87,7 +87,7 @@ def tangents(alpha: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def normal(alpha: Tensor, uv: Tensor) -> Tensor:
-    """Unit normal (-z_u, -z_v, 1) / |.|, (..., P, 3)."""
+    """Unit normal (..., P, 3), along (-z_u, -z_v, 1)."""
     zu, zv = height_derivatives(alpha, uv)
     return torch.nn.functional.normalize(torch.stack([-zu, -zv, torch.ones_like(zu)], -1), dim=-1)
 

@@ -35,7 +35,7 @@ class JetFit:
 def fit(
     points: Tensor, order: int, *, weights: Tensor | None = None, mask: Tensor | None = None
 ) -> JetFit:
-    """Least-squares n-jets through ``points`` (..., P, 3), in charts with |u|, |v| of about 1: a
+    """Least-squares n-jets through ``points`` (..., P, 3), in charts with u and v of about 1: a
     :class:`JetFit`.
 
     ``weights`` (..., P) not negative; ``mask`` (..., P) bool: the points that exist, the others are

@@ -1,0 +1,45 @@
+"""The examples run, and show what they say."""
+
+import numpy as np
+import pytest
+from places import ROOT
+from scripts import load
+
+torch_loss, own_unknowns, drape_to_blender, bend_a_patch = (
+    load(f"examples/{name}.py")
+    for name in ("torch_loss", "own_unknowns", "drape_to_blender", "bend_a_patch")
+)
+
+
+def test_the_image_pulls_the_sheet_back():
+    distances = torch_loss.main(steps=6)
+    assert distances[-1] < 0.6 * distances[0] < 0.6 * 6
+
+
+def test_curvature_and_distance_are_found():
+    found = own_unknowns.main(steps=60, width=64)
+    assert found == pytest.approx(own_unknowns.TRUE, rel=0.05)
+
+
+def test_the_drape_moves(tmp_path):
+    Usd, UsdGeom = (pytest.importorskip(f"pxr.{name}") for name in ("Usd", "UsdGeom"))
+    paths = drape_to_blender.main(tmp_path, seconds=0.2)
+    for path, name in zip(paths, ("tshirt", "body"), strict=True):
+        stage = Usd.Stage.Open(str(path))
+        assert stage.GetEndTimeCode() == 5 and UsdGeom.GetStageMetersPerUnit(stage) == 1
+        points = UsdGeom.Mesh(stage.GetPrimAtPath(f"/{name}/mesh")).GetPointsAttr()
+        first, last = (np.array(points.Get(t)) for t in (0, 5))
+        assert 0.005 < np.linalg.norm(last - first, axis=1).max() < 1
+
+
+def test_one_patch_moves_and_the_rest_stays(tmp_path):
+    before, after = bend_a_patch.main(tmp_path, parts=1)
+    moved = np.linalg.norm(after - before, axis=1)
+    assert 0.005 < moved.max() < 0.1 and 0 < (moved > 1e-6).mean() < 0.3
+    assert (tmp_path / "before.ply").stat().st_size == (tmp_path / "after.ply").stat().st_size
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "examples").glob("*.py")), ids=lambda p: p.stem)
+def test_examples_are_short_and_have_a_line_in_the_gallery(path):
+    assert len(path.read_text(encoding="utf-8").splitlines()) <= 60
+    assert f"examples/{path.name}" in (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
