@@ -148,7 +148,7 @@ def test_a_step_that_is_not_finite_is_stepped_over(small, data, monkeypatch, cap
     assert figures["stepped_over"] == 1 and np.isfinite(figures["loss"])
     assert "step 1: gravity not finite, stepped over" in capsys.readouterr().err
     assert all(torch.equal(v, before[k]) for k, v in training.network.state_dict().items())
-    monkeypatch.setattr(train, "BAD", 2)
+    monkeypatch.setattr(loop, "BAD_STEPS", 2)
     with pytest.raises(InputError, match="2 steps in a row were not finite"):
         training.step()
 
