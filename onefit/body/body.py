@@ -2,8 +2,12 @@
 from shape parameters.
 """
 
-from dataclasses import dataclass, fields, replace
+from __future__ import annotations
 
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
 import torch
 
 from polyfit.errors import InputError
@@ -31,9 +35,9 @@ class Body:
     kind: str
     parents: tuple = skeleton.PARENTS
 
-    def to(self, device):
+    def to(self, device: torch.device | str) -> Body:
         """The same body with its tensors on ``device``."""
-        moved = {
+        moved: dict[str, Any] = {
             f.name: v.to(device)
             for f in fields(self)
             if isinstance(v := getattr(self, f.name), torch.Tensor)
@@ -50,13 +54,13 @@ class BodyModel:
     shape_names: tuple
     standard_shape: torch.Tensor
 
-    def body(self, shape=None):
+    def body(self, shape: torch.Tensor | None = None) -> Body:
         """The :class:`Body` of ``shape`` (S,); None is the standard shape. Raises InputError for a
         shape that the model has not.
         """
         raise NotImplementedError
 
-    def random_shape(self, rng):
+    def random_shape(self, rng: np.random.Generator) -> torch.Tensor:
         """A plausible shape (S,), drawn from a ``numpy.random.Generator``."""
         raise NotImplementedError
 
@@ -102,7 +106,7 @@ class AnnyBody(BodyModel):
     shape_names = ("gender", "age", "muscle", "weight", "height", "proportions")
     standard_shape = torch.full((6,), 0.5)
 
-    def __init__(self):
+    def __init__(self) -> None:
         import anny
 
         # plain skinning: Anny's default compiles Warp kernels for seconds, and all skinning here is
@@ -128,9 +132,9 @@ class AnnyBody(BodyModel):
         self._vertices = model.template_vertices[kept].float()
         self._vertices_basis = model.blendshapes[:, kept].float().flatten(1)  # (C, 3 V)
 
-    def joint_of_bone(self):
+    def joint_of_bone(self) -> torch.Tensor:
         """The joint (104,) int64 that each of Anny's bones moves with."""
-        of_bone = []
+        of_bone: list[int] = []
         for label, parent in zip(self._anny.bone_labels, self._anny.bone_parents, strict=True):
             name, _, side = label.partition(".")
             joint = next((j for start, j in _BONES.items() if name.startswith(start)), None)
@@ -140,7 +144,7 @@ class AnnyBody(BodyModel):
                 of_bone.append(skeleton.INDEX[{"L": "left_", "R": "right_", "": ""}[side] + joint])
         return torch.tensor(of_bone)
 
-    def body(self, shape=None):
+    def body(self, shape: torch.Tensor | None = None) -> Body:
         shape = self._shape(shape)
         if not ((shape >= 0) & (shape <= 1)).all():
             name, value = next(
@@ -168,7 +172,7 @@ class AnnyBody(BodyModel):
         "height": (0.3, 0.55), "proportions": (0.25, 0.75),
     }  # fmt: skip
 
-    def random_shape(self, rng):
+    def random_shape(self, rng: np.random.Generator) -> torch.Tensor:
         """A shape (6,) between teenager and middle age, uniform in :attr:`RANGES`, from a
         ``numpy.random.Generator``.
         """

@@ -5,6 +5,9 @@ Whatever their files hold, all bodies come out in OneFit's axes and in its stand
 root joint where the standard body has it.
 """
 
+from __future__ import annotations
+
+import os
 import pickle
 import zipfile
 
@@ -129,7 +132,7 @@ class SmplBody(BodyModel):
     key, or whose shapes do not fit.
     """
 
-    def __init__(self, path):
+    def __init__(self, path: str | os.PathLike[str]) -> None:
         data = _read(
             path, ("v_template", "f", "weights", "J_regressor", "kintree_table", "shapedirs")
         )
@@ -157,7 +160,7 @@ class SmplBody(BodyModel):
         self.shape_names = tuple(f"beta{k}" for k in range(self._basis.shape[2]))
         self.standard_shape = torch.zeros(len(self.shape_names))
 
-    def body(self, shape=None):
+    def body(self, shape: torch.Tensor | None = None) -> Body:
         shape = self._shape(shape)
         vertices = self._vertices + self._basis @ shape.double().numpy()
         weights, joints = _reduced(
@@ -177,7 +180,7 @@ class SmplBody(BodyModel):
             self.kind,
         )
 
-    def random_shape(self, rng):
+    def random_shape(self, rng: np.random.Generator) -> torch.Tensor:
         """Betas (S,) from the normal distribution that SMPL's are scaled to, cut off at ±2."""
         return torch.from_numpy(np.clip(rng.standard_normal(len(self.shape_names)), -2, 2)).float()
 
@@ -192,7 +195,7 @@ class PlainBody(BodyModel):
     misses a key, or has another skeleton or unit.
     """
 
-    def __init__(self, path):
+    def __init__(self, path: str | os.PathLike[str]) -> None:
         data = _read(path, ("vertices", "faces", "blend_weights", "joints", "rest_pose", "parents"))
         V, F = data["vertices"].astype(np.float64), data["faces"].astype(np.int64)
         if F.ndim == 2 and F.shape[1] == 4:
@@ -231,11 +234,11 @@ class PlainBody(BodyModel):
             path, V[kept], F, weights[kept], places, rest, self.standard_shape, self.kind
         )
 
-    def body(self, shape=None):
+    def body(self, shape: torch.Tensor | None = None) -> Body:
         self._shape(shape)
         return self._body
 
-    def random_shape(self, rng):
+    def random_shape(self, rng: np.random.Generator) -> torch.Tensor:
         """The empty shape (0,): this body has one shape only."""
         return self.standard_shape
 

@@ -2,8 +2,12 @@
 :func:`onefit.load` is the way in.
 """
 
+from __future__ import annotations
+
+import os
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import torch
 
@@ -17,6 +21,11 @@ from onefit.objective.objective import posed
 
 from . import ease
 from .post import pushed_out
+
+if TYPE_CHECKING:
+    from onefit.body import Body
+    from onefit.body.body import BodyModel
+    from onefit.objective.measures import Measures
 
 FPS = 30.0  # that the networks know
 WARM_UP = 10  # frames in which the first pose is held, for the network's memory to settle
@@ -38,7 +47,7 @@ class Drape:
     root: torch.Tensor
     fps: float
 
-    def measures(self):
+    def measures(self) -> Measures:
         """The :class:`onefit.objective.measures.Measures` of this drape."""
         from onefit.objective import measure
 
@@ -61,7 +70,9 @@ class Draper:
     its shapes and the network is told the standard shape.
     """
 
-    def __init__(self, trained: Trained, model=None, device="cpu"):
+    def __init__(
+        self, trained: Trained, model: BodyModel | None = None, device: torch.device | str = "cpu"
+    ) -> None:
         self.trained, self.device = trained, torch.device(device)
         self.network = trained.network.to(self.device).eval()
         self.model = model or AnnyBody()
@@ -71,11 +82,11 @@ class Draper:
         self._ease: dict = {}
 
     @cached_property
-    def standard(self):
+    def standard(self) -> Body:
         """The standard body, which garments are made around."""
         return standard_body()
 
-    def garment(self, garment):
+    def garment(self, garment: Garment | str | os.PathLike[str]) -> Garment:
         """A :class:`Garment` of one, of a template's name, or of a mesh file; names and files are
         read once.
         """
@@ -85,7 +96,7 @@ class Draper:
             self._garments[str(garment)] = Garment.named(garment)
         return self._garments[str(garment)]
 
-    def patched(self, garment):
+    def patched(self, garment: Garment) -> PatchedGarment:
         """The :class:`onefit.PatchedGarment` of a garment, cut once."""
         key = id(garment)
         if key not in self._patched:
@@ -94,7 +105,16 @@ class Draper:
             ).to(self.device)
         return self._patched[key]
 
-    def drape(self, garment, motion, shape=None, *, post=False, eased=True, skinning_only=False):
+    def drape(
+        self,
+        garment: Garment | str | os.PathLike[str],
+        motion: Motion | str | os.PathLike[str],
+        shape: torch.Tensor | None = None,
+        *,
+        post: bool = False,
+        eased: bool = True,
+        skinning_only: bool = False,
+    ) -> Drape:
         """A :class:`Drape`: ``garment`` (as :meth:`garment` takes it) on the body of ``shape`` (S,)
         in each frame of ``motion`` (a :class:`Motion` or a file of one), at 30 frames a second.
         With a shape, the way is scaled by the length of its legs.
@@ -125,7 +145,7 @@ class Draper:
             for first in range(0, len(motion.poses), step):
                 frames = slice(first, first + step)
                 points = (rest + offset)[:, None]
-                if not skinning_only:
+                if embedding is not None:
                     points = points + self._displacement(garment, embedding[frames])
                 parts.append(posed(points, weights, transforms[frames]).transpose(0, 1))
             bodies = torch.cat(
@@ -138,11 +158,11 @@ class Draper:
         root = skinning.posed_joints(body, transforms)[:, 0]
         if post:
             vertices = pushed_out(vertices, garment.faces.to(self.device), bodies, body.faces)
-        return Drape(
-            *(x.cpu() for x in (vertices, garment.faces, rest, bodies, body.faces, root)), FPS
-        )
+        found = (vertices, garment.faces, rest, bodies, body.faces, root)
+        vertices, faces, rest, bodies, body_faces, root = (x.cpu() for x in found)
+        return Drape(vertices, faces, rest, bodies, body_faces, root, FPS)
 
-    def codes(self, garment):
+    def codes(self, garment: Garment) -> torch.Tensor:
         """Z_T (K, width) of the garment's patches, found once."""
         key = id(garment)
         if key not in self._codes:
@@ -161,7 +181,7 @@ class Draper:
             patched.changes(self.network.decoder(self.codes(garment), embedding))
         )
 
-    def ease(self, garment):
+    def ease(self, garment: Garment) -> torch.Tensor:
         """The offset of the garment's vertices in the rest space, (N, 3) [m], found once:
         :func:`onefit.draping.ease.ease`.
         """
@@ -194,7 +214,7 @@ class Draper:
                 draped, skinned, skinning.skin(body.vertices, body.blend_weights, transforms)
             )
 
-    def embedding(self, motion, body):
+    def embedding(self, motion: Motion, body: Body) -> torch.Tensor:
         """Z_B (T, width) of the motion, after the first pose was held for a while."""
         hold = lambda x: torch.cat([x[:1].expand(WARM_UP, *x.shape[1:]), x])[None]
         known = body.kind == self.trained.body == self.model.kind
@@ -208,7 +228,12 @@ class Draper:
         ]
 
 
-def load(name="six-garments", *, model=None, device="cpu"):
+def load(
+    name: str | os.PathLike[str] = "six-garments",
+    *,
+    model: BodyModel | None = None,
+    device: torch.device | str = "cpu",
+) -> Draper:
     """The :class:`Draper` of a network: ``name`` of one that comes with the package
     (:func:`onefit.pretrained`), or a file of weights.
 

@@ -2,8 +2,12 @@
 to the body's shapes.
 """
 
+from __future__ import annotations
+
+import os
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -44,10 +48,10 @@ class Garment:
     faces: torch.Tensor
     blend_weights: torch.Tensor
     repairs: tuple = ()
-    _binding: Binding | None = field(default=None, repr=False, compare=False)
+    _binding: Any = field(default=None, repr=False, compare=False)
 
     @classmethod
-    def template(cls, name):
+    def template(cls, name: str) -> Garment:
         """One of :data:`TEMPLATES`, which :mod:`onefit.tailor` made."""
         if name not in TEMPLATES:
             raise InputError(
@@ -57,7 +61,7 @@ class Garment:
             return cls.bound(name, file["vertices"], file["faces"])
 
     @classmethod
-    def named(cls, name, **options):
+    def named(cls, name: str | os.PathLike[str], **options: Any) -> Garment:
         """A template by its name, or else the garment of a mesh file, with the ``options`` of
         :meth:`read`. Raises InputError.
         """
@@ -73,16 +77,16 @@ class Garment:
     @classmethod
     def read(
         cls,
-        path,
+        path: str | os.PathLike[str],
         *,
-        name=None,
-        made_for=None,
-        loose=False,
-        scale=1.0,
-        up="z",
-        turn=0.0,
-        offset=(0.0, 0.0, 0.0),
-    ):
+        name: str | None = None,
+        made_for: Body | str | None = None,
+        loose: bool = False,
+        scale: float = 1.0,
+        up: str = "z",
+        turn: float = 0.0,
+        offset: Any = (0.0, 0.0, 0.0),
+    ) -> Garment:
         """The garment of an OBJ or PLY file of triangles or quads, repaired by the rules of
         :mod:`onefit.garment.mending`.
 
@@ -105,7 +109,16 @@ class Garment:
         )
 
     @classmethod
-    def of_mesh(cls, name, vertices, faces, *, made_for=None, loose=False, where="garment"):
+    def of_mesh(
+        cls,
+        name: str,
+        vertices: np.ndarray,
+        faces: np.ndarray,
+        *,
+        made_for: Body | str | None = None,
+        loose: bool = False,
+        where: str = "garment",
+    ) -> Garment:
         """The garment of any triangle mesh (N, 3) [m], (F, 3) in OneFit's axes; otherwise as
         :meth:`read`.
         """
@@ -130,7 +143,9 @@ class Garment:
         return cls.bound(name, V, F, told + turned + pushed)
 
     @classmethod
-    def bound(cls, name, vertices, faces, repairs=()):
+    def bound(
+        cls, name: str, vertices: np.ndarray, faces: np.ndarray, repairs: tuple = ()
+    ) -> Garment:
         """The garment of a clean mesh (N, 3) [m], (F, 3) around the standard body, with blend
         weights from there.
         """
@@ -151,18 +166,16 @@ class Garment:
     def __len__(self):
         return len(self.vertices)
 
-    def to(self, device):
+    def to(self, device: torch.device | str) -> Garment:
         """The same garment with its tensors on ``device``."""
-        return replace(
-            self,
-            **{
-                f.name: v.to(device)
-                for f in fields(self)
-                if isinstance(v := getattr(self, f.name), torch.Tensor)
-            },
-        )
+        moved: dict[str, Any] = {
+            f.name: v.to(device)
+            for f in fields(self)
+            if isinstance(v := getattr(self, f.name), torch.Tensor)
+        }
+        return replace(self, **moved)
 
-    def graded(self, body):
+    def graded(self, body: Body) -> torch.Tensor:
         """Rest vertices (N, 3) [m] moved with the shape of ``body``: a Body in the standard stand.
         The standard shape leaves them where they are.
         """
@@ -172,7 +185,7 @@ class Garment:
         )
         return torch.as_tensor(moved, dtype=torch.float32, device=self.vertices.device)
 
-    def remeshed(self, count):
+    def remeshed(self, count: int) -> Garment:
         """The same garment with about ``count`` vertices: every face is cut in four as often as is
         needed for 0.7 times as many; where there are more than 1.4 times as many, even triangles
         are made anew (ACVD).

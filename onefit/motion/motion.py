@@ -1,12 +1,15 @@
 """Motions: poses and places of the root over time, read from files, generated, resampled."""
 
+from __future__ import annotations
+
+import os
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from onefit.body import skeleton
+from onefit.body import Body, skeleton
 from polyfit.errors import InputError
 
 from . import files, generate
@@ -67,12 +70,14 @@ class Motion:
         """The motion of a slice of the frames."""
         return replace(self, poses=self.poses[frames], translation=self.translation[frames])
 
-    def to(self, device):
+    def to(self, device: torch.device | str) -> Motion:
         """The same motion on ``device``."""
         return replace(self, poses=self.poses.to(device), translation=self.translation.to(device))
 
     @classmethod
-    def read(cls, path, fps=None, up=None):
+    def read(
+        cls, path: str | os.PathLike[str], fps: float | None = None, up: str | None = None
+    ) -> Motion:
         """A motion from a file: AMASS's ``.npz`` (``poses``, ``trans``, ``mocap_framerate``; z up),
         Neural Cloth Simulation's (``fps``; y up), or BVH.
 
@@ -85,14 +90,14 @@ class Motion:
         return cls(*files.read(path, fps, up))
 
     @classmethod
-    def generate(cls, name, seconds=10.0, seed=0, fps=30.0):
+    def generate(cls, name: str, seconds: float = 10.0, seed: int = 0, fps: float = 30.0) -> Motion:
         """A generated motion of the kind ``name``, one of :data:`onefit.motion.generate.KINDS`; see
         :mod:`onefit.motion.generate`.
         """
         poses, translation = generate.generate(name, seconds, seed, fps)
         return cls(poses, translation, float(fps), f"{name}-{seed}")
 
-    def fitted(self, body):
+    def fitted(self, body: Body) -> Motion:
         """The motion for a :class:`~onefit.Body` with longer or shorter legs than the standard
         body's: its way is scaled by their length, so that feet which stood still on the standard
         body nearly do on this one.
@@ -103,12 +108,12 @@ class Motion:
             * (skeleton.leg_length(body.joints) / skeleton.leg_length(skeleton.standard_joints())),
         )
 
-    def mirrored(self):
+    def mirrored(self) -> Motion:
         """The motion seen in a mirror: left is right, and x is -x."""
         poses, translation = skeleton.mirrored(self.poses, self.translation)
         return replace(self, poses=poses, translation=translation)
 
-    def resampled(self, fps=30.0):
+    def resampled(self, fps: float = 30.0) -> Motion:
         """The same motion at ``fps`` frames a second from the same start to (at most) the same end.
 
         Rotations go along great arcs (slerp) between the two frames beside each new one, places

@@ -5,6 +5,8 @@ jets, orientations, places of the patches ─► PatchEncoder ─► Z_T ─┐
 poses, shape, root velocity ─► BodyEncoder ─────────────────► Z_B ┴─► Decoder ─► Deformation
 """
 
+from __future__ import annotations
+
 import itertools
 import math
 
@@ -162,7 +164,7 @@ class OneFit(nn.Module):
     """One network for any garment: ``patches``, ``body`` and ``decoder``. ``order`` of the jets,
     ``joints`` and ``shape``: how many of both the body has."""
 
-    def __init__(self, order=4, joints=24, shape=6):
+    def __init__(self, order: int = 4, joints: int = 24, shape: int = 6) -> None:
         super().__init__()
         self.shape = dict(order=order, joints=joints, shape=shape)
         self.order = order

@@ -1,7 +1,11 @@
 """Trained networks: files, and those that come with the package."""
 
+from __future__ import annotations
+
+import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -13,7 +17,7 @@ SCALE = ":scale"  # after the name of a matrix: its rows' scales
 FOLDER = Path(__file__).parents[1] / "data" / "weights"
 
 
-def pretrained():
+def pretrained() -> tuple[str, ...]:
     """Names of the networks that come with the package."""
     return tuple(sorted(path.stem for path in FOLDER.glob("*.safetensors")))
 
@@ -24,7 +28,7 @@ class Trained:
     on, and the names of its ``garments``.
     """
 
-    network: torch.nn.Module
+    network: Any  # torch.nn.Module, whose type tells nothing of its parts
     body: str
     garments: tuple
 
@@ -52,7 +56,7 @@ def save(path, network, model, garments):
     write_weights(path, tensors, about)
 
 
-def load(name):
+def load(name: str | os.PathLike[str]) -> Trained:
     """The :class:`Trained` network of a file, or one of :func:`pretrained` by its name. Raises
     InputError.
     """

@@ -5,7 +5,7 @@ import inspect
 
 import pytest
 
-PACKAGES = ("polysft_mi", "polyfit")
+PACKAGES = ("polysft_mi", "polyfit", "onefit")
 
 
 def untyped(function):

@@ -8,22 +8,30 @@ one sparse matrix, made once, times the changes of the C_k (:attr:`PatchedGarmen
 evaluated frame by frame.
 """
 
+from __future__ import annotations
+
 import copy
 from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.sparse as sp
 import torch
 
+from onefit.body import Body
 from onefit.garment.binding import surface_of
 from onefit.garment.waistband import held
 from polyfit import mesh
 from polyfit.patches import PatchedSurface
 
 from .blending import blend_matrix, drift_planes, drift_scale, looseness_of
+from .deformation import Deformation
 from .frames import along_bones
 from .samples import basis_and_slopes, boundary_points, metric_points, refinement
 from .sparse import SparseMatrix
+
+if TYPE_CHECKING:
+    from onefit.garment.garment import Garment
 
 
 class PatchedGarment:
@@ -36,7 +44,15 @@ class PatchedGarment:
     K M points where the metric is held. Lengths in metres, in the rest space.
     """
 
-    def __init__(self, garment, body, *, patches=None, order=4, seed=0):
+    def __init__(
+        self,
+        garment: Garment,
+        body: Body,
+        *,
+        patches: int | None = None,
+        order: int = 4,
+        seed: int = 0,
+    ) -> None:
         """Cut ``garment`` into ``patches`` (by default as many as the paper has for its area);
         ``body``: the standard one.
         """
@@ -89,7 +105,7 @@ class PatchedGarment:
         """K, the number of patches."""
         return len(self.alpha)
 
-    def to(self, device):
+    def to(self, device: torch.device | str) -> PatchedGarment:
         """The same, with its tensors on ``device``."""
         moved = copy.copy(self)
         for name in (
@@ -103,9 +119,12 @@ class PatchedGarment:
             "vertex_area",
         ):
             getattr(self, name)
-        move = lambda x: (
-            tuple(map(move, x)) if isinstance(x, tuple) else x.to(device) if hasattr(x, "to") else x
-        )
+
+        def move(value: Any) -> Any:
+            if isinstance(value, tuple):
+                return tuple(map(move, value))
+            return value.to(device) if hasattr(value, "to") else value
+
         vars(moved).update({name: move(value) for name, value in vars(self).items()})
         return moved
 
@@ -127,26 +146,26 @@ class PatchedGarment:
     # ---- fields of the vertices at the metric's points -------------------------------------------
 
     @cached_property
-    def field(self):
+    def field(self) -> SparseMatrix:
         """A SparseMatrix (3 P, N): value, u- and v-derivative, at the P points of the metric, of
         any field given at the vertices.
         """
         return SparseMatrix(self._field)
 
     @cached_property
-    def metric_weights(self):
+    def metric_weights(self) -> torch.Tensor:
         """Blend weights at the metric's points and their derivatives along u and v: (P, 3, J)."""
         return torch.as_tensor(
             self._field @ self.garment.blend_weights.double().numpy(), dtype=torch.float32
         ).unflatten(0, (-1, 3))
 
     @cached_property
-    def metric_basis(self):
+    def metric_basis(self) -> torch.Tensor:
         """Monomials at the metric's points and their derivatives along u and v: (K, 3 M, A)."""
         return self._of_basis(self.metric_uv)
 
     @cached_property
-    def boundary_basis(self):
+    def boundary_basis(self) -> torch.Tensor:
         """The same at the boundary points, on both sides: (2, B, 3, A)."""
         return self._of_basis(self.boundary_uv.transpose(0, 1)[:, :, None])
 
@@ -156,7 +175,7 @@ class PatchedGarment:
 
     # ---- deformation -----------------------------------------------------------------------------
 
-    def changes(self, deformation):
+    def changes(self, deformation: Deformation) -> torch.Tensor:
         """The changes of the matrices C_k, (K, A, T, 3) [m], by a :class:`Deformation` of T
         frames.
         """
@@ -174,13 +193,13 @@ class PatchedGarment:
         plane = (self.planes @ deformation.drift.transpose(0, 1)).unflatten(0, (K, 3))
         return change + torch.nn.functional.pad(plane, (0, 0, 0, 0, 0, A - 3))
 
-    def displacement(self, changes):
+    def displacement(self, changes: torch.Tensor) -> torch.Tensor:
         """Displacements of the vertices in the rest space, (N, T, 3) [m]."""
         moved = self.blend @ changes.flatten(0, 1)
         band, along = self.band
         return moved.index_add(0, band, moved[band] @ along, alpha=-1) if len(band) else moved
 
-    def at_metric(self, changes):
+    def at_metric(self, changes: torch.Tensor) -> torch.Tensor:
         """Displacement at the metric's points and its derivatives along u and v, each patch by its
         own chart: (P, 3, T, 3) [m].
         """
@@ -192,7 +211,7 @@ class PatchedGarment:
             .unflatten(-1, (T, 3))
         )
 
-    def at_boundary(self, changes):
+    def at_boundary(self, changes: torch.Tensor) -> torch.Tensor:
         """Displacement and its derivatives along u and v at the boundary points by the chart of
         each side: (2, B, 3, T, 3) [m].
         """
@@ -206,7 +225,7 @@ class PatchedGarment:
         ).unflatten(-1, (T, 3))
 
     @cached_property
-    def boundary_tangents(self):
+    def boundary_tangents(self) -> torch.Tensor:
         """Tangents of the template along u and v at the boundary points, on each side: (2, B, 2, 3)
         [m].
         """
@@ -219,7 +238,7 @@ class PatchedGarment:
         return torch.stack(out)
 
     @cached_property
-    def features(self):
+    def features(self) -> tuple[torch.Tensor, ...]:
         """What the network reads of each patch: ``alpha`` (K, A), ``orientation`` (K, 7) (log s / 5
         cm, two axes of R), ``centre`` (K, 3), ``looseness`` (K, 3) (least, mean and greatest
         distance of its vertices from the standard body, as asinh(d / 5 mm)), ``held`` (K, 1) and
@@ -239,12 +258,12 @@ class PatchedGarment:
         )
 
     @cached_property
-    def edges(self):
+    def edges(self) -> torch.Tensor:
         """Edges of the mesh, (E, 2), each once."""
         return torch.as_tensor(mesh.edges_of(self.garment.faces.numpy())[0])
 
     @cached_property
-    def vertex_area(self):
+    def vertex_area(self) -> torch.Tensor:
         """The area that each vertex speaks for, (N,) [m^2]."""
         faces = self.garment.faces.numpy()
         area = np.repeat(mesh.areas(self.garment.vertices.double().numpy(), faces) / 3, 3)
