@@ -1,7 +1,7 @@
 """Make the pictures of ``docs/tutorial.md``: ``python docs/tutorial.py`` (a minute or two).
 
 The demo's frames become a video, which is prepared and run by the tutorial's own commands, into
-``out/tutorial``; the pictures go into ``docs``.
+``out/tutorial``; the pictures go into ``docs``. With ``--inputs``: the video and the photo alone.
 """
 
 import os
@@ -22,6 +22,7 @@ HERE = os.path.dirname(os.path.abspath(__file__))
 ROOT = os.path.dirname(HERE)
 
 OUT = "out/tutorial"
+FRAMES = 12  # of the demo
 PICTURES = {  # from: (to, pixels it is wide)
     f"{OUT}/clip/prepare/matches.png": ("tutorial_matches.jpg", 900),
     f"{OUT}/clip/prepare/pose.png": ("tutorial_pose.jpg", 644),
@@ -40,20 +41,21 @@ def commands():
 
 
 def write_inputs(out):
-    """The video and the photo that the tutorial starts from, in the folder ``out``."""
+    """The video and the photo that the tutorial starts from, in the folder ``out``: the first
+    FRAMES of the demo's frames."""
     os.makedirs(out, exist_ok=True)
     demo = os.path.join(ROOT, "scenes", "demo")
     write_video(
         os.path.join(out, "clip.mp4"),
-        (read_rgb(p) for p in list_images(os.path.join(demo, "frames"))),
+        (read_rgb(p) for p in list_images(os.path.join(demo, "frames"))[:FRAMES]),
         fps=8,
     )
     photo = cv2.imread(
         os.path.join(demo, "texture.jpg")
-    )  # a square: the sheet is 0.3 m wide and 0.22 m high
+    )  # a square: the sheet is 0.3 m wide and 0.225 m high
     cv2.imwrite(
         os.path.join(out, "photo.jpg"),
-        cv2.resize(photo, (600, 440), interpolation=cv2.INTER_AREA),
+        cv2.resize(photo, (800, 600), interpolation=cv2.INTER_AREA),
         [cv2.IMWRITE_JPEG_QUALITY, 95],
     )
 
@@ -75,6 +77,8 @@ def errors():
 def main():
     os.chdir(ROOT)
     write_inputs(OUT)
+    if "--inputs" in sys.argv:
+        return
     for words in commands():
         print(shlex.join(words), flush=True)
         subprocess.run(
