@@ -58,17 +58,20 @@ def parser():
         nargs="*",
         default=[],
         metavar="NAME=VALUE",
-        help="the body's shape, e.g. weight=0.7; what is not named is standard",
+        help="the body's shape, e.g. weight=0.7; the rest is standard",
     )
     group = p.add_argument_group("a garment's mesh that is not in metres around the standard body")
     group.add_argument(
-        "--scale", type=float, default=1.0, help="to metres: 0.01 for centimetres (default: 1)"
+        "--scale",
+        type=float,
+        default=1.0,
+        help="factor to metres: 0.01 for centimetres (default: 1)",
     )
     group.add_argument(
         "--up", default="z", choices=("z", "y"), help="the axis that points up (default: z)"
     )
     group.add_argument(
-        "--turn", type=float, default=0.0, help="about the vertical [degrees] (default: 0)"
+        "--turn", type=float, default=0.0, help="rotation about the vertical [degrees] (default: 0)"
     )
     group.add_argument(
         "--offset",
@@ -76,7 +79,7 @@ def parser():
         type=float,
         default=(0.0, 0.0, 0.0),
         metavar=("X", "Y", "Z"),
-        help="to move it by [m]",
+        help="translation [m]",
     )
     group.add_argument(
         "--made-for",
@@ -87,18 +90,20 @@ def parser():
         "--loose", action="store_true", help="a skirt or dress: the legs' pose is not followed"
     )
     p.add_argument(
-        "--fps", type=float, help="frames a second of a motion file, in place of what it says"
+        "--fps", type=float, help="frames a second of a motion file (default: as the file says)"
     )
     p.add_argument(
         "--motion-up",
         choices=("y", "z"),
-        help="the axis that points up in a motion file, in place of what its kind has",
+        help="the axis that points up in a motion file (default: that of its format)",
     )
-    p.add_argument("--seconds", type=float, default=3.0, help="of a generated motion (default: 3)")
-    p.add_argument("--seed", type=int, default=0, help="of a generated motion (default: 0)")
+    p.add_argument(
+        "--seconds", type=float, default=3.0, help="length of a generated motion (default: 3)"
+    )
+    p.add_argument("--seed", type=int, default=0, help="seed of a generated motion (default: 0)")
     p.add_argument("--post", action="store_true", help="push vertices out of the body afterwards")
     p.add_argument(
-        "--skip", nargs="*", default=[], choices=("usd", "render"), help="what not to write"
+        "--skip", nargs="*", default=[], choices=("usd", "render"), help="results to leave out"
     )
     p.add_argument("--meshes", choices=("obj", "ply"), help="also one mesh a frame")
     p.add_argument(
@@ -107,13 +112,11 @@ def parser():
         type=int,
         default=(480, 360),
         metavar=("HEIGHT", "WIDTH"),
-        help="of the rendering (default: 480 360)",
+        help="size of the rendering [pixels] (default: 480 360)",
     )
     p.add_argument("--spp", type=int, default=32, help="samples a pixel (default: 32)")
     p.add_argument("--device", default="cpu", help="cpu or cuda, for the network (default: cpu)")
-    p.add_argument(
-        "--overwrite", action="store_true", help="replace what a previous drape left in OUT"
-    )
+    p.add_argument("--overwrite", action="store_true", help="replace an earlier drape in OUT")
     return p
 
 

@@ -32,12 +32,12 @@ def main():
         "--output",
         default=FOLDER,
         metavar="FOLDER",
-        help="of the .npz files (default: the package's own)",
+        help="folder of the .npz files (default: the package's own)",
     )
     parser.add_argument(
         "--body",
         metavar="FILE.ply",
-        help="write the standard body, to make garments around, and sew nothing",
+        help="write the standard body, to make garments around it, and sew nothing",
     )
     args = parser.parse_args()
     if unknown := [n for n in args.names if n not in PATTERNS]:

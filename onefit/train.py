@@ -48,34 +48,37 @@ def parser():
         help="AMASS, NCS or BVH files (default: generated ones)",
     )
     p.add_argument(
-        "--fps", type=float, help="frames a second of the motion files, in place of what they say"
+        "--fps", type=float, help="frames a second of the motion files (default: as each file says)"
     )
     p.add_argument(
         "--motion-up",
         choices=("y", "z"),
-        help="the axis that points up in the motion files, in place of what their kind has",
+        help="the axis that points up in the motion files (default: that of their format)",
     )
     p.add_argument(
         "--from",
         dest="start",
         default="",
         metavar="WEIGHTS",
-        help="weights to fine-tune, a file or a name of the package's",
+        help="weights to fine-tune: a file, or a name of the package's weights",
     )
     for name, text in {
-        "order": "of the jets", "batch": "patches of a step, all frames together", "epochs": "",
-        "lr-epochs": "epochs with the full rate, a tenth of it after",
-        "epoch-steps": "steps of an epoch, 0: each window of the motions once",
+        "order": "order of the jets", "epochs": "",
+        "batch": "patches of a step, all frames together",
+        "lr-epochs": "epochs at the full rate; later ones have a tenth of it",
+        "epoch-steps": "steps of an epoch; 0: each window of the motions once",
         "seeds": "generated motions of each kind",
         "shapes": "random bodies beside the standard one",
-        "cuts": "random cuts of the templates' patterns to train on beside the garments",
+        "cuts": "random cuts of the templates' patterns, trained on beside the garments",
         "seed": "",
     }.items():  # fmt: skip
         value = getattr(default, name.replace("-", "_"))
         p.add_argument(
             f"--{name}", type=int, default=value, help=f"{text} (default: {value})".strip()
         )
-    p.add_argument("--lr", type=float, default=default.lr, help=f"of Adam (default: {default.lr})")
+    p.add_argument(
+        "--lr", type=float, default=default.lr, help=f"Adam's rate (default: {default.lr})"
+    )
     group = p.add_argument_group("the losses' weights (0 switches one off)")
     for f in fields(Weights):
         group.add_argument(
@@ -85,7 +88,7 @@ def parser():
             help=f"(default: {f.default})",
         )
     p.add_argument("--checkpoint-every", type=float, default=120.0, metavar="SECONDS")
-    p.add_argument("--resume", action="store_true", help="go on from OUT/checkpoint.safetensors")
+    p.add_argument("--resume", action="store_true", help="continue from OUT/checkpoint.safetensors")
     p.add_argument(
         "--device", default="cuda" if torch.cuda.is_available() else "cpu", help="cpu or cuda"
     )

@@ -16,14 +16,16 @@ def main(argv=None):
     parser.add_argument("mesh", help="an .obj or .ply file [m]")
     parser.add_argument("-o", "--output", required=True, help="the .ply file to write")
     parser.add_argument(
-        "--patches", type=int, help="how many; by default the paper's number for the mesh's area"
+        "--patches", type=int, help="number of patches (default: the paper's, by the mesh's area)"
     )
-    parser.add_argument("--order", type=int, default=4, help="of the jets, 1 to 10 (default: 4)")
+    parser.add_argument(
+        "--order", type=int, default=4, help="order of the jets, 1 to 10 (default: 4)"
+    )
     parser.add_argument(
         "--resolution",
         type=int,
         default=4,
-        help="in how many parts every side of the mesh's faces is cut (default: 4)",
+        help="parts that each side of the mesh's faces is cut into (default: 4)",
     )
     parser.add_argument(
         "--smoothing",
@@ -33,7 +35,7 @@ def main(argv=None):
     )
     args = parser.parse_args(argv)
     if not args.output.lower().endswith(".ply"):
-        raise InputError(f"{args.output}: a .ply file is written")
+        raise InputError(f"{args.output}: a .ply file is needed")
     if os.path.dirname(args.output) and not os.path.isdir(os.path.dirname(args.output)):
         raise InputError(f"{os.path.dirname(args.output)}: no such folder")
     for name, least in (("resolution", 1), ("smoothing", 0)):

@@ -49,7 +49,7 @@ def parser():
         nargs="+",
         type=int,
         default=list(default.cuts),
-        help="numbers of patches that each mesh is cut into",
+        help="numbers of patches; each mesh is cut into each",
     )
     for name in ("order", "patches", "points", "reads", "steps", "batch", "charts", "seed"):
         p.add_argument(
@@ -62,10 +62,10 @@ def parser():
         "--lr",
         type=float,
         default=default.lr,
-        help=f"of Adam, falling to a hundredth as a cosine (default: {default.lr})",
+        help=f"Adam's rate, which falls to a hundredth as a cosine (default: {default.lr})",
     )
     p.add_argument("--checkpoint-every", type=float, default=120.0, metavar="SECONDS")
-    p.add_argument("--resume", action="store_true", help="go on from OUT/checkpoint.safetensors")
+    p.add_argument("--resume", action="store_true", help="continue from OUT/checkpoint.safetensors")
     p.add_argument(
         "--device", default="cuda" if torch.cuda.is_available() else "cpu", help="cpu or cuda"
     )

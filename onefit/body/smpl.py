@@ -276,7 +276,7 @@ def _read(path, keys):
         if array.dtype.kind not in "fiu" or (
             array.dtype.kind == "f" and not np.isfinite(array).all()
         ):
-            raise InputError(f"{path}: {key} holds other things than finite numbers")
+            raise InputError(f"{path}: {key} holds values that are not finite numbers")
     return data
 
 
@@ -320,7 +320,7 @@ class _Arrays(pickle.Unpickler):
         ):
             return super().find_class(module, name)
         raise pickle.UnpicklingError(
-            f"it names {module}.{name}, which could run code; only arrays are admitted"
+            f"it names {module}.{name}, which could run code; only arrays are accepted"
         )
 
 
@@ -338,5 +338,5 @@ def _array(value, what):
             return kind((state["data"], state["indices"], state["indptr"]), shape=shape).toarray()
         if isinstance(state.get("x"), np.ndarray):
             return state["x"]
-        raise InputError(f"{what} is a {name} whose numbers are not kept; save the model as .npz")
+        raise InputError(f"{what} is a {name}, which cannot be read; save the model as .npz")
     return np.asarray(value)

@@ -35,7 +35,7 @@ def motion_of(name, *, seconds, seed, fps=None, up=None):
         return Motion.generate(name, seconds=seconds, seed=seed)
     if not Path(name).exists():
         raise InputError(
-            f"motion {name}: no such file, and no kind of motion; there are {', '.join(KINDS)}"
+            f"motion {name}: no such file, and no kind of motion; the kinds are {', '.join(KINDS)}"
         )
     return Motion.read(name, fps, up)
 

@@ -47,7 +47,9 @@ def read_bvh(path, fps=None, up=None):
     joints = _standing(path, rest, joint_of)
     if fps is None:
         if not period > 0:
-            raise InputError(f"{path}: a frame time of {period}; say the rate: fps=30, or --fps 30")
+            raise InputError(
+                f"{path}: a frame time of {period}; give the rate: fps=30, or --fps 30"
+            )
         fps = 1 / period
         fps = round(fps) if abs(fps - round(fps)) < 0.01 else fps
 
@@ -236,8 +238,8 @@ def _standing(path, rest, joint_of):
     ]
     if not (trunk[2] > 0.8 * trunk.norm() and min(down) > 0.8 * skeleton.leg_length(joints)):
         raise InputError(
-            f"{path}: its zero pose is no upright stand with the legs down; export the motion with"
-            " a T-pose as rest pose"
+            f"{path}: its zero pose is not an upright stance with the legs down; export the motion"
+            " with a T-pose as rest pose"
         )
     return joints
 

@@ -63,7 +63,7 @@ def _read_npz(path, fps, up):
     if fps is None:
         if rate is None:
             raise InputError(
-                f"{path}: no frame rate ({', '.join(_RATES)}); say it: fps=30, or --fps 30"
+                f"{path}: no frame rate ({', '.join(_RATES)}); give it: fps=30, or --fps 30"
             )
         fps = float(np.asarray(data[rate]).ravel()[0])
     if up is None:  # AMASS names its rate after its motion capture
@@ -111,6 +111,6 @@ def _upright(path, root, up):
     if abs(mean[2]) < 0.3 and abs(mean[1]) > 0.85:
         other = "z" if up == "y" else "y"
         raise InputError(
-            f"{path}: its body lies down throughout if {up} is up; say that {other} is:"
-            f" up={other!r}, or --motion-up {other}"
+            f"{path}: with {up} up, its body lies down in all frames; give up={other!r}, or"
+            f" --motion-up {other}"
         )

@@ -106,7 +106,7 @@ class OneFitTraining(Training):
         wrong = [
             name for name, value in figures.items() if name != "loss" and not math.isfinite(value)
         ] or ["the gradient"]
-        print(f"step {self.done}: {', '.join(wrong)} not finite, stepped over", file=sys.stderr)
+        print(f"step {self.done}: {', '.join(wrong)} not finite, skipped", file=sys.stderr)
         if self.bad >= BAD_STEPS:
             raise InputError(f"{self.bad} steps in a row were not finite; a lower --lr may help")
         return dict(loss=self.last, stepped_over=1.0)

@@ -38,11 +38,11 @@ class Settings:
     def __post_init__(self):
         for name in ("batch", "epochs", "seeds"):
             if getattr(self, name) < 1:
-                raise InputError(f"{name} = {getattr(self, name)}: 1 at least")
+                raise InputError(f"{name} = {getattr(self, name)}; at least 1 is needed")
         for name in ("epoch_steps", "lr_epochs", "shapes", "cuts"):
             if getattr(self, name) < 0:
-                raise InputError(f"{name} = {getattr(self, name)}: 0 at least")
+                raise InputError(f"{name} = {getattr(self, name)}; at least 0 is needed")
         if not 2 <= self.order <= 10:
             raise InputError(f"order = {self.order}; the order of OneFit's jets is 2 to 10")
         if not self.lr > 0:
-            raise InputError(f"lr = {self.lr}: more than 0")
+            raise InputError(f"lr = {self.lr}; more than 0 is needed")

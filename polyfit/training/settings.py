@@ -42,14 +42,15 @@ class Settings:
             )
         for name in ("patches", "points", "reads", "steps", "batch", "charts"):
             if getattr(self, name) < 1:
-                raise InputError(f"{name} = {getattr(self, name)}: 1 at least")
+                raise InputError(f"{name} = {getattr(self, name)}; at least 1 is needed")
         if not 1 <= self.order <= 10:
             raise InputError(f"order = {self.order}; the order of a jet is 1 to 10")
         if not self.lr > 0:
-            raise InputError(f"lr = {self.lr}: more than 0")
+            raise InputError(f"lr = {self.lr}; more than 0 is needed")
         if self.points > SAMPLES or self.reads > self.points:
             raise InputError(
-                f"reads {self.reads}, points {self.points}: at most points, at most {SAMPLES}"
+                f"reads = {self.reads}, points = {self.points}; reads <= points <= {SAMPLES} is"
+                " needed"
             )
         if not self.meshes and (not self.families or self.model == "atlasnet"):
             raise InputError(

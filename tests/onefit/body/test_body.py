@@ -430,7 +430,7 @@ def test_fingers_and_face_of_larger_skeletons_are_folded_into_24_joints(smpl, tm
         ),
         (
             {"v_template": np.full((13348, 3), np.nan)},
-            "v_template holds other things than finite numbers",
+            "v_template holds values that are not finite numbers",
         ),
     ],
 )

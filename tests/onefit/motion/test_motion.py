@@ -176,7 +176,9 @@ def test_all_files_of_smpls_family_say_the_same(tmp_path):
         motion = Motion.read(tmp_path / f"{name}.npz")
         assert np.abs(places(motion) - places(reference)).max() < 1e-5, name
     np.savez(tmp_path / "z.npz", poses=flat, trans=trans, fps=60)
-    with pytest.raises(InputError, match="lies down throughout if y is up; say that z is"):
+    with pytest.raises(
+        InputError, match="with y up, its body lies down in all frames; give up='z'"
+    ):
         Motion.read(tmp_path / "z.npz")
     assert np.abs(places(Motion.read(tmp_path / "z.npz", up="z")) - places(reference)).max() < 1e-5
 
@@ -226,7 +228,7 @@ def test_motion_files_that_cannot_be_used(tmp_path):
     far = np.linspace(0, 150, 12)[:, None] * [1.0, 0, 0]
     for change, message in (
         ({"poses": None}, "misses poses; a motion file has poses, trans and a frame rate"),
-        ({"mocap_framerate": None}, "no frame rate .*; say it: fps=30"),
+        ({"mocap_framerate": None}, "no frame rate .*; give it: fps=30"),
         ({"poses": nan}, "poses are not finite in 1 of 12 frames, the first is frame 3"),
         ({"poses": np.zeros((12, 63))}, r"poses of shape \(12, 63\); axis-angle vectors of 22, 24"),
         ({"poses": np.zeros((12, 65, 4))}, r"poses of shape \(12, 65, 4\); axis-angle vectors"),
@@ -430,15 +432,17 @@ def test_bvh_files_that_cannot_be_used(tmp_path):
         "frames are not finite in 1 of 3 frames, the first is frame 1": "\n".join(
             [*rows[:-2], "nan " + rows[-2].split(" ", 1)[1], rows[-1]]
         ),
-        "a frame time of 0.0; say the rate": good.replace("Frame Time: 0.0333333", "Frame Time: 0"),
-        "its zero pose is no upright stand": (tmp_path / "sat.bvh").read_text(),
+        "a frame time of 0.0; give the rate": good.replace(
+            "Frame Time: 0.0333333", "Frame Time: 0"
+        ),
+        "its zero pose is not an upright stance": (tmp_path / "sat.bvh").read_text(),
     }
     for message, text in cases.items():
         (tmp_path / "bad.bvh").write_text(text)
         with pytest.raises(InputError, match=message) as error:
             Motion.read(tmp_path / "bad.bvh")
         assert "\n" not in str(error.value) and "bad.bvh" in str(error.value)
-    (tmp_path / "bad.bvh").write_text(cases["a frame time of 0.0; say the rate"])
+    (tmp_path / "bad.bvh").write_text(cases["a frame time of 0.0; give the rate"])
     assert Motion.read(tmp_path / "bad.bvh", fps=25).fps == 25
 
 

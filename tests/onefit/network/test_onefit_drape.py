@@ -93,7 +93,7 @@ def test_what_is_there_is_not_lost(out, network):
     [
         (
             ("shorts", "tango"),
-            "motion tango: no such file, and no kind of motion; there are idle, walk",
+            "motion tango: no such file, and no kind of motion; the kinds are idle, walk",
         ),
         (("tuxedo.obj", "walk"), "tuxedo.obj: no such file"),
         (("tuxedo", "walk"), "garment 'tuxedo': no such template; there are tshirt, dress, tank"),
@@ -163,8 +163,8 @@ def test_what_a_motion_file_does_not_say_is_said_by_flags(network, tmp_path):
         str(tmp_path / "out"),
     ]
     for flags, message in (
-        ([], "no frame rate .*say it: .* --fps 30$"),
-        (["--fps", "60"], "lies down throughout .* --motion-up y$"),
+        ([], "no frame rate .*give it: .* --fps 30$"),
+        (["--fps", "60"], "lies down in all frames.* --motion-up y$"),
     ):
         with pytest.raises(InputError, match=message):
             drape.main([*arguments, *flags])

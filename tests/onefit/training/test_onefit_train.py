@@ -78,7 +78,7 @@ def test_motions_are_read_as_the_flags_say(motion, tmp_path):
     )
     (read,) = data_of(settings, str(tmp_path), Progress()).motions
     assert len(read.poses) == 46  # 31 frames at 20 a second last 1.5 s
-    with pytest.raises(InputError, match="lies down throughout"):
+    with pytest.raises(InputError, match="lies down in all frames"):
         data_of(replace(settings, motion_up="y"), str(tmp_path), Progress())
 
 
@@ -146,7 +146,7 @@ def test_a_step_that_is_not_finite_is_stepped_over(small, data, monkeypatch, cap
     )
     figures = training.step()
     assert figures["stepped_over"] == 1 and np.isfinite(figures["loss"])
-    assert "step 1: gravity not finite, stepped over" in capsys.readouterr().err
+    assert "step 1: gravity not finite, skipped" in capsys.readouterr().err
     assert all(torch.equal(v, before[k]) for k, v in training.network.state_dict().items())
     monkeypatch.setattr(loop, "BAD_STEPS", 2)
     with pytest.raises(InputError, match="2 steps in a row were not finite"):
@@ -264,9 +264,9 @@ class _Nothing:
 @pytest.mark.parametrize(
     "change, message",
     [
-        (dict(batch=0), "batch = 0: 1 at least"),
+        (dict(batch=0), "batch = 0; at least 1 is needed"),
         (dict(order=1), "order = 1"),
-        (dict(lr=0.0), "lr = 0.0: more than 0"),
+        (dict(lr=0.0), "lr = 0.0; more than 0 is needed"),
         (dict(epoch_steps=-1), "epoch_steps = -1"),
     ],
 )
