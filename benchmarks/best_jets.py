@@ -101,7 +101,7 @@ def _refined(chart, state, V, steps=60):
             whole = chart.fitted(state, V, iterations=1, bending=1e-9)
             tried = [
                 (distance(x), x)
-                for x in (state.towards(whole, -back) for back in (0, 0.5, 0.75, 0.9, 0.97))
+                for x in (state.extrapolated(whole, -back) for back in (0, 0.5, 0.75, 0.9, 0.97))
             ]
         except (np.linalg.LinAlgError, ValueError):
             break

@@ -65,7 +65,7 @@ def measured(path, overrides, turns):
     surface = chart.surface(rest)
     vertices, at = surface.vertices, images._frames.level(1, level)
     with dr.suspend_grad():
-        view = images._look(vertices, level)
+        view = images._view(vertices, level)
         given = (
             *images._compared(view, 1, level, images.appearance(vertices, level)),
             dr.opaque(mi.Float, 0.3),
@@ -85,7 +85,7 @@ def measured(path, overrides, turns):
 
     def look():
         images._last = None
-        images._look(vertices, level)
+        images._view(vertices, level)
 
     def traced():
         assembly._in_unknowns = recorded.__wrapped__

@@ -26,7 +26,7 @@ from sequences import DATA, ROOT
 
 from polysft_mi.camera import Intrinsics
 from polysft_mi.capture import iou
-from polysft_mi.capture.pictures import laid
+from polysft_mi.capture.pictures import photo_on_frame
 from polysft_mi.capture.sheet import grid
 from polysft_mi.errors import InputError, cli
 from polysft_mi.pictures.video import write_video
@@ -246,7 +246,7 @@ def bending_frames(photo, camera, count, finer=3):
     size = finer * camera.width, finer * camera.height
     for k in range(count):
         x = finer * camera.project(bending(mesh.uv, k / (count - 1)))
-        frame = laid(np.full((size[1], size[0], 3), 45, np.uint8), photo, mesh, x)
+        frame = photo_on_frame(np.full((size[1], size[0], 3), 45, np.uint8), photo, mesh, x)
         frame = cv2.resize(frame, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
         noisy = frame + random.normal(0, 2, frame.shape)
         yield np.clip(noisy, 0, 255).astype(np.uint8)

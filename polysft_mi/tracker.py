@@ -25,10 +25,10 @@ from .solvers import Solver
 from .surface.patch import Unknowns
 
 CHECKPOINT, LOG = "checkpoint.npz", "log.jsonl"
-_VISIBLE = (
+_MIN_VISIBLE_SHARE = (
     0.02  # share of the vertices inside the image below which the surface is said to have left it
 )
-_PAST = 20  # frames that a solver is told of
+_MAX_HISTORY = 20  # frames that a solver is told of
 _LOG_EVERY = 10  # iterations between records of the log
 
 
@@ -209,7 +209,7 @@ def _advance(problem, solver, done, start, width, log, progress):
     while usable := [k for k in members if k not in done.unusable]:
         before = [Unknowns.from_numpy(done.states[k]) for k in usable]
         try:
-            earlier = range(max(0, members[-1] - _PAST), members[-1]) if start else []
+            earlier = range(max(0, members[-1] - _MAX_HISTORY), members[-1]) if start else []
             past = [
                 (done.states[k], done.totals[k - width + 1] if k >= width - 1 else {})
                 for k in earlier
@@ -237,7 +237,7 @@ def _advance(problem, solver, done, start, width, log, progress):
             state = solved[k].to_numpy()
             if not all(np.isfinite(x).all() for x in state.values()):
                 failed[k] = "its state is not finite"
-            elif problem.visible_share(solved[k]) < _VISIBLE:
+            elif problem.visible_share(solved[k]) < _MIN_VISIBLE_SHARE:
                 failed[k] = "the surface left the image"
             else:
                 done.states[k] = state

@@ -98,7 +98,10 @@ def write_frames(folder, frames, masks, expected, straight, progress, registrati
 def _write_contact_sheets(folder, indices, masked):
     """Pictures of some of the frames and masks that were written."""
     read = lambda name: read_rgb(os.path.join(folder, name))
-    few = [(k, f"frame {indices[k]}", read(FRAME.format(k))) for k in pictures.chosen(len(indices))]
+    few = [
+        (k, f"frame {indices[k]}", read(FRAME.format(k)))
+        for k in pictures.evenly_spaced(len(indices))
+    ]
     write_png(
         os.path.join(folder, REPORT, "frames.png"),
         pictures.contact_sheet([(caption, image) for _, caption, image in few]),

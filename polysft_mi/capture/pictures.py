@@ -54,7 +54,7 @@ def contact_sheet(cells, columns=4, side=320):
     return sheet
 
 
-def chosen(count, most=12):
+def evenly_spaced(count, most=12):
     """Indices of at most ``most`` of ``count`` things, evenly spread, the first and the last among
     them.
     """
@@ -118,12 +118,12 @@ def pose(frame, photo, sheet, placed, camera):
     for loop in loops(sheet.faces):
         draw(np.stack([loop, np.roll(loop, -1)], axis=1), YELLOW, 2)
     label(wired, "the template in the first frame")
-    beside, _ = _canvas(laid(frame, photo, sheet, x))
+    beside, _ = _canvas(photo_on_frame(frame, photo, sheet, x))
     label(beside, "the photo, placed on the template")
     return np.hstack([wired, np.full((wired.shape[0], 4, 3), 255, np.uint8), beside])
 
 
-def laid(frame, photo, sheet, x):
+def photo_on_frame(frame, photo, sheet, x):
     """The frame (H, W, 3), and on it the photo where the vertices' pixels ``x`` (N, 2) have it."""
     from matplotlib.tri import Triangulation
 

@@ -62,7 +62,7 @@ class Frames:
         # all levels are made of one decoding
         self._decoded = lru_cache(2)(lambda frame: (sequence.frame(frame), sequence.mask(frame)))
 
-    def expect(self, frames, levels, brightness=None):
+    def prefetch(self, frames, levels, brightness=None):
         """Read ``frames`` ahead at ``levels`` and, with a
         :class:`polysft_mi.images.light.Brightness`, their luminance.
         """
@@ -80,18 +80,18 @@ class Frames:
         return level_image(*self._decoded(frame), level, self._normalise)
 
     def _luminance(self, frame, brightness):
-        return brightness.prepared(*self._decoded(frame))
+        return brightness.frame_luminance(*self._decoded(frame))
 
     def luminance(self, frame, brightness):
-        """What :meth:`polysft_mi.images.light.Brightness.prepared` makes of a frame."""
+        """What :meth:`polysft_mi.images.light.Brightness.frame_luminance` makes of a frame."""
         if (frame, "luminance") not in self._kept:
-            self.expect([frame], [], brightness)
+            self.prefetch([frame], [], brightness)
         return self._kept[frame, "luminance"].result()
 
     def level(self, frame, level):
         """A :class:`Frame` at a level. Raises BadFrame where it is not finite."""
         if (frame, level) not in self._kept:
-            self.expect([frame], [level])
+            self.prefetch([frame], [level])
         entry = self._kept[frame, level]
         if not isinstance(entry, Frame):
             image = entry.result()

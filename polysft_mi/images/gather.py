@@ -143,7 +143,7 @@ def projection(camera, vertices, index):
     return [(row - z * (dr.dot(row, d) * depth)) * depth for row in (x, y)]
 
 
-def between(left, matrix, right):
+def congruence(left, matrix, right):
     """left^T matrix right, of lists of rows: (p, q), (p, p), (p, r)."""
     half = [
         [sum(row[m] * right[m][b] for m in range(len(right))) for b in range(len(right[0]))]
@@ -172,7 +172,7 @@ def at_vertices(tables, table, figures, vertices, camera, numbers, silhouette):
     ``vertices`` Float64 of 3N [m]; ``numbers`` Float64: weights of all pixels and of a mask's
     pixel, how many are all (0: as many as are seen), and 1 over the grid's stride; ``silhouette``:
     of each pixel there the edge's ends i and j, derivatives ci and cj, excess and share, as
-    :func:`polysft_mi.images.pixels.outline` gives them, or None.
+    :func:`polysft_mi.images.pixels.silhouette_terms` gives them, or None.
     """
     weight, mask_weight, area, scale = (dr.gather(mi.Float64, numbers, k) for k in range(4))
     count = dr.sum(

@@ -94,16 +94,18 @@ class Light:
         is known.
         """
         return (
-            np.linalg.solve(self._held(triangles), self.right) if self.frames else np.eye(_SIZE)[0]
+            np.linalg.solve(self._prior_curvature(triangles), self.right)
+            if self.frames
+            else np.eye(_SIZE)[0]
         )
 
-    def _held(self, triangles):
+    def _prior_curvature(self, triangles):
         """The curvature (7, 7) that holds the coefficients where they are, in squared residuals of
         a triangle.
         """
         return self.matrix + np.diag([1e-9] + [self.rules.light_ridge * triangles] * (_SIZE - 1))
 
-    def explaining(self, shade):
+    def fit(self, shade):
         """The light that explains a frame and the frames before it best, where its surface has the
         triangles ``shade`` (a :class:`Shade`): :class:`Fit`.
         """
@@ -112,7 +114,7 @@ class Light:
         )
         area = np.where(shade.seen, shade.area, 0.0)
         area *= shade.seen.sum() / max(area.sum(), 1e-30)  # 1 on average
-        held, before = self._held(len(shade.seen)), self.coefficients(len(shade.seen))
+        held, before = self._prior_curvature(len(shade.seen)), self.coefficients(len(shade.seen))
         value = shade.luminance
         if self.rules.exposure:
             value = value / _exposure(value[shade.seen], (rows @ before)[shade.seen])
@@ -124,11 +126,11 @@ class Light:
         change = found - before
         return Fit(found, value - rows @ found, area, float(change @ held @ change), matrix, right)
 
-    def learned(self, shade):
+    def updated(self, shade):
         """The light after a frame whose surface had the triangles ``shade``."""
         if shade.seen.sum() < _SIZE:
             return self
-        fit = self.explaining(shade)
+        fit = self.fit(shade)
         deviation = _NORMAL_DEVIATION * float(np.median(np.abs(fit.residual[shade.seen])))
         return Light(
             self.rules.light_kept * (self.matrix + fit.matrix),
@@ -180,7 +182,7 @@ class Brightness:
         self.texture = found / self.mean
         self.trusted &= self.texture > 0
 
-    def prepared(self, colour, mask):
+    def frame_luminance(self, colour, mask):
         """A frame ``colour`` (H, W, 3) [linear RGB] with its ``mask`` (H, W) or None, as :meth:`of`
         wants it: luminances over the texture's mean, blurred, on a grid of blocks of ``pool`` x
         ``pool`` pixels, and ``pool``."""
@@ -190,7 +192,7 @@ class Brightness:
             image, mask = shrink(image, pool), None if mask is None else shrink(mask, pool)
         return blur(image, self.sigma / pool, mask) / self.mean, pool
 
-    def shown(self, colour, inside, stride, position):
+    def texture_luminance(self, colour, inside, stride, position):
         """Luminance (F,) of the triangles' texture over its mean, where a sheet's image without
         light is ``colour`` (h, w, 3), covered by it where ``inside`` (h, w) is 1, of blocks of
         ``stride`` x ``stride`` pixels, and its vertices lie at ``position`` (N, 2) [blocks] there.
@@ -198,7 +200,7 @@ class Brightness:
         image = blur(colour @ _LUMINANCE, self.sigma / stride, inside)
         return _sampled(image, position[self.faces].sum(1) / 3 - 0.5) / self.mean
 
-    def lit(self, vertices, origin, light):
+    def irradiance(self, vertices, origin, light):
         """How bright the ``light`` (7,) makes the triangles (F,) of a surface with ``vertices`` (N,
         3) [m], seen from ``origin`` (3,): averages over their neighbours."""
         corner = vertices[self.faces]
@@ -249,7 +251,7 @@ def residuals(shade, light, weight):
     and the derivatives (F, 3, 3) of r by the corners [1/m]. The light follows the surface; at its
     best, the energy has no slope along it.
     """
-    fit, scale = light.explaining(shade), light.scale
+    fit, scale = light.fit(shade), light.scale
     weight = weight / max(shade.seen.sum(), 1)
     over = (fit.residual / scale) ** 2
     energy = weight * (scale**2 * float((fit.area * np.log1p(over)).sum()) + fit.departure)

@@ -15,7 +15,7 @@ import mitsuba as mi
 from polysft_mi.render.silhouette import blend
 from polysft_mi.render.view import point2
 
-from .pyramid import FARTHEST
+from .pyramid import MAX_CONTOUR_DISTANCE
 
 MISFIT = 0.5  # residual, in local standard deviations, that counts half a misfit
 CORNERS = (
@@ -29,7 +29,7 @@ CORNERS = (
 CURVATURES, SLOPES, FIGURES = 18, 9, 4  # sums over the pixels of a triangle
 TAPS = 2  # across a pixel's footprint on the texture, and along it
 # pixels by which a ray may pass the triangle that it meets: it and the projection round differently
-_BEYOND = 0.01
+_BOX_TOLERANCE = 0.01
 
 
 @dataclass
@@ -139,7 +139,7 @@ def ray_hits(seen, sheet):
     return RayHit(ray, triangle, b1, b2, e1, e2, at, c1 - c0, c2 - c0)
 
 
-def places(seen):
+def pixel_coordinates(seen):
     """The pixels' places (x, y) on the level's grid, Int32."""
     x0, y0, width, _ = seen.region
     local = dr.arange(mi.UInt32, dr.width(seen.triangle))
@@ -152,7 +152,7 @@ def across(seen):
     return [seen.depth * mi.Vector3f(*(seen.basis[k, axis] for k in range(3))) for axis in (0, 1)]
 
 
-def compared(seen, sheet, texture, frame, excess):
+def residuals(seen, sheet, texture, frame, excess):
     """Residuals (Vector4f, its fourth entry 0) and weights of the pixels; what they met, and the
     texture's derivatives by texture coordinates.
 
@@ -161,7 +161,7 @@ def compared(seen, sheet, texture, frame, excess):
     """
     hit, found = seen.hit, ray_hits(seen, sheet)
     colour, by_x, by_y = texture.bilinear(found.at, hit)
-    x, y = places(seen)
+    x, y = pixel_coordinates(seen)
     pixel, known = frame.at(x, y)
     target = dr.gather(mi.Vector4f, frame.texels, pixel, hit & known)
     weight = dr.select(hit & (colour.w > 0.5), target.w, 0)
@@ -175,21 +175,21 @@ def compared(seen, sheet, texture, frame, excess):
 
 def squares(seen, sheet, texture, frame, excess):
     """Squared residuals r^2 = |T - I|^2 / 3 of the pixels, and their weights; arguments as of
-    :func:`compared`.
+    :func:`residuals`.
     """
-    residual, weight, *_ = compared(seen, sheet, texture, frame, excess)
+    residual, weight, *_ = residuals(seen, sheet, texture, frame, excess)
     return dr.squared_norm(residual) / 3, weight
 
 
-def sums(seen, sheet, texture, frame, excess, scale):
+def triangle_sums(seen, sheet, texture, frame, excess, scale):
     """Sums over the pixels that see each triangle, under the robust ``scale`` (Float): curvatures
     and slopes, Float of 27 F, and figures, Float of 4 F: energy, pixels, r^2 / (r^2 + scale^2) and
-    the same with the fixed ``MISFIT``. Other arguments as of :func:`compared`.
+    the same with the fixed ``MISFIT``. Other arguments as of :func:`residuals`.
 
     The curvatures (xx, xy, yy) of each pair of ``CORNERS`` are in the image plane [1/pixel^2 of the
     grid], the slopes of each corner in space [1/m].
     """
-    residual, weight, found, (by_x, by_y) = compared(seen, sheet, texture, frame, excess)
+    residual, weight, found, (by_x, by_y) = residuals(seen, sheet, texture, frame, excess)
     squared, c2 = dr.squared_norm(residual) / 3, scale * scale
     # the texture coordinate under a pixel moves against the triangle's plane, which slides along
     # the ray
@@ -281,7 +281,10 @@ def _box(seen, corners):
         a, b, c = (p[axis] for p in point)
         low, high = dr.minimum(dr.minimum(a, b), c), dr.maximum(dr.maximum(a, b), c)
         first, size = mi.Float(seen.region[axis]) + 0.5, mi.Float(seen.region[2 + axis])
-        start, end = dr.ceil(low - _BEYOND - first), dr.floor(high + _BEYOND - first) + 1
+        start, end = (
+            dr.ceil(low - _BOX_TOLERANCE - first),
+            dr.floor(high + _BOX_TOLERANCE - first) + 1,
+        )
         ends.append(
             [
                 mi.Int32(dr.select(before, dr.clip(x, 0, size), all))
@@ -303,7 +306,7 @@ def packed(columns, index):
 def rendered(seen, sheet, texture, fine, lit, stride, footprint_limit):
     """The sheet as the camera has it before any blur: colour and, in the fourth channel, the light
     on it (0 where there is no sheet), Vector4f of n; and the ``texture``, an :class:`Image`, as
-    :func:`compared` takes it, likewise.
+    :func:`residuals` takes it, likewise.
 
     ``fine``: the :class:`Image` that a pixel's footprint is averaged over; ``lit`` Float of F:
     light on the triangles; ``stride`` Float: pixels of the video to one of the grid, times the
@@ -327,7 +330,7 @@ def rendered(seen, sheet, texture, fine, lit, stride, footprint_limit):
     return dr.select(hit, colour, 0), template
 
 
-def outline(seen, pairs, mask, distance, corner_of):
+def silhouette_terms(seen, pairs, mask, distance, corner_of):
     """The silhouette against the mask, before its weight.
 
     ``pairs``: of :meth:`RasterIntegrator.crossings`; ``mask``: an :class:`Image` whose texels are
@@ -339,7 +342,7 @@ def outline(seen, pairs, mask, distance, corner_of):
     term's slope here and its minimum at the mask's contour. A step then goes all the way, where
     plain Gauss-Newton, whose residuals are pixels, would go one pixel.
     """
-    x, y = places(seen)
+    x, y = pixel_coordinates(seen)
     pixel, known = mask.at(x, y)
     wanted, alpha = (
         dr.gather(mi.Float, mask.texels, pixel, known),
@@ -363,9 +366,9 @@ def outline(seen, pairs, mask, distance, corner_of):
     far = dr.select(
         dr.gather(mi.Bool, known, to),
         dr.gather(mi.Float, distance, dr.gather(mi.UInt32, pixel, to)),
-        FARTHEST,
+        MAX_CONTOUR_DISTANCE,
     )
     ci, cj = da * step, db * step
-    share = dr.rcp(dr.maximum(1, dr.norm(ci + cj) * dr.minimum(far, FARTHEST)))
+    share = dr.rcp(dr.maximum(1, dr.norm(ci + cj) * dr.minimum(far, MAX_CONTOUR_DISTANCE)))
     ends = [dr.gather(mi.UInt32, corner_of, i) for i in (va, vb)]
     return dr.square(alpha - wanted) - dr.square(wanted), (*ends, ci, cj, excess, share)

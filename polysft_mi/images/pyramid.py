@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 
 POOL = 4  # local statistics are taken on an image this many times smaller
-FARTHEST = 30.0  # pixels of the grid beyond which a silhouette is pulled no harder
+MAX_CONTOUR_DISTANCE = 30.0  # pixels of the grid beyond which a silhouette is pulled no harder
 # local standard deviation below which an area counts as flat: it is not blown up to the contrast of
 # the rest
-_FLOOR = 0.02
+_MIN_DEVIATION = 0.02
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class LevelImage:
     compared; with a mask, ``mask`` (h, w) in [0, 1], and ``distance`` (h, w), pixels of this grid
     from the mask's contour, of either side. ``corner`` (x, y) [pixels of this grid]: where these
     arrays begin; with a mask they end where it does, and everything that it takes part in: what
-    lies beyond is not of the sheet, and farther than ``FARTHEST`` from the contour."""
+    lies beyond is not of the sheet, and farther than ``MAX_CONTOUR_DISTANCE`` from the contour."""
 
     colour: np.ndarray
     inside: np.ndarray
@@ -42,7 +42,7 @@ class LevelImage:
 
 def level_image(image, mask, level, normalise=True):
     """A frame (H, W, 3), linear, with its mask (H, W) or None, at a :class:`Level`."""
-    (y, x), near = _around(mask, level)
+    (y, x), near = _slices_around(mask, level)
     image, mask = image[near], mask[near] if mask is not None else None
     colour = compared(image, mask, level.sigma, level.window, normalise)
     inside = (
@@ -59,7 +59,7 @@ def level_image(image, mask, level, normalise=True):
     return LevelImage(colour, inside, small, distance, (x // level.stride, y // level.stride))
 
 
-def _around(mask, level):
+def _slices_around(mask, level):
     """(y, x) where the part of an image begins that a mask (H, W) has a say in at a level, and its
     slices: everything without a mask.
     """
@@ -68,7 +68,7 @@ def _around(mask, level):
     )
     if len(rows) == 0:
         return (0, 0), (slice(None), slice(None))
-    margin = int(max((FARTHEST + 2) * level.stride, 4 * level.sigma, 4 * level.window))
+    margin = int(max((MAX_CONTOUR_DISTANCE + 2) * level.stride, 4 * level.sigma, 4 * level.window))
     step = math.lcm(level.stride, POOL)  # so that the grids of the part are those of the whole
     at = [
         (max(0, int(x[0]) - margin) // step * step, (int(x[-1]) + margin) // step * step + step)
@@ -116,7 +116,7 @@ def normalised(image, sigma, weight=None):
     mean = local(weighted) / share[..., None]
     power = local(np.einsum("hwc,hwc->hw", weighted, image) / image.shape[2]) / share
     variance = power - (mean * mean).mean(-1)
-    scale = 1 / np.sqrt(np.maximum(variance, 0) + _FLOOR**2)
+    scale = 1 / np.sqrt(np.maximum(variance, 0) + _MIN_DEVIATION**2)
     both = cv2.resize(
         np.concatenate([mean * scale[..., None], scale[..., None]], -1),
         (width, height),

@@ -1,7 +1,7 @@
 """What the images say of a surface, to second order: how well it explains a frame, and how that
 changes with each vertex.
 
-Visibility comes from Mitsuba: one ray a pixel (:meth:`RasterIntegrator.look`). The texture is the
+Visibility comes from Mitsuba: one ray a pixel (:meth:`RasterIntegrator.view`). The texture is the
 template's, blurred like the frame. Residuals and their derivatives are closed forms
 (:mod:`polysft_mi.images.pixels`), summed on the device for each triangle and gathered at the
 vertices (:mod:`polysft_mi.images.gather`). Import only after a Mitsuba variant is set.
@@ -35,15 +35,15 @@ class Evaluation:
 
     ``photometric``, ``silhouette``: energies; ``images``: a
     :class:`polysft_mi.images.gather.Images`, what they say at the vertices; ``pixels``: how many of
-    the video were compared; ``outlying``: the mean of r^2 / (r^2 + scale^2) over them; ``misfit``:
-    the same with a fixed scale (both are 1 where no pixel is compared); ``seen`` (F,): pixels of
-    the video that see each triangle; ``noise``: the variance of a residual, as the residuals' own
-    size says it.
+    the video were compared; ``outlier_share``: the mean of r^2 / (r^2 + scale^2) over them;
+    ``misfit``: the same with a fixed scale (both are 1 where no pixel is compared); ``seen`` (F,):
+    pixels of the video that see each triangle; ``noise``: the variance of a residual, as the
+    residuals' own size says it.
     """
 
     photometric: float
     silhouette: float
-    outlying: float
+    outlier_share: float
     misfit: float
     images: Images
     pixels: float
@@ -96,7 +96,7 @@ class Registration:
         self.gather = Gather(self.pattern, self.camera)
         self._corner_of = on_device(self._corner, mi.UInt32)
         self._triangle = on_device(np.arange(len(rendered)), mi.UInt32)
-        self._sums, self._outline = frozen(pixels.sums), frozen(pixels.outline)
+        self._sums, self._outline = frozen(pixels.triangle_sums), frozen(pixels.silhouette_terms)
         self.normalise = problem.settings.lighting == "local"
         self._masked = bool(experiment.masks)
         position, _ = self.camera.project(template.vertices)
@@ -123,14 +123,14 @@ class Registration:
 
     # -- what is known before a frame is looked at ---------------------------
 
-    def expect(self, frames, blurs):
+    def prefetch(self, frames, blurs):
         """Read ``frames`` ahead in a second thread, for what follows at ``blurs``; those beyond the
         video are left out.
         """
         shading = self._problem.settings.k_shading > 0
         # made here, because the thread must not touch the device
         brightness = self.brightness if shading else None
-        self._frames.expect(frames, [self._level(blur) for blur in blurs], brightness)
+        self._frames.prefetch(frames, [self._level(blur) for blur in blurs], brightness)
 
     @property
     def brightness(self):
@@ -175,8 +175,8 @@ class Registration:
         """Squared residuals r^2 = |T - I|^2 / 3 of the pixels that are compared, (P,) float32."""
         level = self._level(blur)
         with dr.suspend_grad():
-            view = self._look(vertices, level)
-            squared, weight = pixels.squares(*self._compared(view, frame, level))
+            view = self._view(vertices, level)
+            squared, weight = pixels.squares(*self._residual_arguments(view, frame, level))
             return np.array(squared)[np.array(weight) > 0]
 
     def evaluate(self, vertices, frame, blur, scale, appearance=None):
@@ -186,9 +186,10 @@ class Registration:
         level, s = self._level(blur), self._problem.settings
         shown = self._frames.level(frame, level)
         with dr.suspend_grad():
-            view = self._look(vertices, level)
+            view = self._view(vertices, level)
             table, figures = self._sums(
-                *self._compared(view, frame, level, appearance), dr.opaque(mi.Float, scale)
+                *self._residual_arguments(view, frame, level, appearance),
+                dr.opaque(mi.Float, scale),
             )
             masked, error, pairs = s.k_silhouette > 0 and shown.mask is not None, None, None
             if masked:
@@ -203,13 +204,13 @@ class Registration:
             )
             # waits for the device: by now it knows all that it has to do
             figures = np.array(figures).reshape(-1, pixels.FIGURES).astype(np.float64)
-            energy, count, outlying, misfit = figures.sum(0).tolist()
+            energy, count, outlier_share, misfit = figures.sum(0).tolist()
             weight = s.k_rgb / (shown.area or max(count, 1.0))
             silhouette = 0.0
             if masked:  # the squares are of the whole frame, the errors, less these, of the region
                 squares = shown.squares + float(np.array(error).sum(dtype=np.float64))
                 silhouette = mask_weight * squares
-        outlying, misfit = (outlying / count, misfit / count) if count else (1.0, 1.0)
+        outlier_share, misfit = (outlier_share / count, misfit / count) if count else (1.0, 1.0)
         photometric, compared_pixels = weight * energy, count * level.stride**2
         # pixels closer than the blur are no evidence of their own
         noise = 2 * photometric / (3 * max(compared_pixels, 1.0))
@@ -217,7 +218,7 @@ class Registration:
         return Evaluation(
             photometric,
             silhouette,
-            outlying,
+            outlier_share,
             misfit,
             images,
             compared_pixels,
@@ -245,15 +246,15 @@ class Registration:
         level = self._level(blur)
         lit = np.ones(len(self.faces))
         if light is not None:
-            lit = self.brightness.lit(vertices, self.camera.origin, light)
+            lit = self.brightness.irradiance(vertices, self.camera.origin, light)
         lit = on_device(lit, mi.Float)
         with dr.suspend_grad():
-            view = self._look(vertices, level)
+            view = self._view(vertices, level)
             found, template = pixels.rendered(
                 view.seen(),
                 self._sheet,
                 self.texture.level(level),
-                self.texture.fine(level.stride),
+                self.texture.footprint_texture(level.stride),
                 lit,
                 dr.opaque(mi.Float, level.stride * self.texture.density),
                 dr.opaque(mi.Float, self._rules.footprint),
@@ -278,12 +279,12 @@ class Registration:
         if shaded:
             position, _ = self.camera.project(vertices)
             at = position / level.stride - corner
-            luminance = self.brightness.shown(found[..., :3], inside, level.stride, at)
+            luminance = self.brightness.texture_luminance(found[..., :3], inside, level.stride, at)
         return Appearance(excess, luminance)
 
     # -- parts ----------------------------------------------------------------
 
-    def _look(self, vertices, level):
+    def _view(self, vertices, level):
         """The :class:`polysft_mi.render.view.View` of the sheet on a level's grid; the last is
         kept.
         """
@@ -292,7 +293,7 @@ class Registration:
             self._problem.place(mi.Point3f(np.ascontiguousarray(vertices.T, dtype=np.float32)))
             position, before = self.camera.project(vertices)
             box = (*position.min(0), *position.max(0)) if before.all() else None
-            view = self._raster.look(self._scene, self._sensor, 1 / level.stride, box)
+            view = self._raster.view(self._scene, self._sensor, 1 / level.stride, box)
             self._last = level.stride, vertices.copy(), view
         return self._last[2]
 
@@ -303,8 +304,8 @@ class Registration:
             self._triangle, faces, texture.coordinates, texture.scale, texture.shift
         )
 
-    def _compared(self, view, frame, level, appearance=None):
-        """What :func:`polysft_mi.images.pixels.compared` takes."""
+    def _residual_arguments(self, view, frame, level, appearance=None):
+        """What :func:`polysft_mi.images.pixels.residuals` takes."""
         return (
             view.seen(),
             self._sheet,

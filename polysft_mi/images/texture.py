@@ -110,7 +110,7 @@ class Texture:
             self._levels[level] = pixels.Image.of(packed_image(image, trusted), trusted.shape)
         return self._levels[level]
 
-    def fine(self, stride):
+    def footprint_texture(self, stride):
         """The texture that the footprints of pixels are averaged over, on a grid of ``stride``
         pixels; the fourth channel is 0.
         """

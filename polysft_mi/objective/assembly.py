@@ -12,7 +12,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from polysft_mi.images.gather import add, between, flat, flattened, numbers_of, projection, rows_of
+from polysft_mi.images.gather import (
+    add,
+    congruence,
+    flat,
+    flattened,
+    numbers_of,
+    projection,
+    rows_of,
+)
 from polysft_mi.images.pixels import packed
 from polysft_mi.render.device import frozen
 
@@ -59,8 +67,8 @@ def in_unknowns(
     camera,
     lengths,
     numbers,
-    by_offset,
-    by_motion,
+    offset_jacobian,
+    motion_jacobian,
     basis,
     entry,
     size,
@@ -70,8 +78,8 @@ def in_unknowns(
     jet patch.
 
     ``vertices`` Float64 of 3N [m]; ``lengths`` Float64 of E [m], ``numbers`` Float64: stiffness
-    [1/m^2], give; ``by_offset`` Float64 of 9N, ``by_motion`` of 18N, ``basis`` of A N: of
-    :class:`polysft_mi.surface.chart.Surface`; ``entry``: 0, 1, ... of A N, and ``size``: A,
+    [1/m^2], give; ``offset_jacobian`` Float64 of 9N, ``motion_jacobian`` of 18N, ``basis`` of A N:
+    of :class:`polysft_mi.surface.chart.Surface`; ``entry``: 0, 1, ... of A N, and ``size``: A,
     UInt32; ``triangles``: None, or Float64: r h of F, h of F and derivatives of 9F, as
     :meth:`Assembly.normal` takes them. Returns Float64: energies of the edges without their weight
     (E), gradient (3N) in space; by (Δu, Δv, Δw): gradient (3N), curvature (9U) of the pairs; with
@@ -106,7 +114,7 @@ def in_unknowns(
 
     # curvature in the positions, of each pair of neighbours: of the images by their projections
     left, right = (projection(camera, vertices, k) for k in (tables.i, tables.j))
-    space = flattened(between(left, rows_of(numbers_of(images.second, pair, 4), 2), right))
+    space = flattened(congruence(left, rows_of(numbers_of(images.second, pair, 4), 2), right))
     same = tables.i == tables.j
     own = numbers_of(around, tables.i, 6)
     other = [
@@ -129,10 +137,10 @@ def in_unknowns(
 
     # each vertex moves by its own (u, v), by a height, which is its own and that of all
     # coefficients there, and by the motion
-    left, right = (rows_of(numbers_of(by_offset, k, 9), 3) for k in (tables.i, tables.j))
-    local = packed(flattened(between(left, rows_of(space, 3), right)), pair)
+    left, right = (rows_of(numbers_of(offset_jacobian, k, 9), 3) for k in (tables.i, tables.j))
+    local = packed(flattened(congruence(left, rows_of(space, 3), right)), pair)
     space = packed(space, pair)
-    own = rows_of(numbers_of(by_offset, vertex, 9), 3)
+    own = rows_of(numbers_of(offset_jacobian, vertex, 9), 3)
 
     def places(entry):  # of the 3 x 3 of one of a vertex's pairs, row by row
         half = dr.gather(mi.UInt32, tables.half, entry)
@@ -142,7 +150,9 @@ def in_unknowns(
         ]
 
     def motion(entry):
-        m = rows_of(numbers_of(by_motion, dr.gather(mi.UInt32, tables.neighbour, entry), 18), 6)
+        m = rows_of(
+            numbers_of(motion_jacobian, dr.gather(mi.UInt32, tables.neighbour, entry), 18), 6
+        )
         h = [[dr.gather(mi.Float64, space, k) for k in row] for row in places(entry)]
         return [sum(row[k] * m[k][c] for k in range(3)) for row in h for c in range(6)]
 
@@ -215,8 +225,8 @@ class Assembly:
             self._gather.camera,
             flat(lengths),
             flat([stiffness, give]),
-            flat(surface.by_offset),
-            flat(surface.by_motion),
+            flat(surface.offset_jacobian),
+            flat(surface.motion_jacobian),
             flat(basis),
             dr.arange(mi.UInt32, basis.size),
             dr.opaque(mi.UInt32, size),
@@ -226,21 +236,24 @@ class Assembly:
         gradient, by_motion = gradient.reshape(-1, 3), by_motion.reshape(-1, 3, 6)
         local = local.reshape(-1, 3, 3)[:, :d, :d]
         if wide is None:
-            blocks = pattern.whole(local)
+            blocks = pattern.all_blocks(local)
         else:
             blocks = np.zeros((len(wide.row), 3, 3))
-            blocks[self._places(wide)] = pattern.whole(local)
+            blocks[self._places(wide)] = pattern.all_blocks(local)
         glob = np.empty((size + 6, size + 6))
         glob[:size, :size] = basis.T @ lifted[2].reshape(-1, size)
         glob[:size, size:] = basis.T @ by_motion[:, 2]
         glob[size:, :size] = glob[:size, size:].T
-        glob[size:, size:] = surface.by_motion.reshape(-1, 6).T @ moved.reshape(-1, 6)
+        glob[size:, size:] = surface.motion_jacobian.reshape(-1, 6).T @ moved.reshape(-1, 6)
         cross = np.empty((count, d, size + 6))
         for k in range(d):
             cross[:, k, :size] = lifted[k].reshape(-1, size)
         cross[:, :, size:] = by_motion[:, :d]
         right = np.concatenate(
-            [basis.T @ (gradient @ surface.up), np.einsum("nk,nkm->m", gradient, surface.by_motion)]
+            [
+                basis.T @ (gradient @ surface.up),
+                np.einsum("nk,nkm->m", gradient, surface.motion_jacobian),
+            ]
         )
         normal = Normal(
             blocks,

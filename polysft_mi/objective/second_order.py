@@ -72,7 +72,7 @@ class Context:
         """
         return math.isnan(self.noise)
 
-    def anchored(self, anchor):
+    def with_anchor(self, anchor):
         """The same, held to another state."""
         return replace(self, anchor=anchor)
 

@@ -21,7 +21,7 @@ from polysft_mi.results import metrics
 
 from . import figures
 from .exr import write_exr
-from .panels import COLUMNS, PEAKS, Box, heat, heat_values, spread
+from .panels import COLUMNS, PEAKS, Box, evenly_spaced, heat, heat_values
 from .shading import srgb
 from .video import write_video
 
@@ -270,7 +270,7 @@ class Album:
 
             list(self._pool.map(shade, range(count)))
         self.rows = []
-        for k in spread(count, self.settings.rows):
+        for k in evenly_spaced(count, self.settings.rows):
             row = self._panels(k)
             for name, peak in PEAKS.items():
                 row[name] = heat_values(row[name], peak)

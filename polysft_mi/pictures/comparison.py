@@ -13,7 +13,7 @@ from polysft_mi.files import folder_aside
 from polysft_mi.results.comparison import LABELS
 
 from . import exr, figures
-from .panels import box_of, panels, spread
+from .panels import box_of, evenly_spaced, panels
 from .shading import seen
 
 
@@ -28,7 +28,7 @@ def write_comparison(comparison, out, *, count=20, scale=None):
     run = comparison.run
     if run.camera is None:
         raise InputError(f"{run.folder}: holds no camera.json, which pictures need; run it again")
-    shown = [comparison.frames[i] for i in spread(len(comparison.frames), count)]
+    shown = [comparison.frames[i] for i in evenly_spaced(len(comparison.frames), count)]
     maps = {k: difference_maps(comparison, k) for k in shown}
     scale = max(_scale_of(maps.values()) if scale is None else scale, 1e-3)
     runs = [r for r in (run, comparison.other) if r]

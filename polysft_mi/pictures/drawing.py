@@ -16,7 +16,7 @@ from functools import partial
 
 import numpy as np
 
-from .panels import spread
+from .panels import evenly_spaced
 
 _album = None  # of the drawing process
 
@@ -87,7 +87,7 @@ class Drawing:
             self._submit()  # starts the process
 
     def _chosen(self, count):
-        return set(spread(count, self.exr_frames))
+        return set(evenly_spaced(count, self.exr_frames))
 
     def _submit(self, *calls):
         """Have the album's methods called: the future of the last one, None where the process is

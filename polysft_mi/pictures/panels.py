@@ -59,7 +59,7 @@ class Box(NamedTuple):
         return slice(self.top, self.bottom), slice(self.left, self.right)
 
 
-def spread(count, limit):
+def evenly_spaced(count, limit):
     """At most ``limit`` of ``count`` indices, spread evenly, first and last among them."""
     if limit >= count:
         return list(range(count))

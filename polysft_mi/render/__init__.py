@@ -8,7 +8,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submodules=["device", "pinhole", "projective", "silhouette", "stage", "topology", "view"],
     submod_attrs={
-        "pinhole": ["NEAR", "Pinhole"],
+        "pinhole": ["MIN_DEPTH", "Pinhole"],
         "raster": ["RasterIntegrator"],
         "silhouette": ["blend"],
         "topology": ["Topology"],

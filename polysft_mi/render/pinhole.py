@@ -9,7 +9,7 @@ import numpy as np
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError
 
-NEAR = 1e-6  # depth [m] up to which a point counts as behind the camera
+MIN_DEPTH = 1e-6  # depth [m] up to which a point counts as behind the camera
 
 
 class Pinhole:
@@ -60,7 +60,7 @@ class Pinhole:
         camera (N,).
         """
         x = (np.asarray(points, dtype=np.float64) - self.origin) @ self.inverse.T
-        before = x[:, 2] > NEAR
+        before = x[:, 2] > MIN_DEPTH
         return x[:, :2] / np.where(before, x[:, 2], 1)[:, None], before
 
     def intrinsics(self):

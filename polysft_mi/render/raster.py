@@ -17,7 +17,7 @@ import numpy as np
 
 from polysft_mi.errors import InputError
 
-from .pinhole import NEAR, Pinhole
+from .pinhole import MIN_DEPTH, Pinhole
 from .shading import interaction, unlit
 from .silhouette import blend, crossings
 from .topology import Topology
@@ -166,7 +166,7 @@ class RasterIntegrator(mi.SamplingIntegrator):
             self._topology = Topology(scene)
         return self._topology
 
-    def look(self, scene, sensor, scale=1, box=None):
+    def view(self, scene, sensor, scale=1, box=None):
         """Trace one ray a pixel: the :class:`View` of the scene at ``scale`` pixels a pixel and
         axis (a fraction for a coarser grid).
 
@@ -215,7 +215,7 @@ class RasterIntegrator(mi.SamplingIntegrator):
         scale = math.isqrt(spp)
         if scale * scale != spp:
             raise InputError(f"raster: spp = {spp}; a square number is needed (1, 4, 9, 16, ...)")
-        view = self.look(scene, sensor, scale)
+        view = self.view(scene, sensor, scale)
         topology, hit = self._topology, view.hit
         si, z = interaction(
             topology,
@@ -257,7 +257,7 @@ class RasterIntegrator(mi.SamplingIntegrator):
             ]
             dr.eval(box)
             xa, ya, xb, yb, near = (x[0] for x in box)
-        if not near > NEAR or not all(map(math.isfinite, (xa, ya, xb, yb))):
+        if not near > MIN_DEPTH or not all(map(math.isfinite, (xa, ya, xb, yb))):
             return 0, 0, width, height
         return margin((xa, ya, xb, yb), width, height)
 

@@ -9,7 +9,7 @@ triangles seen at the two centres). Import only after a Mitsuba variant is set.
 import drjit as dr
 import mitsuba as mi
 
-from .pinhole import NEAR
+from .pinhole import MIN_DEPTH
 from .view import centre, point2
 
 # pixels by which an edge through a centre may pass it: the ray and the projection round differently
@@ -130,7 +130,7 @@ def _walk(topology, screen, triangle, start, end, x0, y0, w, active):
             t = at0 / (at0 - at1)
             first = (at1 < at0) & (t < exit_at)
             exit_at, exit_edge = dr.select(first, t, exit_at), dr.select(first, k, exit_edge)
-        usable = (dr.minimum(dr.minimum(p[0].z, p[1].z), p[2].z) > NEAR) & (sign != 0)
+        usable = (dr.minimum(dr.minimum(p[0].z, p[1].z), p[2].z) > MIN_DEPTH) & (sign != 0)
         leaves = active & usable & (exit_at < 1 + _TOLERANCE)
         across = dr.gather(
             mi.Int32, topology.neighbours, 3 * mi.UInt32(current) + exit_edge, leaves

@@ -78,7 +78,7 @@ def load(
     try:
         scene = mi.load_file(path, optimize=False, **given)
     except Exception as error:  # whatever a plugin raised reaches us wrapped by the parser
-        raise InputError(_told(error, path)) from None
+        raise InputError(_mitsuba_message(error, path)) from None
 
     if len(scene.sensors()) != 1:
         raise InputError(f"{path}: {len(scene.sensors())} sensors; exactly one is needed")
@@ -107,7 +107,7 @@ def load(
     )
 
 
-def _told(error, path):
+def _mitsuba_message(error, path):
     """What Mitsuba's parser says of the scene at ``path``, in one line: the file, the line, and the
     cause.
     """
@@ -136,7 +136,7 @@ def _check_nodes(path, overrides):
     try:
         state = mi.parser.parse_file(config, path, **overrides)
     except Exception as error:
-        raise InputError(_told(error, path)) from None
+        raise InputError(_mitsuba_message(error, path)) from None
     shapes = []
     top = [
         state.nodes[v.index()]

@@ -236,14 +236,16 @@ class OutlineSearch:
         by_point = (
             np.column_stack([scaled, -inwards]) / points[:, 2:]
         )  # of the place across the outline
-        by_motion = np.column_stack([np.cross(points - self.centre - shift, by_point), by_point])
+        motion_jacobian = np.column_stack(
+            [np.cross(points - self.centre - shift, by_point), by_point]
+        )
         # in units in which all ways to move it shift the outline alike, as far as the prior does
         # not hold them
         values, vectors = np.linalg.eigh(
-            by_motion.T @ by_motion / len(by_motion) + np.diag(self.sd**-2.0)
+            motion_jacobian.T @ motion_jacobian / len(motion_jacobian) + np.diag(self.sd**-2.0)
         )
         to_motion = vectors / np.sqrt(values)
-        by_unit, step = by_motion @ to_motion, self.across[1] - self.across[0]
+        by_unit, step = motion_jacobian @ to_motion, self.across[1] - self.across[0]
         before = np.concatenate([turn.as_rotvec(), shift]) / self.sd
         held = to_motion / self.sd[:, None]
         rows, last = np.arange(len(smooth)), smooth.shape[1] - 2

@@ -25,7 +25,7 @@ class State:
     rotation: Rotation
     translation: np.ndarray
 
-    def moved(self, step, factor=1.0):
+    def after_step(self, step, factor=1.0):
         """The state after a step (global (G,), local (N, d)); with d = 2 the relief stays."""
         g, local = step
         alpha, offset = self.alpha.copy(), self.offset.copy()
@@ -38,7 +38,7 @@ class State:
             self.translation + factor * g[-3:],
         )
 
-    def towards(self, other, factor):
+    def extrapolated(self, other, factor):
         """The state that goes on from this one past ``other``: other + factor (other - self)."""
         turn = (other.rotation * self.rotation.inv()).as_rotvec()
         return State(
@@ -53,16 +53,16 @@ class State:
 class Surface:
     """The vertices (N, 3) [m, world] that a :class:`State` makes, with derivatives.
 
-    ``by_offset`` (N, 3, 3): by (Δu, Δv, Δw), of which the last, ``up`` (3,), is the same
+    ``offset_jacobian`` (N, 3, 3): by (Δu, Δv, Δw), of which the last, ``up`` (3,), is the same
     everywhere; by the coefficients: ``up`` times ``basis`` (N, A); by rotation and translation:
-    ``by_motion`` (N, 3, 6).
+    ``motion_jacobian`` (N, 3, 6).
     """
 
     vertices: np.ndarray
-    by_offset: np.ndarray
+    offset_jacobian: np.ndarray
     up: np.ndarray
     basis: np.ndarray
-    by_motion: np.ndarray
+    motion_jacobian: np.ndarray
 
 
 class Chart:
@@ -151,21 +151,23 @@ class Chart:
         rotation = state.rotation.as_matrix()
         turn = self._axes @ rotation
         y = np.column_stack([uv, height])
-        by_motion = np.empty((len(y), 3, 6))
-        by_motion[:, :, 3:] = self._axes
+        motion_jacobian = np.empty((len(y), 3, 6))
+        motion_jacobian[:, :, 3:] = self._axes
         x = y @ rotation.T
         for k, (a, b) in enumerate(
             ((1, 2), (2, 0), (0, 1))
         ):  # axis k of the chart crossed with the point
-            by_motion[:, :, k] = x[:, a, None] * self._axes[:, b] - x[:, b, None] * self._axes[:, a]
-        by_offset = np.tile(turn, (len(y), 1, 1))
-        by_offset[:, :, :2] += turn[None, :, 2:] * slope[:, None, :]
+            motion_jacobian[:, :, k] = (
+                x[:, a, None] * self._axes[:, b] - x[:, b, None] * self._axes[:, a]
+            )
+        offset_jacobian = np.tile(turn, (len(y), 1, 1))
+        offset_jacobian[:, :, :2] += turn[None, :, 2:] * slope[:, None, :]
         return Surface(
             y @ turn.T + (t.origin + self._axes @ state.translation),
-            by_offset,
+            offset_jacobian,
             turn[:, 2],
             pu[:, self._u] * pv[:, self._v],
-            by_motion,
+            motion_jacobian,
         )
 
     def fitted(self, state, vertices, iterations=8, bending=1e-6):
@@ -181,13 +183,13 @@ class Chart:
         for _ in range(iterations):
             surface = self.surface(state)
             missing = vertices - surface.vertices
-            tangents = surface.by_offset[:, :, :2]
+            tangents = surface.offset_jacobian[:, :, :2]
             normal = np.cross(tangents[:, :, 0], tangents[:, :, 1])
             normal /= np.linalg.norm(normal, axis=1, keepdims=True)
             rows = np.column_stack(
                 [
                     (normal @ surface.up)[:, None] * surface.basis,
-                    np.einsum("nk,nkm->nm", normal, surface.by_motion),
+                    np.einsum("nk,nkm->nm", normal, surface.motion_jacobian),
                 ]
             )
             # sliding makes rotations in the plane and shifts along it free: a little damping holds
@@ -200,16 +202,16 @@ class Chart:
             rest = (
                 missing
                 - (surface.basis @ g[:size])[:, None] * surface.up
-                - surface.by_motion @ g[size:]
+                - surface.motion_jacobian @ g[size:]
             )
             square = tangents.transpose(0, 2, 1) @ tangents
             uv = np.linalg.solve(square, np.einsum("nka,nk->na", tangents, rest)[:, :, None])[
                 :, :, 0
             ]
-            state = state.moved((g, uv))
+            state = state.after_step((g, uv))
         return state
 
-    def absorbed(self, state, ridge=1e-6):
+    def with_relief_in_jet(self, state, ridge=1e-6):
         """The state of the same surface with as much of the relief as the jet can hold in the
         coefficients instead; ``ridge`` holds those that the vertices do not determine.
         """

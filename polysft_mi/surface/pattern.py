@@ -66,7 +66,7 @@ class Pattern:
         """
         return np.searchsorted(self._half_keys, np.minimum(i, j) * self.count + np.maximum(i, j))
 
-    def whole(self, half):
+    def all_blocks(self, half):
         """All blocks (B, d, d) of the symmetric matrix whose upper ``half`` (U, d, d) is given."""
         out = np.empty((len(self._keys), *half.shape[1:]))
         out[self.upper] = half

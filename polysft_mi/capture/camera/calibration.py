@@ -182,7 +182,7 @@ def _different(views, most):
 
 def _picture(views):
     cells = []
-    for k in pictures.chosen(len(views)):
+    for k in pictures.evenly_spaced(len(views)):
         index, image, _, pixels = views[k]
         shown = image.copy()
         for x in pixels:

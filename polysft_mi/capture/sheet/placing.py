@@ -11,7 +11,8 @@ from polysft_mi.scene.outline import fitted
 
 from .pose import Matches, MatchRules, Pose, from_corners, from_matches, match
 
-BENT = 0.005  # of the frame's diagonal: a rigid pose that misses the matches by more is said
+# share of the frame's diagonal: matches that miss a rigid pose by more mean that the sheet is bent
+MAX_FLAT_RESIDUAL = 0.005
 
 
 @dataclass
@@ -48,7 +49,7 @@ def place(sheet, photo, frame, camera, corners=None, pose_fit="auto"):
     agree, count = int(matches.agree.sum()), len(matches.agree)
     figures = {"by": "features", "matches": count, "agree": agree, "residual_px": residual}
     lines = [f"pose: {agree} of {count} matches agree, {residual:.2f} pixels RMS"]
-    if residual > BENT * np.hypot(camera.width, camera.height):
+    if residual > MAX_FLAT_RESIDUAL * np.hypot(camera.width, camera.height):
         lines.append(
             "note: the sheet is bent in the first frame, but the template is flat; a run may start"
             " wrongly: see pose.png, or choose another --first"

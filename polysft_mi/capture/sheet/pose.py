@@ -105,7 +105,7 @@ def from_matches(matches, sheet, camera, rules=None):
     if agree.sum() < rules.least or not starts:
         return None, matches
     pose = _refined(starts, points[agree], matches.frame[agree], camera, rules)
-    pose = pose if pose is not None and _sane(pose, sheet, camera, rules) else None
+    pose = pose if pose is not None and _plausible(pose, sheet, camera, rules) else None
     return pose, matches
 
 
@@ -241,7 +241,7 @@ def _refined(starts, points, pixels, camera, rules):
     )
 
 
-def _sane(pose, sheet, camera, rules):
+def _plausible(pose, sheet, camera, rules):
     """Whether the sheet lies before the camera, shows its front, and covers some pixels. A pose by
     chance seldom does.
     """

@@ -10,7 +10,7 @@ from polysft_mi.errors import InputError
 from polysft_mi.files import aside
 from polysft_mi.results.run import Run
 
-from ..panels import PEAKS, box_of, spread
+from ..panels import PEAKS, box_of, evenly_spaced
 from .content import LABELS, about, figures, loss, subtitle, warning
 from .images import images
 from .surface import mesh, scalars
@@ -31,7 +31,7 @@ def write_report(out, path=None, *, truth=None, frames=200, positions=450_000):
     if os.path.isdir(path) or not os.path.isdir(os.path.dirname(os.path.abspath(path))):
         raise InputError(f"{path}: is not a file in a folder that exists")
     count, vertices = run.vertices.shape[:2]
-    shown = spread(count, min(frames, max(1, positions // vertices)))
+    shown = evenly_spaced(count, min(frames, max(1, positions // vertices)))
     columns, cards, distance = figures(run, truth)
     pictures, errors = images(run, shown)
     data = {

@@ -86,7 +86,7 @@ class Descent:
             gain = 1 - found.cost / best.cost
             if gain <= 0:
                 return best
-            start = best.state.towards(found.state, rules.fine_start)
+            start = best.state.extrapolated(found.state, rules.fine_start)
             best = found
             if gain < rules.fine_gain:
                 break
@@ -122,7 +122,7 @@ class Descent:
             except LinAlgError:
                 damping = max(10 * damping, _RAISED_DAMPING)
                 continue
-            trial = state.moved(step)
+            trial = state.after_step(step)
             if promised < rules.small_step * model.total:
                 state = trial
                 break
@@ -133,13 +133,13 @@ class Descent:
                 state, model = trial, found
             else:
                 damping *= 10
-        fitted = self._robust_scale(model.evaluation.outlying, scale)
+        fitted = self._robust_scale(model.evaluation.outlier_share, scale)
         return Found(state, model, {stage: fitted})
 
-    def _robust_scale(self, outlying, scale):
+    def _robust_scale(self, outlier_share, scale):
         """The scale at which a residual of 2/3 of it is the median, were the residuals'
         distribution only stretched.
         """
-        m = min(max(outlying, 0.02), 0.98)
+        m = min(max(outlier_share, 0.02), 0.98)
         stretched = scale * math.sqrt(m / (1 - m) / 0.44)
         return float(np.clip(stretched, *self.rules.scale_bounds))

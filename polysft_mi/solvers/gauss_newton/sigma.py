@@ -14,8 +14,8 @@ def along_rays(descent, model, origin):
     ray = surface.vertices - origin
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     by_jet = (ray @ surface.up)[:, None] * surface.basis
-    by_global = np.column_stack([by_jet, np.einsum("nk,nkm->nm", ray, surface.by_motion)])
-    by_local = np.einsum("nk,nka->na", ray, surface.by_offset)[:, :local]
+    by_global = np.column_stack([by_jet, np.einsum("nk,nkm->nm", ray, surface.motion_jacobian)])
+    by_local = np.einsum("nk,nka->na", ray, surface.offset_jacobian)[:, :local]
     try:
         variance = descent.reduced(model.normal, _UNDAMPED).variance(by_local, by_global)
     except (LinAlgError, np.linalg.LinAlgError):

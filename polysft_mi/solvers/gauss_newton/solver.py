@@ -68,7 +68,7 @@ class GaussNewton:
                 start = states[k] if past or k == 0 else states[k - 1]
                 history = (before + states[:k])[-2:]
                 found, context = self._newest(start, frames[k], history, known)
-                states[k] = self._chart.absorbed(found.state)
+                states[k] = self._chart.with_relief_in_jet(found.state)
                 known.append(self._facts(found, context, known))
             results = [found]
             if len(frames) > 1:
@@ -90,7 +90,7 @@ class GaussNewton:
         with self._blas.limit(limits=1, user_api="blas"):
             self._prepare(problem, None)
             a, b = self._chart.state(before), self._chart.state(after)
-            middle = a.towards(b, -0.5)
+            middle = a.extrapolated(b, -0.5)
             context = replace(self._context(frame, middle, [terms]), hold=weight)
             found = self._descent.descend(middle, context, self._descent.usual)
             facts = self._facts(found, context, [terms])
@@ -124,7 +124,7 @@ class GaussNewton:
     def _expect(self, frame):
         """Have this frame and the next one read in a second thread."""
         frames = [k for k in (frame, frame + 1) if k < len(self._problem.sequence)]
-        self._images.expect(frames, [stage.blur for stage in self._descent.usual])
+        self._images.prefetch(frames, [stage.blur for stage in self._descent.usual])
 
     def _context(self, frame, anchor, known):
         """The :class:`polysft_mi.objective.second_order.Context` of a frame after those whose facts
@@ -143,19 +143,20 @@ class GaussNewton:
     def _facts(self, found, context, known):
         """What the frames that follow want to know of this one.
 
-        ``misfit``, ``outlying``; ``least_misfit``: of the frames so far, the first one aside, which
-        the texture was taken from; ``light``: its numbers; ``scale_k``: robust scale of stage k.
+        ``misfit``, ``outlier_share``; ``least_misfit``: of the frames so far, the first one aside,
+        which the texture was taken from; ``light``: its numbers; ``scale_k``: robust scale of
+        stage k.
         """
         model, frame = found.model, context.frame
         stages = self._descent.far, *self._descent.usual
         first = self._descent.rules.first_scale
         facts = {f"scale_{k}": found.scales.get(stage, first) for k, stage in enumerate(stages)}
-        facts |= {"misfit": found.misfit, "outlying": model.evaluation.outlying}
+        facts |= {"misfit": found.misfit, "outlier_share": model.evaluation.outlier_share}
         facts["least_misfit"] = self._least_misfit(found, context, known)
         light = context.light
         if self.settings.k_shading > 0:
             vertices, seen = model.surface.vertices, model.evaluation.seen
-            light = light.learned(self._images.shade(vertices, frame, seen, model.appearance))
+            light = light.updated(self._images.shade(vertices, frame, seen, model.appearance))
         facts["light"] = light.numbers()
         return facts
 

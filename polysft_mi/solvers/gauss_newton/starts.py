@@ -17,7 +17,7 @@ def motion_starts(start, history):
     """
     if len(history) < 2:
         return [start]
-    return [start, *(history[-2].towards(history[-1], factor) for factor in (0.5, 1.0))]
+    return [start, *(history[-2].extrapolated(history[-1], factor) for factor in (0.5, 1.0))]
 
 
 class Starts:
@@ -51,7 +51,7 @@ class Starts:
         limit = self._suspect_above(usual_misfits, context.noise)
         stages = descent.far, *descent.usual
         if best.misfit > limit:
-            descent.objective.images.expect([frame], [descent.far.blur])
+            descent.objective.images.prefetch([frame], [descent.far.blur])
         for other in (lambda: self.nearest(starts, frame, descent.far), lambda: self._rigid(frame)):
             if best.misfit <= limit:
                 break

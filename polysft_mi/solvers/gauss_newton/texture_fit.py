@@ -33,7 +33,7 @@ def fit_texture(problem, descent, context):
                 slide = descent.reduced(model.normal, _DAMPING).slide()
             except (BadFrame, LinAlgError):
                 return
-            state = state.moved((np.zeros(len(model.normal.gradient)), slide))
+            state = state.after_step((np.zeros(len(model.normal.gradient)), slide))
     after = images.misfit(chart.surface(state).vertices, 0, finest.blur)
     near = np.abs(state.offset).max() < rules.texture_farthest
     if after < rules.texture_gain * before and near:

@@ -34,7 +34,7 @@ class Window:
             except LinAlgError:
                 damping = max(10 * damping, _DAMPING)
                 continue
-            trial = [state.moved(step) for state, step in zip(states, steps, strict=True)]
+            trial = [state.after_step(step) for state, step in zip(states, steps, strict=True)]
             found = self._models(trial, appearances)
             total, now = (sum(m.total for m in ms) for ms in (models, found))
             if promised < small * total:
@@ -57,7 +57,7 @@ class Window:
             states, anchors, self._contexts, appearances, strict=True
         ):
             scale = context.scales.get(self._stage, self._descent.rules.first_scale)
-            context = context.anchored(anchor)
+            context = context.with_anchor(anchor)
             models.append(self._descent.model(state, context, self._stage, scale, x))
         for k in range(len(models) - 1):
             self._couple(models[k], models[k + 1], states[k], states[k + 1])

@@ -5,7 +5,7 @@ import pytest
 from clips import CAMERA, HEIGHT, WIDTH, placed, refused
 
 from polysft_mi.capture.sheet import Matches, from_matches, grid, parse_size
-from polysft_mi.capture.sheet.placing import BENT
+from polysft_mi.capture.sheet.placing import MAX_FLAT_RESIDUAL
 
 
 @pytest.mark.parametrize(
@@ -77,6 +77,6 @@ def test_bent_first_frame_is_said(tmp_path):
             Matches(flat.uv.clip(1e-6, 1 - 1e-6), pixels, np.zeros(len(x), bool)), flat, CAMERA
         )
         missed = np.sqrt((found.residual**2).mean()) / np.hypot(320, 240)
-        lines.append(missed > BENT)
+        lines.append(missed > MAX_FLAT_RESIDUAL)
         assert after.agree.sum() >= 10
     assert lines == [False, True]

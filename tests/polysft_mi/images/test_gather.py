@@ -14,7 +14,7 @@ from problems import problem_of
 from scipy.spatial.transform import Rotation
 
 from polysft_mi.images import pixels
-from polysft_mi.images.pyramid import FARTHEST, Level
+from polysft_mi.images.pyramid import MAX_CONTOUR_DISTANCE, Level
 from polysft_mi.images.registration import Registration
 from polysft_mi.render.device import on_device
 
@@ -52,7 +52,7 @@ def surfaces(problem):
 def test_sums_over_each_triangles_pixels(problem):
     known, rng = Registration(problem), np.random.default_rng(2)
     for vertices in surfaces(problem):
-        view = known._look(vertices, LEVEL)
+        view = known._view(vertices, LEVEL)
         triangle = np.array(view.triangle)
         found = rng.random((3, len(triangle), 4)).astype(np.float32)
         arrays = [mi.Vector4f(*(on_device(x[:, k], mi.Float) for k in range(4))) for x in found]
@@ -79,7 +79,7 @@ def test_a_triangle_behind_the_camera_misses_no_pixel_of_the_others(problem):
     known = Registration(problem)
     vertices = problem.template.vertices.copy()
     vertices[0, 2] = -0.5
-    view = known._look(vertices, LEVEL)
+    view = known._view(vertices, LEVEL)
     ones = [
         mi.Vector4f(*(dr.select(view.hit, mi.Float(x), 0) for x in (0.0, 0.0, 0.0, 1.0)))
     ] * 2 + [mi.Vector4f(dr.select(view.hit, mi.Float(1), 0))]
@@ -96,13 +96,13 @@ def test_what_is_recorded_is_what_is_traced(problem):
     for (k, vertices), level in itertools.product(enumerate(surfaces(problem)), levels):
         appearance = known.appearance(vertices + [0.003, 0, 0], level) if k else None
         with dr.suspend_grad():
-            view = known._look(vertices, level)
+            view = known._view(vertices, level)
             sizes.add(view.size)
             at, crossings = (
                 known._frames.level(1, level),
                 known._raster.crossings(view, outline=True),
             )
-            given = *known._compared(view, 1, level, appearance), dr.opaque(mi.Float, 0.3)
+            given = *known._residual_arguments(view, 1, level, appearance), dr.opaque(mi.Float, 0.3)
             outline = view.seen(), crossings, at.mask, at.distance, known._corner_of
             table, figures = known._sums(*given)
             _, pairs = known._outline(*outline)
@@ -182,17 +182,17 @@ def test_beyond_the_surroundings_of_the_mask_a_silhouette_is_as_far_as_counts(pr
         pixels.Image.of(on_device(np.zeros(400), mi.Float), (20, 20), (2, 3)),
     )
     with dr.suspend_grad():
-        view = known._look(problem.template.vertices, LEVEL)
+        view = known._view(problem.template.vertices, LEVEL)
         crossings, distance = (
             known._raster.crossings(view, outline=True),
             on_device(np.full(400, 2.0), mi.Float),
         )
-        _, (*_, ci, cj, _excess, share) = pixels.outline(
+        _, (*_, ci, cj, _excess, share) = pixels.silhouette_terms(
             view.seen(), crossings, mask, distance, known._corner_of
         )
     assert int(view.region[0][0]) > 2 + 20
     slope = np.linalg.norm(np.array(ci + cj), axis=0)
     assert (
-        np.allclose(np.array(share), 1 / np.maximum(1, FARTHEST * slope), rtol=1e-5)
+        np.allclose(np.array(share), 1 / np.maximum(1, MAX_CONTOUR_DISTANCE * slope), rtol=1e-5)
         and (np.array(share) < 0.1).any()
     )

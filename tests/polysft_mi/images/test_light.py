@@ -49,7 +49,7 @@ def brightness(luminance=0.5, masked=False):
 def shade_of(found, vertices, image, seen=1e9, mask=None):
     colour = np.broadcast_to(np.asarray(image, np.float32)[..., None], (120, 160, 3))
     return found.of(
-        found.prepared(colour, mask),
+        found.frame_luminance(colour, mask),
         vertices,
         np.zeros(3),
         project(vertices),
@@ -121,7 +121,7 @@ def test_the_light_follows_the_surface_and_the_energy_has_no_slope_along_it():
         Rules(light_refits=60),
     )
     shade = shade_of(found, vertices, 0.4)
-    fit = light.explaining(shade)
+    fit = light.fit(shade)
     before = light.coefficients(len(FACES))
     assert np.abs(fit.coefficients - before).max() > 0.05 and fit.departure > 0
 
@@ -159,13 +159,13 @@ def test_the_light_follows_the_surface_and_the_energy_has_no_slope_along_it():
 @pytest.mark.parametrize("exposure", [0.5, 1.7])
 def test_a_frames_exposure_changes_nothing(exposure):
     found = brightness(masked=True)
-    light = known().learned(shade_of(found, wavy(), 0.4))
+    light = known().updated(shade_of(found, wavy(), 0.4))
     for brighter, usual in zip(
         residuals(shade_of(found, wavy(), 0.4 * exposure), light, 12.0),
         residuals(shade_of(found, wavy(), 0.4), light, 12.0),
     ):
         np.testing.assert_allclose(brighter, usual, rtol=1e-5, atol=1e-7)
-    assert known().learned(shade_of(found, wavy(), 0.4 * exposure)).numbers() == pytest.approx(
+    assert known().updated(shade_of(found, wavy(), 0.4 * exposure)).numbers() == pytest.approx(
         light.numbers(), rel=1e-5
     )
 
@@ -205,7 +205,7 @@ def test_only_triangles_that_are_seen_count():
 def test_a_frame_larger_than_its_triangles_need_is_shrunk():
     found = brightness(masked=True)
     found.sigma = 6.0
-    image, pool = found.prepared(
+    image, pool = found.frame_luminance(
         np.full((120, 160, 3), 0.4, np.float32), np.ones((120, 160), np.float32)
     )
     assert pool == 3 and image.shape == (40, 53) and image == pytest.approx(0.8, rel=1e-5)
@@ -219,7 +219,7 @@ def test_the_light_is_learned_from_surfaces_that_bend():
         shade = shade_of(found, wavy(k, 0.01), 0.4)
         value = lit(wavy(k, 0.01)) + 0.005 * rng.normal(size=len(FACES))
         value[rng.random(len(FACES)) < 0.1] += 0.5  # a highlight, a shadow's end
-        light = light.learned(dataclasses.replace(shade, luminance=value))
+        light = light.updated(dataclasses.replace(shade, luminance=value))
     learned = light.coefficients(len(FACES))
     assert light.frames == 20 and learned * (LIGHT[0] / learned[0]) == pytest.approx(
         LIGHT, abs=0.03
@@ -237,7 +237,7 @@ def test_the_last_frames_say_most():
     for k in range(30):  # in the first ten frames the light comes a little less from the side
         vertices = wavy(k, 0.01)
         value = lit(vertices) - 0.08 * normals(vertices)[:, 0] * (k < 10)
-        light = light.learned(dataclasses.replace(shade_of(found, vertices, 0.4), luminance=value))
+        light = light.updated(dataclasses.replace(shade_of(found, vertices, 0.4), luminance=value))
         level, slope = light.coefficients(len(FACES))[:2]
         slopes.append(slope / level * LIGHT[0])
     assert slopes[9] == pytest.approx(LIGHT[1] - 0.08, abs=0.015) and slopes[29] == pytest.approx(
@@ -248,7 +248,7 @@ def test_the_last_frames_say_most():
 def test_a_flat_sheet_says_nothing_of_where_the_light_comes_from():
     found, light = brightness(masked=True), Light.unknown(Rules())
     for _ in range(20):
-        light = light.learned(shade_of(found, synthetic.sheet(0, ROWS, COLUMNS), 0.4))
+        light = light.updated(shade_of(found, synthetic.sheet(0, ROWS, COLUMNS), 0.4))
     level, *slope = light.coefficients(len(FACES))
     across = level - slope[2]  # what a sheet across the view is lit with, but for the exposure
     assert (
@@ -256,7 +256,7 @@ def test_a_flat_sheet_says_nothing_of_where_the_light_comes_from():
         and np.abs(slope[:2]).max() < 1e-6
         and np.abs(slope[3:]).max() < 1e-4
     )
-    assert light.learned(shade_of(found, synthetic.sheet(0, ROWS, COLUMNS), 0.4, seen=0)) == light
+    assert light.updated(shade_of(found, synthetic.sheet(0, ROWS, COLUMNS), 0.4, seen=0)) == light
 
 
 def test_what_no_frame_tells_is_an_unknown_light():
@@ -339,7 +339,7 @@ def test_only_the_last_stage_is_shaded_and_a_step_goes_where_the_shading_leads(t
     if shading:
         step, _ = descent.reduced(normal, 1e-3).step()
         slope = step[0] @ normal.gradient + (step[1] * normal.local_gradient).sum()
-        found = descent.model(rest.moved(step, 0.1), context, stage, 0.5).terms["shading"]
+        found = descent.model(rest.after_step(step, 0.1), context, stage, 0.5).terms["shading"]
         # less than the slope says, for the exposure follows
         assert 0.1 * slope < found - shading < 0.02 * slope < 0
 
@@ -349,11 +349,11 @@ def test_what_a_light_makes_of_each_triangle():
     each = lit(vertices)
     around = [[t for t, face in enumerate(FACES) if k in face] for k in range(len(vertices))]
     expected = [np.mean([each[around[k]].mean() for k in face]) for face in FACES]
-    assert np.allclose(found.lit(vertices, np.zeros(3), LIGHT), expected)
+    assert np.allclose(found.irradiance(vertices, np.zeros(3), LIGHT), expected)
     turned = found.faces[:, ::-1].copy()
     found.faces = turned  # whichever way triangles are listed
-    assert np.allclose(found.lit(vertices, np.zeros(3), LIGHT), expected)
-    assert found.lit(
+    assert np.allclose(found.irradiance(vertices, np.zeros(3), LIGHT), expected)
+    assert found.irradiance(
         vertices, np.zeros(3), np.array([0.5, 0, 0, 3.0, 0, 0, 0])
     ).min() == pytest.approx(0.05)  # never black
 
@@ -363,14 +363,14 @@ def test_a_textures_luminance_as_an_image_shows_it():
     image = np.broadcast_to(
         np.linspace(0.2, 0.8, 80, dtype=np.float32)[None, :, None], (60, 80, 3)
     )  # on a grid of two pixels
-    value = found.shown(image, np.ones((60, 80), np.float32), 2, project(vertices) / 2)
+    value = found.texture_luminance(image, np.ones((60, 80), np.float32), 2, project(vertices) / 2)
     x = project(vertices)[FACES].mean(1)[:, 0] / 2 - 0.5
     assert np.allclose(value * found.mean, 0.2 + 0.6 * x / 79, atol=1e-3)
     assert np.array_equal(
         shade_of(found, vertices, np.full((120, 160), 0.5)).texture, found.texture
     )
     known = found.of(
-        found.prepared(np.full((120, 160, 3), 0.5, np.float32), None),
+        found.frame_luminance(np.full((120, 160, 3), 0.5, np.float32), None),
         vertices,
         np.zeros(3),
         project(vertices),

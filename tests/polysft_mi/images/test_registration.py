@@ -10,7 +10,7 @@ from problems import problem_of
 
 from polysft_mi import prepare
 from polysft_mi.images import pyramid
-from polysft_mi.images.pyramid import FARTHEST, Level, level_image
+from polysft_mi.images.pyramid import MAX_CONTOUR_DISTANCE, Level, level_image
 from polysft_mi.images.registration import Registration
 from polysft_mi.objective import terms as objective
 from polysft_mi.objective.problem import Problem
@@ -137,7 +137,7 @@ def test_a_masked_image_is_that_of_the_whole_where_the_mask_has_a_say(monkeypatc
     cv2.ellipse(mask, (320, 200), (30, 20), 20, 0, 360, 1, -1)
     part = level_image(image, mask, level)
     monkeypatch.setattr(
-        pyramid, "_around", lambda mask, level: ((0, 0), (slice(None), slice(None)))
+        pyramid, "_slices_around", lambda mask, level: ((0, 0), (slice(None), slice(None)))
     )
     whole = level_image(image, mask, level)
     (rows, columns), (x, y) = part.inside.shape, part.corner
@@ -149,7 +149,7 @@ def test_a_masked_image_is_that_of_the_whole_where_the_mask_has_a_say(monkeypatc
         outside[here] = 0
         assert not outside.any()
     assert np.abs(part.colour - whole.colour[here])[part.inside > 0].max() < 1e-5
-    near = whole.distance < FARTHEST
+    near = whole.distance < MAX_CONTOUR_DISTANCE
     assert np.abs(part.distance - whole.distance[here])[near[here]].max() < 1e-5
     near[here] = False
     assert not near.any()
@@ -178,4 +178,4 @@ def test_a_sheet_out_of_view_explains_nothing(problem, shift):
     """
     vertices = problem.template.vertices + shift
     found = Registration(problem).evaluate(vertices, 1, 1.0, 0.3)
-    assert (found.misfit, found.outlying, found.pixels, found.photometric) == (1, 1, 0, 0)
+    assert (found.misfit, found.outlier_share, found.pixels, found.photometric) == (1, 1, 0, 0)

@@ -166,8 +166,8 @@ def test_all_terms_are_those_of_their_dense_jacobians():
         def moved(step):  # the vertices along a step of all unknowns, by differences of the surface
             parts = step[d * count :], step[: d * count].reshape(-1, d)
             return (
-                chart.surface(state.moved(parts, 1e-5)).vertices
-                - chart.surface(state.moved(parts, -1e-5)).vertices
+                chart.surface(state.after_step(parts, 1e-5)).vertices
+                - chart.surface(state.after_step(parts, -1e-5)).vertices
             ).ravel() / 2e-5
 
         by = np.stack([moved(row) for row in np.eye(d * count + size + 6)], 1)

@@ -73,12 +73,14 @@ def test_inextensibility_gradient_is_that_of_autodiff(problem):
     assert energy == pytest.approx(value[0], rel=1e-4)
     by_alpha = chart.to_monomials.T @ np.array(dr.grad(unknowns.delta_alpha))
     assert np.abs(normal.gradient[: len(by_alpha)] - by_alpha).max() < 1e-3 * np.abs(by_alpha).max()
-    by_offset = np.stack(
+    offset_jacobian = np.stack(
         [np.array(dr.grad(x)) for x in (unknowns.delta_u, unknowns.delta_v, unknowns.delta_w)], 1
     )
-    assert np.abs(normal.local_gradient - by_offset).max() < 1e-3 * np.abs(by_offset).max()
+    assert (
+        np.abs(normal.local_gradient - offset_jacobian).max() < 1e-3 * np.abs(offset_jacobian).max()
+    )
     by_shift = np.array(dr.grad(unknowns.translation))
-    assert np.abs(normal.gradient[-3:] - by_shift).max() < 1e-3 * np.abs(by_offset).max()
+    assert np.abs(normal.gradient[-3:] - by_shift).max() < 1e-3 * np.abs(offset_jacobian).max()
 
 
 def test_stretched_edges_give_and_compressed_ones_do_not(problem):
@@ -97,8 +99,8 @@ def test_stretched_edges_give_and_compressed_ones_do_not(problem):
             RNG.normal(size=normal.local_gradient.shape) * 1e-6,
         )
         slope = (
-            edges_alone(state.moved(step), lengths, 7.0, give=give)[1]
-            - edges_alone(state.moved(step, -1), lengths, 7.0, give=give)[1]
+            edges_alone(state.after_step(step), lengths, 7.0, give=give)[1]
+            - edges_alone(state.after_step(step, -1), lengths, 7.0, give=give)[1]
         ) / 2
         assert step[0] @ normal.gradient + (step[1] * normal.local_gradient).sum() == pytest.approx(
             slope, rel=1e-4
@@ -109,7 +111,7 @@ def test_stretched_edges_give_and_compressed_ones_do_not(problem):
         RNG.normal(size=len(normal.gradient)) * 1e-6,
         RNG.normal(size=normal.local_gradient.shape) * 1e-6,
     )
-    ends = [chart.surface(state.moved(step, f)).vertices for f in (1, -1)]
+    ends = [chart.surface(state.after_step(step, f)).vertices for f in (1, -1)]
     change = np.subtract(*(np.linalg.norm(p[a] - p[b], axis=1) for p in ends)) / 2
     h = dense(pattern, normal)[0]
     whole = np.concatenate([step[1].ravel(), step[0]])
@@ -160,7 +162,9 @@ def test_whole_gradient_against_finite_differences(problem, stage):
                 RNG.normal(size=len(normal.gradient)) * 3e-4,
                 RNG.normal(size=normal.local_gradient.shape) * 3e-4,
             )
-            slope = (model(state.moved(step)).total - model(state.moved(step, -1)).total) / 2
+            slope = (
+                model(state.after_step(step)).total - model(state.after_step(step, -1)).total
+            ) / 2
             mine = step[0] @ normal.gradient + (step[1] * normal.local_gradient).sum()
             size = np.linalg.norm
             scale = size(step[0]) * size(normal.gradient) + size(step[1]) * size(
@@ -189,7 +193,7 @@ def test_gradient_and_curvature_of_what_holds_the_relief(truth):
     h = dense(whole.patterns[3], normal)[0][:count, :count]
     for _ in range(3):
         step = np.zeros(len(normal.gradient)), RNG.normal(size=state.offset.shape) * 1e-2
-        change = whole.model(state.moved(step), context, stage, 0.5).total - model.total
+        change = whole.model(state.after_step(step), context, stage, 0.5).total - model.total
         along = step[1].ravel()
         promised = along @ normal.local_gradient.ravel() + 0.5 * along @ h @ along
         assert change == pytest.approx(promised, rel=1e-6)

@@ -20,7 +20,7 @@ from polysft_mi.objective.problem import Problem
 from polysft_mi.pictures import exr, video
 from polysft_mi.pictures.album import Album, AlbumSettings, residual
 from polysft_mi.pictures.drawing import Drawing
-from polysft_mi.pictures.panels import Box, spread
+from polysft_mi.pictures.panels import Box, evenly_spaced
 from polysft_mi.scene import experiment as scene
 from polysft_mi.scene.sequence import Sequence
 
@@ -198,7 +198,7 @@ def test_a_surface_that_leaves_the_view_of_the_first_is_shown_whole(sheet, tmp_p
         album.draw(k, problem.camera.origin + v @ problem.camera.axes)
     assert len(album.finish(surfaces)[0]) == 9
     assert album._view.holds(surfaces) and [row["label"] for row in album.rows] == [
-        f"frame {k}" for k in spread(9, 5)
+        f"frame {k}" for k in evenly_spaced(9, 5)
     ]
     for row in album.rows:
         background = row["surface"][0, 0]

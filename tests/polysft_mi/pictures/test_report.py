@@ -19,7 +19,7 @@ from polysft_mi import report
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError
 from polysft_mi.pictures import video
-from polysft_mi.pictures.panels import PEAKS, Box, box_of, heat, heat_values, spread
+from polysft_mi.pictures.panels import PEAKS, Box, box_of, evenly_spaced, heat, heat_values
 from polysft_mi.pictures.report.images import _at_vertices
 from polysft_mi.pictures.report.page import write_report
 from polysft_mi.results.run import Run
@@ -222,7 +222,11 @@ def test_fewer_frames_and_odd_names(finished_run, tmp_path):
     )
     assert data["command"] == "</script><!-- x" and data["title"] == out.name
     assert "<title>a &lt;b> &amp; 'ü'</title>" in (out / "report.html").read_text(encoding="utf-8")
-    assert spread(5, 3) == [0, 2, 4] and spread(2, 9) == [0, 1] and spread(9, 1) == [0]
+    assert (
+        evenly_spaced(5, 3) == [0, 2, 4]
+        and evenly_spaced(2, 9) == [0, 1]
+        and evenly_spaced(9, 1) == [0]
+    )
 
 
 def test_pngs_stand_in_for_the_video(finished_run, tmp_path):

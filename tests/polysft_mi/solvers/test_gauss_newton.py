@@ -120,7 +120,7 @@ def test_what_is_not_explained_goes_through_the_fine_stages_again(
     descent, seen = Descent(SecondOrder(problem)), []
 
     class At(int):
-        def towards(self, other, factor):
+        def extrapolated(self, other, factor):
             return self, other, factor
 
     class Pass(Found):

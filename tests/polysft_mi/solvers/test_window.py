@@ -43,7 +43,7 @@ def test_a_windows_step_against_finite_differences_and_the_dense_system(truth):
     window = Window(descent, contexts)
 
     def moved(steps, factor):
-        return [s.moved(d, factor) for s, d in zip(states, steps, strict=True)]
+        return [s.after_step(d, factor) for s, d in zip(states, steps, strict=True)]
 
     def total(at):
         return sum(model.total for model in window._models(at, [None] * 3))

@@ -77,11 +77,12 @@ def test_derivatives_of_the_surface(order):
     a = len(chart.bending)
     linear = (
         (s.basis @ step[0][:a])[:, None] * s.up
-        + s.by_motion @ step[0][a:]
-        + np.einsum("nka,na->nk", s.by_offset, step[1])
+        + s.motion_jacobian @ step[0][a:]
+        + np.einsum("nka,na->nk", s.offset_jacobian, step[1])
     )
     numeric = (
-        chart.surface(state.moved(step)).vertices - chart.surface(state.moved(step, -1)).vertices
+        chart.surface(state.after_step(step)).vertices
+        - chart.surface(state.after_step(step, -1)).vertices
     ) / 2
     assert np.abs(linear - numeric).max() < 1e-6 * np.abs(numeric).max()
 
@@ -100,10 +101,10 @@ def test_bending_is_the_mean_square_of_second_derivatives():
 def test_towards_goes_on_with_the_motion():
     chart = Chart(grid_template())
     a, b = some_state(chart, RNG), some_state(chart, RNG)
-    assert np.allclose(a.towards(b, 0).alpha, b.alpha) and np.allclose(
-        a.towards(b, -1).offset, a.offset
+    assert np.allclose(a.extrapolated(b, 0).alpha, b.alpha) and np.allclose(
+        a.extrapolated(b, -1).offset, a.offset
     )
-    c = a.towards(b, 1)
+    c = a.extrapolated(b, 1)
     assert (
         c.rotation * b.rotation.inv() * (b.rotation * a.rotation.inv()).inv()
     ).magnitude() < 1e-12
@@ -136,7 +137,7 @@ def test_absorbed_leaves_the_surface_and_as_little_relief_as_the_jet_can():
         state.offset[:, 2] + chart.surface(state).basis @ RNG.normal(size=len(chart.bending)) * 0.1
     )
     state = dataclasses.replace(state, offset=np.column_stack([state.offset[:, :2], fine]))
-    found = chart.absorbed(state, ridge=1e-12)
+    found = chart.with_relief_in_jet(state, ridge=1e-12)
     assert np.allclose(chart.surface(found).vertices, chart.surface(state).vertices, atol=1e-12)
     basis = chart.surface(state).basis
     assert np.abs(basis.T @ fine).max() > 0.1 and np.abs(basis.T @ found.offset[:, 2]).max() < 1e-6
