@@ -194,3 +194,12 @@ def test_commands_of_the_tutorial_are_those_that_its_pictures_come_from():
         for name, _ in tutorial.PICTURES.values()
         if f"({name})" not in text or not (ROOT / "docs" / name).exists()
     ] == []
+
+
+def test_the_picture_of_the_code_has_every_package():
+    layout = load("docs/layout.py")
+    for package in layout.PACKAGES:
+        assert sorted(layout.WAY[package]) == sorted(layout.rooms(package))
+    found = {(first, second) for (_, first), (_, second) in layout.imports()}
+    assert {("capture", "scene"), ("patches", "jets"), ("surface", "jets")} <= found
+    assert layout.needed({(2, 1), (3, 2), (3, 1)}) == {(2, 1), (3, 2)}

@@ -23,8 +23,8 @@ def test_curvature_and_distance_are_found():
 
 def test_the_drape_moves(tmp_path):
     Usd, UsdGeom = (pytest.importorskip(f"pxr.{name}") for name in ("Usd", "UsdGeom"))
-    paths = drape_to_blender.main(tmp_path, seconds=0.2)
-    for path, name in zip(paths, ("tshirt", "body"), strict=True):
+    paths = drape_to_blender.main(tmp_path, "shorts", seconds=0.2)
+    for path, name in zip(paths, ("shorts", "body"), strict=True):
         stage = Usd.Stage.Open(str(path))
         assert stage.GetEndTimeCode() == 5 and UsdGeom.GetStageMetersPerUnit(stage) == 1
         points = UsdGeom.Mesh(stage.GetPrimAtPath(f"/{name}/mesh")).GetPointsAttr()
