@@ -116,19 +116,11 @@ def run(switch, scene_file, data):
     from polysft_mi.results.evaluation import score
     from polysft_mi.results.truth import find_truth
     from polysft_mi.scene import experiment as scene
-    from polysft_mi.scene.sequence import Sequence
     from polysft_mi.surface.patch import Unknowns
 
     experiment = scene.load(scene_file, {"data": data, **switch.settings})
     s = experiment.settings
-    sequence = Sequence.open(
-        experiment.frames,
-        experiment.masks,
-        first=s.first,
-        last=s.last,
-        stride=s.stride,
-        size=experiment.size,
-    )
+    sequence = experiment.sequence()
     rules = dataclasses.replace(Rules(), **switch.fields)
     problem = Problem(experiment, sequence, rules)
     problem.check_start()

@@ -13,27 +13,23 @@ import time
 import numpy as np
 from sequences import SCENES
 
+from polysft_mi.commands import add_define_argument, definitions
+from polysft_mi.errors import cli
+
 
 def main(arguments=None):
     p = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     p.add_argument("scene", nargs="?", default=os.path.join(SCENES, "demo.xml"))
-    p.add_argument(
-        "-D",
-        dest="defines",
-        metavar="NAME=VALUE",
-        action="append",
-        default=[],
-        help="the scene's defaults, as for polysft_mi.run",
-    )
+    add_define_argument(p)
     p.add_argument("--turns", type=int, default=30)
     options = p.parse_args(arguments)
 
     from polysft_mi.backend import set_variant
 
     set_variant()
-    rows = measured(options.scene, dict(x.split("=", 1) for x in options.defines), options.turns)
+    rows = measured(options.scene, definitions(options.define), options.turns)
     print("| part | milliseconds |\n|---|---|")
     for name, milliseconds in rows.items():
         print(f"| {name} | {milliseconds:.2f} |")
@@ -49,13 +45,10 @@ def measured(path, overrides, turns):
     from polysft_mi.objective.problem import Problem
     from polysft_mi.objective.second_order import SecondOrder
     from polysft_mi.scene import experiment as scene
-    from polysft_mi.scene.sequence import Sequence
     from polysft_mi.solvers.gauss_newton.descent import Descent
 
     experiment = scene.load(path, {**overrides, "solver": "gauss-newton"})
-    s = experiment.settings
-    chosen = {"first": s.first, "last": s.last, "stride": s.stride, "size": experiment.size}
-    problem = Problem(experiment, Sequence.open(experiment.frames, experiment.masks, **chosen))
+    problem = Problem(experiment, experiment.sequence())
     objective = SecondOrder(problem)
     descent, chart, images = Descent(objective), objective.chart, objective.images
     level = images._level(descent.usual[-1].blur)
@@ -125,4 +118,4 @@ def measured(path, overrides, turns):
 
 
 if __name__ == "__main__":
-    main()
+    cli(main)

@@ -27,6 +27,7 @@ import time
 import numpy as np
 
 from polysft_mi.backend import add_mode_argument, set_variant
+from polysft_mi.commands import add_define_argument, definitions
 from polysft_mi.errors import InputError, cli
 from polysft_mi.files import aside
 
@@ -76,19 +77,11 @@ def load(scene, overrides, smoothing=SMOOTHING):
         raise InputError("mi.ad.LargeSteps needs the package cholespy: pip install cholespy")
     from polysft_mi.objective.problem import Problem
     from polysft_mi.scene import experiment as scenes
-    from polysft_mi.scene.sequence import Sequence
 
     experiment = scenes.load(scene, overrides)
     s = dataclasses.replace(experiment.settings, solver="adam")  # whose objective it is
     experiment = dataclasses.replace(experiment, settings=s)
-    sequence = Sequence.open(
-        experiment.frames,
-        experiment.masks,
-        first=s.first,
-        last=s.last,
-        stride=s.stride,
-        size=experiment.size,
-    )
+    sequence = experiment.sequence()
     problem = Problem(experiment, sequence)
     problem.check_start()
     problem.patch = Vertices(problem.template, smoothing)
@@ -183,14 +176,7 @@ def parser():
     p.add_argument(
         "-o", "--out", metavar="OUT", required=True, help="folder for surface.npz and metrics.json"
     )
-    p.add_argument(
-        "-D",
-        dest="define",
-        metavar="NAME=VALUE",
-        action="append",
-        default=[],
-        help="override a <default> of the scene",
-    )
+    add_define_argument(p)
     p.add_argument(
         "--iterations",
         type=int,
@@ -219,9 +205,7 @@ def parser():
 
 def main(arguments=None):
     options = parser().parse_args(arguments)
-    for text in options.define:
-        if "=" not in text:
-            raise InputError(f"-D {text}: NAME=VALUE is needed")
+    overrides = definitions(options.define)
     if options.iterations < 1 or not (
         0 < options.step < math.inf and 0 <= options.smoothing < math.inf
     ):
@@ -233,9 +217,7 @@ def main(arguments=None):
     if os.path.exists(os.path.join(options.out, "surface.npz")) and not options.overwrite:
         raise InputError(f"{options.out}: holds another result; give --overwrite to replace it")
     set_variant(options.mode)
-    problem = load(
-        options.scene, dict(text.split("=", 1) for text in options.define), options.smoothing
-    )
+    problem = load(options.scene, overrides, options.smoothing)
     os.makedirs(options.out, exist_ok=True)
     say = (lambda text: None) if options.quiet else lambda text: print(text, file=sys.stderr)
     surfaces, rows = track(problem, options.iterations, options.step, say)

@@ -80,7 +80,6 @@ def make(folder, points, size, frames):
     from polysft_mi.objective.problem import Problem
     from polysft_mi.pictures.shading import srgb
     from polysft_mi.scene import experiment as scene
-    from polysft_mi.scene.sequence import Sequence
 
     faces, uv = faces_and_uv(points)
     truth = np.stack([sheet(points, size, k / max(frames - 1, 1)) for k in range(frames)])
@@ -110,7 +109,7 @@ def make(folder, points, size, frames):
     )  # so that there is a scene to render with
     prepare.main([folder])
     experiment = scene.load(os.path.join(folder, "scene.xml"), {"spp": str(SAMPLES)})
-    problem = Problem(experiment, Sequence.open(experiment.frames, experiment.masks))
+    problem = Problem(experiment, experiment.sequence())
     for k, vertices in enumerate(truth):
         rgb, alpha = problem.image(mi.Point3f(np.ascontiguousarray(vertices.T, dtype=np.float32)))
         alpha = np.array(alpha).reshape(size[1], size[0])
@@ -126,14 +125,13 @@ def measure(folder):
     from polysft_mi import solvers
     from polysft_mi.objective.problem import Problem
     from polysft_mi.scene import experiment as scene
-    from polysft_mi.scene.sequence import Sequence
     from polysft_mi.surface.patch import Unknowns
     from polysft_mi.tracker import track
 
     with open("/proc/self/statm") as file:
         started = int(file.read().split()[1]) * resource.getpagesize() / 1e6
     experiment = scene.load(os.path.join(folder, "scene.xml"), {})
-    problem = Problem(experiment, Sequence.open(experiment.frames, experiment.masks))
+    problem = Problem(experiment, experiment.sequence())
     ticks = {}
 
     def tick(frame, *_):

@@ -28,6 +28,7 @@ from sft_report import report
 from sft_results import JET, METHODS, SEQUENCES
 
 from polysft_mi.backend import add_mode_argument
+from polysft_mi.commands import add_define_argument, definitions
 from polysft_mi.errors import InputError, cli
 
 
@@ -61,14 +62,7 @@ def parser():
         metavar="N",
         help="iterations a frame of per-vertex (default: its own)",
     )
-    p.add_argument(
-        "-D",
-        dest="define",
-        metavar="NAME=VALUE",
-        action="append",
-        default=[],
-        help="override a <default> of every scene",
-    )
+    add_define_argument(p)
     p.add_argument("--again", action="store_true", help="run what has a result, too")
     p.add_argument(
         "-o",
@@ -94,9 +88,7 @@ def main(arguments=None):
     for name in ("frames", "threads", "iterations"):
         if getattr(options, name) is not None and getattr(options, name) < 1:
             raise InputError(f"--{name} {getattr(options, name)}: at least 1 is needed")
-    for text in options.define:
-        if "=" not in text:
-            raise InputError(f"-D {text}: NAME=VALUE is needed")
+    definitions(options.define)  # a wrong one is told before anything runs
     if not os.path.isdir(options.data):
         raise InputError(
             f"--data {options.data}: no such folder; it must hold the sequences' folders"

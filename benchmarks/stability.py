@@ -22,6 +22,7 @@ import numpy as np
 from sequences import ROOT
 
 from polysft_mi.backend import add_mode_argument, set_variant
+from polysft_mi.commands import add_define_argument, definitions
 from polysft_mi.errors import InputError, cli
 from polysft_mi.files import aside
 
@@ -72,20 +73,12 @@ def run(scene, overrides, counts, folder, say=print):
     from polysft_mi import solvers
     from polysft_mi.objective.problem import Problem
     from polysft_mi.scene import experiment as scenes
-    from polysft_mi.scene.sequence import Sequence
     from polysft_mi.surface.patch import Unknowns
     from polysft_mi.tracker import track
 
     experiment = scenes.load(scene, {"solver": "adam", **overrides})
     s = experiment.settings
-    sequence = Sequence.open(
-        experiment.frames,
-        experiment.masks,
-        first=s.first,
-        last=s.last,
-        stride=s.stride,
-        size=experiment.size,
-    )
+    sequence = experiment.sequence()
     problem = Problem(experiment, sequence)
     problem.check_start()
     frame = len(sequence.indices) - 1
@@ -267,14 +260,7 @@ def parser():
         default=os.path.join(ROOT, "scenes", "demo.xml"),
         help="default: the demo",
     )
-    p.add_argument(
-        "-D",
-        dest="define",
-        metavar="NAME=VALUE",
-        action="append",
-        default=[],
-        help="override a <default> of the scene; may be repeated",
-    )
+    add_define_argument(p)
     p.add_argument(
         "--counts",
         nargs="+",
@@ -304,10 +290,7 @@ def main(arguments=None):
     counts = sorted(set(options.counts))
     if counts[0] < 1:
         raise InputError(f"--counts {counts[0]}: at least 1 iteration is needed")
-    for text in options.define:
-        if "=" not in text:
-            raise InputError(f"-D {text}: NAME=VALUE is needed")
-    overrides = dict(text.split("=", 1) for text in options.define)
+    overrides = definitions(options.define)
     usual = min(USUAL, counts[-1])
     set_variant(options.mode)
     from polysft_mi.results import outputs

@@ -38,6 +38,26 @@ def parser(name, description, examples):
     )
 
 
+def add_define_argument(parser):
+    """Add ``-D NAME=VALUE``, which may be repeated; :func:`definitions` reads what it takes."""
+    parser.add_argument(
+        "-D",
+        dest="define",
+        metavar="NAME=VALUE",
+        action="append",
+        default=[],
+        help="override a <default> of the scene; may be repeated",
+    )
+
+
+def definitions(texts):
+    """Names to values of the texts of ``-D``. Raises InputError for one that is no NAME=VALUE."""
+    for text in texts:
+        if text.find("=") < 1:
+            raise InputError(f"-D {text}: NAME=VALUE is needed")
+    return dict(text.split("=", 1) for text in texts)
+
+
 def print_table(figures, labels, title):
     """Print ``figures`` (name to number) as a table: by rich on a terminal, as aligned plain text
     elsewhere. ``labels``: name to what it is called.

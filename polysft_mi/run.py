@@ -42,14 +42,7 @@ def parser():
         "scene", metavar="scene.xml", help="Mitsuba scene with a polysft integrator (docs/scene.md)"
     )
     p.add_argument("-o", "--output", metavar="OUT", required=True, help="folder for the results")
-    p.add_argument(
-        "-D",
-        dest="define",
-        metavar="NAME=VALUE",
-        action="append",
-        default=[],
-        help="override a <default> of the scene; may be repeated",
-    )
+    commands.add_define_argument(p)
     add_mode_argument(p)
     again = p.add_mutually_exclusive_group()
     again.add_argument("--overwrite", action="store_true", help="replace the run that OUT holds")
@@ -71,12 +64,7 @@ def parser():
 
 def main(arguments=None):
     options = parser().parse_args(arguments)
-    overrides = {}
-    for text in options.define:
-        name, equals, value = text.partition("=")
-        if not equals or not name:
-            raise InputError(f"-D {text}: NAME=VALUE is needed")
-        overrides[name] = value
+    overrides = commands.definitions(options.define)
     try:
         exr_frames = sys.maxsize if options.exr == "all" else int(options.exr)
         if exr_frames < 0 or not 0 < options.fps <= 1000:
@@ -185,7 +173,6 @@ def reconstruct(
     from .render.device import threads
     from .results import outputs
     from .scene import experiment as experiments
-    from .scene.sequence import Sequence
     from .surface.meshio import size_note
 
     experiment = experiments.load(scene, overrides)
@@ -193,14 +180,7 @@ def reconstruct(
     if note:
         print(note, file=sys.stderr)
     s = experiment.settings
-    sequence = Sequence.open(
-        experiment.frames,
-        experiment.masks,
-        first=s.first,
-        last=s.last,
-        stride=s.stride,
-        size=experiment.size,
-    )
+    sequence = experiment.sequence()
     problem = Problem(experiment, sequence)
     problem.check_start()
     solver = solvers.create(s)

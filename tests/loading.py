@@ -2,8 +2,6 @@
 
 import numpy as np
 
-from polysft_mi.scene.sequence import Sequence
-
 
 def loaded(path, **overrides):
     from polysft_mi.scene import experiment as scene
@@ -17,7 +15,7 @@ def difference(experiment):
     """
     import mitsuba as mi
 
-    frame = Sequence.open(experiment.frames, experiment.masks, size=experiment.size).frame(0)
+    frame = experiment.sequence().frame(0)
     image = np.array(mi.render(experiment.scene, sensor=experiment.sensor, spp=1))
     inside = image[..., 3] > 0.999
     rgb = image[..., :3]

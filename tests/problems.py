@@ -8,23 +8,20 @@ from scipy.spatial.transform import Rotation
 from polysft_mi import prepare
 from polysft_mi.objective.problem import Problem
 from polysft_mi.scene import experiment as scene
-from polysft_mi.scene.sequence import Sequence
 from polysft_mi.surface.chart import State
 from polysft_mi.surface.template import Template
+
+
+def small_cloth(folder, frames):
+    """A cloth of 9 x 12 vertices in images of 160 x 120, in the new folder ``folder``/cloth."""
+    return synthetic.cloth(folder / "cloth", frames=frames, size=(160, 120), rows=9, columns=12)
 
 
 def problem_of(folder, rules=None, **settings):
     """The problem of a folder of :mod:`synthetic`, under ``rules`` and settings."""
     prepare.main([str(folder), "--overwrite"])
     experiment = scene.load(str(folder / "scene.xml"), settings)
-    s = experiment.settings
-    return Problem(
-        experiment,
-        Sequence.open(
-            experiment.frames, experiment.masks, first=s.first, last=s.last, size=experiment.size
-        ),
-        rules,
-    )
+    return Problem(experiment, experiment.sequence(), rules)
 
 
 def grid_template(rows=6, columns=7, order=4, bend=4.0):

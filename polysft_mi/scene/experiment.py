@@ -23,6 +23,7 @@ from polysft_mi.surface.template import Template
 from . import plugins
 from .defaults import located, resolved_defaults
 from .images import checked_size
+from .sequence import Sequence
 from .settings import Settings
 
 
@@ -52,6 +53,13 @@ class Experiment:
         """(width, height) of the film's crop window, pixels."""
         width, height = self.sensor.film().crop_size()
         return int(width), int(height)
+
+    def sequence(self):
+        """The :class:`Sequence` of the frames that the settings select. Raises InputError."""
+        s = self.settings
+        return Sequence.open(
+            self.frames, self.masks, first=s.first, last=s.last, stride=s.stride, size=self.size
+        )
 
 
 def load(

@@ -16,7 +16,6 @@ from polysft_mi.objective.problem import Problem
 from polysft_mi.prepare import parser as prepare_parser
 from polysft_mi.scene import experiment as scene
 from polysft_mi.scene import plugins, rules, settings
-from polysft_mi.scene.sequence import Sequence
 
 PAGES = [
     p
@@ -103,9 +102,7 @@ def test_example_scene_runs(tmp_path):
     experiment = scene.load(
         tmp_path / "example.xml", {"data": str(ROOT / "scenes" / "demo"), "last": "0"}
     )
-    sequence = Sequence.open(
-        experiment.frames, experiment.masks, last=experiment.settings.last, size=experiment.size
-    )
+    sequence = experiment.sequence()
     problem = Problem(experiment, sequence)
     assert experiment.settings == settings.Settings(last=0)
     _, alpha = problem.image(problem.patch.vertices(problem.patch.rest()))

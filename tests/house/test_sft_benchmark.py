@@ -56,13 +56,10 @@ def test_baseline_starts_from_the_template_and_moves_what_its_unknowns_move(shee
 def test_objective_of_the_baseline_is_adams(sheet, large_steps):
     from polysft_mi.objective.problem import Problem
     from polysft_mi.scene import experiment as scene
-    from polysft_mi.scene.sequence import Sequence
 
     baseline = per_vertex.load(str(sheet.folder / "scene.xml"), {})
     experiment = scene.load(str(sheet.folder / "scene.xml"), {"solver": "adam"})
-    problem = Problem(
-        experiment, Sequence.open(experiment.frames, experiment.masks, size=experiment.size)
-    )
+    problem = Problem(experiment, experiment.sequence())
     mine, terms = baseline.evaluate([baseline.patch.rest()], [1])
     theirs, wanted = problem.evaluate([problem.patch.rest()], [1])
     assert mine == pytest.approx(theirs, rel=1e-3) and mine > 0

@@ -14,7 +14,6 @@ from scripts import load
 from polysft_mi.images.registration import Registration
 from polysft_mi.objective.problem import Problem
 from polysft_mi.scene import experiment as scene
-from polysft_mi.scene.sequence import Sequence
 
 simulate = load("benchmarks/simulate.py")
 KIND = simulate.KINDS["bend"]
@@ -60,9 +59,7 @@ def test_frames_show_the_texture_on_the_true_surface(bent):
     """
     folder, vertices = bent
     experiment = scene.load(str(ROOT / "scenes" / "bend.xml"), {"data": str(folder)})
-    problem = Problem(
-        experiment, Sequence.open(experiment.frames, experiment.masks, size=experiment.size)
-    )
+    problem = Problem(experiment, experiment.sequence())
     registration = Registration(problem)
     finest = problem.rules.blurs[-1]
     for t, x in enumerate(vertices):

@@ -27,7 +27,6 @@ from polysft_mi.camera import Intrinsics
 from polysft_mi.capture import iou, prepare_video
 from polysft_mi.pictures.video import write_video
 from polysft_mi.scene.images import read_rgb
-from polysft_mi.scene.sequence import Sequence
 from polysft_mi.surface import meshio
 
 
@@ -73,7 +72,7 @@ def test_folder_of_a_video(clip, tmp_path):
 
     experiment = scene.load(scene_path)
     image = np.array(mi.render(experiment.scene, sensor=experiment.sensor, spp=1))
-    frame = Sequence.open(experiment.frames, experiment.masks, size=experiment.size).frame(0)
+    frame = experiment.sequence().frame(0)
     inside = image[..., 3] > 0.999
     right, upside_down, mirrored = (
         np.abs(image[..., :3] - x)[inside].mean() for x in (frame, frame[::-1], frame[:, ::-1])

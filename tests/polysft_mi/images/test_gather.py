@@ -9,8 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-import synthetic
-from problems import problem_of
+from problems import problem_of, small_cloth
 from scipy.spatial.transform import Rotation
 
 from polysft_mi.images import pixels
@@ -23,15 +22,7 @@ LEVEL = Level(1.0, 1, 8.0)
 
 @pytest.fixture(scope="module")
 def problem(tmp_path_factory):
-    return problem_of(
-        synthetic.cloth(
-            tmp_path_factory.mktemp("assembly") / "cloth",
-            frames=3,
-            size=(160, 120),
-            rows=9,
-            columns=12,
-        ).folder
-    )
+    return problem_of(small_cloth(tmp_path_factory.mktemp("data"), frames=3).folder)
 
 
 def surfaces(problem):

@@ -6,7 +6,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import synthetic
-from problems import problem_of
 
 from polysft_mi import prepare
 from polysft_mi.images import pyramid
@@ -17,22 +16,6 @@ from polysft_mi.objective.problem import Problem
 from polysft_mi.scene import experiment as scene
 
 RNG = np.random.default_rng(4)
-
-
-@pytest.fixture(scope="module")
-def truth(tmp_path_factory):
-    return synthetic.cloth(
-        tmp_path_factory.mktemp("gauss_newton") / "cloth",
-        frames=4,
-        size=(160, 120),
-        rows=9,
-        columns=12,
-    )
-
-
-@pytest.fixture(scope="module")
-def problem(truth):
-    return problem_of(truth.folder, brightness="none")
 
 
 def displaced(problem, amount=1.0):

@@ -12,7 +12,6 @@ from polysft_mi import capture
 from polysft_mi.objective import terms as objective
 from polysft_mi.objective.problem import Problem
 from polysft_mi.scene import experiment as scene
-from polysft_mi.scene.sequence import Sequence
 from polysft_mi.surface.patch import Unknowns
 
 RNG = np.random.default_rng(1)
@@ -200,9 +199,7 @@ def problem(folder, masks=True, **overrides):
     path.write_text(capture.scene_xml(layout, str(truth.folder)))
     experiment = scene.load(path, {"solver": "adam", **overrides})
     return (
-        Problem(
-            experiment, Sequence.open(experiment.frames, experiment.masks, size=experiment.size)
-        ),
+        Problem(experiment, experiment.sequence()),
         truth,
     )
 
@@ -319,9 +316,7 @@ def test_padding_does_not_change_the_loss(tmp_path):
         path = tmp_path / f"{name}.xml"
         path.write_text(capture.scene_xml(capture.recognise(str(truth.folder)), str(truth.folder)))
         experiment = scene.load(path, {"solver": "adam"})
-        p = Problem(
-            experiment, Sequence.open(experiment.frames, experiment.masks, size=experiment.size)
-        )
+        p = Problem(experiment, experiment.sequence())
         totals.append(p.evaluate([p.patch.rest()], [4])[0])
     assert totals[1] == pytest.approx(totals[0], rel=1e-3)
 

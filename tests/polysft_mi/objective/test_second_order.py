@@ -7,7 +7,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-import synthetic
 from problems import dense, problem_of, some_state
 
 from polysft_mi.images.gather import Images
@@ -19,22 +18,6 @@ from polysft_mi.scene.rules import Rules
 from polysft_mi.surface.patch import Unknowns
 
 RNG = np.random.default_rng(4)
-
-
-@pytest.fixture(scope="module")
-def truth(tmp_path_factory):
-    return synthetic.cloth(
-        tmp_path_factory.mktemp("gauss_newton") / "cloth",
-        frames=4,
-        size=(160, 120),
-        rows=9,
-        columns=12,
-    )
-
-
-@pytest.fixture(scope="module")
-def problem(truth):
-    return problem_of(truth.folder, brightness="none")
 
 
 def edges_of(problem):

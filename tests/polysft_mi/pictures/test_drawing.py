@@ -22,7 +22,6 @@ from polysft_mi.pictures.album import Album, AlbumSettings, residual
 from polysft_mi.pictures.drawing import Drawing
 from polysft_mi.pictures.panels import Box, evenly_spaced
 from polysft_mi.scene import experiment as scene
-from polysft_mi.scene.sequence import Sequence
 
 
 @pytest.fixture(scope="module")
@@ -36,9 +35,7 @@ def sheet(tmp_path_factory):
 
 def problem_of(sheet):
     experiment = scene.load(str(sheet.folder / "scene.xml"))
-    return Problem(
-        experiment, Sequence.open(experiment.frames, experiment.masks, size=experiment.size)
-    )
+    return Problem(experiment, experiment.sequence())
 
 
 def drawn(sheet, out, during=lambda drawing: None, *, problem=None, frames=9, **options):

@@ -7,8 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-import synthetic
-from problems import problem_of
+from problems import problem_of, small_cloth
 
 from polysft_mi import solvers
 from polysft_mi.render.device import frozen, interruptible, on_device
@@ -18,15 +17,7 @@ from polysft_mi.tracker import Track, track
 
 @pytest.fixture(scope="module")
 def problem(tmp_path_factory):
-    return problem_of(
-        synthetic.cloth(
-            tmp_path_factory.mktemp("assembly") / "cloth",
-            frames=3,
-            size=(160, 120),
-            rows=9,
-            columns=12,
-        ).folder
-    )
+    return problem_of(small_cloth(tmp_path_factory.mktemp("data"), frames=3).folder)
 
 
 @pytest.mark.parametrize("kind", ["Float", "Float64", "UInt32", "Int32"])

@@ -28,22 +28,6 @@ from polysft_mi.tracker import track
 RNG = np.random.default_rng(4)
 
 
-@pytest.fixture(scope="module")
-def truth(tmp_path_factory):
-    return synthetic.cloth(
-        tmp_path_factory.mktemp("gauss_newton") / "cloth",
-        frames=4,
-        size=(160, 120),
-        rows=9,
-        columns=12,
-    )
-
-
-@pytest.fixture(scope="module")
-def problem(truth):
-    return problem_of(truth.folder, brightness="none")
-
-
 def test_texture_is_fitted_to_the_first_frame(truth, tmp_path):
     moved = tmp_path / "moved"
     moved.mkdir()

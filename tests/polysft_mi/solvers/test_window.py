@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import synthetic
 from problems import dense, problem_of, some_state
 from scipy.linalg import block_diag
 
@@ -15,17 +14,6 @@ from polysft_mi.surface.patch import Unknowns
 from polysft_mi.tracker import track
 
 RNG = np.random.default_rng(4)
-
-
-@pytest.fixture(scope="module")
-def truth(tmp_path_factory):
-    return synthetic.cloth(
-        tmp_path_factory.mktemp("gauss_newton") / "cloth",
-        frames=4,
-        size=(160, 120),
-        rows=9,
-        columns=12,
-    )
 
 
 def test_a_windows_step_against_finite_differences_and_the_dense_system(truth):

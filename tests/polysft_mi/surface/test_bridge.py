@@ -15,7 +15,6 @@ from polyfit.network import PolyFit, SpatialTransformer
 from polysft_mi import bridge, capture
 from polysft_mi.objective.problem import Problem
 from polysft_mi.scene import experiment as scene
-from polysft_mi.scene.sequence import Sequence
 from polysft_mi.surface.patch import JetPatch
 
 RNG = np.random.default_rng(2)
@@ -42,7 +41,7 @@ def bent(tmp_path_factory):
     truth = synthetic.cloth(folder / "sequence", frames=2, bend=6.0)
     path, _ = capture.prepare_folder(str(truth.folder), out=str(folder / "scene"))
     experiment = scene.load(path, {})
-    sequence = Sequence.open(experiment.frames, experiment.masks, size=experiment.size)
+    sequence = experiment.sequence()
     return Problem(experiment, sequence), torch.as_tensor(truth.vertices[1], dtype=torch.float32)
 
 

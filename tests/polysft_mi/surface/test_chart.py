@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import synthetic
 import torch
-from problems import grid_template, problem_of, some_state
+from problems import grid_template, some_state
 from scipy.spatial.transform import Rotation
 
 from polyfit import jets
@@ -15,22 +15,6 @@ from polysft_mi.surface.chart import Chart, State
 from polysft_mi.surface.patch import Unknowns
 
 RNG = np.random.default_rng(4)
-
-
-@pytest.fixture(scope="module")
-def truth(tmp_path_factory):
-    return synthetic.cloth(
-        tmp_path_factory.mktemp("gauss_newton") / "cloth",
-        frames=4,
-        size=(160, 120),
-        rows=9,
-        columns=12,
-    )
-
-
-@pytest.fixture(scope="module")
-def problem(truth):
-    return problem_of(truth.folder, brightness="none")
 
 
 @pytest.mark.parametrize("order", [1, 4, 7, 10])

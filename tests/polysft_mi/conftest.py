@@ -1,0 +1,19 @@
+"""The small cloth that many tests look at, and the tracker's problem of it."""
+
+import pytest
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory):
+    """Four frames of a small cloth, as :mod:`synthetic` makes them."""
+    from problems import small_cloth
+
+    return small_cloth(tmp_path_factory.mktemp("data"), frames=4)
+
+
+@pytest.fixture(scope="module")
+def problem(truth):
+    """The problem of ``truth``, its images compared as they are."""
+    from problems import problem_of
+
+    return problem_of(truth.folder, brightness="none")
