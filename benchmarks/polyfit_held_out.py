@@ -26,7 +26,7 @@ from polyfit.errors import InputError
 from polyfit.jets import CanonicalFrame
 from polyfit.mesh import read_mesh
 from polyfit.patches import Patches
-from polyfit.training import behind, garments
+from polyfit.training import garments, share_behind
 from polyfit.training.training_set import axes, rotations_to
 
 HELD_OUT = [
@@ -90,7 +90,7 @@ def simulated(folder, seed):
 def is_folded(patches):
     """Which patches are no height graphs over their PCA plane, but are over another, (M,)."""
     normals = patches.normals @ CanonicalFrame.from_points(patches.points).R
-    seen = torch.stack([behind(normals @ turn) for turn in rotations_to(axes())], 1)
+    seen = torch.stack([share_behind(normals @ turn) for turn in rotations_to(axes())], 1)
     return (seen[:, 0] > FOLDED) & (seen.amin(1) <= GRAPH)
 
 

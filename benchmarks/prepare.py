@@ -102,24 +102,15 @@ def kinect_inputs(data, out, count):
     return video, photo, camera
 
 
+def prepare_kinect(data, out, frames, target, *options):
+    """Prepare the first ``frames`` of Kinect-Paper in the folder ``target``; seconds it took."""
+    video, photo, camera = kinect_inputs(data, out, frames)
+    words = [video, "--texture", photo, "--size", *PRINT, "--camera", camera, "-o", target]
+    return python("-m", "polysft_mi.prepare", *words, "--overwrite", *options)
+
+
 def measure_pose(data, out):
-    video, photo, camera = kinect_inputs(data, out, FRAMES)
-    size = [f"{side:g}" for side in PRINT]
-    python(
-        "-m",
-        "polysft_mi.prepare",
-        video,
-        "--texture",
-        photo,
-        "--size",
-        *size,
-        "--camera",
-        camera,
-        "--no-masks",
-        "-o",
-        f"{out}/kinect",
-        "--overwrite",
-    )
+    prepare_kinect(data, out, FRAMES, f"{out}/kinect", "--no-masks")
     python(
         "-m",
         "polysft_mi.run",
@@ -284,21 +275,7 @@ def measure_corners(data, out):
 
 
 def measure_time(data, out):
-    video, photo, camera = kinect_inputs(data, out, TIMED)
-    seconds = python(
-        "-m",
-        "polysft_mi.prepare",
-        video,
-        "--texture",
-        photo,
-        "--size",
-        *map(str, PRINT),
-        "--camera",
-        camera,
-        "-o",
-        f"{out}/timed",
-        "--overwrite",
-    )
+    seconds = prepare_kinect(data, out, TIMED, f"{out}/timed")
     print(f"time: {TIMED} frames of 640x480, with masks: {seconds:.1f} s")
     return {"frames": TIMED, "seconds": seconds}
 

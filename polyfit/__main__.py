@@ -1,5 +1,5 @@
-"""A mesh as patches of jets, from the command line: ``python -m polyfit garment.obj -o
-surface.ply``.
+"""``python -m polyfit garment.obj -o surface.ply``: a mesh as patches of jets, written at any
+resolution.
 """
 
 import argparse

@@ -9,11 +9,8 @@ from pathlib import Path
 
 from .errors import InputError
 
-FULL = (
-    errno.ENOSPC,
-    errno.EDQUOT,
-    errno.EFBIG,
-)  # numbers of the OSErrors that say that no more can be written
+# Numbers of the OSErrors that say that no more can be written
+DISK_FULL_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 @contextlib.contextmanager
@@ -42,9 +39,8 @@ def aside(path: str | os.PathLike[str]) -> Iterator[str]:
     temporary = os.path.join(folder, f".{os.getpid()}.partial.{name}")
     try:
         yield temporary
-        with open(
-            temporary, "rb+"
-        ) as file:  # a full disk shows here at the latest, before the rename
+        with open(temporary, "rb+") as file:
+            # a full disk shows here at the latest, before the rename
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except BaseException as error:
@@ -55,9 +51,8 @@ def aside(path: str | os.PathLike[str]) -> Iterator[str]:
             and error.errno is not None
             and error.filename in (None, temporary)
         ):
-            error.filename = os.fspath(
-                path
-            )  # the name that the user knows; a full disk comes with none
+            # the name that the user knows; a full disk comes with none
+            error.filename = os.fspath(path)
         raise
 
 

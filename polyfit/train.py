@@ -1,10 +1,11 @@
-"""Trains PolyFit's spatial transformer, or a network that it is held against.
+"""Train PolyFit's spatial transformer, or a network that it is compared with.
 
-    python -m polyfit.train [MESH ...] -o OUT [--model polyfit] [--families jet trigonometric
-    gaussian bessel] [--steps 2500] [--resume] torchrun --nproc-per-node 2 -m polyfit.train ...
+    python -m polyfit.train [MESH ...] -o OUT [--model polyfit] [--steps 2500] [--resume]
+                            [--families jet trigonometric gaussian bessel]
+    torchrun --nproc-per-node 2 -m polyfit.train ...
 
-MESH are garments (.obj, .ply), cut into patches and deformed at random; without any, the analytic
-families are all there is. OUT receives
+Each MESH is a garment (.obj, .ply). It is cut into patches, which are deformed at random. Without
+any, the training sees the analytic families alone. OUT receives
 
     weights.safetensors     the trained network, for ``PolyFit.load``
     weights.json            what made it

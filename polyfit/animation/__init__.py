@@ -15,7 +15,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     submod_attrs={
         "frames": ["write_frames"],
         "gltf": ["write_glb"],
-        "moving": ["UP", "encoded", "from_camera", "normals"],
+        "moving": ["AXES_FROM_CAMERA", "encoded", "from_camera", "normals"],
         "usd": ["write_usd"],
     },
 )

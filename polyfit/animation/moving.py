@@ -10,7 +10,11 @@ import numpy as np
 from polyfit.errors import InputError
 from polyfit.mesh import face_vectors
 
-UP = {"y": np.diag([1.0, -1.0, -1.0]), "z": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])}
+# Rotations from OpenCV's camera axes to axes with y or z up
+AXES_FROM_CAMERA = {
+    "y": np.diag([1.0, -1.0, -1.0]),
+    "z": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
+}
 
 
 def from_camera(points, up="y"):
@@ -20,7 +24,7 @@ def from_camera(points, up="y"):
     Both are rotations about x: nothing is mirrored. The camera stays at the origin; with y up it
     looks along -z, as the cameras of glTF and USD do.
     """
-    return np.asarray(points) @ UP[up].T.astype(np.asarray(points).dtype)
+    return np.asarray(points) @ AXES_FROM_CAMERA[up].T.astype(np.asarray(points).dtype)
 
 
 def normals(vertices, faces):

@@ -9,7 +9,7 @@ import torch
 from polyfit.errors import InputError
 from polyfit.network import load_into, pointwise, read_weights, write_weights
 
-VERSION = 1
+WEIGHTS_VERSION = 1
 
 
 class AtlasNet(torch.nn.Module):
@@ -72,7 +72,7 @@ class AtlasNet(torch.nn.Module):
         """The network with the weights of the file ``path``. Raises InputError where they are no
         such, or of another version.
         """
-        weights, about = read_weights(path, "atlasnet", VERSION)
+        weights, about = read_weights(path, "atlasnet", WEIGHTS_VERSION)
         model = cls(**about["network"])
         load_into(model, weights, path)
         return model.eval()
@@ -84,7 +84,7 @@ class AtlasNet(torch.nn.Module):
         write_weights(
             path,
             self.state_dict(),
-            dict(model="atlasnet", version=VERSION, network=self.shape, **about),
+            dict(model="atlasnet", version=WEIGHTS_VERSION, network=self.shape, **about),
         )
 
 
@@ -103,9 +103,8 @@ def chamfer(a, b):
     """Symmetric Chamfer distance (B,), the sum of both mean squared distances, of points a (B, P,
     3) and b (B, Q, 3); differentiable.
     """
-    with (
-        torch.no_grad()
-    ):  # which is nearest; their distances are taken again, exactly and with gradients
+    # which is nearest; the distances are taken again, exactly and with gradients
+    with torch.no_grad():
         d = torch.cdist(a, b)
         to_b, to_a = d.argmin(2), d.argmin(1)
     gathered = [y.gather(1, i[..., None].expand(-1, -1, 3)) for y, i in ((b, to_b), (a, to_a))]

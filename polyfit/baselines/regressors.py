@@ -17,11 +17,11 @@ from polyfit.network import (
     normalised_layer,
     pointwise,
     read_weights,
-    thinned,
+    subsampled,
     write_weights,
 )
 
-VERSION = 1
+WEIGHTS_VERSION = 1
 
 
 class Regressor(torch.nn.Module):
@@ -43,7 +43,9 @@ class Regressor(torch.nn.Module):
 
     def alpha(self, x, mask=None):
         """alpha (B, A) of patches x (B, P, 3) in the charts of their PCA frames."""
-        return self.head(self.feature(thinned(x.to(self.head[-1].weight.dtype), self.points, mask)))
+        return self.head(
+            self.feature(subsampled(x.to(self.head[-1].weight.dtype), self.points, mask))
+        )
 
     def forward(self, points, *, mask=None):
         """:class:`PatchFit` of patches ``points`` (B, P, 3) in any unit and frame."""
@@ -58,7 +60,7 @@ class Regressor(torch.nn.Module):
         """The network with the weights of the file ``path``. Raises InputError where they are no
         such, of another version, or not for ``order``.
         """
-        weights, about = read_weights(path, cls.__name__.lower(), VERSION)
+        weights, about = read_weights(path, cls.__name__.lower(), WEIGHTS_VERSION)
         if order is not None and about["order"] != order:
             raise InputError(f"{path}: weights for jets of order {about['order']}, not {order}")
         model = cls(about["order"])
@@ -72,7 +74,12 @@ class Regressor(torch.nn.Module):
         write_weights(
             path,
             self.state_dict(),
-            dict(model=type(self).__name__.lower(), version=VERSION, order=self.order, **about),
+            dict(
+                model=type(self).__name__.lower(),
+                version=WEIGHTS_VERSION,
+                order=self.order,
+                **about,
+            ),
         )
 
 

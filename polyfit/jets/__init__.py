@@ -26,6 +26,6 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
             "turned_over",
         ],
         "least_squares": ["JetFit", "fit"],
-        "monomials": ["DETERMINED", "NARROWEST", "exponents", "order_of", "size_of"],
+        "monomials": ["DETERMINED_RMS", "MIN_BOX_RATIO", "exponents", "order_of", "size_of"],
     },
 )

@@ -31,12 +31,12 @@ class CanonicalFrame:
         from it, z the direction of least spread.
 
         ``mask`` (..., P) bool: the points that exist; ``weights`` (..., P) not negative, for mean
-        and spread. Signs are fixed by the data, so that the frame turns with the points: u and v
-        point to the side where the third moment of the coordinate is positive (for a symmetric
-        patch: to the side of the first point that is half as far out as the farthest), z follows by
-        the right hand. In float64 inside, in the points' dtype outside, and without gradient: a
-        frame is a choice of coordinates. Raises InputError where a patch has no points, or points
-        that are not finite or all the same.
+        and spread. The data fix the signs, so that the frame turns with the points: u and v point
+        to the side where the third moment of the coordinate is positive. For a symmetric patch they
+        point to the first point that is at least half as far out as the farthest. z follows by the
+        right hand. Computed in float64, returned in the points' dtype. Without gradient: a frame is
+        a choice of coordinates. Raises InputError where a patch has no points, or points that are
+        not finite or all the same.
         """
         with torch.no_grad():
             dtype, points = points.dtype, points.detach().to(torch.float64)

@@ -1,10 +1,10 @@
 """The jets that fit points best: weighted least squares for batches of patches (Cazals & Pouget
 2003).
 
-Each patch is fitted in the box of its own points, in a basis of products of Chebyshev polynomials,
-whose Gram matrix follows from the products' moments: T_a T_c = (T_{a+c} + T_{|a-c|}) / 2. So no
+Each patch is fitted in the bounding box of its own points, in products of Chebyshev polynomials.
+The Gram matrix of this basis follows from moments: T_a T_c = (T_{a+c} + T_{|a-c|}) / 2. So no
 matrix of points times coefficients is ever made, and the systems stay well conditioned up to order
-10. Sums and solves are in float64, whatever the points are in.
+10. Sums and solves are in float64, whatever dtype the points have.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from torch import Tensor
 from polyfit.errors import InputError
 
 from . import jet
-from .monomials import DETERMINED, NARROWEST, exponents, size_of
+from .monomials import DETERMINED_RMS, MIN_BOX_RATIO, exponents, size_of
 
 
 @dataclass(frozen=True)
@@ -39,10 +39,10 @@ def fit(
     :class:`JetFit`.
 
     ``weights`` (..., P) not negative; ``mask`` (..., P) bool: the points that exist, the others are
-    padding of any value. Where the points are too few for ``order``, or lie such (on a line, on a
-    small grid) that they do not determine it, the patch is fitted by the highest order that they do
-    determine. Differentiable once in points and weights, at the cost of evaluating two jets. Raises
-    InputError where a patch has no points or weight, or where numbers are not finite.
+    padding of any value. Points that are too few for ``order``, or that lie on a line or a small
+    grid, may not determine it. Then the patch gets the highest order that they determine.
+    Differentiable once in points and weights, at the cost of evaluating two jets. Raises InputError
+    where a patch has no points or weight, or where numbers are not finite.
     """
     if not 1 <= order <= 10:
         raise InputError(f"order = {order}; the order of a jet is 1 to 10")
@@ -61,9 +61,8 @@ def fit(
         weights = weights.expand(shape).reshape(flat.shape[:2])
         if mask is not None:
             weights = torch.where(mask, weights, 0)
-    if (
-        mask is not None
-    ):  # padding is moved onto a point of the patch, where it changes neither box nor sums
+    if mask is not None:
+        # padding moves onto a point of the patch, where it changes neither box nor sums
         first = mask.to(torch.uint8).argmax(1)
         flat = torch.where(
             mask[..., None], flat, flat[torch.arange(len(flat), device=flat.device), first][:, None]
@@ -135,7 +134,7 @@ class _Box:
         """Of coordinates (2, B, P)."""
         low, high = torch.aminmax(uv, dim=2)
         half = ((high - low) / 2).T
-        half = torch.maximum(half, NARROWEST * half.amax(1, keepdim=True))
+        half = torch.maximum(half, MIN_BOX_RATIO * half.amax(1, keepdim=True))
         return cls(((low + high) / 2).T, torch.where(half > 0, half, 1))
 
     def normalised(self, uv: Tensor) -> Tensor:
@@ -239,7 +238,7 @@ def _factorise(gram: Tensor, order: int) -> tuple[Tensor, Tensor, Tensor]:
     eye = torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)
     factor, info = torch.linalg.cholesky_ex(gram)
     while True:
-        short = (factor.diagonal(dim1=1, dim2=2) < DETERMINED) | (
+        short = (factor.diagonal(dim1=1, dim2=2) < DETERMINED_RMS) | (
             torch.arange(1, len(degree) + 1, device=gram.device) == info[:, None]
         )
         low = torch.where(short, degree, order + 1).amin(1) - 1

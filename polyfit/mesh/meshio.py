@@ -136,17 +136,13 @@ def _read_ply(path: str) -> MeshArrays:
     import trimesh
 
     log = logging.getLogger("trimesh")
-    was_disabled, log.disabled = (
-        log.disabled,
-        True,
-    )  # it prints a traceback where a TextureFile is missing
+    was_disabled = log.disabled
+    log.disabled = True  # it prints a traceback where a TextureFile is missing
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             mesh = trimesh.load(path, file_type="ply", process=False, maintain_order=True)
-    except (
-        Exception
-    ) as error:  # trimesh lets everything through: KeyError, IndexError, UnicodeDecodeError, ...
+    except Exception as error:  # trimesh raises anything: KeyError, UnicodeDecodeError, ...
         raise InputError(
             f"{path}: not a readable PLY file ({type(error).__name__}: {error})"
         ) from None

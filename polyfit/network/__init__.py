@@ -15,7 +15,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
             "linear",
             "normalised_layer",
             "pointwise",
-            "thinned",
+            "subsampled",
         ],
         "weights": ["load_into", "read_weights", "write_weights"],
     },

@@ -1,13 +1,14 @@
 """PolyFit as a network: the PCA frame, a spatial transformer that refines it, the jet (paper,
 section "PolyFit").
 
-The plane of least spread is the wrong one for a patch that is large or folded: over it the patch is
-no height graph. The transformer sees the patch in its PCA frame and answers with a few unit
-quaternions, each a turn of the frame; the PCA frame itself is always one of them. The turn whose
-jet leaves the least height is kept. So the refined frame is never worse than PCA at the points that
-were read, and a patch with two plausible planes needs no guess between them. A rotation within the
-plane changes nothing, for a jet of full degree spans the same heights in any (u, v); what counts is
-where z points.
+PCA takes the plane of least spread. For a large or folded patch this plane is wrong: over it the
+patch is no height graph. The transformer sees the patch in its PCA frame and answers with a few
+unit quaternions. Each is a turn of the frame; the PCA frame itself is always one of them. The turn
+whose jet leaves the least height is kept. So the refined frame is never worse than PCA at the
+points that were read. A patch with two plausible planes needs no guess between them.
+
+Only the direction of z counts. A rotation within the plane changes nothing, because a jet of full
+degree spans the same heights in any (u, v).
 """
 
 import math
@@ -26,9 +27,9 @@ from polyfit.jets import CanonicalFrame, rotation_matrix
 
 from .weights import load_into, read_weights, write_weights
 
-VERSION = 1  # of the network's shape and the meaning of its weights
+WEIGHTS_VERSION = 1  # of the network's shape and the meaning of its weights
 PRETRAINED = Path(__file__).parents[1] / "data" / "polyfit.safetensors"
-TILT = math.radians(55)  # between the PCA frame's z and the first guesses'
+INITIAL_TILT = math.radians(55)  # between the PCA frame's z and the first guesses'
 
 
 class SpatialTransformer(torch.nn.Module):
@@ -60,10 +61,10 @@ class SpatialTransformer(torch.nn.Module):
         side = torch.arange(turns) * 2 * math.pi / turns
         first = torch.stack(
             [
-                math.sin(TILT / 2) * side.cos(),
-                math.sin(TILT / 2) * side.sin(),
+                math.sin(INITIAL_TILT / 2) * side.cos(),
+                math.sin(INITIAL_TILT / 2) * side.sin(),
                 0 * side,
-                math.cos(TILT / 2) + 0 * side,
+                math.cos(INITIAL_TILT / 2) + 0 * side,
             ],
             -1,
         )
@@ -77,7 +78,7 @@ class SpatialTransformer(torch.nn.Module):
 
         ``mask`` (B, P) marks the points that count.
         """
-        x = thinned(x.to(next(self.parameters()).dtype), self.points, mask)
+        x = subsampled(x.to(next(self.parameters()).dtype), self.points, mask)
         turns = torch.nn.functional.normalize(
             self.head(self.local(x).amax(1)).unflatten(-1, (-1, 4)), dim=-1
         )
@@ -105,7 +106,7 @@ def normalised_layer(entries: int, exits: int) -> tuple[torch.nn.Module, ...]:
     return linear(entries, exits), torch.nn.LayerNorm(exits), torch.nn.ReLU()
 
 
-def thinned(x: Tensor, count: int, mask: Tensor | None = None) -> Tensor:
+def subsampled(x: Tensor, count: int, mask: Tensor | None = None) -> Tensor:
     """At most ``count`` of the points x (B, P, 3), evenly through the order of those that ``mask``
     (B, P) leaves: (B, count, 3).
 
@@ -160,7 +161,7 @@ class PolyFit(torch.nn.Module):
         x = frame.to_chart(points)
         turns = self.stn(x, mask)
         kept = self.least_height(
-            thinned(x, max(self.stn.points, 4 * jets.size_of(self.order)), mask), turns.detach()
+            subsampled(x, max(self.stn.points, 4 * jets.size_of(self.order)), mask), turns.detach()
         )
         return frame.rotated(
             turns[torch.arange(len(turns), device=turns.device), kept].to(frame.R.dtype)
@@ -200,7 +201,7 @@ class PolyFit(torch.nn.Module):
         """PolyFit with the weights of the file ``path``, as ``polyfit.train`` writes them. Raises
         InputError where they are no such, of another version, or not for ``order``.
         """
-        weights, about = read_weights(path, "polyfit", VERSION)
+        weights, about = read_weights(path, "polyfit", WEIGHTS_VERSION)
         if order is not None and about["order"] != order:
             raise InputError(f"{path}: weights for jets of order {about['order']}, not {order}")
         model = cls(about["order"], SpatialTransformer(**about["network"]))
@@ -217,6 +218,10 @@ class PolyFit(torch.nn.Module):
             path,
             self.state_dict(),
             dict(
-                model="polyfit", version=VERSION, order=self.order, network=self.stn.shape, **about
+                model="polyfit",
+                version=WEIGHTS_VERSION,
+                order=self.order,
+                network=self.stn.shape,
+                **about,
             ),
         )

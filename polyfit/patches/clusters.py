@@ -1,12 +1,14 @@
 """Clusters of vertices that one jet can hold: ACVD (Valette & Chassery 2004), with the normals in
 its energy.
 
-ACVD finds connected clusters of least sum of squared distances from their centroids, so round ones
-of equal area. A jet also needs its cluster to be a height graph, and a round cluster of a sleeve
-may go all the way around it. Here a vertex is the point (x / r, w n) in six dimensions, with r the
-radius of a disc of the clusters' mean area and n its normal; the energy is ACVD's. A fine cut by
-pyacvd is merged to the number asked for, each time where the energy grows least (Ward 1963), and
-the boundaries then move to where it is lowest.
+ACVD finds connected clusters that have the least sum of squared distances from their centroids.
+They are round and of equal area. A jet also needs a height graph, but a round cluster of a sleeve
+may go all the way around it. So a vertex is the point (x / r, w n) in six dimensions here: r is the
+radius of a disc of the clusters' mean area, n the vertex's normal, w a weight. The energy is
+ACVD's.
+
+pyacvd makes a fine cut. Its clusters are merged down to the number asked for, each time where the
+energy grows least (Ward 1963). Then the boundaries move to where the energy is lowest.
 """
 
 import heapq
@@ -16,14 +18,13 @@ import numpy as np
 
 from polyfit import mesh
 
-# Weights w of the normals against positions, tried in this order until no more than this share of
-# the area is folded over.
-NORMALS, FOLDED = (1.5, 3.0, 6.0), 0.01
-# Clusters of the fine cut for each cluster asked for, and the vertices that each of them should
-# have.
-FINE, FINE_VERTICES = 12, 4
-# Sweeps over the boundaries, at most.
-SWEEPS = 100
+# Weights w of the normals against positions, tried in this order
+NORMAL_WEIGHTS = (1.5, 3.0, 6.0)
+# until at most this share of the area faces away from its cluster's mean normal
+FOLDED_SHARE = 0.01
+FINE_PER_CLUSTER = 12  # clusters of the fine cut for each cluster asked for
+VERTICES_PER_FINE = 4  # vertices that each of the fine cut should have, at least
+MAX_SWEEPS = 100  # over the boundaries
 
 
 def clusters(points, normals, area, faces, edges, count):
@@ -34,11 +35,11 @@ def clusters(points, normals, area, faces, edges, count):
     the normals get more weight, as long as that helps.
     """
     radius = np.sqrt(area.sum() / (np.pi * count))
-    fine = max(count, min(FINE * count, len(points) // FINE_VERTICES))
+    fine = max(count, min(FINE_PER_CLUSTER * count, len(points) // VERTICES_PER_FINE))
     fine = connected(_acvd(points, faces, fine), edges, area)
     fine = np.unique(fine, return_inverse=True)[1]
     best, least = None, np.inf
-    for weight in NORMALS:
+    for weight in NORMAL_WEIGHTS:
         feature = np.concatenate([points / radius, weight * normals], axis=1)
         label = connected(
             _relaxed(_merged(fine, feature, area, edges, count), feature, area, edges), edges, area
@@ -46,7 +47,7 @@ def clusters(points, normals, area, faces, edges, count):
         folded = _folded(label, normals, area)
         if folded < 0.9 * least:
             best, least = label, folded
-        if folded <= FOLDED or folded > least:
+        if folded <= FOLDED_SHARE or folded > least:
             break
     return np.unique(best, return_inverse=True)[1]
 
@@ -118,7 +119,7 @@ def _relaxed(label, feature, area, edges):
     until few move.
     """
     label = label.copy()
-    for sweep in range(SWEEPS):
+    for sweep in range(MAX_SWEEPS):
         total, size = _sums(label, feature, area)
         centre = total / size[:, None]
 
@@ -128,12 +129,12 @@ def _relaxed(label, feature, area, edges):
             joined = size[to] * w / (size[to] + w) * _squared(feature[v] - centre[to])
             return joined - size[own] * w / rest * _squared(feature[v] - centre[own])
 
-        if swept(label, edges, sweep, cost) < 1e-3:
+        if sweep_boundaries(label, edges, sweep, cost) < 1e-3:
             break
     return label
 
 
-def swept(label, edges, sweep, cost):
+def sweep_boundaries(label, edges, sweep, cost):
     """Give, in place, vertices at the clusters' boundaries to that neighbouring cluster for which
     ``cost(vertices, own, to)`` (C,) is least, where it is negative.
 
@@ -184,7 +185,7 @@ def connected(label, edges, weight):
     return label
 
 
-def halved(label, which, points, edges, weight):
+def split_in_two(label, which, points, edges, weight):
     """The labels with the cluster ``which`` cut across its longest extent; the new cluster has the
     next free number.
     """

@@ -11,12 +11,11 @@ from numpy.typing import ArrayLike
 from polyfit import mesh
 from polyfit.errors import InputError
 
-from .clusters import clusters, halved
+from .clusters import clusters, split_in_two
 
-# Vertices that a mesh should have before it is cut, for each patch and altogether: enough for the
-# patches' outlines and for their jets' fit.
-DENSITY = 100
-LEAST = 10_000
+# Vertices that a mesh should have before it is cut: enough for the patches' outlines and jets
+VERTICES_PER_PATCH = 100
+MIN_VERTICES = 10_000  # of the whole mesh
 
 
 def patch_count(area: float) -> int:
@@ -64,7 +63,7 @@ class Patches:
         faces: ArrayLike,
         count: int | None = None,
         *,
-        density: int = DENSITY,
+        density: int = VERTICES_PER_PATCH,
         where: str = "mesh",
     ) -> "Patches":
         """Cut the mesh (N, 3) [m], (F, 3) into ``count`` connected patches; by default
@@ -136,7 +135,7 @@ class Patches:
         return self.entry_patch[self.vertex_entry]
 
     @cached_property
-    def mixed(self) -> np.ndarray:
+    def on_boundary(self) -> np.ndarray:
         """Which faces touch several patches, (G,) bool."""
         return (self.corner_patch != self.corner_patch[:, :1]).any(axis=1)
 
@@ -215,7 +214,7 @@ def _components_of_faces(F: np.ndarray) -> np.ndarray:
 def _levels(vertices: int, area: np.ndarray, count: int, density: int) -> int:
     """Subdivisions until there are vertices enough, and no face is larger than a tenth of a patch
     (or until there are some million faces)."""
-    few = np.log(max(density * count, LEAST) / vertices) / np.log(4)
+    few = np.log(max(density * count, MIN_VERTICES) / vertices) / np.log(4)
     large = np.log(10 * count * area.max() / area.sum()) / np.log(4)
     most = np.log(4e6 / len(area)) / np.log(4)
     return max(0, min(int(np.ceil(max(few, large))), int(most)))
@@ -258,7 +257,7 @@ def _cluster(
             )
             while found.max() + 1 < share:
                 several = np.bincount(found) > 1
-                found = halved(
+                found = split_in_two(
                     found,
                     np.where(several, np.bincount(found, area[inside]), -1).argmax(),
                     points[inside],
@@ -292,6 +291,6 @@ def _entries(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """``entry_patch``, ``entry_vertex`` and ``face_entries`` of :class:`Patches`."""
     keys = corner_patch[:, :, None] * size + F[:, None, :]
-    mixed = (corner_patch != corner_patch[:, :1]).any(axis=1)
-    entries = np.unique(np.concatenate([keys[~mixed, 0].ravel(), keys[mixed].ravel()]))
+    on_boundary = (corner_patch != corner_patch[:, :1]).any(axis=1)
+    entries = np.unique(np.concatenate([keys[~on_boundary, 0].ravel(), keys[on_boundary].ravel()]))
     return entries // size, entries % size, np.searchsorted(entries, keys)

@@ -13,7 +13,7 @@ from . import clusters
 # the jet, each divided by its mean: keeps patches compact.
 COMPACTNESS = 1.0
 # Sweeps over the boundaries between two fits.
-SWEEPS = 4
+SWEEPS_PER_FIT = 4
 
 
 def refined(surface, rounds, **options):
@@ -55,7 +55,7 @@ def _reassigned(surface, error):
         1e-300,
     )
     tensor = torch.as_tensor(points, dtype=surface.uv.dtype, device=surface.uv.device)
-    for sweep in range(SWEEPS):
+    for sweep in range(SWEEPS_PER_FIT):
         weight = np.bincount(label, area)
         centre = (
             np.stack([np.bincount(label, area * x) for x in points.T], axis=1) / weight[:, None]
@@ -71,5 +71,7 @@ def _reassigned(surface, error):
                 + COMPACTNESS * ((points[v] - centre[patch]) ** 2).sum(axis=1) / spread
             )
 
-        clusters.swept(label, edges, sweep, lambda v, own, to: squared(v, to) - squared(v, own))
+        clusters.sweep_boundaries(
+            label, edges, sweep, lambda v, own, to: squared(v, to) - squared(v, own)
+        )
     return clusters.connected(label, edges, area)

@@ -220,24 +220,26 @@ class PatchedSurface:
         """
         faces, face, barycentric = mesh.refined(self.patches.given, parts)
         vertices = self.at(face, barycentric)
-        seam = self.patches.mixed[self.patches.locate(face, barycentric)[0]]
+        seam = self.patches.on_boundary[self.patches.locate(face, barycentric)[0]]
         faces = self._index(faces)
         return smoothed(vertices, faces, self._index(seam), smoothing), faces
 
     def _blended(self, face: np.ndarray, barycentric: np.ndarray, what: str) -> Tensor:
         value = {"points": self.points, "normals": self.normals}[what]
-        mixed = self.patches.mixed[face]
+        on_boundary = self.patches.on_boundary[face]
         entries, patch = self.patches.face_entries[face], self.patches.corner_patch[face]
         b = torch.as_tensor(barycentric, dtype=self.uv.dtype, device=self.uv.device)
         at = lambda e, p, b: value(self._index(p), (b[..., None] * self.uv[self._index(e)]).sum(-2))
         out = self.uv.new_empty(len(face), 3)
-        pure = at(entries[~mixed, 0], patch[~mixed, 0], b[self._index(~mixed)])
-        rows = b[self._index(mixed)]
-        blend = (rows[..., None] * at(entries[mixed], patch[mixed], rows[:, None])).sum(1)
+        pure = at(entries[~on_boundary, 0], patch[~on_boundary, 0], b[self._index(~on_boundary)])
+        rows = b[self._index(on_boundary)]
+        blend = (rows[..., None] * at(entries[on_boundary], patch[on_boundary], rows[:, None])).sum(
+            1
+        )
         if what == "normals":
             blend = torch.nn.functional.normalize(blend, dim=-1)
-        out = out.index_put((self._index(np.flatnonzero(~mixed)),), pure)
-        return out.index_put((self._index(np.flatnonzero(mixed)),), blend)
+        out = out.index_put((self._index(np.flatnonzero(~on_boundary)),), pure)
+        return out.index_put((self._index(np.flatnonzero(on_boundary)),), blend)
 
     # ---- boundaries ------------------------------------------------------------------------------
 

@@ -9,7 +9,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     submod_attrs={
         "garments": ["GarmentPatches", "cut_meshes"],
         "loop": ["Training", "conduct"],
-        "losses": ["Discrepancy", "behind", "discrepancy"],
+        "losses": ["Discrepancy", "share_behind", "discrepancy"],
         "processes": ["Processes", "device_of"],
         "settings": ["MODELS", "Settings"],
         "trainer": ["train"],

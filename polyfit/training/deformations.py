@@ -1,18 +1,18 @@
-"""Random smooth maps of space that fold, bend and stretch patches: how few garments become many
-(``polyfit.train``), and how held-out garments are posed.
+"""Random smooth maps of space that fold, bend and stretch patches. They make many garments of few
+for the training, and pose garments that are held out.
 
-A map is a stretch along random axes, then bends about random axes, then plane waves. Each is
-applied to a batch, one map a patch, and carries the normals with it by its own derivative.
-Coordinates are in the unit of the patch (or garment): a ball of radius 1 about the origin.
+A map is a stretch along random axes, then bends about random axes, then plane waves. It acts on a
+batch, one map a patch, and maps normals by its derivative. Coordinates are in the unit of the patch
+or garment: a ball of radius 1 about the origin.
 """
 
 from dataclasses import dataclass
 
 import torch
 
-# curvature * |height| of a bend, at most, for the points farthest from its axis: they are stretched
+# Largest curvature * |height| of a bend, no unit: the points farthest from its axis are stretched
 # by 1.8 or shrunk to 0.2.
-STRONGEST = 0.8
+MAX_BEND = 0.8
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class SmoothMaps:
         angle = x @ self.wave.transpose(1, 2) + self.phase[:, None]
         return x + torch.sin(angle) @ self.push
 
-    def carry(self, x, normals):
+    def map_with_normals(self, x, normals):
         """Where points and their unit normals (B, P, 3) go: (points, normals), by the map's
         derivative along two tangents.
         """
@@ -55,7 +55,7 @@ def _bend(x, frame, curvature):
     """
     along, across, up = (x @ frame).unbind(-1)
     # at up = 1 / curvature space would shrink to a line, and turn inside out beyond
-    most = STRONGEST / up.detach().abs().amax(1, keepdim=True).clamp_min(1e-6)
+    most = MAX_BEND / up.detach().abs().amax(1, keepdim=True).clamp_min(1e-6)
     curvature = torch.maximum(torch.minimum(curvature, most), -most)
     angle = curvature * along
     half = torch.special.sinc(angle / (2 * torch.pi))

@@ -59,9 +59,8 @@ class GarmentPatches:
         chosen = []
         for k in range(len(patches)):
             faces = order[ends[k] : ends[k + 1]]
-            if (
-                len(faces) and area[faces].sum() > 0
-            ):  # a patch of a few vertices may be no face's first corner
+            # a patch of a few vertices may be no face's first corner
+            if len(faces) and area[faces].sum() > 0:
                 chosen.append(generator.choice(faces, points, p=area[faces] / area[faces].sum()))
         chosen = np.array(chosen)
         b = generator.dirichlet((1, 1, 1), chosen.shape)
@@ -77,7 +76,9 @@ class GarmentPatches:
         x, n = self.points[index], self.normals[index]
         frame = CanonicalFrame.from_points(x)
         return GarmentPatches(
-            *deformations.random(count, generator, **strength).carry(frame.to_chart(x), n @ frame.R)
+            *deformations.random(count, generator, **strength).map_with_normals(
+                frame.to_chart(x), n @ frame.R
+            )
         )
 
 

@@ -17,8 +17,8 @@ from polyfit.network import load_into, read_weights, write_weights
 
 from .processes import Processes
 
-VERSION = 1  # of the checkpoints
-LINE = 50  # steps that a line of the log sums up
+CHECKPOINT_VERSION = 1  # of the form of a checkpoint
+STEPS_PER_LOG_LINE = 50
 
 
 class Training:
@@ -71,12 +71,14 @@ class Training:
         write_weights(
             path,
             tensors,
-            dict(model="checkpoint", version=VERSION, settings=self.settings, **progress),
+            dict(
+                model="checkpoint", version=CHECKPOINT_VERSION, settings=self.settings, **progress
+            ),
         )
 
     def restore(self, path):
         """Goes on from a checkpoint. Raises InputError where it was made with other settings."""
-        tensors, about = read_weights(path, "checkpoint", VERSION)
+        tensors, about = read_weights(path, "checkpoint", CHECKPOINT_VERSION)
         other = [
             f"{k} {about['settings'].get(k)}"
             for k, v in self.settings.items()
@@ -101,7 +103,7 @@ class Training:
     # ---- the loop --------------------------------------------------------------------------------
 
     def run(self, folder, end, every, advance):
-        """Steps up to ``end``, with a line of ``folder``/log.jsonl every LINE of them and a
+        """Steps up to ``end``, with a line of ``folder``/log.jsonl every so many and a
         checkpoint every so many seconds, at the end, and at Ctrl-C. ``advance()`` is called after
         each step. Raises InputError where the loss is not finite.
         """
@@ -122,7 +124,7 @@ class Training:
                             f"the loss is {lines[-1]['loss']} at step {self.done}; a lower --lr may"
                             " help"
                         )
-                    if first and (self.done % LINE == 0 or self.done == end):
+                    if first and (self.done % STEPS_PER_LOG_LINE == 0 or self.done == end):
                         file.write(json.dumps(self._line(lines)) + "\n")
                         file.flush()
                         lines.clear()

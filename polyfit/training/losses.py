@@ -1,11 +1,10 @@
-"""How far fitted jets are from the patches they were fitted to: what training lowers and what the
-tables report.
+"""How far fitted jets are from their patches: what training lowers and what the tables report.
 
-Heights are in the chart's unit s (the patch's largest distance from its mean), which no rotation
-changes. A height residual alone can be made small by a frame that looks at the patch from its edge,
-where it folds onto itself and its two sheets lie close. The normals tell: over a fold half of them
-point against the jet's. So training lowers both, and every table gives both, and the distance to
-the surface, which does not depend on the frame.
+Heights are in the chart's unit s, the patch's largest distance from its mean, which no rotation
+changes. Height alone misleads: a frame that looks at the patch from its edge folds it onto itself,
+and the two sheets then lie close together. The normals tell, because over a fold half of them point
+against the jet's. So training lowers both, and every table gives both. The tables also give the
+distance to the surface, which does not depend on the frame.
 """
 
 from dataclasses import dataclass
@@ -59,7 +58,7 @@ def discrepancy(alpha, x, normals, mask=None):
     )
 
 
-def behind(normals, mask=None):
+def share_behind(normals, mask=None):
     """Share of each patch, (B,), that faces away from the z axis, whichever side of the patch is
     up: 0 for a height graph; ``normals`` (B, P, 3).
     """

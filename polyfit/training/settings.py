@@ -9,7 +9,7 @@ from polyfit.network import PolyFit, SpatialTransformer
 from . import families
 
 MODELS = ("polyfit", "pointnet", "dgcnn", "atlasnet")
-SAMPLES = 256  # points that are made of each patch
+POINTS_PER_PATCH = 256  # points that are made of each patch
 
 
 @dataclass(frozen=True)
@@ -47,10 +47,10 @@ class Settings:
             raise InputError(f"order = {self.order}; the order of a jet is 1 to 10")
         if not self.lr > 0:
             raise InputError(f"lr = {self.lr}; more than 0 is needed")
-        if self.points > SAMPLES or self.reads > self.points:
+        if self.points > POINTS_PER_PATCH or self.reads > self.points:
             raise InputError(
-                f"reads = {self.reads}, points = {self.points}; reads <= points <= {SAMPLES} is"
-                " needed"
+                f"reads = {self.reads}, points = {self.points};"
+                f" reads <= points <= {POINTS_PER_PATCH} is needed"
             )
         if not self.meshes and (not self.families or self.model == "atlasnet"):
             raise InputError(

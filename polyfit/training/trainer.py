@@ -17,14 +17,15 @@ from polyfit.network import read_weights, write_weights
 from . import deformations, garments, training_set
 from .loop import Training, conduct
 from .losses import discrepancy
-from .settings import SAMPLES
+from .settings import POINTS_PER_PATCH
 
-VERSION = 1  # of the training sets
+TRAINING_SET_VERSION = 1  # of the files that keep one
 # height [s] by which one turn must be better than another to be chosen e times as likely, in
 # training
-CHOICE = 0.01
-SHARPNESS = (15.0, 80.0)  # of the table's smoothing over directions, at the start and at the end
-ATLAS_POINTS = 1000  # of a garment, and of its reconstruction
+CHOICE_HEIGHT = 0.01
+# of the smoothing of the table over directions, at the start and at the end; no unit
+AXIS_SHARPNESS = (15.0, 80.0)
+CLOUD_POINTS = 1000  # points of a garment, and of its reconstruction
 
 
 class PolyFitTraining(Training):
@@ -86,16 +87,16 @@ class PatchBatches:
         height, loss = self.patches.at(
             index,
             _z_axis(quaternion),
-            SHARPNESS[0] + (SHARPNESS[1] - SHARPNESS[0]) * min(1, 1.2 * share),
+            AXIS_SHARPNESS[0] + (AXIS_SHARPNESS[1] - AXIS_SHARPNESS[0]) * min(1, 1.2 * share),
         )
         # the turn of least height is kept; here softly, so that all of them learn which patches are
         # theirs
-        return (torch.softmax(-height / CHOICE, 1) * loss).sum(1).mean()
+        return (torch.softmax(-height / CHOICE_HEIGHT, 1) * loss).sum(1).mean()
 
     def _of_regressor(self, network, index):
         x = self.patches.points[index]
         d = discrepancy(network.alpha(x), x, self.patches.normals[index])
-        return (d.height + training_set.NORMALS * (1 - d.cosine)).mean()
+        return (d.height + training_set.NORMAL_WEIGHT * (1 - d.cosine)).mean()
 
 
 class GarmentBatches:
@@ -110,11 +111,11 @@ class GarmentBatches:
             settings.batch, generator, bend=1.0, waves=2, frequency=(1.0, 3.0)
         )
         read = torch.randint(
-            self.points.shape[1], (settings.batch, ATLAS_POINTS), generator=generator
+            self.points.shape[1], (settings.batch, CLOUD_POINTS), generator=generator
         )
         x = normalised(maps(self.points[index].gather(1, read[..., None].expand(-1, -1, 3))))[0]
         x = x[processes.rank :: processes.count].to(processes.device)
-        return chamfer(network(x, math.ceil(ATLAS_POINTS / settings.charts), generator), x).mean()
+        return chamfer(network(x, math.ceil(CLOUD_POINTS / settings.charts), generator), x).mean()
 
 
 def _z_axis(quaternion):
@@ -157,10 +158,11 @@ def _prepare(settings, folder, processes, progress):
         if k in ("order", "families", "meshes", "cuts", "patches", "points", "seed")
     }
     if processes.rank == 0 and not (
-        path.exists() and read_weights(path, "training set", VERSION)[1]["settings"] == wanted
+        path.exists()
+        and read_weights(path, "training set", TRAINING_SET_VERSION)[1]["settings"] == wanted
     ):
         cut = (
-            garments.cut_meshes(settings.meshes, settings.cuts, SAMPLES, settings.seed)
+            garments.cut_meshes(settings.meshes, settings.cuts, POINTS_PER_PATCH, settings.seed)
             if settings.meshes
             else None
         )
@@ -173,10 +175,10 @@ def _prepare(settings, folder, processes, progress):
         write_weights(
             path,
             {name: getattr(made, name) for name in names},
-            dict(model="training set", version=VERSION, settings=wanted),
+            dict(model="training set", version=TRAINING_SET_VERSION, settings=wanted),
         )
     processes.wait()
-    tensors, _ = read_weights(path, "training set", VERSION)
+    tensors, _ = read_weights(path, "training set", TRAINING_SET_VERSION)
     return PatchBatches(
         training_set.TrainingSet(*(tensors[name] for name in names)).to(processes.device)
     )

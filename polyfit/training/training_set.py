@@ -1,11 +1,10 @@
-"""What is trained on: patches in the charts of their PCA frames, and how well a jet fits each of
+"""The training set: patches in the charts of their PCA frames, and how well a jet fits each of
 them from every side.
 
-A transformer that follows the gradient of a fit's error from the PCA frame finds the valley next to
-it, not the right one: across a fold the error first rises. So the height discrepancy is tabulated
-once for every patch, on axes all over the half sphere, and training reads the table, smoothed over
-directions (:meth:`TrainingSet.at`). The table is the loss itself, the jets' own fits; the smoothing
-narrows as training goes on.
+The gradient of a fit's error leads from the PCA frame into the nearest minimum. That is often not
+the right one, because across a fold the error first rises. So the discrepancy of every patch is
+tabulated once, on axes all over the half sphere. Training reads the table smoothed over directions
+(:meth:`TrainingSet.at`), and the smoothing narrows as training goes on.
 """
 
 from dataclasses import dataclass, fields
@@ -19,16 +18,16 @@ from . import families
 from .garments import GarmentPatches
 from .losses import discrepancy
 
-CHUNK = 500  # patches made, and fitted, at a time
-AXES = 65
+PATCHES_PER_CHUNK = 500  # patches made, and fitted, at a time
+AXIS_COUNT = 65  # axes of the half sphere along which jets are fitted
 GARMENT_SHARE = 0.75  # of the patches, where there are garments; the analytic families are the rest
-NORMALS = 0.1  # weight of 1 - cosine of the normals against RMS of height
+NORMAL_WEIGHT = 0.1  # weight of 1 - cosine of the normals against RMS of height
 
 
 @dataclass(frozen=True)
 class TrainingSet:
     """``points`` and ``normals`` (N, P, 3) in the charts of the PCA frames; ``height`` and ``loss``
-    (N, D): RMS of height, and that plus ``NORMALS`` (1 - cosine) between the normals, of the jets
+    (N, D): RMS of height, and that plus ``NORMAL_WEIGHT`` (1 - cosine) between the normals, of jets
     fitted with z along each of :func:`axes`. float32.
     """
 
@@ -54,9 +53,9 @@ class TrainingSet:
 
 
 def axes(device=None):
-    """Unit vectors (AXES, 3) evenly over the half sphere z > 0, the pole first."""
-    k = torch.arange(AXES - 1, device=device) + 0.5
-    z, turn = 1 - k / (AXES - 1), k * torch.pi * (3 - 5**0.5)
+    """Unit vectors (AXIS_COUNT, 3) evenly over the half sphere z > 0, the pole first."""
+    k = torch.arange(AXIS_COUNT - 1, device=device) + 0.5
+    z, turn = 1 - k / (AXIS_COUNT - 1), k * torch.pi * (3 - 5**0.5)
     r = (1 - z * z).sqrt()
     return torch.cat(
         [z.new_tensor([[0.0, 0.0, 1.0]]), torch.stack([r * turn.cos(), r * turn.sin(), z], -1)]
@@ -89,8 +88,8 @@ def build(
     """
     parts = []
     turns = rotations_to(axes())
-    for first in range(0, count, CHUNK):
-        size = min(CHUNK, count - first)
+    for first in range(0, count, PATCHES_PER_CHUNK):
+        size = min(PATCHES_PER_CHUNK, count - first)
         generator = torch.Generator().manual_seed(seed * 1_000_003 + first)
         deformed = 0 if garments is None else size if not names else round(GARMENT_SHARE * size)
         made = []
@@ -129,5 +128,5 @@ def _tabulated(points, normals, turns, order):
         y = x @ turn
         d = discrepancy(jets.fit(y, order).alpha, y, n @ turn)
         height.append(d.height)
-        loss.append(d.height + NORMALS * (1 - d.cosine))
+        loss.append(d.height + NORMAL_WEIGHT * (1 - d.cosine))
     return TrainingSet(x, n, torch.stack(height, 1), torch.stack(loss, 1))

@@ -12,7 +12,7 @@ import warnings
 
 import numpy as np
 
-from polysft_mi.files import FULL, aside
+from polysft_mi.files import DISK_FULL_ERRORS, aside
 
 from .panels import PEAKS
 from .shading import View, shade_surface
@@ -40,7 +40,7 @@ def _kept_safe(draw):
                 figure.savefig(temporary, facecolor="white")
             return os.fspath(path)
         except Exception as error:  # whatever it is, the results stand without the picture
-            if getattr(error, "errno", None) in FULL:
+            if getattr(error, "errno", None) in DISK_FULL_ERRORS:
                 raise
             warnings.warn(
                 f"{path}: picture not written ({type(error).__name__}: {error})",

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial import Chebyshev, Polynomial, chebyshev
 
-from polyfit.jets import DETERMINED, NARROWEST, exponents, order_of, size_of
+from polyfit.jets import DETERMINED_RMS, MIN_BOX_RATIO, exponents, order_of, size_of
 from polysft_mi.errors import InputError
 
 
@@ -162,7 +162,7 @@ def _fitted(x, order):
     powers = exponents(order)
     low, high = x[:, :2].min(0), x[:, :2].max(0)
     centre, half = (low + high) / 2, (high - low) / 2
-    half = np.maximum(half, max(NARROWEST * half.max(), 1e-300))
+    half = np.maximum(half, max(MIN_BOX_RATIO * half.max(), 1e-300))
     values = [
         chebyshev.chebvander((x[:, k] - centre[k]) / half[k], order)[:, powers[:, k]]
         for k in (0, 1)
@@ -171,7 +171,7 @@ def _fitted(x, order):
     kept = np.zeros(len(powers))
     diagonal = np.abs(np.diagonal(np.linalg.qr(basis, mode="r")))
     kept[: len(diagonal)] = diagonal
-    fitted = int(min(powers.sum(1)[kept < DETERMINED], default=order + 1)) - 1
+    fitted = int(min(powers.sum(1)[kept < DETERMINED_RMS], default=order + 1)) - 1
     size = size_of(fitted)
     solution = np.zeros(len(powers))
     solution[:size] = np.linalg.lstsq(basis[:, :size], x[:, 2] / np.sqrt(len(x)), rcond=None)[0]

@@ -1,4 +1,4 @@
-"""The networks that PolyFit is held against, each against a slow reference."""
+"""The networks that PolyFit is compared with, each against a slow reference."""
 
 import pytest
 import torch

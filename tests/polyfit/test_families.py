@@ -91,7 +91,7 @@ def test_maps_carry_normals_as_they_carry_tangents():
     n = torch.nn.functional.normalize(
         torch.randn(20, 30, 3, generator=generator(2), dtype=torch.float64), dim=-1
     )
-    y, carried = maps.carry(x, n)
+    y, carried = maps.map_with_normals(x, n)
     assert torch.equal(y, maps(x))
     t = torch.linalg.cross(n, torch.randn(20, 30, 3, generator=generator(3), dtype=torch.float64))
     h = 1e-5

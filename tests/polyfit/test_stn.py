@@ -8,8 +8,8 @@ import torch
 
 from polyfit import InputError, PolyFit, jets
 from polyfit.jets import CanonicalFrame, rotation_matrix
-from polyfit.network import SpatialTransformer, read_weights, thinned, write_weights
-from polyfit.training import behind, discrepancy
+from polyfit.network import SpatialTransformer, read_weights, subsampled, write_weights
+from polyfit.training import discrepancy, share_behind
 
 
 def bent_sheets(count, points=200, dtype=torch.float64, depth=(0.9, 1.6), width=(0.5, 0.9)):
@@ -55,12 +55,12 @@ def test_answers_are_unit_quaternions_and_the_first_is_pca_s_frame():
 
 def test_thinned_takes_points_evenly_and_none_that_the_mask_leaves_out():
     x = torch.arange(2 * 11 * 3, dtype=torch.float32).reshape(2, 11, 3)
-    assert torch.equal(thinned(x, 20), x)
-    assert torch.equal(thinned(x, 4), x[:, [0, 2, 5, 8]])
+    assert torch.equal(subsampled(x, 20), x)
+    assert torch.equal(subsampled(x, 4), x[:, [0, 2, 5, 8]])
     mask = torch.tensor(
         [[1, 0, 1, 1, 0, 1, 1, 0, 1, 0, 0], [0, 0, 0, 1, 0, 0, 1, 0, 0, 0, 0]], dtype=torch.bool
     )
-    got = thinned(x, 4, mask)
+    got = subsampled(x, 4, mask)
     for k in range(2):
         left = x[k][mask[k]]
         assert torch.equal(got[k], torch.stack([left[i * len(left) // 4] for i in range(4)]))
@@ -206,7 +206,7 @@ def test_shipped_weights_turn_narrow_valleys_the_right_way_up(model):
             fit = m(points)
             n = normals @ fit.frame.R
             found[name] = (
-                behind(n).mean(),
+                share_behind(n).mean(),
                 discrepancy(fit.jet.alpha, fit.frame.to_chart(points), n),
             )
     assert (
@@ -246,10 +246,10 @@ def test_discrepancy_of_a_tilted_plane_is_its_distance_and_its_angle():
     half = (
         torch.where(torch.arange(50) < 20, -1.0, 1.0)[None, :, None] * n
     )  # 20 of 50 face the other way
-    assert behind(half).item() == pytest.approx(0.4)
+    assert share_behind(half).item() == pytest.approx(0.4)
     assert discrepancy(alpha, x, half).angle.item() == pytest.approx(0.4 * 180, abs=1e-4)
     mask = torch.arange(50)[None] >= 20
-    assert behind(half, mask).item() == 0
+    assert share_behind(half, mask).item() == 0
     assert discrepancy(alpha, x, half, mask).angle.item() == pytest.approx(0, abs=1e-4)
 
 

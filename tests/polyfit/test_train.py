@@ -49,7 +49,7 @@ def test_table_is_the_loss_of_jets_fitted_along_each_axis(table):
         d = discrepancy(jets.fit(x, 3).alpha[None], x[None], n[None])
         assert table.height[patch, k].item() == pytest.approx(d.height.item(), rel=1e-3)
         assert table.loss[patch, k].item() == pytest.approx(
-            (d.height + training_set.NORMALS * (1 - d.cosine)).item(), rel=1e-3
+            (d.height + training_set.NORMAL_WEIGHT * (1 - d.cosine)).item(), rel=1e-3
         )
 
 

@@ -23,6 +23,12 @@ from polysft_mi.scene.images import read_rgb
 from polysft_mi.surface import meshio
 
 
+def arguments(clip, out, *options):
+    """Those of a command that prepares ``clip``, a video, a photo of an A4 sheet and a camera."""
+    words = [clip[0], "--texture", clip[1], "--size", "A4", "--camera", clip[2], "-o", str(out)]
+    return [*words, *options]
+
+
 def test_command_line(clip, tmp_path):
     def command(*words):
         return subprocess.run(
@@ -32,19 +38,7 @@ def test_command_line(clip, tmp_path):
             text=True,
         )
 
-    words = [
-        clip[0],
-        "--texture",
-        clip[1],
-        "--size",
-        "A4",
-        "--camera",
-        clip[2],
-        "-o",
-        tmp_path / "o ut",
-        "--last",
-        1,
-    ]
+    words = arguments(clip, tmp_path / "o ut", "--last", 1)
     done = command(*words)
     assert done.returncode == 0 and done.stderr == ""
     assert f"python -m polysft_mi.run '{tmp_path / 'o ut' / 'scene.xml'}'" in done.stdout
@@ -62,18 +56,7 @@ def test_command_line(clip, tmp_path):
 
 
 def test_replacing_a_folder(clip, tmp_path, capsys):
-    words = [
-        clip[0],
-        "--texture",
-        clip[1],
-        "--size",
-        "A4",
-        "--camera",
-        clip[2],
-        "-o",
-        str(tmp_path / "out"),
-        "--no-masks",
-    ]
+    words = arguments(clip, tmp_path / "out", "--no-masks")
     prepare.main([*words, "--last", "0", "-q"])
     assert capsys.readouterr().out == ""
     prepare.main([*words, "--last", "1", "--overwrite", "--json"])

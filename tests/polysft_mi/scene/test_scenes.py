@@ -10,6 +10,7 @@ from places import ROOT
 from scripts import load
 
 from polysft_mi.capture import Layout, recognise, scene_xml
+from polysft_mi.scene.sequence import Sequence
 
 write_scenes = load("scenes/write_scenes.py")
 
@@ -52,7 +53,9 @@ def test_demo():
     right, *mirrored = difference(experiment)
     assert right < 0.03 and min(mirrored) > 2 * right
     truth = np.load(folder / "gt.npz")
-    assert len(truth["vertices"]) == len(experiment.sequence())
+    assert len(truth["vertices"]) == len(
+        Sequence.open(experiment.frames, experiment.masks, size=experiment.size)
+    )
     np.testing.assert_allclose(truth["vertices"][0], experiment.template.vertices, atol=1e-4)
     np.testing.assert_array_equal(truth["faces"], experiment.template.faces)
 
