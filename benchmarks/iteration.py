@@ -60,7 +60,7 @@ def measured(path, overrides, turns):
     with dr.suspend_grad():
         view = images._view(vertices, level)
         given = (
-            *images._compared(view, 1, level, images.appearance(vertices, level)),
+            *images._residual_arguments(view, 1, level, images.appearance(vertices, level)),
             dr.opaque(mi.Float, 0.3),
         )
         table, figures = images._sums(*given)

@@ -17,34 +17,34 @@ class OutlineSettings:
     ``size`` pixels, and grow with it.
 
     - ``reach``: how far from where it is given an outline is looked for; ``blur``: standard
-      deviation of the image's blur; ``across``: that of the edges' strength across the outline, in
-      the rounds of the search.
+      deviation of the image's blur; ``blurs``: that of the edges' strength across the outline,
+      in the rounds of the search.
     - ``spacing`` of points along the outline, ``step`` of samples across it; ``line``: width up to
       which two opposite edges are those of a drawn line.
     - ``straight``: how far an outline may leave the polygon that is tried in its place, as a share
       of its size.
     - ``turn`` [rad], ``shift`` [of the distance]: how wrong a pose that is given may be, where
-      edges do not tell; ``held``: weight of this prior's square.
-    - ``starts`` of the search, and ``spread``: how far they shift the outline [pixels, RMS].
-    - ``clear``, ``clear_part``: least ratio of the edges' strength along the outline to that
-      around it, for all of it and for each of ``parts`` parts.
+      edges do not tell; ``prior_weight``: weight of this prior's square.
+    - ``starts`` of the search, and ``start_shift``: how far they shift the outline [pixels, RMS].
+    - ``min_contrast``, ``min_part_contrast``: least ratio of the edges' strength along the
+      outline to that around it, for all of it and for each of ``parts`` parts.
     """
 
     size: float = 225.0
     reach: float = 8.0
     blur: float = 0.4
-    across: tuple = (2.5, 1.25, 0.6)
+    blurs: tuple = (2.5, 1.25, 0.6)
     spacing: float = 2.0
     step: float = 0.25
     line: float = 4.0
     straight: float = 0.01
     turn: float = 0.1
     shift: float = 0.05
-    held: float = 0.005
+    prior_weight: float = 0.005
     starts: int = 12
-    spread: float = 1.0
-    clear: float = 1.7
-    clear_part: float = 1.4
+    start_shift: float = 1.0
+    min_contrast: float = 1.7
+    min_part_contrast: float = 1.4
     parts: int = 8
 
 
@@ -155,8 +155,8 @@ class OutlineSearch:
         """The :class:`Fit`, from coarse to fine."""
         s = self.settings
         turn, shift = Rotation.identity(), np.zeros(3)
-        for sigma in s.across:
-            spread = s.spread * self.unit if sigma == s.across[0] else 0.0
+        for sigma in s.blurs:
+            spread = s.start_shift * self.unit if sigma == s.blurs[0] else 0.0
             cost, to_motion = self.costs(turn, shift, sigma)
             starts = (
                 spread * np.random.default_rng(0).normal(size=(s.starts, 6))
@@ -173,14 +173,18 @@ class OutlineSearch:
             )
             turn, shift = Rotation.from_rotvec(change[:3]) * turn, shift + change[3:]
         position, normal, _ = self._projected(turn, shift)
-        strength = self._blurred(self._strength(position, normal), s.across[-1])
+        strength = self._blurred(self._strength(position, normal), s.blurs[-1])
         parts = np.array_split(np.argsort(np.arctan2(*(position - position.mean(0)).T)), s.parts)
         clear, *clear_parts = (
             float(s[:, len(self.across) // 2].mean() / max(s.mean(), 1e-12))
             for s in (strength, *(strength[k] for k in parts))
         )
         moved = np.sqrt(((position - self.camera.project(self.points)) ** 2).sum(1).mean())
-        sure = clear > s.clear and min(clear_parts) > s.clear_part and moved <= s.reach * self.unit
+        sure = (
+            clear > s.min_contrast
+            and min(clear_parts) > s.min_part_contrast
+            and moved <= s.reach * self.unit
+        )
         rotation = turn.as_matrix()
         return Fit(
             rotation, self.centre + shift - rotation @ self.centre, float(moved), clear, bool(sure)
@@ -249,7 +253,7 @@ class OutlineSearch:
         before = np.concatenate([turn.as_rotvec(), shift]) / self.sd
         held = to_motion / self.sd[:, None]
         rows, last = np.arange(len(smooth)), smooth.shape[1] - 2
-        weight = self.settings.held
+        weight = self.settings.prior_weight
 
         def cost(q):
             at = (by_unit @ q - self.across[0]) / step

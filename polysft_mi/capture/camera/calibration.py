@@ -19,19 +19,21 @@ from .lens import Lens
 class CalibrationRules:
     """Which views are used, and which calibrations are refused.
 
-    ``looked_at``: frames of a video; ``used``: views at most, of those that show the board;
-    ``least`` views that are needed; ``noise`` [pixels]: how far a corner is off at best; ``tilt``
-    [degrees]: least angle between two views; ``unsure``: largest standard deviation of the focal
-    length, as a share of it; ``missed`` [pixels, RMS]: largest distance of the corners.
+    - ``max_frames`` of a video are searched; of the views that show the board, ``max_views`` are
+      used, and ``min_views`` are needed.
+    - ``noise`` [pixels]: how far a corner is off at best.
+    - ``tilt`` [degrees]: the largest angle between two views must reach this.
+    - ``max_focal_deviation``: largest standard deviation of the focal length, as a share of it.
+    - ``max_residual`` [pixels, RMS]: largest distance of the corners.
     """
 
-    looked_at: int = 60
-    used: int = 25
-    least: int = 4
+    max_frames: int = 60
+    max_views: int = 25
+    min_views: int = 4
     noise: float = 0.1
     tilt: float = 15.0
-    unsure: float = 0.02
-    missed: float = 3.0
+    max_focal_deviation: float = 0.02
+    max_residual: float = 3.0
 
 
 def parse_board(text):
@@ -113,18 +115,18 @@ def calibrate(path, board="9x6", rules=None):
     detect = parse_board(board)
     views, size = [], None
     count = sum(1 for _ in read_frames(path))
-    for index, image in read_frames(path, stride=max(1, count // rules.looked_at)):
+    for index, image in read_frames(path, stride=max(1, count // rules.max_frames)):
         size = image.shape[1::-1]
         found = detect(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
         if found is not None:
             views.append((index, image if len(views) < 200 else None, *found))
-    if len(views) < rules.least:
+    if len(views) < rules.min_views:
         hint = "; --board says which board it is" if not views else ""
         raise InputError(
-            f"{path}: {detect.name} is found in {len(views)} frames; at least {rules.least}, from"
-            f" different sides, are needed{hint}"
+            f"{path}: {detect.name} is found in {len(views)} frames; at least {rules.min_views},"
+            f" from different sides, are needed{hint}"
         )
-    views = _different(views, rules.used)
+    views = _different(views, rules.max_views)
     start = np.array(
         [[max(size), 0, size[0] / 2 - 0.5], [0, max(size), size[1] / 2 - 0.5], [0, 0, 1]],
         dtype=np.float64,
@@ -147,14 +149,14 @@ def calibrate(path, board="9x6", rules=None):
     unsure = (
         float(np.max(np.ravel(deviations)[:2])) / f * max(1.0, rules.noise / missed)
     )  # corners that fit better than they are seen promise too much
-    if not np.isfinite(K).all() or not np.isfinite(missed) or missed > rules.missed:
+    if not np.isfinite(K).all() or not np.isfinite(missed) or missed > rules.max_residual:
         raise InputError(
             f"{path}: the camera that fits best misses the board's corners by {missed:.2g} pixels;"
             " a flat board, sharp images and one zoom are needed"
         )
     normals = np.stack([cv2.Rodrigues(turn)[0][:, 2] for turn in turns])
     tilt = float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1)).max()))
-    if unsure > rules.unsure or tilt < rules.tilt:
+    if unsure > rules.max_focal_deviation or tilt < rules.tilt:
         raise InputError(
             f"{path}: the views do not determine the focal length: it is known to"
             f" {100 * unsure:.1f} %, and the board is tilted by {tilt:.0f} degrees between them;"

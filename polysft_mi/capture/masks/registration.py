@@ -15,22 +15,26 @@ from numpy.polynomial import chebyshev
 
 @dataclass(frozen=True)
 class RegistrationSettings:
-    """``order`` of the polynomial; ``passes`` of correction in a frame; ``side`` [pixels]: the
-    photo's longer side at most, it is shrunk to the size at which it is seen; ``window`` [pixels]:
-    standard deviation of the window of local means; ``held``: how much the map is held, against a
-    pixel of the photo; ``cell`` [pixels]: side of the photo's cells that are compared with the
-    frame; ``colour``: largest difference of a cell's colour (0 to 1); ``alike``: least correlation
-    of photo and frame for the map to be believed.
+    """How the photo is registered.
+
+    - ``order`` of the polynomial; ``passes`` of correction in a frame.
+    - ``side`` [pixels]: the photo's longer side at most. It is shrunk to the size at which it is
+      seen.
+    - ``window`` [pixels]: standard deviation of the window of local means.
+    - ``prior_weight``: of the map's deviation, against a pixel of the photo.
+    - ``cell`` [pixels]: side of the photo's cells that are compared with the frame.
+    - ``max_colour_difference``: largest difference of a cell's colour (0 to 1).
+    - ``min_correlation``: least correlation of photo and frame at which the map is used.
     """
 
     order: int = 6
     passes: int = 2
     side: int = 320
     window: float = 5.0
-    held: float = 1e-3
+    prior_weight: float = 1e-3
     cell: int = 4
-    colour: float = 0.08
-    alike: float = 0.6
+    max_colour_difference: float = 0.08
+    min_correlation: float = 0.6
 
 
 class Registration:
@@ -107,7 +111,7 @@ class Registration:
                 by_x, by_y = np.gradient(x, axis=1), np.gradient(x, axis=0)
                 self._fit(by_x * flow[..., :1] + by_y * flow[..., 1:], weight)
         used = self._covered & _inside(x, image)
-        if not used.any() or alike[used].mean() < s.alike:
+        if not used.any() or alike[used].mean() < s.min_correlation:
             return None
         return self._shown(unrolled, used & (alike > 0.5), image.shape[:2])
 
@@ -119,7 +123,7 @@ class Registration:
         if not kept.any():
             return None
         gain = (photo * seen)[kept].sum(0) / np.maximum((photo**2)[kept].sum(0), 1e-9)
-        same = np.abs(seen - gain * photo).mean(-1) < s.colour
+        same = np.abs(seen - gain * photo).mean(-1) < s.max_colour_difference
         x = self._places(self._corners)
         quads = np.stack([x[:-1, :-1], x[:-1, 1:], x[1:, 1:], x[1:, :-1]], axis=2)
         a, b = quads[..., 2, :] - quads[..., 0, :], quads[..., 3, :] - quads[..., 1, :]
@@ -148,7 +152,7 @@ class Registration:
         if w.sum() < 1:
             return
         mean = _cells(weight[..., None] * change, self._settings.cell).reshape(-1, 2)
-        held = self._settings.held * w.sum() * np.diag(1.0 + self._powers.sum(1) ** 2)
+        held = self._settings.prior_weight * w.sum() * np.diag(1.0 + self._powers.sum(1) ** 2)
         normal = self._basis.T @ (w[:, None] * self._basis)
         self._map += np.linalg.solve(normal + held, self._basis.T @ mean)
 

@@ -72,7 +72,7 @@ def _by_corners(corners, sheet, frame, camera, pose_fit):
 
 def _why_not(photo, frame, matches, sheet, camera):
     """In words, why no pose was found."""
-    agree, count, least = int(matches.agree.sum()), len(matches.agree), MatchRules().least
+    agree, count, least = int(matches.agree.sum()), len(matches.agree), MatchRules().min_matches
     mirrored = replace(sheet, uv=sheet.uv * (-1, 1) + (1, 0))
     flipped = match(np.ascontiguousarray(photo[:, ::-1]), frame)
     if from_matches(flipped, mirrored, camera)[1].agree.sum() >= max(2 * agree, 2 * least):

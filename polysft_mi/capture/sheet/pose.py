@@ -16,21 +16,23 @@ from polysft_mi.errors import InputError
 class MatchRules:
     """What counts as a match, and as a pose.
 
-    ``least``: matches that must agree (four fix a plane's pose, and some agree by chance);
-    ``ratio`` of the distances to the best and the second match, above which a match is ambiguous;
-    ``features`` of an image at most; ``photo_side`` [pixels]: the longer side to which a photo is
-    shrunk before; ``tolerance``: how far a rigid pose may miss a match, as a share of the frame's
-    diagonal (the sheet may be bent); ``soft`` [pixels]: a residual from which on it counts less;
-    ``smallest``: share of the frame that a sheet must cover.
+    - ``min_matches``: matches that must agree (four fix a plane's pose, and some agree by chance).
+    - ``ratio`` of the distances to the best and the second match, above which a match is ambiguous.
+    - ``features`` of an image at most; ``photo_side`` [pixels]: the longer side to which a photo is
+      shrunk before.
+    - ``tolerance``: how far a rigid pose may miss a match, as a share of the frame's diagonal (the
+      sheet may be bent).
+    - ``robust_scale`` [pixels]: residuals above it count less.
+    - ``min_area``: share of the frame that a sheet must cover.
     """
 
-    least: int = 10
+    min_matches: int = 10
     ratio: float = 0.8
     features: int = 5000
     photo_side: int = 2000
     tolerance: float = 0.012
-    soft: float = 1.5
-    smallest: float = 2e-4
+    robust_scale: float = 1.5
+    min_area: float = 2e-4
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,7 @@ def from_matches(matches, sheet, camera, rules=None):
         )
         agree[np.flatnonzero(on)[inliers]] = True
     matches = Matches(matches.photo, matches.frame, agree)
-    if agree.sum() < rules.least or not starts:
+    if agree.sum() < rules.min_matches or not starts:
         return None, matches
     pose = _refined(starts, points[agree], matches.frame[agree], camera, rules)
     pose = pose if pose is not None and _plausible(pose, sheet, camera, rules) else None
@@ -230,7 +232,9 @@ def _refined(starts, points, pixels, camera, rules):
         x = np.concatenate([turn.ravel(), shift.ravel()])
         if (Rotation.from_rotvec(x[:3]).apply(points) + x[3:])[:, 2].min() <= 0:
             continue
-        found.append(least_squares(missed, x, loss="soft_l1", f_scale=rules.soft, x_scale="jac"))
+        found.append(
+            least_squares(missed, x, loss="soft_l1", f_scale=rules.robust_scale, x_scale="jac")
+        )
     if not found:
         return None
     x = min(found, key=lambda f: f.cost).x
@@ -255,7 +259,7 @@ def _plausible(pose, sheet, camera, rules):
     facing = -_cross(uv[1] - uv[0], uv[2] - uv[0])  # v goes up, y down
     return (np.sign(area) == np.sign(facing)).mean() > 0.7 and 0.5 * np.abs(
         area
-    ).sum() > rules.smallest * camera.width * camera.height
+    ).sum() > rules.min_area * camera.width * camera.height
 
 
 def _cross(a, b):
