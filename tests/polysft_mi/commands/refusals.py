@@ -47,6 +47,13 @@ def edited(folder, old, new, *, pattern=False):
     return path
 
 
+def line_of(path, text):
+    """``line N``, as a message names the one line of a scene file that has ``text``."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    (number,) = (k for k, line in enumerate(lines, start=1) if text in line)
+    return f"line {number}"
+
+
 def has(message, *words):
     assert all(word in message for word in words), message
 

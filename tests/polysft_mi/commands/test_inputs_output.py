@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import synthetic
 from places import ROOT
-from refusals import QUICK, SIZE, edited, has, process, refused
+from refusals import QUICK, SIZE, edited, has, line_of, process, refused
 
 from polysft_mi import errors, prepare, run
 from polysft_mi.pictures import exr
@@ -108,7 +108,8 @@ def test_overwriting_a_run_by_its_own_scene(finished, tmp_path):
 def test_processes_end_with_one_line_and_status_2(sheet, tmp_path):
     scene, out = sheet / "scene.xml", tmp_path / "out"
     has(process(tmp_path / "nothing.xml", "-o", out), "nothing.xml: no such scene file")
-    has(process(scene, "-o", out, "-D", "integrator=foo"), "line 72", '"foo" not found')
+    line = line_of(scene, 'type="$integrator"')
+    has(process(scene, "-o", out, "-D", "integrator=foo"), line, '"foo" not found')
     has(process(scene, "-o", out, "-m", "scalar_rgb"), "mode 'scalar_rgb': one of llvm_ad_rgb,")
     has(
         process(edited(sheet, 'name="wrap_mode"', 'name="wrap_mod"'), "-o", out),
