@@ -23,7 +23,7 @@ import onefit
 from onefit.body import ClosestSurface, skinning
 from onefit.garment import waistband
 from onefit.garment.charts import Deformation
-from onefit.network.network import UNIT
+from onefit.network.network import OUTPUT_UNIT
 from onefit.objective import losses, measure, objective
 from polyfit.errors import cli
 
@@ -50,7 +50,9 @@ def least(draper, garment, motion, advance=lambda: None):
         adam = torch.optim.Adam(unknowns.values())
         for step in range(steps):
             adam.param_groups[0]["lr"] = RATE * (1 - 0.9 * step / steps)
-            deformation = Deformation(**{name: x * UNIT[name] for name, x in unknowns.items()})
+            deformation = Deformation(
+                **{name: x * OUTPUT_UNIT[name] for name, x in unknowns.items()}
+            )
             terms, x = objective.evaluate(
                 patched, deformation, scene, losses.Weights(), past=past, generator=generator
             )

@@ -14,9 +14,9 @@ import torch
 
 from .quietwarp import warp
 
-FAR = 0.15  # [m]; how far :meth:`ClosestSurface.distances` looks
+SEARCH_RADIUS = 0.15  # [m]; how far :meth:`ClosestSurface.distances` looks
 # barycentric coordinates below it are on an edge; points nearer than this [m] are on the surface
-ON = 1e-5
+EDGE_TOLERANCE = 1e-5
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ def _warp():
     row = wp.types.vector(
         length=10, dtype=float
     )  # barycentric coordinates, point, distance, normal
-    ON_EDGE = wp.constant(ON)
+    ON_EDGE = wp.constant(EDGE_TOLERANCE)
 
     @wp.func
     def pseudonormal(
@@ -163,20 +163,21 @@ class ClosestSurface:
 
     def distances(self, points, vertices):
         """Signed distances (T, P) [m], negative inside, of points (T, P, 3) [m] from the mesh with
-        its vertices at (T, V, 3); differentiable in ``points``. Points farther than FAR have FAR.
+        its vertices at (T, V, 3); differentiable in ``points``. It is at
+        most SEARCH_RADIUS.
         """
         found = []
         for x, at in zip(points, vertices):
             self.follow(at)
-            found.append(self(x, FAR))
+            found.append(self(x, SEARCH_RADIUS))
         face, point, distance, normal = (
             torch.stack([getattr(n, k) for n in found])
             for k in ("face", "point", "distance", "normal")
         )
         away = (points.detach() - point) / distance[..., None]
         away = torch.where(
-            distance[..., None].abs() > ON, away, normal
+            distance[..., None].abs() > EDGE_TOLERANCE, away, normal
         )  # the gradient of the distance
         missed = (face < 0)[..., None]
         d = ((points - point.masked_fill(missed, 0)) * away.masked_fill(missed, 0)).sum(-1)
-        return torch.where(face < 0, FAR, d)
+        return torch.where(face < 0, SEARCH_RADIUS, d)

@@ -204,8 +204,12 @@ class Draper:
         weights = garment.blend_weights.to(self.device)
         for kind in ease.MOTIONS:
             motion = Motion.generate(kind, seconds=ease.SECONDS, fps=FPS).to(self.device)
-            transforms = skinning.transforms(body, motion.poses, motion.translation)[:: ease.EVERY]
-            displacement = self._displacement(garment, self.embedding(motion, body)[:: ease.EVERY])
+            transforms = skinning.transforms(body, motion.poses, motion.translation)[
+                :: ease.FRAME_STEP
+            ]
+            displacement = self._displacement(
+                garment, self.embedding(motion, body)[:: ease.FRAME_STEP]
+            )
             draped, skinned = (
                 posed(x, weights, transforms).transpose(0, 1)
                 for x in (rest[:, None] + displacement, rest[:, None])

@@ -16,7 +16,7 @@ from onefit.body import ClosestSurface
 from onefit.garment.charts import SparseMatrix
 from onefit.garment.remesh import neighbour_mean
 
-from .post import REACH, spread
+from .post import DEEPEST, spread
 
 MOTIONS = (
     "idle",
@@ -28,14 +28,15 @@ MOTIONS = (
     "arms_up",
     "arms_crossed",
 )  # of the kinds that networks are trained on
-SECONDS, EVERY = 1.0, 6  # of each motion; one frame in so many is looked at
-SHARE = 0.95  # of those frames in which a vertex is to lie far enough out
+SECONDS = 1.0  # [s] of each motion
+FRAME_STEP = 6  # one frame in so many is looked at
+CLEAR_SHARE = 0.95  # of those frames in which a vertex is to lie far enough out
 CLEARANCE = (
     0.007  # [m] from the body, where the garment was made with as much and skinning leaves as much
 )
 # [m]; of triangles with a longer side the centre is looked at, too: a limb comes through between
 # their vertices
-COARSE = 0.035
+LONG_SIDE = 0.035
 
 
 def ease(rest, faces, body, frames):
@@ -45,25 +46,26 @@ def ease(rest, faces, body, frames):
     ``frames``: for each frame, the vertices as the network drapes them and as plain skinning does
     (N, 3), and the body's (V, 3) [m]. A vertex should lie as far out of the body as in the rest
     pose and under plain skinning, whichever is less, or CLEARANCE where both are more. It is moved
-    along the body's normal at rest, so far that this holds in SHARE of the frames, and its
-    neighbours go along. What the centre of a COARSE triangle misses, all its vertices are moved by.
+    along the body's normal at rest, so far that this holds in CLEAR_SHARE of the frames, and its
+    neighbours go along. What the centre of a triangle with a side above LONG_SIDE misses, all its
+    vertices are moved by.
     """
     surface = ClosestSurface(body.vertices, body.faces)
     faces, count = faces.to(rest.device), len(rest)
     corners = rest[faces]
-    coarse = faces[(corners - corners.roll(1, 1)).norm(dim=-1).amax(1) > COARSE]
+    coarse = faces[(corners - corners.roll(1, 1)).norm(dim=-1).amax(1) > LONG_SIDE]
     places = lambda x: torch.cat([x, x[coarse].mean(1)])
-    at_rest = surface(places(rest), REACH)
+    at_rest = surface(places(rest), DEEPEST)
     missing = []
     for draped, skinned, vertices in frames:
         surface.follow(vertices)
-        wanted = torch.minimum(at_rest.distance, surface(places(skinned), REACH).distance).clamp(
+        wanted = torch.minimum(at_rest.distance, surface(places(skinned), DEEPEST).distance).clamp(
             max=CLEARANCE
         )
-        missing.append((wanted - surface(places(draped), REACH).distance).clamp(min=0))
-    missing = torch.as_tensor(np.quantile(torch.stack(missing).cpu().numpy(), SHARE, axis=0)).to(
-        rest
-    )  # torch's has a largest size
+        missing.append((wanted - surface(places(draped), DEEPEST).distance).clamp(min=0))
+    missing = torch.as_tensor(
+        np.quantile(torch.stack(missing).cpu().numpy(), CLEAR_SHARE, axis=0)
+    ).to(rest)  # torch's has a largest size
     missing = missing[:count].scatter_reduce(
         0, coarse.flatten(), missing[count:].repeat_interleave(3), "amax"
     )[:, None]

@@ -11,7 +11,7 @@ from onefit.garment.remesh import neighbour_mean
 
 CLEARANCE = 0.003  # [m] from the body
 SMOOTHING = 4  # times that pushes are smoothed
-REACH = 0.08  # [m]; vertices deeper in the body than this stay there
+DEEPEST = 0.08  # [m]; vertices deeper in the body than this stay there
 
 
 def spread(push, mean):
@@ -47,7 +47,7 @@ def pushed_out(vertices, faces, bodies, body_faces, rounds=5):
         that are nearer than half of it.
         """
         push, known = torch.zeros_like(x), torch.zeros(len(x), dtype=torch.bool, device=x.device)
-        first, reach = chosen is None, CLEARANCE if chosen is None else REACH
+        first, reach = chosen is None, CLEARANCE if chosen is None else DEEPEST
         chosen = torch.arange(len(x), device=x.device) if first else chosen
         while len(chosen):
             found = surface(x[chosen], reach)
@@ -58,7 +58,7 @@ def pushed_out(vertices, faces, bodies, body_faces, rounds=5):
             inside = at[found.distance[near] < 0]
             if not first or not len(inside):
                 break
-            chosen, reach = beside(inside), REACH
+            chosen, reach = beside(inside), DEEPEST
             chosen = chosen[~known[chosen]]
         return push
 

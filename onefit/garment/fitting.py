@@ -27,8 +27,8 @@ from .binding import (
 )
 from .remesh import neighbour_mean
 
-DEEP = 0.03  # vertices inside the body by less than this are pushed out [m]
-CLEARANCE, SPREAD = (
+PUSHED_DEPTH = 0.03  # vertices inside the body by less than this are pushed out [m]
+CLEARANCE, PUSH_RADIUS = (
     0.004,
     0.02,
 )  # that a vertex pushed out is left with, and how far it takes its neighbours with it [m]
@@ -41,8 +41,8 @@ UNITS = {
     100.0: "hundreds of metres",
 }
 T_POSE = "T-pose"
-ON_GROUND = np.array([0.0, 0.0, -0.82])  # from a world in which the body stands at z = 0 [m]
-SEEN = 400  # vertices that places are tried on
+GROUND_OFFSET = np.array([0.0, 0.0, -0.82])  # from a world in which the body stands at z = 0 [m]
+TRIAL_VERTICES = 400  # vertices that places are tried on
 
 
 def placed(V, scale=1.0, up="z", turn=0.0, offset=(0.0, 0.0, 0.0)):
@@ -97,9 +97,9 @@ def check_place(V, surface, where, tell_pose=True):
     and no other place or stand would fit much better: half the misfit where it is above 4 cm, 0.87
     times of it for the T-pose (with ``tell_pose``).
     """
-    seen = V[np.linspace(0, len(V) - 1, min(SEEN, len(V))).astype(int)]
+    seen = V[np.linspace(0, len(V) - 1, min(TRIAL_VERTICES, len(V))).astype(int)]
     d, own = surface(V, 1e9).distance, misfit(surface, seen)
-    lies = np.abs(d).mean() < 0.15 and (d < -DEEP).mean() <= 0.02
+    lies = np.abs(d).mean() < 0.15 and (d < -PUSHED_DEPTH).mean() <= 0.02
     if lies and tell_pose:
         other = misfit(_t_surface(), seen)
         if other < 0.87 * own and own - other > 0.005:
@@ -113,7 +113,7 @@ def check_place(V, surface, where, tell_pose=True):
     if lies and not (best and best[0] < 0.5 * own):
         return
     size = " x ".join(f"{s:.3g}" for s in np.ptp(V, axis=0))
-    deep = 100 * (d < -DEEP).mean()
+    deep = 100 * (d < -PUSHED_DEPTH).mean()
     found = (
         f"{where}: does not lie on the body: {_mm(np.abs(d).mean())} from it on average, {deep:.0f}"
         " % of the vertices deep inside"
@@ -147,7 +147,7 @@ def _best_place(seen, surface, scales, tell_pose):
         if not 0.15 < np.ptp(V, axis=0).max() < 2.3:
             continue
         for (at, pose), moved in product(bodies, range(3)):
-            offset = _offset(V, at) if moved == 2 else moved * ON_GROUND
+            offset = _offset(V, at) if moved == 2 else moved * GROUND_OFFSET
             worse = (scale != 1) + (up != "z") + (turn != 0) + 0.5 * (pose is not None) + moved
             found.append(
                 (
@@ -181,7 +181,7 @@ def _best_place(seen, surface, scales, tell_pose):
     if offset.any():
         looks.append(
             "on a body that stands on the ground"
-            if (offset == ON_GROUND).all()
+            if (offset == GROUND_OFFSET).all()
             else "in another place"
         )
         give.append(f"offset=({', '.join(f'{o:g}' for o in offset)})")
@@ -284,10 +284,10 @@ def pushed_out(V, F, where="garment"):
     d = surface(V).distance
     if (d >= 0).all():
         return V, ()
-    if (deep := (d < -DEEP).mean()) > 0.02:
+    if (deep := (d < -PUSHED_DEPTH).mean()) > 0.02:
         raise InputError(
-            f"{where}: {100 * deep:.0f} % of the vertices are more than {100 * DEEP:.0f} cm inside"
-            " the body"
+            f"{where}: {100 * deep:.0f} % of the vertices are more than {100 * PUSHED_DEPTH:.0f} cm"
+            " inside the body"
         )
     area, stiffness = cotangent_laplacian(V, F)
     out = V
@@ -305,7 +305,9 @@ def pushed_out(V, F, where="garment"):
             )
             / 2
         )
-        out = out + smoother(area * np.where(move.any(axis=1), 1.0, 0.1), stiffness, SPREAD)(move)
+        out = out + smoother(area * np.where(move.any(axis=1), 1.0, 0.1), stiffness, PUSH_RADIUS)(
+            move
+        )
     for _ in range(8):
         found = surface(out)
         out = np.where(

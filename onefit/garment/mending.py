@@ -24,8 +24,11 @@ from polyfit.errors import InputError
 from .remesh import loops
 
 COINCIDENT = 2e-5  # vertices closer than this lie on one another [m]
-SMALL_PART, MOST = 0.05, 0.80  # of the area: parts that are dropped, and what has to be left
-SMALL_HOLE = 0.10  # around [m]
+SMALL_PART_SHARE, LEAST_SHARE = (
+    0.05,
+    0.80,
+)  # of the area: parts that are dropped, and what has to be left
+SMALL_HOLE_LENGTH = 0.10  # around [m]
 
 
 def mended(V, F, where="garment"):
@@ -172,8 +175,8 @@ def _cut_apart(V, F, told):
 def _large_parts(V, F, where, told):
     part, area = parts(F), mesh.areas(V, F)
     share = np.bincount(part, area) / area.sum()
-    keep = share >= SMALL_PART
-    if share[keep].sum() < MOST:
+    keep = share >= SMALL_PART_SHARE
+    if share[keep].sum() < LEAST_SHARE:
         found = (
             f"falls apart into {len(share)} parts, {100 * share[~keep].sum():.0f} % of its area in"
             " small ones"
@@ -215,7 +218,7 @@ def _filled(V, F, told):
     extra, faces, filled = [], [F], 0
     for loop in loops(F):
         following = np.roll(loop, -1)
-        if np.linalg.norm(V[following] - V[loop], axis=1).sum() >= SMALL_HOLE:
+        if np.linalg.norm(V[following] - V[loop], axis=1).sum() >= SMALL_HOLE_LENGTH:
             continue
         filled += 1
         if len(loop) == 3:
@@ -227,7 +230,7 @@ def _filled(V, F, told):
     if not filled:
         return V, F
     told.append(
-        f"filled {filled} hole{'s' if filled > 1 else ''} of less than {100 * SMALL_HOLE:.0f} cm"
-        " around"
+        f"filled {filled} hole{'s' if filled > 1 else ''} of less than"
+        f" {100 * SMALL_HOLE_LENGTH:.0f} cm around"
     )
     return np.concatenate([V, *[x[None] for x in extra]]), np.concatenate(faces)

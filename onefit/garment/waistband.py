@@ -13,7 +13,7 @@ from onefit.body import skeleton
 from .remesh import loops, nearest_on_segments
 
 SHOULDERS = [skeleton.INDEX["left_shoulder"], skeleton.INDEX["right_shoulder"]]
-BAND = 0.02, 0.05  # [m]; cloth so near to the rim is held, farther away it is free
+BAND_WIDTH = 0.02, 0.05  # [m]; cloth so near to the rim is held, farther away it is free
 
 
 def highest_rim(vertices, faces):
@@ -34,11 +34,12 @@ def held(vertices, faces, joints):
         return out
     rim = vertices[rim]
     near = np.flatnonzero(
-        (vertices[:, 2] > rim[:, 2].min() - BAND[1]) & (vertices[:, 2] < rim[:, 2].max() + BAND[1])
+        (vertices[:, 2] > rim[:, 2].min() - BAND_WIDTH[1])
+        & (vertices[:, 2] < rim[:, 2].max() + BAND_WIDTH[1])
     )
     distance = np.linalg.norm(
         vertices[near] - nearest_on_segments(vertices[near], rim, np.roll(rim, -1, axis=0)), axis=1
     )
-    x = np.clip((BAND[1] - distance) / (BAND[1] - BAND[0]), 0, 1)
+    x = np.clip((BAND_WIDTH[1] - distance) / (BAND_WIDTH[1] - BAND_WIDTH[0]), 0, 1)
     out[near] = x * x * (3 - 2 * x)
     return out

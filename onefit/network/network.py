@@ -18,11 +18,13 @@ from onefit.garment.charts import Deformation
 from polyfit import jets
 
 GRAVITY = (0.0, 0.0, -1.0)  # unit, world
-SLOPE = 0.1  # of the leaky ReLUs
-HANG = 4  # numbers that tell how a patch hangs: how far from the body, and how much of it is held
+LEAKY_SLOPE = 0.1  # of the leaky ReLUs
+LOOSENESS_SIZE = (
+    4  # numbers that tell how a patch hangs: how far from the body, and how much of it is held
+)
 # Deformations that a unit of the decoder's output stands for: coefficients and translation in units
 # of the patch's radius, scale as a logarithm, drift in units of the patch's room.
-UNIT = {"alpha": 0.2, "translation": 0.3, "scale": 0.05, "drift": 1.0}
+OUTPUT_UNIT = {"alpha": 0.2, "translation": 0.3, "scale": 0.05, "drift": 1.0}
 
 
 def layers(widths, bias=True, last=True):
@@ -30,12 +32,12 @@ def layers(widths, bias=True, last=True):
     out = []
     for i, (a, b) in enumerate(itertools.pairwise(widths)):
         linear = nn.Linear(a, b, bias=bias)
-        nn.init.kaiming_normal_(linear.weight, SLOPE, nonlinearity="leaky_relu")
+        nn.init.kaiming_normal_(linear.weight, LEAKY_SLOPE, nonlinearity="leaky_relu")
         if bias:
             nn.init.zeros_(linear.bias)
         out.append(linear)
         if last or i + 2 < len(widths):
-            out.append(nn.LeakyReLU(SLOPE, inplace=True))
+            out.append(nn.LeakyReLU(LEAKY_SLOPE, inplace=True))
     return nn.Sequential(*out)
 
 
@@ -60,7 +62,7 @@ class PatchEncoder(nn.Module):
             + 7
             + 3 * (1 + 2 * octaves[0])
             + 3 * joints * (1 + 2 * octaves[1])
-            + HANG
+            + LOOSENESS_SIZE
             + joints
         )
         self.first = layers([size, hidden, hidden])
@@ -154,9 +156,9 @@ class Decoder(nn.Module):
         """Of patches Z_T (K, patch) and frames Z_B (T, body)."""
         # the first layer is linear in both: no concatenation of each patch with each frame is
         # needed
-        x = nn.functional.leaky_relu(self.of_patch(Z_T) + self.of_body(Z_B)[:, None], SLOPE)
+        x = nn.functional.leaky_relu(self.of_patch(Z_T) + self.of_body(Z_B)[:, None], LEAKY_SLOPE)
         x = self.trunk(x)
-        out = {name: head(x) * UNIT[name] for name, head in self.heads.items()}
+        out = {name: head(x) * OUTPUT_UNIT[name] for name, head in self.heads.items()}
         return Deformation(out["alpha"], out["translation"], out["scale"][..., 0], out["drift"])
 
 

@@ -15,8 +15,8 @@ from polyfit.errors import InputError
 
 GRAVITY = 9.81  # [m/s^2], along -z
 DENSITY = 0.2  # [kg/m^2], a light cotton jersey
-METRIC = 0.1  # what a change of the metric by the square of the patch's radius counts for
-POINT = 1e-5  # [m^2] that a point of a sum stands for
+METRIC_FACTOR = 0.1  # what a change of the metric by the square of the patch's radius counts for
+POINT_AREA = 1e-5  # [m^2] that a point of a sum stands for
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ def collision(distance, area, epsilon):
     """Sum over points of d_c^2 [m^2], of signed distances (N, T) [m] at points that stand for
     ``area`` (N,) [m^2] each.
     """
-    return (penetration(distance, epsilon).square() * (area / POINT)[:, None]).sum(0).mean()
+    return (penetration(distance, epsilon).square() * (area / POINT_AREA)[:, None]).sum(0).mean()
 
 
 def extension(distance, epoch, epsilon):
@@ -88,7 +88,7 @@ def inextensibility(rest, posed, k_ext, s):
     :func:`metric` gives them, in units of the patches' radius ``s`` (P,) [m]. The off-diagonal
     entry counts twice, as it stands twice in the matrix."""
     difference = (k_ext[..., None] * rest - posed) / s[:, None, None].square()
-    return METRIC * (difference.abs() * difference.new_tensor([1, 2, 1])).sum(-1).mean()
+    return METRIC_FACTOR * (difference.abs() * difference.new_tensor([1, 2, 1])).sum(-1).mean()
 
 
 def mesh_inextensibility(lengths, rest):

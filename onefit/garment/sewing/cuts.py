@@ -77,19 +77,19 @@ CUTS = {
     ),
 }  # fmt: skip
 EASE = 0.001, 0.020  # of all [m], drawn evenly in its logarithm: half of the cuts lie on the skin
-COUNT = 500, 5000  # vertices, likewise
-WRINKLES = (
+VERTEX_COUNTS = 500, 5000  # vertices, likewise
+WRINKLE_HEIGHT = (
     0.004  # the greatest amplitude [m] of four waves, halved in their sum, for half of the cuts
 )
-WAVES = 0.05, 0.15  # their lengths [m]
-STRETCH = 0.4  # of the triangles: the logarithm of the greatest
-SHORTEST = 2e-4  # edge [m]: at a rim, vertices may slide onto each other
+WAVE_LENGTHS = 0.05, 0.15  # their lengths [m]
+LOG_STRETCH = 0.4  # of the triangles: the logarithm of the greatest
+SHORTEST_EDGE = 2e-4  # edge [m]: at a rim, vertices may slide onto each other
 TRIES = 20
 
 
 def drawn(name, rng):
-    """The arguments of :func:`onefit.tailor.sewn` for a cut ``name`` of :data:`CUTS`, but for its
-    ``bumps``: a dict, lengths in metres.
+    """The arguments of :func:`onefit.garment.sewing.sew.sewn` for a cut ``name`` of :data:`CUTS`,
+    but for its ``bumps``: a dict, lengths in metres.
     """
     measures = {"snug": rng.uniform(), "ease": _log_uniform(rng, *EASE)}
     for key, (first, last) in CUTS[name][2].items():
@@ -105,21 +105,22 @@ def drawn(name, rng):
             -0.12 if name.startswith("wide") else rng.uniform(measures["hem"] - 0.02, -0.12)
         )
     return measures | dict(
-        count=int(_log_uniform(rng, *COUNT)), stretch=np.exp(rng.uniform(-STRETCH, STRETCH, 3))
+        count=int(_log_uniform(rng, *VERTEX_COUNTS)),
+        stretch=np.exp(rng.uniform(-LOG_STRETCH, LOG_STRETCH, 3)),
     )
 
 
 def wrinkles(block, rng):
     """Four plane waves, summed, on the grid (X, Y, Z) of ``block`` [m], at most twice
-    :data:`WRINKLES` high; or 0.
+    :data:`WRINKLE_HEIGHT` high; or 0.
     """
     if rng.random() < 0.5:
         return 0.0
-    height = rng.uniform(0, WRINKLES)
+    height = rng.uniform(0, WRINKLE_HEIGHT)
     out = 0.0
     for _ in range(4):
         direction = rng.normal(size=3)
-        wave = 2 * np.pi / rng.uniform(*WAVES) * direction / np.linalg.norm(direction)
+        wave = 2 * np.pi / rng.uniform(*WAVE_LENGTHS) * direction / np.linalg.norm(direction)
         out = (
             out
             + np.sin(
@@ -152,7 +153,7 @@ def cut(block, number, seed=0):
             continue
         edges = mesh.edges_of(F)[0]
         shortest = np.linalg.norm(V[edges[:, 0]] - V[edges[:, 1]], axis=1).min()
-        if len(loops(F)) == rims and shortest > SHORTEST:
+        if len(loops(F)) == rims and shortest > SHORTEST_EDGE:
             return name, V, F
     raise RuntimeError(f"no cut {number} of {name} in {TRIES} tries")
 

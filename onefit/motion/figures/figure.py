@@ -49,9 +49,9 @@ HIP = _J["left_hip"]  # and the left hip [m]
 _THIGH = _J["left_knee"] - _J["left_hip"]
 _SHIN = _J["left_ankle"] - _J["left_knee"]
 _BALL = _J["left_foot"] - _J["left_ankle"]  # from the ankle to the ball
-_SOFT = 0.003  # how softly a leg that is almost straight gives in [m]
+_KNEE_SOFTNESS = 0.003  # [m] of missing length over which an almost straight knee bends
 _HEEL = 0.19  # from the ball back to the heel's edge, about which toes are lifted [m]
-REACH = float(np.linalg.norm(_THIGH + _SHIN))  # of a leg in the T-pose: longer it never gets [m]
+LEG_LENGTH = float(np.linalg.norm(_THIGH + _SHIN))  # in the T-pose, its greatest [m]
 
 
 def stand(frames):
@@ -230,9 +230,11 @@ def _leg(c, side):
     to = ankle - hip
     # never quite straight: there the knee's bend goes with the root of what is missing, and would
     # jerk
-    most = 0.9985 * REACH
-    distance = most - _SOFT * np.logaddexp(0.0, (most - np.linalg.norm(to, axis=1)) / _SOFT)
-    distance = np.maximum(distance, 0.35 * REACH)
+    most = 0.9985 * LEG_LENGTH
+    distance = most - _KNEE_SOFTNESS * np.logaddexp(
+        0.0, (most - np.linalg.norm(to, axis=1)) / _KNEE_SOFTNESS
+    )
+    distance = np.maximum(distance, 0.35 * LEG_LENGTH)
     # law of cosines in the thigh's frame: |thigh + Rx(k) shin| = distance, with thigh and shin in
     # the plane x = 0
     a, b = np.linalg.norm(_THIGH), np.linalg.norm(_SHIN)
@@ -279,7 +281,9 @@ def _lowered(c, fps):
         for side in ("left", "right"):
             ankle, _, _, hip, _ = _side(c | {"pelvis": pelvis}, side)
             across = np.linalg.norm((ankle - hip)[:, :2], axis=1)
-            highest = ankle[:, 2] + np.sqrt(np.clip((0.996 * REACH) ** 2 - across**2, 0.01, None))
+            highest = ankle[:, 2] + np.sqrt(
+                np.clip((0.996 * LEG_LENGTH) ** 2 - across**2, 0.01, None)
+            )
             excess = np.maximum(excess, hip[:, 2] - highest)
         if not (excess > 0).any():
             break

@@ -5,13 +5,13 @@ import pytest
 import torch
 
 from onefit.body import AnnyBody, ClosestSurface, skinning
-from onefit.body.nearest import FAR
+from onefit.body.nearest import SEARCH_RADIUS
 from onefit.garment import TEMPLATES, Garment, standard_surface
 from onefit.garment.charts import Deformation, PatchedGarment, SparseMatrix
 from onefit.garment.charts.blending import DRIFT_WIDTH, SLOPE_RIDGE
 from onefit.garment.charts.frames import steady_jets
 from onefit.garment.remesh import loops
-from onefit.garment.waistband import BAND, held
+from onefit.garment.waistband import BAND_WIDTH, held
 from onefit.objective import losses, objective
 from polyfit import jets
 
@@ -202,7 +202,7 @@ def test_garments_are_held_at_the_waist_or_hang_from_the_shoulders(body):
                 for i in range(0, len(V), 500)
             ]
         )
-        x = np.clip((BAND[1] - away) / (BAND[1] - BAND[0]), 0, 1)
+        x = np.clip((BAND_WIDTH[1] - away) / (BAND_WIDTH[1] - BAND_WIDTH[0]), 0, 1)
         assert np.allclose(found, 3 * x**2 - 2 * x**3, atol=0.01)
         assert (found == 1).sum() > 50
     # the dress without what is above its waist is a skirt; a dress that ends below the shoulders is
@@ -376,7 +376,7 @@ def test_signed_distances(body):
     assert torch.allclose(both[0], both[1], atol=1e-5)
     assert collider.distances(
         torch.full((1, 1, 3), 9.0), body.vertices[None]
-    ).item() == pytest.approx(FAR)
+    ).item() == pytest.approx(SEARCH_RADIUS)
 
 
 def test_gradient_of_the_signed_distance(body):

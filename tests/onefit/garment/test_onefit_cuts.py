@@ -53,9 +53,9 @@ def test_cuts_are_clean_and_off_the_body(sewn):
         assert name == NAMES[n % len(NAMES)]
         edges, side = mesh.edges_of(F)
         assert np.bincount(side.ravel()).max() == 2  # manifold
-        assert np.linalg.norm(V[edges[:, 0]] - V[edges[:, 1]], axis=1).min() > cuts.SHORTEST
+        assert np.linalg.norm(V[edges[:, 0]] - V[edges[:, 1]], axis=1).min() > cuts.SHORTEST_EDGE
         assert len(loops(F)) == cuts.CUTS[name][1] and np.isfinite(V).all()
-        assert len(np.unique(F)) == len(V) >= 0.8 * cuts.COUNT[0]
+        assert len(np.unique(F)) == len(V) >= 0.8 * cuts.VERTEX_COUNTS[0]
         assert standard_surface()(V).distance.min() > 0
 
 
@@ -99,7 +99,7 @@ def test_wrinkles_are_as_high_as_they_say(block):
     heights = [
         np.abs(cuts.wrinkles(block, np.random.default_rng(seed))).max() for seed in range(20)
     ]
-    assert max(heights) <= 2 * cuts.WRINKLES and 4 < sum(h > 0 for h in heights) < 16
+    assert max(heights) <= 2 * cuts.WRINKLE_HEIGHT and 4 < sum(h > 0 for h in heights) < 16
 
 
 def test_what_was_sewn_is_read_again_and_trained_on(block, sewn, tmp_path, monkeypatch):

@@ -13,7 +13,7 @@ from onefit.garment import Garment
 from onefit.garment.charts import PatchedGarment
 from onefit.motion import Motion
 from onefit.network import OneFit, weights
-from onefit.network.network import SLOPE, Decoder, descriptors, encoded
+from onefit.network.network import LEAKY_SLOPE, Decoder, descriptors, encoded
 from polyfit.errors import InputError
 
 
@@ -91,7 +91,7 @@ def test_the_decoder_is_that_of_the_concatenation():
     out = decoder(Z_T, Z_B)
     weight = torch.cat([decoder.of_patch.weight, decoder.of_body.weight], 1)
     both = torch.cat([Z_T[None].expand(3, 5, 128), Z_B[:, None].expand(3, 5, 256)], -1)
-    x = torch.nn.functional.leaky_relu(both @ weight.T + decoder.of_patch.bias, SLOPE)
+    x = torch.nn.functional.leaky_relu(both @ weight.T + decoder.of_patch.bias, LEAKY_SLOPE)
     expected = decoder.heads["translation"](decoder.trunk(x))
     assert torch.allclose(out.translation, expected * 0.3, atol=1e-5)
     assert out.alpha.shape == (3, 5, 15) and out.scale.shape == (3, 5)
@@ -312,7 +312,7 @@ def test_pushing_out_finds_deep_vertices_from_their_neighbours(monkeypatch):
     monkeypatch.setattr(
         ClosestSurface,
         "__call__",
-        lambda self, points, reach: query(self, points, onefit.draping.post.REACH),
+        lambda self, points, reach: query(self, points, onefit.draping.post.DEEPEST),
     )
     assert torch.allclose(pushed_out(x, torch.as_tensor(cloth.faces), body, faces), out, atol=1e-5)
 

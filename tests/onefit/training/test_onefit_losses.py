@@ -32,7 +32,7 @@ def gradient_agrees(function, x, tolerance=1e-6):
 def test_collision_counts_depth_below_epsilon():
     # three points for 1e-5 m^2 each: 1 cm away, on the surface, 6 mm inside; epsilon 4 mm
     distance = torch.tensor([[0.01], [0.0], [-0.006]])
-    area = torch.full((3,), losses.POINT)
+    area = torch.full((3,), losses.POINT_AREA)
     assert float(losses.collision(distance, area, 0.004)) == pytest.approx(0.004**2 + 0.01**2)
     # twice the points for half the area each are the same cloth
     assert float(
@@ -64,18 +64,18 @@ def test_inextensibility_of_an_isometry_and_of_a_stretch():
     # 10 % along u: E from 1 to 1.21
     assert float(
         losses.inextensibility(rest, losses.metric((1.1 * u, v)), one, s)
-    ) == pytest.approx(losses.METRIC * (0.21), rel=1e-4)
+    ) == pytest.approx(losses.METRIC_FACTOR * (0.21), rel=1e-4)
     # shear: F from 0 to 0.2, and it stands twice in the matrix
     assert float(
         losses.inextensibility(rest, losses.metric((u, v + 0.2 * u)), one, s)
-    ) == pytest.approx(losses.METRIC * (0.4 + 0.04), rel=1e-4)
+    ) == pytest.approx(losses.METRIC_FACTOR * (0.4 + 0.04), rel=1e-4)
     # where the metric may be larger by k_ext, that much costs nothing
     assert float(losses.inextensibility(rest, 1.3 * rest, 1.3 * one, s)) == pytest.approx(
         0, abs=1e-6
     )
     assert float(
         losses.inextensibility(rest, losses.metric((1.1 * u, v)), one, 2 * s)
-    ) == pytest.approx(losses.METRIC * (0.21 / 4), rel=1e-4)
+    ) == pytest.approx(losses.METRIC_FACTOR * (0.21 / 4), rel=1e-4)
     T = losses.metric((random(4, 2, 3), random(4, 2, 3)))
     weights = random(4, 2).abs() + 1
     gradient_agrees(
