@@ -118,7 +118,7 @@ def draw(path):
             colour, bend = "#c4572e", 0.0
         style = {"arrowstyle": "-|>", "color": colour, "shrinkA": 0, "shrinkB": 0}
         style["connectionstyle"] = f"arc3,rad={bend}"
-        axes.annotate("", ends[1], ends[0], arrowprops=style)
+        axes.annotate("", ends[1], ends[0], arrowprops=style, zorder=0.5)  # below the boxes
     for (package, room), (x, y) in at.items():
         style = {"boxstyle": "round,pad=0,rounding_size=0.06", "fc": PACKAGES[package]}
         corner = (x - width / 2, y - height / 2)
