@@ -42,7 +42,7 @@ def main(argv=None):
             (drape.vertices[chosen].numpy(), drape.faces.numpy(), colour),
         ]
         rows.append(
-            np.concatenate(list(stage.render(parts, size=SIZE, spp=96, follow=True)), axis=1)
+            np.concatenate(list(stage.render(parts, size=SIZE, spp=100, follow=True)), axis=1)
         )
     cv2.imwrite(args.output, np.concatenate(rows)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
 

@@ -114,7 +114,7 @@ def parser():
         metavar=("HEIGHT", "WIDTH"),
         help="size of the rendering [pixels] (default: 480 360)",
     )
-    p.add_argument("--spp", type=int, default=32, help="samples a pixel (default: 32)")
+    p.add_argument("--spp", type=int, default=36, help="samples a pixel (default: 36)")
     p.add_argument("--device", default="cpu", help="cpu or cuda, for the network (default: cpu)")
     p.add_argument("--overwrite", action="store_true", help="replace an earlier drape in OUT")
     return p
