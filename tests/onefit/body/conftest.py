@@ -1,0 +1,15 @@
+"""Bodies for the tests of this folder."""
+
+import pytest
+
+from onefit.body import AnnyBody
+
+
+@pytest.fixture(scope="module")
+def model():
+    return AnnyBody()
+
+
+@pytest.fixture(scope="module")
+def standard(model):
+    return model.body()

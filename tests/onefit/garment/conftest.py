@@ -1,0 +1,38 @@
+"""Garments for the tests of this folder."""
+
+import pytest
+
+from onefit.body import AnnyBody
+from onefit.garment import TEMPLATES, Garment
+from onefit.garment.charts import PatchedGarment
+
+
+@pytest.fixture(scope="module")
+def templates():
+    return {name: Garment.template(name) for name in TEMPLATES}
+
+
+@pytest.fixture(scope="module")
+def tank(templates):
+    g = templates["tank"]
+    return g.vertices.double().numpy(), g.faces.numpy()
+
+
+@pytest.fixture(scope="module")
+def anny():
+    return AnnyBody()
+
+
+@pytest.fixture(scope="module")
+def body():
+    return AnnyBody().body()
+
+
+@pytest.fixture(scope="module")
+def garment():
+    return Garment.template("tank")
+
+
+@pytest.fixture(scope="module")
+def patched(garment, body):
+    return PatchedGarment(garment, body)

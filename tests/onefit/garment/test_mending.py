@@ -1,0 +1,312 @@
+"""Meshes that are repaired or refused, and garments of other makes."""
+
+import re
+
+import numpy as np
+import pytest
+import torch
+from meshes import turned
+from surfaces import joined, sphere, tube
+
+from onefit.body import skeleton, skinning
+from onefit.garment import Garment, fitting, standard_body, standard_surface
+from onefit.garment.binding import vertex_normals
+from onefit.garment.mending import mended
+from onefit.garment.remesh import loops
+from polyfit import write_ply
+from polyfit.errors import InputError
+
+
+def soup(V, F):
+    """Every face with vertices of its own."""
+    return V[F.ravel()], np.arange(F.size).reshape(-1, 3)
+
+
+def punched(V, F, at, faces=1):
+    """Without the faces nearest to vertex ``at``."""
+    d = np.linalg.norm(V[F].mean(axis=1) - V[at], axis=1)
+    return V, np.delete(F, np.argsort(d, kind="stable")[:faces], axis=0)
+
+
+def flipped(F, rows):
+    G = F.copy()
+    G[rows] = G[rows, ::-1]
+    return G
+
+
+class TestRepairs:
+    """Each case is made from the tank top; what reading says of it, and that the tank top comes
+    out.
+    """
+
+    def check(self, V, F, *said):
+        g = Garment.of_mesh("case", V, F)
+        assert len(g.repairs) == len(said), g.repairs
+        for sentence, expected in zip(g.repairs, said):
+            assert re.search(expected, sentence), (sentence, expected)
+        assert (
+            len(loops(g.faces.numpy())) == 4
+            and mended(g.vertices.double().numpy(), g.faces.numpy())[2] == ()
+        )
+        assert standard_surface()(g.vertices.numpy()).distance.min() > 0
+        agree = (
+            standard_surface()(g.vertices.numpy()).normal
+            * vertex_normals(g.vertices.numpy(), g.faces.numpy())
+        ).sum(axis=1)
+        assert (agree > 0).mean() > 0.999
+        return g
+
+    def test_a_clean_one_is_left_alone(self, tank):
+        V, F = tank
+        g = self.check(V, F)
+        assert np.allclose(g.vertices.numpy(), V, atol=1e-7) and np.array_equal(g.faces.numpy(), F)
+
+    def test_vertices_in_no_face_and_faces_without_area(self, tank):
+        V, F = tank
+        V, F = np.concatenate([[[0, 0, 0], [9, 9, np.nan]], V]), F + 2
+        F = np.concatenate([F[:100], [[5, 5, 9]], F[100:], F[40:42]])
+        self.check(
+            V,
+            F,
+            "2 vertices that are in no face",
+            "1 faces without area",
+            "2 faces that repeat others",
+        )
+
+    def test_seams_and_soups_are_sewn(self, tank):
+        V, F = tank
+        g = self.check(*soup(V, F), f"merged {F.size - len(V)} vertices")
+        assert len(g) == len(V)
+
+    def test_faces_wound_against_the_others_and_inwards(self, tank):
+        V, F = tank
+        self.check(V, flipped(F, slice(100, 300)), "turned 200 faces that were wound against")
+        self.check(V, F[:, ::-1], f"turned {len(F)} faces that were wound inwards")
+
+    def test_small_holes_are_filled(self, tank):
+        V, F = tank
+        inner = np.setdiff1d(np.arange(len(V)), np.concatenate(loops(F)))
+        at = inner[np.argsort(np.abs(V[inner, 2] - 0.2))[0]]
+        g = self.check(*punched(V, F, at), "filled 1 hole of less than 10 cm")
+        assert len(g.faces) == len(F)
+        self.check(*punched(V, F, at, 5), "filled 1 hole")
+
+    def test_a_pocket_sewn_on_comes_off(self, tank):
+        V, F = tank
+        # five faces that stand on one side each of five of the front
+        front = [
+            np.argmin(np.linalg.norm(V[F].mean(axis=1) - [x, -0.14, 0.2], axis=1))
+            for x in np.linspace(-0.08, 0.08, 5)
+        ]
+        outer = V[F[front]].mean(axis=1) + [0, -0.01, 0]
+        extra = np.stack([F[front, 0], F[front, 1], len(V) + np.arange(5)], axis=1)
+        g = self.check(
+            np.concatenate([V, outer]),
+            np.concatenate([F, extra]),
+            "cut apart at 5 edges",
+            "dropped 5 parts of 5 faces",
+        )
+        assert len(g) == len(V)
+
+    def test_buttons_are_dropped(self, tank):
+        button, G = sphere(0.006, 1)
+        self.check(
+            *joined(tank, (button + [0, -0.16, 0.3], G)), f"dropped a part of {len(G)} faces"
+        )
+
+    def test_separate_parts_stay(self, templates, tank):
+        shorts = templates["shorts"]
+        V, F = joined(tank, (shorts.vertices.double().numpy(), shorts.faces.numpy()))
+        g = Garment.of_mesh("both", V, F)
+        assert g.repairs == ("has 2 separate parts, which move each for itself",) and len(g) == len(
+            V
+        )
+
+    def test_parts_that_touch_in_a_point(self, tank):
+        V, F = tank
+        T, G = tube(0.03, 0.2, 12, 8)
+        T = T + V[5] - T[0]
+        T, G = joined((V, F), (T, G))
+        G[len(V) == G] = 5
+        _, _, told = mended(T, G)
+        assert any("1 vertices where parts touch in a point" in s for s in told), told
+
+    def test_vertices_inside_the_body_are_pushed_out(self, tank):
+        V, F = tank
+        found = standard_surface()(V)
+        dent = (
+            np.linalg.norm(V - V[np.argmin(np.linalg.norm(V - [0, -0.13, 0.2], axis=1))], axis=1)
+            < 0.05
+        )
+        W = V - np.where(dent, found.distance + 0.015, 0)[:, None] * found.normal
+        g = self.check(W, F, rf"pushed {dent.sum()} vertices out of the body, by up to 15\.\d mm")
+        assert (
+            np.abs(g.vertices.numpy() - W)[
+                np.linalg.norm(V - V[dent].mean(axis=0), axis=1) > 0.2
+            ].max()
+            < 0.002
+        )
+
+
+class TestRefusals:
+    def refused(self, V, F, match, **how):
+        with pytest.raises(InputError, match=match) as error:
+            Garment.of_mesh("case", V, F, where="case.obj", **how)
+        assert "\n" not in str(error.value) and str(error.value).startswith("case.obj: ")
+        return str(error.value)
+
+    def test_meshes_that_are_no_garment(self, tank):
+        V, F = tank
+        self.refused(V, F[:0], "no faces")
+        self.refused(V[:0], F[:0], "no faces")
+        W = V.copy()
+        W[17, 1] = np.nan
+        self.refused(W, F, "1 vertices have coordinates that are not finite .*vertex 17")
+        self.refused(np.zeros_like(V), F, "no area")
+        loose, G = soup(V, F)
+        self.refused(
+            loose + np.random.default_rng(0).normal(0, 3e-4, loose.shape),
+            G,
+            f"falls apart into {len(F)} parts, 100 % of its area",
+        )
+        body = standard_body()
+        self.refused(body.vertices.numpy(), body.faces.numpy(), "closed surface without openings")
+        rim = np.concatenate([np.stack([x, np.roll(x, -1)], 1) for x in loops(F)])
+        walls = [
+            np.stack([rim[:, 1], rim[:, 0], rim[:, 0] + len(V)], 1),
+            np.stack([rim[:, 1], rim[:, 0] + len(V), rim[:, 1] + len(V)], 1),
+        ]
+        thick = np.concatenate([F, F[:, ::-1] + len(V), *walls])
+        self.refused(
+            np.concatenate([V, V + 0.003 * vertex_normals(V, F)]), thick, "cloth with a thickness"
+        )
+
+    def test_moebius_strip(self):
+        a = np.linspace(0, 2 * np.pi, 60, endpoint=False)
+        w = np.array([-1.0, 0, 1])[:, None] * 0.06
+        r, z = 0.2 + w * np.cos(a / 2), w * np.sin(a / 2)
+        V = np.stack([r * np.cos(a), r * np.sin(a) - 0.03, z + 0.1], axis=-1)  # (3, 60, 3)
+        number = np.arange(180).reshape(3, 60)
+        number = np.concatenate([number, number[::-1, :1]], axis=1)
+        p, q, r, s = number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]
+        F = np.concatenate(
+            [np.stack([p, q, r], -1).reshape(-1, 3), np.stack([p, r, s], -1).reshape(-1, 3)]
+        )
+        self.refused(V.reshape(-1, 3), F, "one side only")
+
+    @pytest.mark.parametrize(
+        "what, change, expected",
+        [
+            ("centimetres", lambda V: 100 * V, dict(scale=0.01)),
+            ("millimetres", lambda V: 1000 * V, dict(scale=0.001)),
+            ("y up", lambda V: np.stack([V[:, 0], V[:, 2], -V[:, 1]], 1), dict(up="y")),
+            ("facing backwards", lambda V: V * [-1, -1, 1], dict(turn=180.0)),
+            (
+                "centimetres, y up",
+                lambda V: 100 * np.stack([V[:, 0], V[:, 2], -V[:, 1]], 1),
+                dict(scale=0.01, up="y"),
+            ),
+            (
+                "on a body that stands on the ground",
+                lambda V: V + [0, 0, 0.82],
+                dict(offset=(0, 0, -0.82)),
+            ),
+        ],
+    )
+    def test_units_axes_and_places_are_found(self, templates, what, change, expected, tmp_path):
+        g = templates["tshirt"]
+        path = tmp_path / "shirt.ply"
+        write_ply(path, change(g.vertices.double().numpy()), g.faces.numpy())
+        with pytest.raises(InputError) as error:
+            Garment.read(path)
+        found = re.fullmatch(
+            rf"{re.escape(str(path))}: does not lie on the body: .*; it looks like {what}: give"
+            r" (.*)",
+            str(error.value),
+        )
+        assert found, error.value
+        given = eval(f"dict({found[1]})")
+        assert given == expected
+        assert (
+            np.abs(Garment.read(path, **given).vertices.numpy() - g.vertices.numpy()).max() < 1e-4
+        )
+
+    def test_nothing_fits(self):
+        V, F = tube(0.5, 0.4)
+        assert "1.63 m tall" in self.refused(1e-7 * V, F, "does not lie on the body")
+
+    def test_t_pose(self, templates):
+        g, body = templates["long_sleeve_top"], standard_body()
+        maps = skinning.transforms(body, torch.zeros(1, 24, 3), torch.zeros(1, 3))
+        V = skinning.skin(g.vertices, g.blend_weights, maps)[0].double().numpy()
+        self.refused(V, g.faces.numpy(), "looks made for the T-pose .*give made_for='T-pose'")
+        back = Garment.of_mesh("top", V, g.faces.numpy(), made_for="T-pose")
+        error = (back.vertices - g.vertices).norm(dim=1)
+        assert error.mean() < 0.003 and error.max() < 0.02
+
+    def test_made_for_something_else_than_a_body(self, tank):
+        with pytest.raises(InputError, match="made_for='A-pose'"):
+            Garment.of_mesh("case", *tank, made_for="A-pose")
+
+    def test_deep_inside(self, tank):
+        V, F = tank
+        self.refused(V * [0.5, 0.3, 1] + [0, -0.02, 0], F, "does not lie on the body")
+
+    def test_wrong_up(self):
+        with pytest.raises(InputError, match="'z' or 'y'"):
+            fitting.placed(np.zeros((1, 3)), up="x")
+
+
+@pytest.mark.parametrize("name, loose", [("tshirt", False), ("trousers", False), ("dress", True)])
+def test_made_for_another_shape_in_another_stand(name, loose, templates, anny):
+    g = templates[name]
+    body = anny.body(anny.random_shape(np.random.default_rng(4)))
+    pose = skeleton.standard_rest_pose() if loose else torch.zeros(24, 3)
+    stands = fitting.in_pose(body, pose)
+    maps = skinning.transforms(body, pose[None], torch.zeros(1, 3))
+    V = skinning.skin(g.graded(body), g.blend_weights, maps)[0].double().numpy()
+    back = Garment.of_mesh(name, V, g.faces.numpy(), made_for=stands, loose=loose)
+    error = (back.vertices - g.vertices).norm(dim=1)
+    assert error.mean() < 0.004 and error.max() < 0.02
+    assert (torch.as_tensor(V) - g.vertices).norm(dim=1).mean() > 3 * error.mean()
+
+
+def test_loose_leaves_the_pose_of_the_legs(templates):
+    g, body = templates["dress"], standard_body()
+    wide = body.rest_pose.clone()
+    for side, sign in (("left", -1), ("right", 1)):
+        wide[skeleton.INDEX[f"{side}_hip"]] = turned(
+            wide[skeleton.INDEX[f"{side}_hip"]], [0, 0.12 * sign, 0]
+        )
+    V, F = g.vertices.double().numpy(), g.faces.numpy()
+    made_for = fitting.in_pose(body, wide)
+    moved = lambda loose: np.linalg.norm(
+        fitting.to_standard(V, F, made_for, loose) - V, axis=1
+    ).max()
+    assert moved(True) < 0.005 < 0.02 < moved(False)
+
+
+def test_garments_of_others(shared_data):
+    for path in sorted((shared_data / "garments_makehuman").glob("*.obj")):
+        if path.stem == "body_rest":
+            continue
+        g = Garment.read(path)
+        assert (
+            g.repairs == ()
+            and g.name == path.stem
+            and g.blend_weights.sum(1) == pytest.approx(torch.ones(len(g)), abs=1e-5)
+        )
+
+
+def test_garments_in_another_pose_and_axes(shared_data):
+    for path in (
+        shared_data / "garments_snug" / name for name in ("long_sleeve_top.obj", "shorts.obj")
+    ):
+        with pytest.raises(
+            InputError,
+            match="does not lie on the body: .* it looks like y up, .*give up='y'.*offset=",
+        ) as error:
+            Garment.read(path)
+        given = eval(f"dict({str(error.value).partition('give ')[2]})")
+        g = Garment.read(path, **{"made_for": "T-pose", **given})
+        assert standard_surface()(g.vertices.numpy()).distance.min() > 0

@@ -1,0 +1,204 @@
+"""Motions from BVH files."""
+
+import numpy as np
+import pytest
+import torch
+from motions import FROM_SMPL, T_POSE, places, some_motion
+from scipy.spatial.transform import Rotation
+
+from onefit.body import skeleton, skinning
+from onefit.body.skeleton import INDEX
+from onefit.motion import Motion
+from polyfit.errors import InputError
+
+# --- BVH ------------------------------------------------------------------------------------------
+
+PARTS = ("hip", "knee", "ankle", "foot", "collar", "shoulder", "elbow", "wrist")
+
+
+# names of pelvis, spine, neck and head, and of a side's bones; Euler order; axes; units a metre
+STYLES = {
+    "mixamo": (
+        ["Hips", "Spine", "Spine1", "Spine2", "Neck", "Head"],
+        [
+            "{S}UpLeg", "{S}Leg", "{S}Foot", "{S}ToeBase", "{S}Shoulder", "{S}Arm", "{S}ForeArm",
+            "{S}Hand"
+        ], "mixamorig:", "ZXY", "y", 100.0
+    ),
+    "cmu": (
+        ["Hips", "LowerBack", "Spine", "Spine1", "Neck", "Head"],
+        [
+            "{S}UpLeg", "{S}Leg", "{S}Foot", "{S}ToeBase", "{S}Shoulder", "{S}Arm", "{S}ForeArm",
+            "{S}Hand"
+        ], "", "ZYX", "y", 17.7
+    ),
+    "rigify": (
+        ["spine", "spine.001", "spine.002", "spine.003", "spine.004", "head"],
+        [
+            "thigh.{s}", "shin.{s}", "foot.{s}", "toe.{s}", "shoulder.{s}", "upper_arm.{s}",
+            "forearm.{s}", "hand.{s}"
+        ], "", "XYZ", "z", 1.0
+    ),
+    "poser": (
+        ["hip", "abdomen", "chest", "chest2", "neck", "head"],
+        [
+            "{l}Thigh", "{l}Shin", "{l}Foot", "{l}Toe", "{l}Collar", "{l}Shldr", "{l}ForeArm",
+            "{l}Hand"
+        ], "", "YZX", "y", 40.0
+    ),
+    "mocap": (
+        ["Hips", "Chest", "Chest2", "Chest3", "Neck", "Head"],
+        [
+            "{S}Hip", "{S}Knee", "{S}Ankle", "{S}Toe", "{S}Collar", "{S}Shoulder", "{S}Elbow",
+            "{S}Wrist"
+        ], "", "ZXY", "y", 100.0
+    ),
+    "unreal": (
+        ["pelvis", "spine_01", "spine_02", "spine_03", "neck_01", "head"],
+        [
+            "thigh_{l}", "calf_{l}", "foot_{l}", "ball_{l}", "clavicle_{l}", "upperarm_{l}",
+            "lowerarm_{l}", "hand_{l}"
+        ], "", "ZYX", "z", 100.0
+    ),
+}  # fmt: skip
+
+
+def bvh_names(style):
+    trunk, limbs, prefix, *_ = STYLES[style]
+    names = dict(zip(("pelvis", "spine1", "spine2", "spine3", "neck", "head"), trunk, strict=True))
+    for side in ("left", "right"):
+        for part, name in zip(PARTS, limbs, strict=True):
+            names[f"{side}_{part}"] = name.format(S=side.capitalize(), s=side[0].upper(), l=side[0])
+    return {joint: prefix + name for joint, name in names.items()}
+
+
+def write_bvh(path, motion, style, zero=None, frame_time=None):
+    """A motion of the standard skeleton as a BVH file whose zero pose is the pose ``zero`` (24, 3),
+    the T-pose where None.
+    """
+    *_, order, up, unit = STYLES[style]
+    names = bvh_names(style)
+    turn = FROM_SMPL.inv() if up == "y" else Rotation.identity()  # to the file's axes
+    zero = torch.zeros(24, 3) if zero is None else zero
+    stand = skeleton.chained_rotations(zero.double()).numpy()
+    J = skinning.joint_places(T_POSE.double(), zero.double()[None], torch.zeros(1, 3).double())[
+        0
+    ].numpy()
+    G = skeleton.chained_rotations(motion.poses.double()).numpy()
+    world = {
+        j: turn * Rotation.from_matrix(G[:, j]) * Rotation.from_matrix(stand[j]).inv() * turn.inv()
+        for j in range(24)
+    }
+    lines, rows = ["HIERARCHY"], []
+
+    def bone(j, depth):
+        parent = skeleton.PARENTS[j]
+        tab = "  " * depth
+        offset = turn.apply(J[j] - (J[parent] if parent >= 0 else J[j])) * unit
+        lines.append(f"{tab}{'JOINT' if depth else 'ROOT'} {names[skeleton.JOINTS[j]]}")
+        lines.append(tab + "{")
+        lines.append(f"{tab}  OFFSET {offset[0]:.8f} {offset[1]:.8f} {offset[2]:.8f}")
+        rotations = " ".join(f"{axis}rotation" for axis in order)
+        lines.append(
+            f"{tab}  CHANNELS "
+            + ("3 " if depth else "6 Xposition Yposition Zposition ")
+            + rotations
+        )
+        if parent < 0:
+            rows.append(turn.apply(T_POSE[0].numpy() + motion.translation.double().numpy()) * unit)
+        rows.append(
+            (world[j] if parent < 0 else world[parent].inv() * world[j]).as_euler(
+                order, degrees=True
+            )
+        )
+        children = [
+            c for c, p in enumerate(skeleton.PARENTS) if p == j and skeleton.JOINTS[c] in names
+        ]
+        for child in children:
+            bone(child, depth + 1)
+        if not children:
+            lines.extend(
+                [tab + "  End Site", tab + "  {", f"{tab}    OFFSET {0.1 * unit} 0 0", tab + "  }"]
+            )
+        lines.append(tab + "}")
+
+    bone(0, 0)
+    values = np.concatenate(rows, 1)
+    frame_time = 1 / motion.fps if frame_time is None else frame_time
+    lines += [
+        "MOTION",
+        f"Frames: {len(values)}",
+        f"Frame Time: {frame_time:.7f}",
+        *(" ".join(f"{v:.8f}" for v in row) for row in values),
+    ]
+    path.write_text("\n".join(lines))
+
+
+def body_only(motion):
+    poses = motion.poses.clone()
+    poses[:, 22:] = 0
+    return Motion(poses, motion.translation, motion.fps, motion.name)
+
+
+@pytest.mark.parametrize("style", STYLES)
+@pytest.mark.parametrize("zero", ["t", "a"])
+def test_bvh_of_many_makes_comes_back(style, zero, tmp_path):
+    motion = body_only(some_motion(size=0.3))
+    write_bvh(
+        tmp_path / "m.bvh", motion, style, skeleton.standard_rest_pose() if zero == "a" else None
+    )
+    read = Motion.read(tmp_path / "m.bvh")
+    assert read.fps == 30
+    there, back = places(motion), places(read)
+    for J in (there, back):  # moved as a whole
+        J -= J[:1, :1].copy()
+    assert np.abs(there - back)[:, :22].max() < 1e-4
+    assert np.abs(there - back).max() < (
+        1e-4 if zero == "t" else 0.02
+    )  # the file does not say how a hand is turned in its zero pose
+
+
+def test_bvh_without_collars_toes_and_with_a_short_spine(tmp_path):
+    """What a file does not have stays as in the T-pose; a rotation of a bone that is not ours
+    reaches the next joint that is.
+    """
+    still = torch.zeros(2, 24, 3)
+    still[1, INDEX["spine2"], 0] = 0.5
+    still[1, INDEX["right_elbow"], 2] = 1.0
+    write_bvh(tmp_path / "m.bvh", Motion(still, torch.zeros(2, 3), 30.0), "mixamo")
+    text = (tmp_path / "m.bvh").read_text()
+    for old, new in (("LeftShoulder", "Extra1"), ("RightShoulder", "Extra2"), ("Spine1", "Hump")):
+        text = text.replace(old, new)
+    (tmp_path / "n.bvh").write_text(text)
+    a, b = places(Motion.read(tmp_path / "m.bvh")), places(Motion.read(tmp_path / "n.bvh"))
+    assert np.abs(a - b).max() < 1e-4
+
+
+def test_bvh_files_that_cannot_be_used(tmp_path):
+    motion = body_only(some_motion(frames=3))
+    write_bvh(tmp_path / "m.bvh", motion, "mixamo")
+    good = (tmp_path / "m.bvh").read_text()
+    rows = good.split("\n")
+    lying = motion.poses.clone() * 0
+    lying[:, 1:3, 0] = -1.5
+    write_bvh(tmp_path / "sat.bvh", motion, "mixamo", lying[0])
+    cases = {
+        "no BVH file": "#!/bin/sh",
+        "no left knee among its bones": good.replace("LeftLeg", "LeftThing"),
+        "numbers for 69 channels": "\n".join(rows[:-1] + [rows[-1].rsplit(" ", 1)[0]]),
+        "3 frames are announced, 2 are there": "\n".join(rows[:-1]),
+        "frames are not finite in 1 of 3 frames, the first is frame 1": "\n".join(
+            [*rows[:-2], "nan " + rows[-2].split(" ", 1)[1], rows[-1]]
+        ),
+        "a frame time of 0.0; give the rate": good.replace(
+            "Frame Time: 0.0333333", "Frame Time: 0"
+        ),
+        "its zero pose is not an upright stance": (tmp_path / "sat.bvh").read_text(),
+    }
+    for message, text in cases.items():
+        (tmp_path / "bad.bvh").write_text(text)
+        with pytest.raises(InputError, match=message) as error:
+            Motion.read(tmp_path / "bad.bvh")
+        assert "\n" not in str(error.value) and "bad.bvh" in str(error.value)
+    (tmp_path / "bad.bvh").write_text(cases["a frame time of 0.0; give the rate"])
+    assert Motion.read(tmp_path / "bad.bvh", fps=25).fps == 25
