@@ -38,7 +38,7 @@ def _error(surface):
     weight = torch.as_tensor(
         surface.patches.entry_weight, dtype=surface.uv.dtype, device=surface.uv.device
     )
-    return float((surface.residual**2 * weight).sum() / weight.sum())
+    return float((surface.residual.detach() ** 2 * weight).sum() / weight.sum())
 
 
 @torch.no_grad()
