@@ -54,7 +54,7 @@ class Experiment:
         width, height = self.sensor.film().crop_size()
         return int(width), int(height)
 
-    def sequence(self):
+    def sequence(self) -> Sequence:
         """The :class:`Sequence` of the frames that the settings select. Raises InputError."""
         s = self.settings
         return Sequence.open(
