@@ -25,7 +25,7 @@ drape: .venv/with-drape llvm
 	$(PY) -m onefit.drape dress dance --weights dress -o out/drape --seconds 2 --overwrite
 
 test: .venv/with-test llvm
-	$(PY) -m pytest -q
+	$(PY) -m pytest -q -n 2 --dist loadfile
 
 # The pages of docs/ as HTML, in out/docs, with the API reference; a warning is an error
 docs: .venv/with-docs llvm
