@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from polyfit import jets
 from polyfit.jets import CanonicalFrame
 from polysft_mi.results import metrics
-from polysft_mi.surface.chart import Chart
+from polysft_mi.surface.atlas import Atlas
 from polysft_mi.surface.template import Template
 
 
@@ -23,7 +23,7 @@ def best_jets(template, truth):
     orders = [*range(2, template.order, 2), template.order]
     parts = (template.vertices, template.faces, template.uv)
     charts = [
-        Chart(template if n == template.order else Template.fit(*parts, n, tolerance=np.inf))
+        Atlas(template if n == template.order else Template.fit(*parts, n, tolerance=np.inf))
         for n in orders
     ]
     previous, surfaces = None, []

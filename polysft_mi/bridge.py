@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from polyfit.network import PolyFit
 
     from .objective.problem import Problem
-    from .surface.patch import JetPatch
+    from .surface.patch import JetAtlas
 
 
 def template(
@@ -94,8 +94,8 @@ def rendering(
     return lambda vertices: render(vertices.to(torch.float32).contiguous())
 
 
-def deformed(patch: JetPatch) -> Callable[..., torch.Tensor]:
-    """The surface of a :class:`polysft_mi.surface.patch.JetPatch` as a torch function of the
+def deformed(patch: JetAtlas) -> Callable[..., torch.Tensor]:
+    """The surface of a :class:`polysft_mi.surface.patch.JetAtlas` as a torch function of the
     unknowns: delta_alpha (A,), delta_u, delta_v, delta_w (N,), rotation (4,), translation (3,) ->
     vertices (N, 3) [m, camera frame]."""
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from polysft_mi import prepare
 from polysft_mi.objective.problem import Problem
 from polysft_mi.scene import experiment as scene
-from polysft_mi.surface.chart import State
+from polysft_mi.surface.atlas import State
 from polysft_mi.surface.template import Template
 
 

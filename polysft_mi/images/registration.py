@@ -21,7 +21,7 @@ from polysft_mi.surface.pattern import Pattern
 from . import pixels
 from .frames import Frames
 from .gather import Gather, Images
-from .light import Brightness, areas
+from .light import Brightness
 from .pyramid import POOL, Level, compared
 from .texture import Texture, packed_image
 
@@ -108,7 +108,7 @@ class Registration:
             self._masked,
             self.normalise,
         )
-        self._unit = max(1.0, math.sqrt(areas(position, self.faces).sum()) / _SHEET)
+        self._unit = max(1.0, math.sqrt(_shown_area(position, self.faces)) / _SHEET)
         self._frames = Frames(problem.sequence, self.normalise)
         self._levels, self._last, self._brightness = {}, None, None
 
@@ -333,3 +333,12 @@ class Registration:
         )
         (top, _), (left, _) = pads
         return wide[top : top + inside.shape[0], left : left + inside.shape[1]], inside
+
+
+def _shown_area(position, faces):
+    """Area [pixels^2] of the side of a surface that is turned to the camera, its vertices at
+    ``position`` (N, 2) [pixels]: the larger one, for a sheet may be wound either way."""
+    a, b, c = (position[faces[:, k]] for k in range(3))
+    ab, ac = b - a, c - a
+    signed = 0.5 * (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0])
+    return max(signed[signed > 0].sum(), -signed[signed < 0].sum())

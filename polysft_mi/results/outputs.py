@@ -21,6 +21,18 @@ from polysft_mi.surface import meshio
 from polysft_mi.surface.patch import Unknowns
 
 
+_PARAMS = ("alpha", "patch", "weight", "chart", "rest", "scale", "radius")
+
+
+def _texcoords(template):
+    """Arrays of surface.npz: ``uv`` (M, 2), and ``uv_faces`` (F, 3) where there are seams."""
+    per_vertex = template.texcoords.of_vertices(template.faces)
+    if per_vertex is not None:
+        return {"uv": per_vertex.astype(np.float32)}
+    texcoords = template.texcoords
+    return {"uv": texcoords.coordinates.astype(np.float32), "uv_faces": texcoords.faces}
+
+
 def versions():
     """What a result depends on besides its scene."""
     return {
@@ -89,7 +101,7 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
             temporary,
             vertices=vertices,
             faces=template.faces.astype(np.int32),
-            uv=template.uv.astype(np.float32),
+            **_texcoords(template),
             frames=indices,
             **sigma,
         )
@@ -98,19 +110,17 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
         np.savez_compressed(
             temporary,
             frames=indices,
-            alpha=template.alpha,
-            chart=template.chart,
-            scale=template.scale,
+            **{name: getattr(template, name) for name in _PARAMS},
             frame_rotation=problem.camera.axes @ template.rotation,
             frame_origin=problem.camera.to_camera(template.origin),
+            axes=problem.camera.axes @ template.axes,
             **arrays,
         )
     say("meshes")
     os.makedirs(os.path.join(out, "meshes"), exist_ok=True)
+    source, uv, faces = template.texcoords.split(template.faces)
     for index, v in zip(indices, vertices):
-        meshio.write_ply(
-            os.path.join(out, "meshes", f"{index:03d}.ply"), v, template.faces, template.uv
-        )
+        meshio.write_ply(os.path.join(out, "meshes", f"{index:03d}.ply"), v[source], faces, uv)
     say("pictures")
     (per_frame, box), video = drawn(), bound()
 

@@ -36,6 +36,9 @@ class Rules:
     window: float = _rule(
         8.0, "pixels", "standard deviation of the window of local brightness, likewise"
     )
+    joint: float = _rule(
+        1.0, "", "weight of the squared distances of overlapping patches, over the template's radius"
+    )
     # the step
     small_step: float = _rule(
         2e-3, "share", "of the objective that a step must promise for another one to follow"

@@ -37,11 +37,6 @@ class Settings:
         low=0,
         high=10,
     )
-    fit_tolerance: float = _setting(
-        0.05,
-        "a template farther from its jet than this share of its radius is refused",
-        above=0,
-    )
     k_rgb: float = _setting(1.0, "weight of the photometric loss", low=0)
     k_silhouette: float = _setting(1.0, "weight of the silhouette loss (needs masks)", low=0)
     k_shading: float = _setting(

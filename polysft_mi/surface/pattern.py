@@ -50,10 +50,17 @@ class Pattern:
             self.to_ends @ self.difference
         )  # sum over edges of (x_a - x_b)^2
 
-    def blocks_of(self, matrix):
-        """A sparse matrix (N, N) within the pattern as one number a block, (B,)."""
-        matrix, out = matrix.tocoo(), np.zeros(len(self._keys))
-        out[self.find(matrix.row, matrix.col)] = matrix.data
+    def blocks_of(self, matrix, size=None):
+        """A sparse matrix (N, N) within the pattern as one number a block, (B,); with ``size``, a
+        matrix (size N, size N) as its blocks, (B, size, size)."""
+        matrix = matrix.tocoo()
+        if size is None:
+            out = np.zeros(len(self._keys))
+            out[self.find(matrix.row, matrix.col)] = matrix.data
+            return out
+        out = np.zeros((len(self._keys), size, size))
+        (i, a), (j, b) = np.divmod(matrix.row, size), np.divmod(matrix.col, size)
+        out[self.find(i, j), a, b] = matrix.data
         return out
 
     def find(self, i, j):

@@ -336,10 +336,10 @@ def template_of(sheet, order):
 
 
 def test_a_jet_that_was_turned_is_found_again(sheet):
-    from polysft_mi.surface.chart import Chart
+    from polysft_mi.surface.atlas import Atlas
 
     template, rng = template_of(sheet, 4), np.random.default_rng(0)
-    chart = Chart(template)
+    chart = Atlas(template)
     arrays = {
         "delta_alpha": 0.1 * rng.standard_normal(15),
         **{name: np.zeros(99) for name in ("delta_u", "delta_v", "delta_w")},

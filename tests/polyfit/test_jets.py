@@ -153,7 +153,7 @@ def test_drjit_and_torch_agree(order):
 @pytest.fixture
 def patch():
     """A bent sheet as a patch, and unknowns away from rest."""
-    from polysft_mi.surface.patch import JetPatch, Unknowns
+    from polysft_mi.surface.patch import JetAtlas, Unknowns
     from polysft_mi.surface.template import Template
 
     y, x = np.meshgrid(np.linspace(-0.1, 0.1, 7), np.linspace(-0.15, 0.15, 9), indexing="ij")
@@ -170,7 +170,7 @@ def patch():
         "rotation": np.array([0.1, -0.2, 0.3, 0.9]),
         "translation": 0.1 * RNG.normal(size=3),
     }
-    return JetPatch(template), Unknowns.from_numpy(arrays), arrays
+    return JetAtlas(template), Unknowns.from_numpy(arrays), arrays
 
 
 def test_patch_at_rest_is_the_template(patch):

@@ -15,7 +15,7 @@ from polysft_mi.images.gather import Gather
 from polysft_mi.objective.assembly import Assembly
 from polysft_mi.render.device import on_device
 from polysft_mi.surface.bending import hinges
-from polysft_mi.surface.chart import Chart, State
+from polysft_mi.surface.atlas import Atlas, State
 from polysft_mi.surface.pattern import Pattern
 
 
@@ -112,7 +112,7 @@ def test_all_terms_are_those_of_their_dense_jacobians():
     """
     rng = np.random.default_rng(7)
     template = grid_template()
-    chart, faces, count = Chart(template), template.faces, len(template.chart)
+    chart, faces, count = Atlas(template), template.faces, len(template.chart)
     turn = Rotation.from_rotvec(rng.normal(size=3) * 0.05)
     state = State(
         rng.normal(size=len(chart.bending)) * 0.05,

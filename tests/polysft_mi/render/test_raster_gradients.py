@@ -17,7 +17,7 @@ from raster_scenes import (
 
 from polysft_mi.objective import terms as objective
 from polysft_mi.scene import plugins
-from polysft_mi.surface.patch import JetPatch, Unknowns
+from polysft_mi.surface.patch import JetAtlas, Unknowns
 from polysft_mi.surface.template import Template
 
 
@@ -37,7 +37,7 @@ class Sheet:
         a, b, c, d = i[:-1, :-1].ravel(), i[:-1, 1:].ravel(), i[1:, :-1].ravel(), i[1:, 1:].ravel()
         faces = np.concatenate([np.stack([a, b, c], 1), np.stack([b, d, c], 1)])
         uv = np.stack([x.ravel() / 0.32 + 0.5, y.ravel() / 0.24 + 0.5], 1)
-        self.patch = JetPatch(Template.fit(vertices, faces, uv, 4))
+        self.patch = JetAtlas(Template.fit(vertices, faces, uv, 4))
         mesh = write_mesh(folder / "sheet.ply", vertices, faces, uv)
         v, u = np.meshgrid(np.linspace(0, 1, 192), np.linspace(0, 1, 256), indexing="ij")
         frequency = 5 if kind != "textured" else 30

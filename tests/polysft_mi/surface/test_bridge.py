@@ -15,7 +15,7 @@ from polyfit.network import PolyFit, SpatialTransformer
 from polysft_mi import bridge, capture
 from polysft_mi.objective.problem import Problem
 from polysft_mi.scene import experiment as scene
-from polysft_mi.surface.patch import JetPatch
+from polysft_mi.surface.patch import JetAtlas
 
 RNG = np.random.default_rng(2)
 
@@ -80,7 +80,7 @@ def test_polyfit_sets_up_the_template(bent, network):
     ) == pytest.approx(1)
     frame = network(points[None]).frame[0]
     assert made.rotation == pytest.approx(frame.R.detach().numpy(), abs=1e-5)
-    patch = JetPatch(made)
+    patch = JetAtlas(made)
     assert np.abs(np.array(patch.vertices(patch.rest())).T - points.numpy()).max() < 2e-4
     assert made.residual_max < 2e-4
 
@@ -130,7 +130,7 @@ def test_rendering_in_torch_is_the_problems(bent):
 def test_a_torch_loss_reaches_alpha(bent, network):
     """The loss is one of coefficients that torch fits to the surface that Dr.Jit makes of alpha."""
     problem, points = bent
-    patch = JetPatch(
+    patch = JetAtlas(
         bridge.template(network, points.numpy(), problem.template.faces, problem.template.uv)
     )
     weight = torch.as_tensor(RNG.normal(size=(2, 15)), dtype=torch.float32)
@@ -166,7 +166,7 @@ def test_a_torch_loss_reaches_alpha(bent, network):
 
 def test_gradient_of_the_deformed_patch_in_torch(bent, network):
     problem, points = bent
-    patch = JetPatch(
+    patch = JetAtlas(
         bridge.template(network, points.numpy(), problem.template.faces, problem.template.uv)
     )
     vertices, N = bridge.deformed(patch), len(points)

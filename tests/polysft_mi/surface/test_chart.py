@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from polyfit import jets
 from polysft_mi.surface.bending import hinges
-from polysft_mi.surface.chart import Chart, State
+from polysft_mi.surface.atlas import Atlas, State
 from polysft_mi.surface.patch import Unknowns
 
 RNG = np.random.default_rng(4)
@@ -20,7 +20,7 @@ RNG = np.random.default_rng(4)
 @pytest.mark.parametrize("order", [1, 4, 7, 10])
 def test_chart_is_the_jet_of_polyfit(order):
     template = grid_template(13, 14, order=order)
-    chart = Chart(template)
+    chart = Atlas(template)
     state = some_state(chart, RNG)
     arrays = chart.arrays(state)
     uv = template.chart + state.offset[:, :2]
@@ -41,7 +41,7 @@ def test_chart_is_the_jet_of_polyfit(order):
 
 
 def test_chart_agrees_with_the_device(problem):
-    chart = Chart(problem.template)
+    chart = Atlas(problem.template)
     state = some_state(chart, RNG)
     device = problem.surface(Unknowns.from_numpy(chart.arrays(state)))
     assert (
@@ -51,7 +51,7 @@ def test_chart_agrees_with_the_device(problem):
 
 @pytest.mark.parametrize("order", [4, 10])
 def test_derivatives_of_the_surface(order):
-    chart = Chart(grid_template(13, 14, order=order))
+    chart = Atlas(grid_template(13, 14, order=order))
     state = some_state(chart, RNG)
     step = (
         RNG.normal(size=len(chart.bending) + 6) * 1e-5,
@@ -72,7 +72,7 @@ def test_derivatives_of_the_surface(order):
 
 
 def test_bending_is_the_mean_square_of_second_derivatives():
-    chart = Chart(grid_template())
+    chart = Atlas(grid_template())
     state = dataclasses.replace(
         some_state(chart, RNG),
         alpha=np.linalg.solve(chart.to_monomials, np.array([0, 0, 0, 1.5, 0.5, -1, *np.zeros(9)])),
@@ -83,7 +83,7 @@ def test_bending_is_the_mean_square_of_second_derivatives():
 
 
 def test_towards_goes_on_with_the_motion():
-    chart = Chart(grid_template())
+    chart = Atlas(grid_template())
     a, b = some_state(chart, RNG), some_state(chart, RNG)
     assert np.allclose(a.extrapolated(b, 0).alpha, b.alpha) and np.allclose(
         a.extrapolated(b, -1).offset, a.offset
@@ -95,7 +95,7 @@ def test_towards_goes_on_with_the_motion():
 
 
 def test_rigid_motion_moves_the_template():
-    chart = Chart(grid_template())
+    chart = Atlas(grid_template())
     rest = State(np.zeros(15), np.zeros((42, 3)), Rotation.identity(), np.zeros(3))
     turn, shift = Rotation.from_rotvec([0.2, -0.1, 0.3]), np.array([0.02, -0.01, 0.05])
     state = State(rest.alpha, rest.offset, *chart.rigid(turn, shift))
@@ -105,7 +105,7 @@ def test_rigid_motion_moves_the_template():
 
 
 def test_fitted_finds_the_state_of_given_vertices():
-    chart = Chart(grid_template(11, 11))
+    chart = Atlas(grid_template(11, 11))
     rest = State(np.zeros(15), np.zeros((121, 3)), Rotation.identity(), np.zeros(3))
     smooth = some_state(chart, RNG, 0.03)
     smooth.offset[:, 2] = 0
@@ -115,7 +115,7 @@ def test_fitted_finds_the_state_of_given_vertices():
 
 
 def test_absorbed_leaves_the_surface_and_as_little_relief_as_the_jet_can():
-    chart = Chart(grid_template(13, 14, order=4))
+    chart = Atlas(grid_template(13, 14, order=4))
     state = some_state(chart, RNG)
     fine = (
         state.offset[:, 2] + chart.surface(state).basis @ RNG.normal(size=len(chart.bending)) * 0.1
