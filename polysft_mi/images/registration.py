@@ -56,11 +56,13 @@ class Appearance:
     """How a sheet looks in a frame, beyond what its blurred texture tells.
 
     ``excess``: colours of the texture less those of the sheet's image, a
-    :class:`polysft_mi.images.pixels.Image` on a part of the level's grid; ``luminance`` (F,): of
-    the triangles' texture as the image shows it, over its mean, or None.
+    :class:`polysft_mi.images.pixels.Image` on a part of the level's grid; ``misfit``: what it alone
+    would be as a misfit; ``luminance`` (F,): of the triangles' texture as the image shows it, over
+    its mean, or None.
     """
 
     excess: pixels.Image
+    misfit: float
     luminance: np.ndarray | None = None
 
 
@@ -163,6 +165,14 @@ class Registration:
         return True
 
     # -- a surface against a frame -------------------------------------------
+
+    def seen_vertices(self, vertices, blur):
+        """Which vertices of a surface belong to a triangle that a pixel sees, (N,) bool."""
+        with dr.suspend_grad():
+            triangle = np.array(self._view(vertices, self._level(blur)).triangle)
+        seen = np.zeros(len(vertices), dtype=bool)
+        seen[self.faces[np.unique(triangle[triangle >= 0])]] = True
+        return seen
 
     def misfit(self, vertices, frame, blur):
         """The mean of r^2 / (r^2 + c^2) over the pixels that are compared, 0 to 1, with a fixed c;
@@ -274,13 +284,15 @@ class Registration:
                 known = (distance > border).astype(np.float32)
             known = (known > 0)[..., None] & (template[..., 3:] > 0.5)
             excess = np.where(known, template[..., :3] - image, 0)
+            squared = (excess**2).sum(-1) / 3
+            misfit = float((squared / (squared + pixels.MISFIT**2)).sum() / max(inside.sum(), 1.0))
             excess = pixels.Image.of(packed_image(excess, np.zeros_like(inside)), (h, w), corner)
         luminance = None
         if shaded:
             position, _ = self.camera.project(vertices)
             at = position / level.stride - corner
             luminance = self.brightness.texture_luminance(found[..., :3], inside, level.stride, at)
-        return Appearance(excess, luminance)
+        return Appearance(excess, misfit, luminance)
 
     # -- parts ----------------------------------------------------------------
 

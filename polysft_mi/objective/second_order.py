@@ -18,6 +18,7 @@ from polysft_mi.surface.bending import hinges, slides
 from polysft_mi.surface.atlas import Atlas, State, Surface
 
 from .assembly import Assembly, Normal
+from .hidden import Hidden
 from .joints import Joints
 
 
@@ -55,7 +56,8 @@ class Context:
     ``frame``: its number; ``anchor``: the state that it is held to (of the frame before);
     ``noise``: the least misfit so far, NaN in the first frame, where the template has its shape;
     ``light``: what the frames before say of it; ``scales``: robust scale by stage, of the frame
-    before; ``hold``: weight of the squared difference to the anchor, motion included.
+    before; ``hold``: weight of the squared difference to the anchor, motion included; ``hidden``:
+    what holds the parts that no pixel sees.
     """
 
     frame: int
@@ -64,6 +66,7 @@ class Context:
     light: Light
     scales: dict
     hold: float = 0.0
+    hidden: Hidden | None = None
 
     @property
     def is_first(self):
@@ -113,20 +116,22 @@ class SecondOrder:
         self.images, self.atlas = Registration(problem), Atlas(template)
         faces = self.images.faces
         self.pattern = self.images.pattern
-        self._bends = hinges(template.vertices / template.scale, faces)[1]
+        #: (H, N): bends of the heights at the inner edges
+        self.bends = hinges(template.vertices / template.scale, faces)[1]
         self._assembly = Assembly(self.images.pattern, self.images.gather, self.atlas)
-        # a hinge reaches a vertex beyond the neighbours: with it the elimination would take four
-        # times as long
-        bends = self.pattern.bound_of(self._bends.T @ self._bends)
-        self._relief_blocks = self.pattern.laplacian + self.rules.relief_bend * bends
         #: differences of (Δu, Δv) along the edges, in the axes of the first end, (2E, 2N)
-        self._slides = slides(template.edges, template.axes)
-        self._slide_blocks = self.pattern.blocks_of(self._slides.T @ self._slides, 2)
+        self.slides = slides(template.edges, template.axes)
         self._joints = Joints(self.atlas)
         self._lengths = np.array(problem.edge_lengths, dtype=np.float64)
         self.has_relief = self.settings.k_relief > 0 and count <= self.rules.relief_vertices
         #: the weight that holds a frame's jets and displacements to the frame before
         self.temporal = self.settings.k_tc * self.rules.temporal
+
+    def hidden(self, state):
+        """The :class:`polysft_mi.objective.hidden.Hidden` of a surface."""
+        seen = self.images.seen_vertices(self.atlas.surface(state).vertices, self.rules.blurs[-1])
+        hold = self.rules.unseen if len(self.atlas) > 1 else 1.0
+        return Hidden.of(seen, hold, self)
 
     def appearance(self, state, stage, light):
         """The :class:`polysft_mi.images.registration.Appearance` of a sheet at the start of a
@@ -200,11 +205,13 @@ class SecondOrder:
         weight = np.full(size + 6, context.hold)
         weight[:size] += self.temporal
         moved = state.difference(anchor)
-        pull, own = 2 * weight * moved, np.diag(2 * weight)
-        bend = 2 * s.k_bend * self.atlas.bending
-        pull[:, :size] += state.alpha @ bend
-        own[:size, :size] += bend
-        normal.glob += np.kron(np.eye(patches), own)
+        pull = 2 * weight * moved
+        for k in range(patches):
+            bend = 2 * s.k_bend * context.hidden.patches[k] * self.atlas.bending
+            pull[k, :size] += bend @ state.alpha[k]
+            jet = slice(k * (size + 6), k * (size + 6) + size)
+            normal.glob[jet, jet] += bend
+        normal.glob += np.diag(np.tile(2 * weight, patches))
         normal.gradient += pull.ravel()
         joined = self._joints.add(normal, surface, self.rules.joint)
         return float((weight * moved**2).sum()), joined
@@ -215,19 +222,21 @@ class SecondOrder:
         """
         s, pattern, height = self.settings, self.pattern, state.offset[:, 2]
         slid, along = state.offset - context.anchor.offset, state.offset[:, :2].ravel()
-        apart, steps, bent = self._slides @ along, pattern.difference @ height, self._bends @ height
-        bending = relief * self.rules.relief_bend
+        held, bending = context.hidden, relief * self.rules.relief_bend
+        apart, steps, bent = self.slides @ along, pattern.difference @ height, self.bends @ height
         pull = self.temporal * slid
-        pull[:, :2] += s.k_uv * (self._slides.T @ apart).reshape(-1, 2)
-        pull[:, 2] += relief * (pattern.to_ends @ steps) + bending * (self._bends.T @ bent)
+        pull[:, :2] += s.k_uv * (self.slides.T @ (np.repeat(held.edges, 2) * apart)).reshape(-1, 2)
+        pull[:, 2] += relief * (pattern.to_ends @ (held.edges * steps))
+        pull[:, 2] += bending * (self.bends.T @ bent)
         normal.local_gradient += 2 * pull[:, :d]
-        normal.local[:, :2, :2] += 2 * s.k_uv * self._slide_blocks
+        normal.local[:, :2, :2] += 2 * s.k_uv * held.slide_blocks
         if d == 3:
-            normal.local[:, 2, 2] += 2 * relief * self._relief_blocks
+            normal.local[:, 2, 2] += 2 * relief * held.relief_blocks
         for k in range(d):
             normal.local[pattern.diagonal, k, k] += 2 * self.temporal
-        smoothness = s.k_bend * float(((state.alpha @ self.atlas.bending) * state.alpha).sum())
-        smoothness += s.k_uv * float(apart @ apart)
-        smoothness += relief * float(steps @ steps) + bending * float(bent @ bent)
+        bend = ((state.alpha @ self.atlas.bending) * state.alpha).sum(1)
+        smoothness = s.k_bend * float(held.patches @ bend)
+        smoothness += s.k_uv * float(np.repeat(held.edges, 2) @ apart**2)
+        smoothness += relief * float(held.edges @ steps**2) + bending * float(bent @ bent)
         return smoothness, self.temporal * float((slid**2).sum())
 

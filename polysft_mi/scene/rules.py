@@ -36,6 +36,11 @@ class Rules:
     window: float = _rule(
         8.0, "pixels", "standard deviation of the window of local brightness, likewise"
     )
+    unseen: float = _rule(
+        100.0,
+        "",
+        "factor of the weights of smoothness where no pixel sees a surface of several patches",
+    )
     joint: float = _rule(
         1.0, "", "weight of the squared distances of overlapping patches, over the template's radius"
     )

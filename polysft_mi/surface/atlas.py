@@ -14,6 +14,9 @@ from scipy.spatial.transform import Rotation
 from polyfit.jets import exponents
 
 
+_SAME = 1e-4  # of the template's scale: surfaces that are the same
+
+
 @dataclass
 class State:
     """Unknowns of a frame on the host, float64: ``alpha`` (K, A), the offsets of the coefficients
@@ -281,9 +284,12 @@ class Atlas:
             for _ in range(2):
                 now = self.surface(found)
                 missing = surface.vertices - now.vertices
-                found.offset = found.offset + np.linalg.solve(
-                    now.offset_jacobian, missing[..., None]
-                )[..., 0]
+                change = np.linalg.solve(now.offset_jacobian, missing[..., None])[..., 0]
+                found.offset = found.offset + change
+            left = np.abs(self.surface(found).vertices - surface.vertices).max()
+            less = (found.offset**2).sum() < (state.offset**2).sum()
+            if not (less and left < _SAME * self.template.scale):
+                return state
         return found
 
 

@@ -22,6 +22,9 @@ from polyfit.patches.atlas import Cover, is_graph
 from polysft_mi.errors import InputError
 
 
+_RIDGE = 1e-3  # of a jet's mean square, that holds it where several patches share a surface
+
+
 @dataclass(frozen=True)
 class Template:
     """A surface of K patches S_k = {O_k, phi_k(u, v)}, of N vertices, float64.
@@ -159,10 +162,11 @@ def _jets(x, patch, held, count, order, exact, where):
     """(alpha (K, A), rest (N, M)): jets through the points ``x`` (N, M, 3) of the charts, and their
     heights over them.
     """
-    found = []
+    # where the rim of a patch is steep, as a shirt's at its seams, a jet that is free would swing
+    ridge, found = _RIDGE if count > 1 else 0.0, []
     for k in range(count):
         points = x[held & (patch == k)]
-        coefficients, fitted = _fitted(points, order)
+        coefficients, fitted = _fitted(points, order, ridge)
         if fitted < order and exact:
             wanted = f"a jet of order {order} has {size_of(order)} coefficients"
             few = f"the {len(points)} vertices determine no more than order {fitted}"
@@ -171,7 +175,7 @@ def _jets(x, patch, held, count, order, exact, where):
     least = min(fitted for _, fitted in found)
     alpha = np.stack(
         [
-            _fitted(x[held & (patch == k)], least)[0] if fitted > least else c[: size_of(least)]
+            _fitted(x[held & (patch == k)], least, ridge)[0] if fitted > least else c[: size_of(least)]
             for k, (c, fitted) in enumerate(found)
         ]
     )
@@ -250,10 +254,10 @@ def _side(along):
     return -1.0 if (skew if abs(skew) > 1e-9 else along[far.argmax()]) < 0 else 1.0
 
 
-def _fitted(x, order):
+def _fitted(x, order, ridge=0.0):
     """(coefficients (A,), order) of the least-squares jet of ``order`` through points x (P, 3) of a
     chart, or of the highest order that they determine: products of Chebyshev polynomials in the
-    points' box, turned into monomials."""
+    points' box, turned into monomials; ``ridge`` holds their coefficients."""
     powers = exponents(order)
     low, high = x[:, :2].min(0), x[:, :2].max(0)
     centre, half = (low + high) / 2, (high - low) / 2
@@ -269,7 +273,9 @@ def _fitted(x, order):
     fitted = int(min(powers.sum(1)[kept < DETERMINED_RMS], default=order + 1)) - 1
     size = size_of(fitted)
     solution = np.zeros(len(powers))
-    solution[:size] = np.linalg.lstsq(basis[:, :size], x[:, 2] / np.sqrt(len(x)), rcond=None)[0]
+    rows = np.concatenate([basis[:, :size], np.sqrt(ridge) * np.eye(size)[: size if ridge else 0]])
+    right = np.concatenate([x[:, 2] / np.sqrt(len(x)), np.zeros(len(rows) - len(x))])
+    solution[:size] = np.linalg.lstsq(rows, right, rcond=None)[0]
     axes = [
         [
             Chebyshev.basis(n, domain=[c - h, c + h]).convert(kind=Polynomial).coef

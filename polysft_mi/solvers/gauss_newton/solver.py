@@ -138,7 +138,8 @@ class GaussNewton:
         stages = self._descent.far, *self._descent.usual
         scales = {stage: last.get(f"scale_{k}") or first for k, stage in enumerate(stages)}
         light = Light.of(_last(known, "light"), self._descent.rules)
-        return Context(frame, anchor, noise, light, scales)
+        hidden = self._descent.objective.hidden(anchor)
+        return Context(frame, anchor, noise, light, scales, hidden=hidden)
 
     def _facts(self, found, context, known):
         """What the frames that follow want to know of this one.
@@ -162,7 +163,7 @@ class GaussNewton:
 
     def _least_misfit(self, found, context, known):
         """The least misfit of the frames so far, the first one aside, of the texture as the
-        template has it: what the camera's blur makes of it is no noise. NaN in the first frame.
+        template has it, less what the sheet's slant and folds account for. NaN in the first frame.
         """
         if not known:
             return math.nan
@@ -171,7 +172,9 @@ class GaussNewton:
         if found.misfit > least:
             return least
         blur, vertices = self._descent.usual[-1].blur, found.model.surface.vertices
-        return float(np.fmin(least, self._images.misfit(vertices, context.frame, blur)))
+        bare, appearance = self._images.misfit(vertices, context.frame, blur), found.model.appearance
+        known = appearance.misfit if appearance else 0.0
+        return float(np.fmin(least, max(found.misfit, bare - known)))
 
     def _solution(self, states, results, facts):
         """:class:`Solution` of a window: its states, the mean of their terms, and the facts of its

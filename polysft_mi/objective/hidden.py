@@ -1,0 +1,47 @@
+"""What holds the parts of a surface that no pixel sees: its shape at rest, more firmly there.
+
+Where pixels see a surface, little is asked of its displacements. The back of a sleeve has no pixel;
+there, neighbouring displacements and the jets' bending against the template weigh more. NumPy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """Factors of the weights of smoothness: ``edges`` (E,) and ``patches`` (K,), 1 where a surface
+    is seen; and with them the curvature of the displacements along the edges, ``slide_blocks`` (B,
+    2, 2), and of the relief, ``relief_blocks`` (B,)."""
+
+    edges: np.ndarray
+    patches: np.ndarray
+    slide_blocks: np.ndarray
+    relief_blocks: np.ndarray
+
+    @classmethod
+    def of(cls, seen, hold, objective):
+        """From the vertices that are ``seen`` (N,) bool; ``hold``: the factor where nothing is.
+
+        ``objective``: a :class:`polysft_mi.objective.second_order.SecondOrder`.
+        """
+        pattern, atlas = objective.pattern, objective.atlas
+        edges = hold ** (~seen[pattern.edges]).mean(1)
+        entries = np.bincount(atlas.entry_patch, minlength=len(atlas))
+        unseen = np.bincount(atlas.entry_patch, ~seen[atlas.entry_vertex], minlength=len(atlas))
+        slides, difference = objective.slides, pattern.difference
+        weight = sp.diags(np.repeat(edges, 2))
+        # a hinge reaches a vertex beyond the neighbours: with it the elimination would take four
+        # times as long
+        bends = pattern.bound_of(objective.bends.T @ objective.bends)
+        relief = pattern.blocks_of(difference.T @ sp.diags(edges) @ difference)
+        return cls(
+            edges,
+            hold ** (unseen / entries),
+            pattern.blocks_of(slides.T @ weight @ slides, 2),
+            relief + objective.rules.relief_bend * bends,
+        )
