@@ -158,6 +158,8 @@ class SecondOrder:
         if stiffness is not None:
             give = math.inf
         stiffness = s.k_mi * (stiffness or stage.stiffness) / atlas.template.scale**2
+        if len(atlas) > 1:
+            stiffness *= rules.rounded_stiffness
         d = 3 if self.has_relief and stage.relief and not context.is_first else 2
         shading, rows = self._shading(surface, context, stage, seen, appearance)
         normal, inextensibility = self._assembly.normal(

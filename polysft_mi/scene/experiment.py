@@ -230,7 +230,7 @@ def _template(mesh, source, settings, template):
         vertices,
         faces,
         texcoords,
-        settings.jet_order,
+        settings.jet_order,  # of as many patches as it turns out to need
         exact=settings.order > 0,
         where=where,
     )

@@ -32,8 +32,8 @@ class Settings:
     stride: int = _setting(1, "use every stride-th image", low=1)
     order: int = _setting(
         0,
-        "order n of the jet; 0: 8 for gauss-newton, 4 (the paper's) for adam, or less if the"
-        " template has too few vertices",
+        "order n of the jets; 0: 8 for gauss-newton, 5 where the template has several patches, 4"
+        " (the paper's) for adam, or less if the template has too few vertices",
         low=0,
         high=10,
     )
@@ -121,10 +121,9 @@ class Settings:
             else {"gauss-newton": "local", "adam": "none"}[self.solver]
         )
 
-    @property
-    def jet_order(self) -> int:
-        """The order of the jet, where the template's vertices determine it."""
-        return self.order or {"gauss-newton": 8, "adam": 4}[self.solver]
+    def jet_order(self, patches: int) -> int:
+        """The order of the jets of so many patches, where the template's vertices determine it."""
+        return self.order or (4 if self.solver == "adam" else 8 if patches == 1 else 5)
 
     def __post_init__(self):
         for f in dataclasses.fields(self):

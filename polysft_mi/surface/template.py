@@ -101,7 +101,8 @@ class Template:
         float64, or else in its PCA frame; several where the mesh is no height graph there.
 
         ``uv``: texture coordinates (N, 2), or :class:`polyfit.mesh.TexCoords`.
-        Where not ``exact``, vertices that determine less get the highest order that they do. Raises
+        ``order`` may be a function of the number of patches. Where not ``exact``, vertices that
+        determine less get the highest order that they do. Raises
         InputError where the order is too high for the vertices (if ``exact``), or where ``frame``
         is given and one patch cannot hold the mesh.
         """
@@ -130,6 +131,7 @@ class Template:
                 for k, normal in enumerate(cover.normal)
             ]
             axes = _tangent_axes(points, faces, patch[:, 0], np.stack([R for _, R, _ in frames]))
+        order = order(len(frames)) if callable(order) else order
         radius, rotation, origin = (np.array(x) for x in zip(*frames))
         x = np.einsum("nmij,nmi->nmj", rotation[patch], points[:, None] - origin[patch])
         x /= radius[patch][..., None]
