@@ -50,12 +50,12 @@ def measured(path, overrides, turns):
     experiment = scene.load(path, {**overrides, "solver": "gauss-newton"})
     problem = Problem(experiment, experiment.sequence())
     objective = SecondOrder(problem)
-    descent, chart, images = Descent(objective), objective.chart, objective.images
+    descent, atlas, images = Descent(objective), objective.atlas, objective.images
     level = images._level(descent.usual[-1].blur)
     wide = objective.patterns[3] if objective.has_relief else None
-    rest = chart.state(problem.patch.rest().to_numpy())
+    rest = atlas.state(problem.patch.rest().to_numpy())
     rest.translation += 0.005
-    surface = chart.surface(rest)
+    surface = atlas.surface(rest)
     vertices, at = surface.vertices, images._frames.level(1, level)
     with dr.suspend_grad():
         view = images._view(vertices, level)
@@ -94,7 +94,7 @@ def measured(path, overrides, turns):
             dr.eval(images._outline(*outline))
 
     parts = {
-        "surface of the unknowns": lambda: chart.surface(rest),
+        "surface of the unknowns": lambda: atlas.surface(rest),
         "visibility: the mesh put into the scene, a ray a pixel": look,
         "residuals, derivatives, sums over triangles": lambda: dr.eval(images._sums(*given)),
         "silhouette": silhouette,

@@ -182,7 +182,7 @@ def picture(path, problem, frame, surfaces, counts, rows, usual, truth):
         for j in range(
             2
         ):  # lines of equal u and of equal v: the template's own grid of ten by ten cells
-            uv = template.uv[:, j]
+            uv = template.texcoords.of_vertices(template.faces)[:, j]
             levels = np.linspace(uv.min(), uv.max(), 11)[1:-1]
             over.tricontour(
                 xy[:, 0],

@@ -17,6 +17,15 @@ def small_cloth(folder, frames):
     return synthetic.cloth(folder / "cloth", frames=frames, size=(160, 120), rows=9, columns=12)
 
 
+def small_tube(folder, frames):
+    """A sleeve of 9 x 18 vertices, whose texture has a seam, in images of 160 x 120, in the new
+    folder ``folder``/tube.
+    """
+    return synthetic.cloth(
+        folder / "tube", frames=frames, size=(160, 120), rows=9, columns=18, shape=synthetic.tube
+    )
+
+
 def problem_of(folder, rules=None, **settings):
     """The problem of a folder of :mod:`synthetic`, under ``rules`` and settings."""
     prepare.main([str(folder), "--overwrite"])

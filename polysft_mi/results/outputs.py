@@ -24,7 +24,7 @@ from polysft_mi.surface.patch import Unknowns
 _PARAMS = ("alpha", "patch", "weight", "chart", "rest", "scale", "radius")
 
 
-def _texcoords(template):
+def texcoords_of(template):
     """Arrays of surface.npz: ``uv`` (M, 2), and ``uv_faces`` (F, 3) where there are seams."""
     per_vertex = template.texcoords.of_vertices(template.faces)
     if per_vertex is not None:
@@ -101,7 +101,7 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
             temporary,
             vertices=vertices,
             faces=template.faces.astype(np.int32),
-            **_texcoords(template),
+            **texcoords_of(template),
             frames=indices,
             **sigma,
         )
