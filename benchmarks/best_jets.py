@@ -126,7 +126,9 @@ def fitted(atlas, state, vertices, iterations=8, bending=1e-6):
         g = np.linalg.solve(
             square + 1e-6 * np.trace(square) / len(square) * np.eye(len(square)), right
         )
-        rest = missing - (surface.basis @ g[:size])[:, None] * up - surface.motion_jacobian @ g[size:]
+        rest = (
+            missing - (surface.basis @ g[:size])[:, None] * up - surface.motion_jacobian @ g[size:]
+        )
         square = tangents.transpose(0, 2, 1) @ tangents
         right = np.einsum("nka,nk->na", tangents, rest)[:, :, None]
         state = state.after_step((g, np.linalg.solve(square, right)[:, :, 0]))

@@ -147,6 +147,7 @@ def write(problem, surfaces, rows, out, **options):
     ``metrics.json`` begins with.
     """
     from polysft_mi.results import outputs
+    from polysft_mi.results.truth import uv_arrays
 
     template = problem.template
     indices = np.asarray(problem.sequence.indices, dtype=np.int64)
@@ -156,7 +157,7 @@ def write(problem, surfaces, rows, out, **options):
             temporary,
             vertices=surfaces,
             faces=faces,
-            **outputs.texcoords_of(template),
+            **uv_arrays(template.texcoords, template.faces),
             frames=indices,
         )
     summary = {

@@ -237,7 +237,9 @@ def bending_frames(photo, camera, count, finer=3):
     size = finer * camera.width, finer * camera.height
     for k in range(count):
         x = finer * camera.project(bending(mesh.uv, k / (count - 1)))
-        frame = photo_on_frame(np.full((size[1], size[0], 3), 45, np.uint8), photo, mesh, x)
+        frame = photo_on_frame(
+            np.full((size[1], size[0], 3), 45, np.uint8), photo, mesh.uv, mesh.faces, x
+        )
         frame = cv2.resize(frame, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
         noisy = frame + random.normal(0, 2, frame.shape)
         yield np.clip(noisy, 0, 255).astype(np.uint8)

@@ -198,7 +198,9 @@ def picture(path, problem, frame, surfaces, counts, rows, usual, truth):
         over.set_xlim(low[0], high[0]), over.set_ylim(high[1], low[1])
         over.set_title(label, fontsize=10)
         beside.imshow(
-            shading.shade_surface(V, template.faces, view, uv=template.uv, size=(360, 300))
+            shading.shade_surface(
+                V, template.faces, view, uv=template.texcoords.corners, size=(360, 300)
+            )
         )
         if k < len(counts):
             row = rows[counts[k]]

@@ -168,9 +168,7 @@ def write_obj(path, vertices, uv, polygons):
     path.write_text("\n".join(lines) + "\n")
 
 
-def _make(
-    folder, images, frames, size, rows, columns, masks, K, light=None, shape=sheet, **motion
-):
+def _make(folder, images, frames, size, rows, columns, masks, K, light=None, shape=sheet, **motion):
     folder.mkdir(parents=True, exist_ok=True)
     vertices = np.stack(
         [shape(k / max(frames - 1, 1), rows, columns, **motion) for k in range(frames)]

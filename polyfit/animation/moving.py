@@ -8,7 +8,7 @@ import io
 import numpy as np
 
 from polyfit.errors import InputError
-from polyfit.mesh import face_vectors
+from polyfit.mesh import TexCoords, face_vectors
 
 # Rotations from OpenCV's camera axes to axes with y or z up
 AXES_FROM_CAMERA = {
@@ -41,6 +41,9 @@ def normals(vertices, faces):
 
 
 def checked(vertices, faces, uv, fps):
+    """(V, F, :class:`polyfit.mesh.TexCoords` or None): the arguments of a writer, in their types.
+    Raises InputError.
+    """
     V, F = np.asarray(vertices, np.float32), np.asarray(faces, np.int64)
     if (
         V.ndim != 3
@@ -61,10 +64,16 @@ def checked(vertices, faces, uv, fps):
     if not (np.isfinite(fps) and fps > 0):
         raise InputError(f"animation: {fps} frames a second; a positive number is needed")
     if uv is not None:
-        uv = np.asarray(uv, np.float32)
-        if uv.shape != (V.shape[1], 2):
-            raise InputError(f"animation: uv {uv.shape}; ({V.shape[1]}, 2) is needed")
-        uv = np.nan_to_num(uv)
+        if not isinstance(uv, TexCoords):
+            uv = np.asarray(uv, np.float32)
+            if uv.shape != (V.shape[1], 2):
+                raise InputError(f"animation: uv {uv.shape}; ({V.shape[1]}, 2) is needed")
+            uv = TexCoords(uv, F)
+        elif uv.faces.shape != F.shape:
+            raise InputError(
+                f"animation: uv of {len(uv.faces)} faces; those of the {len(F)} are needed"
+            )
+        uv = TexCoords(np.nan_to_num(np.asarray(uv.coordinates, np.float32)), uv.faces)
     return V, F, uv
 
 

@@ -40,7 +40,7 @@ def prepare_folder(
         )
     else:
         where = os.path.join(folder, layout.obj)
-        vertices, faces, uv = meshio.read_template(where)
+        vertices, faces, uv = meshio.read_textured_template(where)
     meshio.check_template(vertices, faces, uv, where)
     _check_view(vertices * ((-1, -1, 1) if layout.flip else 1), camera, where)
 

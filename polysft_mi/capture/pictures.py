@@ -118,28 +118,31 @@ def pose(frame, photo, sheet, placed, camera):
     for loop in loops(sheet.faces):
         draw(np.stack([loop, np.roll(loop, -1)], axis=1), YELLOW, 2)
     label(wired, "the template in the first frame")
-    beside, _ = _canvas(photo_on_frame(frame, photo, sheet, x))
+    shown = sheet.in_view(placed, camera)
+    beside, _ = _canvas(photo_on_frame(frame, photo, sheet.uv, shown, x))
     label(beside, "the photo, placed on the template")
     return np.hstack([wired, np.full((wired.shape[0], 4, 3), 255, np.uint8), beside])
 
 
-def photo_on_frame(frame, photo, sheet, x):
-    """The frame (H, W, 3), and on it the photo where the vertices' pixels ``x`` (N, 2) have it."""
+def photo_on_frame(frame, photo, uv, faces, x):
+    """The frame (H, W, 3), and on it the photo where the vertices' pixels ``x`` (N, 2) have it;
+    ``uv`` (N, 2), ``faces`` (F, 3): of what is seen of the template.
+    """
     from matplotlib.tri import Triangulation
 
     try:
-        finder = Triangulation(*x.T, triangles=sheet.faces).get_trifinder()
+        finder = Triangulation(*x.T, triangles=faces).get_trifinder()
     except (RuntimeError, ValueError):  # a template that hides a part of itself
         return frame
     columns, rows = np.meshgrid(np.arange(frame.shape[1]) + 0.5, np.arange(frame.shape[0]) + 0.5)
     face = finder(columns, rows)
     seen = face >= 0
-    corners = sheet.faces[face[seen]]
+    corners = faces[face[seen]]
     a, b, c = (x[corners[:, k]] for k in range(3))
     p = np.column_stack([columns[seen], rows[seen]])
     t = np.linalg.solve(np.stack([b - a, c - a], axis=2), (p - a)[..., None])[..., 0]
-    u, v, w = (sheet.uv[corners[:, k]] for k in range(3))
-    uv = u + t[:, :1] * (v - u) + t[:, 1:] * (w - u)
+    u, v, w = (uv[corners[:, k]] for k in range(3))
+    at = u + t[:, :1] * (v - u) + t[:, 1:] * (w - u)
     side = max(1.0, max(photo.shape[:2]) / max(np.ptp(p, axis=0).max() if len(p) else 1, 1))
     photo = (
         cv2.resize(photo, None, fx=1 / side, fy=1 / side, interpolation=cv2.INTER_AREA)
@@ -147,7 +150,7 @@ def photo_on_frame(frame, photo, sheet, x):
         else photo
     )
     maps = np.stack(
-        [uv[:, 0] * photo.shape[1] - 0.5, (1 - uv[:, 1]) * photo.shape[0] - 0.5], axis=-1
+        [at[:, 0] * photo.shape[1] - 0.5, (1 - at[:, 1]) * photo.shape[0] - 0.5], axis=-1
     ).astype(np.float32)
     whole = np.full((*frame.shape[:2], 2), -1, np.float32)
     whole[seen] = maps

@@ -14,8 +14,8 @@ import numpy as np
 from polysft_mi.errors import BadFrame
 from polysft_mi.images.light import Light, residuals
 from polysft_mi.images.registration import Appearance, Evaluation, Registration
-from polysft_mi.surface.bending import hinges, slides
 from polysft_mi.surface.atlas import Atlas, State, Surface
+from polysft_mi.surface.bending import hinges, slides
 from polysft_mi.surface.pattern import Pattern
 
 from .assembly import Assembly, Normal
@@ -234,4 +234,3 @@ class SecondOrder:
         smoothness += s.k_uv * float(apart @ apart)
         smoothness += relief * float(steps @ steps) + bending * float(bent @ bent)
         return smoothness, self.temporal * float((slid**2).sum())
-

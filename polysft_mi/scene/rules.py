@@ -37,7 +37,9 @@ class Rules:
         8.0, "pixels", "standard deviation of the window of local brightness, likewise"
     )
     joint: float = _rule(
-        1.0, "", "weight of the squared distances of overlapping patches, over the template's radius"
+        1.0,
+        "",
+        "weight of the squared distances of overlapping patches, over the template's radius",
     )
     # the step
     small_step: float = _rule(

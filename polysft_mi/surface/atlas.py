@@ -252,9 +252,9 @@ class Atlas:
             for _ in range(2):
                 now = self.surface(found)
                 missing = surface.vertices - now.vertices
-                found.offset = found.offset + np.linalg.solve(
-                    now.offset_jacobian, missing[..., None]
-                )[..., 0]
+                found.offset = (
+                    found.offset + np.linalg.solve(now.offset_jacobian, missing[..., None])[..., 0]
+                )
         return found
 
 

@@ -154,9 +154,7 @@ class JetAtlas:
         d = mi.Vector3f(unknowns.delta_u, unknowns.delta_v, unknowns.delta_w)
         if layer.to_chart is not None:
             d = mi.Vector3f(*(dr.dot(row, d) for row in layer.to_chart), layer.lift * d.z)
-        alpha = jet.Coefficients(
-            self.alpha + unknowns.delta_alpha, self._coefficients, layer.patch
-        )
+        alpha = jet.Coefficients(self.alpha + unknowns.delta_alpha, self._coefficients, layer.patch)
         return alpha, layer.u + d.x, layer.v + d.y, layer.rest + d.z
 
     def _turned(self, layer, x, unknowns):

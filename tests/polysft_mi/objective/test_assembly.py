@@ -120,7 +120,9 @@ def test_all_terms_are_those_of_their_dense_jacobians(make):
     state = some_state(chart, rng)
     vertices = chart.surface(state).vertices
     camera, pattern = pinhole(rng, vertices), Pattern(faces, template.edges, count)
-    wider = Pattern(faces, template.edges, count, hinges(template.vertices / template.scale, faces)[0])
+    wider = Pattern(
+        faces, template.edges, count, hinges(template.vertices / template.scale, faces)[0]
+    )
     gather = Gather(pattern, camera)
     assembly = Assembly(pattern, gather, chart)
     images = np.zeros((2 * count, 3 * count))
@@ -168,7 +170,9 @@ def test_all_terms_are_those_of_their_dense_jacobians(make):
                 - chart.surface(state.after_step(parts, -1e-5)).vertices
             ).ravel() / 2e-5
 
-        by = np.stack([moved(row) for row in np.eye(d * count + template.alpha.size + 6 * len(chart))], 1)
+        by = np.stack(
+            [moved(row) for row in np.eye(d * count + template.alpha.size + 6 * len(chart))], 1
+        )
         wide = wider if d == 3 else None
         surface = chart.surface(state)
         normal, found = assembly.normal(
@@ -188,9 +192,7 @@ def joined(make, rng, size=0.05):
     chart = Atlas(make())
     globals_ = chart.template.alpha.size + 6 * len(chart)
     nothing = np.zeros(0)
-    normal = Normal(
-        nothing, nothing, np.zeros((globals_, globals_)), nothing, np.zeros(globals_)
-    )
+    normal = Normal(nothing, nothing, np.zeros((globals_, globals_)), nothing, np.zeros(globals_))
     return chart, Joints(chart), some_state(chart, rng, size), normal
 
 

@@ -114,15 +114,18 @@ def direction_of(name, shape):
     return out / np.linalg.norm(out)
 
 
-@pytest.mark.parametrize("kind", ["smooth", "textured", "self-occluding", "behind", "partly out", "tube"])
+@pytest.mark.parametrize(
+    "kind", ["smooth", "textured", "self-occluding", "behind", "partly out", "tube"]
+)
 def test_gradients_against_finite_differences(tmp_path, kind):
     sheet = Sheet(tmp_path, kind)
     rng = np.random.default_rng(5)
+    shift = (0.03 * rng.normal(size=sheet.arrays["delta_alpha"].shape)).astype(np.float32)
     goal = Unknowns.from_numpy(
         {
             **sheet.arrays,
             "translation": sheet.arrays["translation"] + np.array([0.03, -0.02, 0.05], np.float32),
-            "delta_alpha": sheet.arrays["delta_alpha"] + np.float32(0.03) * rng.normal(size=sheet.arrays["delta_alpha"].shape).astype(np.float32)
+            "delta_alpha": sheet.arrays["delta_alpha"] + shift
         }
     )  # fmt: skip
     target = dr.detach(sheet.image(goal))
@@ -155,7 +158,8 @@ def test_gradients_against_finite_differences(tmp_path, kind):
             ]
             fd = float(np.median(slopes))
             # of a direction across the gradient, what its length would give
-            assert abs(ad - fd) <= 0.05 * max(
+            share = 0.1 if kind == "tube" else 0.05  # its outline passes from edge to edge
+            assert abs(ad - fd) <= share * max(
                 abs(fd), 0.25 * np.linalg.norm(gradient) * np.linalg.norm(direction), 2.0
             ), f"{kind}, channels {channels}, {name}: AD {ad:.4g}, finite differences {fd:.4g}"
 

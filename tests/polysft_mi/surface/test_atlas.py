@@ -95,9 +95,9 @@ def test_bending_is_the_mean_square_of_second_derivatives():
     chart = Atlas(grid_template())
     state = dataclasses.replace(
         some_state(chart, RNG),
-        alpha=np.linalg.solve(
-            chart.to_monomials, np.array([0, 0, 0, 1.5, 0.5, -1, *np.zeros(9)])
-        )[None],
+        alpha=np.linalg.solve(chart.to_monomials, np.array([0, 0, 0, 1.5, 0.5, -1, *np.zeros(9)]))[
+            None
+        ],
     )
     assert state.alpha[0] @ chart.bending @ state.alpha[0] == pytest.approx(
         3**2 + 2 * 0.5**2 + 2**2
@@ -146,9 +146,7 @@ def test_absorbed_leaves_the_surface_of_several_patches():
     state = some_state(chart, RNG, 0.02)
     x = chart.template.vertices
     smooth = 0.05 * np.sin(20 * x[:, 0]) * np.cos(15 * x[:, 1])
-    state = dataclasses.replace(
-        state, offset=np.column_stack([state.offset[:, :2] * 0.2, smooth])
-    )
+    state = dataclasses.replace(state, offset=np.column_stack([state.offset[:, :2] * 0.2, smooth]))
     found = chart.with_relief_in_jets(state)
     apart = chart.surface(found).vertices - chart.surface(state).vertices
     assert np.abs(apart).max() < 1e-5 * chart.template.scale
