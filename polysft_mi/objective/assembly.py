@@ -223,7 +223,7 @@ class Assembly:
     """
 
     def __init__(self, pattern, gather, atlas):
-        self.pattern, self._gather, self._atlas, self._within = pattern, gather, atlas, None
+        self.pattern, self._gather, self._atlas = pattern, gather, atlas
         self._in_unknowns = frozen(in_unknowns)
         self._list_halo()
 
@@ -262,14 +262,13 @@ class Assembly:
                 if len(kept):
                     self._meetings.append((other, k, part.start + kept, at[kept]))
 
-    def normal(self, surface, images, lengths, stiffness, wide=None, give=np.inf, triangles=None):
+    def normal(self, surface, images, lengths, stiffness, d=2, give=np.inf, triangles=None):
         """:class:`Normal` of the images, the edges and further
         residuals of triangles, and the edges' energy.
 
         ``surface``: :class:`polysft_mi.surface.atlas.Surface`; ``lengths`` (E,) [m]: of the
         template's edges; ``stiffness`` [1/m^2]: weight of the squared differences to them;
-        ``wide``: a :class:`polysft_mi.surface.pattern.Pattern` that holds this one, where the
-        relief is an unknown too (d = 3) and the local block is to have that pattern; ``give``: the
+        ``d``: 3 where the relief is an unknown too, or 2; ``give``: the
         strain from which on a stretched edge hardly pulls harder. An excess e > 0 over the length L
         costs 2 c^2 ((1 + e^2 / c^2)^1/2 - 1), c = give L (Charbonnier): cloth that hangs from a
         point is stretched there by a tenth, and by squares that would turn the whole sheet. What is
@@ -277,7 +276,7 @@ class Assembly:
         and derivatives (F, 3, 3) [1/m] of r by the corners; half the sum of h r^2 is added.
         """
         pattern, count, basis = self.pattern, self.pattern.count, surface.basis
-        size, d, patches = basis.shape[1], 2 if wide is None else 3, len(surface.up)
+        size, patches = basis.shape[1], len(surface.up)
         if triangles is not None:
             residual, factor, by_corner = triangles
             triangles = tuple(flat(x) for x in (residual * factor, factor, by_corner))
@@ -301,11 +300,6 @@ class Assembly:
         gradient, moved = gradient.reshape(-1, 3), moved.reshape(-1, 3, 6)
         lifted = [x.reshape(-1, size) for x in lifted]
         local = local.reshape(-1, 3, 3)[:, :d, :d]
-        if wide is None:
-            blocks = pattern.all_blocks(local)
-        else:
-            blocks = np.zeros((len(wide.row), 3, 3))
-            blocks[self._places(wide)] = pattern.all_blocks(local)
         cross = np.zeros((count, d, patches, size + 6))
         for k, (reached, rows) in enumerate(self._reached):
             own = surface.offset_jacobian[reached][:, :, :d]
@@ -315,7 +309,7 @@ class Assembly:
                 )
             cross[reached, :, k, size:] = np.einsum("hca,hcm->ham", own, moved[rows])
         normal = Normal(
-            blocks,
+            pattern.all_blocks(local),
             cross.reshape(count * d, -1),
             self._glob(surface, lifted, moved),
             np.ascontiguousarray(along.reshape(-1, 3)[:, :d]),
@@ -347,9 +341,3 @@ class Assembly:
             parts.append(surface.basis[part].T @ (g @ up))
             parts.append(np.einsum("nk,nkm->m", g, surface.motion_jacobian[part]))
         return np.concatenate(parts)
-
-    def _places(self, wide):
-        """Where the blocks of the pattern are among those of one that holds it."""
-        if self._within is None or self._within[0] is not wide:
-            self._within = wide, wide.find(self.pattern.row, self.pattern.column)
-        return self._within[1]

@@ -41,21 +41,22 @@ class Joints:
         for k, m, one, other, share in self._pairs:
             share = share * (weight * self._unit)
             apart = surface.points[one] - surface.points[other]
-            first, second = (self._columns(surface, p, e) for p, e in ((k, one), (m, other)))
+            columns = np.concatenate(
+                [self._columns(surface, k, one), -self._columns(surface, m, other)], 2
+            ).reshape(-1, 2 * size)
+            weighted = np.repeat(2 * share, 3)[:, None] * columns
             energy += float(share @ (apart * apart).sum(1))
-            for p, x, sign in ((k, first, 1), (m, second, -1)):
-                rows = slice(p * size, (p + 1) * size)
-                pulled = (share[:, None, None] * x).reshape(-1, size)
-                normal.gradient[rows] += 2 * sign * (pulled.T @ apart.ravel())
-                for q, y, other_sign in ((k, first, 1), (m, second, -1)):
-                    columns = slice(q * size, (q + 1) * size)
-                    normal.glob[rows, columns] += (
-                        2 * sign * other_sign * (pulled.T @ y.reshape(-1, size))
-                    )
+            pull, curvature = weighted.T @ apart.ravel(), weighted.T @ columns
+            places = [slice(p * size, (p + 1) * size) for p in (k, m)]
+            for a, rows in enumerate(places):
+                normal.gradient[rows] += pull[a * size : (a + 1) * size]
+                for b, at in enumerate(places):
+                    normal.glob[rows, at] += curvature[
+                        a * size : (a + 1) * size, b * size : (b + 1) * size
+                    ]
         return energy
 
     def _columns(self, surface, patch, entries):
         """Derivatives (P, 3, A + 6) of the patch's own points by its jet and motion."""
-        share = self._atlas.entry_weight[entries][:, None, None]
-        by_jet = surface.up[patch][:, None] * surface.basis[entries][:, None]
-        return np.concatenate([by_jet, surface.motion_jacobian[entries]], 2) / share
+        by_jet = surface.up[patch][:, None] * surface.rest_basis[entries][:, None]
+        return np.concatenate([by_jet, surface.rest_motion[entries]], 2)

@@ -14,9 +14,8 @@ import numpy as np
 from polysft_mi.errors import BadFrame
 from polysft_mi.images.light import Light, residuals
 from polysft_mi.images.registration import Appearance, Evaluation, Registration
-from polysft_mi.surface.atlas import Atlas, State, Surface
 from polysft_mi.surface.bending import hinges, slides
-from polysft_mi.surface.pattern import Pattern
+from polysft_mi.surface.atlas import Atlas, State, Surface
 
 from .assembly import Assembly, Normal
 from .joints import Joints
@@ -105,8 +104,7 @@ class SecondOrder:
     """The objective of a :class:`polysft_mi.objective.problem.Problem` to second order.
 
     ``atlas``: the template's :class:`polysft_mi.surface.atlas.Atlas`; ``images``: the
-    :class:`polysft_mi.images.registration.Registration`; ``patterns``: number of unknowns of a
-    vertex (2, or 3 with its relief) to the pattern of their blocks.
+    :class:`polysft_mi.images.registration.Registration`; ``pattern``: of the vertices' blocks.
     """
 
     def __init__(self, problem):
@@ -114,18 +112,16 @@ class SecondOrder:
         template, count = problem.template, len(problem.template.vertices)
         self.images, self.atlas = Registration(problem), Atlas(template)
         faces = self.images.faces
-        across, self._bends = hinges(template.vertices / template.scale, faces)
-        wide = Pattern(faces, template.edges, count, across)
-        self.patterns = {2: self.images.pattern, 3: wide}
+        self.pattern = self.images.pattern
+        self._bends = hinges(template.vertices / template.scale, faces)[1]
         self._assembly = Assembly(self.images.pattern, self.images.gather, self.atlas)
-        bends = wide.blocks_of(self._bends.T @ self._bends)
-        self._relief_blocks = wide.laplacian + self.rules.relief_bend * bends
+        # a hinge reaches a vertex beyond the neighbours: with it the elimination would take four
+        # times as long
+        bends = self.pattern.bound_of(self._bends.T @ self._bends)
+        self._relief_blocks = self.pattern.laplacian + self.rules.relief_bend * bends
         #: differences of (Δu, Δv) along the edges, in the axes of the first end, (2E, 2N)
         self._slides = slides(template.edges, template.axes)
-        self._slide_blocks = {
-            d: pattern.blocks_of(self._slides.T @ self._slides, 2)
-            for d, pattern in self.patterns.items()
-        }
+        self._slide_blocks = self.pattern.blocks_of(self._slides.T @ self._slides, 2)
         self._joints = Joints(self.atlas)
         self._lengths = np.array(problem.edge_lengths, dtype=np.float64)
         self.has_relief = self.settings.k_relief > 0 and count <= self.rules.relief_vertices
@@ -164,7 +160,7 @@ class SecondOrder:
             seen.images,
             self._lengths,
             stiffness,
-            self.patterns[3] if d == 3 else None,
+            d,
             give,
             rows,
         )
@@ -217,7 +213,7 @@ class SecondOrder:
         """Add the differences of neighbours' displacements, the relief's bends, and what ties the
         displacements to the anchor's; returns the energies (smoothness, temporal).
         """
-        s, pattern, height = self.settings, self.patterns[d], state.offset[:, 2]
+        s, pattern, height = self.settings, self.pattern, state.offset[:, 2]
         slid, along = state.offset - context.anchor.offset, state.offset[:, :2].ravel()
         apart, steps, bent = self._slides @ along, pattern.difference @ height, self._bends @ height
         bending = relief * self.rules.relief_bend
@@ -225,7 +221,7 @@ class SecondOrder:
         pull[:, :2] += s.k_uv * (self._slides.T @ apart).reshape(-1, 2)
         pull[:, 2] += relief * (pattern.to_ends @ steps) + bending * (self._bends.T @ bent)
         normal.local_gradient += 2 * pull[:, :d]
-        normal.local[:, :2, :2] += 2 * s.k_uv * self._slide_blocks[d]
+        normal.local[:, :2, :2] += 2 * s.k_uv * self._slide_blocks
         if d == 3:
             normal.local[:, 2, 2] += 2 * relief * self._relief_blocks
         for k in range(d):
@@ -234,3 +230,4 @@ class SecondOrder:
         smoothness += s.k_uv * float(apart @ apart)
         smoothness += relief * float(steps @ steps) + bending * float(bent @ bent)
         return smoothness, self.temporal * float((slid**2).sum())
+

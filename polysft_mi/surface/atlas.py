@@ -59,10 +59,11 @@ class State:
 class Surface:
     """The vertices (N, 3) [m, world] that a :class:`State` makes, with derivatives.
 
-    ``offset_jacobian`` (N, 3, 3): by (Δu, Δv, Δw). By the coefficients and the motion of a patch
-    an *entry*, a vertex in a patch that holds it, moves ``points`` (E, 3) of its own; here with
-    the patch's weight in the vertex: by coefficients ``up`` (K, 3) of its patch times ``basis``
-    (E, A), by rotation and translation ``motion_jacobian`` (E, 3, 6).
+    ``offset_jacobian`` (N, 3, 3): by (Δu, Δv, Δw). An *entry* is a vertex in a patch that holds it:
+    ``points`` (E, 3) is where the patch has it, before it is displaced. A patch moves its entries'
+    vertices: by its coefficients by ``up`` (K, 3) times ``basis`` (E, A), by its rotation and
+    translation by ``motion_jacobian`` (E, 3, 6); and its entries' points by ``rest_basis`` and
+    ``rest_motion``, which are None where there is one patch.
     """
 
     vertices: np.ndarray
@@ -71,6 +72,8 @@ class Surface:
     up: np.ndarray
     basis: np.ndarray
     motion_jacobian: np.ndarray
+    rest_basis: np.ndarray | None = None
+    rest_motion: np.ndarray | None = None
 
 
 class Atlas:
@@ -111,12 +114,17 @@ class Atlas:
         self.entry_of = np.zeros(t.patch.shape, dtype=np.int64)
         self.entry_of[vertex, slot] = np.arange(len(vertex))
         self.entry_of = np.where(t.weight > 0, self.entry_of, self.entry_of[:, :1])
+        self._own = self.entry_of[:, 0]  # (N,): the entry of each vertex in its own patch
         self._chart, self._rest = t.chart[vertex, slot], t.rest[vertex, slot]
-        # displacements as a chart has them: along u and v, and of the height over the jet
-        self._to_chart = np.einsum("eji,ejk->eik", t.rotation[self.entry_patch], t.axes[vertex])
+        self._at_rest = None
+        if len(t) > 1:  # where no vertex is displaced, a jet's basis stays what it is
+            self._at_rest = self._basis(self._chart)
+        # displacements in the vertex' own chart: along u and v, and of the height over the jet
+        own = t.patch[:, 0]
+        self._to_chart = np.einsum("nji,njk->nik", t.rotation[own], t.axes)
         self._to_chart[:, 2] = 0  # (Δu, Δv) slide along the jet
-        self._to_chart[:, 2, 2] = t.lift[vertex, slot]
-        self._unit = t.scale / t.radius[self.entry_patch]
+        self._to_chart[:, 2, 2] = t.lift
+        self._unit = (t.scale / t.radius[own])[:, None]
 
     def __len__(self):
         """K, the number of patches."""
@@ -169,43 +177,64 @@ class Atlas:
 
     def surface(self, state):
         """The :class:`Surface` of a state."""
-        t, vertex, unit = self.template, self.entry_vertex, self._unit[:, None]
-        moved = unit * np.einsum("eij,ej->ei", self._to_chart, state.offset[vertex])
-        uv, height = self._chart + moved[:, :2], self._rest + moved[:, 2]
+        t, own, patch = self.template, self._own, self.entry_patch
+        moved = self._unit * np.einsum("nij,nj->ni", self._to_chart, state.offset)
+        chart = self._chart[own] + moved[:, :2]
         turns = t.rotation @ state.rotation.as_matrix()
-        turn, slope = turns[self.entry_patch], np.empty_like(uv)
-        basis = np.empty((len(uv), len(self._u)))
-        for k, part in enumerate(self.entries):
-            matrix = np.zeros((self.order + 1, self.order + 1))
-            matrix[self._u, self._v] = self._alpha[k] + state.alpha[k]
-            pu, pv = (legendre.legvander(uv[part, c], self.order) for c in (0, 1))
-            along = pu @ matrix
-            height[part] += (along * pv).sum(1)
-            slope[part, 0] = ((pu @ (self._derivative @ matrix)) * pv).sum(1)
-            slope[part, 1] = (along * (pv @ self._derivative)).sum(1)
-            basis[part] = pu[:, self._u] * pv[:, self._v]
-        # the patch's own point, and its place in space
-        y = t.radius[self.entry_patch, None] * np.column_stack([uv, height])
-        x = np.einsum("eij,ej->ei", turn, y)
-        weight, moving = self.entry_weight[:, None], np.empty((len(y), 3, 6))
-        moving[:, :, 3:] = t.scale * t.rotation[self.entry_patch]
-        axes = t.rotation[self.entry_patch]
-        for k in range(3):  # axis k of the chart crossed with the point
-            for i, (a, b) in enumerate(((1, 2), (2, 0), (0, 1))):
-                moving[:, i, k] = axes[:, a, k] * x[:, b] - axes[:, b, k] * x[:, a]
-        moving *= weight[..., None]
         shift = t.origin + t.scale * np.einsum("kij,kj->ki", t.rotation, state.translation)
-        points = x + shift[self.entry_patch]
+        alpha = self._alpha + state.alpha
+
+        def points(entries, basis, uv, height):
+            """The entries' points [m], with the derivatives by rotation and translation."""
+            k = patch[entries]
+            height = height + np.einsum("ea,ea->e", basis, alpha[k])
+            y = t.radius[k, None] * np.column_stack([uv, height])
+            x = np.einsum("eij,ej->ei", turns[k], y)
+            moving, axes = np.empty((len(y), 3, 6)), t.rotation[k]
+            moving[:, :, 3:] = t.scale * axes
+            for c in range(3):  # axis c of the chart crossed with the point
+                for i, (a, b) in enumerate(((1, 2), (2, 0), (0, 1))):
+                    moving[:, i, c] = axes[:, a, c] * x[:, b] - axes[:, b, c] * x[:, a]
+            return x + shift[k], moving
+
+        values = self._values(chart)
+        basis = self._basis(chart, values)
+        found, moving = points(own, basis, chart, self._rest[own] + moved[:, 2])
+        slope, turn = self._slope(alpha[patch[own]], values), turns[patch[own]]
         jacobian = turn @ self._to_chart
-        jacobian += turn[:, :, 2:] * np.einsum("ec,ecj->ej", slope, self._to_chart[:, :2])[:, None]
-        jacobian *= t.scale * weight[..., None]
-        return Surface(
-            self._summed(weight * points),
-            points,
-            self._summed(jacobian),
-            t.radius[:, None] * turns[:, :, 2],
-            weight * basis,
-            moving,
+        jacobian += turn[:, :, 2:] * np.einsum("nc,ncj->nj", slope, self._to_chart[:, :2])[:, None]
+        up = t.radius[:, None] * turns[:, :, 2]
+        if len(self) == 1:
+            return Surface(found, found, t.scale * jacobian, up, basis, moving)
+        # all patches where the vertices are not displaced, blended, and their own displacements
+        every = slice(None)
+        rest, rest_moving = points(every, self._at_rest, self._chart, self._rest)
+        weight = self.entry_weight[:, None]
+        all_basis, all_moving = weight * self._at_rest, weight[..., None] * rest_moving
+        all_basis[own] += basis - self._at_rest[own]
+        all_moving[own] += moving - rest_moving[own]
+        vertices = self._summed(weight * rest) + found - rest[own]
+        derivatives = t.scale * jacobian, up, all_basis, all_moving
+        return Surface(vertices, rest, *derivatives, self._at_rest, rest_moving)
+
+    def _values(self, uv):
+        """Legendre polynomials at uv (P, 2): two of (P, n + 1)."""
+        return [legendre.legvander(uv[:, c], self.order) for c in (0, 1)]
+
+    def _basis(self, uv, values=None):
+        pu, pv = values or self._values(uv)
+        return pu[:, self._u] * pv[:, self._v]
+
+    def _slope(self, alpha, values):
+        """Derivatives (P, 2) of the jets ``alpha`` (P, A)."""
+        pu, pv = values
+        du, dv = pu @ self._derivative, pv @ self._derivative
+        return np.stack(
+            [
+                np.einsum("pa,pa,pa->p", alpha, du[:, self._u], pv[:, self._v]),
+                np.einsum("pa,pa,pa->p", alpha, pu[:, self._u], dv[:, self._v]),
+            ],
+            1,
         )
 
     def _summed(self, values):
@@ -252,9 +281,9 @@ class Atlas:
             for _ in range(2):
                 now = self.surface(found)
                 missing = surface.vertices - now.vertices
-                found.offset = (
-                    found.offset + np.linalg.solve(now.offset_jacobian, missing[..., None])[..., 0]
-                )
+                found.offset = found.offset + np.linalg.solve(
+                    now.offset_jacobian, missing[..., None]
+                )[..., 0]
         return found
 
 

@@ -1,11 +1,12 @@
 """The deforming atlas in Dr.Jit: unknowns of a frame, and the surface they make (paper, section
 "PolySfT", there with one patch).
 
-    x_i = sum_k w_ik O_k( R_k (phi_k(u + Δu, v + Δv; alpha_k + Δalpha_k) + (0, 0, r + Δw)) + T_k )
+    p_ik(d) = O_k( R_k (phi_k((u, v) + d_uv; alpha_k + Δalpha_k) + (0, 0, r + d_w)) + T_k )
+    x_i     = sum_k w_ik p_ik(0) + p_ii(d_i) - p_ii(0)
 
 with O_k(x) = s_k R x + T; w_ik is the share of patch k in vertex i, r what the jet leaves of the
-template. A vertex has one (Δu, Δv, Δw), along axes of its own; each patch has it along its chart's.
-The paper has no Δw; it is zero but for the second-order solver.
+template, p_ii the vertex in its own patch, and d_i its displacement (Δu, Δv, Δw) there. With one
+patch x_i is p_ii(d_i). The paper has no Δw; it is zero but for the second-order solver.
 
 Import only after a Mitsuba variant is set.
 """
@@ -106,7 +107,13 @@ class JetAtlas:
 
     def vertices(self, unknowns):
         """Positions of the vertices, Point3f of N [m, camera frame]."""
-        return mi.Point3f(self._blended(unknowns, self._points))
+        own, *others = self._layers
+        found = self._points(own, unknowns, displaced=True)
+        if others or own.to_chart is not None:
+            found -= (1 - own.weight) * self._points(own, unknowns)
+            for layer in others:
+                found += layer.weight * self._points(layer, unknowns)
+        return mi.Point3f(found)
 
     def tangents(self, unknowns):
         """Derivatives of the jets, without relief, along u and along v at the vertices, Vector3f of
@@ -134,14 +141,9 @@ class JetAtlas:
         radius = dr.gather(mi.Float, self.radius, own.patch)
         return tuple(radius * radius * g for g in jet.metric(alpha, u, v))
 
-    def _blended(self, unknowns, value):
-        if len(self._layers) == 1:
-            return value(self._layers[0], unknowns)
-        return sum(layer.weight * value(layer, unknowns) for layer in self._layers)
-
-    def _points(self, layer, unknowns):
+    def _points(self, layer, unknowns, displaced=False):
         """The vertices as one patch of each has them [m, camera frame]."""
-        alpha, u, v, height = self._in_chart(layer, unknowns)
+        alpha, u, v, height = self._in_chart(layer, unknowns, displaced)
         x = mi.Vector3f(jet.point(alpha, u, v))
         x.z += height
         radius = dr.gather(mi.Float, self.radius, layer.patch)
@@ -149,12 +151,18 @@ class JetAtlas:
         origin = dr.gather(mi.Vector3f, self.origin, layer.patch)
         return origin + radius * self._turned(layer, x, unknowns) + self.scale * t
 
-    def _in_chart(self, layer, unknowns):
-        """(alpha, u, v, height over the jet) of the vertices in one patch of each."""
+    def _in_chart(self, layer, unknowns, displaced=True):
+        """(alpha, u, v, height over the jet) of the vertices in one patch of each; ``displaced``:
+        with their own displacements, which the own patch alone has.
+        """
+        alpha = jet.Coefficients(
+            self.alpha + unknowns.delta_alpha, self._coefficients, layer.patch
+        )
+        if not displaced:
+            return alpha, layer.u, layer.v, layer.rest
         d = mi.Vector3f(unknowns.delta_u, unknowns.delta_v, unknowns.delta_w)
         if layer.to_chart is not None:
             d = mi.Vector3f(*(dr.dot(row, d) for row in layer.to_chart), layer.lift * d.z)
-        alpha = jet.Coefficients(self.alpha + unknowns.delta_alpha, self._coefficients, layer.patch)
         return alpha, layer.u + d.x, layer.v + d.y, layer.rest + d.z
 
     def _turned(self, layer, x, unknowns):
@@ -198,7 +206,7 @@ class _Layer:
             _flat(t.chart[:, m, 0]),
             _flat(t.chart[:, m, 1]),
             _flat(t.rest[:, m]),
-            _flat(unit * t.lift[:, m]),
+            _flat(unit * t.lift),
             None if same else [_vectors(row) for row in rows.transpose(1, 0, 2)],
         )
         dr.make_opaque(made.patch, made.weight, made.u, made.v, made.rest, made.lift)

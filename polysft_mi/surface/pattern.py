@@ -8,13 +8,13 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 
 class Pattern:
-    """Which vertices of the mesh share an edge, or are one of the ``further`` pairs (P, 2): the
-    blocks of every matrix here, in the order of (row, column), and a narrow ordering.
+    """Which vertices of the mesh share an edge: the blocks of every matrix here, in the order of
+    (row, column), and a narrow ordering.
     """
 
-    def __init__(self, faces, edges, count, further=None):
+    def __init__(self, faces, edges, count):
         self.count, self.faces, self.edges = count, faces, edges
-        a, b = (edges if further is None else np.concatenate([edges, further])).T
+        a, b = edges.T
         each = np.arange(count)
         self._keys = np.unique(
             np.concatenate([each * count + each, a * count + b, b * count + a])
@@ -61,6 +61,19 @@ class Pattern:
         out = np.zeros((len(self._keys), size, size))
         (i, a), (j, b) = np.divmod(matrix.row, size), np.divmod(matrix.col, size)
         out[self.find(i, j), a, b] = matrix.data
+        return out
+
+    def bound_of(self, matrix):
+        """Blocks (B,) of a matrix within the pattern that bounds the symmetric ``matrix`` (N, N)
+        from above: what lies outside the pattern goes to the diagonal, for 2 |x_i x_j| <= x_i^2 +
+        x_j^2.
+        """
+        matrix = matrix.tocoo()
+        place = np.searchsorted(self._keys, key := matrix.row * self.count + matrix.col)
+        inside = self._keys[np.minimum(place, len(self._keys) - 1)] == key
+        out = np.zeros(len(self._keys))
+        out[place[inside]] = matrix.data[inside]
+        np.add.at(out, self.diagonal[matrix.row[~inside]], np.abs(matrix.data[~inside]))
         return out
 
     def find(self, i, j):

@@ -36,9 +36,9 @@ class Template:
     ``patch`` (N, M), ``weight`` (N, M): the patches that hold a vertex, the first its own, and
     their shares in it; ``chart`` (N, M, 2): its (u, v) there, ``rest`` (N, M): its height over the
     jet there [chart unit]; ``axes`` (N, 3, 3): the axes of (Δu, Δv, Δw) in space, columns of length
-    1: tangents and normal, or the chart's where there is one patch; ``lift`` (N, M): what a chart
-    adds to a height, for each length along the third axis, so that in all of them the vertex moves
-    along it, whatever the jet's slope.
+    1: tangents and normal, or the chart's where there is one patch; ``lift`` (N,): what its own chart
+    adds to the height for each length along the third axis, so that the vertex moves along it,
+    whatever the jet's slope.
     """
 
     vertices: np.ndarray
@@ -147,7 +147,7 @@ class Template:
             x[..., :2],
             rest,
             axes,
-            _lift(x[..., :2], patch, weight > 0, alpha, rotation, axes),
+            _lift(x[:, 0, :2], patch[:, 0], alpha, rotation, axes),
         )
 
 
@@ -214,12 +214,14 @@ def _tangent_axes(points, faces, patch, rotation):
     return np.stack([first, np.cross(third, first), third], 2)
 
 
-def _lift(chart, patch, held, alpha, rotation, axes):
-    """``lift`` (N, M) of :class:`Template`."""
-    third = np.einsum("nmij,ni->nmj", rotation[patch], axes[..., 2])
-    lift = third[..., 2].copy()
+def _lift(chart, patch, alpha, rotation, axes):
+    """``lift`` (N,) of :class:`Template`, from the own charts' coordinates (N, 2) and patches
+    (N,).
+    """
+    third = np.einsum("nij,ni->nj", rotation[patch], axes[..., 2])
+    lift = third[:, 2].copy()
     for k, coefficients in enumerate(alpha):
-        at, z = held & (patch == k), matrix(coefficients)
+        at, z = patch == k, matrix(coefficients)
         for axis in (0, 1):
             slope = np.polynomial.polynomial.polyval2d(*chart[at].T, polyder(z, axis=axis))
             lift[at] -= slope * third[at][:, axis]

@@ -56,7 +56,7 @@ class Descent:
     def __init__(self, objective: SecondOrder):
         self.objective, self.rules = objective, objective.rules
         self.far, self.usual = stages_of(objective.rules)
-        self._blocks = {d: Blocks(pattern, d) for d, pattern in objective.patterns.items()}
+        self._blocks = {d: Blocks(objective.pattern, d) for d in (2, 3)}
         self.report, self.count = None, 0
 
     def reduced(self, normal, damping, dtype=np.float64):
