@@ -52,7 +52,7 @@ def measured(path, overrides, turns):
     objective = SecondOrder(problem)
     descent, atlas, images = Descent(objective), objective.atlas, objective.images
     level = images._level(descent.usual[-1].blur)
-    wide = objective.patterns[3] if objective.has_relief else None
+    d = 3 if objective.has_relief else 2
     rest = atlas.state(problem.patch.rest().to_numpy())
     rest.translation += 0.005
     surface = atlas.surface(rest)
@@ -72,7 +72,7 @@ def measured(path, overrides, turns):
         sums = table, figures, vertices, 1.0, 1.0, at.area, level.stride, pairs
         gathered = images.gather.images(*sums)
         assembly, lengths = objective._assembly, objective._lengths
-        normal, _ = assembly.normal(surface, gathered, lengths, 1.0, wide)
+        normal, _ = assembly.normal(surface, gathered, lengths, 1.0, d)
         reduced = descent.reduced(normal, 1e-3, np.float32)
     recorded = assembly._in_unknowns
 
@@ -86,7 +86,7 @@ def measured(path, overrides, turns):
         assembly._in_unknowns = recorded
 
     def equations():
-        return assembly.normal(surface, gathered, lengths, 1.0, wide)
+        return assembly.normal(surface, gathered, lengths, 1.0, d)
 
     def silhouette():
         if outline:

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from polyfit.mesh import TexCoords
+from polysft_mi.results.metrics import vertex_normals
 
 BACKGROUND = 0.03
 SUPERSAMPLING = 4
@@ -214,7 +215,8 @@ def _write_camera(folder, K, size):
 
 def cloth(folder, frames=5, size=(96, 72), rows=9, columns=11, masks=True, **motion):
     """A sequence in the form ``cloth``, with ``gt.npz``; returns its :class:`Truth`. With ``shape``
-    :func:`tube` that of a sleeve whose texture has a seam."""
+    :func:`tube` that of a sleeve whose texture has a seam; then gt.npz has ``seen``.
+    """
     K = _camera(size)
     truth, texture = _make(
         Path(folder), "frames/{:03d}.png", frames, size, rows, columns, masks, K, **motion
@@ -222,10 +224,15 @@ def cloth(folder, frames=5, size=(96, 72), rows=9, columns=11, masks=True, **mot
     write_image(truth.folder / "texture.png", texture)
     write_obj(truth.folder / "template.obj", truth.vertices[0], truth.uv, truth.faces)
     _write_camera(truth.folder, K, size)
+    seen = {}
+    if motion.get("shape") is tube:  # whose normals point outwards
+        normals = np.stack([vertex_normals(V, truth.faces) for V in truth.vertices])
+        seen["seen"] = (normals * truth.vertices).sum(2) < 0
     np.savez(
         truth.folder / "gt.npz",
         vertices=truth.vertices.astype(np.float32),
         faces=truth.faces.astype(np.int32),
+        **seen,
     )
     return truth
 

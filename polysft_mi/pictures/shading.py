@@ -105,8 +105,8 @@ def shade_surface(vertices, faces, view=None, uv=None, size=(480, 480), look=Non
     ]
     if uv is not None:
         uv = np.asarray(uv, dtype=np.float64)
-        low, size = uv.min(axis=(0, 1)), np.ptp(uv, axis=(0, 1))
-        values += [*np.moveaxis((uv - low) / np.maximum(size, 1e-12) * 10, 2, 0)]
+        low, extent = uv.min(axis=(0, 1)), np.ptp(uv, axis=(0, 1))
+        values += [*np.moveaxis((uv - low) / np.maximum(extent, 1e-12) * 10, 2, 0)]
 
     triangle, x, y = _covered_pixels(corners, width, height)
     # values are affine in a triangle, because the view is orthographic: its constant, and slopes to

@@ -124,7 +124,7 @@ class Template:
             cover = Cover.of(points, alike)
             patch, weight = cover.patch, cover.weight
             frames = [
-                _frame_over(points[((patch == k) & (weight > 0)).any(1)], normal)
+                _frame_over(points[((patch == k) & (weight > 0)).any(1)], normal, float(scale))
                 for k, normal in enumerate(cover.normal)
             ]
             axes = _tangent_axes(points, alike, patch[:, 0], np.stack([R for _, R, _ in frames]))
@@ -184,18 +184,18 @@ def _jets(x, patch, held, count, order, exact, where):
     return alpha, rest
 
 
-def _frame_over(points, normal):
+def _frame_over(points, normal, scale):
     """(s, R, T) of the points (P, 3) of a patch, with z along ``normal`` (3,) and u along their
-    largest extent across it.
+    largest extent across it; ``scale``: for a single point.
     """
     origin = points.mean(0)
     centred = points - origin
     flat = centred - (centred @ normal)[:, None] * normal
-    u = np.linalg.eigh(flat.T @ flat)[1][:, 2]
+    extent = np.sqrt((flat**2).sum(1).max())
+    u = np.linalg.eigh(flat.T @ flat)[1][:, 2] if extent > 0 else np.eye(3)[np.abs(normal).argmin()]
     u = (u - (u @ normal) * normal) * _side(centred @ u)
     u /= np.linalg.norm(u)
-    scale = np.sqrt((flat**2).sum(1).max())
-    return scale, np.stack([u, np.cross(normal, u), normal], 1), origin
+    return extent if extent > 0 else scale, np.stack([u, np.cross(normal, u), normal], 1), origin
 
 
 def _tangent_axes(points, faces, patch, rotation):

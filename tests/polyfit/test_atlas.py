@@ -48,7 +48,7 @@ def test_box_is_closed_and_outwards():
 
 
 def test_weights_are_a_partition_of_unity(covered):
-    _, vertices, faces, cover = covered
+    _, vertices, _, cover = covered
     assert cover.patch.shape == cover.weight.shape and len(cover.patch) == len(vertices)
     assert cover.weight.sum(1) == pytest.approx(1, abs=1e-12) and cover.weight.min() >= 0
     assert (cover.weight[:, 0] > 0).all() and (cover.weight.argmax(1) == 0).all()

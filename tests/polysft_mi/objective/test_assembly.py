@@ -18,7 +18,6 @@ from polysft_mi.objective.assembly import Assembly, Normal
 from polysft_mi.objective.joints import Joints
 from polysft_mi.render.device import on_device
 from polysft_mi.surface.atlas import Atlas
-from polysft_mi.surface.bending import hinges
 from polysft_mi.surface.pattern import Pattern
 
 
@@ -120,9 +119,6 @@ def test_all_terms_are_those_of_their_dense_jacobians(make):
     state = some_state(chart, rng)
     vertices = chart.surface(state).vertices
     camera, pattern = pinhole(rng, vertices), Pattern(faces, template.edges, count)
-    wider = Pattern(
-        faces, template.edges, count, hinges(template.vertices / template.scale, faces)[0]
-    )
     gather = Gather(pattern, camera)
     assembly = Assembly(pattern, gather, chart)
     images = np.zeros((2 * count, 3 * count))
@@ -173,12 +169,11 @@ def test_all_terms_are_those_of_their_dense_jacobians(make):
         by = np.stack(
             [moved(row) for row in np.eye(d * count + template.alpha.size + 6 * len(chart))], 1
         )
-        wide = wider if d == 3 else None
         surface = chart.surface(state)
         normal, found = assembly.normal(
-            surface, sums.images(gather, vertices), lengths, stiffness, wide, triangles=triangles
+            surface, sums.images(gather, vertices), lengths, stiffness, d, triangles=triangles
         )
-        matrix, gradient = dense(wide or pattern, normal)
+        matrix, gradient = dense(pattern, normal)
         expected = by.T @ (in_space + images.T @ sums.second @ images) @ by
         case = f"d = {d}, area {area}, silhouette {silhouette}, shading {shaded}"
         assert found == pytest.approx(energy, rel=1e-9), case
@@ -197,14 +192,15 @@ def joined(make, rng, size=0.05):
 
 
 def test_joints_are_the_spread_of_the_patches():
-    """The weighted squared distances from the blended vertices, written out."""
+    """The weighted squared distances from the blended points, written out."""
     chart, joints, state, normal = joined(tube_template, np.random.default_rng(1))
     t, surface = chart.template, chart.surface(state)
     several = (t.weight > 0).sum(1) > 1
     spread = 0.0
     for vertex in np.flatnonzero(several):
         held = np.flatnonzero(chart.entry_vertex == vertex)
-        apart = surface.points[held] - surface.vertices[vertex]
+        blended = chart.entry_weight[held] @ surface.points[held]
+        apart = surface.points[held] - blended
         spread += chart.entry_weight[held] @ (apart**2).sum(1)
     expected = 0.3 * spread / several.sum() / t.scale**2
     assert joints.add(normal, surface, 0.3) == pytest.approx(expected, rel=1e-9) and expected > 0

@@ -27,19 +27,25 @@ def test_atlas_blends_the_jets_of_polyfit(shape, order):
     chart = Atlas(template)
     state = some_state(chart, RNG)
     arrays = chart.arrays(state)
-    expected = np.zeros_like(template.vertices)
-    for k in range(len(template)):
+    unit = template.scale / template.radius
+
+    def point(vertex, slot, offset):
+        """The vertex as the patch in that slot has it, displaced by the offset."""
+        k = template.patch[vertex, slot]
         s, R, T = (x[k] for x in (template.radius, template.rotation, template.origin))
-        unit, motion = template.scale / s, state.rotation[k].as_matrix()
-        for vertex, slot in zip(*np.nonzero((template.patch == k) & (template.weight > 0))):
-            moved = template.axes[vertex] @ state.offset[vertex]
-            uv = template.chart[vertex, slot] + unit * (R.T @ moved)[:2]
-            height = template.rest[vertex, slot]
-            height += unit * template.lift[vertex, slot] * state.offset[vertex, 2]
-            alpha = torch.as_tensor(template.alpha[k] + arrays["delta_alpha"][k])
-            z = float(jets.height(alpha, torch.as_tensor(uv)[None])) + height
-            local = s * motion @ [*uv, z] + template.scale * state.translation[k]
-            expected[vertex] += template.weight[vertex, slot] * (R @ local + T)
+        uv = template.chart[vertex, slot]
+        uv = uv + unit[k] * (R.T @ template.axes[vertex] @ offset)[:2]
+        alpha = torch.as_tensor(template.alpha[k] + arrays["delta_alpha"][k])
+        z = float(jets.height(alpha, torch.as_tensor(uv)[None])) + template.rest[vertex, slot]
+        z += unit[k] * template.lift[vertex] * offset[2]
+        motion = s * state.rotation[k].as_matrix() @ [*uv, z]
+        return R @ (motion + template.scale * state.translation[k]) + T
+
+    expected = np.zeros_like(template.vertices)
+    for vertex, offset in enumerate(state.offset):
+        expected[vertex] = point(vertex, 0, offset) - point(vertex, 0, np.zeros(3))
+        for slot in np.flatnonzero(template.weight[vertex]):
+            expected[vertex] += template.weight[vertex, slot] * point(vertex, slot, np.zeros(3))
     assert np.abs(chart.surface(state).vertices - expected).max() < 1e-9
     back = chart.state(arrays)
     assert np.abs(back.alpha - state.alpha).max() < 1e-9 and np.array_equal(

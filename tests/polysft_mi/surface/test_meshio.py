@@ -256,7 +256,7 @@ def _change(kind):
         ("nan", "1 vertices have coordinates that are not finite (the first is vertex 5"),
         ("inf", "not finite"),
         ("no uv", "no texture coordinates"),
-        ("uv nan", "texture coordinates are not finite (the first is vertex 3"),
+        ("uv nan", "texture coordinates are not finite (the first is coordinate 3"),
         ("uv shape", "(12, 2) is needed"),
         ("two vertices", "2 vertices; a template has at least 3"),
         ("empty", "0 vertices"),
