@@ -29,9 +29,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from sequences import DATA, ROOT, SCENES, folder_of
 
+from polyfit.files import aside
 from polysft_mi.backend import add_mode_argument, set_variant
 from polysft_mi.errors import InputError, cli
-from polysft_mi.files import aside
 from polysft_mi.scene.rules import Rules
 from polysft_mi.scene.settings import Settings
 

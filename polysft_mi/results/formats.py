@@ -5,8 +5,8 @@ import os
 import numpy as np
 
 from polyfit.errors import require
+from polyfit.files import aside
 from polysft_mi.errors import InputError
-from polysft_mi.files import aside
 
 FORMATS = ("usd", "glb", "obj", "ply", "npz")
 # of each format that is one file, the first is the default; the others are folders
