@@ -239,6 +239,7 @@ class TestRefusals:
             (["--format", "glb", "--fps", "0"], "--fps 0"),
             (["--format", "usd", "--texture", "gone.png"], "gone.png: no such file"),
             (["--format", "glb", "--texture", __file__], "not an image"),
+            (["--format", "glb", "--texture", "broken.tif"], "broken.tif: not an image"),
             ([], "--format"),
         ],
     )
