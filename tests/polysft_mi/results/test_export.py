@@ -239,7 +239,6 @@ class TestRefusals:
             (["--format", "glb", "--fps", "0"], "--fps 0"),
             (["--format", "usd", "--texture", "gone.png"], "gone.png: no such file"),
             (["--format", "glb", "--texture", __file__], "not an image"),
-            (["--format", "glb", "--texture", "broken.tif"], "broken.tif: not an image"),
             ([], "--format"),
         ],
     )
@@ -251,6 +250,14 @@ class TestRefusals:
         assert list(tmp_path.iterdir()) == [] and sorted(
             set(shutil.os.listdir(run.folder)) - {"export"}
         ) == sorted(set(before) - {"export"})
+
+    def test_in_an_image_of_which_its_decoder_complains_too(self, run, tmp_path, capfd):
+        broken = tmp_path / "broken.tif"
+        Image.open(run.texture).save(broken, compression="tiff_lzw")
+        broken.write_bytes(broken.read_bytes()[:-3000])
+        with pytest.raises(InputError, match="broken.tif: not an image"):
+            export.main([run.folder, "--format", "glb", "--texture", str(broken)])
+        assert capfd.readouterr().err == ""
 
     def test_in_the_folder(self, run, tmp_path):
         with pytest.raises(InputError, match="no such folder"):
