@@ -26,10 +26,10 @@ import time
 
 import numpy as np
 
+from polyfit.files import aside
 from polysft_mi.backend import add_mode_argument, set_variant
 from polysft_mi.commands import add_define_argument, definitions
 from polysft_mi.errors import InputError, cli
-from polysft_mi.files import aside
 
 ITERATIONS = 150  # a frame
 STEP = 3e-3  # of the template's radius; chosen on the sequence flag (benchmarks/README.md)

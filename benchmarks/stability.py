@@ -21,10 +21,10 @@ import tempfile
 import numpy as np
 from sequences import ROOT
 
+from polyfit.files import aside
 from polysft_mi.backend import add_mode_argument, set_variant
 from polysft_mi.commands import add_define_argument, definitions
 from polysft_mi.errors import InputError, cli
-from polysft_mi.files import aside
 
 COUNTS = (50, 300, 1000, 5000)
 USUAL = 300  # iterations that the paper evaluates at

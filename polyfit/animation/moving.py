@@ -8,6 +8,7 @@ import io
 import numpy as np
 
 from polyfit.errors import InputError
+from polyfit.files import silent_decoders
 from polyfit.mesh import TexCoords, face_vectors
 
 # Rotations from OpenCV's camera axes to axes with y or z up
@@ -84,7 +85,8 @@ def encoded(texture):
     from PIL import Image, UnidentifiedImageError
 
     try:
-        with Image.open(texture) as image:
+        with silent_decoders(), Image.open(texture) as image:
+            image.load()  # the whole file, which may be cut off
             if image.format in ("PNG", "JPEG"):
                 with open(texture, "rb") as file:
                     return file.read(), {"PNG": "png", "JPEG": "jpg"}[image.format]
@@ -93,7 +95,7 @@ def encoded(texture):
             return data.getvalue(), "png"
     except FileNotFoundError:
         raise InputError(f"{texture}: no such file; the image of the texture is needed") from None
-    except (UnidentifiedImageError, SyntaxError, ValueError) as error:
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
         raise InputError(
             f"{texture}: not an image that can be embedded ({error}); PNG, JPEG, TIFF, BMP or WebP"
             " is needed"

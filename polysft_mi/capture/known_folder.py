@@ -3,8 +3,8 @@
 import contextlib
 import os
 
+from polyfit.files import aside
 from polysft_mi.errors import InputError
-from polysft_mi.files import aside
 from polysft_mi.scene.images import checked_size
 from polysft_mi.scene.kinect_paper import template as kinect_paper_template
 from polysft_mi.scene.sequence import Sequence

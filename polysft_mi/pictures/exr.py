@@ -11,7 +11,7 @@ import os
 
 import numpy as np
 
-from polysft_mi.files import aside
+from polyfit.files import aside
 
 # by the layer's name, and float32; the others by their count, and half
 _KINDS = {

@@ -5,8 +5,8 @@ import os
 import numpy as np
 
 from polyfit.errors import require
+from polyfit.files import aside
 from polysft_mi.errors import InputError
-from polysft_mi.files import aside
 
 from .truth import uv_arrays
 

@@ -14,8 +14,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from polyfit.files import aside
 from polysft_mi import __version__
-from polysft_mi.files import aside
 from polysft_mi.scene.defaults import located
 from polysft_mi.surface import meshio
 from polysft_mi.surface.patch import Unknowns

@@ -356,6 +356,6 @@ def test_browser_shows_it(page, tmp_path):
         [part(p, box) for box in seen["boxes"]] for p in (first, last)
     )
     assert np.abs(before - after).max(2).mean() > 5  # the slider changed the picture
-    for picture in (surface, same):
-        assert (np.ptp(picture, axis=2) > 60).mean() > 0.05, "the surface in 3D is blank"
+    for picture in (surface, same):  # its background and axes are grey
+        assert (np.ptp(picture, axis=2) > 20).mean() > 0.1, "the surface in 3D is blank"
     assert (np.abs(surface - same).max(2) > 40).mean() > 0.05

@@ -9,8 +9,8 @@ import pytest
 import trimesh
 from places import ROOT
 
+from polyfit.files import aside
 from polysft_mi.errors import InputError
-from polysft_mi.files import aside
 from polysft_mi.surface.atlas import Atlas
 from polysft_mi.surface.meshio import (
     check_template,
