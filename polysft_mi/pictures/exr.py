@@ -49,9 +49,10 @@ def write_exr(path, layers, metadata=None, plain=DEFAULT_LAYER):
     layer ``plain`` once more as plain R, G, B.
 
     Colours, errors and masks are linear values (Rec.709 primaries) and are stored as half;
-    ``depth`` and its kin [m], ``normal`` (camera frame), ``uv`` and ``patch`` as float32. ``metadata`` (name
-    -> str, int, float, or anything that JSON holds, as a string) goes into the header. Raises
-    ValueError for layers of different sizes and OSError where the file cannot be written.
+    ``depth`` and its kin [m], ``normal`` (camera frame), ``uv`` and ``patch`` as float32.
+    ``metadata`` (name -> str, int, float, or anything that JSON holds, as a string) goes into the
+    header. Raises ValueError for layers of different sizes and OSError where the file cannot be
+    written.
     """
     import OpenEXR
 

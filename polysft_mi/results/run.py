@@ -174,7 +174,7 @@ _PARAMS = (
 )
 
 
-def _of_one_patch(p):
+def _of_one_patch(p: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The arrays of an older params.npz, which had one patch, as this version has them."""
     count = len(p["chart"])
     alone = {"patch": np.zeros((count, 1), dtype=np.int64), "weight": np.ones((count, 1))}

@@ -161,10 +161,15 @@ def texcoords_of(surface: dict[str, np.ndarray], path: str) -> TexCoords:
     """
     uv, faces, count = surface.get("uv"), surface["faces"], surface["vertices"].shape[1]
     corners = surface.get("uv_faces", faces)
-    usable = uv is not None and uv.ndim == 2 and uv.shape[1] == 2 and corners.shape == faces.shape
-    if usable and "uv_faces" not in surface:
-        usable = len(uv) == count
-    if not usable or corners.min() < 0 or corners.max() >= len(uv):
+    if (
+        uv is None
+        or uv.ndim != 2
+        or uv.shape[1] != 2
+        or corners.shape != faces.shape
+        or ("uv_faces" not in surface and len(uv) != count)
+        or corners.min() < 0
+        or corners.max() >= len(uv)
+    ):
         raise InputError(
             f"{path}: holds no uv of ({count}, 2), nor uv of (M, 2) with uv_faces {faces.shape}"
         )
