@@ -74,7 +74,7 @@ def tube_faces(rows, columns):
     """
     open_faces = grid_faces(rows, columns + 1)
     row, column = np.divmod(open_faces, columns + 1)
-    v, u = np.meshgrid(np.linspace(1, 0, rows), np.linspace(0, 1, columns + 1), indexing="ij")
+    v, u = np.meshgrid(np.linspace(1, 0, rows), np.linspace(1, 0, columns + 1), indexing="ij")
     uv = np.stack([u, v], -1).reshape(-1, 2)
     return row * columns + column % columns, TexCoords(uv, open_faces)
 

@@ -61,22 +61,24 @@ class Sheet:
         """Points (K, 3) [m] of the surface whose photo has the coordinates uv (K, 2); NaN where the
         photo does not lie on it.
         """
-        from matplotlib.tri import Triangulation
-
-        try:
-            finder = Triangulation(*self.uv.T, triangles=self.faces).get_trifinder()
-        except (RuntimeError, ValueError):
-            raise InputError(
-                f"{self.name}: its texture coordinates overlap; each place of the photo must belong"
-                " to one place of the template"
-            ) from None
-        face = finder(*np.asarray(uv, dtype=float).T)
-        found = self.faces[face]
-        a, b, c = (self.uv[found[:, k]] for k in range(3))
-        t = np.linalg.solve(np.stack([b - a, c - a], axis=2), (uv - a)[..., None])[..., 0]
-        p, q, r = (self.vertices[found[:, k]] for k in range(3))
-        points = p + t[:, :1] * (q - p) + t[:, 1:] * (r - p)
-        points[face < 0] = np.nan
+        uv = np.asarray(uv, dtype=float)
+        a, b, c = (self.uv[self.faces[:, k]] for k in range(3))
+        to_edges = np.linalg.pinv(np.stack([b - a, c - a], axis=2))  # of no area: zeros
+        points = np.full((len(uv), 3), np.nan)
+        for start in range(0, len(uv), 256):
+            part = slice(start, start + 256)
+            t = np.einsum("fij,kfj->kfi", to_edges, uv[part, None] - a)
+            inner = np.concatenate([1 - t.sum(2, keepdims=True), t], axis=2)
+            least = inner.min(axis=2)
+            if ((least > 1e-6).sum(axis=1) > 1).any():
+                raise InputError(
+                    f"{self.name}: its texture coordinates overlap; each place of the photo must"
+                    " belong to one place of the template"
+                )
+            face = least.argmax(axis=1)
+            rows = np.arange(len(face))
+            found = np.einsum("kc,kci->ki", inner[rows, face], self.vertices[self.faces[face]])
+            points[part] = np.where(least[rows, face, None] >= -1e-9, found, np.nan)
         return points
 
     def corners(self):
