@@ -6,7 +6,7 @@ python -m onefit.tailor --body body.ply       # the body that they are made arou
 
 import argparse
 
-from polyfit.errors import InputError, cli, optional_imports
+from polyfit.errors import InputError, Parser, cli, optional_imports
 from polyfit.mesh import write_ply
 
 with optional_imports(__name__):
@@ -16,11 +16,9 @@ with optional_imports(__name__):
     from onefit.garment.sewing.sew import write
 
 
-def main():
+def main(argv=None):
     raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(
-        prog="python -m onefit.tailor", description=__doc__, formatter_class=raw
-    )
+    parser = Parser(prog="python -m onefit.tailor", description=__doc__, formatter_class=raw)
     parser.add_argument(
         "names",
         nargs="*",
@@ -39,10 +37,12 @@ def main():
         metavar="FILE.ply",
         help="write the standard body, to make garments around it, and sew nothing",
     )
-    args = parser.parse_args()
+    args = parser.parse_args(argv)
     if unknown := [n for n in args.names if n not in PATTERNS]:
         raise InputError(f"{unknown[0]}: no such template; there are {', '.join(PATTERNS)}")
     if args.body:
+        if not args.body.lower().endswith(".ply"):
+            raise InputError(f"--body {args.body}: a .ply file is needed")
         body = standard_body()
         write_ply(args.body, body.vertices.numpy(), body.faces.numpy())
         print(f"written: {args.body}")

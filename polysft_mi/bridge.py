@@ -23,6 +23,7 @@ import numpy as np
 import torch
 
 from polyfit import jets
+from polyfit.mesh import TexCoords
 
 from .surface.patch import Unknowns
 from .surface.template import Template
@@ -35,13 +36,17 @@ if TYPE_CHECKING:
 
 
 def template(
-    polyfit: PolyFit, vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, **options: Any
+    polyfit: PolyFit,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    uv: np.ndarray | TexCoords,
+    **options: Any,
 ) -> Template:
     """The :class:`polysft_mi.surface.template.Template` of the mesh in the frame, and of the order,
     of ``polyfit`` (:class:`polyfit.PolyFit`).
 
-    ``vertices`` (N, 3) [m], ``faces`` (F, 3), ``uv`` (N, 2); ``options`` and errors are those of
-    ``Template.fit``.
+    ``vertices`` (N, 3) [m], ``faces`` (F, 3), ``uv`` (N, 2) or :class:`polyfit.mesh.TexCoords`;
+    ``options`` and errors are those of ``Template.fit``.
     """
     points = torch.as_tensor(np.asarray(vertices))
     with torch.no_grad():

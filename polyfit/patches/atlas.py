@@ -56,7 +56,8 @@ class Cover:
             found = _few(vertices, faces[part[faces[:, 0]] == k], vectors[part[faces[:, 0]] == k])
             label[inside] = found[inside] + count
             count = label[inside].max() + 1
-        return cls(*partition(vertices, faces, edges, label), _normals(label, faces, vectors))
+        patch, weight = partition(vertices, faces, edges, label)
+        return cls(patch, weight, _normals(label, faces, vectors))
 
 
 def is_graph(vertices: np.ndarray, faces: np.ndarray, normal: np.ndarray) -> bool:

@@ -14,23 +14,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from polyfit.files import aside
 from polysft_mi import __version__
-from polysft_mi.files import aside
 from polysft_mi.scene.defaults import located
 from polysft_mi.surface import meshio
 from polysft_mi.surface.patch import Unknowns
 
+from .truth import uv_arrays
 
 _PARAMS = ("alpha", "patch", "weight", "chart", "rest", "scale", "radius")
-
-
-def _texcoords(template):
-    """Arrays of surface.npz: ``uv`` (M, 2), and ``uv_faces`` (F, 3) where there are seams."""
-    per_vertex = template.texcoords.of_vertices(template.faces)
-    if per_vertex is not None:
-        return {"uv": per_vertex.astype(np.float32)}
-    texcoords = template.texcoords
-    return {"uv": texcoords.coordinates.astype(np.float32), "uv_faces": texcoords.faces}
 
 
 def versions():
@@ -101,7 +93,7 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
             temporary,
             vertices=vertices,
             faces=template.faces.astype(np.int32),
-            **_texcoords(template),
+            **uv_arrays(template.texcoords, template.faces),
             frames=indices,
             **sigma,
         )

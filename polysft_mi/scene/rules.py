@@ -38,7 +38,9 @@ class Rules:
     )
     # surfaces of several patches
     joint: float = _rule(
-        1.0, "", "weight of the squared distances of overlapping patches, over the template's radius"
+        1.0,
+        "",
+        "weight of the squared distances of overlapping patches, over the template's radius",
     )
     unseen: float = _rule(
         10.0, "", "factor of the weights of smoothness where no pixel sees such a surface"

@@ -30,11 +30,15 @@ def read_textured_template(path):
 
 
 def write_obj(path, vertices, faces, uv):
-    """Write a mesh as OBJ: vertices (N, 3), faces (F, 3), uv (N, 2) with v up."""
+    """Write a mesh as OBJ: vertices (N, 3), faces (F, 3), uv (N, 2) with v up, or
+    :class:`polyfit.mesh.TexCoords`.
+    """
+    texcoords = uv if isinstance(uv, TexCoords) else TexCoords(uv, faces)
     with open(path, "w", encoding="utf-8") as file:
         file.writelines("v {:.9g} {:.9g} {:.9g}\n".format(*p) for p in vertices)
-        file.writelines("vt {:.9g} {:.9g}\n".format(*t) for t in uv)
-        file.writelines("f {0}/{0} {1}/{1} {2}/{2}\n".format(*f) for f in np.asarray(faces) + 1)
+        file.writelines("vt {:.9g} {:.9g}\n".format(*t) for t in texcoords.coordinates)
+        corners = np.stack([faces, texcoords.faces], axis=2).reshape(len(faces), 6) + 1
+        file.writelines("f {}/{} {}/{} {}/{}\n".format(*f) for f in corners)
 
 
 def size_note(vertices, where="template"):

@@ -17,7 +17,7 @@ from numpy.polynomial import Chebyshev, Polynomial, chebyshev
 from numpy.polynomial.polynomial import polyder
 
 from polyfit.jets import DETERMINED_RMS, MIN_BOX_RATIO, exponents, order_of, size_of
-from polyfit.mesh import TexCoords, components, edges_of, face_vectors
+from polyfit.mesh import TexCoords, components, edges_of, face_vectors, sheets, winding
 from polyfit.patches.atlas import Cover, is_graph
 from polysft_mi.errors import InputError
 
@@ -114,7 +114,8 @@ class Template:
             if frame is None
             else (np.asarray(x) for x in (frame.s, frame.R, frame.T))
         )
-        if is_graph(points, faces, rotation[:, 2]) and components_of(faces) == 1:
+        alike = np.where(winding(sheets(faces))[:, None] < 0, faces[:, ::-1], faces)
+        if is_graph(points, alike, rotation[:, 2]) and components_of(faces) == 1:
             patch, weight = np.zeros((len(points), 1), dtype=np.int64), np.ones((len(points), 1))
             frames = [(float(scale), rotation, origin)]
             axes = np.tile(rotation, (len(points), 1, 1))
@@ -124,13 +125,13 @@ class Template:
                 " in its chart; a height graph over a plane is needed"
             )
         else:
-            cover = Cover.of(points, faces)
+            cover = Cover.of(points, alike)
             patch, weight = cover.patch, cover.weight
             frames = [
-                _frame_over(points[((patch == k) & (weight > 0)).any(1)], normal)
+                _frame_over(points[((patch == k) & (weight > 0)).any(1)], normal, float(scale))
                 for k, normal in enumerate(cover.normal)
             ]
-            axes = _tangent_axes(points, faces, patch[:, 0], np.stack([R for _, R, _ in frames]))
+            axes = _tangent_axes(points, alike, patch[:, 0], np.stack([R for _, R, _ in frames]))
         order = order(len(frames)) if callable(order) else order
         radius, rotation, origin = (np.array(x) for x in zip(*frames))
         x = np.einsum("nmij,nmi->nmj", rotation[patch], points[:, None] - origin[patch])
@@ -189,18 +190,18 @@ def _jets(x, patch, held, count, order, exact, where):
     return alpha, rest
 
 
-def _frame_over(points, normal):
+def _frame_over(points, normal, scale):
     """(s, R, T) of the points (P, 3) of a patch, with z along ``normal`` (3,) and u along their
-    largest extent across it.
+    largest extent across it; ``scale``: for a single point.
     """
     origin = points.mean(0)
     centred = points - origin
     flat = centred - (centred @ normal)[:, None] * normal
-    u = np.linalg.eigh(flat.T @ flat)[1][:, 2]
+    extent = np.sqrt((flat**2).sum(1).max())
+    u = np.linalg.eigh(flat.T @ flat)[1][:, 2] if extent > 0 else np.eye(3)[np.abs(normal).argmin()]
     u = (u - (u @ normal) * normal) * _side(centred @ u)
     u /= np.linalg.norm(u)
-    scale = np.sqrt((flat**2).sum(1).max())
-    return scale, np.stack([u, np.cross(normal, u), normal], 1), origin
+    return extent if extent > 0 else scale, np.stack([u, np.cross(normal, u), normal], 1), origin
 
 
 def _tangent_axes(points, faces, patch, rotation):
