@@ -68,7 +68,7 @@ def drape_into(folder, draper, garment, motion, shape, *, about, how=None, **fil
     )
     with Progress(*columns, console=Console(stderr=True)) as progress:
         task = progress.add_task(
-            "finishing", total=len(motion.resampled(FPS).poses), visible=finish > 0
+            "finishing", total=len(motion.resampled(FPS).poses), visible=how.get("finish", 0) > 0
         )
         start = time.perf_counter()
         advance = lambda: progress.advance(task)
