@@ -29,13 +29,16 @@ class Outcome:
     frames: int
     vertices: int
     seconds: float
+    settling: float
     figures: dict
 
     def as_text(self):
         """One fact a line."""
+        settled = f", after {self.settling:.1f} s to settle" if self.settling else ""
+        speed = 1e3 * (self.seconds - self.settling) / self.frames
         return (
             f"frames: {self.frames}, of {self.vertices} vertices\n"
-            f"speed: {1e3 * self.seconds / self.frames:.1f} ms a frame\n"
+            f"speed: {speed:.1f} ms a frame{settled}\n"
             f"inside the body: {self.figures['collision']:.2f} % of the vertices\n"
         )
 
@@ -66,16 +69,21 @@ def drape_into(folder, draper, garment, motion, shape, *, about, how=None, **fil
         MofNCompleteColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=Console(stderr=True)) as progress:
-        task = progress.add_task(
-            "finishing", total=len(motion.resampled(FPS).poses), visible=how.get("finish", 0) > 0
-        )
+    finished: list = []  # when each frame was
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        frames = len(motion.resampled(FPS).poses)
+        task = progress.add_task("finishing", total=frames, visible=how.get("finish", 0) > 0)
+
+        def advance():
+            finished.append(time.perf_counter())
+            progress.advance(task)
+
         start = time.perf_counter()
-        advance = lambda: progress.advance(task)
         drape = draper.drape(garment, motion, shape, **how, advance=advance)
         seconds = time.perf_counter() - start
+    settling = finished[0] - start if finished else 0.0
     T, N = drape.vertices.shape[:2]
-    outcome = Outcome(folder, T, N, seconds, drape.measures().as_dict())
+    outcome = Outcome(folder, T, N, seconds, settling, drape.measures().as_dict())
     about = about | dict(shape=shape.tolist(), vertices=N, frames=T) | how | outcome.figures
     folder.parent.mkdir(parents=True, exist_ok=True)
     with (

@@ -26,7 +26,7 @@ class Settings:
     """
 
     newton: int = 2
-    iterations: int = 25
+    iterations: int = 20
     tolerance: float = 1e-5
     clearance: float = 0.004
     least: float = 0.001
