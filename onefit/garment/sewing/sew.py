@@ -25,8 +25,15 @@ def sewn(block, name, count=None, bumps=0.0, stretch=(1.0, 1.0, 1.0), **measures
     """
     pattern, own = PATTERNS[name]
     field, inside = pattern(block, **measures)
-    V, F = _clipped(*block.mesh(field - bumps), inside)
-    V, F = remeshed(V * stretch, F, count or own)
+    return meshed(block, field - bumps, inside, count or own, stretch)
+
+
+def meshed(block, field, inside, count, stretch=(1.0, 1.0, 1.0)):
+    """``(vertices (N, 3) [m], faces (F, 3))``, about ``count`` vertices, of the level set of
+    ``field`` where ``inside`` (x, y, z) is positive; ``stretch`` as in :func:`sewn`.
+    """
+    V, F = _clipped(*block.mesh(field), inside)
+    V, F = remeshed(V * stretch, F, count)
     return V / stretch, F
 
 
