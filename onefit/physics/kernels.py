@@ -1,0 +1,198 @@
+"""Warp kernels of the implicit step: gradient and Hessian of a sheet's energies, and conjugate
+gradients. On the CPU each is one compiled loop.
+
+Matrices have 3 x 3 blocks, at the diagonal and where two vertices share an edge. Double precision:
+in single precision the rounding of a coordinate of 1 m is a strain of 1e-5.
+"""
+
+from onefit.body.quietwarp import warp as ready
+
+wp = ready()
+
+real = wp.float64
+vec2 = wp.types.vector(length=2, dtype=real)
+vec3 = wp.types.vector(length=3, dtype=real)
+mat2 = wp.types.matrix(shape=(2, 2), dtype=real)
+mat3 = wp.types.matrix(shape=(3, 3), dtype=real)
+mat32 = wp.types.matrix(shape=(3, 2), dtype=real)
+mat43 = wp.types.matrix(shape=(4, 3), dtype=real)
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def stretching(
+    x: wp.array(dtype=vec3),
+    faces: wp.array2d(dtype=int),
+    gradients: wp.array2d(dtype=vec2),
+    weight: wp.array(dtype=real),  # stretch * area [N m]
+    blocks: wp.array2d(dtype=int),  # (F, 9): where the blocks of the corners' pairs lie
+    force: wp.array(dtype=vec3),  # receives the gradient
+    matrix: wp.array(dtype=mat3),  # receives the Hessian, its negative eigenvalues set to 0
+):
+    """stretch / 2 * area * |F - R|^2: gradient weight (F - R) g_a; Hessian by the modes of F.
+
+    With F = R S, S = sum_i s_i v_i v_i^T and n the normal: in the plane all modes have 1, but the
+    rotation of F in its plane 1 - 2 / (s_1 + s_2); out of it 1 - 1 / s_i.
+    """
+    f = wp.tid()
+    one, two, half = real(1.0), real(2.0), real(0.5)
+    F = mat32()
+    for a in range(3):
+        F += wp.outer(x[faces[f, a]], gradients[f, a])
+    C = wp.transpose(F) * F
+    det = wp.sqrt(wp.max(C[0, 0] * C[1, 1] - C[0, 1] * C[0, 1], real(1.0e-12)))
+    trace = wp.sqrt(C[0, 0] + C[1, 1] + two * det)  # s_1 + s_2
+    S = (C + det * mat2(one, real(0.0), real(0.0), one)) / trace
+    inverse = mat2(S[1, 1], -S[0, 1], -S[0, 1], S[0, 0]) / det
+    R = F * inverse
+    r0 = vec3(R[0, 0], R[1, 0], R[2, 0])
+    r1 = vec3(R[0, 1], R[1, 1], R[2, 1])
+    n = wp.cross(r0, r1)
+    twist = wp.min(one, two / trace)
+    # G = sum_i max(1 - 1 / s_i, 0) v_i v_i^T
+    middle = half * trace
+    apart = wp.sqrt(wp.max(middle * middle - det, real(0.0)))
+    g1 = wp.max(one - one / (middle + apart), real(0.0))
+    g2 = wp.max(one - one / wp.max(middle - apart, real(1.0e-6)), real(0.0))
+    G = half * (g1 + g2) * mat2(one, real(0.0), real(0.0), one)
+    if apart > real(1.0e-9):
+        G = G + (g1 - g2) / (two * apart) * (S - middle * mat2(one, real(0.0), real(0.0), one))
+    w = weight[f]
+    P = F - R
+    nn = wp.outer(n, n)
+    inside = mat3(one, real(0.0), real(0.0), real(0.0), one, real(0.0), real(0.0), real(0.0), one)
+    inside = inside - nn
+    for a in range(3):
+        ga = gradients[f, a]
+        force[faces[f, a]] += w * (P * ga)
+        ta = r1 * ga[0] - r0 * ga[1]
+        for b in range(3):
+            gb = gradients[f, b]
+            tb = r1 * gb[0] - r0 * gb[1]
+            block = wp.dot(ga, gb) * inside + wp.dot(ga, G * gb) * nn
+            matrix[blocks[f, 3 * a + b]] += w * (block - half * twist * wp.outer(ta, tb))
+
+
+@wp.func
+def angle_between(one: vec3, two: vec3, edge: vec3):
+    return wp.atan2(wp.dot(wp.cross(one, two), edge), wp.dot(one, two))
+
+
+@wp.kernel
+def bending(
+    x: wp.array(dtype=vec3),
+    hinges: wp.array2d(dtype=int),
+    angles: wp.array(dtype=real),
+    stiffness: wp.array(dtype=real),
+    blocks: wp.array2d(dtype=int),  # (H, 14): (i, i), then both ways 01, 02, 03, 12, 13
+    force: wp.array(dtype=vec3),
+    matrix: wp.array(dtype=mat3),
+):
+    """Gradient of stiffness / 2 (angle - rest)^2, and its Gauss-Newton matrix u u^T. The opposite
+    corners share no edge: 2 (u_2 x_2)(u_3 x_3) there is replaced by (u_2 x_2)^2 + (u_3 x_3)^2,
+    which is never less, and almost the same where both move alike.
+    """
+    h = wp.tid()
+    x0, x1 = x[hinges[h, 0]], x[hinges[h, 1]]
+    x2, x3 = x[hinges[h, 2]], x[hinges[h, 3]]
+    e = x1 - x0
+    length = wp.length(e)
+    edge = e / length
+    one, two = wp.cross(e, x2 - x0), wp.cross(x3 - x0, e)
+    turned = angle_between(one, two, edge) - angles[h]
+    if turned > real(3.141592653589793):
+        turned -= real(6.283185307179586)
+    if turned < real(-3.141592653589793):
+        turned += real(6.283185307179586)
+    k = stiffness[h]
+    least = real(1.0e-16)
+    a = one / wp.max(wp.dot(one, one), least)
+    b = two / wp.max(wp.dot(two, two), least)
+    u = mat43()
+    u[0] = -(wp.dot(x2 - x1, edge) * a + wp.dot(x3 - x1, edge) * b)
+    u[1] = wp.dot(x2 - x0, edge) * a + wp.dot(x3 - x0, edge) * b
+    u[2] = -length * a
+    u[3] = -length * b
+    for i in range(4):
+        force[hinges[h, i]] += k * turned * u[i]
+        factor = k
+        if i > 1:
+            factor = real(2.0) * k
+        matrix[blocks[h, i]] += factor * wp.outer(u[i], u[i])
+    at = int(4)
+    for i in range(2):
+        for j in range(i + 1, 4):
+            matrix[blocks[h, at]] += k * wp.outer(u[i], u[j])
+            matrix[blocks[h, at + 1]] += k * wp.outer(u[j], u[i])
+            at += 2
+
+
+@wp.kernel
+def conjugate_gradients(
+    first: wp.array(dtype=int),  # (N + 1,): row i has the blocks first[i] to first[i + 1]
+    middle: wp.array(dtype=int),  # (N,): where its diagonal block lies
+    column: wp.array(dtype=int),
+    matrix: wp.array(dtype=mat3),
+    inverse: wp.array(dtype=mat3),  # of the diagonal blocks
+    iterations: int,
+    tolerance: real,  # of the residual's norm, relative to the right-hand side's
+    b: wp.array(dtype=vec3),  # overwritten
+    x: wp.array(dtype=vec3),  # start, and result
+    p: wp.array(dtype=vec3),
+    t: wp.array(dtype=vec3),
+    w: wp.array(dtype=vec3),
+    done: wp.array(dtype=int),  # receives the number of iterations
+):
+    """matrix x = b, preconditioned by a symmetric Gauss-Seidel sweep, in Eisenstat's form (1981): a
+    sweep back and one forward do for the product with the matrix, too. One thread.
+
+    With A = L + D + L^T: CG on (D + L)^-1 A (D + L^T)^-1, preconditioned by D.
+    """
+    n = x.shape[0]
+    zero = real(0.0)
+    size = zero
+    for i in range(n):
+        size += wp.dot(b[i], inverse[i] * b[i])
+    for i in range(n):
+        r = b[i]
+        for k in range(first[i], first[i + 1]):
+            r -= matrix[k] * x[column[k]]
+        t[i] = r
+    for i in range(n):
+        r = t[i]
+        for k in range(first[i], middle[i]):
+            r -= matrix[k] * b[column[k]]
+        b[i] = inverse[i] * r
+    rho = zero
+    for i in range(n):
+        p[i] = matrix[middle[i]] * b[i]
+        rho += wp.dot(b[i], p[i])
+    done[0] = 0
+    limit = tolerance * tolerance * size
+    for turn in range(iterations):
+        if rho <= limit or rho <= real(1.0e-30):
+            break
+        for back in range(n):
+            i = n - 1 - back
+            r = p[i]
+            for k in range(middle[i] + 1, first[i + 1]):
+                r -= matrix[k] * t[column[k]]
+            t[i] = inverse[i] * r
+        curvature = zero
+        for i in range(n):
+            r = p[i] - matrix[middle[i]] * t[i]
+            for k in range(first[i], middle[i]):
+                r -= matrix[k] * w[column[k]]
+            w[i] = inverse[i] * r
+            curvature += wp.dot(p[i], t[i] + w[i])
+        alpha = rho / curvature
+        after = zero
+        for i in range(n):
+            x[i] = x[i] + alpha * t[i]
+            b[i] = b[i] - alpha * (t[i] + w[i])
+            after += wp.dot(b[i], matrix[middle[i]] * b[i])
+        beta = after / rho
+        for i in range(n):
+            p[i] = matrix[middle[i]] * b[i] + beta * p[i]
+        rho = after
+        done[0] = turn + 1

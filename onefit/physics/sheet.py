@@ -1,0 +1,119 @@
+"""A garment's mesh as a thin sheet: what its energies need, found once from the rest shape, and the
+energies themselves in torch: readable, differentiable, and what :mod:`onefit.physics.kernels` is
+tested against.
+
+Points stand first and frames second, (N, T, 3), as in :mod:`onefit.objective`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from polyfit import mesh
+
+from .material import GRAVITY, Material
+
+LEAST = 1e-12  # of the roots below, so that a degenerate triangle has a gradient
+
+
+class Sheet:
+    """``rest`` (N, 3) [m] and ``faces`` (F, 3), arrays, of ``material``.
+
+    ``area`` (F,) [m^2]; ``mass`` (N,) [kg]; ``gradients`` (F, 3, 2) [1/m], those of the three
+    corners' hat functions in the plane of the triangle, so that F = sum_a x_a g_a^T is the
+    deformation gradient; ``hinges`` (H, 4): the ends of an inner edge and the corners opposite to
+    it, of the face that has the edge in this sense and of the other; ``angles`` (H,) [rad], those
+    of the hinges at rest; ``stiffness`` (H,) [J], of a hinge for a unit angle.
+    """
+
+    def __init__(self, rest: np.ndarray, faces: np.ndarray, material: Material) -> None:
+        self.material = material
+        self.rest = np.asarray(rest, dtype=np.float64)
+        self.faces = np.asarray(faces, dtype=np.int64)
+        a, b, c = (self.rest[self.faces[:, k]] for k in range(3))
+        u = (b - a) / np.linalg.norm(b - a, axis=1, keepdims=True)
+        normal = np.cross(b - a, c - a)
+        double = np.linalg.norm(normal, axis=1)
+        v = np.cross(normal / double[:, None], u)
+        flat = np.zeros((len(a), 2, 2))  # the sides from corner 0, as columns
+        flat[:, 0, 0] = ((b - a) * u).sum(1)
+        flat[:, 0, 1], flat[:, 1, 1] = ((c - a) * u).sum(1), ((c - a) * v).sum(1)
+        inverse = np.linalg.inv(flat)
+        self.gradients = np.concatenate([-inverse.sum(1, keepdims=True), inverse], 1)
+        self.area = double / 2
+        share = np.repeat(material.density * self.area / 3, 3)
+        self.mass = np.bincount(self.faces.ravel(), share, len(self.rest))
+        self.edges = mesh.edges_of(self.faces)[0]
+        self.hinges, faces_of = _hinges(self.faces)
+        a, b = self.hinges[:, 0], self.hinges[:, 1]
+        squared = ((self.rest[a] - self.rest[b]) ** 2).sum(1)
+        self.stiffness = material.bending * squared / self.area[faces_of].sum(1)
+        self.angles = hinge_angles(torch.as_tensor(self.rest)[:, None], self.hinges)[:, 0].numpy()
+
+    def __len__(self) -> int:
+        return len(self.rest)
+
+
+def _hinges(faces):
+    """(H, 4) of :class:`Sheet`, and the two faces (H, 2) of each."""
+    start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    opposite = np.roll(faces, -2, axis=1).ravel()
+    count = faces.max() + 1
+    key, back = start * count + end, end * count + start
+    order = np.argsort(key)
+    at = np.searchsorted(key[order], back).clip(max=len(key) - 1)
+    other = order[at]
+    inner = (key[other] == back) & (start < end)
+    chosen, other = np.flatnonzero(inner), other[inner]
+    hinges = np.stack([start[chosen], end[chosen], opposite[chosen], opposite[other]], 1)
+    return hinges, np.stack([chosen // 3, other // 3], 1)
+
+
+def deformation(x, sheet):
+    """Deformation gradients (F, T, 3, 2) of points (N, T, 3) [m]."""
+    gradients = torch.as_tensor(sheet.gradients).to(x)
+    corners = x[torch.as_tensor(sheet.faces, device=x.device)]  # (F, 3, T, 3)
+    return torch.einsum("fatc,fad->ftcd", corners, gradients)
+
+
+def stretching(x, sheet):
+    """Energy (T,) [J] of points (N, T, 3) [m]: stretch / 2 * area * |F - R|^2 of each triangle, R
+    the rotation nearest to F (as-rigid-as-possible; Chao et al. 2010). Its tension is ``stretch``
+    times the strain, along both principal directions for itself.
+
+    |F - R|^2 = tr C - 2 tr S + 2, where C = F^T F = S^2 and tr S = sqrt(tr C + 2 sqrt(det C)).
+    """
+    F = deformation(x, sheet)
+    C = F.transpose(-1, -2) @ F
+    trace = C[..., 0, 0] + C[..., 1, 1]
+    det = C[..., 0, 0] * C[..., 1, 1] - C[..., 0, 1].square()
+    squared = trace - 2 * (trace + 2 * det.clamp(min=LEAST).sqrt()).sqrt() + 2
+    area = torch.as_tensor(sheet.area).to(x)
+    return sheet.material.stretch / 2 * (area[:, None] * squared).sum(0)
+
+
+def hinge_angles(x, hinges):
+    """Angles (H, T) [rad] between the normals of the triangles on both sides of hinges (H, 4), of
+    points (N, T, 3); more than 0 where the outer side is the convex one.
+    """
+    a, b, c, d = (x[torch.as_tensor(hinges[:, k], device=x.device)] for k in range(4))
+    edge = torch.nn.functional.normalize(b - a, dim=-1)
+    one, two = torch.linalg.cross(b - a, c - a), torch.linalg.cross(d - a, b - a)
+    sine = (torch.linalg.cross(one, two) * edge).sum(-1)
+    return torch.atan2(sine, (one * two).sum(-1))
+
+
+def bending(x, sheet):
+    """Energy (T,) [J] of points (N, T, 3) [m]: B / 2 |e|^2 / (A1 + A2) (angle - rest angle)^2 of
+    each hinge (Grinspun et al. 2003); the factor makes a cylinder of even triangles cost B / 2
+    curvature^2 an area.
+    """
+    turned = hinge_angles(x, sheet.hinges) - torch.as_tensor(sheet.angles).to(x)[:, None]
+    turned = torch.remainder(turned + torch.pi, 2 * torch.pi) - torch.pi
+    return (torch.as_tensor(sheet.stiffness).to(x)[:, None] / 2 * turned.square()).sum(0)
+
+
+def potential(x, sheet):
+    """Potential energy (T,) [J] of points (N, T, 3) [m] above z = 0."""
+    return GRAVITY * (torch.as_tensor(sheet.mass).to(x)[:, None] * x[..., 2]).sum(0)
