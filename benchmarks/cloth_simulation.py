@@ -20,8 +20,9 @@ class Settings:
     """``substeps`` of a frame at 30 frames a second, ``iterations`` of VBD in each; ``lead`` [s]:
     the body comes from its rest to the first pose, and ``hold`` [s]: it stays there, before the
     motion starts; ``gap`` [m] between cloth and skin; ``contact`` stiffness [N/m] of a vertex on
-    the body, which is looked for as far as ``reach`` [m]; ``damping`` of stretch and bending, as a time [s] times their stiffness; ``self_gap``
-    [m] at which cloth meets itself, 0 for cloth that does not.
+    the body, which is looked for as far as ``reach`` [m]; ``damping`` of stretch and bending, as a
+    time [s] times their stiffness; ``self_gap`` [m] at which cloth meets itself, 0 for cloth that
+    does not.
     """
 
     substeps: int = 10

@@ -3,8 +3,8 @@ garment on the same body, by a simulator that shares no code with OneFit.
 
     pip install newton                                  # for this benchmark only
     python benchmarks/onefit_reference.py CACHE         # dress and skirt in a dance, 2 s
-    python benchmarks/onefit_reference.py CACHE --garments tshirt circle_skirt --motions dance box \\
-        --picture side.jpg --video side.mp4
+    python benchmarks/onefit_reference.py CACHE --garments tshirt circle_skirt \\
+        --motions dance box --picture side.jpg --video side.mp4
 
 Simulations are kept in CACHE; one that is cut short goes on where it was. 2 s take 5 minutes for
 the skirt and 8 for the dress, on one core. The rows of the table: *skinning* is plain skinning of
@@ -242,9 +242,7 @@ def main(argv=None):
 
         if len({s.shape[1] for s in strips}) > 1:
             raise InputError("--picture: all rows need the same drapes")
-        cv2.imwrite(
-            args.picture, np.vstack(strips)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90]
-        )
+        cv2.imwrite(args.picture, np.vstack(strips)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])
     if films:
         from polysft_mi.pictures.video import write_video
 

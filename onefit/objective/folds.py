@@ -97,7 +97,9 @@ def _smoother(edges, count):
     the mean of the neighbours along ``edges`` (E, 2).
     """
     both = torch.cat([edges, edges.flip(1)])
-    degree = both[:, 0].bincount(minlength=count).clamp(min=1)
+    alone = (both[:, 0].bincount(minlength=count) == 0).nonzero()  # they stay where they are
+    both = torch.cat([both, alone.expand(-1, 2)])
+    degree = both[:, 0].bincount(minlength=count)
 
     def smoothed(x):
         for _ in range(SMOOTHING):

@@ -17,7 +17,7 @@ FLOOR = np.array([0.36, 0.37, 0.39])  # linear RGB
 SKY = np.array([0.50, 0.53, 0.58])  # its radiance, the same from everywhere above
 BOUNCE = 0.3  # radiance of floor, skin and cloth as seen from a vertex, a share of the sky's
 KEY = np.array([1.25, 1.2, 1.12])  # irradiance of the key light, across its direction
-TOWARDS_KEY = np.array([0.50, -0.55, 0.75])  # from where the camera looks along y
+TOWARDS_KEY = np.array([0.22, -0.71, 0.75])  # for a camera that looks along y
 KEY_RADIUS = 8.0  # degrees, as the key light is seen
 SKY_RAYS, KEY_RAYS = 128, 32  # from each vertex
 GRID, REACH = 96, 1.5  # cells of the floor's light along a side, and half of its side [m]
@@ -45,7 +45,7 @@ def render(parts, *, size=(640, 480), spp=16, azimuth=25.0, elevation=8.0, follo
     a, e = np.deg2rad((azimuth, elevation))
     away = np.array([np.sin(a) * np.cos(e), -np.cos(a) * np.cos(e), np.sin(e)])
     away *= across / np.tan(np.deg2rad(FOV / 2)) + half[1]
-    stage = Stage(everything[0], faces, colours, float(low[:, 2].min()))
+    stage = Stage(everything[0], faces, colours, float(low[:, 2].min()), a)
     for t, vertices in enumerate(everything):
         target = (low[t] + high[t]) / 2 if follow else middle
         stage.light(vertices, target)
@@ -54,10 +54,11 @@ def render(parts, *, size=(640, 480), spp=16, azimuth=25.0, elevation=8.0, follo
 
 class Stage:
     """One mesh, ``vertices`` (N, 3) [m], ``faces`` (F, 3), with a colour (N, 3) at each vertex, on
-    a floor at the height ``floor`` [m].
+    a floor at the height ``floor`` [m]; the key light is turned with the camera, by ``azimuth``
+    [rad].
     """
 
-    def __init__(self, vertices, faces, colours, floor):
+    def __init__(self, vertices, faces, colours, floor, azimuth=0.0):
         mesh = mi.Mesh("stage", len(vertices), len(faces))
         self.params = mi.traverse(mesh)
         self.params["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
@@ -70,7 +71,10 @@ class Stage:
         self.corners = mi.Vector3u(faces.T.astype(np.uint32))
         self.colour = mi.Color3f(colours.T.astype(np.float32))
         self.sky = _sphere(SKY_RAYS)
-        self.sun = _cap(TOWARDS_KEY / np.linalg.norm(TOWARDS_KEY), KEY_RADIUS, KEY_RAYS)
+        x, y, z = TOWARDS_KEY / np.linalg.norm(TOWARDS_KEY)
+        cos, sin = np.cos(azimuth), np.sin(azimuth)
+        towards = np.array([cos * x - sin * y, sin * x + cos * y, z])
+        self.sun = _cap(towards, KEY_RADIUS, KEY_RAYS)
 
     def light(self, vertices, target):
         """The vertices are at (N, 3) [m] from now on, and light falls on them, and on the floor
@@ -90,7 +94,7 @@ class Stage:
         front, _, key = self._irradiance(ground, up)
         lit = FLOOR * (front + KEY * (key * self.sun.mean(1)[2])[:, None])
         self.ground = mi.Texture2f(mi.TensorXf(lit.reshape(GRID, GRID, 3).astype(np.float32)))
-        self.open = FLOOR * (SKY * np.pi / np.pi + KEY * self.sun.mean(1)[2])
+        self.open = FLOOR * (SKY + KEY * self.sun.mean(1)[2])
 
     def _irradiance(self, points, normals):
         """At points (n, 3) with normals (n, 3): the sky's irradiance over pi on the front and on
