@@ -119,7 +119,7 @@ def bending(
         if i > 1:
             factor = real(2.0) * k
         matrix[blocks[h, i]] += factor * wp.outer(u[i], u[i])
-    at = int(4)
+    at = int(4)  # noqa: RUF046, UP018 - a variable to Warp
     for i in range(2):
         for j in range(i + 1, 4):
             matrix[blocks[h, at]] += k * wp.outer(u[i], u[j])
@@ -128,12 +128,171 @@ def bending(
 
 
 @wp.kernel
+def drag(
+    x: wp.array(dtype=vec3),
+    before: wp.array(dtype=vec3),
+    velocity: wp.array(dtype=vec3),  # at the start of the step [m/s]
+    faces: wp.array2d(dtype=int),
+    coefficient: real,  # drag * density of the air / 2 [kg/m^3]
+    dt: real,
+    blocks: wp.array2d(dtype=int),
+    force: wp.array(dtype=vec3),
+    matrix: wp.array(dtype=mat3),
+):
+    """The air's drag normal to each triangle, coefficient * area * |v.n| v.n n, with |v.n| of the
+    start of the step.
+    """
+    f = wp.tid()
+    a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+    normal = wp.cross(x[b] - x[a], x[c] - x[a])
+    double = wp.length(normal)
+    n = normal / wp.max(double, real(1.0e-12))
+    third = real(1.0) / real(3.0)
+    speed = third * wp.abs(wp.dot(velocity[a] + velocity[b] + velocity[c], n))
+    k = coefficient * real(0.5) * double * speed * third / dt
+    moved = third * wp.dot(x[a] - before[a] + x[b] - before[b] + x[c] - before[c], n)
+    nn = wp.outer(n, n)
+    for i in range(3):
+        force[faces[f, i]] += k * moved * n
+        matrix[blocks[f, 4 * i]] += k * nn
+
+
+@wp.kernel
+def contact(
+    x: wp.array(dtype=vec3),
+    before: wp.array(dtype=vec3),
+    corners: wp.array2d(dtype=int),  # (C, 4)
+    weights: wp.array2d(dtype=real),  # (C, 4); a corner of no weight is skipped
+    normal: wp.array(dtype=vec3),
+    offset: wp.array(dtype=real),  # [m]; the gap is normal . sum_i weight_i x_i - offset
+    moved: wp.array(dtype=vec3),  # [m]; by what the other side of the contact moved in the step
+    stiffness: real,  # [N/m]
+    drag: wp.array(dtype=real),  # [N/m]; friction for a unit slip
+    middle: wp.array(dtype=int),
+    gap: wp.array(dtype=real),  # receives the gap [m]
+    slip: wp.array(dtype=real),  # receives the length of the slip in the step [m]
+    force: wp.array(dtype=vec3),
+    matrix: wp.array(dtype=mat3),
+):
+    """stiffness / 2 gap^2 where the gap is below 0, and drag / 2 slip^2. In the matrix a contact of
+    several corners is as many of one corner, which is never less.
+    """
+    c = wp.tid()
+    n = normal[c]
+    at, slid = vec3(), -moved[c]
+    total = real(0.0)
+    for i in range(4):
+        if weights[c, i] != real(0.0):
+            place = x[corners[c, i]]
+            at += weights[c, i] * place
+            slid += weights[c, i] * (place - before[corners[c, i]])
+            total += wp.abs(weights[c, i])
+    gap[c] = wp.dot(n, at) - offset[c]
+    slid = slid - wp.dot(slid, n) * n
+    slip[c] = wp.length(slid)
+    k = real(0.0)
+    if gap[c] < real(0.0):
+        k = stiffness
+    if k + drag[c] > real(0.0):
+        g = k * gap[c] * n + drag[c] * slid
+        block = k * wp.outer(n, n)
+        block += drag[c] * (wp.identity(n=3, dtype=real) - wp.outer(n, n))
+        for i in range(4):
+            v = corners[c, i]
+            if weights[c, i] != real(0.0):
+                force[v] += weights[c, i] * g
+                matrix[middle[v]] += total * wp.abs(weights[c, i]) * block
+
+
+@wp.func
+def closest_on_triangle(p: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3):
+    """Barycentric coordinates of the nearest point (Ericson 2005, section 5.1.5)."""
+    ab, ac, ap = b - a, c - a, p - a
+    d1, d2 = wp.dot(ab, ap), wp.dot(ac, ap)
+    if d1 <= 0.0 and d2 <= 0.0:
+        return wp.vec3(1.0, 0.0, 0.0)
+    bp = p - b
+    d3, d4 = wp.dot(ab, bp), wp.dot(ac, bp)
+    if d3 >= 0.0 and d4 <= d3:
+        return wp.vec3(0.0, 1.0, 0.0)
+    vc = d1 * d4 - d3 * d2
+    if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
+        v = d1 / (d1 - d3)
+        return wp.vec3(1.0 - v, v, 0.0)
+    cp = p - c
+    d5, d6 = wp.dot(ab, cp), wp.dot(ac, cp)
+    if d6 >= 0.0 and d5 <= d6:
+        return wp.vec3(0.0, 0.0, 1.0)
+    vb = d5 * d2 - d1 * d6
+    if vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
+        w = d2 / (d2 - d6)
+        return wp.vec3(1.0 - w, 0.0, w)
+    va = d3 * d6 - d5 * d4
+    if va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
+        w = (d4 - d3) / ((d4 - d3) + (d5 - d6))
+        return wp.vec3(0.0, 1.0 - w, w)
+    v = vb / (va + vb + vc)
+    w = vc / (va + vb + vc)
+    return wp.vec3(1.0 - v - w, v, w)
+
+
+@wp.func
+def side_of(p: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3):
+    return wp.dot(p - a, wp.cross(b - a, c - a))
+
+
+@wp.kernel
+def proximity(
+    mesh: wp.uint64,  # of the vertices x
+    x: wp.array(dtype=wp.vec3),
+    before: wp.array(dtype=wp.vec3),  # where they were at the start of the step
+    rest: wp.array(dtype=wp.vec3),
+    reach: float,
+    face: wp.array(dtype=int),  # receives the nearest face within reach that is not beside, or -1
+    found: wp.array2d(dtype=float),  # receives its barycentric coordinates
+    normal: wp.array(dtype=wp.vec3),  # receives the direction in which the vertex must stay away
+):
+    """For each vertex of the sheet the nearest triangle of the same sheet within ``reach``. One
+    with a corner that lies within twice that of the vertex at rest is beside it, and does not
+    count. The vertex belongs on the side of the triangle on which it was before.
+    """
+    i = wp.tid()
+    p = x[i]
+    face[i] = -1
+    closest = reach * reach
+    around = wp.vec3(reach, reach, reach)
+    query = wp.mesh_query_aabb(mesh, p - around, p + around)
+    f = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+    while wp.mesh_query_aabb_next(query, f):
+        a = wp.mesh_get_index(mesh, 3 * f)
+        b = wp.mesh_get_index(mesh, 3 * f + 1)
+        c = wp.mesh_get_index(mesh, 3 * f + 2)
+        beside = wp.min(
+            wp.length_sq(rest[a] - rest[i]),
+            wp.min(wp.length_sq(rest[b] - rest[i]), wp.length_sq(rest[c] - rest[i])),
+        )
+        if i != a and i != b and i != c and beside > 4.0 * reach * reach:
+            near = closest_on_triangle(p, x[a], x[b], x[c])
+            away = p - (near[0] * x[a] + near[1] * x[b] + near[2] * x[c])
+            if wp.length_sq(away) < closest:
+                closest = wp.length_sq(away)
+                face[i] = f
+                for k in range(3):
+                    found[i, k] = near[k]
+                was = side_of(before[i], before[a], before[b], before[c])
+                if was * side_of(p, x[a], x[b], x[c]) > 0.0:
+                    normal[i] = wp.normalize(away)
+                else:
+                    normal[i] = wp.sign(was) * wp.normalize(wp.cross(x[b] - x[a], x[c] - x[a]))
+
+
+@wp.kernel
 def conjugate_gradients(
     first: wp.array(dtype=int),  # (N + 1,): row i has the blocks first[i] to first[i + 1]
     middle: wp.array(dtype=int),  # (N,): where its diagonal block lies
     column: wp.array(dtype=int),
     matrix: wp.array(dtype=mat3),
-    inverse: wp.array(dtype=mat3),  # of the diagonal blocks
+    inverse: wp.array(dtype=mat3),  # receives those of the diagonal blocks
     iterations: int,
     tolerance: real,  # of the residual's norm, relative to the right-hand side's
     b: wp.array(dtype=vec3),  # overwritten
@@ -152,6 +311,7 @@ def conjugate_gradients(
     zero = real(0.0)
     size = zero
     for i in range(n):
+        inverse[i] = wp.inverse(matrix[middle[i]])
         size += wp.dot(b[i], inverse[i] * b[i])
     for i in range(n):
         r = b[i]
