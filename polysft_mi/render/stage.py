@@ -24,7 +24,9 @@ GRID, REACH = 96, 1.5  # cells of the floor's light along a side, and half of it
 LIFT = 2e-3  # [m] by which rays start above a surface
 
 
-def render(parts, *, size=(640, 480), spp=16, azimuth=25.0, elevation=8.0, follow=False):
+def render(
+    parts, *, size=(640, 480), spp=16, azimuth=25.0, elevation=8.0, follow=False, near=None
+):
     """Images (H, W, 3) uint8 sRGB, one a frame, of moving meshes on a floor.
 
     ``parts``: of each mesh its vertices (T, N, 3) [m, z up], its faces (F, 3) and its colour,
@@ -37,7 +39,9 @@ def render(parts, *, size=(640, 480), spp=16, azimuth=25.0, elevation=8.0, follo
     first = np.concatenate([[0], np.cumsum(counts)[:-1]])
     faces = np.concatenate([np.asarray(f) + k for (_, f, _), k in zip(parts, first)])
     colours = np.repeat([c for _, _, c in parts], counts, axis=0)
-    low, high = everything.min(axis=1), everything.max(axis=1)  # (T, 3)
+    floor = float(everything[..., 2].min())
+    kept = everything if near is None else np.asarray(parts[near][0], np.float32)
+    low, high = kept.min(axis=1), kept.max(axis=1)  # (T, 3)
     middle = (low.min(axis=0) + high.max(axis=0)) / 2
     half = ((high - low).max(axis=0) if follow else high.max(axis=0) - low.min(axis=0)) / 2 * MARGIN
     height, width = size
@@ -45,7 +49,7 @@ def render(parts, *, size=(640, 480), spp=16, azimuth=25.0, elevation=8.0, follo
     a, e = np.deg2rad((azimuth, elevation))
     away = np.array([np.sin(a) * np.cos(e), -np.cos(a) * np.cos(e), np.sin(e)])
     away *= across / np.tan(np.deg2rad(FOV / 2)) + half[1]
-    stage = Stage(everything[0], faces, colours, float(low[:, 2].min()), a)
+    stage = Stage(everything[0], faces, colours, floor, a)
     for t, vertices in enumerate(everything):
         target = (low[t] + high[t]) / 2 if follow else middle
         stage.light(vertices, target)
