@@ -21,6 +21,7 @@ TOWARDS_KEY = np.array([0.22, -0.71, 0.75])  # for a camera that looks along y
 KEY_RADIUS = 8.0  # degrees, as the key light is seen
 SKY_RAYS, KEY_RAYS = 128, 32  # from each vertex
 GRID, REACH = 96, 1.5  # cells of the floor's light along a side, and half of its side [m]
+COVER = 0.025  # [m]; what lies so near before a vertex covers it
 LIFT = 2e-3  # [m] by which rays start above a surface
 
 
@@ -39,6 +40,7 @@ def render(
     first = np.concatenate([[0], np.cumsum(counts)[:-1]])
     faces = np.concatenate([np.asarray(f) + k for (_, f, _), k in zip(parts, first)])
     colours = np.repeat([c for _, _, c in parts], counts, axis=0)
+    part = np.repeat(np.arange(len(parts)), counts)
     floor = float(everything[..., 2].min())
     kept = everything if near is None else np.asarray(parts[near][0], np.float32)
     low, high = kept.min(axis=1), kept.max(axis=1)  # (T, 3)
@@ -49,7 +51,7 @@ def render(
     a, e = np.deg2rad((azimuth, elevation))
     away = np.array([np.sin(a) * np.cos(e), -np.cos(a) * np.cos(e), np.sin(e)])
     away *= across / np.tan(np.deg2rad(FOV / 2)) + half[1]
-    stage = Stage(everything[0], faces, colours, floor, a)
+    stage = Stage(everything[0], faces, colours, floor, a, part)
     for t, vertices in enumerate(everything):
         target = (low[t] + high[t]) / 2 if follow else middle
         stage.light(vertices, target)
@@ -59,10 +61,10 @@ def render(
 class Stage:
     """One mesh, ``vertices`` (N, 3) [m], ``faces`` (F, 3), with a colour (N, 3) at each vertex, on
     a floor at the height ``floor`` [m]; the key light is turned with the camera, by ``azimuth``
-    [rad].
+    [rad]. ``part`` (N,): which thing a vertex belongs to; by default all are one.
     """
 
-    def __init__(self, vertices, faces, colours, floor, azimuth=0.0):
+    def __init__(self, vertices, faces, colours, floor, azimuth=0.0, part=None):
         mesh = mi.Mesh("stage", len(vertices), len(faces))
         self.params = mi.traverse(mesh)
         self.params["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
@@ -72,6 +74,8 @@ class Stage:
         self.params = mi.traverse(self.scene)
         self.key = next(k for k in self.params.keys() if k.endswith("vertex_positions"))
         self.faces, self.floor = faces, floor
+        self.part = np.zeros(len(vertices), np.uint32) if part is None else part.astype(np.uint32)
+        self.part_of_face = mi.UInt32(self.part[faces[:, 0]])
         self.corners = mi.Vector3u(faces.T.astype(np.uint32))
         self.colour = mi.Color3f(colours.T.astype(np.float32))
         self.sky = _sphere(SKY_RAYS)
@@ -87,7 +91,9 @@ class Stage:
         self.params[self.key] = mi.Float(vertices.astype(np.float32).ravel())
         self.params.update()
         self.normals = _normals(vertices, self.faces)
-        front, back, key = self._irradiance(vertices, self.normals)
+        front, back, key = self._uncovered(
+            vertices, *self._irradiance(vertices, self.normals)
+        )
         self.front, self.back = (mi.Color3f(x.T.astype(np.float32)) for x in (front, back))
         self.shadow, self.normal = mi.Float(key), mi.Vector3f(self.normals.T.astype(np.float32))
         self.centre = np.asarray(target, np.float64)[:2]
@@ -99,6 +105,28 @@ class Stage:
         lit = FLOOR * (front + KEY * (key * self.sun.mean(1)[2])[:, None])
         self.ground = mi.Texture2f(mi.TensorXf(lit.reshape(GRID, GRID, 3).astype(np.float32)))
         self.open = FLOOR * (SKY + KEY * self.sun.mean(1)[2])
+
+    def _uncovered(self, vertices, *light):
+        """The ``light`` of each vertex; of those that another part covers, skin below cloth, what
+        uncovered neighbours have: so no darkness leaks out at the rim of a sleeve.
+        """
+        p, normal = (mi.Point3f(x.T.astype(np.float32)) for x in (vertices, self.normals))
+        ray = mi.Ray3f(p + LIFT * normal, mi.Vector3f(normal))
+        hit = self.scene.ray_intersect_preliminary(ray)
+        other = dr.gather(mi.UInt32, self.part_of_face, hit.prim_index, hit.is_valid())
+        covered = hit.is_valid() & (hit.t < COVER) & (other != mi.UInt32(self.part))
+        seen = ~np.array(covered)
+        start, end = self.faces.ravel(), np.roll(self.faces, -1, axis=1).ravel()
+        start, end = np.concatenate([start, end]), np.concatenate([end, start])
+        light = np.column_stack(light)
+        for _ in range(2):
+            give = seen[end] & ~seen[start]
+            count = np.bincount(start[give], minlength=len(seen))
+            for k in range(light.shape[1]):
+                total = np.bincount(start[give], light[end[give], k], len(seen))
+                light[:, k] = np.where(count > 0, total / np.maximum(count, 1), light[:, k])
+            seen = seen | (count > 0)
+        return light[:, :3], light[:, 3:6], light[:, 6]
 
     def _irradiance(self, points, normals):
         """At points (n, 3) with normals (n, 3): the sky's irradiance over pi on the front and on

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from onefit.garment.remesh import loops
-from polyfit import mesh
 
+from .block import armhole
 from .patterns import (
     along_arm,
     arm_hole,
@@ -23,7 +23,6 @@ from .patterns import (
     sleeveless_top,
     upper_arm_to,
 )
-from .block import armhole
 from .sew import meshed
 
 
@@ -99,7 +98,7 @@ def waistband(b):
 
 # The pattern, its vertices, and how long the ring of a skirt is that is sewn to its lower rim [m]
 LOOSE_PATTERNS = {
-    "boxy_tshirt": (boxy_tshirt, 4500, 0), "shirt": (shirt, 6000, 0),
+    "boxy_tshirt": (boxy_tshirt, 5000, 0), "shirt": (shirt, 6000, 0),
     "wide_trousers": (wide_trousers, 6000, 0), "waisted_dress": (bodice, 1250, 0.42),
     "circle_skirt": (waistband, 165, 0.44),
 }  # fmt: skip
@@ -141,7 +140,9 @@ def with_ring(V, F, length):
         longer = (along[-1] + 2 * np.pi * r) / (along[-1] + 2 * np.pi * wide)
         amplitude = np.sqrt(longer**2 - 1) * np.sqrt(2) * (along[-1] / 2 / np.pi + wide) / WAVES
         across = wide + amplitude * np.cos(wave)
-        start.append(np.column_stack([at + across[:, None] * normal, 0 * s + level - r * np.sin(SLOPE)]))
+        start.append(
+            np.column_stack([at + across[:, None] * normal, 0 * s + level - r * np.sin(SLOPE)])
+        )
     points = np.concatenate(flat)
     G = _triangles(points, len(waist))
     number = np.concatenate([rim, len(V) + np.arange(len(points) - len(rim))])
@@ -179,7 +180,9 @@ def _outline(waist):
         parallel = spline(fine) + r * normal
         length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(parallel, axis=0), axis=1))])
         at = np.interp(s * length[-1], length, fine)
-        return spline(at), np.column_stack([np.interp(at, fine, np.cos(angle)), np.interp(at, fine, np.sin(angle))])
+        return spline(at), np.column_stack(
+            [np.interp(at, fine, np.cos(angle)), np.interp(at, fine, np.sin(angle))]
+        )
 
     return along, out
 

@@ -51,16 +51,28 @@ def _clipped(V, F, inside):
 
 
 def write(names, folder):
-    """Sew the named templates into ``folder``."""
+    """Sew the named templates into ``folder``; those of :data:`~.loose.LOOSE_PATTERNS` fall once,
+    and keep their cut.
+    """
+    from . import fall, loose
+
     body = standard_body()
     block = Block(body.vertices.numpy(), body.faces.numpy())
     os.makedirs(folder, exist_ok=True)
     for name in names:
-        V, F = sewn(block, name)
+        if name in loose.LOOSE_PATTERNS:
+            cut = loose.cut(block, name)
+            F, arrays = cut.faces, dict(vertices=fall.fallen(cut), cut=cut.vertices)
+        else:
+            V, F = sewn(block, name)
+            arrays = dict(vertices=V)
+        arrays = {key: x.astype(np.float32) for key, x in arrays.items()}
         path = os.path.join(folder, f"{name}.npz")
         with aside(path) as temporary:
-            np.savez_compressed(temporary, vertices=V.astype(np.float32), faces=F.astype(np.int32))
+            np.savez_compressed(temporary, faces=F.astype(np.int32), **arrays)
+        V = arrays.get("cut", arrays["vertices"]).astype(np.float64)
         print(
             f"{path}: {len(V)} vertices, {len(F)} faces, {mesh.areas(V, F).sum():.3f} m^2,"
-            f" {len(loops(F))} loops"
+            f" {len(loops(F))} loops",
+            flush=True,
         )
