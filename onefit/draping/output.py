@@ -50,25 +50,13 @@ def check_folder(folder, overwrite):
             raise InputError(f"{folder}: holds no drape; --overwrite replaces nothing else")
 
 
-def drape_into(
-    folder,
-    draper,
-    garment,
-    motion,
-    shape,
-    *,
-    about,
-    post=False,
-    finish=0,
-    material="cotton",
-    **files,
-):
+def drape_into(folder, draper, garment, motion, shape, *, about, how=None, **files):
     """Drape and write all files; returns the :class:`Outcome`.
 
     ``folder``: new, empty or holding a drape, which is replaced at the end. ``draper``,
-    ``garment``, ``motion``, ``shape``, and ``how``, a dict of ``post``, ``finish``, ``material``: as
-    :meth:`onefit.Draper.drape` takes them. ``about``: names for figures.json; ``files``: options of :func:`write`. Progress goes to
-    stderr.
+    ``garment``, ``motion``, ``shape``, and ``how``, a dict of ``post``, ``finish`` and
+    ``material``: as :meth:`onefit.Draper.drape` takes them. ``about``: names for figures.json;
+    ``files``: options of :func:`write`. Progress goes to stderr.
     """
     folder, how = Path(folder), how or {}
     draper.ease(garment)  # cut and tried on once for all motions, so it does not count
@@ -80,7 +68,7 @@ def drape_into(
     )
     with Progress(*columns, console=Console(stderr=True)) as progress:
         task = progress.add_task(
-            "finishing", total=len(motion.resampled(FPS).poses), visible=finish > 0
+            "finishing", total=len(motion.resampled(FPS).poses), visible=how.get("finish", 0) > 0
         )
         start = time.perf_counter()
         advance = lambda: progress.advance(task)

@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.sparse import bsr_matrix
 
 from . import kernels
 from .contact import Contacts
@@ -109,6 +110,13 @@ class Cloth:
             )  # fmt: skip
             found.append((gap.numpy(), slip.numpy()))
         return force.numpy(), found
+
+    def product(self, vector: np.ndarray) -> np.ndarray:
+        """The matrix that was last assembled times ``vector`` (N, 3)."""
+        first, _, column = (a.numpy() for a in self._rows)
+        size = 3 * len(self.sheet)
+        matrix = bsr_matrix((self._matrix.numpy(), column, first), shape=(size, size))
+        return (matrix @ np.ravel(vector)).reshape(-1, 3)
 
     def flight(self, dt: float) -> np.ndarray:
         """Where the vertices (N, 3) [m] would be after a step of ``dt`` [s] without any force but
