@@ -25,9 +25,7 @@ COVER = 0.025  # [m]; what lies so near before a vertex covers it
 LIFT = 2e-3  # [m] by which rays start above a surface
 
 
-def render(
-    parts, *, size=(640, 480), spp=16, azimuth=25.0, elevation=8.0, follow=False, near=None
-):
+def render(parts, *, size=(640, 480), spp=16, azimuth=25.0, elevation=8.0, follow=False, near=None):
     """Images (H, W, 3) uint8 sRGB, one a frame, of moving meshes on a floor.
 
     ``parts``: of each mesh its vertices (T, N, 3) [m, z up], its faces (F, 3) and its colour,
@@ -91,9 +89,7 @@ class Stage:
         self.params[self.key] = mi.Float(vertices.astype(np.float32).ravel())
         self.params.update()
         self.normals = _normals(vertices, self.faces)
-        front, back, key = self._uncovered(
-            vertices, *self._irradiance(vertices, self.normals)
-        )
+        front, back, key = self._uncovered(vertices, *self._irradiance(vertices, self.normals))
         self.front, self.back = (mi.Color3f(x.T.astype(np.float32)) for x in (front, back))
         self.shadow, self.normal = mi.Float(key), mi.Vector3f(self.normals.T.astype(np.float32))
         self.centre = np.asarray(target, np.float64)[:2]

@@ -31,9 +31,15 @@ def tube(radius, n=64, rows=12):
     for r in range(rows - 1):
         a, b = r * n, (r + 1) * n
         if r % 2 == 0:
-            F += [np.stack([a + k, a + after, b + k], 1), np.stack([a + after, b + after, b + k], 1)]
+            F += [
+                np.stack([a + k, a + after, b + k], 1),
+                np.stack([a + after, b + after, b + k], 1),
+            ]
         else:
-            F += [np.stack([a + k, b + after, b + k], 1), np.stack([a + k, a + after, b + after], 1)]
+            F += [
+                np.stack([a + k, b + after, b + k], 1),
+                np.stack([a + k, a + after, b + after], 1),
+            ]
     F = np.concatenate(F)
     return V, F, 2 * np.pi * radius * side * np.sqrt(3) / 2 * (rows - 1)
 

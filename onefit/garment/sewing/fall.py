@@ -13,7 +13,7 @@ from onefit.physics.settings import Settings
 from onefit.physics.sheet import Sheet
 
 MATERIAL = "cotton"
-STEP, SECONDS = 1 / 120, 1.6  # [s] of a step, and of the whole fall
+STEP, SECONDS = 1 / 120, 2.5  # [s] of a step, and of the whole fall
 SLOWING = 0.88  # of velocities in each step: the cloth comes to rest, as if it fell through honey
 SETTINGS = Settings(clearance=0.006, least=0.0045, newton=2, iterations=150, tolerance=3e-4)
 

@@ -78,10 +78,28 @@ def straight(b):
 
 
 def wide_trousers(b):
-    """Fitted at the waist, with legs that widen down to the hem."""
-    ease = 0.005 + 0.014 * ramp(b.z, 0.13, 0.0) + 0.055 * ramp(b.z, 0.02, -0.60)
+    """Fitted at the waist, with legs that fall straight from the widest place of the thigh."""
+    ease = 0.005 + 0.013 * ramp(b.z, 0.13, 0.0)
     apart = np.where(b.z < -0.10, 0.008 - b.side, -1.0)  # the legs do not meet
-    return np.maximum(lower(b) - ease, apart), lambda x, y, z: minimum(0.15 - z, z + 0.71)
+    field = np.minimum(lower(b), straight_legs(b)) - ease
+    return np.maximum(field, apart), lambda x, y, z: minimum(0.15 - z, z + 0.70)
+
+
+LEG_SLOPE = 0.16  # of the legs, outwards a metre down
+
+
+def straight_legs(b):
+    """Each leg as wide as it was anywhere above, along its own slope."""
+    low = np.searchsorted(b.z.ravel(), -0.12)  # below the crotch
+    half = b.x.ravel() > 0
+    x = b.x.ravel()[half]
+    out = np.full_like(b.legs, 1.0)
+    above = b.legs[half][:, :, low]
+    for k in range(low, -1, -1):
+        shifted = np.array([np.interp(x - LEG_SLOPE * b.spacing, x, row) for row in above.T]).T
+        above = np.minimum(shifted, b.legs[half][:, :, k])
+        out[half, :, k] = above
+    return np.minimum(out, out[::-1])
 
 
 def bodice(b):
