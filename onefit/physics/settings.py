@@ -27,7 +27,7 @@ class Settings:
 
     newton: int = 2
     iterations: int = 25
-    tolerance: float = 1e-3
+    tolerance: float = 1e-5
     clearance: float = 0.004
     least: float = 0.001
     reach: float = 0.03

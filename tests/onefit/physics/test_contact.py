@@ -51,15 +51,14 @@ def test_no_point_of_a_face_is_in_a_ball_that_cloth_falls_on():
 def test_friction_holds_cloth_on_a_slope_or_does_not(friction, held):
     V, F = grid(6, 6, 0.02)
     slope = np.arctan(0.3)
-    turn = np.array(
-        [[np.cos(slope), 0, np.sin(slope)], [0, 1, 0], [-np.sin(slope), 0, np.cos(slope)]]
-    )
+    c, s = np.cos(slope), np.sin(slope)
+    turn = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
     box = trimesh.creation.box((2, 2, 0.2)).subdivide().subdivide()
     material = type(COTTON)(**(vars(COTTON) | {"friction": friction, "drag": 0.0}))
     x = (V + [0, 0, 0.1 + Settings().clearance]) @ turn.T
     cloth, _ = on_body(Sheet(V, F, material), x, box.vertices @ turn.T, box.faces, 60)
     slid = np.linalg.norm((cloth.x - x).mean(0))
-    expected = 9.81 * (np.sin(slope) - friction * np.cos(slope)) / 2
+    expected = 9.81 * (s - friction * c) / 2
     assert slid < 0.01 if held else slid == pytest.approx(expected, rel=0.25)
 
 
@@ -76,17 +75,18 @@ def test_a_fast_body_takes_cloth_along():
 
 def test_a_layer_that_falls_on_another_stays_on_it():
     V, F = grid(10, 10, 0.012)
-    V2 = V * [0.6, 0.6, 1] + [0, 0, 0.02]
+    V2 = V * [0.6, 0.6, 1] + [0, 0, 0.015]
     sheet = Sheet(np.concatenate([V, V2]), np.concatenate([F, F + len(V)]), COTTON)
     settings = Settings()
     itself = SelfContact(sheet, settings, 0)
-    cloth = Cloth(sheet, sheet.rest, settings, len(sheet))
+    x = sheet.rest - [0, 0, 0.009] * (np.arange(len(sheet)) >= len(V))[:, None]  # 6 mm above it
+    cloth = Cloth(sheet, x, settings, len(sheet))
     fixed = np.where(np.arange(len(sheet)) < len(V), 1e3, 0.0)
     for _ in range(40):
         contacts = itself.find(cloth.x, cloth.flight(1 / 60))
         cloth.step(1 / 60, [contacts], sheet.rest, fixed)
     above = cloth.x[len(V) :, 2] - cloth.x[: len(V), 2].mean()
-    assert 0.5 * settings.apart < above.min() and above.max() < 4 * settings.apart
+    assert above.min() > 0 and above.max() < 2 * settings.apart
 
 
 def test_points_of_faces_lie_no_farther_apart_than_the_spacing():
