@@ -21,7 +21,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "body.smpl": ["PlainBody", "SmplBody"],
         "draping.draper": ["Drape", "Draper", "load"],
         "garment.charts.patched": ["PatchedGarment"],
-        "garment.garment": ["TEMPLATES", "Garment"],
+        "garment.garment": ["LOOSE", "TEMPLATES", "Garment"],
         "motion.motion": ["Motion"],
         "network.network": ["OneFit"],
         "network.weights": ["pretrained"],

@@ -18,7 +18,9 @@ LEAST = 1e-12  # of the roots below, so that a degenerate triangle has a gradien
 
 
 class Sheet:
-    """``rest`` (N, 3) [m] and ``faces`` (F, 3), arrays, of ``material``.
+    """``rest`` (N, 3) [m] and ``faces`` (F, 3), arrays, of ``material``. With ``sides`` (F, 3) [m],
+    from each corner of a face to the next, the lengths at rest are these, not those of ``rest``,
+    and the sheet rests flat: cloth that hangs in folds, as it was cut.
 
     ``area`` (F,) [m^2]; ``mass`` (N,) [kg]; ``gradients`` (F, 3, 2) [1/m], those of the three
     corners' hat functions in the plane of the triangle, so that F = sum_a x_a g_a^T is the
@@ -27,36 +29,51 @@ class Sheet:
     of the hinges at rest; ``stiffness`` (H,) [J], of a hinge for a unit angle.
     """
 
-    def __init__(self, rest: np.ndarray, faces: np.ndarray, material: Material) -> None:
+    def __init__(
+        self,
+        rest: np.ndarray,
+        faces: np.ndarray,
+        material: Material,
+        sides: np.ndarray | None = None,
+    ) -> None:
         self.material = material
         self.rest = np.asarray(rest, dtype=np.float64)
         self.faces = np.asarray(faces, dtype=np.int64)
-        a, b, c = (self.rest[self.faces[:, k]] for k in range(3))
-        u = (b - a) / np.linalg.norm(b - a, axis=1, keepdims=True)
-        normal = np.cross(b - a, c - a)
-        double = np.linalg.norm(normal, axis=1)
-        v = np.cross(normal / double[:, None], u)
-        flat = np.zeros((len(a), 2, 2))  # the sides from corner 0, as columns
-        flat[:, 0, 0] = ((b - a) * u).sum(1)
-        flat[:, 0, 1], flat[:, 1, 1] = ((c - a) * u).sum(1), ((c - a) * v).sum(1)
+        corners = self.rest[self.faces]
+        of_rest = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
+        self.sides = of_rest if sides is None else np.asarray(sides, dtype=np.float64)
+        flat = flattened(self.sides)
         inverse = np.linalg.inv(flat)
         self.gradients = np.concatenate([-inverse.sum(1, keepdims=True), inverse], 1)
-        self.area = double / 2
+        self.area = np.linalg.det(flat) / 2
         share = np.repeat(material.density * self.area / 3, 3)
         self.mass = np.bincount(self.faces.ravel(), share, len(self.rest))
         self.edges = mesh.edges_of(self.faces)[0]
-        self.hinges, faces_of = _hinges(self.faces)
-        a, b = self.hinges[:, 0], self.hinges[:, 1]
-        squared = ((self.rest[a] - self.rest[b]) ** 2).sum(1)
-        self.stiffness = material.bending * squared / self.area[faces_of].sum(1)
-        self.angles = hinge_angles(torch.as_tensor(self.rest)[:, None], self.hinges)[:, 0].numpy()
+        self.hinges, of = _hinges(self.faces)
+        squared = self.sides.ravel()[of[:, 0]] ** 2
+        self.stiffness = material.bending * squared / self.area[of // 3].sum(1)
+        if sides is None:
+            x = torch.as_tensor(self.rest)[:, None]
+            self.angles = hinge_angles(x, self.hinges)[:, 0].numpy()
+        else:
+            self.angles = np.zeros(len(self.hinges))
 
     def __len__(self) -> int:
         return len(self.rest)
 
 
+def flattened(sides: np.ndarray) -> np.ndarray:
+    """Matrices (F, 2, 2) [m] whose columns are the sides from corner 0 to 1 and from 0 to 2 of
+    triangles laid flat, of the lengths ``sides`` (F, 3) [m] of 01, 12, 20.
+    """
+    a, b, c = sides.T
+    x = (a * a + c * c - b * b) / (2 * a)
+    y = np.sqrt(np.maximum(c * c - x * x, LEAST))
+    return np.stack([np.stack([a, x], 1), np.stack([0 * a, y], 1)], 1)
+
+
 def _hinges(faces):
-    """(H, 4) of :class:`Sheet`, and the two faces (H, 2) of each."""
+    """(H, 4) of :class:`Sheet`, and of each the sides (H, 2) of its two faces, 3 face + corner."""
     start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
     opposite = np.roll(faces, -2, axis=1).ravel()
     count = faces.max() + 1
@@ -67,7 +84,7 @@ def _hinges(faces):
     inner = (key[other] == back) & (start < end)
     chosen, other = np.flatnonzero(inner), other[inner]
     hinges = np.stack([start[chosen], end[chosen], opposite[chosen], opposite[other]], 1)
-    return hinges, np.stack([chosen // 3, other // 3], 1)
+    return hinges, np.stack([chosen, other], 1)
 
 
 def deformation(x, sheet):
