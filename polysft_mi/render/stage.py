@@ -30,9 +30,11 @@ def render(parts, *, size=(640, 480), spp=16, azimuth=25.0, elevation=8.0, follo
     """Images (H, W, 3) uint8 sRGB, one a frame, of moving meshes on a floor.
 
     ``parts``: of each mesh its vertices (T, N, 3) [m, z up], its faces (F, 3) and its colour,
-    linear RGB; a mesh of fewer than :data:`FINE` faces is drawn as its smooth surface (Loop 1987). ``size``: (height, width) [pixels]; ``spp``: samples a pixel, on a square grid;
-    ``azimuth`` [degrees] to the side of the -y axis that the camera stands on, ``elevation`` above
-    the floor. The camera keeps all in the picture; with ``follow`` it goes along with what moves.
+    linear RGB; a mesh of fewer than :data:`FINE` faces is drawn as Loop's smooth surface.
+    ``size``: (height, width) [pixels]; ``spp``: samples a pixel, on a square grid; ``azimuth``
+    [degrees] to the side of the -y axis that the camera stands on, ``elevation`` above the floor.
+    The camera keeps all in the picture; with ``follow`` it goes along with what moves. ``near``:
+    the number of one of the parts; the camera keeps that one in the picture.
     """
     parts = [_smooth(*part) for part in parts]
     everything = np.concatenate([v for v, _, _ in parts], axis=1)
