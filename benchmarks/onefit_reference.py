@@ -71,7 +71,7 @@ def simulated(folder, garment, motion, body, material, settings, advance=lambda:
     held = waistband.held(rest.numpy(), garment.faces.numpy(), body.joints.numpy()) > 0.5
     moved = skinning.skin(rest[held], garment.blend_weights[held], maps).numpy()
     simulation = cloth_simulation.Simulation(
-        rest.numpy(), garment.faces.numpy(), _sides(garment, rest), held,
+        rest.numpy(), garment.faces.numpy(), garment.sides(rest).double().numpy(), held,
         surface[0], body.faces.numpy(), material, settings,
     )  # fmt: skip
     if state is not None:
@@ -89,13 +89,6 @@ def simulated(folder, garment, motion, body, material, settings, advance=lambda:
                     temporary, vertices=np.array(done, np.float32), state=simulation.state
                 )
     return torch.as_tensor(np.array(done[lead:]))
-
-
-def _sides(garment, rest):
-    """Lengths at rest (F, 3) [m] of the faces' sides, from corner k to the next."""
-    F = garment.faces
-    sides = [torch.stack([F[:, k], F[:, (k + 1) % 3]], 1) for k in range(3)]
-    return torch.stack([garment.rest_lengths(s, rest) for s in sides], 1).double().numpy()
 
 
 def _led_in(body, motion, settings):

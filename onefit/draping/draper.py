@@ -181,6 +181,7 @@ class Draper:
             made = finished(
                 vertices, rest, faces, self._held(garment), bodies, body_faces,
                 material=material, steps=finish, fps=FPS, settings=settings,
+                sides=None if garment.cut is None else garment.sides(rest).double().numpy(),
             )  # fmt: skip
             vertices = torch.stack([(frame, advance())[0] for frame in made])
         return Drape(vertices, faces, rest, bodies, body_faces, root, FPS)

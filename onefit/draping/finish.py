@@ -32,18 +32,20 @@ def finished(
     steps: int,
     fps: float,
     settings: Settings | None = None,
+    sides: np.ndarray | None = None,
 ) -> Iterator[torch.Tensor]:
     """The garment's vertices (N, 3) [m] in one frame after the other.
 
     ``guide`` (T, N, 3) [m]: the drape that is finished; ``rest`` (N, 3) [m] and ``faces`` (F, 3) of
     the garment graded to the body; ``held`` (N,): how firmly each vertex is held, as
     :func:`onefit.garment.waistband.held` says; ``bodies`` (T, V, 3) [m], ``body_faces``; ``steps``
-    in a frame, in which the body moves along straight lines.
+    in a frame, in which the body moves along straight lines; ``sides`` (F, 3) [m]: the lengths of
+    the faces at rest, of a garment that was cut otherwise than it hangs.
     """
     settings = settings or Settings()
     order = _order(faces.numpy(), len(rest))
     number = np.argsort(order)
-    sheet = Sheet(rest.double().numpy()[order], number[faces.numpy()], material)
+    sheet = Sheet(rest.double().numpy()[order], number[faces.numpy()], material, sides)
     start, moving = guide.double().numpy()[:, order], bodies.double().numpy()
     body = BodyContact(sheet, bodies[0], body_faces, settings)
     itself = SelfContact(sheet, settings, len(body))

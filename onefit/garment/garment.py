@@ -206,6 +206,11 @@ class Garment:
         cut = length(self.cut)
         return cut if graded is None else cut * length(graded) / length(self.vertices)
 
+    def sides(self, graded: torch.Tensor | None = None) -> torch.Tensor:
+        """:meth:`rest_lengths` (F, 3) [m] of the faces' sides, from each corner to the next."""
+        pairs = torch.stack([self.faces, self.faces.roll(-1, 1)], -1)
+        return self.rest_lengths(pairs.reshape(-1, 2), graded).reshape(-1, 3)
+
     def remeshed(self, count: int) -> Garment:
         """The same garment with about ``count`` vertices: every face is cut in four as often as is
         needed for 0.7 times as many; where there are more than 1.4 times as many, even triangles
@@ -218,11 +223,13 @@ class Garment:
             finer = lambda x: np.concatenate([x, x[edges].mean(axis=1)])
             V, cut = finer(V), None if cut is None else finer(cut)
         if len(V) > 1.4 * count:
-            W, G = V, F
-            V, F = remesh.remeshed(W, G, count)
-            if cut is not None:
-                at = ClosestSurface(W, G)(V)
-                cut = np.einsum("nk,nkd->nd", at.barycentric, cut[G[at.face]])
+            if cut is None:
+                V, F = remesh.remeshed(V, F, count)
+            else:  # the cut has no folds, in which a point is near to many
+                W, G = cut, F
+                cut, F = remesh.remeshed(W, G, count)
+                at = ClosestSurface(W, G)(cut)
+                V = np.einsum("nk,nkd->nd", at.barycentric, V[G[at.face]])
         V, pushed = fitting.pushed_out(V, F, self.name)
         return Garment.bound(self.name, V, F, self.repairs + pushed, cut)
 

@@ -21,6 +21,7 @@ TOWARDS_KEY = np.array([0.22, -0.71, 0.75])  # for a camera that looks along y
 KEY_RADIUS = 8.0  # degrees, as the key light is seen
 SKY_RAYS, KEY_RAYS = 128, 32  # from each vertex
 GRID, REACH = 96, 1.5  # cells of the floor's light along a side, and half of its side [m]
+FINE = 20_000  # faces
 COVER = 0.025  # [m]; what lies so near before a vertex covers it
 LIFT = 2e-3  # [m] by which rays start above a surface
 
@@ -29,18 +30,21 @@ def render(parts, *, size=(640, 480), spp=16, azimuth=25.0, elevation=8.0, follo
     """Images (H, W, 3) uint8 sRGB, one a frame, of moving meshes on a floor.
 
     ``parts``: of each mesh its vertices (T, N, 3) [m, z up], its faces (F, 3) and its colour,
-    linear RGB. ``size``: (height, width) [pixels]; ``spp``: samples a pixel, on a square grid;
-    ``azimuth`` [degrees] to the side of the -y axis that the camera stands on, ``elevation`` above
-    the floor. The camera keeps all in the picture; with ``follow`` it goes along with what moves.
+    linear RGB; a mesh of fewer than :data:`FINE` faces is drawn as Loop's smooth surface.
+    ``size``: (height, width) [pixels]; ``spp``: samples a pixel, on a square grid; ``azimuth``
+    [degrees] to the side of the -y axis that the camera stands on, ``elevation`` above the floor.
+    The camera keeps all in the picture; with ``follow`` it goes along with what moves. ``near``:
+    the number of one of the parts; the camera keeps that one in the picture.
     """
-    everything = np.concatenate([np.asarray(v, np.float32) for v, _, _ in parts], axis=1)
+    parts = [_smooth(*part) for part in parts]
+    everything = np.concatenate([v for v, _, _ in parts], axis=1)
     counts = [v.shape[1] for v, _, _ in parts]
     first = np.concatenate([[0], np.cumsum(counts)[:-1]])
-    faces = np.concatenate([np.asarray(f) + k for (_, f, _), k in zip(parts, first)])
+    faces = np.concatenate([f + k for (_, f, _), k in zip(parts, first)])
     colours = np.repeat([c for _, _, c in parts], counts, axis=0)
     part = np.repeat(np.arange(len(parts)), counts)
     floor = float(everything[..., 2].min())
-    kept = everything if near is None else np.asarray(parts[near][0], np.float32)
+    kept = everything if near is None else parts[near][0]
     low, high = kept.min(axis=1), kept.max(axis=1)  # (T, 3)
     middle = (low.min(axis=0) + high.max(axis=0)) / 2
     half = ((high - low).max(axis=0) if follow else high.max(axis=0) - low.min(axis=0)) / 2 * MARGIN
@@ -210,6 +214,17 @@ class Stage:
         haze = dr.exp(-dr.maximum(distance - 4, 0) / 12)
         haze = dr.select(d.z < 0, haze, 0)
         return mi.Color3f(*map(float, SKY)) * (1 - haze) + floor * haze
+
+
+def _smooth(vertices, faces, colour):
+    """The part with each face cut in four by Loop's rules, if it has fewer than FINE faces."""
+    vertices, faces = np.asarray(vertices, np.float32), np.asarray(faces)
+    if len(faces) >= FINE:
+        return vertices, faces, colour
+    from trimesh.remesh import subdivide_loop
+
+    finer = [subdivide_loop(v.astype(np.float64), faces) for v in vertices]
+    return np.array([v for v, _ in finer], np.float32), np.asarray(finer[0][1]), colour
 
 
 def _normals(V, F):

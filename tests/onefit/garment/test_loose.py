@@ -1,4 +1,4 @@
-"""Garments with slack: closed seams, outside of the body, hanging at rest, as long as they were cut."""
+"""Garments with slack: closed seams, outside of the body, hanging, as long as they were cut."""
 
 import numpy as np
 import pytest
@@ -105,6 +105,9 @@ def test_rest_lengths_follow_the_cut_and_the_shape(garments):
     assert torch.equal(garment.rest_lengths(pairs), length(garment.cut))
     larger = 1.1 * garment.vertices
     assert torch.allclose(garment.rest_lengths(pairs, larger), 1.1 * length(garment.cut))
+    sides = garment.sides()
+    assert torch.equal(sides[:, 0], length(garment.cut))
+    assert torch.equal(sides[:, 2], garment.rest_lengths(garment.faces[:, [2, 0]]))
     shell = Garment.template("tank")
     assert shell.cut is None
     pairs = shell.faces[:, :2]
