@@ -5,10 +5,11 @@ swing, and its time.
     python benchmarks/onefit_finish.py --garments skirt shirt.obj --finish 3 --material denim
 
 Every garment is draped in each held-out kind of motion, on the standard body and on others drawn at
-random in turn, by skinning, by the network, and by the network with a finish. Columns: *inside* [%] of the vertices;
-*faces* [%] of points of the faces, no farther apart than 5 mm, in every third frame; *strain* [%],
-*wave* [degrees], *swing* [mm] as :mod:`onefit.objective.folds` has them; *jitter* [mm], the mean
-second difference in time; *ms* a frame and *settle* [s], of one drape of the first motion.
+random in turn: by skinning, by the network, and by the network with a finish. Columns: *inside* [%]
+of the vertices; *faces* [%] of points of the faces, no farther apart than 5 mm, in every third
+frame; *strain* [%], *wave* [degrees], *swing* [mm] as :mod:`onefit.objective.folds` has them;
+*jitter* [mm], the mean second difference in time; *ms* a frame and *settle* [s], of one drape of
+the first motion.
 """
 
 import argparse

@@ -8,7 +8,7 @@ on PolyFit's patches::
 
 A garment goes through these packages in this order: ``body`` and ``motion`` (what it is worn on),
 ``garment`` (its mesh, cut into patches), ``network`` (how its patches deform), ``draping`` (all
-frames); ``objective`` and ``training`` make the network. Importing the package loads neither torch
+frames), ``physics`` (which finishes them); ``objective`` and ``training`` make the network. Importing the package loads neither torch
 nor Mitsuba. ``docs/api.md`` lists the public names; other packages may change without notice.
 """
 
@@ -26,5 +26,6 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "network.network": ["OneFit"],
         "network.weights": ["pretrained"],
         "objective.losses": ["Weights"],
+        "physics.material": ["MATERIALS", "Material"],
     },
 )
