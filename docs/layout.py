@@ -40,6 +40,7 @@ WAY = {
         "garment": "mesh → garment, bound and in patches",
         "network": "patches and motion → deformations",
         "objective": "a drape → losses and measures",
+        "physics": "mesh, material, body → steps of cloth",
         "training": "garments and motions → weights",
         "draping": "garment, body, motion → a drape",
     },

@@ -2,6 +2,7 @@
 from behind.
 
 python docs/onefit_garments.py                                        (half a minute)
+python docs/onefit_garments.py --loose -o docs/onefit_loose.png       (those with slack)
 python docs/onefit_garments.py --cuts 18 -o docs/onefit_cuts.jpg      (two minutes: random cuts, as
 training draws them)
 """
@@ -15,7 +16,7 @@ import pyvista
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from onefit.garment import TEMPLATES, Garment, standard_body
+from onefit.garment import LOOSE, TEMPLATES, Garment, standard_body
 from onefit.garment.sewing.cuts import CUTS, cuts
 
 HERE = os.path.dirname(os.path.abspath(__file__))
@@ -69,13 +70,16 @@ def main():
     parser.add_argument(
         "--cuts", type=int, metavar="N", help="N random cuts instead of the templates"
     )
+    parser.add_argument(
+        "--loose", action="store_true", help="the garments with slack instead of the templates"
+    )
     parser.add_argument("-o", "--output", default=os.path.join(HERE, "onefit_garments.png"))
     args = parser.parse_args()
     if args.cuts:
         with tempfile.TemporaryDirectory() as folder:
             garments = cuts(args.cuts, folder)
     else:
-        garments = [Garment.template(name) for name in TEMPLATES]
+        garments = [Garment.template(name) for name in (LOOSE if args.loose else TEMPLATES)]
     body = standard_body()
     skin = (body.vertices.numpy(), body.faces.numpy(), SKIN)
     columns, title = min(len(garments), len(CUTS if args.cuts else TEMPLATES)), 40

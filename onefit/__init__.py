@@ -8,8 +8,9 @@ on PolyFit's patches::
 
 A garment goes through these packages in this order: ``body`` and ``motion`` (what it is worn on),
 ``garment`` (its mesh, cut into patches), ``network`` (how its patches deform), ``draping`` (all
-frames); ``objective`` and ``training`` make the network. Importing the package loads neither torch
-nor Mitsuba. ``docs/api.md`` lists the public names; other packages may change without notice.
+frames), ``physics`` (which finishes them); ``objective`` and ``training`` make the network.
+Importing the package loads neither torch nor Mitsuba. ``docs/api.md`` lists the public names; other
+packages may change without notice.
 """
 
 import lazy_loader
@@ -21,10 +22,11 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "body.smpl": ["PlainBody", "SmplBody"],
         "draping.draper": ["Drape", "Draper", "load"],
         "garment.charts.patched": ["PatchedGarment"],
-        "garment.garment": ["TEMPLATES", "Garment"],
+        "garment.garment": ["LOOSE", "TEMPLATES", "Garment"],
         "motion.motion": ["Motion"],
         "network.network": ["OneFit"],
         "network.weights": ["pretrained"],
         "objective.losses": ["Weights"],
+        "physics.material": ["MATERIALS", "Material"],
     },
 )

@@ -17,6 +17,7 @@ OUT receives
 import argparse
 import sys
 
+from onefit.physics.material import MATERIALS, Material
 from polyfit.errors import InputError, Parser, cli, require
 
 
@@ -103,6 +104,18 @@ def parser():
     p.add_argument("--seed", type=int, default=0, help="seed of a generated motion (default: 0)")
     p.add_argument("--post", action="store_true", help="push vertices out of the body afterwards")
     p.add_argument(
+        "--finish",
+        type=int,
+        default=2,
+        metavar="N",
+        help="implicit steps of cloth a frame, after the network; 0: none (default: 2)",
+    )
+    p.add_argument(
+        "--material",
+        default="cotton",
+        help=f"of the finish: {', '.join(MATERIALS)} (default: cotton)",
+    )
+    p.add_argument(
         "--skip", nargs="*", default=[], choices=("usd", "render"), help="results to leave out"
     )
     p.add_argument("--meshes", choices=("obj", "ply"), help="also one mesh a frame")
@@ -134,6 +147,9 @@ def main(argv=None):
     from .garment import Garment
 
     output.check_folder(args.output, args.overwrite)
+    Material.named(args.material)
+    if args.finish < 0:
+        raise InputError(f"--finish {args.finish}: steps a frame, 0 or more")
     model = inputs.body_model(args.body)
     draper = load(args.weights, model=model, device=device_of(args.device))
     garment = Garment.named(
@@ -158,7 +174,7 @@ def main(argv=None):
         motion,
         shape,
         about=dict(garment=args.garment, motion=motion.name, weights=args.weights),
-        post=args.post,
+        how=dict(post=args.post, finish=args.finish, material=args.material),
         skip=args.skip,
         meshes=args.meshes,
         size=args.size,

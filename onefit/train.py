@@ -3,6 +3,9 @@
     python -m onefit.train [GARMENT ...] -o OUT [--motions FILE ...] [--from WEIGHTS] [--resume]
     torchrun --nproc-per-node 2 -m onefit.train ...
 
+With --teacher LESSONS the network learns finished drapes by regression; physics alone goes on from
+there with --from OUT/weights.safetensors.
+
 GARMENT are names of the package's templates (tshirt, dress, ...) or meshes (.obj, .ply); without
 any, the six templates of the paper. OUT receives
 
@@ -60,6 +63,12 @@ def parser():
         default="",
         metavar="WEIGHTS",
         help="weights to fine-tune: a file, or a name of the package's weights",
+    )
+    p.add_argument(
+        "--teacher",
+        default="",
+        metavar="LESSONS",
+        help="learn these lessons of onefit.teach by regression, in place of the physics",
     )
     for name, text in {
         "order": "order of the jets", "epochs": "",

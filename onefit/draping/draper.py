@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -12,12 +13,14 @@ from typing import TYPE_CHECKING
 import torch
 
 from onefit.body import AnnyBody, ClosestSurface, skinning
-from onefit.garment import Garment, standard_body
+from onefit.garment import Garment, standard_body, waistband
 from onefit.garment.charts import PatchedGarment
 from onefit.motion import Motion
 from onefit.network.weights import Trained
 from onefit.network.weights import load as load_weights
 from onefit.objective.objective import posed
+from onefit.physics import Material
+from polyfit.errors import InputError
 
 from . import ease
 from .post import pushed_out
@@ -26,6 +29,7 @@ if TYPE_CHECKING:
     from onefit.body import Body
     from onefit.body.body import BodyModel
     from onefit.objective.measures import Measures
+    from onefit.physics import Settings
 
 FPS = 30.0  # that the networks know
 WARM_UP = 10  # frames in which the first pose is held, for the network's memory to settle
@@ -114,6 +118,10 @@ class Draper:
         post: bool = False,
         eased: bool = True,
         skinning_only: bool = False,
+        finish: int = 0,
+        material: Material | str = "cotton",
+        settings: Settings | None = None,
+        advance: Callable[[], object] = lambda: None,
     ) -> Drape:
         """A :class:`Drape`: ``garment`` (as :meth:`garment` takes it) on the body of ``shape`` (S,)
         in each frame of ``motion`` (a :class:`Motion` or a file of one), at 30 frames a second.
@@ -122,9 +130,16 @@ class Draper:
         ``post``: vertices are pushed out of the body and the pushes are smoothed. ``eased``: with
         the garment's :meth:`ease`, which costs seconds once, and nothing a frame; without it a
         drape is what the network alone makes. ``skinning_only``: plain skinning of the template,
-        what OneFit is held against. Raises InputError for a garment, motion or shape that cannot be
-        used.
+        what OneFit is held against. ``finish``: implicit steps of physics a frame on the garment's
+        own mesh, after all this (:func:`onefit.draping.finish.finished`), of a ``material`` (one of
+        :data:`onefit.physics.MATERIALS` by its name, or a :class:`onefit.physics.Material`), solved
+        as :class:`onefit.physics.Settings` say; two steps are enough, and 0 leaves it out.
+        ``advance`` is called after each finished frame. Raises InputError for a garment, motion,
+        shape or material that cannot be used.
         """
+        if finish < 0:
+            raise InputError(f"finish = {finish}; steps a frame, 0 or more")
+        material = Material.named(material)
         garment = self.garment(garment)
         motion = (
             (motion if isinstance(motion, Motion) else Motion.read(motion))
@@ -160,7 +175,21 @@ class Draper:
             vertices = pushed_out(vertices, garment.faces.to(self.device), bodies, body.faces)
         found = (vertices, garment.faces, rest, bodies, body.faces, root)
         vertices, faces, rest, bodies, body_faces, root = (x.cpu() for x in found)
+        if finish:
+            from .finish import finished
+
+            made = finished(
+                vertices, rest, faces, self._held(garment), bodies, body_faces,
+                material=material, steps=finish, fps=FPS, settings=settings,
+                sides=None if garment.cut is None else garment.sides(rest).double().numpy(),
+            )  # fmt: skip
+            vertices = torch.stack([(frame, advance())[0] for frame in made])
         return Drape(vertices, faces, rest, bodies, body_faces, root, FPS)
+
+    def _held(self, garment):
+        """How firmly each vertex is held at a waistband, (N,)."""
+        vertices, faces = garment.vertices.cpu().numpy(), garment.faces.cpu().numpy()
+        return waistband.held(vertices, faces, self.standard.joints.numpy())
 
     def codes(self, garment: Garment) -> torch.Tensor:
         """Z_T (K, width) of the garment's patches, found once."""

@@ -13,26 +13,32 @@ from polyfit.animation import write_frames, write_usd
 from polyfit.errors import InputError
 from polyfit.files import aside, folder_aside
 
+from .draper import FPS
+
 GARMENT_COLOUR, BODY_COLOUR = (0.08, 0.19, 0.42), (0.5, 0.48, 0.46)  # linear RGB
 
 
 @dataclass(frozen=True)
 class Outcome:
     """What a drape took and how good it is. ``folder``: where it lies; ``frames``, ``vertices``:
-    how many; ``seconds``: what draping took; ``figures``: its measures by name.
+    how many; ``seconds``: what draping took, the finish and its settling included; ``figures``:
+    its measures by name.
     """
 
     folder: Path
     frames: int
     vertices: int
     seconds: float
+    settling: float
     figures: dict
 
     def as_text(self):
         """One fact a line."""
+        settled = f", after {self.settling:.1f} s to settle" if self.settling else ""
+        speed = 1e3 * (self.seconds - self.settling) / self.frames
         return (
             f"frames: {self.frames}, of {self.vertices} vertices\n"
-            f"speed: {1e3 * self.seconds / self.frames:.1f} ms a frame\n"
+            f"speed: {speed:.1f} ms a frame{settled}\n"
             f"inside the body: {self.figures['collision']:.2f} % of the vertices\n"
         )
 
@@ -47,29 +53,39 @@ def check_folder(folder, overwrite):
             raise InputError(f"{folder}: holds no drape; --overwrite replaces nothing else")
 
 
-def drape_into(folder, draper, garment, motion, shape, *, about, post=False, **files):
+def drape_into(folder, draper, garment, motion, shape, *, about, how=None, **files):
     """Drape and write all files; returns the :class:`Outcome`.
 
     ``folder``: new, empty or holding a drape, which is replaced at the end. ``draper``,
-    ``garment``, ``motion``, ``shape``, ``post``: as :meth:`onefit.Draper.drape` takes them.
-    ``about``: names for figures.json; ``files``: options of :func:`write`. Progress goes to
-    stderr.
+    ``garment``, ``motion``, ``shape``, and ``how``, a dict of ``post``, ``finish`` and
+    ``material``: as :meth:`onefit.Draper.drape` takes them. ``about``: names for figures.json;
+    ``files``: options of :func:`write`. Progress goes to stderr.
     """
-    folder = Path(folder)
+    folder, how = Path(folder), how or {}
     draper.ease(garment)  # cut and tried on once for all motions, so it does not count
-    start = time.perf_counter()
-    drape = draper.drape(garment, motion, shape, post=post)
-    seconds = time.perf_counter() - start
-    T, N = drape.vertices.shape[:2]
-    outcome = Outcome(folder, T, N, seconds, drape.measures().as_dict())
-    about = about | dict(shape=shape.tolist(), post=post, vertices=N, frames=T) | outcome.figures
-    folder.parent.mkdir(parents=True, exist_ok=True)
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
         TimeRemainingColumn(),
     )
+    finished: list = []  # when each frame was
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        frames = len(motion.resampled(FPS).poses)
+        task = progress.add_task("finishing", total=frames, visible=how.get("finish", 0) > 0)
+
+        def advance():
+            finished.append(time.perf_counter())
+            progress.advance(task)
+
+        start = time.perf_counter()
+        drape = draper.drape(garment, motion, shape, **how, advance=advance)
+        seconds = time.perf_counter() - start
+    settling = finished[0] - start if finished else 0.0
+    T, N = drape.vertices.shape[:2]
+    outcome = Outcome(folder, T, N, seconds, settling, drape.measures().as_dict())
+    about = about | dict(shape=shape.tolist(), vertices=N, frames=T) | how | outcome.figures
+    folder.parent.mkdir(parents=True, exist_ok=True)
     with (
         Progress(*columns, console=Console(stderr=True)) as progress,
         folder_aside(folder, lambda name: True) as temporary,

@@ -8,6 +8,6 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
         "binding": ["standard_body", "standard_surface"],
-        "garment": ["Garment", "TEMPLATES"],
+        "garment": ["Garment", "LOOSE", "TEMPLATES"],
     },
 )

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from onefit.body import Body
+from onefit.body import Body, ClosestSurface
 from polyfit import mesh
 from polyfit.errors import InputError
 from polyfit.mesh import read_mesh
@@ -31,6 +31,8 @@ TEMPLATES = (
     "jumpsuit",
     "skirt",
 )
+# Garments with slack: a cut that fell once
+LOOSE = ("boxy_tshirt", "shirt", "waisted_dress", "circle_skirt", "wide_trousers")
 FOLDER = Path(__file__).parents[1] / "data" / "garments"
 
 
@@ -40,7 +42,8 @@ class Garment:
 
     ``name``; ``vertices`` (N, 3) float32 [m], in OneFit's axes; ``faces`` (F, 3) int64, wound
     outwards; ``blend_weights`` (N, 24), rows that sum to one; ``repairs``, sentences on what was
-    changed when it was read.
+    changed when it was read. ``cut`` (N, 3) float32 [m]: the cloth as it was cut, before it fell
+    and hung in folds, whose lengths are its lengths at rest; None: the garment is its own cut.
     """
 
     name: str
@@ -48,29 +51,30 @@ class Garment:
     faces: torch.Tensor
     blend_weights: torch.Tensor
     repairs: tuple = ()
+    cut: torch.Tensor | None = None
     _binding: Any = field(default=None, repr=False, compare=False)
 
     @classmethod
     def template(cls, name: str) -> Garment:
-        """One of :data:`TEMPLATES`, which :mod:`onefit.tailor` made."""
-        if name not in TEMPLATES:
+        """One of :data:`TEMPLATES` or :data:`LOOSE`, which :mod:`onefit.tailor` made."""
+        if name not in TEMPLATES + LOOSE:
             raise InputError(
-                f"garment '{name}': no such template; there are {', '.join(TEMPLATES)}"
+                f"garment '{name}': no such template; there are {', '.join(TEMPLATES + LOOSE)}"
             )
         with np.load(FOLDER / f"{name}.npz") as file:
-            return cls.bound(name, file["vertices"], file["faces"])
+            return cls.bound(name, file["vertices"], file["faces"], cut=file.get("cut"))
 
     @classmethod
     def named(cls, name: str | os.PathLike[str], **options: Any) -> Garment:
         """A template by its name, or else the garment of a mesh file, with the ``options`` of
         :meth:`read`. Raises InputError.
         """
-        if name in TEMPLATES:
-            return cls.template(name)
+        if name in TEMPLATES + LOOSE:
+            return cls.template(str(name))
         if not Path(name).suffix and not Path(name).exists():
             raise InputError(
-                f"garment '{name}': no such template; there are {', '.join(TEMPLATES)}; or give an"
-                " .obj or .ply file"
+                f"garment '{name}': no such template; there are {', '.join(TEMPLATES + LOOSE)}; or"
+                " give an .obj or .ply file"
             )
         return cls.read(name, **options)
 
@@ -144,10 +148,15 @@ class Garment:
 
     @classmethod
     def bound(
-        cls, name: str, vertices: np.ndarray, faces: np.ndarray, repairs: tuple = ()
+        cls,
+        name: str,
+        vertices: np.ndarray,
+        faces: np.ndarray,
+        repairs: tuple = (),
+        cut: np.ndarray | None = None,
     ) -> Garment:
         """The garment of a clean mesh (N, 3) [m], (F, 3) around the standard body, with blend
-        weights from there.
+        weights from there; ``cut`` (N, 3) [m] as in the class.
         """
         V, F = np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64)
         binding = Binding(V, F)
@@ -160,6 +169,7 @@ class Garment:
             torch.as_tensor(F),
             weights,
             tuple(repairs),
+            None if cut is None else torch.as_tensor(cut, dtype=torch.float32),
             binding,
         )
 
@@ -185,19 +195,43 @@ class Garment:
         )
         return torch.as_tensor(moved, dtype=torch.float32, device=self.vertices.device)
 
+    def rest_lengths(self, pairs: torch.Tensor, graded: torch.Tensor | None = None) -> torch.Tensor:
+        """Lengths at rest (E,) [m] between the vertices of ``pairs`` (E, 2), each the corners of a
+        face: those of the cut, or of the garment itself. With ``graded`` (N, 3) [m], from
+        :meth:`graded`, as much longer as that has made them.
+        """
+        length = lambda x: (x[pairs[:, 0]] - x[pairs[:, 1]]).norm(dim=-1)
+        if self.cut is None:
+            return length(self.vertices if graded is None else graded)
+        cut = length(self.cut)
+        return cut if graded is None else cut * length(graded) / length(self.vertices)
+
+    def sides(self, graded: torch.Tensor | None = None) -> torch.Tensor:
+        """:meth:`rest_lengths` (F, 3) [m] of the faces' sides, from each corner to the next."""
+        pairs = torch.stack([self.faces, self.faces.roll(-1, 1)], -1)
+        return self.rest_lengths(pairs.reshape(-1, 2), graded).reshape(-1, 3)
+
     def remeshed(self, count: int) -> Garment:
         """The same garment with about ``count`` vertices: every face is cut in four as often as is
         needed for 0.7 times as many; where there are more than 1.4 times as many, even triangles
         are made anew (ACVD).
         """
         V, F = self.vertices.cpu().double().numpy(), self.faces.cpu().numpy()
+        cut = None if self.cut is None else self.cut.cpu().double().numpy()
         while len(V) < 0.7 * count:
             F, edges = mesh.subdivided(F)
-            V = np.concatenate([V, V[edges].mean(axis=1)])
+            finer = lambda x: np.concatenate([x, x[edges].mean(axis=1)])
+            V, cut = finer(V), None if cut is None else finer(cut)
         if len(V) > 1.4 * count:
-            V, F = remesh.remeshed(V, F, count)
+            if cut is None:
+                V, F = remesh.remeshed(V, F, count)
+            else:  # the cut has no folds, in which a point is near to many
+                W, G = cut, F
+                cut, F = remesh.remeshed(W, G, count)
+                at = ClosestSurface(W, G)(cut)
+                V = np.einsum("nk,nkd->nd", at.barycentric, V[G[at.face]])
         V, pushed = fitting.pushed_out(V, F, self.name)
-        return Garment.bound(self.name, V, F, self.repairs + pushed)
+        return Garment.bound(self.name, V, F, self.repairs + pushed, cut)
 
 
 def _outward(V, F, surface):

@@ -110,6 +110,27 @@ class TrainingData:
             torch.stack(poses).to(device), torch.stack(translation).to(device), shape, number
         )
 
+    def lesson_windows(self, lessons, count, generator):
+        """``count`` windows drawn from :class:`onefit.training.teacher.Lesson`, each with the
+        body of its lesson, and the ``changes`` (K, A, count, 3) [m] of their last frames.
+        """
+        chosen = torch.randint(len(lessons), (count,), generator=generator).tolist()
+        parts = []
+        for lesson in (lessons[k] for k in chosen):
+            end = int(torch.randint(len(lesson.poses), (1,), generator=generator))
+            at = torch.arange(end - LENGTH + 1, end + 1).clamp(min=0)
+            shape = lesson.shape - self.model.standard_shape
+            parts.append(
+                (lesson.poses[at], lesson.translation[at], shape, lesson.changes[:, :, end])
+            )
+        poses, translation, shape, changes = zip(*parts)
+        device = self.vertices.device
+        windows = Windows(
+            *(torch.stack(x).to(device) for x in (poses, translation, shape)),
+            torch.zeros(count, dtype=torch.long, device=device),
+        )
+        return windows, torch.stack(changes, 2)
+
     def scene(self, windows, rest, field):
         """The :class:`onefit.objective.objective.Scene` of the windows' last frames, and the
         transforms (B, J, 3, 4) one and two frames before; of a garment whose graded vertices are

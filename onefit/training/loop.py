@@ -19,9 +19,11 @@ from polyfit.errors import InputError
 from polyfit.training import Training, conduct
 
 from .data import FPS, TrainingData
+from .teacher import lessons
 
 GRADIENT_NORM = 1.0  # gradients are clipped to it
 BAD_STEPS = 20  # in a row without a finite loss, after which a training is given up
+LESSON_UNIT = 0.01  # [m] of a vertex from where its lesson has it, that a loss of 1 stands for
 HIDDEN_NOISE = 0.1  # standard deviation of the encoder's memory at the start of a window
 
 
@@ -34,6 +36,10 @@ class OneFitTraining(Training):
         network = load(settings.start).network if settings.start else _network(settings, data)
         plain = json.loads(json.dumps(asdict(settings)))
         network = network.to(processes.device).train()
+        self.lessons = [
+            lessons(settings.teacher, patched) if settings.teacher else ()
+            for patched, *_ in data.garments
+        ]
         windows = min(self._windows(garment, processes) for garment, *_ in data.garments)
         self.epoch_steps = settings.epoch_steps or -(-len(data) // windows)
         super().__init__(
@@ -58,10 +64,13 @@ class OneFitTraining(Training):
         """The objective's terms on a batch of the random numbers of ``generator``: this process's
         share of it.
         """
-        garment, rest, field = self.data.garments[
-            self.done % len(self.data.garments) if garment is None else garment
-        ]
-        windows = self.data.windows(self._windows(garment, self.processes), generator)
+        number = self.done % len(self.data.garments) if garment is None else garment
+        garment, rest, field = self.data.garments[number]
+        count = self._windows(garment, self.processes)
+        if self.given.teacher:
+            windows, wanted = self.data.lesson_windows(self.lessons[number], count, generator)
+        else:
+            windows = self.data.windows(count, generator)
         hidden = HIDDEN_NOISE * torch.randn(
             1, len(windows.number), self.network.body.memory.hidden_size, generator=generator
         )
@@ -70,6 +79,10 @@ class OneFitTraining(Training):
         hidden = hidden.to(self.processes.device)[:, mine].contiguous()
         Z_T = self.network.patches(*garment.features, self.data.standard.joints)
         Z_B, _ = self.network.body(windows.poses, windows.translation, windows.shape, FPS, hidden)
+        if self.given.teacher:
+            found = garment.changes(self.network.decoder(Z_T, Z_B[:, -1]))
+            away = garment.displacement(found - wanted[:, :, mine].to(found))
+            return {"regression": away.square().sum(-1).mean() / LESSON_UNIT**2}
         scene, before = self.data.scene(windows, rest, field)
         changes = [garment.changes(self.network.decoder(Z_T, Z_B[:, -k])) for k in (2, 3)]
         past = [

@@ -15,7 +15,9 @@ class Settings:
     :meth:`onefit.Motion.read` takes them; ``batch``: patches of a step, all frames together
     (the paper's 20,000); ``lr`` for the first ``lr_epochs`` epochs, a tenth of it for the rest; an
     epoch has ``epoch_steps`` steps (0: as many as show each window of the motions once); ``cuts``:
-    how many random cuts (:mod:`onefit.garment.sewing.cuts`) are trained on beside the garments.
+    how many random cuts (:mod:`onefit.garment.sewing.cuts`) are trained on beside the garments;
+    ``teacher``: a folder of lessons (:mod:`onefit.training.teacher`) to learn by regression, in
+    place of the physics.
     """
 
     garments: tuple = STANDARD
@@ -23,6 +25,7 @@ class Settings:
     fps: float | None = None
     motion_up: str | None = None
     start: str = ""
+    teacher: str = ""
     order: int = 4
     batch: int = 20_000
     epochs: int = 30
@@ -42,6 +45,8 @@ class Settings:
         for name in ("epoch_steps", "lr_epochs", "shapes", "cuts"):
             if getattr(self, name) < 0:
                 raise InputError(f"{name} = {getattr(self, name)}; at least 0 is needed")
+        if self.teacher and self.cuts:
+            raise InputError("--teacher and --cuts: lessons are of garments, not of cuts")
         if not 2 <= self.order <= 10:
             raise InputError(f"order = {self.order}; the order of OneFit's jets is 2 to 10")
         if not self.lr > 0:

@@ -1,120 +1,254 @@
-"""A stage: moving meshes, a floor and light, path-traced by Mitsuba. How drapes of OneFit become
-pictures and videos.
+"""A stage: moving meshes, a floor and soft light. How drapes of OneFit become pictures and videos.
+
+The light is found at the vertices, by Mitsuba's rays in directions that are the same for all, and
+runs smoothly between them; only what the camera sees is asked for each sample of a pixel. So a
+picture has no grain, and costs a fraction of a traced path's.
 
 Import only after a Mitsuba variant is set.
 """
 
-import cv2
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-FLOOR = (0.55, 0.56, 0.58)
 MARGIN = 1.12  # of the picture around what moves
 FOV = 28.0  # degrees, of the picture's height
-GRAIN = 3.0  # strength of the filter that takes the paths' noise off, in 8-bit steps
+FLOOR = np.array([0.36, 0.37, 0.39])  # linear RGB
+SKY = np.array([0.50, 0.53, 0.58])  # its radiance, the same from everywhere above
+BOUNCE = 0.3  # radiance of floor, skin and cloth as seen from a vertex, a share of the sky's
+KEY = np.array([1.25, 1.2, 1.12])  # irradiance of the key light, across its direction
+TOWARDS_KEY = np.array([0.22, -0.71, 0.75])  # for a camera that looks along y
+KEY_RADIUS = 8.0  # degrees, as the key light is seen
+SKY_RAYS, KEY_RAYS = 128, 32  # from each vertex
+GRID, REACH = 96, 1.5  # cells of the floor's light along a side, and half of its side [m]
+FINE = 20_000  # faces
+COVER = 0.025  # [m]; what lies so near before a vertex covers it
+LIFT = 2e-3  # [m] by which rays start above a surface
 
 
-def render(parts, *, size=(640, 480), spp=24, azimuth=25.0, elevation=8.0, follow=False):
+def render(parts, *, size=(640, 480), spp=16, azimuth=25.0, elevation=8.0, follow=False, near=None):
     """Images (H, W, 3) uint8 sRGB, one a frame, of moving meshes on a floor.
 
     ``parts``: of each mesh its vertices (T, N, 3) [m, z up], its faces (F, 3) and its colour,
-    linear RGB. ``size``: (height, width) [pixels]; ``azimuth`` [degrees] to the side of the -y axis
-    that the camera stands on, ``elevation`` above the floor. The camera keeps all in the picture;
-    with ``follow`` it goes along with what moves.
+    linear RGB; a mesh of fewer than :data:`FINE` faces is drawn as Loop's smooth surface.
+    ``size``: (height, width) [pixels]; ``spp``: samples a pixel, on a square grid; ``azimuth``
+    [degrees] to the side of the -y axis that the camera stands on, ``elevation`` above the floor.
+    The camera keeps all in the picture; with ``follow`` it goes along with what moves. ``near``:
+    the number of one of the parts; the camera keeps that one in the picture.
     """
-    height, width = size
-    everything = np.concatenate([np.asarray(v, np.float32) for v, _, _ in parts], axis=1)
-    low, high = everything.min(axis=1), everything.max(axis=1)  # (T, 3)
-    scene = mi.load_dict(_scene(parts, low[:, 2].min()))
-    params = mi.traverse(scene)
-    film = {
-        "type": "hdrfilm",
-        "width": width,
-        "height": height,
-        "rfilter": {"type": "gaussian"},
-        "pixel_format": "rgb",
-    }
+    parts = [_smooth(*part) for part in parts]
+    everything = np.concatenate([v for v, _, _ in parts], axis=1)
+    counts = [v.shape[1] for v, _, _ in parts]
+    first = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    faces = np.concatenate([f + k for (_, f, _), k in zip(parts, first)])
+    colours = np.repeat([c for _, _, c in parts], counts, axis=0)
+    part = np.repeat(np.arange(len(parts)), counts)
+    floor = float(everything[..., 2].min())
+    kept = everything if near is None else parts[near][0]
+    low, high = kept.min(axis=1), kept.max(axis=1)  # (T, 3)
     middle = (low.min(axis=0) + high.max(axis=0)) / 2
     half = ((high - low).max(axis=0) if follow else high.max(axis=0) - low.min(axis=0)) / 2 * MARGIN
+    height, width = size
     across = max(half[2], np.hypot(half[0], half[1]) * height / width)
-    distance = across / np.tan(np.deg2rad(FOV / 2)) + half[1]
     a, e = np.deg2rad((azimuth, elevation))
-    away = distance * np.array([np.sin(a) * np.cos(e), -np.cos(a) * np.cos(e), np.sin(e)])
-    for t in range(len(everything)):
-        for k, (vertices, _, _) in enumerate(parts):
-            params[f"part{k}.vertex_positions"] = mi.Float(
-                np.asarray(vertices[t], np.float32).ravel()
-            )
-        params.update()
+    away = np.array([np.sin(a) * np.cos(e), -np.cos(a) * np.cos(e), np.sin(e)])
+    away *= across / np.tan(np.deg2rad(FOV / 2)) + half[1]
+    stage = Stage(everything[0], faces, colours, floor, a, part)
+    for t, vertices in enumerate(everything):
         target = (low[t] + high[t]) / 2 if follow else middle
-        sensor = mi.load_dict({
-            "type": "perspective", "fov": FOV, "fov_axis": "y", "near_clip": 0.05, "film": film,
-            # strata in place of independent samples: two thirds of the noise
-            "sampler": {"type": "multijitter", "sample_count": spp},
-            "to_world": mi.ScalarTransform4f().look_at(
-                origin=list(target + away), target=list(target), up=[0, 0, 1]
-            ),
-        })  # fmt: skip
-        image = mi.render(scene, sensor=sensor, spp=spp, seed=t)
-        yield _smooth(
-            np.array(
-                mi.Bitmap(image).convert(
-                    mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True
-                )
-            )
-        )
+        stage.light(vertices, target)
+        yield stage.seen(target + away, target, size, spp)
 
 
-def _smooth(image):
-    """The image without the grain of few samples: each pixel averaged with those whose
-    surroundings look alike (non-local means, Buades et al. 2005). Edges and folds stay.
+class Stage:
+    """One mesh, ``vertices`` (N, 3) [m], ``faces`` (F, 3), with a colour (N, 3) at each vertex, on
+    a floor at the height ``floor`` [m]; the key light is turned with the camera, by ``azimuth``
+    [rad]. ``part`` (N,): which thing a vertex belongs to; by default all are one.
     """
-    bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-    smooth = cv2.fastNlMeansDenoisingColored(bgr, None, GRAIN, GRAIN, 5, 15)
-    return cv2.cvtColor(smooth, cv2.COLOR_BGR2RGB)
 
+    def __init__(self, vertices, faces, colours, floor, azimuth=0.0, part=None):
+        mesh = mi.Mesh("stage", len(vertices), len(faces))
+        self.params = mi.traverse(mesh)
+        self.params["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
+        self.params["vertex_positions"] = mi.Float(vertices.ravel())
+        self.params.update()
+        self.scene = mi.load_dict({"type": "scene", "mesh": mesh})
+        self.params = mi.traverse(self.scene)
+        self.key = next(k for k in self.params.keys() if k.endswith("vertex_positions"))
+        self.faces, self.floor = faces, floor
+        self.part = np.zeros(len(vertices), np.uint32) if part is None else part.astype(np.uint32)
+        self.part_of_face = mi.UInt32(self.part[faces[:, 0]])
+        self.corners = mi.Vector3u(faces.T.astype(np.uint32))
+        self.colour = mi.Color3f(colours.T.astype(np.float32))
+        self.sky = _sphere(SKY_RAYS)
+        x, y, z = TOWARDS_KEY / np.linalg.norm(TOWARDS_KEY)
+        cos, sin = np.cos(azimuth), np.sin(azimuth)
+        towards = np.array([cos * x - sin * y, sin * x + cos * y, z])
+        self.sun = _cap(towards, KEY_RADIUS, KEY_RAYS)
 
-def _scene(parts, floor):
-    stage = {
-        "type": "scene", "integrator": {"type": "path", "max_depth": 4},
-        "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.55, 0.58, 0.62]}},
-        "key": {
-            "type": "rectangle",
-            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [9.0, 8.6, 8.0]}},
-            "to_world": mi.ScalarTransform4f().look_at(
-                origin=[2.5, -3.5, floor + 4.0], target=[0, 0, floor + 1.0], up=[0, 0, 1]
-            ),
-        },
-        "floor": {
-            "type": "rectangle",
-            "to_world": mi.ScalarTransform4f().translate([0, 0, float(floor)]).scale(40.0),
-            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(FLOOR)}},
-        },
-    }  # fmt: skip
-    for k, (vertices, faces, colour) in enumerate(parts):
-        stage[f"part{k}"] = _mesh(
-            f"part{k}", np.asarray(vertices[0], np.float32), np.asarray(faces), colour
+    def light(self, vertices, target):
+        """The vertices are at (N, 3) [m] from now on, and light falls on them, and on the floor
+        around ``target``.
+        """
+        self.params[self.key] = mi.Float(vertices.astype(np.float32).ravel())
+        self.params.update()
+        self.normals = _normals(vertices, self.faces)
+        front, back, key = self._uncovered(vertices, *self._irradiance(vertices, self.normals))
+        self.front, self.back = (mi.Color3f(x.T.astype(np.float32)) for x in (front, back))
+        self.shadow, self.normal = mi.Float(key), mi.Vector3f(self.normals.T.astype(np.float32))
+        self.centre = np.asarray(target, np.float64)[:2]
+        x = np.linspace(-REACH, REACH, GRID)
+        y, x = np.meshgrid(self.centre[1] + x, self.centre[0] + x, indexing="ij")
+        ground = np.stack([x, y, np.full_like(x, self.floor - LIFT)], -1).reshape(-1, 3)
+        up = np.tile([0.0, 0.0, 1.0], (len(ground), 1))
+        front, _, key = self._irradiance(ground, up)
+        lit = FLOOR * (front + KEY * (key * self.sun.mean(1)[2])[:, None])
+        self.ground = mi.Texture2f(mi.TensorXf(lit.reshape(GRID, GRID, 3).astype(np.float32)))
+        self.open = FLOOR * (SKY + KEY * self.sun.mean(1)[2])
+
+    def _uncovered(self, vertices, *light):
+        """The ``light`` of each vertex; of those that another part covers, skin below cloth, what
+        uncovered neighbours have: so no darkness leaks out at the rim of a sleeve.
+        """
+        p, normal = (mi.Point3f(x.T.astype(np.float32)) for x in (vertices, self.normals))
+        ray = mi.Ray3f(p + LIFT * normal, mi.Vector3f(normal))
+        hit = self.scene.ray_intersect_preliminary(ray)
+        other = dr.gather(mi.UInt32, self.part_of_face, hit.prim_index, hit.is_valid())
+        covered = hit.is_valid() & (hit.t < COVER) & (other != mi.UInt32(self.part))
+        seen = ~np.array(covered)
+        start, end = self.faces.ravel(), np.roll(self.faces, -1, axis=1).ravel()
+        start, end = np.concatenate([start, end]), np.concatenate([end, start])
+        light = np.column_stack(light)
+        for _ in range(2):
+            give = seen[end] & ~seen[start]
+            count = np.bincount(start[give], minlength=len(seen))
+            for k in range(light.shape[1]):
+                total = np.bincount(start[give], light[end[give], k], len(seen))
+                light[:, k] = np.where(count > 0, total / np.maximum(count, 1), light[:, k])
+            seen = seen | (count > 0)
+        return light[:, :3], light[:, 3:6], light[:, 6]
+
+    def _irradiance(self, points, normals):
+        """At points (n, 3) with normals (n, 3): the sky's irradiance over pi on the front and on
+        the back, (n, 3) each, and the share of the key light that is not hidden, (n,).
+        """
+        n = len(points)
+        p = mi.Point3f(points.T.astype(np.float32))
+        m = mi.Vector3f(normals.T.astype(np.float32))
+        sums = dr.zeros(mi.Float, 6 * n)
+        index = dr.arange(mi.UInt32, n * self.sky.shape[1])
+        point, ray = index % n, index // n
+        d = dr.gather(mi.Vector3f, mi.Vector3f(self.sky.astype(np.float32)), ray)
+        at, normal = dr.gather(mi.Point3f, p, point), dr.gather(mi.Vector3f, m, point)
+        cosine = dr.dot(d, normal)
+        side = dr.select(cosine > 0, 1.0, -1.0)
+        hidden = self.scene.ray_test(mi.Ray3f(at + side * LIFT * normal, d))
+        # 0, 1, 2: what comes from the sky, the floor, and the meshes themselves
+        kind = dr.select(hidden, mi.UInt32(2), dr.select(d.z < 0, mi.UInt32(1), mi.UInt32(0)))
+        place = (kind * 2 + dr.select(cosine > 0, mi.UInt32(0), mi.UInt32(1))) * n + point
+        dr.scatter_reduce(dr.ReduceOp.Add, sums, dr.abs(cosine), place)
+        sky, floor, near = np.array(sums).reshape(3, 2, n, 1)
+        total = np.maximum(sky + floor + near, 1e-6)
+        found = (sky * SKY + BOUNCE * (floor * SKY + near * SKY)) / total
+        rays = self.sun.shape[1]
+        index = dr.arange(mi.UInt32, n * rays)
+        point, ray = index % n, index // n
+        d = dr.gather(mi.Vector3f, mi.Vector3f(self.sun.astype(np.float32)), ray)
+        at, normal = dr.gather(mi.Point3f, p, point), dr.gather(mi.Vector3f, m, point)
+        side = dr.select(dr.dot(d, normal) > 0, 1.0, -1.0)
+        hidden = self.scene.ray_test(mi.Ray3f(at + side * LIFT * normal, d))
+        key = dr.zeros(mi.Float, n)
+        dr.scatter_reduce(dr.ReduceOp.Add, key, dr.select(hidden, 0.0, 1.0 / rays), point)
+        return found[0], found[1], np.array(key)
+
+    def seen(self, origin, target, size, spp):
+        """Image (H, W, 3) uint8 sRGB from ``origin`` [m] towards ``target``."""
+        height, width = size
+        side = max(1, round(np.sqrt(spp)))
+        ahead = np.asarray(target) - origin
+        ahead /= np.linalg.norm(ahead)
+        right = np.cross(ahead, [0, 0, 1])
+        right /= np.linalg.norm(right)
+        up = np.cross(right, ahead)
+        scale = np.tan(np.deg2rad(FOV / 2)) / (height / 2)
+        index = dr.arange(mi.UInt32, height * side * width * side)
+        x, y = index % (width * side), index // (width * side)
+        u = ((mi.Float(x) + 0.5) / side - width / 2) * scale
+        v = (height / 2 - (mi.Float(y) + 0.5) / side) * scale
+        ahead, right, up = (mi.Vector3f(*map(float, x)) for x in (ahead, right, up))
+        d = dr.normalize(ahead + u * right + v * up)
+        o = mi.Point3f(*map(float, origin))
+        hit = self.scene.ray_intersect_preliminary(mi.Ray3f(o, d), coherent=True)
+        colour = dr.select(hit.is_valid(), self._cloth(hit, d), self._behind(o, d))
+        samples = np.array(dr.clip(colour, 0, 1)).T.reshape(height, side, width, side, 3)
+        linear = samples.mean(axis=(1, 3))
+        srgb = np.where(linear < 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+        return np.round(255 * srgb).astype(np.uint8)
+
+    def _cloth(self, hit, d):
+        corner = dr.gather(mi.Vector3u, self.corners, hit.prim_index, hit.is_valid())
+        b = hit.prim_uv
+        share = mi.Vector3f(1 - b.x - b.y, b.x, b.y)
+        mixed = lambda kind, of: sum(
+            dr.gather(kind, of, corner[k], hit.is_valid()) * share[k] for k in range(3)
         )
-    return stage
+        normal = dr.normalize(mixed(mi.Vector3f, self.normal))
+        front = dr.dot(normal, d) < 0
+        sky = dr.select(front, mixed(mi.Color3f, self.front), mixed(mi.Color3f, self.back))
+        sun = mi.Vector3f(*map(float, self.sun.mean(1)))
+        facing = dr.maximum(dr.select(front, 1.0, -1.0) * dr.dot(normal, sun), 0)
+        key = mi.Color3f(*map(float, KEY)) * facing * mixed(mi.Float, self.shadow)
+        return mixed(mi.Color3f, self.colour) * (sky + key)
+
+    def _behind(self, o, d):
+        """The floor as its grid is lit, and farther away the open floor, which becomes the sky."""
+        distance = (self.floor - o.z) / dr.minimum(d.z, -1e-4)
+        at = o + distance * d
+        uv = [(at[k] - float(self.centre[k])) / (2 * REACH) + 0.5 for k in range(2)]
+        lit = mi.Color3f(self.ground.eval(mi.Point2f(*uv)))
+        edge = dr.maximum(dr.abs(uv[0] - 0.5), dr.abs(uv[1] - 0.5)) * 2
+        far = dr.clip((edge - 0.7) / 0.3, 0, 1)
+        far = far * far * (3 - 2 * far)
+        open_ = mi.Color3f(*map(float, self.open))
+        floor = lit + far * (open_ - lit)
+        haze = dr.exp(-dr.maximum(distance - 4, 0) / 12)
+        haze = dr.select(d.z < 0, haze, 0)
+        return mi.Color3f(*map(float, SKY)) * (1 - haze) + floor * haze
 
 
-def _mesh(name, vertices, faces, colour):
-    bsdf = {
-        "type": "twosided",
-        "bsdf": {
-            "type": "principled",
-            "base_color": {"type": "rgb", "value": list(colour)},
-            "roughness": 0.7,
-            "specular": 0.2,
-        },
-    }
-    props = mi.Properties()
-    props["bsdf"] = mi.load_dict(bsdf)
-    mesh = mi.Mesh(name, len(vertices), len(faces), has_vertex_normals=True, props=props)
-    params = mi.traverse(mesh)
-    params["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
-    params["vertex_positions"] = mi.Float(vertices.ravel())
-    params["vertex_normals"] = dr.zeros(mi.Float, vertices.size)
-    params.update()
-    return mesh
+def _smooth(vertices, faces, colour):
+    """The part with each face cut in four by Loop's rules, if it has fewer than FINE faces."""
+    vertices, faces = np.asarray(vertices, np.float32), np.asarray(faces)
+    if len(faces) >= FINE:
+        return vertices, faces, colour
+    from trimesh.remesh import subdivide_loop
+
+    finer = [subdivide_loop(v.astype(np.float64), faces) for v in vertices]
+    return np.array([v for v, _ in finer], np.float32), np.asarray(finer[0][1]), colour
+
+
+def _normals(V, F):
+    """Unit normals (N, 3) at the vertices (N, 3), means of the faces' (F, 3) by area."""
+    a, b, c = (V[F[:, k]].astype(np.float64) for k in range(3))
+    face = np.repeat(np.cross(b - a, c - a), 3, axis=0)
+    N = np.stack([np.bincount(F.ravel(), x, len(V)) for x in face.T], 1)
+    return N / np.maximum(np.linalg.norm(N, axis=1, keepdims=True), 1e-12)
+
+
+def _sphere(count):
+    """Directions (3, count), evenly spread over the sphere (a Fibonacci lattice)."""
+    k = np.arange(count) + 0.5
+    z, turn = 1 - 2 * k / count, np.pi * (1 + np.sqrt(5)) * k
+    r = np.sqrt(1 - z * z)
+    return np.stack([r * np.cos(turn), r * np.sin(turn), z])
+
+
+def _cap(direction, radius, count):
+    """Directions (3, count), evenly spread over a disk of ``radius`` [degrees] around one."""
+    k = np.arange(count) + 0.5
+    r, turn = np.tan(np.deg2rad(radius)) * np.sqrt(k / count), np.pi * (1 + np.sqrt(5)) * k
+    side = np.cross(direction, [0, 0, 1])
+    side /= np.linalg.norm(side)
+    up = np.cross(side, direction)
+    out = direction[:, None] + r * (np.cos(turn) * side[:, None] + np.sin(turn) * up[:, None])
+    return out / np.linalg.norm(out, axis=0)

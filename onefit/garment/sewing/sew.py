@@ -25,8 +25,15 @@ def sewn(block, name, count=None, bumps=0.0, stretch=(1.0, 1.0, 1.0), **measures
     """
     pattern, own = PATTERNS[name]
     field, inside = pattern(block, **measures)
-    V, F = _clipped(*block.mesh(field - bumps), inside)
-    V, F = remeshed(V * stretch, F, count or own)
+    return meshed(block, field - bumps, inside, count or own, stretch)
+
+
+def meshed(block, field, inside, count, stretch=(1.0, 1.0, 1.0)):
+    """``(vertices (N, 3) [m], faces (F, 3))``, about ``count`` vertices, of the level set of
+    ``field`` where ``inside`` (x, y, z) is positive; ``stretch`` as in :func:`sewn`.
+    """
+    V, F = _clipped(*block.mesh(field), inside)
+    V, F = remeshed(V * stretch, F, count)
     return V / stretch, F
 
 
@@ -44,16 +51,28 @@ def _clipped(V, F, inside):
 
 
 def write(names, folder):
-    """Sew the named templates into ``folder``."""
+    """Sew the named templates into ``folder``; those of :data:`~.loose.LOOSE_PATTERNS` fall once,
+    and keep their cut.
+    """
+    from . import fall, loose
+
     body = standard_body()
     block = Block(body.vertices.numpy(), body.faces.numpy())
     os.makedirs(folder, exist_ok=True)
     for name in names:
-        V, F = sewn(block, name)
+        if name in loose.LOOSE_PATTERNS:
+            cut = loose.cut(block, name)
+            F, arrays = cut.faces, dict(vertices=fall.fallen(cut), cut=cut.vertices)
+        else:
+            V, F = sewn(block, name)
+            arrays = dict(vertices=V)
+        arrays = {key: x.astype(np.float32) for key, x in arrays.items()}
         path = os.path.join(folder, f"{name}.npz")
         with aside(path) as temporary:
-            np.savez_compressed(temporary, vertices=V.astype(np.float32), faces=F.astype(np.int32))
+            np.savez_compressed(temporary, faces=F.astype(np.int32), **arrays)
+        V = arrays.get("cut", arrays["vertices"]).astype(np.float64)
         print(
             f"{path}: {len(V)} vertices, {len(F)} faces, {mesh.areas(V, F).sum():.3f} m^2,"
-            f" {len(loops(F))} loops"
+            f" {len(loops(F))} loops",
+            flush=True,
         )

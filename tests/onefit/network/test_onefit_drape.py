@@ -49,6 +49,8 @@ def test_arrays_and_figures(out):
     assert about["garment"] == "shorts" and about["frames"] == T and about["vertices"] == N
     assert about["shape"] == pytest.approx([0.5, 0.5, 0.5, 0.4, 0.6, 0.5])
     assert {"collision", "edge", "area", "energy", "jitter"} <= set(about)
+    assert about["finish"] == 2 and about["material"] == "cotton"
+    assert about["collision"] == 0 and about["edge"] < 1.5
 
 
 def test_animations_hold_the_arrays(out):
@@ -97,6 +99,8 @@ def test_what_is_there_is_not_lost(out, network):
         ),
         (("tuxedo.obj", "walk"), "tuxedo.obj: no such file"),
         (("tuxedo", "walk"), "garment 'tuxedo': no such template; there are tshirt, dress, tank"),
+        (("shorts", "walk", "--finish", "-1"), "--finish -1: steps a frame, 0 or more"),
+        (("shorts", "walk", "--material", "wool"), "material 'wool': choose among cotton, silk"),
         (("shorts", "walk", "--shape", "girth=3"), "--shape girth=3: choose among gender, age"),
         (("shorts", "walk", "--shape", "weight=heavy"), "--shape weight=heavy: a number is needed"),
         (("shorts", "walk", "--shape", "weight=2"), "weight = 2; phenotypes go from 0 to 1"),
@@ -156,6 +160,8 @@ def test_what_a_motion_file_does_not_say_is_said_by_flags(network, tmp_path):
         str(tmp_path / "still.npz"),
         "--weights",
         network,
+        "--finish",
+        "0",
         "--skip",
         "usd",
         "render",
@@ -187,6 +193,8 @@ def test_a_mesh_in_centimetres_with_y_up(network, tmp_path):
         network,
         "--seconds",
         "0.1",
+        "--finish",
+        "0",
         "--skip",
         "usd",
         "render",

@@ -1,0 +1,81 @@
+"""The finish: implicit steps of the cloth's physics on the garment's own mesh, from frame to frame.
+
+A network's drape, or plain skinning, is where the cloth starts, what holds its waistband, and what
+it is weakly drawn to; all else are the material, the air, the moving body and the cloth itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+from onefit.physics.cloth import Cloth
+from onefit.physics.contact import BodyContact, SelfContact
+from onefit.physics.material import Material
+from onefit.physics.settings import Settings
+from onefit.physics.sheet import Sheet
+
+
+def finished(
+    guide: torch.Tensor,
+    rest: torch.Tensor,
+    faces: torch.Tensor,
+    held: np.ndarray,
+    bodies: torch.Tensor,
+    body_faces: torch.Tensor,
+    *,
+    material: Material,
+    steps: int,
+    fps: float,
+    settings: Settings | None = None,
+    sides: np.ndarray | None = None,
+) -> Iterator[torch.Tensor]:
+    """The garment's vertices (N, 3) [m] in one frame after the other.
+
+    ``guide`` (T, N, 3) [m]: the drape that is finished; ``rest`` (N, 3) [m] and ``faces`` (F, 3) of
+    the garment graded to the body; ``held`` (N,): how firmly each vertex is held, as
+    :func:`onefit.garment.waistband.held` says; ``bodies`` (T, V, 3) [m], ``body_faces``; ``steps``
+    in a frame, in which the body moves along straight lines; ``sides`` (F, 3) [m]: the lengths of
+    the faces at rest, of a garment that was cut otherwise than it hangs.
+    """
+    settings = settings or Settings()
+    order = _order(faces.numpy(), len(rest))
+    number = np.argsort(order)
+    sheet = Sheet(rest.double().numpy()[order], number[faces.numpy()], material, sides)
+    start, moving = guide.double().numpy()[:, order], bodies.double().numpy()
+    body = BodyContact(sheet, bodies[0], body_faces, settings)
+    itself = SelfContact(sheet, settings, len(body))
+    cloth = Cloth(sheet, start[0], settings, len(body) + len(sheet))
+    pull = settings.draw * sheet.mass + material.stretch * np.asarray(held)[order]
+    dt = 1 / fps / steps
+    body.find(cloth.x)
+    cloth.x = body.pushed_out(cloth.x)
+
+    def step(now, target):
+        contacts = [body.follow(now), itself.find(cloth.x, cloth.flight(dt))]
+        cloth.step(dt, contacts, target, pull)
+        body.find(cloth.x)
+        cloth.x = body.pushed_out(cloth.x)
+
+    for _ in range(round(settings.settling * fps)):
+        for _ in range(steps):
+            step(moving[0], start[0])
+            cloth.v *= settings.damping
+    yield torch.as_tensor(cloth.x[number]).float()
+    for t in range(1, len(start)):
+        for k in range(1, steps + 1):
+            share = k / steps
+            between = lambda x: (1 - share) * x[t - 1] + share * x[t]
+            step(between(moving), between(start))
+        yield torch.as_tensor(cloth.x[number]).float()
+
+
+def _order(faces, count):
+    """The vertices (N,) in an order in which neighbours are near, for the solver's sweeps."""
+    start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    link = coo_matrix((np.ones(len(start)), (start, end)), (count, count)).tocsr()
+    return np.asarray(reverse_cuthill_mckee((link + link.T).tocsr(), symmetric_mode=True))

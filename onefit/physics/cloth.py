@@ -1,0 +1,171 @@
+"""Cloth in motion: implicit Euler steps of a sheet, each one iteration of Newton's method whose
+linear system conjugate gradients solve, started from what the step before found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.sparse import bsr_matrix
+
+from . import kernels
+from .contact import Contacts
+from .kernels import wp
+from .material import AIR, GRAVITY
+from .settings import Settings
+from .sheet import Sheet
+
+
+def _ints(a):
+    return wp.array(np.ascontiguousarray(a, dtype=np.int32), dtype=int, device="cpu")
+
+
+def _reals(a, dtype=kernels.real):
+    return wp.array(np.ascontiguousarray(a, dtype=np.float64), dtype=dtype, device="cpu")
+
+
+class Cloth:
+    """A ``sheet`` at ``x`` (N, 3) [m] with velocities ``v`` (N, 3) [m/s]; ``keys``: how many
+    contacts can be told from each other.
+
+    Baraff and Witkin's scheme (SIGGRAPH 1998). With y = x + dt v + dt^2 g, the free flight, a step
+    lowers m / (2 dt^2) |x - y|^2 + stretching + bending + air + contacts + friction, linearised at
+    y with a positive semidefinite matrix.
+    """
+
+    def __init__(
+        self, sheet: Sheet, x: np.ndarray, settings: Settings | None = None, keys: int = 0
+    ) -> None:
+        self.sheet, self.settings = sheet, settings or Settings()
+        self.x = np.array(x, dtype=np.float64)
+        self.v = np.zeros_like(self.x)
+        self.load, self.slip = np.zeros(keys), np.zeros(keys)  # [N], [m] in the last step
+        self.iterations = 0  # of the last step
+        self._forced = np.zeros_like(self.x)  # by what forces moved the cloth in the last step
+        N, E, F, H = len(sheet), sheet.edges, sheet.faces, sheet.hinges
+        each = np.arange(N)
+        pairs = np.concatenate([E, E[:, ::-1], np.stack([each, each], 1)])
+        where = np.unique(pairs[:, 0] * N + pairs[:, 1])
+        at = lambda i, j: np.searchsorted(where, i * N + j)
+        self._middle = at(each, each)
+        beside = [
+            (p, q) for i, j in ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3)) for p, q in ((i, j), (j, i))
+        ]
+        of_faces = np.stack([at(F[:, a], F[:, b]) for a in range(3) for b in range(3)], 1)
+        of_hinges = [at(H[:, i], H[:, i]) for i in range(4)]
+        of_hinges += [at(H[:, p], H[:, q]) for p, q in beside]
+        material = sheet.material
+        self._rows = [_ints(np.searchsorted(where // N, np.arange(N + 1))), _ints(self._middle)]
+        self._rows.append(_ints(where % N))
+        self._faces, self._of_faces = _ints(F), _ints(of_faces)
+        self._hinges = _ints(H), _reals(sheet.angles), _reals(sheet.stiffness)
+        self._of_hinges = _ints(np.stack(of_hinges, 1).reshape(-1, 14))
+        self._stretch = _reals(sheet.gradients, kernels.vec2), _reals(material.stretch * sheet.area)
+        self._matrix = _reals(np.zeros((len(where), 3, 3)), kernels.mat3)
+        self._inverse = _reals(np.zeros((N, 3, 3)), kernels.mat3)
+        self._vectors = [_reals(np.zeros((N, 3)), kernels.vec3) for _ in range(8)]
+        self._done = _ints([0])
+
+    def assemble(
+        self, y: np.ndarray, dt: float, contacts: Sequence[Contacts] = ()
+    ) -> tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray]]]:
+        """The gradient (N, 3) [N] at ``y`` (N, 3) [m] of all but inertia and weight, and of each of
+        the ``contacts`` gap and slip (C,) [m]. The matrix stays here, with the masses / dt^2.
+        """
+        x, before, velocity, force = self._vectors[:4]
+        x.numpy()[:], before.numpy()[:], velocity.numpy()[:], force.numpy()[:] = (
+            y,
+            self.x,
+            self.v,
+            0,
+        )
+        matrix = self._matrix.numpy()
+        matrix[:] = 0
+        matrix[self._middle] = (self.sheet.mass / dt**2)[:, None, None] * np.eye(3)
+        into = [force, self._matrix]
+        launch = lambda kernel, size, arguments: wp.launch(kernel, size, arguments, device="cpu")
+        count, material = len(self.sheet.faces), self.sheet.material
+        launch(kernels.stretching, count, [x, self._faces, *self._stretch, self._of_faces, *into])
+        launch(
+            kernels.bending,
+            len(self.sheet.hinges),
+            [x, *self._hinges, self._of_hinges, *into],
+        )
+        air = [material.drag * AIR / 2, dt, self._of_faces]
+        launch(kernels.drag, count, [x, before, velocity, self._faces, *air, *into])
+        found = []
+        for c in contacts:
+            drag = material.friction * self.load[c.key]
+            drag /= np.maximum(self.slip[c.key], self.settings.sticking * dt)
+            gap, slip = _reals(np.zeros(len(c.key))), _reals(np.zeros(len(c.key)))
+            launch(
+                kernels.contact,
+                len(c.key),
+                [
+                    x, before, _ints(c.corners), _reals(c.weights), _reals(c.normal, kernels.vec3),
+                    _reals(c.offset), _reals(c.moved, kernels.vec3), c.stiffness,
+                    _reals(drag), self._rows[1], gap, slip, *into,
+                ],
+            )  # fmt: skip
+            found.append((gap.numpy(), slip.numpy()))
+        return force.numpy(), found
+
+    def product(self, vector: np.ndarray) -> np.ndarray:
+        """The matrix that was last assembled times ``vector`` (N, 3)."""
+        first, _, column = (a.numpy() for a in self._rows)
+        size = 3 * len(self.sheet)
+        matrix = bsr_matrix((self._matrix.numpy(), column, first), shape=(size, size))
+        return (matrix @ np.ravel(vector)).reshape(-1, 3)
+
+    def flight(self, dt: float) -> np.ndarray:
+        """Where the vertices (N, 3) [m] would be after a step of ``dt`` [s] without any force but
+        their weight.
+        """
+        y = self.x + dt * self.v
+        y[:, 2] -= GRAVITY * dt * dt
+        return y
+
+    def step(
+        self,
+        dt: float,
+        contacts: Sequence[Contacts] = (),
+        target: np.ndarray | None = None,
+        pull: np.ndarray | float = 0.0,
+    ) -> None:
+        """One step of ``dt`` [s]. Each vertex is pulled to ``target`` (N, 3) [m] by springs of
+        stiffness ``pull`` (N,) [N/m].
+        """
+        y = self.flight(dt)
+        pull = np.broadcast_to(pull, len(y))[:, None]
+        target = y if target is None else target
+        inertia = self.sheet.mass[:, None] / dt**2
+        b, move, *work = self._vectors[3:]
+        limits = [self.settings.iterations, self.settings.tolerance]
+        arrays = [*self._rows, self._matrix, self._inverse, *limits, b, move, *work, self._done]
+        after, start, self.iterations = y, self._forced, 0
+        for _ in range(self.settings.newton):
+            gradient, found = self.assemble(after, dt, contacts)
+            gradient = gradient + inertia * (after - y) + pull * (after - target)
+            self._matrix.numpy()[self._middle] += pull[:, :, None] * np.eye(3)
+            b.numpy()[:], move.numpy()[:] = -gradient, start
+            wp.launch(kernels.conjugate_gradients, 1, arrays, device="cpu")
+            self.iterations += int(self._done.numpy()[0])
+            after, start = after + move.numpy(), np.zeros_like(y)
+        self._forced = after - y
+        self._remember(after, contacts, found)
+        self.v, self.x = (after - self.x) / dt, after
+
+    def _remember(self, after, contacts, found):
+        """Loads and slips of the contacts, for the next step's friction: what those bear that were
+        in touch when the step was last linearised.
+        """
+        load, slip = np.zeros_like(self.load), np.zeros_like(self.slip)
+        for c, (touching, _) in zip(contacts, found):
+            point = (after[c.corners] * c.weights[:, :, None]).sum(1)
+            gap = (point * c.normal).sum(1) - c.offset
+            slid = point - (self.x[c.corners] * c.weights[:, :, None]).sum(1) - c.moved
+            slid -= (slid * c.normal).sum(1, keepdims=True) * c.normal
+            load[c.key] = c.stiffness * np.maximum(-gap, 0) * (touching < 0)
+            slip[c.key] = np.linalg.norm(slid, axis=1)
+        self.load, self.slip = load, slip

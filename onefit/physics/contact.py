@@ -1,0 +1,155 @@
+"""What cloth touches: the moving body's triangles, and itself. Positions go in, contacts come out:
+planes that points of the sheet must stay in front of.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from onefit.body import ClosestSurface
+
+from . import kernels
+from .kernels import wp
+from .sheet import Sheet
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """C contacts: ``key`` (C,), which is which from step to step; ``corners`` (C, 4) and
+    ``weights`` (C, 4): the point sum_i w_i x_i; the plane's ``normal`` (C, 3) and ``offset`` (C,)
+    [m], so that the gap is normal . point - offset; ``moved`` (C, 3) [m], by what the other side
+    moved in the step; ``stiffness`` [N/m] of each.
+    """
+
+    key: np.ndarray
+    corners: np.ndarray
+    weights: np.ndarray
+    normal: np.ndarray
+    offset: np.ndarray
+    moved: np.ndarray
+    stiffness: float
+
+
+def samples(sheet: Sheet, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+    """``(corners (P, 4), weights (P, 4))`` of points of the faces and edges that lie ``spacing``
+    [m] from each other and from the vertices, or nearer; triangles that are small enough have none.
+    """
+    x = sheet.rest[sheet.faces]
+    longest = np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2).max(1)
+    parts = np.ceil(longest / spacing).astype(int)
+    corners, weights = [np.zeros((0, 4), int)], [np.zeros((0, 4))]
+    for n in np.unique(parts[parts > 1]):
+        i, j = (k.ravel() for k in np.mgrid[: n + 1, : n + 1])
+        grid = np.stack([i, j, n - i - j, 0 * i], 1) / n
+        grid = grid[(grid.min(1) >= 0) & (grid.max(1) < 1)]
+        faces = sheet.faces[parts == n]
+        corners.append(np.repeat(faces[:, [0, 1, 2, 2]], len(grid), axis=0))
+        weights.append(np.tile(grid, (len(faces), 1)))
+    return np.concatenate(corners), np.concatenate(weights)
+
+
+class BodyContact:
+    """Contacts of a sheet with a body that moves: ``vertices`` (V, 3) [m] at first, ``faces``.
+
+    A point is held in front of the plane of the triangle that was nearest to it at the start of the
+    step, which moves with the body. So the side is that of the start, however fast the body is.
+    """
+
+    def __init__(self, sheet: Sheet, vertices: torch.Tensor, faces: torch.Tensor, settings) -> None:
+        self.settings, self.faces = settings, faces.cpu().numpy()
+        self.stiffness = settings.contact * sheet.material.stretch
+        count = len(sheet)
+        own = np.zeros((count, 4))
+        own[:, 0] = 1
+        corners, weights = samples(sheet, settings.spacing)
+        self.corners = np.concatenate([np.repeat(np.arange(count)[:, None], 4, axis=1), corners])
+        self.weights = np.concatenate([own, weights])
+        self.surface = ClosestSurface(vertices, faces)
+        self.body = vertices.double().numpy()
+        self._pool = ThreadPoolExecutor(max(1, torch.get_num_threads()))
+
+    def __len__(self) -> int:
+        return len(self.corners)
+
+    def points(self, x: np.ndarray) -> np.ndarray:
+        """The vertices (N, 3) and, below them, the points of the faces: (P, 3)."""
+        of_faces = slice(len(x), None)
+        inner = (x[self.corners[of_faces]] * self.weights[of_faces, :, None]).sum(1)
+        return np.concatenate([x, inner])
+
+    def find(self, x: np.ndarray) -> None:
+        """Look for what is near to the vertices (N, 3) [m], on the body where it is now."""
+        parts = torch.as_tensor(self.points(x)).float().chunk(self._pool._max_workers)
+        found = list(self._pool.map(lambda p: self.surface(p, self.settings.reach), parts))
+        self.face, self.barycentric, self.point, self.distance, self.normal = (
+            torch.cat([getattr(n, name) for n in found]).numpy()
+            for name in ("face", "barycentric", "point", "distance", "normal")
+        )
+
+    def follow(self, vertices: np.ndarray) -> Contacts:
+        """The body moves to ``vertices`` (V, 3) [m]; the contacts of the step in which it does."""
+        near = np.flatnonzero(self.face >= 0)
+        corners, b = self.faces[self.face[near]], self.barycentric[near, :, None]
+        now = vertices[corners]
+        point, before = (now * b).sum(1), (self.body[corners] * b).sum(1)
+        normal = np.cross(now[:, 1] - now[:, 0], now[:, 2] - now[:, 0])
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        offset = (normal * point).sum(1) + self.settings.clearance
+        self.body = vertices
+        self.surface.follow(torch.as_tensor(vertices))
+        corners, weights = self.corners[near], self.weights[near]
+        return Contacts(near, corners, weights, normal, offset, point - before, self.stiffness)
+
+    def pushed_out(self, x: np.ndarray) -> np.ndarray:
+        """The vertices (N, 3) [m] after those nearer to the body than ``least``, and the corners of
+        points of faces that are, were pushed so far out; after :meth:`find`.
+        """
+        least = self.settings.least
+        deep = np.flatnonzero((self.face >= 0) & (self.distance < least))
+        push = (least - self.distance[deep, None]) * self.normal[deep]
+        out, depth = x.copy(), np.zeros(len(x))
+        order = np.argsort(self.distance[deep])[::-1]  # the deepest last: it counts
+        for k in range(4):
+            used = order[self.weights[deep[order], k] > 0]
+            v = self.corners[deep[used], k]
+            deeper = least - self.distance[deep[used]] > depth[v]
+            v, used = v[deeper], used[deeper]
+            out[v], depth[v] = x[v] + push[used], least - self.distance[deep[used]]
+        return out
+
+
+class SelfContact:
+    """Contacts of a sheet with itself: of each vertex with the nearest triangle. The keys start at
+    ``first``.
+    """
+
+    def __init__(self, sheet: Sheet, settings, first: int) -> None:
+        self.sheet, self.settings, self.first = sheet, settings, first
+        self.stiffness = settings.layers * sheet.material.stretch
+        self._places = [
+            wp.array(sheet.rest.astype(np.float32), dtype=wp.vec3, device="cpu") for _ in range(3)
+        ]
+        indices = wp.array(sheet.faces.ravel().astype(np.int32), dtype=int, device="cpu")
+        self._mesh = wp.Mesh(self._places[0], indices)
+        self._face = wp.zeros(len(sheet), dtype=int, device="cpu")
+        self._found = wp.zeros((len(sheet), 3), dtype=float, device="cpu")
+        self._normal = wp.zeros(len(sheet), dtype=wp.vec3, device="cpu")
+
+    def find(self, before: np.ndarray, x: np.ndarray) -> Contacts:
+        """The contacts of vertices (N, 3) [m] that were ``before`` (N, 3) and may go to ``x``."""
+        self._places[0].numpy()[:], self._places[1].numpy()[:] = x, before
+        self._mesh.refit()
+        arrays = [*self._places, 2 * self.settings.apart, self._face, self._found, self._normal]
+        wp.launch(kernels.proximity, len(x), [self._mesh.id, *arrays], device="cpu")
+        vertex = np.flatnonzero(self._face.numpy() >= 0)
+        face, barycentric = self._face.numpy()[vertex], self._found.numpy()[vertex].astype(float)
+        corners = np.concatenate([vertex[:, None], self.sheet.faces[face]], 1)
+        weights = np.concatenate([np.ones((len(vertex), 1)), -barycentric], 1)
+        offset = np.full(len(vertex), self.settings.apart)
+        normal = self._normal.numpy()[vertex].astype(float)
+        key, still = self.first + vertex, np.zeros_like(normal)
+        return Contacts(key, corners, weights, normal, offset, still, self.stiffness)

@@ -1,0 +1,358 @@
+"""Warp kernels of the implicit step: gradient and Hessian of a sheet's energies, and conjugate
+gradients. On the CPU each is one compiled loop.
+
+Matrices have 3 x 3 blocks, at the diagonal and where two vertices share an edge. Double precision:
+in single precision the rounding of a coordinate of 1 m is a strain of 1e-5.
+"""
+
+from onefit.body.quietwarp import warp as ready
+
+wp = ready()
+
+real = wp.float64
+vec2 = wp.types.vector(length=2, dtype=real)
+vec3 = wp.types.vector(length=3, dtype=real)
+mat2 = wp.types.matrix(shape=(2, 2), dtype=real)
+mat3 = wp.types.matrix(shape=(3, 3), dtype=real)
+mat32 = wp.types.matrix(shape=(3, 2), dtype=real)
+mat43 = wp.types.matrix(shape=(4, 3), dtype=real)
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def stretching(
+    x: wp.array(dtype=vec3),
+    faces: wp.array2d(dtype=int),
+    gradients: wp.array2d(dtype=vec2),
+    weight: wp.array(dtype=real),  # stretch * area [N m]
+    blocks: wp.array2d(dtype=int),  # (F, 9): where the blocks of the corners' pairs lie
+    force: wp.array(dtype=vec3),  # receives the gradient
+    matrix: wp.array(dtype=mat3),  # receives the Hessian, its negative eigenvalues set to 0
+):
+    """stretch / 2 * area * |F - R|^2: gradient weight (F - R) g_a; Hessian by the modes of F.
+
+    With F = R S, S = sum_i s_i v_i v_i^T and n the normal: in the plane all modes have 1, but the
+    rotation of F in its plane 1 - 2 / (s_1 + s_2); out of it 1 - 1 / s_i.
+    """
+    f = wp.tid()
+    one, two, half = real(1.0), real(2.0), real(0.5)
+    F = mat32()
+    for a in range(3):
+        F += wp.outer(x[faces[f, a]], gradients[f, a])
+    C = wp.transpose(F) * F
+    det = wp.sqrt(wp.max(C[0, 0] * C[1, 1] - C[0, 1] * C[0, 1], real(1.0e-12)))
+    trace = wp.sqrt(C[0, 0] + C[1, 1] + two * det)  # s_1 + s_2
+    S = (C + det * mat2(one, real(0.0), real(0.0), one)) / trace
+    inverse = mat2(S[1, 1], -S[0, 1], -S[0, 1], S[0, 0]) / det
+    R = F * inverse
+    r0 = vec3(R[0, 0], R[1, 0], R[2, 0])
+    r1 = vec3(R[0, 1], R[1, 1], R[2, 1])
+    n = wp.cross(r0, r1)
+    twist = wp.min(one, two / trace)
+    # G = sum_i max(1 - 1 / s_i, 0) v_i v_i^T
+    middle = half * trace
+    apart = wp.sqrt(wp.max(middle * middle - det, real(0.0)))
+    g1 = wp.max(one - one / (middle + apart), real(0.0))
+    g2 = wp.max(one - one / wp.max(middle - apart, real(1.0e-6)), real(0.0))
+    G = half * (g1 + g2) * mat2(one, real(0.0), real(0.0), one)
+    if apart > real(1.0e-9):
+        G = G + (g1 - g2) / (two * apart) * (S - middle * mat2(one, real(0.0), real(0.0), one))
+    w = weight[f]
+    P = F - R
+    nn = wp.outer(n, n)
+    inside = mat3(one, real(0.0), real(0.0), real(0.0), one, real(0.0), real(0.0), real(0.0), one)
+    inside = inside - nn
+    for a in range(3):
+        ga = gradients[f, a]
+        force[faces[f, a]] += w * (P * ga)
+        ta = r1 * ga[0] - r0 * ga[1]
+        for b in range(3):
+            gb = gradients[f, b]
+            tb = r1 * gb[0] - r0 * gb[1]
+            block = wp.dot(ga, gb) * inside + wp.dot(ga, G * gb) * nn
+            matrix[blocks[f, 3 * a + b]] += w * (block - half * twist * wp.outer(ta, tb))
+
+
+@wp.func
+def angle_between(one: vec3, two: vec3, edge: vec3):
+    return wp.atan2(wp.dot(wp.cross(one, two), edge), wp.dot(one, two))
+
+
+@wp.kernel
+def bending(
+    x: wp.array(dtype=vec3),
+    hinges: wp.array2d(dtype=int),
+    angles: wp.array(dtype=real),
+    stiffness: wp.array(dtype=real),
+    blocks: wp.array2d(dtype=int),  # (H, 14): (i, i), then both ways 01, 02, 03, 12, 13
+    force: wp.array(dtype=vec3),
+    matrix: wp.array(dtype=mat3),
+):
+    """Gradient of stiffness / 2 (angle - rest)^2, and its Gauss-Newton matrix u u^T. The opposite
+    corners share no edge: 2 (u_2 x_2)(u_3 x_3) there is replaced by (u_2 x_2)^2 + (u_3 x_3)^2,
+    which is never less, and almost the same where both move alike.
+    """
+    h = wp.tid()
+    x0, x1 = x[hinges[h, 0]], x[hinges[h, 1]]
+    x2, x3 = x[hinges[h, 2]], x[hinges[h, 3]]
+    e = x1 - x0
+    length = wp.length(e)
+    edge = e / length
+    one, two = wp.cross(e, x2 - x0), wp.cross(x3 - x0, e)
+    turned = angle_between(one, two, edge) - angles[h]
+    if turned > real(3.141592653589793):
+        turned -= real(6.283185307179586)
+    if turned < real(-3.141592653589793):
+        turned += real(6.283185307179586)
+    k = stiffness[h]
+    least = real(1.0e-16)
+    a = one / wp.max(wp.dot(one, one), least)
+    b = two / wp.max(wp.dot(two, two), least)
+    u = mat43()
+    u[0] = -(wp.dot(x2 - x1, edge) * a + wp.dot(x3 - x1, edge) * b)
+    u[1] = wp.dot(x2 - x0, edge) * a + wp.dot(x3 - x0, edge) * b
+    u[2] = -length * a
+    u[3] = -length * b
+    for i in range(4):
+        force[hinges[h, i]] += k * turned * u[i]
+        factor = k
+        if i > 1:
+            factor = real(2.0) * k
+        matrix[blocks[h, i]] += factor * wp.outer(u[i], u[i])
+    at = int(4)  # noqa: RUF046, UP018 - a variable to Warp
+    for i in range(2):
+        for j in range(i + 1, 4):
+            matrix[blocks[h, at]] += k * wp.outer(u[i], u[j])
+            matrix[blocks[h, at + 1]] += k * wp.outer(u[j], u[i])
+            at += 2
+
+
+@wp.kernel
+def drag(
+    x: wp.array(dtype=vec3),
+    before: wp.array(dtype=vec3),
+    velocity: wp.array(dtype=vec3),  # at the start of the step [m/s]
+    faces: wp.array2d(dtype=int),
+    coefficient: real,  # drag * density of the air / 2 [kg/m^3]
+    dt: real,
+    blocks: wp.array2d(dtype=int),
+    force: wp.array(dtype=vec3),
+    matrix: wp.array(dtype=mat3),
+):
+    """The air's drag normal to each triangle, coefficient * area * |v.n| v.n n, with |v.n| of the
+    start of the step.
+    """
+    f = wp.tid()
+    a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+    normal = wp.cross(x[b] - x[a], x[c] - x[a])
+    double = wp.length(normal)
+    n = normal / wp.max(double, real(1.0e-12))
+    third = real(1.0) / real(3.0)
+    speed = third * wp.abs(wp.dot(velocity[a] + velocity[b] + velocity[c], n))
+    k = coefficient * real(0.5) * double * speed * third / dt
+    moved = third * wp.dot(x[a] - before[a] + x[b] - before[b] + x[c] - before[c], n)
+    nn = wp.outer(n, n)
+    for i in range(3):
+        force[faces[f, i]] += k * moved * n
+        matrix[blocks[f, 4 * i]] += k * nn
+
+
+@wp.kernel
+def contact(
+    x: wp.array(dtype=vec3),
+    before: wp.array(dtype=vec3),
+    corners: wp.array2d(dtype=int),  # (C, 4)
+    weights: wp.array2d(dtype=real),  # (C, 4); a corner of no weight is skipped
+    normal: wp.array(dtype=vec3),
+    offset: wp.array(dtype=real),  # [m]; the gap is normal . sum_i weight_i x_i - offset
+    moved: wp.array(dtype=vec3),  # [m]; by what the other side of the contact moved in the step
+    stiffness: real,  # [N/m]
+    drag: wp.array(dtype=real),  # [N/m]; friction for a unit slip
+    middle: wp.array(dtype=int),
+    gap: wp.array(dtype=real),  # receives the gap [m]
+    slip: wp.array(dtype=real),  # receives the length of the slip in the step [m]
+    force: wp.array(dtype=vec3),
+    matrix: wp.array(dtype=mat3),
+):
+    """stiffness / 2 gap^2 where the gap is below 0, and drag / 2 slip^2. In the matrix a contact of
+    several corners is as many of one corner, which is never less.
+    """
+    c = wp.tid()
+    n = normal[c]
+    at, slid = vec3(), -moved[c]
+    total = real(0.0)
+    for i in range(4):
+        if weights[c, i] != real(0.0):
+            place = x[corners[c, i]]
+            at += weights[c, i] * place
+            slid += weights[c, i] * (place - before[corners[c, i]])
+            total += wp.abs(weights[c, i])
+    gap[c] = wp.dot(n, at) - offset[c]
+    slid = slid - wp.dot(slid, n) * n
+    slip[c] = wp.length(slid)
+    k = real(0.0)
+    if gap[c] < real(0.0):
+        k = stiffness
+    if k + drag[c] > real(0.0):
+        g = k * gap[c] * n + drag[c] * slid
+        block = k * wp.outer(n, n)
+        block += drag[c] * (wp.identity(n=3, dtype=real) - wp.outer(n, n))
+        for i in range(4):
+            v = corners[c, i]
+            if weights[c, i] != real(0.0):
+                force[v] += weights[c, i] * g
+                matrix[middle[v]] += total * wp.abs(weights[c, i]) * block
+
+
+@wp.func
+def closest_on_triangle(p: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3):
+    """Barycentric coordinates of the nearest point (Ericson 2005, section 5.1.5)."""
+    ab, ac, ap = b - a, c - a, p - a
+    d1, d2 = wp.dot(ab, ap), wp.dot(ac, ap)
+    if d1 <= 0.0 and d2 <= 0.0:
+        return wp.vec3(1.0, 0.0, 0.0)
+    bp = p - b
+    d3, d4 = wp.dot(ab, bp), wp.dot(ac, bp)
+    if d3 >= 0.0 and d4 <= d3:
+        return wp.vec3(0.0, 1.0, 0.0)
+    vc = d1 * d4 - d3 * d2
+    if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
+        v = d1 / (d1 - d3)
+        return wp.vec3(1.0 - v, v, 0.0)
+    cp = p - c
+    d5, d6 = wp.dot(ab, cp), wp.dot(ac, cp)
+    if d6 >= 0.0 and d5 <= d6:
+        return wp.vec3(0.0, 0.0, 1.0)
+    vb = d5 * d2 - d1 * d6
+    if vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
+        w = d2 / (d2 - d6)
+        return wp.vec3(1.0 - w, 0.0, w)
+    va = d3 * d6 - d5 * d4
+    if va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
+        w = (d4 - d3) / ((d4 - d3) + (d5 - d6))
+        return wp.vec3(0.0, 1.0 - w, w)
+    v = vb / (va + vb + vc)
+    w = vc / (va + vb + vc)
+    return wp.vec3(1.0 - v - w, v, w)
+
+
+@wp.func
+def side_of(p: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3):
+    return wp.dot(p - a, wp.cross(b - a, c - a))
+
+
+@wp.kernel
+def proximity(
+    mesh: wp.uint64,  # of the vertices x
+    x: wp.array(dtype=wp.vec3),
+    before: wp.array(dtype=wp.vec3),  # where they were at the start of the step
+    rest: wp.array(dtype=wp.vec3),
+    reach: float,
+    face: wp.array(dtype=int),  # receives the nearest face within reach that is not beside, or -1
+    found: wp.array2d(dtype=float),  # receives its barycentric coordinates
+    normal: wp.array(dtype=wp.vec3),  # receives the direction in which the vertex must stay away
+):
+    """For each vertex of the sheet the nearest triangle of the same sheet within ``reach``. One
+    with a corner that lies within twice that of the vertex at rest is beside it, and does not
+    count. The vertex belongs on the side of the triangle on which it was before.
+    """
+    i = wp.tid()
+    p = x[i]
+    face[i] = -1
+    closest = reach * reach
+    around = wp.vec3(reach, reach, reach)
+    query = wp.mesh_query_aabb(mesh, p - around, p + around)
+    f = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+    while wp.mesh_query_aabb_next(query, f):
+        a = wp.mesh_get_index(mesh, 3 * f)
+        b = wp.mesh_get_index(mesh, 3 * f + 1)
+        c = wp.mesh_get_index(mesh, 3 * f + 2)
+        beside = wp.min(
+            wp.length_sq(rest[a] - rest[i]),
+            wp.min(wp.length_sq(rest[b] - rest[i]), wp.length_sq(rest[c] - rest[i])),
+        )
+        if i != a and i != b and i != c and beside > 4.0 * reach * reach:
+            near = closest_on_triangle(p, x[a], x[b], x[c])
+            away = p - (near[0] * x[a] + near[1] * x[b] + near[2] * x[c])
+            if wp.length_sq(away) < closest:
+                closest = wp.length_sq(away)
+                face[i] = f
+                for k in range(3):
+                    found[i, k] = near[k]
+                was = side_of(before[i], before[a], before[b], before[c])
+                if was * side_of(p, x[a], x[b], x[c]) > 0.0:
+                    normal[i] = wp.normalize(away)
+                else:
+                    normal[i] = wp.sign(was) * wp.normalize(wp.cross(x[b] - x[a], x[c] - x[a]))
+
+
+@wp.kernel
+def conjugate_gradients(
+    first: wp.array(dtype=int),  # (N + 1,): row i has the blocks first[i] to first[i + 1]
+    middle: wp.array(dtype=int),  # (N,): where its diagonal block lies
+    column: wp.array(dtype=int),
+    matrix: wp.array(dtype=mat3),
+    inverse: wp.array(dtype=mat3),  # receives those of the diagonal blocks
+    iterations: int,
+    tolerance: real,  # of the residual's norm, relative to the right-hand side's
+    b: wp.array(dtype=vec3),  # overwritten
+    x: wp.array(dtype=vec3),  # start, and result
+    p: wp.array(dtype=vec3),
+    t: wp.array(dtype=vec3),
+    w: wp.array(dtype=vec3),
+    done: wp.array(dtype=int),  # receives the number of iterations
+):
+    """matrix x = b, preconditioned by a symmetric Gauss-Seidel sweep, in Eisenstat's form (1981): a
+    sweep back and one forward do for the product with the matrix, too. One thread.
+
+    With A = L + D + L^T: CG on (D + L)^-1 A (D + L^T)^-1, preconditioned by D.
+    """
+    n = x.shape[0]
+    zero = real(0.0)
+    size = zero
+    for i in range(n):
+        inverse[i] = wp.inverse(matrix[middle[i]])
+        size += wp.dot(b[i], inverse[i] * b[i])
+    for i in range(n):
+        r = b[i]
+        for k in range(first[i], first[i + 1]):
+            r -= matrix[k] * x[column[k]]
+        t[i] = r
+    for i in range(n):
+        r = t[i]
+        for k in range(first[i], middle[i]):
+            r -= matrix[k] * b[column[k]]
+        b[i] = inverse[i] * r
+    rho = zero
+    for i in range(n):
+        p[i] = matrix[middle[i]] * b[i]
+        rho += wp.dot(b[i], p[i])
+    done[0] = 0
+    limit = tolerance * tolerance * size
+    for turn in range(iterations):
+        if rho <= limit or rho <= real(1.0e-30):
+            break
+        for back in range(n):
+            i = n - 1 - back
+            r = p[i]
+            for k in range(middle[i] + 1, first[i + 1]):
+                r -= matrix[k] * t[column[k]]
+            t[i] = inverse[i] * r
+        curvature = zero
+        for i in range(n):
+            r = p[i] - matrix[middle[i]] * t[i]
+            for k in range(first[i], middle[i]):
+                r -= matrix[k] * w[column[k]]
+            w[i] = inverse[i] * r
+            curvature += wp.dot(p[i], t[i] + w[i])
+        alpha = rho / curvature
+        after = zero
+        for i in range(n):
+            x[i] = x[i] + alpha * t[i]
+            b[i] = b[i] - alpha * (t[i] + w[i])
+            after += wp.dot(b[i], matrix[middle[i]] * b[i])
+        beta = after / rho
+        for i in range(n):
+            p[i] = matrix[middle[i]] * b[i] + beta * p[i]
+        rho = after
+        done[0] = turn + 1

@@ -1,0 +1,101 @@
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from onefit.physics import MATERIALS, Settings
+from onefit.physics.cloth import Cloth
+from onefit.physics.contact import BodyContact, SelfContact, samples
+from onefit.physics.sheet import Sheet
+
+COTTON = MATERIALS["cotton"]
+
+
+def grid(columns, rows, side):
+    """A square sheet in the plane z = 0 around the origin, its triangles facing up."""
+    V = np.stack(np.meshgrid(np.arange(columns), np.arange(rows), indexing="ij"), -1).reshape(-1, 2)
+    a = (np.arange(columns - 1)[:, None] * rows + np.arange(rows - 1)).ravel()
+    F = np.concatenate(
+        [np.stack([a, a + rows, a + 1], 1), np.stack([a + 1, a + rows, a + rows + 1], 1)]
+    )
+    V = side * (V - V.mean(0))
+    return np.concatenate([V, np.zeros((len(V), 1))], 1), F
+
+
+def on_body(sheet, x, body, faces, steps, settings=None, moving=lambda t: 0.0, pull=None):
+    """The cloth after steps of 1 / 60 s on a body that is moved by ``moving(t)`` (3,) [m]."""
+    settings = settings or Settings()
+    contact = BodyContact(sheet, torch.as_tensor(body), torch.as_tensor(faces), settings)
+    cloth = Cloth(sheet, x, settings, len(contact))
+    contact.find(cloth.x)
+    for k in range(steps):
+        cloth.step(1 / 60, [contact.follow(body + moving((k + 1) / 60))])
+        contact.find(cloth.x)
+        cloth.x = contact.pushed_out(cloth.x)
+    return cloth, contact
+
+
+def test_no_point_of_a_face_is_in_a_ball_that_cloth_falls_on():
+    V, F = grid(15, 15, 0.03)  # coarser than the ball's curvature: chords of 42 mm
+    sheet = Sheet(V, F, COTTON)
+    ball = trimesh.creation.icosphere(4, 0.1)
+    cloth, contact = on_body(sheet, V + [0, 0, 0.11], ball.vertices, ball.faces, 60)
+    assert contact.distance.min() > 0
+    fine = np.random.default_rng(0).dirichlet((1, 1, 1), 40)
+    points = np.einsum("sk,fkd->fsd", fine, cloth.x[F]).reshape(-1, 3)
+    assert np.linalg.norm(points, axis=1).min() > 0.1 - 5e-4
+    assert cloth.x[:, 2].min() < 0.05  # and it did fall around it
+
+
+@pytest.mark.parametrize("friction, held", [(0.6, True), (0.05, False)])
+def test_friction_holds_cloth_on_a_slope_or_does_not(friction, held):
+    V, F = grid(6, 6, 0.02)
+    slope = np.arctan(0.3)
+    c, s = np.cos(slope), np.sin(slope)
+    turn = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    box = trimesh.creation.box((2, 2, 0.2)).subdivide().subdivide()
+    material = type(COTTON)(**(vars(COTTON) | {"friction": friction, "drag": 0.0}))
+    x = (V + [0, 0, 0.1 + Settings().clearance]) @ turn.T
+    cloth, _ = on_body(Sheet(V, F, material), x, box.vertices @ turn.T, box.faces, 60)
+    slid = np.linalg.norm((cloth.x - x).mean(0))
+    expected = 9.81 * (s - friction * c) / 2
+    assert slid < 0.01 if held else slid == pytest.approx(expected, rel=0.25)
+
+
+def test_a_fast_body_takes_cloth_along():
+    V, F = grid(8, 8, 0.015)
+    ball = trimesh.creation.icosphere(4, 0.1)
+    fast = lambda t: np.array([0.0, 0.0, 4.0 * t])  # 67 mm a step, two thirds of the radius
+    cloth, contact = on_body(
+        Sheet(V, F, COTTON), V + [0, 0, 0.105], ball.vertices, ball.faces, 15, moving=fast
+    )
+    assert contact.distance.min() > 0
+    assert (cloth.x[:, 2] - 1.0).min() > 0  # on the side on which it was
+
+
+def test_a_layer_that_falls_on_another_stays_on_it():
+    V, F = grid(10, 10, 0.012)
+    V2 = V * [0.6, 0.6, 1] + [0, 0, 0.015]
+    sheet = Sheet(np.concatenate([V, V2]), np.concatenate([F, F + len(V)]), COTTON)
+    settings = Settings()
+    itself = SelfContact(sheet, settings, 0)
+    x = sheet.rest - [0, 0, 0.009] * (np.arange(len(sheet)) >= len(V))[:, None]  # 6 mm above it
+    cloth = Cloth(sheet, x, settings, len(sheet))
+    fixed = np.where(np.arange(len(sheet)) < len(V), 1e3, 0.0)
+    for _ in range(40):
+        contacts = itself.find(cloth.x, cloth.flight(1 / 60))
+        cloth.step(1 / 60, [contacts], sheet.rest, fixed)
+    above = cloth.x[len(V) :, 2] - cloth.x[: len(V), 2].mean()
+    assert above.min() > 0 and above.max() < 2 * settings.apart
+
+
+def test_points_of_faces_lie_no_farther_apart_than_the_spacing():
+    V, F = grid(3, 3, 0.1)
+    sheet = Sheet(V, F, COTTON)
+    corners, weights = samples(sheet, 0.02)
+    assert np.allclose(weights.sum(1), 1) and (weights >= 0).all()
+    points = np.concatenate([V, (V[corners] * weights[..., None]).sum(1)])
+    drawn = np.random.default_rng(0).dirichlet((1, 1, 1), 200) @ V[F[0]]
+    nearest = np.linalg.norm(drawn[:, None] - points, axis=-1).min(1)
+    assert nearest.max() < 0.02
+    assert len(samples(sheet, 0.2)[0]) == 0

@@ -1,0 +1,82 @@
+"""The stage of drapes: how bright a ball and the floor below it are, and that there is no grain."""
+
+import numpy as np
+import pytest
+
+from polysft_mi.render import stage
+
+
+def ball(radius=0.5, height=0.7, n=48):
+    """Vertices (N, 3) [m] and faces (F, 3) of a closed ball."""
+    u, v = np.linspace(0, 2 * np.pi, 2 * n + 1)[:-1], np.linspace(0, np.pi, n + 1)[1:-1]
+    u, v = np.meshgrid(u, v)
+    rings = np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)], -1)
+    V = np.concatenate([[[0, 0, 1.0]], rings.reshape(-1, 3), [[0, 0, -1.0]]])
+    m, k = 2 * n, np.arange(2 * n)
+    following = (k + 1) % m
+    F = [np.stack([0 * k, 1 + k, 1 + following], 1)]
+    for r in range(n - 2):
+        a, b = 1 + r * m + k, 1 + r * m + following
+        F += [np.stack([a, a + m, b + m], 1), np.stack([a, b + m, b], 1)]
+    a, b = 1 + (n - 2) * m + k, 1 + (n - 2) * m + following
+    F.append(np.stack([a, np.full_like(k, len(V) - 1), b], 1))
+    return radius * V + [0, 0, height], np.concatenate(F)
+
+
+COLOUR = (0.4, 0.2, 0.1)
+
+
+@pytest.fixture(scope="module")
+def picture():
+    V, F = ball()
+    (image,) = stage.render([(V[None], F, COLOUR)], size=(96, 96), spp=16)
+    return image
+
+
+def linear(image):
+    x = image / 255
+    return np.where(x < 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
+
+
+def test_the_open_top_of_a_ball_has_the_sky_and_the_key_light(picture):
+    """An upward face sees all of the sky and, nearly, all of the key light."""
+    V, F = ball()
+    lit = stage.Stage(V.astype(np.float32), F, np.tile(COLOUR, (len(V), 1)), 0.0)
+    lit.light(V.astype(np.float32), np.array([0, 0, 0.7]))
+    front = np.array(lit.front)
+    assert front[:, 0] == pytest.approx(stage.SKY, rel=0.02)  # the highest vertex
+    assert front[:, -1].max() < 0.5 * stage.SKY.max()  # the lowest sees the floor alone
+    shadow = np.array(lit.shadow)
+    assert shadow[0] == 1 and shadow[-1] == 0
+    up = lit.sun.mean(1)[2]
+    ground = np.array(lit.ground.tensor())
+    middle = ground[len(ground) // 2, len(ground) // 2]
+    assert (middle < 0.6 * lit.open).all()  # under the ball
+    assert ground[0, -1] == pytest.approx(stage.FLOOR * (stage.SKY + stage.KEY * up), rel=0.1)
+
+
+def test_the_picture_has_the_balls_colour_and_no_grain(picture):
+    x = linear(picture.astype(float))
+    middle = x[40:56, 40:56]
+    assert middle.mean((0, 1)) / middle.mean() == pytest.approx(
+        np.array(COLOUR) / np.mean(COLOUR), rel=0.12
+    )
+    # neighbouring pixels of a smooth ball differ by its shading alone, a plane in so small a window
+    plane = middle[..., 0] - middle[..., 0].mean()
+    v, u = np.mgrid[:16, :16]
+    A = np.stack([(u**i * v**j).ravel() for i in range(3) for j in range(3 - i)], 1)
+    rest = plane.ravel() - A @ np.linalg.lstsq(A, plane.ravel(), rcond=None)[0]
+    assert np.abs(rest).max() < 0.02 * middle[..., 0].mean()
+
+
+def test_the_camera_keeps_what_moves_in_the_picture():
+    V, F = ball(0.3)
+    moving = np.stack([V, V + [1.5, 0, 0]])
+    blue = [(moving, F, (0.0, 0.0, 0.6))]
+    seen = lambda image: np.argwhere(image[..., 2].astype(int) - image[..., 0] > 60)
+    fixed = [seen(i) for i in stage.render(blue, size=(60, 80), spp=4)]
+    followed = [seen(i) for i in stage.render(blue, size=(60, 80), spp=4, follow=True)]
+    for where in fixed + followed:
+        assert len(where) and where.min() > 0 and (where.max(0) < [59, 79]).all()
+    assert abs(fixed[1][:, 1].mean() - fixed[0][:, 1].mean()) > 20
+    assert np.abs(followed[1].mean(0) - followed[0].mean(0)).max() < 1
