@@ -261,19 +261,21 @@ class Assembly:
                 if len(kept):
                     self._meetings.append((other, k, part.start + kept, at[kept]))
 
-    def normal(self, surface, images, lengths, stiffness, wide, d=2, give=np.inf, triangles=None):
+    def normal(
+        self, surface, images, lengths, stiffness, d=2, give=np.inf, triangles=None, wide=None
+    ):
         """:class:`Normal` of the images, the edges and further
         residuals of triangles, and the edges' energy.
 
         ``surface``: :class:`polysft_mi.surface.atlas.Surface`; ``lengths`` (E,) [m]: of the
         template's edges; ``stiffness`` [1/m^2]: weight of the squared differences to them;
-        ``wide``: the pattern, which holds this one, that the local block is to have; ``d``: 3 where
-        the relief is an unknown too, or 2; ``give``: the
-        strain from which on a stretched edge hardly pulls harder. An excess e > 0 over the length L
-        costs 2 c^2 ((1 + e^2 / c^2)^1/2 - 1), c = give L (Charbonnier): cloth that hangs from a
-        point is stretched there by a tenth, and by squares that would turn the whole sheet. What is
-        compressed buckles; its costs are squares. ``triangles``: residuals r (F,), factors h (F,),
-        and derivatives (F, 3, 3) [1/m] of r by the corners; half the sum of h r^2 is added.
+        ``d``: 3 where the relief is an unknown too, or 2; ``give``: the strain from which on a
+        stretched edge hardly pulls harder. An excess e > 0 over the length L costs 2 c^2 ((1 + e^2
+        / c^2)^1/2 - 1), c = give L (Charbonnier): cloth that hangs from a point is stretched there
+        by a tenth, and by squares that would turn the whole sheet. What is compressed buckles; its
+        costs are squares. ``triangles``: residuals r (F,), factors h (F,), and derivatives (F, 3,
+        3) [1/m] of r by the corners; half the sum of h r^2 is added. ``wide``: a pattern that holds
+        this one, which the local block is to have.
         """
         pattern, count, basis = self.pattern, self.pattern.count, surface.basis
         size, patches = basis.shape[1], len(surface.up)
@@ -301,7 +303,7 @@ class Assembly:
         lifted = [x.reshape(-1, size) for x in lifted]
         local = local.reshape(-1, 3, 3)[:, :d, :d]
         blocks = pattern.all_blocks(local)
-        if wide is not pattern:
+        if wide is not None and wide is not pattern:
             inner, blocks = blocks, np.zeros((len(wide.row), d, d))
             blocks[wide.find(pattern.row, pattern.column)] = inner
         cross = np.zeros((count, d, patches, size + 6))

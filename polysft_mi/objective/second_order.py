@@ -58,7 +58,7 @@ class Context:
     ``noise``: the least misfit so far, NaN in the first frame, where the template has its shape;
     ``light``: what the frames before say of it; ``scales``: robust scale by stage, of the frame
     before; ``hold``: weight of the squared difference to the anchor, motion included; ``hidden``:
-    what holds the parts that no pixel sees.
+    what holds the parts that no pixel sees, None where all is seen.
     """
 
     frame: int
@@ -128,6 +128,7 @@ class SecondOrder:
         #: differences of (Δu, Δv) along the edges, in the axes of the first end, (2E, 2N)
         self.slides = slides(template.edges, template.axes)
         self._joints = Joints(self.atlas)
+        self._seen = Hidden.of(np.ones(count, dtype=bool), 1.0, self)
         self._lengths = np.array(problem.edge_lengths, dtype=np.float64)
         self.has_relief = self.settings.k_relief > 0 and count <= self.rules.relief_vertices
         #: the weight that holds a frame's jets and displacements to the frame before
@@ -135,9 +136,10 @@ class SecondOrder:
 
     def hidden(self, state):
         """The :class:`polysft_mi.objective.hidden.Hidden` of a surface."""
+        if len(self.atlas) == 1:
+            return self._seen
         seen = self.images.seen_vertices(self.atlas.surface(state).vertices, self.rules.blurs[-1])
-        hold = self.rules.unseen if len(self.atlas) > 1 else 1.0
-        return Hidden.of(seen, hold, self)
+        return Hidden.of(seen, self.rules.unseen, self)
 
     def appearance(self, state, stage, light):
         """The :class:`polysft_mi.images.registration.Appearance` of a sheet at the start of a
@@ -173,10 +175,10 @@ class SecondOrder:
             seen.images,
             self._lengths,
             stiffness,
-            self.patterns[d],
             d,
             give,
             rows,
+            self.patterns[d],
         )
         held, joined = self._hold(normal, surface, state, context)
         relief = s.k_relief * (caution if rules.relief_caution else 1.0)
@@ -215,8 +217,9 @@ class SecondOrder:
         weight[:size] += self.temporal
         moved = state.difference(anchor)
         pull = 2 * weight * moved
+        held = context.hidden or self._seen
         for k in range(patches):
-            bend = 2 * s.k_bend * context.hidden.patches[k] * self.atlas.bending
+            bend = 2 * s.k_bend * held.patches[k] * self.atlas.bending
             pull[k, :size] += bend @ state.alpha[k]
             jet = slice(k * (size + 6), k * (size + 6) + size)
             normal.glob[jet, jet] += bend
@@ -231,7 +234,7 @@ class SecondOrder:
         """
         s, pattern, height = self.settings, self.patterns[d], state.offset[:, 2]
         slid, along = state.offset - context.anchor.offset, state.offset[:, :2].ravel()
-        held, bending = context.hidden, relief * self.rules.relief_bend
+        held, bending = context.hidden or self._seen, relief * self.rules.relief_bend
         apart, steps, bent = self.slides @ along, pattern.difference @ height, self.bends @ height
         pull = self.temporal * slid
         pull[:, :2] += s.k_uv * (self.slides.T @ (np.repeat(held.edges, 2) * apart)).reshape(-1, 2)

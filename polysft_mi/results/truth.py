@@ -57,8 +57,8 @@ class Truth:
             if visible is not None:
                 if visible.shape != arrays["vertices"].shape[:2] or not visible.any(1).all():
                     raise InputError(
-                        f"{path}: seen {visible.shape}; {arrays['vertices'].shape[:2]}, with a vertex"
-                        " that is seen in every frame, is needed"
+                        f"{path}: seen {visible.shape}; {arrays['vertices'].shape[:2]}, with a"
+                        " vertex that is seen in every frame, is needed"
                     )
                 seen = dict(enumerate(visible.astype(bool)))
             return cls(path, "mesh", places, arrays["faces"].astype(np.int64), seen=seen)

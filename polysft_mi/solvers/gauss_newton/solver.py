@@ -163,7 +163,8 @@ class GaussNewton:
 
     def _least_misfit(self, found, context, known):
         """The least misfit of the frames so far, the first one aside, of the texture as the
-        template has it, less what the sheet's slant and folds account for. NaN in the first frame.
+        template has it: what the camera's blur makes of it is no noise. Of a surface of several
+        patches, less what its slant accounts for, which is large at its rims. NaN in the first frame.
         """
         if not known:
             return math.nan
@@ -176,8 +177,8 @@ class GaussNewton:
             self._images.misfit(vertices, context.frame, blur),
             found.model.appearance,
         )
-        known = appearance.misfit if appearance else 0.0
-        return float(np.fmin(least, max(found.misfit, bare - known)))
+        slant = appearance.misfit if appearance and len(self._atlas) > 1 else 0.0
+        return float(np.fmin(least, max(found.misfit, bare - slant) if slant else bare))
 
     def _solution(self, states, results, facts):
         """:class:`Solution` of a window: its states, the mean of their terms, and the facts of its
