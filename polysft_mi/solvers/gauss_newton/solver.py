@@ -164,7 +164,8 @@ class GaussNewton:
     def _least_misfit(self, found, context, known):
         """The least misfit of the frames so far, the first one aside, of the texture as the
         template has it: what the camera's blur makes of it is no noise. Of a surface of several
-        patches, less what its slant accounts for, which is large at its rims. NaN in the first frame.
+        patches, less what its slant accounts for, which is large at its rims. NaN in the first
+        frame.
         """
         if not known:
             return math.nan

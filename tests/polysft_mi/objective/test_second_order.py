@@ -183,7 +183,7 @@ def test_gradient_and_curvature_of_what_holds_the_relief(truth):
     model = whole.model(state, context, stage, 0.5)
     normal, count = model.normal, state.offset.size
     assert normal.local.shape[-1] == 3
-    h = dense(whole.pattern, normal)[0][:count, :count]
+    h = dense(whole.patterns[3], normal)[0][:count, :count]
     for _ in range(3):
         step = np.zeros(len(normal.gradient)), RNG.normal(size=state.offset.shape) * 1e-2
         change = whole.model(state.after_step(step), context, stage, 0.5).total - model.total

@@ -59,7 +59,7 @@ def test_a_windows_step_against_finite_differences_and_the_dense_system(truth):
         *[h + np.diag(np.diag(h) * damping + x) for h, x in zip(parts, floor, strict=True)]
     )
     for k in range(2):
-        jet = np.arange(len(states[k].alpha))
+        jet = np.arange(states[k].alpha.size)
         i, j = start[k] + n + jet, start[k + 1] + n + jet
         whole[i, j] = whole[j, i] = -2 * objective.temporal
     expected = np.split(-np.linalg.solve(whole, np.concatenate(right)), start[1:-1])
