@@ -40,7 +40,8 @@ def edges_of(problem):
 
 def context_of(objective, anchor, noise=math.nan):
     """The context of frame 1 where nothing is known of the light."""
-    return Context(1, anchor, noise, Light.unknown(objective.rules), {})
+    hidden = objective.hidden(anchor)
+    return Context(1, anchor, noise, Light.unknown(objective.rules), {}, hidden=hidden)
 
 
 @pytest.fixture(scope="module", params=["problem", "tube_problem"])
@@ -169,10 +170,12 @@ def test_whole_gradient_against_finite_differences(either, stage):
         problem.settings = before
 
 
-def test_gradient_and_curvature_of_what_holds_the_relief(truth):
+@pytest.mark.parametrize("shape", ["truth", "tube"])
+def test_gradient_and_curvature_of_what_holds_the_relief(request, shape):
     """Without the image, which jumps, differences are sharp; these terms are quadratic in the
-    displacements, so that their curvature is exact.
+    displacements, so that their curvature is exact, but for the bends, which it bounds.
     """
+    truth = request.getfixturevalue(shape)
     problem = problem_of(
         truth.folder, k_rgb=0.0, k_silhouette=0.0, k_mi=0.0, k_tc=5.0, k_relief=0.7, k_shading=0.0
     )
@@ -184,12 +187,18 @@ def test_gradient_and_curvature_of_what_holds_the_relief(truth):
     normal, count = model.normal, state.offset.size
     assert normal.local.shape[-1] == 3
     h = dense(whole.pattern, normal)[0][:count, :count]
-    for _ in range(3):
+    for heights in (0, 1, 1):
         step = np.zeros(len(normal.gradient)), RNG.normal(size=state.offset.shape) * 1e-2
-        change = whole.model(state.after_step(step), context, stage, 0.5).total - model.total
+        step[1][:, 2] *= heights
+        ends = [whole.model(state.after_step(step, f), context, stage, 0.5).total for f in (1, -1)]
         along = step[1].ravel()
-        promised = along @ normal.local_gradient.ravel() + 0.5 * along @ h @ along
-        assert change == pytest.approx(promised, rel=1e-6)
+        slope, curvature = along @ normal.local_gradient.ravel(), along @ h @ along
+        assert ends[0] - ends[1] == pytest.approx(2 * slope, rel=1e-6)
+        found = sum(ends) - 2 * model.total
+        if heights:
+            assert 0.2 * curvature < found < curvature * (1 + 1e-9)
+        else:
+            assert found == pytest.approx(curvature, rel=1e-6)
 
 
 @pytest.mark.parametrize("noise, moves", [(math.nan, [0, 0, 0]), (0.2, [0, 1, 1])])
