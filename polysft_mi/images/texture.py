@@ -26,9 +26,9 @@ def packed_image(colour, fourth):
 class Texture:
     """The reflectance of a rendered mesh over the box of its texture coordinates.
 
-    ``image`` (H, W, 3) float32, linear; ``inside`` (H, W): 1 where a triangle has it; ``density``: texels a
-    pixel of the first frame; ``coordinates``: Float of 2V, of the rendered vertices; ``scale``,
-    ``shift``: take coordinates to texels (whole at their centres).
+    ``image`` (H, W, 3) float32, linear; ``inside`` (H, W): 1 where a triangle has it;
+    ``density``: texels a pixel of the first frame; ``coordinates``: Float of 2V, of the rendered
+    vertices; ``scale``, ``shift``: take coordinates to texels (whole at their centres).
     """
 
     def __init__(self, mesh, faces, position, density, masked, normalise):

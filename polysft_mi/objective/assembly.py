@@ -6,6 +6,7 @@ and further residuals of the triangles. Out: :class:`Normal`, for the linear alg
 Import only after a Mitsuba variant is set.
 """
 
+import itertools
 from dataclasses import dataclass
 
 import drjit as dr
@@ -245,9 +246,7 @@ class Assembly:
         halo_patch, vertex = np.divmod(pairs, pattern.count)
         ends = np.searchsorted(halo_patch, np.arange(len(atlas) + 1))
         #: the vertices of each patch's halo, and its rows
-        self._reached = [
-            (vertex[a:b], slice(a, b)) for a, b in zip(ends[:-1], ends[1:], strict=True)
-        ]
+        self._reached = [(vertex[a:b], slice(a, b)) for a, b in itertools.pairwise(ends)]
         arrays = np.append(first, len(key)), half[block], entry, patch
         self._halo = Halo(*(on_device(x, mi.UInt32) for x in arrays))
         self._index = len(pairs)
@@ -262,13 +261,14 @@ class Assembly:
                 if len(kept):
                     self._meetings.append((other, k, part.start + kept, at[kept]))
 
-    def normal(self, surface, images, lengths, stiffness, d=2, give=np.inf, triangles=None):
+    def normal(self, surface, images, lengths, stiffness, wide, d=2, give=np.inf, triangles=None):
         """:class:`Normal` of the images, the edges and further
         residuals of triangles, and the edges' energy.
 
         ``surface``: :class:`polysft_mi.surface.atlas.Surface`; ``lengths`` (E,) [m]: of the
         template's edges; ``stiffness`` [1/m^2]: weight of the squared differences to them;
-        ``d``: 3 where the relief is an unknown too, or 2; ``give``: the
+        ``wide``: the pattern, which holds this one, that the local block is to have; ``d``: 3 where
+        the relief is an unknown too, or 2; ``give``: the
         strain from which on a stretched edge hardly pulls harder. An excess e > 0 over the length L
         costs 2 c^2 ((1 + e^2 / c^2)^1/2 - 1), c = give L (Charbonnier): cloth that hangs from a
         point is stretched there by a tenth, and by squares that would turn the whole sheet. What is
@@ -300,6 +300,10 @@ class Assembly:
         gradient, moved = gradient.reshape(-1, 3), moved.reshape(-1, 3, 6)
         lifted = [x.reshape(-1, size) for x in lifted]
         local = local.reshape(-1, 3, 3)[:, :d, :d]
+        blocks = pattern.all_blocks(local)
+        if wide is not pattern:
+            inner, blocks = blocks, np.zeros((len(wide.row), d, d))
+            blocks[wide.find(pattern.row, pattern.column)] = inner
         cross = np.zeros((count, d, patches, size + 6))
         for k, (reached, rows) in enumerate(self._reached):
             own = surface.offset_jacobian[reached][:, :, :d]
@@ -309,7 +313,7 @@ class Assembly:
                 )
             cross[reached, :, k, size:] = np.einsum("hca,hcm->ham", own, moved[rows])
         normal = Normal(
-            pattern.all_blocks(local),
+            blocks,
             cross.reshape(count * d, -1),
             self._glob(surface, lifted, moved),
             np.ascontiguousarray(along.reshape(-1, 3)[:, :d]),

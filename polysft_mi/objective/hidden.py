@@ -15,12 +15,12 @@ import scipy.sparse as sp
 @dataclass(frozen=True)
 class Hidden:
     """Factors of the weights of smoothness: ``edges`` (E,) and ``patches`` (K,), 1 where a surface
-    is seen; and with them the curvature of the displacements along the edges, ``slide_blocks`` (B,
-    2, 2), and of the relief, ``relief_blocks`` (B,)."""
+    is seen; and with them the curvature of the displacements along the edges, ``slide_blocks``:
+    number of a vertex' unknowns to (B, 2, 2), and of the relief, ``relief_blocks`` (B,)."""
 
     edges: np.ndarray
     patches: np.ndarray
-    slide_blocks: np.ndarray
+    slide_blocks: dict[int, np.ndarray]
     relief_blocks: np.ndarray
 
     @classmethod
@@ -29,19 +29,17 @@ class Hidden:
 
         ``objective``: a :class:`polysft_mi.objective.second_order.SecondOrder`.
         """
-        pattern, atlas = objective.pattern, objective.atlas
+        pattern, atlas = objective.patterns[3], objective.atlas
         edges = hold ** (~seen[pattern.edges]).mean(1)
         entries = np.bincount(atlas.entry_patch, minlength=len(atlas))
         unseen = np.bincount(atlas.entry_patch, ~seen[atlas.entry_vertex], minlength=len(atlas))
         slides, difference = objective.slides, pattern.difference
-        weight = sp.diags(np.repeat(edges, 2))
-        # a hinge reaches a vertex beyond the neighbours: with it the elimination would take four
-        # times as long
+        slid = slides.T @ sp.diags(np.repeat(edges, 2)) @ slides
         bends = pattern.bound_of(objective.bends.T @ objective.bends)
         relief = pattern.blocks_of(difference.T @ sp.diags(edges) @ difference)
         return cls(
             edges,
             hold ** (unseen / entries),
-            pattern.blocks_of(slides.T @ weight @ slides, 2),
+            {d: each.blocks_of(slid, 2) for d, each in objective.patterns.items()},
             relief + objective.rules.relief_bend * bends,
         )

@@ -14,8 +14,9 @@ import numpy as np
 from polysft_mi.errors import BadFrame
 from polysft_mi.images.light import Light, residuals
 from polysft_mi.images.registration import Appearance, Evaluation, Registration
-from polysft_mi.surface.bending import hinges, slides
 from polysft_mi.surface.atlas import Atlas, State, Surface
+from polysft_mi.surface.bending import hinges, slides
+from polysft_mi.surface.pattern import Pattern
 
 from .assembly import Assembly, Normal
 from .hidden import Hidden
@@ -107,7 +108,8 @@ class SecondOrder:
     """The objective of a :class:`polysft_mi.objective.problem.Problem` to second order.
 
     ``atlas``: the template's :class:`polysft_mi.surface.atlas.Atlas`; ``images``: the
-    :class:`polysft_mi.images.registration.Registration`; ``pattern``: of the vertices' blocks.
+    :class:`polysft_mi.images.registration.Registration`; ``patterns``: number of unknowns of a
+    vertex (2, or 3 with its relief) to the pattern of their blocks.
     """
 
     def __init__(self, problem):
@@ -115,10 +117,14 @@ class SecondOrder:
         template, count = problem.template, len(problem.template.vertices)
         self.images, self.atlas = Registration(problem), Atlas(template)
         faces = self.images.faces
-        self.pattern = self.images.pattern
         #: (H, N): bends of the heights at the inner edges
-        self.bends = hinges(template.vertices / template.scale, faces)[1]
-        self._assembly = Assembly(self.images.pattern, self.images.gather, self.atlas)
+        across, self.bends = hinges(template.vertices / template.scale, faces)
+        narrow = self.images.pattern
+        # A hinge reaches a vertex beyond the neighbours. A sheet's normal equations have room for
+        # it; around a tube they would take four times as long, and its curvature is bounded.
+        wide = Pattern(faces, template.edges, count, across) if len(template) == 1 else narrow
+        self.patterns = {2: narrow, 3: wide}
+        self._assembly = Assembly(narrow, self.images.gather, self.atlas)
         #: differences of (Δu, Δv) along the edges, in the axes of the first end, (2E, 2N)
         self.slides = slides(template.edges, template.axes)
         self._joints = Joints(self.atlas)
@@ -167,6 +173,7 @@ class SecondOrder:
             seen.images,
             self._lengths,
             stiffness,
+            self.patterns[d],
             d,
             give,
             rows,
@@ -222,7 +229,7 @@ class SecondOrder:
         """Add the differences of neighbours' displacements, the relief's bends, and what ties the
         displacements to the anchor's; returns the energies (smoothness, temporal).
         """
-        s, pattern, height = self.settings, self.pattern, state.offset[:, 2]
+        s, pattern, height = self.settings, self.patterns[d], state.offset[:, 2]
         slid, along = state.offset - context.anchor.offset, state.offset[:, :2].ravel()
         held, bending = context.hidden, relief * self.rules.relief_bend
         apart, steps, bent = self.slides @ along, pattern.difference @ height, self.bends @ height
@@ -231,7 +238,7 @@ class SecondOrder:
         pull[:, 2] += relief * (pattern.to_ends @ (held.edges * steps))
         pull[:, 2] += bending * (self.bends.T @ bent)
         normal.local_gradient += 2 * pull[:, :d]
-        normal.local[:, :2, :2] += 2 * s.k_uv * held.slide_blocks
+        normal.local[:, :2, :2] += 2 * s.k_uv * held.slide_blocks[d]
         if d == 3:
             normal.local[:, 2, 2] += 2 * relief * held.relief_blocks
         for k in range(d):
@@ -241,4 +248,3 @@ class SecondOrder:
         smoothness += s.k_uv * float(np.repeat(held.edges, 2) @ apart**2)
         smoothness += relief * float(held.edges @ steps**2) + bending * float(bent @ bent)
         return smoothness, self.temporal * float((slid**2).sum())
-

@@ -53,14 +53,14 @@ class Truth:
             return cls(path, "points", places, K=arrays.get("K"))
         if "vertices" in arrays and "faces" in arrays:
             places = dict(enumerate(arrays["vertices"]))
-            seen = arrays.get("seen")
-            if seen is not None:
-                if seen.shape != arrays["vertices"].shape[:2] or not seen.any(1).all():
+            visible, seen = arrays.get("seen"), None
+            if visible is not None:
+                if visible.shape != arrays["vertices"].shape[:2] or not visible.any(1).all():
                     raise InputError(
-                        f"{path}: seen {seen.shape}; {arrays['vertices'].shape[:2]}, with a vertex"
+                        f"{path}: seen {visible.shape}; {arrays['vertices'].shape[:2]}, with a vertex"
                         " that is seen in every frame, is needed"
                     )
-                seen = dict(enumerate(seen.astype(bool)))
+                seen = dict(enumerate(visible.astype(bool)))
             return cls(path, "mesh", places, arrays["faces"].astype(np.int64), seen=seen)
         raise InputError(
             f"{path}: holds {', '.join(arrays)}; vertices and faces, or points and frames, are"

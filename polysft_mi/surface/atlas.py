@@ -5,6 +5,7 @@ The unknowns of a frame are a :class:`State`; an :class:`Atlas` turns it into a 
 :mod:`polysft_mi.surface.patch` is the same surface on the device.
 """
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,6 @@ from numpy.polynomial import legendre
 from scipy.spatial.transform import Rotation
 
 from polyfit.jets import exponents
-
 
 _SAME = 1e-4  # of the template's scale: surfaces that are the same
 
@@ -112,7 +112,7 @@ class Atlas:
         self.entry_vertex, self.entry_patch = vertex, t.patch[vertex, slot]
         self.entry_weight = t.weight[vertex, slot]
         ends = np.searchsorted(self.entry_patch, np.arange(len(t) + 1)).tolist()
-        self.entries = [slice(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+        self.entries = [slice(a, b) for a, b in itertools.pairwise(ends)]
         #: (N, M): the entry of each vertex's patches; where there is none, that of its own
         self.entry_of = np.zeros(t.patch.shape, dtype=np.int64)
         self.entry_of[vertex, slot] = np.arange(len(vertex))
@@ -245,7 +245,7 @@ class Atlas:
         if len(self) == 1:
             return values
         out = np.zeros((len(self.template.vertices), *values.shape[1:]))
-        for k, part in enumerate(self.entries):  # a patch holds a vertex once
+        for part in self.entries:  # a patch holds a vertex once
             out[self.entry_vertex[part]] += values[part]
         return out
 

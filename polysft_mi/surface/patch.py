@@ -155,9 +155,7 @@ class JetAtlas:
         """(alpha, u, v, height over the jet) of the vertices in one patch of each; ``displaced``:
         with their own displacements, which the own patch alone has.
         """
-        alpha = jet.Coefficients(
-            self.alpha + unknowns.delta_alpha, self._coefficients, layer.patch
-        )
+        alpha = jet.Coefficients(self.alpha + unknowns.delta_alpha, self._coefficients, layer.patch)
         if not displaced:
             return alpha, layer.u, layer.v, layer.rest
         d = mi.Vector3f(unknowns.delta_u, unknowns.delta_v, unknowns.delta_w)

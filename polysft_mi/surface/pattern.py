@@ -8,13 +8,13 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 
 class Pattern:
-    """Which vertices of the mesh share an edge: the blocks of every matrix here, in the order of
-    (row, column), and a narrow ordering.
+    """Which vertices of the mesh share an edge, or are one of the ``further`` pairs (P, 2): the
+    blocks of every matrix here, in the order of (row, column), and a narrow ordering.
     """
 
-    def __init__(self, faces, edges, count):
+    def __init__(self, faces, edges, count, further=None):
         self.count, self.faces, self.edges = count, faces, edges
-        a, b = edges.T
+        a, b = (edges if further is None else np.concatenate([edges, further])).T
         each = np.arange(count)
         self._keys = np.unique(
             np.concatenate([each * count + each, a * count + b, b * count + a])

@@ -21,7 +21,6 @@ from polyfit.mesh import TexCoords, components, edges_of, face_vectors, sheets, 
 from polyfit.patches.atlas import Cover, is_graph
 from polysft_mi.errors import InputError
 
-
 _RIDGE = 1e-3  # of a jet's mean square, that holds it where several patches share a surface
 
 
@@ -39,9 +38,9 @@ class Template:
     ``patch`` (N, M), ``weight`` (N, M): the patches that hold a vertex, the first its own, and
     their shares in it; ``chart`` (N, M, 2): its (u, v) there, ``rest`` (N, M): its height over the
     jet there [chart unit]; ``axes`` (N, 3, 3): the axes of (Δu, Δv, Δw) in space, columns of length
-    1: tangents and normal, or the chart's where there is one patch; ``lift`` (N,): what its own chart
-    adds to the height for each length along the third axis, so that the vertex moves along it,
-    whatever the jet's slope.
+    1: tangents and normal, or the chart's where there is one patch; ``lift`` (N,): what its own
+    chart adds to the height for each length along the third axis, so that the vertex moves along
+    it, whatever the jet's slope.
     """
 
     vertices: np.ndarray
@@ -178,7 +177,9 @@ def _jets(x, patch, held, count, order, exact, where):
     least = min(fitted for _, fitted in found)
     alpha = np.stack(
         [
-            _fitted(x[held & (patch == k)], least, ridge)[0] if fitted > least else c[: size_of(least)]
+            _fitted(x[held & (patch == k)], least, ridge)[0]
+            if fitted > least
+            else c[: size_of(least)]
             for k, (c, fitted) in enumerate(found)
         ]
     )

@@ -10,7 +10,7 @@ from polysft_mi.objective.second_order import Model, SecondOrder, stages_of
 from polysft_mi.solvers.linear import Blocks, Reduced
 from polysft_mi.surface.atlas import State
 
-_FARTHEST_STEP = 0.5  # rotation [rad], translation and displacements [of the template's scale]
+_FARTHEST_STEP = 2.0  # rotation [rad], translation and displacements [of the template's scale]
 _LEAST_DAMPING, _RAISED_DAMPING = 1e-7, 1e-4
 
 
@@ -56,7 +56,7 @@ class Descent:
     def __init__(self, objective: SecondOrder):
         self.objective, self.rules = objective, objective.rules
         self.far, self.usual = stages_of(objective.rules)
-        self._blocks = {d: Blocks(objective.pattern, d) for d in (2, 3)}
+        self._blocks = {d: Blocks(pattern, d) for d, pattern in objective.patterns.items()}
         self.report, self.count = None, 0
 
     def reduced(self, normal, damping, dtype=np.float64):

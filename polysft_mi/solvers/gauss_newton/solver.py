@@ -172,7 +172,10 @@ class GaussNewton:
         if found.misfit > least:
             return least
         blur, vertices = self._descent.usual[-1].blur, found.model.surface.vertices
-        bare, appearance = self._images.misfit(vertices, context.frame, blur), found.model.appearance
+        bare, appearance = (
+            self._images.misfit(vertices, context.frame, blur),
+            found.model.appearance,
+        )
         known = appearance.misfit if appearance else 0.0
         return float(np.fmin(least, max(found.misfit, bare - known)))
 

@@ -73,7 +73,7 @@ class Window:
         normal.local_gradient -= weight * (b.offset - a.offset)[:, :d]
         # the displacements' coupling, weak beside the image, by its bound
         # |a - b|^2 <= 2 |a|^2 + 2 |b|^2: the local blocks stay apart
-        diagonal = self._descent.objective.pattern.diagonal
+        diagonal = self._descent.objective.patterns[d].diagonal
         for k in range(d):
             normal.local[diagonal, k, k] += 2 * weight
             later.normal.local[diagonal, k, k] += weight
