@@ -55,10 +55,11 @@ class Truth:
             places = dict(enumerate(arrays["vertices"]))
             visible, seen = arrays.get("seen"), None
             if visible is not None:
-                if visible.shape != arrays["vertices"].shape[:2] or not visible.any(1).all():
+                shape = arrays["vertices"].shape[:2]
+                if visible.shape != shape or not visible.any(1).all():
                     raise InputError(
-                        f"{path}: seen {visible.shape}; {arrays['vertices'].shape[:2]}, with a vertex"
-                        " that is seen in every frame, is needed"
+                        f"{path}: seen {visible.shape}; {shape}, with a vertex that is seen in every"
+                        " frame, is needed"
                     )
                 seen = dict(enumerate(visible.astype(bool)))
             return cls(path, "mesh", places, arrays["faces"].astype(np.int64), seen=seen)
