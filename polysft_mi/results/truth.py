@@ -58,8 +58,8 @@ class Truth:
                 shape = arrays["vertices"].shape[:2]
                 if visible.shape != shape or not visible.any(1).all():
                     raise InputError(
-                        f"{path}: seen {visible.shape}; {shape}, with a vertex that is seen in every"
-                        " frame, is needed"
+                        f"{path}: seen {visible.shape}; {shape}, with a vertex that is seen in"
+                        " every frame, is needed"
                     )
                 seen = dict(enumerate(visible.astype(bool)))
             return cls(path, "mesh", places, arrays["faces"].astype(np.int64), seen=seen)
