@@ -72,7 +72,7 @@ def measured(path, overrides, turns):
         sums = table, figures, vertices, 1.0, 1.0, at.area, level.stride, pairs
         gathered = images.gather.images(*sums)
         assembly, lengths = objective._assembly, objective._lengths
-        normal, _ = assembly.normal(surface, gathered, lengths, 1.0, d)
+        normal, _ = assembly.normal(surface, gathered, lengths, 1.0, objective.patterns[d], d)
         reduced = descent.reduced(normal, 1e-3, np.float32)
     recorded = assembly._in_unknowns
 
@@ -86,7 +86,7 @@ def measured(path, overrides, turns):
         assembly._in_unknowns = recorded
 
     def equations():
-        return assembly.normal(surface, gathered, lengths, 1.0, d)
+        return assembly.normal(surface, gathered, lengths, 1.0, objective.patterns[d], d)
 
     def silhouette():
         if outline:

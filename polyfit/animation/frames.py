@@ -30,6 +30,7 @@ def write_frames(folder, kind, vertices, faces, uv=None, texture=None, *, labels
     source = np.arange(vertices.shape[1])
     if kind == "ply" and uv is not None:
         source, uv, faces = uv.split(faces)
+        uv = np.nan_to_num(uv)
     with folder_aside(folder, ours) as place:
         if data:
             with open(os.path.join(place, f"texture.{image}"), "wb") as file:

@@ -61,6 +61,7 @@ def write_glb(path, vertices, faces, uv=None, texture=None, *, fps=24.0, name="s
     n = normals(vertices, faces)
     if uv is not None:
         source, uv, faces = uv.split(faces)
+        uv = np.nan_to_num(uv).astype(np.float32)
         vertices, n = vertices[:, source], n[:, source]
     attributes = geometry(vertices[0], n[0])
     if uv is not None:

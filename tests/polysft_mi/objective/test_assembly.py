@@ -18,6 +18,7 @@ from polysft_mi.objective.assembly import Assembly, Normal
 from polysft_mi.objective.joints import Joints
 from polysft_mi.render.device import on_device
 from polysft_mi.surface.atlas import Atlas
+from polysft_mi.surface.bending import hinges
 from polysft_mi.surface.pattern import Pattern
 
 
@@ -119,6 +120,8 @@ def test_all_terms_are_those_of_their_dense_jacobians(make):
     state = some_state(chart, rng)
     vertices = chart.surface(state).vertices
     camera, pattern = pinhole(rng, vertices), Pattern(faces, template.edges, count)
+    further = hinges(template.vertices / template.scale, faces)[0]
+    wider = Pattern(faces, template.edges, count, further)
     gather = Gather(pattern, camera)
     assembly = Assembly(pattern, gather, chart)
     images = np.zeros((2 * count, 3 * count))
@@ -169,11 +172,11 @@ def test_all_terms_are_those_of_their_dense_jacobians(make):
         by = np.stack(
             [moved(row) for row in np.eye(d * count + template.alpha.size + 6 * len(chart))], 1
         )
-        surface = chart.surface(state)
+        surface, wide = chart.surface(state), wider if d == 3 else pattern
         normal, found = assembly.normal(
-            surface, sums.images(gather, vertices), lengths, stiffness, d, triangles=triangles
+            surface, sums.images(gather, vertices), lengths, stiffness, wide, d, triangles=triangles
         )
-        matrix, gradient = dense(pattern, normal)
+        matrix, gradient = dense(wide, normal)
         expected = by.T @ (in_space + images.T @ sums.second @ images) @ by
         case = f"d = {d}, area {area}, silhouette {silhouette}, shading {shaded}"
         assert found == pytest.approx(energy, rel=1e-9), case

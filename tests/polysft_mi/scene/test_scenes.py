@@ -37,8 +37,10 @@ def test_scenes_show_frame_0(name, shared_data):
     right, *mirrored = difference(
         loaded(str(ROOT / "scenes" / f"{name}.xml"), data=_place(name, shared_data))
     )
-    # phi-SfT's template is some pixels away from its own texture coordinates' place in frame 0
-    assert right < (0.13 if name == "phi_sft_R1" else 0.03) and min(mirrored) > 2 * right
+    # phi-SfT's template is some pixels away from its own texture coordinates' place in frame 0; the
+    # shirt is white, and its sides are in the shade
+    most = {"phi_sft_R1": 0.13, "shirt": 0.05}.get(name, 0.03)
+    assert right < most and min(mirrored) > 2 * right
 
 
 @pytest.mark.parametrize("name", write_scenes.DEMOS)
@@ -50,7 +52,7 @@ def test_demos(name):
     )  # shorter than what prepare would write
     experiment = loaded(str(ROOT / "scenes" / f"{name}.xml"))
     right, *mirrored = difference(experiment)
-    assert right < 0.03 and min(mirrored) > 2 * right
+    assert right < (0.05 if name == "demo_shirt" else 0.03) and min(mirrored) > 2 * right
     truth = np.load(folder / "gt.npz")
     assert len(truth["vertices"]) == len(
         Sequence.open(experiment.frames, experiment.masks, size=experiment.size)
