@@ -22,7 +22,7 @@ ROWS = [  # garment, motion, shape, colour
     ("boxy_tshirt", "box", (0.1, 0.6, 0.6, 0.6, 0.6, 0.5), (0.06, 0.16, 0.35)),
     ("shirt", "pick_up", (0.0, 0.65, 0.5, 0.45, 0.5, 0.5), (0.25, 0.27, 0.30)),
 ]
-FRAMES, SIZE, FINISH = 5, (400, 340), 2
+FRAMES, SIZE, FINISH = 4, (400, 400), 2
 BODY = (0.5, 0.48, 0.46)
 
 
@@ -35,11 +35,11 @@ def main(argv=None):
     for garment, motion, shape, colour in ROWS:
         drape = draper.drape(
             garment,
-            onefit.Motion.generate(motion, seconds=3, seed=1_000_005),
+            onefit.Motion.generate(motion, seconds=2, seed=1_000_005),
             shape,
             finish=FINISH,
         )
-        chosen = np.linspace(12, len(drape.vertices) - 1, FRAMES).astype(int)
+        chosen = np.linspace(10, len(drape.vertices) - 1, FRAMES).astype(int)
         parts = [
             (drape.body[chosen].numpy(), drape.body_faces.numpy(), BODY),
             (drape.vertices[chosen].numpy(), drape.faces.numpy(), colour),

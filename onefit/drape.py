@@ -18,11 +18,11 @@ import argparse
 import sys
 
 from onefit.physics.material import MATERIALS, Material
-from polyfit.errors import InputError, cli, require
+from polyfit.errors import InputError, Parser, cli, require
 
 
 def parser():
-    p = argparse.ArgumentParser(
+    p = Parser(
         prog="python -m onefit.drape",
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -135,6 +135,10 @@ def parser():
 
 def main(argv=None):
     args = parser().parse_args(argv)
+    if min(args.size) < 1 or args.spp < 1:
+        raise InputError(
+            f"--size {args.size[0]} {args.size[1]} --spp {args.spp}: each must be at least 1"
+        )
     require("torch", "anny", *(["pxr"] if "usd" not in args.skip else []))
 
     from polyfit.training import device_of
