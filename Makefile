@@ -1,4 +1,4 @@
-# make demo, make drape, make test, make docs, make lint: each installs into .venv what it needs and
+# make demo, make demo-shirt, make drape, make test, make docs, make lint: each installs into .venv what it needs and
 # is not there yet (seconds where nothing is missing), and runs.
 # PYTHON=python3.12 takes another Python for a new .venv; TORCH=any takes torch with CUDA too.
 
@@ -14,12 +14,15 @@ EXTRAS_test := test
 EXTRAS_docs := docs
 EXTRAS_lint := lint
 
-.PHONY: demo drape test docs lint llvm clean
+.PHONY: demo demo-shirt drape test docs lint llvm clean
 .PRECIOUS: .venv/with-%
 .NOTPARALLEL:
 
 demo: .venv/with-demo llvm
 	$(PY) -m polysft_mi.run scenes/demo.xml -o out/demo --overwrite
+
+demo-shirt: .venv/with-demo llvm
+	$(PY) -m polysft_mi.run scenes/demo_shirt.xml -o out/demo-shirt --overwrite
 
 drape: .venv/with-drape llvm
 	$(PY) -m onefit.drape dress dance --weights dress -o out/drape --seconds 2 --overwrite

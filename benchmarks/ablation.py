@@ -23,15 +23,16 @@ import os
 import statistics
 import sys
 import tempfile
+import textwrap
 import time
 from dataclasses import dataclass, field
 
 import numpy as np
 from sequences import DATA, ROOT, SCENES, folder_of
 
+from polyfit.files import aside
 from polysft_mi.backend import add_mode_argument, set_variant
 from polysft_mi.errors import InputError, cli
-from polysft_mi.files import aside
 from polysft_mi.scene.rules import Rules
 from polysft_mi.scene.settings import Settings
 
@@ -56,6 +57,10 @@ NEEDED = {  # rules that pay on one sequence alone, and why they stay
     "more iterations there": "a part of the other starts",
     "texture fit": "without it the texture of φ-SfT R1 lies pixels off in every frame",
 }
+OF_CHANCE = (
+    "The first row changes a setting by a hundred-thousandth. Where folds come and go, small"
+    " changes grow from frame to frame: read no more into a number than this row allows."
+)
 
 
 @dataclass(frozen=True)
@@ -215,6 +220,11 @@ def table(results, rules, names, baseline=BASELINE):
     return "\n".join("| " + " | ".join(row) + " |" for row in rows)
 
 
+def wrap(line):
+    """A line of the page, wrapped where it is no row of a table."""
+    return line if line.startswith("|") else textwrap.fill(line, 100, break_long_words=False)
+
+
 def baseline_table(results, names, baseline=BASELINE):
     """The figures with all rules on."""
     rows = [["sequence", "figure", "error", "normals", "CPU seconds a frame"], ["---"] * 5]
@@ -235,6 +245,14 @@ def page(results, earlier):
     names = [n for (rule, n) in results if rule == BASELINE]
     measured = {rule for rule, _ in results}
     rules = [s.rule for s in SWITCHES[1:] if s.rule in measured]
+    unknown = [s.rule for s in SWITCHES[1:] if s.rule not in measured]
+    of_rules = f"{OF_CHANCE}\n\n" if CHANCE in measured else ""
+    of_rules += table(results, rules, names) if rules else ""
+    if unknown:
+        of_rules += f"\n\nNot measured of the tracker as it is: {', '.join(unknown)}."
+    if unknown and earlier:
+        of_rules += " Those that [an earlier tracker](#before) had too are in its table."
+    of_rules = "\n".join(wrap(line) for line in of_rules.strip().splitlines())
     text = f"""# What each rule of the tracker is worth
 
 Made by `python benchmarks/ablation.py`. Each row is one rule switched off alone. A number is the
@@ -242,10 +260,7 @@ change of the error in percent: +30 means that the error is 30 % larger without 
 the median change of the CPU time, in percent. A rule stays when the error grows by
 {100 * PAYS:.0f} % without it on at least two sequences. "–": not measured.
 
-The first row changes a setting by a hundred-thousandth. Where folds come and go, small changes grow
-from frame to frame: read no more into a number than this row allows.
-
-{table(results, rules, names)}
+{of_rules}
 
 With all rules on (CPU time on one thread, beside other work: compare it within this page only):
 

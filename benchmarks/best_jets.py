@@ -1,13 +1,16 @@
 """The best that one jet can do: jets fitted to the true vertices of each frame."""
 
+import dataclasses
+
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
 from polyfit import jets
 from polyfit.jets import CanonicalFrame
+from polysft_mi.errors import InputError
 from polysft_mi.results import metrics
-from polysft_mi.surface.chart import Chart
+from polysft_mi.surface.atlas import Atlas
 from polysft_mi.surface.template import Template
 
 
@@ -21,37 +24,44 @@ def best_jets(template, truth):
     by and by; at once, it ends farther off. The search is local all the same.
     """
     orders = [*range(2, template.order, 2), template.order]
-    parts = (template.vertices, template.faces, template.uv)
-    charts = [
-        Chart(template if n == template.order else Template.fit(*parts, n, tolerance=np.inf))
-        for n in orders
-    ]
+    atlases = [Atlas(_one_patch(template, n)) for n in orders]
     previous, surfaces = None, []
     for V in np.asarray(truth, dtype=np.float64):
-        over = _rotation_onto(template.vertices, V) @ template.rotation
+        over = _rotation_onto(template.vertices, V) @ template.rotation[0]
         axes = CanonicalFrame.from_points(torch.as_tensor(V)).R.numpy()
         found = [
-            _risen(charts, _standing_in(charts[0].template, V, turn), V)
+            _risen(atlases, _standing_in(atlases[0].template, V, turn), V)
             for turn in (over, _turned_to(over, axes[:, 2]))
         ]
         if previous is not None:
-            found.append(_refined(charts[-1], previous, V))
+            found.append(_refined(atlases[-1], previous, V))
         previous = min(found, key=lambda x: x[1])[0]
-        surfaces.append(charts[-1].surface(previous).vertices)
+        surfaces.append(atlases[-1].surface(previous).vertices)
     return np.stack(surfaces)
 
 
-def _risen(charts, arrays, V):
-    """(state, distance [m]) as of :func:`_refined` in the last chart, by way of those before it;
+def _one_patch(template, order):
+    """A template of one jet of ``order``, whose undeformed surface is that jet alone."""
+    made = template
+    if order != template.order:
+        uv = template.texcoords
+        made = Template.fit(template.vertices, template.faces, uv, order)
+    if len(made) != 1:
+        raise InputError(f"the template has {len(made)} patches; one jet is fitted to sheets alone")
+    return dataclasses.replace(made, rest=np.zeros_like(made.rest))
+
+
+def _risen(atlases, arrays, V):
+    """(state, distance [m]) as of :func:`_refined` in the last atlas, by way of those before it;
     ``arrays`` are unknowns of the first.
     """
-    for k, chart in enumerate(charts):
+    for k, atlas in enumerate(atlases):
         if k:  # the same jet in the higher order
-            lower = charts[k - 1].template.alpha + arrays["delta_alpha"]
-            alpha = np.pad(lower, (0, len(chart.template.alpha) - len(lower)))
-            arrays = {**arrays, "delta_alpha": alpha - chart.template.alpha}
-        state, distance = _refined(chart, chart.state(arrays), V)
-        arrays = chart.arrays(state)
+            lower = atlases[k - 1].template.alpha + arrays["delta_alpha"]
+            alpha = np.pad(lower, ((0, 0), (0, atlas.template.alpha.shape[1] - lower.shape[1])))
+            arrays = {**arrays, "delta_alpha": alpha - atlas.template.alpha}
+        state, distance = _refined(atlas, atlas.state(arrays), V)
+        arrays = atlas.arrays(state)
     return state, distance
 
 
@@ -76,29 +86,64 @@ def _standing_in(template, V, axes):
     """Unknowns, as ``params.npz`` names them: the least-squares jet of the heights of V (N, 3) over
     the first two columns of ``axes``.
     """
-    y = (V - template.origin) @ template.rotation / template.scale
-    turn = template.rotation.T @ axes
+    rotation = template.rotation[0]
+    y = (V - template.origin[0]) @ rotation / template.scale
+    turn = rotation.T @ axes
     x = (y - y.mean(0)) @ turn
     alpha = jets.fit(torch.as_tensor(x), template.order).alpha.numpy()
     return {
         "delta_alpha": alpha - template.alpha,
-        "delta_u": x[:, 0] - template.chart[:, 0],
-        "delta_v": x[:, 1] - template.chart[:, 1],
+        "delta_u": x[:, 0] - template.chart[:, 0, 0],
+        "delta_v": x[:, 1] - template.chart[:, 0, 1],
         "delta_w": np.zeros(len(x)),
         "rotation": Rotation.from_matrix(turn).as_quat(),
         "translation": y.mean(0),
     }
 
 
-def _refined(chart, state, V, steps=60):
+def fitted(atlas, state, vertices, iterations=8, bending=1e-6):
+    """The state of an atlas of one patch, from ``state`` on, whose vertices come closest to
+    ``vertices`` (N, 3) [m, world], in the least-squares sense.
+
+    Each vertex slides freely in its tangent plane, so that only distances along the normals count
+    for the other unknowns. The relief stays as it is.
+    """
+    size = state.alpha.shape[1]
+    prior = np.zeros((size + 6, size + 6))
+    prior[:size, :size] = bending * len(vertices) * atlas.template.scale**2 * atlas.bending
+    for _ in range(iterations):
+        surface = atlas.surface(state)
+        up = surface.up[0]
+        missing = vertices - surface.vertices
+        tangents = surface.offset_jacobian[:, :, :2]
+        normal = np.cross(tangents[:, :, 0], tangents[:, :, 1])
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        rows = atlas.global_columns(surface, normal)
+        # sliding makes rotations in the plane and shifts along it free: a little damping holds
+        # them
+        square = rows.T @ rows + prior
+        right = rows.T @ (normal * missing).sum(1) - prior[:, :size] @ state.alpha[0]
+        g = np.linalg.solve(
+            square + 1e-6 * np.trace(square) / len(square) * np.eye(len(square)), right
+        )
+        rest = (
+            missing - (surface.basis @ g[:size])[:, None] * up - surface.motion_jacobian @ g[size:]
+        )
+        square = tangents.transpose(0, 2, 1) @ tangents
+        right = np.einsum("nka,nk->na", tangents, rest)[:, :, None]
+        state = state.after_step((g, np.linalg.solve(square, right)[:, :, 0]))
+    return state
+
+
+def _refined(atlas, state, V, steps=60):
     """(state, distance [m]): Gauss-Newton from a state towards the vertices V (N, 3), with steps
     shortened where they gain more so.
     """
-    distance = lambda s: metrics.rmse(chart.surface(s).vertices, V)
+    distance = lambda s: metrics.rmse(atlas.surface(s).vertices, V)
     least = distance(state)
     for _ in range(steps):
         try:
-            whole = chart.fitted(state, V, iterations=1, bending=1e-9)
+            whole = fitted(atlas, state, V, iterations=1, bending=1e-9)
             tried = [
                 (distance(x), x)
                 for x in (state.extrapolated(whole, -back) for back in (0, 0.5, 0.75, 0.9, 0.97))

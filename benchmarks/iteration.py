@@ -50,12 +50,12 @@ def measured(path, overrides, turns):
     experiment = scene.load(path, {**overrides, "solver": "gauss-newton"})
     problem = Problem(experiment, experiment.sequence())
     objective = SecondOrder(problem)
-    descent, chart, images = Descent(objective), objective.chart, objective.images
+    descent, atlas, images = Descent(objective), objective.atlas, objective.images
     level = images._level(descent.usual[-1].blur)
-    wide = objective.patterns[3] if objective.has_relief else None
-    rest = chart.state(problem.patch.rest().to_numpy())
+    d = 3 if objective.has_relief else 2
+    rest = atlas.state(problem.patch.rest().to_numpy())
     rest.translation += 0.005
-    surface = chart.surface(rest)
+    surface = atlas.surface(rest)
     vertices, at = surface.vertices, images._frames.level(1, level)
     with dr.suspend_grad():
         view = images._view(vertices, level)
@@ -72,7 +72,7 @@ def measured(path, overrides, turns):
         sums = table, figures, vertices, 1.0, 1.0, at.area, level.stride, pairs
         gathered = images.gather.images(*sums)
         assembly, lengths = objective._assembly, objective._lengths
-        normal, _ = assembly.normal(surface, gathered, lengths, 1.0, wide)
+        normal, _ = assembly.normal(surface, gathered, lengths, 1.0, d)
         reduced = descent.reduced(normal, 1e-3, np.float32)
     recorded = assembly._in_unknowns
 
@@ -86,7 +86,7 @@ def measured(path, overrides, turns):
         assembly._in_unknowns = recorded
 
     def equations():
-        return assembly.normal(surface, gathered, lengths, 1.0, wide)
+        return assembly.normal(surface, gathered, lengths, 1.0, d)
 
     def silhouette():
         if outline:
@@ -94,7 +94,7 @@ def measured(path, overrides, turns):
             dr.eval(images._outline(*outline))
 
     parts = {
-        "surface of the unknowns": lambda: chart.surface(rest),
+        "surface of the unknowns": lambda: atlas.surface(rest),
         "visibility: the mesh put into the scene, a ray a pixel": look,
         "residuals, derivatives, sums over triangles": lambda: dr.eval(images._sums(*given)),
         "silhouette": silhouette,

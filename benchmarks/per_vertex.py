@@ -26,10 +26,10 @@ import time
 
 import numpy as np
 
+from polyfit.files import aside
 from polysft_mi.backend import add_mode_argument, set_variant
 from polysft_mi.commands import add_define_argument, definitions
 from polysft_mi.errors import InputError, cli
-from polysft_mi.files import aside
 
 ITERATIONS = 150  # a frame
 STEP = 3e-3  # of the template's radius; chosen on the sequence flag (benchmarks/README.md)
@@ -49,9 +49,10 @@ class Vertices:
         import mitsuba as mi
 
         self._mi, self._dr = mi, dr
-        self.scale, self.origin = mi.Float(template.scale), mi.Point3f(*map(float, template.origin))
+        origin = template.vertices.mean(0)
+        self.scale, self.origin = mi.Float(template.scale), mi.Point3f(*map(float, origin))
         dr.make_opaque(self.scale, self.origin)
-        rest = self._flat((template.vertices - template.origin) / template.scale)
+        rest = self._flat((template.vertices - origin) / template.scale)
         self._form = mi.ad.LargeSteps(
             rest, mi.UInt32(template.faces.astype(np.uint32).ravel()), smoothing
         )
@@ -146,12 +147,19 @@ def write(problem, surfaces, rows, out, **options):
     ``metrics.json`` begins with.
     """
     from polysft_mi.results import outputs
+    from polysft_mi.results.truth import uv_arrays
 
     template = problem.template
     indices = np.asarray(problem.sequence.indices, dtype=np.int64)
     with aside(os.path.join(out, "surface.npz")) as temporary:
-        faces, uv = template.faces.astype(np.int32), template.uv.astype(np.float32)
-        np.savez_compressed(temporary, vertices=surfaces, faces=faces, uv=uv, frames=indices)
+        faces = template.faces.astype(np.int32)
+        np.savez_compressed(
+            temporary,
+            vertices=surfaces,
+            faces=faces,
+            **uv_arrays(template.texcoords, template.faces),
+            frames=indices,
+        )
     summary = {
         "frames": len(rows),
         "seconds_per_frame": float(np.mean([row["seconds"] for row in rows])),

@@ -234,10 +234,10 @@ def bending(uv, t):
 def bending_frames(photo, camera, count, finer=3):
     """Frames of the sheet before dark grey, with a camera's noise."""
     mesh, random = grid(0.297, 0.21, 65), np.random.default_rng(0)
-    size = finer * camera.width, finer * camera.height
+    fine = Intrinsics(*(finer * x for x in dataclasses.astuple(camera)))
     for k in range(count):
-        x = finer * camera.project(bending(mesh.uv, k / (count - 1)))
-        frame = photo_on_frame(np.full((size[1], size[0], 3), 45, np.uint8), photo, mesh, x)
+        dark = np.full((fine.height, fine.width, 3), 45, np.uint8)
+        frame = photo_on_frame(dark, photo, mesh, bending(mesh.uv, k / (count - 1)), fine)
         frame = cv2.resize(frame, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
         noisy = frame + random.normal(0, 2, frame.shape)
         yield np.clip(noisy, 0, 255).astype(np.uint8)

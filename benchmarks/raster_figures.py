@@ -9,7 +9,7 @@ import sys
 import numpy as np
 from cases import parse_size
 
-from polysft_mi.files import aside
+from polyfit.files import aside
 
 CONTENDERS = ("raster", "raster, mi", "prb_projective")
 TARGET = ("640x480", 33, 3.0)  # a case, and how many times faster raster is to be there

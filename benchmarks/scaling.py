@@ -29,10 +29,10 @@ import numpy as np
 from cases import add_case_arguments, parse_size
 from sequences import ROOT
 
+from polyfit.files import aside
 from polysft_mi.backend import add_mode_argument, set_variant
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError, cli
-from polysft_mi.files import aside
 
 GRIDS, SIZES, FRAMES = (33, 50, 71, 100), ("640x480", "1280x720", "1920x1080"), 8
 SHARE, SAMPLES = 1 / 3, 16  # of the image that the sheet covers; a pixel

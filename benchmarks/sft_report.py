@@ -6,7 +6,7 @@ import textwrap
 import numpy as np
 from sft_results import JET, METHODS, SEQUENCES
 
-from polysft_mi.files import aside
+from polyfit.files import aside
 from polysft_mi.results.evaluation import LABELS
 
 KINDS = (  # of ground truth: title, figures in the table

@@ -6,8 +6,8 @@ A result is a dict: sequence, method, setup, figures, seconds.
 import json
 import os
 
+from polyfit.files import aside
 from polysft_mi.errors import InputError
-from polysft_mi.files import aside
 
 SEQUENCES = ("flag", "bend", "paper", "curtain", "corner", "kinect_paper", "phi_sft_R1")
 METHODS = ("gauss-newton", "adam", "per-vertex")

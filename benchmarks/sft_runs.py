@@ -170,8 +170,10 @@ def jet_result(sequence, folder, order, setup):
     truth = load_npz(truth_path)
     if "vertices" not in truth:
         return None
-    vertices, faces, uv = meshio.read_template(obj)
-    template = Template.fit(vertices, faces, uv, order, tolerance=np.inf, where=obj)
+    vertices, faces, texcoords = meshio.read_textured_template(obj)
+    template = Template.fit(vertices, faces, texcoords, order, where=obj)
+    if len(template) > 1:  # one jet cannot hold it
+        return None
     meshes = truth["vertices"][: setup["frames"] or None]
     surface = {
         "vertices": best_jets(template, meshes),

@@ -21,10 +21,10 @@ import tempfile
 import numpy as np
 from sequences import ROOT
 
+from polyfit.files import aside
 from polysft_mi.backend import add_mode_argument, set_variant
 from polysft_mi.commands import add_define_argument, definitions
 from polysft_mi.errors import InputError, cli
-from polysft_mi.files import aside
 
 COUNTS = (50, 300, 1000, 5000)
 USUAL = 300  # iterations that the paper evaluates at
@@ -182,7 +182,7 @@ def picture(path, problem, frame, surfaces, counts, rows, usual, truth):
         for j in range(
             2
         ):  # lines of equal u and of equal v: the template's own grid of ten by ten cells
-            uv = template.uv[:, j]
+            uv = template.texcoords.of_vertices(template.faces)[:, j]
             levels = np.linspace(uv.min(), uv.max(), 11)[1:-1]
             over.tricontour(
                 xy[:, 0],
@@ -198,7 +198,9 @@ def picture(path, problem, frame, surfaces, counts, rows, usual, truth):
         over.set_xlim(low[0], high[0]), over.set_ylim(high[1], low[1])
         over.set_title(label, fontsize=10)
         beside.imshow(
-            shading.shade_surface(V, template.faces, view, uv=template.uv, size=(360, 300))
+            shading.shade_surface(
+                V, template.faces, view, uv=template.texcoords.corners, size=(360, 300)
+            )
         )
         if k < len(counts):
             row = rows[counts[k]]

@@ -8,7 +8,7 @@ python -m onefit.tailor --body body.ply       # the body that they are made arou
 
 import argparse
 
-from polyfit.errors import InputError, cli, optional_imports
+from polyfit.errors import InputError, Parser, cli, optional_imports
 from polyfit.mesh import write_ply
 
 with optional_imports(__name__):
@@ -19,12 +19,10 @@ with optional_imports(__name__):
     from onefit.garment.sewing.templates import write
 
 
-def main():
+def main(argv=None):
     names = [*PATTERNS, *LOOSE_PATTERNS]
     raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(
-        prog="python -m onefit.tailor", description=__doc__, formatter_class=raw
-    )
+    parser = Parser(prog="python -m onefit.tailor", description=__doc__, formatter_class=raw)
     parser.add_argument(
         "names",
         nargs="*",
@@ -43,10 +41,12 @@ def main():
         metavar="FILE.ply",
         help="write the standard body, to make garments around it, and sew nothing",
     )
-    args = parser.parse_args()
+    args = parser.parse_args(argv)
     if unknown := [n for n in args.names if n not in names]:
         raise InputError(f"{unknown[0]}: no such template; there are {', '.join(names)}")
     if args.body:
+        if not args.body.lower().endswith(".ply"):
+            raise InputError(f"--body {args.body}: a .ply file is needed")
         body = standard_body()
         write_ply(args.body, body.vertices.numpy(), body.faces.numpy())
         print(f"written: {args.body}")

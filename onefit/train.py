@@ -16,13 +16,12 @@ any, the six templates of the paper. OUT receives
                             where an uninterrupted run would have
 """
 
-import argparse
 import os
 import shlex
 import sys
 from dataclasses import fields
 
-from polyfit.errors import cli, optional_imports
+from polyfit.errors import Parser, cli, optional_imports
 
 with optional_imports(__name__):
     import torch
@@ -34,7 +33,7 @@ with optional_imports(__name__):
 
 
 def parser():
-    p = argparse.ArgumentParser(prog="python -m onefit.train", description=__doc__.splitlines()[0])
+    p = Parser(prog="python -m onefit.train", description=__doc__.splitlines()[0])
     default = Settings()
     p.add_argument(
         "garments",

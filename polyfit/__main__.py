@@ -2,14 +2,13 @@
 resolution.
 """
 
-import argparse
 import os
 
-from .errors import InputError, cli
+from .errors import InputError, Parser, cli
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="python -m polyfit",
         description="Fit patches of jets to a mesh, write their surface at any resolution.",
     )

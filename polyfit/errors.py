@@ -1,5 +1,6 @@
 """The one exception for a user's mistake, and how a command line ends on it."""
 
+import argparse
 import contextlib
 import importlib.util
 import os
@@ -14,6 +15,15 @@ class InputError(ValueError):
 
     The message is one line: it names the file or property, its value, and what would be accepted.
     """
+
+
+class Parser(argparse.ArgumentParser):
+    """An ``argparse`` parser whose complaints are an :class:`InputError`, one line as all others
+    are.
+    """
+
+    def error(self, message: str) -> NoReturn:
+        raise InputError(f"{message}; {self.prog} --help lists the options")
 
 
 # What a plain `pip install polysft-mi` leaves out: module, and the extra that brings it

@@ -1,9 +1,12 @@
-"""Files that are either whole or not there: written aside, then renamed."""
+"""Files that are either whole or not there: written aside, then renamed. And image files that are
+read without a word of the decoders.
+"""
 
 import contextlib
 import errno
 import os
 import shutil
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -100,3 +103,43 @@ def folder_aside(path: str | os.PathLike[str], ours: Callable[[str], bool]) -> I
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
         raise
+
+
+class _SilentDecoders:
+    """While any thread is inside, what is written to the process's stderr is dropped: libtiff,
+    libpng, libjpeg and OpenCV tell there of a broken file, beside the error that we raise.
+    """
+
+    def __init__(self) -> None:
+        self._lock, self._inside = threading.Lock(), 0
+        self._saved: int | None = None
+
+    @contextlib.contextmanager
+    def __call__(self) -> Iterator[None]:
+        with self._lock:
+            self._inside += 1
+            if self._inside == 1:
+                self._saved = self._redirected()
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._inside -= 1
+                if not self._inside and self._saved is not None:
+                    os.dup2(self._saved, 2)
+                    os.close(self._saved)
+
+    @staticmethod
+    def _redirected() -> int | None:
+        """A copy of the descriptor of stderr, which now leads nowhere; None where it is closed."""
+        try:
+            saved = os.dup(2)
+        except OSError:
+            return None
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, 2)
+        os.close(nowhere)
+        return saved
+
+
+silent_decoders = _SilentDecoders()

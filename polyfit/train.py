@@ -15,13 +15,12 @@ any, the training sees the analytic families alone. OUT receives
     set.safetensors         the patches (polyfit.training.training_set), for --resume
 """
 
-import argparse
 import os
 import shlex
 import sys
 from dataclasses import fields
 
-from .errors import cli, optional_imports
+from .errors import Parser, cli, optional_imports
 
 with optional_imports(__name__):
     import torch
@@ -30,7 +29,7 @@ with optional_imports(__name__):
 
 
 def parser():
-    p = argparse.ArgumentParser(prog="python -m polyfit.train", description=__doc__.splitlines()[0])
+    p = Parser(prog="python -m polyfit.train", description=__doc__.splitlines()[0])
     default = Settings()
     p.add_argument(
         "meshes", nargs="*", metavar="MESH", help="garments (.obj, .ply) to cut and deform"

@@ -71,7 +71,8 @@ dr.enable_grad(distance)
 hit = scene.ray_intersect(mi.Ray3f(mi.Point3f(0, 0, distance), mi.Vector3f(0, 0, -1)))
 area = dr.minimum(hit.t * distance, 8)
 dr.backward(area)
-print(list(area) == [4, 8] and list(dr.grad(distance)) == [4, 0])
+found = [*area, *dr.grad(distance)]
+print(all(abs(x - y) < 1e-4 for x, y in zip(found, (4, 8, 4, 0))))  # processors round differently
 """
 
 

@@ -23,6 +23,7 @@ import numpy as np
 import torch
 
 from polyfit import jets
+from polyfit.mesh import TexCoords
 
 from .surface.patch import Unknowns
 from .surface.template import Template
@@ -31,17 +32,21 @@ if TYPE_CHECKING:
     from polyfit.network import PolyFit
 
     from .objective.problem import Problem
-    from .surface.patch import JetPatch
+    from .surface.patch import JetAtlas
 
 
 def template(
-    polyfit: PolyFit, vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, **options: Any
+    polyfit: PolyFit,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    uv: np.ndarray | TexCoords,
+    **options: Any,
 ) -> Template:
     """The :class:`polysft_mi.surface.template.Template` of the mesh in the frame, and of the order,
     of ``polyfit`` (:class:`polyfit.PolyFit`).
 
-    ``vertices`` (N, 3) [m], ``faces`` (F, 3), ``uv`` (N, 2); ``options`` and errors are those of
-    ``Template.fit``.
+    ``vertices`` (N, 3) [m], ``faces`` (F, 3), ``uv`` (N, 2) or :class:`polyfit.mesh.TexCoords`;
+    ``options`` and errors are those of ``Template.fit``.
     """
     points = torch.as_tensor(np.asarray(vertices))
     with torch.no_grad():
@@ -94,8 +99,8 @@ def rendering(
     return lambda vertices: render(vertices.to(torch.float32).contiguous())
 
 
-def deformed(patch: JetPatch) -> Callable[..., torch.Tensor]:
-    """The surface of a :class:`polysft_mi.surface.patch.JetPatch` as a torch function of the
+def deformed(patch: JetAtlas) -> Callable[..., torch.Tensor]:
+    """The surface of a :class:`polysft_mi.surface.patch.JetAtlas` as a torch function of the
     unknowns: delta_alpha (A,), delta_u, delta_v, delta_w (N,), rotation (4,), translation (3,) ->
     vertices (N, 3) [m, camera frame]."""
 

@@ -3,7 +3,7 @@
 import argparse
 import sys
 
-from .errors import InputError
+from polyfit.errors import InputError, Parser
 
 # name: what it is for, in a line of `polysft --help`
 COMMANDS = {
@@ -15,13 +15,6 @@ COMMANDS = {
     "compare": "two runs, or a run and its ground truth: figures and pictures",
     "view": "look at a run in an interactive viewer",
 }
-
-
-class Parser(argparse.ArgumentParser):
-    """An ``argparse`` parser whose complaints are one line, as all others are."""
-
-    def error(self, message):
-        raise InputError(f"{message}; {self.prog} --help lists the options")
 
 
 def parser(name, description, examples):

@@ -17,8 +17,9 @@ from typing import Any
 
 import numpy as np
 
+from polyfit.files import aside, naming
+
 from .errors import BadFrame, InputError
-from .files import aside, naming
 from .objective.problem import TERMS, Problem
 from .render.device import interruptible
 from .solvers import Solver

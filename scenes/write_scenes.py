@@ -1,7 +1,7 @@
 """Write the scene files of this folder: ``python scenes/write_scenes.py``, by the writer of
 ``polysft_mi.capture``.
 
-``SCENES`` holds what differs between them. The data of a scene other than the demo is given by ``-D
+``SCENES`` holds what differs between them. The data of a scene that is no demo is given by ``-D
 data=FOLDER``.
 """
 
@@ -20,16 +20,16 @@ def _cloth(**settings):
     )
 
 
+def _demo(**settings):
+    camera = Intrinsics(368, 368, 160, 120, 320, 240)
+    return Layout(
+        "cloth", camera, "frames", "masks", "texture.jpg", "template.obj", settings=settings
+    )
+
+
 SCENES = {
-    "demo": Layout(
-        "cloth",
-        Intrinsics(368, 368, 160, 120, 320, 240),
-        "frames",
-        "masks",
-        "texture.jpg",
-        "template.obj",
-        settings={"last": 11, "period": 150, "patience": 50},
-    ),
+    "demo": _demo(last=11, period=150, patience=50),
+    "demo_shirt": _demo(),
     "flag": _cloth(),
     "bend": _cloth(),
     "paper": _cloth(),
@@ -37,6 +37,9 @@ SCENES = {
     "corner": _cloth(),
     "hand": _cloth(),
     "poster": _cloth(),
+    "tube": _cloth(),
+    "shirt": _cloth(),
+    "ball": _cloth(),
     "kinect_paper": Layout(
         "Kinect-Paper",
         Intrinsics(528.0144, 528.0144, 320, 240, 640, 480),
@@ -56,17 +59,17 @@ SCENES = {
 }
 
 
+DEMOS = {
+    "demo": "A poster that bends, frames 0 to 11 of 45 (-D last=-1: all)",
+    "demo_shirt": "A T-shirt, whose texture has seams, 12 frames",
+}
+
+
 def text(name):
     """The text of the scene file ``name``.xml."""
-    if name == "demo":
-        return scene_xml(
-            SCENES[name],
-            "demo",
-            comment=(
-                "A poster that bends, frames 0 to 11 of 45 (-D last=-1: all):"
-                " python -m polysft_mi.run scenes/demo.xml -o OUT"
-            ),
-        )
+    if name in DEMOS:
+        comment = f"{DEMOS[name]}: python -m polysft_mi.run scenes/{name}.xml -o OUT"
+        return scene_xml(SCENES[name], name, comment=comment)
     comment = (
         f"The sequence {name}, in the form {SCENES[name].form}: python -m polysft_mi.run"
         f" scenes/{name}.xml -D data=FOLDER -o OUT"

@@ -71,17 +71,29 @@ def finished_run(tmp_path_factory):
     """
     import synthetic
 
-    from polysft_mi import prepare, run
-
     truth = synthetic.cloth(
         tmp_path_factory.mktemp("finished") / "sheet", frames=4, bend=2.5, turn=0.1
     )
+    return truth, finished(truth, tmp_path_factory)
+
+
+def finished(truth, tmp_path_factory):
+    """The folder of a run on a sequence, with jets of order 4."""
+    from polysft_mi import prepare, run
+
     prepare.main([str(truth.folder)])
     out = tmp_path_factory.mktemp("finished") / "out"
-    assert (
-        run.main(
-            [str(truth.folder / "scene.xml"), "-o", str(out), "-q", "--exr", "all", "-D", "order=4"]
-        )
-        == 0
-    )
-    return truth, out
+    words = [str(truth.folder / "scene.xml"), "-o", str(out), "-q"]
+    assert run.main([*words, "--exr", "all", "-D", "order=4"]) == 0
+    return out
+
+
+@pytest.fixture(scope="session")
+def finished_tube(tmp_path_factory):
+    """``(truth, out)`` of a short run on a sleeve, whose texture has a seam and whose template has
+    several patches; to be read, not changed.
+    """
+    from problems import small_tube
+
+    truth = small_tube(tmp_path_factory.mktemp("finished"), frames=3)
+    return truth, finished(truth, tmp_path_factory)

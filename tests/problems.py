@@ -8,13 +8,22 @@ from scipy.spatial.transform import Rotation
 from polysft_mi import prepare
 from polysft_mi.objective.problem import Problem
 from polysft_mi.scene import experiment as scene
-from polysft_mi.surface.chart import State
+from polysft_mi.surface.atlas import State
 from polysft_mi.surface.template import Template
 
 
 def small_cloth(folder, frames):
     """A cloth of 9 x 12 vertices in images of 160 x 120, in the new folder ``folder``/cloth."""
     return synthetic.cloth(folder / "cloth", frames=frames, size=(160, 120), rows=9, columns=12)
+
+
+def small_tube(folder, frames):
+    """A sleeve of 9 x 18 vertices, whose texture has a seam, in images of 160 x 120, in the new
+    folder ``folder``/tube.
+    """
+    return synthetic.cloth(
+        folder / "tube", frames=frames, size=(160, 120), rows=9, columns=18, shape=synthetic.tube
+    )
 
 
 def problem_of(folder, rules=None, **settings):
@@ -32,16 +41,36 @@ def grid_template(rows=6, columns=7, order=4, bend=4.0):
         synthetic.grid_faces(rows, columns),
         np.stack([u, v], -1).reshape(-1, 2),
         order,
-        tolerance=1,
+    )
+
+
+def tube_template(rows=9, columns=18, order=4):
+    """A sleeve, held by three patches or more."""
+    return Template.fit(
+        synthetic.tube(0.4, rows, columns), *synthetic.tube_faces(rows, columns), order
     )
 
 
 def some_state(chart, rng, size=0.05):
     """A state of random unknowns of about ``size``."""
-    n, a = len(chart.template.chart), len(chart.bending)
-    turn = Rotation.from_rotvec(rng.normal(size=3) * size)
+    n, (k, a) = len(chart.template.vertices), chart.template.alpha.shape
+    turns = Rotation.from_rotvec(rng.normal(size=(k, 3)) * size)
     return State(
-        rng.normal(size=a) * size, rng.normal(size=(n, 3)) * size, turn, rng.normal(size=3) * size
+        rng.normal(size=(k, a)) * size,
+        rng.normal(size=(n, 3)) * size,
+        turns,
+        rng.normal(size=(k, 3)) * size,
+    )
+
+
+def at_rest(chart):
+    """The state of the undeformed template."""
+    t = chart.template
+    return State(
+        np.zeros(t.alpha.shape),
+        np.zeros(t.vertices.shape),
+        Rotation.identity(len(t)),
+        np.zeros((len(t), 3)),
     )
 
 

@@ -12,6 +12,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from polyfit.mesh import TexCoords
+from polysft_mi.results.metrics import vertex_normals
+
 BACKGROUND = 0.03
 SUPERSAMPLING = 4
 
@@ -19,13 +22,13 @@ SUPERSAMPLING = 4
 @dataclass
 class Truth:
     """``folder``; ``vertices`` (T, N, 3) [m, camera frame], frame 0 is the flat template; ``faces``
-    (F, 3); ``uv`` (N, 2), v up; K (3, 3).
+    (F, 3); ``uv`` (N, 2), v up, or :class:`polyfit.mesh.TexCoords`; K (3, 3).
     """
 
     folder: Path
     vertices: np.ndarray
     faces: np.ndarray
-    uv: np.ndarray
+    uv: np.ndarray | TexCoords
     K: np.ndarray
 
 
@@ -47,6 +50,33 @@ def sheet(t, rows, columns, width=0.24, height=0.18, depth=0.5, bend=3.0, turn=0
     p = np.stack([np.sin(k * x) / k, y, (1 - np.cos(k * x)) / k], axis=-1).reshape(-1, 3)
     c, s = np.cos(turn * t), np.sin(turn * t)
     return p @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + (shift * t, -shift * t, depth)
+
+
+def tube(t, rows, columns, radius=0.06, height=0.18, depth=0.5, bend=1.5, turn=0.25, shift=0.01):
+    """Points (rows * columns, 3) [m] of a sleeve at the time t in [0, 1], row after row along its
+    axis, x: it bends like an arm by the curvature t * bend [1/m], turns about x and moves.
+    """
+    x, a = np.meshgrid(
+        np.linspace(-height / 2, height / 2, rows),
+        2 * np.pi * np.arange(columns) / columns + turn * t,
+        indexing="ij",
+    )
+    # the seam, at a = 0, lies on the far side
+    ring, k = np.stack([-radius * np.sin(a), radius * np.cos(a)]), max(t * bend, 1e-9)
+    out = 1 / k + ring[0]  # from the centre of the bend
+    p = np.stack([out * np.sin(k * x), out * np.cos(k * x) - 1 / k, ring[1]], -1).reshape(-1, 3)
+    return p + (shift * t, -shift * t, depth)
+
+
+def tube_faces(rows, columns):
+    """Triangles of :func:`tube`, outwards, and their :class:`polyfit.mesh.TexCoords`, with a seam
+    along the tube.
+    """
+    open_faces = grid_faces(rows, columns + 1)
+    row, column = np.divmod(open_faces, columns + 1)
+    v, u = np.meshgrid(np.linspace(1, 0, rows), np.linspace(1, 0, columns + 1), indexing="ij")
+    uv = np.stack([u, v], -1).reshape(-1, 2)
+    return row * columns + column % columns, TexCoords(uv, open_faces)
 
 
 def texture_image(size=64):
@@ -76,6 +106,9 @@ def render(vertices, faces, uv, K, size, texture, light=None):
     ``size`` is (width, height); ``light``: (l_0, l), by which a triangle with the unit normal n
     towards the camera has l_0 + l . n times the texture's colour.
     """
+    if isinstance(uv, TexCoords):
+        source, uv, faces = uv.split(faces)
+        vertices = vertices[source]
     w, h = size[0] * SUPERSAMPLING, size[1] * SUPERSAMPLING
     x = vertices @ K.T
     inverse_depth = 1 / x[:, 2]
@@ -123,22 +156,30 @@ def write_image(path, rgb):
 
 
 def write_obj(path, vertices, uv, polygons):
+    coordinates, corners = (
+        (uv.coordinates, uv.faces) if isinstance(uv, TexCoords) else (uv, polygons)
+    )
     lines = ["v {:.8f} {:.8f} {:.8f}".format(*p) for p in vertices] + [
-        "vt {:.8f} {:.8f}".format(*t) for t in uv
+        "vt {:.8f} {:.8f}".format(*t) for t in coordinates
     ]
-    lines += ["f " + " ".join(f"{k}/{k}" for k in np.asarray(polygon) + 1) for polygon in polygons]
+    lines += [
+        "f " + " ".join(f"{k + 1}/{c + 1}" for k, c in zip(polygon, corner))
+        for polygon, corner in zip(np.asarray(polygons).tolist(), np.asarray(corners).tolist())
+    ]
     path.write_text("\n".join(lines) + "\n")
 
 
-def _make(folder, images, frames, size, rows, columns, masks, K, light=None, **motion):
+def _make(folder, images, frames, size, rows, columns, masks, K, light=None, shape=sheet, **motion):
     folder.mkdir(parents=True, exist_ok=True)
     vertices = np.stack(
-        [sheet(k / max(frames - 1, 1), rows, columns, **motion) for k in range(frames)]
+        [shape(k / max(frames - 1, 1), rows, columns, **motion) for k in range(frames)]
     )
-    v, u = np.meshgrid(np.linspace(1, 0, rows), np.linspace(0, 1, columns), indexing="ij")
-    truth = Truth(
-        folder, vertices, grid_faces(rows, columns), np.stack([u, v], axis=-1).reshape(-1, 2), K
-    )
+    if shape is tube:
+        faces, uv = tube_faces(rows, columns)
+    else:
+        v, u = np.meshgrid(np.linspace(1, 0, rows), np.linspace(0, 1, columns), indexing="ij")
+        faces, uv = grid_faces(rows, columns), np.stack([u, v], axis=-1).reshape(-1, 2)
+    truth = Truth(folder, vertices, faces, uv, K)
     texture = texture_image()
     for k in range(frames):
         image, coverage = render(vertices[k], truth.faces, truth.uv, K, size, texture, light)
@@ -173,7 +214,9 @@ def _write_camera(folder, K, size):
 
 
 def cloth(folder, frames=5, size=(96, 72), rows=9, columns=11, masks=True, **motion):
-    """A sequence in the form ``cloth``, with ``gt.npz``; returns its :class:`Truth`."""
+    """A sequence in the form ``cloth``, with ``gt.npz``; returns its :class:`Truth`. With ``shape``
+    :func:`tube` that of a sleeve whose texture has a seam; then gt.npz has ``seen``.
+    """
     K = _camera(size)
     truth, texture = _make(
         Path(folder), "frames/{:03d}.png", frames, size, rows, columns, masks, K, **motion
@@ -181,10 +224,15 @@ def cloth(folder, frames=5, size=(96, 72), rows=9, columns=11, masks=True, **mot
     write_image(truth.folder / "texture.png", texture)
     write_obj(truth.folder / "template.obj", truth.vertices[0], truth.uv, truth.faces)
     _write_camera(truth.folder, K, size)
+    seen = {}
+    if motion.get("shape") is tube:  # whose normals point outwards
+        normals = np.stack([vertex_normals(V, truth.faces) for V in truth.vertices])
+        seen["seen"] = (normals * truth.vertices).sum(2) < 0
     np.savez(
         truth.folder / "gt.npz",
         vertices=truth.vertices.astype(np.float32),
         faces=truth.faces.astype(np.int32),
+        **seen,
     )
     return truth
 

@@ -137,8 +137,13 @@ class ClosestSurface:
         return self._vertices.cpu().numpy()
 
     def follow(self, vertices):
-        """The mesh moves: its vertices are at the tensor (V, 3) [m] from now on."""
-        self._vertices.copy_(vertices.detach())
+        """The mesh moves: its vertices are at (V, 3) [m] from now on, a tensor, or an array for a
+        mesh on the CPU, which no threads of torch's need to meet for.
+        """
+        if torch.is_tensor(vertices):
+            self._vertices.copy_(vertices.detach())
+        else:
+            self._vertices.numpy()[:] = vertices
         self._mesh.refit()
 
     def __call__(self, points, reach=10.0):

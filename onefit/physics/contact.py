@@ -100,7 +100,7 @@ class BodyContact:
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         offset = (normal * point).sum(1) + self.settings.clearance
         self.body = vertices
-        self.surface.follow(torch.as_tensor(vertices))
+        self.surface.follow(vertices)
         corners, weights = self.corners[near], self.weights[near]
         return Contacts(near, corners, weights, normal, offset, point - before, self.stiffness)
 

@@ -131,7 +131,13 @@ def _network(settings, data):
 
 def data_of(settings, folder, progress):
     """The :class:`TrainingData` of ``settings``; what is sewn goes into ``folder``."""
+    # what can be wrong first, then what takes long
     garments = [Garment.named(name) for name in settings.garments]
+    motions = [
+        Motion.read(path, settings.fps, settings.motion_up) for path in settings.motions
+    ] or None
+    if settings.start:
+        load(settings.start)
     if settings.cuts:
         task = progress.add_task("cuts sewn", total=settings.cuts)
         garments += cuts(
@@ -141,9 +147,6 @@ def data_of(settings, folder, progress):
             partial(progress.advance, task),
         )
     task = progress.add_task("garments", total=len(garments))
-    motions = [
-        Motion.read(path, settings.fps, settings.motion_up) for path in settings.motions
-    ] or None
     return TrainingData(
         garments, motions=motions, seeds=settings.seeds, shapes=settings.shapes,
         order=settings.order, seed=settings.seed, advance=partial(progress.advance, task),

@@ -3,7 +3,8 @@ OBJ or PLY a frame.
 
 Everywhere: ``vertices`` (T, N, 3) [m] of T frames, in the axes of the file (right-handed, ``up``
 says which way is up), ``faces`` (F, 3), counterclockwise as seen from outside; ``uv`` (N, 2)
-texture coordinates, v up, or None; ``texture`` the path of an image, or None; ``fps`` frames a
+texture coordinates, v up, :class:`polyfit.mesh.TexCoords` where there are seams, or None;
+``texture`` the path of an image, or None; ``fps`` frames a
 second, the first at time 0. Files are written aside and renamed; InputError and OSError are raised
 for what cannot be used or written.
 """

@@ -2,6 +2,8 @@
 
 import os
 
+import numpy as np
+
 from polyfit.files import folder_aside
 from polyfit.mesh import write_ply
 
@@ -10,7 +12,7 @@ from .moving import checked, encoded
 
 def write_frames(folder, kind, vertices, faces, uv=None, texture=None, *, labels=None, up="y"):
     """Write one mesh a frame into a new or empty ``folder``: ``kind`` "obj", with a material file
-    and the texture, or "ply", with uv as ``s``, ``t``.
+    and the texture, or "ply", with uv as ``s``, ``t``, its vertices split along seams.
 
     ``labels`` (T,): the frames' numbers in the file names, by default 0 to T - 1. A folder that
     holds nothing but such files is replaced.
@@ -25,6 +27,9 @@ def write_frames(folder, kind, vertices, faces, uv=None, texture=None, *, labels
         if kind == "obj" and texture is not None and uv is not None
         else (None, None)
     )
+    source = np.arange(vertices.shape[1])
+    if kind == "ply" and uv is not None:
+        source, uv, faces = uv.split(faces)
     with folder_aside(folder, ours) as place:
         if data:
             with open(os.path.join(place, f"texture.{image}"), "wb") as file:
@@ -38,17 +43,20 @@ def write_frames(folder, kind, vertices, faces, uv=None, texture=None, *, labels
         for label, V in zip(range(len(vertices)) if labels is None else labels, vertices):
             name = os.path.join(place, f"{int(label):03d}.{kind}")
             if kind == "ply":
-                write_ply(name, V, faces, uv)
+                write_ply(name, V[source], faces, uv)
             else:
                 _write_obj(name, V, faces, uv, up)
 
 
 def _write_obj(path, V, F, uv, up):
-    corner = ("{0}/{0}" if uv is not None else "{0}").format
+    corner, corners = ("{}/{}" if uv is not None else "{}").format, F if uv is None else uv.faces
     with open(path, "w", encoding="ascii") as file:
         file.write(f"# metres, {up} up\nmtllib surface.mtl\no surface\n")
         file.writelines("v {:.9g} {:.9g} {:.9g}\n".format(*p) for p in V.tolist())
         if uv is not None:
-            file.writelines("vt {:.9g} {:.9g}\n".format(*t) for t in uv.tolist())
+            file.writelines("vt {:.9g} {:.9g}\n".format(*t) for t in uv.coordinates.tolist())
         file.write("usemtl surface\ns 1\n")
-        file.writelines("f " + " ".join(corner(k + 1) for k in face) + "\n" for face in F.tolist())
+        file.writelines(
+            "f " + " ".join(corner(k + 1, t + 1) for k, t in zip(face, at)) + "\n"
+            for face, at in zip(F.tolist(), corners.tolist())
+        )

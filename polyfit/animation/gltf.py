@@ -13,7 +13,7 @@ from .moving import checked, encoded, normals
 def write_glb(path, vertices, faces, uv=None, texture=None, *, fps=24.0, name="surface"):
     """Write binary glTF 2.0 (``.glb``): the first frame as the mesh, a morph target for each later
     one, and an animation of their weights, which blends each frame into the next. ``vertices`` have
-    y up, as glTF has it. Needs pygltflib.
+    y up, as glTF has it; they are split along seams, for glTF has one uv a vertex. Needs pygltflib.
     """
     import pygltflib as gltf
 
@@ -59,6 +59,9 @@ def write_glb(path, vertices, faces, uv=None, texture=None, *, fps=24.0, name="s
         )
 
     n = normals(vertices, faces)
+    if uv is not None:
+        source, uv, faces = uv.split(faces)
+        vertices, n = vertices[:, source], n[:, source]
     attributes = geometry(vertices[0], n[0])
     if uv is not None:
         attributes.TEXCOORD_0 = accessor(

@@ -8,7 +8,8 @@ import io
 import numpy as np
 
 from polyfit.errors import InputError
-from polyfit.mesh import face_vectors
+from polyfit.files import silent_decoders
+from polyfit.mesh import TexCoords, face_vectors
 
 # Rotations from OpenCV's camera axes to axes with y or z up
 AXES_FROM_CAMERA = {
@@ -41,6 +42,9 @@ def normals(vertices, faces):
 
 
 def checked(vertices, faces, uv, fps):
+    """(V, F, :class:`polyfit.mesh.TexCoords` or None): the arguments of a writer, in their types.
+    Raises InputError.
+    """
     V, F = np.asarray(vertices, np.float32), np.asarray(faces, np.int64)
     if (
         V.ndim != 3
@@ -61,10 +65,16 @@ def checked(vertices, faces, uv, fps):
     if not (np.isfinite(fps) and fps > 0):
         raise InputError(f"animation: {fps} frames a second; a positive number is needed")
     if uv is not None:
-        uv = np.asarray(uv, np.float32)
-        if uv.shape != (V.shape[1], 2):
-            raise InputError(f"animation: uv {uv.shape}; ({V.shape[1]}, 2) is needed")
-        uv = np.nan_to_num(uv)
+        if not isinstance(uv, TexCoords):
+            uv = np.asarray(uv, np.float32)
+            if uv.shape != (V.shape[1], 2):
+                raise InputError(f"animation: uv {uv.shape}; ({V.shape[1]}, 2) is needed")
+            uv = TexCoords(uv, F)
+        elif uv.faces.shape != F.shape:
+            raise InputError(
+                f"animation: uv of {len(uv.faces)} faces; those of the {len(F)} are needed"
+            )
+        uv = TexCoords(np.nan_to_num(np.asarray(uv.coordinates, np.float32)), uv.faces)
     return V, F, uv
 
 
@@ -75,7 +85,8 @@ def encoded(texture):
     from PIL import Image, UnidentifiedImageError
 
     try:
-        with Image.open(texture) as image:
+        with silent_decoders(), Image.open(texture) as image:
+            image.load()  # the whole file, which may be cut off
             if image.format in ("PNG", "JPEG"):
                 with open(texture, "rb") as file:
                     return file.read(), {"PNG": "png", "JPEG": "jpg"}[image.format]
@@ -84,7 +95,7 @@ def encoded(texture):
             return data.getvalue(), "png"
     except FileNotFoundError:
         raise InputError(f"{texture}: no such file; the image of the texture is needed") from None
-    except (UnidentifiedImageError, SyntaxError, ValueError) as error:
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
         raise InputError(
             f"{texture}: not an image that can be embedded ({error}); PNG, JPEG, TIFF, BMP or WebP"
             " is needed"

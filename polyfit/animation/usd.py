@@ -18,7 +18,8 @@ def write_usd(path, vertices, faces, uv=None, texture=None, *, fps=24.0, up="y",
 
     A Mesh ``/name/mesh`` with ``points``, ``normals`` and ``extent`` at the time codes 0 to T - 1,
     ``fps`` time codes a second, metersPerUnit 1, no subdivision, and a UsdPreviewSurface with the
-    texture. Needs usd-core.
+    texture; ``primvars:st`` is a vertex's, or a face corner's where there are seams. Needs
+    usd-core.
     """
     vertices, faces, uv = checked(vertices, faces, uv, fps)
     stem, extension = os.path.splitext(os.fspath(path))
@@ -89,10 +90,17 @@ def _stage(vertices, faces, uv, image, fps, up, name):
     shader.CreateInput("metallic", Sdf.ValueTypeNames.Float).Set(0.0)
     colour = shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f)
     if uv is not None:
+        per_vertex = uv.of_vertices(faces, vertices.shape[1])
+        whole = per_vertex is not None
         st = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(
-            "st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.vertex
+            "st",
+            Sdf.ValueTypeNames.TexCoord2fArray,
+            UsdGeom.Tokens.vertex if whole else UsdGeom.Tokens.faceVarying,
         )
-        st.Set(Vt.Vec2fArray.FromNumpy(uv))
+        values = np.nan_to_num(per_vertex) if whole else uv.coordinates
+        st.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(values, np.float32)))
+        if not whole:
+            st.SetIndices(Vt.IntArray.FromNumpy(uv.faces.astype(np.int32).ravel()))
     if image:
         reader = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("uv"))
         reader.CreateIdAttr("UsdPrimvarReader_float2")

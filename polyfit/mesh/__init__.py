@@ -7,8 +7,9 @@ import lazy_loader
 __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
-        "meshio": ["read_mesh", "write_ply"],
+        "meshio": ["read_mesh", "read_textured", "write_ply"],
         "subdivision": ["child", "refined", "subdivided"],
+        "texcoords": ["TexCoords"],
         "triangles": [
             "areas",
             "checked",

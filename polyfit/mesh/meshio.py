@@ -13,6 +13,9 @@ from numpy.typing import ArrayLike
 from polyfit.errors import InputError
 from polyfit.files import aside
 
+from .texcoords import TexCoords
+
+TexturedMesh = tuple[np.ndarray, np.ndarray, TexCoords | None]  # vertices, faces, coordinates
 MeshArrays = tuple[np.ndarray, np.ndarray, np.ndarray | None]  # vertices, faces, uv
 
 
@@ -55,6 +58,17 @@ def read_mesh(path: str | os.PathLike[str], what: str = "mesh") -> MeshArrays:
     where the file has none for some corner, or several for one vertex (a seam). Raises InputError
     in one line, in which the mesh is called ``what``.
     """
+    vertices, faces, texcoords = read_textured(path, what)
+    count = len(vertices)
+    if texcoords is None or texcoords.faces.min() < 0:
+        return vertices, faces, None
+    return vertices, faces, texcoords.of_vertices(faces, count)
+
+
+def read_textured(path: str | os.PathLike[str], what: str = "mesh") -> TexturedMesh:
+    """As :func:`read_mesh`, with a :class:`polyfit.mesh.TexCoords`, seams included, or None where
+    the file has no texture coordinates at all. Corners without any name the coordinate -1.
+    """
     path = os.fspath(path)
     extension = os.path.splitext(path)[1].lower()
     if extension not in (".obj", ".ply"):
@@ -64,7 +78,7 @@ def read_mesh(path: str | os.PathLike[str], what: str = "mesh") -> MeshArrays:
     return _read_obj(path) if extension == ".obj" else _read_ply(path)
 
 
-def _read_obj(path: str) -> MeshArrays:
+def _read_obj(path: str) -> TexturedMesh:
     """By hand, because trimesh reorders the triangles of quads, drops loose vertices, and loses uv
     beside normals.
     """
@@ -103,7 +117,7 @@ def _read_obj(path: str) -> MeshArrays:
     for what, index, count in (("vertices", F, len(V)), ("texture coordinates", T, len(VT))):
         if index.size and index.max() >= count:
             raise InputError(f"{path}: a face names number {index.max() + 1} of {count} {what}")
-    return V, F, _uv_of_vertices(len(V), F, VT, T)
+    return V, F, TexCoords(VT, T) if T.size and T.max() >= 0 else None
 
 
 def _corner(word: str, vertices: int, coordinates: int) -> tuple[int, int]:
@@ -121,18 +135,7 @@ def _from_zero(index: int, count: int) -> int:
     return index - 1 if index > 0 else count + index
 
 
-def _uv_of_vertices(count: int, F: np.ndarray, VT: np.ndarray, T: np.ndarray) -> np.ndarray | None:
-    """uv (N, 2) where every corner of a vertex agrees, else None. Vertices without a face get
-    NaN.
-    """
-    if not T.size or T.min() < 0:
-        return None
-    uv = np.full((count, 2), np.nan)
-    uv[F] = VT[T]
-    return uv if np.allclose(uv[F], VT[T], rtol=0, atol=1e-9, equal_nan=True) else None
-
-
-def _read_ply(path: str) -> MeshArrays:
+def _read_ply(path: str) -> TexturedMesh:
     import trimesh
 
     log = logging.getLogger("trimesh")
@@ -158,4 +161,6 @@ def _read_ply(path: str) -> MeshArrays:
         raise InputError(
             f"{path}: faces name vertices {F.min()} to {F.max()}; 0 to {len(V) - 1} exist"
         )
-    return V, F, None if uv is None or len(uv) != len(V) else np.array(uv, dtype=np.float64)
+    if uv is None or len(uv) != len(V):
+        return V, F, None
+    return V, F, TexCoords(np.array(uv, dtype=np.float64), F)

@@ -42,7 +42,7 @@ def clusters(points, normals, area, faces, edges, count):
     for weight in NORMAL_WEIGHTS:
         feature = np.concatenate([points / radius, weight * normals], axis=1)
         label = connected(
-            _relaxed(_merged(fine, feature, area, edges, count), feature, area, edges), edges, area
+            relaxed(merged(fine, feature, area, edges, count), feature, area, edges), edges, area
         )
         folded = _folded(label, normals, area)
         if folded < 0.9 * least:
@@ -74,7 +74,7 @@ def _acvd(points, faces, count):
     return np.asarray(found, dtype=np.int64)
 
 
-def _merged(label, feature, area, edges, count):
+def merged(label, feature, area, edges, count):
     """Neighbouring clusters merged, cheapest first, until ``count`` are left."""
     total, size = _sums(label, feature, area)
     near = [set() for _ in size]
@@ -114,7 +114,7 @@ def _merged(label, feature, area, edges, count):
     return np.unique(parent[label], return_inverse=True)[1]
 
 
-def _relaxed(label, feature, area, edges):
+def relaxed(label, feature, area, edges):
     """Vertices at the boundaries given to the neighbouring cluster where that lowers the energy,
     until few move.
     """

@@ -175,6 +175,7 @@ def conduct(make, folder, *, device="cpu", resume=False, until=None, every=120.0
     checkpoints; ``progress`` is a rich.progress.Progress. Raises InputError for a folder that holds
     weights already, or nothing to ``resume``.
     """
+    from rich.console import Console
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
@@ -197,7 +198,12 @@ def conduct(make, folder, *, device="cpu", resume=False, until=None, every=120.0
     )
     processes = Processes(device)
     try:
-        with folder_for(folder), Progress(*columns, disable=processes.rank > 0) as progress:
+        with (
+            folder_for(folder),
+            Progress(
+                *columns, console=Console(stderr=True), disable=processes.rank > 0
+            ) as progress,
+        ):
             training = make(folder, processes, progress)
             if resume:
                 training.restore(checkpoint)

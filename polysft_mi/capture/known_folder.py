@@ -3,8 +3,8 @@
 import contextlib
 import os
 
+from polyfit.files import aside
 from polysft_mi.errors import InputError
-from polysft_mi.files import aside
 from polysft_mi.scene.images import checked_size
 from polysft_mi.scene.kinect_paper import template as kinect_paper_template
 from polysft_mi.scene.sequence import Sequence
@@ -40,7 +40,7 @@ def prepare_folder(
         )
     else:
         where = os.path.join(folder, layout.obj)
-        vertices, faces, uv = meshio.read_template(where)
+        vertices, faces, uv = meshio.read_textured_template(where)
     meshio.check_template(vertices, faces, uv, where)
     _check_view(vertices * ((-1, -1, 1) if layout.flip else 1), camera, where)
 

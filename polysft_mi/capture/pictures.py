@@ -5,6 +5,7 @@ images.
 import cv2
 import numpy as np
 
+from polysft_mi.pictures.shading import seen
 from polysft_mi.scene.outline import loops
 
 GREEN, RED, YELLOW = (60, 220, 90), (235, 70, 60), (255, 210, 40)
@@ -102,7 +103,8 @@ def pose(frame, photo, sheet, placed, camera):
     laid on it where the template is.
     """
     wired, scale = _canvas(frame)
-    plain, x = wired.copy(), camera.project(placed)
+    vertices, faces, _ = sheet.mesh(placed)  # a seam is no border
+    plain, x = wired.copy(), camera.project(vertices)
 
     def draw(edges, colour, width):
         for edge in edges:
@@ -110,53 +112,38 @@ def pose(frame, photo, sheet, placed, camera):
             cv2.line(wired, a, b, colour, width, cv2.LINE_AA)
 
     edges = np.sort(
-        np.concatenate([sheet.faces[:, [0, 1]], sheet.faces[:, [1, 2]], sheet.faces[:, [2, 0]]]),
+        np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]),
         axis=1,
     )
     draw(np.unique(edges, axis=0), GREEN, 1)
     wired = cv2.addWeighted(plain, 0.7, wired, 0.3, 0)  # what is printed shows through
-    for loop in loops(sheet.faces):
+    for loop in loops(faces):
         draw(np.stack([loop, np.roll(loop, -1)], axis=1), YELLOW, 2)
     label(wired, "the template in the first frame")
-    beside, _ = _canvas(photo_on_frame(frame, photo, sheet, x))
+    beside, _ = _canvas(photo_on_frame(frame, photo, sheet, placed, camera))
     label(beside, "the photo, placed on the template")
     return np.hstack([wired, np.full((wired.shape[0], 4, 3), 255, np.uint8), beside])
 
 
-def photo_on_frame(frame, photo, sheet, x):
-    """The frame (H, W, 3), and on it the photo where the vertices' pixels ``x`` (N, 2) have it."""
-    from matplotlib.tri import Triangulation
-
-    try:
-        finder = Triangulation(*x.T, triangles=sheet.faces).get_trifinder()
-    except (RuntimeError, ValueError):  # a template that hides a part of itself
-        return frame
-    columns, rows = np.meshgrid(np.arange(frame.shape[1]) + 0.5, np.arange(frame.shape[0]) + 0.5)
-    face = finder(columns, rows)
-    seen = face >= 0
-    corners = sheet.faces[face[seen]]
-    a, b, c = (x[corners[:, k]] for k in range(3))
-    p = np.column_stack([columns[seen], rows[seen]])
-    t = np.linalg.solve(np.stack([b - a, c - a], axis=2), (p - a)[..., None])[..., 0]
-    u, v, w = (sheet.uv[corners[:, k]] for k in range(3))
-    uv = u + t[:, :1] * (v - u) + t[:, 1:] * (w - u)
-    side = max(1.0, max(photo.shape[:2]) / max(np.ptp(p, axis=0).max() if len(p) else 1, 1))
+def photo_on_frame(frame, photo, sheet, placed, camera):
+    """The frame (H, W, 3), and on it the photo where the camera sees it on the sheet, whose
+    vertices are ``placed`` (N, 3) [m, camera frame].
+    """
+    _, u, v = seen(placed, sheet.faces, camera, sheet.uv.T)
+    rows, columns = np.nonzero(np.isfinite(u))
+    extent = max(np.ptp(rows), np.ptp(columns)) if len(rows) else 1
+    side = max(1.0, max(photo.shape[:2]) / max(extent, 1))
     photo = (
         cv2.resize(photo, None, fx=1 / side, fy=1 / side, interpolation=cv2.INTER_AREA)
         if side > 1
         else photo
     )
-    maps = np.stack(
-        [uv[:, 0] * photo.shape[1] - 0.5, (1 - uv[:, 1]) * photo.shape[0] - 0.5], axis=-1
-    ).astype(np.float32)
-    whole = np.full((*frame.shape[:2], 2), -1, np.float32)
-    whole[seen] = maps
+    maps = np.stack([u * photo.shape[1] - 0.5, (1 - v) * photo.shape[0] - 0.5], axis=-1)
+    maps = np.nan_to_num(maps, nan=-1).astype(np.float32)
     colours = cv2.remap(
-        photo, whole[..., 0], whole[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        photo, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )
-    result = frame.copy()
-    result[seen] = colours[seen]
-    return result
+    return np.where(np.isfinite(u)[..., None], colours, frame)
 
 
 def label(image, text):

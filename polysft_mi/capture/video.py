@@ -120,7 +120,8 @@ def prepare_video(
         uv[:, 1] = 1 - uv[:, 1]
         mesh = replace(mesh, uv=uv)
     found |= {"template": mesh.name, "size_m": np.ptp(mesh.vertices, axis=0).tolist()}
-    meshio.check_template(placed, mesh.faces, mesh.uv, "template")
+    meshio.check_template(*mesh.mesh(placed), "template")
+    in_view = mesh.in_view(placed, view)
 
     shown = {"pose.png": pictures.pose(frame, photo, mesh, placed, view)}
     if board_picture is not None:
@@ -134,7 +135,9 @@ def prepare_video(
             yield k, straight.image(image)
 
     def registration(scale):
-        return Registration(photo, mesh.uv, mesh.faces, view.project(placed) * scale)
+        used = np.unique(in_view)
+        pixels = view.project(placed[used]) * scale
+        return Registration(photo, mesh.uv[used], np.searchsorted(used, in_view), pixels)
 
     with _folder(out) as partial:
         for name, image in shown.items():
@@ -177,7 +180,7 @@ def _write_scene(folder, view, masked, photo, placed, mesh):
     """The files that the scene names beside frames and masks, and the scene itself."""
     finest = 2048  # pixels of the texture's longer side; what is finer no frame shows
     write_png(os.path.join(folder, "texture.png"), pictures.shrunk(photo, finest)[0])
-    meshio.write_obj(os.path.join(folder, "template.obj"), placed, mesh.faces, mesh.uv)
+    meshio.write_obj(os.path.join(folder, "template.obj"), *mesh.mesh(placed))
     write_json(os.path.join(folder, "camera.json"), Lens(view).as_json())
     layout = Layout(
         "cloth", view, "frames", "masks" if masked else "", "texture.png", "template.obj"

@@ -21,7 +21,7 @@ from polysft_mi.surface.pattern import Pattern
 from . import pixels
 from .frames import Frames
 from .gather import Gather, Images
-from .light import Brightness, areas
+from .light import Brightness
 from .pyramid import POOL, Level, compared
 from .texture import Texture, packed_image
 
@@ -56,11 +56,13 @@ class Appearance:
     """How a sheet looks in a frame, beyond what its blurred texture tells.
 
     ``excess``: colours of the texture less those of the sheet's image, a
-    :class:`polysft_mi.images.pixels.Image` on a part of the level's grid; ``luminance`` (F,): of
-    the triangles' texture as the image shows it, over its mean, or None.
+    :class:`polysft_mi.images.pixels.Image` on a part of the level's grid; ``misfit``: what it alone
+    would be as a misfit; ``luminance`` (F,): of the triangles' texture as the image shows it, over
+    its mean, or None.
     """
 
     excess: pixels.Image
+    misfit: float
     luminance: np.ndarray | None = None
 
 
@@ -108,9 +110,12 @@ class Registration:
             self._masked,
             self.normalise,
         )
-        self._unit = max(1.0, math.sqrt(areas(position, self.faces).sum()) / _SHEET)
+        self._unit = max(1.0, math.sqrt(_shown_area(position, self.faces)) / _SHEET)
         self._frames = Frames(problem.sequence, self.normalise)
         self._levels, self._last, self._brightness = {}, None, None
+        self._silhouette_weight = self._rules.silhouette * problem.settings.k_silhouette
+        if len(template) > 1:
+            self._silhouette_weight *= self._rules.rounded_silhouette
 
     def _level(self, blur):
         if isinstance(blur, Level):
@@ -164,6 +169,14 @@ class Registration:
 
     # -- a surface against a frame -------------------------------------------
 
+    def seen_vertices(self, vertices, blur):
+        """Which vertices of a surface belong to a triangle that a pixel sees, (N,) bool."""
+        with dr.suspend_grad():
+            triangle = np.array(self._view(vertices, self._level(blur)).triangle)
+        seen = np.zeros(len(vertices), dtype=bool)
+        seen[self.faces[np.unique(triangle[triangle >= 0])]] = True
+        return seen
+
     def misfit(self, vertices, frame, blur):
         """The mean of r^2 / (r^2 + c^2) over the pixels that are compared, 0 to 1, with a fixed c;
         1 where there are none.
@@ -198,7 +211,7 @@ class Registration:
                 error, pairs = self._outline(
                     view.seen(), crossings, shown.mask, shown.distance, self._corner_of
                 )
-            mask_weight = self._rules.silhouette * s.k_silhouette / shown.area if masked else 0.0
+            mask_weight = self._silhouette_weight / shown.area if masked else 0.0
             images = self.gather.images(
                 table, figures, vertices, s.k_rgb, mask_weight, shown.area, level.stride, pairs
             )
@@ -274,13 +287,15 @@ class Registration:
                 known = (distance > border).astype(np.float32)
             known = (known > 0)[..., None] & (template[..., 3:] > 0.5)
             excess = np.where(known, template[..., :3] - image, 0)
+            squared = (excess**2).sum(-1) / 3
+            misfit = float((squared / (squared + pixels.MISFIT**2)).sum() / max(inside.sum(), 1.0))
             excess = pixels.Image.of(packed_image(excess, np.zeros_like(inside)), (h, w), corner)
         luminance = None
         if shaded:
             position, _ = self.camera.project(vertices)
             at = position / level.stride - corner
             luminance = self.brightness.texture_luminance(found[..., :3], inside, level.stride, at)
-        return Appearance(excess, luminance)
+        return Appearance(excess, misfit, luminance)
 
     # -- parts ----------------------------------------------------------------
 
@@ -333,3 +348,12 @@ class Registration:
         )
         (top, _), (left, _) = pads
         return wide[top : top + inside.shape[0], left : left + inside.shape[1]], inside
+
+
+def _shown_area(position, faces):
+    """Area [pixels^2] of the side of a surface that is turned to the camera, its vertices at
+    ``position`` (N, 2) [pixels]: the larger one, for a sheet may be wound either way."""
+    a, b, c = (position[faces[:, k]] for k in range(3))
+    ab, ac = b - a, c - a
+    signed = 0.5 * (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0])
+    return max(signed[signed > 0].sum(), -signed[signed < 0].sum())

@@ -26,9 +26,9 @@ def packed_image(colour, fourth):
 class Texture:
     """The reflectance of a rendered mesh over the box of its texture coordinates.
 
-    ``image`` (H, W, 3) float32, linear; ``inside`` (H, W): 1 in that box; ``density``: texels a
-    pixel of the first frame; ``coordinates``: Float of 2V, of the rendered vertices; ``scale``,
-    ``shift``: take coordinates to texels (whole at their centres).
+    ``image`` (H, W, 3) float32, linear; ``inside`` (H, W): 1 where a triangle has it;
+    ``density``: texels a pixel of the first frame; ``coordinates``: Float of 2V, of the rendered
+    vertices; ``scale``, ``shift``: take coordinates to texels (whole at their centres).
     """
 
     def __init__(self, mesh, faces, position, density, masked, normalise):
@@ -69,14 +69,22 @@ class Texture:
                 si.wi = mi.Vector3f(0, 0, 1)
                 total = total + np.array(mesh.bsdf().eval_diffuse_reflectance(si)).T
         self.image = (total / fine**2).reshape(len(at[1]), len(at[0]), 3).astype(np.float32)
-        x, y = np.meshgrid(*at)
-        inside = (x >= low[0]) & (x <= low[0] + size[0]) & (y >= low[1]) & (y <= low[1] + size[1])
-        self.inside = inside.astype(np.float32)
         self.scale = mi.Vector2f(*(float(shape[k] / size[k]) for k in (0, 1)))
         self.shift = mi.Point2f(
             *(float(_MARGIN - 0.5 - low[k] * shape[k] / size[k]) for k in (0, 1))
         )
         dr.make_opaque(self.scale, self.shift)
+        x, y = np.meshgrid(*at)
+        inside = (x >= low[0]) & (x <= low[0] + size[0]) & (y >= low[1]) & (y <= low[1] + size[1])
+        self.inside = (inside & self._covered(inside.shape)).astype(np.float32)
+
+    def _covered(self, shape):
+        """Which texels (H, W) touch a triangle."""
+        covered, parts = np.zeros(shape, np.uint8), 8  # bits of a texel's fraction
+        corners = np.round(self.texels()[self._faces] * 2**parts).astype(np.int32)
+        for triangle in corners:
+            cv2.fillConvexPoly(covered, triangle, 1, shift=parts)
+        return covered > 0
 
     def _host_coordinates(self):
         return np.array(self.coordinates, dtype=np.float64).reshape(-1, 2)

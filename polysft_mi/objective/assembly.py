@@ -1,4 +1,4 @@
-"""Normal equations of a frame in the unknowns of a jet patch, accumulated on the device.
+"""Normal equations of a frame in the unknowns of an atlas, accumulated on the device.
 
 In: what the images say at the vertices (:mod:`polysft_mi.images.gather`), the lengths of the edges,
 and further residuals of the triangles. Out: :class:`Normal`, for the linear algebra of
@@ -6,11 +6,13 @@ and further residuals of the triangles. Out: :class:`Normal`, for the linear alg
 Import only after a Mitsuba variant is set.
 """
 
+import itertools
 from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import scipy.sparse as sp
 
 from polysft_mi.images.gather import (
     add,
@@ -22,7 +24,7 @@ from polysft_mi.images.gather import (
     rows_of,
 )
 from polysft_mi.images.pixels import packed
-from polysft_mi.render.device import frozen
+from polysft_mi.render.device import frozen, on_device
 
 
 @dataclass
@@ -60,31 +62,51 @@ def _edges(tables, vertices, lengths, numbers):
 _SYMMETRIC = (0, 1, 2, 1, 3, 4, 2, 4, 5)  # a symmetric 3 x 3, row by row, from its upper half
 
 
+@dataclass
+class Halo:
+    """Which vertices an atlas' patches reach, on the device, UInt32: a vertex belongs to the halo
+    of a patch where it, or a neighbour, is held by the patch. H pairs of patch and vertex, patch by
+    patch.
+
+    ``start`` (H + 1): of each pair's list of the neighbours that the patch holds; of the L in all
+    lists, ``block``: which of the mesh's blocks, 2 p or 2 p + 1 as
+    :class:`polysft_mi.images.gather.Tables` has them, ``entry``: the neighbour's
+    in :class:`polysft_mi.surface.atlas.Atlas`, ``patch``.
+    """
+
+    start: mi.UInt32
+    block: mi.UInt32
+    entry: mi.UInt32
+    patch: mi.UInt32
+
+
 def in_unknowns(
     tables,
+    halo,
     images,
     vertices,
     camera,
     lengths,
     numbers,
     offset_jacobian,
+    up,
     motion_jacobian,
     basis,
-    entry,
+    index,
     size,
     triangles,
 ):
-    """Normal equations of the images, the edges and the triangles' residuals, in the unknowns of a
-    jet patch.
+    """Normal equations of the images, the edges and the triangles' residuals, in the unknowns of an
+    atlas.
 
-    ``vertices`` Float64 of 3N [m]; ``lengths`` Float64 of E [m], ``numbers`` Float64: stiffness
-    [1/m^2], give; ``offset_jacobian`` Float64 of 9N, ``motion_jacobian`` of 18N, ``basis`` of A N:
-    of :class:`polysft_mi.surface.chart.Surface`; ``entry``: 0, 1, ... of A N, and ``size``: A,
+    ``halo``: :class:`Halo`; ``vertices`` Float64 of 3N [m]; ``lengths`` Float64 of E [m],
+    ``numbers`` Float64: stiffness [1/m^2], give; ``offset_jacobian`` Float64 of 9N, ``up`` of 3K,
+    ``motion_jacobian`` of 18 and ``basis`` of A an entry: of
+    :class:`polysft_mi.surface.atlas.Surface`; ``index``: 0, 1, ... of A H, and ``size``: A,
     UInt32; ``triangles``: None, or Float64: r h of F, h of F and derivatives of 9F, as
     :meth:`Assembly.normal` takes them. Returns Float64: energies of the edges without their weight
-    (E), gradient (3N) in space; by (Δu, Δv, Δw): gradient (3N), curvature (9U) of the pairs; with
-    the motion, cross curvature (18N); and with the coefficients (3 of A N each); curvature of
-    positions and the motion (18N).
+    (E), gradient (3N) in space; by (Δu, Δv, Δw): gradient (3N), curvature (9U) of the pairs; of
+    positions in space and, over the halo, the motions (18H) and the coefficients (3 of A H each).
     """
     vertex, pair = (
         dr.arange(mi.UInt32, dr.width(vertices) // 3),
@@ -135,78 +157,118 @@ def in_unknowns(
 
         space = [x + y for x, y in zip(space, add(tables.share_start, tables.share, share, 9))]
 
-    # each vertex moves by its own (u, v), by a height, which is its own and that of all
-    # coefficients there, and by the motion
+    # each vertex moves by its own (u, v) and height, and by the jets and the motions that hold it
     left, right = (rows_of(numbers_of(offset_jacobian, k, 9), 3) for k in (tables.i, tables.j))
     local = packed(flattened(congruence(left, rows_of(space, 3), right)), pair)
     space = packed(space, pair)
     own = rows_of(numbers_of(offset_jacobian, vertex, 9), 3)
-
-    def places(entry):  # of the 3 x 3 of one of a vertex's pairs, row by row
-        half = dr.gather(mi.UInt32, tables.half, entry)
-        first, flipped = 9 * (half // 2), (half & 1) != 0
-        return [
-            [first + dr.select(flipped, 3 * b + a, 3 * a + b) for b in range(3)] for a in range(3)
-        ]
-
-    def motion(entry):
-        m = rows_of(
-            numbers_of(motion_jacobian, dr.gather(mi.UInt32, tables.neighbour, entry), 18), 6
-        )
-        h = [[dr.gather(mi.Float64, space, k) for k in row] for row in places(entry)]
-        return [sum(row[k] * m[k][c] for k in range(3)) for row in h for c in range(6)]
-
-    every = dr.arange(mi.UInt32, dr.width(tables.neighbour))
-    moved = add(tables.neighbour_start, every, motion, 18)
-    by_all = [
-        sum(own[k][a] * moved[6 * k + c] for k in range(3)) for a in range(3) for c in range(6)
-    ]
     along = [sum(own[k][a] * gradient[k] for k in range(3)) for a in range(3)]
 
-    row = (
-        entry // size
-    )  # an argument, in memory: this kernel's size is that of what it reads elementwise
-    coefficient = entry - row * size
-    begin, end = (dr.gather(mi.UInt32, tables.neighbour_start, row + k) for k in (0, 1))
+    # the 3 x 3 of a neighbour in a halo, row by row, times its patch's up
+    flipped, first = (halo.block & 1) != 0, 9 * (halo.block // 2)
+    h = [
+        [
+            dr.gather(mi.Float64, space, first + dr.select(flipped, 3 * b + a, 3 * a + b))
+            for b in range(3)
+        ]
+        for a in range(3)
+    ]
+    direction = numbers_of(up, halo.patch, 3)
+    raised = packed(
+        [sum(row[k] * direction[k] for k in range(3)) for row in h],
+        dr.arange(mi.UInt32, dr.width(halo.block)),
+    )
+
+    def motion(k):
+        block = dr.gather(mi.UInt32, halo.block, k)
+        flipped, first = (block & 1) != 0, 9 * (block // 2)
+        m = rows_of(numbers_of(motion_jacobian, dr.gather(mi.UInt32, halo.entry, k), 18), 6)
+        h = [
+            [
+                dr.gather(mi.Float64, space, first + dr.select(flipped, 3 * b + a, 3 * a + b))
+                for b in range(3)
+            ]
+            for a in range(3)
+        ]
+        return [sum(row[k] * m[k][c] for k in range(3)) for row in h for c in range(6)]
+
+    every = dr.arange(mi.UInt32, dr.width(halo.block))
+    moved = add(halo.start, every, motion, 18)
+
+    row = index // size  # an argument, in memory: this kernel's size is that of what it reads
+    coefficient = index - row * size
+    begin, end = (dr.gather(mi.UInt32, halo.start, row + k) for k in (0, 1))
 
     def lift(k, *before):
-        value = dr.gather(
-            mi.Float64, basis, dr.gather(mi.UInt32, tables.neighbour, k) * size + coefficient
-        )
-        heights = [dr.gather(mi.Float64, local, row[2]) for row in places(k)]
-        return k + 1, *(x + h * value for x, h in zip(before, heights))
+        at = dr.gather(mi.UInt32, halo.entry, k) * size + coefficient
+        value = dr.gather(mi.Float64, basis, at)
+        return k + 1, *(x + h * value for x, h in zip(before, numbers_of(raised, k, 3)))
 
-    zeros = (dr.zeros(mi.Float64, dr.width(basis)) for _ in range(3))
+    zeros = (dr.zeros(mi.Float64, dr.width(index)) for _ in range(3))
     lifted = dr.while_loop((begin, *zeros), lambda k, *_: k < end, lift, label="coefficients")[1:]
     return (
         energy,
         packed(gradient, vertex),
         packed(along, vertex),
         local,
-        packed(by_all, vertex),
+        packed(moved, dr.arange(mi.UInt32, dr.width(halo.start) - 1)),
         *lifted,
-        packed(moved, vertex),
     )
 
 
 class Assembly:
     """Normal equations of frames, from what ``gather`` (:class:`polysft_mi.images.gather.Gather`)
     brings to the vertices of a mesh with the ``pattern``
-    (:class:`polysft_mi.surface.pattern.Pattern`).
+    (:class:`polysft_mi.surface.pattern.Pattern`), in the unknowns of an ``atlas``
+    (:class:`polysft_mi.surface.atlas.Atlas`).
     """
 
-    def __init__(self, pattern, gather):
-        self.pattern, self._gather, self._within = pattern, gather, None
+    def __init__(self, pattern, gather, atlas):
+        self.pattern, self._gather, self._atlas = pattern, gather, atlas
         self._in_unknowns = frozen(in_unknowns)
+        self._list_halo()
 
-    def normal(self, surface, images, lengths, stiffness, wide=None, give=np.inf, triangles=None):
+    def _list_halo(self):
+        pattern, atlas = self.pattern, self._atlas
+        half = np.empty(len(pattern.row), dtype=np.int64)
+        half[pattern.upper] = 2 * np.arange(len(pattern.upper))
+        half[pattern.lower] = 2 * pattern.mirrored + 1
+        entries = sp.csr_matrix(
+            (np.arange(len(atlas.entry_vertex)) + 1, (atlas.entry_vertex, atlas.entry_patch)),
+            (pattern.count, len(atlas)),
+        )
+        # of each block (i, j), the patches that hold j
+        held = entries[pattern.column].tocoo()
+        order = np.lexsort((pattern.row[held.row], held.col))
+        block, patch, entry = held.row[order], held.col[order], held.data[order] - 1
+        key = patch * pattern.count + pattern.row[block]
+        pairs, first = np.unique(key, return_index=True)
+        halo_patch, vertex = np.divmod(pairs, pattern.count)
+        ends = np.searchsorted(halo_patch, np.arange(len(atlas) + 1))
+        #: the vertices of each patch's halo, and its rows
+        self._reached = [(vertex[a:b], slice(a, b)) for a, b in itertools.pairwise(ends)]
+        arrays = np.append(first, len(key)), half[block], entry, patch
+        self._halo = Halo(*(on_device(x, mi.UInt32) for x in arrays))
+        self._index = len(pairs)
+        # of the patches that meet: the entries of one that the other's halo has, and where
+        self._meetings = []
+        for k, (reached, rows) in enumerate(self._reached):
+            place = np.full(pattern.count, -1)
+            place[reached] = np.arange(rows.start, rows.stop)
+            for other, part in enumerate(atlas.entries):
+                at = place[atlas.entry_vertex[part]]
+                kept = np.flatnonzero(at >= 0)
+                if len(kept):
+                    self._meetings.append((other, k, part.start + kept, at[kept]))
+
+    def normal(self, surface, images, lengths, stiffness, wide, d=2, give=np.inf, triangles=None):
         """:class:`Normal` of the images, the edges and further
         residuals of triangles, and the edges' energy.
 
-        ``surface``: :class:`polysft_mi.surface.chart.Surface`; ``lengths`` (E,) [m]: of the
+        ``surface``: :class:`polysft_mi.surface.atlas.Surface`; ``lengths`` (E,) [m]: of the
         template's edges; ``stiffness`` [1/m^2]: weight of the squared differences to them;
-        ``wide``: a :class:`polysft_mi.surface.pattern.Pattern` that holds this one, where the
-        relief is an unknown too (d = 3) and the local block is to have that pattern; ``give``: the
+        ``wide``: the pattern, which holds this one, that the local block is to have; ``d``: 3 where
+        the relief is an unknown too, or 2; ``give``: the
         strain from which on a stretched edge hardly pulls harder. An excess e > 0 over the length L
         costs 2 c^2 ((1 + e^2 / c^2)^1/2 - 1), c = give L (Charbonnier): cloth that hangs from a
         point is stretched there by a tenth, and by squares that would turn the whole sheet. What is
@@ -214,58 +276,72 @@ class Assembly:
         and derivatives (F, 3, 3) [1/m] of r by the corners; half the sum of h r^2 is added.
         """
         pattern, count, basis = self.pattern, self.pattern.count, surface.basis
-        size, d = basis.shape[1], 2 if wide is None else 3
+        size, patches = basis.shape[1], len(surface.up)
         if triangles is not None:
             residual, factor, by_corner = triangles
             triangles = tuple(flat(x) for x in (residual * factor, factor, by_corner))
         found = self._in_unknowns(
             self._gather.tables,
+            self._halo,
             images,
             flat(surface.vertices),
             self._gather.camera,
             flat(lengths),
             flat([stiffness, give]),
             flat(surface.offset_jacobian),
+            flat(surface.up),
             flat(surface.motion_jacobian),
             flat(basis),
-            dr.arange(mi.UInt32, basis.size),
+            dr.arange(mi.UInt32, size * self._index),
             dr.opaque(mi.UInt32, size),
             triangles,
         )
-        energy, gradient, along, local, by_motion, *lifted, moved = (np.array(x) for x in found)
-        gradient, by_motion = gradient.reshape(-1, 3), by_motion.reshape(-1, 3, 6)
+        energy, gradient, along, local, moved, *lifted = (np.array(x) for x in found)
+        gradient, moved = gradient.reshape(-1, 3), moved.reshape(-1, 3, 6)
+        lifted = [x.reshape(-1, size) for x in lifted]
         local = local.reshape(-1, 3, 3)[:, :d, :d]
-        if wide is None:
-            blocks = pattern.all_blocks(local)
-        else:
-            blocks = np.zeros((len(wide.row), 3, 3))
-            blocks[self._places(wide)] = pattern.all_blocks(local)
-        glob = np.empty((size + 6, size + 6))
-        glob[:size, :size] = basis.T @ lifted[2].reshape(-1, size)
-        glob[:size, size:] = basis.T @ by_motion[:, 2]
-        glob[size:, :size] = glob[:size, size:].T
-        glob[size:, size:] = surface.motion_jacobian.reshape(-1, 6).T @ moved.reshape(-1, 6)
-        cross = np.empty((count, d, size + 6))
-        for k in range(d):
-            cross[:, k, :size] = lifted[k].reshape(-1, size)
-        cross[:, :, size:] = by_motion[:, :d]
-        right = np.concatenate(
-            [
-                basis.T @ (gradient @ surface.up),
-                np.einsum("nk,nkm->m", gradient, surface.motion_jacobian),
-            ]
-        )
+        blocks = pattern.all_blocks(local)
+        if wide is not pattern:
+            inner, blocks = blocks, np.zeros((len(wide.row), d, d))
+            blocks[wide.find(pattern.row, pattern.column)] = inner
+        cross = np.zeros((count, d, patches, size + 6))
+        for k, (reached, rows) in enumerate(self._reached):
+            own = surface.offset_jacobian[reached][:, :, :d]
+            for a in range(d):
+                cross[reached, a, k, :size] = sum(
+                    own[:, c, a, None] * lifted[c][rows] for c in range(3)
+                )
+            cross[reached, :, k, size:] = np.einsum("hca,hcm->ham", own, moved[rows])
         normal = Normal(
             blocks,
-            cross.reshape(-1, size + 6),
-            glob,
+            cross.reshape(count * d, -1),
+            self._glob(surface, lifted, moved),
             np.ascontiguousarray(along.reshape(-1, 3)[:, :d]),
-            right,
+            self._right(surface, gradient),
         )
         return normal, stiffness * float(energy.sum())
 
-    def _places(self, wide):
-        """Where the blocks of the pattern are among those of one that holds it."""
-        if self._within is None or self._within[0] is not wide:
-            self._within = wide, wide.find(self.pattern.row, self.pattern.column)
-        return self._within[1]
+    def _glob(self, surface, lifted, moved):
+        """The curvature (G, G) by the jets and the motions."""
+        size, patches = surface.basis.shape[1], len(surface.up)
+        glob = np.zeros((patches, size + 6, patches, size + 6))
+        for one, other, entries, rows in self._meetings:
+            basis, up = surface.basis[entries], surface.up[one]
+            moving = surface.motion_jacobian[entries]
+            raised = sum(up[c] * lifted[c][rows] for c in range(3))
+            glob[one, :size, other, :size] = basis.T @ raised
+            glob[one, :size, other, size:] = basis.T @ (up @ moved[rows])
+            glob[one, size:, other, size:] = moving.reshape(-1, 6).T @ moved[rows].reshape(-1, 6)
+        for one in range(patches):
+            for other in range(patches):
+                glob[other, size:, one, :size] = glob[one, :size, other, size:].T
+        return glob.reshape(patches * (size + 6), -1)
+
+    def _right(self, surface, gradient):
+        """The gradient (G,) by the jets and the motions, of that in space (N, 3)."""
+        parts = []
+        for up, part in zip(surface.up, self._atlas.entries, strict=True):
+            g = gradient[self._atlas.entry_vertex[part]]
+            parts.append(surface.basis[part].T @ (g @ up))
+            parts.append(np.einsum("nk,nkm->m", g, surface.motion_jacobian[part]))
+        return np.concatenate(parts)

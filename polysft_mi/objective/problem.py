@@ -19,7 +19,7 @@ from polysft_mi.render.device import interruptible
 from polysft_mi.render.pinhole import Pinhole
 from polysft_mi.render.raster import RasterIntegrator
 from polysft_mi.scene.rules import Rules
-from polysft_mi.surface.patch import JetPatch, Unknowns
+from polysft_mi.surface.patch import JetAtlas, Unknowns
 
 from . import terms as objective
 
@@ -69,7 +69,7 @@ class Problem:
         self.rules = rules or Rules()
         self.experiment, self.sequence, self.settings = experiment, sequence, experiment.settings
         self.template = experiment.template
-        self.patch = JetPatch(self.template)
+        self.patch = JetAtlas(self.template)
         self.width, self.height = experiment.size
         self.pixels = self.width * self.height
         edges = self.template.edges

@@ -1,5 +1,5 @@
 """The whole objective of a frame to second order: its value, its gradient and a Gauss-Newton
-curvature in the unknowns of the jet patch.
+curvature in the unknowns of the atlas.
 
 This is what :mod:`polysft_mi.solvers.gauss_newton` minimises. :mod:`polysft_mi.objective.problem`
 is the paper's objective, to first order, which Adam minimises. Import only after a Mitsuba variant
@@ -14,11 +14,13 @@ import numpy as np
 from polysft_mi.errors import BadFrame
 from polysft_mi.images.light import Light, residuals
 from polysft_mi.images.registration import Appearance, Evaluation, Registration
-from polysft_mi.surface.bending import hinges
-from polysft_mi.surface.chart import Chart, State, Surface
+from polysft_mi.surface.atlas import Atlas, State, Surface
+from polysft_mi.surface.bending import hinges, slides
 from polysft_mi.surface.pattern import Pattern
 
 from .assembly import Assembly, Normal
+from .hidden import Hidden
+from .joints import Joints
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,8 @@ class Context:
     ``frame``: its number; ``anchor``: the state that it is held to (of the frame before);
     ``noise``: the least misfit so far, NaN in the first frame, where the template has its shape;
     ``light``: what the frames before say of it; ``scales``: robust scale by stage, of the frame
-    before; ``hold``: weight of the squared difference to the anchor, motion included.
+    before; ``hold``: weight of the squared difference to the anchor, motion included; ``hidden``:
+    what holds the parts that no pixel sees.
     """
 
     frame: int
@@ -64,6 +67,7 @@ class Context:
     light: Light
     scales: dict
     hold: float = 0.0
+    hidden: Hidden | None = None
 
     @property
     def is_first(self):
@@ -103,7 +107,7 @@ class Model:
 class SecondOrder:
     """The objective of a :class:`polysft_mi.objective.problem.Problem` to second order.
 
-    ``chart``: the template's :class:`polysft_mi.surface.chart.Chart`; ``images``: the
+    ``atlas``: the template's :class:`polysft_mi.surface.atlas.Atlas`; ``images``: the
     :class:`polysft_mi.images.registration.Registration`; ``patterns``: number of unknowns of a
     vertex (2, or 3 with its relief) to the pattern of their blocks.
     """
@@ -111,18 +115,29 @@ class SecondOrder:
     def __init__(self, problem):
         self.settings, self.rules = problem.settings, problem.rules
         template, count = problem.template, len(problem.template.vertices)
-        self.images, self.chart = Registration(problem), Chart(template)
+        self.images, self.atlas = Registration(problem), Atlas(template)
         faces = self.images.faces
-        across, self._bends = hinges(template.chart, faces)
-        wide = Pattern(faces, template.edges, count, across)
-        self.patterns = {2: self.images.pattern, 3: wide}
-        self._assembly = Assembly(self.images.pattern, self.images.gather)
-        bends = wide.blocks_of(self._bends.T @ self._bends)
-        self._relief_blocks = wide.laplacian + self.rules.relief_bend * bends
+        #: (H, N): bends of the heights at the inner edges
+        across, self.bends = hinges(template.vertices / template.scale, faces)
+        narrow = self.images.pattern
+        # A hinge reaches a vertex beyond the neighbours. A sheet's normal equations have room for
+        # it; around a tube they would take four times as long, and its curvature is bounded.
+        wide = Pattern(faces, template.edges, count, across) if len(template) == 1 else narrow
+        self.patterns = {2: narrow, 3: wide}
+        self._assembly = Assembly(narrow, self.images.gather, self.atlas)
+        #: differences of (Δu, Δv) along the edges, in the axes of the first end, (2E, 2N)
+        self.slides = slides(template.edges, template.axes)
+        self._joints = Joints(self.atlas)
         self._lengths = np.array(problem.edge_lengths, dtype=np.float64)
         self.has_relief = self.settings.k_relief > 0 and count <= self.rules.relief_vertices
-        #: the weight that holds a frame's jet and displacements to the frame before
+        #: the weight that holds a frame's jets and displacements to the frame before
         self.temporal = self.settings.k_tc * self.rules.temporal
+
+    def hidden(self, state):
+        """The :class:`polysft_mi.objective.hidden.Hidden` of a surface."""
+        seen = self.images.seen_vertices(self.atlas.surface(state).vertices, self.rules.blurs[-1])
+        hold = self.rules.unseen if len(self.atlas) > 1 else 1.0
+        return Hidden.of(seen, hold, self)
 
     def appearance(self, state, stage, light):
         """The :class:`polysft_mi.images.registration.Appearance` of a sheet at the start of a
@@ -134,21 +149,23 @@ class SecondOrder:
         lit = self.images.normalise and light.frames
         coefficients = light.coefficients(len(self.images.faces)) if lit else None
         shaded = self.settings.k_shading > 0 and stage.last
-        vertices = self.chart.surface(state).vertices
+        vertices = self.atlas.surface(state).vertices
         return self.images.appearance(vertices, stage.blur, coefficients, shaded)
 
     def model(self, state, context, stage, scale, appearance=None, stiffness=None):
         """The :class:`Model` at a state, at a stage, under the robust ``scale``; ``stiffness``: in
         place of the stage's, and then edges do not give. Raises BadFrame where it is not finite.
         """
-        s, rules, chart = self.settings, self.rules, self.chart
-        surface = chart.surface(state)
+        s, rules, atlas = self.settings, self.rules, self.atlas
+        surface = atlas.surface(state)
         seen = self.images.evaluate(surface.vertices, context.frame, stage.blur, scale, appearance)
         caution = rules.caution(context.noise)
         give = rules.give * (caution if rules.strain_caution else 1.0)
         if stiffness is not None:
             give = math.inf
-        stiffness = s.k_mi * (stiffness or stage.stiffness) / chart.template.scale**2
+        stiffness = s.k_mi * (stiffness or stage.stiffness) / atlas.template.scale**2
+        if len(atlas) > 1:
+            stiffness *= rules.rounded_stiffness
         d = 3 if self.has_relief and stage.relief and not context.is_first else 2
         shading, rows = self._shading(surface, context, stage, seen, appearance)
         normal, inextensibility = self._assembly.normal(
@@ -156,11 +173,12 @@ class SecondOrder:
             seen.images,
             self._lengths,
             stiffness,
-            self.patterns[3] if d == 3 else None,
+            self.patterns[d],
+            d,
             give,
             rows,
         )
-        held = self._hold(normal, state, context)
+        held, joined = self._hold(normal, surface, state, context)
         relief = s.k_relief * (caution if rules.relief_caution else 1.0)
         smoothness, temporal = self._smooth(normal, state, context, d, relief)
         terms = {
@@ -169,7 +187,7 @@ class SecondOrder:
             "shading": shading,
             "inextensibility": inextensibility,
             "temporal": temporal + held,
-            "smoothness": smoothness,
+            "smoothness": smoothness + joined,
         }
         total = sum(terms.values())
         if not math.isfinite(total):
@@ -187,37 +205,46 @@ class SecondOrder:
         energy, *rows = residuals(shade, context.light, s.k_shading)
         return energy, rows
 
-    def _hold(self, normal, state, context):
-        """Add what ties the jet and the motion to the anchor's, and the jet's bending; returns the
-        energy of the first.
+    def _hold(self, normal, surface, state, context):
+        """Add what ties the jets and the motions to the anchor's, the jets' bending, and what joins
+        the patches; returns the energy of the first and that of the last.
         """
-        anchor, weight = context.anchor, self.temporal + context.hold
-        size = len(state.alpha)
-        bend = 2 * self.settings.k_bend * self.chart.bending
-        moved = state.alpha - anchor.alpha
-        turn = (state.rotation * anchor.rotation.inv()).as_rotvec()
-        motion = np.concatenate([turn, state.translation - anchor.translation])
-        normal.glob[:size, :size] += bend + 2 * weight * np.eye(size)
-        normal.gradient[:size] += bend @ state.alpha + 2 * weight * moved
-        normal.glob[size:, size:] += 2 * context.hold * np.eye(6)
-        normal.gradient[size:] += 2 * context.hold * motion
-        return weight * float((moved**2).sum()) + context.hold * float((motion**2).sum())
+        anchor, s = context.anchor, self.settings
+        patches, size = state.alpha.shape
+        weight = np.full(size + 6, context.hold)
+        weight[:size] += self.temporal
+        moved = state.difference(anchor)
+        pull = 2 * weight * moved
+        for k in range(patches):
+            bend = 2 * s.k_bend * context.hidden.patches[k] * self.atlas.bending
+            pull[k, :size] += bend @ state.alpha[k]
+            jet = slice(k * (size + 6), k * (size + 6) + size)
+            normal.glob[jet, jet] += bend
+        normal.glob += np.diag(np.tile(2 * weight, patches))
+        normal.gradient += pull.ravel()
+        joined = self._joints.add(normal, surface, self.rules.joint)
+        return float((weight * moved**2).sum()), joined
 
     def _smooth(self, normal, state, context, d, relief):
         """Add the differences of neighbours' displacements, the relief's bends, and what ties the
         displacements to the anchor's; returns the energies (smoothness, temporal).
         """
-        s, pattern = self.settings, self.patterns[d]
-        apart, bent = pattern.difference @ state.offset, self._bends @ state.offset[:, 2]
-        slid = state.offset - context.anchor.offset
-        weights, bending = np.array([s.k_uv, s.k_uv, relief]), relief * self.rules.relief_bend
-        pull = weights * (pattern.to_ends @ apart)
-        pull[:, 2] += bending * (self._bends.T @ bent)
-        normal.local_gradient += 2 * (pull + self.temporal * slid)[:, :d]
-        blocks = pattern.laplacian, pattern.laplacian, self._relief_blocks
+        s, pattern, height = self.settings, self.patterns[d], state.offset[:, 2]
+        slid, along = state.offset - context.anchor.offset, state.offset[:, :2].ravel()
+        held, bending = context.hidden, relief * self.rules.relief_bend
+        apart, steps, bent = self.slides @ along, pattern.difference @ height, self.bends @ height
+        pull = self.temporal * slid
+        pull[:, :2] += s.k_uv * (self.slides.T @ (np.repeat(held.edges, 2) * apart)).reshape(-1, 2)
+        pull[:, 2] += relief * (pattern.to_ends @ (held.edges * steps))
+        pull[:, 2] += bending * (self.bends.T @ bent)
+        normal.local_gradient += 2 * pull[:, :d]
+        normal.local[:, :2, :2] += 2 * s.k_uv * held.slide_blocks[d]
+        if d == 3:
+            normal.local[:, 2, 2] += 2 * relief * held.relief_blocks
         for k in range(d):
-            normal.local[:, k, k] += 2 * weights[k] * blocks[k]
             normal.local[pattern.diagonal, k, k] += 2 * self.temporal
-        smoothness = s.k_bend * float(state.alpha @ self.chart.bending @ state.alpha)
-        smoothness += float((weights * apart**2).sum() + bending * (bent**2).sum())
+        bend = ((state.alpha @ self.atlas.bending) * state.alpha).sum(1)
+        smoothness = s.k_bend * float(held.patches @ bend)
+        smoothness += s.k_uv * float(np.repeat(held.edges, 2) @ apart**2)
+        smoothness += relief * float(held.edges @ steps**2) + bending * float(bent @ bent)
         return smoothness, self.temporal * float((slid**2).sum())

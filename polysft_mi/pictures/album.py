@@ -53,13 +53,16 @@ class Renderings:
         self.problem = problem
         # geometry comes from the rasteriser whatever renders the colours
         self._raster = RasterIntegrator(mi.Properties("raster"))
-        self._raster.aovs, self._raster.antialias = ["depth", "normal", "uv"], False
+        self._raster.aovs = ["depth", "normal", "uv", "triangle"]
+        self._raster.antialias = False
+        self._first, self._patches = _own_patches(problem.experiment)
 
     def __call__(self, vertices, frame, geometry=True):
         """Layers (H, W[, C]) float32 of the surface with ``vertices`` (N, 3) [m, world]:
         ``target``, ``render`` (linear RGB), ``error`` (root mean square over channels),
         ``mask_target``, ``mask_render``; with ``geometry`` also ``depth`` [m], ``normal`` (camera
-        frame, towards the camera), ``uv`` (texture coordinates, v up); 0 beyond the surface.
+        frame, towards the camera), ``uv`` (texture coordinates, v up), and ``patch`` (its number,
+        from 1); 0 beyond the surface.
         """
         problem = self.problem
         with dr.suspend_grad():
@@ -84,15 +87,34 @@ class Renderings:
         }
 
     def _geometry(self):
-        """The layers ``depth``, ``normal`` and ``uv`` of the surface that was rendered last."""
+        """The layers ``depth``, ``normal``, ``uv`` and ``patch`` of the surface that was rendered
+        last.
+        """
         geometry = np.array(
             self._raster.image(self.problem.experiment.scene, self.problem.experiment.sensor, spp=1)
-        )[..., -6:]
+        )[..., -7:]
         normal = geometry[..., 1:4] @ self.problem.camera.axes.T.astype(np.float32)
         uv = np.where(
             geometry[..., :1] > 0, np.stack([geometry[..., 4], 1 - geometry[..., 5]], -1), 0
         )
-        return {"depth": geometry[..., 0], "normal": normal, "uv": uv}
+        face = np.round(geometry[..., 6]).astype(np.int64) - self._first
+        on = (face >= 0) & (face < len(self._patches))
+        patch = np.where(on, 1 + self._patches[np.where(on, face, 0)], 0).astype(np.float32)
+        return {"depth": geometry[..., 0], "normal": normal, "uv": uv, "patch": patch}
+
+
+def _own_patches(experiment):
+    """Which of the scene's triangles are the template's: the first, and the patch of each (F,), of
+    two of its corners at least or of the middle one.
+    """
+    mesh, template = experiment.mesh, experiment.template
+    first = 0
+    for shape in experiment.scene.shapes():
+        if shape.id() == mesh.id():
+            break
+        first += shape.face_count() if shape.is_mesh() else 0
+    faces = np.array(mesh.faces_buffer(), dtype=np.int64).reshape(-1, 3)
+    return first, np.sort(template.patch[experiment.corner[faces], 0], axis=1)[:, 1]
 
 
 def residual(layers, masked, *, blur=1.0, window=8.0, side=225.0):
@@ -208,7 +230,7 @@ class Album:
         template, first = self.problem.template, next(iter(self._boxes.values()))
         side = max(16, round(min(first.size) * self._scale))
         return figures.shade_surface(
-            surface, template.faces, self._view, uv=template.uv, size=(side, side)
+            surface, template.faces, self._view, uv=template.texcoords.corners, size=(side, side)
         )
 
     def _place(self, frame, name):

@@ -8,8 +8,8 @@ import re
 
 import numpy as np
 
+from polyfit.files import folder_aside
 from polysft_mi.errors import InputError
-from polysft_mi.files import folder_aside
 from polysft_mi.results.comparison import LABELS
 
 from . import exr, figures

@@ -11,13 +11,14 @@ import os
 
 import numpy as np
 
-from polysft_mi.files import aside
+from polyfit.files import aside
 
 # by the layer's name, and float32; the others by their count, and half
 _KINDS = {
     "depth": "Z",
     "normal": "XYZ",
     "uv": "UV",
+    "patch": "Y",
     "depth_a": "Z",
     "depth_b": "Z",
     "depth_difference": "Z",
@@ -48,9 +49,10 @@ def write_exr(path, layers, metadata=None, plain=DEFAULT_LAYER):
     layer ``plain`` once more as plain R, G, B.
 
     Colours, errors and masks are linear values (Rec.709 primaries) and are stored as half;
-    ``depth`` and its kin [m], ``normal`` (camera frame) and ``uv`` as float32. ``metadata`` (name
-    -> str, int, float, or anything that JSON holds, as a string) goes into the header. Raises
-    ValueError for layers of different sizes and OSError where the file cannot be written.
+    ``depth`` and its kin [m], ``normal`` (camera frame), ``uv`` and ``patch`` as float32.
+    ``metadata`` (name -> str, int, float, or anything that JSON holds, as a string) goes into the
+    header. Raises ValueError for layers of different sizes and OSError where the file cannot be
+    written.
     """
     import OpenEXR
 

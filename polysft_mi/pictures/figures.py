@@ -12,7 +12,7 @@ import warnings
 
 import numpy as np
 
-from polysft_mi.files import DISK_FULL_ERRORS, aside
+from polyfit.files import DISK_FULL_ERRORS, aside
 
 from .panels import PEAKS
 from .shading import View, shade_surface

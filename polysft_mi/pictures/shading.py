@@ -2,6 +2,7 @@
 values at its vertices, as the camera sees them.
 """
 
+import colorsys
 import functools
 from dataclasses import dataclass, replace
 
@@ -82,8 +83,9 @@ def shade_surface(vertices, faces, view=None, uv=None, size=(480, 480), look=Non
     ``size`` = (width, height).
 
     Lambert shading with smooth normals under a key light from the left and a weak fill, warm on the
-    side from which the triangles' normals point to the viewer, cool on the other. With ``uv`` (N,
-    2) a thin grid of ten by ten cells is drawn. ``look``: :class:`ShadingLook`.
+    side from which the triangles' normals point to the viewer, cool on the other. With ``uv`` (F,
+    3, 2), of the faces' corners, a thin grid of ten by ten cells is drawn. ``look``:
+    :class:`ShadingLook`.
     """
     look = look or ShadingLook()
     times, codes = look.supersample, _srgb_codes()
@@ -103,11 +105,8 @@ def shade_surface(vertices, faces, view=None, uv=None, size=(480, 480), look=Non
     ]
     if uv is not None:
         uv = np.asarray(uv, dtype=np.float64)
-        values += [
-            *np.moveaxis(
-                ((uv - uv.min(axis=0)) / np.maximum(np.ptp(uv, axis=0), 1e-12) * 10)[F], 2, 0
-            )
-        ]
+        low, extent = uv.min(axis=(0, 1)), np.ptp(uv, axis=(0, 1))
+        values += [*np.moveaxis((uv - low) / np.maximum(extent, 1e-12) * 10, 2, 0)]
 
     triangle, x, y = _covered_pixels(corners, width, height)
     # values are affine in a triangle, because the view is orthographic: its constant, and slopes to
@@ -192,6 +191,15 @@ def seen(vertices, faces, camera, values=()):
             weights[front] * np.asarray(value, dtype=np.float64)[F][triangle[front]]
         ).sum(axis=1) / inverse[front]
     return tuple(images.reshape(-1, camera.height, camera.width))
+
+
+def patch_colours(patch, weight):
+    """Colours (N, 3) uint8 of vertices by the patches that hold them, ``patch`` (N, M), in the
+    shares ``weight`` (N, M): a hue for each patch, blended where they overlap.
+    """
+    hue = np.arange(patch.max() + 1) * 0.618034 + 0.58  # far apart, however many there are
+    own = np.array([colorsys.hsv_to_rgb(h % 1, 0.55, 0.88) for h in hue])
+    return np.round(255 * np.einsum("nm,nmc->nc", weight, own[patch])).astype(np.uint8)
 
 
 def _light(normals, look):

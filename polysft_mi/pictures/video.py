@@ -2,6 +2,7 @@
 built without the encoder.
 """
 
+import contextlib
 import functools
 import os
 import re
@@ -9,8 +10,8 @@ from fractions import Fraction
 
 import numpy as np
 
+from polyfit.files import aside
 from polysft_mi.errors import InputError
-from polysft_mi.files import aside
 
 
 @functools.cache
@@ -33,8 +34,9 @@ def write_video(path, frames, fps=25):
     frames = _checked(frames)
     if not can_encode():
         return _write_pngs(os.path.splitext(os.fspath(path))[0], frames)
-    with aside(path) as temporary:
-        _encode(temporary, frames, fps, os.fspath(path))
+    # a file opened by PyAV would stay open where the disk is full, and "a:" begin a protocol
+    with aside(os.path.abspath(path)) as temporary, open(temporary, "wb", buffering=0) as file:
+        _encode(file, frames, fps, os.fspath(path))
     return os.fspath(path)
 
 
@@ -58,7 +60,7 @@ def _checked(frames):
         raise ValueError("no video frames; at least one is needed")
 
 
-def _encode(temporary, frames, fps, path):
+def _encode(file, frames, fps, path):
     import av
 
     container = stream = None
@@ -68,7 +70,7 @@ def _encode(temporary, frames, fps, path):
             picture = av.VideoFrame.from_ndarray(np.pad(frame, padding, mode="edge"), "rgb24")
             if container is None:
                 # the index first, so that browsers can start before they have all of it
-                container = av.open(temporary, "w", format="mp4", options={"movflags": "faststart"})
+                container = av.open(file, "w", format="mp4", options={"movflags": "faststart"})
                 stream = _stream(container, picture.width, picture.height, fps)
             picture = picture.reformat(
                 stream.width,
@@ -86,7 +88,8 @@ def _encode(temporary, frames, fps, path):
         raise OSError(None, f"the video cannot be written: {message}", path) from None
     finally:
         if container is not None:
-            container.close()
+            with contextlib.suppress(av.FFmpegError, OSError):  # said above
+                container.close()
 
 
 def _stream(container, width, height, fps):

@@ -9,6 +9,8 @@ import numpy as np
 from polyfit.errors import require
 from polysft_mi.errors import InputError
 
+from .shading import patch_colours
+
 
 class Viewer:
     """The window of a run: ``show(k)`` puts its k-th frame there. polyscope holds one window a
@@ -31,6 +33,9 @@ class Viewer:
         self.limits = np.quantile(np.abs(self.curvature), 0.99)
         if run.texture and os.path.isfile(run.texture):
             self._texture()
+        patch, weight = (run.params[name] for name in ("patch", "weight"))
+        if patch.max() > 0:
+            self.mesh.add_color_quantity("patches", patch_colours(patch, weight) / 255)
         self.show(0)
 
     def _texture(self):
@@ -38,7 +43,8 @@ class Viewer:
 
         image = cv2.imread(self.run.texture)
         if image is not None:
-            self.mesh.add_parameterization_quantity("uv", self.run.uv, defined_on="vertices")
+            corners = self.run.texcoords.corners.reshape(-1, 2)
+            self.mesh.add_parameterization_quantity("uv", corners, defined_on="corners")
             colours = image[..., ::-1].astype(np.float32) / 255
             self.mesh.add_color_quantity(
                 "texture", colours, defined_on="texture", param_name="uv", enabled=True

@@ -33,6 +33,9 @@ LABELS = {
     "e3d": "e3d",
     "e3d_proc": "e3d after similarity alignment",
     "en_deg": "angle between normals [deg]",
+    "rmse_mm_seen": "vertex RMSE, vertices in view [mm]",
+    "e3d_proc_seen": "e3d after alignment, vertices in view",
+    "en_deg_seen": "angle between normals, vertices in view [deg]",
     "depth_rmse_mm": "depth RMSE on the surface [mm]",
     "depth_rmse_mm_worst": "depth RMSE, worst frame [mm]",
     "hit": "points whose ray meets the surface",
@@ -123,7 +126,8 @@ def _figures(V, faces, truth, frame, rng):
     """The figures of one frame, whose surface has the vertices V (N, 3) [m]."""
     G = truth.at(frame)
     if truth.kind == "mesh":
-        return against_mesh(V, G, faces, truth.path)
+        seen = truth.seen[frame] if truth.seen is not None else None
+        return against_mesh(V, G, faces, truth.path, seen)
     if truth.kind == "clouds":
         return {"chamfer_1e4": 1e4 * chamfer(sample_surface(V, faces, len(G), rng), G)}
     error, share = depth_rmse(V, faces, G)
@@ -134,9 +138,10 @@ def _figures(V, faces, truth, frame, rng):
     return row
 
 
-def against_mesh(V, G, faces, where):
+def against_mesh(V, G, faces, where, seen=None):
     """The figures of vertices V (N, 3) [m] against G (N, 3) [m], both with the triangles ``faces``
-    (F, 3). Raises InputError, which names ``where``, for different numbers of vertices.
+    (F, 3); NAME_seen: over those alone that are ``seen`` (N,) bool, aligned by these alone. Raises
+    InputError, which names ``where``, for different numbers of vertices.
     """
     if len(V) != len(G):
         raise InputError(
@@ -144,11 +149,19 @@ def against_mesh(V, G, faces, where):
             " needed"
         )
     moved = align_similarity(V, G)
-    return {
+    figures = {
         "rmse_mm": 1e3 * rmse(V, G),
         "e3d": e3d(V, G),
         "e3d_proc": e3d(moved, G),
         "en_deg": normal_angle(moved, G, faces),
+    }
+    if seen is None:
+        return figures
+    moved = align_similarity(V, G, seen)
+    return figures | {
+        "rmse_mm_seen": 1e3 * rmse(V[seen], G[seen]),
+        "e3d_proc_seen": e3d(moved[seen], G[seen]),
+        "en_deg_seen": normal_angle(moved, G, faces, seen),
     }
 
 

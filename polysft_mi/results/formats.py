@@ -5,8 +5,10 @@ import os
 import numpy as np
 
 from polyfit.errors import require
+from polyfit.files import aside
 from polysft_mi.errors import InputError
-from polysft_mi.files import aside
+
+from .truth import uv_arrays
 
 FORMATS = ("usd", "glb", "obj", "ply", "npz")
 # of each format that is one file, the first is the default; the others are folders
@@ -43,14 +45,14 @@ def export(run, kind, path=None, *, up="y", fps=None, texture=None):
     image = _texture(run, texture) if kind in ("usd", "glb", "obj") else None
     os.makedirs(os.path.dirname(path) or ".", exist_ok=True)
     if kind == "usd":
-        animation.write_usd(path, vertices, run.faces, run.uv, image, fps=fps, up=up)
+        animation.write_usd(path, vertices, run.faces, run.texcoords, image, fps=fps, up=up)
     elif kind == "glb":
-        animation.write_glb(path, vertices, run.faces, run.uv, image, fps=fps)
+        animation.write_glb(path, vertices, run.faces, run.texcoords, image, fps=fps)
     elif kind == "npz":
         arrays = {
             "vertices": vertices,
             "faces": run.faces,
-            "uv": run.uv,
+            **uv_arrays(run.texcoords, run.faces),
             "frames": run.frames,
             "fps": np.float64(fps),
             "up": up,
@@ -59,7 +61,7 @@ def export(run, kind, path=None, *, up="y", fps=None, texture=None):
             np.savez_compressed(temporary, **arrays)
     else:
         animation.write_frames(
-            path, kind, vertices, run.faces, run.uv, image, labels=run.frames, up=up
+            path, kind, vertices, run.faces, run.texcoords, image, labels=run.frames, up=up
         )
     return path
 

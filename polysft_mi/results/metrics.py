@@ -24,20 +24,20 @@ def e3d(V, G):
     return float(np.linalg.norm(V - G) / np.linalg.norm(G))
 
 
-def align_similarity(V, G):
+def align_similarity(V, G, chosen=slice(None)):
     """V moved onto G (N, 3) by the similarity (scale, rotation without reflection, translation)
-    that is best in least squares.
+    that is best in least squares for the ``chosen`` vertices.
 
     Umeyama 1991, with the scale that minimises ||s V R + t - G||.
     """
-    mean_v, mean_g = V.mean(axis=0), G.mean(axis=0)
-    v, g = V - mean_v, G - mean_g
+    mean_v, mean_g = V[chosen].mean(axis=0), G[chosen].mean(axis=0)
+    v, g = V[chosen] - mean_v, G[chosen] - mean_g
     left, singular, right = np.linalg.svd(v.T @ g)
     flip = np.ones(3)
     flip[2] = np.sign(np.linalg.det(left) * np.linalg.det(right))
     rotation = (left * flip) @ right
     scale = np.dot(singular, flip) / np.sum(v**2)
-    return scale * (v @ rotation) + mean_g
+    return scale * ((V - mean_v) @ rotation) + mean_g
 
 
 def e3d_procrustes(V, G):
@@ -57,9 +57,11 @@ def vertex_normals(V, F):
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-20)
 
 
-def normal_angle(V, G, F):
-    """Mean angle between corresponding vertex normals [degrees], without alignment."""
-    cosine = np.sum(vertex_normals(V, F) * vertex_normals(G, F), axis=1)
+def normal_angle(V, G, F, chosen=slice(None)):
+    """Mean angle between corresponding vertex normals [degrees], of the ``chosen`` vertices,
+    without alignment.
+    """
+    cosine = np.sum(vertex_normals(V, F) * vertex_normals(G, F), axis=1)[chosen]
     return float(np.degrees(np.arccos(np.clip(cosine, -1, 1)).mean()))
 
 

@@ -14,11 +14,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from polyfit.files import aside
 from polysft_mi import __version__
-from polysft_mi.files import aside
 from polysft_mi.scene.defaults import located
 from polysft_mi.surface import meshio
 from polysft_mi.surface.patch import Unknowns
+
+from .truth import uv_arrays
+
+_PARAMS = ("alpha", "patch", "weight", "chart", "rest", "scale", "radius")
 
 
 def versions():
@@ -89,7 +93,7 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
             temporary,
             vertices=vertices,
             faces=template.faces.astype(np.int32),
-            uv=template.uv.astype(np.float32),
+            **uv_arrays(template.texcoords, template.faces),
             frames=indices,
             **sigma,
         )
@@ -98,19 +102,17 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
         np.savez_compressed(
             temporary,
             frames=indices,
-            alpha=template.alpha,
-            chart=template.chart,
-            scale=template.scale,
+            **{name: getattr(template, name) for name in _PARAMS},
             frame_rotation=problem.camera.axes @ template.rotation,
             frame_origin=problem.camera.to_camera(template.origin),
+            axes=problem.camera.axes @ template.axes,
             **arrays,
         )
     say("meshes")
     os.makedirs(os.path.join(out, "meshes"), exist_ok=True)
+    source, uv, faces = template.texcoords.split(template.faces)
     for index, v in zip(indices, vertices):
-        meshio.write_ply(
-            os.path.join(out, "meshes", f"{index:03d}.ply"), v, template.faces, template.uv
-        )
+        meshio.write_ply(os.path.join(out, "meshes", f"{index:03d}.ply"), v[source], faces, uv)
     say("pictures")
     (per_frame, box), video = drawn(), bound()
 

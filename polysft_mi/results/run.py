@@ -11,25 +11,26 @@ from functools import cached_property
 
 import numpy as np
 
+from polyfit.mesh import TexCoords
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError
 from polysft_mi.scene.defaults import known_defaults, located
 from polysft_mi.surface.template import matrix
 
-from .truth import load_npz, read_surface
+from .truth import load_npz, read_surface, texcoords_of
 
 
 @dataclass(frozen=True)
 class Run:
     """A finished run: ``folder``; ``vertices`` (T, N, 3) float32 [m, camera frame], ``faces`` (F,
-    3), ``uv`` (N, 2) v up, ``frames`` (T,) the index of each, ``sigma`` (T, N) [m] or None;
-    ``metrics`` and ``about``: its metrics.json and run.json.
+    3), ``texcoords``: its :class:`polyfit.mesh.TexCoords`, ``frames`` (T,) the index of each,
+    ``sigma`` (T, N) [m] or None; ``metrics`` and ``about``: its metrics.json and run.json.
     """
 
     folder: str
     vertices: np.ndarray
     faces: np.ndarray
-    uv: np.ndarray
+    texcoords: TexCoords
     frames: np.ndarray
     sigma: np.ndarray | None = None
     metrics: dict = field(default_factory=dict)
@@ -54,14 +55,12 @@ class Run:
                 " --resume"
             )
         surface = read_surface(folder)
-        if "uv" not in surface or surface["uv"].shape != (surface["vertices"].shape[1], 2):
-            raise InputError(
-                f"{os.path.join(folder, 'surface.npz')}: holds no uv of"
-                f" ({surface['vertices'].shape[1]}, 2)"
-            )
         return cls(
             folder,
-            **{name: surface[name] for name in ("vertices", "faces", "uv", "frames")},
+            surface["vertices"],
+            surface["faces"],
+            texcoords_of(surface, os.path.join(folder, "surface.npz")),
+            surface["frames"],
             sigma=surface.get("sigma"),
             metrics=read_json(os.path.join(folder, "metrics.json")),
             about=read_json(os.path.join(folder, "run.json")),
@@ -107,10 +106,24 @@ class Run:
                 return located(path, text)
         return None
 
+    @property
+    def uv(self) -> np.ndarray | None:
+        """Texture coordinates (N, 2), one a vertex, v up; None where the texture has seams."""
+        return self.texcoords.of_vertices(self.faces)
+
     @cached_property
     def params(self) -> dict[str, np.ndarray]:
-        """The arrays of params.npz."""
-        return load_npz(self.path("params.npz"))
+        """The arrays of params.npz. Those of an older version, whose template was one patch, are
+        brought into the form of this one.
+        """
+        path = self.path("params.npz")
+        p = load_npz(path)
+        if "alpha" in p and p["alpha"].ndim == 1:
+            p = _of_one_patch(p)
+        missing = [name for name in _PARAMS if name not in p]
+        if missing:
+            raise InputError(f"{path}: holds no {', '.join(missing)}; run the scene anew")
+        return p
 
     def log(self) -> list[dict]:
         """The records of log.jsonl."""
@@ -124,28 +137,59 @@ class Run:
                 raise InputError(f"{path}: not JSON lines ({error})") from None
 
     def mean_curvature(self) -> np.ndarray:
-        """Mean curvature (T, N) [1/m] of the jets, without relief, at the vertices, positive where
-        the surface bulges towards the camera (by its pose in the first frame).
+        """Mean curvature (T, N) [1/m] of the jets, without relief, at the vertices, each in its own
+        patch; positive where the surface bulges to the side that the patch nearest to the camera
+        shows there, by its pose in the first frame.
         """
         from numpy.polynomial.polynomial import polyder, polyval2d
         from scipy.spatial.transform import Rotation
 
         p = self.params
-        up = (
-            p["frame_rotation"] @ Rotation.from_quat(p["rotation"][0]).as_matrix()[:, 2]
-        )  # the chart's z in the camera frame
-        u, v = (p["chart"][:, k] + p[name] for k, name in enumerate(("delta_u", "delta_v")))
-        out = np.empty_like(u)
-        for t, alpha in enumerate(p["alpha"] + p["delta_alpha"]):
-            z = matrix(alpha)
-            zu, zv, zuu, zuv, zvv = (
-                polyval2d(u[t], v[t], polyder(polyder(z, i), j, axis=1))
-                for i, j in ((1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
+        first = Rotation.from_quat(p["rotation"][0]).as_matrix()
+        nearest = int(p["frame_origin"][:, 2].argmin())
+        up = p["frame_rotation"][nearest] @ first[nearest, :, 2]  # its z in the camera frame
+        out = np.empty(p["delta_u"].shape)
+        for k, (alpha, radius) in enumerate(zip(p["alpha"], p["radius"])):
+            own = p["patch"][:, 0] == k
+            to_chart = p["frame_rotation"][k].T @ p["axes"][own] * (p["scale"] / radius)
+            offset = np.stack([p[f"delta_{name}"][:, own] for name in "uvw"], -1)
+            u, v = np.moveaxis(
+                p["chart"][own, 0] + np.einsum("nij,tnj->tni", to_chart[:, :2], offset), 2, 0
             )
-            out[t] = ((1 + zv**2) * zuu - 2 * zu * zv * zuv + (1 + zu**2) * zvv) / (
-                2 * (1 + zu**2 + zv**2) ** 1.5
-            )
-        return np.sign(up[2]) * out / float(p["scale"])
+            for t, delta in enumerate(p["delta_alpha"][:, k]):
+                z = matrix(alpha + delta)
+                zu, zv, zuu, zuv, zvv = (
+                    polyval2d(u[t], v[t], polyder(polyder(z, i), j, axis=1))
+                    for i, j in ((1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
+                )
+                bend = (1 + zv**2) * zuu - 2 * zu * zv * zuv + (1 + zu**2) * zvv
+                out[t, own] = bend / (2 * radius * (1 + zu**2 + zv**2) ** 1.5)
+        return np.sign(up[2]) * out
+
+
+_PARAMS = (
+    *("alpha", "patch", "weight", "chart", "rest", "scale", "radius"),
+    *("frame_rotation", "frame_origin", "axes"),
+    *("delta_alpha", "delta_u", "delta_v", "delta_w", "rotation", "translation"),
+)
+
+
+def _of_one_patch(p: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The arrays of an older params.npz, which had one patch, as this version has them."""
+    count = len(p["chart"])
+    alone = {"patch": np.zeros((count, 1), dtype=np.int64), "weight": np.ones((count, 1))}
+    for name in ("alpha", "frame_rotation", "frame_origin"):
+        alone[name] = p[name][None]
+    for name in ("delta_alpha", "rotation", "translation"):
+        alone[name] = p[name][:, None]
+    return {
+        **p,
+        **alone,
+        "chart": p["chart"][:, None],
+        "rest": np.zeros((count, 1)),
+        "radius": p["scale"].reshape(1),
+        "axes": np.tile(p["frame_rotation"], (count, 1, 1)),
+    }
 
 
 def read_json(path: str) -> dict:

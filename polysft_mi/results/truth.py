@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from polyfit.mesh import TexCoords
 from polysft_mi.errors import InputError
 
 
@@ -22,8 +23,9 @@ class Truth:
 
     ``kind``: "mesh" (vertices (N, 3) in each frame, with common ``faces`` (F, 3)), "points" (depth
     points (P, 3), with ``K`` (3, 3) or None) or "clouds" (points (P, 3) without an order).
-    ``places``: what each frame holds; for clouds the path of its file. ``path``: where all of it
-    was read.
+    ``places``: what each frame holds; for clouds the path of its file. ``seen``: of a mesh, the
+    vertices (N,) bool that the camera sees, by frame, where that is known. ``path``: where all of
+    it was read.
     """
 
     path: str
@@ -31,6 +33,7 @@ class Truth:
     places: dict
     faces: np.ndarray | None = None
     K: np.ndarray | None = None
+    seen: dict | None = None
 
     @classmethod
     def open(cls, path: str | os.PathLike[str]) -> Truth:
@@ -50,7 +53,15 @@ class Truth:
             return cls(path, "points", places, K=arrays.get("K"))
         if "vertices" in arrays and "faces" in arrays:
             places = dict(enumerate(arrays["vertices"]))
-            return cls(path, "mesh", places, arrays["faces"].astype(np.int64))
+            visible, seen = arrays.get("seen"), None
+            if visible is not None:
+                if visible.shape != arrays["vertices"].shape[:2] or not visible.any(1).all():
+                    raise InputError(
+                        f"{path}: seen {visible.shape}; {arrays['vertices'].shape[:2]}, with a vertex"
+                        " that is seen in every frame, is needed"
+                    )
+                seen = dict(enumerate(visible.astype(bool)))
+            return cls(path, "mesh", places, arrays["faces"].astype(np.int64), seen=seen)
         raise InputError(
             f"{path}: holds {', '.join(arrays)}; vertices and faces, or points and frames, are"
             " needed"
@@ -129,6 +140,40 @@ def read_surface(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     if not np.isfinite(V).all():
         raise InputError(f"{path}: vertices hold values that are not finite")
     return surface
+
+
+def uv_arrays(texcoords: TexCoords, faces: np.ndarray) -> dict[str, np.ndarray]:
+    """Texture coordinates as a ``surface.npz`` has them: ``uv`` (N, 2), one a vertex of the mesh
+    with ``faces`` (F, 3), or ``uv`` (M, 2) and ``uv_faces`` (F, 3) where there are seams.
+    """
+    per_vertex = texcoords.of_vertices(faces)
+    if per_vertex is not None:
+        return {"uv": per_vertex.astype(np.float32)}
+    return {
+        "uv": texcoords.coordinates.astype(np.float32),
+        "uv_faces": texcoords.faces.astype(np.int32),
+    }
+
+
+def texcoords_of(surface: dict[str, np.ndarray], path: str) -> TexCoords:
+    """The texture coordinates of a surface that :func:`read_surface` read from ``path``. Raises
+    InputError where it has none of a form that :func:`uv_arrays` describes.
+    """
+    uv, faces, count = surface.get("uv"), surface["faces"], surface["vertices"].shape[1]
+    corners = surface.get("uv_faces", faces)
+    if (
+        uv is None
+        or uv.ndim != 2
+        or uv.shape[1] != 2
+        or corners.shape != faces.shape
+        or ("uv_faces" not in surface and len(uv) != count)
+        or corners.min() < 0
+        or corners.max() >= len(uv)
+    ):
+        raise InputError(
+            f"{path}: holds no uv of ({count}, 2), nor uv of (M, 2) with uv_faces {faces.shape}"
+        )
+    return TexCoords(uv.astype(np.float64), corners.astype(np.int64))
 
 
 def load_npz(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:

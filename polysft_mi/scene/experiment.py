@@ -16,6 +16,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial import cKDTree
 
+from polyfit.mesh import TexCoords
 from polysft_mi.errors import InputError
 from polysft_mi.surface import meshio
 from polysft_mi.surface.template import Template
@@ -186,8 +187,8 @@ def _check_nodes(path, overrides):
 
 
 def _source(props):
-    """(file, vertices (N, 3), faces (F, 3)) of the template's shape in its file's own order, None
-    where it has no file.
+    """(file, vertices (N, 3), faces (F, 3), texture coordinates) of the template's shape in its
+    file's own order, None where it has no file.
 
     Read and checked before Mitsuba loads the scene, for its loaders tell less, and take files that
     are no meshes.
@@ -195,12 +196,12 @@ def _source(props):
     if props is None or "filename" not in props:
         return None
     where = props["filename"]
-    vertices, faces, _ = meshio.read_template(where)
+    vertices, faces, texcoords = meshio.read_textured_template(where)
     if "to_world" in props:
         m = np.array(props["to_world"].matrix, dtype=np.float64).reshape(4, 4)
         vertices = vertices @ m[:3, :3].T + m[:3, 3]
-    meshio.check_template(vertices, faces, np.zeros((len(vertices), 2)), where)
-    return where, vertices, faces
+    meshio.check_template(vertices, faces, texcoords, where)
+    return where, vertices, faces, texcoords
 
 
 def _template(mesh, source, settings, template):
@@ -208,35 +209,48 @@ def _template(mesh, source, settings, template):
     given), and the map from rendered vertices to it.
     """
     rendered = np.array(mesh.vertex_positions_buffer(), dtype=np.float64).reshape(-1, 3)
-    faces = np.array(mesh.faces_buffer(), dtype=np.int64).reshape(-1, 3)
-    where, vertices, faces = source or (f"template {mesh.id()!r}", rendered, faces)
+    shown = np.array(mesh.faces_buffer(), dtype=np.int64).reshape(-1, 3)
     if not mesh.has_vertex_texcoords():
         raise InputError(
-            f"{where}: it has no texture coordinates (uv); the texture cannot be placed on it"
+            f"{source[0] if source else mesh.id()}: it has no texture coordinates (uv); the texture"
+            " cannot be placed on it"
         )
-    texcoords = np.array(mesh.vertex_texcoords_buffer(), dtype=np.float64).reshape(-1, 2)
+    if source is None:
+        uv = np.array(mesh.vertex_texcoords_buffer(), dtype=np.float64).reshape(-1, 2)
+        texcoords = TexCoords(uv * (1, -1) + (0, 1), shown)  # Mitsuba's v runs down, a file's up
+        source = f"template {mesh.id()!r}", rendered, shown, texcoords
+        meshio.check_template(rendered, shown, texcoords, source[0])
+    where, vertices, faces, texcoords = source
     if not np.isfinite(rendered).all():
         raise InputError(f"{where}: positions are not finite (NaN)")
-    distance, corner = cKDTree(vertices).query(rendered)
+    corner = _corners(rendered, shown, vertices, faces, where)
     if template is not None:
         return template, corner
-    size = np.ptp(vertices, axis=0).max()
-    if distance.max() > 1e-4 * size:
+    template = Template.fit(
+        vertices,
+        faces,
+        texcoords,
+        settings.jet_order,  # of as many patches as it turns out to need
+        exact=settings.order > 0,
+        where=where,
+    )
+    return template, corner
+
+
+def _corners(rendered, shown, vertices, faces, where):
+    """The template's vertex at each vertex (V, 3) that Mitsuba renders: its loaders split vertices
+    along seams, but keep the order of the faces.
+    """
+    limit = 1e-4 * np.ptp(vertices, axis=0).max()
+    if shown.shape == faces.shape:
+        corner = np.zeros(len(rendered), dtype=np.int64)
+        corner[shown] = faces
+        if np.abs(vertices[corner] - rendered).max() <= limit:
+            return corner
+    distance, corner = cKDTree(vertices).query(rendered)
+    if distance.max() > limit:
         raise InputError(
             f"{where}: its vertices are not those that Mitsuba loads (up to {distance.max():.3g} m"
             " apart)"
         )
-    uv = np.zeros((len(vertices), 2))
-    uv[corner[::-1]] = texcoords[::-1]
-    uv[:, 1] = 1 - uv[:, 1]  # Mitsuba's v runs down, a file's up
-    meshio.check_template(vertices, faces, uv, where)
-    template = Template.fit(
-        vertices,
-        faces,
-        uv,
-        settings.jet_order,
-        exact=settings.order > 0,
-        tolerance=settings.fit_tolerance,
-        where=where,
-    )
-    return template, corner
+    return corner

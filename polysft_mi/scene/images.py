@@ -2,14 +2,13 @@
 alpha.
 """
 
-import contextlib
 import glob
 import os
 import re
-import threading
 
 import numpy as np
 
+from polyfit.files import silent_decoders
 from polysft_mi.errors import InputError
 
 EXTENSIONS = (
@@ -101,45 +100,6 @@ def checked_size(path, decode=True):
             raise InputError(
                 f"{path}: not a readable image ({getattr(error, 'strerror', None) or error})"
             ) from None
-
-
-class _SilentDecoders:
-    """While any thread is inside, what is written to the process's stderr is dropped: libtiff,
-    libpng, libjpeg and OpenCV tell there of a broken file, beside the error that we raise.
-    """
-
-    def __init__(self):
-        self._lock, self._inside, self._saved = threading.Lock(), 0, None
-
-    @contextlib.contextmanager
-    def __call__(self):
-        with self._lock:
-            self._inside += 1
-            if self._inside == 1:
-                self._saved = self._redirected()
-        try:
-            yield
-        finally:
-            with self._lock:
-                self._inside -= 1
-                if not self._inside and self._saved is not None:
-                    os.dup2(self._saved, 2)
-                    os.close(self._saved)
-
-    @staticmethod
-    def _redirected():
-        """A copy of the descriptor of stderr, which now leads nowhere; None where it is closed."""
-        try:
-            saved = os.dup(2)
-        except OSError:
-            return None
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, 2)
-        os.close(nowhere)
-        return saved
-
-
-silent_decoders = _SilentDecoders()
 
 
 def read_pixels(path):

@@ -36,6 +36,23 @@ class Rules:
     window: float = _rule(
         8.0, "pixels", "standard deviation of the window of local brightness, likewise"
     )
+    # surfaces of several patches
+    joint: float = _rule(
+        1.0,
+        "",
+        "weight of the squared distances of overlapping patches, over the template's radius",
+    )
+    unseen: float = _rule(
+        10.0, "", "factor of the weights of smoothness where no pixel sees such a surface"
+    )
+    rounded_stiffness: float = _rule(
+        0.3,
+        "",
+        "factor of `k_mi` there: a sheet bends and keeps its lengths, a closed surface cannot",
+    )
+    rounded_silhouette: float = _rule(
+        10.0, "", "factor of `k_silhouette` there: the outline shows a bend that no texture shows"
+    )
     # the step
     small_step: float = _rule(
         2e-3, "share", "of the objective that a step must promise for another one to follow"

@@ -32,15 +32,10 @@ class Settings:
     stride: int = _setting(1, "use every stride-th image", low=1)
     order: int = _setting(
         0,
-        "order n of the jet; 0: 8 for gauss-newton, 4 (the paper's) for adam, or less if the"
-        " template has too few vertices",
+        "order n of the jets; 0: 8 for gauss-newton, 5 where the template has several patches, 4"
+        " (the paper's) for adam, or less if the template has too few vertices",
         low=0,
         high=10,
-    )
-    fit_tolerance: float = _setting(
-        0.05,
-        "a template farther from its jet than this share of its radius is refused",
-        above=0,
     )
     k_rgb: float = _setting(1.0, "weight of the photometric loss", low=0)
     k_silhouette: float = _setting(1.0, "weight of the silhouette loss (needs masks)", low=0)
@@ -126,10 +121,9 @@ class Settings:
             else {"gauss-newton": "local", "adam": "none"}[self.solver]
         )
 
-    @property
-    def jet_order(self) -> int:
-        """The order of the jet, where the template's vertices determine it."""
-        return self.order or {"gauss-newton": 8, "adam": 4}[self.solver]
+    def jet_order(self, patches: int) -> int:
+        """The order of the jets of so many patches, where the template's vertices determine it."""
+        return self.order or (4 if self.solver == "adam" else 8 if patches == 1 else 5)
 
     def __post_init__(self):
         for f in dataclasses.fields(self):

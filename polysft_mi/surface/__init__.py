@@ -1,7 +1,7 @@
 """The surface: a template held by one jet.
 
 In: a mesh with texture coordinates, and the unknowns of a frame. Out: a :class:`Template`, and the
-vertices [m, camera frame] of a :class:`JetPatch`, differentiable by Dr.Jit. What takes Dr.Jit
+vertices [m, camera frame] of a :class:`JetAtlas`, differentiable by Dr.Jit. What takes Dr.Jit
 needs a Mitsuba variant that is set.
 """
 
@@ -10,5 +10,5 @@ import lazy_loader
 __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submodules=["meshio"],
-    submod_attrs={"patch": ["JetPatch", "Unknowns"], "template": ["Template"]},
+    submod_attrs={"patch": ["JetAtlas", "Unknowns"], "template": ["Template"]},
 )

@@ -1,9 +1,12 @@
 """n-jets in Dr.Jit: the functions of ``polyfit.jets``, by the same names, on Mitsuba's types.
 
 Arrays: ``alpha`` is a Float of A = (n+1)(n+2)/2 coefficients in the paper's order
-(``polyfit.exponents``), shared by all points; ``u`` and ``v`` are Floats of N chart
-coordinates. Lengths are in the chart's unit. Import only after a Mitsuba variant is set.
+(``polyfit.exponents``), shared by all points, or :class:`Coefficients` of several jets; ``u`` and
+``v`` are Floats of N chart coordinates. Lengths are in the chart's unit. Import only after a
+Mitsuba variant is set.
 """
+
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -25,21 +28,33 @@ def _term(coefficient, pu, pv, a, b):
     return coefficient
 
 
+@dataclass
+class Coefficients:
+    """Coefficients of several jets: ``alpha`` Float of K A, ``size``: A, and ``patch``, UInt32 of
+    N: which jet each point has."""
+
+    alpha: mi.Float
+    size: int
+    patch: mi.UInt32
+
+
 def _coefficients(alpha, like):
     """alpha_k for every point: a gather, whose gradient is one scatter in the same kernel, in
     double so that its order does not show.
     """
-    zero = dr.zeros(mi.UInt32, dr.width(like))
-    alpha = mi.Float64(alpha)
-    return [mi.Float(dr.gather(mi.Float64, alpha, zero + k)) for k in range(dr.width(alpha))]
+    if not isinstance(alpha, Coefficients):
+        alpha = Coefficients(alpha, dr.width(alpha), dr.zeros(mi.UInt32, dr.width(like)))
+    first, values = alpha.patch * alpha.size, mi.Float64(alpha.alpha)
+    return [mi.Float(dr.gather(mi.Float64, values, first + k)) for k in range(alpha.size)]
 
 
 def height_and_derivatives(alpha, u, v):
     """(z, z_u, z_v), Floats of N."""
-    order = order_of(dr.width(alpha))
+    coefficients = _coefficients(alpha, u)
+    order = order_of(len(coefficients))
     pu, pv = _powers(u, order), _powers(v, order)
     z, zu, zv = mi.Float(0), mi.Float(0), mi.Float(0)
-    for c, (a, b) in zip(_coefficients(alpha, u), exponents(order).tolist()):
+    for c, (a, b) in zip(coefficients, exponents(order).tolist()):
         z = z + _term(c, pu, pv, a, b)
         if a:
             zu = zu + _term(c * a, pu, pv, a - 1, b)

@@ -6,10 +6,17 @@ Texture coordinates are those of OBJ files: (0, 0) is the texture's bottom left,
 
 import numpy as np
 
-from polyfit.mesh import read_mesh, write_ply
+from polyfit.mesh import TexCoords, read_mesh, read_textured, write_ply
 from polysft_mi.errors import InputError
 
-__all__ = ["check_template", "read_template", "size_note", "write_obj", "write_ply"]
+__all__ = [
+    "check_template",
+    "read_template",
+    "read_textured_template",
+    "size_note",
+    "write_obj",
+    "write_ply",
+]
 
 
 def read_template(path):
@@ -17,12 +24,21 @@ def read_template(path):
     return read_mesh(path, what="template")
 
 
+def read_textured_template(path):
+    """:func:`polyfit.mesh.read_textured` of a template."""
+    return read_textured(path, what="template")
+
+
 def write_obj(path, vertices, faces, uv):
-    """Write a mesh as OBJ: vertices (N, 3), faces (F, 3), uv (N, 2) with v up."""
+    """Write a mesh as OBJ: vertices (N, 3), faces (F, 3), uv (N, 2) with v up, or
+    :class:`polyfit.mesh.TexCoords`.
+    """
+    texcoords = uv if isinstance(uv, TexCoords) else TexCoords(uv, faces)
     with open(path, "w", encoding="utf-8") as file:
         file.writelines("v {:.9g} {:.9g} {:.9g}\n".format(*p) for p in vertices)
-        file.writelines("vt {:.9g} {:.9g}\n".format(*t) for t in uv)
-        file.writelines("f {0}/{0} {1}/{1} {2}/{2}\n".format(*f) for f in np.asarray(faces) + 1)
+        file.writelines("vt {:.9g} {:.9g}\n".format(*t) for t in texcoords.coordinates)
+        corners = np.stack([faces, texcoords.faces], axis=2).reshape(len(faces), 6) + 1
+        file.writelines("f {}/{} {}/{} {}/{}\n".format(*f) for f in corners)
 
 
 def size_note(vertices, where="template"):
@@ -46,9 +62,9 @@ def size_note(vertices, where="template"):
 def check_template(vertices, faces, uv, where="template"):
     """Raise InputError, in one line that starts with ``where``, unless the mesh can be a template.
 
-    A template is one connected, consistently oriented manifold (closed or with a boundary) of at
-    least three vertices, each of them in some face, with triangles of positive area and a finite
-    texture coordinate a vertex.
+    ``uv``: a finite texture coordinate a vertex, (N, 2), or :class:`polyfit.mesh.TexCoords`. A
+    template has at least three vertices, each of them in some face, and triangles of positive area.
+    It may be open or closed, of several components, with seams, and wound in any way.
     """
     V, F = np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64)
     if len(V) < 3:
@@ -70,76 +86,19 @@ def check_template(vertices, faces, uv, where="template"):
     )
     if uv is None:
         raise InputError(
-            f"{where}: no texture coordinates, or several at one vertex; one uv a vertex is needed"
+            f"{where}: no texture coordinates; without uv the texture cannot be placed on it"
         )
-    uv = np.asarray(uv, dtype=np.float64)
-    if uv.shape != (len(V), 2):
-        raise InputError(
-            f"{where}: texture coordinates of shape {uv.shape}; ({len(V)}, 2) is needed"
-        )
-    _refuse(~np.isfinite(uv).all(axis=1), where, "texture coordinates are not finite", "vertex")
+    if not isinstance(uv, TexCoords):
+        uv = np.asarray(uv, dtype=np.float64)
+        if uv.shape != (len(V), 2):
+            raise InputError(
+                f"{where}: texture coordinates of shape {uv.shape}; ({len(V)}, 2) is needed"
+            )
+        uv = TexCoords(uv, F)
+    bad = ~np.isfinite(uv.coordinates).all(axis=1)
+    _refuse(bad, where, "texture coordinates are not finite", "coordinate")
     area = 0.5 * np.linalg.norm(np.cross(V[F[:, 1]] - V[F[:, 0]], V[F[:, 2]] - V[F[:, 0]]), axis=1)
     _refuse(area <= 1e-12 * np.ptp(V, axis=0).max() ** 2, where, "faces have no area", "face")
-    _check_topology(V, F, where)
-
-
-def _check_topology(V, F, where):
-    directed = np.stack([F, np.roll(F, -1, axis=1)], axis=2).reshape(
-        -1, 2
-    )  # edge k of face f is row 3 f + k
-    edges, edge_of, uses = np.unique(
-        np.sort(directed, axis=1), axis=0, return_inverse=True, return_counts=True
-    )
-    if (uses > 2).any():
-        a, b = edges[uses > 2][0]
-        raise InputError(
-            f"{where}: {(uses > 2).sum()} edges have more than two faces (the first joins vertices"
-            f" {a} and {b})"
-        )
-    _, ways = np.unique(directed, axis=0, return_counts=True)
-    if (ways > 1).any():
-        raise InputError(
-            f"{where}: {(ways > 1).sum()} pairs of neighbouring faces are oriented against each"
-            " other; one orientation is needed"
-        )
-    parts = _count_components(len(V), directed)
-    if parts > 1:
-        raise InputError(f"{where}: {parts} separate components; one connected mesh is needed")
-    fans = _count_fans(edge_of.ravel())
-    if fans > len(V):
-        raise InputError(
-            f"{where}: {fans - len(V)} vertices join parts that share no edge there; a manifold is"
-            " needed"
-        )
-
-
-def _count_fans(edge_of):
-    """How many fans the faces form around the vertices, one at each vertex of a manifold.
-
-    ``edge_of`` (3 F,): the edge from each corner to the next of its face. Two corners belong to one
-    fan where their faces, oriented alike, share an edge at the corners' vertex.
-    """
-    order = np.argsort(edge_of, kind="stable")
-    shared = edge_of[order[:-1]] == edge_of[order[1:]]
-    first, second = (
-        order[:-1][shared],
-        order[1:][shared],
-    )  # the two sides of each inner edge, which run against each other
-    after_first, after_second = (
-        corner - corner % 3 + (corner + 1) % 3 for corner in (first, second)
-    )
-    joined = np.concatenate(
-        [np.stack([first, after_second], axis=1), np.stack([after_first, second], axis=1)]
-    )
-    return _count_components(len(edge_of), joined)
-
-
-def _count_components(count, pairs):
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
-    return connected_components(graph, directed=False)[0]
 
 
 def _refuse(bad, where, what, element):

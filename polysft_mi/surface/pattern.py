@@ -50,10 +50,30 @@ class Pattern:
             self.to_ends @ self.difference
         )  # sum over edges of (x_a - x_b)^2
 
-    def blocks_of(self, matrix):
-        """A sparse matrix (N, N) within the pattern as one number a block, (B,)."""
-        matrix, out = matrix.tocoo(), np.zeros(len(self._keys))
-        out[self.find(matrix.row, matrix.col)] = matrix.data
+    def blocks_of(self, matrix, size=None):
+        """A sparse matrix (N, N) within the pattern as one number a block, (B,); with ``size``, a
+        matrix (size N, size N) as its blocks, (B, size, size)."""
+        matrix = matrix.tocoo()
+        if size is None:
+            out = np.zeros(len(self._keys))
+            out[self.find(matrix.row, matrix.col)] = matrix.data
+            return out
+        out = np.zeros((len(self._keys), size, size))
+        (i, a), (j, b) = np.divmod(matrix.row, size), np.divmod(matrix.col, size)
+        out[self.find(i, j), a, b] = matrix.data
+        return out
+
+    def bound_of(self, matrix):
+        """Blocks (B,) of a matrix within the pattern that bounds the symmetric ``matrix`` (N, N)
+        from above: what lies outside the pattern goes to the diagonal, for 2 |x_i x_j| <= x_i^2 +
+        x_j^2.
+        """
+        matrix = matrix.tocoo()
+        place = np.searchsorted(self._keys, key := matrix.row * self.count + matrix.col)
+        inside = self._keys[np.minimum(place, len(self._keys) - 1)] == key
+        out = np.zeros(len(self._keys))
+        out[place[inside]] = matrix.data[inside]
+        np.add.at(out, self.diagonal[matrix.row[~inside]], np.abs(matrix.data[~inside]))
         return out
 
     def find(self, i, j):

@@ -1,54 +1,83 @@
-"""The template: a mesh held by one jet in its canonical frame (paper, sections "PolyFit" and
-"PolySfT"). NumPy.
+"""The template: a mesh held by an atlas of jets, each in a canonical frame (paper, sections
+"PolyFit" and "PolySfT"). NumPy.
 
-The frame and the fit are those of :class:`polyfit.CanonicalFrame` and
-:func:`polyfit.jets.fit`, for one patch: to load torch would take longer than the rest of a run's
-start.
+A sheet is one patch. What no height graph over one plane can hold is cut into as few patches as can
+(:mod:`polyfit.patches.atlas`). What the jets leave of the mesh is kept, so that the undeformed
+template is the mesh that was given.
+
+The frame and the fit of one patch are those of :class:`polyfit.CanonicalFrame` and
+:func:`polyfit.jets.fit`: to load torch would take longer than the rest of a run's start.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.polynomial import Chebyshev, Polynomial, chebyshev
+from numpy.polynomial.polynomial import polyder
 
 from polyfit.jets import DETERMINED_RMS, MIN_BOX_RATIO, exponents, order_of, size_of
+from polyfit.mesh import TexCoords, components, edges_of, face_vectors, sheets, winding
+from polyfit.patches.atlas import Cover, is_graph
 from polysft_mi.errors import InputError
+
+_RIDGE = 1e-3  # of a jet's mean square, that holds it where several patches share a surface
 
 
 @dataclass(frozen=True)
 class Template:
-    """A surface S = {O, phi(u, v)}: mesh, orientation, chart and coefficients, float64.
+    """A surface of K patches S_k = {O_k, phi_k(u, v)}, of N vertices, float64.
 
-    ``vertices`` (N, 3) [m, camera frame] and ``faces`` (F, 3) as in the file; ``uv`` (N, 2) texture
-    coordinates, v up; ``scale`` [m], ``rotation`` (3, 3), ``origin`` (3,) [m]: the orientation O =
-    (s, R, T), p = s R x + T; ``chart`` (N, 2): (u, v) of each vertex, at most 1 in norm; ``alpha``
-    (A,): the jet, in the chart's unit; ``residual`` (N,) [m]: signed distance along the chart's
-    normal that the jet leaves.
+    ``vertices`` (N, 3) [m, camera frame] and ``faces`` (F, 3) as in the file; ``texcoords``: the
+    :class:`polyfit.mesh.TexCoords` of the faces' corners; ``scale`` [m]: the
+    surface's radius, the unit of displacements and translations.
+
+    ``radius`` (K,) [m], ``rotation`` (K, 3, 3), ``origin`` (K, 3) [m]: the orientations O_k = (s,
+    R, T), p = s R x + T; ``alpha`` (K, A): the jets, in the charts' units.
+
+    ``patch`` (N, M), ``weight`` (N, M): the patches that hold a vertex, the first its own, and
+    their shares in it; ``chart`` (N, M, 2): its (u, v) there, ``rest`` (N, M): its height over the
+    jet there [chart unit]; ``axes`` (N, 3, 3): the axes of (Δu, Δv, Δw) in space, columns of length
+    1: tangents and normal, or the chart's where there is one patch; ``lift`` (N,): what its own
+    chart adds to the height for each length along the third axis, so that the vertex moves along
+    it, whatever the jet's slope.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
-    uv: np.ndarray
+    texcoords: TexCoords
     scale: float
+    radius: np.ndarray
     rotation: np.ndarray
     origin: np.ndarray
-    chart: np.ndarray
     alpha: np.ndarray
-    residual: np.ndarray
+    patch: np.ndarray
+    weight: np.ndarray
+    chart: np.ndarray
+    rest: np.ndarray
+    axes: np.ndarray
+    lift: np.ndarray
+
+    def __len__(self):
+        """K, the number of patches."""
+        return len(self.alpha)
 
     @property
     def order(self):
-        """The order of the jet."""
-        return order_of(len(self.alpha))
+        """The order of the jets."""
+        return order_of(self.alpha.shape[1])
 
-    @property
+    @cached_property
     def edges(self):
         """Edges of the mesh, each once, (E, 2)."""
-        e = np.sort(
-            np.concatenate([self.faces[:, [0, 1]], self.faces[:, [1, 2]], self.faces[:, [2, 0]]]),
-            axis=1,
-        )
-        return np.unique(e, axis=0)
+        return edges_of(self.faces)[0]
+
+    @property
+    def residual(self):
+        """What the jets leave at each vertex (N,) [m]: distance along the chart's normal in its own
+        patch.
+        """
+        return self.rest[:, 0] * self.radius[self.patch[:, 0]]
 
     @property
     def residual_rms(self):
@@ -60,76 +89,150 @@ class Template:
         """Largest residual [m]."""
         return float(np.abs(self.residual).max())
 
-    @classmethod
-    def fit(
-        cls,
-        vertices,
-        faces,
-        uv,
-        order,
-        *,
-        exact=True,
-        frame=None,
-        tolerance=0.05,
-        where="template",
-    ):
-        """Fit a jet of ``order`` to the mesh, in ``frame``, a
-        :class:`polyfit.CanonicalFrame` in float64, or else in its PCA frame. Where not
-        ``exact``, vertices that determine less get the highest order that they do.
+    @property
+    def is_closed(self):
+        """Whether the mesh has no boundary: each edge has two faces."""
+        return 2 * len(self.edges) == self.faces.size
 
-        Raises InputError where the order is too high for the vertices (if ``exact``), where the
-        surface folds over in its chart (a closed surface does), or where the largest residual
-        exceeds ``tolerance`` times the scale s.
+    @classmethod
+    def fit(cls, vertices, faces, uv, order, *, exact=True, frame=None, where="template"):
+        """Fit jets of ``order`` to the mesh: one in ``frame``, a :class:`polyfit.CanonicalFrame` in
+        float64, or else in its PCA frame; several where the mesh is no height graph there.
+
+        ``uv``: texture coordinates (N, 2), or :class:`polyfit.mesh.TexCoords`.
+        ``order`` may be a function of the number of patches. Where not ``exact``, vertices that
+        determine less get the highest order that they do. Raises
+        InputError where the order is too high for the vertices (if ``exact``), or where ``frame``
+        is given and one patch cannot hold the mesh.
         """
-        points = np.asarray(vertices, dtype=np.float64)
+        points, faces = np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64)
+        if not isinstance(uv, TexCoords):
+            uv = TexCoords(np.asarray(uv, dtype=np.float64), faces)
         scale, rotation, origin = (
             _principal_frame(points)
             if frame is None
             else (np.asarray(x) for x in (frame.s, frame.R, frame.T))
         )
-        x = (points - origin) @ rotation / scale
-        alpha, fitted = _fitted(x, order)
-        if fitted < order and exact:
-            wanted = f"a jet of order {order} has {size_of(order)} coefficients"
-            found = f"the {len(points)} vertices determine no more than order {fitted}"
-            raise InputError(f"{where}: order = {order} is too high: {wanted}, and {found}")
-        height = np.polynomial.polynomial.polyval2d(*x[:, :2].T, matrix(alpha))
-        template = cls(
+        alike = np.where(winding(sheets(faces))[:, None] < 0, faces[:, ::-1], faces)
+        if is_graph(points, alike, rotation[:, 2]) and components_of(faces) == 1:
+            patch, weight = np.zeros((len(points), 1), dtype=np.int64), np.ones((len(points), 1))
+            frames = [(float(scale), rotation, origin)]
+            axes = np.tile(rotation, (len(points), 1, 1))
+        elif frame is not None:
+            raise InputError(
+                f"{where}: one jet cannot hold it in the frame that is given: triangles fold over"
+                " in its chart; a height graph over a plane is needed"
+            )
+        else:
+            cover = Cover.of(points, alike)
+            patch, weight = cover.patch, cover.weight
+            frames = [
+                _frame_over(points[((patch == k) & (weight > 0)).any(1)], normal, float(scale))
+                for k, normal in enumerate(cover.normal)
+            ]
+            axes = _tangent_axes(points, alike, patch[:, 0], np.stack([R for _, R, _ in frames]))
+        order = order(len(frames)) if callable(order) else order
+        radius, rotation, origin = (np.array(x) for x in zip(*frames))
+        x = np.einsum("nmij,nmi->nmj", rotation[patch], points[:, None] - origin[patch])
+        x /= radius[patch][..., None]
+        alpha, rest = _jets(x, patch, weight > 0, len(frames), order, exact, where)
+        texcoords = TexCoords(np.asarray(uv.coordinates, np.float64), np.asarray(uv.faces))
+        return cls(
             points,
-            np.asarray(faces, dtype=np.int64),
-            np.asarray(uv, dtype=np.float64),
+            faces,
+            texcoords,
             float(scale),
+            radius,
             rotation,
             origin,
-            x[:, :2],
-            alpha[: size_of(fitted)],
-            (x[:, 2] - height) * float(scale),
+            alpha,
+            patch,
+            weight,
+            x[..., :2],
+            rest,
+            axes,
+            _lift(x[:, 0, :2], patch[:, 0], alpha, rotation, axes),
         )
-        measured = (
-            f"the residual of the {template.order}-jet is {1e3 * template.residual_rms:.3g} mm"
-            f" RMS, {1e3 * template.residual_max:.3g} mm at most, of a radius of"
-            f" {1e3 * template.scale:.3g} mm"
-        )
-        flipped = _flipped(template.chart, template.faces)
-        if flipped:
-            raise InputError(
-                f"{where}: one jet cannot hold it: {flipped} of {len(faces)} triangles fold over in"
-                f" its chart ({measured}); a height graph over a plane is needed"
-            )
-        if template.residual_max > tolerance * template.scale:
-            raise InputError(
-                f"{where}: one jet cannot hold it: {measured}; at most fit_tolerance ="
-                f" {tolerance:g} of the radius is accepted; a higher order may help"
-            )
-        return template
 
 
-def _flipped(chart, faces):
-    """Triangles that lie in the chart the other way round than most."""
-    a, b, c = (chart[faces[:, k]] for k in range(3))
-    area = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
-    up = int((area > 0).sum())
-    return min(up, len(faces) - up)
+def components_of(faces):
+    """How many connected components the faces (F, 3) have."""
+    return int(components(faces.max() + 1, edges_of(faces)[0])[faces].max()) + 1
+
+
+def _jets(x, patch, held, count, order, exact, where):
+    """(alpha (K, A), rest (N, M)): jets through the points ``x`` (N, M, 3) of the charts, and their
+    heights over them.
+    """
+    # where the rim of a patch is steep, as a shirt's at its seams, a jet that is free would swing
+    ridge, found = _RIDGE if count > 1 else 0.0, []
+    for k in range(count):
+        points = x[held & (patch == k)]
+        coefficients, fitted = _fitted(points, order, ridge)
+        if fitted < order and exact:
+            wanted = f"a jet of order {order} has {size_of(order)} coefficients"
+            few = f"the {len(points)} vertices determine no more than order {fitted}"
+            raise InputError(f"{where}: order = {order} is too high: {wanted}, and {few}")
+        found.append((coefficients, fitted))
+    least = min(fitted for _, fitted in found)
+    alpha = np.stack(
+        [
+            _fitted(x[held & (patch == k)], least, ridge)[0]
+            if fitted > least
+            else c[: size_of(least)]
+            for k, (c, fitted) in enumerate(found)
+        ]
+    )
+    rest = np.zeros(patch.shape)
+    for k in range(count):
+        at = held & (patch == k)
+        height = np.polynomial.polynomial.polyval2d(*x[at][:, :2].T, matrix(alpha[k]))
+        rest[at] = x[at][:, 2] - height
+    return alpha, rest
+
+
+def _frame_over(points, normal, scale):
+    """(s, R, T) of the points (P, 3) of a patch, with z along ``normal`` (3,) and u along their
+    largest extent across it; ``scale``: for a single point.
+    """
+    origin = points.mean(0)
+    centred = points - origin
+    flat = centred - (centred @ normal)[:, None] * normal
+    extent = np.sqrt((flat**2).sum(1).max())
+    u = np.linalg.eigh(flat.T @ flat)[1][:, 2] if extent > 0 else np.eye(3)[np.abs(normal).argmin()]
+    u = (u - (u @ normal) * normal) * _side(centred @ u)
+    u /= np.linalg.norm(u)
+    return extent if extent > 0 else scale, np.stack([u, np.cross(normal, u), normal], 1), origin
+
+
+def _tangent_axes(points, faces, patch, rotation):
+    """Axes (N, 3, 3) at the vertices: the third is the normal, the first the projected u of its own
+    chart.
+    """
+    vectors = face_vectors(points, faces)
+    third = np.stack([np.bincount(faces.ravel(), np.repeat(x, 3)) for x in vectors.T], 1)
+    length = np.linalg.norm(third, axis=1, keepdims=True)
+    third = np.where(length > 0, third / np.maximum(length, 1e-300), rotation[patch][..., 2])
+    first = np.cross(rotation[patch][..., 1], third)
+    flat = np.linalg.norm(first, axis=1) < 0.1  # the normal along the chart's v
+    first[flat] = rotation[patch][flat][..., 0]
+    first -= (first * third).sum(1, keepdims=True) * third
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([first, np.cross(third, first), third], 2)
+
+
+def _lift(chart, patch, alpha, rotation, axes):
+    """``lift`` (N,) of :class:`Template`, from the own charts' coordinates (N, 2) and patches
+    (N,).
+    """
+    third = np.einsum("nij,ni->nj", rotation[patch], axes[..., 2])
+    lift = third[:, 2].copy()
+    for k, coefficients in enumerate(alpha):
+        at, z = patch == k, matrix(coefficients)
+        for axis in (0, 1):
+            slope = np.polynomial.polynomial.polyval2d(*chart[at].T, polyder(z, axis=axis))
+            lift[at] -= slope * third[at][:, axis]
+    return lift
 
 
 def _principal_frame(points):
@@ -155,10 +258,10 @@ def _side(along):
     return -1.0 if (skew if abs(skew) > 1e-9 else along[far.argmax()]) < 0 else 1.0
 
 
-def _fitted(x, order):
+def _fitted(x, order, ridge=0.0):
     """(coefficients (A,), order) of the least-squares jet of ``order`` through points x (P, 3) of a
     chart, or of the highest order that they determine: products of Chebyshev polynomials in the
-    points' box, turned into monomials."""
+    points' box, turned into monomials; ``ridge`` holds their coefficients."""
     powers = exponents(order)
     low, high = x[:, :2].min(0), x[:, :2].max(0)
     centre, half = (low + high) / 2, (high - low) / 2
@@ -174,7 +277,9 @@ def _fitted(x, order):
     fitted = int(min(powers.sum(1)[kept < DETERMINED_RMS], default=order + 1)) - 1
     size = size_of(fitted)
     solution = np.zeros(len(powers))
-    solution[:size] = np.linalg.lstsq(basis[:, :size], x[:, 2] / np.sqrt(len(x)), rcond=None)[0]
+    rows = np.concatenate([basis[:, :size], np.sqrt(ridge) * np.eye(size)[: size if ridge else 0]])
+    right = np.concatenate([x[:, 2] / np.sqrt(len(x)), np.zeros(len(rows) - len(x))])
+    solution[:size] = np.linalg.lstsq(rows, right, rcond=None)[0]
     axes = [
         [
             Chebyshev.basis(n, domain=[c - h, c + h]).convert(kind=Polynomial).coef

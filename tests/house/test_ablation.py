@@ -58,7 +58,10 @@ def test_page_is_made_from_the_file(tmp_path):
     ]
     (tmp_path / "ablation.json").write_text(json.dumps({"results": found}))
     known = ablation.read(str(tmp_path / "ablation.json"))
-    assert "| relief | +100 | +0 | pays on 1 of 1; goes |" in ablation.page(known, {})
+    text = ablation.page(known, {})
+    assert "| relief | +100 | +0 | pays on 1 of 1; goes |" in text
+    unknown = text[text.index("Not measured") : text.index("With all rules on")]
+    assert "appearance" in unknown and "relief's bending" in unknown and "relief," not in unknown
 
 
 def test_rules_are_replaced_not_changed():

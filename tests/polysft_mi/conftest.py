@@ -12,6 +12,22 @@ def truth(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
+def tube(tmp_path_factory):
+    """Four frames of a small sleeve, held by several patches."""
+    from problems import small_tube
+
+    return small_tube(tmp_path_factory.mktemp("data"), frames=4)
+
+
+@pytest.fixture(scope="module")
+def tube_problem(tube):
+    """The problem of ``tube``, its images compared as they are; jets of order 4."""
+    from problems import problem_of
+
+    return problem_of(tube.folder, brightness="none", order=4)
+
+
+@pytest.fixture(scope="module")
 def problem(truth):
     """The problem of ``truth``, its images compared as they are."""
     from problems import problem_of

@@ -11,9 +11,9 @@ import math
 import cv2
 import numpy as np
 
+from polyfit.files import silent_decoders
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError
-from polysft_mi.scene.images import silent_decoders
 
 from .lens import Lens
 

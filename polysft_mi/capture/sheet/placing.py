@@ -62,7 +62,9 @@ def _by_corners(corners, sheet, frame, camera, pose_fit):
     residual = float(np.sqrt((pose.residual**2).mean()))
     figures = {"by": "corners", "residual_px": residual}
     line = f"pose: from the corners, {residual:.2f} pixels RMS"
-    fit = fitted(pose(sheet.vertices), sheet.faces, camera, frame) if pose_fit == "auto" else None
+    fit = None  # of the edges of what hides a part of itself, only some are its border
+    if pose_fit == "auto" and sheet.one_sided:
+        fit = fitted(pose(sheet.vertices), sheet.faces, camera, frame)
     if fit is not None and fit.sure:
         pose = Pose(fit.rotation @ pose.rotation, fit(pose.translation[None])[0], pose.residual)
         figures["moved_px"] = fit.moved

@@ -253,8 +253,9 @@ def _plausible(pose, sheet, camera, rules):
     if placed[:, 2].min() <= 0:
         return False
     x = camera.project(placed)
-    a, b, c = (x[sheet.faces[:, k]] for k in range(3))
-    uv = [sheet.uv[sheet.faces[:, k]] for k in range(3)]
+    faces = sheet.in_view(placed, camera)
+    a, b, c = (x[faces[:, k]] for k in range(3))
+    uv = [sheet.uv[faces[:, k]] for k in range(3)]
     area = _cross(b - a, c - a)
     facing = -_cross(uv[1] - uv[0], uv[2] - uv[0])  # v goes up, y down
     return (np.sign(area) == np.sign(facing)).mean() > 0.7 and 0.5 * np.abs(

@@ -4,7 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from polyfit.mesh import TexCoords
 from polysft_mi.errors import InputError
+from polysft_mi.pictures.shading import seen
 from polysft_mi.surface import meshio
 
 from .size import LARGEST, SMALLEST
@@ -14,12 +16,17 @@ from .size import LARGEST, SMALLEST
 class Sheet:
     """A template in a frame of its own (x right, y down, z away from who looks at its print):
     ``vertices`` (N, 3) [m], ``faces`` (F, 3), ``uv`` (N, 2) of its photo, v up; ``name``: what it
-    is, in words."""
+    is, in words. ``source`` (N,): of an OBJ whose texture has seams, where each vertex is in the
+    file, for here vertices are split along seams. ``one_sided``: whether it is a sheet, which one
+    jet holds: else it hides a part of itself.
+    """
 
     vertices: np.ndarray
     faces: np.ndarray
     uv: np.ndarray
     name: str
+    source: np.ndarray | None = None
+    one_sided: bool = True
 
     @property
     def flat(self):
@@ -27,26 +34,51 @@ class Sheet:
         s = np.linalg.svd(self.vertices - self.vertices.mean(0), compute_uv=False)
         return s[2] <= 1e-3 * s[0]
 
+    def mesh(self, placed):
+        """The template with its vertices ``placed`` (N, 3) as its file has it: vertices, faces, and
+        :class:`polyfit.mesh.TexCoords`.
+        """
+        source = np.arange(len(placed)) if self.source is None else self.source
+        vertices = np.empty((source.max() + 1, 3))
+        vertices[source] = placed
+        return vertices, source[self.faces], TexCoords(self.uv, self.faces)
+
+    def in_view(self, placed, camera):
+        """The faces (V, 3) that the camera sees of the vertices ``placed`` (N, 3) [m, camera
+        frame]; all of a sheet, which is looked at from its front.
+        """
+        if self.one_sided:
+            return self.faces
+        (depth,) = seen(placed, self.faces, camera)
+        middle = placed[self.faces].mean(1)
+        x, y = np.floor(camera.project(middle)).astype(int).T
+        inside = (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
+        near = depth[np.where(inside, y, 0), np.where(inside, x, 0)]
+        room = np.ptp(placed[self.faces], axis=1).max(1)  # a face that is seen at an angle
+        return self.faces[inside & (middle[:, 2] <= near + 0.5 * room)]
+
     def at(self, uv):
         """Points (K, 3) [m] of the surface whose photo has the coordinates uv (K, 2); NaN where the
         photo does not lie on it.
         """
-        from matplotlib.tri import Triangulation
-
-        try:
-            finder = Triangulation(*self.uv.T, triangles=self.faces).get_trifinder()
-        except (RuntimeError, ValueError):
-            raise InputError(
-                f"{self.name}: its texture coordinates overlap; each place of the photo must belong"
-                " to one place of the template"
-            ) from None
-        face = finder(*np.asarray(uv, dtype=float).T)
-        found = self.faces[face]
-        a, b, c = (self.uv[found[:, k]] for k in range(3))
-        t = np.linalg.solve(np.stack([b - a, c - a], axis=2), (uv - a)[..., None])[..., 0]
-        p, q, r = (self.vertices[found[:, k]] for k in range(3))
-        points = p + t[:, :1] * (q - p) + t[:, 1:] * (r - p)
-        points[face < 0] = np.nan
+        uv = np.asarray(uv, dtype=float)
+        a, b, c = (self.uv[self.faces[:, k]] for k in range(3))
+        to_edges = np.linalg.pinv(np.stack([b - a, c - a], axis=2))  # of no area: zeros
+        points = np.full((len(uv), 3), np.nan)
+        for start in range(0, len(uv), 256):
+            part = slice(start, start + 256)
+            t = np.einsum("fij,kfj->kfi", to_edges, uv[part, None] - a)
+            inner = np.concatenate([1 - t.sum(2, keepdims=True), t], axis=2)
+            least = inner.min(axis=2)
+            if ((least > 1e-6).sum(axis=1) > 1).any():
+                raise InputError(
+                    f"{self.name}: its texture coordinates overlap; each place of the photo must"
+                    " belong to one place of the template"
+                )
+            face = least.argmax(axis=1)
+            rows = np.arange(len(face))
+            found = np.einsum("kc,kci->ki", inner[rows, face], self.vertices[self.faces[face]])
+            points[part] = np.where(least[rows, face, None] >= -1e-9, found, np.nan)
         return points
 
     def corners(self):
@@ -87,13 +119,13 @@ def grid(width, height, resolution=33):
 
 
 def from_obj(path):
-    """The :class:`Sheet` of an OBJ in metres with texture coordinates, its frame any; order 4 must
-    hold it. Raises InputError.
+    """The :class:`Sheet` of an OBJ in metres with texture coordinates, its frame any. Raises
+    InputError.
     """
     from polysft_mi.surface.template import Template
 
-    vertices, faces, uv = meshio.read_template(path)
-    meshio.check_template(vertices, faces, uv, path)
+    vertices, faces, texcoords = meshio.read_textured_template(path)
+    meshio.check_template(vertices, faces, texcoords, path)
     extent = np.ptp(vertices, axis=0).max()
     if not SMALLEST <= extent <= LARGEST:
         hint = "in millimetres? write it in metres" if extent > LARGEST else "write it in metres"
@@ -101,5 +133,13 @@ def from_obj(path):
             f"{path}: a template of {extent:.4g} m; {1e3 * SMALLEST:g} mm to {LARGEST:g} m can be"
             f" used ({hint})"
         )
-    Template.fit(vertices, faces, uv, 4, where=path)  # raises where one patch cannot hold it
-    return Sheet(vertices - vertices.mean(0), faces, uv, f"{path}, {len(vertices)} vertices")
+    patches = len(Template.fit(vertices, faces, texcoords, 4, exact=False, where=path))
+    source, uv, split = texcoords.split(faces)
+    return Sheet(
+        (vertices - vertices.mean(0))[source],
+        split,
+        uv,
+        f"{path}, {len(vertices)} vertices" + (f" in {patches} patches" if patches > 1 else ""),
+        source,
+        patches == 1,
+    )

@@ -6,8 +6,8 @@ from importlib import resources
 
 import numpy as np
 
+from polyfit.files import aside
 from polysft_mi.errors import InputError
-from polysft_mi.files import aside
 from polysft_mi.results.run import Run
 
 from ..panels import PEAKS, box_of, evenly_spaced

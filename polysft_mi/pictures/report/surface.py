@@ -5,6 +5,8 @@ import os
 
 import numpy as np
 
+from polysft_mi.pictures.shading import patch_colours
+
 
 def mesh(run, shown, triangles=24_000):
     """The surface for the page: coarse positions, z up, as 16 bit numbers, and a finer mesh on it
@@ -16,10 +18,10 @@ def mesh(run, shown, triangles=24_000):
     V = from_camera(run.vertices[shown], "z").astype(np.float64)
     low, high = V.reshape(-1, 3).min(0), V.reshape(-1, 3).max(0)
     positions = np.round((V - low) / np.maximum(high - low, 1e-12) * 65535).astype("<u2")
-    faces = run.faces.astype(np.int64)
+    source, uv, faces = run.texcoords.split(run.faces.astype(np.int64))
     parts = max(1, min(8, int(np.sqrt(triangles / len(faces)))))
     fine, face, weights = refined(faces, parts)
-    corners = faces[face]
+    corners = source[faces[face]]
     mesh = {
         "vertices": run.vertices.shape[1],
         "low": low.tolist(),
@@ -29,16 +31,18 @@ def mesh(run, shown, triangles=24_000):
         "weights": _base64(weights.astype("<f4")),
         "faces": _base64(fine.astype("<u4")),
     }
-    colours = _texture_colours(
-        run.texture,
-        np.einsum("nk,nkc->nc", weights, run.uv[corners].astype(np.float64)),
-        run.uv,
-        fine,
-    )
-    return mesh if colours is None else {**mesh, "colours": _base64(colours)}
+    at = lambda values: np.einsum("nk,nkc->nc", weights, values)
+    colours = _texture_colours(run.texture, at(uv[faces[face]]), fine)
+    if colours is not None:
+        mesh["colours"] = _base64(colours)
+    patch, weight = (run.params[name] for name in ("patch", "weight"))
+    if patch.max() > 0:
+        shades = at(patch_colours(patch, weight)[corners].astype(np.float64))
+        mesh["patches"] = _base64(np.round(shades).astype(np.uint8))
+    return mesh
 
 
-def _texture_colours(path, uv, coarse_uv, fine):
+def _texture_colours(path, uv, fine):
     """Colours (M, 3) uint8 of the texture at uv (M, 2), averaged over about a triangle's size; None
     where there is no readable texture.
     """

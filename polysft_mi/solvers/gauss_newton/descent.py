@@ -8,9 +8,9 @@ from scipy.linalg import LinAlgError
 
 from polysft_mi.objective.second_order import Model, SecondOrder, stages_of
 from polysft_mi.solvers.linear import Blocks, Reduced
-from polysft_mi.surface.chart import State
+from polysft_mi.surface.atlas import State
 
-_FARTHEST_STEP = 2.0  # rotation [rad], translation and displacements [chart units]
+_FARTHEST_STEP = 2.0  # rotation [rad], translation and displacements [of the template's scale]
 _LEAST_DAMPING, _RAISED_DAMPING = 1e-7, 1e-4
 
 
@@ -37,12 +37,13 @@ class Found:
         return self.model.cost
 
 
-def check_step(step):
-    """Raise LinAlgError where a step (global (G,), local (N, d)) is not finite, or goes farther
-    than any model is good for.
+def check_step(step, patches):
+    """Raise LinAlgError where a step (global (G,), local (N, d)) of so many ``patches`` is not
+    finite, or goes farther than any model is good for.
     """
     g, local = step
-    if not max(np.abs(g[-6:]).max(), np.abs(local).max()) < _FARTHEST_STEP:
+    motion = g.reshape(patches, -1)[:, -6:]
+    if not max(np.abs(motion).max(), np.abs(local).max()) < _FARTHEST_STEP:
         raise LinAlgError("the step is not finite, or too long")
 
 
@@ -118,7 +119,7 @@ class Descent:
         for _ in range(iterations):
             try:
                 step, promised = self.reduced(model.normal, damping, np.float32).step()
-                check_step(step)
+                check_step(step, len(state.alpha))
             except LinAlgError:
                 damping = max(10 * damping, _RAISED_DAMPING)
                 continue

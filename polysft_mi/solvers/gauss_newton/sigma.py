@@ -11,10 +11,10 @@ def along_rays(descent, model, origin):
     NaN where the curvatures are singular.
     """
     surface, local = model.surface, model.normal.local.shape[-1]
+    atlas = descent.objective.atlas
     ray = surface.vertices - origin
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-    by_jet = (ray @ surface.up)[:, None] * surface.basis
-    by_global = np.column_stack([by_jet, np.einsum("nk,nkm->nm", ray, surface.motion_jacobian)])
+    by_global = atlas.global_columns(surface, ray)
     by_local = np.einsum("nk,nka->na", ray, surface.offset_jacobian)[:, :local]
     try:
         variance = descent.reduced(model.normal, _UNDAMPED).variance(by_local, by_global)

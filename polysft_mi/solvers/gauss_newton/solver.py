@@ -60,15 +60,15 @@ class GaussNewton:
         """
         with self._blas.limit(limits=1, user_api="blas"):
             self._prepare(problem, report)
-            states = [self._chart.state(unknowns.to_numpy()) for unknowns in window]
+            states = [self._atlas.state(unknowns.to_numpy()) for unknowns in window]
             known = [facts for _, facts in past]
             outside = past[: max(0, len(past) + 1 - len(frames))][-2:]
-            before = [self._chart.state(arrays) for arrays, _ in outside]
+            before = [self._atlas.state(arrays) for arrays, _ in outside]
             for k in range(len(frames) - 1 if past else 0, len(frames)):
                 start = states[k] if past or k == 0 else states[k - 1]
                 history = (before + states[:k])[-2:]
                 found, context = self._newest(start, frames[k], history, known)
-                states[k] = self._chart.with_relief_in_jet(found.state)
+                states[k] = self._atlas.with_relief_in_jets(found.state)
                 known.append(self._facts(found, context, known))
             results = [found]
             if len(frames) > 1:
@@ -89,7 +89,7 @@ class GaussNewton:
         """
         with self._blas.limit(limits=1, user_api="blas"):
             self._prepare(problem, None)
-            a, b = self._chart.state(before), self._chart.state(after)
+            a, b = self._atlas.state(before), self._atlas.state(after)
             middle = a.extrapolated(b, -0.5)
             context = replace(self._context(frame, middle, [terms]), hold=weight)
             found = self._descent.descend(middle, context, self._descent.usual)
@@ -103,13 +103,13 @@ class GaussNewton:
         if problem is not self._problem:
             self._problem = problem
             self._descent = Descent(SecondOrder(problem))
-            self._images, self._chart = (
+            self._images, self._atlas = (
                 self._descent.objective.images,
-                self._descent.objective.chart,
+                self._descent.objective.atlas,
             )
             self._starts = Starts(problem, self._descent)
             if self.settings.texture_fit == "auto":
-                rest = self._chart.state(problem.patch.rest().to_numpy())
+                rest = self._atlas.state(problem.patch.rest().to_numpy())
                 self._expect(0)
                 fit_texture(problem, self._descent, self._context(0, rest, []))
         self._descent.report, self._descent.count = report, 0
@@ -138,7 +138,8 @@ class GaussNewton:
         stages = self._descent.far, *self._descent.usual
         scales = {stage: last.get(f"scale_{k}") or first for k, stage in enumerate(stages)}
         light = Light.of(_last(known, "light"), self._descent.rules)
-        return Context(frame, anchor, noise, light, scales)
+        hidden = self._descent.objective.hidden(anchor)
+        return Context(frame, anchor, noise, light, scales, hidden=hidden)
 
     def _facts(self, found, context, known):
         """What the frames that follow want to know of this one.
@@ -162,7 +163,7 @@ class GaussNewton:
 
     def _least_misfit(self, found, context, known):
         """The least misfit of the frames so far, the first one aside, of the texture as the
-        template has it: what the camera's blur makes of it is no noise. NaN in the first frame.
+        template has it, less what the sheet's slant and folds account for. NaN in the first frame.
         """
         if not known:
             return math.nan
@@ -171,7 +172,12 @@ class GaussNewton:
         if found.misfit > least:
             return least
         blur, vertices = self._descent.usual[-1].blur, found.model.surface.vertices
-        return float(np.fmin(least, self._images.misfit(vertices, context.frame, blur)))
+        bare, appearance = (
+            self._images.misfit(vertices, context.frame, blur),
+            found.model.appearance,
+        )
+        known = appearance.misfit if appearance else 0.0
+        return float(np.fmin(least, max(found.misfit, bare - known)))
 
     def _solution(self, states, results, facts):
         """:class:`Solution` of a window: its states, the mean of their terms, and the facts of its
@@ -179,7 +185,7 @@ class GaussNewton:
         """
         names = results[0].model.terms
         terms = {name: float(np.mean([r.model.terms[name] for r in results])) for name in names}
-        window = [Unknowns.from_numpy(self._chart.arrays(state)) for state in states]
+        window = [Unknowns.from_numpy(self._atlas.arrays(state)) for state in states]
         origin = self._problem.camera.origin
         sigma = [along_rays(self._descent, result.model, origin) for result in results]
         return Solution(window, sum(terms.values()), terms, self._descent.count, facts, sigma)

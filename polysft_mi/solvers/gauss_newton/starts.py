@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from polysft_mi.surface.chart import State
+from polysft_mi.surface.atlas import State
 
 from .relocate import Relocator
 
@@ -31,7 +31,7 @@ class Starts:
         """The start that explains the frame best at a stage."""
         objective = self._descent.objective
         misfits = [
-            objective.images.misfit(objective.chart.surface(state).vertices, frame, stage.blur)
+            objective.images.misfit(objective.atlas.surface(state).vertices, frame, stage.blur)
             for state in starts
         ]
         return starts[int(np.argmin(misfits))]
@@ -85,5 +85,5 @@ class Starts:
         motion = self._relocator.pose(self._problem.sequence.frame(frame))
         if motion is None:
             return None
-        rest = objective.chart.state(self._problem.patch.rest().to_numpy())
-        return State(rest.alpha, rest.offset, *objective.chart.rigid(*motion))
+        rest = objective.atlas.state(self._problem.patch.rest().to_numpy())
+        return State(rest.alpha, rest.offset, *objective.atlas.rigid(*motion))

@@ -19,9 +19,11 @@ def fit_texture(problem, descent, context):
     ``context``: a :class:`polysft_mi.objective.second_order.Context` of the first frame.
     """
     objective, rules = descent.objective, descent.rules
-    images, chart, finest = objective.images, objective.chart, descent.usual[-1]
+    images, atlas, finest = objective.images, objective.atlas, descent.usual[-1]
     state = context.anchor
-    before = images.misfit(chart.surface(state).vertices, 0, finest.blur)
+    if len(atlas) > 1:  # texture coordinates with seams are no function of a chart
+        return
+    before = images.misfit(atlas.surface(state).vertices, 0, finest.blur)
     if before < rules.texture_misfit:
         return
     for stage in descent.usual[:2]:
@@ -34,8 +36,9 @@ def fit_texture(problem, descent, context):
             except (BadFrame, LinAlgError):
                 return
             state = state.after_step((np.zeros(len(model.normal.gradient)), slide))
-    after = images.misfit(chart.surface(state).vertices, 0, finest.blur)
+    after = images.misfit(atlas.surface(state).vertices, 0, finest.blur)
     near = np.abs(state.offset).max() < rules.texture_farthest
     if after < rules.texture_gain * before and near:
-        flat = problem.template.chart
-        images.move_texture(flat, flat + state.offset[:, :2])
+        template = problem.template
+        flat, unit = template.chart[:, 0], template.scale / template.radius[0]
+        images.move_texture(flat, flat + unit * state.offset[:, :2])

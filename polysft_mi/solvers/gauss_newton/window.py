@@ -65,9 +65,10 @@ class Window:
 
     def _couple(self, earlier, later, a, b):
         """Add what holds state ``b`` to ``a`` to the equations of the earlier frame."""
-        normal, weight, size = earlier.normal, self._coupling, len(a.alpha)
-        normal.gradient[:size] -= weight * (b.alpha - a.alpha)
-        normal.glob[:size, :size] += weight * np.eye(size)
+        normal, weight = earlier.normal, self._coupling
+        jets = self._jets(a)
+        normal.gradient[jets] -= weight * (b.alpha - a.alpha).ravel()
+        normal.glob[jets, jets] += weight
         d = normal.local.shape[-1]
         normal.local_gradient -= weight * (b.offset - a.offset)[:, :d]
         # the displacements' coupling, weak beside the image, by its bound
@@ -77,6 +78,12 @@ class Window:
             normal.local[diagonal, k, k] += 2 * weight
             later.normal.local[diagonal, k, k] += weight
 
+    @staticmethod
+    def _jets(state):
+        """Which of the global unknowns are coefficients."""
+        patches, size = state.alpha.shape
+        return (np.arange(patches)[:, None] * (size + 6) + np.arange(size)).ravel()
+
     def _steps(self, models, damping):
         """The steps of all frames, and the decrease that they promise. The global unknowns are
         coupled from frame to frame: a block-banded system.
@@ -84,7 +91,7 @@ class Window:
         reduced = [self._descent.reduced(model.normal, damping) for model in models]
         start = np.cumsum([0] + [len(r.right) for r in reduced])
         matrix = block_diag(*(r.schur for r in reduced))
-        jet = np.arange(len(reduced[0].right) - 6)
+        jet = self._jets(models[0].state)
         for a, b in zip(start[:-2] if len(start) > 2 else [], start[1:-1], strict=True):
             matrix[a + jet, b + jet] -= self._coupling
             matrix[b + jet, a + jet] -= self._coupling
@@ -93,5 +100,5 @@ class Window:
         parts = np.split(g, start[1:-1])
         steps = [(part, r.following(part)) for part, r in zip(parts, reduced, strict=True)]
         for step in steps:
-            check_step(step)
+            check_step(step, len(models[0].state.alpha))
         return steps, sum(r.promised(part) for r, part in zip(reduced, parts, strict=True))

@@ -1,5 +1,6 @@
 """A sequence's folder from a video and a photo, against what is known of the video."""
 
+import dataclasses
 import json
 import os
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import synthetic
 from clips import (
     CAMERA,
     DEMO,
@@ -20,6 +22,7 @@ from clips import (
     rendered,
     write_png,
 )
+from loading import difference, loaded
 from scripts import load
 
 from polysft_mi import prepare
@@ -101,6 +104,42 @@ def test_demo_is_found_by_its_texture(tmp_path):
             for p in (tmp_path / "demo" / "masks" / f"{k:05d}.png", DEMO / "masks" / f"{k:03d}.png")
         )
         assert iou(found, drawn) > 0.97
+
+
+def test_a_tube_is_found_by_its_photo(tmp_path):
+    """A template that hides a part of itself, and whose texture has a seam."""
+    camera = Intrinsics(660.0, 660.0, 324.0, 234.0, 640, 480)
+    faces, texcoords = synthetic.tube_faces(13, 32)
+    print_ = photo(size=(660, 525))
+    for k in range(2):
+        V = synthetic.tube(0.3 * k, 13, 32, radius=0.1, height=0.5, depth=0.9)
+        image, cover = synthetic.render(V, faces, texcoords, camera.matrix(), (640, 480), print_)
+        behind = background((640, 480))
+        image = image * cover[..., None] + behind * (1 - cover[..., None])
+        write_png(tmp_path / "frames" / f"{k}.png", np.round(image).astype(np.uint8))
+    truth = synthetic.tube(0, 13, 32, radius=0.1, height=0.5, depth=0.9)
+    turn = cv2.Rodrigues(np.array([0.3, -0.5, 0.2]))[0]
+    synthetic.write_obj(tmp_path / "tube.obj", (truth - (0, 0, 1)) @ turn, texcoords, faces)
+    out, figures = prepare_video(
+        str(tmp_path / "frames"),
+        str(tmp_path / "out"),
+        texture=write_png(tmp_path / "photo.png", print_),
+        template=str(tmp_path / "tube.obj"),
+        camera=str(_camera_file(tmp_path, camera)),
+    )
+    vertices, found, uv = meshio.read_textured_template(tmp_path / "out" / "template.obj")
+    np.testing.assert_array_equal(found, faces)
+    np.testing.assert_allclose(uv.corners, texcoords.corners, atol=1e-6)
+    assert np.linalg.norm(vertices - truth, axis=1).max() < 5e-3
+    assert "patches" in figures["template"]
+    right, *mirrored = difference(loaded(out))
+    assert right < 0.05 and min(mirrored) > 2 * right
+
+
+def _camera_file(folder, camera):
+    path = folder / "camera.json"
+    path.write_text(json.dumps(dataclasses.asdict(camera)))
+    return path
 
 
 def test_corners_and_the_first_frame_as_texture(clip, tmp_path):

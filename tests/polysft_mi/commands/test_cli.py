@@ -66,6 +66,18 @@ def test_help_of_a_command_teaches_by_examples_that_parse(name, capsys, monkeypa
     assert module.parser().prog == f"python -m polysft_mi.{name}"
 
 
+@pytest.mark.parametrize(
+    "name",
+    [
+        *(f"polysft_mi.{name}" for name in commands.COMMANDS),
+        *("polyfit.__main__", "polyfit.train", "onefit.drape", "onefit.train", "onefit.tailor"),
+    ],
+)
+def test_a_wrong_option_ends_in_one_line(name):
+    with pytest.raises(InputError, match="--help lists the options$"):
+        importlib.import_module(name).main(["--wrong-option"])
+
+
 def test_no_command_and_a_wrong_one(capsys):
     assert polysft.main([]) == 2
     with pytest.raises(InputError, match="exprot: no such command, did you mean export"):

@@ -196,7 +196,7 @@ def test_the_last_view_is_kept_and_no_other(problem, truth):
 
 def test_each_stage_begins_with_what_the_sheet_looks_like(problem, monkeypatch):
     descent = Descent(SecondOrder(problem))
-    chart, images, seen = descent.objective.chart, descent.objective.images, []
+    chart, images, seen = descent.objective.atlas, descent.objective.images, []
     rest, original = chart.state(problem.patch.rest().to_numpy()), images.appearance
 
     def appearance(vertices, blur, light, shaded):

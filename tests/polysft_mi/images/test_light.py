@@ -329,7 +329,7 @@ def test_only_the_last_stage_is_shaded_and_a_step_goes_where_the_shading_leads(t
     problem = problem_of(truth.folder, k_rgb=0.0, k_silhouette=0.0, k_mi=0.0, k_relief=0.0, order=4)
     descent = Descent(SecondOrder(problem))
     stage = descent.usual[stage]
-    rest = descent.objective.chart.state(problem.patch.rest().to_numpy())
+    rest = descent.objective.atlas.state(problem.patch.rest().to_numpy())
     # what an image shows at another place is no derivative
     light = known(LIGHT * (1, 1, 1, 1, 0, 0, 0))
     context = Context(1, rest, np.nan, light, {})

@@ -1,4 +1,6 @@
-"""From triangles and vertices to the unknowns of a jet patch, against dense Jacobians."""
+"""From triangles and vertices to the unknowns of an atlas, against dense Jacobians; what joins its
+patches, against finite differences.
+"""
 
 import itertools
 import math
@@ -7,15 +9,15 @@ from types import SimpleNamespace
 import mitsuba as mi
 import numpy as np
 import pytest
-from problems import dense, grid_template
+from problems import at_rest, dense, grid_template, some_state, tube_template
 from scipy.spatial.transform import Rotation
 
 from polysft_mi.images import pixels
 from polysft_mi.images.gather import Gather
-from polysft_mi.objective.assembly import Assembly
+from polysft_mi.objective.assembly import Assembly, Normal
+from polysft_mi.objective.joints import Joints
 from polysft_mi.render.device import on_device
-from polysft_mi.surface.bending import hinges
-from polysft_mi.surface.chart import Chart, State
+from polysft_mi.surface.atlas import Atlas
 from polysft_mi.surface.pattern import Pattern
 
 
@@ -27,7 +29,7 @@ class Sums:
     weight, mask_weight, stride = 0.7, 0.4, 2
 
     def __init__(self, template, camera, rng, area, silhouette):
-        faces, count = template.faces, len(template.chart)
+        faces, count = template.faces, len(template.vertices)
         self.area = area
         self.figures = rng.uniform(0, 5, (len(faces), 4)).astype(np.float32)
         weight = self.weight / (area or self.figures[:, 1].sum())
@@ -106,25 +108,19 @@ def pinhole(rng, vertices):
     return SimpleNamespace(inverse=inverse, origin=origin, by_position=by)
 
 
-def test_all_terms_are_those_of_their_dense_jacobians():
-    """Pixels, silhouette, edges and triangles, in the unknowns of a jet patch: with and without
-    each, by one assembly.
+@pytest.mark.parametrize("make", [grid_template, lambda: tube_template(6, 12, order=2)])
+def test_all_terms_are_those_of_their_dense_jacobians(make):
+    """Pixels, silhouette, edges and triangles, in the unknowns of an atlas of one patch and of
+    several: with and without each, by one assembly.
     """
     rng = np.random.default_rng(7)
-    template = grid_template()
-    chart, faces, count = Chart(template), template.faces, len(template.chart)
-    turn = Rotation.from_rotvec(rng.normal(size=3) * 0.05)
-    state = State(
-        rng.normal(size=len(chart.bending)) * 0.05,
-        rng.normal(size=(count, 3)) * 0.05,
-        turn,
-        rng.normal(size=3) * 0.05,
-    )
+    template = make()
+    chart, faces, count = Atlas(template), template.faces, len(template.vertices)
+    state = some_state(chart, rng)
     vertices = chart.surface(state).vertices
     camera, pattern = pinhole(rng, vertices), Pattern(faces, template.edges, count)
-    wider = Pattern(faces, template.edges, count, hinges(template.chart, faces)[0])
     gather = Gather(pattern, camera)
-    assembly = Assembly(pattern, gather)
+    assembly = Assembly(pattern, gather, chart)
     images = np.zeros((2 * count, 3 * count))
     for k in range(count):
         images[2 * k : 2 * k + 2, 3 * k : 3 * k + 3] = camera.by_position[k]
@@ -135,7 +131,7 @@ def test_all_terms_are_those_of_their_dense_jacobians():
         (2, None, True, False),
         (3, 50.0, False, True),
     ):
-        sums, size = Sums(template, camera, rng, area, silhouette), len(chart.bending)
+        sums = Sums(template, camera, rng, area, silhouette)
         in_space, slope, energy = np.zeros((3 * count, 3 * count)), sums.slope.copy(), 0.0
 
         def add(at, rows):  # rows^T rows, where the rows (R, K, 3) see the vertices at (K,)
@@ -170,16 +166,71 @@ def test_all_terms_are_those_of_their_dense_jacobians():
                 - chart.surface(state.after_step(parts, -1e-5)).vertices
             ).ravel() / 2e-5
 
-        by = np.stack([moved(row) for row in np.eye(d * count + size + 6)], 1)
-        wide = wider if d == 3 else None
+        by = np.stack(
+            [moved(row) for row in np.eye(d * count + template.alpha.size + 6 * len(chart))], 1
+        )
         surface = chart.surface(state)
         normal, found = assembly.normal(
-            surface, sums.images(gather, vertices), lengths, stiffness, wide, triangles=triangles
+            surface, sums.images(gather, vertices), lengths, stiffness, d, triangles=triangles
         )
-        matrix, gradient = dense(wide or pattern, normal)
+        matrix, gradient = dense(pattern, normal)
         expected = by.T @ (in_space + images.T @ sums.second @ images) @ by
         case = f"d = {d}, area {area}, silhouette {silhouette}, shading {shaded}"
         assert found == pytest.approx(energy, rel=1e-9), case
         assert np.abs(matrix - expected).max() < 1e-6 * np.abs(expected).max(), case
         assert np.abs(gradient - by.T @ slope.ravel()).max() < 1e-6 * np.abs(gradient).max(), case
     assert assembly._in_unknowns.recorded.n_recordings == 2  # with triangles and without
+
+
+def joined(make, rng, size=0.05):
+    """(Atlas, Joints, a state, zero normal equations of the jets and the motions)."""
+    chart = Atlas(make())
+    globals_ = chart.template.alpha.size + 6 * len(chart)
+    nothing = np.zeros(0)
+    normal = Normal(nothing, nothing, np.zeros((globals_, globals_)), nothing, np.zeros(globals_))
+    return chart, Joints(chart), some_state(chart, rng, size), normal
+
+
+def test_joints_are_the_spread_of_the_patches():
+    """The weighted squared distances from the blended points, written out."""
+    chart, joints, state, normal = joined(tube_template, np.random.default_rng(1))
+    t, surface = chart.template, chart.surface(state)
+    several = (t.weight > 0).sum(1) > 1
+    spread = 0.0
+    for vertex in np.flatnonzero(several):
+        held = np.flatnonzero(chart.entry_vertex == vertex)
+        blended = chart.entry_weight[held] @ surface.points[held]
+        apart = surface.points[held] - blended
+        spread += chart.entry_weight[held] @ (apart**2).sum(1)
+    expected = 0.3 * spread / several.sum() / t.scale**2
+    assert joints.add(normal, surface, 0.3) == pytest.approx(expected, rel=1e-9) and expected > 0
+    assert joints.add(normal, chart.surface(at_rest(chart)), 0.3) < 1e-20
+
+
+def test_joints_gradient_and_curvature_against_finite_differences():
+    rng = np.random.default_rng(2)
+    chart, joints, state, normal = joined(tube_template, rng)
+    joints.add(normal, chart.surface(state), 0.7)
+    still = np.zeros((len(chart.template.vertices), 3))
+
+    def energy(step):
+        *_, other = joined(tube_template, rng)
+        return joints.add(other, chart.surface(state.after_step((step, still))), 0.7)
+
+    assert np.abs(normal.glob - normal.glob.T).max() < 1e-12 * np.abs(normal.glob).max()
+    for _ in range(3):
+        step = rng.normal(size=len(normal.gradient)) * 1e-4
+        slope = (energy(step) - energy(-step)) / 2
+        assert step @ normal.gradient == pytest.approx(slope, rel=1e-4)
+    # the residuals are linear in the coefficients and the translations: there it is exact
+    linear = np.zeros((len(chart), chart.template.alpha.shape[1] + 6))
+    linear[:, :-6], linear[:, -3:] = 1, 1
+    linear = (linear * rng.normal(size=linear.shape)).ravel() * 1e-2
+    change = energy(linear) - energy(0 * linear)
+    promised = linear @ normal.gradient + 0.5 * linear @ normal.glob @ linear
+    assert change == pytest.approx(promised, rel=1e-6)
+
+
+def test_one_patch_has_no_joints():
+    chart, joints, state, normal = joined(grid_template, np.random.default_rng(3))
+    assert joints.add(normal, chart.surface(state), 1.0) == 0 and not normal.glob.any()

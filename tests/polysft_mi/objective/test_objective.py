@@ -221,8 +221,8 @@ def test_gradient_of_the_whole_objective(tmp_path, masks, overrides):
         pytest.skip("the window of the local statistics jumps with the interior, which is detached")
     p, _ = problem(tmp_path, masks, **overrides)
     rest = p.patch.rest().to_numpy()
-    rest["delta_alpha"] = (0.02 * np.sin(np.arange(15))).astype(np.float32)
-    rest["translation"] = np.array([0.01, -0.013, 0.02], np.float32)
+    rest["delta_alpha"] = (0.02 * np.sin(np.arange(15))).astype(np.float32)[None]
+    rest["translation"] = np.array([[0.01, -0.013, 0.02]], np.float32)
     unknowns = Unknowns.from_numpy(rest)
     for _, value in unknowns.items():
         dr.enable_grad(value)
@@ -230,9 +230,9 @@ def test_gradient_of_the_whole_objective(tmp_path, masks, overrides):
     assert total == pytest.approx(sum(terms.values())) and total > 0
     assert (terms["silhouette"] > 0) == (masks and overrides.get("k_silhouette", 1) > 0)
     for name, size in (("delta_alpha", 15), ("translation", 3)):
-        direction = RNG.normal(size=size)
+        direction = RNG.normal(size=(1, size))
         direction /= np.linalg.norm(direction)
-        ad = float(np.array(dr.grad(getattr(unknowns, name))) @ direction)
+        ad = float(np.array(dr.grad(getattr(unknowns, name))) @ direction[0])
         slopes = []
         for h in (1e-3, 2e-3, 4e-3):
             ends = [
@@ -331,7 +331,7 @@ def test_path_replay_gives_the_gradient_of_raster(tmp_path):
         folder.mkdir()
         p, _ = problem(folder, integrator=integrator, spp=spp, k_mi=0)
         rest = p.patch.rest().to_numpy()
-        rest["translation"] = np.array([0.02, -0.03, 0.05], np.float32)
+        rest["translation"] = np.array([[0.02, -0.03, 0.05]], np.float32)
         unknowns = Unknowns.from_numpy(rest)
         dr.enable_grad(unknowns.translation)
         gradients[integrator] = {}
@@ -342,3 +342,41 @@ def test_path_replay_gives_the_gradient_of_raster(tmp_path):
     for name in ("rgb", "silhouette"):
         a, b = gradients["raster"][name], gradients["prb_projective"][name]
         assert np.linalg.norm(a - b) < 0.25 * np.linalg.norm(a), (name, a, b)
+
+
+@pytest.mark.parametrize("integrator", ["raster", "prb_projective"])
+def test_gradients_of_several_patches(tmp_path, integrator):
+    """Of a tube, whose texture has a seam: by the jets and the motions of its patches, against
+    finite differences; path replay's against those of raster, which has no noise.
+    """
+    from polysft_mi import prepare
+
+    truth = synthetic.cloth(tmp_path / "tube", rows=13, columns=24, frames=2, shape=synthetic.tube)
+    prepare.main([str(truth.folder), "-q"])
+
+    def of(name, spp):
+        settings = {"solver": "adam", "k_mi": 0, "order": 3, "integrator": name, "spp": spp}
+        experiment = scene.load(truth.folder / "scene.xml", settings)
+        return Problem(experiment, experiment.sequence())
+
+    p, sharp = of(integrator, 1 if integrator == "raster" else 64), of("raster", 4)
+    assert len(p.template) >= 3
+    rest = p.patch.rest().to_numpy()
+    rest["delta_alpha"] += (0.02 * RNG.normal(size=rest["delta_alpha"].shape)).astype(np.float32)
+    rest["translation"] += np.float32([0.02, -0.03, 0.05])
+    unknowns = Unknowns.from_numpy(rest)
+    for _, value in unknowns.items():
+        dr.enable_grad(value)
+    p.evaluate([unknowns], [1], backward=True)
+    for name in ("delta_alpha", "translation"):
+        gradient = np.array(dr.grad(getattr(unknowns, name))).reshape(rest[name].shape)
+        assert (np.abs(gradient).max(1) > 0).sum() >= 2  # the patches that are in view
+        direction = gradient / np.linalg.norm(gradient)
+        slopes = []
+        for h in (1e-3, 2e-3, 4e-3):
+            ends = [
+                sharp.evaluate([Unknowns.from_numpy({**rest, name: x})], [1])[0]
+                for x in (rest[name] + h * direction, rest[name] - h * direction)
+            ]
+            slopes.append((ends[0] - ends[1]) / (2 * h))
+        assert np.linalg.norm(gradient) == pytest.approx(np.median(slopes), rel=0.2), (name, slopes)

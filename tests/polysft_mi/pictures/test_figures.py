@@ -86,9 +86,8 @@ def test_grid_and_degenerate_triangles():
     V, F = sheet()
     front = View(np.eye(3), np.array([0, 0, 0.6]), 0.11)
     plain = shade_surface(V, F, front, size=(200, 200)).astype(int)
-    lines = shade_surface(
-        V, np.concatenate([F, [[0, 0, 1], [0, 1, 2]]]), front, uv=V[:, :2], size=(200, 200)
-    ).astype(int)
+    faces = np.concatenate([F, [[0, 0, 1], [0, 1, 2]]])
+    lines = shade_surface(V, faces, front, uv=V[faces, :2], size=(200, 200)).astype(int)
     dark = (plain - lines)[..., 0] > 10
     assert 0.05 < dark.mean() < 0.4
     assert shade_surface(V + (0, 0, 0), F[:0], front, size=(20, 20)).min() == 243

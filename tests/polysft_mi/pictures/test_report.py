@@ -6,15 +6,12 @@ import json
 import re
 import shutil
 import subprocess
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from polyfit import jets
 from polysft_mi import report
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError
@@ -148,30 +145,16 @@ def test_figures_and_colours(finished_run, page):
     assert [label for label, _ in data["cards"]].count("lost frames") == 1
 
 
-def test_curvature_is_the_mean_of_polyfits_principal_ones():
-    rng = np.random.default_rng(0)
-    p = {
-        name: 0.3 * rng.normal(size=size)
-        for name, size in dict(
-            chart=(20, 2), delta_u=(3, 20), delta_v=(3, 20), alpha=15, delta_alpha=(3, 15)
-        ).items()
-    }
-    p |= dict(scale=0.2, frame_rotation=np.eye(3), rotation=np.tile([0.1, 0.2, 0.3, 1.0], (3, 1)))
-    uv = torch.as_tensor(p["chart"] + np.stack([p["delta_u"], p["delta_v"]], -1))
-    wanted = (
-        jets.principal_curvatures(torch.as_tensor(p["alpha"] + p["delta_alpha"]), uv).mean(-1) / 0.2
-    )
-    np.testing.assert_allclose(Run.mean_curvature(SimpleNamespace(params=p)), wanted, rtol=1e-9)
-
-
 def test_curvature_is_that_of_the_jets(finished_run):
     """On the middle row of the grid, whose rows and columns stay at right angles: half the sum of
     the normal curvatures along both, by differences of the mesh's own edges.
     """
     run = Run.open(finished_run[1])
     p = run.params
-    up = p["scale"] * p["frame_rotation"] @ Rotation.from_quat(p["rotation"][-1]).as_matrix()[:, 2]
-    jet = run.vertices[-1].astype(float) - p["delta_w"][-1][:, None] * up  # without relief
+    turn = Rotation.from_quat(p["rotation"][-1, 0]).as_matrix()
+    up = p["scale"] * p["frame_rotation"][0] @ turn[:, 2]
+    height = (p["delta_w"][-1] + p["rest"][:, 0])[:, None]
+    jet = run.vertices[-1].astype(float) - height * up  # without relief
     grid = jet.reshape(9, 11, 3)
     row = [grid[4, :-2], grid[4, 1:-1], grid[4, 2:]]
     column = [grid[3, 1:-1], grid[4, 1:-1], grid[5, 1:-1]]
@@ -373,6 +356,6 @@ def test_browser_shows_it(page, tmp_path):
         [part(p, box) for box in seen["boxes"]] for p in (first, last)
     )
     assert np.abs(before - after).max(2).mean() > 5  # the slider changed the picture
-    for picture in (surface, same):
-        assert (np.ptp(picture, axis=2) > 60).mean() > 0.05, "the surface in 3D is blank"
+    for picture in (surface, same):  # its background and axes are grey
+        assert (np.ptp(picture, axis=2) > 20).mean() > 0.1, "the surface in 3D is blank"
     assert (np.abs(surface - same).max(2) > 40).mean() > 0.05

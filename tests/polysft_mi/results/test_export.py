@@ -251,6 +251,14 @@ class TestRefusals:
             set(shutil.os.listdir(run.folder)) - {"export"}
         ) == sorted(set(before) - {"export"})
 
+    def test_in_an_image_of_which_its_decoder_complains_too(self, run, tmp_path, capfd):
+        broken = tmp_path / "broken.tif"
+        Image.open(run.texture).save(broken, compression="tiff_lzw")
+        broken.write_bytes(broken.read_bytes()[:-3000])
+        with pytest.raises(InputError, match="broken.tif: not an image"):
+            export.main([run.folder, "--format", "glb", "--texture", str(broken)])
+        assert capfd.readouterr().err == ""
+
     def test_in_the_folder(self, run, tmp_path):
         with pytest.raises(InputError, match="no such folder"):
             Run.open(tmp_path / "gone")

@@ -21,20 +21,18 @@ def test_scenes_are_as_the_writer_writes_them(name):
 
 
 def _place(name, shared_data):
-    return (
-        shared_data / name
-        if name in ("kinect_paper", "phi_sft_R1")
-        else shared_data / "cloth" / name
-    )
+    """The folder of a sequence, in the data's folder or one further down."""
+    (place,) = [p for p in (shared_data / name, *shared_data.glob(f"*/{name}")) if p.is_dir()]
+    return place
 
 
-@pytest.mark.parametrize("name", [n for n in write_scenes.SCENES if n != "demo"])
+@pytest.mark.parametrize("name", [n for n in write_scenes.SCENES if n not in write_scenes.DEMOS])
 def test_scenes_match_the_sequences(name, shared_data):
     layout = recognise(str(_place(name, shared_data)))
     assert dataclasses.replace(write_scenes.SCENES[name], settings={}) == layout
 
 
-@pytest.mark.parametrize("name", [n for n in write_scenes.SCENES if n != "demo"])
+@pytest.mark.parametrize("name", [n for n in write_scenes.SCENES if n not in write_scenes.DEMOS])
 def test_scenes_show_frame_0(name, shared_data):
     right, *mirrored = difference(
         loaded(str(ROOT / "scenes" / f"{name}.xml"), data=_place(name, shared_data))
@@ -43,13 +41,14 @@ def test_scenes_show_frame_0(name, shared_data):
     assert right < (0.13 if name == "phi_sft_R1" else 0.03) and min(mirrored) > 2 * right
 
 
-def test_demo():
-    folder = ROOT / "scenes" / "demo"
+@pytest.mark.parametrize("name", write_scenes.DEMOS)
+def test_demos(name):
+    folder = ROOT / "scenes" / name
     assert sum(p.stat().st_size for p in folder.rglob("*") if p.is_file()) < 1_900_000
     assert recognise(str(folder)) == dataclasses.replace(
-        write_scenes.SCENES["demo"], settings={}
+        write_scenes.SCENES[name], settings={}
     )  # shorter than what prepare would write
-    experiment = loaded(str(ROOT / "scenes" / "demo.xml"))
+    experiment = loaded(str(ROOT / "scenes" / f"{name}.xml"))
     right, *mirrored = difference(experiment)
     assert right < 0.03 and min(mirrored) > 2 * right
     truth = np.load(folder / "gt.npz")

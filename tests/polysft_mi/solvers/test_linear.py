@@ -42,8 +42,7 @@ def random_normal(pattern, size=9, d=2):
 def test_step_and_variance_are_those_of_the_dense_system(monkeypatch, rows, columns, d, alone):
     monkeypatch.setattr(tridiagonal, "_ALONE", alone)
     template = grid_template(rows, columns, order=1)
-    further = hinges(template.chart, template.faces)[0] if d == 3 else None
-    pattern = Pattern(template.faces, template.edges, rows * columns, further)
+    pattern = Pattern(template.faces, template.edges, rows * columns)
     normal = random_normal(pattern, d=d)
     h, g = dense(pattern, normal)
     n, damping = d * pattern.count, 1e-3
@@ -86,26 +85,21 @@ def test_a_block_that_is_not_positive_is_refused_in_either_thread(monkeypatch, v
         Reduced(blocks, normal, 0)
 
 
-def test_pairs_that_lie_across_two_edges_are_one_block():
-    """Around a vertex of four triangles, two hinges join the same pair: its block must neither be
-    lost nor counted twice.
+def test_bends_are_bounded_within_the_pattern():
+    """Hinges reach beyond the neighbours; the blocks that stand for them are those of the matrix
+    where the pattern has any, and bound it from above.
     """
-    x = np.array([[0.0, 0], [1, 0], [0, 1], [-1, 0], [0, -1]])
-    faces = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1]])
-    edges = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [1, 4]])
-    across, bends = hinges(x, faces)
-    assert len(across) == 4 and len(np.unique(np.sort(across, 1), axis=0)) == 2
-    pattern = Pattern(faces, edges, 5, across)
-    blocks = Blocks(pattern, 3)
-    values = pattern.laplacian + pattern.blocks_of(bends.T @ bends)
-    local = values[:, None, None] * np.eye(3)
-    local[pattern.diagonal] += np.eye(3)
-    difference = np.zeros((8, 5))
-    difference[np.arange(8)[:, None], edges] = [1.0, -1.0]
-    dense = np.kron(difference.T @ difference + (bends.T @ bends).toarray() + np.eye(5), np.eye(3))
-    right = RNG.normal(size=(15, 2))
-    found = blocks.eliminate(local, right, np.float64)
-    np.testing.assert_allclose(found.back(found.columns), np.linalg.solve(dense, right), atol=1e-10)
+    template = grid_template(6, 7)
+    pattern = Pattern(template.faces, template.edges, 42)
+    bends = hinges(template.vertices / template.scale, template.faces)[1]
+    matrix = bends.T @ bends
+    bound = np.zeros((42, 42))
+    bound[pattern.row, pattern.column] = pattern.bound_of(matrix)
+    beside = pattern.row != pattern.column
+    inside = pattern.row[beside], pattern.column[beside]
+    np.testing.assert_allclose(bound[inside], matrix.toarray()[inside], atol=1e-12)
+    least, most = np.linalg.eigvalsh(bound - matrix.toarray())[[0, -1]]
+    assert -1e-9 * most < least and most > 0
 
 
 def test_a_disconnected_and_irregular_mesh_is_factorised():

@@ -25,7 +25,7 @@ def test_a_windows_step_against_finite_differences_and_the_dense_system(truth):
     )
     descent = Descent(SecondOrder(problem))
     objective, light = descent.objective, Light.unknown(problem.rules)
-    before, *states = [some_state(objective.chart, RNG, 0.01) for _ in range(4)]
+    before, *states = [some_state(objective.atlas, RNG, 0.01) for _ in range(4)]
     anchors = before, None, None
     contexts = [Context(k, anchors[k], np.nan, light, {}) for k in range(3)]
     window = Window(descent, contexts)

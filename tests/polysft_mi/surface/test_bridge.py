@@ -15,7 +15,7 @@ from polyfit.network import PolyFit, SpatialTransformer
 from polysft_mi import bridge, capture
 from polysft_mi.objective.problem import Problem
 from polysft_mi.scene import experiment as scene
-from polysft_mi.surface.patch import JetPatch
+from polysft_mi.surface.patch import JetAtlas
 
 RNG = np.random.default_rng(2)
 
@@ -74,13 +74,13 @@ def gradient_and_numeric(loss, network, direction, h):
 def test_polyfit_sets_up_the_template(bent, network):
     problem, points = bent
     t = problem.template
-    made = bridge.template(network, points.numpy(), t.faces, t.uv)
-    assert made.rotation @ made.rotation.T == pytest.approx(np.eye(3), abs=1e-12) and np.linalg.det(
-        made.rotation
-    ) == pytest.approx(1)
+    made = bridge.template(network, points.numpy(), t.faces, t.texcoords)
+    (turn,) = made.rotation
+    assert turn @ turn.T == pytest.approx(np.eye(3), abs=1e-12)
+    assert np.linalg.det(turn) == pytest.approx(1)
     frame = network(points[None]).frame[0]
-    assert made.rotation == pytest.approx(frame.R.detach().numpy(), abs=1e-5)
-    patch = JetPatch(made)
+    assert turn == pytest.approx(frame.R.detach().numpy(), abs=1e-5)
+    patch = JetAtlas(made)
     assert np.abs(np.array(patch.vertices(patch.rest())).T - points.numpy()).max() < 2e-4
     assert made.residual_max < 2e-4
 
@@ -130,8 +130,8 @@ def test_rendering_in_torch_is_the_problems(bent):
 def test_a_torch_loss_reaches_alpha(bent, network):
     """The loss is one of coefficients that torch fits to the surface that Dr.Jit makes of alpha."""
     problem, points = bent
-    patch = JetPatch(
-        bridge.template(network, points.numpy(), problem.template.faces, problem.template.uv)
+    patch = JetAtlas(
+        bridge.template(network, points.numpy(), problem.template.faces, problem.template.texcoords)
     )
     weight = torch.as_tensor(RNG.normal(size=(2, 15)), dtype=torch.float32)
 
@@ -166,8 +166,8 @@ def test_a_torch_loss_reaches_alpha(bent, network):
 
 def test_gradient_of_the_deformed_patch_in_torch(bent, network):
     problem, points = bent
-    patch = JetPatch(
-        bridge.template(network, points.numpy(), problem.template.faces, problem.template.uv)
+    patch = JetAtlas(
+        bridge.template(network, points.numpy(), problem.template.faces, problem.template.texcoords)
     )
     vertices, N = bridge.deformed(patch), len(points)
     unknowns = [

@@ -1,0 +1,43 @@
+"""Texture coordinates of a mesh, which may have seams: vertices with several of them. NumPy."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class TexCoords:
+    """``coordinates`` (M, 2), (0, 0) at the image's bottom left, v up; ``faces`` (F, 3): the one of
+    each corner of each face.
+    """
+
+    coordinates: np.ndarray
+    faces: np.ndarray
+
+    @property
+    def corners(self) -> np.ndarray:
+        """The coordinates of the faces' corners, (F, 3, 2)."""
+        return self.coordinates[self.faces]
+
+    def split(self, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Vertices split along the seams, for files that take one coordinate a vertex.
+
+        ``faces`` (F, 3): of the mesh. Returns (source (V,), uv (V, 2), faces (F, 3)): the mesh's
+        vertex of each of the V new ones, its coordinate, and the faces on them. Without seams the
+        vertices stay as they are.
+        """
+        per_vertex = self.of_vertices(faces)
+        if per_vertex is not None:
+            return np.arange(len(per_vertex)), per_vertex, faces
+        pairs = np.stack([faces.ravel(), self.faces.ravel()], 1)
+        found, index = np.unique(pairs, axis=0, return_inverse=True)
+        return found[:, 0], self.coordinates[found[:, 1]], index.reshape(faces.shape)
+
+    def of_vertices(self, faces: np.ndarray, count: int | None = None) -> np.ndarray | None:
+        """(N, 2), one a vertex of the mesh with ``faces`` (F, 3) and N = ``count`` vertices, NaN
+        for one without a face; None where there is a seam.
+        """
+        uv = np.full((count or int(faces.max()) + 1, 2), np.nan)
+        uv[faces] = self.corners
+        same = np.allclose(uv[faces], self.corners, rtol=0, atol=1e-9, equal_nan=True)
+        return uv if same else None

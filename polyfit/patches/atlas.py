@@ -1,0 +1,148 @@
+"""An atlas: a surface cut into as few patches as height graphs can hold, which overlap and are
+blended by a partition of unity. NumPy and SciPy only.
+
+In: a triangle mesh. Out: for each vertex the patches that hold it and their weights. A patch holds
+a part of a surface that is a height graph over the plane of its mean normal: a sheet is one patch,
+a tube three strips, a ball four or more caps. The clusters are those of
+:mod:`polyfit.patches.clusters`, merged from single vertices.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.csgraph import dijkstra
+
+from polyfit import mesh
+
+from .clusters import NORMAL_WEIGHTS, connected, merged, relaxed
+
+# A face is steep over its patch's plane beyond this cosine; a patch holds a surface of which no
+# larger share of the area is steep
+STEEP, STEEP_SHARE = 0.45, 0.05
+OVERLAP = 0.4  # width of the overlap, in radii of a disc of the patch's area
+LAYERS = 4  # patches that hold a vertex, at most
+FINE = 128  # clusters that vertices are merged to before patches are sought
+
+
+@dataclass(frozen=True)
+class Cover:
+    """The patches of a mesh's vertices, N of them, K patches.
+
+    ``patch`` (N, M): the patches that hold each vertex, the first its own; ``weight`` (N, M): their
+    share in it, each row with the sum 1, 0 where there are fewer than M; ``normal`` (K, 3): mean
+    normals of the patches.
+    """
+
+    patch: np.ndarray
+    weight: np.ndarray
+    normal: np.ndarray
+
+    def __len__(self) -> int:
+        """K, the number of patches."""
+        return len(self.normal)
+
+    @classmethod
+    def of(cls, vertices: np.ndarray, faces: np.ndarray) -> "Cover":
+        """The cover of the mesh (N, 3), (F, 3), whose faces are oriented alike within each
+        component, by the fewest patches that hold it.
+        """
+        edges = mesh.edges_of(faces)[0]
+        vectors = mesh.face_vectors(vertices, faces) / 2
+        part = mesh.components(len(vertices), edges)
+        label, count = np.empty(len(vertices), dtype=np.int64), 0
+        for k in range(part.max() + 1):
+            inside = np.flatnonzero(part == k)
+            found = _few(vertices, faces[part[faces[:, 0]] == k], vectors[part[faces[:, 0]] == k])
+            label[inside] = found[inside] + count
+            count = label[inside].max() + 1
+        patch, weight = partition(vertices, faces, edges, label)
+        return cls(patch, weight, _normals(label, faces, vectors))
+
+
+def is_graph(vertices: np.ndarray, faces: np.ndarray, normal: np.ndarray) -> bool:
+    """Whether no face lies the other way round than most in the plane across ``normal`` (3,)."""
+    up = int((mesh.face_vectors(vertices, faces) @ normal > 0).sum())
+    return min(up, len(faces) - up) == 0
+
+
+def partition(vertices, faces, edges, label):
+    """(patch (N, M), weight (N, M)) of :class:`Cover` for clusters ``label`` (N,): a patch's weight
+    falls with the distance from it along the surface, to nothing at the overlap's width.
+    """
+    count = int(label.max()) + 1
+    length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
+    graph = sp.coo_matrix((length, edges.T), 2 * (len(vertices),)).tocsr()
+    area = np.bincount(
+        label[faces].ravel(), np.repeat(mesh.areas(vertices, faces) / 3, 3), minlength=count
+    )
+    width = np.maximum(OVERLAP * np.sqrt(area / np.pi), 1.5 * length.mean())
+    near = np.zeros((len(vertices), count))
+    for k in range(count):
+        own = np.flatnonzero(label == k)
+        far = dijkstra(graph, directed=False, indices=own, min_only=True, limit=width[k])
+        near[:, k] = np.maximum(1 - far / width[k], 0) ** 2
+    near[np.arange(len(vertices)), label] = 1 + 1e-9  # its own patch comes first
+    order = np.argsort(-near, axis=1, kind="stable")[:, :LAYERS]
+    weight = np.take_along_axis(near, order, axis=1)
+    used = (weight > 0).any(axis=0)
+    weight = weight[:, used]
+    return order[:, used], weight / weight.sum(1, keepdims=True)
+
+
+def _few(vertices, faces, vectors):
+    """Labels (N,) of the vertices of one component, in the fewest clusters that hold it."""
+    count = len(vertices)
+    inside = np.unique(faces)
+    label = np.zeros(count, dtype=np.int64)
+    normals = np.stack(
+        [np.bincount(faces.ravel(), np.repeat(x, 3), minlength=count) for x in vectors.T], 1
+    )
+    area = np.bincount(faces.ravel(), np.repeat(np.linalg.norm(vectors, axis=1) / 3, 3), count)
+    normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    local = np.empty(count, dtype=np.int64)
+    local[inside] = np.arange(len(inside))
+    edges, points = local[mesh.edges_of(faces)[0]], vertices[inside]
+    normals, area = normals[inside], np.maximum(area[inside], 1e-9 * area[inside].mean())
+    own, faces = np.zeros(len(inside), dtype=np.int64), local[faces]
+    if (_steep(own, faces, vectors) <= STEEP_SHARE).all():
+        return label
+
+    def clusters(start, count, weight):
+        radius = np.sqrt(area.sum() / (np.pi * count))
+        feature = np.concatenate([points / radius, weight * normals], axis=1)
+        found = merged(start, feature, area, edges, count)
+        if count < FINE:
+            found = connected(relaxed(found, feature, area, edges), edges, area)
+        return np.unique(found, return_inverse=True)[1]
+
+    fine = clusters(np.arange(len(inside)), FINE, NORMAL_WEIGHTS[0])
+    for wanted in range(2, FINE):
+        for weight in NORMAL_WEIGHTS:
+            own = clusters(fine, wanted, weight)
+            if (_steep(own, faces, vectors) <= STEEP_SHARE).all():
+                label[inside] = own
+                return label
+    label[inside] = fine
+    return label
+
+
+def _normals(label, faces, vectors):
+    """Mean normals (K, 3) of the clusters, of length 1."""
+    count = int(label.max()) + 1
+    found = np.stack(
+        [np.bincount(label[faces].ravel(), np.repeat(x, 3), minlength=count) for x in vectors.T], 1
+    )
+    return found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-300)
+
+
+def _steep(label, faces, vectors):
+    """Share (K,) of each cluster's area that is steep over its plane."""
+    normal, area = _normals(label, faces, vectors), np.linalg.norm(vectors, axis=1)
+    corner = label[faces]
+    steep = np.einsum("fk,fck->fc", vectors, normal[corner]) < STEEP * area[:, None]
+    total, part = (
+        np.bincount(corner.ravel(), (w * area[:, None]).ravel())
+        for w in (np.ones(corner.shape), steep)
+    )
+    return part / np.maximum(total, 1e-300)

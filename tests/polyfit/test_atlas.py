@@ -1,0 +1,120 @@
+"""The cover of a mesh by few overlapping patches, and its partition of unity."""
+
+import numpy as np
+import pytest
+import surfaces
+
+from polyfit import mesh
+from polyfit.patches import atlas
+from polyfit.patches.atlas import Cover, is_graph
+
+
+def box(n=7, size=0.2):
+    """A closed box, its faces outwards; its corners and edges are shared."""
+    parts = []
+    for axis in range(3):
+        for side in (-1, 1):
+            V, F = surfaces.sheet(size=size, n=n)
+            V[:, 2] = size
+            turn = np.roll(np.eye(3), axis, axis=0) * side
+            turn[:, 0] *= np.linalg.det(turn)
+            parts.append((V @ turn.T, F))
+    V, F = surfaces.joined(*parts)
+    _, first, same = np.unique(V.round(9), axis=0, return_index=True, return_inverse=True)
+    return V[first], same[F]
+
+
+SHAPES = {
+    "sheet": surfaces.sheet,
+    "wave": lambda: surfaces.sheet(lambda x, y: 0.05 * np.sin(12 * x)),
+    "tube": surfaces.tube,
+    "ball": lambda: surfaces.sphere(subdivisions=2),
+    "box": box,
+    "several": lambda: surfaces.joined(surfaces.sheet(), surfaces.tube(), box()),
+}
+
+
+@pytest.fixture(scope="module", params=SHAPES)
+def covered(request):
+    vertices, faces = SHAPES[request.param]()
+    return request.param, vertices, faces, Cover.of(vertices, faces)
+
+
+def test_box_is_closed_and_outwards():
+    vertices, faces = box()
+    assert mesh.winding(faces).min() == 1 and 2 * len(mesh.edges_of(faces)[0]) == faces.size
+    outwards = (mesh.face_vectors(vertices, faces) * vertices[faces].mean(1)).sum(1)
+    assert outwards.min() > 0
+
+
+def test_weights_are_a_partition_of_unity(covered):
+    _, vertices, _, cover = covered
+    assert cover.patch.shape == cover.weight.shape and len(cover.patch) == len(vertices)
+    assert cover.weight.sum(1) == pytest.approx(1, abs=1e-12) and cover.weight.min() >= 0
+    assert (cover.weight[:, 0] > 0).all() and (cover.weight.argmax(1) == 0).all()
+    for row, weight in zip(cover.patch, cover.weight):  # each patch once
+        held = row[weight > 0]
+        assert len(np.unique(held)) == len(held)
+
+
+def largest_step(vertices, faces):
+    """The largest change of a patch's weight along an edge."""
+    cover, edges = Cover.of(vertices, faces), mesh.edges_of(faces)[0]
+    share = np.zeros((len(vertices), len(cover)))
+    for m in range(cover.patch.shape[1]):
+        share[np.arange(len(vertices)), cover.patch[:, m]] += cover.weight[:, m]
+    return np.abs(share[edges[:, 0]] - share[edges[:, 1]]).max()
+
+
+def test_weights_are_continuous_along_the_surface():
+    """On a mesh twice as fine, steps of the weights along its edges are half as large."""
+    steps = [largest_step(*surfaces.sphere(subdivisions=n)) for n in (3, 4)]
+    assert steps[1] < 0.3 and steps[1] < 0.6 * steps[0]
+    steps = [largest_step(*surfaces.tube(around=24 * n, along=20 * n)) for n in (1, 2)]
+    assert steps[1] < 0.2 and steps[1] < 0.6 * steps[0]
+
+
+def test_as_few_patches_as_hold_it(covered):
+    name, *_, cover = covered
+    low, high = {
+        "sheet": (1, 1),
+        "wave": (1, 1),
+        "tube": (3, 4),
+        "ball": (4, 8),
+        "box": (2, 24),  # along sharp edges, triangles are steep over either side's plane
+        "several": (6, 29),
+    }[name]
+    assert low <= len(cover) <= high
+
+
+def test_no_patch_is_steep(covered):
+    _, vertices, faces, cover = covered
+    vectors = mesh.face_vectors(vertices, faces) / 2
+    area, corner = np.linalg.norm(vectors, axis=1), cover.patch[faces, 0]
+    steep = np.einsum("fk,fck->fc", vectors, cover.normal[corner]) < atlas.STEEP * area[:, None]
+    for k in range(len(cover)):
+        weight = area[:, None] * (corner == k)
+        assert (weight * steep).sum() <= atlas.STEEP_SHARE * weight.sum() * (1 + 1e-9)
+    assert np.linalg.norm(cover.normal, axis=1) == pytest.approx(1)
+
+
+def test_patches_are_connected_and_of_one_component(covered):
+    _, vertices, faces, cover = covered
+    edges = mesh.edges_of(faces)[0]
+    part = mesh.components(len(vertices), edges)
+    for k in range(len(cover)):
+        for held in (
+            cover.patch[:, 0] == k,
+            ((cover.patch == k) & (cover.weight > 0)).any(1),
+        ):
+            kept = edges[held[edges].all(1)]
+            assert len(np.unique(mesh.components(len(vertices), kept)[held])) == 1
+            assert len(np.unique(part[held])) == 1
+
+
+def test_a_graph_is_one():
+    vertices, faces = surfaces.sheet(lambda x, y: 0.05 * np.sin(12 * x))
+    assert is_graph(vertices, faces, np.array([0, 0, 1.0]))
+    assert is_graph(vertices, faces, np.array([0, 0, -1.0]))
+    assert not is_graph(vertices, faces, np.array([1.0, 0, 0]))
+    assert not is_graph(*surfaces.tube(), np.array([1.0, 0, 0]))

@@ -1,0 +1,201 @@
+"""The atlas on the host: against the device and polyfit, derivatives by finite differences."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import synthetic
+import torch
+from problems import at_rest, grid_template, some_state, tube_template
+from scipy.spatial.transform import Rotation
+
+from polyfit import jets
+from polysft_mi.surface.atlas import Atlas, State
+from polysft_mi.surface.bending import hinges, slides
+from polysft_mi.surface.patch import JetAtlas, Unknowns
+
+RNG = np.random.default_rng(4)
+TEMPLATES = {"sheet": lambda order: grid_template(13, 14, order=order), "tube": tube_template}
+
+
+@pytest.mark.parametrize(
+    "shape, order", [*(("sheet", n) for n in (1, 4, 7, 10)), *(("tube", n) for n in (1, 4, 7))]
+)
+def test_atlas_blends_the_jets_of_polyfit(shape, order):
+    """The formula of :mod:`polysft_mi.surface.patch`, patch by patch, in plain NumPy."""
+    template = TEMPLATES[shape](order=order)
+    chart = Atlas(template)
+    state = some_state(chart, RNG)
+    arrays = chart.arrays(state)
+    unit = template.scale / template.radius
+
+    def point(vertex, slot, offset):
+        """The vertex as the patch in that slot has it, displaced by the offset."""
+        k = template.patch[vertex, slot]
+        s, R, T = (x[k] for x in (template.radius, template.rotation, template.origin))
+        uv = template.chart[vertex, slot]
+        uv = uv + unit[k] * (R.T @ template.axes[vertex] @ offset)[:2]
+        alpha = torch.as_tensor(template.alpha[k] + arrays["delta_alpha"][k])
+        z = float(jets.height(alpha, torch.as_tensor(uv)[None])) + template.rest[vertex, slot]
+        z += unit[k] * template.lift[vertex] * offset[2]
+        motion = s * state.rotation[k].as_matrix() @ [*uv, z]
+        return R @ (motion + template.scale * state.translation[k]) + T
+
+    expected = np.zeros_like(template.vertices)
+    for vertex, offset in enumerate(state.offset):
+        expected[vertex] = point(vertex, 0, offset) - point(vertex, 0, np.zeros(3))
+        for slot in np.flatnonzero(template.weight[vertex]):
+            expected[vertex] += template.weight[vertex, slot] * point(vertex, slot, np.zeros(3))
+    assert np.abs(chart.surface(state).vertices - expected).max() < 1e-9
+    back = chart.state(arrays)
+    assert np.abs(back.alpha - state.alpha).max() < 1e-9 and np.array_equal(
+        back.offset, state.offset
+    )
+    assert (back.rotation * state.rotation.inv()).magnitude().max() < 1e-7
+
+
+@pytest.mark.parametrize("shape", TEMPLATES)
+def test_atlas_agrees_with_the_device(shape):
+    template = TEMPLATES[shape](order=4)
+    chart, device = Atlas(template), JetAtlas(template)
+    for state in (at_rest(chart), some_state(chart, RNG), some_state(chart, RNG, 0.2)):
+        unknowns = Unknowns.from_numpy(chart.arrays(state))
+        found = np.array(device.vertices(unknowns)).T
+        # m; what single precision leaves of monomials
+        assert np.abs(found - chart.surface(state).vertices).max() < 1e-5
+        back = chart.state(unknowns.to_numpy())
+        assert np.abs(back.alpha - state.alpha).max() < 1e-4
+        assert (back.rotation * state.rotation.inv()).magnitude().max() < 1e-5
+        assert np.abs(back.translation - state.translation).max() < 1e-6
+
+
+@pytest.mark.parametrize("shape", TEMPLATES)
+@pytest.mark.parametrize("order", [4, 7])
+def test_derivatives_of_the_surface(order, shape):
+    chart = Atlas(TEMPLATES[shape](order=order))
+    state = some_state(chart, RNG)
+    size = state.alpha.shape[1] + 6
+    step = (
+        RNG.normal(size=size * len(chart)) * 1e-5,
+        RNG.normal(size=state.offset.shape) * 1e-5,
+    )
+    s = chart.surface(state)
+    linear = np.einsum("nka,na->nk", s.offset_jacobian, step[1])
+    for k, part in enumerate(chart.entries):
+        g = step[0][k * size : (k + 1) * size]
+        linear[chart.entry_vertex[part]] += (s.basis[part] @ g[:-6])[:, None] * s.up[k]
+        linear[chart.entry_vertex[part]] += s.motion_jacobian[part] @ g[-6:]
+    numeric = (
+        chart.surface(state.after_step(step)).vertices
+        - chart.surface(state.after_step(step, -1)).vertices
+    ) / 2
+    assert np.abs(linear - numeric).max() < 1e-6 * np.abs(numeric).max()
+    # the columns along rows are the same derivatives
+    rows = RNG.normal(size=numeric.shape)
+    along = chart.global_columns(s, rows) @ step[0]
+    by_offset = np.einsum("nk,nka,na->n", rows, s.offset_jacobian, step[1])
+    assert np.abs(along + by_offset - (rows * numeric).sum(1)).max() < 1e-6 * np.abs(along).max()
+
+
+def test_bending_is_the_mean_square_of_second_derivatives():
+    chart = Atlas(grid_template())
+    state = dataclasses.replace(
+        some_state(chart, RNG),
+        alpha=np.linalg.solve(chart.to_monomials, np.array([0, 0, 0, 1.5, 0.5, -1, *np.zeros(9)]))[
+            None
+        ],
+    )
+    assert state.alpha[0] @ chart.bending @ state.alpha[0] == pytest.approx(
+        3**2 + 2 * 0.5**2 + 2**2
+    )  # of 1.5 u^2 + 0.5 uv - v^2
+
+
+@pytest.mark.parametrize("template", [grid_template, tube_template])
+def test_towards_goes_on_with_the_motion(template):
+    chart = Atlas(template())
+    a, b = some_state(chart, RNG), some_state(chart, RNG)
+    assert np.allclose(a.extrapolated(b, 0).alpha, b.alpha) and np.allclose(
+        a.extrapolated(b, -1).offset, a.offset
+    )
+    c = a.extrapolated(b, 1)
+    turns = c.rotation * b.rotation.inv() * (b.rotation * a.rotation.inv()).inv()
+    assert turns.magnitude().max() < 1e-12
+    assert np.allclose(b.difference(a), -a.difference(b)) and not a.difference(a).any()
+
+
+@pytest.mark.parametrize("template", [grid_template, tube_template])
+def test_rigid_motion_moves_the_template(template):
+    chart = Atlas(template())
+    rest = at_rest(chart)
+    turn, shift = Rotation.from_rotvec([0.2, -0.1, 0.3]), np.array([0.02, -0.01, 0.05])
+    state = State(rest.alpha, rest.offset, *chart.rigid(turn, shift))
+    assert np.allclose(
+        chart.surface(state).vertices, turn.apply(chart.surface(rest).vertices) + shift
+    )
+
+
+def test_absorbed_leaves_the_surface_and_as_little_relief_as_the_jet_can():
+    chart = Atlas(grid_template(13, 14, order=4))
+    state = some_state(chart, RNG)
+    fine = (
+        state.offset[:, 2] + chart.surface(state).basis @ RNG.normal(size=len(chart.bending)) * 0.1
+    )
+    state = dataclasses.replace(state, offset=np.column_stack([state.offset[:, :2], fine]))
+    found = chart.with_relief_in_jets(state, ridge=1e-12)
+    assert np.allclose(chart.surface(found).vertices, chart.surface(state).vertices, atol=1e-12)
+    basis = chart.surface(state).basis
+    assert np.abs(basis.T @ fine).max() > 0.1 and np.abs(basis.T @ found.offset[:, 2]).max() < 1e-6
+
+
+def test_absorbed_leaves_the_surface_of_several_patches():
+    chart = Atlas(tube_template(15, 24))
+    state = some_state(chart, RNG, 0.02)
+    x = chart.template.vertices
+    smooth = 0.05 * np.sin(20 * x[:, 0]) * np.cos(15 * x[:, 1])
+    state = dataclasses.replace(state, offset=np.column_stack([state.offset[:, :2] * 0.2, smooth]))
+    found = chart.with_relief_in_jets(state)
+    apart = chart.surface(found).vertices - chart.surface(state).vertices
+    assert np.abs(apart).max() < 1e-5 * chart.template.scale
+    assert np.linalg.norm(found.offset[:, 2]) < 0.5 * np.linalg.norm(state.offset[:, 2])
+
+
+def test_slides_are_differences_in_turned_axes():
+    """Displacements that are one vector of a plane slide nothing, whatever the axes; others are
+    what each edge's first end sees of them.
+    """
+    template = grid_template()
+    plane = synthetic.sheet(0.0, 6, 7)
+    angle = RNG.uniform(-np.pi, np.pi, len(plane))
+    axes = Rotation.from_rotvec(angle[:, None] * [0, 0, 1.0]).as_matrix()
+    shift = RNG.normal(size=(len(plane), 3)) * [1, 1, 0]
+    in_axes = lambda moved: np.einsum("nij,ni->nj", axes, moved)[:, :2].ravel()
+    difference = slides(template.edges, axes)
+    assert np.abs(difference @ in_axes(np.tile([0.3, -0.2, 0], (len(plane), 1)))).max() < 1e-12
+    a, b = template.edges.T
+    seen = np.einsum("nij,ni->nj", axes[a], shift[a] - shift[b])[:, :2]
+    assert np.abs(difference @ in_axes(shift) - seen.ravel()).max() < 1e-12
+
+
+def test_hinges_measure_bending_and_no_plane_bends():
+    """The sum of squares is the integral of a roll's squared curvature, on an irregular mesh
+    too.
+    """
+    n = 41
+    v, u = np.meshgrid(*2 * [np.linspace(-1, 1, n)], indexing="ij")
+    chart = np.stack([u, v], -1).reshape(-1, 2)
+    inner = np.abs(chart).max(1) < 0.99
+    chart[inner] += RNG.uniform(-0.1, 0.1, (inner.sum(), 2)) * 2 / n
+    faces = synthetic.grid_faces(n, n)
+    across, bends = hinges(np.column_stack([chart, np.zeros(len(chart))]), faces)
+    assert len(across) == bends.shape[0] == 3 * (n - 1) ** 2 - 2 * (n - 1)  # inner edges
+    assert np.abs(bends @ (0.3 + chart @ [1.5, -0.7])).max() < 1e-9
+    for k in (0, 1):
+        assert ((bends @ (0.5 * chart[:, k] ** 2)) ** 2).sum() == pytest.approx(
+            4.0, rel=0.1
+        )  # 1 on an area of 4
+    # the pairs are the corners that an inner edge separates
+    a, b = (
+        set(map(frozenset, x))
+        for x in (across, [(f[k], f[k - 1]) for f in faces for k in range(3)])
+    )
+    assert not a & b
