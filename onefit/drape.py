@@ -10,7 +10,7 @@ OUT receives
                             faces, fps
     figures.json            what was measured
     garment.usd, body.usd   animations that Blender and usdview open
-    frames/NNN.png          path-traced by Mitsuba; drape.mp4 is their video
+    frames/NNN.png          rendered by Mitsuba; drape.mp4 is their video
     meshes/NNN.obj          one mesh a frame, with --meshes obj (or ply)
 """
 
@@ -127,7 +127,7 @@ def parser():
         metavar=("HEIGHT", "WIDTH"),
         help="size of the rendering [pixels] (default: 480 360)",
     )
-    p.add_argument("--spp", type=int, default=36, help="samples a pixel (default: 36)")
+    p.add_argument("--spp", type=int, default=16, help="samples a pixel (default: 16)")
     p.add_argument("--device", default="cpu", help="cpu or cuda, for the network (default: cpu)")
     p.add_argument("--overwrite", action="store_true", help="replace an earlier drape in OUT")
     return p

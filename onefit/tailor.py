@@ -16,7 +16,7 @@ with optional_imports(__name__):
     from onefit.garment.garment import FOLDER
     from onefit.garment.sewing.loose import LOOSE_PATTERNS
     from onefit.garment.sewing.patterns import PATTERNS
-    from onefit.garment.sewing.sew import write
+    from onefit.garment.sewing.templates import write
 
 
 def main(argv=None):

@@ -65,6 +65,8 @@ def finished(
         for _ in range(steps):
             step(moving[0], start[0])
             cloth.v *= settings.damping
+    if len(start) > 1:  # the motion begins at once, and the cloth is in it
+        cloth.v = fps * (start[1] - start[0])
     yield torch.as_tensor(cloth.x[number]).float()
     for t in range(1, len(start)):
         for k in range(1, steps + 1):

@@ -125,7 +125,7 @@ def _render(drape, folder, size, spp, advance):
     write_video(folder / "drape.mp4", pictures(), drape.fps)
 
 
-def write(drape, folder, *, skip=(), meshes=None, size=(480, 360), spp=36, advance=lambda: None):
+def write(drape, folder, *, skip=(), meshes=None, size=(480, 360), spp=16, advance=lambda: None):
     """The files of a :class:`onefit.Drape` in the empty ``folder``; ``skip``: any of "usd",
     "render".
     """

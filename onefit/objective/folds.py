@@ -58,8 +58,7 @@ def folds(
     )
     away = 1e3 * (vertices - skinned)[:, low]
     length = lambda x: (x[..., edges[:, 0], :] - x[..., edges[:, 1], :]).norm(dim=-1)
-    if rest_lengths is None:
-        assert rest is not None
+    if rest is not None:
         rest_lengths = length(rest.double())
     return Folds(
         fold=change(lambda x: x),

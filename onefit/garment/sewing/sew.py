@@ -3,16 +3,10 @@ clusters (ACVD), and its triangles are evened out by sliding along the surface a
 Everything is deterministic.
 """
 
-import os
-
 import numpy as np
 
-from onefit.garment.binding import standard_body
-from onefit.garment.remesh import loops, remeshed
-from polyfit import mesh
-from polyfit.files import aside
+from onefit.garment.remesh import remeshed
 
-from .block import Block
 from .patterns import PATTERNS
 
 
@@ -48,31 +42,3 @@ def _clipped(V, F, inside):
     part = surface.clip_scalar(scalars="inside", value=0.0, invert=False).triangulate()
     part = part.clean(tolerance=1e-6, absolute=True).extract_largest()
     return np.array(part.points, dtype=np.float64), part.regular_faces.astype(np.int64)
-
-
-def write(names, folder):
-    """Sew the named templates into ``folder``; those of :data:`~.loose.LOOSE_PATTERNS` fall once,
-    and keep their cut.
-    """
-    from . import fall, loose
-
-    body = standard_body()
-    block = Block(body.vertices.numpy(), body.faces.numpy())
-    os.makedirs(folder, exist_ok=True)
-    for name in names:
-        if name in loose.LOOSE_PATTERNS:
-            cut = loose.cut(block, name)
-            F, arrays = cut.faces, dict(vertices=fall.fallen(cut), cut=cut.vertices)
-        else:
-            V, F = sewn(block, name)
-            arrays = dict(vertices=V)
-        arrays = {key: x.astype(np.float32) for key, x in arrays.items()}
-        path = os.path.join(folder, f"{name}.npz")
-        with aside(path) as temporary:
-            np.savez_compressed(temporary, faces=F.astype(np.int32), **arrays)
-        V = arrays.get("cut", arrays["vertices"]).astype(np.float64)
-        print(
-            f"{path}: {len(V)} vertices, {len(F)} faces, {mesh.areas(V, F).sum():.3f} m^2,"
-            f" {len(loops(F))} loops",
-            flush=True,
-        )

@@ -6,11 +6,12 @@ import torch
 
 import onefit
 from onefit import teach
+from onefit.body import skinning
 from onefit.garment.charts import PatchedGarment
 from onefit.objective.objective import posed
 from onefit.training import OneFitTraining, Settings, TrainingData
 from onefit.training.projection import Projection, unposed
-from onefit.training.teacher import lessons, path_of
+from onefit.training.teacher import lesson, lessons, path_of
 from polyfit.errors import InputError
 from polyfit.training import Processes
 
@@ -23,6 +24,12 @@ def folder(tmp_path_factory):
     arguments = ["shorts", "-o", str(folder), "--kinds", "walk", "--seconds", "0.3"]
     teach.main([*arguments, "--finish", "1"])
     return folder
+
+
+def test_lessons_are_files_of_every_frame(folder, data):
+    (made,) = lessons(folder, data.garments[0][0])
+    assert made.poses.shape == (9, 24, 3) and made.changes.shape[2] == 9
+    assert torch.isfinite(made.changes).all() and made.changes.abs().max() > 1e-3
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +45,7 @@ def test_what_patches_made_is_projected_back(data):
     moved = patched.blend @ changes.flatten(0, 1)
     again = patched.blend @ Projection(patched)(moved).flatten(0, 1)
     assert moved.abs().max() > 1e-4
-    assert (again - moved).abs().max() < 1e-3 * moved.abs().max()
+    assert (again - moved).norm() < 1e-2 * moved.norm()  # the ridge takes the rest
 
 
 def test_unposed_points_are_posed_where_they_were(data):
@@ -49,20 +56,19 @@ def test_unposed_points_are_posed_where_they_were(data):
     assert torch.allclose(unposed(at, garment.blend_weights, maps), points, atol=1e-4)
 
 
-def test_a_lesson_is_the_finished_drape(folder, data):
-    (lesson,) = lessons(folder, data.garments[0][0])
-    assert lesson.poses.shape == (9, 24, 3) and torch.isfinite(lesson.changes).all()
+def test_a_lesson_gives_the_drape_back():
+    # without a finish: a network's drape is made of patches, and nothing of it may be lost
     draper = onefit.load()
-    garment = draper.garment("shorts")
-    drape = draper.drape(garment, onefit.Motion.generate("walk", seconds=0.3), finish=1)
-    patched = draper.patched(garment)
-    from onefit.body import skinning
-
-    maps = skinning.transforms(draper.standard, lesson.poses, lesson.translation)
-    moved = drape.rest[:, None] + patched.blend @ lesson.changes.flatten(0, 1)
+    garment, shape = draper.garment("shorts"), torch.full((6,), 0.6)
+    motion = onefit.Motion.generate("walk", seconds=0.3)
+    made = lesson(draper, garment, motion, shape, finish=0, material="cotton")
+    drape = draper.drape(garment, motion, shape)
+    maps = skinning.transforms(draper.model.body(shape), made.poses, made.translation)
+    moved = drape.rest[:, None] + draper.patched(garment).blend @ made.changes.flatten(0, 1)
     again = posed(moved, garment.blend_weights, maps).transpose(0, 1)
-    left = (again - drape.vertices).norm(dim=-1)
-    assert left.square().mean().sqrt() < 0.003
+    plain = draper.drape(garment, motion, shape, skinning_only=True)
+    left = (again - drape.vertices).square().mean().sqrt()
+    assert left < 0.001 and left < 0.2 * (drape.vertices - plain.vertices).square().mean().sqrt()
 
 
 def test_lessons_that_are_there_are_kept(folder):
