@@ -38,10 +38,10 @@ class Template:
     ``patch`` (N, M), ``weight`` (N, M): the patches that hold a vertex, the first its own, and
     their shares in it; ``chart`` (N, M, 2): its (u, v) there, ``rest`` (N, M): what is kept of its
     height over the jet there [chart unit]; ``axes`` (N, 3, 3): the axes of (Δu, Δv, Δw) in space,
-    columns of length 1: tangents and normal, or the chart's where there is one patch; ``lift`` (N,): what its own
-    chart adds to the height for each length along the third axis, so that the vertex moves along
-    it, whatever the jet's slope. ``residual`` (N,) [m]: what the jets leave at each vertex, along
-    the chart's normal in its own patch.
+    columns of length 1: tangents and normal, or the chart's where there is one patch; ``lift``
+    (N,): what its own chart adds to the height for each length along the third axis, so that the
+    vertex moves along it, whatever the jet's slope. ``residual`` (N,) [m]: what the jets leave at
+    each vertex, along the chart's normal in its own patch.
     """
 
     vertices: np.ndarray
