@@ -262,7 +262,7 @@ class Assembly:
                     self._meetings.append((other, k, part.start + kept, at[kept]))
 
     def normal(
-        self, surface, images, lengths, stiffness, d=2, give=np.inf, triangles=None, wide=None
+        self, surface, images, lengths, stiffness, wide=None, d=2, give=np.inf, triangles=None
     ):
         """:class:`Normal` of the images, the edges and further
         residuals of triangles, and the edges' energy.

@@ -175,10 +175,10 @@ class SecondOrder:
             seen.images,
             self._lengths,
             stiffness,
+            self.patterns[d],
             d,
             give,
             rows,
-            self.patterns[d],
         )
         held, joined = self._hold(normal, surface, state, context)
         relief = s.k_relief * (caution if rules.relief_caution else 1.0)

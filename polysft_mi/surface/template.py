@@ -264,7 +264,7 @@ def _fitted(x, order, ridge=0.0):
     powers = exponents(order)
     low, high = x[:, :2].min(0), x[:, :2].max(0)
     centre, half = (low + high) / 2, (high - low) / 2
-    half = np.maximum(half, max(MIN_BOX_RATIO * half.max(), 1e-300))
+    half = np.maximum(half, max(MIN_BOX_RATIO * half.max(), 1e-6))
     values = [
         chebyshev.chebvander((x[:, k] - centre[k]) / half[k], order)[:, powers[:, k]]
         for k in (0, 1)

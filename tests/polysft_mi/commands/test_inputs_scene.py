@@ -223,7 +223,7 @@ def test_malformed_setting(sheet, text):
         ),
         *((f"order={n}", f"order = {n}; a whole number, 0 to 10, is needed") for n in (-1, 11)),
         *((f"order={n}", f"order = '{n}'; a whole number is needed") for n in ("four", "2.5", "")),
-        ("fit_tolerance=0", "fit_tolerance = 0.0; a finite number, above 0, is needed"),
+        ("rgb_scale=0", "rgb_scale = 0.0; a finite number, above 0, is needed"),
         ("window=-1", "window = -1; a whole number, at least 0, is needed"),
         ("solver=newton", "solver = 'newton'; known values: gauss-newton, adam"),
         ("rgb_norm=l3", "rgb_norm = 'l3'; known values: l1, l2, charbonnier"),

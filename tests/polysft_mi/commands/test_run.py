@@ -81,16 +81,14 @@ def test_unknowns_make_the_surface(result):
     with np.load(result / "params.npz") as p:
         p = {k: p[k] for k in p}
     for k, expected in enumerate(surface(result)["vertices"]):
-        uv = p["chart"] + np.stack([p["delta_u"][k], p["delta_v"][k]], 1)
+        uv = p["chart"][:, 0] + np.stack([p["delta_u"][k], p["delta_v"][k]], 1)
         x = jets.point(
-            torch.as_tensor(p["alpha"] + p["delta_alpha"][k]), torch.as_tensor(uv)
+            torch.as_tensor((p["alpha"] + p["delta_alpha"][k])[0]), torch.as_tensor(uv)
         ).numpy()
         x[:, 2] += p["delta_w"][k]
-        x = x @ Rotation.from_quat(p["rotation"][k]).as_matrix().T + p["translation"][k]
-        assert (
-            np.abs(p["scale"] * x @ p["frame_rotation"].T + p["frame_origin"] - expected).max()
-            < 1e-5
-        )
+        x = x @ Rotation.from_quat(p["rotation"][k][0]).as_matrix().T + p["translation"][k]
+        found = p["scale"] * x @ p["frame_rotation"][0].T + p["frame_origin"]
+        assert np.abs(found - expected).max() < 1e-5
 
 
 def test_files_of_a_run(sequence, result):
@@ -115,6 +113,7 @@ def test_files_of_a_run(sequence, result):
         "depth": (72, 96, 1),
         "normal": (72, 96, 3),
         "uv": (72, 96, 2),
+        "patch": (72, 96, 1),
     }
     inside = layers["mask_render"][..., 0] > 0.999
     V = surface(result)["vertices"][5]
