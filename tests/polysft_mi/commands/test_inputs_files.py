@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 import pytest
 import synthetic
-import trimesh
 from refusals import SIZE, edited, has, refused
 
 
@@ -83,26 +82,10 @@ def with_nan(truth, which):
     return arrays
 
 
-def twice(truth):
-    V, uv, F = moved(truth)
-    return (
-        np.concatenate([V, V + (0, 0.3, 0)]),
-        np.concatenate([uv, uv]),
-        np.concatenate([F, F + len(V)]),
-    )
-
-
-def ball(_):
-    mesh = trimesh.creation.icosphere(2, 0.06)
-    return mesh.vertices + (0, 0, 0.5), mesh.vertices[:, :2] * 8 + 0.5, mesh.faces
-
-
 BAD_TEMPLATES = {
     "nan": (
         lambda t: with_nan(t, 0),
-        [
-            "template.obj: 1 vertices have coordinates that are not finite (the first is coordinate 5"
-        ],
+        ["template.obj: 1 vertices have coordinates that are not finite (the first is vertex 5"],
     ),
     "uv nan": (
         lambda t: with_nan(t, 1),

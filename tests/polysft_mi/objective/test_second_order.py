@@ -33,7 +33,7 @@ def edges_of(problem):
 
     def edges_alone(state, lengths, stiffness, **more):
         surface = chart.surface(state)
-        return assembly.normal(surface, nothing, lengths, stiffness, 3, **more)
+        return assembly.normal(surface, nothing, lengths, stiffness, d=3, **more)
 
     return chart, pattern, np.array(problem.edge_lengths, dtype=np.float64), edges_alone
 
@@ -116,7 +116,7 @@ def test_stretched_edges_give_and_compressed_ones_do_not(problem):
 def test_strain_is_held_harder_where_it_may_be_noise(problem, monkeypatch, noise, low, high):
     whole, given = SecondOrder(problem), []
     normal = whole._assembly.normal
-    monkeypatch.setattr(whole._assembly, "normal", lambda *a: given.append(a[5]) or normal(*a))
+    monkeypatch.setattr(whole._assembly, "normal", lambda *a: given.append(a[6]) or normal(*a))
     rest = whole.atlas.state(problem.patch.rest().to_numpy())
     context, stage = context_of(whole, rest, noise), stages_of(whole.rules)[1][0]
     whole.model(rest, context, stage, 0.5)
