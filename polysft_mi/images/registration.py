@@ -109,6 +109,7 @@ class Registration:
             self._rules.texels,
             self._masked,
             self.normalise,
+            len(template) > 1,
         )
         self._unit = max(1.0, math.sqrt(_shown_area(position, self.faces)) / _SHEET)
         self._frames = Frames(problem.sequence, self.normalise)

@@ -26,22 +26,23 @@ def packed_image(colour, fourth):
 class Texture:
     """The reflectance of a rendered mesh over the box of its texture coordinates.
 
-    ``image`` (H, W, 3) float32, linear; ``inside`` (H, W): 1 where a triangle has it;
+    ``image`` (H, W, 3) float32, linear; ``inside`` (H, W): 1 where a triangle may have it;
     ``density``: texels a pixel of the first frame; ``coordinates``: Float of 2V, of the rendered
     vertices; ``scale``, ``shift``: take coordinates to texels (whole at their centres).
     """
 
-    def __init__(self, mesh, faces, position, density, masked, normalise):
+    def __init__(self, mesh, faces, position, density, masked, normalise, islands=False):
         """``faces`` (F, 3): of the rendered vertices; ``position`` (V, 2) [pixels]: of these in the
         first frame; ``masked``: whether frames have masks; ``normalise``: whether images are freed
-        from lighting.
+        from lighting; ``islands``: whether the texture is that of the triangles alone. A sheet's is
+        that of their whole box, for it may be moved on the sheet.
         """
         self.density, self._masked, self._normalise = density, masked, normalise
         self._faces, self._levels = faces, {}
         self.coordinates = on_device(mesh.vertex_texcoords_buffer(), mi.Float)
-        self._bake(mesh, position)
+        self._bake(mesh, position, islands)
 
-    def _bake(self, mesh, position):
+    def _bake(self, mesh, position, islands):
         coordinates, faces = self._host_coordinates(), self._faces
         low, size = coordinates.min(0), np.maximum(np.ptp(coordinates, axis=0), 1e-9)
 
@@ -76,7 +77,9 @@ class Texture:
         dr.make_opaque(self.scale, self.shift)
         x, y = np.meshgrid(*at)
         inside = (x >= low[0]) & (x <= low[0] + size[0]) & (y >= low[1]) & (y <= low[1] + size[1])
-        self.inside = (inside & self._covered(inside.shape)).astype(np.float32)
+        if islands:
+            inside &= self._covered(inside.shape)
+        self.inside = inside.astype(np.float32)
 
     def _covered(self, shape):
         """Which texels (H, W) touch a triangle."""
