@@ -76,8 +76,6 @@ class Problem:
         self.edges = tuple(
             mi.UInt32(np.ascontiguousarray(edges[:, k], dtype=np.uint32)) for k in (0, 1)
         )
-        # of the jet at rest, not of the mesh: what the jet smooths away of a noisy template would
-        # else be stretched for ever
         rest = self.surface(self.patch.rest()).astype(np.float64)
         lengths = np.linalg.norm(rest[edges[:, 0]] - rest[edges[:, 1]], axis=1)
         self.edge_lengths = mi.Float(lengths.astype(np.float32))

@@ -2,8 +2,8 @@
 "PolyFit" and "PolySfT"). NumPy.
 
 A sheet is one patch. What no height graph over one plane can hold is cut into as few patches as can
-(:mod:`polyfit.patches.atlas`). What several jets leave of the mesh is kept, so that the undeformed
-template is the mesh that was given; one jet smooths a sheet, whose scan may be noisy.
+(:mod:`polyfit.patches.atlas`). What the jets leave of the mesh is kept, so that the undeformed
+template is the mesh that was given.
 
 The frame and the fit of one patch are those of :class:`polyfit.CanonicalFrame` and
 :func:`polyfit.jets.fit`: to load torch would take longer than the rest of a run's start.
@@ -36,12 +36,11 @@ class Template:
     R, T), p = s R x + T; ``alpha`` (K, A): the jets, in the charts' units.
 
     ``patch`` (N, M), ``weight`` (N, M): the patches that hold a vertex, the first its own, and
-    their shares in it; ``chart`` (N, M, 2): its (u, v) there, ``rest`` (N, M): what is kept of its
-    height over the jet there [chart unit]; ``axes`` (N, 3, 3): the axes of (Δu, Δv, Δw) in space,
+    their shares in it; ``chart`` (N, M, 2): its (u, v) there, ``rest`` (N, M): its height over the
+    jet there [chart unit]; ``axes`` (N, 3, 3): the axes of (Δu, Δv, Δw) in space,
     columns of length 1: tangents and normal, or the chart's where there is one patch; ``lift``
     (N,): what its own chart adds to the height for each length along the third axis, so that the
-    vertex moves along it, whatever the jet's slope. ``residual`` (N,) [m]: what the jets leave at
-    each vertex, along the chart's normal in its own patch.
+    vertex moves along it, whatever the jet's slope.
     """
 
     vertices: np.ndarray
@@ -58,7 +57,6 @@ class Template:
     rest: np.ndarray
     axes: np.ndarray
     lift: np.ndarray
-    residual: np.ndarray
 
     def __len__(self):
         """K, the number of patches."""
@@ -73,6 +71,13 @@ class Template:
     def edges(self):
         """Edges of the mesh, each once, (E, 2)."""
         return edges_of(self.faces)[0]
+
+    @property
+    def residual(self):
+        """What the jets leave at each vertex (N,) [m]: distance along the chart's normal in its own
+        patch.
+        """
+        return self.rest[:, 0] * self.radius[self.patch[:, 0]]
 
     @property
     def residual_rms(self):
@@ -131,9 +136,6 @@ class Template:
         x = np.einsum("nmij,nmi->nmj", rotation[patch], points[:, None] - origin[patch])
         x /= radius[patch][..., None]
         alpha, rest = _jets(x, patch, weight > 0, len(frames), order, exact, where)
-        residual = rest[:, 0] * radius[patch[:, 0]]
-        if len(frames) == 1:
-            rest = np.zeros_like(rest)
         texcoords = TexCoords(np.asarray(uv.coordinates, np.float64), np.asarray(uv.faces))
         return cls(
             points,
@@ -150,7 +152,6 @@ class Template:
             rest,
             axes,
             _lift(x[:, 0, :2], patch[:, 0], alpha, rotation, axes),
-            residual,
         )
 
 
