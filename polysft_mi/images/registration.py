@@ -114,9 +114,6 @@ class Registration:
         self._unit = max(1.0, math.sqrt(_shown_area(position, self.faces)) / _SHEET)
         self._frames = Frames(problem.sequence, self.normalise)
         self._levels, self._last, self._brightness = {}, None, None
-        self._silhouette_weight = self._rules.silhouette * problem.settings.k_silhouette
-        if len(template) > 1:
-            self._silhouette_weight *= self._rules.rounded_silhouette
 
     def _level(self, blur):
         if isinstance(blur, Level):
@@ -212,7 +209,7 @@ class Registration:
                 error, pairs = self._outline(
                     view.seen(), crossings, shown.mask, shown.distance, self._corner_of
                 )
-            mask_weight = self._silhouette_weight / shown.area if masked else 0.0
+            mask_weight = self._rules.silhouette * s.k_silhouette / shown.area if masked else 0.0
             images = self.gather.images(
                 table, figures, vertices, s.k_rgb, mask_weight, shown.area, level.stride, pairs
             )

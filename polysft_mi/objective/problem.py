@@ -66,9 +66,9 @@ class Problem:
     def __init__(
         self, experiment: Experiment, sequence: Sequence, rules: Rules | None = None
     ) -> None:
-        self.rules = rules or Rules()
         self.experiment, self.sequence, self.settings = experiment, sequence, experiment.settings
         self.template = experiment.template
+        self.rules = (rules or Rules()).for_patches(len(self.template))
         self.patch = JetAtlas(self.template)
         self.width, self.height = experiment.size
         self.pixels = self.width * self.height

@@ -136,7 +136,7 @@ class SecondOrder:
 
     def hidden(self, state):
         """The :class:`polysft_mi.objective.hidden.Hidden` of a surface."""
-        if len(self.atlas) == 1:
+        if self.rules.unseen == 1:
             return self._seen
         seen = self.images.seen_vertices(self.atlas.surface(state).vertices, self.rules.blurs[-1])
         return Hidden.of(seen, self.rules.unseen, self)
@@ -166,8 +166,6 @@ class SecondOrder:
         if stiffness is not None:
             give = math.inf
         stiffness = s.k_mi * (stiffness or stage.stiffness) / atlas.template.scale**2
-        if len(atlas) > 1:
-            stiffness *= rules.rounded_stiffness
         d = 3 if self.has_relief and stage.relief and not context.is_first else 2
         shading, rows = self._shading(surface, context, stage, seen, appearance)
         normal, inextensibility = self._assembly.normal(

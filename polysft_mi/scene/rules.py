@@ -147,6 +147,16 @@ class Rules:
     light_first_scale: float = _rule(0.05, "share", "of the mean luminance, before any is known")
     light_scale_bounds: tuple = _rule((0.005, 0.05), "share", "bounds of that scale, likewise")
 
+    def for_patches(self, count: int) -> "Rules":
+        """The rules for a template of so many patches: a sheet is one."""
+        if count == 1:
+            return dataclasses.replace(self, unseen=1.0)
+        return dataclasses.replace(
+            self,
+            stiffness=tuple(self.rounded_stiffness * x for x in self.stiffness),
+            silhouette=self.rounded_silhouette * self.silhouette,
+        )
+
     def caution(self, noise):
         """The factor by which weights grow with the ``noise`` (a misfit; NaN: none is known)."""
         noise = 0.0 if math.isnan(noise) else noise
