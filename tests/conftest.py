@@ -20,12 +20,20 @@ def pytest_addoption(parser):
 
 
 def pytest_configure(config):
+    # Each worker of pytest-xdist has its share of the cores, as have the processes that it starts:
+    # threads that wait for one another's core double the time. Before NumPy and torch are imported
+    threads = max(1, (os.cpu_count() or 1) // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", 1)))
+    os.environ.setdefault("OMP_NUM_THREADS", str(threads))
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", str(threads))
     # Before the test modules are imported: classes that derive from Mitsuba's can be defined only
     # with a variant set
     try:
         config.variant = set_variant(config.getoption("--mode"))
     except InputError as error:
         raise pytest.UsageError(str(error)) from None
+    import drjit as dr
+
+    dr.set_thread_count(threads)
 
 
 def pytest_report_header(config):

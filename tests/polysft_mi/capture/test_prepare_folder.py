@@ -5,8 +5,6 @@ in one line.
 import dataclasses
 import json
 import os
-import subprocess
-import sys
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -14,8 +12,8 @@ import numpy as np
 import pytest
 import synthetic
 from loading import difference, loaded
-from places import ROOT
 
+from polysft_mi import prepare
 from polysft_mi.capture import prepare_folder, recognise
 from polysft_mi.errors import InputError
 from polysft_mi.scene.sequence import Sequence
@@ -214,20 +212,11 @@ def test_folder_that_cannot_be_written(tmp_path):
         folder.chmod(0o755)
 
 
-def test_command_line(tmp_path):
-    folder = synthetic.cloth(tmp_path / "data", frames=2).folder
-    command = lambda *a: subprocess.run(
-        [sys.executable, "-m", "polysft_mi.prepare", *map(str, a)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-    )
-    done = command(folder, "-o", tmp_path / "out")
-    assert done.returncode == 0 and "template of 99 vertices" in done.stdout
-    assert f"python -m polysft_mi.run {tmp_path / 'out' / 'scene.xml'}" in done.stdout
-    again = command(folder, "-o", tmp_path / "out")
-    assert (
-        again.returncode == 2
-        and again.stderr.startswith("error: ")
-        and again.stderr.count("\n") == 1
-    )
+def test_command_line(tmp_path, capsys):
+    words = [str(synthetic.cloth(tmp_path / "data", frames=2).folder), "-o", str(tmp_path / "out")]
+    prepare.main(words)
+    said = capsys.readouterr().out
+    assert "template of 99 vertices" in said
+    assert f"python -m polysft_mi.run {tmp_path / 'out' / 'scene.xml'}" in said
+    with pytest.raises(InputError, match="--overwrite"):
+        prepare.main(words)
