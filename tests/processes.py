@@ -1,5 +1,7 @@
 """Processes of their own, for tests of how a command or an import starts and ends."""
 
+import os
+import socket
 import subprocess
 import sys
 
@@ -23,3 +25,26 @@ def refusal(done):
     assert done.returncode == 2 and done.stdout == "", done.stderr
     assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1, done.stderr
     return done.stderr
+
+
+def two_ranks(*arguments):
+    """Two Pythons that find each other as torchrun's would, by their environment, one thread each;
+    both must end well.
+    """
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    where = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "OMP_NUM_THREADS": "1"}
+    started = [
+        subprocess.Popen(
+            [sys.executable, *map(str, arguments)],
+            cwd=ROOT,
+            env=os.environ | where | {"WORLD_SIZE": "2", "RANK": rank, "LOCAL_RANK": rank},
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for rank in "01"
+    ]
+    for process, (_, said) in [(p, p.communicate()) for p in started]:
+        assert process.returncode == 0, said[-2000:]

@@ -3,13 +3,12 @@ refuses.
 """
 
 import json
-import os
 from dataclasses import replace
 
 import pytest
 import torch
 import trimesh
-from processes import python
+from processes import two_ranks
 from safetensors.torch import load_file
 
 from polyfit import InputError, PolyFit, jets, train
@@ -144,19 +143,14 @@ def test_ctrl_c_leaves_a_checkpoint(tmp_path, monkeypatch):
     assert all(torch.equal(resumed[k], whole[k]) for k in whole)
 
 
-def test_two_processes_of_torchrun_do_what_one_does(tmp_path):
+def test_two_processes_do_what_one_does(tmp_path):
     # a thread of the group that outlives it may abort the ending interpreter
     (tmp_path / "run.py").write_text(
         "import sys\nfrom pathlib import Path\nfrom polyfit import train\ntrain.main()\nleft ="
         " [name for task in Path('/proc/self/task').glob('*') if 'gloo' in (name := (task /"
         " 'comm').read_text())]\nsys.exit(f'threads left: {left}' if left else 0)\n"
     )
-    torchrun = "-m torch.distributed.run --nproc-per-node 2 --master-port 29731".split()
-    done = python(
-        *torchrun, tmp_path / "run.py", *FLAGS, "-o", tmp_path / "two",
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr[-2000:]
+    two_ranks(tmp_path / "run.py", *FLAGS, "-o", tmp_path / "two")
     assert json.loads((tmp_path / "two" / "weights.json").read_text())["processes"] == 2
     two, one = (
         load_file(tmp_path / "two" / "weights.safetensors"),

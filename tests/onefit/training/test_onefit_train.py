@@ -1,11 +1,10 @@
 import json
-import os
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from processes import python
+from processes import two_ranks
 from safetensors.torch import load_file
 
 import onefit
@@ -192,15 +191,10 @@ def test_a_resumed_training_ends_where_an_uninterrupted_one_does(small, tmp_path
     assert 0 < max(changes) < 0.01
 
 
-def test_two_processes_of_torchrun_have_the_curve_of_one(small, tmp_path):
+def test_two_processes_have_the_curve_of_one(small, tmp_path):
     flags = "shorts --batch 600 --epochs 1 --epoch-steps 3 --shapes 1".split()
     flags += ["--motions", small.motions[0]]
-    torchrun = "-m torch.distributed.run --nproc-per-node 2 --master-port 29741".split()
-    done = python(
-        *torchrun, "-m", "onefit.train", *flags, "-o", tmp_path / "two",
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr[-2000:]
+    two_ranks("-m", "onefit.train", *flags, "-o", tmp_path / "two")
     train.main([*flags, "-o", str(tmp_path / "one")])
     two, one = (load_file(tmp_path / name / "checkpoint.safetensors") for name in ("two", "one"))
     assert json.loads((tmp_path / "two" / "weights.json").read_text())["processes"] == 2

@@ -99,7 +99,12 @@ def test_photo_that_is_not_in_the_video(clip, tmp_path):
 )
 def test_corners_that_cannot_be(corners, said, clip, tmp_path):
     assert said in refused(
-        prepare_video, clip[0], str(tmp_path / "out"), corners=corners, **given(clip)
+        prepare_video,
+        clip[0],
+        str(tmp_path / "out"),
+        corners=corners,
+        pose_fit="none",
+        **given(clip),
     )
     assert os.listdir(tmp_path) == []
 

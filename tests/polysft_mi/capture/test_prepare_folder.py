@@ -61,8 +61,8 @@ def test_prepared_scene_shows_frame_0(form, tmp_path):
 def test_scene_beside_or_away_from_the_data(form, tmp_path, monkeypatch):
     truth = FORMS[form](tmp_path / "data", frames=2)
     monkeypatch.chdir(tmp_path)
-    beside, _ = prepare_folder("data")
-    away, _ = prepare_folder("data", "somewhere/else")
+    beside, _ = prepare_folder("data", pose_fit="none")
+    away, _ = prepare_folder("data", "somewhere/else", pose_fit="none")
     monkeypatch.chdir(tmp_path / "somewhere")
     folders = [
         ET.parse(tmp_path / p).find("default[@name='data']").get("value") for p in (beside, away)
@@ -191,12 +191,12 @@ def test_template_and_frames_are_checked(tmp_path):
 
 def test_files_that_are_there_stay(tmp_path):
     folder = synthetic.kinect_paper(tmp_path / "data", frames=1).folder
-    _path, _ = prepare_folder(str(folder), resolution=5)
+    prepare_folder(str(folder), resolution=5, pose_fit="none")
     before = {name: (folder / name).read_bytes() for name in ("scene.xml", "template.obj")}
     assert "--overwrite" in refused(str(folder))
     (folder / "scene.xml").unlink()
     assert "template.obj" in refused(str(folder)) and not (folder / "scene.xml").exists()
-    prepare_folder(str(folder), resolution=9, overwrite=True)
+    prepare_folder(str(folder), resolution=9, overwrite=True, pose_fit="none")
     assert (folder / "scene.xml").read_bytes() == before["scene.xml"] and (
         folder / "template.obj"
     ).read_bytes() != before["template.obj"]

@@ -22,7 +22,7 @@ from polysft_mi.results import metrics
 from polysft_mi.results.evaluation import evaluate, score
 from polysft_mi.scene import experiment as scene
 
-QUICK = ["-D", "solver=adam", "-D", "period=30", "-D", "patience=30"]
+QUICK = ["-D", "solver=adam", "-D", "period=10", "-D", "patience=10"]
 
 
 @pytest.fixture(scope="module")
