@@ -129,7 +129,7 @@ class SecondOrder:
         self.slides = slides(template.edges, template.axes)
         self._joints = Joints(self.atlas)
         self._seen = Hidden.of(np.ones(count, dtype=bool), 1.0, self)
-        self._lengths = np.array(problem.edge_lengths, dtype=np.float64)
+        self.lengths = np.array(problem.edge_lengths, dtype=np.float64)
         self.has_relief = self.settings.k_relief > 0 and count <= self.rules.relief_vertices
         #: the weight that holds a frame's jets and displacements to the frame before
         self.temporal = self.settings.k_tc * self.rules.temporal
@@ -171,7 +171,7 @@ class SecondOrder:
         normal, inextensibility = self._assembly.normal(
             surface,
             seen.images,
-            self._lengths,
+            self.lengths,
             stiffness,
             self.patterns[d],
             d,
@@ -179,7 +179,7 @@ class SecondOrder:
             rows,
         )
         held, joined = self._hold(normal, surface, state, context)
-        relief = s.k_relief * (caution if rules.relief_caution else 1.0)
+        relief = s.k_relief * rules.relief * (caution if rules.relief_caution else 1.0)
         smoothness, temporal = self._smooth(normal, state, context, d, relief)
         terms = {
             "rgb": seen.photometric,

@@ -53,6 +53,14 @@ class Rules:
     rounded_silhouette: float = _rule(
         10.0, "", "factor of `k_silhouette` there: the outline shows a bend that no texture shows"
     )
+    rounded_relief: float = _rule(
+        0.1, "", "factor of `k_relief` there: their jets leave more of a bend to it"
+    )
+    # how sure a vertex is
+    sigma_strain: float = _rule(
+        7.2, "", "factor of what the strain around a vertex adds to the doubt of noise"
+    )
+    sigma_unseen: float = _rule(3.3, "", "factor of it where no pixel sees the vertex")
     # the step
     small_step: float = _rule(
         2e-3, "share", "of the objective that a step must promise for another one to follow"
@@ -93,6 +101,7 @@ class Rules:
     relief_vertices: int = _rule(
         3000, "vertices", "of the template, above which there is no relief: it costs too much time"
     )
+    relief: float = _rule(1.0, "share", "of `k_relief`")
     relief_bend: float = _rule(3e-3, "share", "of the relief's weight, for its bending")
     noise_misfit: float = _rule(
         0.05, "misfit", "of noise, at which the relief's weight and `give` have doubled"
@@ -155,6 +164,7 @@ class Rules:
             self,
             stiffness=tuple(self.rounded_stiffness * x for x in self.stiffness),
             silhouette=self.rounded_silhouette * self.silhouette,
+            relief=self.rounded_relief * self.relief,
         )
 
     def caution(self, noise):

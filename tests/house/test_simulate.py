@@ -8,12 +8,14 @@ import pytest
 from places import ROOT
 from scripts import load
 
+from polyfit.mesh import edges_of
 from polysft_mi.errors import InputError
 from polysft_mi.images.registration import Registration
 from polysft_mi.objective.problem import Problem
 from polysft_mi.scene import experiment as scene
 
 simulate = load("benchmarks/simulate.py")
+pictures, shapes = load("benchmarks/simulate_pictures.py"), load("benchmarks/simulate_shapes.py")
 KIND = simulate.KINDS["bend"]
 
 
@@ -26,14 +28,16 @@ def bent(tmp_path_factory):
     x = flat.copy()
     x[:, 0], x[:, 2] = (
         KIND.size[0] / 0.8 * np.sin(angle),
-        simulate.DEPTH + KIND.size[0] / 0.8 * (1 - np.cos(angle)),
+        shapes.DEPTH + KIND.size[0] / 0.8 * (1 - np.cos(angle)),
     )
     nx, ny = KIND.cells
     a = (np.arange(ny)[:, None] * (nx + 1) + np.arange(nx)).ravel()
     faces = np.concatenate(
         [np.stack([a, a + 1, a + nx + 2], 1), np.stack([a, a + nx + 2, a + nx + 1], 1)]
     )
-    simulate.render(str(folder), np.stack([flat, x]), faces, uv, np.random.default_rng(2))
+    shape = shapes.Shape(flat, faces, uv, np.zeros(len(flat), bool), KIND.size[0] / KIND.size[1])
+    seen = pictures.render(str(folder), np.stack([flat, x]), shape, np.random.default_rng(2))
+    assert seen.all()
     return folder, np.stack([flat, x])
 
 
@@ -41,7 +45,7 @@ def test_masks_are_where_the_vertices_are(bent):
     folder, vertices = bent
     for t, x in enumerate(vertices):
         mask = cv2.imread(str(folder / "masks" / f"{t:03d}.png"), cv2.IMREAD_GRAYSCALE) > 0
-        pixel = simulate.FOCAL * x[:, :2] / x[:, 2:] + np.array(simulate.SIZE) / 2
+        pixel = pictures.FOCAL * x[:, :2] / x[:, 2:] + np.array(pictures.SIZE) / 2
         rows, columns = np.nonzero(mask)
         low, high = np.array([columns.min(), rows.min()]), np.array([columns.max(), rows.max()]) + 1
         assert np.abs(low - pixel.min(0)).max() < 1.5 and np.abs(high - pixel.max(0)).max() < 1.5
@@ -83,6 +87,8 @@ def test_drag_pushes_along_the_normal_and_not_in_still_air():
 
 def test_pinned_points_come_together_by_the_share_that_is_said():
     for name, kind in simulate.KINDS.items():
+        if name in shapes.ROUNDED:
+            continue
         rng = np.random.default_rng(0)
         rest, uv = simulate.sheet(kind)
         held = simulate.pinned(name, kind, rng)
@@ -93,6 +99,39 @@ def test_pinned_points_come_together_by_the_share_that_is_said():
         assert (
             uv.min() == 0 and uv.max() == 1 and uv[0].tolist() == [0, 1]
         )  # the image's upper left corner
+
+
+@pytest.mark.parametrize("name", shapes.ROUNDED)
+def test_rounded_shapes_are_sewn_and_their_hands_move_rigidly(name):
+    shape, kind = shapes.ROUNDED[name](), simulate.KINDS[name]
+    edges, faces = edges_of(shape.faces)
+    boundary = (np.bincount(faces.ravel(), minlength=len(edges)) == 1).sum()
+    euler = len(shape.vertices) - len(edges) + len(shape.faces)
+    # an open tube, a closed surface, a disc
+    assert (euler, boundary > 0) == {"skirt": (0, True), "pillow": (2, False), "roll": (1, True)}[
+        name
+    ]
+    normal = np.cross(
+        *(shape.vertices[shape.faces[:, k]] - shape.vertices[shape.faces[:, 0]] for k in (1, 2))
+    )
+    outwards = (normal * (shape.vertices[shape.faces].mean(1) - [0, 0, shapes.DEPTH])).sum(1)
+    assert (outwards > 0).all() or (outwards < 0).all()
+    weather = simulate.Weather(name, kind, shape.vertices, shape.held, np.random.default_rng(0))
+    start, end = (weather.points(t) for t in (0.0, 0.4))
+    assert np.allclose(start, shape.vertices[shape.held]) and np.abs(end - start).max() > 0.005
+    hands = [start[:, 0] < 0, start[:, 0] >= 0] if name == "pillow" else [slice(None)]
+    for hand in hands:
+        apart = [np.linalg.norm(x[hand][:, None] - x[hand], axis=-1) for x in (start, end)]
+        assert np.allclose(*apart, atol=1e-9)
+
+
+def test_a_camera_sees_the_front_of_a_closed_shape(tmp_path):
+    shape = shapes.pillow()
+    rng = np.random.default_rng(0)
+    seen = pictures.render(str(tmp_path), shape.vertices[None], shape, rng)[0]
+    height, inner = shape.vertices[:, 2] - shapes.DEPTH, np.abs(shape.vertices[:, 0]) < 0.08
+    # a ray may slip through between two triangles
+    assert seen[inner & (height > 0.01)].mean() < 0.02 and seen[inner & (height < -0.01)].all()
 
 
 def test_a_folder_that_exists_is_refused(tmp_path):

@@ -1,0 +1,157 @@
+"""Pictures of what ``simulate.py`` lets move: textures, and frames by Mitsuba's path tracer."""
+
+import json
+import os
+
+import cv2
+import numpy as np
+
+from polysft_mi.surface.meshio import write_obj
+
+SIZE, FOCAL = (480, 360), 552.0  # of the images [pixels]
+SAMPLES, NOISE = 32, 1.5  # paths a pixel; standard deviation of the noise [levels of 255]
+BACKGROUND = np.array([45, 49, 57]) / 255
+NEAR = 2e-3  # [m]: what a ray meets within so far of a vertex is the vertex
+
+
+def _noise(rng, height, width, first, channels):
+    """Smooth noise (height, width, channels) of unit variance, in six octaves from ``first`` knots
+    across.
+    """
+    out = 0
+    for octave in range(6):
+        knots = first * 2**octave
+        coarse = rng.normal(size=(max(2, knots * height // width), knots, channels)).astype(
+            np.float32
+        )
+        out = out + 0.6**octave * cv2.resize(
+            coarse, (width, height), interpolation=cv2.INTER_CUBIC
+        ).reshape(height, width, channels)
+    return out / out.std()
+
+
+def texture(rng, aspect, height=512):
+    """An sRGB texture (H, W, 3) uint8 of one of four kinds: clouds, bars, squares, dots."""
+    width = round(height * aspect)
+    style = rng.integers(4)
+    if style == 0:
+        image = 0.5 + 0.28 * _noise(rng, height, width, 4, 3)
+    elif style == 1:
+        image = np.full((height, width, 3), 0.92, np.float32)
+        for _ in range(90):
+            x, y, a, b = (
+                rng.integers(0, width),
+                rng.integers(0, height),
+                rng.integers(8, 120),
+                rng.integers(4, 40),
+            )
+            image[y : y + b, x : x + a] = rng.uniform(0, 0.9, 3)
+    elif style == 2:
+        count = rng.integers(7, 12)
+        y, x = np.mgrid[:height, :width] * count // width
+        image = np.where(((x + y) % 2)[..., None], rng.uniform(0.1, 0.9, 3), [0.9, 0.88, 0.8]) * (
+            1 + 0.06 * _noise(rng, height, width, 30, 1)
+        )
+    else:
+        image = np.tile(np.float32([0.85, 0.82, 0.77]), (height, width, 1))
+        for _ in range(60):
+            at, radius = (
+                (int(rng.integers(0, width)), int(rng.integers(0, height))),
+                int(rng.integers(6, 45)),
+            )
+            cv2.circle(
+                image,
+                at,
+                radius,
+                rng.uniform(0, 0.8, 3).tolist(),
+                -1 if rng.random() < 0.6 else 5,
+                cv2.LINE_AA,
+            )
+    return (255 * np.clip(image, 0.02, 0.98)).astype(np.uint8)
+
+
+def render(folder, vertices, shape, rng):
+    """Write texture, template, camera, frames and masks of vertices (T, N, 3) [m, camera frame] of
+    a :class:`simulate_shapes.Shape` into ``folder``; ``rng`` draws texture, light and noise.
+    Returns which vertices the camera sees, (T, N) bool.
+    """
+    import mitsuba as mi
+
+    for name in ("frames", "masks"):
+        os.makedirs(os.path.join(folder, name), exist_ok=True)
+    at = lambda *names: os.path.join(folder, *names)
+    image = texture(rng, shape.aspect)
+    cv2.imwrite(at("texture.png"), image[..., ::-1])
+    write_obj(at("template.obj"), vertices[0], shape.faces, shape.uv)
+    width, height = SIZE
+    with open(at("camera.json"), "w", encoding="utf-8") as file:
+        json.dump(
+            dict(width=width, height=height, fx=FOCAL, fy=FOCAL, cx=width / 2, cy=height / 2),
+            file,
+            indent=1,
+        )
+    scene = mi.load_dict({
+        "type": "scene", "integrator": {"type": "path", "max_depth": 3},
+        "sensor": {
+            "type": "perspective", "fov": float(np.degrees(2 * np.arctan(width / 2 / FOCAL))),
+            "fov_axis": "x",
+            "to_world": mi.ScalarTransform4f().look_at([0, 0, 0], [0, 0, 1], [0, -1, 0]),
+            "film": {
+                "type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"},
+                "pixel_format": "rgb"
+            },
+        }, "sky": {"type": "constant", "radiance": 0.35},
+        "lamp": {
+            "type": "sphere", "center": [rng.uniform(-0.9, 0.9), -0.9, -0.3], "radius": 0.18,
+            "emitter": {"type": "area", "radiance": 9.0}
+        },
+        "cloth": {
+            "type": "obj", "filename": at("template.obj"),
+            "bsdf": {
+                "type": "twosided",
+                "bsdf": {
+                    "type": "diffuse",
+                    "reflectance": {"type": "bitmap", "filename": at("texture.png")}
+                }
+            }
+        },
+    })  # fmt: skip
+    depth = mi.load_dict({"type": "aov", "aovs": "z:depth"})
+    parameters = mi.traverse(scene)
+    key = next(
+        k for k in parameters.keys() if k.startswith("cloth") and k.endswith("vertex_positions")
+    )
+    start = np.array(parameters[key]).reshape(-1, 3)
+    corner = np.linalg.norm(start[:, None] - vertices[0], axis=-1).argmin(
+        1
+    )  # Mitsuba orders an OBJ's vertices itself
+    gain, seen = None, []
+    for t, x in enumerate(vertices):
+        parameters[key] = x[corner].astype(np.float32).ravel()
+        parameters.update()
+        light = np.array(mi.render(scene, spp=SAMPLES, seed=t))[..., :3]
+        mask = (
+            np.array(mi.render(scene, integrator=depth, spp=16, seed=t))[..., -1]
+            > 0.5 * x[:, 2].min()
+        )  # most of its rays meet the sheet
+        gain = gain or 1.25 * (image.mean() / 255) ** 2.2 / np.median(light[mask].mean(-1))
+        srgb = np.where(mask[..., None], np.clip(gain * light, 0, 1) ** (1 / 2.2), BACKGROUND)
+        levels = 255 * srgb + rng.normal(0, NOISE, srgb.shape)
+        cv2.imwrite(
+            at("frames", f"{t:03d}.png"),
+            np.clip(np.round(levels), 0, 255).astype(np.uint8)[..., ::-1],
+        )
+        cv2.imwrite(at("masks", f"{t:03d}.png"), 255 * mask.astype(np.uint8))
+        seen.append(visible(scene, x))
+    return np.array(seen)
+
+
+def visible(scene, x):
+    """Which of the vertices x (N, 3) [m] the camera at the origin sees, (N,) bool."""
+    import mitsuba as mi
+
+    far = np.linalg.norm(x, axis=1)
+    ray = mi.Ray3f(mi.Point3f(0.0), mi.Vector3f((x / far[:, None]).T.astype(np.float32)))
+    met = np.array(scene.ray_intersect_preliminary(ray).t)
+    pixel = FOCAL * x[:, :2] / x[:, 2:] + np.array(SIZE) / 2
+    return (met > far - NEAR) & ((pixel > 0) & (pixel < SIZE)).all(1)
