@@ -22,9 +22,11 @@ def pytest_addoption(parser):
 def pytest_configure(config):
     # Each worker of pytest-xdist has its share of the cores, as have the processes that it starts:
     # threads that wait for one another's core double the time. Before NumPy and torch are imported
-    threads = max(1, (os.cpu_count() or 1) // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", 1)))
-    os.environ.setdefault("OMP_NUM_THREADS", str(threads))
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", str(threads))
+    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", 0))  # 0 in what starts them
+    threads = str(max(1, (os.cpu_count() or 1) // max(1, workers)))
+    if workers:
+        os.environ.setdefault("OMP_NUM_THREADS", threads)
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", threads)
     # Before the test modules are imported: classes that derive from Mitsuba's can be defined only
     # with a variant set
     try:
@@ -33,7 +35,7 @@ def pytest_configure(config):
         raise pytest.UsageError(str(error)) from None
     import drjit as dr
 
-    dr.set_thread_count(threads)
+    dr.set_thread_count(int(threads))
 
 
 def pytest_report_header(config):
