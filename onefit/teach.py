@@ -11,11 +11,11 @@ import argparse
 from pathlib import Path
 
 from onefit.physics.material import MATERIALS, Material
-from polyfit.errors import InputError, cli, require
+from polyfit.errors import InputError, Parser, cli, require
 
 
 def parser():
-    p = argparse.ArgumentParser(
+    p = Parser(
         prog="python -m onefit.teach",
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,

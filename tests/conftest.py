@@ -20,12 +20,22 @@ def pytest_addoption(parser):
 
 
 def pytest_configure(config):
+    # Each worker of pytest-xdist has its share of the cores, as have the processes that it starts:
+    # threads that wait for one another's core double the time. Before NumPy and torch are imported
+    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", 0))  # 0 in what starts them
+    threads = str(max(1, (os.cpu_count() or 1) // max(1, workers)))
+    if workers:
+        os.environ.setdefault("OMP_NUM_THREADS", threads)
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", threads)
     # Before the test modules are imported: classes that derive from Mitsuba's can be defined only
     # with a variant set
     try:
         config.variant = set_variant(config.getoption("--mode"))
     except InputError as error:
         raise pytest.UsageError(str(error)) from None
+    import drjit as dr
+
+    dr.set_thread_count(int(threads))
 
 
 def pytest_report_header(config):

@@ -42,10 +42,7 @@ def test_contenders_take_the_same_gradient(tmp_path):
     for name in raster.CONTENDERS:
         contender = raster.Contender(name, SIZE, POINTS, str(tmp_path))
         contender.place(-2.0)
-        gradients[name] = sum(
-            np.array(contender.forward_backward(k), dtype=np.float64)
-            for k in range(40 if contender.path_replay else 1)
-        )
+        gradients[name] = np.array(contender.forward_backward(0), dtype=np.float64)
     g, through_mi, noisy = (gradients[name] for name in raster.CONTENDERS)
     assert np.linalg.norm(g) > 0
     assert through_mi == pytest.approx(g, rel=1e-3, abs=1e-3 * np.abs(g).max())
@@ -160,8 +157,8 @@ def test_poses_of_a_print_are_found_again(tmp_path):
     lines += [f"vt {a + 0.5:.6f} {0.5 - b:.6f}" for a, b in zip(u, v, strict=True)]
     lines += ["f " + " ".join(f"{k + 1}/{k + 1}" for k in face) for face in faces]
     (tmp_path / "template.obj").write_text("\n".join(lines) + "\n")
-    rows, sure = outline.measure(str(tmp_path), 3)
-    assert rows.shape == (3, 4) and sure == 3
+    rows, sure = outline.measure(str(tmp_path), 2)
+    assert rows.shape == (2, 4) and sure == 2
     assert (
         rows[:, 0].min() > 1 and rows[:, 2].max() < 0.2 and (rows[:, 3] < 0.25 * rows[:, 1]).all()
     )

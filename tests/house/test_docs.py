@@ -4,12 +4,11 @@ import contextlib
 import importlib
 import importlib.util
 import re
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 from places import ROOT
+from processes import python
 from scripts import load
 
 from polysft_mi.objective.problem import Problem
@@ -143,19 +142,8 @@ def test_options_of_the_command_are_described():
 
 
 def test_pages_build_without_a_warning(tmp_path):
-    command = [
-        sys.executable,
-        "-m",
-        "sphinx",
-        "-W",
-        "--keep-going",
-        "-q",
-        "-b",
-        "html",
-        ROOT / "docs",
-        tmp_path / "html",
-    ]
-    done = subprocess.run(command, capture_output=True, text=True)
+    options = "-W --keep-going -q -b html".split()
+    done = python("-m", "sphinx", *options, ROOT / "docs", tmp_path / "html")
     assert done.returncode == 0, done.stderr
     index = (tmp_path / "html" / "index.html").read_text(encoding="utf-8")
     assert [

@@ -1,11 +1,8 @@
 """What a plain installation does without torch, USD and polyscope, and what a command says that
 needs one of them."""
 
-import subprocess
-import sys
-
+import processes
 import pytest
-from places import ROOT
 
 from polyfit.errors import EXTRAS
 
@@ -31,12 +28,7 @@ for module in pkgutil.walk_packages(polysft_mi.__path__, "polysft_mi."):
 
 
 def python(code, *arguments):
-    return subprocess.run(
-        [sys.executable, "-c", _BLOCKED + code, *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        cwd=ROOT,
-    )
+    return processes.python("-c", _BLOCKED + code, *arguments)
 
 
 def test_polysft_imports_without_any_extra():
@@ -57,8 +49,7 @@ def test_polysft_imports_without_any_extra():
 def test_a_command_names_the_extra_that_it_misses(command, module, tmp_path):
     arguments = command.replace("OUT", str(tmp_path / "out")).split()
     done = python(_COMMAND, *arguments)
-    assert done.returncode == 2
-    (line,) = done.stderr.splitlines()
+    line = processes.refusal(done)
     assert f"{module} is not installed" in line and f"'polysft-mi[{EXTRAS[module]}]'" in line
     assert list(tmp_path.iterdir()) == []
 
@@ -66,9 +57,7 @@ def test_a_command_names_the_extra_that_it_misses(command, module, tmp_path):
 def test_export_to_usd_names_the_extra_that_it_misses(finished_run, tmp_path):
     _, run = finished_run
     done = python(_COMMAND, "polysft_mi.export", run, "--format", "usd", "-o", tmp_path / "a.usdc")
-    assert done.returncode == 2
-    (line,) = done.stderr.splitlines()
-    assert "'polysft-mi[usd]'" in line
+    assert "'polysft-mi[usd]'" in processes.refusal(done)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -2,9 +2,6 @@
 The simulator itself need not be installed.
 """
 
-import subprocess
-import sys
-
 import cv2
 import numpy as np
 import pytest
@@ -12,6 +9,7 @@ from places import ROOT
 from scripts import load
 
 from polyfit.mesh import edges_of
+from polysft_mi.errors import InputError
 from polysft_mi.images.registration import Registration
 from polysft_mi.objective.problem import Problem
 from polysft_mi.scene import experiment as scene
@@ -138,16 +136,5 @@ def test_a_camera_sees_the_front_of_a_closed_shape(tmp_path):
 
 def test_a_folder_that_exists_is_refused(tmp_path):
     (tmp_path / "flag").mkdir()
-    line = [
-        sys.executable,
-        str(ROOT / "benchmarks" / "simulate.py"),
-        str(tmp_path),
-        "--only",
-        "flag",
-    ]
-    done = subprocess.run(line, capture_output=True, text=True)
-    assert (
-        done.returncode == 2
-        and done.stderr.strip().endswith("exists already; another OUT is needed")
-        and len(done.stderr.strip().splitlines()) == 1
-    )
+    with pytest.raises(InputError, match="exists already; another OUT is needed"):
+        simulate.main([str(tmp_path), "--only", "flag"])

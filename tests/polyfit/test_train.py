@@ -3,15 +3,12 @@ refuses.
 """
 
 import json
-import os
-import subprocess
-import sys
 from dataclasses import replace
 
 import pytest
 import torch
 import trimesh
-from places import ROOT
+from processes import two_ranks
 from safetensors.torch import load_file
 
 from polyfit import InputError, PolyFit, jets, train
@@ -146,33 +143,14 @@ def test_ctrl_c_leaves_a_checkpoint(tmp_path, monkeypatch):
     assert all(torch.equal(resumed[k], whole[k]) for k in whole)
 
 
-def test_two_processes_of_torchrun_do_what_one_does(tmp_path):
+def test_two_processes_do_what_one_does(tmp_path):
     # a thread of the group that outlives it may abort the ending interpreter
     (tmp_path / "run.py").write_text(
         "import sys\nfrom pathlib import Path\nfrom polyfit import train\ntrain.main()\nleft ="
         " [name for task in Path('/proc/self/task').glob('*') if 'gloo' in (name := (task /"
         " 'comm').read_text())]\nsys.exit(f'threads left: {left}' if left else 0)\n"
     )
-    command = [
-        sys.executable,
-        "-m",
-        "torch.distributed.run",
-        "--nproc-per-node",
-        "2",
-        "--master-port",
-        "29731",
-        str(tmp_path / "run.py"),
-    ]
-    command += [*FLAGS, "-o", str(tmp_path / "two")]
-    done = subprocess.run(
-        command,
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
+    two_ranks(tmp_path / "run.py", *FLAGS, "-o", tmp_path / "two")
     assert json.loads((tmp_path / "two" / "weights.json").read_text())["processes"] == 2
     two, one = (
         load_file(tmp_path / "two" / "weights.safetensors"),
@@ -200,19 +178,9 @@ def test_networks_of_others_train_on_the_same_patches(tmp_path, mesh):
 
 
 class TestRefused:
-    def run(self, *flags):
-        return subprocess.run(
-            [sys.executable, "-m", "polyfit.train", *flags],
-            cwd=ROOT,
-            capture_output=True,
-            text=True,
-        )
-
-    def test_on_the_command_line_in_one_line(self, tmp_path):
-        done = self.run("none.obj", "-o", str(tmp_path / "new" / "out"))
-        assert done.returncode == 2
-        assert done.stderr.strip().splitlines()[-1].startswith("error: none.obj: no such file")
-        assert "Traceback" not in done.stderr
+    def test_on_the_command_line(self, tmp_path):
+        with pytest.raises(InputError, match="^none.obj: no such file"):
+            train.main(["none.obj", "-o", str(tmp_path / "new" / "out")])
         assert list(tmp_path.iterdir()) == []
 
     def test_a_folder_of_the_user_stays(self, tmp_path):

@@ -3,7 +3,7 @@
 import pytest
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def truth(tmp_path_factory):
     """Four frames of a small cloth, as :mod:`synthetic` makes them."""
     from problems import small_cloth
@@ -11,12 +11,25 @@ def truth(tmp_path_factory):
     return small_cloth(tmp_path_factory.mktemp("data"), frames=4)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def tube(tmp_path_factory):
     """Four frames of a small sleeve, held by several patches."""
     from problems import small_tube
 
     return small_tube(tmp_path_factory.mktemp("data"), frames=4)
+
+
+@pytest.fixture(scope="session")
+def tracked(truth, tmp_path_factory):
+    """The :class:`polysft_mi.tracker.Track` of ``truth`` under the default settings."""
+    from problems import problem_of
+
+    from polysft_mi import solvers
+    from polysft_mi.tracker import track
+
+    problem = problem_of(truth.folder)
+    folder = str(tmp_path_factory.mktemp("tracked"))
+    return track(problem, solvers.create(problem.settings), 4, folder)
 
 
 @pytest.fixture(scope="module")

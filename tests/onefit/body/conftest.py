@@ -5,11 +5,11 @@ import pytest
 from onefit.body import AnnyBody
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def model():
     return AnnyBody()
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def standard(model):
     return model.body()

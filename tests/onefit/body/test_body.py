@@ -1,11 +1,9 @@
 """Bodies: Anny reduced to 24 joints, models of the SMPL family, plain files, and skinning."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 import torch
+from processes import python
 from standing import random_poses
 
 from onefit.body import skeleton, skinning
@@ -194,7 +192,7 @@ def test_making_a_body_says_nothing_and_compiles_nothing():
         "import sys; from onefit.body import AnnyBody; AnnyBody().body(); print([m for m in"
         " ('warp', 'mitsuba') if m in sys.modules])"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = python("-c", code)
     assert (done.stdout, done.stderr) == ("[]\n", "")
 
 

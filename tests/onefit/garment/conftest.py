@@ -7,32 +7,32 @@ from onefit.garment import TEMPLATES, Garment
 from onefit.garment.charts import PatchedGarment
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def templates():
     return {name: Garment.template(name) for name in TEMPLATES}
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def tank(templates):
     g = templates["tank"]
     return g.vertices.double().numpy(), g.faces.numpy()
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def anny():
     return AnnyBody()
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def body():
     return AnnyBody().body()
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def garment():
     return Garment.template("tank")
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def patched(garment, body):
     return PatchedGarment(garment, body)

@@ -1,5 +1,7 @@
 """Motions that are generated."""
 
+import functools
+
 import numpy as np
 import pytest
 import torch
@@ -24,57 +26,53 @@ def test_kinds():
         Motion.generate("walk", seconds=0)
 
 
+@functools.cache
+def eight_seconds(kind):
+    """One motion of a kind, at 120 frames a second."""
+    return Motion.generate(kind, seconds=8, seed=11, fps=120.0)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_generated_motions_are_smooth_and_within_joints_limits(kind):
-    for seed in (0, 1):
-        motion = Motion.generate(kind, seconds=6, seed=seed, fps=120.0)
-        again, other = (
-            Motion.generate(kind, seconds=6, seed=seed, fps=120.0),
-            Motion.generate(kind, seconds=6, seed=seed + 10, fps=120.0),
-        )
-        assert (
-            torch.equal(motion.poses, again.poses)
-            and (motion.poses - other.poses).abs().max() > 0.2
-        )
-        J = places(motion)
-        # accelerations are continuous: nearly the same at half the rate, where a jump would be
-        # halved, a kink's peak too
-        fine, coarse = (
-            np.abs(np.diff(x, 2, axis=0)).max((0, 2)) * fps**2
-            for x, fps in ((J, 120), (J[::2], 60))
-        )
-        assert (fine < 1.6 * coarse + 1.5).all() and fine.max() < 400  # m/s²
-        bend = Rotation.from_rotvec(
-            motion.poses[:, [INDEX["left_knee"], INDEX["right_knee"]]]
-            .reshape(-1, 3)
-            .double()
-            .numpy()
-        ).as_rotvec()
-        assert (
-            bend[:, 0].min() > -0.02
-            and bend[:, 0].max() < 2.45
-            and np.abs(bend[:, 1:]).max() < 1e-5
-        )
-        elbow = motion.poses[:, [INDEX["left_elbow"], INDEX["right_elbow"]]].double()
-        for side, x in ((0, 1.0), (1, -1.0)):  # a forearm never bends backwards
-            assert Rotation.from_rotvec(elbow[:, side].numpy()).apply([x, 0, 0])[:, 1].max() < 0.01
-        assert elbow.norm(dim=-1).max() < 2.6
-        for joint, most in (
-            ("spine1", 0.5),
-            ("spine2", 0.65),
-            ("spine3", 0.5),
-            ("neck", 0.75),
-            ("head", 0.75),
-            ("left_ankle", 1.25),
-            ("left_collar", 0.75),
-        ):
-            assert motion.poses[:, INDEX[joint]].norm(dim=-1).max() < most, joint
+    motion = eight_seconds(kind)
+    J = places(motion)
+    # accelerations are continuous: nearly the same at half the rate, where a jump would be halved,
+    # a kink's peak too
+    fine, coarse = (
+        np.abs(np.diff(x, 2, axis=0)).max((0, 2)) * fps**2 for x, fps in ((J, 120), (J[::2], 60))
+    )
+    assert (fine < 1.6 * coarse + 1.5).all() and fine.max() < 400  # m/s²
+    knees = motion.poses[:, [INDEX["left_knee"], INDEX["right_knee"]]].reshape(-1, 3)
+    bend = Rotation.from_rotvec(knees.double().numpy()).as_rotvec()
+    assert bend[:, 0].min() > -0.02 and bend[:, 0].max() < 2.45
+    assert np.abs(bend[:, 1:]).max() < 1e-5
+    elbow = motion.poses[:, [INDEX["left_elbow"], INDEX["right_elbow"]]].double()
+    for side, x in ((0, 1.0), (1, -1.0)):  # a forearm never bends backwards
+        assert Rotation.from_rotvec(elbow[:, side].numpy()).apply([x, 0, 0])[:, 1].max() < 0.01
+    assert elbow.norm(dim=-1).max() < 2.6
+    for joint, most in (
+        ("spine1", 0.5),
+        ("spine2", 0.65),
+        ("spine3", 0.5),
+        ("neck", 0.75),
+        ("head", 0.75),
+        ("left_ankle", 1.25),
+        ("left_collar", 0.75),
+    ):
+        assert motion.poses[:, INDEX[joint]].norm(dim=-1).max() < most, joint
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_same_at_any_rate_and_length_and_another_by_another_seed(kind):
+    long = eight_seconds(kind)
+    short, other = (Motion.generate(kind, seconds=4, seed=seed) for seed in (11, 12))
+    assert np.abs(places(long)[:400:4] - places(short)[:100]).max() < 0.02
+    assert (short.poses - other.poses).abs().max() > 0.2
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_feet_stand_still_on_the_ground(kind):
-    motion = Motion.generate(kind, seconds=8, seed=4, fps=60.0)
-    feet = places(motion)[:, [INDEX["left_foot"], INDEX["right_foot"]]]
+    feet = places(eight_seconds(kind)[::2])[:, [INDEX["left_foot"], INDEX["right_foot"]]]
     ground = T_POSE[INDEX["left_foot"], 2].item()
     assert feet[..., 2].min() > ground - 0.02
     down = (feet[1:, :, 2] < ground + 0.004) & (feet[:-1, :, 2] < ground + 0.004)
@@ -119,15 +117,5 @@ def test_arms_do_not_pass_through_the_body():
     through[:, INDEX["left_shoulder"], 1] = np.pi / 2 + 0.6  # an arm let down into the hip
     assert core.depth(script.posed(body, Motion(through, torch.zeros(1, 3), 30.0))[0]) > 0.03
     for kind in KINDS:
-        depths = [
-            core.depth(V)
-            for V in script.posed(body, Motion.generate(kind, seconds=8, seed=11)[::35])
-        ]
+        depths = [core.depth(V) for V in script.posed(body, eight_seconds(kind)[::140])]
         assert max(depths) < (0.03 if kind == "pick_up" else 0.015), kind
-
-
-def test_the_same_at_any_rate_and_length():
-    for kind in KINDS:
-        long = Motion.generate(kind, seconds=4, seed=2, fps=60.0)
-        short = Motion.generate(kind, seconds=2, seed=2, fps=30.0)
-        assert np.abs(places(long)[:100:2] - places(short)[:50]).max() < 0.02, kind

@@ -1,13 +1,11 @@
 import json
-import os
-import subprocess
-import sys
 
 import cv2
 import numpy as np
 import pytest
 import torch
 from places import ROOT
+from processes import python
 
 from onefit import drape
 from onefit.body import AnnyBody
@@ -114,42 +112,28 @@ def test_refused_in_one_line(arguments, message, network, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_name_of_no_garment_ends_in_one_line_with_the_templates(tmp_path):
-    command = [sys.executable, "-m", "onefit.drape", "tuxedo", "dance", "-o", str(tmp_path / "out")]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
-    assert done.returncode == 2 and done.stdout == ""
-    (line,) = done.stderr.splitlines()
-    assert line.startswith("error: garment 'tuxedo': no such template; there are tshirt, dress")
-    assert not (tmp_path / "out").exists()
-
-
-def test_the_summary_is_in_lines_that_fit_a_terminal(network, tmp_path):
-    command = [
-        sys.executable, "-m", "onefit.drape", "shorts", "walk", "-o", str(tmp_path / "out"),
-        "--weights", network, "--seconds", "0.1", "--skip", "usd", "render",
-    ]  # fmt: skip
-    done = subprocess.run(
-        command, capture_output=True, text=True, cwd=ROOT, env=os.environ | {"COLUMNS": "80"}
-    )
-    assert done.stdout.strip() == str(tmp_path / "out")
-    lines = [line for line in done.stderr.splitlines() if line.strip()]
+def test_the_summary_is_in_lines_that_fit_a_terminal(network, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    drape.main([
+        "shorts", "walk", "-o", str(tmp_path / "out"), "--weights", network, "--seconds", "0.1",
+        "--skip", "usd", "render",
+    ])  # fmt: skip
+    said = capsys.readouterr()
+    assert said.out.strip() == str(tmp_path / "out")
+    lines = [line for line in said.err.splitlines() if line.strip()]
     assert [line.partition(":")[0] for line in lines] == ["frames", "speed", "inside the body"]
     assert max(map(len, lines)) < 80
 
 
 def test_importing_onefit_is_quick_and_loads_nothing_heavy():
-    code = (
-        "import sys, onefit; print([x for x in ('torch', 'numpy', 'mitsuba', 'drjit', 'warp',"
-        " 'anny') if x in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
-    assert done.stdout.strip() == "[]"
-    code = (
-        "import sys, onefit; onefit.load, onefit.Garment, onefit.AnnyBody, onefit.Motion,"
-        " onefit.SmplBody; print('mitsuba' in sys.modules)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
-    assert done.stdout.strip() == "False", done.stderr
+    code = """
+import sys, onefit
+print({"torch", "numpy", "mitsuba", "drjit", "warp", "anny"} & set(sys.modules))
+onefit.load, onefit.Garment, onefit.AnnyBody, onefit.Motion, onefit.SmplBody
+print("mitsuba" in sys.modules)
+"""
+    done = python("-c", code)
+    assert done.stdout == "set()\nFalse\n", done.stderr
 
 
 def test_what_a_motion_file_does_not_say_is_said_by_flags(network, tmp_path):

@@ -5,8 +5,6 @@ in one line.
 import dataclasses
 import json
 import os
-import subprocess
-import sys
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -14,8 +12,8 @@ import numpy as np
 import pytest
 import synthetic
 from loading import difference, loaded
-from places import ROOT
 
+from polysft_mi import prepare
 from polysft_mi.capture import prepare_folder, recognise
 from polysft_mi.errors import InputError
 from polysft_mi.scene.sequence import Sequence
@@ -63,8 +61,8 @@ def test_prepared_scene_shows_frame_0(form, tmp_path):
 def test_scene_beside_or_away_from_the_data(form, tmp_path, monkeypatch):
     truth = FORMS[form](tmp_path / "data", frames=2)
     monkeypatch.chdir(tmp_path)
-    beside, _ = prepare_folder("data")
-    away, _ = prepare_folder("data", "somewhere/else")
+    beside, _ = prepare_folder("data", pose_fit="none")
+    away, _ = prepare_folder("data", "somewhere/else", pose_fit="none")
     monkeypatch.chdir(tmp_path / "somewhere")
     folders = [
         ET.parse(tmp_path / p).find("default[@name='data']").get("value") for p in (beside, away)
@@ -193,12 +191,13 @@ def test_template_and_frames_are_checked(tmp_path):
 
 def test_files_that_are_there_stay(tmp_path):
     folder = synthetic.kinect_paper(tmp_path / "data", frames=1).folder
-    _path, _ = prepare_folder(str(folder), resolution=5)
+    prepare_folder(str(folder), resolution=5, pose_fit="none")
     before = {name: (folder / name).read_bytes() for name in ("scene.xml", "template.obj")}
-    assert "--overwrite" in refused(str(folder))
+    assert "--overwrite" in refused(str(folder), pose_fit="none")
     (folder / "scene.xml").unlink()
-    assert "template.obj" in refused(str(folder)) and not (folder / "scene.xml").exists()
-    prepare_folder(str(folder), resolution=9, overwrite=True)
+    assert "template.obj" in refused(str(folder), pose_fit="none")
+    assert not (folder / "scene.xml").exists()
+    prepare_folder(str(folder), resolution=9, overwrite=True, pose_fit="none")
     assert (folder / "scene.xml").read_bytes() == before["scene.xml"] and (
         folder / "template.obj"
     ).read_bytes() != before["template.obj"]
@@ -214,20 +213,11 @@ def test_folder_that_cannot_be_written(tmp_path):
         folder.chmod(0o755)
 
 
-def test_command_line(tmp_path):
-    folder = synthetic.cloth(tmp_path / "data", frames=2).folder
-    command = lambda *a: subprocess.run(
-        [sys.executable, "-m", "polysft_mi.prepare", *map(str, a)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-    )
-    done = command(folder, "-o", tmp_path / "out")
-    assert done.returncode == 0 and "template of 99 vertices" in done.stdout
-    assert f"python -m polysft_mi.run {tmp_path / 'out' / 'scene.xml'}" in done.stdout
-    again = command(folder, "-o", tmp_path / "out")
-    assert (
-        again.returncode == 2
-        and again.stderr.startswith("error: ")
-        and again.stderr.count("\n") == 1
-    )
+def test_command_line(tmp_path, capsys):
+    words = [str(synthetic.cloth(tmp_path / "data", frames=2).folder), "-o", str(tmp_path / "out")]
+    prepare.main(words)
+    said = capsys.readouterr().out
+    assert "template of 99 vertices" in said
+    assert f"python -m polysft_mi.run {tmp_path / 'out' / 'scene.xml'}" in said
+    with pytest.raises(InputError, match="--overwrite"):
+        prepare.main(words)

@@ -222,21 +222,8 @@ def test_corners_by_hand_are_moved_to_the_edges(clip, tmp_path):
 
 
 def test_sheet_that_fills_the_picture(clip, tmp_path):
-    words = [
-        "--texture",
-        "first-frame",
-        "--size",
-        "40cm",
-        "30cm",
-        "--fov",
-        "50",
-        "--corners",
-        "frame",
-        "--no-masks",
-        "--last",
-        "1",
-        "-q",
-    ]
+    words = "--texture first-frame --size 40cm 30cm --fov 50 --corners frame --no-masks".split()
+    words += "--scale 0.5 --last 1 -q".split()
     prepare.main([clip[0], *words, "-o", str(tmp_path / "out")])
     vertices, _, uv = meshio.read_template(tmp_path / "out" / "template.obj")
     assert (uv.min(), uv.max()) == pytest.approx((0, 1), abs=1e-3)

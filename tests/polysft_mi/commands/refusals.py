@@ -1,12 +1,9 @@
 """What the tests of bad input share: edits of a scene, and what a refusal must look like."""
 
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
-from places import ROOT
 
 from polysft_mi import errors, run
 
@@ -56,19 +53,3 @@ def line_of(path, text):
 
 def has(message, *words):
     assert all(word in message for word in words), message
-
-
-def process(*arguments, module="run", **options):
-    """Exit status 2 and one line; returns it."""
-    done = subprocess.run(
-        [sys.executable, "-m", f"polysft_mi.{module}", *map(str, arguments)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        **options,
-    )
-    assert done.returncode == 2, done.stderr
-    assert (
-        done.stderr.startswith("error: ") and done.stderr.count("\n") == 1 and done.stdout == ""
-    ), done.stderr
-    return done.stderr

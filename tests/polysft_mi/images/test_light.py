@@ -272,31 +272,28 @@ def truth(tmp_path_factory):
     return synthetic.cloth(folder, frames=5, size=(160, 120), rows=9, columns=12, light=LIGHT[:4])
 
 
-def test_the_tracker_learns_the_light_and_follows_it(truth, tmp_path):
-    done = {}
-    for weight in (0.0, 12.0):
-        problem = problem_of(truth.folder, k_shading=weight)
-        (tmp_path / str(weight)).mkdir()
-        done[weight] = track(
-            problem, solvers.create(problem.settings), 5, str(tmp_path / str(weight))
-        )
-    assert (
-        Light.of(done[0.0].totals[-1]["light"], Rules()).frames == 0
-        and done[0.0].totals[-1]["shading"] == 0
-    )
-    found = Light.of(done[12.0].totals[-1]["light"], Rules())
-    assert (
-        found.frames == 5
-        and done[12.0].totals[0]["shading"] == 0 < done[12.0].totals[-1]["shading"]
-    )
+@pytest.fixture(scope="module")
+def tracked(truth, tmp_path_factory):
+    """All frames, followed under a light that is learned."""
+    problem = problem_of(truth.folder)
+    folder = str(tmp_path_factory.mktemp("whole"))
+    return track(problem, solvers.create(problem.settings), 5, folder)
+
+
+def test_the_tracker_learns_the_light_and_follows_it(truth, tracked, tmp_path):
+    problem = problem_of(truth.folder, k_shading=0.0)
+    off = track(problem, solvers.create(problem.settings), 3, str(tmp_path)).totals[-1]
+    assert Light.of(off["light"], Rules()).frames == 0 and off["shading"] == 0
+    found = Light.of(tracked.totals[-1]["light"], Rules())
+    assert found.frames == 5
+    assert tracked.totals[0]["shading"] == 0 < tracked.totals[-1]["shading"]
     # the sheet rolls about the image's upright: that is where the light's slope shows
     slope = found.coefficients(len(truth.faces))[1]
     assert 0.5 < slope / (LIGHT[1] / (LIGHT[0] - LIGHT[3])) < 1.5
 
 
-def test_what_is_known_of_the_light_survives_an_interruption(truth, tmp_path):
+def test_what_is_known_of_the_light_survives_an_interruption(truth, tracked, tmp_path):
     problem = problem_of(truth.folder)
-    whole = track(problem, solvers.create(problem.settings), 5, str(tmp_path))
 
     class Interrupted(Exception):
         pass
@@ -305,14 +302,14 @@ def test_what_is_known_of_the_light_survives_an_interruption(truth, tmp_path):
         if frame == 2:
             raise Interrupted
 
-    parts = tmp_path / "parts"
-    parts.mkdir()
     with pytest.raises(Interrupted):
-        track(problem, solvers.create(problem.settings), 5, str(parts), solved=stop)
-    resumed = track(problem, solvers.create(problem.settings), 5, str(parts), resume=True)
-    assert resumed.totals[-1]["light"] == whole.totals[-1]["light"]
+        track(problem, solvers.create(problem.settings), 5, str(tmp_path), solved=stop)
+    resumed = track(problem, solvers.create(problem.settings), 5, str(tmp_path), resume=True)
+    assert resumed.totals[-1]["light"] == tracked.totals[-1]["light"]
     assert all(
-        np.array_equal(a[name], b[name]) for a, b in zip(whole.states, resumed.states) for name in a
+        np.array_equal(a[name], b[name])
+        for a, b in zip(tracked.states, resumed.states)
+        for name in a
     )
 
 

@@ -38,10 +38,10 @@ def problem_of(sheet):
     return Problem(experiment, experiment.sequence())
 
 
-def drawn(sheet, out, during=lambda drawing: None, *, problem=None, frames=9, **options):
+def drawn(sheet, out, during=lambda drawing: None, *, problem=None, **options):
     """(figures of each frame, the video's frames, names of the EXRs): of the true surfaces."""
     problem = problem or problem_of(sheet)
-    surfaces = sheet.vertices[:frames].astype(np.float32)
+    surfaces = sheet.vertices.astype(np.float32)
     vertices = np.stack([problem.camera.origin + v @ problem.camera.axes for v in surfaces]).astype(
         np.float32
     )
@@ -82,25 +82,18 @@ def assert_same(a, b):
     assert a[2] == b[2]
 
 
-def test_another_process_draws_the_same(sheet, here, tmp_path):
-    found = drawn(sheet, tmp_path / "out", lambda made: [job.result() for job in made._jobs])
-    assert_same(found, here)
-    assert [f["frame"] for f in found[0]] == list(range(9)) and found[2] == [
-        "000.exr",
-        "004.exr",
-        "008.exr",
-    ]
-    assert found[0][0]["psnr_mask"] > 30
-    assert np.isfinite(
-        exr.read_exr(str(tmp_path / "out" / "comparison" / "004.exr"))[0]["depth"]
-    ).all()
-
-
-def test_frames_that_change_are_drawn_again(sheet, here, tmp_path):
+def test_another_process_draws_the_same_and_again_what_changes(sheet, here, tmp_path):
     def spoil(made):
         made.frame(3, sheet.vertices[0].astype(np.float32) + 0.01)
+        [job.result() for job in made._jobs]
 
-    assert_same(drawn(sheet, tmp_path / "out", spoil), here)
+    found = drawn(sheet, tmp_path / "out", spoil)
+    assert_same(found, here)
+    assert [f["frame"] for f in found[0]] == list(range(9))
+    assert found[2] == ["000.exr", "004.exr", "008.exr"]
+    assert found[0][0]["psnr_mask"] > 30
+    depth = exr.read_exr(str(tmp_path / "out" / "comparison" / "004.exr"))[0]["depth"]
+    assert np.isfinite(depth).all()
 
 
 def test_a_killed_process_costs_nothing_but_time(sheet, here, tmp_path):
@@ -132,23 +125,29 @@ def test_an_error_in_the_process_has_all_drawn_here_after_its_end(
     assert_same(drawn(sheet, tmp_path / "out", fail), here)
 
 
-def test_no_file_is_removed_that_is_being_written(sheet, tmp_path):
+def test_fewer_frames_than_expected(sheet, here, tmp_path):
+    """As after Ctrl-C: the EXRs are spread over the frames that there are; others are removed, but
+    none that is being written.
+    """
     problem = problem_of(sheet)
-    surfaces = sheet.vertices.astype(np.float32)
+    surfaces = sheet.vertices[:5].astype(np.float32)
     vertices = np.stack([problem.camera.origin + v @ problem.camera.axes for v in surfaces])
+    vertices = vertices.astype(np.float32)
     (tmp_path / "comparison").mkdir()
     others = [tmp_path / "comparison" / name for name in (".1.partial.008.exr", "003.exr")]
     for path in others:
         path.touch()
     with Drawing(problem, {}, str(tmp_path), exr_frames=3, about={}) as made:
-        finished, *_ = made.finish(vertices, surfaces, 15)
+        for k, v in enumerate(vertices):
+            made.frame(k, v)
+        finished, bound, _ = made.finish(vertices, surfaces, 15)
         assert all(path.exists() for path in others)
-        finished()
-    assert sorted(p.name for p in (tmp_path / "comparison").iterdir()) == [
-        "000.exr",
-        "004.exr",
-        "008.exr",
-    ]
+        figures, _box = finished()
+        assert len(list(video.read_video(bound()))) == 5
+    names = sorted(p.name for p in (tmp_path / "comparison").iterdir())
+    assert names == ["000.exr", "002.exr", "004.exr"]
+    for x, y in zip(figures, here[0]):
+        assert x == pytest.approx(y, rel=1e-4)
 
 
 def test_nothing_is_drawn_any_more_after_an_error(sheet, tmp_path, monkeypatch):
@@ -177,14 +176,6 @@ def test_texture_that_was_moved_is_moved_in_the_pictures(sheet, here, tmp_path):
     problem.set_texcoords(mi.Float(moved))
     other = drawn(sheet, tmp_path / "out", problem=problem)
     assert all(a["psnr_mask"] < b["psnr_mask"] - 3 for a, b in zip(other[0], here[0]))
-
-
-def test_fewer_frames_than_expected(sheet, here, tmp_path):
-    """As after Ctrl-C: the EXRs are spread over the frames that there are."""
-    found = drawn(sheet, tmp_path / "out", frames=5)
-    assert found[2] == ["000.exr", "002.exr", "004.exr"] and len(found[1]) == 5
-    for x, y in zip(found[0], here[0]):
-        assert x == pytest.approx(y, rel=1e-4)
 
 
 def test_a_surface_that_leaves_the_view_of_the_first_is_shown_whole(sheet, tmp_path):
@@ -318,12 +309,8 @@ def test_metrics_name_the_frames_in_order(sheet, tmp_path):
     from polysft_mi import run
 
     out = tmp_path / "out"
-    assert (
-        run.main(
-            [str(sheet.folder / "scene.xml"), "-o", str(out), "-q", "-D", "first=1", "--exr", "2"]
-        )
-        == 0
-    )
+    words = [str(sheet.folder / "scene.xml"), "-o", str(out), "-q", "--exr", "2"]
+    assert run.main([*words, "-D", "first=1", "-D", "last=3"]) == 0
     metrics = json.loads((out / "metrics.json").read_text())
-    assert [f["frame"] for f in metrics["per_frame"]] == list(range(1, 9))
-    assert sorted(p.name for p in (out / "comparison").iterdir()) == ["001.exr", "008.exr"]
+    assert [f["frame"] for f in metrics["per_frame"]] == [1, 2, 3]
+    assert sorted(p.name for p in (out / "comparison").iterdir()) == ["001.exr", "003.exr"]

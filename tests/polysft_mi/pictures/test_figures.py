@@ -1,13 +1,11 @@
 """Pictures by what can be measured in them, and that a run outlives a picture that fails."""
 
 import os
-import subprocess
-import sys
 
 import cv2
 import numpy as np
 import pytest
-from places import ROOT
+from processes import python
 
 from polysft_mi.pictures import figures
 from polysft_mi.pictures.figures import View, contact_sheet, frame_plot, loss_plot, shade_surface
@@ -175,10 +173,5 @@ def test_importing_loads_no_heavy_module():
         " polysft_mi.surface.meshio\nprint([m for m in ('matplotlib', 'OpenEXR',"
         " 'trimesh', 'skimage', 'scipy', 'rich', 'mitsuba', 'torch', 'cv2') if m in sys.modules])"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", script],
-        capture_output=True,
-        text=True,
-        cwd=ROOT,
-    )
+    done = python("-c", script)
     assert done.stdout.strip() == "[]", done.stdout + done.stderr

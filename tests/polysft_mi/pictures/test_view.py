@@ -1,13 +1,12 @@
 """The interactive viewer: what it draws, and its one line where it cannot."""
 
 import os
-import subprocess
 import sys
 
 import cv2
 import numpy as np
 import pytest
-from places import ROOT
+from processes import python
 
 from polysft_mi import view
 from polysft_mi.errors import InputError
@@ -32,13 +31,7 @@ cli(main)
 def test_draws_the_textured_surface_of_a_frame(finished_run, tmp_path):
     """In a process of its own, without a display."""
     pytest.importorskip("polyscope", reason="polyscope is not installed (the extra 'view')")
-    done = subprocess.run(
-        [sys.executable, "-c", SCRIPT, finished_run[1], tmp_path],
-        capture_output=True,
-        text=True,
-        cwd=ROOT,
-        timeout=120,
-    )
+    done = python("-c", SCRIPT, finished_run[1], tmp_path)
     if "cannot open a window" in done.stderr:
         pytest.skip("polyscope finds no OpenGL here (EGL, or a display)")
     assert done.returncode == 0, done.stderr

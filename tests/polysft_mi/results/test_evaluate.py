@@ -5,12 +5,12 @@ cannot be scored.
 import json
 import math
 import os
-import subprocess
 import sys
 
 import numpy as np
 import pytest
 from places import ROOT
+from processes import python
 
 from polysft_mi import evaluate
 from polysft_mi.errors import InputError
@@ -24,17 +24,11 @@ needs_scorer = pytest.mark.skipif(
 )
 
 
-def command(*arguments):
-    return subprocess.run(
-        [sys.executable, *map(str, arguments)], capture_output=True, text=True, cwd=ROOT
-    )
-
-
 def agree(surface, truth, tmp_path):
     """Both programs on the same surface; every figure of the scorer, found in ours to 1e-6."""
     np.savez(tmp_path / "surface.npz", **surface)
-    theirs = json.loads(command(SCORER, tmp_path / "surface.npz", truth, "--json").stdout)
-    ours = json.loads(command("-m", "polysft_mi.evaluate", tmp_path, truth, "--json").stdout)
+    theirs = json.loads(python(SCORER, tmp_path / "surface.npz", truth, "--json").stdout)
+    ours = evaluation.evaluate(tmp_path, truth)
     assert len(theirs) >= 3
     for name, value in theirs.items():
         if isinstance(value, dict):
@@ -125,21 +119,22 @@ def run_folder(tmp_path):
     return tmp_path
 
 
-def test_table_and_json_with_image_figures(run_folder):
+def test_table_and_json_with_image_figures(run_folder, capsys):
+    def printed(*arguments):
+        assert evaluate.main([str(a) for a in arguments]) == 0
+        seen = capsys.readouterr()
+        assert seen.err == ""
+        return seen.out
+
     (run_folder / "out" / "metrics.json").write_text(
         json.dumps({"psnr": 31.25, "ssim": 0.9, "time_s": 3, "psnr_frames": [1, 2]})
     )
-    done = command("-m", "polysft_mi.evaluate", run_folder / "out", run_folder / "seq")
-    assert done.returncode == 0 and done.stderr == ""
-    table = dict(line.rsplit("  ", 1) for line in done.stdout.splitlines())
+    shown = printed(run_folder / "out", run_folder / "seq")
+    table = dict(line.rsplit("  ", 1) for line in shown.splitlines())
     assert float({k.strip(): v for k, v in table.items()}["vertex RMSE [mm]"]) == pytest.approx(
         10, rel=1e-4
     )
-    figures = json.loads(
-        command(
-            "-m", "polysft_mi.evaluate", run_folder / "out", run_folder / "seq" / "gt.npz", "--json"
-        ).stdout
-    )
+    figures = json.loads(printed(run_folder / "out", run_folder / "seq" / "gt.npz", "--json"))
     assert (
         figures["psnr"] == 31.25
         and figures["ssim"] == 0.9
@@ -194,11 +189,11 @@ def test_refuses_a_surface_of_another_form(tmp_path, change, words):
         read_surface(str(tmp_path))
 
 
-def test_bad_input_is_one_line_and_status_2(run_folder):
+def test_bad_input_is_told(run_folder):
     for out, truth in [("nowhere", "seq"), ("seq", "seq"), ("out", "nowhere"), ("out", "out")]:
-        done = command("-m", "polysft_mi.evaluate", run_folder / out, run_folder / truth)
-        assert done.returncode == 2 and done.stdout == ""
-        assert len(done.stderr.splitlines()) == 1 and done.stderr.startswith("error: ")
+        with pytest.raises(InputError) as caught:
+            evaluate.main([str(run_folder / out), str(run_folder / truth)])
+        assert "\n" not in str(caught.value)
     (run_folder / "out" / "metrics.json").write_text("{")
-    done = command("-m", "polysft_mi.evaluate", run_folder / "out", run_folder / "seq")
-    assert done.returncode == 2 and "metrics.json: not JSON" in done.stderr
+    with pytest.raises(InputError, match="metrics.json: not JSON"):
+        evaluate.main([str(run_folder / "out"), str(run_folder / "seq")])

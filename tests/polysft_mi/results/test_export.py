@@ -6,14 +6,13 @@ import io
 import json
 import shutil
 import struct
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 from PIL import Image
+from processes import python
 
 from polyfit import animation
 from polysft_mi import export
@@ -163,7 +162,8 @@ np.savez(
     image=np.frombuffer(inside, np.uint8), bound=bool(material),
 )
 """
-    subprocess.run([sys.executable, "-c", script, path, tmp_path / "a.npz"], check=True, timeout=60)
+    done = python("-c", script, path, tmp_path / "a.npz")
+    assert done.returncode == 0, done.stderr
     seen = np.load(tmp_path / "a.npz")
     x, y, z = np.moveaxis(run.vertices, -1, 0)
     np.testing.assert_allclose(seen["points"], np.stack([x, z, -y], -1), atol=1e-6)

@@ -4,6 +4,7 @@ one.
 
 import os
 
+import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
@@ -57,28 +58,14 @@ def test_ply_without_uv(tmp_path):
 
 
 def test_ply_is_what_mitsuba_reads(tmp_path):
-    """In a process of its own: the variant is a setting of the whole process."""
-    pytest.importorskip("mitsuba", reason="the reader is Mitsuba")
-    import subprocess
-    import sys
-
     V, F, uv = sheet()
     write_ply(tmp_path / "a.ply", V, F, uv)
-    script = (
-        "import sys, numpy as np, mitsuba as mi; mi.set_variant('scalar_rgb')\nm ="
-        " mi.traverse(mi.load_dict({'type': 'ply', 'filename': sys.argv[1], 'flip_tex_coords':"
-        " False}))\nnp.savez(sys.argv[2], **{k: np.array(m[k]) for k in ('vertex_positions',"
-        " 'faces', 'vertex_texcoords')})"
-    )
-    subprocess.run(
-        [sys.executable, "-c", script, tmp_path / "a.ply", tmp_path / "a.npz"],
-        check=True,
-        timeout=60,
-    )
-    seen = np.load(tmp_path / "a.npz")
-    np.testing.assert_allclose(seen["vertex_positions"].reshape(-1, 3), V, atol=1e-6)
-    np.testing.assert_array_equal(seen["faces"].reshape(-1, 3), F)
-    np.testing.assert_allclose(seen["vertex_texcoords"].reshape(-1, 2), uv, atol=1e-6)
+    file = {"type": "ply", "filename": str(tmp_path / "a.ply"), "flip_tex_coords": False}
+    seen = mi.traverse(mi.load_dict(file))
+    array = lambda name, columns: np.array(seen[name]).reshape(-1, columns)
+    np.testing.assert_allclose(array("vertex_positions", 3), V, atol=1e-6)
+    np.testing.assert_array_equal(array("faces", 3), F)
+    np.testing.assert_allclose(array("vertex_texcoords", 2), uv, atol=1e-6)
 
 
 OBJ = """# a comment
