@@ -264,6 +264,7 @@ def main(argv=None):
         help=f"of {', '.join(KINDS)}",
     )
     parser.add_argument("--seed", type=int, default=3)
+    parser.add_argument("--plain", action="store_true", help="textures with few details")
     args = parser.parse_args(argv)
     if args.seed < 0:
         raise InputError(f"--seed {args.seed}: 0 or more")
@@ -274,7 +275,7 @@ def main(argv=None):
             raise InputError(f"{folder}: exists already; another OUT is needed")
         vertices, shape = simulate(name, args.seed)
         rng = np.random.default_rng([args.seed, list(KINDS).index(name), 1])
-        seen = render(folder, vertices, shape, rng)
+        seen = render(folder, vertices, shape, rng, args.plain)
         faces = shape.faces
         np.savez_compressed(
             os.path.join(folder, "gt.npz"),

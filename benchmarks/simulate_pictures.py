@@ -30,11 +30,23 @@ def _noise(rng, height, width, first, channels):
     return out / out.std()
 
 
-def texture(rng, aspect, height=512):
-    """An sRGB texture (H, W, 3) uint8 of one of four kinds: clouds, bars, squares, dots."""
+def texture(rng, aspect, plain=False, height=512):
+    """An sRGB texture (H, W, 3) uint8 of one of four kinds: clouds, bars, squares, dots; or a
+    ``plain`` one: slow changes of colour, and three large flat regions.
+    """
     width = round(height * aspect)
     style = rng.integers(4)
-    if style == 0:
+    if plain:
+        y, x = np.mgrid[:height, :width] / height - 0.5
+        slow = rng.uniform(-0.5, 0.5, (2, 3))
+        image = rng.uniform(0.4, 0.6, 3) + x[..., None] * slow[0] / aspect + y[..., None] * slow[1]
+        image = np.ascontiguousarray(image, np.float32)
+        for k in range(3):
+            at = int((k + rng.uniform(0.3, 0.7)) * width / 3), int(rng.uniform(0.3, 0.7) * height)
+            axes = int(rng.uniform(0.1, 0.15) * width), int(rng.uniform(0.15, 0.25) * height)
+            colour = rng.uniform(0.1, 0.9, 3).tolist()
+            cv2.ellipse(image, at, axes, rng.uniform(0, 180), 0, 360, colour, -1, cv2.LINE_AA)
+    elif style == 0:
         image = 0.5 + 0.28 * _noise(rng, height, width, 4, 3)
     elif style == 1:
         image = np.full((height, width, 3), 0.92, np.float32)
@@ -70,9 +82,10 @@ def texture(rng, aspect, height=512):
     return (255 * np.clip(image, 0.02, 0.98)).astype(np.uint8)
 
 
-def render(folder, vertices, shape, rng):
+def render(folder, vertices, shape, rng, plain=False):
     """Write texture, template, camera, frames and masks of vertices (T, N, 3) [m, camera frame] of
-    a :class:`simulate_shapes.Shape` into ``folder``; ``rng`` draws texture, light and noise.
+    a :class:`simulate_shapes.Shape` into ``folder``; ``rng`` draws texture (a
+    ``plain`` one), light and noise.
     Returns which vertices the camera sees, (T, N) bool.
     """
     import mitsuba as mi
@@ -80,7 +93,7 @@ def render(folder, vertices, shape, rng):
     for name in ("frames", "masks"):
         os.makedirs(os.path.join(folder, name), exist_ok=True)
     at = lambda *names: os.path.join(folder, *names)
-    image = texture(rng, shape.aspect)
+    image = texture(rng, shape.aspect, plain)
     cv2.imwrite(at("texture.png"), image[..., ::-1])
     write_obj(at("template.obj"), vertices[0], shape.faces, shape.uv)
     width, height = SIZE

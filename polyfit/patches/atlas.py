@@ -19,7 +19,7 @@ from .clusters import NORMAL_WEIGHTS, connected, merged, relaxed
 
 # A face is steep over its patch's plane beyond this cosine; a patch holds a surface of which no
 # larger share of the area is steep
-STEEP, STEEP_SHARE = 0.45, 0.05
+STEEP, STEEP_SHARE = 0.45, 0.1
 OVERLAP = 0.4  # width of the overlap, in radii of a disc of the patch's area
 LAYERS = 4  # patches that hold a vertex, at most
 FINE = 128  # clusters that vertices are merged to before patches are sought
@@ -71,6 +71,8 @@ def partition(vertices, faces, edges, label):
     falls with the distance from it along the surface, to nothing at the overlap's width.
     """
     count = int(label.max()) + 1
+    if count == 1:
+        return np.zeros((len(vertices), 1), dtype=np.int64), np.ones((len(vertices), 1))
     length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
     graph = sp.coo_matrix((length, edges.T), 2 * (len(vertices),)).tocsr()
     area = np.bincount(

@@ -319,7 +319,7 @@ class Assembly:
             cross.reshape(count * d, -1),
             self._glob(surface, lifted, moved),
             np.ascontiguousarray(along.reshape(-1, 3)[:, :d]),
-            self._right(surface, gradient),
+            self._atlas.to_globals(surface, gradient),
         )
         return normal, stiffness * float(energy.sum())
 
@@ -338,12 +338,3 @@ class Assembly:
             for other in range(patches):
                 glob[other, size:, one, :size] = glob[one, :size, other, size:].T
         return glob.reshape(patches * (size + 6), -1)
-
-    def _right(self, surface, gradient):
-        """The gradient (G,) by the jets and the motions, of that in space (N, 3)."""
-        parts = []
-        for up, part in zip(surface.up, self._atlas.entries, strict=True):
-            g = gradient[self._atlas.entry_vertex[part]]
-            parts.append(surface.basis[part].T @ (g @ up))
-            parts.append(np.einsum("nk,nkm->m", g, surface.motion_jacobian[part]))
-        return np.concatenate(parts)

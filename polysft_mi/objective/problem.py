@@ -22,6 +22,7 @@ from polysft_mi.scene.rules import Rules
 from polysft_mi.surface.patch import JetAtlas, Unknowns
 
 from . import terms as objective
+from .volume import Volume
 
 if TYPE_CHECKING:
     from polysft_mi.scene.experiment import Experiment
@@ -79,6 +80,7 @@ class Problem:
         rest = self.surface(self.patch.rest()).astype(np.float64)
         lengths = np.linalg.norm(rest[edges[:, 0]] - rest[edges[:, 1]], axis=1)
         self.edge_lengths = mi.Float(lengths.astype(np.float32))
+        self.volume = self._kept_volume()
         self._corner = mi.UInt32(experiment.corner.astype(np.uint32))
         self._identity = np.array_equal(experiment.corner, np.arange(len(self.template.vertices)))
         # through the scene, not the mesh alone: only so does the scene rebuild what it traces rays
@@ -89,6 +91,17 @@ class Problem:
         self.texcoords: np.ndarray | None = None
         self.camera = Pinhole(experiment.sensor)
         self._setup_renderer()
+
+    def _kept_volume(self):
+        """What the volume costs, None where it is free; InputError where the template is open."""
+        if self.settings.k_volume == 0:
+            return None
+        if not self.template.is_closed:
+            raise InputError(
+                f"{self.experiment.path}: k_volume = {self.settings.k_volume:g}, but the template"
+                " is open and has no volume; 0 is right"
+            )
+        return Volume(self.template)
 
     # -- rendering ----------------------------------------------------------
 
@@ -239,6 +252,9 @@ class Problem:
         terms["inextensibility"] = s.k_mi * objective.inextensibility(
             vertices, self.edges, self.edge_lengths, self.patch.scale
         )
+        if self.volume:
+            now = objective.volume(vertices, self.volume.faces)
+            terms["inextensibility"] += s.k_volume * dr.square(now / self.volume.rest - 1)
         return terms
 
     def _channels(self, tensor):

@@ -128,6 +128,7 @@ class SecondOrder:
         #: differences of (Δu, Δv) along the edges, in the axes of the first end, (2E, 2N)
         self.slides = slides(template.edges, template.axes)
         self._joints = Joints(self.atlas)
+        self._volume = problem.volume
         self._seen = Hidden.of(np.ones(count, dtype=bool), 1.0, self)
         self.lengths = np.array(problem.edge_lengths, dtype=np.float64)
         self.has_relief = self.settings.k_relief > 0 and count <= self.rules.relief_vertices
@@ -178,6 +179,8 @@ class SecondOrder:
             give,
             rows,
         )
+        if self._volume:
+            inextensibility += self._volume.add(normal, atlas, surface, s.k_volume)
         held, joined = self._hold(normal, surface, state, context)
         relief = s.k_relief * rules.relief * (caution if rules.relief_caution else 1.0)
         smoothness, temporal = self._smooth(normal, state, context, d, relief)

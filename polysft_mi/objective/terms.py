@@ -73,6 +73,15 @@ def inextensibility(points, edges, rest, scale):
     return dr.sum(dr.square((edge_lengths(points, edges) - rest) / scale))
 
 
+def volume(points, faces):
+    """The volume [unit of the points, cubed] within a closed mesh of ``points`` (Point3f of N) and
+    ``faces`` (F, 3), NumPy, wound alike: a Float of 1; negative where they are wound inwards.
+    """
+    flat = mi.Float64(dr.ravel(points))
+    a, b, c = (dr.gather(mi.Vector3d, flat, mi.UInt32(k.astype(np.uint32))) for k in faces.T)
+    return mi.Float(dr.sum(dr.dot(a, dr.cross(b, c))) / 6)
+
+
 def temporal(window):
     """(1 / (W-1)) sum_t |δα_t|^2 + |δuv_t|^2 over a list of W Unknowns (eq. tc without its weight);
     0 where W = 1.

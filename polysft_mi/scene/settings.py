@@ -46,6 +46,12 @@ class Settings:
         low=0,
     )
     k_mi: float = _setting(0.1, "weight of mesh inextensibility", low=0)
+    k_volume: float = _setting(
+        0.0,
+        "weight of the squared relative change of the volume within a closed template; counts as"
+        " inextensibility",
+        low=0,
+    )
     k_tc: float = _setting(0.05, "weight of temporal consistency", low=0)
     k_bend: float = _setting(
         1e-6, "weight of the jet's mean squared second derivatives (gauss-newton)", low=0

@@ -262,6 +262,15 @@ class Atlas:
             out[at, k * size : (k + 1) * size] = np.concatenate([by_jet, by_motion], 1)
         return out
 
+    def to_globals(self, surface, gradient):
+        """The gradient (G,) by the jets and the motions, of that in space (N, 3)."""
+        parts = []
+        for up, part in zip(surface.up, self.entries, strict=True):
+            g = gradient[self.entry_vertex[part]]
+            parts.append(surface.basis[part].T @ (g @ up))
+            parts.append(np.einsum("nk,nkm->m", g, surface.motion_jacobian[part]))
+        return np.concatenate(parts)
+
     def with_relief_in_jets(self, state, ridge=1e-6):
         """The state of the same surface with as much of the relief as the jets can hold in the
         coefficients instead; ``ridge`` holds those that the vertices do not determine.

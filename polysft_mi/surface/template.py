@@ -97,11 +97,13 @@ class Template:
     @classmethod
     def fit(cls, vertices, faces, uv, order, *, exact=True, frame=None, where="template"):
         """Fit jets of ``order`` to the mesh: one in ``frame``, a :class:`polyfit.CanonicalFrame` in
-        float64, or else in its PCA frame; several where the mesh is no height graph there.
+        float64, or else in its PCA frame; several where the mesh is no height graph there, or a
+        steep one.
 
         ``uv``: texture coordinates (N, 2), or :class:`polyfit.mesh.TexCoords`.
         ``order`` may be a function of the number of patches. Where not ``exact``, vertices that
-        determine less get the highest order that they do. Raises
+        determine less get the highest order that they do, of several patches those that determine
+        most. Raises
         InputError where the order is too high for the vertices (if ``exact``), or where ``frame``
         is given and one patch cannot hold the mesh.
         """
@@ -114,7 +116,10 @@ class Template:
             else (np.asarray(x) for x in (frame.s, frame.R, frame.T))
         )
         alike = np.where(winding(sheets(faces))[:, None] < 0, faces[:, ::-1], faces)
-        if is_graph(points, alike, rotation[:, 2]) and components_of(faces) == 1:
+        graph = is_graph(points, alike, rotation[:, 2]) and components_of(faces) == 1
+        # a skirt is a graph over the plane of its hem, but a steep one
+        cover = Cover.of(points, alike) if frame is None else None
+        if graph and (frame is not None or len(cover) == 1):
             patch, weight = np.zeros((len(points), 1), dtype=np.int64), np.ones((len(points), 1))
             frames = [(float(scale), rotation, origin)]
             axes = np.tile(rotation, (len(points), 1, 1))
@@ -124,7 +129,6 @@ class Template:
                 " in its chart; a height graph over a plane is needed"
             )
         else:
-            cover = Cover.of(points, alike)
             patch, weight = cover.patch, cover.weight
             frames = [
                 _frame_over(points[((patch == k) & (weight > 0)).any(1)], normal, float(scale))
@@ -174,15 +178,8 @@ def _jets(x, patch, held, count, order, exact, where):
             few = f"the {len(points)} vertices determine no more than order {fitted}"
             raise InputError(f"{where}: order = {order} is too high: {wanted}, and {few}")
         found.append((coefficients, fitted))
-    least = min(fitted for _, fitted in found)
-    alpha = np.stack(
-        [
-            _fitted(x[held & (patch == k)], least, ridge)[0]
-            if fitted > least
-            else c[: size_of(least)]
-            for k, (c, fitted) in enumerate(found)
-        ]
-    )
+    most = max(fitted for _, fitted in found)  # coefficients beyond a jet's own order are 0
+    alpha = np.stack([coefficients[: size_of(most)] for coefficients, _ in found])
     rest = np.zeros(patch.shape)
     for k in range(count):
         at = held & (patch == k)

@@ -125,6 +125,15 @@ def test_rounded_shapes_are_sewn_and_their_hands_move_rigidly(name):
         assert np.allclose(*apart, atol=1e-9)
 
 
+def test_a_plain_texture_has_few_details():
+    def detail(plain, seed):
+        image = pictures.texture(np.random.default_rng(seed), 1.4, plain, height=128).astype(float)
+        return (np.abs(np.diff(image, axis=1)).max(-1) > 8).mean()
+
+    assert max(detail(True, seed) for seed in range(8)) < 0.02
+    assert min(detail(False, seed) for seed in range(8)) > 0.02
+
+
 def test_a_camera_sees_the_front_of_a_closed_shape(tmp_path):
     shape = shapes.pillow()
     rng = np.random.default_rng(0)

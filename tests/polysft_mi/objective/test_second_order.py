@@ -2,20 +2,27 @@
 
 import dataclasses
 import math
+from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+import surfaces
+import trimesh
 from problems import dense, problem_of, some_state
 
+from polysft_mi.errors import InputError
 from polysft_mi.images.gather import Images
 from polysft_mi.images.light import Light
 from polysft_mi.objective import terms as objective
 from polysft_mi.objective.assembly import Assembly
 from polysft_mi.objective.second_order import Context, SecondOrder, stages_of
+from polysft_mi.objective.volume import Volume
 from polysft_mi.scene.rules import Rules
+from polysft_mi.surface.atlas import Atlas
 from polysft_mi.surface.patch import Unknowns
+from polysft_mi.surface.template import Template
 
 RNG = np.random.default_rng(4)
 
@@ -211,3 +218,45 @@ def test_rules_are_immutable_and_each_is_told():
     assert all(f.metadata["doc"] for f in dataclasses.fields(rules))
     assert rules.caution(math.nan) == 1.0 and rules.caution(rules.noise_misfit) == 2.0
     assert rules.caution(1e3) == 1 + rules.noise_most
+
+
+def test_volume_is_that_of_the_mesh_and_its_gradients_are_right():
+    """A ball: the volume, the gradient against finite differences, and Adam's against it."""
+    points, faces = surfaces.sphere(subdivisions=2)
+    template = Template.fit(points, faces, points[:, :2], 3, exact=False)
+    atlas, volume = Atlas(template), Volume(template)
+    assert abs(volume.rest) == pytest.approx(abs(trimesh.Trimesh(points, faces).volume), rel=1e-9)
+    state = some_state(atlas, RNG, 0.02)
+    size = (len(atlas), state.alpha.shape[1] + 6)
+    n, g = len(points), size[0] * size[1]
+
+    def model(state):
+        normal = SimpleNamespace(
+            local=np.zeros((0, 3, 3)),
+            glob=np.zeros((g, g)),
+            gradient=np.zeros(g),
+            local_gradient=np.zeros((n, 3)),
+        )
+        return volume.add(normal, atlas, atlas.surface(state), 5.0), normal
+
+    step = RNG.normal(size=g), RNG.normal(size=(n, 3))
+    ahead, behind = (model(state.after_step(step, h))[0] for h in (1e-6, -1e-6))
+    energy, normal = model(state)
+    slope = normal.gradient @ step[0] + (normal.local_gradient * step[1]).sum()
+    assert (ahead - behind) / 2e-6 == pytest.approx(slope, rel=1e-5)
+    assert np.linalg.matrix_rank(normal.glob) == 1
+    x = atlas.surface(state).vertices
+    points = mi.Point3f(x.T.astype(np.float32))
+    dr.enable_grad(points)
+    cost = 5 * dr.square(objective.volume(points, volume.faces) / volume.rest - 1)
+    assert cost[0] == pytest.approx(energy, rel=1e-3)
+    dr.backward(cost)
+    by_place = np.einsum(
+        "nk,nka->na", np.array(dr.grad(points)).T, atlas.surface(state).offset_jacobian
+    )
+    assert np.allclose(by_place, normal.local_gradient, atol=1e-3 * np.abs(by_place).max())
+
+
+def test_an_open_template_has_no_volume(truth):
+    with pytest.raises(InputError, match="k_volume = 2, but the template is open"):
+        problem_of(truth.folder, k_volume=2.0)

@@ -201,9 +201,30 @@ from polysft_mi import backend; backend.set_variant("llvm_ad_rgb")
 import polysft_mi.run, polysft_mi.scene.experiment, polysft_mi.solvers, polysft_mi.report
 from polysft_mi.surface.template import Template
 x, y = (a.ravel() for a in np.meshgrid(np.linspace(0, 1, 4), np.linspace(0, 2, 4)))
-faces = np.array([[4 * r + c, 4 * r + c + 1, 4 * r + c + 4] for r in range(3) for c in range(3)])
-Template.fit(np.stack([x, y, 0 * x], 1), faces, np.stack([x, y], 1), 2)
+square = (0, 1, 4), (1, 5, 4)
+faces = [[4 * r + c + k for k in f] for r in range(3) for c in range(3) for f in square]
+Template.fit(np.stack([x, y, 0 * x], 1), np.array(faces), np.stack([x, y], 1), 2)
 print("torch" in sys.modules)
 """
     done = python("-c", code)
     assert done.stdout == "False\n", done.stderr
+
+
+def test_a_steep_cone_is_no_sheet_and_small_patches_lower_no_other_order():
+    """A skirt is a graph over the plane of its hem, but steep; a vane is held by few vertices."""
+    angle, height = np.meshgrid(2 * np.pi * np.arange(24) / 24, np.linspace(0, 1, 10))
+    radius = 0.4 + 0.3 * height
+    skirt = np.stack([radius * np.cos(angle), height, radius * np.sin(angle)], -1).reshape(-1, 3)
+    at = np.arange(240).reshape(10, 24)
+    right = np.roll(at, -1, 1)
+    faces = np.concatenate([
+        np.stack([at[:-1], at[1:], right[:-1]], -1).reshape(-1, 3),
+        np.stack([right[:-1], at[1:], right[1:]], -1).reshape(-1, 3),
+    ])  # fmt: skip
+    found = Template.fit(skirt, faces, skirt[:, :2], lambda count: 8 if count == 1 else 5)
+    assert len(found) == 3 and found.order == 5
+    vane = np.array([[3.0, 0, 0], [3.2, 0, 0], [3.0, 0.2, 0]])
+    points, every = np.concatenate([skirt, vane]), np.concatenate([faces, [[240, 241, 242]]])
+    both = Template.fit(points, every, points[:, :2], 5, exact=False)
+    assert len(both) == 4 and both.order == 5
+    assert (np.abs(both.alpha).max(1) > 0).sum() >= 3 and np.isfinite(both.alpha).all()
