@@ -71,7 +71,7 @@ def measured(path, overrides, turns):
         pairs = images._outline(*outline)[1] if outline else None
         sums = table, figures, vertices, 1.0, 1.0, at.area, level.stride, pairs
         gathered = images.gather.images(*sums)
-        assembly, lengths = objective._assembly, objective._lengths
+        assembly, lengths = objective._assembly, objective.lengths
         normal, _ = assembly.normal(surface, gathered, lengths, 1.0, objective.patterns[d], d)
         reduced = descent.reduced(normal, 1e-3, np.float32)
     recorded = assembly._in_unknowns
