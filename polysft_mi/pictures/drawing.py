@@ -40,8 +40,9 @@ def _draw_in_background(variant, scene, overrides, template, sequence, album, ca
 
         from .album import Album
 
-        dr.set_thread_count(1)
         _album = Album(Problem(scenes.load(scene, overrides, template), sequence), *album)
+        # not before: with one thread, Mitsuba waits for ever for an EXR texture
+        dr.set_thread_count(1)
     result = None
     for name, *arguments in calls:
         result = getattr(_album, name)(*arguments)

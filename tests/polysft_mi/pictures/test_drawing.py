@@ -96,6 +96,28 @@ def test_another_process_draws_the_same_and_again_what_changes(sheet, here, tmp_
     assert np.isfinite(depth).all()
 
 
+def test_another_process_reads_an_exr_texture(sheet, tmp_path):
+    """With one Dr.Jit thread, Mitsuba would wait for it for ever."""
+    folder = tmp_path / "sheet"
+    folder.mkdir()
+    for name in ("frames", "masks", "camera.json", "template.obj"):
+        (folder / name).symlink_to(sheet.folder / name)
+    image = mi.Bitmap(str(sheet.folder / "texture.png"))
+    image = image.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
+    image.write(str(folder / "texture.exr"))
+    prepare.main([str(folder)])
+    experiment = scene.load(str(folder / "scene.xml"))
+    problem = Problem(experiment, experiment.sequence())
+    with Drawing(problem, {}, str(tmp_path), exr_frames=0, about={}) as made:
+        (job,) = made._jobs or [made._submit()]
+        try:
+            job.result(timeout=120)
+        except TimeoutError:
+            for process in made._pool._processes.values():
+                process.kill()
+            raise
+
+
 def test_a_killed_process_costs_nothing_but_time(sheet, here, tmp_path):
     def kill(made):
         made._jobs[3].result()
