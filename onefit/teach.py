@@ -27,7 +27,7 @@ def parser():
     p.add_argument("garments", nargs="*", metavar="GARMENT", help="templates or meshes")
     p.add_argument("-o", "--output", required=True, metavar="LESSONS", help="folder of the files")
     p.add_argument("--cuts", type=int, default=0, help="random cuts, beside the garments")
-    p.add_argument("--vertices", type=int, default=2500, help="of a garment (default: 2500)")
+    p.add_argument("--vertices", type=int, default=2000, help="of a garment (default: 2000)")
     p.add_argument("--kinds", nargs="*", metavar="KIND", help="of motion (default: the training's)")
     p.add_argument("--seeds", type=int, default=1, help="motions of each kind (default: 1)")
     p.add_argument("--seconds", type=float, default=6.0, help="of a motion (default: 6)")

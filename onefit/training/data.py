@@ -60,28 +60,31 @@ class TrainingData:
             [self.model.standard_shape] + [self.model.random_shape(rng) for _ in range(shapes)]
         )
         self.lessons = lessons
+        #: (G,): of each garment's lessons
+        self.lesson_frames = torch.tensor([float(sum(len(x.poses) for x in g)) for g in lessons])
         if lessons:
-            self.shapes = torch.stack([x.shape for found in lessons for x in found]).unique(dim=0)
+            others = torch.stack([x.shape for found in lessons for x in found]).unique(dim=0)
+            others = others[(others != self.shapes[0]).any(1)]
+            self.shapes = torch.cat([self.shapes[:1], others])
         bodies = [self.model.body(shape) for shape in self.shapes]
         self.standard = bodies[0]
         self.vertices, self.joints, self.rest_poses = (
             torch.stack([getattr(b, name) for b in bodies])
             for name in ("vertices", "joints", "rest_pose")
         )
-        if motions is None:
+        if motions is None and not lessons:
             motions = [
                 Motion.generate(name, seconds=seconds, seed=k)
                 for name in generate.TRAINING
                 for k in range(seeds)
             ]
-        self.motions = [m.resampled(FPS) for m in motions]
-        frames = [max(1, len(m.poses) - LENGTH + 1) for m in self.motions]
-        self._windows = np.stack(
+        self.motions = [m.resampled(FPS) for m in motions or ()]
+        self._windows = np.array(
             [
-                np.repeat(np.arange(len(frames)), frames),
-                np.concatenate([np.arange(f) for f in frames]),
-            ],
-            1,
+                (k, first)
+                for k, m in enumerate(self.motions)
+                for first in range(max(1, len(m.poses) - LENGTH + 1))
+            ]
         )
         self.garments, self._sheets = [], {}
         for garment in garments:
@@ -92,8 +95,8 @@ class TrainingData:
         self.collider = ClosestSurface(self.standard.vertices, self.standard.faces)
 
     def __len__(self):
-        """How many windows there are."""
-        return len(self._windows)
+        """How many windows there are; of lessons, how many frames."""
+        return int(self.lesson_frames.sum()) if self.lessons else len(self._windows)
 
     def to(self, device):
         for name in ("shapes", "vertices", "joints", "rest_poses"):

@@ -62,10 +62,10 @@ class OneFitTraining(Training):
         """The objective's terms on a batch of the random numbers of ``generator``: this process's
         share of it.
         """
+        if self.given.teacher:
+            return self._of_lessons(generator, garment)
         number = self.done % len(self.data.garments) if garment is None else garment
         garment, rest, _ = self.data.garments[number]
-        if self.given.teacher:
-            return self._of_lessons(number, generator)
         windows = self.data.windows(self._windows(garment, self.processes), generator)
         windows, Z_T, Z_B, _ = self._encoded(garment, windows, generator)
         frame = lambda k: (windows.poses[:, -k], windows.translation[:, -k], windows.number)
@@ -81,10 +81,12 @@ class OneFitTraining(Training):
         deformation = self.network.decoder(Z_T, Z_B[:, -1])
         return self._terms(number, deformation, frame(1), past, generator)[0]
 
-    def _of_lessons(self, number, generator):
+    def _of_lessons(self, generator, number):
         """The same of lessons: the objective without inertia, which they have, and how far the
-        vertices are from where they have them.
+        vertices are from where they have them. Garments are drawn by the frames of their lessons.
         """
+        if number is None:
+            number = int(torch.multinomial(self.data.lesson_frames, 1, generator=generator))
         garment, rest, _ = self.data.garments[number]
         count = self._windows(garment, self.processes)
         windows, asked, wanted = self.data.lesson_windows(number, count, generator)

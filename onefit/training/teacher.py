@@ -15,12 +15,15 @@ import torch
 
 from onefit.body import skinning
 from onefit.garment import Garment
+from onefit.physics import Settings
 from polyfit.errors import InputError
 from polyfit.files import aside
 
 from .projection import unposed
 
 FPS = 30.0
+# A lesson's faces are of 2 cm, and a third of its time would go into points between their corners
+SETTINGS = Settings(spacing=0.05)
 BETWEEN = "--"  # the names of garment and motion, in those of files
 
 
@@ -41,7 +44,9 @@ def lesson(draper, garment, motion, shape, *, finish, material, advance=lambda: 
     """What the finished drape of ``garment`` in ``motion`` on a body of ``shape`` (S,) teaches; the
     arguments as :meth:`onefit.Draper.drape` takes them.
     """
-    drape = draper.drape(garment, motion, shape, finish=finish, material=material, advance=advance)
+    drape = draper.drape(
+        garment, motion, shape, finish=finish, material=material, settings=SETTINGS, advance=advance
+    )
     body = draper.model.body(shape)
     motion = motion.resampled(FPS).fitted(body)
     maps = skinning.transforms(body, motion.poses, motion.translation)
