@@ -6,12 +6,12 @@ swing, and its time.
     python benchmarks/onefit_finish.py --finish 0        # the network alone: quick
 
 Every garment is draped in each held-out kind of motion, on the standard body and on others drawn at
-random in turn: by skinning, by the networks, and by the first of them with a finish. Columns: *inside* [%]
-of the vertices; *faces* [%] of points of the faces, no farther apart than 5 mm, in every third
-frame; *strain* [%], *wave* [degrees], *swing* [mm] as :mod:`onefit.objective.folds` has them;
-*jitter* [mm], the mean second difference in time; *energy* [J], the material's stretching, bending
-and weight below the hips, which a finish makes small; *ms*, the median of the frames, and *settle* [s],
-of one drape of the first motion.
+random in turn: by skinning, by the networks, and by the first of them with a finish. Columns:
+*inside* [%] of the vertices; *faces* [%] of points of the faces, no farther apart than 5 mm, in
+every third frame; *strain* [%], *wave* [degrees], *swing* [mm] as :mod:`onefit.objective.folds` has
+them; *jitter* [mm], the mean second difference in time; *energy* [J] of the material: stretching,
+bending, and weight as seen from the hips; *ms*, the median of the frames, and *settle* [s], of one
+drape of the first motion.
 """
 
 import argparse
@@ -115,8 +115,9 @@ def main(argv=None):
                 drapes[of] = other.drape(garment, motion, body)
             if args.finish:
                 ends.append(time.perf_counter())
+                tick = lambda: ends.append(time.perf_counter())
                 drapes[f"{first}, finished"] = draper.drape(
-                    garment, motion, body, **finish, advance=lambda: ends.append(time.perf_counter())
+                    garment, motion, body, **finish, advance=tick
                 )
                 times = times or (1e3 * float(np.median(np.diff(ends[1:]))), ends[1] - ends[0])
             for row, found in drapes.items():

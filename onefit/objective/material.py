@@ -18,8 +18,8 @@ def evaluate(garment, deformation, scene, sheets, weights, past=None, dt=1 / 30,
     (N, T, 3) [m].
 
     ``sheets``: ``(sheet, frames)`` for each body, its :class:`onefit.physics.sheet.Sheet` and which
-    of the T frames are its own; otherwise as :func:`onefit.objective.objective.evaluate`. Stretching,
-    bending, gravity and inertia count ``k_m``, the collision ``k_c``.
+    of the T frames are its own; otherwise as :func:`onefit.objective.objective.evaluate`.
+    Stretching, bending, gravity and inertia count ``k_m``, the collision ``k_c``.
     """
     x = objective.vertices(garment, garment.changes(deformation), scene.rest, scene.transforms)
     terms = {}

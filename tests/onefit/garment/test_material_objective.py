@@ -41,9 +41,7 @@ def test_each_body_has_its_own_sheet(patched, body, cloth, garment):
     both = [(larger, torch.tensor([1])), (cloth, torch.tensor([k for k in range(T) if k != 1]))]
     weights = losses.Weights(k_c=0.0)
     terms, x = material.evaluate(patched, d, s, both, weights)
-    expected = [
-        sheet.stretching(x[:, [k]].double(), larger if k == 1 else cloth) for k in range(T)
-    ]
+    expected = [sheet.stretching(x[:, [k]].double(), larger if k == 1 else cloth) for k in range(T)]
     assert float(terms["stretching"]) == pytest.approx(float(sum(expected)) / T, rel=1e-3)
 
 

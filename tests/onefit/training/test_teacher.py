@@ -122,8 +122,8 @@ def test_regression_comes_nearer_to_the_lessons(folder, learned):
 
 def test_the_regression_is_none_where_the_lesson_is_what_the_network_says(learned, folder):
     # an untrained network is plain skinning
-    still = [[replace(x, displacement=0 * x.displacement) for x in found] for found in learned.lessons]
-    given = TrainingData([learned.garments[0][0].garment], lessons=still)
+    still = [replace(x, displacement=0 * x.displacement) for x in learned.lessons[0]]
+    given = TrainingData([learned.garments[0][0].garment], lessons=[still])
     training = OneFitTraining(replace(SMALL, teacher=str(folder)), given, Processes("cpu"))
     terms = training.loss(torch.Generator().manual_seed(0))
     assert terms["regression"] < 1e-8
