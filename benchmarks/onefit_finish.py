@@ -24,7 +24,7 @@ from onefit_accuracy import SEED
 import onefit
 from onefit.body import ClosestSurface
 from onefit.motion import generate
-from onefit.network.weights import DEFAULT
+from onefit.network import DEFAULT
 from onefit.objective.folds import folds, inner_edges
 from onefit.physics import MATERIALS, Material
 from onefit.physics.sheet import Sheet, bending, potential, stretching

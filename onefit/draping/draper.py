@@ -16,7 +16,8 @@ from onefit.body import AnnyBody, ClosestSurface, skinning
 from onefit.garment import Garment, standard_body, waistband
 from onefit.garment.charts import PatchedGarment
 from onefit.motion import Motion
-from onefit.network.weights import DEFAULT, Trained
+from onefit.network import DEFAULT
+from onefit.network.weights import Trained
 from onefit.network.weights import load as load_weights
 from onefit.objective.objective import posed
 from onefit.physics import Material

@@ -15,7 +15,6 @@ from polyfit.network import load_into, read_weights, write_weights
 VERSION = 4  # of the network's shape and the meaning of its weights
 SCALE = ":scale"  # after the name of a matrix: its rows' scales
 FOLDER = Path(__file__).parents[1] / "data" / "weights"
-DEFAULT = "six-garments"  # which of them is taken where none is named
 
 
 def pretrained() -> tuple[str, ...]:
