@@ -19,6 +19,7 @@ from polyfit import jets
 
 GRAVITY = (0.0, 0.0, -1.0)  # unit, world
 LEAKY_SLOPE = 0.1  # of the leaky ReLUs
+MEMORY = 40.0  # frames that the slowest units of the memory keep, at first: a skirt's swing
 LOOSENESS_SIZE = (
     4  # numbers that tell how a patch hangs: how far from the body, and how much of it is held
 )
@@ -110,7 +111,8 @@ class BodyEncoder(nn.Module):
         self.static = layers([9 * joints, 64, 128, 256, 512])
         self.local = layers([9, 32, 32], bias=False)
         self.moving = layers([32 * joints + 3, 512, 512], bias=False)
-        self.memory = nn.GRU(512, 512, bias=False, batch_first=True)
+        self.memory = nn.GRU(512, 512, batch_first=True)
+        _keep(self.memory)
         self.join = layers([512 + 512 + shape + 3, 256, 256, 256, 256, width], last=False)
 
     def forward(self, poses, translation, shape, fps, hidden=None):
@@ -122,7 +124,7 @@ class BodyEncoder(nn.Module):
         """
         x = descriptors(poses)
         root = _matrices(poses[..., 0, :])
-        change = self._steps(x, root) * (fps / 30)
+        change = self._steps(x, root) * fps
         velocity = torch.nn.functional.pad(translation.diff(dim=1), (0, 0, 1, 0)) * fps
         velocity = (velocity[..., None, :] @ root)[..., 0, :]
         moving = torch.cat([self.local(change).flatten(-2), velocity], -1)
@@ -148,6 +150,16 @@ class BodyEncoder(nn.Module):
         turn = torch.nn.functional.pad(turn[..., :2].mT.flatten(-2), (0, 0, 1, 0))
         first = torch.cat([turn, steps[:, :, 0, 6:]], -1)
         return torch.cat([first[:, :, None], steps[:, :, 1:]], 2)
+
+
+def _keep(gru):
+    """Biases of a GRU whose units keep 1 to MEMORY frames (Tallec and Ollivier 2018). Without any,
+    all of them forget half in a frame, and nothing can swing.
+    """
+    for bias in (gru.bias_ih_l0, gru.bias_hh_l0):
+        nn.init.zeros_(bias)
+    _, update, _ = gru.bias_ih_l0.data.chunk(3)
+    update.copy_(torch.linspace(1, MEMORY, len(update) + 1)[1:].sub(1).log().clamp(min=0))
 
 
 class Decoder(nn.Module):
