@@ -128,7 +128,7 @@ def test_a_body_at_rest_leaves_the_dynamic_encoding_at_zero():
         1, 12, 24, 3
     )
     _, memory = body(poses, torch.zeros(1, 12, 3), torch.zeros(1, 6), 30.0)
-    assert memory.abs().max() == 0
+    assert memory.abs().max() < 1e-5
     _, moving = body(
         poses * torch.linspace(0, 1, 12)[:, None, None],
         torch.zeros(1, 12, 3),
@@ -206,7 +206,7 @@ def test_the_memory_sees_the_root_move():
     turned = poses.clone()
     turned[0, 3:, 0, 2] = 0.5
     _, none = body(poses, still, torch.zeros(1, 6), 30.0)
-    assert none.abs().max() == 0
+    assert none.abs().max() < 1e-5
     for moved in ((poses, jump), (turned, still)):
         _, memory = body(*moved, torch.zeros(1, 6), 30.0)
         assert memory.abs().max() > 1e-3
