@@ -25,7 +25,7 @@ demo-shirt: .venv/with-demo llvm
 	$(PY) -m polysft_mi.run scenes/demo_shirt.xml -o out/demo-shirt --overwrite
 
 drape: .venv/with-drape llvm
-	$(PY) -m onefit.drape dress dance --weights dress -o out/drape --seconds 2 --overwrite
+	$(PY) -m onefit.drape dress dance -o out/drape --seconds 2 --overwrite
 
 test: .venv/with-test llvm
 	$(PY) -m pytest -q -n 2 --dist loadfile

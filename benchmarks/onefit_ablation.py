@@ -54,6 +54,7 @@ def main(argv=None):
             batch=args.batch,
             epochs=12,
             epoch_steps=args.epoch_steps,
+            objective="paper",
             weights=weights,
         )
         if not (folder / "weights.safetensors").exists():

@@ -3,13 +3,15 @@ swing, and its time.
 
     python benchmarks/onefit_finish.py
     python benchmarks/onefit_finish.py --garments skirt shirt.obj --finish 3 --material denim
+    python benchmarks/onefit_finish.py --finish 0        # the network alone: quick
 
 Every garment is draped in each held-out kind of motion, on the standard body and on others drawn at
-random in turn: by skinning, by the network, and by the network with a finish. Columns: *inside* [%]
-of the vertices; *faces* [%] of points of the faces, no farther apart than 5 mm, in every third
-frame; *strain* [%], *wave* [degrees], *swing* [mm] as :mod:`onefit.objective.folds` has them;
-*jitter* [mm], the mean second difference in time; *ms*, the median of the frames, and *settle* [s],
-of one drape of the first motion.
+random in turn: by skinning, by the networks, and by the first of them with a finish. Columns:
+*inside* [%] of the vertices; *faces* [%] of points of the faces, no farther apart than 5 mm, in
+every third frame; *strain* [%], *wave* [degrees], *swing* [mm] as :mod:`onefit.objective.folds` has
+them; *jitter* [mm], the mean second difference in time; *energy* [J] of the material: stretching,
+bending, and weight as seen from the hips; *ms*, the median of the frames, and *settle* [s], of one
+drape of the first motion.
 """
 
 import argparse
@@ -22,8 +24,10 @@ from onefit_accuracy import SEED
 import onefit
 from onefit.body import ClosestSurface
 from onefit.motion import generate
+from onefit.network import DEFAULT
 from onefit.objective.folds import folds, inner_edges
-from onefit.physics import MATERIALS
+from onefit.physics import MATERIALS, Material
+from onefit.physics.sheet import Sheet, bending, potential, stretching
 from onefit.training import STANDARD
 from polyfit.errors import cli
 
@@ -47,7 +51,15 @@ def face_points(rest, faces):
     return torch.cat(corners), torch.cat(weights)
 
 
-def figures(drape, plain, garment):
+def energy(drape, garment, material):
+    """Of a drape [J], a mean over frames; heights are counted from the root."""
+    sides = None if garment.cut is None else garment.sides(drape.rest).double().numpy()
+    sheet = Sheet(drape.rest.double().numpy(), drape.faces.numpy(), material, sides)
+    x = (drape.vertices - drape.root[:, None]).transpose(0, 1).double()
+    return float((stretching(x, sheet) + bending(x, sheet) + potential(x, sheet)).mean())
+
+
+def figures(drape, plain, garment, material):
     """The row's numbers of one drape; ``plain``: the same by skinning."""
     edges = inner_edges(drape.faces)[0]
     found = folds(
@@ -66,49 +78,56 @@ def figures(drape, plain, garment):
     measures = drape.measures()
     return [
         measures.collision, 100 * np.mean(inside), found.strain, measures.jitter, found.wave,
-        found.swing,
+        found.swing, energy(drape, garment, material),
     ]  # fmt: skip
 
 
 def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--garments", nargs="+", default=[*STANDARD, "skirt", "jumpsuit"])
-    parser.add_argument("--weights", default="six-garments", help="(default: six-garments)")
-    parser.add_argument("--finish", type=int, default=2, help="steps a frame (default: 2)")
+    parser.add_argument("--weights", nargs="+", default=[DEFAULT], help="of networks")
+    parser.add_argument("--finish", type=int, default=2, help="steps a frame; 0: none")
     parser.add_argument("--material", default="cotton", choices=list(MATERIALS))
     parser.add_argument("--motions", nargs="+", default=list(generate.HELD_OUT), metavar="KIND")
     parser.add_argument("--seconds", type=float, default=1.0, help="of a motion (default: 1)")
     parser.add_argument("--shapes", type=int, default=2, help="random bodies (default: 2)")
     args = parser.parse_args(argv)
-    draper = onefit.load(args.weights)
-    rng = np.random.default_rng(SEED)
+    drapers = {name: onefit.load(name) for name in args.weights}
+    first, draper = next(iter(drapers.items()))
+    material, rng = Material.named(args.material), np.random.default_rng(SEED)
     bodies = [None] + [draper.model.random_shape(rng) for _ in range(args.shapes)]
     motions = [
         onefit.Motion.generate(kind, seconds=args.seconds, seed=SEED + k)
         for k, kind in enumerate(args.motions)
     ]
-    print("| garment | | inside | faces | strain | jitter | wave | swing | ms | settle |")
-    print("|---|---|---|---|---|---|---|---|---|---|")
-    finish = dict(finish=args.finish, material=args.material)
+    print(
+        "| garment | | inside % | faces % | strain % | jitter mm | wave ° | swing mm | energy J |"
+        " ms | settle s |\n|---|---|---|---|---|---|---|---|---|---|---|"
+    )
+    finish = dict(finish=args.finish, material=material)
     for name in args.garments:
-        garment, table = draper.garment(name), {}
-        draper.ease(garment)
+        garment, table, times = draper.garment(name), {}, None
         for k, motion in enumerate(motions):
-            drape = lambda **how: draper.drape(garment, motion, bodies[k % len(bodies)], **how)
-            plain, ends = drape(skinning_only=True), [time.perf_counter()]
-            finished = drape(**finish, advance=lambda: ends.append(time.perf_counter()))
-            table.setdefault("time", [ends[1] - ends[0], float(np.median(np.diff(ends[1:])))])
-            for row, found in {
-                "skinning": plain, args.weights: drape(), f"{args.weights}, finished": finished,
-            }.items():  # fmt: skip
-                table.setdefault(row, []).append(figures(found, plain, garment))
-        settle, frame = table.pop("time")
+            body = bodies[k % len(bodies)]
+            plain, ends = draper.drape(garment, motion, body, skinning_only=True), []
+            drapes = {"skinning": plain}
+            for of, other in drapers.items():
+                drapes[of] = other.drape(garment, motion, body)
+            if args.finish:
+                ends.append(time.perf_counter())
+                tick = lambda: ends.append(time.perf_counter())
+                drapes[f"{first}, finished"] = draper.drape(
+                    garment, motion, body, **finish, advance=tick
+                )
+                times = times or (1e3 * float(np.median(np.diff(ends[1:]))), ends[1] - ends[0])
+            for row, found in drapes.items():
+                table.setdefault(row, []).append(figures(found, plain, garment, material))
         for row, found in table.items():
-            times = f"{1e3 * frame:.0f} | {settle:.1f}" if row.endswith("finished") else " | "
-            inside, faces, strain, jitter, wave, swing = np.mean(found, axis=0)
+            last = f"{times[0]:.0f} | {times[1]:.1f}" if row.endswith("finished") else " | "
+            inside, faces, strain, jitter, wave, swing, joules = np.mean(found, axis=0)
             print(
                 f"| {garment.name} | {row} | {inside:.3f} | {faces:.3f} | {strain:.2f}"
-                f" | {jitter:.1f} | {wave:.1f} | {swing:.0f} | {times} |",
+                f" | {jitter:.1f} | {wave:.1f} | {swing:.0f} | {joules:.2f} | {last} |",
                 flush=True,
             )
 

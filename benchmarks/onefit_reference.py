@@ -34,6 +34,7 @@ from onefit.draping import inputs
 from onefit.draping.draper import FPS
 from onefit.garment import waistband
 from onefit.garment.remesh import loops
+from onefit.network import DEFAULT
 from onefit.objective.folds import folds, inner_edges
 from onefit.physics import MATERIALS, Material
 from polyfit.errors import InputError, cli
@@ -188,7 +189,7 @@ def parser():
     p.add_argument("--seconds", type=float, default=2.0)
     p.add_argument("--seed", type=int, default=SEED)
     p.add_argument("--shape", nargs="*", default=[], metavar="NAME=VALUE")
-    p.add_argument("--weights", nargs="+", default=["six-garments"], metavar="WEIGHTS")
+    p.add_argument("--weights", nargs="+", default=[DEFAULT], metavar="WEIGHTS")
     p.add_argument("--finish", type=int, default=0, metavar="STEPS")
     p.add_argument("--material", default="cotton", choices=list(MATERIALS))
     p.add_argument("--picture", metavar="FILE.jpg", help="four frames of all, side by side")

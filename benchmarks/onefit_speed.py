@@ -1,6 +1,6 @@
 """How long OneFit takes to drape: a frame, its parts, and the same garment at four resolutions.
 
-    python benchmarks/onefit_speed.py [--weights six-garments] [--device cuda]
+    python benchmarks/onefit_speed.py [--weights NAME] [--device cuda]
 
 Milliseconds a frame, the median of repeated drapes of a motion of 90 frames in batches, without
 rendering: all of ``Draper.drape``, the network alone, and post-processing; then the T-shirt at
@@ -21,6 +21,7 @@ import torch
 import onefit
 from onefit.draping.draper import FPS
 from onefit.draping.post import pushed_out
+from onefit.network import DEFAULT
 from polyfit.errors import cli
 
 FRAMES = 90
@@ -55,7 +56,7 @@ def network_alone(draper, garment, motion):
 
 def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--weights", default="six-garments")
+    parser.add_argument("--weights", default=DEFAULT)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--counts", type=int, nargs="+", default=[1000, 4000, 16_000, 64_000])
     parser.add_argument("-o", "--output", help="a JSON file of the figures")

@@ -102,7 +102,7 @@ def main(argv=None):
     parser.add_argument(
         "--weights",
         nargs="+",
-        default=["six-garments", "dress"],
+        default=list(onefit.pretrained()),
         help="networks of the package, or files",
     )
     parser.add_argument(

@@ -1,7 +1,7 @@
 """Draws docs/onefit.jpg: garments draped by a network of the package and finished by the physics of
 cloth, in held-out motions, from near.
 
-python docs/drapes.py [OUT.jpg] [--weights six-garments]          (five minutes on two cores)
+python docs/drapes.py [OUT.jpg] [--weights NAME]          (five minutes on two cores)
 """
 
 import argparse
@@ -14,6 +14,7 @@ from polysft_mi.backend import set_variant
 
 set_variant()
 import onefit  # noqa: E402
+from onefit.network import DEFAULT  # noqa: E402
 from polysft_mi.render import stage  # noqa: E402
 
 ROWS = [  # garment, motion, shape, colour
@@ -29,7 +30,7 @@ BODY = (0.5, 0.48, 0.46)
 def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("output", nargs="?", default=str(Path(__file__).parent / "onefit.jpg"))
-    parser.add_argument("--weights", default="six-garments")
+    parser.add_argument("--weights", default=DEFAULT)
     args = parser.parse_args(argv)
     draper, rows = onefit.load(args.weights), []
     for garment, motion, shape, colour in ROWS:

@@ -3,7 +3,7 @@ on PolyFit's patches::
 
     import onefit
 
-    drape = onefit.load("six-garments").drape("shirt.obj", onefit.Motion.generate("walk"))
+    drape = onefit.load().drape("shirt.obj", onefit.Motion.generate("walk"))
     drape.vertices  # (T, N, 3), metres
 
 A garment goes through these packages in this order: ``body`` and ``motion`` (what it is worn on),

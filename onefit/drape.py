@@ -17,6 +17,7 @@ OUT receives
 import argparse
 import sys
 
+from onefit.network import DEFAULT
 from onefit.physics.material import MATERIALS, Material
 from polyfit.errors import InputError, Parser, cli, require
 
@@ -46,8 +47,8 @@ def parser():
     )
     p.add_argument(
         "--weights",
-        default="six-garments",
-        help="a network of the package, or a file (default: six-garments)",
+        default=DEFAULT,
+        help=f"a network of the package, or a file (default: {DEFAULT})",
     )
     p.add_argument(
         "--body",

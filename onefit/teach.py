@@ -1,13 +1,17 @@
-"""Makes lessons for networks: finished drapes of generated motions, as deformations of patches.
+"""Makes lessons for networks: finished drapes of generated motions.
 
     python -m onefit.teach dress tshirt -o LESSONS --seeds 2     # the training's kinds of motion
-    python -m onefit.train dress tshirt --teacher LESSONS -o runs/taught
+    python -m onefit.teach -o LESSONS --cuts 18 --seconds 3      # and random cuts of the patterns
+    python -m onefit.train --teacher LESSONS -o runs/taught
 
-LESSONS receives one file for each garment, kind of motion and seed; those that are there are kept,
-so that a run that was cut short goes on. Every second lesson is of a random body.
+LESSONS receives one file for each garment, and one for each of its drapes, by kind of motion and
+seed; those that are there are kept, so that a run that was cut short goes on. Garments have about
+--vertices; every second lesson is of one of --shapes random bodies.
 """
 
 import argparse
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from onefit.physics.material import MATERIALS, Material
@@ -22,9 +26,12 @@ def parser():
     )
     p.add_argument("garments", nargs="*", metavar="GARMENT", help="templates or meshes")
     p.add_argument("-o", "--output", required=True, metavar="LESSONS", help="folder of the files")
+    p.add_argument("--cuts", type=int, default=0, help="random cuts, beside the garments")
+    p.add_argument("--vertices", type=int, default=2000, help="of a garment (default: 2000)")
     p.add_argument("--kinds", nargs="*", metavar="KIND", help="of motion (default: the training's)")
     p.add_argument("--seeds", type=int, default=1, help="motions of each kind (default: 1)")
     p.add_argument("--seconds", type=float, default=6.0, help="of a motion (default: 6)")
+    p.add_argument("--shapes", type=int, default=12, help="random bodies (default: 12)")
     p.add_argument("--finish", type=int, default=2, help="steps a frame (default: 2)")
     p.add_argument("--material", default="cotton", help=f"one of {', '.join(MATERIALS)}")
     p.add_argument("--weights", default="six-garments", help="what drapes before the finish")
@@ -39,36 +46,54 @@ def main(argv=None):
     from rich.progress import Progress
 
     from .draping import load
+    from .garment.sewing.cuts import cuts
     from .motion import Motion, generate
     from .training import STANDARD, teacher
 
     Material.named(args.material)
-    for name in ("finish", "seeds"):
-        if getattr(args, name) < 1:
-            raise InputError(f"--{name} {getattr(args, name)}: 1 or more")
+    for name, least in dict(finish=1, seeds=1, vertices=100, shapes=0, cuts=0).items():
+        if getattr(args, name) < least:
+            raise InputError(f"--{name} {getattr(args, name)}: {least} or more")
     kinds = args.kinds or generate.TRAINING
     for kind in kinds:
         if kind not in generate.TRAINING:
             raise InputError(f"--kinds {kind}: choose among {', '.join(generate.TRAINING)}")
-    draper = load(args.weights)
-    garments = [draper.garment(name) for name in args.garments or STANDARD]
-    Path(args.output).mkdir(parents=True, exist_ok=True)
-    work = [(g, kind, seed) for seed in range(args.seeds) for kind in kinds for g in garments]
+    draper, folder = load(args.weights), Path(args.output)
+    named = args.garments or (() if args.cuts else STANDARD)
+    garments = [draper.garment(name) for name in named]
+    folder.mkdir(parents=True, exist_ok=True)
+    rng = np.random.default_rng(0)
+    shapes = [draper.model.standard_shape]
+    shapes += [draper.model.random_shape(rng) for _ in range(args.shapes)]
     with Progress(console=Console(stderr=True)) as progress:
+        task = progress.add_task("cuts sewn", total=args.cuts)
+        if args.cuts:
+            garments += cuts(args.cuts, folder / "cuts", advance=partial(progress.advance, task))
+        garments = [_resized(folder, garment, args.vertices) for garment in garments]
+        work = [(g, kind, seed) for seed in range(args.seeds) for kind in kinds for g in garments]
         task = progress.add_task("lessons", total=len(work))
         for k, (garment, kind, seed) in enumerate(work):
             motion = Motion.generate(kind, seconds=args.seconds, seed=seed)
-            path = teacher.path_of(args.output, garment.name, motion.name)
+            path = teacher.path_of(folder, garment.name, motion.name)
             if not path.exists():
-                rng = np.random.default_rng([seed, k])
-                model = draper.model
-                shape = model.random_shape(rng) if k % 2 else model.standard_shape
+                # each garment sees the standard body in turn with the others
+                turn = k // len(garments) + k % len(garments)
+                shape = shapes[1 + turn // 2 % args.shapes if turn % 2 and args.shapes else 0]
                 made = teacher.lesson(
                     draper, garment, motion, shape, finish=args.finish, material=args.material
                 )
                 teacher.write(path, made)
             progress.advance(task)
     print(args.output)
+
+
+def _resized(folder, garment, vertices):
+    """The garment at about so many vertices, kept in ``folder``."""
+    from .training import teacher
+
+    if not teacher.path_of(folder, garment.name).exists():
+        teacher.write_garment(folder, replace(garment.remeshed(vertices), name=garment.name))
+    return teacher.garment_of(folder, garment.name)
 
 
 if __name__ == "__main__":

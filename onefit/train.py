@@ -29,7 +29,7 @@ with optional_imports(__name__):
     from polyfit.training import device_of
 
     from .objective import Weights
-    from .training import STANDARD, Settings, train
+    from .training import OBJECTIVES, Settings, train
 
 
 def parser():
@@ -68,8 +68,10 @@ def parser():
         "--teacher",
         default="",
         metavar="LESSONS",
-        help="learn these lessons of onefit.teach by regression, in place of the physics",
+        help="learn these lessons of onefit.teach by regression, beside the objective",
     )
+    p.add_argument("--objective", choices=OBJECTIVES, default=default.objective)
+    p.add_argument("--material", default=default.material, help="of the objective (cotton)")
     for name, text in {
         "order": "order of the jets", "epochs": "",
         "batch": "patches of a step, all frames together",
@@ -107,7 +109,7 @@ def main(argv=None):
     args = parser().parse_args(argv)
     weights = Weights(**{f.name: getattr(args, f.name) for f in fields(Weights)})
     values = {f.name: getattr(args, f.name) for f in fields(Settings) if f.name != "weights"}
-    values |= dict(garments=tuple(args.garments) or STANDARD, motions=tuple(args.motions))
+    values |= dict(garments=tuple(args.garments), motions=tuple(args.motions))
     command = "python -m onefit.train " + shlex.join(sys.argv[1:] if argv is None else argv)
     settings = Settings(**values, weights=weights)
     path = train(

@@ -16,6 +16,7 @@ from onefit.body import AnnyBody, ClosestSurface, skinning
 from onefit.garment import Garment, standard_body, waistband
 from onefit.garment.charts import PatchedGarment
 from onefit.motion import Motion
+from onefit.network import DEFAULT
 from onefit.network.weights import Trained
 from onefit.network.weights import load as load_weights
 from onefit.objective.objective import posed
@@ -262,7 +263,7 @@ class Draper:
 
 
 def load(
-    name: str | os.PathLike[str] = "six-garments",
+    name: str | os.PathLike[str] = DEFAULT,
     *,
     model: BodyModel | None = None,
     device: torch.device | str = "cpu",

@@ -19,6 +19,7 @@ from polyfit import jets
 
 GRAVITY = (0.0, 0.0, -1.0)  # unit, world
 LEAKY_SLOPE = 0.1  # of the leaky ReLUs
+MEMORY = 40.0  # frames that the slowest units of the memory keep, at first: a skirt's swing
 LOOSENESS_SIZE = (
     4  # numbers that tell how a patch hangs: how far from the body, and how much of it is held
 )
@@ -101,14 +102,17 @@ def _matrices(rotvec):
 
 class BodyEncoder(nn.Module):
     """Z_B (..., width) of a moving body: static and dynamic encodings of its poses (Bertiche et al.
-    2022), shape and root velocity, and the five layers that join them."""
+    2022), shape and root velocity, and the five layers that join them. The memory sees the root's
+    velocity too: a jump lifts a skirt. Where the body faces and where it is tell nothing.
+    """
 
     def __init__(self, joints, shape, width=256):
         super().__init__()
         self.static = layers([9 * joints, 64, 128, 256, 512])
         self.local = layers([9, 32, 32], bias=False)
-        self.moving = layers([32 * joints, 512, 512], bias=False)
-        self.memory = nn.GRU(512, 512, bias=False, batch_first=True)
+        self.moving = layers([32 * joints + 3, 512, 512], bias=False)
+        self.memory = nn.GRU(512, 512, batch_first=True)
+        _keep(self.memory)
         self.join = layers([512 + 512 + shape + 3, 256, 256, 256, 256, width], last=False)
 
     def forward(self, poses, translation, shape, fps, hidden=None):
@@ -119,21 +123,43 @@ class BodyEncoder(nn.Module):
         from rest. In the first frame of a window without memory the body is taken to be at rest.
         """
         x = descriptors(poses)
-        change = torch.cat([torch.zeros_like(x[:, :1]), x[:, 1:] - x[:, :-1]], 1) * (fps / 30)
-        velocity = (
-            torch.cat(
-                [torch.zeros_like(translation[:, :1]), translation[:, 1:] - translation[:, :-1]], 1
-            )
-            * fps
-        )
         root = _matrices(poses[..., 0, :])
+        change = self._steps(x, root) * fps
+        velocity = torch.nn.functional.pad(translation.diff(dim=1), (0, 0, 1, 0)) * fps
         velocity = (velocity[..., None, :] @ root)[..., 0, :]
-        moving, memory = self.memory(self.moving(self.local(change).flatten(-2)), hidden)
+        moving = torch.cat([self.local(change).flatten(-2), velocity], -1)
+        moving, memory = self.memory(self.moving(moving), hidden)
         shape = shape[:, None].expand(*x.shape[:2], -1)
-        return (
-            self.join(torch.cat([self.static(x.flatten(-2)), moving, shape, velocity], -1)),
-            memory,
-        )
+        still = self.static(self._without_heading(x).flatten(-2))
+        return self.join(torch.cat([still, moving, shape, velocity], -1)), memory
+
+    @staticmethod
+    def _without_heading(x):
+        """Descriptors (B, L, J, 9) with the root's rotation left out; gravity tells its tilt."""
+        kept = torch.ones_like(x[0, 0])
+        kept[0, :6] = 0
+        return x * kept
+
+    @staticmethod
+    def _steps(x, root):
+        """Differences in time (B, L, J, 9) of descriptors; that of the root's rotations (B, L, 3,
+        3) as it is seen from the root.
+        """
+        steps = torch.nn.functional.pad(x.diff(dim=1), (0, 0, 0, 0, 1, 0))
+        turn = root[:, :-1].mT @ root[:, 1:] - torch.eye(3, device=x.device)
+        turn = torch.nn.functional.pad(turn[..., :2].mT.flatten(-2), (0, 0, 1, 0))
+        first = torch.cat([turn, steps[:, :, 0, 6:]], -1)
+        return torch.cat([first[:, :, None], steps[:, :, 1:]], 2)
+
+
+def _keep(gru):
+    """Biases of a GRU whose units keep 1 to MEMORY frames (Tallec and Ollivier 2018). Without any,
+    all of them forget half in a frame, and nothing can swing.
+    """
+    for bias in (gru.bias_ih_l0, gru.bias_hh_l0):
+        nn.init.zeros_(bias)
+    _, update, _ = gru.bias_ih_l0.data.chunk(3)
+    update.copy_(torch.linspace(1, MEMORY, len(update) + 1)[1:].sub(1).log().clamp(min=0))
 
 
 class Decoder(nn.Module):

@@ -12,7 +12,7 @@ import torch
 from polyfit.errors import InputError
 from polyfit.network import load_into, read_weights, write_weights
 
-VERSION = 3  # of the network's shape and the meaning of its weights
+VERSION = 4  # of the network's shape and the meaning of its weights
 SCALE = ":scale"  # after the name of a matrix: its rows' scales
 FOLDER = Path(__file__).parents[1] / "data" / "weights"
 

@@ -21,8 +21,9 @@ POINT_AREA = 1e-5  # [m^2] that a point of a sum stands for
 
 @dataclass(frozen=True)
 class Weights:
-    """The paper's weights, and what it leaves open: ``k_bn`` and ``epsilon`` [m]. 0 switches a loss
-    off.
+    """The paper's weights, and what it leaves open: ``k_bn`` and ``epsilon`` [m]. ``k_m``: of the
+    energies of the objective "material", which has ``k_c`` and ``epsilon`` as well; ``k_t``: of a
+    teacher's lessons. 0 switches a loss off.
     """
 
     k_c: float = 1.0
@@ -32,6 +33,8 @@ class Weights:
     k_mi: float = 2.0
     k_g: float = 1.0
     k_in: float = 1.0
+    k_m: float = 1.0
+    k_t: float = 1.0
     epsilon: float = 0.004
 
     def __post_init__(self):

@@ -59,13 +59,7 @@ def evaluate(garment, deformation, scene, weights, epoch=100, past=None, dt=1 / 
     terms = {}
     k_ext = torch.ones((), device=x.device)
     if weights.k_c:
-        drawn = torch.randint(len(x), (RANDOM_POINTS,), generator=generator).to(x.device)
-        chosen = torch.cat([garment.metric_vertex, drawn])
-        distance = scene.collider.distances(x[chosen].transpose(0, 1), scene.body).T
-        share = area.sum() / len(chosen)
-        terms["collision"] = weights.k_c * losses.collision(
-            distance, share.expand(len(chosen)), weights.epsilon
-        )
+        terms["collision"], distance = collision(garment, x, scene, weights, generator)
         k_ext = losses.extension(distance[: len(garment.metric_vertex)], epoch, weights.epsilon)
     if weights.k_i:
         terms["inextensibility"] = weights.k_i * _metric_term(garment, changes, scene, k_ext)
@@ -87,6 +81,17 @@ def evaluate(garment, deformation, scene, weights, epoch=100, past=None, dt=1 / 
     if weights.k_in and past is not None:
         terms["inertia"] = weights.k_in * losses.inertia(x, *past, mass, dt)
     return terms, x
+
+
+def collision(garment, x, scene, weights, generator=None):
+    """The collision's term for vertices ``x`` (N, T, 3) [m], and signed distances (P, T) [m] of
+    those nearest to the metric's points and of :data:`RANDOM_POINTS` more.
+    """
+    drawn = torch.randint(len(x), (RANDOM_POINTS,), generator=generator).to(x.device)
+    chosen = torch.cat([garment.metric_vertex, drawn])
+    distance = scene.collider.distances(x[chosen].transpose(0, 1), scene.body).T
+    share = (garment.vertex_area.sum() / len(chosen)).expand(len(chosen))
+    return weights.k_c * losses.collision(distance, share, weights.epsilon), distance
 
 
 def _metric_term(garment, changes, scene, k_ext):

@@ -11,8 +11,12 @@ from onefit.body import AnnyBody, ClosestSurface, skinning
 from onefit.garment.charts import PatchedGarment
 from onefit.motion import Motion, generate
 from onefit.objective import objective
+from onefit.physics import Material
+from onefit.physics.sheet import Sheet
 
 LENGTH = 10  # frames of a window that the body's encoder sees
+# the same of lessons, how many of the last of them may be asked for, and how many are
+LESSON_LENGTH, LESSON_LAST, LESSON_FRAMES = 45, 30, 4
 FPS = 30.0
 
 
@@ -30,7 +34,8 @@ class Windows:
 class TrainingData:
     """``garments``: names of templates or :class:`onefit.Garment`; ``motions``: those to
     draw from, by default every training kind of :mod:`onefit.motion.generate` with the seeds 0 ..
-    ``seeds`` - 1; ``shapes``: how many random bodies beside the standard one.
+    ``seeds`` - 1; ``shapes``: how many random bodies beside the standard one. ``lessons``: those of
+    each garment, with their own motions and bodies; ``material`` of the cloth.
     """
 
     def __init__(
@@ -44,36 +49,44 @@ class TrainingData:
         shapes=48,
         patches=None,
         order=4,
+        material="cotton",
+        lessons=(),
         seed=0,
         advance=lambda: None,
     ):
-        self.model = model or AnnyBody()
+        self.model, self.material = model or AnnyBody(), Material.named(material)
         rng = np.random.default_rng(seed)
         self.shapes = torch.stack(
             [self.model.standard_shape] + [self.model.random_shape(rng) for _ in range(shapes)]
         )
+        self.lessons = lessons
+        #: (G,): of each garment's lessons
+        self.lesson_frames = torch.tensor([float(sum(len(x.poses) for x in g)) for g in lessons])
+        if lessons:
+            others = torch.stack([x.shape for found in lessons for x in found]).unique(dim=0)
+            others = others[(others != self.shapes[0]).any(1)]
+            self.shapes = torch.cat([self.shapes[:1], others])
         bodies = [self.model.body(shape) for shape in self.shapes]
         self.standard = bodies[0]
         self.vertices, self.joints, self.rest_poses = (
             torch.stack([getattr(b, name) for b in bodies])
             for name in ("vertices", "joints", "rest_pose")
         )
-        if motions is None:
+        if motions is None and not lessons:
             motions = [
                 Motion.generate(name, seconds=seconds, seed=k)
                 for name in generate.TRAINING
                 for k in range(seeds)
             ]
-        self.motions = [m.resampled(FPS) for m in motions]
-        frames = [max(1, len(m.poses) - LENGTH + 1) for m in self.motions]
-        self._windows = np.stack(
+        self.motions = [m.resampled(FPS) for m in motions or ()]
+        self._windows = np.array(
             [
-                np.repeat(np.arange(len(frames)), frames),
-                np.concatenate([np.arange(f) for f in frames]),
-            ],
-            1,
+                (k, first)
+                for k, m in enumerate(self.motions)
+                for first in range(max(1, len(m.poses) - LENGTH + 1))
+            ]
         )
-        self.garments = []
+        self.garments, self._sheets = [], {}
         for garment in garments:
             patched = PatchedGarment(garment, self.standard, patches=patches, order=order)
             rest = torch.stack([garment.graded(b) for b in bodies], 1)
@@ -82,8 +95,8 @@ class TrainingData:
         self.collider = ClosestSurface(self.standard.vertices, self.standard.faces)
 
     def __len__(self):
-        """How many windows there are."""
-        return len(self._windows)
+        """How many windows there are; of lessons, how many frames."""
+        return int(self.lesson_frames.sum()) if self.lessons else len(self._windows)
 
     def to(self, device):
         for name in ("shapes", "vertices", "joints", "rest_poses"):
@@ -110,37 +123,60 @@ class TrainingData:
             torch.stack(poses).to(device), torch.stack(translation).to(device), shape, number
         )
 
-    def lesson_windows(self, lessons, count, generator):
-        """``count`` windows drawn from :class:`onefit.training.teacher.Lesson`, each with the
-        body of its lesson, and the ``changes`` (K, A, count, 3) [m] of their last frames.
+    def lesson_windows(self, number, count, generator):
+        """``count`` :class:`Windows` of LESSON_LENGTH frames, drawn from the lessons of the garment
+        ``number``; which of their frames are asked for, (count, n), the same number of each; and
+        the displacements (N, count n, 3) [m] of these.
         """
-        chosen = torch.randint(len(lessons), (count,), generator=generator).tolist()
+        draw = lambda most, size: torch.randint(most, (size,), generator=generator)
+        lessons = [self.lessons[number][k] for k in draw(len(self.lessons[number]), count)]
+        first = LESSON_LENGTH - LESSON_LAST
+        asked = torch.stack([first + draw(LESSON_LAST, LESSON_FRAMES) for _ in lessons])
         parts = []
-        for lesson in (lessons[k] for k in chosen):
-            end = int(torch.randint(len(lesson.poses), (1,), generator=generator))
-            at = torch.arange(end - LENGTH + 1, end + 1).clamp(min=0)
-            shape = lesson.shape - self.model.standard_shape
-            parts.append(
-                (lesson.poses[at], lesson.translation[at], shape, lesson.changes[:, :, end])
-            )
-        poses, translation, shape, changes = zip(*parts)
+        for lesson, chosen in zip(lessons, asked):
+            end = int(draw(len(lesson.poses) + LESSON_LAST - 1, 1))
+            at = torch.arange(end - LESSON_LENGTH + 1, end + 1).clamp(0, len(lesson.poses) - 1)
+            known = int((self.shapes == lesson.shape.to(self.shapes)).all(1).nonzero()[0, 0])
+            wanted = lesson.displacement[:, at[chosen]].float()
+            parts.append((lesson.poses[at], lesson.translation[at], torch.tensor(known), wanted))
+        poses, translation, which, wanted = zip(*parts)
         device = self.vertices.device
+        which = torch.stack(which).to(device)
+        shape = self.shapes[which] - self.model.standard_shape.to(device)
         windows = Windows(
-            *(torch.stack(x).to(device) for x in (poses, translation, shape)),
-            torch.zeros(count, dtype=torch.long, device=device),
+            torch.stack(poses).to(device), torch.stack(translation).to(device), shape, which
         )
-        return windows, torch.stack(changes, 2)
+        return windows, asked, torch.cat(wanted, 1)
 
-    def scene(self, windows, rest, field):
-        """The :class:`onefit.objective.objective.Scene` of the windows' last frames, and the
-        transforms (B, J, 3, 4) one and two frames before; of a garment whose graded vertices are
-        ``rest`` (N, S, 3), with the ``field`` (3 P, S, 3) of them.
+    def scene(self, garment, poses, translation, number):
+        """The :class:`onefit.objective.objective.Scene` of the garment of that index in frames of
+        ``poses`` (T, J, 3) and ``translation`` (T, 3) [m], on bodies of the shapes ``number`` (T,).
         """
-        number = windows.number
-        body = replace(self.standard, joints=self.joints[number], rest_pose=self.rest_poses[number])
-        now, *past = (
-            skinning.transforms(body, windows.poses[:, -k], windows.translation[:, -k])
-            for k in (1, 2, 3)
-        )
+        _, rest, field = self.garments[garment]
+        now = self.transforms(poses, translation, number)
         posed = skinning.skin(self.vertices[number], self.standard.blend_weights, now)
-        return objective.Scene(now, posed, self.collider, rest[:, number], field[:, number]), past
+        return objective.Scene(now, posed, self.collider, rest[:, number], field[:, number])
+
+    def transforms(self, poses, translation, number):
+        """Those (T, J, 3, 4) of bodies of the shapes ``number`` (T,)."""
+        body = replace(self.standard, joints=self.joints[number], rest_pose=self.rest_poses[number])
+        return skinning.transforms(body, poses, translation)
+
+    def sheets(self, garment, number):
+        """``(sheet, frames)`` of the garment of that index for each of the shapes in ``number``
+        (T,), and in which of the frames it is; each :class:`onefit.physics.sheet.Sheet` made once.
+        """
+        return [
+            (self._sheet(garment, k), (number == k).nonzero()[:, 0])
+            for k in number.unique().tolist()
+        ]
+
+    def _sheet(self, garment, shape):
+        if (garment, shape) not in self._sheets:
+            patched, rest, _ = self.garments[garment]
+            cloth, rest = patched.garment, rest[:, shape].cpu()
+            sides = None if cloth.cut is None else cloth.sides(rest).double().numpy()
+            self._sheets[garment, shape] = Sheet(
+                rest.double().numpy(), cloth.faces.cpu().numpy(), self.material, sides
+            )
+        return self._sheets[garment, shape]

@@ -14,12 +14,13 @@ from onefit.garment.sewing.cuts import cuts
 from onefit.motion import Motion
 from onefit.network import OneFit
 from onefit.network.weights import load, save
-from onefit.objective import objective
+from onefit.objective import material, objective
 from polyfit.errors import InputError
 from polyfit.training import Training, conduct
 
-from .data import FPS, TrainingData
-from .teacher import lessons
+from .data import FPS, LESSON_FRAMES, TrainingData
+from .settings import STANDARD
+from .teacher import garment_of, lessons, taught
 
 GRADIENT_NORM = 1.0  # gradients are clipped to it
 BAD_STEPS = 20  # in a row without a finite loss, after which a training is given up
@@ -36,10 +37,6 @@ class OneFitTraining(Training):
         network = load(settings.start).network if settings.start else _network(settings, data)
         plain = json.loads(json.dumps(asdict(settings)))
         network = network.to(processes.device).train()
-        self.lessons = [
-            lessons(settings.teacher, patched) if settings.teacher else ()
-            for patched, *_ in data.garments
-        ]
         windows = min(self._windows(garment, processes) for garment, *_ in data.garments)
         self.epoch_steps = settings.epoch_steps or -(-len(data) // windows)
         super().__init__(
@@ -51,26 +48,67 @@ class OneFitTraining(Training):
         )
 
     def write_weights(self, path):
-        save(path, self.network, self.data.model, self.given.garments)
+        names = [garment.garment.name for garment, *_ in self.data.garments]
+        save(path, self.network, self.data.model, names[: len(names) - self.given.cuts])
 
     def _windows(self, garment, processes):
         """Windows of a step, so that it has about ``batch`` patches, and each process the same
         number of windows.
         """
-        count = processes.count
-        return max(1, round(self.given.batch / len(garment) / count)) * count
+        count, frames = processes.count, LESSON_FRAMES if self.given.teacher else 1
+        return max(1, round(self.given.batch / len(garment) / frames / count)) * count
 
     def loss(self, generator, garment=None):
         """The objective's terms on a batch of the random numbers of ``generator``: this process's
         share of it.
         """
-        number = self.done % len(self.data.garments) if garment is None else garment
-        garment, rest, field = self.data.garments[number]
-        count = self._windows(garment, self.processes)
         if self.given.teacher:
-            windows, wanted = self.data.lesson_windows(self.lessons[number], count, generator)
-        else:
-            windows = self.data.windows(count, generator)
+            return self._of_lessons(generator, garment)
+        number = self.done % len(self.data.garments) if garment is None else garment
+        garment, rest, _ = self.data.garments[number]
+        windows = self.data.windows(self._windows(garment, self.processes), generator)
+        windows, Z_T, Z_B, _ = self._encoded(garment, windows, generator)
+        frame = lambda k: (windows.poses[:, -k], windows.translation[:, -k], windows.number)
+        past = [
+            objective.vertices(
+                garment,
+                garment.changes(self.network.decoder(Z_T, Z_B[:, -k])),
+                rest[:, windows.number],
+                self.data.transforms(*frame(k)),
+            )
+            for k in (2, 3)
+        ]
+        deformation = self.network.decoder(Z_T, Z_B[:, -1])
+        return self._terms(number, deformation, frame(1), past, generator)[0]
+
+    def _of_lessons(self, generator, number):
+        """The same of lessons: the objective without inertia, which they have, and how far the
+        vertices are from where they have them. Garments are drawn by the frames of their lessons.
+        """
+        if number is None:
+            number = int(torch.multinomial(self.data.lesson_frames, 1, generator=generator))
+        garment, rest, _ = self.data.garments[number]
+        count = self._windows(garment, self.processes)
+        windows, asked, wanted = self.data.lesson_windows(number, count, generator)
+        windows, Z_T, Z_B, mine = self._encoded(garment, windows, generator)
+        asked = asked[mine].to(Z_B.device)
+        wanted = wanted.unflatten(1, (count, -1))[:, mine].flatten(1, 2).to(Z_B)
+        chosen = lambda x: x[torch.arange(len(asked))[:, None], asked].flatten(0, 1)
+        frame = (
+            chosen(windows.poses),
+            chosen(windows.translation),
+            windows.number.repeat_interleave(asked.shape[1]),
+        )
+        deformation = self.network.decoder(Z_T, chosen(Z_B))
+        terms, x = self._terms(number, deformation, frame, None, generator)
+        there = objective.posed(
+            rest[:, frame[2]] + wanted, garment.garment.blend_weights, self.data.transforms(*frame)
+        )
+        away = (x - there).square().sum(-1).mean() / LESSON_UNIT**2
+        return terms | {"regression": self.given.weights.k_t * away}
+
+    def _encoded(self, garment, windows, generator):
+        """This process's share of the windows, Z_T, Z_B, and which windows are its own."""
         hidden = HIDDEN_NOISE * torch.randn(
             1, len(windows.number), self.network.body.memory.hidden_size, generator=generator
         )
@@ -79,21 +117,22 @@ class OneFitTraining(Training):
         hidden = hidden.to(self.processes.device)[:, mine].contiguous()
         Z_T = self.network.patches(*garment.features, self.data.standard.joints)
         Z_B, _ = self.network.body(windows.poses, windows.translation, windows.shape, FPS, hidden)
-        if self.given.teacher:
-            found = garment.changes(self.network.decoder(Z_T, Z_B[:, -1]))
-            away = garment.displacement(found - wanted[:, :, mine].to(found))
-            return {"regression": away.square().sum(-1).mean() / LESSON_UNIT**2}
-        scene, before = self.data.scene(windows, rest, field)
-        changes = [garment.changes(self.network.decoder(Z_T, Z_B[:, -k])) for k in (2, 3)]
-        past = [
-            objective.vertices(garment, c, scene.rest, transforms)
-            for c, transforms in zip(changes, before)
-        ]
-        deformation = self.network.decoder(Z_T, Z_B[:, -1])
+        return windows, Z_T, Z_B, mine
+
+    def _terms(self, number, deformation, frame, past, generator):
+        """The terms of the objective that is asked for, and the vertices (N, T, 3) [m], in frames
+        of (poses, translation, number of the shape).
+        """
+        garment, scene = self.data.garments[number][0], self.data.scene(number, *frame)
+        if self.given.objective == "material":
+            sheets = self.data.sheets(number, frame[2])
+            return material.evaluate(
+                garment, deformation, scene, sheets, self.given.weights, past, 1 / FPS, generator
+            )
         epoch = self.done // self.epoch_steps
         return objective.evaluate(
             garment, deformation, scene, self.given.weights, epoch, past, 1 / FPS, generator
-        )[0]
+        )
 
     def update(self):
         epoch = self.done // self.epoch_steps
@@ -132,7 +171,12 @@ def _network(settings, data):
 def data_of(settings, folder, progress):
     """The :class:`TrainingData` of ``settings``; what is sewn goes into ``folder``."""
     # what can be wrong first, then what takes long
-    garments = [Garment.named(name) for name in settings.garments]
+    if settings.teacher:
+        named = settings.garments or taught(settings.teacher)
+        garments = [garment_of(settings.teacher, name) for name in named]
+    else:
+        garments = [Garment.named(name) for name in settings.garments or STANDARD]
+    learned = [lessons(settings.teacher, g) for g in garments] if settings.teacher else ()
     motions = [
         Motion.read(path, settings.fps, settings.motion_up) for path in settings.motions
     ] or None
@@ -149,7 +193,8 @@ def data_of(settings, folder, progress):
     task = progress.add_task("garments", total=len(garments))
     return TrainingData(
         garments, motions=motions, seeds=settings.seeds, shapes=settings.shapes,
-        order=settings.order, seed=settings.seed, advance=partial(progress.advance, task),
+        order=settings.order, material=settings.material, lessons=learned, seed=settings.seed,
+        advance=partial(progress.advance, task),
     )  # fmt: skip
 
 

@@ -3,28 +3,33 @@
 from dataclasses import dataclass, field
 
 from onefit.objective import Weights
+from onefit.physics import Material
 from polyfit.errors import InputError
 
 # the paper's six garments
 STANDARD = ("tshirt", "dress", "trousers", "shorts", "long_sleeve_top", "tank")
+OBJECTIVES = ("material", "paper")
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What decides the result. ``fps`` and ``motion_up``: of the files of ``motions``, as
+    """What decides the result. ``garments``: by default those of the lessons, or else
+    :data:`STANDARD`; ``fps`` and ``motion_up``: of the files of ``motions``, as
     :meth:`onefit.Motion.read` takes them; ``batch``: patches of a step, all frames together
     (the paper's 20,000); ``lr`` for the first ``lr_epochs`` epochs, a tenth of it for the rest; an
     epoch has ``epoch_steps`` steps (0: as many as show each window of the motions once); ``cuts``:
     how many random cuts (:mod:`onefit.garment.sewing.cuts`) are trained on beside the garments;
-    ``teacher``: a folder of lessons (:mod:`onefit.training.teacher`) to learn by regression, in
-    place of the physics.
+    ``objective``: "material", the energies of ``material``, or "paper"; ``teacher``: a folder of
+    lessons (:mod:`onefit.training.teacher`) to learn as well.
     """
 
-    garments: tuple = STANDARD
+    garments: tuple = ()
     motions: tuple = ()
     fps: float | None = None
     motion_up: str | None = None
     start: str = ""
+    objective: str = "material"
+    material: str = "cotton"
     teacher: str = ""
     order: int = 4
     batch: int = 20_000
@@ -45,8 +50,11 @@ class Settings:
         for name in ("epoch_steps", "lr_epochs", "shapes", "cuts"):
             if getattr(self, name) < 0:
                 raise InputError(f"{name} = {getattr(self, name)}; at least 0 is needed")
+        if self.objective not in OBJECTIVES:
+            raise InputError(f"objective '{self.objective}': choose {' or '.join(OBJECTIVES)}")
+        Material.named(self.material)
         if self.teacher and self.cuts:
-            raise InputError("--teacher and --cuts: lessons are of garments, not of cuts")
+            raise InputError("--teacher and --cuts: lessons have their own garments and cuts")
         if not 2 <= self.order <= 10:
             raise InputError(f"order = {self.order}; the order of OneFit's jets is 2 to 10")
         if not self.lr > 0:

@@ -1,6 +1,7 @@
-"""A teacher: finished drapes of generated motions, as deformations of the garments' patches. A
-network learns them by plain regression, without a body to collide with, before physics alone
-teaches it.
+"""A teacher: finished drapes of generated motions. A network learns them by regression, beside the
+objective or before it.
+
+A folder of lessons has a file for each garment, as it was draped, and one for each of its drapes.
 """
 
 from __future__ import annotations
@@ -13,43 +14,51 @@ import numpy as np
 import torch
 
 from onefit.body import skinning
+from onefit.garment import Garment
+from onefit.physics import Settings
 from polyfit.errors import InputError
 from polyfit.files import aside
 
-from .projection import Projection, unposed
+from .projection import unposed
 
 FPS = 30.0
+# A lesson's faces are of 2 cm, and a third of its time would go into points between their corners
+SETTINGS = Settings(spacing=0.05)
+BETWEEN = "--"  # the names of garment and motion, in those of files
 
 
 @dataclass(frozen=True)
 class Lesson:
     """One drape: ``poses`` (T, 24, 3), ``translation`` (T, 3) [m] and ``shape`` (S,) of the body at
-    30 frames a second; ``changes`` (K, A, T, 3) [m] of the patches' matrices, as
-    :meth:`onefit.PatchedGarment.changes` gives them.
+    30 frames a second; ``displacement`` (N, T, 3) [m] of the garment's vertices in the rest space,
+    from the garment graded to the shape; in half precision, a tenth of a millimetre.
     """
 
     poses: torch.Tensor
     translation: torch.Tensor
     shape: torch.Tensor
-    changes: torch.Tensor
+    displacement: torch.Tensor
 
 
 def lesson(draper, garment, motion, shape, *, finish, material, advance=lambda: None) -> Lesson:
     """What the finished drape of ``garment`` in ``motion`` on a body of ``shape`` (S,) teaches; the
     arguments as :meth:`onefit.Draper.drape` takes them.
     """
-    drape = draper.drape(garment, motion, shape, finish=finish, material=material, advance=advance)
+    drape = draper.drape(
+        garment, motion, shape, finish=finish, material=material, settings=SETTINGS, advance=advance
+    )
     body = draper.model.body(shape)
     motion = motion.resampled(FPS).fitted(body)
     maps = skinning.transforms(body, motion.poses, motion.translation)
     at_rest = unposed(drape.vertices, garment.blend_weights, maps)
-    changes = Projection(draper.patched(garment))(at_rest - drape.rest[:, None])
-    return Lesson(motion.poses, motion.translation, shape, changes)
+    away = (at_rest - drape.rest[:, None]).half()
+    return Lesson(motion.poses, motion.translation, shape, away)
 
 
-def path_of(folder, garment: str, motion: str) -> Path:
-    """The file of a lesson; ``garment`` and ``motion`` by their names."""
-    return Path(folder) / f"{re.sub('[^A-Za-z0-9_]', '_', garment)}--{motion}.npz"
+def path_of(folder, garment: str, motion: str = "") -> Path:
+    """The file of a lesson, or that of the garment; ``garment`` and ``motion`` by their names."""
+    name = re.sub("[^A-Za-z0-9_]", "_", garment)
+    return Path(folder) / f"{name}{BETWEEN if motion else ''}{motion}.npz"
 
 
 def write(path: Path, lesson: Lesson) -> None:
@@ -57,20 +66,44 @@ def write(path: Path, lesson: Lesson) -> None:
         np.savez(temporary, **{name: value.numpy() for name, value in vars(lesson).items()})
 
 
-def lessons(folder, patched) -> list[Lesson]:
-    """Those of a garment (:class:`onefit.PatchedGarment`) in ``folder``. Raises InputError without
-    any, and for those of a garment that was cut otherwise.
+def write_garment(folder, garment: Garment) -> None:
+    """The garment of the lessons of its name in ``folder``."""
+    arrays = dict(vertices=garment.vertices, faces=garment.faces, cut=garment.cut)
+    with aside(path_of(folder, garment.name)) as temporary:
+        np.savez(temporary, **{k: x.numpy() for k, x in arrays.items() if x is not None})
+
+
+def garment_of(folder, name: str) -> Garment:
+    """The garment of that name in a folder of lessons. Raises InputError where there is none."""
+    path = path_of(folder, name)
+    if not path.exists():
+        raise InputError(f"{folder}: no lesson of {name}; onefit.teach makes them")
+    with np.load(path) as file:
+        return Garment.bound(path.stem, file["vertices"], file["faces"], cut=file.get("cut"))
+
+
+def taught(folder) -> tuple[str, ...]:
+    """The names of the garments in a folder of lessons. Raises InputError for none."""
+    paths = Path(folder).glob("*.npz")
+    names = tuple(sorted(path.stem for path in paths if BETWEEN not in path.stem))
+    if not names:
+        raise InputError(f"{folder}: no lessons; onefit.teach makes them")
+    return names
+
+
+def lessons(folder, garment: Garment) -> list[Lesson]:
+    """Those of a garment in ``folder``. Raises InputError without any, and for those of another
+    mesh.
     """
     found = []
-    for path in sorted(Path(folder).glob(path_of("", patched.garment.name, "*").name)):
+    for path in sorted(Path(folder).glob(path_of("", garment.name, "*").name)):
         with np.load(path) as file:
             lesson = Lesson(*(torch.as_tensor(file[n]) for n in Lesson.__annotations__))
-        if lesson.changes.shape[:2] != patched.alpha.shape:
+        if len(lesson.displacement) != len(garment):
             raise InputError(
-                f"{path}: of {tuple(lesson.changes.shape[:2])} coefficients, not"
-                f" {tuple(patched.alpha.shape)}: another garment, or another order"
+                f"{path}: of {len(lesson.displacement)} vertices, not {len(garment)}: another mesh"
             )
         found.append(lesson)
     if not found:
-        raise InputError(f"{folder}: no lesson of {patched.garment.name}; onefit.teach makes them")
+        raise InputError(f"{folder}: no lesson of {garment.name}; onefit.teach makes them")
     return found

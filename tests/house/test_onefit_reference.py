@@ -105,7 +105,7 @@ def test_the_body_is_led_from_its_rest_into_the_motion():
 
 @pytest.fixture(scope="module")
 def tank():
-    draper, garment = onefit.load("six-garments"), Garment.template("tank")
+    draper, garment = onefit.load(), Garment.template("tank")
     motion = onefit.Motion.generate("walk", seconds=0.3, seed=3)
     return garment, motion, draper.drape(garment, motion, skinning_only=True)
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from charted import T, deformation
+from charted import deformation, scene
 
 from onefit.body import AnnyBody, ClosestSurface, skinning
 from onefit.body.nearest import SEARCH_RADIUS
@@ -51,17 +51,6 @@ def test_gradient_of_the_signed_distance(body):
         slope = (ends[0] - ends[1]) / (2 * step)
         assert (gradient[..., k] - slope).abs().median() < 1e-2
     assert torch.allclose(gradient.norm(dim=-1), torch.ones(1), atol=1e-4)
-
-
-def scene(body, patched, frames=T, seed=2, bend=0.15):
-    g = torch.Generator().manual_seed(seed)
-    poses = body.rest_pose + bend * torch.randn(frames, 24, 3, generator=g)
-    transforms = skinning.transforms(body, poses, 0.02 * torch.randn(frames, 3, generator=g))
-    posed = skinning.skin(body.vertices, body.blend_weights, transforms)
-    rest = patched.garment.vertices[:, None].expand(-1, frames, -1)
-    return objective.Scene(
-        transforms, posed, ClosestSurface(body.vertices, body.faces), rest, patched.field @ rest
-    )
 
 
 def test_without_deformation_the_objective_is_plain_skinning(patched, garment, body):

@@ -104,13 +104,13 @@ def test_layers_are_those_of_the_paper():
     ]
     assert widths(network.body.static) == [(216, 64), (64, 128), (128, 256), (256, 512)]
     assert widths(network.body.local) == [(9, 32), (32, 32)] and widths(network.body.moving) == [
-        (768, 512),
+        (771, 512),
         (512, 512),
     ]
     assert network.body.memory.hidden_size == 512
     assert not any(
         "bias" in name
-        for part in (network.body.local, network.body.moving, network.body.memory)
+        for part in (network.body.local, network.body.moving)
         for name, _ in part.named_parameters()
     )
     assert [b for _, b in widths(network.body.join)][:4] == [256] * 4 and len(
@@ -128,7 +128,7 @@ def test_a_body_at_rest_leaves_the_dynamic_encoding_at_zero():
         1, 12, 24, 3
     )
     _, memory = body(poses, torch.zeros(1, 12, 3), torch.zeros(1, 6), 30.0)
-    assert memory.abs().max() == 0
+    assert memory.abs().max() < 1e-5
     _, moving = body(
         poses * torch.linspace(0, 1, 12)[:, None, None],
         torch.zeros(1, 12, 3),
@@ -136,10 +136,16 @@ def test_a_body_at_rest_leaves_the_dynamic_encoding_at_zero():
         30.0,
     )
     assert moving.abs().max() > 1e-3
-    # a memory that was anything fades while the body stands still
+    # a memory that was anything fades while the body stands still, but not at once
     noise = torch.randn(1, 1, 512, generator=torch.Generator().manual_seed(3))
-    _, faded = body(poses, torch.zeros(1, 12, 3), torch.zeros(1, 6), 30.0, noise)
-    assert faded.norm() < 0.05 * noise.norm()
+    rest = lambda frames: body(
+        poses[:, :1].expand(1, frames, 24, 3),
+        torch.zeros(1, frames, 3),
+        torch.zeros(1, 6),
+        30.0,
+        noise,
+    )[1].norm()
+    assert rest(10) > 0.2 * noise.norm() and rest(300) < 0.01 * noise.norm()
 
 
 def test_the_memory_goes_on_where_it_stopped():
@@ -189,15 +195,21 @@ def test_place_and_direction_of_a_motion_only_move_the_drape(draper, walk):
     )
     a, b = draper.drape("tank", walk), draper.drape("tank", other)
     expected = a.vertices @ turn.T + torch.tensor([1.0, 2.0, 0])
-    # the root's descriptor says where the body faces, so the network may see a little of it
-    plain = draper.drape("tank", other, skinning_only=True).vertices
-    assert torch.allclose(
-        draper.drape("tank", walk, skinning_only=True).vertices @ turn.T
-        + torch.tensor([1.0, 2.0, 0]),
-        plain,
-        atol=1e-4,
-    )
-    assert (b.vertices - expected).norm(dim=-1).mean() < (b.vertices - plain).norm(dim=-1).mean()
+    assert torch.allclose(b.vertices, expected, atol=1e-3)
+
+
+def test_the_memory_sees_the_root_move():
+    body = perturbed().body
+    poses, still = torch.zeros(1, 6, 24, 3), torch.zeros(1, 6, 3)
+    jump = still.clone()
+    jump[0, 3:, 2] = 0.1
+    turned = poses.clone()
+    turned[0, 3:, 0, 2] = 0.5
+    _, none = body(poses, still, torch.zeros(1, 6), 30.0)
+    assert none.abs().max() < 1e-5
+    for moved in ((poses, jump), (turned, still)):
+        _, memory = body(*moved, torch.zeros(1, 6), 30.0)
+        assert memory.abs().max() > 1e-3
 
 
 def test_post_processing_leaves_nothing_inside(draper, walk):

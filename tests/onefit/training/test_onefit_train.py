@@ -108,16 +108,28 @@ def test_each_loss_has_a_switch(small, data):
     )
     for switch, name in names.items():
         training = OneFitTraining(
-            replace(small, weights=Weights(**{switch: 0.0})), data, Processes("cpu")
+            replace(small, objective="paper", weights=Weights(**{switch: 0.0})),
+            data,
+            Processes("cpu"),
         )
         with torch.no_grad():
             terms = training.loss(torch.Generator().manual_seed(0))
         assert set(terms) == (set(names.values()) | {"boundary"}) - {name}
     training = OneFitTraining(
-        replace(small, weights=Weights(k_b=0.0, k_bn=0.0)), data, Processes("cpu")
+        replace(small, objective="paper", weights=Weights(k_b=0.0, k_bn=0.0)),
+        data,
+        Processes("cpu"),
     )
     with torch.no_grad():
         assert "boundary" not in training.loss(torch.Generator().manual_seed(0))
+
+
+def test_the_objective_of_the_material_has_its_own_terms(small, data):
+    energies = {"stretching", "bending", "gravity", "inertia"}
+    for off, names in (({}, energies | {"collision"}), (dict(k_c=0.0), energies)):
+        training = OneFitTraining(replace(small, weights=Weights(**off)), data, Processes("cpu"))
+        with torch.no_grad():
+            assert set(training.loss(torch.Generator().manual_seed(0))) == names
 
 
 def test_the_rate_falls_to_a_tenth(small, data):
@@ -234,6 +246,8 @@ class _Nothing:
         (dict(order=1), "order = 1"),
         (dict(lr=0.0), "lr = 0.0; more than 0 is needed"),
         (dict(epoch_steps=-1), "epoch_steps = -1"),
+        (dict(objective="beauty"), "objective 'beauty': choose material or paper"),
+        (dict(material="tin"), "material 'tin': choose among"),
     ],
 )
 def test_settings_are_checked(change, message):
