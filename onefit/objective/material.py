@@ -33,8 +33,11 @@ def evaluate(garment, deformation, scene, sheets, weights, past=None, dt=1 / 30,
         for name in energies[0]:
             terms[name] = weights.k_m * torch.cat([e[name] for e in energies]).mean()
         if past is not None:
-            mass = x.new_tensor(sheets[0][0].mass)
-            terms["inertia"] = weights.k_m * losses.inertia(x, *past, mass, dt)
+            of = lambda sheet, frames: losses.inertia(
+                *(a[:, frames] for a in (x, *past)), x.new_tensor(sheet.mass), dt
+            )
+            shares = [len(frames) / x.shape[1] * of(sheet, frames) for sheet, frames in sheets]
+            terms["inertia"] = weights.k_m * sum(shares)
     return terms, x
 
 
