@@ -54,13 +54,13 @@ class Rules:
         10.0, "", "factor of `k_silhouette` there: the outline shows a bend that no texture shows"
     )
     rounded_relief: float = _rule(
-        0.1, "", "factor of `k_relief` there: their jets leave more of a bend to it"
+        0.1, "", "factor of `k_relief` there: the jets leave more of a bend to the relief"
     )
     # how sure a vertex is
     sigma_strain: float = _rule(
-        7.2, "", "factor of what the strain around a vertex adds to the doubt of noise"
+        7.2, "", "factor of sigma, the geometric mean of the noise's and the strain around a vertex"
     )
-    sigma_unseen: float = _rule(3.3, "", "factor of it where no pixel sees the vertex")
+    sigma_unseen: float = _rule(3.3, "", "factor of sigma where no pixel sees the vertex")
     # the step
     small_step: float = _rule(
         2e-3, "share", "of the objective that a step must promise for another one to follow"

@@ -100,12 +100,11 @@ class Template:
         float64, or else in its PCA frame; several where the mesh is no height graph there, or a
         steep one.
 
-        ``uv``: texture coordinates (N, 2), or :class:`polyfit.mesh.TexCoords`.
-        ``order`` may be a function of the number of patches. Where not ``exact``, vertices that
-        determine less get the highest order that they do, of several patches those that determine
-        most. Raises
-        InputError where the order is too high for the vertices (if ``exact``), or where ``frame``
-        is given and one patch cannot hold the mesh.
+        ``uv``: texture coordinates (N, 2), or :class:`polyfit.mesh.TexCoords`. ``order`` may be a
+        function of the number of patches. Where not ``exact``, vertices that determine less get the
+        highest order that they do, of several patches those that determine most. Raises InputError
+        where the order is too high for the vertices (if ``exact``), or where ``frame`` is given and
+        one patch cannot hold the mesh.
         """
         points, faces = np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64)
         if not isinstance(uv, TexCoords):
