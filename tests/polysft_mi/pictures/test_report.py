@@ -6,6 +6,8 @@ import json
 import re
 import shutil
 import subprocess
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 import pytest
@@ -264,9 +266,10 @@ addEventListener("error", e => problems.push(String(e.message)));
 addEventListener("unhandledrejection", e => problems.push(String(e.reason)));
 console.error = (...a) => problems.push(a.join(" "));
 </script>"""
-_ACT = """<script>
+_ACT = """<img src="/hold" hidden><script>
 (async () => {
-  const wait = () => new Promise(done => setTimeout(done, 300)), seen = {};
+  const sleep = () => new Promise(done => setTimeout(done, 100)), seen = {};
+  const wait = async () => { do await sleep(); while (busy); };  // `busy`: the page still draws
   const note = name => {
     const surface = $("surface").data[0];
     seen[name] = {
@@ -281,7 +284,8 @@ _ACT = """<script>
     b => [b.top, Math.min(b.bottom, innerHeight), b.left, b.right].map(Math.round));
   const fetched = performance.getEntriesByType("resource").map(r => r.name).filter(
     name => !/^(data|blob):/.test(name));
-  console.log("SEEN " + JSON.stringify({...seen, problems, boxes, fetched}));
+  const body = JSON.stringify({...seen, problems, boxes, fetched});
+  await fetch("/seen", {method: "POST", body});
 })();
 </script></body>"""
 _STEPS = """
@@ -298,12 +302,36 @@ _STEPS = """
 
 def browse(page, tmp_path, steps):
     """The page opened in a browser, with steps done in it: what it noted, and a screenshot (H, W,
-    3) from the page's top.
+    3) from the page's top. The browser takes it when all of the page has come; a picture in it that
+    comes after the steps holds it until then, however slow the machine.
     """
     text = page.read_text(encoding="utf-8").replace("<head>", "<head>" + _WATCH, 1)
     before, _, after = text.rpartition("</body>")
-    copy, picture = tmp_path / "page.html", tmp_path / "page.png"
-    copy.write_text(before + _ACT.replace("STEPS", steps) + after, encoding="utf-8")
+    served = (before + _ACT.replace("STEPS", steps) + after).encode()
+    seen, ready = [], threading.Event()
+
+    class Server(BaseHTTPRequestHandler):
+        def do_GET(self):
+            if self.path == "/hold":
+                ready.wait(120)
+            self.answer(served if self.path == "/page.html" else b"")
+
+        def do_POST(self):
+            seen.append(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
+            self.answer(b"")
+            ready.set()
+
+        def answer(self, body):
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html; charset=utf-8")
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            self.wfile.write(body)
+
+        def log_message(self, *args):
+            pass
+
+    picture = tmp_path / "page.png"
     flags = [
         "--headless",
         "--no-sandbox",
@@ -311,26 +339,24 @@ def browse(page, tmp_path, steps):
         "--use-angle=swiftshader",
         "--enable-unsafe-swiftshader",
         "--disable-dev-shm-usage",
-    ]
-    flags += [
         "--disable-background-networking",
         "--disable-component-update",
         "--disable-sync",
         "--no-first-run",
         f"--user-data-dir={tmp_path / 'profile'}",
-    ]
-    flags += [
         "--window-size=1300,1500",
-        "--virtual-time-budget=6000",
-        "--enable-logging=stderr",
         f"--screenshot={picture}",
     ]
-    done = subprocess.run(
-        [BROWSER, *flags, copy.as_uri()], capture_output=True, text=True, timeout=120
-    )
-    seen = re.search(r'"SEEN (\{.*\})"', done.stderr)
+    with ThreadingHTTPServer(("127.0.0.1", 0), Server) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        address = f"http://127.0.0.1:{server.server_port}/page.html"
+        done = subprocess.run(
+            [BROWSER, *flags, address], capture_output=True, text=True, timeout=120
+        )
+        ready.set()
+        server.shutdown()
     assert seen, done.stderr[-2000:]
-    return json.loads(seen[1]), np.asarray(Image.open(picture).convert("RGB")).astype(int)
+    return seen[0], np.asarray(Image.open(picture).convert("RGB")).astype(int)
 
 
 def part(picture, box):
@@ -343,7 +369,8 @@ def test_browser_shows_it(page, tmp_path):
     (tmp_path / "still").mkdir(), (tmp_path / "moved").mkdir()
     still, first = browse(page, tmp_path / "still", "")
     seen, last = browse(page, tmp_path / "moved", _STEPS)
-    assert seen["problems"] == still["problems"] == [] and seen["fetched"] == []
+    assert seen["problems"] == still["problems"] == []
+    assert [name for name in seen["fetched"] if not name.endswith("/hold")] == []
     assert [seen[n]["now"] for n in ("start", "slid", "right", "home", "end")] == [0, 2, 3, 0, 3]
     assert (
         seen["slid"]["label"].startswith("frame 2")
