@@ -7,8 +7,10 @@ A rule is a field of ``polysft_mi.scene.rules.Rules``, or a setting, that decide
 something happens. Each is switched off by the values in ``SWITCHES``, and everything else stays as
 it is. Measured are the error of the surface and the seconds of CPU a frame, tracking alone.
 
-A rule stays when the error grows by 5 % without it on at least two sequences. Two rules stay that
-pay on one sequence alone: without them a real video is lost.
+Where folds come and go, the smallest change grows from frame to frame. So the tracker runs several
+times with a setting changed by some hundred-thousandths; a rule's error is compared with the median
+of these runs, and pays only where it is larger than all of them. A rule stays when the error grows
+so by 5 % without it on at least two sequences. Rules stay, too, without which a real video is lost.
 
 Each result goes into ``ablation.json`` as soon as it is there, and the next call does what is
 missing. All of it takes hours. The simulated sequences are made by ``benchmarks/simulate.py OUT
@@ -37,7 +39,7 @@ from polysft_mi.scene.rules import Rules
 from polysft_mi.scene.settings import Settings
 
 BASELINE = "all rules"
-CHANCE = "nothing (k_mi changed by 1e-5)"
+CHANCES = {f"nothing (k_mi changed by {share:+g})": share for share in (1e-5, -1e-5, 2e-5)}
 PAYS = 0.05  # share by which the error must grow without a rule
 FIGURES = {"e3d_proc": "e3d aligned", "depth_rmse_mm": "depth RMSE [mm]", "chamfer_1e4": "Chamfer"}
 SEQUENCES = (
@@ -71,8 +73,10 @@ NEEDED = {  # rules that pay on one sequence alone, and why they stay
     "texture fit": "without it the texture of φ-SfT R1 lies pixels off in every frame",
 }
 OF_CHANCE = (
-    "The first row changes a setting by a hundred-thousandth. Where folds come and go, small"
-    " changes grow from frame to frame: read no more into a number than this row allows."
+    "Where folds come and go, the smallest change grows from frame to frame. So the tracker also"
+    " ran with a setting changed by some hundred-thousandths. Errors are compared with the median"
+    " of these runs. The first row is how far the runs lie from it: a rule pays only where its"
+    " error is above all of them."
 )
 
 
@@ -90,8 +94,8 @@ class Switch:
 
 SWITCHES = (
     Switch(BASELINE),
-    # a change that means nothing: how far results move by themselves
-    Switch(CHANCE, settings={"k_mi": Settings().k_mi * (1 + 1e-5)}),
+    # changes that mean nothing: how far results move by themselves
+    *(Switch(rule, settings={"k_mi": Settings().k_mi * (1 + s)}) for rule, s in CHANCES.items()),
     Switch("appearance", {"appearance": False}),
     Switch("shading", settings={"k_shading": 0}),
     Switch("exposure", {"exposure": False}),
@@ -191,22 +195,29 @@ def error_of(result):
     return next((n, result["figures"][n]) for n in FIGURES if n in result["figures"])
 
 
-def change(results, rule, sequence, baseline=BASELINE):
-    """By what share the error grows without a rule; None where it was not measured."""
-    with_it, without = results.get((baseline, sequence)), results.get((rule, sequence))
-    if not (with_it and without):
+def errors_with_all_rules(results, sequence):
+    """The errors of the runs with all rules, ascending: the first, and those of chance."""
+    runs = (results.get((rule, sequence)) for rule in (BASELINE, *CHANCES))
+    return sorted(error_of(result)[1] for result in runs if result)
+
+
+def change(results, rule, sequence):
+    """(share, pays): by what share the error grows without a rule, and whether that is more than
+    :data:`PAYS` and than chance; None where it was not measured.
+    """
+    known, without = errors_with_all_rules(results, sequence), results.get((rule, sequence))
+    if not (known and without):
         return None
-    return error_of(without)[1] / error_of(with_it)[1] - 1
+    error = error_of(without)[1]
+    share = error / statistics.median(known) - 1
+    return share, share >= PAYS and error > known[-1]
 
 
-def verdict(results, rule, names, baseline=BASELINE):
+def verdict(results, rule, names):
     """What the table says of a rule, in a few words."""
-    changes = [change(results, rule, name, baseline) for name in names]
-    known = [c for c in changes if c is not None]
-    pays = sum(c >= PAYS for c in known)
+    known = [c for name in names if (c := change(results, rule, name)) is not None]
+    pays = sum(pays for _, pays in known)
     said = f"pays on {pays} of {len(known)}"
-    if rule == CHANCE:
-        return "what chance does"
     if len(known) < len(names):
         return said
     if rule in NEEDED and pays < 2:
@@ -214,30 +225,46 @@ def verdict(results, rule, names, baseline=BASELINE):
     return f"{said}; {'stays' if pays > 1 else 'goes'}"
 
 
-def slower(results, rule, names, baseline=BASELINE):
+def slower(results, rule, names):
     """Median over the sequences of the time without a rule over the time with it; None: unknown."""
     ratios = [
-        results[rule, n]["cpu"] / results[baseline, n]["cpu"]
+        results[rule, n]["cpu"] / results[BASELINE, n]["cpu"]
         for n in names
-        if (rule, n) in results and (baseline, n) in results
+        if (rule, n) in results and (BASELINE, n) in results
     ]
     return statistics.median(ratios) if ratios else None
 
 
-def table(results, rules, names, baseline=BASELINE):
-    """A row a rule: by how many percent the error grows without it, on each sequence."""
-    number = lambda c: "–" if c is None else f"{100 * c:+.0f}" if c < 99 else "lost"
+def table(results, rules, names):
+    """A row a rule: by how many percent the error grows without it, on each sequence; the first is
+    what chance does.
+    """
+
+    def number(change):
+        if change is None:
+            return "–"
+        return f"{100 * change[0]:+.0f}" if change[0] < 99 else "lost"
+
+    def spread(errors):
+        if len(errors) < 2:
+            return "–"
+        median = statistics.median(errors)
+        return f"{100 * (errors[0] / median - 1):+.0f} to {100 * (errors[-1] / median - 1):+.0f}"
+
     rows = [
         ["rule off", *names, "time", "verdict"],
         ["---", *["---:"] * (len(names) + 1), "---"],
     ]
+    known = [errors_with_all_rules(results, name) for name in names]
+    if any(len(errors) > 1 for errors in known):
+        rows.append(["none", *(spread(errors) for errors in known), "–", "what chance does"])
     for rule in rules:
-        ratio = slower(results, rule, names, baseline)
+        ratio = slower(results, rule, names)
         rows.append(
             [rule]
-            + [number(change(results, rule, name, baseline)) for name in names]
+            + [number(change(results, rule, name)) for name in names]
             + ["–" if ratio is None else f"{100 * (ratio - 1):+.0f}"]
-            + [verdict(results, rule, names, baseline)]
+            + [verdict(results, rule, names)]
         )
     return "\n".join("| " + " | ".join(row) + " |" for row in rows)
 
@@ -247,12 +274,15 @@ def wrap(line):
     return line if line.startswith("|") else textwrap.fill(line, 100, break_long_words=False)
 
 
-def baseline_table(results, names, baseline=BASELINE):
-    """The figures with all rules on."""
+def baseline_table(results, names):
+    """The figures with all rules on: the median error of the runs."""
     rows = [["sequence", "figure", "error", "normals", "CPU seconds a frame"], ["---"] * 5]
     for name in names:
-        if result := results.get((baseline, name)):
-            figure, value = error_of(result)
+        if result := results.get((BASELINE, name)):
+            figure, value = (
+                error_of(result)[0],
+                statistics.median(errors_with_all_rules(results, name)),
+            )
             normals = result["figures"].get("en_deg")
             rows.append(
                 [name, FIGURES[figure], f"{value:.4g}"]
@@ -266,10 +296,10 @@ def page(results, earlier):
     removed."""
     names = [n for (rule, n) in results if rule == BASELINE and n not in ROUNDED]
     measured = {rule for rule, n in results if n not in ROUNDED}
-    switches = [s for s in SWITCHES[1:] if not s.rounded]
+    switches = [s for s in SWITCHES if s.rule not in (BASELINE, *CHANCES) and not s.rounded]
     rules = [s.rule for s in switches if s.rule in measured]
     unknown = [s.rule for s in switches if s.rule not in measured]
-    of_rules = f"{OF_CHANCE}\n\n" if CHANCE in measured else ""
+    of_rules = f"{OF_CHANCE}\n\n" if measured & set(CHANCES) else ""
     of_rules += table(results, rules, names) if rules else ""
     if unknown:
         of_rules += f"\n\nNot measured of the tracker as it is: {', '.join(unknown)}."
@@ -281,7 +311,8 @@ def page(results, earlier):
 Made by `python benchmarks/ablation.py`. Each row is one rule switched off alone. A number is the
 change of the error in percent: +30 means that the error is 30 % larger without the rule. *Time* is
 the median change of the CPU time, in percent. A rule stays when the error grows by
-{100 * PAYS:.0f} % without it on at least two sequences. "–": not measured.
+{100 * PAYS:.0f} % without it, and more than by chance, on at least two sequences. "–": not
+measured.
 
 {of_rules}
 
@@ -290,7 +321,8 @@ With all rules on (CPU time on one thread, beside other work: compare it within 
 {baseline_table(results, names)}
 """
     rounded = [n for (rule, n) in results if rule == BASELINE and n in ROUNDED]
-    rules = [s.rule for s in SWITCHES[1:] if any((s.rule, n) in results for n in rounded)]
+    switches = [s for s in SWITCHES if s.rule not in (BASELINE, *CHANCES)]
+    rules = [s.rule for s in switches if any((s.rule, n) in results for n in rounded)]
     if rules:
         text += f"""
 ## Surfaces of several patches

@@ -57,7 +57,8 @@ class Context:
     ``frame``: its number; ``anchor``: the state that it is held to (of the frame before);
     ``noise``: the least misfit so far, NaN in the first frame, where the template has its shape;
     ``light``: what the frames before say of it; ``scales``: robust scale by stage, of the frame
-    before; ``hold``: weight of the squared difference to the anchor, motion included; ``hidden``:
+    before; ``explained``: the misfit up to which a frame is as good as iterations can make it;
+    ``hold``: weight of the squared difference to the anchor, motion included; ``hidden``:
     what holds the parts that no pixel sees, None where all is seen.
     """
 
@@ -66,6 +67,7 @@ class Context:
     noise: float
     light: Light
     scales: dict
+    explained: float = 0.0
     hold: float = 0.0
     hidden: Hidden | None = None
 

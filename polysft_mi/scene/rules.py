@@ -79,9 +79,6 @@ class Rules:
     fine_passes: int = _rule(
         8, "", "further passes of the fine stages for a frame that is not explained"
     )
-    fine_misfit: float = _rule(
-        1.3, "", "a frame is not explained above so many times the least misfit so far"
-    )
     fine_gain: float = _rule(0.01, "share", "of its cost that a pass must gain for another one")
     fine_start: float = _rule(
         1.0, "", "how far beyond the last pass, in its own steps, the next pass starts"

@@ -32,12 +32,24 @@ def test_every_switch_changes_what_is_there(switch):
 
 
 def test_a_rule_that_pays_on_two_sequences_stays():
-    found = results(on=(1.0, 1.0, 1.0), twice=(1.2, 1.06, 0.9), once=(1.2, 1.04, 1.0))
-    verdict = lambda rule: ablation.verdict(found, rule, (0, 1, 2), "on")
+    found = results(twice=(1.2, 1.06, 0.9), once=(1.2, 1.04, 1.0))
+    found |= results(**{ablation.BASELINE: (1.0, 1.0, 1.0)})
+    verdict = lambda rule: ablation.verdict(found, rule, (0, 1, 2))
     assert verdict("twice") == "pays on 2 of 3; stays"
     assert verdict("once") == "pays on 1 of 3; goes"
     del found["twice", 2]
     assert verdict("twice") == "pays on 2 of 2"
+
+
+def test_what_chance_does_too_does_not_count():
+    one, two = list(ablation.CHANCES)[:2]
+    found = results(rule=(1.2, 1.2)) | results(**{ablation.BASELINE: (1.0, 1.0)})
+    found |= results(**{one: (0.9, 1.0), two: (1.1, 1.3)})
+    assert ablation.verdict(found, "rule", (0, 1)) == "pays on 1 of 2; goes"
+    found = {(rule, f"sequence {k}"): result for (rule, k), result in found.items()}
+    table = ablation.table(found, ["rule"], ("sequence 0", "sequence 1")).splitlines()
+    assert table[2] == "| none | -10 to +10 | +0 to +30 | – | what chance does |"
+    assert table[3].startswith("| rule | +20 | +20 |")
 
 
 def test_the_switch_reaches_the_tracker(tmp_path):

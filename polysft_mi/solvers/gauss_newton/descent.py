@@ -1,7 +1,7 @@
 """Levenberg-Marquardt for one frame, stage after stage, from one start."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import LinAlgError
@@ -17,12 +17,14 @@ _LEAST_DAMPING, _RAISED_DAMPING = 1e-7, 1e-4
 @dataclass(frozen=True)
 class Found:
     """Where a descent ended: the ``state``, the last ``model`` on the way (one small step before
-    it at most), and the robust ``scales`` by stage that fit the residuals there.
+    it at most), the robust ``scales`` by stage that fit the residuals there, and whether more
+    iterations gain nothing.
     """
 
     state: State
     model: Model
     scales: dict
+    more_is_vain: bool = False
 
     @property
     def misfit(self):
@@ -76,28 +78,22 @@ class Descent:
         that is not explained: :class:`Found`.
 
         Folds come gradually, and too few iterations leave each frame a little further behind. Each
-        further pass starts beyond the last, as far again as that had come.
+        further pass starts beyond the last, as far again as that had come. A frame counts as
+        explained up to the misfit that such passes could not lower in a frame before.
         """
         rules = self.rules
         best = self._stages(start, context, stages, iterations)
-        for _ in range(rules.fine_passes):
-            if not self._is_unexplained(best, context):
+        for count in range(rules.fine_passes):
+            if context.is_first or best.misfit <= max(rules.explained, context.explained):
                 break
             found = self._stages(start, context, self.usual[1:], iterations)
             gain = 1 - found.cost / best.cost
-            if gain <= 0:
-                return best
             start = best.state.extrapolated(found.state, rules.fine_start)
-            best = found
+            if gain > 0:
+                best = found
             if gain < rules.fine_gain:
-                break
+                return replace(best, more_is_vain=count == 0)
         return best
-
-    def _is_unexplained(self, found, context):
-        """Whether the misfit is more than the noise of the images."""
-        rules = self.rules
-        least = max(rules.explained, rules.fine_misfit * context.noise)
-        return not context.is_first and found.misfit > least
 
     def _stages(self, state, context, stages, iterations):
         scales, found = {}, None

@@ -139,14 +139,15 @@ class GaussNewton:
         scales = {stage: last.get(f"scale_{k}") or first for k, stage in enumerate(stages)}
         light = Light.of(_last(known, "light"), self._descent.rules)
         hidden = self._descent.objective.hidden(anchor)
-        return Context(frame, anchor, noise, light, scales, hidden=hidden)
+        explained = _last(known, "explained") or 0.0
+        return Context(frame, anchor, noise, light, scales, explained, hidden=hidden)
 
     def _facts(self, found, context, known):
         """What the frames that follow want to know of this one.
 
         ``misfit``, ``outlier_share``; ``least_misfit``: of the frames so far, the first one aside,
-        which the texture was taken from; ``light``: its numbers; ``scale_k``: robust scale of
-        stage k.
+        which the texture was taken from; ``explained``: the highest misfit that more iterations
+        could not lower; ``light``: its numbers; ``scale_k``: robust scale of stage k.
         """
         model, frame = found.model, context.frame
         stages = self._descent.far, *self._descent.usual
@@ -154,6 +155,7 @@ class GaussNewton:
         facts = {f"scale_{k}": found.scales.get(stage, first) for k, stage in enumerate(stages)}
         facts |= {"misfit": found.misfit, "outlier_share": model.evaluation.outlier_share}
         facts["least_misfit"] = self._least_misfit(found, context, known)
+        facts["explained"] = found.misfit if found.more_is_vain else context.explained
         light = context.light
         if self.settings.k_shading > 0:
             vertices, seen = model.surface.vertices, model.evaluation.seen

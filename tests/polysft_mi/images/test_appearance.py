@@ -206,12 +206,13 @@ def test_each_stage_begins_with_what_the_sheet_looks_like(problem, monkeypatch):
     monkeypatch.setattr(images, "appearance", appearance)
     blurs = problem.rules.blurs
     usual = [(blur, blur == blurs[-1]) for blur in blurs]
-    context = Context(1, rest, 1.0, Light.unknown(problem.rules), {})  # all that is left is noise
+    # all that is left is what iterations cannot lower
+    context = Context(1, rest, 1.0, Light.unknown(problem.rules), {}, explained=1.0)
     descent.descend(rest, context, (descent.far, *descent.usual))
     assert seen == usual
     seen.clear()
     monkeypatch.setattr(descent, "rules", dataclasses.replace(problem.rules, explained=0.0))
-    descent.descend(rest, dataclasses.replace(context, noise=0.0), descent.usual)
+    descent.descend(rest, dataclasses.replace(context, explained=0.0), descent.usual)
     assert seen[:5] == [*usual, *usual[1:]]  # what is not explained is looked at again
 
 

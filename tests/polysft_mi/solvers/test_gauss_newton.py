@@ -86,19 +86,20 @@ def test_a_sheet_that_jumps_is_found_again(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "noise, misfits, passes, kept",
+    "explained, misfits, passes, kept, vain",
     [
-        (0.03, [0.1, 0.08, 0.0795, 0.01], 3, 2),  # until it gains little
-        (0.03, [0.2 * 0.9**k for k in range(12)], 9, 8),  # or eight times
-        (0.03, [0.1, 0.035, 0.01], 2, 1),  # or what is left is noise
-        (0.03, [0.1, 0.11, 0.01], 2, 0),  # what is worse is not kept
-        (0.03, [0.035, 0.01], 1, 0),
-        (0.005, [0.015, 0.01], 1, 0),
-        (math.nan, [0.3, 0.01], 1, 0),  # the first frame
+        (0.03, [0.1, 0.08, 0.0795, 0.01], 3, 2, False),  # until it gains little
+        (0.03, [0.2 * 0.9**k for k in range(12)], 9, 8, False),  # or eight times
+        (0.03, [0.1, 0.025, 0.01], 2, 1, False),  # or it is explained
+        (0.03, [0.1, 0.11, 0.01], 2, 0, True),  # what is worse is not kept
+        (0.03, [0.1, 0.0995, 0.01], 2, 1, True),
+        (0.03, [0.025, 0.01], 1, 0, False),
+        (0.005, [0.015, 0.01], 1, 0, False),
+        (None, [0.3, 0.01], 1, 0, False),  # the first frame
     ],
 )
 def test_what_is_not_explained_goes_through_the_fine_stages_again(
-    problem, monkeypatch, noise, misfits, passes, kept
+    problem, monkeypatch, explained, misfits, passes, kept, vain
 ):
     descent, seen = Descent(SecondOrder(problem)), []
 
@@ -114,14 +115,15 @@ def test_what_is_not_explained_goes_through_the_fine_stages_again(
         return Pass(At(len(seen) - 1), None, {})
 
     monkeypatch.setattr(descent, "_stages", stage_by_stage)
-    context = Context(5, None, noise, Light.unknown(Rules()), {})
+    noise = math.nan if explained is None else 0.0
+    context = Context(5, None, noise, Light.unknown(Rules()), {}, explained or 0.0)
     every = descent.far, *descent.usual
     found = descent.descend("start", context, every)
     assert seen[0] == ("start", every)
     # from where the last led, and as far again
     starts = ["start"] + [(k, k + 1, 1.0) for k in range(passes - 2)]
     assert seen[1:] == [(start, descent.usual[1:]) for start in starts[: passes - 1]]
-    assert found.state == kept
+    assert found.state == kept and found.more_is_vain == vain
 
 
 def test_what_is_suspect_is_measured_from_the_noise(problem):
