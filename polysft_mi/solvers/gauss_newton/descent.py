@@ -86,11 +86,11 @@ class Descent:
         for count in range(rules.fine_passes):
             if context.is_first or best.misfit <= max(rules.explained, context.explained):
                 break
-            found = self._stages(start, context, self.usual[1:], iterations)
+            beyond = start.extrapolated(best.state, rules.fine_start)
+            found = self._stages(beyond, context, self.usual[1:], iterations)
             gain = 1 - found.cost / best.cost
-            start = best.state.extrapolated(found.state, rules.fine_start)
             if gain > 0:
-                best = found
+                start, best = best.state, found
             if gain < rules.fine_gain:
                 return replace(best, more_is_vain=count == 0)
         return best

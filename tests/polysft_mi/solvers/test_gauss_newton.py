@@ -118,10 +118,10 @@ def test_what_is_not_explained_goes_through_the_fine_stages_again(
     noise = math.nan if explained is None else 0.0
     context = Context(5, None, noise, Light.unknown(Rules()), {}, explained or 0.0)
     every = descent.far, *descent.usual
-    found = descent.descend("start", context, every)
-    assert seen[0] == ("start", every)
+    found = descent.descend(At(-1), context, every)
+    assert seen[0] == (-1, every)
     # from where the last led, and as far again
-    starts = ["start"] + [(k, k + 1, 1.0) for k in range(passes - 2)]
+    starts = [(k, k + 1, 1.0) for k in range(-1, passes - 2)]
     assert seen[1:] == [(start, descent.usual[1:]) for start in starts[: passes - 1]]
     assert found.state == kept and found.more_is_vain == vain
 
