@@ -16,7 +16,6 @@ any, the six templates of the paper. OUT receives
                             where an uninterrupted run would have
 """
 
-import os
 import shlex
 import sys
 from dataclasses import fields
@@ -24,9 +23,7 @@ from dataclasses import fields
 from polyfit.errors import Parser, cli, optional_imports
 
 with optional_imports(__name__):
-    import torch
-
-    from polyfit.training import device_of
+    from polyfit.training import add_run_arguments, run
 
     from .objective import Weights
     from .training import OBJECTIVES, Settings, train
@@ -97,11 +94,7 @@ def parser():
             default=f.default,
             help=f"(default: {f.default})",
         )
-    p.add_argument("--checkpoint-every", type=float, default=120.0, metavar="SECONDS")
-    p.add_argument("--resume", action="store_true", help="continue from OUT/checkpoint.safetensors")
-    p.add_argument(
-        "--device", default="cuda" if torch.cuda.is_available() else "cpu", help="cpu or cuda"
-    )
+    add_run_arguments(p)
     return p
 
 
@@ -112,16 +105,7 @@ def main(argv=None):
     values |= dict(garments=tuple(args.garments), motions=tuple(args.motions))
     command = "python -m onefit.train " + shlex.join(sys.argv[1:] if argv is None else argv)
     settings = Settings(**values, weights=weights)
-    path = train(
-        settings,
-        args.output,
-        device=device_of(args.device),
-        resume=args.resume,
-        every=args.checkpoint_every,
-        command=command,
-    )
-    if path and int(os.environ.get("RANK", 0)) == 0:
-        print(path)
+    run(train, settings, args, command)
 
 
 if __name__ == "__main__":

@@ -23,9 +23,7 @@ from dataclasses import fields
 from .errors import Parser, cli, optional_imports
 
 with optional_imports(__name__):
-    import torch
-
-    from .training import MODELS, Settings, device_of, train
+    from .training import MODELS, Settings, add_run_arguments, run, train
 
 
 def parser():
@@ -64,11 +62,7 @@ def parser():
         default=default.lr,
         help=f"Adam's rate, which falls to a hundredth as a cosine (default: {default.lr})",
     )
-    p.add_argument("--checkpoint-every", type=float, default=120.0, metavar="SECONDS")
-    p.add_argument("--resume", action="store_true", help="continue from OUT/checkpoint.safetensors")
-    p.add_argument(
-        "--device", default="cuda" if torch.cuda.is_available() else "cpu", help="cpu or cuda"
-    )
+    add_run_arguments(p)
     return p
 
 
@@ -81,16 +75,7 @@ def main(argv=None):
         for a in (sys.argv[1:] if argv is None else argv)
     ]
     command = "python -m polyfit.train " + shlex.join(names)
-    path = train(
-        settings,
-        args.output,
-        device=device_of(args.device),
-        resume=args.resume,
-        every=args.checkpoint_every,
-        command=command,
-    )
-    if path and int(os.environ.get("RANK", 0)) == 0:
-        print(path)
+    run(train, settings, args, command)
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ import lazy_loader
 __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
+        "command": ["add_run_arguments", "run"],
         "garments": ["GarmentPatches", "cut_meshes"],
         "loop": ["Training", "conduct"],
         "losses": ["Discrepancy", "share_behind", "discrepancy"],
