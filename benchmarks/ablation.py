@@ -42,19 +42,8 @@ BASELINE = "all rules"
 CHANCES = {f"nothing (k_mi changed by {share:+g})": share for share in (1e-5, -1e-5, 2e-5)}
 PAYS = 0.05  # share by which the error must grow without a rule
 FIGURES = {"e3d_proc": "e3d aligned", "depth_rmse_mm": "depth RMSE [mm]", "chamfer_1e4": "Chamfer"}
-SEQUENCES = (
-    "flag",
-    "bend",
-    "paper",
-    "curtain",
-    "corner",
-    "hand",
-    "poster",
-    "kinect_paper",
-    "phi_sft_R1",
-    "tube",
-    "shirt",
-    "ball",
+SEQUENCES = tuple(
+    "flag bend paper curtain corner hand poster kinect_paper phi_sft_R1 tube shirt ball".split()
 )
 SIMULATED = (
     ("flag", 5),
@@ -72,9 +61,8 @@ NEEDED = {  # rules that pay on one sequence alone, and why they stay
     "more iterations there": "a part of the other starts",
     "texture fit": "without it the texture of φ-SfT R1 lies pixels off in every frame",
 }
-OPEN = {  # rules that do not pay on what was measured, and what is not
-    "frontal triangles": "not measured where rims are slanted, on surfaces of several patches",
-}
+# rules that do not pay on what was measured, and what is not
+OPEN = {"frontal triangles": "not measured where rims are slanted, on surfaces of several patches"}
 OF_CHANCE = (
     "Where folds come and go, the smallest change grows from frame to frame. So the tracker also"
     " ran with a setting changed by some hundred-thousandths. Errors are compared with the median"

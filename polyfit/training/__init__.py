@@ -7,11 +7,10 @@ import lazy_loader
 __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
-        "command": ["add_run_arguments", "run"],
         "garments": ["GarmentPatches", "cut_meshes"],
         "loop": ["Training", "conduct"],
         "losses": ["Discrepancy", "share_behind", "discrepancy"],
-        "processes": ["Processes", "device_of"],
+        "processes": ["Processes", "add_run_arguments", "device_of", "run"],
         "settings": ["MODELS", "Settings"],
         "trainer": ["train"],
     },
