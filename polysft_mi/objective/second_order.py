@@ -165,7 +165,9 @@ class SecondOrder:
         surface = atlas.surface(state)
         seen = self.images.evaluate(surface.vertices, context.frame, stage.blur, scale, appearance)
         caution = rules.caution(context.noise)
-        give = rules.give if stiffness is None else math.inf
+        give = rules.give * (caution if rules.strain_caution else 1.0)
+        if stiffness is not None:
+            give = math.inf
         stiffness = s.k_mi * (stiffness or stage.stiffness) / atlas.template.scale**2
         d = 3 if self.has_relief and stage.relief and not context.is_first else 2
         shading, rows = self._shading(surface, context, stage, seen, appearance)

@@ -101,11 +101,12 @@ class Rules:
     relief: float = _rule(1.0, "share", "of `k_relief`")
     relief_bend: float = _rule(3e-3, "share", "of the relief's weight, for its bending")
     noise_misfit: float = _rule(
-        0.05, "misfit", "of noise, at which the relief's weight has doubled"
+        0.05, "misfit", "of noise, at which the relief's weight and `give` have doubled"
     )
-    noise_power: float = _rule(8.0, "", "with which it grows with the noise")
+    noise_power: float = _rule(8.0, "", "with which they grow with the noise")
     noise_most: float = _rule(1e3, "", "factor by which the relief's weight grows at most")
     relief_caution: bool = _rule(True, "", "whether the relief's weight grows with noise")
+    strain_caution: bool = _rule(True, "", "whether `give` grows with noise")
     give: float = _rule(
         0.002, "strain", "from which on a stretched edge hardly pulls harder (Charbonnier)"
     )

@@ -79,7 +79,7 @@ class Descent:
 
         Folds come gradually, and too few iterations leave each frame a little further behind. Each
         further pass starts beyond the last, as far again as that had come. A frame counts as
-        explained up to the misfit that such passes could not lower in an earlier frame.
+        explained up to the misfit that such passes could not lower in a frame before.
         """
         rules = self.rules
         best = self._stages(start, context, stages, iterations)

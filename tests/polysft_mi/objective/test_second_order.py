@@ -116,8 +116,11 @@ def test_stretched_edges_give_and_compressed_ones_do_not(problem):
     assert whole @ h @ whole == pytest.approx(2 * 7.0 * (weight * change**2).sum(), rel=1e-3)
 
 
-@pytest.mark.parametrize("noise", [math.nan, 0.124])
-def test_edges_give_whatever_the_noise(problem, monkeypatch, noise):
+@pytest.mark.parametrize(
+    ("noise", "low", "high"),
+    [(math.nan, 1, 1.01), (0.007, 1, 1.01), (0.05, 1.99, 2.01), (0.124, 500, 1100)],
+)
+def test_strain_is_held_harder_where_it_may_be_noise(problem, monkeypatch, noise, low, high):
     whole, given = SecondOrder(problem), []
     normal = whole._assembly.normal
     monkeypatch.setattr(whole._assembly, "normal", lambda *a: given.append(a[6]) or normal(*a))
@@ -125,7 +128,7 @@ def test_edges_give_whatever_the_noise(problem, monkeypatch, noise):
     context, stage = context_of(whole, rest, noise), stages_of(whole.rules)[1][0]
     whole.model(rest, context, stage, 0.5)
     whole.model(rest, context, stage, 0.5, stiffness=1.0)  # where the texture is fitted: never
-    assert given == [whole.rules.give, math.inf]
+    assert low <= given[0] / whole.rules.give <= high and given[1] == math.inf
 
 
 @pytest.mark.parametrize("stage", [0, 2])  # without and with the relief
