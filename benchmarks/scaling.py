@@ -4,18 +4,19 @@ image.
     python benchmarks/scaling.py [--grids 33 50 71 100] [--sizes 640x480 1280x720 1920x1080]
     [--frames 8] [--docs docs] [-m llvm_ad_rgb]
 
-A textured sheet that covers a third of the image bends and turns (its edges keep their lengths);
-``raster`` renders it, with its masks, 16 samples a pixel. The template is the sheet in the first
-frame, of so many vertices a side. Each case is tracked by default settings in a process of its own,
-which has rendered nothing before. A case's seconds are medians over its frames but the first, for
-which kernels are compiled: of all the process's threads together, so that what else the machine
-does counts little (those of the clock are printed too). Its memory is the process's peak;
+A textured sheet that covers a third of the image bends and turns, or one whose pleats are drawn
+apart (:mod:`scaling_surfaces`); ``raster`` renders it, with its masks, 16 samples a pixel. The
+template is the surface in the first frame. Each case is tracked by default settings in a process of
+its own, which has rendered nothing before. A case's seconds are medians over its frames but the
+first, for which kernels are compiled: of all the process's threads together, so that what else the
+machine does counts little (those of the clock are printed too). Its memory is the process's peak;
 ``started`` is what a process holds before it loads a scene.
 
 Writes ``scaling.md`` and ``scaling.png`` into ``docs`` (``--docs FOLDER`` for another).
 """
 
 import argparse
+import dataclasses
 import json
 import os
 import resource
@@ -27,49 +28,22 @@ import time
 
 import numpy as np
 from cases import add_case_arguments, parse_size
+from scaling_surfaces import Surface, camera
 from sequences import ROOT
 
 from polyfit.files import aside
 from polysft_mi.backend import add_mode_argument, set_variant
-from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError, cli
 
 GRIDS, SIZES, FRAMES = (33, 50, 71, 100), ("640x480", "1280x720", "1920x1080"), 8
-SHARE, SAMPLES = 1 / 3, 16  # of the image that the sheet covers; a pixel
+PLEATED = Surface(100, 10, 4), Surface(100, 25, 4), Surface(250, 40, 10)
+SAMPLES = 16  # a pixel
 
 
 # ---- in a worker's process -----------------------------------------------------------------------
 
 
-def camera(size):
-    width, height = size
-    return Intrinsics(1.1 * width, 1.1 * width, width / 2, height / 2, width, height)
-
-
-def sheet(points, size, t):
-    """The sheet at the time t in [0, 1]: vertices (N, 3) [m, camera frame] of a flat sheet at 0, of
-    a cylinder around a slanting axis later.
-    """
-    x, y = (a.ravel() for a in np.meshgrid(*2 * [np.linspace(-0.5, 0.5, points)]))
-    extent = np.sqrt(SHARE) * np.array(size) / camera(size).fx
-    x, y = x * extent[0], y * extent[1]
-    c, s = np.cos(0.4), np.sin(0.4)
-    along, across = c * x + s * y, c * y - s * x
-    curvature = max(1.5 * t, 1e-9) / extent[0]
-    bent, z = np.sin(curvature * along) / curvature, (1 - np.cos(curvature * along)) / curvature
-    x, y = c * bent - s * across, s * bent + c * across
-    c, s = np.cos(0.2 * t), np.sin(0.2 * t)
-    return np.stack([c * x - s * y + 0.02 * t, s * x + c * y, 1 + z], axis=1)
-
-
-def faces_and_uv(points):
-    k = np.arange(points * points).reshape(points, points)
-    a, b, d, e = (q.ravel() for q in (k[:-1, :-1], k[:-1, 1:], k[1:, :-1], k[1:, 1:]))
-    u, v = (x.ravel() for x in np.meshgrid(*2 * [np.linspace(0, 1, points)]))
-    return np.stack([a, d, b, b, d, e], axis=1).reshape(-1, 3), np.stack([u, 1 - v], axis=1)
-
-
-def make(folder, points, size, frames):
+def make(folder, surface, size, frames):
     """A sequence's folder: frames and masks, template.obj, texture and camera.json, and the true
     surfaces in gt.npz.
     """
@@ -81,8 +55,8 @@ def make(folder, points, size, frames):
     from polysft_mi.pictures.shading import srgb
     from polysft_mi.scene import experiment as scene
 
-    faces, uv = faces_and_uv(points)
-    truth = np.stack([sheet(points, size, k / max(frames - 1, 1)) for k in range(frames)])
+    faces, uv = surface.faces_and_uv()
+    truth = np.stack([surface.at(size, k / max(frames - 1, 1)) for k in range(frames)])
     shutil.copy(os.path.join(ROOT, "scenes", "demo", "texture.jpg"), folder)
     lines = ["v {:.8f} {:.8f} {:.8f}".format(*p) for p in truth[0]] + [
         "vt {:.8f} {:.8f}".format(*t) for t in uv
@@ -151,7 +125,8 @@ def measure(folder):
         "evaluations": done.iterations[1:],
         "rmse_mm": error.tolist(),
     }
-    return {**figures, "started_mb": started, "peak_mb": peak}
+    patches = len(problem.template)
+    return {**figures, "patches": patches, "started_mb": started, "peak_mb": peak}
 
 
 def worker(job):
@@ -161,7 +136,8 @@ def worker(job):
 
     plugins.register()
     if job["task"] == "make":
-        make(job["folder"], job["points"], parse_size(job["size"]), job["frames"])
+        surface = Surface(*job["surface"])
+        make(job["folder"], surface, parse_size(job["size"]), job["frames"])
     else:
         print(json.dumps({**measure(job["folder"]), "versions": outputs.versions()}))
 
@@ -169,14 +145,14 @@ def worker(job):
 # ---- in the benchmark's own process --------------------------------------------------------------
 
 
-def run_case(points, size, frames, mode):
+def run_case(surface, size, frames, mode):
     """The figures of a case (dict)."""
     with tempfile.TemporaryDirectory() as folder:
         for task in ("make", "measure"):
             job = {
                 "task": task,
                 "folder": folder,
-                "points": points,
+                "surface": dataclasses.astuple(surface),
                 "size": size,
                 "frames": frames,
                 "mode": mode,
@@ -186,15 +162,16 @@ def run_case(points, size, frames, mode):
             if done.returncode:
                 why = done.stderr.strip()[-500:]
                 raise InputError(
-                    f"{points * points} vertices at {size}: {task} ended with status"
-                    f" {done.returncode}: {why}"
+                    f"{surface.name} at {size}: {task} ended with status {done.returncode}: {why}"
                 )
-    return summarise(points, size, json.loads(done.stdout.splitlines()[-1]))
+    return summarise(surface, size, json.loads(done.stdout.splitlines()[-1]))
 
 
-def summarise(points, size, found):
+def summarise(surface, size, found):
     return {
-        "vertices": points * points,
+        "vertices": surface.columns * surface.rows,
+        "pleats": surface.pleats,
+        "patches": found["patches"],
         "size": size,
         **{name: float(np.median(found[name])) for name in ("seconds", "cpu")},
         "evaluations": float(np.mean(found["evaluations"])),
@@ -207,12 +184,13 @@ def summarise(points, size, found):
 
 def report(cases, docs, frames):
     """Write scaling.md and scaling.png for cases that are done; the text."""
-    v = cases[0]["versions"]
-    rows = [
-        f"| {c['vertices']:,} | {c['size'].replace('x', '×')} | {c['cpu']:.2f} |"
+    v, sheets = cases[0]["versions"], [c for c in cases if not c["pleats"]]
+    figures = lambda c: (
+        f"{c['size'].replace('x', '×')} | {c['cpu']:.2f} |"
         f" {c['evaluations']:.0f} | {c['peak_mb']:.0f} | {c['rmse_mm']:.2f} |"
-        for c in cases
-    ]
+    )
+    rows = [f"| {c['vertices']:,} | {figures(c)}" for c in sheets]
+    pleated = [f"| {c['vertices']:,} | {c['patches']} | {figures(c)}" for c in cases if c["pleats"]]
     started = np.median([c["started_mb"] for c in cases])
     text = f"""# How the tracker scales
 
@@ -242,13 +220,23 @@ With the template grows the elimination of each vertex's (Δu, Δv). A sheet's b
 matrix is as wide as the sheet, so its factorisation grows with the square of the number of
 vertices. Up to 3,000 vertices the relief moves too. It costs time, and on such a smooth sheet its
 noise shows in the distances.
+
+## Many patches
+
+A curtain whose pleats hang over at first, and are drawn apart. It is no height graph, so each half
+of a pleat is a patch. Each patch has its own jet and motion; vertices see the jets of the patches
+that hold them or a neighbour alone.
+
+| vertices | patches | image | seconds a frame | evaluations a frame | memory [MB] | RMS [mm] |
+|---:|---:|---|---:|---:|---:|---:|
+{chr(10).join(pleated)}
 """
     with (
         aside(os.path.join(docs, "scaling.md")) as temporary,
         open(temporary, "w", encoding="utf-8") as file,
     ):
         file.write(text)
-    plot(os.path.join(docs, "scaling.png"), cases)
+    plot(os.path.join(docs, "scaling.png"), sheets)
     return text
 
 
@@ -322,19 +310,17 @@ def main(arguments=None):
         given = f"--grids {options.grids} --frames {options.frames} --docs {options.docs}"
         raise InputError(f"{given}: at least 4 vertices a side, 2 frames and a folder are needed")
     began, cases = time.perf_counter(), []
-    for size in options.sizes:
-        for points in options.grids:
-            cases.append(run_case(points, size, options.frames, options.mode))
-            c = cases[-1]
-            figures = (
-                f"{c['seconds']:.2f} s a frame ({c['cpu']:.2f} of all threads),"
-                f" {c['peak_mb']:.0f} MB"
-            )
-            print(
-                f"{time.perf_counter() - began:4.0f} s  {c['vertices']} vertices, {size}:"
-                f" {figures}",
-                file=sys.stderr,
-            )
+    surfaces = [(Surface(n, n), size) for size in options.sizes for n in options.grids]
+    surfaces += [(pleated, options.sizes[0]) for pleated in PLEATED]
+    for surface, size in surfaces:
+        cases.append(c := run_case(surface, size, options.frames, options.mode))
+        figures = (
+            f"{c['seconds']:.2f} s a frame ({c['cpu']:.2f} of all threads), {c['peak_mb']:.0f} MB"
+        )
+        print(
+            f"{time.perf_counter() - began:4.0f} s  {surface.name}, {size}: {figures}",
+            file=sys.stderr,
+        )
     print(report(cases, options.docs, options.frames))
 
 

@@ -30,6 +30,7 @@ def parser():
     p.add_argument("--vertices", type=int, default=2000, help="of a garment (default: 2000)")
     p.add_argument("--kinds", nargs="*", metavar="KIND", help="of motion (default: the training's)")
     p.add_argument("--seeds", type=int, default=1, help="motions of each kind (default: 1)")
+    p.add_argument("--each", type=int, help="kinds of a garment, taken in turn (default: all)")
     p.add_argument("--seconds", type=float, default=6.0, help="of a motion (default: 6)")
     p.add_argument("--shapes", type=int, default=12, help="random bodies (default: 12)")
     p.add_argument("--finish", type=int, default=2, help="steps a frame (default: 2)")
@@ -51,9 +52,10 @@ def main(argv=None):
     from .training import STANDARD, teacher
 
     Material.named(args.material)
-    for name, least in dict(finish=1, seeds=1, vertices=100, shapes=0, cuts=0).items():
-        if getattr(args, name) < least:
-            raise InputError(f"--{name} {getattr(args, name)}: {least} or more")
+    for name, least in dict(finish=1, seeds=1, vertices=100, shapes=0, cuts=0, each=1).items():
+        given = getattr(args, name)
+        if given is not None and given < least:
+            raise InputError(f"--{name} {given}: {least} or more")
     kinds = args.kinds or generate.TRAINING
     for kind in kinds:
         if kind not in generate.TRAINING:
@@ -70,7 +72,13 @@ def main(argv=None):
         if args.cuts:
             garments += cuts(args.cuts, folder / "cuts", advance=partial(progress.advance, task))
         garments = [_resized(folder, garment, args.vertices) for garment in garments]
-        work = [(g, kind, seed) for seed in range(args.seeds) for kind in kinds for g in garments]
+        each = min(args.each or len(kinds), len(kinds))
+        work = [
+            (garment, kinds[(each * place + turn) % len(kinds)], seed)
+            for seed in range(args.seeds)
+            for turn in range(each)
+            for place, garment in enumerate(garments)
+        ]
         task = progress.add_task("lessons", total=len(work))
         for k, (garment, kind, seed) in enumerate(work):
             motion = Motion.generate(kind, seconds=args.seconds, seed=seed)

@@ -12,6 +12,7 @@ from clips import CAMERA, HEIGHT, WIDTH, photo, placed, rendered, write_png
 from places import ROOT
 from scripts import load
 
+from polyfit.patches.atlas import Cover
 from polysft_mi.results.truth import load_npz
 from polysft_mi.scene import plugins
 
@@ -125,7 +126,8 @@ def test_iteration_times_every_part(capsys):
 
 
 def test_scaling_tracks_the_sheet_that_it_makes(tmp_path):
-    scaling.make(str(tmp_path), POINTS, (160, 120), 3)
+    sheet = scaling.Surface(POINTS, POINTS)
+    scaling.make(str(tmp_path), sheet, (160, 120), 3)
     with np.load(tmp_path / "gt.npz") as truth:
         vertices, faces = truth["vertices"], truth["faces"]
     a, b = vertices[:, faces], np.roll(vertices[:, faces], -1, axis=2)
@@ -136,14 +138,28 @@ def test_scaling_tracks_the_sheet_that_it_makes(tmp_path):
     moved = 1e3 * np.linalg.norm(vertices[-1] - vertices[0], axis=1).mean()
     assert 0 < found["rmse_mm"][-1] < 0.1 * moved and found["peak_mb"] >= found["started_mb"]
     case = scaling.summarise(
-        POINTS, "160x120", {**found, "versions": {"variant": "v", "machine": "m"}}
+        sheet, "160x120", {**found, "versions": {"variant": "v", "machine": "m"}}
     )
-    text = scaling.report([case, {**case, "vertices": 4}], str(tmp_path), 3)
+    pleated = {**case, "vertices": 100, "pleats": 2, "patches": 4}
+    text = scaling.report([case, {**case, "vertices": 4}, pleated], str(tmp_path), 3)
     assert (
         "| 81 | 160×120 |" in text
+        and "| 100 | 4 | 160×120 |" in text
         and (tmp_path / "scaling.md").read_text(encoding="utf-8") == text
         and (tmp_path / "scaling.png").exists()
     )
+
+
+def test_pleats_are_drawn_apart_and_keep_their_lengths():
+    pleats = scaling.Surface(120, 6, 3)
+    start, end = (pleats.at((640, 480), t) for t in (0, 1))
+    faces, uv = pleats.faces_and_uv()
+    sides = [np.linalg.norm(np.diff(v[faces], axis=1), axis=2) for v in (start, end)]
+    assert np.abs(sides[1] / sides[0] - 1).max() < 0.01  # chords of a curve
+    hanging_over = lambda v: np.diff(v.reshape(6, 120, 3)[0, :, 0]).min() < 0
+    assert hanging_over(start) and not hanging_over(end)
+    assert np.ptp(end[:, 0]) > 1.3 * np.ptp(start[:, 0]) and len(uv) == len(start) == 720
+    assert Cover.of(start, faces).patch.max() == 5  # each half of a pleat
 
 
 def test_poses_of_a_print_are_found_again(tmp_path):

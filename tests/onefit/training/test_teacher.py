@@ -89,8 +89,9 @@ def test_lessons_that_are_there_are_kept(folder):
 
 
 def test_cuts_are_taught_by_their_names(tmp_path):
-    arguments = ["--cuts", "1", "--kinds", "idle", "--seconds", "0.1", "--vertices", "500"]
-    teach.main([*arguments, "-o", str(tmp_path), "--finish", "1", "--shapes", "0"])
+    arguments = ["--cuts", "1", "--kinds", "idle", "walk", "--each", "1", "--seconds", "0.1"]
+    arguments += ["--vertices", "500", "--finish", "1", "--shapes", "0"]
+    teach.main([*arguments, "-o", str(tmp_path)])
     (name,) = taught(tmp_path)
     assert name == "tshirt__cut_0"
     (made,) = lessons(tmp_path, garment_of(tmp_path, name))
