@@ -16,12 +16,12 @@ from scipy.sparse.csgraph import dijkstra
 from polyfit import mesh
 
 from .clusters import NORMAL_WEIGHTS, connected, merged, relaxed
+from .unity import shares
 
 # A face is steep over its patch's plane beyond this cosine; a patch holds a surface of which no
 # larger share of the area is steep
 STEEP, STEEP_SHARE = 0.45, 0.1
 OVERLAP = 0.4  # width of the overlap, in radii of a disc of the patch's area
-LAYERS = 4  # patches that hold a vertex, at most
 FINE = 128  # clusters that vertices are merged to before patches are sought
 
 
@@ -85,11 +85,14 @@ def partition(vertices, faces, edges, label):
         far = dijkstra(graph, directed=False, indices=own, min_only=True, limit=width[k])
         near[:, k] = np.maximum(1 - far / width[k], 0) ** 2
     near[np.arange(len(vertices)), label] = 1 + 1e-9  # its own patch comes first
-    order = np.argsort(-near, axis=1, kind="stable")[:, :LAYERS]
-    weight = np.take_along_axis(near, order, axis=1)
-    used = (weight > 0).any(axis=0)
-    weight = weight[:, used]
-    return order[:, used], weight / weight.sum(1, keepdims=True)
+    vertex, cluster = np.nonzero(near)
+    kept, share = shares(vertex, near[vertex, cluster], len(near))
+    vertex, cluster = vertex[kept], cluster[kept]
+    layer = np.arange(len(kept)) - np.searchsorted(vertex, vertex)
+    patch = np.repeat(label[:, None], layer.max() + 1, axis=1)
+    weight = np.zeros(patch.shape)
+    patch[vertex, layer], weight[vertex, layer] = cluster, share
+    return patch, weight
 
 
 def _few(vertices, faces, vectors):

@@ -7,6 +7,7 @@ import surfaces
 from polyfit import mesh
 from polyfit.patches import atlas
 from polyfit.patches.atlas import Cover, is_graph
+from polyfit.patches.unity import LAYERS, shares
 
 
 def box(n=7, size=0.2):
@@ -118,3 +119,16 @@ def test_a_graph_is_one():
     assert is_graph(vertices, faces, np.array([0, 0, -1.0]))
     assert not is_graph(vertices, faces, np.array([1.0, 0, 0]))
     assert not is_graph(*surfaces.tube(), np.array([1.0, 0, 0]))
+
+
+def test_the_heaviest_patches_of_a_vertex_share_it():
+    rng = np.random.default_rng(0)
+    vertex, patch = np.divmod(rng.permutation(40 * 7), 7)
+    weight = np.maximum(rng.normal(size=len(vertex)), 0) + (patch == vertex % 7)
+    kept, share = shares(vertex, weight, 40)
+    for k in range(40):
+        heaviest = np.sort(weight[vertex == k])[::-1][:LAYERS]
+        heaviest = heaviest[heaviest > 0]
+        assert np.allclose(weight[kept][vertex[kept] == k], heaviest)
+        assert np.allclose(share[vertex[kept] == k], heaviest / heaviest.sum())
+    assert (np.diff(vertex[kept]) >= 0).all()

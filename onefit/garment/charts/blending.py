@@ -6,11 +6,12 @@ import numpy as np
 import scipy.sparse as sp
 import torch
 
+from polyfit.patches.unity import shares
+
 from .samples import basis
 
 # A chart's weight falls to zero at this distance from its middle, in units of the patch's radius.
 CHART_RADIUS = 1.3
-CHARTS_AT_A_POINT = 4  # at most, whose weights are the largest
 # A patch that fills less of its chart's disc than this share is a strip (a hem turned in), of which
 # networks know little: its neighbours have more say.
 STRIP_SHARE = 0.2
@@ -50,10 +51,9 @@ def blend_matrix(p, vertices, frame, order):
         np.pi * frame.s.numpy() ** 2
     )  # as a share of the chart's disc
     weight = (near * np.minimum(area / STRIP_SHARE, 1)[patch]) ** 3
-    keep = _largest(row, weight, CHARTS_AT_A_POINT) & (weight > 0)
-    row, patch, weight, x = row[keep], patch[keep], weight[keep], x[keep]
-    weight /= np.bincount(row, weight, minlength=count)[row]
-    b = weight[:, None] * basis(x[:, :2], order)
+    kept, share = shares(row, weight, count)
+    row, patch, x = row[kept], patch[kept], x[kept]
+    b = share[:, None] * basis(x[:, :2], order)
     A = b.shape[1]
     columns = patch[:, None] * A + np.arange(A)
     return sp.csr_matrix((b.ravel(), (np.repeat(row, A), columns.ravel())), (count, K * A))
@@ -111,11 +111,3 @@ def drift_scale(looseness):
     from the standard body, within :data:`DRIFT_RANGE`.
     """
     return np.clip(SKIN_DISTANCE * np.sinh(looseness[:, 1].double().numpy()), *DRIFT_RANGE)
-
-
-def _largest(row, weight, count):
-    """Which entries (E,) are among the ``count`` of the largest weight in their row."""
-    order = np.lexsort((-weight, row))
-    rank = np.empty(len(row), dtype=np.int64)
-    rank[order] = np.arange(len(row)) - np.searchsorted(row[order], row[order])
-    return rank < count
