@@ -85,7 +85,9 @@ def page(results, picture):
         (
             "`python benchmarks/sft.py` makes this page. It compares the accuracy and the time of"
             " the solvers on every sequence. The time a frame is that of the whole command,"
-            " start-up and outputs included, divided by the number of frames. Measured on:"
+            " start-up and outputs included, divided by the number of frames. Others share the"
+            " machine: what takes 0.4 s in one hour takes 0.9 s in another, and each method was"
+            " measured in hours of its own. Measured on:"
         ),
         *(f"- {machine}" for machine in machines or ["no machine yet"]),
         "The methods and figures:",
