@@ -223,9 +223,9 @@ noise shows in the distances.
 
 ## Many patches
 
-A curtain whose pleats hang over at first, and are drawn apart: in these frames it becomes 45 % wider.
-It is no height graph, so each half of a pleat is a patch. Each patch has its own jet and motion;
-vertices see the jets of the patches that hold them or a neighbour alone.
+A curtain whose pleats hang over at first, and are drawn apart: in these frames it becomes 45 %
+wider. It is no height graph, so each half of a pleat is a patch. Each patch has its own jet and
+motion; vertices see the jets of the patches that hold them or a neighbour alone.
 
 | vertices | patches | image | seconds a frame | evaluations a frame | memory [MB] | RMS [mm] |
 |---:|---:|---|---:|---:|---:|---:|
