@@ -7,7 +7,7 @@ import numpy as np
 from polysft_mi.camera import Intrinsics
 
 SHARE = 1 / 3  # of the image that a sheet covers
-PLEATED = 0.85, 0.55  # of the image's width and height that pleats cover at the end
+PLEATED_SHARES = 0.85, 0.55  # of the image's width and height that pleats cover at the end
 STEEPEST = np.radians([100.0, 83.0])  # slope of pleats at the start, where they hang over; the end
 _FINE = 40  # steps of the quadrature for each vertex
 
@@ -22,9 +22,8 @@ class Surface:
 
     @property
     def name(self):
-        return f"{self.columns * self.rows} vertices" + f", {self.pleats} pleats" * bool(
-            self.pleats
-        )
+        vertices = f"{self.columns * self.rows} vertices"
+        return f"{vertices}, {self.pleats} pleats" if self.pleats else vertices
 
     def at(self, size, t):
         """Vertices (N, 3) [m, camera frame] at the time t in [0, 1]; ``size`` of the image."""
@@ -56,7 +55,7 @@ class Surface:
 
     def _pleated(self, size, t):
         """A curtain whose pleats are drawn apart: its slope is a sine of the length."""
-        width, height = np.array(PLEATED) * size / camera(size).fx
+        width, height = np.array(PLEATED_SHARES) * size / camera(size).fx
         ends = [self._profile(steepest) for steepest in STEEPEST]
         x, z = self._profile((1 - t) * STEEPEST[0] + t * STEEPEST[1])
         scale = width / np.ptp(ends[1][0])
@@ -74,5 +73,6 @@ class Surface:
 
 
 def camera(size):
+    """The :class:`polysft_mi.camera.Intrinsics` [pixels] of images of ``size`` (width, height)."""
     width, height = size
     return Intrinsics(1.1 * width, 1.1 * width, width / 2, height / 2, width, height)

@@ -1,7 +1,7 @@
 """Makes lessons for networks: finished drapes of generated motions.
 
     python -m onefit.teach dress tshirt -o LESSONS --seeds 2     # the training's kinds of motion
-    python -m onefit.teach -o LESSONS --cuts 18 --seconds 3      # and random cuts of the patterns
+    python -m onefit.teach -o LESSONS --cuts 160 --each 2        # random cuts, two kinds for each
     python -m onefit.train --teacher LESSONS -o runs/taught
 
 LESSONS receives one file for each garment, and one for each of its drapes, by kind of motion and
