@@ -1,7 +1,7 @@
 """What each rule of the tracker is worth: it is switched off alone, on every sequence.
 
     python benchmarks/ablation.py [--data FOLDER] [--simulated FOLDER] [--only flag ...]
-    [--rules relief ...] [--threads N] [--docs docs]
+    [--rules relief ...] [--until-decided] [--threads N] [--docs docs]
 
 A rule is a field of ``polysft_mi.scene.rules.Rules``, or a setting, that decides when or whether
 something happens. Each is switched off by the values in ``SWITCHES``, and everything else stays as
@@ -13,8 +13,10 @@ of these runs, and pays only where it is larger than all of them. A rule stays w
 so by 5 % without it on at least two sequences. Rules stay, too, without which a real video is lost.
 
 Each result goes into ``ablation.json`` as soon as it is there, and the next call does what is
-missing. All of it takes hours. The simulated sequences are made by ``benchmarks/simulate.py OUT
---seed N``, one folder a seed below FOLDER. Writes ``ablation.json`` and ``ablation.md`` into DOCS.
+missing. All of it takes many hours. With ``--until-decided`` a rule is measured until two sequences
+need it, and only a rule that may go on all. The simulated sequences are made by
+``benchmarks/simulate.py OUT --seed N``, one folder a seed below FOLDER. Writes ``ablation.json``
+and ``ablation.md`` into DOCS.
 """
 
 import argparse
@@ -204,12 +206,22 @@ def change(results, rule, sequence):
     return share, share >= PAYS and error > known[-1]
 
 
+def outcome(results, rule, names):
+    """(on how many of the sequences a rule pays, on how many it was measured)."""
+    known = [c for name in names if (c := change(results, rule, name)) is not None]
+    return sum(pays for _, pays in known), len(known)
+
+
+def decided(results, rule):
+    """Whether a rule stays, whatever else is measured."""
+    return outcome(results, rule, [name for kind, name in results if kind == rule])[0] > 1
+
+
 def verdict(results, rule, names):
     """What the table says of a rule, in a few words."""
-    known = [c for name in names if (c := change(results, rule, name)) is not None]
-    pays = sum(pays for _, pays in known)
-    said = f"pays on {pays} of {len(known)}"
-    if len(known) < len(names):
+    pays, measured = outcome(results, rule, names)
+    said = f"pays on {pays} of {measured}"
+    if measured < len(names) and pays < 2:
         return said
     if rule in NEEDED and pays < 2:
         return f"{said}; stays: {NEEDED[rule]}"
@@ -360,6 +372,11 @@ def parser():
         "--threads", type=int, default=1, metavar="N", help="default: 1, times are of it"
     )
     p.add_argument("--docs", metavar="FOLDER", default=os.path.join(ROOT, "docs"))
+    p.add_argument(
+        "--until-decided",
+        action="store_true",
+        help="no more of a rule that pays on two sequences already",
+    )
     add_mode_argument(p)
     return p
 
@@ -383,7 +400,10 @@ def main(arguments=None):
         if options.rules is not None and switch.rule not in options.rules:
             continue
         for name in options.only or found:
-            if (switch.rule, name) in read(path) or (switch.rounded and name not in ROUNDED):
+            known = read(path)
+            if options.until_decided and decided(known, switch.rule):
+                break
+            if (switch.rule, name) in known or (switch.rounded and name not in ROUNDED):
                 continue
             result = {"rule": switch.rule, "sequence": name, **run(switch, *found[name])}
             write(path, read(path) | {(switch.rule, name): result})

@@ -8,7 +8,7 @@ network was trained on.
 The first measures the six garments, by the networks of the package and by skinning.
 Every garment is draped in each held-out kind of motion, on bodies drawn at random with a seed that
 training does not use, and on the standard one. ``skinning`` is plain skinning of the template, the
-baseline; ``+ post`` pushes vertices out of the body after draping.
+baseline; ``+ post`` is with post-processing.
 """
 
 import argparse
@@ -98,10 +98,10 @@ def main(argv=None):
             (key, draper, dict(eased=not args.no_ease)) for key, draper in drapers.items()
         ]
         for network, draper, options in rows:
-            plain = row(draper, garment, args.seconds, args.shapes, **options)
+            plain = row(draper, garment, args.seconds, args.shapes, post=False, **options)
             post = (
                 None
-                if args.no_post
+                if args.no_post or "skinning_only" in options
                 else row(draper, garment, args.seconds, args.shapes, post=True, **options)
             )
             print(line(garment.name, network, plain, post), flush=True)

@@ -6,7 +6,8 @@ swing, and its time.
     python benchmarks/onefit_finish.py --finish 0        # the network alone: quick
 
 Every garment is draped in each held-out kind of motion, on the standard body and on others drawn at
-random in turn: by skinning, by the networks, and by the first of them with a finish. Columns:
+random in turn: by skinning, by the networks without and with post-processing, and by the first of
+them with a finish. Columns:
 *inside* [%] of the vertices; *faces* [%] of points of the faces, no farther apart than 5 mm, in
 every third frame; *strain* [%], *wave* [degrees], *swing* [mm] as :mod:`onefit.objective.folds` has
 them; *jitter* [mm], the mean second difference in time; *energy* [J] of the material: stretching,
@@ -112,7 +113,8 @@ def main(argv=None):
             plain, ends = draper.drape(garment, motion, body, skinning_only=True), []
             drapes = {"skinning": plain}
             for of, other in drapers.items():
-                drapes[of] = other.drape(garment, motion, body)
+                drapes[of] = other.drape(garment, motion, body, post=False)
+                drapes[f"{of}, post"] = other.drape(garment, motion, body)
             if args.finish:
                 ends.append(time.perf_counter())
                 tick = lambda: ends.append(time.perf_counter())

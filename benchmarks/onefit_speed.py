@@ -20,9 +20,10 @@ import torch
 
 import onefit
 from onefit.draping.draper import FPS
-from onefit.draping.post import pushed_out
+from onefit.draping.post import post_processed
 from onefit.network import DEFAULT
 from polyfit.errors import cli
+from polyfit.mesh import edges_of
 
 FRAMES = 90
 
@@ -87,11 +88,15 @@ def main(argv=None):
         network = [
             x / T for x in timed(lambda: network_alone(draper, garment, motion), args.device)
         ]
-        drape = draper.drape(garment, motion)
+        drape = draper.drape(garment, motion, post=False)
+        edges = torch.as_tensor(edges_of(drape.faces.numpy())[0])
+        lengths = garment.rest_lengths(edges)
         post = [
             x / T
             for x in timed(
-                lambda: pushed_out(drape.vertices, drape.faces, drape.body, drape.body_faces),
+                lambda: post_processed(
+                    drape.vertices, drape.faces, edges, lengths, drape.body, drape.body_faces
+                ),
                 args.device,
                 3,
             )

@@ -132,7 +132,7 @@ def main(argv=None):
                 lowest = z < z.min() + LOWEST * (z.max() - z.min())
                 found = (
                     {"skinning": skinned.vertices}
-                    | {n: d.drape(garment, motion).vertices for n, d in drapers.items()}
+                    | {n: d.drape(garment, motion, post=False).vertices for n, d in drapers.items()}
                     | {"least": reference}
                 )
                 collider = ClosestSurface(skinned.body[0], skinned.body_faces)

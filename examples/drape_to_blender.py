@@ -17,7 +17,7 @@ from polyfit.animation import write_usd
 def main(out="out/blender", garment="tshirt", seconds=2.0):
     """Returns the paths of the garment's and the body's file."""
     motion = onefit.Motion.generate("walk", seconds=seconds)
-    drape = onefit.load().drape(garment, motion, post=True)
+    drape = onefit.load().drape(garment, motion)
     Path(out).mkdir(parents=True, exist_ok=True)
     parts = {garment: (drape.vertices, drape.faces), "body": (drape.body, drape.body_faces)}
     paths = []

@@ -1,7 +1,7 @@
 """Drapes a garment on a moving body, and writes the arrays, an animation and a rendering of it.
 
     python -m onefit.drape dress walk -o OUT                   # a template, a generated motion
-    python -m onefit.drape shirt.obj motion.npz -o OUT --post  # a mesh, a motion (AMASS, NCS, BVH)
+    python -m onefit.drape shirt.obj motion.npz -o OUT         # a mesh, a motion (AMASS, NCS, BVH)
     python -m onefit.drape tshirt dance -o OUT --shape weight=0.7 height=0.6 --skip render
 
 OUT receives
@@ -103,7 +103,12 @@ def parser():
         "--seconds", type=float, default=3.0, help="length of a generated motion (default: 3)"
     )
     p.add_argument("--seed", type=int, default=0, help="seed of a generated motion (default: 0)")
-    p.add_argument("--post", action="store_true", help="push vertices out of the body afterwards")
+    p.add_argument(
+        "--no-post",
+        dest="post",
+        action="store_false",
+        help="with --finish 0: what the network alone makes, without post-processing",
+    )
     p.add_argument(
         "--finish",
         type=int,

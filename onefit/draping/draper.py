@@ -21,10 +21,11 @@ from onefit.network.weights import Trained
 from onefit.network.weights import load as load_weights
 from onefit.objective.objective import posed
 from onefit.physics import Material
+from polyfit import mesh
 from polyfit.errors import InputError
 
 from . import ease
-from .post import pushed_out
+from .post import post_processed
 
 if TYPE_CHECKING:
     from onefit.body import Body
@@ -116,7 +117,7 @@ class Draper:
         motion: Motion | str | os.PathLike[str],
         shape: torch.Tensor | None = None,
         *,
-        post: bool = False,
+        post: bool = True,
         eased: bool = True,
         skinning_only: bool = False,
         finish: int = 0,
@@ -128,13 +129,15 @@ class Draper:
         in each frame of ``motion`` (a :class:`Motion` or a file of one), at 30 frames a second.
         With a shape, the way is scaled by the length of its legs.
 
-        ``post``: vertices are pushed out of the body and the pushes are smoothed. ``eased``: with
-        the garment's :meth:`ease`, which costs seconds once, and nothing a frame; without it a
-        drape is what the network alone makes. ``skinning_only``: plain skinning of the template,
-        what OneFit is held against. ``finish``: implicit steps of physics a frame on the garment's
-        own mesh, after all this (:func:`onefit.draping.finish.finished`), of a ``material`` (one of
-        :data:`onefit.physics.MATERIALS` by its name, or a :class:`onefit.physics.Material`), solved
-        as :class:`onefit.physics.Settings` say; two steps are enough, and 0 leaves it out.
+        ``post``: post-processing (:func:`onefit.draping.post.post_processed`): edges come back
+        towards their lengths at rest, and vertices are pushed out of the body. ``eased``: with
+        the garment's :meth:`ease`, which costs seconds once, and nothing a frame; without it and
+        ``post`` a drape is what the network alone makes. ``skinning_only``: plain skinning of the
+        template, what OneFit is held against, without any of these. ``finish``: implicit steps of
+        physics a frame on the garment's own mesh (:func:`onefit.draping.finish.finished`), in place
+        of post-processing, of a ``material`` (one of :data:`onefit.physics.MATERIALS` by its name,
+        or a :class:`onefit.physics.Material`), solved as :class:`onefit.physics.Settings` say; two
+        steps are enough, and 0 leaves it out.
         ``advance`` is called after each finished frame. Raises InputError for a garment, motion,
         shape or material that cannot be used.
         """
@@ -172,8 +175,11 @@ class Draper:
             )
             vertices = torch.cat(parts)
         root = skinning.posed_joints(body, transforms)[:, 0]
-        if post:
-            vertices = pushed_out(vertices, garment.faces.to(self.device), bodies, body.faces)
+        if post and not finish and not skinning_only:
+            edges = torch.as_tensor(mesh.edges_of(garment.faces.cpu().numpy())[0])
+            lengths = garment.rest_lengths(edges, rest.cpu())
+            faces = garment.faces.to(self.device)
+            vertices = post_processed(vertices, faces, edges, lengths, bodies, body.faces)
         found = (vertices, garment.faces, rest, bodies, body.faces, root)
         vertices, faces, rest, bodies, body_faces, root = (x.cpu() for x in found)
         if finish:

@@ -1,4 +1,6 @@
-"""Post-processing of drapes: vertices are pushed out of the body."""
+"""Post-processing of drapes: edges come back towards their lengths, and vertices are pushed out of
+the body.
+"""
 
 from concurrent.futures import ThreadPoolExecutor
 
@@ -9,9 +11,18 @@ from onefit.body import ClosestSurface
 from onefit.garment.charts import SparseMatrix
 from onefit.garment.remesh import neighbour_mean
 
+from .lengths import with_lengths
+
 CLEARANCE = 0.003  # [m] from the body
 SMOOTHING = 4  # times that pushes are smoothed
 DEEPEST = 0.08  # [m]; vertices deeper in the body than this stay there
+
+
+def post_processed(vertices, faces, edges, lengths, bodies, body_faces):
+    """Vertices (T, N, 3) [m] after :func:`onefit.draping.lengths.with_lengths`, of the edges (E, 2)
+    and their lengths at rest (E,) [m], and then :func:`pushed_out`.
+    """
+    return pushed_out(with_lengths(vertices, edges, lengths), faces, bodies, body_faces)
 
 
 def spread(push, mean):
