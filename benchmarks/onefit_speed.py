@@ -89,13 +89,12 @@ def main(argv=None):
             x / T for x in timed(lambda: network_alone(draper, garment, motion), args.device)
         ]
         drape = draper.drape(garment, motion, post=False)
-        edges = torch.as_tensor(edges_of(drape.faces.numpy())[0])
-        lengths = garment.rest_lengths(edges)
+        lengths = garment.rest_lengths(torch.as_tensor(edges_of(drape.faces.numpy())[0]))
         post = [
             x / T
             for x in timed(
                 lambda: post_processed(
-                    drape.vertices, drape.faces, edges, lengths, drape.body, drape.body_faces
+                    drape.vertices, drape.faces, lengths, drape.body, drape.body_faces
                 ),
                 args.device,
                 3,

@@ -15,8 +15,7 @@ import torch
 from .quietwarp import warp
 
 SEARCH_RADIUS = 0.15  # [m]; how far :meth:`ClosestSurface.distances` looks
-# barycentric coordinates below it are on an edge; points nearer than this [m] are on the surface
-EDGE_TOLERANCE = 1e-5
+EDGE_TOLERANCE = 1e-5  # [m]; points nearer than this are on the surface
 
 
 @dataclass(frozen=True)
@@ -36,77 +35,9 @@ class Nearest:
 
 @lru_cache(maxsize=1)
 def _warp():
-    wp = warp()
-    row = wp.types.vector(
-        length=10, dtype=float
-    )  # barycentric coordinates, point, distance, normal
-    ON_EDGE = wp.constant(EDGE_TOLERANCE)
+    from . import kernels  # compiled at the first use
 
-    @wp.func
-    def pseudonormal(
-        mesh: wp.uint64,
-        face: int,
-        b: wp.vec3,
-        first: wp.array(dtype=int),
-        around: wp.array(dtype=int),
-    ):
-        most = 0
-        for k in range(3):
-            if b[k] > b[most]:
-                most = k
-        one, two = (most + 1) % 3, (most + 2) % 3
-        normal = wp.mesh_eval_face_normal(mesh, face)
-        if wp.min(b[one], b[two]) < ON_EDGE:
-            on_vertex = wp.max(b[one], b[two]) < ON_EDGE
-            v = wp.mesh_get_index(mesh, 3 * face + most)
-            other = wp.mesh_get_index(mesh, 3 * face + wp.where(b[one] > b[two], one, two))
-            points = wp.mesh_get(mesh).points
-            normal = wp.vec3(0.0, 0.0, 0.0)
-            for j in range(first[v], first[v + 1]):
-                f, k = around[j] // 3, around[j] % 3
-                p, q = (
-                    wp.mesh_get_index(mesh, 3 * f + (k + 1) % 3),
-                    wp.mesh_get_index(mesh, 3 * f + (k + 2) % 3),
-                )
-                weight = 0.0
-                if on_vertex:
-                    weight = wp.acos(
-                        wp.dot(
-                            wp.normalize(points[p] - points[v]), wp.normalize(points[q] - points[v])
-                        )
-                    )
-                elif p == other or q == other:
-                    weight = 1.0
-                normal += weight * wp.mesh_eval_face_normal(mesh, f)
-        return wp.normalize(normal)
-
-    @wp.kernel
-    def nearest(
-        mesh: wp.uint64,
-        first: wp.array(dtype=int),
-        around: wp.array(dtype=int),
-        points: wp.array(dtype=wp.vec3),
-        reach: float,
-        face: wp.array(dtype=int),
-        found: wp.array(dtype=row),
-    ):
-        i = wp.tid()
-        query = wp.mesh_query_point_no_sign(mesh, points[i], reach)
-        face[i] = -1
-        found[i][6] = reach
-        if query.result:
-            b = wp.vec3(query.u, query.v, 1.0 - query.u - query.v)
-            at = wp.mesh_eval_position(mesh, query.face, query.u, query.v)
-            normal = pseudonormal(mesh, query.face, b, first, around)
-            away = points[i] - at
-            face[i] = query.face
-            for k in range(3):
-                found[i][k] = b[k]
-                found[i][3 + k] = at[k]
-                found[i][7 + k] = normal[k]
-            found[i][6] = wp.length(away) * wp.where(wp.dot(away, normal) < 0.0, -1.0, 1.0)
-
-    return wp, nearest, row
+    return warp(), kernels.nearest, kernels.row
 
 
 class ClosestSurface:
@@ -146,6 +77,11 @@ class ClosestSurface:
             self._vertices.numpy()[:] = vertices
         self._mesh.refit()
 
+    @property
+    def of_kernels(self):
+        """The first three arguments of :func:`onefit.body.kernels.closest`."""
+        return self._mesh.id, *self._corners
+
     def __call__(self, points, reach=10.0):
         """:class:`Nearest` of points (N, 3) [m], an array or a tensor on the mesh's device. Those
         farther than ``reach`` [m] get the distance ``reach``, the face -1 and NaN. Without
@@ -160,9 +96,7 @@ class ClosestSurface:
             wp.from_torch(face),
             wp.from_torch(found, dtype=self._row),
         )
-        wp.launch(
-            self._nearest, len(x), [self._mesh.id, *self._corners, *arrays], device=self._device
-        )
+        wp.launch(self._nearest, len(x), [*self.of_kernels, *arrays], device=self._device)
         parts = face.long(), found[:, :3], found[:, 3:6], found[:, 6], found[:, 7:]
         return Nearest(*parts if torch.is_tensor(points) else (p.cpu().numpy() for p in parts))
 

@@ -178,8 +178,7 @@ class Draper:
         if post and not finish and not skinning_only:
             edges = torch.as_tensor(mesh.edges_of(garment.faces.cpu().numpy())[0])
             lengths = garment.rest_lengths(edges, rest.cpu())
-            faces = garment.faces.to(self.device)
-            vertices = post_processed(vertices, faces, edges, lengths, bodies, body.faces)
+            vertices = post_processed(vertices, garment.faces, lengths, bodies, body.faces)
         found = (vertices, garment.faces, rest, bodies, body.faces, root)
         vertices, faces, rest, bodies, body_faces, root = (x.cpu() for x in found)
         if finish:

@@ -1,5 +1,5 @@
 """Post-processing of drapes: edges come back towards their lengths, and vertices are pushed out of
-the body.
+the body. On the CPU, a frame in one compiled loop.
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -8,21 +8,87 @@ import numpy as np
 import torch
 
 from onefit.body import ClosestSurface
-from onefit.garment.charts import SparseMatrix
-from onefit.garment.remesh import neighbour_mean
+from polyfit import mesh
 
-from .lengths import with_lengths
-
+ROUNDS = 12  # of the lengths
+STEP = 0.9  # of Jacobi's: with 1 the corrections of neighbouring edges may add up to too much
+RADIUS = 0.98  # spectral radius of a round, as the acceleration takes it to be
 CLEARANCE = 0.003  # [m] from the body
-SMOOTHING = 4  # times that pushes are smoothed
+PUSHES = 5  # rounds
+SMOOTHED = 2  # of these, whose pushes are smoothed
+SMOOTHING = 4  # times
 DEEPEST = 0.08  # [m]; vertices deeper in the body than this stay there
 
 
-def post_processed(vertices, faces, edges, lengths, bodies, body_faces):
-    """Vertices (T, N, 3) [m] after :func:`onefit.draping.lengths.with_lengths`, of the edges (E, 2)
-    and their lengths at rest (E,) [m], and then :func:`pushed_out`.
+def post_processed(vertices, faces, lengths, bodies, body_faces):
+    """Vertices (T, N, 3) [m] after :func:`with_lengths` and :func:`pushed_out`; ``lengths``: at
+    rest, of the edges as :func:`polyfit.mesh.edges_of` has them.
     """
+    edges = mesh.edges_of(faces.cpu().numpy())[0]
     return pushed_out(with_lengths(vertices, edges, lengths), faces, bodies, body_faces)
+
+
+def with_lengths(vertices, edges, lengths, rounds=ROUNDS):
+    """Vertices (T, N, 3) [m], moved so that the ``edges`` (E, 2) come nearer to ``lengths`` (E,)
+    [m].
+
+    A network says what cloth does on average, and a mean of folds has shorter edges than cloth: its
+    folds become deeper. A few rounds mend what is wrong over some centimetres, and leave where the
+    cloth hangs.
+    """
+    from . import kernels  # compiled at the first use
+
+    wp, count = kernels.wp, vertices.shape[1]
+    edges, degree = np.asarray(edges), np.bincount(np.ravel(edges), minlength=count)
+    arguments = [
+        wp.array(edges, dtype=int, ndim=2, device="cpu"),
+        wp.array(np.asarray(lengths), dtype=float, device="cpu"),
+        wp.array(degree, dtype=float, device="cpu"),
+        rounds,
+        STEP,
+        RADIUS,
+    ]
+
+    def frames(part):
+        work = [wp.empty(count, dtype=wp.vec3, device="cpu") for _ in range(2)]
+        for x in part:
+            x = wp.from_torch(x, dtype=wp.vec3)
+            wp.launch(kernels.lengths_restored, 1, [*arguments, x, *work], device="cpu")
+
+    return _in_threads(frames, vertices)
+
+
+def pushed_out(vertices, faces, bodies, body_faces, rounds=PUSHES, reach=CLEARANCE):
+    """Vertices (T, N, 3) [m] moved out of the bodies (T, V, 3), to CLEARANCE from them; faces (F,
+    3), body_faces (B, 3).
+
+    The pushes, not the surface, are smoothed over the mesh, so that no fold is lost and none made;
+    what that leaves inside is pushed again, unsmoothed from the third of at most ``rounds`` rounds
+    on. That a vertex is not within ``reach`` [m] of the body's surface is quickly told; only beside
+    those found inside, and among those that were pushed, deeper ones are looked for.
+    """
+    from . import kernels  # compiled at the first use
+
+    wp, count = kernels.wp, vertices.shape[1]
+    edges = mesh.edges_of(faces.cpu().numpy())[0]
+    start, end = np.concatenate([edges, edges[:, ::-1]]).T
+    first = np.concatenate([[0], np.cumsum(np.bincount(start, minlength=count))])
+    other = end[np.argsort(start, kind="stable")]
+    settings = [rounds, SMOOTHED, SMOOTHING, CLEARANCE, reach, DEEPEST]
+    arguments = [*(wp.array(a, dtype=int, device="cpu") for a in (first, other)), *settings]
+
+    def frames(part, bodies):
+        surface = ClosestSurface(bodies[0], body_faces.cpu())
+        work = [
+            wp.empty(count, dtype=t, device="cpu") for t in (wp.vec3, wp.vec3, wp.int32, wp.int32)
+        ]
+        for x, body in zip(part, bodies):
+            surface.follow(body)
+            x = wp.from_torch(x, dtype=wp.vec3)
+            arrays = [*surface.of_kernels, *arguments, x, *work]
+            wp.launch(kernels.pushed_out, 1, arrays, device="cpu")
+
+    return _in_threads(frames, vertices, bodies.cpu())
 
 
 def spread(push, mean):
@@ -38,62 +104,13 @@ def spread(push, mean):
     return push
 
 
-def pushed_out(vertices, faces, bodies, body_faces, rounds=5):
-    """Vertices (T, N, 3) [m] moved out of the bodies (T, V, 3), to CLEARANCE from them; faces (F,
-    3), body_faces (B, 3).
-
-    The pushes, not the surface, are smoothed over the mesh, so that no fold is lost and none made;
-    what that leaves inside is pushed again, unsmoothed from the third of at most ``rounds`` rounds
-    on. That a vertex is not within CLEARANCE of the body's surface is quickly told; only beside
-    those found inside, and among those that were pushed, deeper ones are looked for.
+def _in_threads(frames, vertices, *more):
+    """A copy of the vertices (T, N, 3), changed by ``frames``: each thread has some of them, with
+    their share of the tensors ``more``.
     """
-    adjacency = neighbour_mean(faces.cpu().numpy(), vertices.shape[1])
-    mean = SparseMatrix(adjacency, vertices.device)
-    beside = lambda chosen: torch.as_tensor(
-        np.unique(adjacency[chosen.cpu().numpy()].indices), device=vertices.device
-    ).long()
-
-    def pushes(x, surface, chosen=None):
-        """(N, 3) [m]: to CLEARANCE, of those among all vertices that are nearer; or of those chosen
-        that are nearer than half of it.
-        """
-        push, known = torch.zeros_like(x), torch.zeros(len(x), dtype=torch.bool, device=x.device)
-        first, reach = chosen is None, CLEARANCE if chosen is None else DEEPEST
-        chosen = torch.arange(len(x), device=x.device) if first else chosen
-        while len(chosen):
-            found = surface(x[chosen], reach)
-            near = (found.distance < (CLEARANCE if first else CLEARANCE / 2)).nonzero()[:, 0]
-            at = chosen[near]
-            push[at] = found.point[near] + CLEARANCE * found.normal[near] - x[at]
-            known[at] = True
-            inside = at[found.distance[near] < 0]
-            if not first or not len(inside):
-                break
-            chosen, reach = beside(inside), DEEPEST
-            chosen = chosen[~known[chosen]]
-        return push
-
-    def one(part):
-        surface = ClosestSurface(bodies[0], body_faces)
-        out = vertices[part].clone()
-        for x, body in zip(out, bodies[part]):
-            surface.follow(body)
-            chosen = None
-            for turn in range(rounds):
-                push = pushes(x, surface, chosen)
-                if not push.any():
-                    break
-                push = spread(push, mean) if turn < 2 else push
-                x += push
-                chosen = push.any(-1).nonzero()[
-                    :, 0
-                ]  # the others are clear, and stay where they are
-        return out
-
-    workers = min(torch.get_num_threads(), len(vertices)) if not vertices.is_cuda else 1
-    parts = [
-        slice(k * len(vertices) // workers, (k + 1) * len(vertices) // workers)
-        for k in range(workers)
-    ]
+    out = vertices.detach().float().cpu().clone()
+    workers = max(1, min(torch.get_num_threads(), len(out)))
+    parts = zip(*(x.tensor_split(workers) for x in (out, *more)))
     with ThreadPoolExecutor(workers) as pool:
-        return torch.cat(list(pool.map(one, parts)))
+        list(pool.map(lambda part: frames(*part), parts))
+    return out.to(vertices)

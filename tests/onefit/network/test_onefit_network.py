@@ -9,8 +9,7 @@ import onefit
 import onefit.draping.post
 from onefit.body import AnnyBody, ClosestSurface
 from onefit.draping import Draper, ease
-from onefit.draping.lengths import RADIUS, STEP, with_lengths
-from onefit.draping.post import pushed_out
+from onefit.draping.post import DEEPEST, RADIUS, STEP, pushed_out, with_lengths
 from onefit.garment import Garment
 from onefit.garment.charts import PatchedGarment
 from onefit.motion import Motion
@@ -244,7 +243,7 @@ def test_lengths_come_back_as_in_a_slow_reference():
     edges = edges_of(faces.numpy())[0]
     lengths = (x[edges[:, 0]] - x[edges[:, 1]]).norm(dim=-1)
     given = x + torch.as_tensor(rng.normal(size=(3, *x.shape)) * 2e-3).float()
-    found = with_lengths(given, torch.as_tensor(edges), lengths, rounds=6)
+    found = with_lengths(given, edges, lengths, rounds=6)
     degree = np.bincount(edges.ravel())[:, None]
     for frame, after in zip(given.double().numpy(), found.numpy()):
         before, now, ahead = frame, frame, 1.0
@@ -258,7 +257,7 @@ def test_lengths_come_back_as_in_a_slow_reference():
                 ahead = 1 / (1 - RADIUS**2 / 2) if turn == 1 else 1 / (1 - RADIUS**2 * ahead / 4)
             before, now = now, before + ahead * (now + STEP * pull / degree - before)
         assert np.abs(now - after).max() < 1e-6
-    assert torch.allclose(with_lengths(x[None], torch.as_tensor(edges), lengths)[0], x, atol=1e-6)
+    assert torch.allclose(with_lengths(x[None], edges, lengths)[0], x, atol=1e-6)
 
 
 def ball(radius, subdivisions=4):
@@ -359,13 +358,8 @@ def test_pushing_out_finds_deep_vertices_from_their_neighbours(monkeypatch):
     out = pushed_out(x, torch.as_tensor(cloth.faces), body, faces)
     assert surface.distances(out, body).min() > 0
     # as when every vertex is asked how deep it is
-    query = ClosestSurface.__call__
-    monkeypatch.setattr(
-        ClosestSurface,
-        "__call__",
-        lambda self, points, reach: query(self, points, onefit.draping.post.DEEPEST),
-    )
-    assert torch.allclose(pushed_out(x, torch.as_tensor(cloth.faces), body, faces), out, atol=1e-5)
+    asked = pushed_out(x, torch.as_tensor(cloth.faces), body, faces, reach=DEEPEST)
+    assert torch.allclose(asked, out, atol=1e-5)
 
 
 def test_weights_in_eight_bits_drape_alike(draper, model, walk, tmp_path):

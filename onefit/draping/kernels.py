@@ -1,0 +1,133 @@
+"""The Warp kernels of post-processing: each one compiled loop over a frame, on the CPU."""
+
+from onefit.body.kernels import closest, wp
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def lengths_restored(
+    edges: wp.array2d(dtype=int),
+    lengths: wp.array(dtype=float),
+    degree: wp.array(dtype=float),  # edges at each vertex
+    rounds: int,
+    step: float,
+    radius: float,
+    x: wp.array(dtype=wp.vec3),
+    old: wp.array(dtype=wp.vec3),  # work: the vertices a round ago
+    pull: wp.array(dtype=wp.vec3),  # work
+):
+    """Rounds of Jacobi's for the sum of (|e| - length)^2, accelerated by Chebyshev's polynomials.
+
+    Wang 2015, "A Chebyshev semi-iterative approach for accelerating projective and position-based
+    dynamics"; ``radius``: what it takes a round's spectral radius to be.
+    """
+    ahead = wp.float32(1.0)
+    for v in range(x.shape[0]):
+        old[v] = x[v]
+    for turn in range(rounds):
+        for v in range(x.shape[0]):
+            pull[v] = wp.vec3(0.0, 0.0, 0.0)
+        for e in range(edges.shape[0]):
+            a, b = edges[e, 0], edges[e, 1]
+            edge = x[b] - x[a]
+            p = (1.0 - lengths[e] / wp.max(wp.length(edge), 1.0e-9)) * edge
+            pull[a] = pull[a] + p
+            pull[b] = pull[b] - p
+        if turn == 1:
+            ahead = 1.0 / (1.0 - 0.5 * radius * radius)
+        if turn > 1:
+            ahead = 1.0 / (1.0 - 0.25 * radius * radius * ahead)
+        for v in range(x.shape[0]):
+            here = x[v]
+            x[v] = old[v] + ahead * (here + step / wp.max(degree[v], 1.0) * pull[v] - old[v])
+            old[v] = here
+
+
+@wp.func
+def pushed(
+    mesh: wp.uint64,
+    first: wp.array(dtype=int),
+    around: wp.array(dtype=int),
+    point: wp.vec3,
+    reach: float,
+    near: float,  # what is nearer than this is pushed
+    clearance: float,  # to so far from the body
+):
+    """(push, signed distance)."""
+    face, found = closest(mesh, first, around, point, reach)
+    push = wp.vec3(0.0, 0.0, 0.0)
+    if face >= 0 and found[6] < near:
+        for k in range(3):
+            push[k] = found[3 + k] + clearance * found[7 + k] - point[k]
+    return push, found[6]
+
+
+@wp.kernel
+def pushed_out(
+    mesh: wp.uint64,
+    first: wp.array(dtype=int),
+    around: wp.array(dtype=int),
+    start: wp.array(dtype=int),  # the neighbours of vertex v are other[start[v]:start[v + 1]]
+    other: wp.array(dtype=int),
+    rounds: int,
+    smooth_rounds: int,  # the first of them, whose pushes are smoothed
+    smoothing: int,
+    clearance: float,
+    reach: float,  # of the first look at every vertex
+    deepest: float,
+    x: wp.array(dtype=wp.vec3),
+    push: wp.array(dtype=wp.vec3),  # work
+    smooth: wp.array(dtype=wp.vec3),  # work
+    queue: wp.array(dtype=int),  # work
+    known: wp.array(dtype=int),  # work
+):
+    """See :func:`onefit.draping.post.pushed_out`."""
+    count = x.shape[0]
+    for turn in range(rounds):
+        some = wp.int32(0)
+        last = wp.int32(0)
+        for v in range(count):
+            if turn == 0:
+                p, d = pushed(mesh, first, around, x[v], reach, clearance, clearance)
+                known[v] = 0
+                push[v] = p
+                if wp.length_sq(p) > 0.0:
+                    known[v] = 1
+                    some = 1
+                    if d < 0.0:
+                        queue[last] = v
+                        last += 1
+            elif wp.length_sq(push[v]) > 0.0:
+                p, d = pushed(mesh, first, around, x[v], deepest, 0.5 * clearance, clearance)
+                push[v] = p
+                if wp.length_sq(p) > 0.0:
+                    some = 1
+        head = wp.int32(0)
+        while head < last:  # what lies deeper, beside what was found inside
+            v = queue[head]
+            head += 1
+            for k in range(start[v], start[v + 1]):
+                n = other[k]
+                if known[n] == 0:
+                    known[n] = 1
+                    p, d = pushed(mesh, first, around, x[n], deepest, clearance, clearance)
+                    push[n] = p
+                    if d < 0.0:
+                        queue[last] = n
+                        last += 1
+        if some == 0:
+            break
+        if turn < smooth_rounds:
+            for _s in range(smoothing):
+                for v in range(count):
+                    mean = wp.vec3(0.0, 0.0, 0.0)
+                    for k in range(start[v], start[v + 1]):
+                        mean += push[other[k]]
+                    mean = mean / wp.max(float(start[v + 1] - start[v]), 1.0)
+                    longer = wp.length_sq(push[v]) > wp.length_sq(mean)
+                    smooth[v] = wp.where(longer, push[v], mean)
+                for v in range(count):
+                    push[v] = smooth[v]
+        for v in range(count):
+            x[v] = x[v] + push[v]
