@@ -70,6 +70,8 @@ def pushed_out(
     around: wp.array(dtype=int),
     start: wp.array(dtype=int),  # the neighbours of vertex v are other[start[v]:start[v + 1]]
     other: wp.array(dtype=int),
+    corners: wp.array2d(dtype=int),  # points of large faces: sum_i weights[p, i] x[corners[p, i]]
+    weights: wp.array2d(dtype=float),
     rounds: int,
     smooth_rounds: int,  # the first of them, whose pushes are smoothed
     smoothing: int,
@@ -116,6 +118,16 @@ def pushed_out(
                     if d < 0.0:
                         queue[last] = n
                         last += 1
+        for s in range(corners.shape[0]):
+            point = wp.vec3(0.0, 0.0, 0.0)
+            for k in range(corners.shape[1]):
+                point += weights[s, k] * x[corners[s, k]]
+            p, d = pushed(mesh, first, around, point, deepest, 0.0, 0.5 * clearance)
+            if wp.length_sq(p) > 0.0:
+                some = 1
+                for k in range(corners.shape[1]):
+                    if wp.length_sq(p) > wp.length_sq(push[corners[s, k]]):
+                        push[corners[s, k]] = p
         if some == 0:
             break
         if turn < smooth_rounds:

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from onefit.body import ClosestSurface
+from onefit.physics.sheet import samples
 from polyfit import mesh
 
 ROUNDS = 12  # of the lengths
@@ -18,6 +19,7 @@ PUSHES = 5  # rounds
 SMOOTHED = 2  # of these, whose pushes are smoothed
 SMOOTHING = 4  # times
 DEEPEST = 0.08  # [m]; vertices deeper in the body than this stay there
+SPACING = 0.025  # [m] of the points of faces that are looked at beside the vertices
 
 
 def post_processed(vertices, faces, lengths, bodies, body_faces):
@@ -65,7 +67,8 @@ def pushed_out(vertices, faces, bodies, body_faces, rounds=PUSHES, reach=CLEARAN
     The pushes, not the surface, are smoothed over the mesh, so that no fold is lost and none made;
     what that leaves inside is pushed again, unsmoothed from the third of at most ``rounds`` rounds
     on. That a vertex is not within ``reach`` [m] of the body's surface is quickly told; only beside
-    those found inside, and among those that were pushed, deeper ones are looked for.
+    those found inside, and among those that were pushed, deeper ones are looked for. Points of the
+    faces, SPACING from each other, push the face's corners.
     """
     from . import kernels  # compiled at the first use
 
@@ -74,8 +77,11 @@ def pushed_out(vertices, faces, bodies, body_faces, rounds=PUSHES, reach=CLEARAN
     start, end = np.concatenate([edges, edges[:, ::-1]]).T
     first = np.concatenate([[0], np.cumsum(np.bincount(start, minlength=count))])
     other = end[np.argsort(start, kind="stable")]
+    corners, weights = samples(vertices[0].cpu().numpy(), faces.cpu().numpy(), SPACING)
     settings = [rounds, SMOOTHED, SMOOTHING, CLEARANCE, reach, DEEPEST]
-    arguments = [*(wp.array(a, dtype=int, device="cpu") for a in (first, other)), *settings]
+    arguments = [*(wp.array(a, dtype=int, device="cpu") for a in (first, other))]
+    arguments += [wp.array(corners, dtype=int, ndim=2, device="cpu")]
+    arguments += [wp.array(weights, dtype=float, ndim=2, device="cpu"), *settings]
 
     def frames(part, bodies):
         surface = ClosestSurface(bodies[0], body_faces.cpu())

@@ -4,7 +4,7 @@ out. Its weights are read from files and written to them.
 
 import lazy_loader
 
-DEFAULT = "six-garments"  # of the networks of the package, where none is named
+DEFAULT = "taught"  # of the networks of the package, where none is named
 
 __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,

@@ -14,7 +14,7 @@ from onefit.body import ClosestSurface
 
 from . import kernels
 from .kernels import wp
-from .sheet import Sheet
+from .sheet import Sheet, samples
 
 
 @dataclass(frozen=True)
@@ -34,24 +34,6 @@ class Contacts:
     stiffness: float
 
 
-def samples(sheet: Sheet, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """``(corners (P, 4), weights (P, 4))`` of points of the faces and edges that lie ``spacing``
-    [m] from each other and from the vertices, or nearer; triangles that are small enough have none.
-    """
-    x = sheet.rest[sheet.faces]
-    longest = np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2).max(1)
-    parts = np.ceil(longest / spacing).astype(int)
-    corners, weights = [np.zeros((0, 4), int)], [np.zeros((0, 4))]
-    for n in np.unique(parts[parts > 1]):
-        i, j = (k.ravel() for k in np.mgrid[: n + 1, : n + 1])
-        grid = np.stack([i, j, n - i - j, 0 * i], 1) / n
-        grid = grid[(grid.min(1) >= 0) & (grid.max(1) < 1)]
-        faces = sheet.faces[parts == n]
-        corners.append(np.repeat(faces[:, [0, 1, 2, 2]], len(grid), axis=0))
-        weights.append(np.tile(grid, (len(faces), 1)))
-    return np.concatenate(corners), np.concatenate(weights)
-
-
 class BodyContact:
     """Contacts of a sheet with a body that moves: ``vertices`` (V, 3) [m] at first, ``faces``.
 
@@ -65,7 +47,7 @@ class BodyContact:
         count = len(sheet)
         own = np.zeros((count, 4))
         own[:, 0] = 1
-        corners, weights = samples(sheet, settings.spacing)
+        corners, weights = samples(sheet.rest, sheet.faces, settings.spacing)
         self.corners = np.concatenate([np.repeat(np.arange(count)[:, None], 4, axis=1), corners])
         self.weights = np.concatenate([own, weights])
         self.surface = ClosestSurface(vertices, faces)

@@ -362,6 +362,16 @@ def test_pushing_out_finds_deep_vertices_from_their_neighbours(monkeypatch):
     assert torch.allclose(asked, out, atol=1e-5)
 
 
+def test_large_faces_are_pushed_out_of_what_passes_between_their_vertices():
+    body, faces = ball(0.05)
+    x = torch.tensor([[-0.2, -0.2, 0.04], [0.2, -0.2, 0.04], [0.0, 0.2, 0.04]])
+    out = pushed_out(x[None], torch.tensor([[0, 1, 2]]), body[None], faces)[0]
+    shares = torch.distributions.Dirichlet(torch.ones(3)).sample((2000,))
+    distance = ClosestSurface(body, faces)
+    assert distance(shares @ x, 0.1).distance.min() < -0.009
+    assert distance(shares @ out, 0.1).distance.min() > -0.002
+
+
 def test_weights_in_eight_bits_drape_alike(draper, model, walk, tmp_path):
     path = tmp_path / "weights.safetensors"
     weights.save(path, draper.network, model, ("tank",))

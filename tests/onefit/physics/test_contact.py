@@ -5,8 +5,8 @@ import trimesh
 
 from onefit.physics import MATERIALS, Settings
 from onefit.physics.cloth import Cloth
-from onefit.physics.contact import BodyContact, SelfContact, samples
-from onefit.physics.sheet import Sheet
+from onefit.physics.contact import BodyContact, SelfContact
+from onefit.physics.sheet import Sheet, samples
 
 COTTON = MATERIALS["cotton"]
 
@@ -92,10 +92,10 @@ def test_a_layer_that_falls_on_another_stays_on_it():
 def test_points_of_faces_lie_no_farther_apart_than_the_spacing():
     V, F = grid(3, 3, 0.1)
     sheet = Sheet(V, F, COTTON)
-    corners, weights = samples(sheet, 0.02)
+    corners, weights = samples(sheet.rest, sheet.faces, 0.02)
     assert np.allclose(weights.sum(1), 1) and (weights >= 0).all()
     points = np.concatenate([V, (V[corners] * weights[..., None]).sum(1)])
     drawn = np.random.default_rng(0).dirichlet((1, 1, 1), 200) @ V[F[0]]
     nearest = np.linalg.norm(drawn[:, None] - points, axis=-1).min(1)
     assert nearest.max() < 0.02
-    assert len(samples(sheet, 0.2)[0]) == 0
+    assert len(samples(sheet.rest, sheet.faces, 0.2)[0]) == 0
