@@ -45,7 +45,7 @@ CHANCES = {f"nothing (k_mi changed by {share:+g})": share for share in (1e-5, -1
 PAYS = 0.05  # share by which the error must grow without a rule
 FIGURES = {"e3d_proc": "e3d aligned", "depth_rmse_mm": "depth RMSE [mm]", "chamfer_1e4": "Chamfer"}
 SEQUENCES = tuple(
-    "flag bend paper curtain corner hand poster kinect_paper phi_sft_R1 tube shirt ball".split()
+    "demo flag bend paper curtain corner hand poster kinect_paper phi_sft_R1 tube shirt ball".split()
 )
 SIMULATED = (
     ("flag", 5),
@@ -123,6 +123,7 @@ SWITCHES = (
 def sequences(data, simulated):
     """Name in the table to (scene file, folder of the data and the truth); those that are there."""
     found = {name: (name, folder_of(data, name)) for name in SEQUENCES}
+    found["demo"] = "demo", os.path.join(SCENES, "demo")
     for name, seed in SIMULATED if simulated else ():
         scene = SCENE_OF.get(name, name)
         found[f"{name} {seed}"] = scene, os.path.join(simulated, str(seed), name)
@@ -388,7 +389,7 @@ def main(arguments=None):
         os.path.join(options.docs, f) for f in ("ablation.json", "ablation_before.json")
     )
     found = sequences(options.data, options.simulated)
-    if not found:
+    if set(found) == {"demo"}:
         raise InputError(f"--data {options.data}: none of the sequences is there")
     if unknown := set(options.only or ()) - set(found):
         raise InputError(f"--only {', '.join(sorted(unknown))}: known are {', '.join(found)}")
