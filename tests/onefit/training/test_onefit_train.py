@@ -37,7 +37,7 @@ def small(motion):
     return Settings(
         garments=("shorts",),
         motions=(motion,),
-        batch=200,
+        batch=600,
         epochs=2,
         lr_epochs=1,
         epoch_steps=4,
@@ -52,7 +52,7 @@ def data(small):
     from onefit.training import TrainingData
 
     return TrainingData(
-        [Garment.template("shorts")], motions=[Motion.read(small.motions[0])], shapes=1, patches=30
+        [Garment.template("shorts")], motions=[Motion.read(small.motions[0])], shapes=1
     )
 
 
@@ -205,7 +205,7 @@ def test_a_resumed_training_ends_where_an_uninterrupted_one_does(small, tmp_path
 
 
 def test_two_processes_have_the_curve_of_one(small, tmp_path):
-    flags = "shorts --batch 200 --epochs 1 --epoch-steps 3 --shapes 1".split()
+    flags = "shorts --batch 600 --epochs 1 --epoch-steps 3 --shapes 1".split()
     flags += ["--motions", small.motions[0]]
     two_ranks("-m", "onefit.train", *flags, "-o", tmp_path / "two")
     train.main([*flags, "-o", str(tmp_path / "one")])
