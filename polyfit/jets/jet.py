@@ -9,9 +9,9 @@ its inverse. Everything is differentiable in ``alpha`` and ``uv``. The same func
 Dr.Jit in ``polysft_mi.surface.jet``, by the same names.
 """
 
+import math
 from functools import lru_cache
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -44,7 +44,7 @@ def powers(x: Tensor, order: int, derivative: int = 0) -> Tensor:
     out = [torch.zeros_like(x)] * min(derivative, order + 1)
     power = torch.ones_like(x)
     for k in range(derivative, order + 1):
-        out.append(power * float(np.prod(np.arange(k - derivative + 1, k + 1))))
+        out.append(power * float(math.perm(k, derivative)))
         power = power * x
     return torch.stack(out, -1)
 

@@ -3,8 +3,9 @@
 import pytest
 
 from onefit.body import AnnyBody
-from onefit.garment import TEMPLATES, Garment
+from onefit.garment import TEMPLATES, Garment, standard_body
 from onefit.garment.charts import PatchedGarment
+from onefit.garment.sewing.block import Block
 
 
 @pytest.fixture(scope="session")
@@ -16,6 +17,13 @@ def templates():
 def tank(templates):
     g = templates["tank"]
     return g.vertices.double().numpy(), g.faces.numpy()
+
+
+@pytest.fixture(scope="session")
+def block():
+    """Twice as coarse as it is sewn on, several times as fast."""
+    body = standard_body()
+    return Block(body.vertices.numpy(), body.faces.numpy(), spacing=0.016)
 
 
 @pytest.fixture(scope="session")

@@ -11,7 +11,6 @@ from onefit.garment import TEMPLATES, Garment, standard_body, standard_surface
 from onefit.garment.binding import Binding, surface_of, vertex_normals
 from onefit.garment.mending import mended
 from onefit.garment.remesh import loops
-from onefit.garment.sewing.block import Block
 from onefit.garment.sewing.patterns import ramp, smooth_union
 from onefit.garment.sewing.sew import sewn
 from polyfit import mesh
@@ -177,11 +176,7 @@ def test_unknown_template():
         Garment.template("kilt")
 
 
-def test_shorts_are_sewn_as_the_template_was(templates):
-    body = standard_body()
-    block = Block(
-        body.vertices.numpy(), body.faces.numpy(), spacing=0.016
-    )  # twice as coarse, several times as fast
+def test_shorts_are_sewn_as_the_template_was(templates, block):
     V, F = sewn(block, "shorts")
     assert abs(len(V) - len(templates["shorts"])) <= 5 and len(loops(F)) == 3
     far = np.abs(ClosestSurface(V, F)(templates["shorts"].vertices.numpy()).distance)

@@ -9,7 +9,6 @@ from onefit.garment import LOOSE, Garment, standard_body, standard_surface
 from onefit.garment.mending import mended
 from onefit.garment.remesh import loops
 from onefit.garment.sewing import fall, loose
-from onefit.garment.sewing.block import Block
 from polyfit import mesh
 
 LOOPS = {
@@ -162,9 +161,7 @@ def _angles(V, F):
     return np.arccos(np.clip(-(side * np.roll(side, 1, axis=1)).sum(2), -1, 1))
 
 
-def test_a_skirt_is_cut_as_the_template_was(garments):
-    body = standard_body()
-    block = Block(body.vertices.numpy(), body.faces.numpy(), spacing=0.016)
+def test_a_skirt_is_cut_as_the_template_was(garments, block):
     cut = loose.cut(block, "circle_skirt")
     garment = garments["circle_skirt"]
     hem = max(loops(cut.faces), key=len)

@@ -5,22 +5,13 @@ import pytest
 import torch
 
 from onefit import train, training
-from onefit.garment import Garment, standard_body, standard_surface
+from onefit.garment import Garment, standard_surface
 from onefit.garment.remesh import loops
 from onefit.garment.sewing import cuts, patterns
-from onefit.garment.sewing.block import Block
 from polyfit import mesh
 from polyfit.errors import InputError
 
 NAMES = list(cuts.CUTS)
-
-
-@pytest.fixture(scope="module")
-def block():
-    body = standard_body()
-    return Block(
-        body.vertices.numpy(), body.faces.numpy(), spacing=0.016
-    )  # twice as coarse, several times as fast
 
 
 @pytest.fixture(scope="module")

@@ -116,7 +116,7 @@ def test_the_summary_is_in_lines_that_fit_a_terminal(network, tmp_path, capsys, 
     monkeypatch.setenv("COLUMNS", "80")
     drape.main([
         "shorts", "walk", "-o", str(tmp_path / "out"), "--weights", network, "--seconds", "0.1",
-        "--skip", "usd", "render",
+        "--finish", "0", "--skip", "usd", "render",
     ])  # fmt: skip
     said = capsys.readouterr()
     assert said.out.strip() == str(tmp_path / "out")

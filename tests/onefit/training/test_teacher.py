@@ -1,4 +1,5 @@
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -7,6 +8,7 @@ import torch
 import onefit
 from onefit import teach
 from onefit.body import skinning
+from onefit.garment.sewing import cuts
 from onefit.objective import Weights
 from onefit.objective.objective import posed
 from onefit.training import OneFitTraining, Settings, TrainingData, data
@@ -15,7 +17,8 @@ from onefit.training.teacher import garment_of, lesson, lessons, path_of, taught
 from polyfit.errors import InputError
 from polyfit.training import Processes
 
-SMALL = Settings(batch=600, epochs=1, lr_epochs=1, epoch_steps=40, shapes=0)
+SMALL = Settings(batch=240, epochs=1, lr_epochs=1, epoch_steps=40, shapes=0)
+PATCHES = 30
 ARGUMENTS = ["shorts", "--kinds", "walk", "--seconds", "0.3", "--vertices", "600"]
 
 
@@ -29,7 +32,7 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def learned(folder):
     garment = garment_of(folder, "shorts")
-    return TrainingData([garment], lessons=[lessons(folder, garment)], shapes=3)
+    return TrainingData([garment], lessons=[lessons(folder, garment)], shapes=3, patches=PATCHES)
 
 
 def test_lessons_are_files_of_every_frame(folder):
@@ -88,7 +91,8 @@ def test_lessons_that_are_there_are_kept(folder):
     assert path.stat().st_mtime_ns == before
 
 
-def test_cuts_are_taught_by_their_names(tmp_path):
+def test_cuts_are_taught_by_their_names(tmp_path, monkeypatch):
+    monkeypatch.setattr(cuts, "Block", partial(cuts.Block, spacing=0.024))  # thrice as coarse
     arguments = ["--cuts", "1", "--kinds", "idle", "walk", "--each", "1", "--seconds", "0.1"]
     arguments += ["--vertices", "500", "--finish", "1", "--shapes", "0"]
     teach.main([*arguments, "-o", str(tmp_path)])
@@ -124,7 +128,7 @@ def test_regression_comes_nearer_to_the_lessons(folder, learned):
 def test_the_regression_is_none_where_the_lesson_is_what_the_network_says(learned, folder):
     # an untrained network is plain skinning
     still = [replace(x, displacement=0 * x.displacement) for x in learned.lessons[0]]
-    given = TrainingData([learned.garments[0][0].garment], lessons=[still])
+    given = TrainingData([learned.garments[0][0].garment], lessons=[still], patches=PATCHES)
     training = OneFitTraining(replace(SMALL, teacher=str(folder)), given, Processes("cpu"))
     terms = training.loss(torch.Generator().manual_seed(0))
     assert terms["regression"] < 1e-8
@@ -132,7 +136,8 @@ def test_the_regression_is_none_where_the_lesson_is_what_the_network_says(learne
 
 
 def test_garments_are_drawn_by_their_lessons(learned, folder):
-    long = TrainingData([learned.garments[0][0].garment] * 2, lessons=[[], *learned.lessons])
+    garments = [learned.garments[0][0].garment] * 2
+    long = TrainingData(garments, lessons=[[], *learned.lessons], patches=PATCHES)
     assert len(long) == 18 and long.lesson_frames.tolist() == [0, 18]
     training = OneFitTraining(replace(SMALL, teacher=str(folder)), long, Processes("cpu"))
     assert "regression" in training.loss(torch.Generator().manual_seed(0))  # never of the first
