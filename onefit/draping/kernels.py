@@ -78,11 +78,12 @@ def pushed_out(
     clearance: float,
     reach: float,  # of the first look at every vertex
     deepest: float,
+    face_reach: float,
     x: wp.array(dtype=wp.vec3),
     push: wp.array(dtype=wp.vec3),  # work
     smooth: wp.array(dtype=wp.vec3),  # work
     queue: wp.array(dtype=int),  # work
-    known: wp.array(dtype=int),  # work
+    known: wp.array(dtype=int),  # work: 1 where a vertex was asked deeply, or moved in a round
 ):
     """See :func:`onefit.draping.post.pushed_out`."""
     count = x.shape[0]
@@ -120,9 +121,13 @@ def pushed_out(
                         last += 1
         for s in range(corners.shape[0]):
             point = wp.vec3(0.0, 0.0, 0.0)
+            moved = wp.int32(turn == 0)
             for k in range(corners.shape[1]):
                 point += weights[s, k] * x[corners[s, k]]
-            p, d = pushed(mesh, first, around, point, deepest, 0.0, 0.5 * clearance)
+                moved = moved + known[corners[s, k]]
+            if moved == 0:
+                continue
+            p, d = pushed(mesh, first, around, point, face_reach, 0.0, 0.5 * clearance)
             if wp.length_sq(p) > 0.0:
                 some = 1
                 for k in range(corners.shape[1]):
@@ -143,3 +148,4 @@ def pushed_out(
                     push[v] = smooth[v]
         for v in range(count):
             x[v] = x[v] + push[v]
+            known[v] = wp.int32(wp.length_sq(push[v]) > 0.0)

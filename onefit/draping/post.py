@@ -20,6 +20,7 @@ SMOOTHED = 2  # of these, whose pushes are smoothed
 SMOOTHING = 4  # times
 DEEPEST = 0.08  # [m]; vertices deeper in the body than this stay there
 SPACING = 0.025  # [m] of the points of faces that are looked at beside the vertices
+FACE_DEEPEST = 0.03  # [m], for these
 
 
 def post_processed(vertices, faces, lengths, bodies, body_faces):
@@ -78,7 +79,7 @@ def pushed_out(vertices, faces, bodies, body_faces, rounds=PUSHES, reach=CLEARAN
     first = np.concatenate([[0], np.cumsum(np.bincount(start, minlength=count))])
     other = end[np.argsort(start, kind="stable")]
     corners, weights = samples(vertices[0].cpu().numpy(), faces.cpu().numpy(), SPACING)
-    settings = [rounds, SMOOTHED, SMOOTHING, CLEARANCE, reach, DEEPEST]
+    settings = [rounds, SMOOTHED, SMOOTHING, CLEARANCE, reach, DEEPEST, FACE_DEEPEST]
     arguments = [*(wp.array(a, dtype=int, device="cpu") for a in (first, other))]
     arguments += [wp.array(corners, dtype=int, ndim=2, device="cpu")]
     arguments += [wp.array(weights, dtype=float, ndim=2, device="cpu"), *settings]
