@@ -24,14 +24,13 @@ import dataclasses
 import json
 import math
 import os
-import statistics
 import sys
 import tempfile
-import textwrap
 import time
 from dataclasses import dataclass, field
 
 import numpy as np
+from ablation_results import BASELINE, CHANCES, FIGURES, ROUNDED, decided, page, read, write
 from sequences import DATA, ROOT, SCENES, folder_of
 
 from polyfit.files import aside
@@ -40,12 +39,9 @@ from polysft_mi.errors import InputError, cli
 from polysft_mi.scene.rules import Rules
 from polysft_mi.scene.settings import Settings
 
-BASELINE = "all rules"
-CHANCES = {f"nothing (k_mi changed by {share:+g})": share for share in (1e-5, -1e-5, 2e-5)}
-PAYS = 0.05  # share by which the error must grow without a rule
-FIGURES = {"e3d_proc": "e3d aligned", "depth_rmse_mm": "depth RMSE [mm]", "chamfer_1e4": "Chamfer"}
 SEQUENCES = tuple(
-    "demo flag bend paper curtain corner hand poster kinect_paper phi_sft_R1 tube shirt ball".split()
+    "demo flag bend paper curtain corner hand poster".split()
+    + "kinect_paper phi_sft_R1 tube shirt ball".split()
 )
 SIMULATED = (
     ("flag", 5),
@@ -56,21 +52,7 @@ SIMULATED = (
     ("pillow", 1),
     ("roll", 1),
 )
-ROUNDED = ("tube", "shirt", "ball", "skirt 1", "pillow 1", "roll 1")  # surfaces of several patches
 SCENE_OF = {"skirt": "tube", "pillow": "tube", "roll": "tube"}
-NEEDED = {  # rules that pay on one sequence alone, and why they stay
-    "other starts": "without it Kinect-Paper loses its sheet in fast motion",
-    "more iterations there": "a part of the other starts",
-    "texture fit": "without it the texture of φ-SfT R1 lies pixels off in every frame",
-}
-# rules that do not pay on what was measured, and what is not
-OPEN = {"frontal triangles": "not measured where rims are slanted, on surfaces of several patches"}
-OF_CHANCE = (
-    "Where folds come and go, the smallest change grows from frame to frame. So the tracker also"
-    " ran with a setting changed by some hundred-thousandths. Errors are compared with the median"
-    " of these runs. The first row is how far the runs lie from it: a rule pays only where its"
-    " error is above all of them."
-)
 
 
 @dataclass(frozen=True)
@@ -105,9 +87,7 @@ SWITCHES = (
     Switch("motion starts", {"motion_starts": False}),
     Switch("other starts", {"suspect_margin": math.inf}),
     Switch("more iterations there", {"far_iterations": 6}),
-    Switch("pixels that must be seen", {"shown": 0.0}),
     Switch("small step ends a stage", {"small_step": 0.0}),
-    Switch("longest footprint", {"footprint": 1e9}),
     Switch("texture fit", settings={"texture_fit": "none"}),
     Switch("joints", {"joint": 0.0}, rounded=True),
     Switch("unseen parts are held", {"unseen": 1.0}, rounded=True),
@@ -164,199 +144,6 @@ def run(switch, scene_file, data):
     return {"figures": kept, "lost": len(done.lost), "cpu": seconds / len(states)}
 
 
-# ---- results -------------------------------------------------------------------------------------
-
-
-def read(path):
-    """Results (rule, sequence) -> result; none where there is no such file."""
-    if not os.path.exists(path):
-        return {}
-    try:
-        with open(path, encoding="utf-8") as file:
-            return {(r["rule"], r["sequence"]): r for r in json.load(file)["results"]}
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: not a file of results ({error}); remove it") from None
-
-
-def write(path, results):
-    with aside(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
-        json.dump({"results": list(results.values())}, file, indent=1)
-        file.write("\n")
-
-
-def error_of(result):
-    """(name, value) of a result's figure; a lost sheet may leave it infinite."""
-    return next((n, result["figures"][n]) for n in FIGURES if n in result["figures"])
-
-
-def errors_with_all_rules(results, sequence):
-    """The errors of the runs with all rules, ascending: the first, and those of chance."""
-    runs = (results.get((rule, sequence)) for rule in (BASELINE, *CHANCES))
-    return sorted(error_of(result)[1] for result in runs if result)
-
-
-def change(results, rule, sequence):
-    """(share, pays): by what share the error grows without a rule, and whether that is more than
-    :data:`PAYS` and than chance; None where it was not measured.
-    """
-    known, without = errors_with_all_rules(results, sequence), results.get((rule, sequence))
-    if not (known and without):
-        return None
-    error = error_of(without)[1]
-    share = error / statistics.median(known) - 1
-    return share, share >= PAYS and error > known[-1]
-
-
-def outcome(results, rule, names):
-    """(on how many of the sequences a rule pays, on how many it was measured)."""
-    known = [c for name in names if (c := change(results, rule, name)) is not None]
-    return sum(pays for _, pays in known), len(known)
-
-
-def decided(results, rule):
-    """Whether a rule stays, whatever else is measured."""
-    return outcome(results, rule, [name for kind, name in results if kind == rule])[0] > 1
-
-
-def verdict(results, rule, names):
-    """What the table says of a rule, in a few words."""
-    pays, measured = outcome(results, rule, names)
-    said = f"pays on {pays} of {measured}"
-    if measured < len(names) and pays < 2:
-        return said
-    if rule in NEEDED and pays < 2:
-        return f"{said}; stays: {NEEDED[rule]}"
-    if rule in OPEN and pays < 2:
-        return f"{said}; open: {OPEN[rule]}"
-    return f"{said}; {'stays' if pays > 1 else 'goes'}"
-
-
-def slower(results, rule, names):
-    """Median over the sequences of the time without a rule over the time with it; None: unknown."""
-    ratios = [
-        results[rule, n]["cpu"] / results[BASELINE, n]["cpu"]
-        for n in names
-        if (rule, n) in results and (BASELINE, n) in results
-    ]
-    return statistics.median(ratios) if ratios else None
-
-
-def table(results, rules, names):
-    """A row a rule: by how many percent the error grows without it, on each sequence; the first is
-    what chance does.
-    """
-
-    def number(change):
-        if change is None:
-            return "–"
-        return f"{100 * change[0]:+.0f}" if change[0] < 99 else "lost"
-
-    def spread(errors):
-        if len(errors) < 2:
-            return "–"
-        median = statistics.median(errors)
-        return f"{100 * (errors[0] / median - 1):+.0f} to {100 * (errors[-1] / median - 1):+.0f}"
-
-    rows = [
-        ["rule off", *names, "time", "verdict"],
-        ["---", *["---:"] * (len(names) + 1), "---"],
-    ]
-    known = [errors_with_all_rules(results, name) for name in names]
-    if any(len(errors) > 1 for errors in known):
-        rows.append(["none", *(spread(errors) for errors in known), "–", "what chance does"])
-    for rule in rules:
-        ratio = slower(results, rule, names)
-        rows.append(
-            [rule]
-            + [number(change(results, rule, name)) for name in names]
-            + ["–" if ratio is None else f"{100 * (ratio - 1):+.0f}"]
-            + [verdict(results, rule, names)]
-        )
-    return "\n".join("| " + " | ".join(row) + " |" for row in rows)
-
-
-def wrap(line):
-    """A line of the page, wrapped where it is no row of a table."""
-    return line if line.startswith("|") else textwrap.fill(line, 100, break_long_words=False)
-
-
-def baseline_table(results, names):
-    """The figures with all rules on: the median error of the runs."""
-    rows = [["sequence", "figure", "error", "normals", "CPU seconds a frame"], ["---"] * 5]
-    for name in names:
-        if result := results.get((BASELINE, name)):
-            figure, value = (
-                error_of(result)[0],
-                statistics.median(errors_with_all_rules(results, name)),
-            )
-            normals = result["figures"].get("en_deg")
-            rows.append(
-                [name, FIGURES[figure], f"{value:.4g}"]
-                + ["–" if normals is None else f"{normals:.1f}°", f"{result['cpu']:.2f}"]
-            )
-    return "\n".join("| " + " | ".join(row) + " |" for row in rows)
-
-
-def page(results, earlier):
-    """The text of ``ablation.md``; ``earlier``: results of the tracker before rules were
-    removed."""
-    names = [n for (rule, n) in results if rule == BASELINE and n not in ROUNDED]
-    measured = {rule for rule, n in results if n not in ROUNDED}
-    switches = [s for s in SWITCHES if s.rule not in (BASELINE, *CHANCES) and not s.rounded]
-    rules = [s.rule for s in switches if s.rule in measured]
-    unknown = [s.rule for s in switches if s.rule not in measured]
-    of_rules = f"{OF_CHANCE}\n\n" if measured & set(CHANCES) else ""
-    of_rules += table(results, rules, names) if rules else ""
-    if unknown:
-        of_rules += f"\n\nNot measured of the tracker as it is: {', '.join(unknown)}."
-    if unknown and earlier:
-        of_rules += " Those that [an earlier tracker](#before) had too are in its table."
-    of_rules = "\n".join(wrap(line) for line in of_rules.strip().splitlines())
-    text = f"""# What each rule of the tracker is worth
-
-Made by `python benchmarks/ablation.py`. Each row is one rule switched off alone. A number is the
-change of the error in percent: +30 means that the error is 30 % larger without the rule. *Time* is
-the median change of the CPU time, in percent. A rule stays when the error grows by
-{100 * PAYS:.0f} % without it, and more than by chance, on at least two sequences. "–": not
-measured.
-
-{of_rules}
-
-With all rules on (CPU time on one thread, beside other work: compare it within this page only):
-
-{baseline_table(results, names)}
-"""
-    rounded = [n for (rule, n) in results if rule == BASELINE and n in ROUNDED]
-    switches = [s for s in SWITCHES if s.rule not in (BASELINE, *CHANCES)]
-    rules = [s.rule for s in switches if any((s.rule, n) in results for n in rounded)]
-    if rules:
-        text += f"""
-## Surfaces of several patches
-
-The error is that of all vertices, of those that no pixel sees too. The sequences with a number were
-made by `python benchmarks/simulate.py` with that seed, after the rules had their values.
-
-{table(results, rules, rounded)}
-
-{baseline_table(results, rounded)}
-"""
-    if earlier:
-        rules = list(dict.fromkeys(rule for rule, _ in earlier if rule != BASELINE))
-        before = [n for (rule, n) in earlier if rule == BASELINE]
-        text += f"""
-## Before
-
-The same, of the tracker that had more rules. The rules that do not pay here are gone since. No
-command makes these figures again. A rule that never acted on a sequence has +0 there. Times were
-taken beside other work. The seven from the mirror twin to the relief in the first stage, removed
-together, cost 41 % on flag 5, 13 % on poster and at most 4 % elsewhere; a frame takes a fifth less
-time. Strain's caution acts on noisy videos alone; without it the demo's error is four times larger.
-
-{table(earlier, rules, before)}
-"""
-    return text
-
-
 # ---- the command ---------------------------------------------------------------------------------
 
 
@@ -409,7 +196,7 @@ def main(arguments=None):
             result = {"rule": switch.rule, "sequence": name, **run(switch, *found[name])}
             write(path, read(path) | {(switch.rule, name): result})
             print(f"{switch.rule}, {name}: {json.dumps(result)}", file=sys.stderr, flush=True)
-    text = page(read(path), read(before))
+    text = page(read(path), read(before), SWITCHES)
     with (
         aside(os.path.join(options.docs, "ablation.md")) as temporary,
         open(temporary, "w", encoding="utf-8") as file,

@@ -33,6 +33,14 @@ def sphere(radius=0.2, subdivisions=3):
     return np.array(ball.vertices), np.array(ball.faces)
 
 
+def ball(radius, subdivisions=4):
+    """A :func:`sphere` as tensors, single precision."""
+    import torch
+
+    vertices, faces = sphere(radius, subdivisions)
+    return torch.as_tensor(vertices, dtype=torch.float32), torch.as_tensor(faces)
+
+
 def joined(*meshes):
     """Several meshes as one, each with vertices of its own."""
     start = np.cumsum([0] + [len(V) for V, _ in meshes])

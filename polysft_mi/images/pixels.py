@@ -303,14 +303,13 @@ def packed(columns, index):
     return out
 
 
-def rendered(seen, sheet, texture, fine, lit, stride, footprint_limit):
+def rendered(seen, sheet, texture, fine, lit):
     """The sheet as the camera has it before any blur: colour and, in the fourth channel, the light
     on it (0 where there is no sheet), Vector4f of n; and the ``texture``, an :class:`Image`, as
     :func:`residuals` takes it, likewise.
 
     ``fine``: the :class:`Image` that a pixel's footprint is averaged over; ``lit`` Float of F:
-    light on the triangles; ``stride`` Float: pixels of the video to one of the grid, times the
-    texels to a pixel.
+    light on the triangles.
     """
     hit, found = seen.hit, ray_hits(seen, sheet)
     template = texture.bilinear(found.at, hit)[0]
@@ -319,7 +318,7 @@ def rendered(seen, sheet, texture, fine, lit, stride, footprint_limit):
     for pixel in across(seen):
         pixel -= found.ray.d * dr.dot(slide, pixel)
         step = (found.c1 * dr.dot(grad1, pixel) + found.c2 * dr.dot(grad2, pixel)) * sheet.scale
-        footprint.append(step * dr.minimum(1, footprint_limit * stride * dr.rcp(dr.norm(step))))
+        footprint.append(step)
     colour = mi.Vector4f(0)
     for i in range(TAPS):
         for j in range(TAPS):

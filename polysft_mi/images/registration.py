@@ -34,10 +34,10 @@ class Evaluation:
     of the level's grid.
 
     ``photometric``, ``silhouette``: energies; ``images``: a
-    :class:`polysft_mi.images.gather.Images`, what they say at the vertices; ``pixels``: how many of
-    the video were compared; ``outlier_share``: the mean of r^2 / (r^2 + scale^2) over them;
-    ``misfit``: the same with a fixed scale (both are 1 where no pixel is compared); ``seen`` (F,):
-    pixels of the video that see each triangle; ``noise``: the variance of a residual, as the
+    :class:`polysft_mi.images.gather.Images`, what they say at the vertices; ``outlier_share``: the
+    mean of r^2 / (r^2 + scale^2) over the pixels that are compared; ``misfit``: the same with a
+    fixed scale (both are 1 where none is); ``seen`` (F,): pixels of the video that see each
+    triangle; ``noise``: the variance of a residual, as the
     residuals' own size says it.
     """
 
@@ -46,7 +46,6 @@ class Evaluation:
     outlier_share: float
     misfit: float
     images: Images
-    pixels: float
     seen: np.ndarray
     noise: float
 
@@ -232,7 +231,6 @@ class Registration:
             outlier_share,
             misfit,
             images,
-            compared_pixels,
             figures[:, 1] * level.stride**2,
             noise,
         )
@@ -267,8 +265,6 @@ class Registration:
                 self.texture.level(level),
                 self.texture.footprint_texture(level.stride),
                 lit,
-                dr.opaque(mi.Float, level.stride * self.texture.density),
-                dr.opaque(mi.Float, self._rules.footprint),
             )
             corner, (w, h) = (int(view.region[0][0]), int(view.region[1][0])), view.size
             found, template = (

@@ -68,9 +68,6 @@ class Rules:
     damping: tuple = _rule(
         (1e-4, 3e-3), "", "Levenberg-Marquardt damping at a stage's start, without and with relief"
     )
-    shown: float = _rule(
-        0.7, "share", "of the pixels that see the sheet, below which no step or start may lead"
-    )
     first_scale: float = _rule(
         0.3, "deviations", "robust scale of the first frame's residuals, in local deviations"
     )
@@ -124,9 +121,6 @@ class Rules:
     )
     border: float = _rule(
         2.0, "windows", "from the sheet's border where images without masks are not corrected so"
-    )
-    footprint: float = _rule(
-        12.0, "pixels", "longest footprint of a pixel on the texture [of the first frame]"
     )
     # the silhouette
     silhouette: float = _rule(

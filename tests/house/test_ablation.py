@@ -12,6 +12,7 @@ from polysft_mi.scene.rules import Rules
 from polysft_mi.scene.settings import Settings
 
 ablation = load("benchmarks/ablation.py")
+results_of = load("benchmarks/ablation_results.py")
 
 
 def results(**errors):
@@ -33,21 +34,23 @@ def test_every_switch_changes_what_is_there(switch):
 
 def test_a_rule_that_pays_on_two_sequences_stays():
     found = results(twice=(1.2, 1.06, 0.9), once=(1.2, 1.04, 1.0))
-    found |= results(**{ablation.BASELINE: (1.0, 1.0, 1.0)})
-    verdict = lambda rule: ablation.verdict(found, rule, (0, 1, 2))
+    found |= results(**{results_of.BASELINE: (1.0, 1.0, 1.0)})
+    verdict = lambda rule: results_of.verdict(found, rule, (0, 1, 2))
     assert verdict("twice") == "pays on 2 of 3; stays"
     assert verdict("once") == "pays on 1 of 3; goes"
-    del found["twice", 2]
-    assert verdict("twice") == "pays on 2 of 2"
+    assert results_of.decided(found, "twice") and not results_of.decided(found, "once")
+    del found["twice", 2], found["once", 2]
+    assert verdict("twice") == "pays on 2 of 2; stays"  # whatever the third says
+    assert verdict("once") == "pays on 1 of 2"
 
 
 def test_what_chance_does_too_does_not_count():
-    one, two = list(ablation.CHANCES)[:2]
-    found = results(rule=(1.2, 1.2)) | results(**{ablation.BASELINE: (1.0, 1.0)})
+    one, two = list(results_of.CHANCES)[:2]
+    found = results(rule=(1.2, 1.2)) | results(**{results_of.BASELINE: (1.0, 1.0)})
     found |= results(**{one: (0.9, 1.0), two: (1.1, 1.3)})
-    assert ablation.verdict(found, "rule", (0, 1)) == "pays on 1 of 2; goes"
+    assert results_of.verdict(found, "rule", (0, 1)) == "pays on 1 of 2; goes"
     found = {(rule, f"sequence {k}"): result for (rule, k), result in found.items()}
-    table = ablation.table(found, ["rule"], ("sequence 0", "sequence 1")).splitlines()
+    table = results_of.table(found, ["rule"], ("sequence 0", "sequence 1")).splitlines()
     assert table[2] == "| none | -10 to +10 | +0 to +30 | – | what chance does |"
     assert table[3].startswith("| rule | +20 | +20 |")
 
@@ -66,11 +69,11 @@ def test_the_switch_reaches_the_tracker(tmp_path):
 def test_page_is_made_from_the_file(tmp_path):
     found = [
         {"rule": rule, "sequence": "flag", "figures": {"e3d_proc": e}, "lost": 0, "cpu": 1.0}
-        for rule, e in ((ablation.BASELINE, 0.001), ("relief", 0.002))
+        for rule, e in ((results_of.BASELINE, 0.001), ("relief", 0.002))
     ]
     (tmp_path / "ablation.json").write_text(json.dumps({"results": found}))
-    known = ablation.read(str(tmp_path / "ablation.json"))
-    text = ablation.page(known, {})
+    known = results_of.read(str(tmp_path / "ablation.json"))
+    text = results_of.page(known, {}, ablation.SWITCHES)
     assert "| relief | +100 | +0 | pays on 1 of 1; goes |" in text
     unknown = text[text.index("Not measured") : text.index("With all rules on")]
     assert "appearance" in unknown and "relief's bending" in unknown and "relief," not in unknown

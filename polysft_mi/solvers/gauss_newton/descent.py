@@ -31,10 +31,6 @@ class Found:
         return self.model.evaluation.misfit
 
     @property
-    def pixels(self):
-        return self.model.evaluation.pixels
-
-    @property
     def cost(self):
         return self.model.cost
 
@@ -111,7 +107,6 @@ class Descent:
         appearance = self.objective.appearance(state, stage, context.light)
         model = self.model(state, context, stage, scale, appearance)
         damping = rules.damping[model.normal.local.shape[-1] - 2]
-        least = rules.shown * model.evaluation.pixels
         for _ in range(iterations):
             try:
                 step, promised = self.reduced(model.normal, damping, np.float32).step()
@@ -124,7 +119,7 @@ class Descent:
                 state = trial
                 break
             found = self.model(trial, context, stage, scale, appearance)
-            if found.total < model.total and found.evaluation.pixels > least:
+            if found.total < model.total:
                 if model.total - found.total > 0.5 * promised:
                     damping = max(damping / 5, _LEAST_DAMPING)
                 state, model = trial, found

@@ -58,8 +58,7 @@ class Starts:
             if (other := other()) is None:
                 continue
             found = descent.descend(other, context, stages, rules.far_iterations)
-            # what no pixel sees costs nothing
-            if found.pixels > rules.shown * best.pixels and found.cost < best.cost:
+            if found.cost < best.cost:
                 best = found
         return best
 

@@ -77,7 +77,7 @@ def test_a_lesson_gives_the_drape_back():
     garment, shape = draper.garment("shorts"), torch.full((6,), 0.6)
     motion = onefit.Motion.generate("walk", seconds=0.3)
     made = lesson(draper, garment, motion, shape, finish=0, material="cotton")
-    drape = draper.drape(garment, motion, shape, post=False)
+    drape = draper.drape(garment, motion, shape)
     maps = skinning.transforms(draper.model.body(shape), made.poses, made.translation)
     moved = drape.rest[:, None] + made.displacement.float()
     again = posed(moved, garment.blend_weights, maps).transpose(0, 1)
