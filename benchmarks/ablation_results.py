@@ -166,9 +166,13 @@ def page(results, earlier, all_switches):
     measured = {rule for rule, n in results if n not in ROUNDED}
     switches = [s for s in all_switches if s.rule not in (BASELINE, *CHANCES) and not s.rounded]
     rules = [s.rule for s in switches if s.rule in measured]
+    now = {s.rule for s in all_switches}
+    gone = list(dict.fromkeys(r for r, n in results if r not in now and n not in ROUNDED))
     unknown = [s.rule for s in switches if s.rule not in measured]
     of_rules = f"{OF_CHANCE}\n\n" if measured & set(CHANCES) else ""
-    of_rules += table(results, rules, names) if rules else ""
+    of_rules += table(results, rules + gone, names) if rules else ""
+    if gone:
+        of_rules += f"\n\nGone since, for they did not pay: {', '.join(gone)}."
     if unknown:
         of_rules += f"\n\nNot measured of the tracker as it is: {', '.join(unknown)}."
     if unknown and earlier:
