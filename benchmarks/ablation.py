@@ -74,7 +74,6 @@ SWITCHES = (
     Switch("appearance", {"appearance": False}),
     Switch("shading", settings={"k_shading": 0}),
     Switch("exposure", {"exposure": False}),
-    Switch("frontal triangles", {"shading_frontal": 0.0}),
     Switch("light's memory", {"light_kept": 1.0}),
     Switch("relief", settings={"k_relief": 0}),
     Switch("relief's bending", {"relief_bend": 0.0}),

@@ -230,12 +230,9 @@ class Brightness:
         towards = -np.einsum("fk,fk->f", cross, ray)
         facing = np.sign(towards)
         normal = cross * (facing / double)[:, None]
-        frontal = np.abs(towards) > self.rules.shading_frontal * double * np.sqrt(
-            np.einsum("fk,fk->f", ray, ray)
-        )
         luminance = _sampled(image, (position[self.faces].sum(1) / 3) / pool - 0.5)
         texture = self.texture if texture is None else np.where(texture > 0, texture, self.texture)
-        seen = self.trusted & frontal & (pixels > 0)
+        seen = self.trusted & (pixels > 0)
         centre = (corner.sum(1) / 3 - self.centre) / self.unit
         return Shade(
             normal, centre, self.unit, texture, luminance, seen, (a, b), double / 2, facing

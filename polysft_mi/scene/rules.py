@@ -135,7 +135,6 @@ class Rules:
         "share",
         "of a triangle's surroundings that must be texture, with and without masks",
     )
-    shading_frontal: float = _rule(0.3, "cosine", "between normal and ray, below which none counts")
     exposure: bool = _rule(True, "", "whether a frame's overall brightness is its own")
     light_ridge: float = _rule(
         3e-3, "observations", "a triangle, that hold the light to be the same from all sides"
