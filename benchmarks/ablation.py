@@ -52,6 +52,7 @@ SIMULATED = (
     ("pillow", 1),
     ("roll", 1),
 )
+ORDER = (*SEQUENCES, *(f"{name} {seed}" for name, seed in SIMULATED))  # of the table's columns
 SCENE_OF = {"skirt": "tube", "pillow": "tube", "roll": "tube"}
 
 
@@ -171,9 +172,7 @@ def parser():
 def main(arguments=None):
     options = parser().parse_args(arguments)
     os.makedirs(options.docs, exist_ok=True)
-    path, before = (
-        os.path.join(options.docs, f) for f in ("ablation.json", "ablation_before.json")
-    )
+    path = os.path.join(options.docs, "ablation.json")
     found = sequences(options.data, options.simulated)
     if set(found) == {"demo"}:
         raise InputError(f"--data {options.data}: none of the sequences is there")
@@ -195,7 +194,7 @@ def main(arguments=None):
             result = {"rule": switch.rule, "sequence": name, **run(switch, *found[name])}
             write(path, read(path) | {(switch.rule, name): result})
             print(f"{switch.rule}, {name}: {json.dumps(result)}", file=sys.stderr, flush=True)
-    text = page(read(path), read(before), SWITCHES)
+    text = page(read(path), SWITCHES, ORDER)
     with (
         aside(os.path.join(options.docs, "ablation.md")) as temporary,
         open(temporary, "w", encoding="utf-8") as file,

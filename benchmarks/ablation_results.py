@@ -84,10 +84,10 @@ def verdict(results, rule, names):
     """What the table says of a rule, in a few words."""
     pays, measured = outcome(results, rule, names)
     said = f"pays on {pays} of {measured}"
-    if measured < len(names) and pays < 2:
-        return said
     if rule in NEEDED and pays < 2:
         return f"{said}; stays: {NEEDED[rule]}"
+    if measured < len(names) and pays < 2:
+        return said
     return f"{said}; {'stays' if pays > 1 else 'goes'}"
 
 
@@ -157,43 +157,38 @@ def baseline_table(results, names):
     return "\n".join("| " + " | ".join(row) + " |" for row in rows)
 
 
-def page(results, earlier, all_switches):
-    """The text of ``ablation.md``, of the rules of ``all_switches``; ``earlier``: results of the
-    tracker before rules were removed.
-    """
-    names = [n for (rule, n) in results if rule == BASELINE and n not in ROUNDED]
-    measured = {rule for rule, n in results if n not in ROUNDED}
-    switches = [s for s in all_switches if s.rule not in (BASELINE, *CHANCES) and not s.rounded]
-    rules = [s.rule for s in switches if s.rule in measured]
+def page(results, all_switches, order):
+    """The text of ``ablation.md``: the rules of ``all_switches``, sequences in ``order``."""
+    done = [n for n in order if (BASELINE, n) in results]
+    sheets, rounded = ([n for n in done if (n in ROUNDED) == part] for part in (False, True))
+    switches = [s for s in all_switches if s.rule not in (BASELINE, *CHANCES)]
+    measured = lambda rule, names: any((rule, n) in results for n in names)
+    rules = [s.rule for s in switches if not s.rounded and measured(s.rule, sheets)]
+    unknown = [s.rule for s in switches if not s.rounded and not measured(s.rule, sheets)]
     now = {s.rule for s in all_switches}
-    gone = list(dict.fromkeys(r for r, n in results if r not in now and n not in ROUNDED))
-    unknown = [s.rule for s in switches if s.rule not in measured]
-    of_rules = f"{OF_CHANCE}\n\n" if measured & set(CHANCES) else ""
-    of_rules += table(results, rules + gone, names) if rules else ""
+    gone = list(dict.fromkeys(rule for rule, _ in results if rule not in now))
+    parts = [OF_CHANCE] if any(measured(rule, sheets) for rule in CHANCES) else []
+    parts += [table(results, rules + gone, sheets)] if rules + gone else []
     if gone:
-        of_rules += f"\n\nGone since, for they did not pay: {', '.join(gone)}."
+        parts.append(f"Gone since, for they did not pay: {', '.join(gone)}.")
     if unknown:
-        of_rules += f"\n\nNot measured of the tracker as it is: {', '.join(unknown)}."
-    if unknown and earlier:
-        of_rules += " Those that [an earlier tracker](#before) had too are in its table."
-    of_rules = "\n".join(wrap(line) for line in of_rules.strip().splitlines())
+        parts.append(f"Not measured: {', '.join(unknown)}.")
+    of_rules = "\n\n".join("\n".join(map(wrap, part.splitlines())) for part in parts)
     text = f"""# What each rule of the tracker is worth
 
 Made by `python benchmarks/ablation.py`. Each row is one rule switched off alone. A number is the
 change of the error in percent: +30 means that the error is 30 % larger without the rule. *Time* is
 the median change of the CPU time, in percent. A rule stays when the error grows by
 {100 * PAYS:.0f} % without it, and more than by chance, on at least two sequences. "–": not
-measured.
+measured, for two sequences had decided.
 
 {of_rules}
 
 With all rules on (CPU time on one thread, beside other work: compare it within this page only):
 
-{baseline_table(results, names)}
+{baseline_table(results, sheets)}
 """
-    rounded = [n for (rule, n) in results if rule == BASELINE and n in ROUNDED]
-    switches = [s for s in all_switches if s.rule not in (BASELINE, *CHANCES)]
-    rules = [s.rule for s in switches if any((s.rule, n) in results for n in rounded)]
+    rules = [s.rule for s in switches if measured(s.rule, rounded)]
     if rules:
         text += f"""
 ## Surfaces of several patches
@@ -204,19 +199,5 @@ made by `python benchmarks/simulate.py` with that seed, after the rules had thei
 {table(results, rules, rounded)}
 
 {baseline_table(results, rounded)}
-"""
-    if earlier:
-        rules = list(dict.fromkeys(rule for rule, _ in earlier if rule != BASELINE))
-        before = [n for (rule, n) in earlier if rule == BASELINE]
-        text += f"""
-## Before
-
-The same, of the tracker that had more rules. The rules that do not pay here are gone since. No
-command makes these figures again. A rule that never acted on a sequence has +0 there. Times were
-taken beside other work. The seven from the mirror twin to the relief in the first stage, removed
-together, cost 41 % on flag 5, 13 % on poster and at most 4 % elsewhere; a frame takes a fifth less
-time. Strain's caution acts on noisy videos alone; without it the demo's error is four times larger.
-
-{table(earlier, rules, before)}
 """
     return text

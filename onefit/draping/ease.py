@@ -16,7 +16,7 @@ from onefit.body import ClosestSurface
 from onefit.garment.charts import SparseMatrix
 from onefit.garment.remesh import neighbour_mean
 
-from .post import DEEPEST, spread
+from .post import DEEPEST, SMOOTHING
 
 MOTIONS = (
     "idle",
@@ -73,3 +73,16 @@ def ease(rest, faces, body, frames):
     moved = (missing > 0) & (at_rest.face >= 0)[:, None]
     mean = SparseMatrix(neighbour_mean(faces.cpu().numpy(), len(rest)), rest.device)
     return spread(torch.where(moved, missing * at_rest.normal, 0.0), mean)
+
+
+def spread(push, mean):
+    """Pushes (N, 3) [m], smoothed over the mesh; none becomes shorter. ``mean``: a matrix (N, N)
+    that takes the mean of each vertex's neighbours
+    (:func:`onefit.garment.remesh.neighbour_mean`).
+    """
+    for _ in range(SMOOTHING):
+        around = mean @ push
+        push = torch.where(
+            push.norm(dim=-1, keepdim=True) > around.norm(dim=-1, keepdim=True), push, around
+        )
+    return push

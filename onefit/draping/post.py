@@ -98,19 +98,6 @@ def pushed_out(vertices, faces, bodies, body_faces, rounds=PUSHES, reach=CLEARAN
     return _in_threads(frames, vertices, bodies.cpu())
 
 
-def spread(push, mean):
-    """Pushes (N, 3) [m], smoothed over the mesh; none becomes shorter. ``mean``: a matrix (N, N)
-    that takes the mean of each vertex's neighbours
-    (:func:`onefit.garment.remesh.neighbour_mean`).
-    """
-    for _ in range(SMOOTHING):
-        around = mean @ push
-        push = torch.where(
-            push.norm(dim=-1, keepdim=True) > around.norm(dim=-1, keepdim=True), push, around
-        )
-    return push
-
-
 def _in_threads(frames, vertices, *more):
     """A copy of the vertices (T, N, 3), changed by ``frames``: each thread has some of them, with
     their share of the tensors ``more``.

@@ -73,7 +73,7 @@ def test_page_is_made_from_the_file(tmp_path):
     ]
     (tmp_path / "ablation.json").write_text(json.dumps({"results": found}))
     known = results_of.read(str(tmp_path / "ablation.json"))
-    text = results_of.page(known, {}, ablation.SWITCHES)
+    text = results_of.page(known, ablation.SWITCHES, ablation.ORDER)
     assert "| relief | +100 | +0 | pays on 1 of 1; goes |" in text
     unknown = text[text.index("Not measured") : text.index("With all rules on")]
     assert "appearance" in unknown and "relief's bending" in unknown and "relief," not in unknown
