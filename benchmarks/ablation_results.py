@@ -18,6 +18,7 @@ NEEDED = {  # rules that pay on one sequence alone, and why they stay
     "more iterations there": "a part of the other starts",
     "texture fit": "without it the texture of φ-SfT R1 lies pixels off in every frame",
     "strain's caution": "without it the demo, a noisy video, crumples",
+    "joints": "it is what holds patches together",
     "small step ends a stage": "it is for time: a stage that has converged ends",
 }
 # rules that do not pay on what was measured, and what is not
