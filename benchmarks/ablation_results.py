@@ -13,7 +13,7 @@ CHANCES = {f"nothing (k_mi changed by {share:+g})": share for share in (1e-5, -1
 PAYS = 0.05  # share by which the error must grow without a rule
 FIGURES = {"e3d_proc": "e3d aligned", "depth_rmse_mm": "depth RMSE [mm]", "chamfer_1e4": "Chamfer"}
 ROUNDED = ("tube", "shirt", "ball", "skirt 1", "pillow 1", "roll 1")  # surfaces of several patches
-NEEDED = {  # rules that pay on one sequence alone, and why they stay
+NEEDED = {  # rules that stay where they pay on one sequence alone, and why
     "other starts": "without it Kinect-Paper loses its sheet in fast motion",
     "more iterations there": "a part of the other starts",
     "texture fit": "without it the texture of φ-SfT R1 lies pixels off in every frame",
@@ -21,7 +21,6 @@ NEEDED = {  # rules that pay on one sequence alone, and why they stay
     "joints": "it is what holds patches together",
     "small step ends a stage": "it is for time: a stage that has converged ends",
 }
-# rules that do not pay on what was measured, and what is not
 OF_CHANCE = (
     "Where folds come and go, the smallest change grows from frame to frame. So the tracker also"
     " ran with a setting changed by some hundred-thousandths. Errors are compared with the median"
@@ -181,7 +180,7 @@ Made by `python benchmarks/ablation.py`. Each row is one rule switched off alone
 change of the error in percent: +30 means that the error is 30 % larger without the rule. *Time* is
 the median change of the CPU time, in percent. A rule stays when the error grows by
 {100 * PAYS:.0f} % without it, and more than by chance, on at least two sequences. "–": not
-measured, for two sequences had decided.
+measured, mostly since two sequences had decided by then.
 
 {of_rules}
 

@@ -37,7 +37,7 @@ class Nearest:
 def _warp():
     from . import kernels  # compiled at the first use
 
-    return warp(), kernels.nearest, kernels.row
+    return warp(), kernels.nearest, kernels.row, kernels.Surface
 
 
 class ClosestSurface:
@@ -46,7 +46,7 @@ class ClosestSurface:
     """
 
     def __init__(self, vertices, faces):
-        self._wp, self._nearest, self._row = _warp()
+        self._wp, self._nearest, self._row, surface = _warp()
         vertices, faces = torch.as_tensor(vertices).detach(), torch.as_tensor(faces)
         self.faces = np.ascontiguousarray(faces.cpu().numpy(), dtype=np.int64)
         self._device = self._wp.device_from_torch(vertices.device)
@@ -56,11 +56,11 @@ class ClosestSurface:
             self._wp.from_torch(self._vertices, dtype=self._wp.vec3), on_device(self.faces.ravel())
         )
         counts = np.bincount(self.faces.ravel(), minlength=len(vertices))
-        # the corners of faces at vertex v are around[first[v]:first[v + 1]]
-        self._corners = (
-            on_device(np.concatenate([[0], np.cumsum(counts)])),
-            on_device(np.argsort(self.faces.ravel(), kind="stable")),
-        )
+        #: the :class:`onefit.body.kernels.Surface` that kernels take
+        self.of_kernels = surface()
+        self.of_kernels.mesh = self._mesh.id
+        self.of_kernels.first = on_device(np.concatenate([[0], np.cumsum(counts)]))
+        self.of_kernels.around = on_device(np.argsort(self.faces.ravel(), kind="stable"))
 
     @property
     def vertices(self):
@@ -77,11 +77,6 @@ class ClosestSurface:
             self._vertices.numpy()[:] = vertices
         self._mesh.refit()
 
-    @property
-    def of_kernels(self):
-        """The first three arguments of :func:`onefit.body.kernels.closest`."""
-        return self._mesh.id, *self._corners
-
     def __call__(self, points, reach=10.0):
         """:class:`Nearest` of points (N, 3) [m], an array or a tensor on the mesh's device. Those
         farther than ``reach`` [m] get the distance ``reach``, the face -1 and NaN. Without
@@ -96,7 +91,7 @@ class ClosestSurface:
             wp.from_torch(face),
             wp.from_torch(found, dtype=self._row),
         )
-        wp.launch(self._nearest, len(x), [*self.of_kernels, *arrays], device=self._device)
+        wp.launch(self._nearest, len(x), [self.of_kernels, *arrays], device=self._device)
         parts = face.long(), found[:, :3], found[:, 3:6], found[:, 6], found[:, 7:]
         return Nearest(*parts if torch.is_tensor(points) else (p.cpu().numpy() for p in parts))
 

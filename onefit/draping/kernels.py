@@ -1,6 +1,6 @@
 """The Warp kernels of post-processing: each one compiled loop over a frame, on the CPU."""
 
-from onefit.body.kernels import closest, wp
+from onefit.body.kernels import Surface, closest, wp
 
 wp.set_module_options({"enable_backward": False})
 
@@ -46,16 +46,14 @@ def lengths_restored(
 
 @wp.func
 def pushed(
-    mesh: wp.uint64,
-    first: wp.array(dtype=int),
-    around: wp.array(dtype=int),
+    body: Surface,
     point: wp.vec3,
     reach: float,
     near: float,  # what is nearer than this is pushed
     clearance: float,  # to so far from the body
 ):
-    """(push, signed distance)."""
-    face, found = closest(mesh, first, around, point, reach)
+    """(push, signed distance) of a point [m]."""
+    face, found = closest(body, point, reach)
     push = wp.vec3(0.0, 0.0, 0.0)
     if face >= 0 and found[6] < near:
         for k in range(3):
@@ -65,9 +63,7 @@ def pushed(
 
 @wp.kernel
 def pushed_out(
-    mesh: wp.uint64,
-    first: wp.array(dtype=int),
-    around: wp.array(dtype=int),
+    body: Surface,
     start: wp.array(dtype=int),  # the neighbours of vertex v are other[start[v]:start[v + 1]]
     other: wp.array(dtype=int),
     corners: wp.array2d(dtype=int),  # points of large faces: sum_i weights[p, i] x[corners[p, i]]
@@ -92,7 +88,7 @@ def pushed_out(
         last = wp.int32(0)
         for v in range(count):
             if turn == 0:
-                p, d = pushed(mesh, first, around, x[v], reach, clearance, clearance)
+                p, d = pushed(body, x[v], reach, clearance, clearance)
                 known[v] = 0
                 push[v] = p
                 if wp.length_sq(p) > 0.0:
@@ -102,7 +98,7 @@ def pushed_out(
                         queue[last] = v
                         last += 1
             elif wp.length_sq(push[v]) > 0.0:
-                p, d = pushed(mesh, first, around, x[v], deepest, 0.5 * clearance, clearance)
+                p, d = pushed(body, x[v], deepest, 0.5 * clearance, clearance)
                 push[v] = p
                 if wp.length_sq(p) > 0.0:
                     some = 1
@@ -114,7 +110,7 @@ def pushed_out(
                 n = other[k]
                 if known[n] == 0:
                     known[n] = 1
-                    p, d = pushed(mesh, first, around, x[n], deepest, clearance, clearance)
+                    p, d = pushed(body, x[n], deepest, clearance, clearance)
                     push[n] = p
                     if d < 0.0:
                         queue[last] = n
@@ -127,7 +123,7 @@ def pushed_out(
                 moved = moved + known[corners[s, k]]
             if moved == 0:
                 continue
-            p, d = pushed(mesh, first, around, point, face_reach, 0.0, 0.5 * clearance)
+            p, d = pushed(body, point, face_reach, 0.0, 0.5 * clearance)
             if wp.length_sq(p) > 0.0:
                 some = 1
                 for k in range(corners.shape[1]):

@@ -92,7 +92,7 @@ def pushed_out(vertices, faces, bodies, body_faces, rounds=PUSHES, reach=CLEARAN
         for x, body in zip(part, bodies):
             surface.follow(body)
             x = wp.from_torch(x, dtype=wp.vec3)
-            arrays = [*surface.of_kernels, *arguments, x, *work]
+            arrays = [surface.of_kernels, *arguments, x, *work]
             wp.launch(kernels.pushed_out, 1, arrays, device="cpu")
 
     return _in_threads(frames, vertices, bodies.cpu())

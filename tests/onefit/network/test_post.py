@@ -33,42 +33,27 @@ def test_lengths_come_back_as_in_a_slow_reference():
 
 
 def test_pushing_out_of_a_sphere():
-    import trimesh
-
-    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.1)
-    body, faces = (
-        torch.as_tensor(ball.vertices, dtype=torch.float32)[None],
-        torch.as_tensor(ball.faces),
-    )
-    cloth = trimesh.creation.icosphere(subdivisions=3, radius=0.1)
-    x = torch.as_tensor(cloth.vertices, dtype=torch.float32)[None].clone()
+    (body, faces), (x, cloth) = ball(0.1), ball(0.1, 3)
+    body, x = body[None], x[None]
     x[:, ::7] *= 0.95
-    out = pushed_out(x, torch.as_tensor(cloth.faces), body, faces)
+    out = pushed_out(x, cloth, body, faces)
     distance = ClosestSurface(body[0], faces).distances(out, body)
     assert distance.min() > 0.0025 and distance.max() < 0.02
 
 
 def test_pushing_out_finds_deep_vertices_from_their_neighbours():
-    import trimesh
-
-    ball, cloth = (
-        trimesh.creation.icosphere(subdivisions=k, radius=r) for k, r in ((4, 0.1), (5, 0.103))
-    )
-    body, faces = (
-        torch.as_tensor(ball.vertices, dtype=torch.float32)[None],
-        torch.as_tensor(ball.faces),
-    )
-    x = torch.as_tensor(cloth.vertices, dtype=torch.float32)[None]
+    (body, faces), (x, cloth) = ball(0.1), ball(0.103, 5)
+    body, x = body[None], x[None]
     x = x - 0.4 * x * torch.exp(
         -((x / 0.103 - torch.tensor([0, 0, 1.0])).square().sum(-1, keepdim=True) / 0.5**2)
     )
     surface = ClosestSurface(body[0], faces)
     before = surface.distances(x, body)
     assert before.min() < -0.03
-    out = pushed_out(x, torch.as_tensor(cloth.faces), body, faces)
+    out = pushed_out(x, cloth, body, faces)
     assert surface.distances(out, body).min() > 0
     # as when every vertex is asked how deep it is
-    asked = pushed_out(x, torch.as_tensor(cloth.faces), body, faces, reach=DEEPEST)
+    asked = pushed_out(x, cloth, body, faces, reach=DEEPEST)
     assert torch.allclose(asked, out, atol=1e-5)
 
 
@@ -76,7 +61,7 @@ def test_large_faces_are_pushed_out_of_what_passes_between_their_vertices():
     body, faces = ball(0.05)
     x = torch.tensor([[-0.2, -0.2, 0.04], [0.2, -0.2, 0.04], [0.0, 0.2, 0.04]])
     out = pushed_out(x[None], torch.tensor([[0, 1, 2]]), body[None], faces)[0]
-    shares = torch.distributions.Dirichlet(torch.ones(3)).sample((2000,))
+    shares = torch.as_tensor(np.random.default_rng(0).dirichlet(np.ones(3), 2000)).float()
     distance = ClosestSurface(body, faces)
     assert distance(shares @ x, 0.1).distance.min() < -0.009
     assert distance(shares @ out, 0.1).distance.min() > -0.002
