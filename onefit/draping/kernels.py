@@ -17,7 +17,8 @@ def lengths_restored(
     old: wp.array(dtype=wp.vec3),  # work: the vertices a round ago
     pull: wp.array(dtype=wp.vec3),  # work
 ):
-    """Rounds of Jacobi's for the sum of (|e| - length)^2, accelerated by Chebyshev's polynomials.
+    """Iterations of Jacobi's method for the sum of (|e| - length)^2 [m^2], accelerated by
+    Chebyshev's polynomials.
 
     Wang 2015, "A Chebyshev semi-iterative approach for accelerating projective and position-based
     dynamics"; ``radius``: what it takes a round's spectral radius to be.

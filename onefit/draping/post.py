@@ -12,7 +12,7 @@ from onefit.physics.sheet import samples
 from polyfit import mesh
 
 ROUNDS = 12  # of the lengths
-STEP = 0.9  # of Jacobi's: with 1 the corrections of neighbouring edges may add up to too much
+STEP = 0.9  # share of a Jacobi step: with 1, corrections of neighbouring edges may overshoot
 RADIUS = 0.98  # spectral radius of a round, as the acceleration takes it to be
 CLEARANCE = 0.003  # [m] from the body
 PUSHES = 5  # rounds
@@ -36,8 +36,8 @@ def with_lengths(vertices, edges, lengths, rounds=ROUNDS):
     [m].
 
     A network says what cloth does on average, and a mean of folds has shorter edges than cloth: its
-    folds become deeper. A few rounds mend what is wrong over some centimetres, and leave where the
-    cloth hangs.
+    folds become deeper. A few rounds mend errors that span about ten edges, and hardly move the
+    cloth as a whole.
     """
     from . import kernels  # compiled at the first use
 
