@@ -189,6 +189,7 @@ With all rules on (CPU time on one thread, beside other work: compare it within 
 {baseline_table(results, sheets)}
 """
     rules = [s.rule for s in switches if measured(s.rule, rounded)]
+    gone = [rule for rule in gone if measured(rule, rounded)]
     if rules:
         text += f"""
 ## Surfaces of several patches
@@ -196,7 +197,7 @@ With all rules on (CPU time on one thread, beside other work: compare it within 
 The error is that of all vertices, of those that no pixel sees too. The sequences with a number were
 made by `python benchmarks/simulate.py` with that seed, after the rules had their values.
 
-{table(results, rules, rounded)}
+{table(results, rules + gone, rounded)}
 
 {baseline_table(results, rounded)}
 """

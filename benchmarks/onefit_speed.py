@@ -20,10 +20,8 @@ import torch
 
 import onefit
 from onefit.draping.draper import FPS
-from onefit.draping.post import post_processed
 from onefit.network import DEFAULT
 from polyfit.errors import cli
-from polyfit.mesh import edges_of
 
 FRAMES = 90
 
@@ -89,13 +87,11 @@ def main(argv=None):
             x / T for x in timed(lambda: network_alone(draper, garment, motion), args.device)
         ]
         drape = draper.drape(garment, motion, post=False)
-        lengths = garment.rest_lengths(torch.as_tensor(edges_of(drape.faces.numpy())[0]))
+        process = draper.post_processing(garment, drape.rest)
         post = [
             x / T
             for x in timed(
-                lambda: post_processed(
-                    drape.vertices, drape.faces, lengths, drape.body, drape.body_faces
-                ),
+                lambda: process(drape.vertices, drape.body, drape.body_faces, FPS),
                 args.device,
                 3,
             )

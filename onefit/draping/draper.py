@@ -25,7 +25,7 @@ from polyfit import mesh
 from polyfit.errors import InputError
 
 from . import ease
-from .post import post_processed
+from .post import PostProcessing, pull
 
 if TYPE_CHECKING:
     from onefit.body import Body
@@ -86,6 +86,7 @@ class Draper:
         self._patched: dict = {}
         self._codes: dict = {}
         self._ease: dict = {}
+        self._pulls: dict = {}
 
     @cached_property
     def standard(self) -> Body:
@@ -129,8 +130,9 @@ class Draper:
         in each frame of ``motion`` (a :class:`Motion` or a file of one), at 30 frames a second.
         With a shape, the way is scaled by the length of its legs.
 
-        ``post``: post-processing (:func:`onefit.draping.post.post_processed`): edges come back
-        towards their lengths at rest, and vertices are pushed out of the body. ``eased``: with
+        ``post``: post-processing (:class:`onefit.draping.post.PostProcessing`): the cloth keeps
+        its motion, edges come back towards their lengths at rest, and vertices are pushed out of
+        the body. ``eased``: with
         the garment's :meth:`ease`, which costs seconds once, and nothing a frame; without it and
         ``post`` a drape is what the network alone makes. ``skinning_only``: plain skinning of the
         template, what OneFit is held against, without any of these. ``finish``: implicit steps of
@@ -176,9 +178,8 @@ class Draper:
             vertices = torch.cat(parts)
         root = skinning.posed_joints(body, transforms)[:, 0]
         if post and not finish and not skinning_only:
-            edges = torch.as_tensor(mesh.edges_of(garment.faces.cpu().numpy())[0])
-            lengths = garment.rest_lengths(edges, rest.cpu())
-            vertices = post_processed(vertices, garment.faces, lengths, bodies, body.faces)
+            post_processed = self.post_processing(garment, rest)
+            vertices = post_processed(vertices, bodies, body.faces, FPS)
         found = (vertices, garment.faces, rest, bodies, body.faces, root)
         vertices, faces, rest, bodies, body_faces, root = (x.cpu() for x in found)
         if finish:
@@ -196,6 +197,17 @@ class Draper:
         """How firmly each vertex is held at a waistband, (N,)."""
         vertices, faces = garment.vertices.cpu().numpy(), garment.faces.cpu().numpy()
         return waistband.held(vertices, faces, self.standard.joints.numpy())
+
+    def post_processing(self, garment: Garment, rest: torch.Tensor) -> PostProcessing:
+        """The :class:`onefit.draping.post.PostProcessing` of a garment graded to a body, ``rest``
+        (N, 3) [m].
+        """
+        key, vertices = id(garment), garment.vertices.cpu().numpy()
+        if key not in self._pulls:
+            self._pulls[key] = pull(vertices, self.standard, self._held(garment))
+        edges = torch.as_tensor(mesh.edges_of(garment.faces.cpu().numpy())[0])
+        lengths = garment.rest_lengths(edges, rest.cpu())
+        return PostProcessing(rest, garment.faces, lengths, self._pulls[key])
 
     def codes(self, garment: Garment) -> torch.Tensor:
         """Z_T (K, width) of the garment's patches, found once."""

@@ -6,6 +6,22 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.kernel
+def moved(
+    x: wp.array(dtype=wp.vec3),  # where the cloth is drawn to; then where it is
+    before: wp.array(dtype=wp.vec3),  # a step ago
+    was: wp.array(dtype=wp.vec3),  # two steps ago
+    pull: wp.array(dtype=float),
+    kept: float,
+    dt: float,
+):
+    """See :meth:`onefit.draping.post.PostProcessing.move`."""
+    for v in range(x.shape[0]):
+        share = pull[v] * dt * dt
+        ahead = before[v] + kept * (before[v] - was[v])
+        x[v] = (ahead + share * x[v]) / (1.0 + share)
+
+
+@wp.kernel
 def lengths_restored(
     edges: wp.array2d(dtype=int),
     lengths: wp.array(dtype=float),
@@ -18,7 +34,7 @@ def lengths_restored(
     pull: wp.array(dtype=wp.vec3),  # work
 ):
     """Iterations of Jacobi's method for the sum of (|e| - length)^2 [m^2], accelerated by
-    Chebyshev's polynomials.
+    Chebyshev's polynomials; (|e|^2 - length^2) / (|e|^2 + length^2) stands for 1 - length / |e|.
 
     Wang 2015, "A Chebyshev semi-iterative approach for accelerating projective and position-based
     dynamics"; ``radius``: what it takes a round's spectral radius to be.
@@ -32,7 +48,8 @@ def lengths_restored(
         for e in range(edges.shape[0]):
             a, b = edges[e, 0], edges[e, 1]
             edge = x[b] - x[a]
-            p = (1.0 - lengths[e] / wp.max(wp.length(edge), 1.0e-9)) * edge
+            now, rest = wp.length_sq(edge), lengths[e] * lengths[e]
+            p = (now - rest) / (now + rest) * edge
             pull[a] = pull[a] + p
             pull[b] = pull[b] - p
         if turn == 1:
@@ -82,7 +99,7 @@ def pushed_out(
     queue: wp.array(dtype=int),  # work
     known: wp.array(dtype=int),  # work: 1 where a vertex was asked deeply, or moved in a round
 ):
-    """See :func:`onefit.draping.post.pushed_out`."""
+    """See :meth:`onefit.draping.post.PostProcessing.push_out`."""
     count = x.shape[0]
     for turn in range(rounds):
         some = wp.int32(0)
@@ -99,7 +116,9 @@ def pushed_out(
                         queue[last] = v
                         last += 1
             elif wp.length_sq(push[v]) > 0.0:
-                p, d = pushed(body, x[v], deepest, 0.5 * clearance, clearance)
+                # no deeper than it was moved, for before that it was outside, or was to come there
+                far = wp.min(deepest, clearance + 2.0 * wp.length(push[v]))
+                p, d = pushed(body, x[v], far, 0.5 * clearance, clearance)
                 push[v] = p
                 if wp.length_sq(p) > 0.0:
                     some = 1
@@ -132,17 +151,30 @@ def pushed_out(
                         push[corners[s, k]] = p
         if some == 0:
             break
+        last = wp.int32(0)
+        for v in range(count):
+            known[v] = wp.int32(wp.length_sq(push[v]) > 0.0)
+            if known[v] > 0:
+                queue[last] = v
+                last += 1
         if turn < smooth_rounds:
-            for _s in range(smoothing):
-                for v in range(count):
+            for _s in range(smoothing):  # a ring of neighbours more in each
+                inner = last + 0
+                for i in range(inner):
+                    for k in range(start[queue[i]], start[queue[i] + 1]):
+                        if known[other[k]] == 0:
+                            known[other[k]] = 1
+                            queue[last] = other[k]
+                            last += 1
+                for i in range(last):
+                    v = queue[i]
                     mean = wp.vec3(0.0, 0.0, 0.0)
                     for k in range(start[v], start[v + 1]):
                         mean += push[other[k]]
                     mean = mean / wp.max(float(start[v + 1] - start[v]), 1.0)
                     longer = wp.length_sq(push[v]) > wp.length_sq(mean)
                     smooth[v] = wp.where(longer, push[v], mean)
-                for v in range(count):
-                    push[v] = smooth[v]
-        for v in range(count):
-            x[v] = x[v] + push[v]
-            known[v] = wp.int32(wp.length_sq(push[v]) > 0.0)
+                for i in range(last):
+                    push[queue[i]] = smooth[queue[i]]
+        for i in range(last):
+            x[queue[i]] = x[queue[i]] + push[queue[i]]

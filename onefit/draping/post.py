@@ -1,5 +1,8 @@
-"""Post-processing of drapes: edges come back towards their lengths, and vertices are pushed out of
-the body. On the CPU, a frame in one compiled loop.
+"""Post-processing of drapes, frame after frame, on the CPU: the cloth keeps its motion, edges come
+back towards their lengths, and vertices are pushed out of the body.
+
+A network says what cloth does on average. A mean of folds has shorter edges than cloth, and a mean
+of swings is a smaller one.
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -11,7 +14,10 @@ from onefit.body import ClosestSurface
 from onefit.physics.sheet import samples
 from polyfit import mesh
 
-ROUNDS = 12  # of the lengths
+PULL = 60.0  # [1/s^2]: acceleration towards the network's drape, for a unit distance
+KEPT = 0.93  # share of the velocity that the air leaves after 1/30 s
+NEAR = 0.06  # [m] from the body at rest, where skin doubles the pull
+ROUNDS = 14  # of the lengths
 STEP = 0.9  # share of a Jacobi step: with 1, corrections of neighbouring edges may overshoot
 RADIUS = 0.98  # spectral radius of a round, as the acceleration takes it to be
 CLEARANCE = 0.003  # [m] from the body
@@ -23,88 +29,119 @@ SPACING = 0.025  # [m] of the points of faces that are looked at beside the vert
 FACE_DEEPEST = 0.03  # [m], for these
 
 
-def post_processed(vertices, faces, lengths, bodies, body_faces):
-    """Vertices (T, N, 3) [m] after :func:`with_lengths` and :func:`pushed_out`; ``lengths``: at
-    rest, of the edges as :func:`polyfit.mesh.edges_of` has them.
+def pull(vertices, body, held):
+    """How firmly each of a garment's ``vertices`` (N, 3) [m] at rest is drawn to the network's
+    drape, (N,) [1/s^2]: by PULL far from the standard ``body`` (:class:`onefit.Body`), more the
+    nearer it is to the skin, which holds it; wholly where it is ``held`` (N,), 0 to 1.
     """
-    edges = mesh.edges_of(faces.cpu().numpy())[0]
-    return pushed_out(with_lengths(vertices, edges, lengths), faces, bodies, body_faces)
+    surface = ClosestSurface(body.vertices, body.faces)
+    gap = surface(vertices, 10 * NEAR).distance
+    gap = np.maximum(np.asarray(gap, dtype=float), CLEARANCE)
+    return (PULL * (1 + (NEAR / gap) ** 2) + 1e6 * np.asarray(held)).astype(np.float32)
 
 
-def with_lengths(vertices, edges, lengths, rounds=ROUNDS):
-    """Vertices (T, N, 3) [m], moved so that the ``edges`` (E, 2) come nearer to ``lengths`` (E,)
-    [m].
-
-    A network says what cloth does on average, and a mean of folds has shorter edges than cloth: its
-    folds become deeper. A few rounds mend errors that span about ten edges, and hardly move the
-    cloth as a whole.
+class PostProcessing:
+    """Post-processing of one garment with ``faces`` (F, 3): ``rest`` (N, 3) [m] graded to the body,
+    ``lengths`` (E,) [m] at rest, of the edges as :func:`polyfit.mesh.edges_of` has them, ``pull``
+    (N,) [1/s^2] as :func:`pull` says. The methods that take a frame ``x`` (N, 3) float32 [m] change
+    it.
     """
-    from . import kernels  # compiled at the first use
 
-    wp, count = kernels.wp, vertices.shape[1]
-    edges, degree = np.asarray(edges), np.bincount(np.ravel(edges), minlength=count)
-    arguments = [
-        wp.array(edges, dtype=int, ndim=2, device="cpu"),
-        wp.array(np.asarray(lengths), dtype=float, device="cpu"),
-        wp.array(degree, dtype=float, device="cpu"),
-        rounds,
-        STEP,
-        RADIUS,
-    ]
+    def __init__(self, rest, faces, lengths, pull):
+        from . import kernels  # compiled at the first use
 
-    def frames(part):
-        work = [wp.empty(count, dtype=wp.vec3, device="cpu") for _ in range(2)]
-        for x in part:
-            x = wp.from_torch(x, dtype=wp.vec3)
-            wp.launch(kernels.lengths_restored, 1, [*arguments, x, *work], device="cpu")
+        self._kernels, self._wp, count = kernels, kernels.wp, len(rest)
+        rest, faces = rest.cpu().numpy(), faces.cpu().numpy()
+        edges = mesh.edges_of(faces)[0]
+        start, end = np.concatenate([edges, edges[:, ::-1]]).T
+        degree = np.bincount(start, minlength=count)
+        first = np.concatenate([[0], np.cumsum(degree)])
+        self._edges = self._array(edges, int, 2), self._array(np.asarray(lengths), float)
+        self._degree = self._array(degree, float)
+        self._around = [self._array(a, int) for a in (first, end[np.argsort(start, kind="stable")])]
+        corners, weights = _distinct(*samples(rest, faces, SPACING))
+        self._points = self._array(corners, int, 2), self._array(weights, float, 2)
+        self._pull = self._array(np.asarray(pull), float)
+        empty = lambda kind: self._wp.empty(count, dtype=kind, device="cpu")
+        self._work = [empty(self._wp.vec3) for _ in range(2)]
+        self._marks = [empty(self._wp.int32) for _ in range(2)]
 
-    return _in_threads(frames, vertices)
+    def _array(self, values, kind, dimensions=1):
+        return self._wp.array(values, dtype=kind, ndim=dimensions, device="cpu")
 
-
-def pushed_out(vertices, faces, bodies, body_faces, rounds=PUSHES, reach=CLEARANCE):
-    """Vertices (T, N, 3) [m] moved out of the bodies (T, V, 3), to CLEARANCE from them; faces (F,
-    3), body_faces (B, 3).
-
-    The pushes, not the surface, are smoothed over the mesh, so that no fold is lost and none made;
-    what that leaves inside is pushed again, unsmoothed from the third of at most ``rounds`` rounds
-    on. That a vertex is not within ``reach`` [m] of the body's surface is quickly told; only beside
-    those found inside, and among those that were pushed, deeper ones are looked for. Points of the
-    faces, SPACING from each other, push the face's corners.
-    """
-    from . import kernels  # compiled at the first use
-
-    wp, count = kernels.wp, vertices.shape[1]
-    edges = mesh.edges_of(faces.cpu().numpy())[0]
-    start, end = np.concatenate([edges, edges[:, ::-1]]).T
-    first = np.concatenate([[0], np.cumsum(np.bincount(start, minlength=count))])
-    other = end[np.argsort(start, kind="stable")]
-    corners, weights = samples(vertices[0].cpu().numpy(), faces.cpu().numpy(), SPACING)
-    settings = [rounds, SMOOTHED, SMOOTHING, CLEARANCE, reach, DEEPEST, FACE_DEEPEST]
-    arguments = [*(wp.array(a, dtype=int, device="cpu") for a in (first, other))]
-    arguments += [wp.array(corners, dtype=int, ndim=2, device="cpu")]
-    arguments += [wp.array(weights, dtype=float, ndim=2, device="cpu"), *settings]
-
-    def frames(part, bodies):
-        surface = ClosestSurface(bodies[0], body_faces.cpu())
-        work = [
-            wp.empty(count, dtype=t, device="cpu") for t in (wp.vec3, wp.vec3, wp.int32, wp.int32)
+    def _launch(self, kernel, *arguments):
+        arguments = [
+            self._wp.from_torch(a, dtype=self._wp.vec3) if torch.is_tensor(a) else a
+            for a in arguments
         ]
-        for x, body in zip(part, bodies):
-            surface.follow(body)
-            x = wp.from_torch(x, dtype=wp.vec3)
-            arrays = [surface.of_kernels, *arguments, x, *work]
-            wp.launch(kernels.pushed_out, 1, arrays, device="cpu")
+        self._wp.launch(kernel, 1, arguments, device="cpu")
 
-    return _in_threads(frames, vertices, bodies.cpu())
+    def __call__(self, guide, bodies, body_faces, fps):
+        """Vertices (T, N, 3) [m]: ``guide`` (T, N, 3), a network's drape at ``fps`` frames a
+        second, post-processed; ``bodies`` (T, V, 3) [m], ``body_faces`` (B, 3). The motion begins
+        at once, and the cloth is in it.
+        """
+        out = guide.detach().float().cpu().clone()
+        begins = out[min(1, len(out) - 1)] - out[0]
+        frames = self._wp.from_torch(out, dtype=self._wp.vec3)
+        was = before = None
+        for t, surface in enumerate(_followed(bodies.detach().cpu(), body_faces.cpu())):
+            x = frames[t]
+            if t:
+                self.move(x, before, was, 1 / fps)
+            self.restore_lengths(x)
+            self.push_out(x, surface)
+            was, before = before if t else out[0] - begins, x
+        return out.to(guide)
+
+    def move(self, x, before, was, dt):
+        """One step of ``dt`` [s], by the implicit Euler method: the cloth goes on as from ``was``
+        to ``before``, (N, 3) [m], slowed down by the air, and is pulled to where ``x`` has it.
+        """
+        kept = KEPT ** (30 * dt)
+        self._launch(self._kernels.moved, x, before, was, self._pull, kept, dt)
+
+    def restore_lengths(self, x, rounds=ROUNDS):
+        """Edges come nearer to their lengths: errors that span about ten edges are mended, and the
+        cloth as a whole hardly moves.
+        """
+        settings = rounds, STEP, RADIUS
+        self._launch(
+            self._kernels.lengths_restored, *self._edges, self._degree, *settings, x, *self._work
+        )
+
+    def push_out(self, x, surface, rounds=PUSHES, reach=CLEARANCE):
+        """Vertices are pushed to CLEARANCE from the body's ``surface``
+        (:class:`onefit.body.ClosestSurface`).
+
+        The pushes, not the surface, are smoothed over the mesh, so that no fold is lost and none
+        made; what that leaves inside is pushed again, unsmoothed from the third of at most
+        ``rounds`` rounds on. That a vertex is not within ``reach`` [m] of the body is quickly told;
+        only beside those found inside, and among those that were pushed, deeper ones are looked
+        for. Points of the faces, SPACING from each other, push the face's corners.
+        """
+        settings = rounds, SMOOTHED, SMOOTHING, CLEARANCE, reach, DEEPEST, FACE_DEEPEST
+        arrays = *self._around, *self._points, *settings, x, *self._work, *self._marks
+        self._launch(self._kernels.pushed_out, surface.of_kernels, *arrays)
 
 
-def _in_threads(frames, vertices, *more):
-    """A copy of the vertices (T, N, 3), changed by ``frames``: each thread has some of them, with
-    their share of the tensors ``more``.
-    """
-    out = vertices.detach().float().cpu().clone()
-    workers = max(1, min(torch.get_num_threads(), len(out)))
-    parts = zip(*(x.tensor_split(workers) for x in (out, *more)))
-    with ThreadPoolExecutor(workers) as pool:
-        list(pool.map(lambda part: frames(*part), parts))
-    return out.to(vertices)
+def _distinct(corners, weights):
+    """Of points (P, C) those that differ: a point of an edge is one of both its faces."""
+    order = np.argsort(np.where(weights > 0, corners, -1), axis=1)
+    corners, weights = (np.take_along_axis(a, order, axis=1) for a in (corners, weights))
+    key = np.concatenate([np.where(weights > 0, corners, -1), np.rint(1e6 * weights)], axis=1)
+    first = np.unique(key, axis=0, return_index=True)[1]
+    return corners[first], weights[first]
+
+
+def _followed(bodies, faces):
+    """The :class:`onefit.body.ClosestSurface` of each frame; that of the next follows meanwhile."""
+    surfaces = [ClosestSurface(bodies[0], faces) for _ in range(min(2, len(bodies)))]
+    with ThreadPoolExecutor(1) as pool:
+        for t in range(len(bodies)):
+            following = None
+            if t + 1 < len(bodies):
+                following = pool.submit(surfaces[(t + 1) % 2].follow, bodies[t + 1])
+            yield surfaces[t % 2]
+            if following:
+                following.result()

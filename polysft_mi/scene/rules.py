@@ -77,9 +77,6 @@ class Rules:
         8, "", "further passes of the fine stages for a frame that is not explained"
     )
     fine_gain: float = _rule(0.01, "share", "of its cost that a pass must gain for another one")
-    fine_start: float = _rule(
-        1.0, "", "how far beyond the last pass, in its own steps, the next pass starts"
-    )
     explained: float = _rule(0.02, "misfit", "below this misfit a frame counts as explained")
     # starts
     motion_starts: bool = _rule(

@@ -73,20 +73,19 @@ class Descent:
         """All ``stages`` from a start, then the fine ones again while they explain more of a frame
         that is not explained: :class:`Found`.
 
-        Folds come gradually, and too few iterations leave each frame a little further behind. Each
-        further pass starts beyond the last, as far again as that had come. A frame counts as
-        explained up to the misfit that such passes could not lower in a frame before.
+        Folds come gradually, and too few iterations leave each frame a little further behind. A
+        frame counts as explained up to the misfit that such passes could not lower in a frame
+        before.
         """
         rules = self.rules
         best = self._stages(start, context, stages, iterations)
         for count in range(rules.fine_passes):
             if context.is_first or best.misfit <= max(rules.explained, context.explained):
                 break
-            beyond = start.extrapolated(best.state, rules.fine_start)
-            found = self._stages(beyond, context, self.usual[1:], iterations)
+            found = self._stages(best.state, context, self.usual[1:], iterations)
             gain = 1 - found.cost / best.cost
             if gain > 0:
-                start, best = best.state, found
+                best = found
             if gain < rules.fine_gain:
                 return replace(best, more_is_vain=count == 0)
         return best

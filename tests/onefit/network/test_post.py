@@ -1,66 +1,123 @@
-"""Post-processing of drapes, on balls: lengths come back, and nothing is left inside."""
+"""Post-processing of drapes, on balls: cloth keeps its motion, lengths come back, and nothing is
+left inside.
+"""
 
 import numpy as np
+import pytest
 import torch
 from surfaces import ball
 
 from onefit.body import ClosestSurface
-from onefit.draping.post import DEEPEST, RADIUS, STEP, pushed_out, with_lengths
+from onefit.draping import post
+from onefit.draping.post import CLEARANCE, DEEPEST, KEPT, NEAR, PULL, RADIUS, STEP, PostProcessing
 from polyfit.mesh import edges_of
+
+
+def lengths_of(x, faces):
+    """Edges (E, 2) and their lengths (E,)."""
+    edges = edges_of(faces.numpy())[0]
+    return edges, (x[edges[:, 0]] - x[edges[:, 1]]).norm(dim=-1)
+
+
+def processing(x, faces, pull=0.0):
+    return PostProcessing(x, faces, lengths_of(x, faces)[1], np.full(len(x), pull))
+
+
+def pushed_out(x, cloth, body, faces, **settings):
+    """Vertices ``x`` (N, 3) pushed out of a body (V, 3), as :class:`PostProcessing` does."""
+    x = x.clone()
+    processing(x, cloth).push_out(x, ClosestSurface(body, faces), **settings)
+    return x
 
 
 def test_lengths_come_back_as_in_a_slow_reference():
     rng = np.random.default_rng(0)
     x, faces = ball(0.1, 2)
-    edges = edges_of(faces.numpy())[0]
-    lengths = (x[edges[:, 0]] - x[edges[:, 1]]).norm(dim=-1)
-    given = x + torch.as_tensor(rng.normal(size=(3, *x.shape)) * 2e-3).float()
-    found = with_lengths(given, edges, lengths, rounds=6)
+    edges, lengths = lengths_of(x, faces)
     degree = np.bincount(edges.ravel())[:, None]
-    for frame, after in zip(given.double().numpy(), found.numpy()):
-        before, now, ahead = frame, frame, 1.0
-        for turn in range(6):
-            pull = np.zeros_like(now)
-            for (a, b), rest in zip(edges, lengths.numpy()):
-                edge = now[b] - now[a]
-                pull[a] += (1 - rest / np.linalg.norm(edge)) * edge
-                pull[b] -= (1 - rest / np.linalg.norm(edge)) * edge
-            if turn:
-                ahead = 1 / (1 - RADIUS**2 / 2) if turn == 1 else 1 / (1 - RADIUS**2 * ahead / 4)
-            before, now = now, before + ahead * (now + STEP * pull / degree - before)
-        assert np.abs(now - after).max() < 1e-6
-    assert torch.allclose(with_lengths(x[None], edges, lengths)[0], x, atol=1e-6)
+    given = x + torch.as_tensor(rng.normal(size=x.shape) * 2e-3).float()
+    before, now, ahead = given.double().numpy(), given.double().numpy(), 1.0
+    for turn in range(6):
+        pull = np.zeros_like(now)
+        for (a, b), rest in zip(edges, lengths.numpy()):
+            edge = now[b] - now[a]
+            too_long = (edge @ edge - rest**2) / (edge @ edge + rest**2)
+            pull[a] += too_long * edge
+            pull[b] -= too_long * edge
+        if turn:
+            ahead = 1 / (1 - RADIUS**2 / 2) if turn == 1 else 1 / (1 - RADIUS**2 * ahead / 4)
+        before, now = now, before + ahead * (now + STEP * pull / degree - before)
+    process, found, same = processing(x, faces), given.clone(), x.clone()
+    process.restore_lengths(found, rounds=6)
+    assert np.abs(now - found.numpy()).max() < 1e-6
+    process.restore_lengths(same)
+    assert torch.allclose(same, x, atol=1e-6)
+
+
+def test_cloth_keeps_its_motion_and_is_pulled_to_the_drape():
+    x, faces = ball(0.1, 1)
+    before, was = x + 0.01, x
+    free, drawn = (x + 0.5, x + 0.5)
+    free, drawn = free.clone(), drawn.clone()
+    processing(x, faces).move(free, before, was, 1 / 30)
+    assert torch.allclose(free, before + KEPT * 0.01, atol=1e-6)
+    processing(x, faces, pull=200.0).move(drawn, before, was, 1 / 30)
+    acceleration = ((drawn - before) - KEPT * (before - was)) * 900
+    assert torch.allclose(acceleration, 200 * (x + 0.5 - drawn), rtol=1e-3)
+
+
+def test_a_drape_swings_on_and_comes_to_rest():
+    (body, faces), (x, cloth) = ball(0.02), ball(0.1, 2)
+    guide = x[None].repeat(90, 1, 1)
+    guide[:15, :, 0] += torch.linspace(-0.3, 0, 15)[:, None]  # it comes, and stops
+    process = processing(x, cloth, pull=PULL)
+    out = process(guide, body[None].expand(90, -1, -1) - 1, faces, 30.0).mean(1)[:, 0]
+    assert out[14] < -0.02 and out.max() > 0.02  # late, then beyond
+    assert abs(out[-1]) < 0.005
+    firm = processing(x, cloth, pull=1e6)(guide, body[None].expand(90, -1, -1) - 1, faces, 30.0)
+    assert torch.allclose(firm, guide, atol=1e-4)
+
+
+def test_skin_and_waistband_hold_the_cloth():
+    (body, faces), (x, _) = ball(0.1), ball(0.1, 3)
+    where = torch.stack([x[0] * (1 + NEAR / 0.1), x[0] * 9, x[0], x[0] * 1.5])
+    found = post.pull(where.numpy(), Standard(body, faces), np.array([0, 0, 0, 1]))
+    assert found[0] == pytest.approx(2 * PULL, rel=0.05)
+    assert found[1] == pytest.approx(PULL, rel=0.05)
+    assert found[2] == pytest.approx(PULL * (1 + (NEAR / CLEARANCE) ** 2), rel=0.05)
+    assert found[3] > 1e5
+
+
+class Standard:
+    def __init__(self, vertices, faces):
+        self.vertices, self.faces = vertices, faces
 
 
 def test_pushing_out_of_a_sphere():
     (body, faces), (x, cloth) = ball(0.1), ball(0.1, 3)
-    body, x = body[None], x[None]
-    x[:, ::7] *= 0.95
+    x[::7] *= 0.95
     out = pushed_out(x, cloth, body, faces)
-    distance = ClosestSurface(body[0], faces).distances(out, body)
+    distance = ClosestSurface(body, faces)(out, 0.1).distance
     assert distance.min() > 0.0025 and distance.max() < 0.02
 
 
 def test_pushing_out_finds_deep_vertices_from_their_neighbours():
     (body, faces), (x, cloth) = ball(0.1), ball(0.103, 5)
-    body, x = body[None], x[None]
     x = x - 0.4 * x * torch.exp(
         -((x / 0.103 - torch.tensor([0, 0, 1.0])).square().sum(-1, keepdim=True) / 0.5**2)
     )
-    surface = ClosestSurface(body[0], faces)
-    before = surface.distances(x, body)
-    assert before.min() < -0.03
+    surface = ClosestSurface(body, faces)
+    assert surface(x, 0.1).distance.min() < -0.03
     out = pushed_out(x, cloth, body, faces)
-    assert surface.distances(out, body).min() > 0
+    assert surface(out, 0.1).distance.min() > 0
     # as when every vertex is asked how deep it is
-    asked = pushed_out(x, cloth, body, faces, reach=DEEPEST)
-    assert torch.allclose(asked, out, atol=1e-5)
+    assert torch.allclose(pushed_out(x, cloth, body, faces, reach=DEEPEST), out, atol=1e-5)
 
 
 def test_large_faces_are_pushed_out_of_what_passes_between_their_vertices():
     body, faces = ball(0.05)
     x = torch.tensor([[-0.2, -0.2, 0.04], [0.2, -0.2, 0.04], [0.0, 0.2, 0.04]])
-    out = pushed_out(x[None], torch.tensor([[0, 1, 2]]), body[None], faces)[0]
+    out = pushed_out(x, torch.tensor([[0, 1, 2]]), body, faces)
     shares = torch.as_tensor(np.random.default_rng(0).dirichlet(np.ones(3), 2000)).float()
     distance = ClosestSurface(body, faces)
     assert distance(shares @ x, 0.1).distance.min() < -0.009

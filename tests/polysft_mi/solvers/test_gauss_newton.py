@@ -103,26 +103,20 @@ def test_what_is_not_explained_goes_through_the_fine_stages_again(
 ):
     descent, seen = Descent(SecondOrder(problem)), []
 
-    class At(int):
-        def extrapolated(self, other, factor):
-            return self, other, factor
-
     class Pass(Found):
         misfit = cost = property(lambda self: misfits[self.state])
 
     def stage_by_stage(state, context, stages, iterations):
         seen.append((state, stages))
-        return Pass(At(len(seen) - 1), None, {})
+        return Pass(len(seen) - 1, None, {})
 
     monkeypatch.setattr(descent, "_stages", stage_by_stage)
     noise = math.nan if explained is None else 0.0
     context = Context(5, None, noise, Light.unknown(Rules()), {}, explained or 0.0)
     every = descent.far, *descent.usual
-    found = descent.descend(At(-1), context, every)
+    found = descent.descend(-1, context, every)
     assert seen[0] == (-1, every)
-    # from where the last led, and as far again
-    starts = [(k, k + 1, 1.0) for k in range(-1, passes - 2)]
-    assert seen[1:] == [(start, descent.usual[1:]) for start in starts[: passes - 1]]
+    assert seen[1:] == [(k, descent.usual[1:]) for k in range(passes - 1)]
     assert found.state == kept and found.more_is_vain == vain
 
 
