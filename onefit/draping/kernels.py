@@ -5,6 +5,17 @@ from onefit.body.kernels import Surface, closest, wp
 wp.set_module_options({"enable_backward": False})
 
 
+@wp.func
+def neighbour_mean(
+    values: wp.array(dtype=wp.vec3), start: wp.array(dtype=int), other: wp.array(dtype=int), v: int
+):
+    """Of the neighbours of vertex ``v``, which are other[start[v]:start[v + 1]]."""
+    mean = wp.vec3(0.0, 0.0, 0.0)
+    for k in range(start[v], start[v + 1]):
+        mean += values[other[k]]
+    return mean / wp.max(float(start[v + 1] - start[v]), 1.0)
+
+
 @wp.kernel
 def moved(
     x: wp.array(dtype=wp.vec3),  # where the cloth is drawn to; then where it is
@@ -13,12 +24,22 @@ def moved(
     pull: wp.array(dtype=float),
     kept: float,
     dt: float,
+    start: wp.array(dtype=int),
+    other: wp.array(dtype=int),
+    smoothing: int,
+    away: wp.array(dtype=wp.vec3),  # work
+    smooth: wp.array(dtype=wp.vec3),  # work
 ):
     """See :meth:`onefit.draping.post.PostProcessing.move`."""
     for v in range(x.shape[0]):
-        share = pull[v] * dt * dt
-        ahead = before[v] + kept * (before[v] - was[v])
-        x[v] = (ahead + share * x[v]) / (1.0 + share)
+        away[v] = before[v] + kept * (before[v] - was[v]) - x[v]
+    for _s in range(smoothing):
+        for v in range(x.shape[0]):
+            smooth[v] = 0.5 * (away[v] + neighbour_mean(away, start, other, v))
+        for v in range(x.shape[0]):
+            away[v] = smooth[v]
+    for v in range(x.shape[0]):
+        x[v] = x[v] + away[v] / (1.0 + pull[v] * dt * dt)
 
 
 @wp.kernel
@@ -27,7 +48,6 @@ def lengths_restored(
     lengths: wp.array(dtype=float),
     degree: wp.array(dtype=float),  # edges at each vertex
     rounds: int,
-    step: float,
     radius: float,
     x: wp.array(dtype=wp.vec3),
     old: wp.array(dtype=wp.vec3),  # work: the vertices a round ago
@@ -58,7 +78,7 @@ def lengths_restored(
             ahead = 1.0 / (1.0 - 0.25 * radius * radius * ahead)
         for v in range(x.shape[0]):
             here = x[v]
-            x[v] = old[v] + ahead * (here + step / wp.max(degree[v], 1.0) * pull[v] - old[v])
+            x[v] = old[v] + ahead * (here + pull[v] / wp.max(degree[v], 1.0) - old[v])
             old[v] = here
 
 
@@ -168,10 +188,7 @@ def pushed_out(
                             last += 1
                 for i in range(last):
                     v = queue[i]
-                    mean = wp.vec3(0.0, 0.0, 0.0)
-                    for k in range(start[v], start[v + 1]):
-                        mean += push[other[k]]
-                    mean = mean / wp.max(float(start[v + 1] - start[v]), 1.0)
+                    mean = neighbour_mean(push, start, other, v)
                     longer = wp.length_sq(push[v]) > wp.length_sq(mean)
                     smooth[v] = wp.where(longer, push[v], mean)
                 for i in range(last):

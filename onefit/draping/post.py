@@ -16,10 +16,10 @@ from polyfit import mesh
 
 PULL = 60.0  # [1/s^2]: acceleration towards the network's drape, for a unit distance
 KEPT = 0.93  # share of the velocity that the air leaves after 1/30 s
+SWING_SMOOTHING = 2  # times in a frame
 NEAR = 0.06  # [m] from the body at rest, where skin doubles the pull
 ROUNDS = 14  # of the lengths
-STEP = 0.9  # share of a Jacobi step: with 1, corrections of neighbouring edges may overshoot
-RADIUS = 0.98  # spectral radius of a round, as the acceleration takes it to be
+RADIUS = 0.985  # spectral radius of a round, as the acceleration takes it to be
 CLEARANCE = 0.003  # [m] from the body
 PUSHES = 5  # rounds
 SMOOTHED = 2  # of these, whose pushes are smoothed
@@ -96,19 +96,19 @@ class PostProcessing:
 
     def move(self, x, before, was, dt):
         """One step of ``dt`` [s], by the implicit Euler method: the cloth goes on as from ``was``
-        to ``before``, (N, 3) [m], slowed down by the air, and is pulled to where ``x`` has it.
+        to ``before``, (N, 3) [m], slowed down by the air, and is pulled to where ``x`` has it. How
+        far it is from there is smoothed over the mesh: a swing makes no wrinkles.
         """
         kept = KEPT ** (30 * dt)
-        self._launch(self._kernels.moved, x, before, was, self._pull, kept, dt)
+        arrays = self._pull, kept, dt, *self._around, SWING_SMOOTHING, *self._work
+        self._launch(self._kernels.moved, x, before, was, *arrays)
 
     def restore_lengths(self, x, rounds=ROUNDS):
         """Edges come nearer to their lengths: errors that span about ten edges are mended, and the
         cloth as a whole hardly moves.
         """
-        settings = rounds, STEP, RADIUS
-        self._launch(
-            self._kernels.lengths_restored, *self._edges, self._degree, *settings, x, *self._work
-        )
+        arrays = *self._edges, self._degree, rounds, RADIUS, x, *self._work
+        self._launch(self._kernels.lengths_restored, *arrays)
 
     def push_out(self, x, surface, rounds=PUSHES, reach=CLEARANCE):
         """Vertices are pushed to CLEARANCE from the body's ``surface``

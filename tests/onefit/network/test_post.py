@@ -9,7 +9,8 @@ from surfaces import ball
 
 from onefit.body import ClosestSurface
 from onefit.draping import post
-from onefit.draping.post import CLEARANCE, DEEPEST, KEPT, NEAR, PULL, RADIUS, STEP, PostProcessing
+from onefit.draping.post import CLEARANCE, DEEPEST, KEPT, NEAR, PULL, RADIUS, PostProcessing
+from onefit.physics.sheet import samples
 from polyfit.mesh import edges_of
 
 
@@ -46,7 +47,7 @@ def test_lengths_come_back_as_in_a_slow_reference():
             pull[b] -= too_long * edge
         if turn:
             ahead = 1 / (1 - RADIUS**2 / 2) if turn == 1 else 1 / (1 - RADIUS**2 * ahead / 4)
-        before, now = now, before + ahead * (now + STEP * pull / degree - before)
+        before, now = now, before + ahead * (now + pull / degree - before)
     process, found, same = processing(x, faces), given.clone(), x.clone()
     process.restore_lengths(found, rounds=6)
     assert np.abs(now - found.numpy()).max() < 1e-6
@@ -64,6 +65,16 @@ def test_cloth_keeps_its_motion_and_is_pulled_to_the_drape():
     processing(x, faces, pull=200.0).move(drawn, before, was, 1 / 30)
     acceleration = ((drawn - before) - KEPT * (before - was)) * 900
     assert torch.allclose(acceleration, 200 * (x + 0.5 - drawn), rtol=1e-3)
+
+
+def test_a_swing_makes_no_wrinkles_and_a_drape_keeps_its_own():
+    x, faces = ball(0.1, 3)
+    rough = torch.as_tensor(np.random.default_rng(0).normal(size=x.shape) * 1e-3).float()
+    smooth, wrinkled = x.clone(), x + rough
+    processing(x, faces).move(smooth, x + rough, x + rough, 1 / 30)
+    processing(x, faces).move(wrinkled, x + rough, x + rough, 1 / 30)
+    assert (smooth - x).norm() < 0.4 * rough.norm()
+    assert torch.allclose(wrinkled, x + rough, atol=1e-7)
 
 
 def test_a_drape_swings_on_and_comes_to_rest():
@@ -122,3 +133,12 @@ def test_large_faces_are_pushed_out_of_what_passes_between_their_vertices():
     distance = ClosestSurface(body, faces)
     assert distance(shares @ x, 0.1).distance.min() < -0.009
     assert distance(shares @ out, 0.1).distance.min() > -0.002
+
+
+def test_a_point_of_an_edge_is_looked_at_once():
+    x = 0.04 * torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    corners, weights = post._distinct(*samples(x.numpy(), faces, 0.03))
+    points = (weights[..., None] * x.numpy()[corners]).sum(1)
+    known = {tuple(point) for point in np.round(points, 6)}
+    assert len(known) == len(points) and (0.02, 0.02, 0.0) in {tuple(k) for k in known}
