@@ -16,7 +16,7 @@ from onefit.body import ClosestSurface
 from onefit.garment.charts import SparseMatrix
 from onefit.garment.remesh import neighbour_mean
 
-from .post import DEEPEST, SMOOTHING
+from .post import DEEPEST
 
 MOTIONS = (
     "idle",
@@ -34,6 +34,7 @@ CLEAR_SHARE = 0.95  # of those frames in which a vertex is to lie far enough out
 CLEARANCE = (
     0.007  # [m] from the body, where the garment was made with as much and skinning leaves as much
 )
+SMOOTHING = 4  # times
 # [m]; of triangles with a longer side the centre is looked at, too: a limb comes through between
 # their vertices
 LONG_SIDE = 0.035

@@ -16,13 +16,27 @@ def neighbour_mean(
     return mean / wp.max(float(start[v + 1] - start[v]), 1.0)
 
 
+@wp.func
+def stopped(body: Surface, start: wp.vec3, end: wp.vec3, shortest: float, clearance: float):
+    """Where a point that goes straight from ``start`` towards ``end`` is at the end of its way: in
+    front of the body where it would enter it, if the way is not shorter than ``shortest``.
+    """
+    way, place = wp.length(end - start), end
+    if way > shortest:
+        along = (end - start) / way
+        hit = wp.mesh_query_ray(body.mesh, start, along, way)
+        if hit.result and wp.dot(hit.normal, along) < 0.0:
+            place = start + hit.t * along + clearance * hit.normal
+    return place
+
+
 @wp.kernel
 def moved(
     x: wp.array(dtype=wp.vec3),  # where the cloth is drawn to; then where it is
     before: wp.array(dtype=wp.vec3),  # a step ago
     was: wp.array(dtype=wp.vec3),  # two steps ago
     pull: wp.array(dtype=float),
-    kept: float,
+    air: float,
     dt: float,
     start: wp.array(dtype=int),
     other: wp.array(dtype=int),
@@ -32,7 +46,8 @@ def moved(
 ):
     """See :meth:`onefit.draping.post.PostProcessing.move`."""
     for v in range(x.shape[0]):
-        away[v] = before[v] + kept * (before[v] - was[v]) - x[v]
+        way = before[v] - was[v]
+        away[v] = before[v] + way / (1.0 + air * wp.length(way)) - x[v]
     for _s in range(smoothing):
         for v in range(x.shape[0]):
             smooth[v] = 0.5 * (away[v] + neighbour_mean(away, start, other, v))
@@ -100,6 +115,28 @@ def pushed(
 
 
 @wp.kernel
+def looked(
+    body: Surface,
+    first: int,  # vertex
+    thinnest: float,  # limb
+    clearance: float,
+    reach: float,
+    goal: wp.array(dtype=wp.vec3),
+    x: wp.array(dtype=wp.vec3),
+    push: wp.array(dtype=wp.vec3),
+    known: wp.array(dtype=int),  # 1 where a vertex is pushed, 2 where it was inside
+):
+    """The first look of :meth:`onefit.draping.post.PostProcessing.push_out`, at some vertices."""
+    v = first + wp.tid()
+    push[v] = stopped(body, goal[v], x[v], thinnest, clearance) - x[v]
+    known[v] = wp.int32(wp.length_sq(push[v]) > 0.0)
+    if known[v] == 0:
+        p, d = pushed(body, x[v], reach, clearance, clearance)
+        push[v] = p
+        known[v] = wp.int32(wp.length_sq(p) > 0.0) * wp.where(d < 0.0, 2, 1)
+
+
+@wp.kernel
 def pushed_out(
     body: Surface,
     start: wp.array(dtype=int),  # the neighbours of vertex v are other[start[v]:start[v + 1]]
@@ -107,17 +144,15 @@ def pushed_out(
     corners: wp.array2d(dtype=int),  # points of large faces: sum_i weights[p, i] x[corners[p, i]]
     weights: wp.array2d(dtype=float),
     rounds: int,
-    smooth_rounds: int,  # the first of them, whose pushes are smoothed
     smoothing: int,
     clearance: float,
-    reach: float,  # of the first look at every vertex
     deepest: float,
     face_reach: float,
     x: wp.array(dtype=wp.vec3),
-    push: wp.array(dtype=wp.vec3),  # work
+    push: wp.array(dtype=wp.vec3),  # as looked says
+    known: wp.array(dtype=int),  # likewise; then > 0 where a vertex was asked deeply, or moved
     smooth: wp.array(dtype=wp.vec3),  # work
     queue: wp.array(dtype=int),  # work
-    known: wp.array(dtype=int),  # work: 1 where a vertex was asked deeply, or moved in a round
 ):
     """See :meth:`onefit.draping.post.PostProcessing.push_out`."""
     count = x.shape[0]
@@ -126,15 +161,10 @@ def pushed_out(
         last = wp.int32(0)
         for v in range(count):
             if turn == 0:
-                p, d = pushed(body, x[v], reach, clearance, clearance)
-                known[v] = 0
-                push[v] = p
-                if wp.length_sq(p) > 0.0:
-                    known[v] = 1
-                    some = 1
-                    if d < 0.0:
-                        queue[last] = v
-                        last += 1
+                some = wp.max(some, known[v])
+                if known[v] == 2:
+                    queue[last] = v
+                    last += 1
             elif wp.length_sq(push[v]) > 0.0:
                 # no deeper than it was moved, for before that it was outside, or was to come there
                 far = wp.min(deepest, clearance + 2.0 * wp.length(push[v]))
@@ -177,7 +207,7 @@ def pushed_out(
             if known[v] > 0:
                 queue[last] = v
                 last += 1
-        if turn < smooth_rounds:
+        if turn == 0:
             for _s in range(smoothing):  # a ring of neighbours more in each
                 inner = last + 0
                 for i in range(inner):

@@ -15,15 +15,15 @@ from onefit.physics.sheet import samples
 from polyfit import mesh
 
 PULL = 60.0  # [1/s^2]: acceleration towards the network's drape, for a unit distance
-KEPT = 0.93  # share of the velocity that the air leaves after 1/30 s
+AIR = 4.0  # [1/m]: its drag on cotton, 1.2 kg/m^3 over twice 0.15 kg/m^2, times velocity squared
 SWING_SMOOTHING = 2  # times in a frame
 NEAR = 0.06  # [m] from the body at rest, where skin doubles the pull
 ROUNDS = 14  # of the lengths
 RADIUS = 0.985  # spectral radius of a round, as the acceleration takes it to be
 CLEARANCE = 0.003  # [m] from the body
 PUSHES = 5  # rounds
-SMOOTHED = 2  # of these, whose pushes are smoothed
-SMOOTHING = 4  # times
+THINNEST = 0.02  # [m], of limbs: cloth that is no farther from the drape has not passed through one
+SMOOTHING = 6  # times, of the pushes of the first round
 DEEPEST = 0.08  # [m]; vertices deeper in the body than this stay there
 SPACING = 0.025  # [m] of the points of faces that are looked at beside the vertices
 FACE_DEEPEST = 0.03  # [m], for these
@@ -43,18 +43,19 @@ def pull(vertices, body, held):
 class PostProcessing:
     """Post-processing of one garment with ``faces`` (F, 3): ``rest`` (N, 3) [m] graded to the body,
     ``lengths`` (E,) [m] at rest, of the edges as :func:`polyfit.mesh.edges_of` has them, ``pull``
-    (N,) [1/s^2] as :func:`pull` says. The methods that take a frame ``x`` (N, 3) float32 [m] change
-    it.
+    (N,) [1/s^2] as :func:`pull` says. The methods change a frame ``x`` (N, 3) float32 [m];
+    ``surface`` is the body's, a :class:`onefit.body.ClosestSurface`.
     """
 
     def __init__(self, rest, faces, lengths, pull):
         from . import kernels  # compiled at the first use
 
-        self._kernels, self._wp, count = kernels, kernels.wp, len(rest)
+        self._kernels, self._wp, self._count = kernels, kernels.wp, len(rest)
+        self._pool = ThreadPoolExecutor(1)  # a second thread
         rest, faces = rest.cpu().numpy(), faces.cpu().numpy()
         edges = mesh.edges_of(faces)[0]
         start, end = np.concatenate([edges, edges[:, ::-1]]).T
-        degree = np.bincount(start, minlength=count)
+        degree = np.bincount(start, minlength=self._count)
         first = np.concatenate([[0], np.cumsum(degree)])
         self._edges = self._array(edges, int, 2), self._array(np.asarray(lengths), float)
         self._degree = self._array(degree, float)
@@ -62,19 +63,19 @@ class PostProcessing:
         corners, weights = _distinct(*samples(rest, faces, SPACING))
         self._points = self._array(corners, int, 2), self._array(weights, float, 2)
         self._pull = self._array(np.asarray(pull), float)
-        empty = lambda kind: self._wp.empty(count, dtype=kind, device="cpu")
+        empty = lambda kind: self._wp.empty(self._count, dtype=kind, device="cpu")
         self._work = [empty(self._wp.vec3) for _ in range(2)]
-        self._marks = [empty(self._wp.int32) for _ in range(2)]
+        self._known, self._queue = (empty(self._wp.int32) for _ in range(2))
 
     def _array(self, values, kind, dimensions=1):
         return self._wp.array(values, dtype=kind, ndim=dimensions, device="cpu")
 
-    def _launch(self, kernel, *arguments):
+    def _launch(self, kernel, *arguments, count=1):
         arguments = [
             self._wp.from_torch(a, dtype=self._wp.vec3) if torch.is_tensor(a) else a
             for a in arguments
         ]
-        self._wp.launch(kernel, 1, arguments, device="cpu")
+        self._wp.launch(kernel, count, arguments, device="cpu")
 
     def __call__(self, guide, bodies, body_faces, fps):
         """Vertices (T, N, 3) [m]: ``guide`` (T, N, 3), a network's drape at ``fps`` frames a
@@ -83,14 +84,15 @@ class PostProcessing:
         """
         out = guide.detach().float().cpu().clone()
         begins = out[min(1, len(out) - 1)] - out[0]
+        goals = self._wp.from_torch(out.clone(), dtype=self._wp.vec3)
         frames = self._wp.from_torch(out, dtype=self._wp.vec3)
         was = before = None
-        for t, surface in enumerate(_followed(bodies.detach().cpu(), body_faces.cpu())):
+        for t, surface in enumerate(self._followed(bodies.detach().cpu(), body_faces.cpu())):
             x = frames[t]
             if t:
                 self.move(x, before, was, 1 / fps)
             self.restore_lengths(x)
-            self.push_out(x, surface)
+            self.push_out(x, goals[t], surface)
             was, before = before if t else out[0] - begins, x
         return out.to(guide)
 
@@ -99,8 +101,7 @@ class PostProcessing:
         to ``before``, (N, 3) [m], slowed down by the air, and is pulled to where ``x`` has it. How
         far it is from there is smoothed over the mesh: a swing makes no wrinkles.
         """
-        kept = KEPT ** (30 * dt)
-        arrays = self._pull, kept, dt, *self._around, SWING_SMOOTHING, *self._work
+        arrays = self._pull, AIR, dt, *self._around, SWING_SMOOTHING, *self._work
         self._launch(self._kernels.moved, x, before, was, *arrays)
 
     def restore_lengths(self, x, rounds=ROUNDS):
@@ -110,19 +111,43 @@ class PostProcessing:
         arrays = *self._edges, self._degree, rounds, RADIUS, x, *self._work
         self._launch(self._kernels.lengths_restored, *arrays)
 
-    def push_out(self, x, surface, rounds=PUSHES, reach=CLEARANCE):
-        """Vertices are pushed to CLEARANCE from the body's ``surface``
-        (:class:`onefit.body.ClosestSurface`).
+    def push_out(self, x, goal, surface, rounds=PUSHES, reach=CLEARANCE):
+        """Vertices are pushed to CLEARANCE from the body's ``surface``.
 
-        The pushes, not the surface, are smoothed over the mesh, so that no fold is lost and none
-        made; what that leaves inside is pushed again, unsmoothed from the third of at most
-        ``rounds`` rounds on. That a vertex is not within ``reach`` [m] of the body is quickly told;
+        Where the body lies between the network's drape, ``goal`` (N, 3) [m], and the cloth, the
+        cloth comes to the body's near side: a knee that rises fast takes it along. All else goes
+        the shortest way. The pushes, not the surface, are smoothed over the mesh, so that no fold
+        is lost and none made. What that leaves inside is pushed again, unsmoothed, in at most
+        ``rounds`` rounds. That a vertex is not within ``reach`` [m] of the body is quickly told;
         only beside those found inside, and among those that were pushed, deeper ones are looked
         for. Points of the faces, SPACING from each other, push the face's corners.
         """
-        settings = rounds, SMOOTHED, SMOOTHING, CLEARANCE, reach, DEEPEST, FACE_DEEPEST
-        arrays = *self._around, *self._points, *settings, x, *self._work, *self._marks
+        push, smooth = self._work
+
+        def look(first, last):
+            settings = first, THINNEST, CLEARANCE, reach, goal, x, push, self._known
+            self._launch(self._kernels.looked, surface.of_kernels, *settings, count=last - first)
+
+        half = self._count // 2
+        other = self._pool.submit(look, 0, half)
+        look(half, self._count)
+        other.result()
+        settings = rounds, SMOOTHING, CLEARANCE, DEEPEST, FACE_DEEPEST
+        arrays = *self._around, *self._points, *settings, x, push, self._known, smooth, self._queue
         self._launch(self._kernels.pushed_out, surface.of_kernels, *arrays)
+
+    def _followed(self, bodies, faces):
+        """The :class:`onefit.body.ClosestSurface` of each frame; that of the next follows
+        meanwhile.
+        """
+        surfaces = [ClosestSurface(bodies[0], faces) for _ in range(min(2, len(bodies)))]
+        following = None
+        for t in range(len(bodies)):
+            if following:
+                following.result()
+            if t + 1 < len(bodies):
+                following = self._pool.submit(surfaces[(t + 1) % 2].follow, bodies[t + 1])
+            yield surfaces[t % 2]
 
 
 def _distinct(corners, weights):
@@ -132,16 +157,3 @@ def _distinct(corners, weights):
     key = np.concatenate([np.where(weights > 0, corners, -1), np.rint(1e6 * weights)], axis=1)
     first = np.unique(key, axis=0, return_index=True)[1]
     return corners[first], weights[first]
-
-
-def _followed(bodies, faces):
-    """The :class:`onefit.body.ClosestSurface` of each frame; that of the next follows meanwhile."""
-    surfaces = [ClosestSurface(bodies[0], faces) for _ in range(min(2, len(bodies)))]
-    with ThreadPoolExecutor(1) as pool:
-        for t in range(len(bodies)):
-            following = None
-            if t + 1 < len(bodies):
-                following = pool.submit(surfaces[(t + 1) % 2].follow, bodies[t + 1])
-            yield surfaces[t % 2]
-            if following:
-                following.result()
