@@ -88,10 +88,11 @@ def main(argv=None):
         ]
         drape = draper.drape(garment, motion, post=False)
         process = draper.post_processing(garment, drape.rest)
+        surfaces = draper.surfaces(draper.standard)
         post = [
             x / T
             for x in timed(
-                lambda: process(drape.vertices, drape.body, drape.body_faces, FPS),
+                lambda: process(drape.vertices, drape.body, surfaces, FPS),
                 args.device,
                 3,
             )

@@ -87,6 +87,7 @@ class Draper:
         self._codes: dict = {}
         self._ease: dict = {}
         self._pulls: dict = {}
+        self._surfaces: tuple = ()
 
     @cached_property
     def standard(self) -> Body:
@@ -179,7 +180,7 @@ class Draper:
         root = skinning.posed_joints(body, transforms)[:, 0]
         if post and not finish and not skinning_only:
             post_processed = self.post_processing(garment, rest)
-            vertices = post_processed(vertices, bodies, body.faces, FPS)
+            vertices = post_processed(vertices, bodies, self.surfaces(body), FPS)
         found = (vertices, garment.faces, rest, bodies, body.faces, root)
         vertices, faces, rest, bodies, body_faces, root = (x.cpu() for x in found)
         if finish:
@@ -205,9 +206,16 @@ class Draper:
         key, vertices = id(garment), garment.vertices.cpu().numpy()
         if key not in self._pulls:
             self._pulls[key] = pull(vertices, self.standard, self._held(garment))
-        edges = torch.as_tensor(mesh.edges_of(garment.faces.cpu().numpy())[0])
-        lengths = garment.rest_lengths(edges, rest.cpu())
-        return PostProcessing(rest, garment.faces, lengths, self._pulls[key])
+        edges = mesh.edges_of(garment.faces.cpu().numpy())[0]
+        lengths = garment.rest_lengths(torch.as_tensor(edges), rest.cpu())
+        return PostProcessing(rest, garment.faces, edges, lengths, self._pulls[key])
+
+    def surfaces(self, body: Body) -> tuple[ClosestSurface, ClosestSurface]:
+        """Two surfaces of the body model on the CPU, made once, that follow its bodies in turn."""
+        if not self._surfaces:
+            vertices, faces = body.vertices.cpu(), body.faces.cpu()
+            self._surfaces = ClosestSurface(vertices, faces), ClosestSurface(vertices, faces)
+        return self._surfaces
 
     def codes(self, garment: Garment) -> torch.Tensor:
         """Z_T (K, width) of the garment's patches, found once."""

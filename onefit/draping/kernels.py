@@ -165,7 +165,9 @@ def pushed_out(
                 if known[v] == 2:
                     queue[last] = v
                     last += 1
-            elif wp.length_sq(push[v]) > 0.0:
+            elif wp.length(push[v]) < 0.02 * clearance:  # too little to matter
+                push[v] = wp.vec3(0.0, 0.0, 0.0)
+            else:
                 # no deeper than it was moved, for before that it was outside, or was to come there
                 far = wp.min(deepest, clearance + 2.0 * wp.length(push[v]))
                 p, d = pushed(body, x[v], far, 0.5 * clearance, clearance)

@@ -12,7 +12,6 @@ import torch
 
 from onefit.body import ClosestSurface
 from onefit.physics.sheet import samples
-from polyfit import mesh
 
 PULL = 60.0  # [1/s^2]: acceleration towards the network's drape, for a unit distance
 AIR = 4.0  # [1/m]: its drag on cotton, 1.2 kg/m^3 over twice 0.15 kg/m^2, times velocity squared
@@ -42,18 +41,17 @@ def pull(vertices, body, held):
 
 class PostProcessing:
     """Post-processing of one garment with ``faces`` (F, 3): ``rest`` (N, 3) [m] graded to the body,
-    ``lengths`` (E,) [m] at rest, of the edges as :func:`polyfit.mesh.edges_of` has them, ``pull``
-    (N,) [1/s^2] as :func:`pull` says. The methods change a frame ``x`` (N, 3) float32 [m];
+    ``lengths`` (E,) [m] at rest of its ``edges`` (E, 2), ``pull`` (N,) [1/s^2] as :func:`pull`
+    says. The methods change a frame ``x`` (N, 3) float32 [m];
     ``surface`` is the body's, a :class:`onefit.body.ClosestSurface`.
     """
 
-    def __init__(self, rest, faces, lengths, pull):
+    def __init__(self, rest, faces, edges, lengths, pull):
         from . import kernels  # compiled at the first use
 
         self._kernels, self._wp, self._count = kernels, kernels.wp, len(rest)
         self._pool = ThreadPoolExecutor(1)  # a second thread
         rest, faces = rest.cpu().numpy(), faces.cpu().numpy()
-        edges = mesh.edges_of(faces)[0]
         start, end = np.concatenate([edges, edges[:, ::-1]]).T
         degree = np.bincount(start, minlength=self._count)
         first = np.concatenate([[0], np.cumsum(degree)])
@@ -77,17 +75,17 @@ class PostProcessing:
         ]
         self._wp.launch(kernel, count, arguments, device="cpu")
 
-    def __call__(self, guide, bodies, body_faces, fps):
+    def __call__(self, guide, bodies, surfaces, fps):
         """Vertices (T, N, 3) [m]: ``guide`` (T, N, 3), a network's drape at ``fps`` frames a
-        second, post-processed; ``bodies`` (T, V, 3) [m], ``body_faces`` (B, 3). The motion begins
-        at once, and the cloth is in it.
+        second, post-processed; ``bodies`` (T, V, 3) [m], which the two ``surfaces`` will follow in
+        turn. The motion begins at once, and the cloth is in it.
         """
         out = guide.detach().float().cpu().clone()
         begins = out[min(1, len(out) - 1)] - out[0]
         goals = self._wp.from_torch(out.clone(), dtype=self._wp.vec3)
         frames = self._wp.from_torch(out, dtype=self._wp.vec3)
         was = before = None
-        for t, surface in enumerate(self._followed(bodies.detach().cpu(), body_faces.cpu())):
+        for t, surface in enumerate(self._followed(surfaces, bodies.detach().cpu())):
             x = frames[t]
             if t:
                 self.move(x, before, was, 1 / fps)
@@ -136,17 +134,14 @@ class PostProcessing:
         arrays = *self._around, *self._points, *settings, x, push, self._known, smooth, self._queue
         self._launch(self._kernels.pushed_out, surface.of_kernels, *arrays)
 
-    def _followed(self, bodies, faces):
-        """The :class:`onefit.body.ClosestSurface` of each frame; that of the next follows
-        meanwhile.
-        """
-        surfaces = [ClosestSurface(bodies[0], faces) for _ in range(min(2, len(bodies)))]
-        following = None
+    def _followed(self, surfaces, bodies):
+        """The surface of each frame; that of the next follows meanwhile."""
+        follow = lambda t: self._pool.submit(surfaces[t % 2].follow, bodies[t])
+        following = follow(0)
         for t in range(len(bodies)):
-            if following:
-                following.result()
+            following.result()
             if t + 1 < len(bodies):
-                following = self._pool.submit(surfaces[(t + 1) % 2].follow, bodies[t + 1])
+                following = follow(t + 1)
             yield surfaces[t % 2]
 
 

@@ -21,7 +21,7 @@ def lengths_of(x, faces):
 
 
 def processing(x, faces, pull=0.0):
-    return PostProcessing(x, faces, lengths_of(x, faces)[1], np.full(len(x), pull))
+    return PostProcessing(x, faces, *lengths_of(x, faces), np.full(len(x), pull))
 
 
 def pushed_out(x, cloth, body, faces, **settings):
@@ -95,10 +95,12 @@ def test_a_drape_swings_on_and_comes_to_rest():
     guide = x[None].repeat(90, 1, 1)
     guide[:15, :, 0] += torch.linspace(-0.3, 0, 15)[:, None]  # it comes, and stops
     process = processing(x, cloth, pull=PULL)
-    out = process(guide, body[None].expand(90, -1, -1) - 1, faces, 30.0).mean(1)[:, 0]
+    surfaces = [ClosestSurface(body - 1, faces) for _ in range(2)]  # far away
+    bodies = body[None].expand(90, -1, -1) - 1
+    out = process(guide, bodies, surfaces, 30.0).mean(1)[:, 0]
     assert out[14] < -0.02 and out.max() > 0.02  # late, then beyond
     assert abs(out[-1]) < 0.005
-    firm = processing(x, cloth, pull=1e6)(guide, body[None].expand(90, -1, -1) - 1, faces, 30.0)
+    firm = processing(x, cloth, pull=1e6)(guide, bodies, surfaces, 30.0)
     assert torch.allclose(firm, guide, atol=1e-4)
 
 
