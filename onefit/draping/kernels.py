@@ -36,7 +36,7 @@ def moved(
     before: wp.array(dtype=wp.vec3),  # a step ago
     was: wp.array(dtype=wp.vec3),  # two steps ago
     pull: wp.array(dtype=float),
-    air: float,
+    drag: float,
     dt: float,
     start: wp.array(dtype=int),
     other: wp.array(dtype=int),
@@ -47,7 +47,7 @@ def moved(
     """See :meth:`onefit.draping.post.PostProcessing.move`."""
     for v in range(x.shape[0]):
         way = before[v] - was[v]
-        away[v] = before[v] + way / (1.0 + air * wp.length(way)) - x[v]
+        away[v] = before[v] + way / (1.0 + drag * wp.length(way)) - x[v]
     for _s in range(smoothing):
         for v in range(x.shape[0]):
             smooth[v] = 0.5 * (away[v] + neighbour_mean(away, start, other, v))
@@ -115,7 +115,7 @@ def pushed(
 
 
 @wp.kernel
-def looked(
+def first_look(
     body: Surface,
     first: int,  # vertex
     thinnest: float,  # limb
@@ -149,7 +149,7 @@ def pushed_out(
     deepest: float,
     face_reach: float,
     x: wp.array(dtype=wp.vec3),
-    push: wp.array(dtype=wp.vec3),  # as looked says
+    push: wp.array(dtype=wp.vec3),  # as first_look says
     known: wp.array(dtype=int),  # likewise; then > 0 where a vertex was asked deeply, or moved
     smooth: wp.array(dtype=wp.vec3),  # work
     queue: wp.array(dtype=int),  # work

@@ -14,7 +14,7 @@ from onefit.body import ClosestSurface
 from onefit.physics.sheet import samples
 
 PULL = 60.0  # [1/s^2]: acceleration towards the network's drape, for a unit distance
-AIR = 4.0  # [1/m]: its drag on cotton, 1.2 kg/m^3 over twice 0.15 kg/m^2, times velocity squared
+DRAG = 4.0  # [1/m] of the air on cotton, 1.2 kg/m^3 over twice 0.15 kg/m^2, times velocity squared
 SWING_SMOOTHING = 2  # times in a frame
 NEAR = 0.06  # [m] from the body at rest, where skin doubles the pull
 ROUNDS = 14  # of the lengths
@@ -99,7 +99,7 @@ class PostProcessing:
         to ``before``, (N, 3) [m], slowed down by the air, and is pulled to where ``x`` has it. How
         far it is from there is smoothed over the mesh: a swing makes no wrinkles.
         """
-        arrays = self._pull, AIR, dt, *self._around, SWING_SMOOTHING, *self._work
+        arrays = self._pull, DRAG, dt, *self._around, SWING_SMOOTHING, *self._work
         self._launch(self._kernels.moved, x, before, was, *arrays)
 
     def restore_lengths(self, x, rounds=ROUNDS):
@@ -124,7 +124,9 @@ class PostProcessing:
 
         def look(first, last):
             settings = first, THINNEST, CLEARANCE, reach, goal, x, push, self._known
-            self._launch(self._kernels.looked, surface.of_kernels, *settings, count=last - first)
+            self._launch(
+                self._kernels.first_look, surface.of_kernels, *settings, count=last - first
+            )
 
         half = self._count // 2
         other = self._pool.submit(look, 0, half)

@@ -190,14 +190,15 @@ def at_vertices(tables, table, figures, vertices, camera, numbers, silhouette):
 
     def slope(entry):
         face = entry // 3
-        return three(face * _WIDTH + CURVATURES + 3 * (entry - 3 * face))
+        return three_floats(face * _WIDTH + CURVATURES + 3 * (entry - 3 * face))
 
-    def three(first):
+    def three_floats(first):
         return [mi.Float64(dr.gather(mi.Float, table, first + k)) for k in range(3)]
 
     gradient = [weight * x for x in add(tables.corner_start, tables.corner, slope, 3)]
     xx, xy, yy = (
-        weight * scale * scale * x for x in add(tables.share_start, tables.curvature, three, 3)
+        weight * scale * scale * x
+        for x in add(tables.share_start, tables.curvature, three_floats, 3)
     )
     second = [xx, xy, xy, yy]
     if silhouette is not None:

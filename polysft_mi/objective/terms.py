@@ -23,6 +23,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from polysft_mi.images.pyramid import POOL
+
 _INTERIOR = 0.999  # alpha above which a pixel counts as filled by the surface
 
 
@@ -119,18 +121,15 @@ def blur(image, sigma):
     return dr.convolve(dr.convolve(image, taps, axis=0), taps, axis=1)
 
 
-_POOL = 4  # local statistics are taken on an image this many times smaller
-
-
 def _smooth(image, sigma):
     """A wide Gaussian blur (H, W, C) for slowly varying statistics: shrink, blur, enlarge;
     differentiable.
     """
     height, width, channels = image.shape
     small = dr.resample(
-        image, (max(1, height // _POOL), max(1, width // _POOL), channels), filter="box"
+        image, (max(1, height // POOL), max(1, width // POOL), channels), filter="box"
     )
-    return dr.resample(blur(small, sigma / _POOL), image.shape, filter="linear")
+    return dr.resample(blur(small, sigma / POOL), image.shape, filter="linear")
 
 
 def normalise_locally(image, weight, sigma=8.0, floor=0.02):

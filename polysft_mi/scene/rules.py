@@ -11,13 +11,15 @@ import math
 from dataclasses import dataclass, field
 
 
-def _rule(default, unit, doc):
-    return field(default=default, metadata={"unit": unit, "doc": doc})
+def _rule(default, unit, doc, row=""):
+    """A field; ``row``: of docs/ablation.md, where it is switched off."""
+    return field(default=default, metadata={"unit": unit, "doc": doc, "row": row})
 
 
 @dataclass(frozen=True)
 class Rules:
-    """Every number that the tracker decides by. The metadata of a field holds its unit and meaning.
+    """Every number that the tracker decides by. The metadata of a field holds its unit, what it
+    does, and the row of docs/ablation.md that says what it is worth.
 
     A "share" is a fraction of one. A field without a unit is a factor, a count, or a switch.
     """
@@ -41,20 +43,31 @@ class Rules:
         1.0,
         "",
         "weight of the squared distances of overlapping patches, over the template's radius",
+        row="joints",
     )
     unseen: float = _rule(
-        10.0, "", "factor of the weights of smoothness where no pixel sees such a surface"
+        10.0,
+        "",
+        "factor of the weights of smoothness where no pixel sees such a surface",
+        row="unseen parts are held",
     )
     rounded_stiffness: float = _rule(
         0.3,
         "",
         "factor of `k_mi` there: a sheet bends and keeps its lengths, a closed surface cannot",
+        row="softer lengths",
     )
     rounded_silhouette: float = _rule(
-        10.0, "", "factor of `k_silhouette` there: the outline shows a bend that no texture shows"
+        10.0,
+        "",
+        "factor of `k_silhouette` there: the outline shows a bend that no texture shows",
+        row="firmer outline",
     )
     rounded_relief: float = _rule(
-        0.1, "", "factor of `k_relief` there: the jets leave more of a bend to the relief"
+        0.1,
+        "",
+        "factor of `k_relief` there: the jets leave more of a bend to the relief",
+        row="softer relief",
     )
     # how sure a vertex is
     sigma_strain: float = _rule(
@@ -63,7 +76,10 @@ class Rules:
     sigma_unseen: float = _rule(3.3, "", "factor of sigma where no pixel sees the vertex")
     # the step
     small_step: float = _rule(
-        2e-3, "share", "of the objective that a step must promise for another one to follow"
+        2e-3,
+        "share",
+        "of the objective that a step must promise for another one to follow",
+        row="small step ends a stage",
     )
     damping: tuple = _rule(
         (1e-4, 3e-3), "", "Levenberg-Marquardt damping at a stage's start, without and with relief"
@@ -71,38 +87,60 @@ class Rules:
     first_scale: float = _rule(
         0.3, "deviations", "robust scale of the first frame's residuals, in local deviations"
     )
-    scale_bounds: tuple = _rule((0.2, 1.0), "deviations", "bounds of the robust scale")
+    scale_bounds: tuple = _rule(
+        (0.2, 1.0), "deviations", "bounds of the robust scale", row="robust scale"
+    )
     # frames that the stages do not explain
     fine_passes: int = _rule(
-        8, "", "further passes of the fine stages for a frame that is not explained"
+        8,
+        "",
+        "further passes of the fine stages for a frame that is not explained",
+        row="fine passes",
     )
     fine_gain: float = _rule(0.01, "share", "of its cost that a pass must gain for another one")
     explained: float = _rule(0.02, "misfit", "below this misfit a frame counts as explained")
     # starts
     motion_starts: bool = _rule(
-        True, "", "whether a frame may start where the motion of the two before leads"
+        True,
+        "",
+        "whether a frame may start where the motion of the two before leads",
+        row="motion starts",
     )
     suspect_factor: float = _rule(
         1.25, "", "a frame is suspect whose misfit exceeds the noise by so many times the usual"
     )
-    suspect_margin: float = _rule(0.03, "misfit", "and by this much more")
+    suspect_margin: float = _rule(0.03, "misfit", "and by this much more", row="other starts")
     suspect_memory: int = _rule(5, "frames", "over which the usual misfit is a median")
-    far_iterations: int = _rule(18, "", "iterations a stage when a suspect frame is started anew")
+    far_iterations: int = _rule(
+        18,
+        "",
+        "iterations a stage when a suspect frame is started anew",
+        row="more iterations there",
+    )
     # the relief, and caution with noise
     relief_vertices: int = _rule(
         3000, "vertices", "of the template, above which there is no relief: it costs too much time"
     )
     relief: float = _rule(1.0, "share", "of `k_relief`")
-    relief_bend: float = _rule(3e-3, "share", "of the relief's weight, for its bending")
+    relief_bend: float = _rule(
+        3e-3, "share", "of the relief's weight, for its bending", row="relief's bending"
+    )
     noise_misfit: float = _rule(
         0.05, "misfit", "of noise, at which the relief's weight and `give` have doubled"
     )
     noise_power: float = _rule(8.0, "", "with which they grow with the noise")
     noise_most: float = _rule(1e3, "", "factor by which the relief's weight grows at most")
-    relief_caution: bool = _rule(True, "", "whether the relief's weight grows with noise")
-    strain_caution: bool = _rule(True, "", "whether `give` grows with noise")
+    relief_caution: bool = _rule(
+        True, "", "whether the relief's weight grows with noise", row="relief's caution"
+    )
+    strain_caution: bool = _rule(
+        True, "", "whether `give` grows with noise", row="strain's caution"
+    )
     give: float = _rule(
-        0.002, "strain", "from which on a stretched edge hardly pulls harder (Charbonnier)"
+        0.002,
+        "strain",
+        "from which on a stretched edge hardly pulls harder (Charbonnier)",
+        row="edges give",
     )
     # the texture
     texels: float = _rule(1.5, "texels", "of the baked texture to a pixel of the first frame")
@@ -114,7 +152,10 @@ class Rules:
         0.08, "chart units", "farthest that the texture may move, for it to be taken"
     )
     appearance: bool = _rule(
-        True, "", "whether the sheet's own image takes the place of its blurred texture"
+        True,
+        "",
+        "whether the sheet's own image takes the place of its blurred texture",
+        row="appearance",
     )
     border: float = _rule(
         2.0, "windows", "from the sheet's border where images without masks are not corrected so"
@@ -132,13 +173,17 @@ class Rules:
         "share",
         "of a triangle's surroundings that must be texture, with and without masks",
     )
-    exposure: bool = _rule(True, "", "whether a frame's overall brightness is its own")
+    exposure: bool = _rule(
+        True, "", "whether a frame's overall brightness is its own", row="exposure"
+    )
     light_ridge: float = _rule(
         3e-3, "observations", "a triangle, that hold the light to be the same from all sides"
     )
     light_dimmest: float = _rule(0.1, "share", "of the ambient light that a triangle has at least")
     light_refits: int = _rule(3, "", "of a frame's robust regression")
-    light_kept: float = _rule(0.8, "share", "of what earlier frames say of light, a frame later")
+    light_kept: float = _rule(
+        0.8, "share", "of what earlier frames say of light, a frame later", row="light's memory"
+    )
     light_scale: float = _rule(8.0, "deviations", "at which a triangle's residual is an outlier")
     light_first_scale: float = _rule(0.05, "share", "of the mean luminance, before any is known")
     light_scale_bounds: tuple = _rule((0.005, 0.05), "share", "bounds of that scale, likewise")
@@ -162,12 +207,15 @@ class Rules:
 
 def table():
     """All rules as a Markdown table."""
-    rows = ["| rule | value | unit | meaning |", "|---|---|---|---|"]
+    rows = ["| rule | value | unit | meaning | ablation |", "|---|---|---|---|---|"]
     for f in dataclasses.fields(Rules):
         value = (
             ", ".join(f"{x:g}" for x in f.default) if isinstance(f.default, tuple) else f.default
         )
-        rows.append(f"| `{f.name}` | {value} | {f.metadata['unit']} | {f.metadata['doc']} |")
+        rows.append(
+            f"| `{f.name}` | {value} | {f.metadata['unit']} | {f.metadata['doc']} |"
+            f" {f.metadata['row']} |"
+        )
     return "\n".join(rows)
 
 

@@ -1,4 +1,4 @@
-"""The surface: a template held by one jet.
+"""The surface: a template held by one jet, or by several that are blended.
 
 In: a mesh with texture coordinates, and the unknowns of a frame. Out: a :class:`Template`, and the
 vertices [m, camera frame] of a :class:`JetAtlas`, differentiable by Dr.Jit. What takes Dr.Jit

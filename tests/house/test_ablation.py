@@ -32,6 +32,13 @@ def test_every_switch_changes_what_is_there(switch):
     assert switch.fields or switch.settings
 
 
+def test_a_rule_names_the_row_that_switches_it_off():
+    named = {f.name: f.metadata["row"] for f in dataclasses.fields(Rules) if f.metadata["row"]}
+    assert named == {name: s.rule for s in ablation.SWITCHES for name in s.fields} | {
+        "scale_bounds": "robust scale"
+    }
+
+
 def test_a_rule_that_pays_on_two_sequences_stays():
     found = results(twice=(1.2, 1.06, 0.9), once=(1.2, 1.04, 1.0))
     found |= results(**{results_of.BASELINE: (1.0, 1.0, 1.0)})

@@ -22,7 +22,7 @@ NOT_YET = {
     "lines of a file": set(),
     "width of a line": set(),
     "private names": set(),
-    "constants": 149,
+    "constants": 131,
 }
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from . import lapack
 
 # rows a block below which one thread is faster than two, which pass Python's lock to and fro
-_ALONE = 100
+_WORTH_A_THREAD = 100
 _other = ThreadPoolExecutor(1, "elimination")
 
 
@@ -58,12 +58,12 @@ class Blocks:
         """The next block after k towards the middle."""
         return k + (1 if k < self.middle else -1)
 
-    def both(self, run):
+    def run_chains(self, run):
         """Run either chain of blocks, the second in a thread of its own where blocks are large
         enough to be worth it.
         """
         first, second = self.chains
-        if self.size < _ALONE:
+        if self.size < _WORTH_A_THREAD:
             run(first)
             run(second)
             return
@@ -100,7 +100,7 @@ class Blocks:
                     lapack.subtract_square(factors[following], w)
                     y[parts[following]] -= w.T @ y[parts[k]]
 
-        self.both(run)
+        self.run_chains(run)
         for k in (chain[-1] for chain in self.chains if chain):
             lapack.subtract_square(factors[self.middle], coupling[k])
             y[parts[self.middle]] -= coupling[k].T @ y[parts[k]]
@@ -130,7 +130,7 @@ class Elimination:
                 solve(k)
 
         solve(blocks.middle)
-        blocks.both(run)
+        blocks.run_chains(run)
         out = np.empty_like(x)
         out[blocks._order] = x
         return out.reshape(y.shape)
@@ -156,7 +156,7 @@ class Elimination:
                 fill(k, blocks.following(k))
 
         fill(blocks.middle)
-        blocks.both(run)
+        blocks.run_chains(run)
         part, at = np.divmod(blocks.d * blocks.pattern.place, size)
         each = np.arange(blocks.d)
         return found[

@@ -9,7 +9,7 @@ from surfaces import ball
 
 from onefit.body import ClosestSurface
 from onefit.draping import post
-from onefit.draping.post import AIR, CLEARANCE, DEEPEST, NEAR, PULL, RADIUS, PostProcessing
+from onefit.draping.post import CLEARANCE, DEEPEST, DRAG, NEAR, PULL, RADIUS, PostProcessing
 from onefit.physics.sheet import samples
 from polyfit.mesh import edges_of
 
@@ -58,7 +58,7 @@ def test_lengths_come_back_as_in_a_slow_reference():
 def test_cloth_keeps_its_motion_and_is_pulled_to_the_drape():
     x, faces = ball(0.1, 1)
     before, was = x + torch.tensor([0.03, 0.0, 0.0]), x
-    slowed = torch.tensor([0.03 / (1 + AIR * 0.03), 0.0, 0.0])
+    slowed = torch.tensor([0.03 / (1 + DRAG * 0.03), 0.0, 0.0])
     free, drawn = x + 0.5, x + 0.5
     processing(x, faces).move(free, before, was, 1 / 30)
     assert torch.allclose(free, before + slowed, atol=1e-6)
