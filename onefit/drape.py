@@ -18,7 +18,7 @@ import argparse
 import sys
 
 from onefit.network import DEFAULT
-from onefit.physics.material import MATERIALS, Material
+from onefit.physics import MATERIALS, Material
 from polyfit.errors import InputError, Parser, cli, require
 
 

@@ -12,8 +12,7 @@ from polyfit.errors import InputError, Parser, cli, optional_imports
 from polyfit.mesh import write_ply
 
 with optional_imports(__name__):
-    from onefit.garment.binding import standard_body
-    from onefit.garment.garment import FOLDER
+    from onefit.garment import FOLDER, standard_body
     from onefit.garment.sewing.loose import LOOSE_PATTERNS
     from onefit.garment.sewing.patterns import PATTERNS
     from onefit.garment.sewing.templates import write

@@ -14,7 +14,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from onefit.physics.material import MATERIALS, Material
+from onefit.physics import MATERIALS, Material
 from polyfit.errors import InputError, Parser, cli, require
 
 

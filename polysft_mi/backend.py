@@ -22,14 +22,14 @@ from collections.abc import Iterable
 
 from .errors import InputError, cli
 
-Version = tuple[int, ...]
+_Version = tuple[int, ...]
 
 OLDEST_LLVM = 16  # the first that tells its version; an older one is not tried
 PROVEN_LLVM = (19, 22)  # what the tests passed with; any other is tried before it is used
 VARIABLE = "DRJIT_LIBLLVM_PATH"  # Dr.Jit's own
 DEFAULT = "llvm_ad_rgb"  # the one that the tests passed on
 # what the code needs of a variant: Dr.Jit arrays with derivatives, three colour channels
-SUFFIX = "_ad_rgb"
+_SUFFIX = "_ad_rgb"
 
 # libLLVM-15.so.1, libLLVM-14.0.6.so.1, libLLVM.so.19.1, libLLVM.so, libLLVM.dylib; not libLLVM-C.so
 # (a part of the interface alone)
@@ -76,7 +76,7 @@ print(all(abs(x - y) < 1e-4 for x, y in zip(found, (4, 8, 4, 0))))  # processors
 """
 
 
-def find_libllvm(folders: Iterable[str] | None = None) -> tuple[str, Version]:
+def find_libllvm(folders: Iterable[str] | None = None) -> tuple[str, _Version]:
     """The newest libLLVM that Dr.Jit can use.
 
     ``DRJIT_LIBLLVM_PATH`` goes before everything, and must then hold; else the files of ``folders``
@@ -122,7 +122,7 @@ def set_variant(mode: str | None = None) -> str:
     """
     mitsuba = sys.modules.get("mitsuba")
     current = mitsuba and mitsuba.variant()
-    if current and (mode == current or mode is None) and current.endswith(SUFFIX):
+    if current and (mode == current or mode is None) and current.endswith(_SUFFIX):
         return current
     if mode is None:
         mode = DEFAULT
@@ -134,7 +134,7 @@ def set_variant(mode: str | None = None) -> str:
             raise
     import mitsuba as mi
 
-    known = [name for name in mi.variants() if name.endswith(SUFFIX)]
+    known = [name for name in mi.variants() if name.endswith(_SUFFIX)]
     if mode not in known:
         raise InputError(f"mode {mode!r}: one of {', '.join(known)} is needed")
     if mode.startswith("cuda") and not gpu_works():
@@ -224,7 +224,7 @@ def _driver_sees_device() -> bool:
         return False
 
 
-def _check_chosen(path: str) -> Version:
+def _check_chosen(path: str) -> _Version:
     accepted = "give the file of a newer libLLVM (19, say), or unset it to have one searched"
     if not os.path.isfile(path):
         raise InputError(f"{VARIABLE}={path}: no such file; {accepted}")
@@ -240,7 +240,7 @@ def _check_chosen(path: str) -> Version:
     return version
 
 
-def _usable(path: str, version: Version) -> bool:
+def _usable(path: str, version: _Version) -> bool:
     return version[0] >= OLDEST_LLVM and (
         version[0] in PROVEN_LLVM or variant_works("llvm_ad_rgb", library=path)
     )
@@ -277,7 +277,7 @@ def _libraries(folders: Iterable[str]) -> list[str]:
     return list(found)
 
 
-def _named_version(path: str) -> Version | None:
+def _named_version(path: str) -> _Version | None:
     """The version that a file's name tells, as a tuple of ints, or None: libLLVM-14.0.6.so.1 is
     (14, 0, 6), libLLVM.so.19.1 is (19, 1).
     """
@@ -286,7 +286,7 @@ def _named_version(path: str) -> Version | None:
     return tuple(int(part) for part in text.split(".") if part) if text else None
 
 
-def _version(path: str) -> Version | None:
+def _version(path: str) -> _Version | None:
     """A library's version as a tuple of ints, told by its name if that is too old to be loaded,
     else by itself; None where it does not load or does not tell.
     """

@@ -25,14 +25,13 @@ import torch
 from polyfit import jets
 from polyfit.mesh import TexCoords
 
-from .surface.patch import Unknowns
-from .surface.template import Template
+from .surface import Template, Unknowns
 
 if TYPE_CHECKING:
     from polyfit.network import PolyFit
 
-    from .objective.problem import Problem
-    from .surface.patch import JetAtlas
+    from .objective import Problem
+    from .surface import JetAtlas
 
 
 def template(
@@ -71,7 +70,7 @@ def surface(polyfit: PolyFit, points: torch.Tensor) -> torch.Tensor:
     return found.frame.from_chart(jets.point(found.jet.alpha, chart[..., :2]))
 
 
-def in_drjit(function: Callable) -> Callable:
+def _in_drjit(function: Callable) -> Callable:
     """A Dr.Jit ``function`` as a torch function: of tensors, on tensors, torch's autograd runs
     through it.
     """
@@ -91,7 +90,7 @@ def rendering(
     """The rendering of a :class:`polysft_mi.objective.problem.Problem` as a torch function:
     vertices (N, 3) [m, camera frame] -> (rgb (H, W, 3) linear, alpha (H, W))."""
 
-    @in_drjit
+    @_in_drjit
     def render(vertices: mi.TensorXf) -> tuple[mi.TensorXf, mi.TensorXf]:
         rgb, alpha = problem.image(_points(vertices.array), seed)
         return rgb, mi.TensorXf(alpha, (problem.height, problem.width))
@@ -104,7 +103,7 @@ def deformed(patch: JetAtlas) -> Callable[..., torch.Tensor]:
     unknowns: delta_alpha (A,), delta_u, delta_v, delta_w (N,), rotation (4,), translation (3,) ->
     vertices (N, 3) [m, camera frame]."""
 
-    @in_drjit
+    @_in_drjit
     def vertices(*unknowns: mi.TensorXf) -> mi.TensorXf:
         points = patch.vertices(Unknowns(*(x.array for x in unknowns)))
         return mi.TensorXf(dr.ravel(points), (dr.width(points), 3))  # type: ignore[call-overload]

@@ -76,7 +76,7 @@ def main(arguments=None):
     comparison = compare(options.a, options.b)
     figures = comparison.figures
     if options.output is not None:
-        from .pictures.comparison import write_comparison
+        from .pictures import write_comparison
 
         write_comparison(comparison, options.output, count=options.frames, scale=options.scale)
     if options.json:

@@ -6,8 +6,7 @@ import os
 
 from . import commands
 from .errors import cli
-from .results.formats import FORMATS, export
-from .results.run import Run
+from .results import FORMATS, Run, export
 
 _EXAMPLES = [
     ("out/demo --format glb", "out/demo/export/surface.glb, for browsers, Blender, Windows"),

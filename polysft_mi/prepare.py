@@ -39,7 +39,7 @@ _EXAMPLES = [
 
 def parser():
     """The command line's parser."""
-    from .capture.layouts import FORMS
+    from .capture import FORMS
 
     p = commands.parser(
         "prepare",

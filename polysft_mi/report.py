@@ -6,7 +6,7 @@ import os
 
 from . import commands
 from .errors import InputError, cli
-from .pictures.report.page import write_report
+from .pictures import write_report
 
 _EXAMPLES = [
     ("out/demo", "out/demo/report.html again (a run writes it at its end)"),

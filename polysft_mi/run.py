@@ -16,8 +16,7 @@ from dataclasses import dataclass, field
 
 from . import commands
 from .errors import InputError, cli
-from .results import folder
-from .results.progress import Progress
+from .results import Progress, folder
 
 _EXAMPLES = [
     ("scenes/demo.xml -o out/demo", "the demo; then open out/demo/report.html"),
@@ -160,7 +159,7 @@ def reconstruct(
     """
     scene, out = os.fspath(scene), os.fspath(out)
     from .backend import set_variant
-    from .scene.defaults import resolved_defaults
+    from .scene import resolved_defaults
 
     began, overrides = time.perf_counter(), overrides or {}
     folder.check_output(out, resume=resume, overwrite=overwrite)
@@ -168,9 +167,9 @@ def reconstruct(
     set_variant(variant)
 
     from . import solvers
-    from .objective.problem import Problem
-    from .pictures.drawing import Drawing
-    from .render.device import threads
+    from .objective import Problem
+    from .pictures import Drawing
+    from .render import threads
     from .results import outputs
     from .scene import experiment as experiments
     from .surface.meshio import size_note
@@ -248,7 +247,7 @@ def _report(out, progress):
     """The path of the report, or None after a warning: a finished run must not be lost to its
     page.
     """
-    from .pictures.report.page import write_report
+    from .pictures import write_report
 
     progress.stage("report")
     try:

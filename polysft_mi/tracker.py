@@ -20,12 +20,12 @@ import numpy as np
 from polyfit.files import aside, naming
 
 from .errors import BadFrame, InputError
-from .objective.problem import TERMS, Problem
-from .render.device import interruptible
+from .objective import TERMS, Problem
+from .render import interruptible
 from .solvers import Solver
-from .surface.patch import Unknowns
+from .surface import Unknowns
 
-CHECKPOINT, LOG = "checkpoint.npz", "log.jsonl"
+CHECKPOINT, _LOG = "checkpoint.npz", "log.jsonl"
 _MIN_VISIBLE_SHARE = (
     0.02  # share of the vertices inside the image below which the surface is said to have left it
 )
@@ -129,7 +129,7 @@ def track(
     the checkpoint on disk is then that of the last complete window.
     """
     width = min(problem.settings.width, frames)
-    checkpoint, log_path = os.path.join(out, CHECKPOINT), os.path.join(out, LOG)
+    checkpoint, log_path = os.path.join(out, CHECKPOINT), os.path.join(out, _LOG)
     done = Track.load(checkpoint) if resume and os.path.exists(checkpoint) else Track()
     _trim_log(log_path, done.next_window)
     with interruptible(), naming(log_path), open(log_path, "a", encoding="utf-8") as log:

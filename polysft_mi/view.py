@@ -2,8 +2,8 @@
 
 from . import commands
 from .errors import cli
-from .pictures.viewer import show
-from .results.run import Run
+from .pictures import show
+from .results import Run
 
 _EXAMPLES = [
     ("out/demo", "opens a window"),

@@ -133,7 +133,9 @@ def rest_pose(joints):
             chain = [INDEX[f"{side}_{name}"] for name in ("shoulder", "elbow", "wrist", "hand")]
             axis, before = joints.new_tensor([x, 0.0, 0.0]), torch.eye(3, dtype=torch.float64)
             for joint, end in itertools.pairwise(chain):
-                before = before @ smallest_rotation(axis, before.mT @ (joints[end] - joints[joint]))
+                before = before @ _smallest_rotation(
+                    axis, before.mT @ (joints[end] - joints[joint])
+                )
                 world[joint] = before
             world[chain[-1]] = before
             for joint, end in (("hip", "knee"), ("knee", "ankle")):
@@ -153,7 +155,7 @@ def _relative(world):
     return roma.rotmat_to_rotvec(parents.mT @ world)
 
 
-def smallest_rotation(a, b):
+def _smallest_rotation(a, b):
     """The rotation (3, 3) about a × b that takes the direction of a (3,) to that of b (3,); they
     may not be opposite.
     """

@@ -13,13 +13,11 @@ from typing import TYPE_CHECKING
 import torch
 
 from onefit.body import AnnyBody, ClosestSurface, skinning
-from onefit.garment import Garment, standard_body, waistband
-from onefit.garment.charts import PatchedGarment
+from onefit.garment import Garment, PatchedGarment, standard_body, waistband
 from onefit.motion import Motion
-from onefit.network import DEFAULT
-from onefit.network.weights import Trained
+from onefit.network import DEFAULT, Trained
 from onefit.network.weights import load as load_weights
-from onefit.objective.objective import posed
+from onefit.objective import posed
 from onefit.physics import Material
 from polyfit import mesh
 from polyfit.errors import InputError
@@ -28,9 +26,8 @@ from . import ease
 from .post import PostProcessing, pull
 
 if TYPE_CHECKING:
-    from onefit.body import Body
-    from onefit.body.body import BodyModel
-    from onefit.objective.measures import Measures
+    from onefit.body import Body, BodyModel
+    from onefit.objective import Measures
     from onefit.physics import Settings
 
 FPS = 30.0  # that the networks know

@@ -13,8 +13,7 @@ import numpy as np
 import torch
 
 from onefit.body import ClosestSurface
-from onefit.garment.charts import SparseMatrix
-from onefit.garment.remesh import neighbour_mean
+from onefit.garment import SparseMatrix, neighbour_mean
 
 from .post import DEEPEST
 
@@ -30,14 +29,14 @@ MOTIONS = (
 )  # of the kinds that networks are trained on
 SECONDS = 1.0  # [s] of each motion
 FRAME_STEP = 6  # one frame in so many is looked at
-CLEAR_SHARE = 0.95  # of those frames in which a vertex is to lie far enough out
+_CLEAR_SHARE = 0.95  # of those frames in which a vertex is to lie far enough out
 CLEARANCE = (
     0.007  # [m] from the body, where the garment was made with as much and skinning leaves as much
 )
 SMOOTHING = 4  # times
 # [m]; of triangles with a longer side the centre is looked at, too: a limb comes through between
 # their vertices
-LONG_SIDE = 0.035
+_LONG_SIDE = 0.035
 
 
 def ease(rest, faces, body, frames):
@@ -47,14 +46,14 @@ def ease(rest, faces, body, frames):
     ``frames``: for each frame, the vertices as the network drapes them and as plain skinning does
     (N, 3), and the body's (V, 3) [m]. A vertex should lie as far out of the body as in the rest
     pose and under plain skinning, whichever is less, or CLEARANCE where both are more. It is moved
-    along the body's normal at rest, so far that this holds in CLEAR_SHARE of the frames, and its
-    neighbours go along. What the centre of a triangle with a side above LONG_SIDE misses, all its
+    along the body's normal at rest, so far that this holds in _CLEAR_SHARE of the frames, and its
+    neighbours go along. What the centre of a triangle with a side above _LONG_SIDE misses, all its
     vertices are moved by.
     """
     surface = ClosestSurface(body.vertices, body.faces)
     faces, count = faces.to(rest.device), len(rest)
     corners = rest[faces]
-    coarse = faces[(corners - corners.roll(1, 1)).norm(dim=-1).amax(1) > LONG_SIDE]
+    coarse = faces[(corners - corners.roll(1, 1)).norm(dim=-1).amax(1) > _LONG_SIDE]
     places = lambda x: torch.cat([x, x[coarse].mean(1)])
     at_rest = surface(places(rest), DEEPEST)
     missing = []
@@ -65,7 +64,7 @@ def ease(rest, faces, body, frames):
         )
         missing.append((wanted - surface(places(draped), DEEPEST).distance).clamp(min=0))
     missing = torch.as_tensor(
-        np.quantile(torch.stack(missing).cpu().numpy(), CLEAR_SHARE, axis=0)
+        np.quantile(torch.stack(missing).cpu().numpy(), _CLEAR_SHARE, axis=0)
     ).to(rest)  # torch's has a largest size
     missing = missing[:count].scatter_reduce(
         0, coarse.flatten(), missing[count:].repeat_interleave(3), "amax"

@@ -13,11 +13,7 @@ import torch
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from onefit.physics.cloth import Cloth
-from onefit.physics.contact import BodyContact, SelfContact
-from onefit.physics.material import Material
-from onefit.physics.settings import Settings
-from onefit.physics.sheet import Sheet
+from onefit.physics import BodyContact, Cloth, Material, SelfContact, Settings, Sheet
 
 
 def finished(

@@ -6,8 +6,7 @@ import zipfile
 from pathlib import Path
 
 from onefit.body import AnnyBody, PlainBody, SmplBody
-from onefit.motion import Motion
-from onefit.motion.generate import KINDS
+from onefit.motion import KINDS, Motion
 from polyfit.errors import InputError
 
 

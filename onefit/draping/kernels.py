@@ -17,7 +17,7 @@ def neighbour_mean(
 
 
 @wp.func
-def stopped(body: Surface, start: wp.vec3, end: wp.vec3, shortest: float, clearance: float):
+def _stopped(body: Surface, start: wp.vec3, end: wp.vec3, shortest: float, clearance: float):
     """Where a point that goes straight from ``start`` towards ``end`` is at the end of its way: in
     front of the body where it would enter it, if the way is not shorter than ``shortest``.
     """
@@ -128,7 +128,7 @@ def first_look(
 ):
     """The first look of :meth:`onefit.draping.post.PostProcessing.push_out`, at some vertices."""
     v = first + wp.tid()
-    push[v] = stopped(body, goal[v], x[v], thinnest, clearance) - x[v]
+    push[v] = _stopped(body, goal[v], x[v], thinnest, clearance) - x[v]
     known[v] = wp.int32(wp.length_sq(push[v]) > 0.0)
     if known[v] == 0:
         p, d = pushed(body, x[v], reach, clearance, clearance)

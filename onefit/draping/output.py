@@ -106,7 +106,7 @@ def _render(drape, folder, size, spp, advance):
     set_variant()
     import cv2
 
-    from polysft_mi.pictures.video import write_video
+    from polysft_mi.pictures import write_video
     from polysft_mi.render import stage
 
     parts = [

@@ -11,21 +11,23 @@ import numpy as np
 import torch
 
 from onefit.body import ClosestSurface
-from onefit.physics.sheet import samples
+from onefit.physics import samples
 
 PULL = 60.0  # [1/s^2]: acceleration towards the network's drape, for a unit distance
 DRAG = 4.0  # [1/m] of the air on cotton, 1.2 kg/m^3 over twice 0.15 kg/m^2, times velocity squared
-SWING_SMOOTHING = 2  # times in a frame
+_SWING_SMOOTHING = 2  # times in a frame
 NEAR = 0.06  # [m] from the body at rest, where skin doubles the pull
-ROUNDS = 14  # of the lengths
+_ROUNDS = 14  # of the lengths
 RADIUS = 0.985  # spectral radius of a round, as the acceleration takes it to be
 CLEARANCE = 0.003  # [m] from the body
-PUSHES = 5  # rounds
-THINNEST = 0.02  # [m], of limbs: cloth that is no farther from the drape has not passed through one
+_PUSHES = 5  # rounds
+_THINNEST = (
+    0.02  # [m], of limbs: cloth that is no farther from the drape has not passed through one
+)
 SMOOTHING = 6  # times, of the pushes of the first round
 DEEPEST = 0.08  # [m]; vertices deeper in the body than this stay there
 SPACING = 0.025  # [m] of the points of faces that are looked at beside the vertices
-FACE_DEEPEST = 0.03  # [m], for these
+_FACE_DEEPEST = 0.03  # [m], for these
 
 
 def pull(vertices, body, held):
@@ -99,17 +101,17 @@ class PostProcessing:
         to ``before``, (N, 3) [m], slowed down by the air, and is pulled to where ``x`` has it. How
         far it is from there is smoothed over the mesh: a swing makes no wrinkles.
         """
-        arrays = self._pull, DRAG, dt, *self._around, SWING_SMOOTHING, *self._work
+        arrays = self._pull, DRAG, dt, *self._around, _SWING_SMOOTHING, *self._work
         self._launch(self._kernels.moved, x, before, was, *arrays)
 
-    def restore_lengths(self, x, rounds=ROUNDS):
+    def restore_lengths(self, x, rounds=_ROUNDS):
         """Edges come nearer to their lengths: errors that span about ten edges are mended, and the
         cloth as a whole hardly moves.
         """
         arrays = *self._edges, self._degree, rounds, RADIUS, x, *self._work
         self._launch(self._kernels.lengths_restored, *arrays)
 
-    def push_out(self, x, goal, surface, rounds=PUSHES, reach=CLEARANCE):
+    def push_out(self, x, goal, surface, rounds=_PUSHES, reach=CLEARANCE):
         """Vertices are pushed to CLEARANCE from the body's ``surface``.
 
         Where the body lies between the network's drape, ``goal`` (N, 3) [m], and the cloth, the
@@ -123,7 +125,7 @@ class PostProcessing:
         push, smooth = self._work
 
         def look(first, last):
-            settings = first, THINNEST, CLEARANCE, reach, goal, x, push, self._known
+            settings = first, _THINNEST, CLEARANCE, reach, goal, x, push, self._known
             self._launch(
                 self._kernels.first_look, surface.of_kernels, *settings, count=last - first
             )
@@ -132,7 +134,7 @@ class PostProcessing:
         other = self._pool.submit(look, 0, half)
         look(half, self._count)
         other.result()
-        settings = rounds, SMOOTHING, CLEARANCE, DEEPEST, FACE_DEEPEST
+        settings = rounds, SMOOTHING, CLEARANCE, DEEPEST, _FACE_DEEPEST
         arrays = *self._around, *self._points, *settings, x, push, self._known, smooth, self._queue
         self._launch(self._kernels.pushed_out, surface.of_kernels, *arrays)
 

@@ -8,6 +8,8 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
         "binding": ["standard_body", "standard_surface"],
-        "garment": ["Garment", "LOOSE", "TEMPLATES"],
+        "charts": ["Deformation", "PatchedGarment", "SparseMatrix"],
+        "garment": ["FOLDER", "Garment", "LOOSE", "TEMPLATES"],
+        "remesh": ["neighbour_mean"],
     },
 )

@@ -13,7 +13,7 @@ from polyfit import mesh
 
 # Lengths over which the weights and the displacements of a shape are smoothed where the garment
 # touches the body [m]; they grow with the distance from it, doubled at 1.7 times this one.
-WEIGHTS_LENGTH, SHAPE_LENGTH, TOUCHING_DISTANCE = 0.010, 0.008, 0.007
+_WEIGHTS_LENGTH, _SHAPE_LENGTH, _TOUCHING_DISTANCE = 0.010, 0.008, 0.007
 CLEARANCE = 0.003  # that grading leaves between body and cloth [m]
 
 
@@ -43,9 +43,9 @@ class Binding:
     the nearest point does, between arm and chest or from leg to leg, and mean less the farther away
     the body is; so they are smoothed: x minimises sum_i m_i c_i |x_i - y_i|^2 + l^2 sum_ij w_ij
     |x_i - x_j|^2, with the areas m, the cotangent weights w (above zero, so that x stays within the
-    range of y), and the trust c = n / (1 + (distance / TOUCHING_DISTANCE)^2), where n is the cosine
-    between the normals of garment and body (at least 0.001: the other side of an armpit, the other
-    leg tell nothing). Independent of the mesh's resolution.
+    range of y), and the trust c = n / (1 + (distance / _TOUCHING_DISTANCE)^2), where n is the
+    cosine between the normals of garment and body (at least 0.001: the other side of an armpit, the
+    other leg tell nothing). Independent of the mesh's resolution.
     """
 
     def __init__(self, V, F, surface=None):
@@ -59,7 +59,7 @@ class Binding:
         self._above = self._above_body(V, surface.vertices.astype(np.float64))[0]
         area, self._stiffness = cotangent_laplacian(V, F)
         self._trust = (
-            area * np.clip(facing, 1e-3, 1) / (1 + (self.distance / TOUCHING_DISTANCE) ** 2)
+            area * np.clip(facing, 1e-3, 1) / (1 + (self.distance / _TOUCHING_DISTANCE) ** 2)
         )
 
     def on_body(self, values):
@@ -74,11 +74,11 @@ class Binding:
 
     @cached_property
     def _smooth_shape(self):
-        return self.smoother(SHAPE_LENGTH)
+        return self.smoother(_SHAPE_LENGTH)
 
     def blend_weights(self, of_body):
         """(N, 24), rows that sum to one, of those of the body (V, 24)."""
-        weights = np.maximum(self.smoother(WEIGHTS_LENGTH)(self.on_body(of_body)), 0)
+        weights = np.maximum(self.smoother(_WEIGHTS_LENGTH)(self.on_body(of_body)), 0)
         return weights / weights.sum(axis=1, keepdims=True)
 
     def displacement(self, of_body):

@@ -27,8 +27,8 @@ from .binding import (
 )
 from .remesh import neighbour_mean
 
-PUSHED_DEPTH = 0.03  # vertices inside the body by less than this are pushed out [m]
-CLEARANCE, PUSH_RADIUS = (
+_PUSHED_DEPTH = 0.03  # vertices inside the body by less than this are pushed out [m]
+CLEARANCE, _PUSH_RADIUS = (
     0.004,
     0.02,
 )  # that a vertex pushed out is left with, and how far it takes its neighbours with it [m]
@@ -41,8 +41,8 @@ UNITS = {
     100.0: "hundreds of metres",
 }
 T_POSE = "T-pose"
-GROUND_OFFSET = np.array([0.0, 0.0, -0.82])  # from a world in which the body stands at z = 0 [m]
-TRIAL_VERTICES = 400  # vertices that places are tried on
+_GROUND_OFFSET = np.array([0.0, 0.0, -0.82])  # from a world in which the body stands at z = 0 [m]
+_TRIAL_VERTICES = 400  # vertices that places are tried on
 
 
 def placed(V, scale=1.0, up="z", turn=0.0, offset=(0.0, 0.0, 0.0)):
@@ -97,9 +97,9 @@ def check_place(V, surface, where, tell_pose=True):
     and no other place or stand would fit much better: half the misfit where it is above 4 cm, 0.87
     times of it for the T-pose (with ``tell_pose``).
     """
-    seen = V[np.linspace(0, len(V) - 1, min(TRIAL_VERTICES, len(V))).astype(int)]
+    seen = V[np.linspace(0, len(V) - 1, min(_TRIAL_VERTICES, len(V))).astype(int)]
     d, own = surface(V, 1e9).distance, misfit(surface, seen)
-    lies = np.abs(d).mean() < 0.15 and (d < -PUSHED_DEPTH).mean() <= 0.02
+    lies = np.abs(d).mean() < 0.15 and (d < -_PUSHED_DEPTH).mean() <= 0.02
     if lies and tell_pose:
         other = misfit(_t_surface(), seen)
         if other < 0.87 * own and own - other > 0.005:
@@ -113,7 +113,7 @@ def check_place(V, surface, where, tell_pose=True):
     if lies and not (best and best[0] < 0.5 * own):
         return
     size = " x ".join(f"{s:.3g}" for s in np.ptp(V, axis=0))
-    deep = 100 * (d < -PUSHED_DEPTH).mean()
+    deep = 100 * (d < -_PUSHED_DEPTH).mean()
     found = (
         f"{where}: does not lie on the body: {_mm(np.abs(d).mean())} from it on average, {deep:.0f}"
         " % of the vertices deep inside"
@@ -147,7 +147,7 @@ def _best_place(seen, surface, scales, tell_pose):
         if not 0.15 < np.ptp(V, axis=0).max() < 2.3:
             continue
         for (at, pose), moved in product(bodies, range(3)):
-            offset = _offset(V, at) if moved == 2 else moved * GROUND_OFFSET
+            offset = _offset(V, at) if moved == 2 else moved * _GROUND_OFFSET
             worse = (scale != 1) + (up != "z") + (turn != 0) + 0.5 * (pose is not None) + moved
             found.append(
                 (
@@ -181,7 +181,7 @@ def _best_place(seen, surface, scales, tell_pose):
     if offset.any():
         looks.append(
             "on a body that stands on the ground"
-            if (offset == GROUND_OFFSET).all()
+            if (offset == _GROUND_OFFSET).all()
             else "in another place"
         )
         give.append(f"offset=({', '.join(f'{o:g}' for o in offset)})")
@@ -245,12 +245,12 @@ def to_standard(V, F, made_for, loose=False):
     )
     stands = in_pose(made_for, pose)
     target = standard if not loose else in_pose(standard, pose)
-    difference = counterpart(stands, target) - stands.vertices.numpy()
+    difference = _counterpart(stands, target) - stands.vertices.numpy()
     V = V + Binding(V, F, surface_of(stands)).displacement(difference)
     return 0.5 * (V + neighbour_mean(F, len(V), boundary_apart=True) @ V)
 
 
-def counterpart(source, target):
+def _counterpart(source, target):
     """Where the vertices of the body ``source`` (V, 3) lie on the body ``target``, in the same
     stand [m].
 
@@ -284,10 +284,10 @@ def pushed_out(V, F, where="garment"):
     d = surface(V).distance
     if (d >= 0).all():
         return V, ()
-    if (deep := (d < -PUSHED_DEPTH).mean()) > 0.02:
+    if (deep := (d < -_PUSHED_DEPTH).mean()) > 0.02:
         raise InputError(
-            f"{where}: {100 * deep:.0f} % of the vertices are more than {100 * PUSHED_DEPTH:.0f} cm"
-            " inside the body"
+            f"{where}: {100 * deep:.0f} % of the vertices are more than"
+            f" {100 * _PUSHED_DEPTH:.0f} cm inside the body"
         )
     area, stiffness = cotangent_laplacian(V, F)
     out = V
@@ -305,7 +305,7 @@ def pushed_out(V, F, where="garment"):
             )
             / 2
         )
-        out = out + smoother(area * np.where(move.any(axis=1), 1.0, 0.1), stiffness, PUSH_RADIUS)(
+        out = out + smoother(area * np.where(move.any(axis=1), 1.0, 0.1), stiffness, _PUSH_RADIUS)(
             move
         )
     for _ in range(8):
@@ -335,7 +335,7 @@ def standard_on(body):
     key = body.kind, len(vertices), int(body.faces.sum()), int(body.faces[:, 0].sum())
     if key not in _correspondences:
         body = body.to("cpu")
-        found = surface_of(body)(counterpart(standard, body))
+        found = surface_of(body)(_counterpart(standard, body))
         _correspondences[key] = body.faces.numpy()[found.face], found.barycentric.astype(np.float64)
     corners, barycentric = _correspondences[key]
     return np.einsum("nk,nkd->nd", barycentric, vertices[corners])

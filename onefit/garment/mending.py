@@ -23,12 +23,12 @@ from polyfit.errors import InputError
 
 from .remesh import loops
 
-COINCIDENT = 2e-5  # vertices closer than this lie on one another [m]
-SMALL_PART_SHARE, LEAST_SHARE = (
+_COINCIDENT = 2e-5  # vertices closer than this lie on one another [m]
+_SMALL_PART_SHARE, _LEAST_SHARE = (
     0.05,
     0.80,
 )  # of the area: parts that are dropped, and what has to be left
-SMALL_HOLE_LENGTH = 0.10  # around [m]
+_SMALL_HOLE_LENGTH = 0.10  # around [m]
 
 
 def mended(V, F, where="garment"):
@@ -81,7 +81,7 @@ def _without_slivers(V, F, where, told):
         told.append(f"dropped {loose} vertices that are in no face")
     V, F = _used(V, F)
     e = mesh.edges_of(F)[0]
-    short = e[np.linalg.norm(V[e[:, 0]] - V[e[:, 1]], axis=1) < COINCIDENT]
+    short = e[np.linalg.norm(V[e[:, 0]] - V[e[:, 1]], axis=1) < _COINCIDENT]
     V, G = _merged(V, F, short)
     whole = (np.roll(G, 1, axis=1) != G).all(axis=1)
     _, first = np.unique(np.sort(G, axis=1), axis=0, return_index=True)
@@ -116,7 +116,7 @@ def _sewn(V, F, told):
     rim_edges = edges[uses == 1]
     rim = np.unique(rim_edges)
     pairs = (
-        rim[cKDTree(V[rim]).query_pairs(COINCIDENT, output_type="ndarray")]
+        rim[cKDTree(V[rim]).query_pairs(_COINCIDENT, output_type="ndarray")]
         if len(rim)
         else np.empty((0, 2), dtype=np.int64)
     )
@@ -175,8 +175,8 @@ def _cut_apart(V, F, told):
 def _large_parts(V, F, where, told):
     part, area = parts(F), mesh.areas(V, F)
     share = np.bincount(part, area) / area.sum()
-    keep = share >= SMALL_PART_SHARE
-    if share[keep].sum() < LEAST_SHARE:
+    keep = share >= _SMALL_PART_SHARE
+    if share[keep].sum() < _LEAST_SHARE:
         found = (
             f"falls apart into {len(share)} parts, {100 * share[~keep].sum():.0f} % of its area in"
             " small ones"
@@ -218,7 +218,7 @@ def _filled(V, F, told):
     extra, faces, filled = [], [F], 0
     for loop in loops(F):
         following = np.roll(loop, -1)
-        if np.linalg.norm(V[following] - V[loop], axis=1).sum() >= SMALL_HOLE_LENGTH:
+        if np.linalg.norm(V[following] - V[loop], axis=1).sum() >= _SMALL_HOLE_LENGTH:
             continue
         filled += 1
         if len(loop) == 3:
@@ -231,6 +231,6 @@ def _filled(V, F, told):
         return V, F
     told.append(
         f"filled {filled} hole{'s' if filled > 1 else ''} of less than"
-        f" {100 * SMALL_HOLE_LENGTH:.0f} cm around"
+        f" {100 * _SMALL_HOLE_LENGTH:.0f} cm around"
     )
     return np.concatenate([V, *[x[None] for x in extra]]), np.concatenate(faces)

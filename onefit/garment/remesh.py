@@ -11,7 +11,7 @@ from onefit.body import ClosestSurface
 from polyfit import mesh
 
 
-def boundary_edges(F):
+def _boundary_edges(F):
     """Directed edges (B, 2) that have one face only, as the face walks them."""
     edges, side = mesh.edges_of(F)
     once = np.bincount(side.ravel(), minlength=len(edges))[side] == 1
@@ -22,7 +22,7 @@ def loops(F):
     """The boundary of a manifold mesh as a list of vertex indices, in the order in which their
     faces walk them; the longest first.
     """
-    after = dict(boundary_edges(F).tolist())
+    after = dict(_boundary_edges(F).tolist())
     found = []
     while after:
         loop = [next(iter(after))]
@@ -38,7 +38,7 @@ def neighbour_mean(F, count, boundary_apart=False):
     """
     e = mesh.edges_of(F)[0]
     if boundary_apart:
-        b = boundary_edges(F)
+        b = _boundary_edges(F)
         on = np.zeros(count, dtype=bool)
         on[b] = True
         pairs = np.concatenate([e[~on[e[:, 0]]], e[~on[e[:, 1]]][:, ::-1], b, b[:, ::-1]])
@@ -59,7 +59,7 @@ def nearest_on_segments(points, a, b):
     return at[np.arange(len(points)), best]
 
 
-def delaunay(V, F):
+def _delaunay(V, F):
     """Faces (F, 3) with the edges flipped whose two opposite angles together are more than 180
     degrees, as long as there are any.
     """
@@ -116,14 +116,14 @@ def remeshed(V, F, count, steps=40):
         made = clusters.create_mesh()
     x, f = np.array(made.points, dtype=np.float64), made.regular_faces.astype(np.int64)
     f = np.where(mesh.winding(f)[:, None] < 0, f[:, ::-1], f)
-    surface, rim = ClosestSurface(V, F), boundary_edges(np.asarray(F))
-    own = np.unique(boundary_edges(f))
+    surface, rim = ClosestSurface(V, F), _boundary_edges(np.asarray(F))
+    own = np.unique(_boundary_edges(f))
     for step in range(steps):
         if step % 10 == 0:
-            f = delaunay(x, f)
+            f = _delaunay(x, f)
             mean = neighbour_mean(f, len(x), boundary_apart=True)
         y = mean @ x
         x = np.array(surface(0.5 * (x + y)).point, dtype=np.float64)
         if len(own):
             x[own] = nearest_on_segments(0.5 * (x + y)[own], V[rim[:, 0]], V[rim[:, 1]])
-    return x, delaunay(x, f)
+    return x, _delaunay(x, f)

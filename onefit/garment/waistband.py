@@ -12,7 +12,7 @@ from onefit.body import skeleton
 
 from .remesh import loops, nearest_on_segments
 
-SHOULDERS = [skeleton.INDEX["left_shoulder"], skeleton.INDEX["right_shoulder"]]
+_SHOULDERS = [skeleton.INDEX["left_shoulder"], skeleton.INDEX["right_shoulder"]]
 BAND_WIDTH = 0.02, 0.05  # [m]; cloth so near to the rim is held, farther away it is free
 
 
@@ -30,7 +30,7 @@ def held(vertices, faces, joints):
     held. Of any other one it is what lies along the highest loop of its boundary.
     """
     out, rim = np.zeros(len(vertices)), highest_rim(vertices, faces)
-    if rim is None or vertices[:, 2].max() > joints[SHOULDERS, 2].mean():
+    if rim is None or vertices[:, 2].max() > joints[_SHOULDERS, 2].mean():
         return out
     rim = vertices[rim]
     near = np.flatnonzero(

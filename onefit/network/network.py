@@ -14,13 +14,13 @@ import torch
 from torch import nn
 
 from onefit.body import skeleton
-from onefit.garment.charts import Deformation
+from onefit.garment import Deformation
 from polyfit import jets
 
 GRAVITY = (0.0, 0.0, -1.0)  # unit, world
 LEAKY_SLOPE = 0.1  # of the leaky ReLUs
-MEMORY = 40.0  # frames that the slowest units of the memory keep, at first: a skirt's swing
-LOOSENESS_SIZE = (
+_MEMORY = 40.0  # frames that the slowest units of the memory keep, at first: a skirt's swing
+_LOOSENESS_SIZE = (
     4  # numbers that tell how a patch hangs: how far from the body, and how much of it is held
 )
 # Deformations that a unit of the decoder's output stands for: coefficients and translation in units
@@ -63,7 +63,7 @@ class PatchEncoder(nn.Module):
             + 7
             + 3 * (1 + 2 * octaves[0])
             + 3 * joints * (1 + 2 * octaves[1])
-            + LOOSENESS_SIZE
+            + _LOOSENESS_SIZE
             + joints
         )
         self.first = layers([size, hidden, hidden])
@@ -153,13 +153,13 @@ class BodyEncoder(nn.Module):
 
 
 def _keep(gru):
-    """Biases of a GRU whose units keep 1 to MEMORY frames (Tallec and Ollivier 2018). Without any,
+    """Biases of a GRU whose units keep 1 to _MEMORY frames (Tallec and Ollivier 2018). Without any,
     all of them forget half in a frame, and nothing can swing.
     """
     for bias in (gru.bias_ih_l0, gru.bias_hh_l0):
         nn.init.zeros_(bias)
     _, update, _ = gru.bias_ih_l0.data.chunk(3)
-    update.copy_(torch.linspace(1, MEMORY, len(update) + 1)[1:].sub(1).log().clamp(min=0))
+    update.copy_(torch.linspace(1, _MEMORY, len(update) + 1)[1:].sub(1).log().clamp(min=0))
 
 
 class Decoder(nn.Module):

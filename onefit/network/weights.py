@@ -13,7 +13,7 @@ from polyfit.errors import InputError
 from polyfit.network import load_into, read_weights, write_weights
 
 VERSION = 4  # of the network's shape and the meaning of its weights
-SCALE = ":scale"  # after the name of a matrix: its rows' scales
+_SCALE = ":scale"  # after the name of a matrix: its rows' scales
 FOLDER = Path(__file__).parents[1] / "data" / "weights"
 
 
@@ -47,7 +47,7 @@ def save(path, network, model, garments):
     for name, tensor in network.state_dict().items():
         if tensor.ndim == 2:
             scale = tensor.abs().amax(1, keepdim=True).clamp(min=1e-12) / 127
-            tensors[name], tensors[f"{name}{SCALE}"] = (
+            tensors[name], tensors[f"{name}{_SCALE}"] = (
                 (tensor / scale).round().to(torch.int8),
                 scale,
             )
@@ -73,9 +73,9 @@ def load(name: str | os.PathLike[str]) -> Trained:
     tensors, about = read_weights(path, "onefit", VERSION)
     network = OneFit(**about["shape"])
     values = {
-        k: v.float() * tensors.get(f"{k}{SCALE}", 1.0)
+        k: v.float() * tensors.get(f"{k}{_SCALE}", 1.0)
         for k, v in tensors.items()
-        if not k.endswith(SCALE)
+        if not k.endswith(_SCALE)
     }
     load_into(network, values, path)
     return Trained(network.eval(), about["body"], tuple(about["garments"]))

@@ -43,7 +43,7 @@ class Weights:
                 raise InputError(f"{name} = {value}: a number, 0 or more")
 
 
-def penetration(distance, epsilon):
+def _penetration(distance, epsilon):
     """d_c = max(epsilon - d, 0) of signed distances [m]: how far a point is from being ``epsilon``
     outside the body.
     """
@@ -54,13 +54,13 @@ def collision(distance, area, epsilon):
     """Sum over points of d_c^2 [m^2], of signed distances (N, T) [m] at points that stand for
     ``area`` (N,) [m^2] each.
     """
-    return (penetration(distance, epsilon).square() * (area / POINT_AREA)[:, None]).sum(0).mean()
+    return (_penetration(distance, epsilon).square() * (area / POINT_AREA)[:, None]).sum(0).mean()
 
 
 def extension(distance, epoch, epsilon):
     """k_ext = 1 + min(d_c, 0.01) min(e, 100), of the same shape: how much the metric may stretch
     where the body is in the way. Without gradient."""
-    return 1 + penetration(distance.detach(), epsilon).clamp(max=0.01) * min(epoch, 100)
+    return 1 + _penetration(distance.detach(), epsilon).clamp(max=0.01) * min(epoch, 100)
 
 
 def metric(tangents):

@@ -10,7 +10,7 @@ from onefit.physics import sheet as physics
 
 from . import losses, objective
 
-COLLISION_FRAMES = 8  # drawn at random: to look for the body costs more than all else
+_COLLISION_FRAMES = 8  # drawn at random: to look for the body costs more than all else
 
 
 def evaluate(garment, deformation, scene, sheets, weights, past=None, dt=1 / 30, generator=None):
@@ -24,7 +24,7 @@ def evaluate(garment, deformation, scene, sheets, weights, past=None, dt=1 / 30,
     x = objective.vertices(garment, garment.changes(deformation), scene.rest, scene.transforms)
     terms = {}
     if weights.k_c:
-        some = torch.randperm(x.shape[1], generator=generator)[:COLLISION_FRAMES].to(x.device)
+        some = torch.randperm(x.shape[1], generator=generator)[:_COLLISION_FRAMES].to(x.device)
         seen = replace(scene, body=scene.body[some])
         terms["collision"], _ = objective.collision(garment, x[:, some], seen, weights, generator)
     if weights.k_m:

@@ -39,7 +39,7 @@ def lengths(vertices, edges):
     return (vertices[:, edges[:, 0]] - vertices[:, edges[:, 1]]).norm(dim=-1)
 
 
-def physical_energy(vertices, rest, faces, root, dt, k_mi=losses.Weights.k_mi):
+def _physical_energy(vertices, rest, faces, root, dt, k_mi=losses.Weights.k_mi):
     """Stretching, gravity and inertia [J], each (T - 2,), of vertices (T, N, 3) of a garment that
     rests at ``rest`` (N, 3).
 
@@ -71,7 +71,7 @@ def measure(vertices, faces, rest, body_vertices, collider, root, fps):
         .mean()
     )
     change = lambda now, then: ((now - then).abs() / then).mean()
-    energy = sum(physical_energy(vertices, rest, faces, root, 1 / fps)).mean()
+    energy = sum(_physical_energy(vertices, rest, faces, root, 1 / fps)).mean()
     second = (vertices[2:] - 2 * vertices[1:-1] + vertices[:-2]).norm(dim=-1).mean()
     return Measures(
         100 * float(inside),

@@ -8,7 +8,7 @@ import torch
 
 from . import losses
 
-RANDOM_POINTS = (
+_RANDOM_POINTS = (
     1000  # vertices drawn for the collision, beside those nearest to the metric's points
 )
 
@@ -85,9 +85,9 @@ def evaluate(garment, deformation, scene, weights, epoch=100, past=None, dt=1 / 
 
 def collision(garment, x, scene, weights, generator=None):
     """The collision's term for vertices ``x`` (N, T, 3) [m], and signed distances (P, T) [m] of
-    those nearest to the metric's points and of :data:`RANDOM_POINTS` more.
+    those nearest to the metric's points and of :data:`_RANDOM_POINTS` more.
     """
-    drawn = torch.randint(len(x), (RANDOM_POINTS,), generator=generator).to(x.device)
+    drawn = torch.randint(len(x), (_RANDOM_POINTS,), generator=generator).to(x.device)
     chosen = torch.cat([garment.metric_vertex, drawn])
     distance = scene.collider.distances(x[chosen].transpose(0, 1), scene.body).T
     share = (garment.vertex_area.sum() / len(chosen)).expand(len(chosen))

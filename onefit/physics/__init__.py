@@ -7,7 +7,10 @@ import lazy_loader
 __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
+        "cloth": ["Cloth"],
+        "contact": ["BodyContact", "SelfContact"],
         "material": ["MATERIALS", "Material"],
         "settings": ["Settings"],
+        "sheet": ["Sheet", "samples"],
     },
 )

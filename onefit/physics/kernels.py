@@ -12,10 +12,10 @@ wp = ready()
 real = wp.float64
 vec2 = wp.types.vector(length=2, dtype=real)
 vec3 = wp.types.vector(length=3, dtype=real)
-mat2 = wp.types.matrix(shape=(2, 2), dtype=real)
+_mat2 = wp.types.matrix(shape=(2, 2), dtype=real)
 mat3 = wp.types.matrix(shape=(3, 3), dtype=real)
-mat32 = wp.types.matrix(shape=(3, 2), dtype=real)
-mat43 = wp.types.matrix(shape=(4, 3), dtype=real)
+_mat32 = wp.types.matrix(shape=(3, 2), dtype=real)
+_mat43 = wp.types.matrix(shape=(4, 3), dtype=real)
 wp.set_module_options({"enable_backward": False})
 
 
@@ -36,14 +36,14 @@ def stretching(
     """
     f = wp.tid()
     one, two, half = real(1.0), real(2.0), real(0.5)
-    F = mat32()
+    F = _mat32()
     for a in range(3):
         F += wp.outer(x[faces[f, a]], gradients[f, a])
     C = wp.transpose(F) * F
     det = wp.sqrt(wp.max(C[0, 0] * C[1, 1] - C[0, 1] * C[0, 1], real(1.0e-12)))
     trace = wp.sqrt(C[0, 0] + C[1, 1] + two * det)  # s_1 + s_2
-    S = (C + det * mat2(one, real(0.0), real(0.0), one)) / trace
-    inverse = mat2(S[1, 1], -S[0, 1], -S[0, 1], S[0, 0]) / det
+    S = (C + det * _mat2(one, real(0.0), real(0.0), one)) / trace
+    inverse = _mat2(S[1, 1], -S[0, 1], -S[0, 1], S[0, 0]) / det
     R = F * inverse
     r0 = vec3(R[0, 0], R[1, 0], R[2, 0])
     r1 = vec3(R[0, 1], R[1, 1], R[2, 1])
@@ -54,9 +54,9 @@ def stretching(
     apart = wp.sqrt(wp.max(middle * middle - det, real(0.0)))
     g1 = wp.max(one - one / (middle + apart), real(0.0))
     g2 = wp.max(one - one / wp.max(middle - apart, real(1.0e-6)), real(0.0))
-    G = half * (g1 + g2) * mat2(one, real(0.0), real(0.0), one)
+    G = half * (g1 + g2) * _mat2(one, real(0.0), real(0.0), one)
     if apart > real(1.0e-9):
-        G = G + (g1 - g2) / (two * apart) * (S - middle * mat2(one, real(0.0), real(0.0), one))
+        G = G + (g1 - g2) / (two * apart) * (S - middle * _mat2(one, real(0.0), real(0.0), one))
     w = weight[f]
     P = F - R
     nn = wp.outer(n, n)
@@ -74,7 +74,7 @@ def stretching(
 
 
 @wp.func
-def angle_between(one: vec3, two: vec3, edge: vec3):
+def _angle_between(one: vec3, two: vec3, edge: vec3):
     return wp.atan2(wp.dot(wp.cross(one, two), edge), wp.dot(one, two))
 
 
@@ -99,7 +99,7 @@ def bending(
     length = wp.length(e)
     edge = e / length
     one, two = wp.cross(e, x2 - x0), wp.cross(x3 - x0, e)
-    turned = angle_between(one, two, edge) - angles[h]
+    turned = _angle_between(one, two, edge) - angles[h]
     if turned > real(3.141592653589793):
         turned -= real(6.283185307179586)
     if turned < real(-3.141592653589793):
@@ -108,7 +108,7 @@ def bending(
     least = real(1.0e-16)
     a = one / wp.max(wp.dot(one, one), least)
     b = two / wp.max(wp.dot(two, two), least)
-    u = mat43()
+    u = _mat43()
     u[0] = -(wp.dot(x2 - x1, edge) * a + wp.dot(x3 - x1, edge) * b)
     u[1] = wp.dot(x2 - x0, edge) * a + wp.dot(x3 - x0, edge) * b
     u[2] = -length * a
@@ -205,7 +205,7 @@ def contact(
 
 
 @wp.func
-def closest_on_triangle(p: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3):
+def _closest_on_triangle(p: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3):
     """Barycentric coordinates of the nearest point (Ericson 2005, section 5.1.5)."""
     ab, ac, ap = b - a, c - a, p - a
     d1, d2 = wp.dot(ab, ap), wp.dot(ac, ap)
@@ -237,7 +237,7 @@ def closest_on_triangle(p: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3):
 
 
 @wp.func
-def side_of(p: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3):
+def _side_of(p: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3):
     return wp.dot(p - a, wp.cross(b - a, c - a))
 
 
@@ -272,15 +272,15 @@ def proximity(
             wp.min(wp.length_sq(rest[b] - rest[i]), wp.length_sq(rest[c] - rest[i])),
         )
         if i != a and i != b and i != c and beside > 4.0 * reach * reach:
-            near = closest_on_triangle(p, x[a], x[b], x[c])
+            near = _closest_on_triangle(p, x[a], x[b], x[c])
             away = p - (near[0] * x[a] + near[1] * x[b] + near[2] * x[c])
             if wp.length_sq(away) < closest:
                 closest = wp.length_sq(away)
                 face[i] = f
                 for k in range(3):
                     found[i, k] = near[k]
-                was = side_of(before[i], before[a], before[b], before[c])
-                if was * side_of(p, x[a], x[b], x[c]) > 0.0:
+                was = _side_of(before[i], before[a], before[b], before[c])
+                if was * _side_of(p, x[a], x[b], x[c]) > 0.0:
                     normal[i] = wp.normalize(away)
                 else:
                     normal[i] = wp.sign(was) * wp.normalize(wp.cross(x[b] - x[a], x[c] - x[a]))

@@ -14,7 +14,7 @@ from polyfit import mesh
 
 from .material import GRAVITY, Material
 
-LEAST = 1e-12  # of the roots below, so that a degenerate triangle has a gradient
+_LEAST = 1e-12  # of the roots below, so that a degenerate triangle has a gradient
 
 
 class Sheet:
@@ -54,7 +54,7 @@ class Sheet:
         self.stiffness = material.bending * squared / self.area[of // 3].sum(1)
         if sides is None:
             x = torch.as_tensor(self.rest)[:, None]
-            self.angles = hinge_angles(x, self.hinges)[:, 0].numpy()
+            self.angles = _hinge_angles(x, self.hinges)[:, 0].numpy()
         else:
             self.angles = np.zeros(len(self.hinges))
 
@@ -68,7 +68,7 @@ def flattened(sides: np.ndarray) -> np.ndarray:
     """
     a, b, c = sides.T
     x = (a * a + c * c - b * b) / (2 * a)
-    y = np.sqrt(np.maximum(c * c - x * x, LEAST))
+    y = np.sqrt(np.maximum(c * c - x * x, _LEAST))
     return np.stack([np.stack([a, x], 1), np.stack([0 * a, y], 1)], 1)
 
 
@@ -105,12 +105,12 @@ def stretching(x, sheet):
     C = F.transpose(-1, -2) @ F
     trace = C[..., 0, 0] + C[..., 1, 1]
     det = C[..., 0, 0] * C[..., 1, 1] - C[..., 0, 1].square()
-    squared = trace - 2 * (trace + 2 * det.clamp(min=LEAST).sqrt()).sqrt() + 2
+    squared = trace - 2 * (trace + 2 * det.clamp(min=_LEAST).sqrt()).sqrt() + 2
     area = torch.as_tensor(sheet.area).to(x)
     return sheet.material.stretch / 2 * (area[:, None] * squared).sum(0)
 
 
-def hinge_angles(x, hinges):
+def _hinge_angles(x, hinges):
     """Angles (H, T) [rad] between the normals of the triangles on both sides of hinges (H, 4), of
     points (N, T, 3); more than 0 where the outer side is the convex one.
     """
@@ -126,7 +126,7 @@ def bending(x, sheet):
     each hinge (Grinspun et al. 2003); the factor makes a cylinder of even triangles cost B / 2
     curvature^2 an area.
     """
-    turned = hinge_angles(x, sheet.hinges) - torch.as_tensor(sheet.angles).to(x)[:, None]
+    turned = _hinge_angles(x, sheet.hinges) - torch.as_tensor(sheet.angles).to(x)[:, None]
     turned = torch.remainder(turned + torch.pi, 2 * torch.pi) - torch.pi
     return (torch.as_tensor(sheet.stiffness).to(x)[:, None] / 2 * turned.square()).sum(0)
 

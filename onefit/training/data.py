@@ -8,11 +8,10 @@ import numpy as np
 import torch
 
 from onefit.body import AnnyBody, ClosestSurface, skinning
-from onefit.garment.charts import PatchedGarment
+from onefit.garment import PatchedGarment
 from onefit.motion import Motion, generate
 from onefit.objective import objective
-from onefit.physics import Material
-from onefit.physics.sheet import Sheet
+from onefit.physics import Material, Sheet
 
 LENGTH = 10  # frames of a window that the body's encoder sees
 # the same of lessons, how many of the last of them may be asked for, and how many are

@@ -22,10 +22,10 @@ from .data import FPS, LESSON_FRAMES, TrainingData
 from .settings import STANDARD
 from .teacher import garment_of, lessons, taught
 
-GRADIENT_NORM = 1.0  # gradients are clipped to it
+_GRADIENT_NORM = 1.0  # gradients are clipped to it
 BAD_STEPS = 20  # in a row without a finite loss, after which a training is given up
-LESSON_UNIT = 0.01  # [m] of a vertex from where its lesson has it, that a loss of 1 stands for
-HIDDEN_NOISE = 0.1  # standard deviation of the encoder's memory at the start of a window
+_LESSON_UNIT = 0.01  # [m] of a vertex from where its lesson has it, that a loss of 1 stands for
+_HIDDEN_NOISE = 0.1  # standard deviation of the encoder's memory at the start of a window
 
 
 class OneFitTraining(Training):
@@ -104,12 +104,12 @@ class OneFitTraining(Training):
         there = objective.posed(
             rest[:, frame[2]] + wanted, garment.garment.blend_weights, self.data.transforms(*frame)
         )
-        away = (x - there).square().sum(-1).mean() / LESSON_UNIT**2
+        away = (x - there).square().sum(-1).mean() / _LESSON_UNIT**2
         return terms | {"regression": self.given.weights.k_t * away}
 
     def _encoded(self, garment, windows, generator):
         """This process's share of the windows, Z_T, Z_B, and which windows are its own."""
-        hidden = HIDDEN_NOISE * torch.randn(
+        hidden = _HIDDEN_NOISE * torch.randn(
             1, len(windows.number), self.network.body.memory.hidden_size, generator=generator
         )
         mine = slice(self.processes.rank, None, self.processes.count)
@@ -146,7 +146,7 @@ class OneFitTraining(Training):
             {"loss": total.item(), **{name: value.item() for name, value in terms.items()}}
         )
         self.processes.average(self.network)
-        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), GRADIENT_NORM)
+        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), _GRADIENT_NORM)
         if not (math.isfinite(figures["loss"]) and norm.isfinite()):
             return self._stepped_over(figures)
         self.bad, self.last = 0, figures["loss"]

@@ -7,9 +7,9 @@ from __future__ import annotations
 import scipy.linalg
 import torch
 
-from onefit.garment.charts import PatchedGarment
+from onefit.garment import PatchedGarment
 
-RIDGE = (
+_RIDGE = (
     1e-6  # of the normal matrix's mean diagonal: monomials that no vertex sees stay where they are
 )
 
@@ -32,7 +32,7 @@ class Projection:
         blend = patched.blend @ torch.eye(patched.blend.shape[1])
         self._blend = blend.double().numpy()
         normal = self._blend.T @ self._blend
-        normal[range(len(normal)), range(len(normal))] += RIDGE * normal.diagonal().mean()
+        normal[range(len(normal)), range(len(normal))] += _RIDGE * normal.diagonal().mean()
         self._factor = scipy.linalg.cho_factor(normal)
 
     def __call__(self, displacement: torch.Tensor) -> torch.Tensor:

@@ -24,7 +24,7 @@ from .projection import unposed
 FPS = 30.0
 # A lesson's faces are of 2 cm, and a third of its time would go into points between their corners
 SETTINGS = Settings(spacing=0.05)
-BETWEEN = "--"  # the names of garment and motion, in those of files
+_BETWEEN = "--"  # the names of garment and motion, in those of files
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def lesson(draper, garment, motion, shape, *, finish, material, advance=lambda: 
 def path_of(folder, garment: str, motion: str = "") -> Path:
     """The file of a lesson, or that of the garment; ``garment`` and ``motion`` by their names."""
     name = re.sub("[^A-Za-z0-9_]", "_", garment)
-    return Path(folder) / f"{name}{BETWEEN if motion else ''}{motion}.npz"
+    return Path(folder) / f"{name}{_BETWEEN if motion else ''}{motion}.npz"
 
 
 def write(path: Path, lesson: Lesson) -> None:
@@ -85,7 +85,7 @@ def garment_of(folder, name: str) -> Garment:
 def taught(folder) -> tuple[str, ...]:
     """The names of the garments in a folder of lessons. Raises InputError for none."""
     paths = Path(folder).glob("*.npz")
-    names = tuple(sorted(path.stem for path in paths if BETWEEN not in path.stem))
+    names = tuple(sorted(path.stem for path in paths if _BETWEEN not in path.stem))
     if not names:
         raise InputError(f"{folder}: no lessons; onefit.teach makes them")
     return names

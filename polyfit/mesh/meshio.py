@@ -15,8 +15,8 @@ from polyfit.files import aside
 
 from .texcoords import TexCoords
 
-TexturedMesh = tuple[np.ndarray, np.ndarray, TexCoords | None]  # vertices, faces, coordinates
-MeshArrays = tuple[np.ndarray, np.ndarray, np.ndarray | None]  # vertices, faces, uv
+_TexturedMesh = tuple[np.ndarray, np.ndarray, TexCoords | None]  # vertices, faces, coordinates
+_MeshArrays = tuple[np.ndarray, np.ndarray, np.ndarray | None]  # vertices, faces, uv
 
 
 def write_ply(
@@ -49,7 +49,7 @@ def write_ply(
         file.write(corners.tobytes())
 
 
-def read_mesh(path: str | os.PathLike[str], what: str = "mesh") -> MeshArrays:
+def read_mesh(path: str | os.PathLike[str], what: str = "mesh") -> _MeshArrays:
     """``(vertices (N, 3) float64, faces (F, 3) int64, uv (N, 2) float64 or None)`` of an OBJ or PLY
     file.
 
@@ -65,7 +65,7 @@ def read_mesh(path: str | os.PathLike[str], what: str = "mesh") -> MeshArrays:
     return vertices, faces, texcoords.of_vertices(faces, count)
 
 
-def read_textured(path: str | os.PathLike[str], what: str = "mesh") -> TexturedMesh:
+def read_textured(path: str | os.PathLike[str], what: str = "mesh") -> _TexturedMesh:
     """As :func:`read_mesh`, with a :class:`polyfit.mesh.TexCoords`, seams included, or None where
     the file has no texture coordinates at all. Corners without any name the coordinate -1.
     """
@@ -78,7 +78,7 @@ def read_textured(path: str | os.PathLike[str], what: str = "mesh") -> TexturedM
     return _read_obj(path) if extension == ".obj" else _read_ply(path)
 
 
-def _read_obj(path: str) -> TexturedMesh:
+def _read_obj(path: str) -> _TexturedMesh:
     """By hand, because trimesh reorders the triangles of quads, drops loose vertices, and loses uv
     beside normals.
     """
@@ -135,7 +135,7 @@ def _from_zero(index: int, count: int) -> int:
     return index - 1 if index > 0 else count + index
 
 
-def _read_ply(path: str) -> TexturedMesh:
+def _read_ply(path: str) -> _TexturedMesh:
     import trimesh
 
     log = logging.getLogger("trimesh")

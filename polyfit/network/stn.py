@@ -29,7 +29,7 @@ from .weights import load_into, read_weights, write_weights
 
 WEIGHTS_VERSION = 1  # of the network's shape and the meaning of its weights
 PRETRAINED = Path(__file__).parents[1] / "data" / "polyfit.safetensors"
-INITIAL_TILT = math.radians(55)  # between the PCA frame's z and the first guesses'
+_INITIAL_TILT = math.radians(55)  # between the PCA frame's z and the first guesses'
 
 
 class SpatialTransformer(torch.nn.Module):
@@ -61,10 +61,10 @@ class SpatialTransformer(torch.nn.Module):
         side = torch.arange(turns) * 2 * math.pi / turns
         first = torch.stack(
             [
-                math.sin(INITIAL_TILT / 2) * side.cos(),
-                math.sin(INITIAL_TILT / 2) * side.sin(),
+                math.sin(_INITIAL_TILT / 2) * side.cos(),
+                math.sin(_INITIAL_TILT / 2) * side.sin(),
                 0 * side,
-                math.cos(INITIAL_TILT / 2) + 0 * side,
+                math.cos(_INITIAL_TILT / 2) + 0 * side,
             ],
             -1,
         )

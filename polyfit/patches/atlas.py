@@ -21,7 +21,7 @@ from .unity import shares
 # A face is steep over its patch's plane beyond this cosine; a patch holds a surface of which no
 # larger share of the area is steep
 STEEP, STEEP_SHARE = 0.45, 0.1
-OVERLAP = 0.4  # width of the overlap, in radii of a disc of the patch's area
+_OVERLAP = 0.4  # width of the overlap, in radii of a disc of the patch's area
 FINE = 128  # clusters that vertices are merged to before patches are sought
 
 
@@ -78,7 +78,7 @@ def partition(vertices, faces, edges, label):
     area = np.bincount(
         label[faces].ravel(), np.repeat(mesh.areas(vertices, faces) / 3, 3), minlength=count
     )
-    width = np.maximum(OVERLAP * np.sqrt(area / np.pi), 1.5 * length.mean())
+    width = np.maximum(_OVERLAP * np.sqrt(area / np.pi), 1.5 * length.mean())
     near = np.zeros((len(vertices), count))
     for k in range(count):
         own = np.flatnonzero(label == k)

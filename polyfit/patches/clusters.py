@@ -21,10 +21,10 @@ from polyfit import mesh
 # Weights w of the normals against positions, tried in this order
 NORMAL_WEIGHTS = (1.5, 3.0, 6.0)
 # until at most this share of the area faces away from its cluster's mean normal
-FOLDED_SHARE = 0.01
-FINE_PER_CLUSTER = 12  # clusters of the fine cut for each cluster asked for
-VERTICES_PER_FINE = 4  # vertices that each of the fine cut should have, at least
-MAX_SWEEPS = 100  # over the boundaries
+_FOLDED_SHARE = 0.01
+_FINE_PER_CLUSTER = 12  # clusters of the fine cut for each cluster asked for
+_VERTICES_PER_FINE = 4  # vertices that each of the fine cut should have, at least
+_MAX_SWEEPS = 100  # over the boundaries
 
 
 def clusters(points, normals, area, faces, edges, count):
@@ -35,7 +35,7 @@ def clusters(points, normals, area, faces, edges, count):
     the normals get more weight, as long as that helps.
     """
     radius = np.sqrt(area.sum() / (np.pi * count))
-    fine = max(count, min(FINE_PER_CLUSTER * count, len(points) // VERTICES_PER_FINE))
+    fine = max(count, min(_FINE_PER_CLUSTER * count, len(points) // _VERTICES_PER_FINE))
     fine = connected(_acvd(points, faces, fine), edges, area)
     fine = np.unique(fine, return_inverse=True)[1]
     best, least = None, np.inf
@@ -47,7 +47,7 @@ def clusters(points, normals, area, faces, edges, count):
         folded = _folded(label, normals, area)
         if folded < 0.9 * least:
             best, least = label, folded
-        if folded <= FOLDED_SHARE or folded > least:
+        if folded <= _FOLDED_SHARE or folded > least:
             break
     return np.unique(best, return_inverse=True)[1]
 
@@ -119,7 +119,7 @@ def relaxed(label, feature, area, edges):
     until few move.
     """
     label = label.copy()
-    for sweep in range(MAX_SWEEPS):
+    for sweep in range(_MAX_SWEEPS):
         total, size = _sums(label, feature, area)
         centre = total / size[:, None]
 

@@ -14,8 +14,8 @@ from polyfit.errors import InputError
 from .clusters import clusters, split_in_two
 
 # Vertices that a mesh should have before it is cut: enough for the patches' outlines and jets
-VERTICES_PER_PATCH = 100
-MIN_VERTICES = 10_000  # of the whole mesh
+_VERTICES_PER_PATCH = 100
+_MIN_VERTICES = 10_000  # of the whole mesh
 
 
 def patch_count(area: float) -> int:
@@ -63,7 +63,7 @@ class Patches:
         faces: ArrayLike,
         count: int | None = None,
         *,
-        density: int = VERTICES_PER_PATCH,
+        density: int = _VERTICES_PER_PATCH,
         where: str = "mesh",
     ) -> "Patches":
         """Cut the mesh (N, 3) [m], (F, 3) into ``count`` connected patches; by default
@@ -214,7 +214,7 @@ def _components_of_faces(F: np.ndarray) -> np.ndarray:
 def _levels(vertices: int, area: np.ndarray, count: int, density: int) -> int:
     """Subdivisions until there are vertices enough, and no face is larger than a tenth of a patch
     (or until there are some million faces)."""
-    few = np.log(max(density * count, MIN_VERTICES) / vertices) / np.log(4)
+    few = np.log(max(density * count, _MIN_VERTICES) / vertices) / np.log(4)
     large = np.log(10 * count * area.max() / area.sum()) / np.log(4)
     most = np.log(4e6 / len(area)) / np.log(4)
     return max(0, min(int(np.ceil(max(few, large))), int(most)))

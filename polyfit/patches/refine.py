@@ -11,9 +11,9 @@ from . import clusters
 
 # Weight of a vertex's squared distance from its patch's centroid against its squared distance from
 # the jet, each divided by its mean: keeps patches compact.
-COMPACTNESS = 1.0
+_COMPACTNESS = 1.0
 # Sweeps over the boundaries between two fits.
-SWEEPS_PER_FIT = 4
+_SWEEPS_PER_FIT = 4
 
 
 def refined(surface, rounds, **options):
@@ -55,7 +55,7 @@ def _reassigned(surface, error):
         1e-300,
     )
     tensor = torch.as_tensor(points, dtype=surface.uv.dtype, device=surface.uv.device)
-    for sweep in range(SWEEPS_PER_FIT):
+    for sweep in range(_SWEEPS_PER_FIT):
         weight = np.bincount(label, area)
         centre = (
             np.stack([np.bincount(label, area * x) for x in points.T], axis=1) / weight[:, None]
@@ -68,7 +68,7 @@ def _reassigned(surface, error):
             from_jet = surface.distance(index[1], tensor[index[0]]).double().cpu().numpy()
             return (
                 from_jet**2 / error
-                + COMPACTNESS * ((points[v] - centre[patch]) ** 2).sum(axis=1) / spread
+                + _COMPACTNESS * ((points[v] - centre[patch]) ** 2).sum(axis=1) / spread
             )
 
         clusters.sweep_boundaries(

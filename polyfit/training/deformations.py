@@ -12,7 +12,7 @@ import torch
 
 # Largest curvature * |height| of a bend, no unit: the points farthest from its axis are stretched
 # by 1.8 or shrunk to 0.2.
-MAX_BEND = 0.8
+_MAX_BEND = 0.8
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ def _bend(x, frame, curvature):
     """
     along, across, up = (x @ frame).unbind(-1)
     # at up = 1 / curvature space would shrink to a line, and turn inside out beyond
-    most = MAX_BEND / up.detach().abs().amax(1, keepdim=True).clamp_min(1e-6)
+    most = _MAX_BEND / up.detach().abs().amax(1, keepdim=True).clamp_min(1e-6)
     curvature = torch.maximum(torch.minimum(curvature, most), -most)
     angle = curvature * along
     half = torch.special.sinc(angle / (2 * torch.pi))

@@ -20,11 +20,11 @@ from polyfit.errors import InputError
 
 FAMILIES = ("jet", "trigonometric", "gaussian", "bessel")
 
-AMPLITUDE = 0.5
+_AMPLITUDE = 0.5
 ORDER = 4
 THETA = (math.pi, 2 * math.pi)
 SIGMA = (0.5, 1.0)
-BESSEL_K = 5.0
+_BESSEL_K = 5.0
 
 
 def _uniform(shape, low, high, generator):
@@ -59,14 +59,14 @@ def bessel(alpha, centre, uv):
     (B,).
     """
     d = uv - centre[:, None]
-    x = BESSEL_K * d.norm(dim=-1)
+    x = _BESSEL_K * d.norm(dim=-1)
     # J1(x) / x -> 1/2 at the centre
     ratio = torch.where(
         x > 1e-6, torch.special.bessel_j1(x) / x.clamp_min(1e-6), torch.full_like(x, 0.5)
     )
     return (
         alpha[:, None] * torch.special.bessel_j0(x),
-        -(alpha[:, None] * BESSEL_K**2 * ratio)[..., None] * d,
+        -(alpha[:, None] * _BESSEL_K**2 * ratio)[..., None] * d,
     )
 
 
@@ -89,7 +89,7 @@ def sample(patches, points, generator, families=FAMILIES):
     )
 
     def amplitude(*shape):
-        return _uniform((patches, *shape), -AMPLITUDE, AMPLITUDE, generator)
+        return _uniform((patches, *shape), -_AMPLITUDE, _AMPLITUDE, generator)
 
     def centre():
         return _uniform((patches, 2), -1, 1, generator)

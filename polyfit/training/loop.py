@@ -17,8 +17,8 @@ from polyfit.network import load_into, read_weights, write_weights
 
 from .processes import Processes
 
-CHECKPOINT_VERSION = 1  # of the form of a checkpoint
-STEPS_PER_LOG_LINE = 50
+_CHECKPOINT_VERSION = 1  # of the form of a checkpoint
+_STEPS_PER_LOG_LINE = 50
 
 
 class Training:
@@ -72,13 +72,13 @@ class Training:
             path,
             tensors,
             dict(
-                model="checkpoint", version=CHECKPOINT_VERSION, settings=self.settings, **progress
+                model="checkpoint", version=_CHECKPOINT_VERSION, settings=self.settings, **progress
             ),
         )
 
     def restore(self, path):
         """Goes on from a checkpoint. Raises InputError where it was made with other settings."""
-        tensors, about = read_weights(path, "checkpoint", CHECKPOINT_VERSION)
+        tensors, about = read_weights(path, "checkpoint", _CHECKPOINT_VERSION)
         other = [
             f"{k} {about['settings'].get(k)}"
             for k, v in self.settings.items()
@@ -124,7 +124,7 @@ class Training:
                             f"the loss is {lines[-1]['loss']} at step {self.done}; a lower --lr may"
                             " help"
                         )
-                    if first and (self.done % STEPS_PER_LOG_LINE == 0 or self.done == end):
+                    if first and (self.done % _STEPS_PER_LOG_LINE == 0 or self.done == end):
                         file.write(json.dumps(self._line(lines)) + "\n")
                         file.flush()
                         lines.clear()

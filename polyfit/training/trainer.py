@@ -19,12 +19,12 @@ from .loop import Training, conduct
 from .losses import discrepancy
 from .settings import POINTS_PER_PATCH
 
-TRAINING_SET_VERSION = 1  # of the files that keep one
+_TRAINING_SET_VERSION = 1  # of the files that keep one
 # height [s] by which one turn must be better than another to be chosen e times as likely, in
 # training
-CHOICE_HEIGHT = 0.01
+_CHOICE_HEIGHT = 0.01
 # of the smoothing of the table over directions, at the start and at the end; no unit
-AXIS_SHARPNESS = (15.0, 80.0)
+_AXIS_SHARPNESS = (15.0, 80.0)
 CLOUD_POINTS = 1000  # points of a garment, and of its reconstruction
 
 
@@ -87,11 +87,11 @@ class PatchBatches:
         height, loss = self.patches.at(
             index,
             _z_axis(quaternion),
-            AXIS_SHARPNESS[0] + (AXIS_SHARPNESS[1] - AXIS_SHARPNESS[0]) * min(1, 1.2 * share),
+            _AXIS_SHARPNESS[0] + (_AXIS_SHARPNESS[1] - _AXIS_SHARPNESS[0]) * min(1, 1.2 * share),
         )
         # the turn of least height is kept; here softly, so that all of them learn which patches are
         # theirs
-        return (torch.softmax(-height / CHOICE_HEIGHT, 1) * loss).sum(1).mean()
+        return (torch.softmax(-height / _CHOICE_HEIGHT, 1) * loss).sum(1).mean()
 
     def _of_regressor(self, network, index):
         x = self.patches.points[index]
@@ -159,7 +159,7 @@ def _prepare(settings, folder, processes, progress):
     }
     if processes.rank == 0 and not (
         path.exists()
-        and read_weights(path, "training set", TRAINING_SET_VERSION)[1]["settings"] == wanted
+        and read_weights(path, "training set", _TRAINING_SET_VERSION)[1]["settings"] == wanted
     ):
         cut = (
             garments.cut_meshes(settings.meshes, settings.cuts, POINTS_PER_PATCH, settings.seed)
@@ -175,10 +175,10 @@ def _prepare(settings, folder, processes, progress):
         write_weights(
             path,
             {name: getattr(made, name) for name in names},
-            dict(model="training set", version=TRAINING_SET_VERSION, settings=wanted),
+            dict(model="training set", version=_TRAINING_SET_VERSION, settings=wanted),
         )
     processes.wait()
-    tensors, _ = read_weights(path, "training set", TRAINING_SET_VERSION)
+    tensors, _ = read_weights(path, "training set", _TRAINING_SET_VERSION)
     return PatchBatches(
         training_set.TrainingSet(*(tensors[name] for name in names)).to(processes.device)
     )

@@ -18,9 +18,11 @@ from . import families
 from .garments import GarmentPatches
 from .losses import discrepancy
 
-PATCHES_PER_CHUNK = 500  # patches made, and fitted, at a time
-AXIS_COUNT = 65  # axes of the half sphere along which jets are fitted
-GARMENT_SHARE = 0.75  # of the patches, where there are garments; the analytic families are the rest
+_PATCHES_PER_CHUNK = 500  # patches made, and fitted, at a time
+_AXIS_COUNT = 65  # axes of the half sphere along which jets are fitted
+_GARMENT_SHARE = (
+    0.75  # of the patches, where there are garments; the analytic families are the rest
+)
 NORMAL_WEIGHT = 0.1  # weight of 1 - cosine of the normals against RMS of height
 
 
@@ -53,9 +55,9 @@ class TrainingSet:
 
 
 def axes(device=None):
-    """Unit vectors (AXIS_COUNT, 3) evenly over the half sphere z > 0, the pole first."""
-    k = torch.arange(AXIS_COUNT - 1, device=device) + 0.5
-    z, turn = 1 - k / (AXIS_COUNT - 1), k * torch.pi * (3 - 5**0.5)
+    """Unit vectors (_AXIS_COUNT, 3) evenly over the half sphere z > 0, the pole first."""
+    k = torch.arange(_AXIS_COUNT - 1, device=device) + 0.5
+    z, turn = 1 - k / (_AXIS_COUNT - 1), k * torch.pi * (3 - 5**0.5)
     r = (1 - z * z).sqrt()
     return torch.cat(
         [z.new_tensor([[0.0, 0.0, 1.0]]), torch.stack([r * turn.cos(), r * turn.sin(), z], -1)]
@@ -88,10 +90,10 @@ def build(
     """
     parts = []
     turns = rotations_to(axes())
-    for first in range(0, count, PATCHES_PER_CHUNK):
-        size = min(PATCHES_PER_CHUNK, count - first)
+    for first in range(0, count, _PATCHES_PER_CHUNK):
+        size = min(_PATCHES_PER_CHUNK, count - first)
         generator = torch.Generator().manual_seed(seed * 1_000_003 + first)
-        deformed = 0 if garments is None else size if not names else round(GARMENT_SHARE * size)
+        deformed = 0 if garments is None else size if not names else round(_GARMENT_SHARE * size)
         made = []
         if deformed:
             made.append(garments.deformed(deformed, generator))

@@ -7,7 +7,7 @@ import os
 import numpy as np
 
 from polysft_mi.errors import InputError
-from polysft_mi.scene.images import focal_35mm, list_images, read_rgb
+from polysft_mi.scene import focal_35mm, list_images, read_rgb
 
 
 def read_frames(path, first=0, last=-1, stride=1):

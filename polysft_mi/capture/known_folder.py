@@ -5,9 +5,8 @@ import os
 
 from polyfit.files import aside
 from polysft_mi.errors import InputError
-from polysft_mi.scene.images import checked_size
+from polysft_mi.scene import Sequence, checked_size
 from polysft_mi.scene.kinect_paper import template as kinect_paper_template
-from polysft_mi.scene.sequence import Sequence
 from polysft_mi.surface import meshio
 
 from .layouts import recognise

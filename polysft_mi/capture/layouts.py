@@ -9,8 +9,7 @@ from dataclasses import dataclass, field
 
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError
-from polysft_mi.scene import kinect_paper
-from polysft_mi.scene.images import EXTENSIONS
+from polysft_mi.scene import EXTENSIONS, kinect_paper
 
 FORMS = (
     "cloth (camera.json, an OBJ file, a texture image, frames/, masks/ or none), "

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from threadpoolctl import threadpool_limits
 
 from polysft_mi.errors import InputError
-from polysft_mi.scene.images import list_images, read_rgb
+from polysft_mi.scene import list_images, read_rgb
 
 from . import pictures
 from .masks import Masks, iou

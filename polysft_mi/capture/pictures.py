@@ -5,10 +5,10 @@ images.
 import cv2
 import numpy as np
 
-from polysft_mi.pictures.shading import seen
+from polysft_mi.pictures import seen
 from polysft_mi.scene.outline import loops
 
-GREEN, RED, YELLOW = (60, 220, 90), (235, 70, 60), (255, 210, 40)
+GREEN, _RED, _YELLOW = (60, 220, 90), (235, 70, 60), (255, 210, 40)
 
 
 def shrunk(image, side):
@@ -69,7 +69,7 @@ def masked(image, mask):
         (mask > 127).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE
     )
     return cv2.drawContours(
-        np.ascontiguousarray(shown), outline, -1, YELLOW, max(1, round(max(image.shape[:2]) / 320))
+        np.ascontiguousarray(shown), outline, -1, _YELLOW, max(1, round(max(image.shape[:2]) / 320))
     )
 
 
@@ -83,7 +83,7 @@ def matches(photo, frame, found, most=60):
     )
     at = np.column_stack([found.photo[:, 0], 1 - found.photo[:, 1]]) * left.shape[1::-1]
     to = found.frame * b + (left.shape[1] + 8, 0)
-    for agree, colour in ((False, RED), (True, GREEN)):
+    for agree, colour in ((False, _RED), (True, GREEN)):
         lines = np.flatnonzero(found.agree == agree)
         for k in lines[:: max(1, len(lines) // most)]:
             p, q = (tuple(round(v) for v in x) for x in (at[k], to[k]))
@@ -118,7 +118,7 @@ def pose(frame, photo, sheet, placed, camera):
     draw(np.unique(edges, axis=0), GREEN, 1)
     wired = cv2.addWeighted(plain, 0.7, wired, 0.3, 0)  # what is printed shows through
     for loop in loops(faces):
-        draw(np.stack([loop, np.roll(loop, -1)], axis=1), YELLOW, 2)
+        draw(np.stack([loop, np.roll(loop, -1)], axis=1), _YELLOW, 2)
     label(wired, "the template in the first frame")
     beside, _ = _canvas(photo_on_frame(frame, photo, sheet, placed, camera))
     label(beside, "the photo, placed on the template")

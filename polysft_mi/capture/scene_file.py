@@ -5,7 +5,7 @@
 from xml.sax.saxutils import escape, quoteattr
 
 from polysft_mi.errors import InputError
-from polysft_mi.scene.settings import defaults_xml, properties_xml
+from polysft_mi.scene import defaults_xml, properties_xml
 
 
 def scene_xml(layout, data, template=None, comment=""):

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from polysft_mi.errors import InputError
-from polysft_mi.scene.images import focal_35mm, read_rgb
+from polysft_mi.scene import focal_35mm, read_rgb
 from polysft_mi.surface import meshio
 
 from . import pictures, sheet
@@ -24,7 +24,7 @@ from .masks import Registration, silhouette
 from .output import REPORT, replace_folder, target_folder, write_json, write_png
 from .scene_file import scene_xml
 
-FIRST_FRAME = "first-frame"  # the word for a texture that is taken from the video
+_FIRST_FRAME = "first-frame"  # the word for a texture that is taken from the video
 
 
 def prepare_video(
@@ -79,7 +79,7 @@ def prepare_video(
     inputs = [
         x
         for x in (video, texture, template, camera, calibrate, masks)
-        if isinstance(x, str) and x != FIRST_FRAME
+        if isinstance(x, str) and x != _FIRST_FRAME
     ]
     out = target_folder(video, out, inputs, overwrite)
     masks = GivenMasks(masks) if isinstance(masks, str) else masks
@@ -200,7 +200,7 @@ def _lens(video, texture, camera, fov, calibrate, board, size):
         lens, picture = calibrate_camera(calibrate, board)
         return lens.resized(*size), picture
     focal, where = focal_length(video)
-    if focal is None and texture != FIRST_FRAME:
+    if focal is None and texture != _FIRST_FRAME:
         focal, where = focal_35mm(texture), f"{texture}, if it has the same camera and zoom"
     if focal is None:
         raise InputError(
@@ -212,7 +212,7 @@ def _lens(video, texture, camera, fov, calibrate, board, size):
 
 def _photo(texture, corners, size):
     """The photo (H, W, 3) uint8, cut to its corners; None where the first frame is the texture."""
-    photo = None if texture == FIRST_FRAME else read_rgb(texture)
+    photo = None if texture == _FIRST_FRAME else read_rgb(texture)
     if corners is None:
         return photo
     if photo is None:

@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from polysft_mi.errors import BadFrame
-from polysft_mi.render.device import on_device
+from polysft_mi.render import on_device
 
 from . import pixels
 from .pyramid import level_image

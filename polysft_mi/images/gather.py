@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from polysft_mi.render.device import frozen, on_device
+from polysft_mi.render import frozen, on_device
 
 from .pixels import CORNERS, CURVATURES, FIGURES, SLOPES, packed
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from polysft_mi.scene.rules import Rules
+from polysft_mi.scene import Rules
 
 from .pyramid import blur, shrink
 

@@ -15,8 +15,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from polysft_mi.render.device import frozen, on_device
-from polysft_mi.surface.pattern import Pattern
+from polysft_mi.render import frozen, on_device
+from polysft_mi.surface import Pattern
 
 from . import pixels
 from .frames import Frames
@@ -74,7 +74,7 @@ class Registration:
     """
 
     def __init__(self, problem):
-        from polysft_mi.render.raster import RasterIntegrator
+        from polysft_mi.render import RasterIntegrator
 
         self._problem, self._rules = problem, problem.rules
         experiment, mesh = problem.experiment, problem.experiment.mesh

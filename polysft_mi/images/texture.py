@@ -9,12 +9,12 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial import cKDTree
 
-from polysft_mi.render.device import on_device
+from polysft_mi.render import on_device
 
 from . import pixels
 from .pyramid import blur, compared
 
-PIXEL_BLUR = 0.29  # standard deviation of a pixel's own square [pixels]
+_PIXEL_BLUR = 0.29  # standard deviation of a pixel's own square [pixels]
 _MARGIN = 12  # texels around the box of the texture coordinates
 
 
@@ -110,7 +110,7 @@ class Texture:
         :class:`polysft_mi.images.pixels.Image` whose fourth channel is 1 where it may be trusted.
         """
         if level not in self._levels:
-            sigma = self.density * np.sqrt(level.sigma**2 + (PIXEL_BLUR * level.stride) ** 2)
+            sigma = self.density * np.sqrt(level.sigma**2 + (_PIXEL_BLUR * level.stride) ** 2)
             window = self.density * level.window
             image = compared(self.image, self._weight, sigma, window, self._normalise)
             trusted = np.ones_like(self.inside)
@@ -127,7 +127,7 @@ class Texture:
         """
         key = "fine", stride
         if key not in self._levels:
-            sigma = self.density * PIXEL_BLUR * stride / pixels.TAPS
+            sigma = self.density * _PIXEL_BLUR * stride / pixels.TAPS
             image = blur(self.image, sigma, self._weight)
             self._levels[key] = pixels.Image.of(
                 packed_image(image, np.zeros_like(self.inside)), image.shape[:2]

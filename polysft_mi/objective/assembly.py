@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 import scipy.sparse as sp
 
+from polysft_mi.images import packed
 from polysft_mi.images.gather import (
     add,
     congruence,
@@ -23,8 +24,7 @@ from polysft_mi.images.gather import (
     projection,
     rows_of,
 )
-from polysft_mi.images.pixels import packed
-from polysft_mi.render.device import frozen, on_device
+from polysft_mi.render import frozen, on_device
 
 
 @dataclass
@@ -80,7 +80,7 @@ class Halo:
     patch: mi.UInt32
 
 
-def in_unknowns(
+def _vertex_sums_in_unknowns(
     tables,
     halo,
     images,
@@ -225,7 +225,7 @@ class Assembly:
 
     def __init__(self, pattern, gather, atlas):
         self.pattern, self._gather, self._atlas = pattern, gather, atlas
-        self._in_unknowns = frozen(in_unknowns)
+        self._in_unknowns = frozen(_vertex_sums_in_unknowns)
         self._list_halo()
 
     def _list_halo(self):

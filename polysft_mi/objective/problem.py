@@ -15,18 +15,15 @@ import mitsuba as mi
 import numpy as np
 
 from polysft_mi.errors import BadFrame, InputError
-from polysft_mi.render.device import interruptible
-from polysft_mi.render.pinhole import Pinhole
-from polysft_mi.render.raster import RasterIntegrator
-from polysft_mi.scene.rules import Rules
-from polysft_mi.surface.patch import JetAtlas, Unknowns
+from polysft_mi.render import Pinhole, RasterIntegrator, interruptible
+from polysft_mi.scene import Rules
+from polysft_mi.surface import JetAtlas, Unknowns
 
 from . import terms as objective
 from .volume import Volume
 
 if TYPE_CHECKING:
-    from polysft_mi.scene.experiment import Experiment
-    from polysft_mi.scene.sequence import Sequence
+    from polysft_mi.scene import Experiment, Sequence
 
 TERMS = ("rgb", "silhouette", "inextensibility", "temporal")
 _CACHED_FRAMES = 8

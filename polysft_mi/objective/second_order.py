@@ -12,11 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from polysft_mi.errors import BadFrame
+from polysft_mi.images import Appearance, Evaluation, Registration
 from polysft_mi.images.light import Light, residuals
-from polysft_mi.images.registration import Appearance, Evaluation, Registration
-from polysft_mi.surface.atlas import Atlas, State, Surface
-from polysft_mi.surface.bending import hinges, slides
-from polysft_mi.surface.pattern import Pattern
+from polysft_mi.surface import Atlas, Pattern, State, Surface, hinges, slides
 
 from .assembly import Assembly, Normal
 from .hidden import Hidden

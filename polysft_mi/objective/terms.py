@@ -23,7 +23,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from polysft_mi.images.pyramid import POOL
+from polysft_mi.images import POOL
 
 _INTERIOR = 0.999  # alpha above which a pixel counts as filled by the surface
 
@@ -105,7 +105,7 @@ def gain(render, target, weight):
         return dr.clip(top / dr.maximum(bottom, 1e-12), 0.25, 4)
 
 
-def gaussian_taps(sigma):
+def _gaussian_taps(sigma):
     """A normalised, truncated Gaussian of standard deviation sigma [pixels], as a list."""
     radius = max(1, int(np.ceil(2.5 * sigma)))
     x = np.arange(-radius, radius + 1)
@@ -117,7 +117,7 @@ def blur(image, sigma):
     """Gaussian blur of an image tensor (H, W, C), zeros beyond its border; differentiable."""
     if sigma <= 0:
         return image
-    taps = gaussian_taps(sigma)
+    taps = _gaussian_taps(sigma)
     return dr.convolve(dr.convolve(image, taps, axis=0), taps, axis=1)
 
 

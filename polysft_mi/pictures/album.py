@@ -15,8 +15,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from polysft_mi.images.pyramid import compared
-from polysft_mi.render.raster import RasterIntegrator
+from polysft_mi.images import compared
+from polysft_mi.render import RasterIntegrator
 from polysft_mi.results import metrics
 
 from . import figures

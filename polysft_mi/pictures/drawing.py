@@ -35,7 +35,7 @@ def _draw_in_background(variant, scene, overrides, template, sequence, album, ca
         set_variant(variant)
         import drjit as dr
 
-        from polysft_mi.objective.problem import Problem
+        from polysft_mi.objective import Problem
         from polysft_mi.scene import experiment as scenes
 
         from .album import Album

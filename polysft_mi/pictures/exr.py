@@ -26,10 +26,10 @@ _KINDS = {
 }
 _COLOURS = {1: "Y", 3: "RGB", 4: "RGBA"}
 _REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
-DEFAULT_LAYER = "render"
+_DEFAULT_LAYER = "render"
 
 
-def channel_names(layer, count):
+def _channel_names(layer, count):
     """The names of the ``count`` channels of a layer, for example ``["render.R", "render.G",
     "render.B"]``.
 
@@ -44,7 +44,7 @@ def channel_names(layer, count):
     return [f"{layer}.{s}" for s in suffixes]
 
 
-def write_exr(path, layers, metadata=None, plain=DEFAULT_LAYER):
+def write_exr(path, layers, metadata=None, plain=_DEFAULT_LAYER):
     """Write ``layers`` (name -> (H, W) or (H, W, C)) to the EXR file ``path``, ZIP-compressed; the
     layer ``plain`` once more as plain R, G, B.
 
@@ -66,7 +66,7 @@ def write_exr(path, layers, metadata=None, plain=DEFAULT_LAYER):
                 " are needed"
             )
         size = image.shape[:2]
-        names = channel_names(layer, image.shape[2])
+        names = _channel_names(layer, image.shape[2])
         if layer in _KINDS:
             image = image.astype(np.float32)
         else:
@@ -122,5 +122,5 @@ def read_exr(path):
     layers = {}
     for layer in sorted({name.rpartition(".")[0] for name in planes} - {""}):
         count = sum(name.rpartition(".")[0] == layer for name in planes)
-        layers[layer] = np.stack([planes[name] for name in channel_names(layer, count)], axis=-1)
+        layers[layer] = np.stack([planes[name] for name in _channel_names(layer, count)], axis=-1)
     return layers, header

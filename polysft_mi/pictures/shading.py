@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from polysft_mi.results.metrics import vertex_normals
+from polysft_mi.results import vertex_normals
 
 
 @dataclass(frozen=True)

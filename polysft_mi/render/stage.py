@@ -12,18 +12,18 @@ import mitsuba as mi
 import numpy as np
 
 MARGIN = 1.12  # of the picture around what moves
-FOV = 28.0  # degrees, of the picture's height
+_FOV = 28.0  # degrees, of the picture's height
 FLOOR = np.array([0.36, 0.37, 0.39])  # linear RGB
 SKY = np.array([0.50, 0.53, 0.58])  # its radiance, the same from everywhere above
-BOUNCE = 0.3  # radiance of floor, skin and cloth as seen from a vertex, a share of the sky's
+_BOUNCE = 0.3  # radiance of floor, skin and cloth as seen from a vertex, a share of the sky's
 KEY = np.array([1.25, 1.2, 1.12])  # irradiance of the key light, across its direction
-TOWARDS_KEY = np.array([0.22, -0.71, 0.75])  # for a camera that looks along y
-KEY_RADIUS = 8.0  # degrees, as the key light is seen
-SKY_RAYS, KEY_RAYS = 128, 32  # from each vertex
-GRID, REACH = 96, 1.5  # cells of the floor's light along a side, and half of its side [m]
+_TOWARDS_KEY = np.array([0.22, -0.71, 0.75])  # for a camera that looks along y
+_KEY_RADIUS = 8.0  # degrees, as the key light is seen
+_SKY_RAYS, _KEY_RAYS = 128, 32  # from each vertex
+GRID, _REACH = 96, 1.5  # cells of the floor's light along a side, and half of its side [m]
 FINE = 20_000  # faces
-COVER = 0.025  # [m]; what lies so near before a vertex covers it
-LIFT = 2e-3  # [m] by which rays start above a surface
+_COVER = 0.025  # [m]; what lies so near before a vertex covers it
+_LIFT = 2e-3  # [m] by which rays start above a surface
 
 
 def render(parts, *, size=(640, 480), spp=16, azimuth=25.0, elevation=8.0, follow=False, near=None):
@@ -52,7 +52,7 @@ def render(parts, *, size=(640, 480), spp=16, azimuth=25.0, elevation=8.0, follo
     across = max(half[2], np.hypot(half[0], half[1]) * height / width)
     a, e = np.deg2rad((azimuth, elevation))
     away = np.array([np.sin(a) * np.cos(e), -np.cos(a) * np.cos(e), np.sin(e)])
-    away *= across / np.tan(np.deg2rad(FOV / 2)) + half[1]
+    away *= across / np.tan(np.deg2rad(_FOV / 2)) + half[1]
     stage = Stage(everything[0], faces, colours, floor, a, part)
     for t, vertices in enumerate(everything):
         target = (low[t] + high[t]) / 2 if follow else middle
@@ -80,11 +80,11 @@ class Stage:
         self.part_of_face = mi.UInt32(self.part[faces[:, 0]])
         self.corners = mi.Vector3u(faces.T.astype(np.uint32))
         self.colour = mi.Color3f(colours.T.astype(np.float32))
-        self.sky = _sphere(SKY_RAYS)
-        x, y, z = TOWARDS_KEY / np.linalg.norm(TOWARDS_KEY)
+        self.sky = _sphere(_SKY_RAYS)
+        x, y, z = _TOWARDS_KEY / np.linalg.norm(_TOWARDS_KEY)
         cos, sin = np.cos(azimuth), np.sin(azimuth)
         towards = np.array([cos * x - sin * y, sin * x + cos * y, z])
-        self.sun = _cap(towards, KEY_RADIUS, KEY_RAYS)
+        self.sun = _cap(towards, _KEY_RADIUS, _KEY_RAYS)
 
     def light(self, vertices, target):
         """The vertices are at (N, 3) [m] from now on, and light falls on them, and on the floor
@@ -97,9 +97,9 @@ class Stage:
         self.front, self.back = (mi.Color3f(x.T.astype(np.float32)) for x in (front, back))
         self.shadow, self.normal = mi.Float(key), mi.Vector3f(self.normals.T.astype(np.float32))
         self.centre = np.asarray(target, np.float64)[:2]
-        x = np.linspace(-REACH, REACH, GRID)
+        x = np.linspace(-_REACH, _REACH, GRID)
         y, x = np.meshgrid(self.centre[1] + x, self.centre[0] + x, indexing="ij")
-        ground = np.stack([x, y, np.full_like(x, self.floor - LIFT)], -1).reshape(-1, 3)
+        ground = np.stack([x, y, np.full_like(x, self.floor - _LIFT)], -1).reshape(-1, 3)
         up = np.tile([0.0, 0.0, 1.0], (len(ground), 1))
         front, _, key = self._irradiance(ground, up)
         lit = FLOOR * (front + KEY * (key * self.sun.mean(1)[2])[:, None])
@@ -111,10 +111,10 @@ class Stage:
         uncovered neighbours have: so no darkness leaks out at the rim of a sleeve.
         """
         p, normal = (mi.Point3f(x.T.astype(np.float32)) for x in (vertices, self.normals))
-        ray = mi.Ray3f(p + LIFT * normal, mi.Vector3f(normal))
+        ray = mi.Ray3f(p + _LIFT * normal, mi.Vector3f(normal))
         hit = self.scene.ray_intersect_preliminary(ray)
         other = dr.gather(mi.UInt32, self.part_of_face, hit.prim_index, hit.is_valid())
-        covered = hit.is_valid() & (hit.t < COVER) & (other != mi.UInt32(self.part))
+        covered = hit.is_valid() & (hit.t < _COVER) & (other != mi.UInt32(self.part))
         seen = ~np.array(covered)
         start, end = self.faces.ravel(), np.roll(self.faces, -1, axis=1).ravel()
         start, end = np.concatenate([start, end]), np.concatenate([end, start])
@@ -142,21 +142,21 @@ class Stage:
         at, normal = dr.gather(mi.Point3f, p, point), dr.gather(mi.Vector3f, m, point)
         cosine = dr.dot(d, normal)
         side = dr.select(cosine > 0, 1.0, -1.0)
-        hidden = self.scene.ray_test(mi.Ray3f(at + side * LIFT * normal, d))
+        hidden = self.scene.ray_test(mi.Ray3f(at + side * _LIFT * normal, d))
         # 0, 1, 2: what comes from the sky, the floor, and the meshes themselves
         kind = dr.select(hidden, mi.UInt32(2), dr.select(d.z < 0, mi.UInt32(1), mi.UInt32(0)))
         place = (kind * 2 + dr.select(cosine > 0, mi.UInt32(0), mi.UInt32(1))) * n + point
         dr.scatter_reduce(dr.ReduceOp.Add, sums, dr.abs(cosine), place)
         sky, floor, near = np.array(sums).reshape(3, 2, n, 1)
         total = np.maximum(sky + floor + near, 1e-6)
-        found = (sky * SKY + BOUNCE * (floor * SKY + near * SKY)) / total
+        found = (sky * SKY + _BOUNCE * (floor * SKY + near * SKY)) / total
         rays = self.sun.shape[1]
         index = dr.arange(mi.UInt32, n * rays)
         point, ray = index % n, index // n
         d = dr.gather(mi.Vector3f, mi.Vector3f(self.sun.astype(np.float32)), ray)
         at, normal = dr.gather(mi.Point3f, p, point), dr.gather(mi.Vector3f, m, point)
         side = dr.select(dr.dot(d, normal) > 0, 1.0, -1.0)
-        hidden = self.scene.ray_test(mi.Ray3f(at + side * LIFT * normal, d))
+        hidden = self.scene.ray_test(mi.Ray3f(at + side * _LIFT * normal, d))
         key = dr.zeros(mi.Float, n)
         dr.scatter_reduce(dr.ReduceOp.Add, key, dr.select(hidden, 0.0, 1.0 / rays), point)
         return found[0], found[1], np.array(key)
@@ -170,7 +170,7 @@ class Stage:
         right = np.cross(ahead, [0, 0, 1])
         right /= np.linalg.norm(right)
         up = np.cross(right, ahead)
-        scale = np.tan(np.deg2rad(FOV / 2)) / (height / 2)
+        scale = np.tan(np.deg2rad(_FOV / 2)) / (height / 2)
         index = dr.arange(mi.UInt32, height * side * width * side)
         x, y = index % (width * side), index // (width * side)
         u = ((mi.Float(x) + 0.5) / side - width / 2) * scale
@@ -204,7 +204,7 @@ class Stage:
         """The floor as its grid is lit, and farther away the open floor, which becomes the sky."""
         distance = (self.floor - o.z) / dr.minimum(d.z, -1e-4)
         at = o + distance * d
-        uv = [(at[k] - float(self.centre[k])) / (2 * REACH) + 0.5 for k in range(2)]
+        uv = [(at[k] - float(self.centre[k])) / (2 * _REACH) + 0.5 for k in range(2)]
         lit = mi.Color3f(self.ground.eval(mi.Point2f(*uv)))
         edge = dr.maximum(dr.abs(uv[0] - 0.5), dr.abs(uv[1] - 0.5)) * 2
         far = dr.clip((edge - 0.7) / 0.3, 0, 1)

@@ -10,8 +10,10 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
         "comparison": ["Comparison", "compare"],
-        "evaluation": ["evaluate", "score"],
-        "formats": ["export"],
+        "evaluation": ["evaluate", "per_frame", "score"],
+        "formats": ["FORMATS", "export"],
+        "metrics": ["vertex_normals"],
+        "progress": ["Progress"],
         "run": ["Run"],
         "truth": ["Truth", "load_npz", "read_surface"],
     },

@@ -59,10 +59,10 @@ def evaluate(out, truth):
     InputError.
     """
     figures = score(read_surface(out), truth)
-    return {**figures, **(image_figures(out) if os.path.isdir(out) else {})}
+    return {**figures, **(_image_figures(out) if os.path.isdir(out) else {})}
 
 
-def image_figures(out):
+def _image_figures(out):
     """The PSNR and SSIM figures that a run left in its metrics.json, or none."""
     path = os.path.join(out, "metrics.json")
     if not os.path.isfile(path):

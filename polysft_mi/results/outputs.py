@@ -16,9 +16,8 @@ import numpy as np
 
 from polyfit.files import aside
 from polysft_mi import __version__
-from polysft_mi.scene.defaults import located
-from polysft_mi.surface import meshio
-from polysft_mi.surface.patch import Unknowns
+from polysft_mi.scene import located
+from polysft_mi.surface import Unknowns, meshio
 
 from .truth import uv_arrays
 

@@ -14,7 +14,7 @@ import numpy as np
 from polyfit.mesh import TexCoords
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError
-from polysft_mi.scene.defaults import known_defaults, located
+from polysft_mi.scene import known_defaults, located
 from polysft_mi.surface.template import matrix
 
 from .truth import load_npz, read_surface, texcoords_of
@@ -62,8 +62,8 @@ class Run:
             texcoords_of(surface, os.path.join(folder, "surface.npz")),
             surface["frames"],
             sigma=surface.get("sigma"),
-            metrics=read_json(os.path.join(folder, "metrics.json")),
-            about=read_json(os.path.join(folder, "run.json")),
+            metrics=_read_json(os.path.join(folder, "metrics.json")),
+            about=_read_json(os.path.join(folder, "run.json")),
         )
 
     def path(self, *names: str) -> str:
@@ -192,7 +192,7 @@ def _of_one_patch(p: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     }
 
 
-def read_json(path: str) -> dict:
+def _read_json(path: str) -> dict:
     """The object that a JSON file holds. Raises InputError."""
     try:
         with open(path, encoding="utf-8") as file:

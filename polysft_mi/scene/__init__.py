@@ -13,9 +13,17 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     submod_attrs={
         "defaults": ["known_defaults", "located", "resolved_defaults"],
         "experiment": ["Experiment", "load"],
-        "images": ["focal_35mm", "image_size", "list_images", "read_rgb"],
+        "images": [
+            "EXTENSIONS",
+            "checked_size",
+            "focal_35mm",
+            "image_size",
+            "list_images",
+            "read_rgb",
+        ],
         "plugins": ["register"],
+        "rules": ["Rules"],
         "sequence": ["Sequence", "drop_stray_components"],
-        "settings": ["Settings"],
+        "settings": ["Settings", "defaults_xml", "properties_xml"],
     },
 )

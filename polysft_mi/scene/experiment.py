@@ -18,8 +18,7 @@ from scipy.spatial import cKDTree
 
 from polyfit.mesh import TexCoords
 from polysft_mi.errors import InputError
-from polysft_mi.surface import meshio
-from polysft_mi.surface.template import Template
+from polysft_mi.surface import Template, meshio
 
 from . import plugins
 from .defaults import located, resolved_defaults

@@ -59,10 +59,10 @@ def list_images(pattern, what="images"):
             f"{what}: {pattern}: no images in this {kind}; PNG, JPEG, TIFF, EXR and the like are"
             " read"
         )
-    return sorted(images, key=natural_key)
+    return sorted(images, key=_natural_key)
 
 
-def natural_key(name):
+def _natural_key(name):
     """Sort key by which ``frame_2`` comes before ``frame_10``."""
     return [
         int(part) if part.isdigit() else part.lower() for part in re.split(r"([0-9]+)", name)

@@ -14,8 +14,7 @@ import numpy as np
 
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError
-from polysft_mi.render.projective import SilhouetteProjective
-from polysft_mi.render.raster import RasterIntegrator
+from polysft_mi.render import RasterIntegrator, SilhouetteProjective
 
 from . import settings
 

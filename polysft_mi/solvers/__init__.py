@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Protocol
 from .solution import Solution
 
 if TYPE_CHECKING:
-    from polysft_mi.objective.problem import Problem
-    from polysft_mi.scene.settings import Settings
-    from polysft_mi.surface.patch import Unknowns
+    from polysft_mi.objective import Problem
+    from polysft_mi.scene import Settings
+    from polysft_mi.surface import Unknowns
 
 __all__ = ["Solution", "Solver", "create"]
 

@@ -10,5 +10,11 @@ import lazy_loader
 __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submodules=["meshio"],
-    submod_attrs={"patch": ["JetAtlas", "Unknowns"], "template": ["Template"]},
+    submod_attrs={
+        "atlas": ["Atlas", "State", "Surface"],
+        "bending": ["hinges", "slides"],
+        "patch": ["JetAtlas", "Unknowns"],
+        "pattern": ["Pattern"],
+        "template": ["Template"],
+    },
 )

@@ -48,7 +48,7 @@ def _coefficients(alpha, like):
     return [mi.Float(dr.gather(mi.Float64, values, first + k)) for k in range(alpha.size)]
 
 
-def height_and_derivatives(alpha, u, v):
+def _height_and_derivatives(alpha, u, v):
     """(z, z_u, z_v), Floats of N."""
     coefficients = _coefficients(alpha, u)
     order = order_of(len(coefficients))
@@ -65,7 +65,7 @@ def height_and_derivatives(alpha, u, v):
 
 def height(alpha, u, v):
     """z(u, v), a Float of N."""
-    return height_and_derivatives(alpha, u, v)[0]
+    return _height_and_derivatives(alpha, u, v)[0]
 
 
 def point(alpha, u, v):
@@ -75,18 +75,18 @@ def point(alpha, u, v):
 
 def tangents(alpha, u, v):
     """phi_u = (1, 0, z_u) and phi_v = (0, 1, z_v), Vector3f of N."""
-    _, zu, zv = height_and_derivatives(alpha, u, v)
+    _, zu, zv = _height_and_derivatives(alpha, u, v)
     one, zero = dr.ones(mi.Float, dr.width(zu)), dr.zeros(mi.Float, dr.width(zu))
     return mi.Vector3f(one, zero, zu), mi.Vector3f(zero, one, zv)
 
 
 def normal(alpha, u, v):
     """Unit normal (-z_u, -z_v, 1) / |.|, a Normal3f of N."""
-    _, zu, zv = height_and_derivatives(alpha, u, v)
+    _, zu, zv = _height_and_derivatives(alpha, u, v)
     return dr.normalize(mi.Normal3f(-zu, -zv, 1))
 
 
 def metric(alpha, u, v):
     """First fundamental form (E, F, G) = (1 + z_u^2, z_u z_v, 1 + z_v^2), Floats of N."""
-    _, zu, zv = height_and_derivatives(alpha, u, v)
+    _, zu, zv = _height_and_derivatives(alpha, u, v)
     return 1 + zu * zu, zu * zv, 1 + zv * zv

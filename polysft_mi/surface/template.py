@@ -18,7 +18,7 @@ from numpy.polynomial.polynomial import polyder
 
 from polyfit.jets import DETERMINED_RMS, MIN_BOX_RATIO, exponents, order_of, size_of
 from polyfit.mesh import TexCoords, components, edges_of, face_vectors, sheets, winding
-from polyfit.patches.atlas import Cover, is_graph
+from polyfit.patches import Cover, is_graph
 from polysft_mi.errors import InputError
 
 _RIDGE = 1e-3  # of a jet's mean square, that holds it where several patches share a surface
@@ -115,7 +115,7 @@ class Template:
             else (np.asarray(x) for x in (frame.s, frame.R, frame.T))
         )
         alike = np.where(winding(sheets(faces))[:, None] < 0, faces[:, ::-1], faces)
-        graph = is_graph(points, alike, rotation[:, 2]) and components_of(faces) == 1
+        graph = is_graph(points, alike, rotation[:, 2]) and _components_of(faces) == 1
         # a skirt is a graph over the plane of its hem, but a steep one
         cover = Cover.of(points, alike) if frame is None else None
         if graph and (frame is not None or len(cover) == 1):
@@ -158,7 +158,7 @@ class Template:
         )
 
 
-def components_of(faces):
+def _components_of(faces):
     """How many connected components the faces (F, 3) have."""
     return int(components(faces.max() + 1, edges_of(faces)[0])[faces].max()) + 1
 

@@ -5,6 +5,7 @@ imported late. ``from package import Name`` counts as an import of the file that
 """
 
 import ast
+import collections
 import functools
 import importlib
 import re
@@ -22,6 +23,23 @@ NOT_YET = {
     "lines of a file": set(),
     "width of a line": set(),
     "private names": set(),
+    "imports past a package": {
+        "onefit.body.kernels",
+        "onefit.body.quietwarp",
+        "onefit.garment.sewing.cuts",
+        "onefit.garment.sewing.loose",
+        "onefit.garment.sewing.patterns",
+        "onefit.garment.sewing.templates",
+        "onefit.network.weights",
+        "polysft_mi.images.gather",
+        "polysft_mi.images.light",
+        "polysft_mi.results.comparison",
+        "polysft_mi.results.evaluation",
+        "polysft_mi.scene.kinect_paper",
+        "polysft_mi.scene.outline",
+        "polysft_mi.surface.meshio",
+        "polysft_mi.surface.template",
+    },
     "constants": 131,
 }
 
@@ -193,6 +211,33 @@ def test_packages_take_no_private_names_of_each_other():
             if other != module and private:
                 taken.add(f"{module} {name}")
     assert_only_known("private names", taken)
+
+
+def test_packages_import_each_other_by_their_names():
+    """What a package's ``__init__`` hands on; few files are asked by others themselves."""
+    past = set()
+    for name, path in modules().items():
+        for node in ast.walk(tree_of(path)):
+            where = absolute(node, name, path) if isinstance(node, ast.ImportFrom) else ""
+            if where in modules() and where.count(".") > 1 and room_of(where) != room_of(name):
+                past.add(where)
+    assert_only_known("imports past a package", past)
+
+
+def test_what_one_file_alone_uses_begins_with_an_underscore():
+    """Functions and numbers; classes may be what a public function returns."""
+    texts = [text_of(p) for p in sources(*PACKAGES, "tests", "benchmarks", "docs", "examples")]
+    texts += [
+        text_of(p) for p in [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("*.toml")]
+    ]
+    count = collections.Counter(word for text in texts for word in set(re.findall(r"\w+", text)))
+    alone = set()
+    for module, path in modules().items():
+        names = [n.name for n in tree_of(path).body if isinstance(n, ast.FunctionDef)]
+        for name in [*names, *constants(path)]:
+            if not name.startswith("_") and count[name] < 2:
+                alone.add(f"{module}.{name}")
+    assert_only_known("private names", alone)
 
 
 def test_every_package_says_what_it_is_for():

@@ -6,21 +6,21 @@ import numpy as np
 import scipy.sparse as sp
 import torch
 
-from polyfit.patches.unity import shares
+from polyfit.patches import shares
 
 from .samples import basis
 
 # A chart's weight falls to zero at this distance from its middle, in units of the patch's radius.
-CHART_RADIUS = 1.3
+_CHART_RADIUS = 1.3
 # A patch that fills less of its chart's disc than this share is a strip (a hem turned in), of which
 # networks know little: its neighbours have more say.
-STRIP_SHARE = 0.2
+_STRIP_SHARE = 0.2
 # Width of the Gaussian by which patches share their drift, in distances of neighbours.
 DRIFT_WIDTH = 1.0
 SLOPE_RIDGE = 1e-2  # weight that holds the slopes of the drifts' plane to zero
 # [m]; least and greatest displacement that a drift of 1 stands for
-DRIFT_RANGE = 0.005, 0.1
-SKIN_DISTANCE = 0.005  # [m]; a patch much nearer to the body than this lies on it
+_DRIFT_RANGE = 0.005, 0.1
+_SKIN_DISTANCE = 0.005  # [m]; a patch much nearer to the body than this lies on it
 
 
 def blend_matrix(p, vertices, frame, order):
@@ -41,7 +41,7 @@ def blend_matrix(p, vertices, frame, order):
         )
         / frame.s.numpy()[patch, None]
     )
-    r = np.linalg.norm(x[:, :2], axis=1) / CHART_RADIUS
+    r = np.linalg.norm(x[:, :2], axis=1) / _CHART_RADIUS
     near = np.where(
         patch == own[row],
         np.maximum(1 - r**2, 0.02),
@@ -50,7 +50,7 @@ def blend_matrix(p, vertices, frame, order):
     area = np.bincount(p.entry_patch, p.entry_weight) / (
         np.pi * frame.s.numpy() ** 2
     )  # as a share of the chart's disc
-    weight = (near * np.minimum(area / STRIP_SHARE, 1)[patch]) ** 3
+    weight = (near * np.minimum(area / _STRIP_SHARE, 1)[patch]) ** 3
     kept, share = shares(row, weight, count)
     row, patch, x = row[kept], patch[kept], x[kept]
     b = share[:, None] * basis(x[:, :2], order)
@@ -91,7 +91,7 @@ def drift_planes(pairs, frame):
 
 def looseness_of(p, surface):
     """Least, mean and greatest distance of each patch's vertices from the body's ``surface``, as
-    asinh(d / SKIN_DISTANCE): (K, 3).
+    asinh(d / _SKIN_DISTANCE): (K, 3).
     """
     distance = surface(p.vertices).distance
     order = np.argsort(p.vertex_patch, kind="stable")
@@ -101,13 +101,13 @@ def looseness_of(p, surface):
         ufunc.reduceat(distance[order], first) for ufunc in (np.minimum, np.add, np.maximum)
     )
     return torch.as_tensor(
-        np.arcsinh(np.stack([least, total / count, greatest], 1) / SKIN_DISTANCE),
+        np.arcsinh(np.stack([least, total / count, greatest], 1) / _SKIN_DISTANCE),
         dtype=torch.float32,
     )
 
 
 def drift_scale(looseness):
     """How far a patch of ``looseness`` (K, 3) goes with a drift of 1, (K,) [m]: its mean distance
-    from the standard body, within :data:`DRIFT_RANGE`.
+    from the standard body, within :data:`_DRIFT_RANGE`.
     """
-    return np.clip(SKIN_DISTANCE * np.sinh(looseness[:, 1].double().numpy()), *DRIFT_RANGE)
+    return np.clip(_SKIN_DISTANCE * np.sinh(looseness[:, 1].double().numpy()), *_DRIFT_RANGE)

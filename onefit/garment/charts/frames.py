@@ -9,7 +9,7 @@ from polyfit import jets
 from polyfit.jets import CanonicalFrame
 
 # weight of the ridge that holds jets to the chart's plane, see steady_jets
-JET_RIDGE = 1e-3
+_JET_RIDGE = 1e-3
 
 
 def along_bones(surface, weights, body):
@@ -41,7 +41,7 @@ def along_bones(surface, weights, body):
 
 def steady_jets(x, patch, weight, count, order):
     """Jets (K, A) of the points ``x`` (E, 3) of the charts ``patch`` (E,): least squares, held by
-    JET_RIDGE times the mean square of the jet over the chart's unit disc.
+    _JET_RIDGE times the mean square of the jet over the chart's unit disc.
 
     A strip of cloth (a hem turned in, a waistband) does not determine a jet across it: coefficients
     a hundred times those of other patches fit it a little better, and a network that reads them
@@ -64,7 +64,7 @@ def steady_jets(x, patch, weight, count, order):
         ),
         order,
     )
-    return torch.linalg.solve(gram + JET_RIDGE * disc.T @ disc / len(disc), right)
+    return torch.linalg.solve(gram + _JET_RIDGE * disc.T @ disc / len(disc), right)
 
 
 def _bones(body):

@@ -8,8 +8,8 @@ import torch
 
 from polyfit import jets, mesh
 
-METRIC_POINTS = 16  # of each patch
-BOUNDARY_POINTS = 6  # of each pair of patches that meet
+_METRIC_POINTS = 16  # of each patch
+_BOUNDARY_POINTS = 6  # of each pair of patches that meet
 
 
 def refinement(count, given, levels):
@@ -35,8 +35,8 @@ def metric_points(p, uv, order, rng):
     points, rows, columns, values = [], [], [], []
     for k, (first, last) in enumerate(zip(np.concatenate([[0], ends[:-1]]), ends)):
         e = np.arange(first, last)
-        mine = e[own[first:last]] if own[first:last].sum() >= METRIC_POINTS else e
-        chosen = mine[_far_apart(uv[mine], METRIC_POINTS, rng)]
+        mine = e[own[first:last]] if own[first:last].sum() >= _METRIC_POINTS else e
+        chosen = mine[_far_apart(uv[mine], _METRIC_POINTS, rng)]
         points.append(chosen)
         # a field of the vertices as a jet: least squares, weighted by area, held by a trace of
         # a ridge
@@ -48,8 +48,8 @@ def metric_points(p, uv, order, rng):
         stack = np.stack(
             [basis(uv[chosen], order, *d) @ fit for d in ((0, 0), (1, 0), (0, 1))], 1
         )  # (M, 3, E_k)
-        rows.append(np.repeat(3 * METRIC_POINTS * k + np.arange(3 * METRIC_POINTS), len(e)))
-        columns.append(np.tile(p.entry_vertex[e], 3 * METRIC_POINTS))
+        rows.append(np.repeat(3 * _METRIC_POINTS * k + np.arange(3 * _METRIC_POINTS), len(e)))
+        columns.append(np.tile(p.entry_vertex[e], 3 * _METRIC_POINTS))
         values.append(stack.reshape(-1))
     points = np.stack(points)  # (K, M)
     field = sp.csr_matrix(
@@ -61,14 +61,14 @@ def metric_points(p, uv, order, rng):
 
 def boundary_points(p, rng):
     """Pairs (B, 2) of entries of the patches ``p`` that lie on one another at the boundary of two
-    patches: at most :data:`BOUNDARY_POINTS`, at random, for each pair of patches.
+    patches: at most :data:`_BOUNDARY_POINTS`, at random, for each pair of patches.
     """
     pairs = p.boundary
     key = p.entry_patch[pairs] @ [len(p.label), 1]
     shuffled = rng.permutation(len(pairs))
     order = shuffled[np.argsort(key[shuffled], kind="stable")]
     rank = np.arange(len(order)) - np.searchsorted(key[order], key[order])
-    return pairs[np.sort(order[rank < BOUNDARY_POINTS])]
+    return pairs[np.sort(order[rank < _BOUNDARY_POINTS])]
 
 
 def basis_and_slopes(uv, order):

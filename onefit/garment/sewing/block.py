@@ -12,7 +12,7 @@ import numpy as np
 from onefit.body import ClosestSurface
 
 SPACING = 0.008  # of the grid [m]
-LOW, HIGH = np.array([-0.536, -0.424, -0.80]), np.array([0.536, 0.36, 0.80])  # its corners [m]
+_LOW, _HIGH = np.array([-0.536, -0.424, -0.80]), np.array([0.536, 0.36, 0.80])  # its corners [m]
 
 
 class Block:
@@ -20,8 +20,8 @@ class Block:
 
     def __init__(self, vertices, faces, spacing=SPACING):
         self.spacing = spacing
-        shape = np.round((HIGH - LOW) / spacing).astype(int) + 1
-        axes = [(LOW[k] + spacing * np.arange(shape[k])).astype(np.float32) for k in range(3)]
+        shape = np.round((_HIGH - _LOW) / spacing).astype(int) + 1
+        axes = [(_LOW[k] + spacing * np.arange(shape[k])).astype(np.float32) for k in range(3)]
         self.x, self.y, self.z = np.meshgrid(*axes, indexing="ij", sparse=True)
         self.side = np.abs(self.x)
         self.points = np.stack(np.broadcast_arrays(self.x, self.y, self.z), axis=-1)
@@ -78,7 +78,7 @@ class Block:
             gradient_direction="descent",
             allow_degenerate=False,
         )
-        return V + LOW, F.astype(np.int64)
+        return V + _LOW, F.astype(np.int64)
 
     def _distance(self, surface, reach):
         return (

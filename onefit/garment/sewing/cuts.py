@@ -81,10 +81,10 @@ VERTEX_COUNTS = 500, 5000  # vertices, likewise
 WRINKLE_HEIGHT = (
     0.004  # the greatest amplitude [m] of four waves, halved in their sum, for half of the cuts
 )
-WAVE_LENGTHS = 0.05, 0.15  # their lengths [m]
-LOG_STRETCH = 0.4  # of the triangles: the logarithm of the greatest
+_WAVE_LENGTHS = 0.05, 0.15  # their lengths [m]
+_LOG_STRETCH = 0.4  # of the triangles: the logarithm of the greatest
 SHORTEST_EDGE = 2e-4  # edge [m]: at a rim, vertices may slide onto each other
-TRIES = 20
+_TRIES = 20
 
 
 def drawn(name, rng):
@@ -106,7 +106,7 @@ def drawn(name, rng):
         )
     return measures | dict(
         count=int(_log_uniform(rng, *VERTEX_COUNTS)),
-        stretch=np.exp(rng.uniform(-LOG_STRETCH, LOG_STRETCH, 3)),
+        stretch=np.exp(rng.uniform(-_LOG_STRETCH, _LOG_STRETCH, 3)),
     )
 
 
@@ -120,7 +120,7 @@ def wrinkles(block, rng):
     out = 0.0
     for _ in range(4):
         direction = rng.normal(size=3)
-        wave = 2 * np.pi / rng.uniform(*WAVE_LENGTHS) * direction / np.linalg.norm(direction)
+        wave = 2 * np.pi / rng.uniform(*_WAVE_LENGTHS) * direction / np.linalg.norm(direction)
         out = (
             out
             + np.sin(
@@ -143,7 +143,7 @@ def cut(block, number, seed=0):
     """
     rng = np.random.default_rng([seed, number])
     name = list(CUTS)[number % len(CUTS)]
-    for _ in range(TRIES):
+    for _ in range(_TRIES):
         pattern, rims, _ = CUTS[name]
         measures = drawn(name, rng)
         V, F = sewn(block, pattern, bumps=wrinkles(block, rng), **measures)
@@ -155,7 +155,7 @@ def cut(block, number, seed=0):
         shortest = np.linalg.norm(V[edges[:, 0]] - V[edges[:, 1]], axis=1).min()
         if len(loops(F)) == rims and shortest > SHORTEST_EDGE:
             return name, V, F
-    raise RuntimeError(f"no cut {number} of {name} in {TRIES} tries")
+    raise RuntimeError(f"no cut {number} of {name} in {_TRIES} tries")
 
 
 def cuts(count, folder, seed=0, advance=lambda: None):

@@ -6,15 +6,11 @@ import numpy as np
 
 from onefit.garment.binding import standard_body
 from onefit.garment.waistband import held
-from onefit.physics import Material
-from onefit.physics.cloth import Cloth
-from onefit.physics.contact import BodyContact, SelfContact
-from onefit.physics.settings import Settings
-from onefit.physics.sheet import Sheet
+from onefit.physics import BodyContact, Cloth, Material, SelfContact, Settings, Sheet
 
-MATERIAL = "cotton"
+_MATERIAL = "cotton"
 STEP, SECONDS = 1 / 120, 2.5  # [s] of a step, and of the whole fall
-SLOWING = 0.88  # of velocities in each step: the cloth comes to rest, as if it fell through honey
+_SLOWING = 0.88  # of velocities in each step: the cloth comes to rest, as if it fell through honey
 SETTINGS = Settings(clearance=0.006, least=0.0045, newton=2, iterations=150, tolerance=3e-4)
 
 
@@ -25,7 +21,7 @@ def fallen(cut, seconds=SECONDS, advance=lambda cloth: None):
     body = standard_body()
     corners = cut.vertices[cut.faces]
     sides = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
-    sheet = Sheet(cut.start, cut.faces, Material.named(MATERIAL), sides)
+    sheet = Sheet(cut.start, cut.faces, Material.named(_MATERIAL), sides)
     surface = body.vertices.double().numpy()
     skin = BodyContact(sheet, body.vertices, body.faces, SETTINGS)
     itself = SelfContact(sheet, SETTINGS, len(skin))
@@ -37,6 +33,6 @@ def fallen(cut, seconds=SECONDS, advance=lambda cloth: None):
         cloth.step(STEP, contacts, cut.start, pull)
         skin.find(cloth.x)
         cloth.x = skin.pushed_out(cloth.x)
-        cloth.v *= SLOWING
+        cloth.v *= _SLOWING
         advance(cloth)
     return cloth.x

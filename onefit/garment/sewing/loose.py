@@ -81,14 +81,14 @@ def wide_trousers(b):
     """Fitted at the waist, with legs that fall straight from the widest place of the thigh."""
     ease = 0.005 + 0.013 * ramp(b.z, 0.13, 0.0)
     apart = np.where(b.z < -0.10, 0.008 - b.side, -1.0)  # the legs do not meet
-    field = np.minimum(lower(b), straight_legs(b)) - ease
+    field = np.minimum(lower(b), _straight_legs(b)) - ease
     return np.maximum(field, apart), lambda x, y, z: minimum(0.15 - z, z + 0.70)
 
 
-LEG_SLOPE = 0.16  # of the legs, outwards a metre down
+_LEG_SLOPE = 0.16  # of the legs, outwards a metre down
 
 
-def straight_legs(b):
+def _straight_legs(b):
     """Each leg as wide as it was anywhere above, along its own slope."""
     low = np.searchsorted(b.z.ravel(), -0.12)  # below the crotch
     half = b.x.ravel() > 0
@@ -96,13 +96,13 @@ def straight_legs(b):
     out = np.full_like(b.legs, 1.0)
     above = b.legs[half][:, :, low]
     for k in range(low, -1, -1):
-        shifted = np.array([np.interp(x - LEG_SLOPE * b.spacing, x, row) for row in above.T]).T
+        shifted = np.array([np.interp(x - _LEG_SLOPE * b.spacing, x, row) for row in above.T]).T
         above = np.minimum(shifted, b.legs[half][:, :, k])
         out[half, :, k] = above
     return np.minimum(out, out[::-1])
 
 
-def bodice(b):
+def _bodice(b):
     """A sleeveless top down to the waist."""
     return sleeveless_top(b, 0.8) - 0.006, lambda *p: minimum(
         below_neckline(*p, 0.43, 0.51, 8), arm_hole(*p), p[2] - 0.17
@@ -117,7 +117,7 @@ def waistband(b):
 # The pattern, its vertices, and how long the ring of a skirt is that is sewn to its lower rim [m]
 LOOSE_PATTERNS = {
     "boxy_tshirt": (boxy_tshirt, 5000, 0), "shirt": (shirt, 6000, 0),
-    "wide_trousers": (wide_trousers, 6000, 0), "waisted_dress": (bodice, 1250, 0.42),
+    "wide_trousers": (wide_trousers, 6000, 0), "waisted_dress": (_bodice, 1250, 0.42),
     "circle_skirt": (waistband, 165, 0.44),
 }  # fmt: skip
 
@@ -131,8 +131,8 @@ def cut(block, name):
     return with_ring(V, F, length)
 
 
-SLOPE = np.radians(48)  # of a skirt before it falls, below the horizontal
-WAVES = 9  # of its hem, so that it is about as long there as it was cut
+_SLOPE = np.radians(48)  # of a skirt before it falls, below the horizontal
+_WAVES = 9  # of its hem, so that it is about as long there as it was cut
 
 
 def with_ring(V, F, length):
@@ -154,12 +154,12 @@ def with_ring(V, F, length):
         s = (np.arange(n) + 0.5 * (k % 2)) / n
         at, normal = out(s, r)
         flat.append(at + r * normal)
-        wide, wave = r * np.cos(SLOPE), 2 * np.pi * WAVES * s + 0.9 * np.sin(4 * np.pi * s)
+        wide, wave = r * np.cos(_SLOPE), 2 * np.pi * _WAVES * s + 0.9 * np.sin(4 * np.pi * s)
         longer = (along[-1] + 2 * np.pi * r) / (along[-1] + 2 * np.pi * wide)
-        amplitude = np.sqrt(longer**2 - 1) * np.sqrt(2) * (along[-1] / 2 / np.pi + wide) / WAVES
+        amplitude = np.sqrt(longer**2 - 1) * np.sqrt(2) * (along[-1] / 2 / np.pi + wide) / _WAVES
         across = wide + amplitude * np.cos(wave)
         start.append(
-            np.column_stack([at + across[:, None] * normal, 0 * s + level - r * np.sin(SLOPE)])
+            np.column_stack([at + across[:, None] * normal, 0 * s + level - r * np.sin(_SLOPE)])
         )
     points = np.concatenate(flat)
     G = _triangles(points, len(waist))

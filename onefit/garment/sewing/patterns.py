@@ -1,7 +1,7 @@
 """The patterns of the templates: a block and a garment's measures go in; the signed distance of its
 cloth, and a function that is positive where the cloth is, come out.
 
-Torso, arms, legs and a flared skirt are joined by a smooth union, less the ease that the garment
+Torso, arms, legs and a _flared skirt are joined by a smooth union, less the ease that the garment
 has there; neck, hem and cuffs are zeros of smooth functions. Metres, OneFit's axes.
 """
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from .block import armhole
 
-SHOULDER, ELBOW, WRIST = np.array(
+_SHOULDER, _ELBOW, _WRIST = np.array(
     [[0.162, -0.017, 0.467], [0.329, -0.021, 0.279], [0.446, -0.179, 0.164]]
 )  # its left arm's joints [m]
 
@@ -34,7 +34,7 @@ def along_arm(x, y, z):
     """
     p = np.stack(np.broadcast_arrays(np.abs(x), y, z), axis=-1)
     unit = lambda v: v / np.linalg.norm(v)
-    return (p - SHOULDER) @ unit(ELBOW - SHOULDER), (p - ELBOW) @ unit(WRIST - ELBOW)
+    return (p - _SHOULDER) @ unit(_ELBOW - _SHOULDER), (p - _ELBOW) @ unit(_WRIST - _ELBOW)
 
 
 def below_neckline(x, y, z, front, back, narrow):
@@ -52,7 +52,7 @@ def arm_hole(x, y, z, centre=(0.20, -0.02, 0.47), radii=(0.08, 0.10, 0.095)):
     return (np.sqrt(sum((v / r) ** 2 for v, r in zip(d, radii))) - 1) * min(radii)
 
 
-def flared(x, y, z, waist, hem):
+def _flared(x, y, z, waist, hem):
     """About the signed distance to an elliptic cone: ``waist`` and ``hem`` are (z, half width, half
     depth, centre's y) [m].
     """
@@ -168,7 +168,7 @@ def dress(
     """Half widths and depths of the cone at the ``waist`` and, ``flare``, at its ``hem``; fitted to
     the body down to ``fitted``; ``top``: the upper rim of a skirt.
     """
-    cone = flared(b.x, b.y, b.z, (0.20, *waist, -0.035), (hem, *flare, -0.03))
+    cone = _flared(b.x, b.y, b.z, (0.20, *waist, -0.035), (hem, *flare, -0.03))
     body = sleeveless_top(b, snug) - ease
     field = smooth_union(np.where(b.z > fitted, body, np.maximum(body, fitted - b.z)), cone, 0.06)
     return field, lambda *p: minimum(

@@ -31,7 +31,7 @@ CHANNELS = {
     "right_hand": 2, "left_foot": 3, "right_foot": 3, "left_foot_turn": 3, "right_foot_turn": 3,
 }  # fmt: skip
 # hanging arms, a hand's breadth from the hips, elbows soft
-STAND = {
+_STAND = {
     "left_arm": (0.0, 0.2, 0.1, 0.3),
     "right_arm": (0.0, 0.2, 0.1, 0.3),
     "left_foot_turn": (0.0, 0.1, 0.0),
@@ -51,13 +51,13 @@ _SHIN = _J["left_ankle"] - _J["left_knee"]
 _BALL = _J["left_foot"] - _J["left_ankle"]  # from the ankle to the ball
 _KNEE_SOFTNESS = 0.003  # [m] of missing length over which an almost straight knee bends
 _HEEL = 0.19  # from the ball back to the heel's edge, about which toes are lifted [m]
-LEG_LENGTH = float(np.linalg.norm(_THIGH + _SHIN))  # in the T-pose, its greatest [m]
+_LEG_LENGTH = float(np.linalg.norm(_THIGH + _SHIN))  # in the T-pose, its greatest [m]
 
 
 def stand(frames):
     """The channels of a figure standing upright for ``frames`` frames."""
     return {
-        name: np.tile(np.asarray(STAND.get(name, np.zeros(size)), dtype=np.float64), (frames, 1))
+        name: np.tile(np.asarray(_STAND.get(name, np.zeros(size)), dtype=np.float64), (frames, 1))
         for name, size in CHANNELS.items()
     }
 
@@ -230,11 +230,11 @@ def _leg(c, side):
     to = ankle - hip
     # never quite straight: there the knee's bend goes with the root of what is missing, and would
     # jerk
-    most = 0.9985 * LEG_LENGTH
+    most = 0.9985 * _LEG_LENGTH
     distance = most - _KNEE_SOFTNESS * np.logaddexp(
         0.0, (most - np.linalg.norm(to, axis=1)) / _KNEE_SOFTNESS
     )
-    distance = np.maximum(distance, 0.35 * LEG_LENGTH)
+    distance = np.maximum(distance, 0.35 * _LEG_LENGTH)
     # law of cosines in the thigh's frame: |thigh + Rx(k) shin| = distance, with thigh and shin in
     # the plane x = 0
     a, b = np.linalg.norm(_THIGH), np.linalg.norm(_SHIN)
@@ -282,7 +282,7 @@ def _lowered(c, fps):
             ankle, _, _, hip, _ = _side(c | {"pelvis": pelvis}, side)
             across = np.linalg.norm((ankle - hip)[:, :2], axis=1)
             highest = ankle[:, 2] + np.sqrt(
-                np.clip((0.996 * LEG_LENGTH) ** 2 - across**2, 0.01, None)
+                np.clip((0.996 * _LEG_LENGTH) ** 2 - across**2, 0.01, None)
             )
             excess = np.maximum(excess, hip[:, 2] - highest)
         if not (excess > 0).any():

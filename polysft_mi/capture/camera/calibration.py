@@ -36,7 +36,7 @@ class CalibrationRules:
     max_residual: float = 3.0
 
 
-def parse_board(text):
+def _parse_board(text):
     """The board: ``9x6``, inner corners of a chessboard, or ``charuco:7x5:4X4_50:0.75``, squares,
     dictionary, and marker by square side.
 
@@ -112,7 +112,7 @@ def calibrate(path, board="9x6", rules=None):
     few, or where the views do not tell the focal length.
     """
     rules = rules or CalibrationRules()
-    detect = parse_board(board)
+    detect = _parse_board(board)
     views, size = [], None
     count = sum(1 for _ in read_frames(path))
     for index, image in read_frames(path, stride=max(1, count // rules.max_frames)):

@@ -66,7 +66,7 @@ class Lens:
         if (width, height) == (c.width, c.height):
             return self
         x, y = width / c.width, height / c.height
-        if not same_aspect((width, height), (c.width, c.height)):
+        if not _same_aspect((width, height), (c.width, c.height)):
             raise InputError(
                 f"{self.source}: for pictures of {c.width}x{c.height}; the frames have"
                 f" {width}x{height}, another shape"
@@ -91,7 +91,7 @@ class Lens:
         return {**values, "distortion": list(self.distortion)} if self.distortion else values
 
 
-def same_aspect(a, b):
+def _same_aspect(a, b):
     """Whether two sizes (width, height) are of one shape, but for rounding to whole pixels."""
     return abs(a[0] * b[1] / (a[1] * b[0]) - 1) <= 0.01
 
@@ -115,7 +115,7 @@ class Undistortion:
                 f"--scale {scale:g}: makes frames of {size[0]}x{size[1]} pixels; at least 16 a side"
                 " are needed"
             )
-        if not same_aspect(size, self.size):
+        if not _same_aspect(size, self.size):
             raise InputError(
                 f"--scale {scale:g}: makes frames of {size[0]}x{size[1]} pixels, too small to keep"
                 f" the shape of {c.width}x{c.height}"

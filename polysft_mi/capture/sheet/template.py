@@ -6,7 +6,7 @@ import numpy as np
 
 from polyfit.mesh import TexCoords
 from polysft_mi.errors import InputError
-from polysft_mi.pictures.shading import seen
+from polysft_mi.pictures import seen
 from polysft_mi.surface import meshio
 
 from .size import LARGEST, SMALLEST
@@ -122,7 +122,7 @@ def from_obj(path):
     """The :class:`Sheet` of an OBJ in metres with texture coordinates, its frame any. Raises
     InputError.
     """
-    from polysft_mi.surface.template import Template
+    from polysft_mi.surface import Template
 
     vertices, faces, texcoords = meshio.read_textured_template(path)
     meshio.check_template(vertices, faces, texcoords, path)

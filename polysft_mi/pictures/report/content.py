@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from polysft_mi.results.evaluation import per_frame
-from polysft_mi.results.truth import Truth
+from polysft_mi.results import Truth, per_frame
 
 from ..figures import COLOURS, TERMS, loss_curves
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from polyfit.files import aside
 from polysft_mi.errors import InputError
-from polysft_mi.results.run import Run
+from polysft_mi.results import Run
 
 from ..panels import PEAKS, box_of, evenly_spaced
 from .content import LABELS, about, figures, loss, subtitle, warning

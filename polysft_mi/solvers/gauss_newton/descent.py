@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import LinAlgError
 
-from polysft_mi.objective.second_order import Model, SecondOrder, stages_of
+from polysft_mi.objective import Model, SecondOrder, stages_of
 from polysft_mi.solvers.linear import Blocks, Reduced
-from polysft_mi.surface.atlas import State
+from polysft_mi.surface import State
 
 _FARTHEST_STEP = 2.0  # rotation [rad], translation and displacements [of the template's scale]
 _LEAST_DAMPING, _RAISED_DAMPING = 1e-7, 1e-4

@@ -7,10 +7,10 @@ import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from polysft_mi.errors import InputError
-from polysft_mi.images.light import Light
-from polysft_mi.objective.second_order import Context, SecondOrder
+from polysft_mi.images import Light
+from polysft_mi.objective import Context, SecondOrder
 from polysft_mi.solvers.solution import Solution
-from polysft_mi.surface.patch import Unknowns
+from polysft_mi.surface import Unknowns
 
 from .descent import Descent
 from .sigma import along_rays

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from polysft_mi.surface.atlas import State
+from polysft_mi.surface import State
 
 from .relocate import Relocator
 

@@ -40,7 +40,7 @@ def random_normal(pattern, size=9, d=2):
     "rows, columns, d", [(2, 2, 2), (3, 9, 2), (8, 7, 2), (2, 2, 3), (8, 7, 3)]
 )
 def test_step_and_variance_are_those_of_the_dense_system(monkeypatch, rows, columns, d, alone):
-    monkeypatch.setattr(tridiagonal, "_ALONE", alone)
+    monkeypatch.setattr(tridiagonal, "_WORTH_A_THREAD", alone)
     template = grid_template(rows, columns, order=1)
     further = hinges(template.vertices, template.faces)[0] if d == 3 else None
     pattern = Pattern(template.faces, template.edges, rows * columns, further)
@@ -75,7 +75,7 @@ def test_step_and_variance_are_those_of_the_dense_system(monkeypatch, rows, colu
 
 @pytest.mark.parametrize("vertex", [0, 30, 55])  # in either half, and in the middle
 def test_a_block_that_is_not_positive_is_refused_in_either_thread(monkeypatch, vertex):
-    monkeypatch.setattr(tridiagonal, "_ALONE", 0)
+    monkeypatch.setattr(tridiagonal, "_WORTH_A_THREAD", 0)
     template = grid_template(8, 7, order=1)
     pattern = Pattern(template.faces, template.edges, 56)
     normal = random_normal(pattern)
