@@ -184,7 +184,8 @@ measured, mostly since two sequences had decided by then.
 
 {of_rules}
 
-With all rules on (CPU time on one thread, beside other work: compare it within this page only):
+With all rules on, also those that are gone since (CPU time on one thread, beside other work:
+compare it within this page only):
 
 {baseline_table(results, sheets)}
 """

@@ -165,7 +165,7 @@ def pushed_out(
                 if known[v] == 2:
                     queue[last] = v
                     last += 1
-            elif wp.length(push[v]) < 0.02 * clearance:  # too little to matter
+            elif wp.length(push[v]) < 0.02 * clearance:  # the rim of a smoothed push: not asked
                 push[v] = wp.vec3(0.0, 0.0, 0.0)
             else:
                 # no deeper than it was moved, for before that it was outside, or was to come there

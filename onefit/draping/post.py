@@ -14,16 +14,14 @@ from onefit.body import ClosestSurface
 from onefit.physics import samples
 
 PULL = 60.0  # [1/s^2]: acceleration towards the network's drape, for a unit distance
-DRAG = 4.0  # [1/m] of the air on cotton, 1.2 kg/m^3 over twice 0.15 kg/m^2, times velocity squared
-_SWING_SMOOTHING = 2  # times in a frame
 NEAR = 0.06  # [m] from the body at rest, where skin doubles the pull
+DRAG = 4.0  # [1/m] of the air, times velocity squared: 1.2 kg/m^3 over twice cotton's 0.15 kg/m^2
+_SWING_SMOOTHING = 2  # times in a frame
 _ROUNDS = 14  # of the lengths
 RADIUS = 0.985  # spectral radius of a round, as the acceleration takes it to be
 CLEARANCE = 0.003  # [m] from the body
 _PUSHES = 5  # rounds
-_THINNEST = (
-    0.02  # [m], of limbs: cloth that is no farther from the drape has not passed through one
-)
+_THINNEST = 0.02  # [m] of limbs: cloth no farther from the drape has not passed through one
 SMOOTHING = 6  # times, of the pushes of the first round
 DEEPEST = 0.08  # [m]; vertices deeper in the body than this stay there
 SPACING = 0.025  # [m] of the points of faces that are looked at beside the vertices
@@ -44,8 +42,8 @@ def pull(vertices, body, held):
 class PostProcessing:
     """Post-processing of one garment with ``faces`` (F, 3): ``rest`` (N, 3) [m] graded to the body,
     ``lengths`` (E,) [m] at rest of its ``edges`` (E, 2), ``pull`` (N,) [1/s^2] as :func:`pull`
-    says. The methods change a frame ``x`` (N, 3) float32 [m];
-    ``surface`` is the body's, a :class:`onefit.body.ClosestSurface`.
+    says. The methods change a frame ``x`` (N, 3) float32 [m]; ``surface`` is the body's, a
+    :class:`onefit.body.ClosestSurface`.
     """
 
     def __init__(self, rest, faces, edges, lengths, pull):
