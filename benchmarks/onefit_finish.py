@@ -9,10 +9,11 @@ Every garment is draped in each held-out kind of motion, on the standard body an
 random in turn: by skinning, by the networks without and with post-processing, and by the first of
 them with a finish. Columns:
 *inside* [%] of the vertices; *faces* [%] of points of the faces, no farther apart than 5 mm, in
-every third frame; *strain* [%], *wave* [degrees], *swing* [mm] as :mod:`onefit.objective.folds` has
-them; *jitter* [mm], the mean second difference in time; *energy* [J] of the material: stretching,
-bending, and weight as seen from the hips; *ms*, the median of the frames, and *settle* [s], of one
-drape of the first motion.
+every third frame; *room* [%], those of them that lie where cloth has room, which it has not where
+the body overlaps itself, or all but touches itself; *strain* [%], *wave* [degrees], *swing* [mm] as
+:mod:`onefit.objective.folds` has them; *jitter* [mm], the mean second difference in time; *energy*
+[J] of the material: stretching, bending, and weight as seen from the hips; *ms*, the median of the
+frames, and *settle* [s], of one drape of the first motion.
 """
 
 import argparse
@@ -33,6 +34,7 @@ from onefit.training import STANDARD
 from polyfit.errors import cli
 
 SPACING, FRAME_STEP = 0.005, 3  # [m] of the faces' points; one frame in so many is looked at
+ROOM = 0.008  # [m] between skin and skin that cloth needs, to keep half of it from both
 
 
 def face_points(rest, faces):
@@ -71,15 +73,19 @@ def figures(drape, plain, garment, material):
     )
     surface = ClosestSurface(drape.body[0], drape.body_faces)
     corners, weights = face_points(drape.rest, drape.faces)
-    inside = []
+    inside, roomy = [], []
     for x, body in zip(drape.vertices[::FRAME_STEP], drape.body[::FRAME_STEP]):
         surface.follow(body)
         points = (x[corners] * weights[..., None]).sum(1)
-        inside.append(float((surface(points, 0.05).distance < 0).float().mean()))
+        found_at = surface(points, 0.05)
+        wrong = found_at.distance < 0
+        opposite = (found_at.point + ROOM * found_at.normal)[wrong]
+        inside.append(int(wrong.sum()) / len(points))
+        roomy.append(int((surface(opposite, ROOM).distance > ROOM / 2).sum()) / len(points))
     measures = drape.measures()
     return [
-        measures.collision, 100 * np.mean(inside), found.strain, measures.jitter, found.wave,
-        found.swing, energy(drape, garment, material),
+        measures.collision, 100 * np.mean(inside), 100 * np.mean(roomy), found.strain,
+        measures.jitter, found.wave, found.swing, energy(drape, garment, material),
     ]  # fmt: skip
 
 
@@ -102,8 +108,8 @@ def main(argv=None):
         for k, kind in enumerate(args.motions)
     ]
     print(
-        "| garment | | inside % | faces % | strain % | jitter mm | wave ° | swing mm | energy J |"
-        " ms | settle s |\n|---|---|---|---|---|---|---|---|---|---|---|"
+        "| garment | | inside % | faces % | room % | strain % | jitter mm | wave ° | swing mm |"
+        " energy J | ms | settle s |\n|---|---|---|---|---|---|---|---|---|---|---|---|"
     )
     finish = dict(finish=args.finish, material=material)
     for name in args.garments:
@@ -126,9 +132,9 @@ def main(argv=None):
                 table.setdefault(row, []).append(figures(found, plain, garment, material))
         for row, found in table.items():
             last = f"{times[0]:.0f} | {times[1]:.1f}" if row.endswith("finished") else " | "
-            inside, faces, strain, jitter, wave, swing, joules = np.mean(found, axis=0)
+            inside, faces, room, strain, jitter, wave, swing, joules = np.mean(found, axis=0)
             print(
-                f"| {garment.name} | {row} | {inside:.3f} | {faces:.3f} | {strain:.2f}"
+                f"| {garment.name} | {row} | {inside:.3f} | {faces:.3f} | {room:.3f} | {strain:.2f}"
                 f" | {jitter:.1f} | {wave:.1f} | {swing:.0f} | {joules:.2f} | {last} |",
                 flush=True,
             )

@@ -87,12 +87,11 @@ def main(argv=None):
             x / T for x in timed(lambda: network_alone(draper, garment, motion), args.device)
         ]
         drape = draper.drape(garment, motion, post=False)
-        process = draper.post_processing(garment, drape.rest)
-        surfaces = draper.surfaces(draper.standard)
+        process = draper.post_processing(garment, drape.rest, draper.standard)
         post = [
             x / T
             for x in timed(
-                lambda: process(drape.vertices, drape.body, surfaces, FPS),
+                lambda: process(drape.vertices, drape.body, FPS),
                 args.device,
                 3,
             )

@@ -1,6 +1,7 @@
 """Linear blend skinning from the rest space to a posed body, differentiable and on any device."""
 
 import torch
+from torch import nn
 
 from . import skeleton
 
@@ -47,8 +48,13 @@ def skin(points, blend_weights, transforms):
     """Points (T, N, 3) [m] in the world, of points (N, 3) or (T, N, 3) [m] in the rest space.
 
     ``blend_weights`` (N, 24), rows that sum to one; ``transforms`` (T, 24, 3, 4) of
-    :func:`transforms`. Needs 48 bytes a point and frame on the way: pass long motions in pieces.
+    :func:`transforms`. Points that differ from frame to frame need 48 bytes a point and frame on
+    the way: pass long motions in pieces.
     """
+    if points.ndim == 2:  # the same points in all frames: one product of matrices
+        weighted = blend_weights[..., None] * nn.functional.pad(points, (0, 1), value=1.0)[:, None]
+        maps = transforms.permute(1, 3, 0, 2).flatten(2).flatten(0, 1)
+        return (weighted.flatten(1) @ maps).unflatten(1, (-1, 3)).transpose(0, 1)
     A = blended(blend_weights, transforms)
     return (A[..., :3] @ points[..., None])[..., 0] + A[..., 3]
 

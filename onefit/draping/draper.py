@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -32,7 +33,8 @@ if TYPE_CHECKING:
 
 FPS = 30.0  # that the networks know
 WARM_UP = 10  # frames in which the first pose is held, for the network's memory to settle
-POINTS = 400_000  # vertices times frames that are draped at once
+BATCH = 16  # frames at most that go through the network at once
+POINTS = 400_000  # vertices times frames, likewise
 
 
 @dataclass(frozen=True)
@@ -159,25 +161,29 @@ class Draper:
         transforms = skinning.transforms(body, motion.poses, motion.translation)
         with torch.inference_mode():
             embedding = None if skinning_only else self.embedding(motion, body)
-            step = max(1, POINTS // len(rest))
-            parts = []
-            for first in range(0, len(motion.poses), step):
-                frames = slice(first, first + step)
-                points = (rest + offset)[:, None]
+
+        def batch(first):
+            """The drape (n, N, 3) and the bodies (n, V, 3), before post-processing."""
+            with torch.inference_mode():
+                points, some = (rest + offset)[:, None], slice(first, first + step)
                 if embedding is not None:
-                    points = points + self._displacement(garment, embedding[frames])
-                parts.append(posed(points, weights, transforms[frames]).transpose(0, 1))
-            bodies = torch.cat(
-                [
-                    skinning.skin(body.vertices, body.blend_weights, part)
-                    for part in transforms.split(64)
-                ]
-            )
-            vertices = torch.cat(parts)
-        root = skinning.posed_joints(body, transforms)[:, 0]
+                    points = points + self._displacement(garment, embedding[some])
+                return (
+                    posed(points, weights, transforms[some]).transpose(0, 1),
+                    skinning.skin(body.vertices, body.blend_weights, transforms[some]).contiguous(),
+                )
+
+        step = max(2, min(BATCH, POINTS // len(rest)))
+        batches, done = range(0, len(motion.poses), step), []
+        post_processed = lambda vertices, *_: vertices
         if post and not finish and not skinning_only:
-            post_processed = self.post_processing(garment, rest)
-            vertices = post_processed(vertices, bodies, self.surfaces(body), FPS)
+            post_processed = self.post_processing(garment, rest, body)
+        with ThreadPoolExecutor(1) as ahead:  # of the post-processing
+            for vertices, bodies in ahead.map(batch, batches):
+                past = done[-1][0][-2:] if done else None
+                done.append((post_processed(vertices, bodies, FPS, past), bodies))
+        vertices, bodies = (torch.cat(parts) for parts in zip(*done))
+        root = skinning.posed_joints(body, transforms)[:, 0]
         found = (vertices, garment.faces, rest, bodies, body.faces, root)
         vertices, faces, rest, bodies, body_faces, root = (x.cpu() for x in found)
         if finish:
@@ -196,23 +202,19 @@ class Draper:
         vertices, faces = garment.vertices.cpu().numpy(), garment.faces.cpu().numpy()
         return waistband.held(vertices, faces, self.standard.joints.numpy())
 
-    def post_processing(self, garment: Garment, rest: torch.Tensor) -> PostProcessing:
-        """The :class:`onefit.draping.post.PostProcessing` of a garment graded to a body, ``rest``
-        (N, 3) [m].
+    def post_processing(self, garment: Garment, rest: torch.Tensor, body: Body) -> PostProcessing:
+        """The :class:`onefit.draping.post.PostProcessing` of a garment graded to a ``body``, its
+        vertices at ``rest`` (N, 3) [m].
         """
         key, vertices = id(garment), garment.vertices.cpu().numpy()
         if key not in self._pulls:
             self._pulls[key] = pull(vertices, self.standard, self._held(garment))
+        if not self._surfaces:  # made once for a body model
+            at, faces = body.vertices.cpu(), body.faces.cpu()
+            self._surfaces = ClosestSurface(at, faces), ClosestSurface(at, faces)
         edges = mesh.edges_of(garment.faces.cpu().numpy())[0]
         lengths = garment.rest_lengths(torch.as_tensor(edges), rest.cpu())
-        return PostProcessing(rest, garment.faces, edges, lengths, self._pulls[key])
-
-    def surfaces(self, body: Body) -> tuple[ClosestSurface, ClosestSurface]:
-        """Two surfaces of the body model on the CPU, made once, that follow its bodies in turn."""
-        if not self._surfaces:
-            vertices, faces = body.vertices.cpu(), body.faces.cpu()
-            self._surfaces = ClosestSurface(vertices, faces), ClosestSurface(vertices, faces)
-        return self._surfaces
+        return PostProcessing(rest, garment.faces, edges, lengths, self._pulls[key], self._surfaces)
 
     def codes(self, garment: Garment) -> torch.Tensor:
         """Z_T (K, width) of the garment's patches, found once."""

@@ -59,8 +59,8 @@ def moved(
 
 @wp.kernel
 def lengths_restored(
-    edges: wp.array2d(dtype=int),
-    lengths: wp.array(dtype=float),
+    edges: wp.array(dtype=wp.vec2i),
+    lengths: wp.array(dtype=float),  # squared
     degree: wp.array(dtype=float),  # edges at each vertex
     rounds: int,
     radius: float,
@@ -77,24 +77,24 @@ def lengths_restored(
     ahead = wp.float32(1.0)
     for v in range(x.shape[0]):
         old[v] = x[v]
+        pull[v] = wp.vec3(0.0, 0.0, 0.0)
     for turn in range(rounds):
-        for v in range(x.shape[0]):
-            pull[v] = wp.vec3(0.0, 0.0, 0.0)
         for e in range(edges.shape[0]):
-            a, b = edges[e, 0], edges[e, 1]
-            edge = x[b] - x[a]
-            now, rest = wp.length_sq(edge), lengths[e] * lengths[e]
+            ends = edges[e]
+            edge = x[ends[1]] - x[ends[0]]
+            now, rest = wp.length_sq(edge), lengths[e]
             p = (now - rest) / (now + rest) * edge
-            pull[a] = pull[a] + p
-            pull[b] = pull[b] - p
+            pull[ends[0]] = pull[ends[0]] + p
+            pull[ends[1]] = pull[ends[1]] - p
         if turn == 1:
             ahead = 1.0 / (1.0 - 0.5 * radius * radius)
         if turn > 1:
             ahead = 1.0 / (1.0 - 0.25 * radius * radius * ahead)
         for v in range(x.shape[0]):
             here = x[v]
-            x[v] = old[v] + ahead * (here + pull[v] / wp.max(degree[v], 1.0) - old[v])
+            x[v] = old[v] + ahead * (here + pull[v] / degree[v] - old[v])
             old[v] = here
+            pull[v] = wp.vec3(0.0, 0.0, 0.0)
 
 
 @wp.func

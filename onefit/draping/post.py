@@ -13,11 +13,11 @@ import torch
 from onefit.body import ClosestSurface
 from onefit.physics import samples
 
-PULL = 60.0  # [1/s^2]: acceleration towards the network's drape, for a unit distance
+PULL = 40.0  # [1/s^2]: acceleration towards the drape, for a unit distance: a pendulum of 25 cm
 NEAR = 0.06  # [m] from the body at rest, where skin doubles the pull
-DRAG = 4.0  # [1/m] of the air, times velocity squared: 1.2 kg/m^3 over twice cotton's 0.15 kg/m^2
+DRAG = 8.0  # [1/m] of the air, times velocity squared: 1.2 kg/m^3 over 0.15 kg/m^2, of a plate
 _SWING_SMOOTHING = 2  # times in a frame
-_ROUNDS = 14  # of the lengths
+_ROUNDS = 16  # of the lengths
 RADIUS = 0.985  # spectral radius of a round, as the acceleration takes it to be
 CLEARANCE = 0.003  # [m] from the body
 _PUSHES = 5  # rounds
@@ -42,21 +42,23 @@ def pull(vertices, body, held):
 class PostProcessing:
     """Post-processing of one garment with ``faces`` (F, 3): ``rest`` (N, 3) [m] graded to the body,
     ``lengths`` (E,) [m] at rest of its ``edges`` (E, 2), ``pull`` (N,) [1/s^2] as :func:`pull`
-    says. The methods change a frame ``x`` (N, 3) float32 [m]; ``surface`` is the body's, a
-    :class:`onefit.body.ClosestSurface`.
+    says; two ``surfaces`` of the body, each a :class:`onefit.body.ClosestSurface`, will follow its
+    frames in turn. The methods change a frame ``x`` (N, 3) float32 [m].
     """
 
-    def __init__(self, rest, faces, edges, lengths, pull):
+    def __init__(self, rest, faces, edges, lengths, pull, surfaces=()):
         from . import kernels  # compiled at the first use
 
         self._kernels, self._wp, self._count = kernels, kernels.wp, len(rest)
+        self._surfaces = surfaces
         self._pool = ThreadPoolExecutor(1)  # a second thread
         rest, faces = rest.cpu().numpy(), faces.cpu().numpy()
         start, end = np.concatenate([edges, edges[:, ::-1]]).T
         degree = np.bincount(start, minlength=self._count)
         first = np.concatenate([[0], np.cumsum(degree)])
-        self._edges = self._array(edges, int, 2), self._array(np.asarray(lengths), float)
-        self._degree = self._array(degree, float)
+        squares = np.asarray(lengths) ** 2
+        self._edges = self._array(edges, self._wp.vec2i), self._array(squares, float)
+        self._degree = self._array(np.maximum(degree, 1), float)
         self._around = [self._array(a, int) for a in (first, end[np.argsort(start, kind="stable")])]
         corners, weights = _distinct(*samples(rest, faces, SPACING))
         self._points = self._array(corners, int, 2), self._array(weights, float, 2)
@@ -75,23 +77,23 @@ class PostProcessing:
         ]
         self._wp.launch(kernel, count, arguments, device="cpu")
 
-    def __call__(self, guide, bodies, surfaces, fps):
+    def __call__(self, guide, bodies, fps, past=None):
         """Vertices (T, N, 3) [m]: ``guide`` (T, N, 3), a network's drape at ``fps`` frames a
-        second, post-processed; ``bodies`` (T, V, 3) [m], which the two ``surfaces`` will follow in
-        turn. The motion begins at once, and the cloth is in it.
+        second, post-processed; ``bodies`` (T, V, 3) [m]; ``past`` (2, N, 3) [m], the cloth in the
+        two frames before. Without a past the motion begins at once, and the cloth is in it.
         """
         out = guide.detach().float().cpu().clone()
-        begins = out[min(1, len(out) - 1)] - out[0]
         goals = self._wp.from_torch(out.clone(), dtype=self._wp.vec3)
         frames = self._wp.from_torch(out, dtype=self._wp.vec3)
-        was = before = None
-        for t, surface in enumerate(self._followed(surfaces, bodies.detach().cpu())):
+        was, before = (None, None) if past is None else past.detach().float().cpu()
+        begins = out[min(1, len(out) - 1)] - out[0]
+        for t, surface in enumerate(self._followed(bodies.detach().cpu().numpy())):
             x = frames[t]
-            if t:
+            if before is not None:
                 self.move(x, before, was, 1 / fps)
             self.restore_lengths(x)
             self.push_out(x, goals[t], surface)
-            was, before = before if t else out[0] - begins, x
+            was, before = out[0] - begins if before is None else before, x
         return out.to(guide)
 
     def move(self, x, before, was, dt):
@@ -136,8 +138,9 @@ class PostProcessing:
         arrays = *self._around, *self._points, *settings, x, push, self._known, smooth, self._queue
         self._launch(self._kernels.pushed_out, surface.of_kernels, *arrays)
 
-    def _followed(self, surfaces, bodies):
+    def _followed(self, bodies):
         """The surface of each frame; that of the next follows meanwhile."""
+        surfaces = self._surfaces
         follow = lambda t: self._pool.submit(surfaces[t % 2].follow, bodies[t])
         following = follow(0)
         for t in range(len(bodies)):
