@@ -45,14 +45,14 @@ def finished(
     start, moving = guide.double().numpy()[:, order], bodies.double().numpy()
     body = BodyContact(sheet, bodies[0], body_faces, settings)
     itself = SelfContact(sheet, settings, len(body))
-    cloth = Cloth(sheet, start[0], settings, len(body) + len(sheet))
+    cloth = Cloth(sheet, start[0], settings, len(body) + len(itself))
     pull = settings.draw * sheet.mass + material.stretch * np.asarray(held)[order]
     dt = 1 / fps / steps
     body.find(cloth.x)
     cloth.x = body.pushed_out(cloth.x)
 
     def step(now, target):
-        contacts = [body.follow(now), itself.find(cloth.x, cloth.flight(dt))]
+        contacts = [body.follow(now), itself.find(cloth.x)]
         cloth.step(dt, contacts, target, pull)
         body.find(cloth.x)
         cloth.x = body.pushed_out(cloth.x)

@@ -156,24 +156,28 @@ def pushed_out(
 ):
     """See :meth:`onefit.draping.post.PostProcessing.push_out`."""
     count = x.shape[0]
+    last = wp.int32(0)
     for turn in range(rounds):
         some = wp.int32(0)
-        last = wp.int32(0)
-        for v in range(count):
-            if turn == 0:
+        if turn == 0:
+            for v in range(count):
                 some = wp.max(some, known[v])
                 if known[v] == 2:
                     queue[last] = v
                     last += 1
-            elif wp.length(push[v]) < 0.02 * clearance:  # the rim of a smoothed push: not asked
-                push[v] = wp.vec3(0.0, 0.0, 0.0)
-            else:
-                # no deeper than it was moved, for before that it was outside, or was to come there
-                far = wp.min(deepest, clearance + 2.0 * wp.length(push[v]))
-                p, d = pushed(body, x[v], far, 0.5 * clearance, clearance)
-                push[v] = p
-                if wp.length_sq(p) > 0.0:
-                    some = 1
+        else:  # those that were pushed
+            for i in range(last):
+                v = queue[i]
+                if wp.length(push[v]) < 0.02 * clearance:  # the rim of a smoothed push: not asked
+                    push[v] = wp.vec3(0.0, 0.0, 0.0)
+                else:
+                    # no deeper than it was moved, for before that it was outside, or was to come
+                    far = wp.min(deepest, clearance + 2.0 * wp.length(push[v]))
+                    p, d = pushed(body, x[v], far, 0.5 * clearance, clearance)
+                    push[v] = p
+                    if wp.length_sq(p) > 0.0:
+                        some = 1
+            last = 0
         head = wp.int32(0)
         while head < last:  # what lies deeper, beside what was found inside
             v = queue[head]

@@ -13,9 +13,9 @@ import torch
 from onefit.body import ClosestSurface
 from onefit.physics import samples
 
-PULL = 40.0  # [1/s^2]: acceleration towards the drape, for a unit distance: a pendulum of 25 cm
+PULL = 50.0  # [1/s^2]: acceleration towards the drape, for a unit distance: a pendulum of 20 cm
 NEAR = 0.06  # [m] from the body at rest, where skin doubles the pull
-DRAG = 8.0  # [1/m] of the air, times velocity squared: 1.2 kg/m^3 over 0.15 kg/m^2, of a plate
+DRAG = 4.0  # [1/m] of the air, times velocity squared: 1.2 kg/m^3 over twice cotton's 0.15 kg/m^2
 _SWING_SMOOTHING = 2  # times in a frame
 _ROUNDS = 16  # of the lengths
 RADIUS = 0.985  # spectral radius of a round, as the acceleration takes it to be

@@ -5,7 +5,7 @@ import trimesh
 
 from onefit.physics import MATERIALS, Settings
 from onefit.physics.cloth import Cloth
-from onefit.physics.contact import BodyContact, SelfContact
+from onefit.physics import BodyContact, SelfContact
 from onefit.physics.sheet import Sheet, samples
 
 COTTON = MATERIALS["cotton"]
@@ -80,10 +80,10 @@ def test_a_layer_that_falls_on_another_stays_on_it():
     settings = Settings()
     itself = SelfContact(sheet, settings, 0)
     x = sheet.rest - [0, 0, 0.009] * (np.arange(len(sheet)) >= len(V))[:, None]  # 6 mm above it
-    cloth = Cloth(sheet, x, settings, len(sheet))
+    cloth = Cloth(sheet, x, settings, len(itself))
     fixed = np.where(np.arange(len(sheet)) < len(V), 1e3, 0.0)
     for _ in range(40):
-        contacts = itself.find(cloth.x, cloth.flight(1 / 60))
+        contacts = itself.find(cloth.x)
         cloth.step(1 / 60, [contacts], sheet.rest, fixed)
     above = cloth.x[len(V) :, 2] - cloth.x[: len(V), 2].mean()
     assert above.min() > 0 and above.max() < 2 * settings.apart
