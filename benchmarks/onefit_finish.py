@@ -12,8 +12,9 @@ them with a finish. Columns:
 every third frame; *room* [%], those of them that lie where cloth has room, which it has not where
 the body overlaps itself, or all but touches itself; *strain* [%], *wave* [degrees], *swing* [mm] as
 :mod:`onefit.objective.folds` has them; *jitter* [mm], the mean second difference in time; *energy*
-[J] of the material: stretching, bending, and weight as seen from the hips; *ms*, the median of the
-frames, and *settle* [s], of one drape of the first motion.
+[J] of the material: stretching, bending, and weight as seen from the hips; *crossings*, pairs of
+faces that pass through each other; *ms*, the median of the frames, and *settle* [s], of one drape
+of the first motion.
 """
 
 import argparse
@@ -27,6 +28,7 @@ import onefit
 from onefit.body import ClosestSurface
 from onefit.motion import generate
 from onefit.network import DEFAULT
+from onefit.objective.crossings import crossings
 from onefit.objective.folds import folds, inner_edges
 from onefit.physics import MATERIALS, Material
 from onefit.physics.sheet import Sheet, bending, potential, stretching
@@ -34,6 +36,11 @@ from onefit.training import STANDARD
 from polyfit.errors import cli
 
 SPACING, FRAME_STEP = 0.005, 3  # [m] of the faces' points; one frame in so many is looked at
+HEAD = (
+    "| garment | | inside % | faces % | room % | strain % | jitter mm | wave ° | swing mm |"
+    " energy J | crossings | ms | settle s |"
+)
+DIGITS = (3, 3, 3, 2, 1, 1, 0, 2, 1)
 ROOM = 0.008  # [m] between skin and skin that cloth needs, to keep half of it from both
 
 
@@ -86,6 +93,7 @@ def figures(drape, plain, garment, material):
     return [
         measures.collision, 100 * np.mean(inside), 100 * np.mean(roomy), found.strain,
         measures.jitter, found.wave, found.swing, energy(drape, garment, material),
+        np.mean([crossings(x, drape.faces.numpy()) for x in drape.vertices[::FRAME_STEP].numpy()]),
     ]  # fmt: skip
 
 
@@ -107,10 +115,7 @@ def main(argv=None):
         onefit.Motion.generate(kind, seconds=args.seconds, seed=SEED + k)
         for k, kind in enumerate(args.motions)
     ]
-    print(
-        "| garment | | inside % | faces % | room % | strain % | jitter mm | wave ° | swing mm |"
-        " energy J | ms | settle s |\n|---|---|---|---|---|---|---|---|---|---|---|---|"
-    )
+    print(HEAD, "|---" * HEAD.count(" |") + "|", sep="\n")
     finish = dict(finish=args.finish, material=material)
     for name in args.garments:
         garment, table, times = draper.garment(name), {}, None
@@ -132,10 +137,9 @@ def main(argv=None):
                 table.setdefault(row, []).append(figures(found, plain, garment, material))
         for row, found in table.items():
             last = f"{times[0]:.0f} | {times[1]:.1f}" if row.endswith("finished") else " | "
-            inside, faces, room, strain, jitter, wave, swing, joules = np.mean(found, axis=0)
+            cells = [f"{x:.{n}f}" for x, n in zip(np.mean(found, axis=0), DIGITS)]
             print(
-                f"| {garment.name} | {row} | {inside:.3f} | {faces:.3f} | {room:.3f} | {strain:.2f}"
-                f" | {jitter:.1f} | {wave:.1f} | {swing:.0f} | {joules:.2f} | {last} |",
+                "| " + " | ".join([garment.name, row, *cells, last]) + " |",
                 flush=True,
             )
 

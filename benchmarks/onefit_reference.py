@@ -15,7 +15,7 @@ Columns. wave, fold [degrees], swing, hang [mm], strain [%]: :mod:`onefit.object
 [%] of the vertices in the body, and of the faces' middles. jitter [mm]: mean second difference in
 time. rims [mm]: how far the loops of the boundary, all but the lowest, are in the mean from where
 plain skinning has them; the worst of them. A strap that slides off a shoulder shows there, and a
-sleeve that bunches up.
+sleeve that bunches up. crossings: pairs of faces that pass through each other.
 """
 
 import argparse
@@ -35,6 +35,7 @@ from onefit.draping.draper import FPS
 from onefit.garment import waistband
 from onefit.garment.remesh import loops
 from onefit.network import DEFAULT
+from onefit.objective.crossings import crossings
 from onefit.objective.folds import folds, inner_edges
 from onefit.physics import MATERIALS, Material
 from polyfit.errors import InputError, cli
@@ -140,14 +141,16 @@ def figures(vertices, skinned, garment, rest):
         found.wave, found.fold, found.swing, found.hang, found.strain,
         100 * float(inside[:, : len(z)].mean()), 100 * float(inside[:, len(z) :].mean()),
         1e3 * float(second.norm(dim=-1).mean()), max(away),
+        np.mean([crossings(x, F.numpy()) for x in vertices[::FRAME_STEP].numpy()]),
     ]  # fmt: skip
 
 
 HEAD = (
     "| garment | motion | | wave ° | fold ° | swing mm | hang mm | strain % | inside % | faces % |"
-    " jitter mm | rims mm |\n|---|---|---|---|---|---|---|---|---|---|---|---|"
+    " jitter mm | rims mm | crossings |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|"
 )
-DIGITS = (1, 1, 0, 0, 2, 2, 2, 2, 0)
+DIGITS = (1, 1, 0, 0, 2, 2, 2, 2, 0, 1)
+FRAME_STEP = 3  # one frame in so many is looked at for crossings
 
 
 def pictures(drapes, skinned, frames, size, spp):

@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 import torch
+from surfaces import ball
 
+from onefit.objective.crossings import crossings
 from onefit.objective.folds import angles, folds, inner_edges
 from polyfit import mesh
 
@@ -80,3 +82,31 @@ def test_strain_is_against_the_lengths_at_rest():
     edges = inner_edges(F)[0]
     lengths = 1.02 * (V[edges[:, 0]] - V[edges[:, 1]]).norm(dim=-1)
     assert folds(stretched, V.expand(2, -1, -1), F, lengths).strain < 1e-6
+
+
+def test_crossings_are_pairs_of_faces_that_pass_through_each_other():
+    (a, F), (b, _) = ball(0.1, 1), ball(0.1, 1)
+    both = np.concatenate([F.numpy(), F.numpy() + len(a)])
+    at = lambda x: np.concatenate([a.numpy(), (b + torch.tensor([x, 0.013, 0.007])).numpy()])
+    assert crossings(at(0.25), both) == 0  # beside
+    assert crossings(a.numpy(), F.numpy()) == 0
+    vertices, slow = at(0.15), 0
+    for f in F.numpy():
+        for g in F.numpy() + len(a):
+            slow += pierces(vertices[f], vertices[g]) or pierces(vertices[g], vertices[f])
+    assert crossings(vertices, both) == slow > 10
+
+
+def pierces(one, two):
+    """Whether a side of triangle ``one`` (3, 3) passes through triangle ``two``, by solving for the
+    point.
+    """
+    for k in range(3):
+        p, q = one[k], one[(k + 1) % 3]
+        sides = np.stack([q - p, two[0] - two[1], two[0] - two[2]], 1)
+        if abs(np.linalg.det(sides)) < 1e-15:  # parallel
+            continue
+        t, u, v = np.linalg.solve(sides, two[0] - p)
+        if 0 < t < 1 and u > 0 and v > 0 and u + v < 1:
+            return True
+    return False

@@ -1,0 +1,28 @@
+"""How often a surface passes through itself."""
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+
+def crossings(vertices: np.ndarray, faces: np.ndarray) -> int:
+    """Pairs of faces (F, 3) without a common corner that pass through each other, of a surface with
+    its vertices at (N, 3) [m]: a side of one pierces the other.
+    """
+    corners = np.asarray(vertices, dtype=float)[faces]
+    centre = corners.mean(1)
+    radius = np.linalg.norm(corners - centre[:, None], axis=2).max(1)
+    one, two = cKDTree(centre).query_pairs(2 * radius.max(), output_type="ndarray").T
+    near = np.linalg.norm(centre[one] - centre[two], axis=1) < radius[one] + radius[two]
+    apart = ~(faces[one][:, :, None] == faces[two][:, None]).any((1, 2))
+    one, two = one[near & apart], two[near & apart]
+    return int((_pierces(corners[one], corners[two]) | _pierces(corners[two], corners[one])).sum())
+
+
+def _pierces(one, two):
+    """Whether a side of triangle ``one`` (P, 3, 3) passes through ``two`` (P, 3, 3), (P,)."""
+    a, b, c = (two[:, k, None] for k in range(3))
+    start, end = one, np.roll(one, -1, axis=1)
+    volume = lambda p, q, r, s: np.einsum("pki,pki->pk", np.cross(q - p, r - p), s - p)
+    through = volume(a, b, c, start) * volume(a, b, c, end) < 0
+    around = np.stack([volume(start, end, p, q) for p, q in ((a, b), (b, c), (c, a))])
+    return (through & ((around > 0).all(0) | (around < 0).all(0))).any(1)
