@@ -24,6 +24,8 @@ class SelfContact:
         self._mesh = wp.Mesh(self._x, self._array(sheet.faces.ravel().astype(np.int32), int))
         self._face = self._array(np.full(count, -1), int)
         self._found, self._normal = vectors(np.zeros((count, 3))), vectors(np.zeros((count, 3)))
+        ends = sheet.rest[sheet.edges]
+        self._long = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > 2 * settings.meeting
         self._halves = Halves()
 
     def __len__(self) -> int:
@@ -63,8 +65,11 @@ class SelfContact:
         )
 
     def _of_edges(self):
-        """The same of edges that have an end near another layer, each pair once."""
-        asked = np.flatnonzero((self._face.numpy()[self.sheet.edges] >= 0).any(1))
+        """The same of edges that have an end near another layer, or may have none though they
+        are.
+        """
+        near = (self._face.numpy()[self.sheet.edges] >= 0).any(1)
+        asked = np.flatnonzero(near | self._long)
         edges = self.sheet.edges[asked].astype(np.int32)
         own, other = self._array(edges, wp.vec2i), self._array(edges, wp.vec2i)
         share = self._array(np.zeros((len(asked), 2), np.float32), wp.vec2)

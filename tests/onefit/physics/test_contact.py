@@ -91,9 +91,9 @@ def test_a_layer_that_falls_on_another_stays_on_it():
 
 @pytest.mark.parametrize("speed", [0.05, 0.5])  # [m/s], 8 mm a step the faster
 def test_strips_whose_edges_alone_meet_do_not_pass_through_each_other(speed):
-    V, F = grid(2, 9, 0.02)
-    edge_on = V[:, [2, 1, 0]] + [0, 0, 0.04]  # upright, its lower side along y, 3 cm up
-    across = V[:, [1, 0, 2]]
+    V, F = grid(2, 4, 1.0)
+    across = V[:, [1, 0, 2]] * [0.03, 0.01, 0]  # along x
+    edge_on = V[:, [2, 1, 0]] * [0, 0.03, 0.02] + [0, 0, 0.04]  # upright, along y, 3 cm up
     sheet = Sheet(np.concatenate([across, edge_on]), np.concatenate([F, F + len(V)]), COTTON)
     itself = SelfContact(sheet, Settings(), 0)
     falls = np.arange(len(sheet)) >= len(V)
