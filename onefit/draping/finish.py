@@ -52,7 +52,7 @@ def finished(
     cloth.x = body.pushed_out(cloth.x)
 
     def step(now, target):
-        contacts = [body.follow(now), itself.find(cloth.x)]
+        contacts = [body.follow(now), itself.find(cloth.x, body.on_skin())]
         cloth.step(dt, contacts, target, pull)
         body.find(cloth.x)
         cloth.x = body.pushed_out(cloth.x)

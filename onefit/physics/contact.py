@@ -52,7 +52,7 @@ class BodyContact:
     def __init__(self, sheet: Sheet, vertices: torch.Tensor, faces: torch.Tensor, settings) -> None:
         self.settings, self.faces = settings, faces.cpu().numpy()
         self.stiffness = settings.contact * sheet.material.stretch
-        count = len(sheet)
+        self.count = count = len(sheet)
         own = np.zeros((count, 4))
         own[:, 0] = 1
         corners, weights = samples(sheet.rest, sheet.faces, settings.spacing)
@@ -94,6 +94,10 @@ class BodyContact:
         self.surface.follow(vertices)
         corners, weights = self.corners[near], self.weights[near]
         return Contacts(near, corners, weights, normal, offset, point - before, self.stiffness)
+
+    def on_skin(self) -> np.ndarray:
+        """Which of the sheet's vertices touch the body or are about to, (N,); after :meth:`find`."""
+        return self.distance[: self.count] < 2 * self.settings.clearance
 
     def pushed_out(self, x: np.ndarray) -> np.ndarray:
         """The vertices (N, 3) [m] after those nearer to the body than ``least``, and the corners of

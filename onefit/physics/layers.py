@@ -34,14 +34,18 @@ class SelfContact:
     def _array(self, values, kind):
         return wp.array(values, dtype=kind, device="cpu")
 
-    def find(self, x: np.ndarray) -> Contacts:
+    def find(self, x: np.ndarray, on_skin: np.ndarray | None = None) -> Contacts:
         """The contacts of the step that starts with the vertices at ``x`` (N, 3) [m]. Layers are
-        kept on the sides on which they are then, however fast they meet.
+        kept on the sides on which they are then, however fast they meet. Where both lie ``on_skin``
+        (N,), in an armpit, the skin keeps them apart.
         """
         self._x.numpy()[:] = x
         self._mesh.refit()
         kinds = zip(self._of_vertices(), self._of_edges())
         key, corners, weights, normal = (np.concatenate(pair) for pair in kinds)
+        if on_skin is not None:
+            free = ~on_skin[corners].all(1)
+            key, corners, weights, normal = (a[free] for a in (key, corners, weights, normal))
         offset, still = np.full(len(key), self.settings.apart), np.zeros_like(normal)
         least = -self.settings.apart / 2
         return Contacts(key, corners, weights, normal, offset, still, self.stiffness, least)
