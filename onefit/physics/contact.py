@@ -96,7 +96,7 @@ class BodyContact:
         return Contacts(near, corners, weights, normal, offset, point - before, self.stiffness)
 
     def on_skin(self) -> np.ndarray:
-        """Which of the sheet's vertices touch the body or are about to, (N,); after :meth:`find`."""
+        """Which vertices touch the body or are about to, (N,); after :meth:`find`."""
         return self.distance[: self.count] < 2 * self.settings.clearance
 
     def pushed_out(self, x: np.ndarray) -> np.ndarray:
