@@ -45,14 +45,14 @@ def finished(
     start, moving = guide.double().numpy()[:, order], bodies.double().numpy()
     body = BodyContact(sheet, bodies[0], body_faces, settings)
     itself = SelfContact(sheet, settings, len(body))
-    cloth = Cloth(sheet, start[0], settings, len(body) + len(itself))
+    cloth = Cloth(sheet, start[0], settings, len(body) + len(sheet))
     pull = settings.draw * sheet.mass + material.stretch * np.asarray(held)[order]
     dt = 1 / fps / steps
     body.find(cloth.x)
     cloth.x = body.pushed_out(cloth.x)
 
     def step(now, target):
-        contacts = [body.follow(now), itself.find(cloth.x, body.on_skin())]
+        contacts = [body.follow(now), itself.find(cloth.x, cloth.flight(dt))]
         cloth.step(dt, contacts, target, pull)
         body.find(cloth.x)
         cloth.x = body.pushed_out(cloth.x)

@@ -8,8 +8,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
         "cloth": ["Cloth"],
-        "contact": ["BodyContact"],
-        "layers": ["SelfContact"],
+        "contact": ["BodyContact", "SelfContact"],
         "material": ["MATERIALS", "Material"],
         "settings": ["Settings"],
         "sheet": ["Sheet", "samples"],

@@ -144,10 +144,7 @@ class Cloth:
         limits = [self.settings.iterations, self.settings.tolerance]
         arrays = [*self._rows, self._matrix, self._inverse, *limits, b, move, *work, self._done]
         after, start, self.iterations = y, self._forced, 0
-        least, most = self.settings.newton, self.settings.newton_most
-        for turn in range(max(least, most)):
-            if turn >= least and all((c.gap(after) >= c.least).all() for c in contacts):
-                break
+        for _ in range(self.settings.newton):
             gradient, found = self.assemble(after, dt, contacts)
             gradient = gradient + inertia * (after - y) + pull * (after - target)
             self._matrix.numpy()[self._middle] += pull[:, :, None] * np.eye(3)
@@ -165,8 +162,10 @@ class Cloth:
         """
         load, slip = np.zeros_like(self.load), np.zeros_like(self.slip)
         for c, (touching, _) in zip(contacts, found):
-            slid = c.points(after) - c.points(self.x) - c.moved
+            point = (after[c.corners] * c.weights[:, :, None]).sum(1)
+            gap = (point * c.normal).sum(1) - c.offset
+            slid = point - (self.x[c.corners] * c.weights[:, :, None]).sum(1) - c.moved
             slid -= (slid * c.normal).sum(1, keepdims=True) * c.normal
-            load[c.key] = c.stiffness * np.maximum(-c.gap(after), 0) * (touching < 0)
+            load[c.key] = c.stiffness * np.maximum(-gap, 0) * (touching < 0)
             slip[c.key] = np.linalg.norm(slid, axis=1)
         self.load, self.slip = load, slip

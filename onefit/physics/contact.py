@@ -1,9 +1,10 @@
-"""What cloth touches: planes that points of the sheet must stay in front of. Here those of the
-moving body's triangles; those of other layers of the cloth are in :mod:`onefit.physics.layers`.
+"""What cloth touches: the moving body's triangles, and itself. Positions go in, contacts come out:
+planes that points of the sheet must stay in front of.
 """
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +12,8 @@ import torch
 
 from onefit.body import ClosestSurface
 
-from .halves import Halves
+from . import kernels
+from .kernels import wp
 from .sheet import Sheet, samples
 
 
@@ -20,8 +22,7 @@ class Contacts:
     """C contacts: ``key`` (C,), which is which from step to step; ``corners`` (C, 4) and
     ``weights`` (C, 4): the point sum_i w_i x_i; the plane's ``normal`` (C, 3) and ``offset`` (C,)
     [m], so that the gap is normal . point - offset; ``moved`` (C, 3) [m], by what the other side
-    moved in the step; ``stiffness`` [N/m] of each. As long as a gap is below ``least`` [m] a step
-    has more iterations.
+    moved in the step; ``stiffness`` [N/m] of each.
     """
 
     key: np.ndarray
@@ -31,15 +32,6 @@ class Contacts:
     offset: np.ndarray
     moved: np.ndarray
     stiffness: float
-    least: float = -np.inf
-
-    def points(self, x: np.ndarray) -> np.ndarray:
-        """The points (C, 3) [m] of a sheet with vertices at ``x`` (N, 3) [m]."""
-        return np.einsum("ck,ckj->cj", self.weights, x[self.corners])
-
-    def gap(self, x: np.ndarray) -> np.ndarray:
-        """How far they are in front of the planes, (C,) [m]."""
-        return np.einsum("cj,cj->c", self.points(x), self.normal) - self.offset
 
 
 class BodyContact:
@@ -52,7 +44,7 @@ class BodyContact:
     def __init__(self, sheet: Sheet, vertices: torch.Tensor, faces: torch.Tensor, settings) -> None:
         self.settings, self.faces = settings, faces.cpu().numpy()
         self.stiffness = settings.contact * sheet.material.stretch
-        self.count = count = len(sheet)
+        count = len(sheet)
         own = np.zeros((count, 4))
         own[:, 0] = 1
         corners, weights = samples(sheet.rest, sheet.faces, settings.spacing)
@@ -60,7 +52,7 @@ class BodyContact:
         self.weights = np.concatenate([own, weights])
         self.surface = ClosestSurface(vertices, faces)
         self.body = vertices.double().numpy()
-        self._halves = Halves()
+        self._pool = ThreadPoolExecutor(max(1, torch.get_num_threads()))
 
     def __len__(self) -> int:
         return len(self.corners)
@@ -73,9 +65,8 @@ class BodyContact:
 
     def find(self, x: np.ndarray) -> None:
         """Look for what is near to the vertices (N, 3) [m], on the body where it is now."""
-        points = torch.as_tensor(self.points(x)).float()
-        ask = lambda first, last: self.surface(points[first:last], self.settings.reach)
-        found = self._halves(ask, len(points))
+        parts = torch.as_tensor(self.points(x)).float().chunk(self._pool._max_workers)
+        found = list(self._pool.map(lambda p: self.surface(p, self.settings.reach), parts))
         self.face, self.barycentric, self.point, self.distance, self.normal = (
             torch.cat([getattr(n, name) for n in found]).numpy()
             for name in ("face", "barycentric", "point", "distance", "normal")
@@ -95,10 +86,6 @@ class BodyContact:
         corners, weights = self.corners[near], self.weights[near]
         return Contacts(near, corners, weights, normal, offset, point - before, self.stiffness)
 
-    def on_skin(self) -> np.ndarray:
-        """Which vertices touch the body or are about to, (N,); after :meth:`find`."""
-        return self.distance[: self.count] < 2 * self.settings.clearance
-
     def pushed_out(self, x: np.ndarray) -> np.ndarray:
         """The vertices (N, 3) [m] after those nearer to the body than ``least``, and the corners of
         points of faces that are, were pushed so far out; after :meth:`find`.
@@ -115,3 +102,36 @@ class BodyContact:
             v, used = v[deeper], used[deeper]
             out[v], depth[v] = x[v] + push[used], least - self.distance[deep[used]]
         return out
+
+
+class SelfContact:
+    """Contacts of a sheet with itself: of each vertex with the nearest triangle. The keys start at
+    ``first``.
+    """
+
+    def __init__(self, sheet: Sheet, settings, first: int) -> None:
+        self.sheet, self.settings, self.first = sheet, settings, first
+        self.stiffness = settings.layers * sheet.material.stretch
+        self._places = [
+            wp.array(sheet.rest.astype(np.float32), dtype=wp.vec3, device="cpu") for _ in range(3)
+        ]
+        indices = wp.array(sheet.faces.ravel().astype(np.int32), dtype=int, device="cpu")
+        self._mesh = wp.Mesh(self._places[0], indices)
+        self._face = wp.zeros(len(sheet), dtype=int, device="cpu")
+        self._found = wp.zeros((len(sheet), 3), dtype=float, device="cpu")
+        self._normal = wp.zeros(len(sheet), dtype=wp.vec3, device="cpu")
+
+    def find(self, before: np.ndarray, x: np.ndarray) -> Contacts:
+        """The contacts of vertices (N, 3) [m] that were ``before`` (N, 3) and may go to ``x``."""
+        self._places[0].numpy()[:], self._places[1].numpy()[:] = x, before
+        self._mesh.refit()
+        arrays = [*self._places, 2 * self.settings.apart, self._face, self._found, self._normal]
+        wp.launch(kernels.proximity, len(x), [self._mesh.id, *arrays], device="cpu")
+        vertex = np.flatnonzero(self._face.numpy() >= 0)
+        face, barycentric = self._face.numpy()[vertex], self._found.numpy()[vertex].astype(float)
+        corners = np.concatenate([vertex[:, None], self.sheet.faces[face]], 1)
+        weights = np.concatenate([np.ones((len(vertex), 1)), -barycentric], 1)
+        offset = np.full(len(vertex), self.settings.apart)
+        normal = self._normal.numpy()[vertex].astype(float)
+        key, still = self.first + vertex, np.zeros_like(normal)
+        return Contacts(key, corners, weights, normal, offset, still, self.stiffness)

@@ -204,6 +204,88 @@ def contact(
                 matrix[middle[v]] += total * wp.abs(weights[c, i]) * block
 
 
+@wp.func
+def _closest_on_triangle(p: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3):
+    """Barycentric coordinates of the nearest point (Ericson 2005, section 5.1.5)."""
+    ab, ac, ap = b - a, c - a, p - a
+    d1, d2 = wp.dot(ab, ap), wp.dot(ac, ap)
+    if d1 <= 0.0 and d2 <= 0.0:
+        return wp.vec3(1.0, 0.0, 0.0)
+    bp = p - b
+    d3, d4 = wp.dot(ab, bp), wp.dot(ac, bp)
+    if d3 >= 0.0 and d4 <= d3:
+        return wp.vec3(0.0, 1.0, 0.0)
+    vc = d1 * d4 - d3 * d2
+    if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
+        v = d1 / (d1 - d3)
+        return wp.vec3(1.0 - v, v, 0.0)
+    cp = p - c
+    d5, d6 = wp.dot(ab, cp), wp.dot(ac, cp)
+    if d6 >= 0.0 and d5 <= d6:
+        return wp.vec3(0.0, 0.0, 1.0)
+    vb = d5 * d2 - d1 * d6
+    if vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
+        w = d2 / (d2 - d6)
+        return wp.vec3(1.0 - w, 0.0, w)
+    va = d3 * d6 - d5 * d4
+    if va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
+        w = (d4 - d3) / ((d4 - d3) + (d5 - d6))
+        return wp.vec3(0.0, 1.0 - w, w)
+    v = vb / (va + vb + vc)
+    w = vc / (va + vb + vc)
+    return wp.vec3(1.0 - v - w, v, w)
+
+
+@wp.func
+def _side_of(p: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3):
+    return wp.dot(p - a, wp.cross(b - a, c - a))
+
+
+@wp.kernel
+def proximity(
+    mesh: wp.uint64,  # of the vertices x
+    x: wp.array(dtype=wp.vec3),
+    before: wp.array(dtype=wp.vec3),  # where they were at the start of the step
+    rest: wp.array(dtype=wp.vec3),
+    reach: float,
+    face: wp.array(dtype=int),  # receives the nearest face within reach that is not beside, or -1
+    found: wp.array2d(dtype=float),  # receives its barycentric coordinates
+    normal: wp.array(dtype=wp.vec3),  # receives the direction in which the vertex must stay away
+):
+    """For each vertex of the sheet the nearest triangle of the same sheet within ``reach``. One
+    with a corner that lies within twice that of the vertex at rest is beside it, and does not
+    count. The vertex belongs on the side of the triangle on which it was before.
+    """
+    i = wp.tid()
+    p = x[i]
+    face[i] = -1
+    closest = reach * reach
+    around = wp.vec3(reach, reach, reach)
+    query = wp.mesh_query_aabb(mesh, p - around, p + around)
+    f = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+    while wp.mesh_query_aabb_next(query, f):
+        a = wp.mesh_get_index(mesh, 3 * f)
+        b = wp.mesh_get_index(mesh, 3 * f + 1)
+        c = wp.mesh_get_index(mesh, 3 * f + 2)
+        beside = wp.min(
+            wp.length_sq(rest[a] - rest[i]),
+            wp.min(wp.length_sq(rest[b] - rest[i]), wp.length_sq(rest[c] - rest[i])),
+        )
+        if i != a and i != b and i != c and beside > 4.0 * reach * reach:
+            near = _closest_on_triangle(p, x[a], x[b], x[c])
+            away = p - (near[0] * x[a] + near[1] * x[b] + near[2] * x[c])
+            if wp.length_sq(away) < closest:
+                closest = wp.length_sq(away)
+                face[i] = f
+                for k in range(3):
+                    found[i, k] = near[k]
+                was = _side_of(before[i], before[a], before[b], before[c])
+                if was * _side_of(p, x[a], x[b], x[c]) > 0.0:
+                    normal[i] = wp.normalize(away)
+                else:
+                    normal[i] = wp.sign(was) * wp.normalize(wp.cross(x[b] - x[a], x[c] - x[a]))
+
+
 @wp.kernel
 def conjugate_gradients(
     first: wp.array(dtype=int),  # (N + 1,): row i has the blocks first[i] to first[i + 1]

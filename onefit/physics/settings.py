@@ -11,24 +11,21 @@ class Settings:
     :class:`onefit.physics.Material`.
 
     ``newton``: iterations of Newton's method in a step; a second one finds what the first brought
-    into contact, and how far triangles have turned. More follow, ``newton_most`` in all, as long as
-    folds are nearer to each other than half of ``apart``. ``iterations`` of conjugate gradients in
-    each of them, at most, and the ``tolerance`` of the residual, relative to the forces', below
-    which they end earlier. ``clearance`` [m] that cloth keeps from the body, which covers what a
-    chord of 2 cm misses of a limb; ``least`` [m] to which it is pushed at the end of a step, if it
-    came nearer. ``reach`` [m]: cloth and body that come nearer to each other than this in a step
-    are seen. ``contact`` and ``layers`` [1]: the stiffness of a contact with the body and of cloth
-    with itself, in units of the material's stretch stiffness. ``sticking`` [m/s]: a slower slip is
-    not friction's full force. ``apart`` [m]: what folds keep from each other; ``meeting`` [m]:
-    those that come nearer to each other than this in a step are seen. ``spacing`` [m]: of points of
-    the faces that must stay out of the body, as vertices must. ``draw`` [1/s^2]: acceleration
-    towards the drape that is finished, for a unit distance. ``settling`` [s]: how long the first
-    pose is held before the motion, for the cloth to come to rest, with velocities multiplied by
-    ``damping`` in each step of it.
+    into contact, and how far triangles have turned. ``iterations`` of conjugate gradients in each
+    of them, at most, and the ``tolerance`` of the residual, relative to the forces', below which
+    they end earlier. ``clearance`` [m] that cloth keeps from the body, which covers what a chord of
+    2 cm misses of a limb; ``least`` [m] to which it is pushed at the end of a step, if it came
+    nearer. ``reach`` [m]: cloth and body that come nearer to each other than this in a step are
+    seen. ``contact`` and ``layers`` [1]: the stiffness of a contact with the body and of cloth with
+    itself, in units of the material's stretch stiffness. ``sticking`` [m/s]: a slower slip is not
+    friction's full force. ``apart`` [m]: what folds keep from each other. ``spacing`` [m]: of
+    points of the faces that must stay out of the body, as vertices must. ``draw`` [1/s^2]:
+    acceleration towards the drape that is finished, for a unit distance. ``settling`` [s]: how long
+    the first pose is held before the motion, for the cloth to come to rest, with velocities
+    multiplied by ``damping`` in each step of it.
     """
 
     newton: int = 2
-    newton_most: int = 4
     iterations: int = 20
     tolerance: float = 1e-5
     clearance: float = 0.004
@@ -38,7 +35,6 @@ class Settings:
     layers: float = 0.05
     sticking: float = 0.005
     apart: float = 0.003
-    meeting: float = 0.012
     spacing: float = 0.02
     draw: float = 0.2
     settling: float = 1.0

@@ -28,11 +28,10 @@ class Level:
 @dataclass
 class LevelImage:
     """A frame at a level: ``colour`` (h, w, 3) float32; ``inside`` (h, w), 1 where the sheet may be
-    compared, which with a mask leaves out its border; with a mask, ``mask`` (h, w) in [0, 1], and
-    ``distance`` (h, w), pixels of this grid from the mask's contour, of either side. ``corner``
-    (x, y) [pixels of this grid]: where these arrays begin; with a mask they end where it does, and
-    everything that it takes part in: what lies beyond is not of the sheet, and farther than
-    ``MAX_CONTOUR_DISTANCE`` from the contour."""
+    compared; with a mask, ``mask`` (h, w) in [0, 1], and ``distance`` (h, w), pixels of this grid
+    from the mask's contour, of either side. ``corner`` (x, y) [pixels of this grid]: where these
+    arrays begin; with a mask they end where it does, and everything that it takes part in: what
+    lies beyond is not of the sheet, and farther than ``MAX_CONTOUR_DISTANCE`` from the contour."""
 
     colour: np.ndarray
     inside: np.ndarray
@@ -45,9 +44,10 @@ def level_image(image, mask, level, normalise=True):
     """A frame (H, W, 3), linear, with its mask (H, W) or None, at a :class:`Level`."""
     (y, x), near = _slices_around(mask, level)
     image, mask = image[near], mask[near] if mask is not None else None
-    inner = None if mask is None else unmixed(mask > 0.5)
-    colour = compared(image, inner, level.sigma, level.window, normalise)
-    inside = np.ones(image.shape[:2], np.float32) if mask is None else inner
+    colour = compared(image, mask, level.sigma, level.window, normalise)
+    inside = (
+        np.ones(image.shape[:2], np.float32) if mask is None else (mask > 0.5).astype(np.float32)
+    )
     if level.stride > 1:
         colour, inside = shrink(colour, level.stride), shrink(inside, level.stride)
         inside = (inside > 0.5).astype(np.float32)
@@ -57,13 +57,6 @@ def level_image(image, mask, level, normalise=True):
     on = (small > 0.5).astype(np.uint8)
     distance = sum(cv2.distanceTransform(x, cv2.DIST_L2, 3) for x in (on, 1 - on))
     return LevelImage(colour, inside, small, distance, (x // level.stride, y // level.stride))
-
-
-def unmixed(inside):
-    """(H, W) float32: 1 where a pixel and its eight neighbours are ``inside`` (H, W). Those along
-    the border are mixed with the background, whose colour normalisation would spread.
-    """
-    return cv2.erode(inside.astype(np.float32), np.ones((3, 3), np.uint8))
 
 
 def _slices_around(mask, level):

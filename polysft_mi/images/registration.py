@@ -22,7 +22,7 @@ from . import pixels
 from .frames import Frames
 from .gather import Gather, Images
 from .light import Brightness
-from .pyramid import POOL, Level, compared, unmixed
+from .pyramid import POOL, Level, compared
 from .texture import Texture, packed_image
 
 _SHEET = 225.0  # side [pixels] of the sheet that blurs and windows are given for
@@ -333,10 +333,9 @@ class Registration:
             for k, n in zip(corner[::-1], inside.shape, strict=True)
         ]
         inside = inside.astype(np.float32)
-        fine = self._masked and level.stride == 1  # coarser blocks are mostly of the sheet
         wide = compared(
             np.pad(colour, (*pads, (0, 0))),
-            np.pad(unmixed(inside) if fine else inside, pads),
+            np.pad(inside, pads),
             level.sigma / level.stride,
             level.window / level.stride,
             self.normalise,

@@ -25,11 +25,11 @@ def fallen(cut, seconds=SECONDS, advance=lambda cloth: None):
     surface = body.vertices.double().numpy()
     skin = BodyContact(sheet, body.vertices, body.faces, SETTINGS)
     itself = SelfContact(sheet, SETTINGS, len(skin))
-    cloth = Cloth(sheet, cut.start, SETTINGS, keys=len(skin) + len(itself))
+    cloth = Cloth(sheet, cut.start, SETTINGS, keys=len(skin) + len(sheet))
     pull = sheet.material.stretch * held(cut.start, cut.faces, body.joints.double().numpy())
     skin.find(cloth.x)
     for _ in range(round(seconds / STEP)):
-        contacts = [skin.follow(surface), itself.find(cloth.x, skin.on_skin())]
+        contacts = [skin.follow(surface), itself.find(cloth.x, cloth.flight(STEP))]
         cloth.step(STEP, contacts, cut.start, pull)
         skin.find(cloth.x)
         cloth.x = skin.pushed_out(cloth.x)

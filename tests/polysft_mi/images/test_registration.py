@@ -113,19 +113,6 @@ def slope(evaluation):
     return np.array(evaluation.images.gradient).reshape(-1, 3)
 
 
-def test_a_mask_s_border_has_no_say_in_colours():
-    rng = np.random.default_rng(0)
-    image, mask = rng.random((60, 80, 3), np.float32), np.zeros((60, 80), np.float32)
-    mask[10:50, 15:65] = 1
-    border = mask.astype(bool)
-    border[11:49, 16:64] = False
-    bright = np.where(border[..., None], 9.0, image).astype(np.float32)
-    a, b = (level_image(x, mask, Level(1.0)) for x in (image, bright))
-    inside = a.inside > 0
-    assert inside.sum() == 38 * 48
-    np.testing.assert_allclose(a.colour[inside], b.colour[inside], atol=1e-6)
-
-
 @pytest.mark.parametrize("level", [Level(0.0), Level(2.5, 2), Level(3.8, 3, 10.0)])
 def test_a_masked_image_is_that_of_the_whole_where_the_mask_has_a_say(monkeypatch, level):
     image = cv2.GaussianBlur(RNG.random((360, 480, 3)).astype(np.float32), (0, 0), 2)
