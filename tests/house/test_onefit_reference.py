@@ -113,8 +113,9 @@ def tank():
 def test_a_row_tells_what_is_wrong_with_a_drape(tank):
     garment, _, skinned = tank
     row = lambda x: reference.figures(x, skinned, garment, skinned.rest)
-    wave, _, swing, hang, strain, inside, faces, _, rims = row(skinned.vertices)
+    wave, _, swing, hang, strain, inside, faces, _, rims, crossed = row(skinned.vertices)
     assert wave < 2 and swing == hang == rims == 0 and 1 < strain < 10 and inside < 5 > faces
+    assert crossed == row(skinned.vertices + 1)[9]
     slid = skinned.vertices.clone()
     slid[..., 2] -= 0.05  # off the shoulders
     worse = row(slid)
