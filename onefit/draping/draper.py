@@ -174,7 +174,8 @@ class Draper:
                 )
 
         step = max(2, min(BATCH, POINTS // len(rest)))
-        batches, done = range(0, len(motion.poses), step), []
+        batches = range(0, len(motion.poses), step)
+        done: list[tuple[torch.Tensor, torch.Tensor]] = []
         post_processed = lambda vertices, *_: vertices
         if post and not finish and not skinning_only:
             post_processed = self.post_processing(garment, rest, body)
