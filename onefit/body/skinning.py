@@ -1,7 +1,6 @@
 """Linear blend skinning from the rest space to a posed body, differentiable and on any device."""
 
 import torch
-from torch import nn
 
 from . import skeleton
 
@@ -52,7 +51,8 @@ def skin(points, blend_weights, transforms):
     the way: pass long motions in pieces.
     """
     if points.ndim == 2:  # the same points in all frames: one product of matrices
-        weighted = blend_weights[..., None] * nn.functional.pad(points, (0, 1), value=1.0)[:, None]
+        homogeneous = torch.nn.functional.pad(points, (0, 1), value=1.0)
+        weighted = blend_weights[..., None] * homogeneous[:, None]
         maps = transforms.permute(1, 3, 0, 2).flatten(2).flatten(0, 1)
         return (weighted.flatten(1) @ maps).unflatten(1, (-1, 3)).transpose(0, 1)
     A = blended(blend_weights, transforms)

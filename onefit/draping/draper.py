@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
 FPS = 30.0  # that the networks know
 WARM_UP = 10  # frames in which the first pose is held, for the network's memory to settle
-BATCH = 16  # frames at most that go through the network at once
-POINTS = 400_000  # vertices times frames, likewise
+BATCH = 16  # frames that go through the network at once
+POINTS = 400_000  # vertices times frames, at most, likewise
 
 
 @dataclass(frozen=True)
@@ -130,16 +130,16 @@ class Draper:
         in each frame of ``motion`` (a :class:`Motion` or a file of one), at 30 frames a second.
         With a shape, the way is scaled by the length of its legs.
 
-        ``post``: post-processing (:class:`onefit.draping.post.PostProcessing`): the cloth keeps
-        its motion, edges come back towards their lengths at rest, and vertices are pushed out of
-        the body. ``eased``: with
-        the garment's :meth:`ease`, which costs seconds once, and nothing a frame; without it and
-        ``post`` a drape is what the network alone makes. ``skinning_only``: plain skinning of the
-        template, what OneFit is held against, without any of these. ``finish``: implicit steps of
-        physics a frame on the garment's own mesh (:func:`onefit.draping.finish.finished`), in place
-        of post-processing, of a ``material`` (one of :data:`onefit.physics.MATERIALS` by its name,
-        or a :class:`onefit.physics.Material`), solved as :class:`onefit.physics.Settings` say; two
-        steps are enough, and 0 leaves it out.
+        ``post``: post-processing (:class:`onefit.draping.post.PostProcessing`): the cloth keeps its
+        motion, edges come back towards their lengths at rest, and vertices are pushed out of the
+        body. ``eased``: with the garment's :meth:`ease`, which costs seconds once, and nothing a
+        frame; without it and ``post`` a drape is what the network alone makes. ``skinning_only``:
+        plain skinning of the template, what OneFit is held against, without any of these.
+        ``finish``: implicit steps of physics a frame on the garment's own mesh
+        (:func:`onefit.draping.finish.finished`), in place of post-processing, of a ``material``
+        (one of :data:`onefit.physics.MATERIALS` by its name, or a
+        :class:`onefit.physics.Material`), solved as :class:`onefit.physics.Settings` say; two steps
+        are enough, and 0 leaves it out.
         ``advance`` is called after each finished frame. Raises InputError for a garment, motion,
         shape or material that cannot be used.
         """
@@ -179,7 +179,7 @@ class Draper:
         post_processed = lambda vertices, *_: vertices
         if post and not finish and not skinning_only:
             post_processed = self.post_processing(garment, rest, body)
-        with ThreadPoolExecutor(1) as ahead:  # of the post-processing
+        with ThreadPoolExecutor(1) as ahead:  # the network does not wait for post-processing
             for vertices, bodies in ahead.map(batch, batches):
                 past = done[-1][0][-2:] if done else None
                 done.append((post_processed(vertices, bodies, FPS, past), bodies))

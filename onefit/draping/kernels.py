@@ -60,8 +60,8 @@ def moved(
 @wp.kernel
 def lengths_restored(
     edges: wp.array(dtype=wp.vec2i),
-    lengths: wp.array(dtype=float),  # squared
-    degree: wp.array(dtype=float),  # edges at each vertex
+    squares: wp.array(dtype=float),  # of their lengths at rest [m^2]
+    degree: wp.array(dtype=float),  # edges at each vertex, at least 1
     rounds: int,
     radius: float,
     x: wp.array(dtype=wp.vec3),
@@ -82,7 +82,7 @@ def lengths_restored(
         for e in range(edges.shape[0]):
             ends = edges[e]
             edge = x[ends[1]] - x[ends[0]]
-            now, rest = wp.length_sq(edge), lengths[e]
+            now, rest = wp.length_sq(edge), squares[e]
             p = (now - rest) / (now + rest) * edge
             pull[ends[0]] = pull[ends[0]] + p
             pull[ends[1]] = pull[ends[1]] - p
@@ -171,7 +171,7 @@ def pushed_out(
                 if wp.length(push[v]) < 0.02 * clearance:  # the rim of a smoothed push: not asked
                     push[v] = wp.vec3(0.0, 0.0, 0.0)
                 else:
-                    # no deeper than it was moved, for before that it was outside, or was to come
+                    # no deeper than it was moved, for before it was outside, or to come there
                     far = wp.min(deepest, clearance + 2.0 * wp.length(push[v]))
                     p, d = pushed(body, x[v], far, 0.5 * clearance, clearance)
                     push[v] = p

@@ -115,7 +115,9 @@ def test_a_row_tells_what_is_wrong_with_a_drape(tank):
     row = lambda x: reference.figures(x, skinned, garment, skinned.rest)
     wave, _, swing, hang, strain, inside, faces, _, rims, crossed = row(skinned.vertices)
     assert wave < 2 and swing == hang == rims == 0 and 1 < strain < 10 and inside < 5 > faces
-    assert crossed == row(skinned.vertices + 1)[9]
+    pierced = skinned.vertices.clone()
+    pierced[:, garment.vertices[:, 1] > 0, 1] -= 0.5  # one side through the other
+    assert row(pierced)[9] > crossed + 20
     slid = skinned.vertices.clone()
     slid[..., 2] -= 0.05  # off the shoulders
     worse = row(slid)

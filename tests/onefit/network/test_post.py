@@ -92,15 +92,15 @@ def test_cloth_stays_on_the_side_of_the_body_on_which_the_drape_is():
 
 def test_a_drape_swings_on_and_comes_to_rest():
     (body, faces), (x, cloth) = ball(0.02), ball(0.1, 2)
-    guide = x[None].repeat(90, 1, 1)
+    guide = x[None].repeat(120, 1, 1)
     guide[:15, :, 0] += torch.linspace(-0.3, 0, 15)[:, None]  # it comes, and stops
     surfaces = [ClosestSurface(body - 1, faces) for _ in range(2)]  # far away
     process = processing(x, cloth, PULL, surfaces)
-    bodies = body[None].expand(90, -1, -1) - 1
+    bodies = body[None].expand(120, -1, -1) - 1
     whole = process(guide, bodies, 30.0)
     out = whole.mean(1)[:, 0]
     assert out[14] < -0.02 and out.max() > 0.02  # late, then beyond
-    assert abs(out[-1]) < 0.01
+    assert abs(out[-1]) < 0.005
     firm = processing(x, cloth, 1e6, surfaces)(guide, bodies, 30.0)
     assert torch.allclose(firm, guide, atol=1e-4)
     first = process(guide[:20], bodies[:20], 30.0)  # in two parts
