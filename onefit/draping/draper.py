@@ -19,7 +19,7 @@ from onefit.motion import Motion
 from onefit.network import DEFAULT, Trained
 from onefit.network.weights import load as load_weights
 from onefit.objective import posed
-from onefit.physics import Material
+from onefit.physics import Material, Settings
 from polyfit import mesh
 from polyfit.errors import InputError
 
@@ -29,7 +29,6 @@ from .post import PostProcessing, pull
 if TYPE_CHECKING:
     from onefit.body import Body, BodyModel
     from onefit.objective import Measures
-    from onefit.physics import Settings
 
 FPS = 30.0  # that the networks know
 WARM_UP = 10  # frames in which the first pose is held, for the network's memory to settle
@@ -190,13 +189,28 @@ class Draper:
         if finish:
             from .finish import finished
 
+            settings = settings or Settings()
+            lead = motion.led_in(body, settings.lead)[: -len(motion)]
+            before, moving = self._skinned(garment, rest, body, lead)
+            cut = garment.cut is not None
             made = finished(
-                vertices, rest, faces, self._held(garment), bodies, body_faces,
-                material=material, steps=finish, fps=FPS, settings=settings,
-                sides=None if garment.cut is None else garment.sides(rest).double().numpy(),
+                torch.cat([before, vertices]), rest, faces, self._held(garment),
+                torch.cat([moving, bodies]), body_faces,
+                material=material, steps=finish, fps=FPS, settings=settings, first=len(lead),
+                sides=garment.sides(rest).double().numpy() if cut else None,
+                cut=garment.cut.numpy() if cut else None,
             )  # fmt: skip
             vertices = torch.stack([(frame, advance())[0] for frame in made])
         return Drape(vertices, faces, rest, bodies, body_faces, root, FPS)
+
+    def _skinned(self, garment, rest, body, motion):
+        """A garment at ``rest`` (N, 3) [m] by plain skinning, (T, N, 3) [m], and the body's
+        vertices (T, V, 3) [m].
+        """
+        transforms = skinning.transforms(body, motion.poses, motion.translation)
+        weights = garment.blend_weights.to(self.device)
+        cloth = posed(rest[:, None].to(self.device), weights, transforms).transpose(0, 1)
+        return cloth.cpu(), skinning.skin(body.vertices, body.blend_weights, transforms).cpu()
 
     def _held(self, garment):
         """How firmly each vertex is held at a waistband, (N,)."""

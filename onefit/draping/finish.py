@@ -28,20 +28,24 @@ def finished(
     steps: int,
     fps: float,
     settings: Settings | None = None,
+    first: int = 0,
     sides: np.ndarray | None = None,
+    cut: np.ndarray | None = None,
 ) -> Iterator[torch.Tensor]:
-    """The garment's vertices (N, 3) [m] in one frame after the other.
+    """The garment's vertices (N, 3) [m] in one frame after the other, from the ``first`` on: those
+    before lead to it, and are not given.
 
     ``guide`` (T, N, 3) [m]: the drape that is finished; ``rest`` (N, 3) [m] and ``faces`` (F, 3) of
     the garment graded to the body; ``held`` (N,): how firmly each vertex is held, as
     :func:`onefit.garment.waistband.held` says; ``bodies`` (T, V, 3) [m], ``body_faces``; ``steps``
     in a frame, in which the body moves along straight lines; ``sides`` (F, 3) [m]: the lengths of
-    the faces at rest, of a garment that was cut otherwise than it hangs.
+    the faces at rest, and ``cut`` (N, 3) [m], of a garment that was cut otherwise than it hangs.
     """
     settings = settings or Settings()
     order = _order(faces.numpy(), len(rest))
     number = np.argsort(order)
-    sheet = Sheet(rest.double().numpy()[order], number[faces.numpy()], material, sides)
+    cut = None if cut is None else cut[order]
+    sheet = Sheet(rest.double().numpy()[order], number[faces.numpy()], material, sides, cut)
     start, moving = guide.double().numpy()[:, order], bodies.double().numpy()
     body = BodyContact(sheet, bodies[0], body_faces, settings)
     itself = SelfContact(sheet, settings, len(body))
@@ -52,23 +56,30 @@ def finished(
     cloth.x = body.pushed_out(cloth.x)
 
     def step(now, target):
-        contacts = [body.follow(now), itself.find(cloth.x, cloth.flight(dt))]
+        contacts = [body.follow(now), itself.find(cloth.x)]
         cloth.step(dt, contacts, target, pull)
         body.find(cloth.x)
         cloth.x = body.pushed_out(cloth.x)
 
-    for _ in range(round(settings.settling * fps)):
-        for _ in range(steps):
-            step(moving[0], start[0])
-            cloth.v *= settings.damping
-    if len(start) > 1:  # the motion begins at once, and the cloth is in it
-        cloth.v = fps * (start[1] - start[0])
-    yield torch.as_tensor(cloth.x[number]).float()
-    for t in range(1, len(start)):
+    def slowly(now, target):
+        step(now, target)
+        cloth.v *= settings.damping
+
+    def frame(t, step):
         for k in range(1, steps + 1):
             share = k / steps
             between = lambda x: (1 - share) * x[t - 1] + share * x[t]
             step(between(moving), between(start))
+
+    for t in range(1, first + 1):
+        frame(t, slowly)
+    for _ in range(round(settings.settling * fps) * steps):
+        slowly(moving[first], start[first])
+    if len(start) > first + 1:  # the motion begins at once, and the cloth is in it
+        cloth.v = fps * (start[first + 1] - start[first])
+    yield torch.as_tensor(cloth.x[number]).float()
+    for t in range(first + 1, len(start)):
+        frame(t, step)
         yield torch.as_tensor(cloth.x[number]).float()
 
 

@@ -108,6 +108,28 @@ class Motion:
             * (skeleton.leg_length(body.joints) / skeleton.leg_length(skeleton.standard_joints())),
         )
 
+    def led_in(self, body: Body, seconds: float) -> Motion:
+        """The motion with ``seconds`` before it in which a :class:`~onefit.Body`, standing where
+        the motion starts and turned as there, goes from its rest, in which garments are made, to
+        the first pose.
+        """
+        count = round(seconds * self.fps)
+        share = np.linspace(0, 1, count + 1)[:-1]
+        share = share * share * (3 - 2 * share)
+        pose = torch.cat([self.poses[0, :1], body.rest_pose[1:].to(self.poses)])
+        rest, first = (
+            Rotation.from_rotvec(x.detach().cpu().double().numpy()) for x in (pose, self.poses[0])
+        )
+        turn = (rest.inv() * first).as_rotvec()
+        lead = [(rest * Rotation.from_rotvec(s * turn)).as_rotvec() for s in share]
+        poses = torch.as_tensor(np.array(lead).reshape(-1, *self.poses.shape[1:])).to(self.poses)
+        places = self.translation[:1].expand(count, -1)
+        return replace(
+            self,
+            poses=torch.cat([poses, self.poses]),
+            translation=torch.cat([places, self.translation]),
+        )
+
     def mirrored(self) -> Motion:
         """The motion seen in a mirror: left is right, and x is -x."""
         poses, translation = skeleton.mirrored(self.poses, self.translation)

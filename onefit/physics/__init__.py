@@ -8,7 +8,8 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
         "cloth": ["Cloth"],
-        "contact": ["BodyContact", "SelfContact"],
+        "contact": ["BodyContact"],
+        "layers": ["SelfContact"],
         "material": ["MATERIALS", "Material"],
         "settings": ["Settings"],
         "sheet": ["Sheet", "samples"],

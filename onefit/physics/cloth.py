@@ -10,7 +10,7 @@ import numpy as np
 from scipy.sparse import bsr_matrix
 
 from . import kernels
-from .contact import Contacts
+from .contact import Contacts, weighted
 from .kernels import wp
 from .material import AIR, GRAVITY
 from .settings import Settings
@@ -23,6 +23,26 @@ def _ints(a):
 
 def _reals(a, dtype=kernels.real):
     return wp.array(np.ascontiguousarray(a, dtype=np.float64), dtype=dtype, device="cpu")
+
+
+class _Touch:
+    """Contacts as the kernels take them, with friction's ``drag`` (C,) [N/m] for a unit slip, and
+    the arrays that receive what they find.
+    """
+
+    def __init__(self, contacts: Contacts, drag: np.ndarray) -> None:
+        c, self.contacts, self.drag, count = contacts, contacts, drag, len(contacts.key)
+        self.arrays = [_ints(c.corners), _reals(c.weights), _reals(c.normal, kernels.vec3)]
+        self.arrays += [_reals(c.offset), _reals(c.moved, kernels.vec3), c.stiffness, _reals(drag)]
+        gap, slip = _reals(np.zeros(count)), _reals(np.zeros(count))
+        self.found = [gap, slip, _reals(np.zeros((count, 3, 3)), kernels.mat3)]
+        self.gap, self.slip, self.block = (a.numpy() for a in self.found)
+        self.coupling = c.weights.sum(1) < 0.5  # or the Hessian is lumped
+
+    def coupled(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Corners, weights and blocks of those that do something and couple their corners."""
+        active = np.flatnonzero(((self.gap < 0) | (self.drag > 0)) & self.coupling)
+        return self.contacts.corners[active], self.contacts.weights[active], self.block[active]
 
 
 class Cloth:
@@ -64,14 +84,18 @@ class Cloth:
         self._stretch = _reals(sheet.gradients, kernels.vec2), _reals(material.stretch * sheet.area)
         self._matrix = _reals(np.zeros((len(where), 3, 3)), kernels.mat3)
         self._inverse = _reals(np.zeros((N, 3, 3)), kernels.mat3)
-        self._vectors = [_reals(np.zeros((N, 3)), kernels.vec3) for _ in range(8)]
+        self._vectors = [_reals(np.zeros((N, 3)), kernels.vec3) for _ in range(9)]
         self._done = _ints([0])
 
-    def assemble(
-        self, y: np.ndarray, dt: float, contacts: Sequence[Contacts] = ()
-    ) -> tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray]]]:
-        """The gradient (N, 3) [N] at ``y`` (N, 3) [m] of all but inertia and weight, and of each of
-        the ``contacts`` gap and slip (C,) [m]. The matrix stays here, with the masses / dt^2.
+    def touches(self, contacts: Sequence[Contacts], dt: float) -> list[_Touch]:
+        """The ``contacts`` of a step of ``dt`` [s], as :meth:`assemble` takes them."""
+        slow, friction = self.settings.sticking * dt, self.sheet.material.friction
+        drag = lambda c: friction * self.load[c.key] / np.maximum(self.slip[c.key], slow)
+        return [_Touch(c, drag(c)) for c in contacts]
+
+    def assemble(self, y: np.ndarray, dt: float, touches: Sequence[_Touch] = ()) -> np.ndarray:
+        """The gradient (N, 3) [N] at ``y`` (N, 3) [m] of all but inertia and weight. The matrix
+        stays here, with the masses / dt^2.
         """
         x, before, velocity, force = self._vectors[:4]
         x.numpy()[:], before.numpy()[:], velocity.numpy()[:], force.numpy()[:] = (
@@ -94,29 +118,27 @@ class Cloth:
         )
         air = [material.drag * AIR / 2, dt, self._of_faces]
         launch(kernels.drag, count, [x, before, velocity, self._faces, *air, *into])
-        found = []
-        for c in contacts:
-            drag = material.friction * self.load[c.key]
-            drag /= np.maximum(self.slip[c.key], self.settings.sticking * dt)
-            gap, slip = _reals(np.zeros(len(c.key))), _reals(np.zeros(len(c.key)))
-            launch(
-                kernels.contact,
-                len(c.key),
-                [
-                    x, before, _ints(c.corners), _reals(c.weights), _reals(c.normal, kernels.vec3),
-                    _reals(c.offset), _reals(c.moved, kernels.vec3), c.stiffness,
-                    _reals(drag), self._rows[1], gap, slip, *into,
-                ],
-            )  # fmt: skip
-            found.append((gap.numpy(), slip.numpy()))
-        return force.numpy(), found
+        for touch in touches:
+            size, places = len(touch.gap), [x, before, *touch.arrays, self._rows[1]]
+            launch(kernels.contact, size, [*places, *touch.found, *into])
+        none = (np.zeros((0, 4)), np.zeros((0, 4)), np.zeros((0, 3, 3)))
+        parts = [none, *(touch.coupled() for touch in touches)]
+        corners, weights, blocks = (np.concatenate(a) for a in zip(*parts))
+        self._coupled = _ints(corners), _reals(weights), _reals(blocks, kernels.mat3)
+        return force.numpy()
 
     def product(self, vector: np.ndarray) -> np.ndarray:
         """The matrix that was last assembled times ``vector`` (N, 3)."""
         first, _, column = (a.numpy() for a in self._rows)
         size = 3 * len(self.sheet)
         matrix = bsr_matrix((self._matrix.numpy(), column, first), shape=(size, size))
-        return (matrix @ np.ravel(vector)).reshape(-1, 3)
+        out = (matrix @ np.ravel(vector)).reshape(-1, 3)
+        corners, weights, block = (a.numpy() for a in self._coupled)
+        at = np.einsum("ck,ckd->cd", weights, vector[corners])[:, None]
+        one_by_one = weights[:, :, None] * vector[corners]
+        of_corners = np.einsum("cde,cke->ckd", block, at - one_by_one) * weights[:, :, None]
+        np.add.at(out, corners, of_corners)
+        return out
 
     def flight(self, dt: float) -> np.ndarray:
         """Where the vertices (N, 3) [m] would be after a step of ``dt`` [s] without any force but
@@ -142,30 +164,33 @@ class Cloth:
         inertia = self.sheet.mass[:, None] / dt**2
         b, move, *work = self._vectors[3:]
         limits = [self.settings.iterations, self.settings.tolerance]
-        arrays = [*self._rows, self._matrix, self._inverse, *limits, b, move, *work, self._done]
+        solve = [*self._rows, self._matrix, self._inverse]
         after, start, self.iterations = y, self._forced, 0
+        touches = self.touches(contacts, dt)
         for _ in range(self.settings.newton):
-            gradient, found = self.assemble(after, dt, contacts)
+            gradient = self.assemble(after, dt, touches)
             gradient = gradient + inertia * (after - y) + pull * (after - target)
             self._matrix.numpy()[self._middle] += pull[:, :, None] * np.eye(3)
             b.numpy()[:], move.numpy()[:] = -gradient, start
+            arrays = [*solve, *self._coupled, *limits, b, move, *work, self._done]
             wp.launch(kernels.conjugate_gradients, 1, arrays, device="cpu")
             self.iterations += int(self._done.numpy()[0])
             after, start = after + move.numpy(), np.zeros_like(y)
         self._forced = after - y
-        self._remember(after, contacts, found)
+        self._remember(after, touches)
         self.v, self.x = (after - self.x) / dt, after
 
-    def _remember(self, after, contacts, found):
+    def _remember(self, after, touches):
         """Loads and slips of the contacts, for the next step's friction: what those bear that were
         in touch when the step was last linearised.
         """
         load, slip = np.zeros_like(self.load), np.zeros_like(self.slip)
-        for c, (touching, _) in zip(contacts, found):
-            point = (after[c.corners] * c.weights[:, :, None]).sum(1)
-            gap = (point * c.normal).sum(1) - c.offset
-            slid = point - (self.x[c.corners] * c.weights[:, :, None]).sum(1) - c.moved
-            slid -= (slid * c.normal).sum(1, keepdims=True) * c.normal
-            load[c.key] = c.stiffness * np.maximum(-gap, 0) * (touching < 0)
-            slip[c.key] = np.linalg.norm(slid, axis=1)
+        for touch in touches:
+            c = touch.contacts
+            point = weighted(after[c.corners], c.weights)
+            gap = np.einsum("ci,ci->c", point, c.normal) - c.offset
+            slid = point - weighted(self.x[c.corners], c.weights) - c.moved
+            slid -= np.einsum("ci,ci->c", slid, c.normal)[:, None] * c.normal
+            np.maximum.at(load, c.key, c.stiffness * np.maximum(-gap, 0) * (touch.gap < 0))
+            np.maximum.at(slip, c.key, np.linalg.norm(slid, axis=1))
         self.load, self.slip = load, slip

@@ -12,8 +12,6 @@ import torch
 
 from onefit.body import ClosestSurface
 
-from . import kernels
-from .kernels import wp
 from .sheet import Sheet, samples
 
 
@@ -32,6 +30,11 @@ class Contacts:
     offset: np.ndarray
     moved: np.ndarray
     stiffness: float
+
+
+def weighted(x: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """The sums (C, 3) of ``x`` (C, K, 3) with ``weights`` (C, K)."""
+    return np.einsum("cki,ck->ci", x, weights)
 
 
 class BodyContact:
@@ -60,7 +63,7 @@ class BodyContact:
     def points(self, x: np.ndarray) -> np.ndarray:
         """The vertices (N, 3) and, below them, the points of the faces: (P, 3)."""
         of_faces = slice(len(x), None)
-        inner = (x[self.corners[of_faces]] * self.weights[of_faces, :, None]).sum(1)
+        inner = weighted(x[self.corners[of_faces]], self.weights[of_faces])
         return np.concatenate([x, inner])
 
     def find(self, x: np.ndarray) -> None:
@@ -75,12 +78,12 @@ class BodyContact:
     def follow(self, vertices: np.ndarray) -> Contacts:
         """The body moves to ``vertices`` (V, 3) [m]; the contacts of the step in which it does."""
         near = np.flatnonzero(self.face >= 0)
-        corners, b = self.faces[self.face[near]], self.barycentric[near, :, None]
+        corners, b = self.faces[self.face[near]], self.barycentric[near]
         now = vertices[corners]
-        point, before = (now * b).sum(1), (self.body[corners] * b).sum(1)
+        point, before = weighted(now, b), weighted(self.body[corners], b)
         normal = np.cross(now[:, 1] - now[:, 0], now[:, 2] - now[:, 0])
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        offset = (normal * point).sum(1) + self.settings.clearance
+        offset = np.einsum("ci,ci->c", normal, point) + self.settings.clearance
         self.body = vertices
         self.surface.follow(vertices)
         corners, weights = self.corners[near], self.weights[near]
@@ -102,36 +105,3 @@ class BodyContact:
             v, used = v[deeper], used[deeper]
             out[v], depth[v] = x[v] + push[used], least - self.distance[deep[used]]
         return out
-
-
-class SelfContact:
-    """Contacts of a sheet with itself: of each vertex with the nearest triangle. The keys start at
-    ``first``.
-    """
-
-    def __init__(self, sheet: Sheet, settings, first: int) -> None:
-        self.sheet, self.settings, self.first = sheet, settings, first
-        self.stiffness = settings.layers * sheet.material.stretch
-        self._places = [
-            wp.array(sheet.rest.astype(np.float32), dtype=wp.vec3, device="cpu") for _ in range(3)
-        ]
-        indices = wp.array(sheet.faces.ravel().astype(np.int32), dtype=int, device="cpu")
-        self._mesh = wp.Mesh(self._places[0], indices)
-        self._face = wp.zeros(len(sheet), dtype=int, device="cpu")
-        self._found = wp.zeros((len(sheet), 3), dtype=float, device="cpu")
-        self._normal = wp.zeros(len(sheet), dtype=wp.vec3, device="cpu")
-
-    def find(self, before: np.ndarray, x: np.ndarray) -> Contacts:
-        """The contacts of vertices (N, 3) [m] that were ``before`` (N, 3) and may go to ``x``."""
-        self._places[0].numpy()[:], self._places[1].numpy()[:] = x, before
-        self._mesh.refit()
-        arrays = [*self._places, 2 * self.settings.apart, self._face, self._found, self._normal]
-        wp.launch(kernels.proximity, len(x), [self._mesh.id, *arrays], device="cpu")
-        vertex = np.flatnonzero(self._face.numpy() >= 0)
-        face, barycentric = self._face.numpy()[vertex], self._found.numpy()[vertex].astype(float)
-        corners = np.concatenate([vertex[:, None], self.sheet.faces[face]], 1)
-        weights = np.concatenate([np.ones((len(vertex), 1)), -barycentric], 1)
-        offset = np.full(len(vertex), self.settings.apart)
-        normal = self._normal.numpy()[vertex].astype(float)
-        key, still = self.first + vertex, np.zeros_like(normal)
-        return Contacts(key, corners, weights, normal, offset, still, self.stiffness)

@@ -171,11 +171,13 @@ def contact(
     middle: wp.array(dtype=int),
     gap: wp.array(dtype=real),  # receives the gap [m]
     slip: wp.array(dtype=real),  # receives the length of the slip in the step [m]
+    block: wp.array(dtype=mat3),  # receives the Hessian in the point
     force: wp.array(dtype=vec3),
-    matrix: wp.array(dtype=mat3),
+    matrix: wp.array(dtype=mat3),  # receives the Hessian's blocks of each corner with itself
 ):
-    """stiffness / 2 gap^2 where the gap is below 0, and drag / 2 slip^2. In the matrix a contact of
-    several corners is as many of one corner, which is never less.
+    """stiffness / 2 gap^2 where the gap is below 0, and drag / 2 slip^2. Where the weights sum to
+    one, the other side is not the sheet, and the Hessian is lumped, as masses are; where they sum
+    to zero, it is exact, with what couples the corners in :func:`_coupled`.
     """
     c = wp.tid()
     n = normal[c]
@@ -186,7 +188,7 @@ def contact(
             place = x[corners[c, i]]
             at += weights[c, i] * place
             slid += weights[c, i] * (place - before[corners[c, i]])
-            total += wp.abs(weights[c, i])
+            total += weights[c, i]
     gap[c] = wp.dot(n, at) - offset[c]
     slid = slid - wp.dot(slid, n) * n
     slip[c] = wp.length(slid)
@@ -195,95 +197,34 @@ def contact(
         k = stiffness
     if k + drag[c] > real(0.0):
         g = k * gap[c] * n + drag[c] * slid
-        block = k * wp.outer(n, n)
-        block += drag[c] * (wp.identity(n=3, dtype=real) - wp.outer(n, n))
+        nn = wp.outer(n, n)
+        block[c] = k * nn + drag[c] * (wp.identity(n=3, dtype=real) - nn)
         for i in range(4):
             v = corners[c, i]
             if weights[c, i] != real(0.0):
                 force[v] += weights[c, i] * g
-                matrix[middle[v]] += total * wp.abs(weights[c, i]) * block
+                share = wp.where(total > real(0.5), real(1.0), weights[c, i])
+                matrix[middle[v]] += share * weights[c, i] * block[c]
 
 
 @wp.func
-def _closest_on_triangle(p: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3):
-    """Barycentric coordinates of the nearest point (Ericson 2005, section 5.1.5)."""
-    ab, ac, ap = b - a, c - a, p - a
-    d1, d2 = wp.dot(ab, ap), wp.dot(ac, ap)
-    if d1 <= 0.0 and d2 <= 0.0:
-        return wp.vec3(1.0, 0.0, 0.0)
-    bp = p - b
-    d3, d4 = wp.dot(ab, bp), wp.dot(ac, bp)
-    if d3 >= 0.0 and d4 <= d3:
-        return wp.vec3(0.0, 1.0, 0.0)
-    vc = d1 * d4 - d3 * d2
-    if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
-        v = d1 / (d1 - d3)
-        return wp.vec3(1.0 - v, v, 0.0)
-    cp = p - c
-    d5, d6 = wp.dot(ab, cp), wp.dot(ac, cp)
-    if d6 >= 0.0 and d5 <= d6:
-        return wp.vec3(0.0, 0.0, 1.0)
-    vb = d5 * d2 - d1 * d6
-    if vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
-        w = d2 / (d2 - d6)
-        return wp.vec3(1.0 - w, 0.0, w)
-    va = d3 * d6 - d5 * d4
-    if va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
-        w = (d4 - d3) / ((d4 - d3) + (d5 - d6))
-        return wp.vec3(0.0, 1.0 - w, w)
-    v = vb / (va + vb + vc)
-    w = vc / (va + vb + vc)
-    return wp.vec3(1.0 - v - w, v, w)
-
-
-@wp.func
-def _side_of(p: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3):
-    return wp.dot(p - a, wp.cross(b - a, c - a))
-
-
-@wp.kernel
-def proximity(
-    mesh: wp.uint64,  # of the vertices x
-    x: wp.array(dtype=wp.vec3),
-    before: wp.array(dtype=wp.vec3),  # where they were at the start of the step
-    rest: wp.array(dtype=wp.vec3),
-    reach: float,
-    face: wp.array(dtype=int),  # receives the nearest face within reach that is not beside, or -1
-    found: wp.array2d(dtype=float),  # receives its barycentric coordinates
-    normal: wp.array(dtype=wp.vec3),  # receives the direction in which the vertex must stay away
+def _coupled(
+    corners: wp.array2d(dtype=int),
+    weights: wp.array2d(dtype=real),
+    block: wp.array(dtype=mat3),
+    x: wp.array(dtype=vec3),
+    out: wp.array(dtype=vec3),
 ):
-    """For each vertex of the sheet the nearest triangle of the same sheet within ``reach``. One
-    with a corner that lies within twice that of the vertex at rest is beside it, and does not
-    count. The vertex belongs on the side of the triangle on which it was before.
-    """
-    i = wp.tid()
-    p = x[i]
-    face[i] = -1
-    closest = reach * reach
-    around = wp.vec3(reach, reach, reach)
-    query = wp.mesh_query_aabb(mesh, p - around, p + around)
-    f = int(0)  # noqa: RUF046, UP018 - a variable to Warp
-    while wp.mesh_query_aabb_next(query, f):
-        a = wp.mesh_get_index(mesh, 3 * f)
-        b = wp.mesh_get_index(mesh, 3 * f + 1)
-        c = wp.mesh_get_index(mesh, 3 * f + 2)
-        beside = wp.min(
-            wp.length_sq(rest[a] - rest[i]),
-            wp.min(wp.length_sq(rest[b] - rest[i]), wp.length_sq(rest[c] - rest[i])),
-        )
-        if i != a and i != b and i != c and beside > 4.0 * reach * reach:
-            near = _closest_on_triangle(p, x[a], x[b], x[c])
-            away = p - (near[0] * x[a] + near[1] * x[b] + near[2] * x[c])
-            if wp.length_sq(away) < closest:
-                closest = wp.length_sq(away)
-                face[i] = f
-                for k in range(3):
-                    found[i, k] = near[k]
-                was = _side_of(before[i], before[a], before[b], before[c])
-                if was * _side_of(p, x[a], x[b], x[c]) > 0.0:
-                    normal[i] = wp.normalize(away)
-                else:
-                    normal[i] = wp.sign(was) * wp.normalize(wp.cross(x[b] - x[a], x[c] - x[a]))
+    """Contacts of several corners, less their blocks of each corner with itself, times x."""
+    for i in range(out.shape[0]):
+        out[i] = vec3()
+    for c in range(corners.shape[0]):
+        at = vec3()
+        for k in range(4):
+            at += weights[c, k] * x[corners[c, k]]
+        for k in range(4):
+            v = corners[c, k]
+            out[v] = out[v] + block[c] * (weights[c, k] * (at - weights[c, k] * x[v]))
 
 
 @wp.kernel
@@ -293,6 +234,9 @@ def conjugate_gradients(
     column: wp.array(dtype=int),
     matrix: wp.array(dtype=mat3),
     inverse: wp.array(dtype=mat3),  # receives those of the diagonal blocks
+    corners: wp.array2d(dtype=int),  # (C, 4), of contacts that couple vertices
+    weights: wp.array2d(dtype=real),
+    block: wp.array(dtype=mat3),
     iterations: int,
     tolerance: real,  # of the residual's norm, relative to the right-hand side's
     b: wp.array(dtype=vec3),  # overwritten
@@ -300,12 +244,14 @@ def conjugate_gradients(
     p: wp.array(dtype=vec3),
     t: wp.array(dtype=vec3),
     w: wp.array(dtype=vec3),
+    u: wp.array(dtype=vec3),
     done: wp.array(dtype=int),  # receives the number of iterations
 ):
-    """matrix x = b, preconditioned by a symmetric Gauss-Seidel sweep, in Eisenstat's form (1981): a
-    sweep back and one forward do for the product with the matrix, too. One thread.
+    """(matrix + contacts) x = b, preconditioned by a symmetric Gauss-Seidel sweep, in Eisenstat's
+    form (1981): a sweep back and one forward do for the product with the matrix, too. One thread.
 
-    With A = L + D + L^T: CG on (D + L)^-1 A (D + L^T)^-1, preconditioned by D.
+    With A = L + D + L^T + C: CG on (D + L)^-1 A (D + L^T)^-1, preconditioned by D. C is what
+    contacts couple beyond the mesh's edges: a product more.
     """
     n = x.shape[0]
     zero = real(0.0)
@@ -313,8 +259,9 @@ def conjugate_gradients(
     for i in range(n):
         inverse[i] = wp.inverse(matrix[middle[i]])
         size += wp.dot(b[i], inverse[i] * b[i])
+    _coupled(corners, weights, block, x, u)
     for i in range(n):
-        r = b[i]
+        r = b[i] - u[i]
         for k in range(first[i], first[i + 1]):
             r -= matrix[k] * x[column[k]]
         t[i] = r
@@ -339,8 +286,9 @@ def conjugate_gradients(
                 r -= matrix[k] * t[column[k]]
             t[i] = inverse[i] * r
         curvature = zero
+        _coupled(corners, weights, block, t, u)
         for i in range(n):
-            r = p[i] - matrix[middle[i]] * t[i]
+            r = p[i] - matrix[middle[i]] * t[i] + u[i]
             for k in range(first[i], middle[i]):
                 r -= matrix[k] * w[column[k]]
             w[i] = inverse[i] * r

@@ -18,11 +18,13 @@ class Settings:
     nearer. ``reach`` [m]: cloth and body that come nearer to each other than this in a step are
     seen. ``contact`` and ``layers`` [1]: the stiffness of a contact with the body and of cloth with
     itself, in units of the material's stretch stiffness. ``sticking`` [m/s]: a slower slip is not
-    friction's full force. ``apart`` [m]: what folds keep from each other. ``spacing`` [m]: of
-    points of the faces that must stay out of the body, as vertices must. ``draw`` [1/s^2]:
-    acceleration towards the drape that is finished, for a unit distance. ``settling`` [s]: how long
-    the first pose is held before the motion, for the cloth to come to rest, with velocities
-    multiplied by ``damping`` in each step of it.
+    friction's full force. ``apart`` [m]: what folds keep from each other, of those that are nearer
+    than ``approach`` [m] at the start of a step. ``spacing`` [m]: of points of the faces that must
+    stay out of the body, as vertices must. ``draw`` [1/s^2]: acceleration towards the drape that is
+    finished, for a unit distance. ``lead`` [s]: how long the body takes, before the motion, from
+    its rest, in which garments are made, to the first pose; ``settling`` [s]: how long that is held
+    then, for the cloth to come to rest. In each step of both, velocities are multiplied by
+    ``damping``.
     """
 
     newton: int = 2
@@ -32,12 +34,14 @@ class Settings:
     least: float = 0.001
     reach: float = 0.03
     contact: float = 0.5
-    layers: float = 0.05
+    layers: float = 0.2
     sticking: float = 0.005
     apart: float = 0.003
+    approach: float = 0.012
     spacing: float = 0.02
     draw: float = 0.2
-    settling: float = 1.0
+    lead: float = 0.6
+    settling: float = 0.4
     damping: float = 0.9
 
     def __post_init__(self) -> None:

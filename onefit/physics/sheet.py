@@ -20,7 +20,8 @@ _LEAST = 1e-12  # of the roots below, so that a degenerate triangle has a gradie
 class Sheet:
     """``rest`` (N, 3) [m] and ``faces`` (F, 3), arrays, of ``material``. With ``sides`` (F, 3) [m],
     from each corner of a face to the next, the lengths at rest are these, not those of ``rest``,
-    and the sheet rests flat: cloth that hangs in folds, as it was cut.
+    and the sheet rests flat: cloth that hangs in folds, as it was cut; ``cut`` (N, 3) [m] is where
+    it has no folds yet, so that only neighbours are near to each other.
 
     ``area`` (F,) [m^2]; ``mass`` (N,) [kg]; ``gradients`` (F, 3, 2) [1/m], those of the three
     corners' hat functions in the plane of the triangle, so that F = sum_a x_a g_a^T is the
@@ -35,10 +36,12 @@ class Sheet:
         faces: np.ndarray,
         material: Material,
         sides: np.ndarray | None = None,
+        cut: np.ndarray | None = None,
     ) -> None:
         self.material = material
         self.rest = np.asarray(rest, dtype=np.float64)
         self.faces = np.asarray(faces, dtype=np.int64)
+        self.cut = self.rest if cut is None else np.asarray(cut, dtype=np.float64)
         corners = self.rest[self.faces]
         of_rest = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
         self.sides = of_rest if sides is None else np.asarray(sides, dtype=np.float64)

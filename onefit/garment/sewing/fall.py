@@ -21,7 +21,7 @@ def fallen(cut, seconds=SECONDS, advance=lambda cloth: None):
     body = standard_body()
     corners = cut.vertices[cut.faces]
     sides = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
-    sheet = Sheet(cut.start, cut.faces, Material.named(_MATERIAL), sides)
+    sheet = Sheet(cut.start, cut.faces, Material.named(_MATERIAL), sides, cut.vertices)
     surface = body.vertices.double().numpy()
     skin = BodyContact(sheet, body.vertices, body.faces, SETTINGS)
     itself = SelfContact(sheet, SETTINGS, len(skin))
@@ -29,7 +29,7 @@ def fallen(cut, seconds=SECONDS, advance=lambda cloth: None):
     pull = sheet.material.stretch * held(cut.start, cut.faces, body.joints.double().numpy())
     skin.find(cloth.x)
     for _ in range(round(seconds / STEP)):
-        contacts = [skin.follow(surface), itself.find(cloth.x, cloth.flight(STEP))]
+        contacts = [skin.follow(surface), itself.find(cloth.x)]
         cloth.step(STEP, contacts, cut.start, pull)
         skin.find(cloth.x)
         cloth.x = skin.pushed_out(cloth.x)

@@ -227,3 +227,17 @@ def test_motion_files_that_cannot_be_used(tmp_path):
     ):
         with pytest.raises(InputError, match=message):
             Motion.read(tmp_path / name)
+
+
+def test_a_motion_is_led_in_from_the_bodys_rest_to_its_first_pose():
+    body, motion = AnnyBody().body(), Motion.generate("box", seconds=0.2)
+    led = motion.led_in(body, 0.5)
+    lead = led[: -len(motion)]
+    assert len(lead) == 15
+    assert torch.equal(led.poses[15:], motion.poses)
+    assert torch.equal(led.translation[15:], motion.translation)
+    assert torch.allclose(lead.poses[0, 1:], body.rest_pose[1:], atol=1e-6)
+    assert torch.allclose(lead.poses[:, 0], motion.poses[:1, 0].expand(15, -1), atol=1e-6)
+    assert (lead.translation == motion.translation[0]).all()
+    steps = torch.cat([lead.poses, motion.poses[:1]]).diff(dim=0).norm(dim=-1).amax(1)
+    assert steps[0] < 0.2 * steps.max() and steps[-1] < 0.2 * steps.max()  # softly

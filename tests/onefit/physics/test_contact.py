@@ -5,7 +5,7 @@ import trimesh
 
 from onefit.physics import MATERIALS, Settings
 from onefit.physics.cloth import Cloth
-from onefit.physics.contact import BodyContact, SelfContact
+from onefit.physics.contact import BodyContact, Contacts
 from onefit.physics.sheet import Sheet, samples
 
 COTTON = MATERIALS["cotton"]
@@ -73,22 +73,6 @@ def test_a_fast_body_takes_cloth_along():
     assert (cloth.x[:, 2] - 1.0).min() > 0  # on the side on which it was
 
 
-def test_a_layer_that_falls_on_another_stays_on_it():
-    V, F = grid(10, 10, 0.012)
-    V2 = V * [0.6, 0.6, 1] + [0, 0, 0.015]
-    sheet = Sheet(np.concatenate([V, V2]), np.concatenate([F, F + len(V)]), COTTON)
-    settings = Settings()
-    itself = SelfContact(sheet, settings, 0)
-    x = sheet.rest - [0, 0, 0.009] * (np.arange(len(sheet)) >= len(V))[:, None]  # 6 mm above it
-    cloth = Cloth(sheet, x, settings, len(sheet))
-    fixed = np.where(np.arange(len(sheet)) < len(V), 1e3, 0.0)
-    for _ in range(40):
-        contacts = itself.find(cloth.x, cloth.flight(1 / 60))
-        cloth.step(1 / 60, [contacts], sheet.rest, fixed)
-    above = cloth.x[len(V) :, 2] - cloth.x[: len(V), 2].mean()
-    assert above.min() > 0 and above.max() < 2 * settings.apart
-
-
 def test_points_of_faces_lie_no_farther_apart_than_the_spacing():
     V, F = grid(3, 3, 0.1)
     sheet = Sheet(V, F, COTTON)
@@ -99,3 +83,26 @@ def test_points_of_faces_lie_no_farther_apart_than_the_spacing():
     nearest = np.linalg.norm(drawn[:, None] - points, axis=-1).min(1)
     assert nearest.max() < 0.02
     assert len(samples(sheet.rest, sheet.faces, 0.2)[0]) == 0
+
+
+def test_the_matrix_of_contacts_between_cloth_and_cloth_is_their_gradients_derivative():
+    V, F = grid(6, 6, 0.02)
+    sheet, rng = Sheet(V, F, COTTON), np.random.default_rng(0)
+    cloth = Cloth(sheet, V, keys=4)
+    cloth.load[:], cloth.slip[:] = rng.random(4), 0.01
+    corners = np.array([[0, 7, 20, 30], [3, 9, 10, 15], [35, 1, 2, 8], [12, 13, 20, 21]])
+    weights = np.array([[0.4, 0.6, -0.2, -0.8], [1, -0.2, -0.3, -0.5]] * 2)
+    normal = rng.normal(size=(4, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    between = weights @ np.ones(4)
+    assert np.allclose(between, 0)
+    offset, moved = np.array([1.0, 1.0, 1.0, -1.0]), rng.normal(size=(4, 3))  # the last is open
+    contacts = Contacts(np.arange(4), corners, weights, normal, offset, moved, 30.0)
+    touches, step, size = cloth.touches([contacts], 1 / 60), rng.normal(size=V.shape), 1e-6
+    of = lambda y: cloth.assemble(y, 1 / 60, touches).copy() - cloth.assemble(y, 1 / 60)
+    expected = (of(V + size * step) - of(V - size * step)) / (2 * size)
+    cloth.assemble(V, 1 / 60)
+    alone = cloth.product(step)
+    cloth.assemble(V, 1 / 60, touches)
+    assert np.abs(expected).max() > 1
+    assert np.abs(cloth.product(step) - alone - expected).max() < 1e-6 * np.abs(expected).max()

@@ -1,0 +1,193 @@
+"""Warp kernels that find where a sheet lies near to itself."""
+
+from onefit.body.quietwarp import warp as ready
+
+wp = ready()
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Layers:
+    """A sheet: its ``mesh`` as Warp knows it, of the vertices ``x`` (N,) [m]; where these are at
+    ``rest``; of each face its ``middle`` at rest and the ``radius`` [m] around it that holds the
+    corners; the ends of its ``edges`` (E, 2), the edges of each face ``edges_of`` (F, 3), and the
+    first face of each edge, its ``owner`` (E,).
+    """
+
+    mesh: wp.uint64
+    x: wp.array(dtype=wp.vec3)
+    rest: wp.array(dtype=wp.vec3)
+    middle: wp.array(dtype=wp.vec3)
+    radius: wp.array(dtype=float)
+    edges: wp.array2d(dtype=int)
+    edges_of: wp.array2d(dtype=int)
+    owner: wp.array(dtype=int)
+
+
+@wp.struct
+class Found:
+    """Pairs: how many so far (``count``), and, of as many as there is room for, ``corners`` and
+    ``weights`` (P, 4) of the vector sum_i w_i x_i from one to the other, and its direction, the
+    ``normal``.
+    """
+
+    count: wp.array(dtype=int)
+    corners: wp.array2d(dtype=int)
+    weights: wp.array2d(dtype=float)
+    normal: wp.array(dtype=wp.vec3)
+
+
+@wp.func
+def _closest_on_triangle(p: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3):
+    """Barycentric coordinates of the nearest point (Ericson 2005, section 5.1.5)."""
+    ab, ac, ap = b - a, c - a, p - a
+    d1, d2 = wp.dot(ab, ap), wp.dot(ac, ap)
+    if d1 <= 0.0 and d2 <= 0.0:
+        return wp.vec3(1.0, 0.0, 0.0)
+    bp = p - b
+    d3, d4 = wp.dot(ab, bp), wp.dot(ac, bp)
+    if d3 >= 0.0 and d4 <= d3:
+        return wp.vec3(0.0, 1.0, 0.0)
+    vc = d1 * d4 - d3 * d2
+    if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
+        v = d1 / (d1 - d3)
+        return wp.vec3(1.0 - v, v, 0.0)
+    cp = p - c
+    d5, d6 = wp.dot(ab, cp), wp.dot(ac, cp)
+    if d6 >= 0.0 and d5 <= d6:
+        return wp.vec3(0.0, 0.0, 1.0)
+    vb = d5 * d2 - d1 * d6
+    if vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
+        w = d2 / (d2 - d6)
+        return wp.vec3(1.0 - w, 0.0, w)
+    va = d3 * d6 - d5 * d4
+    if va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
+        w = (d4 - d3) / ((d4 - d3) + (d5 - d6))
+        return wp.vec3(0.0, 1.0 - w, w)
+    v = vb / (va + vb + vc)
+    w = vc / (va + vb + vc)
+    return wp.vec3(1.0 - v - w, v, w)
+
+
+@wp.func
+def _keep(found: Found, corners: wp.vec4i, weights: wp.vec4, normal: wp.vec3):
+    at = wp.atomic_add(found.count, 0, 1)
+    if at < found.corners.shape[0]:
+        found.normal[at] = normal
+        for k in range(4):
+            found.corners[at, k] = corners[k]
+            found.weights[at, k] = weights[k]
+
+
+@wp.kernel
+def vertices_near(
+    first: int,
+    layers: Layers,
+    apart: float,  # [m]; what lies nearer than this at rest is beside, and does not count
+    reach: float,  # [m]
+    beside: wp.array(dtype=int),  # receives 1 where there is one within ``reach``
+    found: Found,
+):
+    """For each vertex from ``first`` on the triangles of other layers within ``reach``: those that
+    it stands above, and the nearest one. A layer is what is half as far away as at rest, or less.
+    """
+    i = first + wp.tid()
+    p, q = layers.x[i], layers.rest[i]
+    box = wp.vec3(reach, reach, reach)
+    query = wp.mesh_query_aabb(layers.mesh, p - box, p + box)
+    nearest = reach
+    corners, weights, normal = wp.vec4i(), wp.vec4(), wp.vec3()
+    inner = int(0)  # noqa: RUF046, UP018 - a variable to Warp
+    beside[i] = 0
+    f = int(0)  # noqa: RUF046, UP018
+    while wp.mesh_query_aabb_next(query, f):
+        if wp.length(layers.middle[f] - q) > layers.radius[f] + apart:
+            a = wp.mesh_get_index(layers.mesh, 3 * f)
+            b = wp.mesh_get_index(layers.mesh, 3 * f + 1)
+            c = wp.mesh_get_index(layers.mesh, 3 * f + 2)
+            x = layers.x
+            on = _closest_on_triangle(p, x[a], x[b], x[c])
+            away = p - (on[0] * x[a] + on[1] * x[b] + on[2] * x[c])
+            distance = wp.length(away)
+            r = layers.rest
+            at_rest = wp.length(q - (on[0] * r[a] + on[1] * r[b] + on[2] * r[c]))
+            if distance < reach and at_rest > 2.0 * distance and distance > 0.0:
+                beside[i] = 1
+                is_inner = wp.min(on[0], wp.min(on[1], on[2])) > 0.0
+                if is_inner:
+                    _keep(
+                        found,
+                        wp.vec4i(i, a, b, c),
+                        wp.vec4(1.0, -on[0], -on[1], -on[2]),
+                        away / distance,
+                    )
+                if distance < nearest:
+                    nearest = distance
+                    inner = wp.where(is_inner, 1, 0)
+                    corners = wp.vec4i(i, a, b, c)
+                    weights = wp.vec4(1.0, -on[0], -on[1], -on[2])
+                    normal = away / distance
+    if beside[i] == 1 and inner == 0:
+        _keep(found, corners, weights, normal)
+
+
+@wp.func
+def _edge_pair(layers: Layers, e: int, g: int, reach: float, found: Found):
+    """Keeps the edges e and g if they are a pair (nearest points: Ericson 2005, section 5.1.9)."""
+    i, j, m, n = layers.edges[e, 0], layers.edges[e, 1], layers.edges[g, 0], layers.edges[g, 1]
+    x, r = layers.x, layers.rest
+    along, other, between = x[j] - x[i], x[n] - x[m], x[i] - x[m]
+    aa, bb, ab = wp.dot(along, along), wp.dot(other, other), wp.dot(along, other)
+    ca, cb = wp.dot(along, between), wp.dot(other, between)
+    det = aa * bb - ab * ab
+    if det > 1.0e-6 * aa * bb:
+        s, t = (ab * cb - ca * bb) / det, (aa * cb - ab * ca) / det
+        if wp.min(s, t) > 0.0 and wp.max(s, t) < 1.0:
+            away = between + s * along - t * other
+            distance = wp.length(away)
+            at_rest = (1.0 - s) * r[i] + s * r[j] - (1.0 - t) * r[m] - t * r[n]
+            if distance < reach and wp.length(at_rest) > 2.0 * distance and distance > 0.0:
+                _keep(
+                    found,
+                    wp.vec4i(i, j, m, n),
+                    wp.vec4(1.0 - s, s, t - 1.0, -t),
+                    away / distance,
+                )
+
+
+@wp.func
+def _is_looked_at(layers: Layers, e: int, reach: float, beside: wp.array(dtype=int)):
+    i, j = layers.edges[e, 0], layers.edges[e, 1]
+    is_long = wp.length(layers.rest[i] - layers.rest[j]) > 2.0 * reach
+    return is_long or beside[i] + beside[j] > 0
+
+
+@wp.kernel
+def edges_near(
+    first: int,
+    layers: Layers,
+    apart: float,
+    reach: float,
+    beside: wp.array(dtype=int),  # as :func:`vertices_near` leaves it
+    found: Found,
+):
+    """For each edge from ``first`` on, if one of its ends is beside another layer, or it is long,
+    the edges of layers within ``reach``, where both are nearest to each other between their ends.
+    """
+    e = first + wp.tid()
+    if not _is_looked_at(layers, e, reach, beside):
+        return
+    i, j = layers.edges[e, 0], layers.edges[e, 1]
+    x, r = layers.x, layers.rest
+    half = 0.5 * wp.length(r[j] - r[i])
+    q = 0.5 * (r[i] + r[j])
+    box = wp.vec3(reach, reach, reach)
+    query = wp.mesh_query_aabb(layers.mesh, wp.min(x[i], x[j]) - box, wp.max(x[i], x[j]) + box)
+    f = int(0)  # noqa: RUF046, UP018
+    while wp.mesh_query_aabb_next(query, f):
+        if wp.length(layers.middle[f] - q) > layers.radius[f] + half + apart:
+            for k in range(3):
+                g = layers.edges_of[f, k]
+                once = g > e or not _is_looked_at(layers, g, reach, beside)
+                if once and layers.owner[g] == f:
+                    _edge_pair(layers, e, g, reach, found)

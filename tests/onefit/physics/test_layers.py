@@ -1,0 +1,160 @@
+import numpy as np
+import pytest
+from test_contact import COTTON, grid
+
+from onefit.objective.crossings import crossings
+from onefit.physics import SelfContact, Settings
+from onefit.physics.cloth import Cloth
+from onefit.physics.sheet import Sheet
+
+SETTINGS = Settings()
+
+
+def two(one, other):
+    """Vertices and faces of two meshes as one."""
+    (V, F), (W, G) = one, other
+    return np.concatenate([V, W]), np.concatenate([F, G + len(V)])
+
+
+def test_a_layer_that_falls_on_another_stays_on_it():
+    V, F = grid(10, 10, 0.012)
+    V2 = V * [0.6, 0.6, 1] + [0, 0, 0.015]
+    sheet = Sheet(np.concatenate([V, V2]), np.concatenate([F, F + len(V)]), COTTON)
+    settings = Settings()
+    itself = SelfContact(sheet, settings, 0)
+    x = sheet.rest - [0, 0, 0.009] * (np.arange(len(sheet)) >= len(V))[:, None]  # 6 mm above it
+    cloth = Cloth(sheet, x, settings, len(sheet))
+    fixed = np.where(np.arange(len(sheet)) < len(V), 1e3, 0.0)
+    for _ in range(40):
+        contacts = itself.find(cloth.x)
+        cloth.step(1 / 60, [contacts], sheet.rest, fixed)
+    above = cloth.x[len(V) :, 2] - cloth.x[: len(V), 2].mean()
+    assert above.min() > 0 and above.max() < 2 * settings.apart
+
+
+def test_a_narrow_strip_that_falls_across_another_is_held_by_its_edges():
+    # neither has a vertex above or below a face of the other
+    one = np.array([[x, y, 0.0] for x in (-0.08, 0.08) for y in (-0.004, 0.004)])
+    other = np.array([[x, y, 0.2] for y in (-0.08, 0.08) for x in (0.004, -0.004)])
+    faces = np.array([[0, 2, 1], [1, 2, 3]])
+    V, F = two((one, faces), (other, faces))
+    sheet = Sheet(V, F, COTTON)
+    itself, x = SelfContact(sheet, SETTINGS, 0), V - [0, 0, 0.195] * (V[:, 2:] > 0.1)
+    cloth = Cloth(sheet, x, SETTINGS, len(sheet))
+    fixed = np.where(np.arange(8) < 4, 1e4, 0.0)
+    for _ in range(30):
+        contacts = itself.find(cloth.x)
+        assert (np.sign(contacts.weights) == [1, 1, -1, -1]).all() and len(contacts.key) >= 4
+        cloth.step(1 / 60, [contacts], x, fixed)
+    assert cloth.x[4:, 2].min() > 0 and cloth.x[4:, 2].max() < 2 * SETTINGS.apart
+    assert crossings(cloth.x, F) == 0
+
+
+def closest(p, a, b, c):
+    """Barycentric coordinates of the point of a triangle nearest to p, by trying all features."""
+    best, found = np.inf, None
+    for corners in ((0, 1, 2), (0, 1), (1, 2), (2, 0), (0,), (1,), (2,)):
+        x = np.stack([a, b, c])[list(corners)]
+        sides = (x[1:] - x[0]).T
+        t = np.linalg.lstsq(sides, p - x[0], rcond=None)[0] if len(corners) > 1 else np.zeros(0)
+        weights = np.concatenate([[1 - t.sum()], t])
+        away = np.linalg.norm(p - weights @ x)
+        if weights.min() >= 0 and away < best:
+            best, found = away, np.zeros(3)
+            found[list(corners)] = weights
+    return found
+
+
+def pairs_of(sheet, x):
+    """What :meth:`SelfContact.find` finds, all against all: {corners: vector}, a vertex and the
+    corners of what is nearest to it, or two sorted edges.
+    """
+    rest, F, found = sheet.cut, sheet.faces, {}
+    middle = rest[F].mean(1)
+    radius = np.linalg.norm(rest[F] - middle[:, None], axis=2).max(1)
+    beside = np.zeros(len(x), bool)
+    for i in range(len(x)):
+        best, inner = (SETTINGS.approach, None, None), False
+        for f, corners in enumerate(F):
+            if np.linalg.norm(middle[f] - rest[i]) <= radius[f] + 2 * SETTINGS.apart:
+                continue
+            on = closest(x[i], *x[corners])
+            away, at_rest = x[i] - on @ x[corners], rest[i] - on @ rest[corners]
+            distance = np.linalg.norm(away)
+            if distance < SETTINGS.approach and np.linalg.norm(at_rest) > 2 * distance:
+                beside[i], key = True, (i, *sorted(corners[on > 1e-4]))
+                if on.min() > 1e-4:
+                    found[key] = away
+                if distance < best[0]:
+                    best, inner = (distance, key, away), on.min() > 1e-4
+        if best[1] and not inner:
+            found[best[1]] = best[2]
+    E = sheet.edges
+    middle, half = rest[E].mean(1), np.linalg.norm(rest[E[:, 0]] - rest[E[:, 1]], axis=1) / 2
+    for e, (i, j) in enumerate(E):
+        for g, (m, n) in enumerate(E[:e]):
+            A = np.stack([x[j] - x[i], x[m] - x[n]], 1)
+            (s, t), *_ = np.linalg.lstsq(A, x[m] - x[i], rcond=None)
+            weights = np.array([1 - s, s, t - 1, -t])
+            away, at_rest = (weights @ y[[i, j, m, n]] for y in (x, rest))
+            distance = np.linalg.norm(away)
+            far = np.linalg.norm(middle[e] - middle[g]) > half[e] + half[g] + 0.03
+            near = distance < SETTINGS.approach and np.linalg.norm(at_rest) > 2 * distance
+            if min(s, t) > 0 and max(s, t) < 1 and near and far and beside[[i, j, m, n]].any():
+                found[tuple(sorted([(i, j), (m, n)]))] = away
+    return found
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_pairs_are_those_that_a_search_of_all_against_all_finds(seed):
+    rng = np.random.default_rng(seed)
+    V, F = two(grid(7, 7, 0.015), grid(6, 6, 0.015))
+    V[49:] += [0, 0, 1.0]
+    sheet = Sheet(V, F, COTTON)
+    x = V - [0, 0, 0.992] * (np.arange(len(V)) >= 49)[:, None]
+    x += rng.normal(size=x.shape) * [0.002, 0.002, 0.002]
+    contacts = SelfContact(sheet, SETTINGS, 0).find(x)
+    found = {}
+    for corners, weights, normal in zip(contacts.corners, contacts.weights, contacts.normal):
+        vector = weights @ x[corners]
+        assert normal @ vector == pytest.approx(np.linalg.norm(vector), rel=1e-3)
+        i, j, m, n = (int(v) for v in corners)
+        edges = weights[1] > 0
+        key = (i, *sorted(corners[1:][weights[1:] < -1e-4]))
+        key = tuple(sorted([(i, j), (m, n)])) if edges else key
+        assert key not in found
+        found[key] = vector
+    expected = pairs_of(sheet, x)
+    assert len(expected) > 50 and sum(isinstance(k[0], tuple) for k in expected) > 20
+    assert set(found) == set(expected)
+    for key, vector in expected.items():
+        assert np.allclose(np.abs(found[key]), np.abs(vector), atol=2e-6)
+
+
+def test_neighbours_do_not_touch_and_a_tight_fold_does():
+    V, F = grid(40, 6, 0.01)
+    sheet = Sheet(V, F, COTTON)
+    itself, radius = SelfContact(sheet, SETTINGS, 0), 0.004
+    assert len(itself.find(sheet.rest).key) == 0
+    s, x = V[:, 0], V.copy()  # around half a circle
+    turn = np.clip(s / radius, -np.pi / 2, np.pi / 2)
+    over = np.abs(s) - radius * np.pi / 2
+    x[:, 0] = np.where(over > 0, -over, radius * np.cos(turn))
+    x[:, 2] = radius * np.sin(turn)
+    contacts = itself.find(x)
+    assert len(np.unique(contacts.corners[:, 0])) > 0.6 * len(V)
+    assert np.abs(contacts.normal[:, 2]).min() > 0.5
+
+
+def test_a_cut_in_folds_rests_on_its_folds():
+    # the rest shape of what hangs in folds says nothing of who is whose neighbour; its cut does
+    V, F = grid(24, 4, 0.01)
+    hung = V.copy()
+    hung[:, 0], hung[:, 2] = np.abs(V[:, 0]), 0.004 * np.sign(V[:, 0])
+    folded = np.abs(V[:, 0]) > 0.05
+    corners = V[F]
+    sides = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
+    of_rest = SelfContact(Sheet(hung, F, COTTON), SETTINGS, 0).find(hung)
+    of_cut = SelfContact(Sheet(hung, F, COTTON, sides, V), SETTINGS, 0).find(hung)
+    assert len(of_rest.key) == 0
+    assert set(np.flatnonzero(folded)) <= set(of_cut.corners[:, 0])
