@@ -30,7 +30,7 @@ class Settings:
     newton: int = 2
     iterations: int = 20
     tolerance: float = 1e-5
-    clearance: float = 0.004
+    clearance: float = 0.003
     least: float = 0.001
     reach: float = 0.03
     contact: float = 0.5
