@@ -31,7 +31,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from ablation_results import BASELINE, CHANCES, FIGURES, ROUNDED, decided, page, read, write
-from sequences import DATA, ROOT, SCENES, folder_of
+from sequences import DATA, ROOT, SCENES, folder_of, scene_of
 
 from polyfit.files import aside
 from polysft_mi.backend import add_mode_argument, set_variant
@@ -57,7 +57,6 @@ SIMULATED = (
     ("roll", 1),
 )
 ORDER = (*SEQUENCES, *(f"{name} {seed}" for name, seed in SIMULATED))  # of the table's columns
-SCENE_OF = {"skirt": "tube", "pillow": "tube", "roll": "tube"}
 
 
 @dataclass(frozen=True)
@@ -108,11 +107,10 @@ def sequences(data, simulated):
     found = {name: (name, folder_of(data, name)) for name in SEQUENCES}
     found["demo"] = "demo", os.path.join(SCENES, "demo")
     for name, seed in SIMULATED if simulated else ():
-        scene = SCENE_OF.get(name, name)
-        found[f"{name} {seed}"] = scene, os.path.join(simulated, str(seed), name)
+        found[f"{name} {seed}"] = name, os.path.join(simulated, str(seed), name)
     return {
-        name: (os.path.join(SCENES, f"{scene}.xml"), folder)
-        for name, (scene, folder) in found.items()
+        name: (scene_of(kind), folder)
+        for name, (kind, folder) in found.items()
         if folder and os.path.isdir(folder)
     }
 
