@@ -8,7 +8,7 @@ writes included: ``python -m polysft_mi.run`` with the solver ``gauss-newton`` o
 ``per_vertex.py``. The figures are those of ``python -m polysft_mi.evaluate``. Each result goes into
 ``sft.json`` as soon as it is there; the next call does what is missing (all of it with
 ``--again``), and draws the tables and the plot from everything that was run in the same way. Where
-the truth is a mesh, they also say what the best jet of the order used makes of it: one fitted to
+the truth is a mesh, they also say what the best jets of the order used make of it: those fitted to
 the true vertices of each frame.
 
 Writes ``sft.json``, ``sft.md`` and ``sft.png`` into ``docs``, where the results of whole videos

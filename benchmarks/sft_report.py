@@ -112,9 +112,10 @@ def page(results, picture):
         )
     if jets:
         text.append(
-            "- *Best jet* is the jet that comes closest to the true vertices of each frame, found"
-            " by a local search: about the least distance that its order can reach. Its normals"
-            " belong to that jet; they are not the best possible."
+            "- *Best jet* is the jet that comes closest to the true vertices of each frame, or the"
+            " jets of a template of several patches, found by a local search: about the least"
+            " distance that their order can reach without a relief. Normals belong to these jets;"
+            " they are not the best possible."
         )
     if any(
         np.isinf(value)

@@ -171,9 +171,7 @@ def jet_result(sequence, folder, order, setup):
     if "vertices" not in truth:
         return None
     vertices, faces, texcoords = meshio.read_textured_template(obj)
-    template = Template.fit(vertices, faces, texcoords, order, where=obj)
-    if len(template) > 1:  # one jet cannot hold it
-        return None
+    template = Template.fit(vertices, faces, texcoords, order, exact=False, where=obj)
     meshes = truth["vertices"][: setup["frames"] or None]
     surface = {
         "vertices": best_jets(template, meshes),
