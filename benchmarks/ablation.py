@@ -115,8 +115,10 @@ def sequences(data, simulated):
     }
 
 
-def run(switch, scene_file, data):
-    """One sequence with one rule off: its figures, ``lost`` frames and ``cpu`` seconds a frame."""
+def run(switch, scene_file, data, template=None):
+    """One sequence with one rule off: its figures, ``lost`` frames and ``cpu`` seconds a frame;
+    with a :class:`Template`, where one is given, instead of the scene's.
+    """
     from polysft_mi import solvers, tracker
     from polysft_mi.objective.problem import Problem
     from polysft_mi.results.evaluation import score
@@ -124,7 +126,7 @@ def run(switch, scene_file, data):
     from polysft_mi.scene import experiment as scene
     from polysft_mi.surface.patch import Unknowns
 
-    experiment = scene.load(scene_file, {"data": data, **switch.settings})
+    experiment = scene.load(scene_file, {"data": data, **switch.settings}, template)
     s = experiment.settings
     sequence = experiment.sequence()
     rules = dataclasses.replace(Rules(), **switch.fields)
@@ -141,7 +143,8 @@ def run(switch, scene_file, data):
         "frames": np.array(sequence.indices),
     }
     figures = score(surface, find_truth(data))
-    kept = {name: float(figures[name]) for name in (*FIGURES, "en_deg") if name in figures}
+    names = (*FIGURES, "en_deg", "e3d_proc_seen", "en_deg_seen")
+    kept = {name: float(figures[name]) for name in names if name in figures}
     return {"figures": kept, "lost": len(done.lost), "cpu": seconds / len(states)}
 
 
