@@ -31,7 +31,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from ablation_results import BASELINE, CHANCES, FIGURES, ROUNDED, decided, page, read, write
-from sequences import DATA, ROOT, SCENES, folder_of
+from sequences import DATA, ROOT, SCENES, folder_of, scene_of
 
 from polyfit.files import aside
 from polysft_mi.backend import add_mode_argument, set_variant
@@ -57,7 +57,6 @@ SIMULATED = (
     ("roll", 1),
 )
 ORDER = (*SEQUENCES, *(f"{name} {seed}" for name, seed in SIMULATED))  # of the table's columns
-SCENE_OF = {"skirt": "tube", "pillow": "tube", "roll": "tube"}
 
 
 @dataclass(frozen=True)
@@ -108,17 +107,18 @@ def sequences(data, simulated):
     found = {name: (name, folder_of(data, name)) for name in SEQUENCES}
     found["demo"] = "demo", os.path.join(SCENES, "demo")
     for name, seed in SIMULATED if simulated else ():
-        scene = SCENE_OF.get(name, name)
-        found[f"{name} {seed}"] = scene, os.path.join(simulated, str(seed), name)
+        found[f"{name} {seed}"] = name, os.path.join(simulated, str(seed), name)
     return {
-        name: (os.path.join(SCENES, f"{scene}.xml"), folder)
-        for name, (scene, folder) in found.items()
+        name: (scene_of(kind), folder)
+        for name, (kind, folder) in found.items()
         if folder and os.path.isdir(folder)
     }
 
 
-def run(switch, scene_file, data):
-    """One sequence with one rule off: its figures, ``lost`` frames and ``cpu`` seconds a frame."""
+def run(switch, scene_file, data, template=None):
+    """One sequence with one rule off: its figures, ``lost`` frames and ``cpu`` seconds a frame;
+    with a :class:`Template`, where one is given, instead of the scene's.
+    """
     from polysft_mi import solvers, tracker
     from polysft_mi.objective.problem import Problem
     from polysft_mi.results.evaluation import score
@@ -126,7 +126,7 @@ def run(switch, scene_file, data):
     from polysft_mi.scene import experiment as scene
     from polysft_mi.surface.patch import Unknowns
 
-    experiment = scene.load(scene_file, {"data": data, **switch.settings})
+    experiment = scene.load(scene_file, {"data": data, **switch.settings}, template)
     s = experiment.settings
     sequence = experiment.sequence()
     rules = dataclasses.replace(Rules(), **switch.fields)
@@ -143,7 +143,8 @@ def run(switch, scene_file, data):
         "frames": np.array(sequence.indices),
     }
     figures = score(surface, find_truth(data))
-    kept = {name: float(figures[name]) for name in (*FIGURES, "en_deg") if name in figures}
+    names = (*FIGURES, "en_deg", "e3d_proc_seen", "en_deg_seen")
+    kept = {name: float(figures[name]) for name in names if name in figures}
     return {"figures": kept, "lost": len(done.lost), "cpu": seconds / len(states)}
 
 

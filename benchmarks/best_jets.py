@@ -1,160 +1,94 @@
-"""The best that one jet can do: jets fitted to the true vertices of each frame."""
+"""The best that jets can do without relief: those of a template's patches, fitted to the true
+vertices of each frame.
+"""
 
 import dataclasses
 
 import numpy as np
-import torch
 from scipy.spatial.transform import Rotation
 
-from polyfit import jets
-from polyfit.jets import CanonicalFrame
-from polysft_mi.errors import InputError
 from polysft_mi.results import metrics
 from polysft_mi.surface.atlas import Atlas
-from polysft_mi.surface.template import Template
+
+_STEPS, _LEAST_GAIN = 200, 1e-4  # of a search; the share that a step must gain for another one
+_FIRST_DAMPING, _MOST_DAMPING = 1e-3, 1e3
+_BENDING = 1e-9  # weight of the jets' bending, that holds what the vertices leave free
 
 
 def best_jets(template, truth):
-    """The jets of the template's order that come closest to the true vertices (T, N, 3) [m], at the
-    vertices: (T, N, 3) [m].
+    """The jets of the template's order and patches, without relief, that come closest to the true
+    vertices (T, N, 3) [m], at the vertices: (T, N, 3) [m].
 
-    A jet may turn and move, and each vertex may slide on it. What comes closest in the end, by
-    least squares, is kept of three starts: the template's orientation laid over the truth, the
-    truth's own principal axes, and the jet of the frame before. From the first two the order rises
-    by and by; at once, it ends farther off. The search is local all the same.
+    Each patch may turn and move and have any jet, and each vertex may slide along its own patch.
+    What comes closest is kept of two starts: the patches laid over the truth, each by itself, and
+    the frame before. The search is local, by Levenberg and Marquardt.
     """
-    orders = [*range(2, template.order, 2), template.order]
-    atlases = [Atlas(_one_patch(template, n)) for n in orders]
+    atlas = Atlas(dataclasses.replace(template, rest=np.zeros_like(template.rest)))
     previous, surfaces = None, []
     for V in np.asarray(truth, dtype=np.float64):
-        over = _rotation_onto(template.vertices, V) @ template.rotation[0]
-        axes = CanonicalFrame.from_points(torch.as_tensor(V)).R.numpy()
-        found = [
-            _risen(atlases, _standing_in(atlases[0].template, V, turn), V)
-            for turn in (over, _turned_to(over, axes[:, 2]))
-        ]
-        if previous is not None:
-            found.append(_refined(atlases[-1], previous, V))
-        previous = min(found, key=lambda x: x[1])[0]
-        surfaces.append(atlases[-1].surface(previous).vertices)
+        starts = [_laid_over(atlas, V), *([] if previous is None else [previous])]
+        previous = min((_refined(atlas, start, V) for start in starts), key=lambda x: x[1])[0]
+        surfaces.append(atlas.surface(previous).vertices)
     return np.stack(surfaces)
 
 
-def _one_patch(template, order):
-    """A template of one jet of ``order``, whose undeformed surface is that jet alone."""
-    made = template
-    if order != template.order:
-        uv = template.texcoords
-        made = Template.fit(template.vertices, template.faces, uv, order)
-    if len(made) != 1:
-        raise InputError(f"the template has {len(made)} patches; one jet is fitted to sheets alone")
-    return dataclasses.replace(made, rest=np.zeros_like(made.rest))
+def _laid_over(atlas, V):
+    """The state whose patches, each moved as a whole, lie closest to the vertices V (N, 3)."""
+    t = atlas.template
+    zeros = {name: np.zeros(len(V)) for name in ("delta_u", "delta_v", "delta_w")}
+    turns, shifts = [], []
+    for k, part in enumerate(atlas.entries):
+        at = atlas.entry_vertex[part]
+        start, end = t.vertices[at].mean(0), V[at].mean(0)
+        turn = Rotation.align_vectors(V[at] - end, t.vertices[at] - start)[0]
+        rotation, translation = atlas.rigid(turn, end - turn.apply(start))
+        turns.append(rotation[k].as_quat())
+        shifts.append(translation[k])
+    moved = {"rotation": np.array(turns), "translation": np.array(shifts)}
+    return atlas.state({"delta_alpha": np.zeros_like(t.alpha), **zeros, **moved})
 
 
-def _risen(atlases, arrays, V):
-    """(state, distance [m]) as of :func:`_refined` in the last atlas, by way of those before it;
-    ``arrays`` are unknowns of the first.
-    """
-    for k, atlas in enumerate(atlases):
-        if k:  # the same jet in the higher order
-            lower = atlases[k - 1].template.alpha + arrays["delta_alpha"]
-            alpha = np.pad(lower, ((0, 0), (0, atlas.template.alpha.shape[1] - lower.shape[1])))
-            arrays = {**arrays, "delta_alpha": alpha - atlas.template.alpha}
-        state, distance = _refined(atlas, atlas.state(arrays), V)
-        arrays = atlas.arrays(state)
-    return state, distance
-
-
-def _rotation_onto(A, B):
-    """The rotation (3, 3) that, with a translation, takes points A (N, 3) closest to B (N, 3)."""
-    left, _, right = np.linalg.svd((B - B.mean(0)).T @ (A - A.mean(0)))
-    return left @ np.diag([1, 1, np.linalg.det(left) * np.linalg.det(right)]) @ right
-
-
-def _turned_to(rotation, axis):
-    """The rotation (3, 3), turned the shortest way so that its third column lies along ``axis``
-    (3,) or against it.
-    """
-    z = rotation[:, 2]
-    axis = axis * (1 if axis @ z >= 0 else -1)
-    v, c = np.cross(z, axis), z @ axis
-    K = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
-    return (np.eye(3) + K + K @ K / (1 + c)) @ rotation
-
-
-def _standing_in(template, V, axes):
-    """Unknowns, as ``params.npz`` names them: the least-squares jet of the heights of V (N, 3) over
-    the first two columns of ``axes``.
-    """
-    rotation = template.rotation[0]
-    y = (V - template.origin[0]) @ rotation / template.scale
-    turn = rotation.T @ axes
-    x = (y - y.mean(0)) @ turn
-    alpha = jets.fit(torch.as_tensor(x), template.order).alpha.numpy()
-    return {
-        "delta_alpha": alpha - template.alpha,
-        "delta_u": x[:, 0] - template.chart[:, 0, 0],
-        "delta_v": x[:, 1] - template.chart[:, 0, 1],
-        "delta_w": np.zeros(len(x)),
-        "rotation": Rotation.from_matrix(turn).as_quat(),
-        "translation": y.mean(0),
-    }
-
-
-def fitted(atlas, state, vertices, iterations=8, bending=1e-6):
-    """The state of an atlas of one patch, from ``state`` on, whose vertices come closest to
-    ``vertices`` (N, 3) [m, world], in the least-squares sense.
-
-    Each vertex slides freely in its tangent plane, so that only distances along the normals count
-    for the other unknowns. The relief stays as it is.
-    """
-    size = state.alpha.shape[1]
-    prior = np.zeros((size + 6, size + 6))
-    prior[:size, :size] = bending * len(vertices) * atlas.template.scale**2 * atlas.bending
-    for _ in range(iterations):
-        surface = atlas.surface(state)
-        up = surface.up[0]
-        missing = vertices - surface.vertices
-        tangents = surface.offset_jacobian[:, :, :2]
-        normal = np.cross(tangents[:, :, 0], tangents[:, :, 1])
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        rows = atlas.global_columns(surface, normal)
-        # sliding makes rotations in the plane and shifts along it free: a little damping holds
-        # them
-        square = rows.T @ rows + prior
-        right = rows.T @ (normal * missing).sum(1) - prior[:, :size] @ state.alpha[0]
-        g = np.linalg.solve(
-            square + 1e-6 * np.trace(square) / len(square) * np.eye(len(square)), right
-        )
-        rest = (
-            missing - (surface.basis @ g[:size])[:, None] * up - surface.motion_jacobian @ g[size:]
-        )
-        square = tangents.transpose(0, 2, 1) @ tangents
-        right = np.einsum("nka,nk->na", tangents, rest)[:, :, None]
-        state = state.after_step((g, np.linalg.solve(square, right)[:, :, 0]))
-    return state
-
-
-def _refined(atlas, state, V, steps=60):
-    """(state, distance [m]): Gauss-Newton from a state towards the vertices V (N, 3), with steps
-    shortened where they gain more so.
+def _refined(atlas, state, V):
+    """(state, distance [m]): from a state of an :class:`Atlas` towards the vertices V (N, 3) [m],
+    by Levenberg and Marquardt; each vertex may slide along its own patch.
     """
     distance = lambda s: metrics.rmse(atlas.surface(s).vertices, V)
-    least = distance(state)
-    for _ in range(steps):
+    least, damping = distance(state), _FIRST_DAMPING
+    for _ in range(_STEPS):
         try:
-            whole = fitted(atlas, state, V, iterations=1, bending=1e-9)
-            tried = [
-                (distance(x), x)
-                for x in (state.extrapolated(whole, -back) for back in (0, 0.5, 0.75, 0.9, 0.97))
-            ]
+            there = _stepped(atlas, state, V, damping)
+            now = distance(there)
         except (np.linalg.LinAlgError, ValueError):
-            break
-        now, there = min(tried, key=lambda x: x[0] if np.isfinite(x[0]) else np.inf)
-        if not now < least:
-            break
-        gained = 1 - now / max(least, 1e-30)
-        state, least = there, now
-        if gained < 1e-4:
+            now = np.inf
+        if now < least:
+            gained = 1 - now / max(least, 1e-30)
+            state, least, damping = there, now, damping / 5
+            if gained < _LEAST_GAIN:
+                break
+        elif damping < _MOST_DAMPING:
+            damping *= 10
+        else:
             break
     return state, least
+
+
+def _stepped(atlas, state, V, damping):
+    """The state after one step towards the vertices V (N, 3): of the jets and motions, with the
+    vertices' sliding eliminated, and of the sliding.
+    """
+    surface, scale = atlas.surface(state), atlas.template.scale
+    missing, slide = V - surface.vertices, surface.offset_jacobian[:, :, :2]
+    held = slide.transpose(0, 2, 1) @ slide + damping * scale**2 * np.eye(2)
+    left = np.eye(3) - slide @ np.linalg.solve(held, slide.transpose(0, 2, 1))  # by sliding
+    axes = [np.broadcast_to(axis, V.shape) for axis in np.eye(3)]
+    columns = np.stack([atlas.global_columns(surface, axis) for axis in axes], 1)  # (N, 3, G)
+    reduced = left @ columns
+    bending = np.pad(_BENDING * len(V) * scale**2 * atlas.bending, (0, 6))
+    prior = np.kron(np.eye(len(atlas)), bending)
+    square = np.tensordot(columns, reduced, ((0, 1), (0, 1))) + prior
+    right = np.einsum("nig,ni->g", reduced, missing)
+    right -= prior @ np.pad(state.alpha, ((0, 0), (0, 6))).ravel()
+    diagonal = np.diag(square) + 1e-4 * np.trace(square) / len(square)
+    g = np.linalg.solve(square + damping * np.diag(diagonal), right)
+    rest = (missing - columns @ g)[:, :, None]
+    return state.after_step((g, np.linalg.solve(held, slide.transpose(0, 2, 1) @ rest)[..., 0]))

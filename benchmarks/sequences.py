@@ -4,7 +4,14 @@ import os
 
 ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 SCENES = os.path.join(ROOT, "scenes")
+# Simulated surfaces that are no sheet (benchmarks/simulate.py) have no scene of their own
+_SCENE_OF = {"skirt": "tube", "pillow": "tube", "roll": "tube"}
 DATA = os.environ.get("POLYSFT_DATA") or os.path.join(os.path.dirname(ROOT), "shared", "data")
+
+
+def scene_of(sequence):
+    """The path of the scene file of a sequence."""
+    return os.path.join(SCENES, f"{_SCENE_OF.get(sequence, sequence)}.xml")
 
 
 def folder_of(data, sequence):

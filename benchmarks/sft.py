@@ -1,6 +1,6 @@
 """Every sequence by every solver, and by a per-vertex baseline: accuracy against time a frame.
 
-    python benchmarks/sft.py [--data FOLDER] [--only flag ...] [--methods adam ...] [--frames N]
+    python benchmarks/sft.py [--data FOLDER ...] [--only flag ...] [--methods adam ...] [--frames N]
     [--threads N] [-o out/benchmarks]
 
 Each method is a command, run as a user would and timed as a whole, start-up and everything it
@@ -8,7 +8,7 @@ writes included: ``python -m polysft_mi.run`` with the solver ``gauss-newton`` o
 ``per_vertex.py``. The figures are those of ``python -m polysft_mi.evaluate``. Each result goes into
 ``sft.json`` as soon as it is there; the next call does what is missing (all of it with
 ``--again``), and draws the tables and the plot from everything that was run in the same way. Where
-the truth is a mesh, they also say what the best jet of the order used makes of it: one fitted to
+the truth is a mesh, they also say what the best jets of the order used make of it: those fitted to
 the true vertices of each frame.
 
 Writes ``sft.json``, ``sft.md`` and ``sft.png`` into ``docs``, where the results of whole videos
@@ -38,9 +38,10 @@ def parser():
     )
     p.add_argument(
         "--data",
+        nargs="+",
         metavar="FOLDER",
-        default=DATA,
-        help="holds the sequences' folders (default, or POLYSFT_DATA: %(default)s)",
+        default=[DATA],
+        help=f"hold the sequences' folders (default, or POLYSFT_DATA: {DATA})",
     )
     p.add_argument(
         "--only",
@@ -89,19 +90,19 @@ def main(arguments=None):
         if getattr(options, name) is not None and getattr(options, name) < 1:
             raise InputError(f"--{name} {getattr(options, name)}: at least 1 is needed")
     definitions(options.define)  # a wrong one is told before anything runs
-    if not os.path.isdir(options.data):
-        raise InputError(
-            f"--data {options.data}: no such folder; it must hold the sequences' folders"
-        )
+    for folder in options.data:
+        if not os.path.isdir(folder):
+            raise InputError(f"--data {folder}: no such folder; the sequences' folders are needed")
     setup = sft_runs.setup_of(options)
     docs = options.docs or (os.path.join(ROOT, "docs") if sft_runs.is_whole(setup) else options.out)
     path = os.path.join(docs, "sft.json")
     os.makedirs(docs, exist_ok=True)
     sft_results.read(path)  # a damaged file is told before anything runs
     for sequence in options.only:
-        folder = folder_of(options.data, sequence)
+        places = (folder_of(data, sequence) for data in options.data)
+        folder = next(filter(None, places), None)
         if folder is None:
-            print(f"{sequence}: not in {options.data}, left out", file=sys.stderr)
+            print(f"{sequence}: not in {', '.join(options.data)}, left out", file=sys.stderr)
             continue
         for method in options.methods:
             if (

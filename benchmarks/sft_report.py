@@ -4,17 +4,18 @@ import os
 import textwrap
 
 import numpy as np
-from sft_results import JET, METHODS, SEQUENCES
+from sft_results import JET, METHODS, SEQUENCES, SIMULATED
 
 from polyfit.files import aside
 from polysft_mi.results.evaluation import LABELS
 
 KINDS = (  # of ground truth: title, figures in the table
     ("True vertices", ("e3d_proc", "en_deg", "e3d")),
+    ("True vertices, with those in view", ("e3d_proc_seen", "en_deg_seen", "e3d_proc")),
     ("Depth points", ("depth_rmse_mm", "depth_rmse_mm_worst", "depth_rmse_allpix_mm")),
     ("Point clouds", ("chamfer_1e4", "chamfer_1e4_worst")),
 )
-PANELS = ("e3d_proc", "en_deg", "depth_rmse_mm", "chamfer_1e4")
+PANELS = ("e3d_proc", "en_deg", "depth_rmse_mm", "e3d_proc_seen", "en_deg_seen", "chamfer_1e4")
 COLOURS = {
     "gauss-newton": ("#c4572e", "o"),
     "adam": ("#3b6ea5", "s"),
@@ -33,7 +34,7 @@ def table(results):
     )
     parts = []
     for title, names in KINDS:
-        rows = [r for r in ordered if names[0] in r.get("figures", {})]
+        rows = [r for r in ordered if _shows(r, names[0])]
         if not rows:
             continue
         head = [
@@ -64,6 +65,12 @@ def table(results):
         if lines:
             parts.append("\n".join([f"## {title}", "", *lines]))
     return "\n\n".join(parts)
+
+
+def _shows(result, name):
+    """Whether a result is shown by a figure: where it is known what is in view, by that."""
+    figures = result.get("figures", {})
+    return name in figures and f"{name}_seen" not in figures
 
 
 def _row(cells):
@@ -98,11 +105,17 @@ def page(results, picture):
             " vertices as unknowns through `mi.ad.LargeSteps`. It writes no pictures."
         ),
     ]
+    if any(r["sequence"] in SIMULATED for r in results):
+        text.append(
+            f"- {', '.join(SIMULATED)}: made by `python benchmarks/simulate.py FOLDER --seed 1"
+            f" --only {' '.join(SIMULATED)}`; `--data DATA FOLDER` finds them."
+        )
     if jets:
         text.append(
-            "- *Best jet* is the jet that comes closest to the true vertices of each frame, found"
-            " by a local search: about the least distance that its order can reach. Its normals"
-            " belong to that jet; they are not the best possible."
+            "- *Best jet* is the jet that comes closest to the true vertices of each frame, or the"
+            " jets of a template of several patches, found by a local search: about the least"
+            " distance that their order can reach without a relief. Normals belong to these jets;"
+            " they are not the best possible."
         )
     if any(
         np.isinf(value)
@@ -133,17 +146,17 @@ def plot(path, results):
     from matplotlib.ticker import LogFormatter
 
     timed = [r for r in results if r.get("seconds_a_frame") and "figures" in r]
-    panels = [
-        name for name in PANELS if any(np.isfinite(r["figures"].get(name, np.nan)) for r in timed)
+    points_of = lambda name: [  # infinite where a sheet has left the truth's rays
+        r for r in timed if _shows(r, name) and np.isfinite(r["figures"][name])
     ]
+    panels = [name for name in PANELS if points_of(name)]
     if not panels:
         return False
-    figure = Figure(figsize=(4.2 * len(panels), 4), dpi=110, layout="constrained")
-    for axes, name in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels):
-        shown = [
-            r for r in timed if np.isfinite(r["figures"].get(name, np.nan))
-        ]  # infinite where a sheet has left the truth's rays
-        named = []
+    columns = min(len(panels), 3)
+    rows = -(-len(panels) // columns)
+    figure = Figure(figsize=(4.2 * columns, 4 * rows), dpi=110, layout="constrained")
+    for place, name in enumerate(panels):
+        axes, shown, named = figure.add_subplot(rows, columns, place + 1), points_of(name), []
         for sequence in dict.fromkeys(r["sequence"] for r in shown):
             points = sorted(
                 (r["seconds_a_frame"], r["figures"][name])

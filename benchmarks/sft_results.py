@@ -9,7 +9,12 @@ import os
 from polyfit.files import aside
 from polysft_mi.errors import InputError
 
-SEQUENCES = ("flag", "bend", "paper", "curtain", "corner", "kinect_paper", "phi_sft_R1")
+SIMULATED = ("roll", "pillow", "skirt")  # by benchmarks/simulate.py
+SEQUENCES = (
+    *("flag", "bend", "paper", "curtain", "corner", "hand", "poster"),
+    *("ball", "shirt", "tube", *SIMULATED),  # no sheets
+    *("kinect_paper", "phi_sft_R1"),
+)
 METHODS = ("gauss-newton", "adam", "per-vertex")
 JET = "best jet"  # the method of a result that no command made: the jet nearest to the truth
 

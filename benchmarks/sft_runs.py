@@ -10,7 +10,7 @@ import time
 
 import numpy as np
 from best_jets import best_jets
-from sequences import ROOT, SCENES
+from sequences import ROOT, scene_of
 from sft_results import JET
 
 from polysft_mi.errors import InputError
@@ -29,7 +29,7 @@ def command(sequence, method, folder, out, setup):
     else:
         line = [sys.executable, "-m", "polysft_mi.run"]
         define.append(f"solver={method}")
-    line += [os.path.join(SCENES, f"{sequence}.xml"), "-o", out, "--overwrite", "-q"]
+    line += [scene_of(sequence), "-o", out, "--overwrite", "-q"]
     if setup["mode"]:
         line += ["-m", setup["mode"]]
     if method == "per-vertex" and setup["iterations"]:
@@ -171,9 +171,7 @@ def jet_result(sequence, folder, order, setup):
     if "vertices" not in truth:
         return None
     vertices, faces, texcoords = meshio.read_textured_template(obj)
-    template = Template.fit(vertices, faces, texcoords, order, where=obj)
-    if len(template) > 1:  # one jet cannot hold it
-        return None
+    template = Template.fit(vertices, faces, texcoords, order, exact=False, where=obj)
     meshes = truth["vertices"][: setup["frames"] or None]
     surface = {
         "vertices": best_jets(template, meshes),

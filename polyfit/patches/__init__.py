@@ -7,7 +7,7 @@ import lazy_loader
 __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
-        "atlas": ["Cover", "is_graph"],
+        "atlas": ["Cover", "is_graph", "partition"],
         "patches": ["Patches", "patch_count"],
         "surface": ["PatchedSurface", "smoothed"],
         "unity": ["shares"],

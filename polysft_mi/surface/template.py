@@ -95,10 +95,12 @@ class Template:
         return 2 * len(self.edges) == self.faces.size
 
     @classmethod
-    def fit(cls, vertices, faces, uv, order, *, exact=True, frame=None, where="template"):
+    def fit(
+        cls, vertices, faces, uv, order, *, exact=True, frame=None, cover=None, where="template"
+    ):
         """Fit jets of ``order`` to the mesh: one in ``frame``, a :class:`polyfit.CanonicalFrame` in
         float64, or else in its PCA frame; several where the mesh is no height graph there, or a
-        steep one.
+        steep one; or those of ``cover``, a :class:`polyfit.patches.Cover` of the mesh.
 
         ``uv``: texture coordinates (N, 2), or :class:`polyfit.mesh.TexCoords`. ``order`` may be a
         function of the number of patches. Where not ``exact``, vertices that determine less get the
@@ -116,8 +118,10 @@ class Template:
         )
         alike = np.where(winding(sheets(faces))[:, None] < 0, faces[:, ::-1], faces)
         graph = is_graph(points, alike, rotation[:, 2]) and _components_of(faces) == 1
-        # a skirt is a graph over the plane of its hem, but a steep one
-        cover = Cover.of(points, alike) if frame is None else None
+        graph = graph and cover is None
+        if cover is None and frame is None:
+            # a skirt is a graph over the plane of its hem, but a steep one
+            cover = Cover.of(points, alike)
         if graph and (frame is not None or len(cover) == 1):
             patch, weight = np.zeros((len(points), 1), dtype=np.int64), np.ones((len(points), 1))
             frames = [(float(scale), rotation, origin)]
