@@ -190,13 +190,16 @@ class Draper:
             from .finish import finished
 
             settings = settings or Settings()
-            lead = motion.led_in(body, settings.lead)[: -len(motion)]
-            before, moving = self._skinned(garment, rest, body, lead)
+            led = motion.led_in(body, settings.lead)
+            first = len(led) - len(motion)
+            guide, moving = vertices, bodies
+            if first:
+                lead = self._skinned(garment, rest, body, led[:first])
+                guide, moving = torch.cat([lead[0], vertices]), torch.cat([lead[1], bodies])
             cut = garment.cut is not None
             made = finished(
-                torch.cat([before, vertices]), rest, faces, self._held(garment),
-                torch.cat([moving, bodies]), body_faces,
-                material=material, steps=finish, fps=FPS, settings=settings, first=len(lead),
+                guide, rest, faces, self._held(garment), moving, body_faces,
+                material=material, steps=finish, fps=FPS, settings=settings, first=first,
                 sides=garment.sides(rest).double().numpy() if cut else None,
                 cut=garment.cut.numpy() if cut else None,
             )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Cloth in motion: implicit Euler steps of a sheet, each one iteration of Newton's method whose
+"""Cloth in motion: implicit Euler steps of a sheet, each some iterations of Newton's method whose
 linear system conjugate gradients solve, started from what the step before found.
 """
 

@@ -1,0 +1,35 @@
+import pytest
+
+import onefit
+from onefit.objective.crossings import crossings
+from onefit.physics import Settings
+
+
+@pytest.fixture(scope="module")
+def draped():
+    draper, motion = onefit.load(), onefit.Motion.generate("dance", seconds=0.1, seed=1_000_003)
+    make = lambda **how: draper.drape("shorts", motion, **how)
+    quick = dict(lead=0.3, settling=0.1)
+    return {
+        "network": make(),
+        "finished": make(finish=2, settings=Settings(**quick)),
+        "at once": make(finish=2, settings=Settings(**quick | {"lead": 0.0})),
+    }
+
+
+def test_a_finish_begins_as_the_garment_was_made_not_as_the_network_folds_it(draped):
+    of = lambda name: crossings(draped[name].vertices[0].numpy(), draped[name].faces.numpy())
+    assert of("network") > 10
+    assert of("finished") == 0
+    assert of("at once") > 0  # what has passed through stays
+
+
+def test_what_leads_to_the_first_frame_is_not_given(draped):
+    network = draped["network"]
+    for name in ("finished", "at once"):
+        drape = draped[name]
+        assert drape.vertices.shape == network.vertices.shape
+        assert (drape.body == network.body).all() and (drape.root == network.root).all()
+        far = (drape.vertices - network.vertices).norm(dim=-1)
+        assert 1e-3 < far.mean() < 0.03
+        assert drape.measures().collision == 0
