@@ -18,7 +18,8 @@ from .sheet import Sheet, samples
 @dataclass(frozen=True)
 class Contacts:
     """C contacts: ``key`` (C,), which is which from step to step; ``corners`` (C, 4) and
-    ``weights`` (C, 4): the point sum_i w_i x_i; the plane's ``normal`` (C, 3) and ``offset`` (C,)
+    ``weights`` (C, 4): the point sum_i w_i x_i, or, where the weights sum to zero, the vector from
+    one point of the sheet to another; the plane's ``normal`` (C, 3) and ``offset`` (C,)
     [m], so that the gap is normal . point - offset; ``moved`` (C, 3) [m], by what the other side
     moved in the step; ``stiffness`` [N/m] of each.
     """

@@ -83,9 +83,9 @@ def _keep(found: Found, corners: wp.vec4i, weights: wp.vec4, normal: wp.vec3):
 def vertices_near(
     first: int,
     layers: Layers,
-    apart: float,  # [m]; what lies nearer than this at rest is beside, and does not count
+    neighbourhood: float,  # [m] between circles around both, at rest; nearer is no layer
     reach: float,  # [m]
-    beside: wp.array(dtype=int),  # receives 1 where there is one within ``reach``
+    layered: wp.array(dtype=int),  # receives 1 where a layer is within ``reach``
     found: Found,
 ):
     """For each vertex from ``first`` on the triangles of other layers within ``reach``: those that
@@ -98,10 +98,10 @@ def vertices_near(
     nearest = reach
     corners, weights, normal = wp.vec4i(), wp.vec4(), wp.vec3()
     inner = int(0)  # noqa: RUF046, UP018 - a variable to Warp
-    beside[i] = 0
+    layered[i] = 0
     f = int(0)  # noqa: RUF046, UP018
     while wp.mesh_query_aabb_next(query, f):
-        if wp.length(layers.middle[f] - q) > layers.radius[f] + apart:
+        if wp.length(layers.middle[f] - q) > layers.radius[f] + neighbourhood:
             a = wp.mesh_get_index(layers.mesh, 3 * f)
             b = wp.mesh_get_index(layers.mesh, 3 * f + 1)
             c = wp.mesh_get_index(layers.mesh, 3 * f + 2)
@@ -112,7 +112,7 @@ def vertices_near(
             r = layers.rest
             at_rest = wp.length(q - (on[0] * r[a] + on[1] * r[b] + on[2] * r[c]))
             if distance < reach and at_rest > 2.0 * distance and distance > 0.0:
-                beside[i] = 1
+                layered[i] = 1
                 is_inner = wp.min(on[0], wp.min(on[1], on[2])) > 0.0
                 if is_inner:
                     _keep(
@@ -127,7 +127,7 @@ def vertices_near(
                     corners = wp.vec4i(i, a, b, c)
                     weights = wp.vec4(1.0, -on[0], -on[1], -on[2])
                     normal = away / distance
-    if beside[i] == 1 and inner == 0:
+    if layered[i] == 1 and inner == 0:
         _keep(found, corners, weights, normal)
 
 
@@ -156,26 +156,27 @@ def _edge_pair(layers: Layers, e: int, g: int, reach: float, found: Found):
 
 
 @wp.func
-def _is_looked_at(layers: Layers, e: int, reach: float, beside: wp.array(dtype=int)):
+def _is_looked_at(layers: Layers, e: int, reach: float, layered: wp.array(dtype=int)):
+    """Whether an end of the edge e is near a layer, or the edge so long that its middle may be."""
     i, j = layers.edges[e, 0], layers.edges[e, 1]
     is_long = wp.length(layers.rest[i] - layers.rest[j]) > 2.0 * reach
-    return is_long or beside[i] + beside[j] > 0
+    return is_long or layered[i] + layered[j] > 0
 
 
 @wp.kernel
 def edges_near(
     first: int,
     layers: Layers,
-    apart: float,
+    neighbourhood: float,
     reach: float,
-    beside: wp.array(dtype=int),  # as :func:`vertices_near` leaves it
+    layered: wp.array(dtype=int),  # as :func:`vertices_near` leaves it
     found: Found,
 ):
-    """For each edge from ``first`` on, if one of its ends is beside another layer, or it is long,
-    the edges of layers within ``reach``, where both are nearest to each other between their ends.
+    """For each edge from ``first`` on, if one of its ends is near a layer, or it is long, the
+    edges of layers within ``reach``, where both are nearest to each other between their ends.
     """
     e = first + wp.tid()
-    if not _is_looked_at(layers, e, reach, beside):
+    if not _is_looked_at(layers, e, reach, layered):
         return
     i, j = layers.edges[e, 0], layers.edges[e, 1]
     x, r = layers.x, layers.rest
@@ -185,9 +186,9 @@ def edges_near(
     query = wp.mesh_query_aabb(layers.mesh, wp.min(x[i], x[j]) - box, wp.max(x[i], x[j]) + box)
     f = int(0)  # noqa: RUF046, UP018
     while wp.mesh_query_aabb_next(query, f):
-        if wp.length(layers.middle[f] - q) > layers.radius[f] + half + apart:
+        if wp.length(layers.middle[f] - q) > layers.radius[f] + half + neighbourhood:
             for k in range(3):
                 g = layers.edges_of[f, k]
-                once = g > e or not _is_looked_at(layers, g, reach, beside)
+                once = g > e or not _is_looked_at(layers, g, reach, layered)
                 if once and layers.owner[g] == f:
                     _edge_pair(layers, e, g, reach, found)

@@ -44,7 +44,7 @@ class SelfContact:
         self._mesh = wp.Mesh(layers.x, _array(faces.ravel().astype(np.int32), int))
         layers.mesh = self._mesh.id
         self._layers = layers
-        self._beside = wp.zeros(len(rest), dtype=int, device="cpu")
+        self._layered = wp.zeros(len(rest), dtype=int, device="cpu")
         self._found = [_room(len(rest)) for _ in range(_PARTS)]
         self._others = ThreadPoolExecutor(_PARTS - 1)
 
@@ -77,7 +77,7 @@ class SelfContact:
 
         def part(k):
             settings, first = self.settings, int(ends[k])
-            near = [2 * settings.apart, settings.approach, self._beside, self._found[k]]
+            near = [2 * settings.apart, settings.approach, self._layered, self._found[k]]
             size = int(ends[k + 1]) - first
             wp.launch(kernel, size, [first, self._layers, *near], device="cpu")
 

@@ -50,6 +50,23 @@ def test_a_narrow_strip_that_falls_across_another_is_held_by_its_edges():
     assert crossings(cloth.x, F) == 0
 
 
+@pytest.mark.parametrize("speed", [0.05, 0.5])  # [m/s], 8 mm a step the faster
+def test_strips_whose_edges_alone_meet_do_not_pass_through_each_other(speed):
+    V, F = grid(2, 4, 1.0)
+    across = V[:, [1, 0, 2]] * [0.03, 0.01, 0]  # along x
+    edge_on = V[:, [2, 1, 0]] * [0, 0.03, 0.02] + [0, 0, 0.06]  # upright, along y, 5 cm up
+    sheet = Sheet(*two((across, F), (edge_on, F)), COTTON)
+    itself = SelfContact(sheet, SETTINGS, 0)
+    falls = np.arange(len(sheet)) >= len(V)
+    x = sheet.rest - [0, 0, 0.044] * falls[:, None]  # 6 mm
+    cloth = Cloth(sheet, x, SETTINGS, len(sheet))
+    cloth.v[falls, 2] = -speed
+    for _ in range(20):
+        cloth.step(1 / 60, [itself.find(cloth.x)], sheet.rest, np.where(falls, 0.0, 1e3))
+        assert crossings(cloth.x, sheet.faces) == 0
+    assert (cloth.x - x)[falls, 2].mean() > -0.02  # it did not fall past
+
+
 def closest(p, a, b, c):
     """Barycentric coordinates of the point of a triangle nearest to p, by trying all features."""
     best, found = np.inf, None
