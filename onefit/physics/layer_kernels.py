@@ -9,16 +9,13 @@ wp.set_module_options({"enable_backward": False})
 @wp.struct
 class Layers:
     """A sheet: its ``mesh`` as Warp knows it, of the vertices ``x`` (N,) [m]; where these are at
-    ``rest``; of each face its ``middle`` at rest and the ``radius`` [m] around it that holds the
-    corners; the ends of its ``edges`` (E, 2), the edges of each face ``edges_of`` (F, 3), and the
+    ``rest``; the ends of its ``edges`` (E, 2), the edges of each face ``edges_of`` (F, 3), and the
     first face of each edge, its ``owner`` (E,).
     """
 
     mesh: wp.uint64
     x: wp.array(dtype=wp.vec3)
     rest: wp.array(dtype=wp.vec3)
-    middle: wp.array(dtype=wp.vec3)
-    radius: wp.array(dtype=float)
     edges: wp.array2d(dtype=int)
     edges_of: wp.array2d(dtype=int)
     owner: wp.array(dtype=int)
@@ -79,17 +76,24 @@ def _keep(found: Found, corners: wp.vec4i, weights: wp.vec4, normal: wp.vec3):
             found.weights[at, k] = weights[k]
 
 
+@wp.func
+def _is_layer(distance: float, at_rest: float, neighbourhood: float, reach: float):
+    """Whether two points are of two layers: half as far from each other as at rest, or less."""
+    far = wp.max(2.0 * distance, neighbourhood)
+    return distance > 0.0 and distance < reach and at_rest > far
+
+
 @wp.kernel
 def vertices_near(
     first: int,
     layers: Layers,
-    neighbourhood: float,  # [m] between circles around both, at rest; nearer is no layer
+    neighbourhood: float,  # [m] at rest; what is nearer is no other layer
     reach: float,  # [m]
     layered: wp.array(dtype=int),  # receives 1 where a layer is within ``reach``
     found: Found,
 ):
     """For each vertex from ``first`` on the triangles of other layers within ``reach``: those that
-    it stands above, and the nearest one. A layer is what is half as far away as at rest, or less.
+    it stands above, and the nearest one.
     """
     i = first + wp.tid()
     p, q = layers.x[i], layers.rest[i]
@@ -101,17 +105,17 @@ def vertices_near(
     layered[i] = 0
     f = int(0)  # noqa: RUF046, UP018
     while wp.mesh_query_aabb_next(query, f):
-        if wp.length(layers.middle[f] - q) > layers.radius[f] + neighbourhood:
-            a = wp.mesh_get_index(layers.mesh, 3 * f)
-            b = wp.mesh_get_index(layers.mesh, 3 * f + 1)
-            c = wp.mesh_get_index(layers.mesh, 3 * f + 2)
+        a = wp.mesh_get_index(layers.mesh, 3 * f)
+        b = wp.mesh_get_index(layers.mesh, 3 * f + 1)
+        c = wp.mesh_get_index(layers.mesh, 3 * f + 2)
+        if i != a and i != b and i != c:
             x = layers.x
             on = _closest_on_triangle(p, x[a], x[b], x[c])
             away = p - (on[0] * x[a] + on[1] * x[b] + on[2] * x[c])
             distance = wp.length(away)
             r = layers.rest
             at_rest = wp.length(q - (on[0] * r[a] + on[1] * r[b] + on[2] * r[c]))
-            if distance < reach and at_rest > 2.0 * distance and distance > 0.0:
+            if _is_layer(distance, at_rest, neighbourhood, reach):
                 layered[i] = 1
                 is_inner = wp.min(on[0], wp.min(on[1], on[2])) > 0.0
                 if is_inner:
@@ -132,9 +136,11 @@ def vertices_near(
 
 
 @wp.func
-def _edge_pair(layers: Layers, e: int, g: int, reach: float, found: Found):
+def _edge_pair(layers: Layers, e: int, g: int, neighbourhood: float, reach: float, found: Found):
     """Keeps the edges e and g if they are a pair (nearest points: Ericson 2005, section 5.1.9)."""
     i, j, m, n = layers.edges[e, 0], layers.edges[e, 1], layers.edges[g, 0], layers.edges[g, 1]
+    if i == m or i == n or j == m or j == n:
+        return
     x, r = layers.x, layers.rest
     along, other, between = x[j] - x[i], x[n] - x[m], x[i] - x[m]
     aa, bb, ab = wp.dot(along, along), wp.dot(other, other), wp.dot(along, other)
@@ -146,7 +152,7 @@ def _edge_pair(layers: Layers, e: int, g: int, reach: float, found: Found):
             away = between + s * along - t * other
             distance = wp.length(away)
             at_rest = (1.0 - s) * r[i] + s * r[j] - (1.0 - t) * r[m] - t * r[n]
-            if distance < reach and wp.length(at_rest) > 2.0 * distance and distance > 0.0:
+            if _is_layer(distance, wp.length(at_rest), neighbourhood, reach):
                 _keep(
                     found,
                     wp.vec4i(i, j, m, n),
@@ -179,16 +185,13 @@ def edges_near(
     if not _is_looked_at(layers, e, reach, layered):
         return
     i, j = layers.edges[e, 0], layers.edges[e, 1]
-    x, r = layers.x, layers.rest
-    half = 0.5 * wp.length(r[j] - r[i])
-    q = 0.5 * (r[i] + r[j])
+    x = layers.x
     box = wp.vec3(reach, reach, reach)
     query = wp.mesh_query_aabb(layers.mesh, wp.min(x[i], x[j]) - box, wp.max(x[i], x[j]) + box)
     f = int(0)  # noqa: RUF046, UP018
     while wp.mesh_query_aabb_next(query, f):
-        if wp.length(layers.middle[f] - q) > layers.radius[f] + half + neighbourhood:
-            for k in range(3):
-                g = layers.edges_of[f, k]
-                once = g > e or not _is_looked_at(layers, g, reach, layered)
-                if once and layers.owner[g] == f:
-                    _edge_pair(layers, e, g, reach, found)
+        for k in range(3):
+            g = layers.edges_of[f, k]
+            once = g > e or not _is_looked_at(layers, g, reach, layered)
+            if once and layers.owner[g] == f and g != e:
+                _edge_pair(layers, e, g, neighbourhood, reach, found)

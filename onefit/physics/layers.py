@@ -30,14 +30,11 @@ class SelfContact:
         self.settings, self.first = settings, first
         self.stiffness = settings.layers * sheet.material.stretch
         rest, faces = sheet.cut.astype(np.float32), sheet.faces
-        middle = rest[faces].mean(1)
         of = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], -1), -1).reshape(-1, 2)
         edges, owner, number = np.unique(of, axis=0, return_index=True, return_inverse=True)
         layers = layer_kernels.Layers()
         layers.x = _array(rest.copy(), wp.vec3)
         layers.rest = _array(rest, wp.vec3)
-        layers.middle = _array(middle, wp.vec3)
-        layers.radius = _array(np.linalg.norm(rest[faces] - middle[:, None], axis=2).max(1), float)
         layers.edges = _array(edges.astype(np.int32), int)
         layers.edges_of = _array(number.reshape(-1, 3).astype(np.int32), int)
         layers.owner = _array((owner // 3).astype(np.int32), int)

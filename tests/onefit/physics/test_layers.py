@@ -54,11 +54,11 @@ def test_a_narrow_strip_that_falls_across_another_is_held_by_its_edges():
 def test_strips_whose_edges_alone_meet_do_not_pass_through_each_other(speed):
     V, F = grid(2, 4, 1.0)
     across = V[:, [1, 0, 2]] * [0.03, 0.01, 0]  # along x
-    edge_on = V[:, [2, 1, 0]] * [0, 0.03, 0.02] + [0, 0, 0.06]  # upright, along y, 5 cm up
+    edge_on = V[:, [2, 1, 0]] * [0, 0.03, 0.02] + [0, 0, 0.04]  # upright, along y, 3 cm up
     sheet = Sheet(*two((across, F), (edge_on, F)), COTTON)
     itself = SelfContact(sheet, SETTINGS, 0)
     falls = np.arange(len(sheet)) >= len(V)
-    x = sheet.rest - [0, 0, 0.044] * falls[:, None]  # 6 mm
+    x = sheet.rest - [0, 0, 0.024] * falls[:, None]  # 6 mm
     cloth = Cloth(sheet, x, SETTINGS, len(sheet))
     cloth.v[falls, 2] = -speed
     for _ in range(20):
@@ -87,37 +87,37 @@ def pairs_of(sheet, x):
     corners of what is nearest to it, or two sorted edges.
     """
     rest, F, found = sheet.cut, sheet.faces, {}
-    middle = rest[F].mean(1)
-    radius = np.linalg.norm(rest[F] - middle[:, None], axis=2).max(1)
     beside = np.zeros(len(x), bool)
+
+    def is_layer(away, at_rest):
+        distance = np.linalg.norm(away)
+        far = max(2 * distance, 2 * SETTINGS.apart)
+        return distance < SETTINGS.approach and np.linalg.norm(at_rest) > far
+
     for i in range(len(x)):
         best, inner = (SETTINGS.approach, None, None), False
         for f, corners in enumerate(F):
-            if np.linalg.norm(middle[f] - rest[i]) <= radius[f] + 2 * SETTINGS.apart:
+            if i in corners:
                 continue
             on = closest(x[i], *x[corners])
             away, at_rest = x[i] - on @ x[corners], rest[i] - on @ rest[corners]
-            distance = np.linalg.norm(away)
-            if distance < SETTINGS.approach and np.linalg.norm(at_rest) > 2 * distance:
+            if is_layer(away, at_rest):
                 beside[i], key = True, (i, *sorted(corners[on > 1e-4]))
                 if on.min() > 1e-4:
                     found[key] = away
-                if distance < best[0]:
-                    best, inner = (distance, key, away), on.min() > 1e-4
+                if np.linalg.norm(away) < best[0]:
+                    best, inner = (np.linalg.norm(away), key, away), on.min() > 1e-4
         if best[1] and not inner:
             found[best[1]] = best[2]
     E = sheet.edges
-    middle, half = rest[E].mean(1), np.linalg.norm(rest[E[:, 0]] - rest[E[:, 1]], axis=1) / 2
     for e, (i, j) in enumerate(E):
         for g, (m, n) in enumerate(E[:e]):
             A = np.stack([x[j] - x[i], x[m] - x[n]], 1)
             (s, t), *_ = np.linalg.lstsq(A, x[m] - x[i], rcond=None)
             weights = np.array([1 - s, s, t - 1, -t])
             away, at_rest = (weights @ y[[i, j, m, n]] for y in (x, rest))
-            distance = np.linalg.norm(away)
-            far = np.linalg.norm(middle[e] - middle[g]) > half[e] + half[g] + 0.03
-            near = distance < SETTINGS.approach and np.linalg.norm(at_rest) > 2 * distance
-            if min(s, t) > 0 and max(s, t) < 1 and near and far and beside[[i, j, m, n]].any():
+            between = min(s, t) > 0 and max(s, t) < 1 and not {i, j} & {m, n}
+            if between and is_layer(away, at_rest) and beside[[i, j, m, n]].any():
                 found[tuple(sorted([(i, j), (m, n)]))] = away
     return found
 
