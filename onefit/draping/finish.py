@@ -56,7 +56,7 @@ def finished(
     cloth.x = body.pushed_out(cloth.x)
 
     def step(now, target):
-        contacts = [body.follow(now), itself.find(cloth.x)]
+        contacts = [body.follow(now), itself.find(cloth.x, dt * cloth.v)]
         cloth.step(dt, contacts, target, pull)
         body.find(cloth.x)
         cloth.x = body.pushed_out(cloth.x)

@@ -88,14 +88,15 @@ def vertices_near(
     first: int,
     layers: Layers,
     neighbourhood: float,  # [m] at rest; what is nearer is no other layer
-    reach: float,  # [m]
-    layered: wp.array(dtype=int),  # receives 1 where a layer is within ``reach``
+    reaches: wp.array(dtype=float),  # [m] of the vertices
+    layered: wp.array(dtype=int),  # receives 1 where a layer is within reach
     found: Found,
 ):
-    """For each vertex from ``first`` on the triangles of other layers within ``reach``: those that
+    """For each vertex from ``first`` on the triangles of other layers within its reach: those that
     it stands above, and the nearest one.
     """
     i = first + wp.tid()
+    reach = reaches[i]
     p, q = layers.x[i], layers.rest[i]
     box = wp.vec3(reach, reach, reach)
     query = wp.mesh_query_aabb(layers.mesh, p - box, p + box)
@@ -137,8 +138,12 @@ def vertices_near(
 
 @wp.func
 def _edge_pair(layers: Layers, e: int, g: int, neighbourhood: float, reach: float, found: Found):
-    """Keeps the edges e and g if they are a pair (nearest points: Ericson 2005, section 5.1.9)."""
-    i, j, m, n = layers.edges[e, 0], layers.edges[e, 1], layers.edges[g, 0], layers.edges[g, 1]
+    """Keeps the edges e and g, the lower number first, if they are a pair (nearest points: Ericson
+    2005, section 5.1.9).
+    """
+    one, two = wp.min(e, g), wp.max(e, g)
+    i, j = layers.edges[one, 0], layers.edges[one, 1]
+    m, n = layers.edges[two, 0], layers.edges[two, 1]
     if i == m or i == n or j == m or j == n:
         return
     x, r = layers.x, layers.rest
@@ -162,11 +167,14 @@ def _edge_pair(layers: Layers, e: int, g: int, neighbourhood: float, reach: floa
 
 
 @wp.func
-def _is_looked_at(layers: Layers, e: int, reach: float, layered: wp.array(dtype=int)):
-    """Whether an end of the edge e is near a layer, or the edge so long that its middle may be."""
+def _edge_reach(layers: Layers, e: int, reaches: wp.array(dtype=float), layered: wp.array(dtype=int)):
+    """How far the edge e looks for others [m]: as its ends do, if one of them is near a layer, or
+    the edge is so long that its middle may be; else 0.
+    """
     i, j = layers.edges[e, 0], layers.edges[e, 1]
+    reach = wp.max(reaches[i], reaches[j])
     is_long = wp.length(layers.rest[i] - layers.rest[j]) > 2.0 * reach
-    return is_long or layered[i] + layered[j] > 0
+    return wp.where(is_long or layered[i] + layered[j] > 0, reach, 0.0)
 
 
 @wp.kernel
@@ -174,15 +182,16 @@ def edges_near(
     first: int,
     layers: Layers,
     neighbourhood: float,
-    reach: float,
+    reaches: wp.array(dtype=float),
     layered: wp.array(dtype=int),  # as :func:`vertices_near` leaves it
     found: Found,
 ):
     """For each edge from ``first`` on, if one of its ends is near a layer, or it is long, the
-    edges of layers within ``reach``, where both are nearest to each other between their ends.
+    edges of layers within reach, where both are nearest to each other between their ends.
     """
     e = first + wp.tid()
-    if not _is_looked_at(layers, e, reach, layered):
+    reach = _edge_reach(layers, e, reaches, layered)
+    if reach == 0.0:
         return
     i, j = layers.edges[e, 0], layers.edges[e, 1]
     x = layers.x
@@ -192,6 +201,7 @@ def edges_near(
     while wp.mesh_query_aabb_next(query, f):
         for k in range(3):
             g = layers.edges_of[f, k]
-            once = g > e or not _is_looked_at(layers, g, reach, layered)
-            if once and layers.owner[g] == f and g != e:
-                _edge_pair(layers, e, g, neighbourhood, reach, found)
+            if layers.owner[g] == f and g != e:
+                other = _edge_reach(layers, g, reaches, layered)
+                if other < reach or (other == reach and g > e):  # that which looks farther finds it
+                    _edge_pair(layers, e, g, neighbourhood, reach, found)

@@ -29,6 +29,7 @@ class SelfContact:
     def __init__(self, sheet: Sheet, settings: Settings, first: int) -> None:
         self.settings, self.first = settings, first
         self.stiffness = settings.layers * sheet.material.stretch
+        self._neighbourhood = 2 * settings.apart
         rest, faces = sheet.cut.astype(np.float32), sheet.faces
         of = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], -1), -1).reshape(-1, 2)
         edges, owner, number = np.unique(of, axis=0, return_index=True, return_inverse=True)
@@ -41,14 +42,22 @@ class SelfContact:
         self._mesh = wp.Mesh(layers.x, _array(faces.ravel().astype(np.int32), int))
         layers.mesh = self._mesh.id
         self._layers = layers
+        self._reaches = wp.zeros(len(rest), dtype=float, device="cpu")
         self._layered = wp.zeros(len(rest), dtype=int, device="cpu")
         self._found = [_room(len(rest)) for _ in range(_PARTS)]
+        self._sides = np.zeros(0, np.dtype((np.void, 20))), np.zeros((0, 3))  # keys and normals
         self._others = ThreadPoolExecutor(_PARTS - 1)
 
-    def find(self, x: np.ndarray) -> Contacts:
-        """The contacts of vertices at (N, 3) [m], on the sides on which they are."""
+    def find(self, x: np.ndarray, way: np.ndarray | float = 0.0) -> Contacts:
+        """The contacts of vertices at (N, 3) [m], on the sides on which they are, or were when this
+        was asked last. A vertex looks as far as its ``way`` (N, 3) [m] in the step leads it against
+        the others, and a little farther.
+        """
         self._layers.x.numpy()[:] = x
         self._mesh.refit()
+        way = np.broadcast_to(way, x.shape)
+        goes = np.linalg.norm(way - way.mean(0), axis=1)
+        self._reaches.numpy()[:] = np.minimum(self._neighbourhood + goes, self.settings.reach)
         while True:
             for found in self._found:
                 found.count.numpy()[:] = 0
@@ -62,19 +71,34 @@ class SelfContact:
             np.concatenate([getattr(f, name).numpy()[:n] for f, n in zip(self._found, counts)])
             for name in ("corners", "weights", "normal")
         )
+        self._keep_sides(corners, weights, normal)
         offset, still = np.full(len(corners), self.settings.apart), np.zeros((len(corners), 3))
         key = self.first + corners[:, 0]
         return Contacts(
             key, corners, weights.astype(float), normal.astype(float), offset, still, self.stiffness
         )
 
+    def _keep_sides(self, corners, weights, normal):
+        """Turns the normals of pairs that have passed through each other since the last time: those
+        of a vertex above a triangle, and of edges. Others have no sides.
+        """
+        edges = weights[:, 1] > 0
+        sided = np.flatnonzero(edges | (weights[:, 1:].max(1) < 0))
+        rows = np.column_stack([edges, corners])[sided].astype(np.int32)
+        keys = rows.view(np.dtype((np.void, 20))).ravel()
+        before, normals = self._sides
+        _, now, then = np.intersect1d(keys, before, assume_unique=True, return_indices=True)
+        passed = np.einsum("ci,ci->c", normal[sided[now]], normals[then]) < 0
+        normal[sided[now[passed]]] *= -1
+        self._sides = keys, normal[sided]
+
     def _search(self, kernel, count):
         """Launches a ``kernel`` for ``count`` vertices or edges, in parts, each in a thread."""
         ends = np.linspace(0, count, _PARTS + 1).astype(int)
 
         def part(k):
-            settings, first = self.settings, int(ends[k])
-            near = [2 * settings.apart, settings.approach, self._layered, self._found[k]]
+            first = int(ends[k])
+            near = [self._neighbourhood, self._reaches, self._layered, self._found[k]]
             size = int(ends[k + 1]) - first
             wp.launch(kernel, size, [first, self._layers, *near], device="cpu")
 

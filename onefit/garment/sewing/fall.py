@@ -29,7 +29,7 @@ def fallen(cut, seconds=SECONDS, advance=lambda cloth: None):
     pull = sheet.material.stretch * held(cut.start, cut.faces, body.joints.double().numpy())
     skin.find(cloth.x)
     for _ in range(round(seconds / STEP)):
-        contacts = [skin.follow(surface), itself.find(cloth.x)]
+        contacts = [skin.follow(surface), itself.find(cloth.x, STEP * cloth.v)]
         cloth.step(STEP, contacts, cut.start, pull)
         skin.find(cloth.x)
         cloth.x = skin.pushed_out(cloth.x)

@@ -26,7 +26,7 @@ def test_a_layer_that_falls_on_another_stays_on_it():
     cloth = Cloth(sheet, x, settings, len(sheet))
     fixed = np.where(np.arange(len(sheet)) < len(V), 1e3, 0.0)
     for _ in range(40):
-        contacts = itself.find(cloth.x)
+        contacts = itself.find(cloth.x, cloth.v / 60)
         cloth.step(1 / 60, [contacts], sheet.rest, fixed)
     above = cloth.x[len(V) :, 2] - cloth.x[: len(V), 2].mean()
     assert above.min() > 0 and above.max() < 2 * settings.apart
@@ -43,7 +43,7 @@ def test_a_narrow_strip_that_falls_across_another_is_held_by_its_edges():
     cloth = Cloth(sheet, x, SETTINGS, len(sheet))
     fixed = np.where(np.arange(8) < 4, 1e4, 0.0)
     for _ in range(30):
-        contacts = itself.find(cloth.x)
+        contacts = itself.find(cloth.x, cloth.v / 60)
         assert (np.sign(contacts.weights) == [1, 1, -1, -1]).all() and len(contacts.key) >= 4
         cloth.step(1 / 60, [contacts], x, fixed)
     assert cloth.x[4:, 2].min() > 0 and cloth.x[4:, 2].max() < 2 * SETTINGS.apart
@@ -62,7 +62,7 @@ def test_strips_whose_edges_alone_meet_do_not_pass_through_each_other(speed):
     cloth = Cloth(sheet, x, SETTINGS, len(sheet))
     cloth.v[falls, 2] = -speed
     for _ in range(20):
-        cloth.step(1 / 60, [itself.find(cloth.x)], sheet.rest, np.where(falls, 0.0, 1e3))
+        cloth.step(1 / 60, [itself.find(cloth.x, cloth.v / 60)], sheet.rest, np.where(falls, 0.0, 1e3))
         assert crossings(cloth.x, sheet.faces) == 0
     assert (cloth.x - x)[falls, 2].mean() > -0.02  # it did not fall past
 
@@ -82,26 +82,28 @@ def closest(p, a, b, c):
     return found
 
 
-def pairs_of(sheet, x):
+def pairs_of(sheet, x, way):
     """What :meth:`SelfContact.find` finds, all against all: {corners: vector}, a vertex and the
     corners of what is nearest to it, or two sorted edges.
     """
     rest, F, found = sheet.cut, sheet.faces, {}
     beside = np.zeros(len(x), bool)
+    reach = 2 * SETTINGS.apart + np.linalg.norm(way - way.mean(0), axis=1)
+    reach = np.minimum(reach, SETTINGS.reach)
 
-    def is_layer(away, at_rest):
+    def is_layer(away, at_rest, reach):
         distance = np.linalg.norm(away)
         far = max(2 * distance, 2 * SETTINGS.apart)
-        return distance < SETTINGS.approach and np.linalg.norm(at_rest) > far
+        return distance < reach and np.linalg.norm(at_rest) > far
 
     for i in range(len(x)):
-        best, inner = (SETTINGS.approach, None, None), False
+        best, inner = (np.inf, None, None), False
         for f, corners in enumerate(F):
             if i in corners:
                 continue
             on = closest(x[i], *x[corners])
             away, at_rest = x[i] - on @ x[corners], rest[i] - on @ rest[corners]
-            if is_layer(away, at_rest):
+            if is_layer(away, at_rest, reach[i]):
                 beside[i], key = True, (i, *sorted(corners[on > 1e-4]))
                 if on.min() > 1e-4:
                     found[key] = away
@@ -117,7 +119,8 @@ def pairs_of(sheet, x):
             weights = np.array([1 - s, s, t - 1, -t])
             away, at_rest = (weights @ y[[i, j, m, n]] for y in (x, rest))
             between = min(s, t) > 0 and max(s, t) < 1 and not {i, j} & {m, n}
-            if between and is_layer(away, at_rest) and beside[[i, j, m, n]].any():
+            far = max([0, *(reach[[a, b]].max() for a, b in ((i, j), (m, n)) if beside[[a, b]].any())])
+            if between and is_layer(away, at_rest, far):
                 found[tuple(sorted([(i, j), (m, n)]))] = away
     return found
 
@@ -130,7 +133,8 @@ def test_pairs_are_those_that_a_search_of_all_against_all_finds(seed):
     sheet = Sheet(V, F, COTTON)
     x = V - [0, 0, 0.992] * (np.arange(len(V)) >= 49)[:, None]
     x += rng.normal(size=x.shape) * [0.002, 0.002, 0.002]
-    contacts = SelfContact(sheet, SETTINGS, 0).find(x)
+    way = rng.normal(size=x.shape) * 0.003 * rng.uniform(0, 3, (len(x), 1))
+    contacts = SelfContact(sheet, SETTINGS, 0).find(x, way)
     found = {}
     for corners, weights, normal in zip(contacts.corners, contacts.weights, contacts.normal):
         vector = weights @ x[corners]
@@ -141,17 +145,34 @@ def test_pairs_are_those_that_a_search_of_all_against_all_finds(seed):
         key = tuple(sorted([(i, j), (m, n)])) if edges else key
         assert key not in found
         found[key] = vector
-    expected = pairs_of(sheet, x)
+    expected = pairs_of(sheet, x, way)
     assert len(expected) > 50 and sum(isinstance(k[0], tuple) for k in expected) > 20
     assert set(found) == set(expected)
     for key, vector in expected.items():
         assert np.allclose(np.abs(found[key]), np.abs(vector), atol=2e-6)
 
 
+def test_what_has_slipped_through_is_drawn_back():
+    V, F = two(grid(7, 7, 0.015), grid(6, 6, 0.015))
+    V[49:] += [0.001, 0.002, 1.0]
+    sheet = Sheet(V, F, COTTON)
+    at = lambda height: V - [0, 0, 1.0 - height] * (np.arange(len(V)) >= 49)[:, None]
+    slipped, itself = SelfContact(sheet, SETTINGS, 0).find(at(-0.001)), SelfContact(sheet, SETTINGS, 0)
+    itself.find(at(0.002))
+    again = itself.find(at(-0.001))
+    upwards = lambda c: np.sign((c.weights * (c.corners >= 49)).sum(1) * c.normal[:, 2])
+    assert (upwards(slipped) == -1).all()  # without a past it is below
+    sided = (again.weights[:, 1] > 0) | (again.weights[:, 1:].max(1) < 0)
+    assert sided.sum() > 50 and (upwards(again)[sided] == 1).all()
+    vectors = np.einsum("ck,ckd->cd", again.weights, at(-0.001)[again.corners])
+    gap = np.einsum("cd,cd->c", vectors, again.normal) - again.offset
+    assert gap[sided] == pytest.approx(-0.001 - SETTINGS.apart, abs=1e-6)
+
+
 def test_neighbours_do_not_touch_and_a_tight_fold_does():
     V, F = grid(40, 6, 0.01)
     sheet = Sheet(V, F, COTTON)
-    itself, radius = SelfContact(sheet, SETTINGS, 0), 0.004
+    itself, radius = SelfContact(sheet, SETTINGS, 0), 0.0025
     assert len(itself.find(sheet.rest).key) == 0
     s, x = V[:, 0], V.copy()  # around half a circle
     turn = np.clip(s / radius, -np.pi / 2, np.pi / 2)
@@ -167,7 +188,7 @@ def test_a_cut_in_folds_rests_on_its_folds():
     # the rest shape of what hangs in folds says nothing of who is whose neighbour; its cut does
     V, F = grid(24, 4, 0.01)
     hung = V.copy()
-    hung[:, 0], hung[:, 2] = np.abs(V[:, 0]), 0.004 * np.sign(V[:, 0])
+    hung[:, 0], hung[:, 2] = np.abs(V[:, 0]), 0.0025 * np.sign(V[:, 0])
     folded = np.abs(V[:, 0]) > 0.05
     corners = V[F]
     sides = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
