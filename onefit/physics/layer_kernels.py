@@ -144,7 +144,8 @@ def _edge_pair(layers: Layers, e: int, g: int, neighbourhood: float, reach: floa
     one, two = wp.min(e, g), wp.max(e, g)
     i, j = layers.edges[one, 0], layers.edges[one, 1]
     m, n = layers.edges[two, 0], layers.edges[two, 1]
-    if i == m or i == n or j == m or j == n:
+    apart = i != m and i != n and j != m and j != n
+    if not apart:
         return
     x, r = layers.x, layers.rest
     along, other, between = x[j] - x[i], x[n] - x[m], x[i] - x[m]
@@ -167,7 +168,9 @@ def _edge_pair(layers: Layers, e: int, g: int, neighbourhood: float, reach: floa
 
 
 @wp.func
-def _edge_reach(layers: Layers, e: int, reaches: wp.array(dtype=float), layered: wp.array(dtype=int)):
+def _edge_reach(
+    layers: Layers, e: int, reaches: wp.array(dtype=float), layered: wp.array(dtype=int)
+):
     """How far the edge e looks for others [m]: as its ends do, if one of them is near a layer, or
     the edge is so long that its middle may be; else 0.
     """

@@ -16,10 +16,11 @@ class Settings:
     they end earlier. ``clearance`` [m] that cloth keeps from the body, which covers what a chord of
     2 cm misses of a limb; ``least`` [m] to which it is pushed at the end of a step, if it came
     nearer. ``reach`` [m]: cloth and body that come nearer to each other than this in a step are
-    seen, and so far does cloth look for other cloth at most. ``contact`` and ``layers`` [1]: the stiffness of a contact with the body and of cloth with
-    itself, in units of the material's stretch stiffness. ``sticking`` [m/s]: a slower slip is not
-    friction's full force. ``apart`` [m]: what folds keep from each other. ``spacing`` [m]: of points of the faces that must
-    stay out of the body, as vertices must. ``draw`` [1/s^2]: acceleration towards the drape that is
+    seen, and so far does cloth look for other cloth at most. ``contact`` and ``layers`` [1]: the
+    stiffness of a contact with the body and of cloth with itself, in units of the material's
+    stretch stiffness. ``sticking`` [m/s]: a slower slip is not friction's full force. ``apart``
+    [m]: what folds keep from each other. ``spacing`` [m]: of points of the faces that must stay out
+    of the body, as vertices must. ``draw`` [1/s^2]: acceleration towards the drape that is
     finished, for a unit distance. ``lead`` [s]: how long the body takes, before the motion, from
     its rest, in which garments are made, to the first pose; ``settling`` [s]: how long that is held
     then, for the cloth to come to rest. In each step of both, velocities are multiplied by

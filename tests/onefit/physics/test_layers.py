@@ -62,7 +62,8 @@ def test_strips_whose_edges_alone_meet_do_not_pass_through_each_other(speed):
     cloth = Cloth(sheet, x, SETTINGS, len(sheet))
     cloth.v[falls, 2] = -speed
     for _ in range(20):
-        cloth.step(1 / 60, [itself.find(cloth.x, cloth.v / 60)], sheet.rest, np.where(falls, 0.0, 1e3))
+        contacts = itself.find(cloth.x, cloth.v / 60)
+        cloth.step(1 / 60, [contacts], sheet.rest, np.where(falls, 0.0, 1e3))
         assert crossings(cloth.x, sheet.faces) == 0
     assert (cloth.x - x)[falls, 2].mean() > -0.02  # it did not fall past
 
@@ -98,7 +99,7 @@ def pairs_of(sheet, x, way):
 
     for i in range(len(x)):
         best, inner = (np.inf, None, None), False
-        for f, corners in enumerate(F):
+        for corners in F:
             if i in corners:
                 continue
             on = closest(x[i], *x[corners])
@@ -113,13 +114,14 @@ def pairs_of(sheet, x, way):
             found[best[1]] = best[2]
     E = sheet.edges
     for e, (i, j) in enumerate(E):
-        for g, (m, n) in enumerate(E[:e]):
+        for m, n in E[:e]:
             A = np.stack([x[j] - x[i], x[m] - x[n]], 1)
             (s, t), *_ = np.linalg.lstsq(A, x[m] - x[i], rcond=None)
             weights = np.array([1 - s, s, t - 1, -t])
             away, at_rest = (weights @ y[[i, j, m, n]] for y in (x, rest))
             between = min(s, t) > 0 and max(s, t) < 1 and not {i, j} & {m, n}
-            far = max([0, *(reach[[a, b]].max() for a, b in ((i, j), (m, n)) if beside[[a, b]].any())])
+            look = [ends for ends in ([i, j], [m, n]) if beside[ends].any()]
+            far = max((reach[ends].max() for ends in look), default=0)
             if between and is_layer(away, at_rest, far):
                 found[tuple(sorted([(i, j), (m, n)]))] = away
     return found
@@ -157,7 +159,8 @@ def test_what_has_slipped_through_is_drawn_back():
     V[49:] += [0.001, 0.002, 1.0]
     sheet = Sheet(V, F, COTTON)
     at = lambda height: V - [0, 0, 1.0 - height] * (np.arange(len(V)) >= 49)[:, None]
-    slipped, itself = SelfContact(sheet, SETTINGS, 0).find(at(-0.001)), SelfContact(sheet, SETTINGS, 0)
+    slipped = SelfContact(sheet, SETTINGS, 0).find(at(-0.001))
+    itself = SelfContact(sheet, SETTINGS, 0)
     itself.find(at(0.002))
     again = itself.find(at(-0.001))
     upwards = lambda c: np.sign((c.weights * (c.corners >= 49)).sum(1) * c.normal[:, 2])
