@@ -87,7 +87,7 @@ class SelfContact:
         rows = np.column_stack([edges, corners])[sided].astype(np.int32)
         keys = rows.view(np.dtype((np.void, 20))).ravel()
         before, normals = self._sides
-        _, now, then = np.intersect1d(keys, before, assume_unique=True, return_indices=True)
+        _, now, then = np.intersect1d(keys, before, return_indices=True)
         passed = np.einsum("ci,ci->c", normal[sided[now]], normals[then]) < 0
         normal[sided[now[passed]]] *= -1
         self._sides = keys, normal[sided]
