@@ -108,8 +108,8 @@ def measure(folder):
     problem = Problem(experiment, experiment.sequence())
     ticks = {}
 
-    def tick(frame, *_):
-        ticks[frame] = time.process_time()  # after the last evaluation of a frame
+    def tick(before, *_):
+        ticks[before] = time.process_time()  # after the last evaluation of a frame
 
     done = track(
         problem, solvers.create(experiment.settings), len(problem.sequence), folder, progress=tick

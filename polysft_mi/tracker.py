@@ -6,6 +6,7 @@ Import only after a Mitsuba variant is set.
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 import os
@@ -41,8 +42,9 @@ class Track:
     of the next window to solve; ``iterations``, ``seconds``: one entry a solved window; ``totals``:
     its terms at the minimum; ``lost``: frame -> reason for those that keep the state of the frame
     before; ``unusable``: those among them whose image breaks the objective; ``sigma``: frame ->
-    standard deviation of each vertex along its ray [m], from solvers that know; ``finished``:
-    whether the solver has looked back over the whole.
+    standard deviation of each vertex along its ray [m], from solvers that know; ``swept``: frames
+    gone over by the setting ``sweeps``, each as often as it was; ``finished``: whether the solver
+    has looked back over the whole.
     """
 
     states: list = field(default_factory=list)
@@ -53,6 +55,7 @@ class Track:
     lost: dict = field(default_factory=dict)
     unusable: dict = field(default_factory=dict)
     sigma: dict = field(default_factory=dict)
+    swept: int = 0
     finished: bool = False
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -68,6 +71,7 @@ class Track:
                 "totals",
                 "lost",
                 "unusable",
+                "swept",
                 "finished",
             )
         }
@@ -115,18 +119,19 @@ def track(
     out: str | os.PathLike[str],
     *,
     resume: bool = False,
-    progress: Callable[[int, int, float, dict], None] | None = None,
+    progress: Callable[[int, int, int, float, dict], None] | None = None,
     solved: Callable[[int, np.ndarray], None] | None = None,
 ) -> Track:
     """Solve window after window; checkpoints and the log go to the folder ``out``. Returns the
     :class:`Track`.
 
-    ``frames``: number of frames. ``progress(frame, iteration, total, terms)`` is called after each
-    evaluation. ``solved(frame, vertices)`` is called with the surface (N, 3) [m, world] of each
-    frame as soon as no later window moves it; only the last pass of the setting ``smooth`` may
-    still change it. If the objective stops being finite, or the surface leaves the image, the new
-    frame keeps the state of the one before, and the run goes on. KeyboardInterrupt passes through;
-    the checkpoint on disk is then that of the last complete window.
+    ``frames``: number of frames. ``progress(done, frame, iteration, total, terms)`` is called after
+    each evaluation; ``done``: windows, and frames gone over again, before this one.
+    ``solved(frame, vertices)`` is called with the surface (N, 3) [m, world] of each frame as soon
+    as no later window moves it; only the settings ``sweeps`` and ``smooth`` may still change it.
+    If the objective stops being finite, or the surface leaves the image, the new frame keeps the
+    state of the one before, and the run goes on. KeyboardInterrupt passes through; the checkpoint
+    on disk is then that of the last complete window, or of the last frame that a sweep went over.
     """
     width = min(problem.settings.width, frames)
     checkpoint, log_path = os.path.join(out, CHECKPOINT), os.path.join(out, _LOG)
@@ -139,6 +144,10 @@ def track(
             done.save(checkpoint)
             if solved:
                 solved(start, problem.surface(Unknowns.from_numpy(done.states[start])))
+        for k, neighbour in _swept(frames, problem.settings.sweeps)[done.swept :]:
+            _retry(problem, solver, done, k, neighbour, progress)
+            done.swept += 1
+            done.save(checkpoint)
     smooth = problem.settings.smooth > 0 and hasattr(solver, "revisit")
     if smooth and len(done.totals) == frames and not done.finished:
         with interruptible():
@@ -146,6 +155,39 @@ def track(
         done.finished = True
         done.save(checkpoint)
     return done
+
+
+def _swept(frames, sweeps):
+    """(frame, neighbour that it starts from) of so many sweeps, each backward and then forward over
+    all frames but the first, which the texture was taken from.
+    """
+    backward = [(k, k + 1) for k in range(frames - 2, 0, -1)]
+    return (backward + [(k, k - 1) for k in range(1, frames)]) * sweeps
+
+
+def _retry(problem, solver, done, k, neighbour, progress):
+    """Solve frame ``k`` again from its neighbour's surface, and keep what costs less."""
+    if k in done.unusable:
+        return
+    began, before = time.perf_counter(), range(max(0, k - _MAX_HISTORY), k)
+    past = [(done.states[j], done.totals[j]) for j in before]
+    report = progress and functools.partial(progress, len(done.totals) + done.swept, k)
+    start, state, terms = done.states[neighbour], done.states[k], done.totals[k]
+    try:
+        solution = solver.retry(problem, k, start, state, terms, past, report)
+    except BadFrame:
+        return
+    if solution and problem.visible_share(solution.window[0]) >= _MIN_VISIBLE_SHARE:
+        _replace(done, k, solution)
+    done.seconds[k] += time.perf_counter() - began
+
+
+def _replace(done, k, solution):
+    """Let frame ``k``, solved again, have this solution."""
+    done.states[k] = solution.window[0].to_numpy()
+    done.totals[k] = _numbers({**solution.terms, **solution.facts})
+    done.sigma[k] = solution.sigma[0]
+    done.lost.pop(k, None)
 
 
 def _smooth(problem, solver, done):
@@ -163,11 +205,8 @@ def _smooth(problem, solver, done):
             )
         except BadFrame:
             continue
-        done.states[k] = solution.window[0].to_numpy()
-        done.totals[k] = _numbers({**solution.terms, **solution.facts})
-        done.sigma[k] = solution.sigma[0]
+        _replace(done, k, solution)
         done.seconds[k] += time.perf_counter() - began
-        done.lost.pop(k, None)
 
 
 def _numbers(values):
@@ -204,7 +243,7 @@ def _advance(problem, solver, done, start, width, log, progress):
         if iteration % _LOG_EVERY == 0:
             record(iteration, total, terms)
         if progress:
-            progress(members[-1], iteration, total, terms)
+            progress(start, members[-1], iteration, total, terms)
 
     solved, sigma, terms, facts, failed = {}, {}, dict.fromkeys(TERMS, math.nan), {}, {}
     while usable := [k for k in members if k not in done.unusable]:

@@ -12,10 +12,11 @@ class Progress:
     """
 
     def __init__(self, frames, settings, quiet):
-        self.windows = frames - min(settings.width, frames) + 1
-        self.first = min(settings.width, frames) - 1  # newest frame of the first window
+        self.frames, self.windows = frames, frames - min(settings.width, frames) + 1
+        # a sweep goes over all frames but the first and the last, and then over all but the first
+        self.total = self.windows + settings.sweeps * max(0, 2 * frames - 3)
         self.period, self.quiet, self.terminal = settings.period, quiet, sys.stderr.isatty()
-        self._frame, self._began, self._done, self._shown = None, time.perf_counter(), 0, 0.0
+        self._start, self._began, self._done, self._shown = None, time.perf_counter(), None, 0.0
 
     def __enter__(self):
         if self.terminal and not self.quiet:
@@ -31,36 +32,37 @@ class Progress:
                 console=Console(stderr=True),
             )
             self._bar.start()
-            self._task = self._bar.add_task("tracking", total=self.windows, state="")
+            self._task = self._bar.add_task("tracking", total=self.total, state="")
         return self
 
     def __exit__(self, *_):
         if self.terminal and not self.quiet:
             self._bar.stop()
 
-    def __call__(self, frame, iteration, total, terms):
+    def __call__(self, done, frame, iteration, total, terms):
         if self.quiet:
             return
         now = time.perf_counter()
-        if self._frame is None:
-            self._start_window, self._began = frame - self.first, now
-        if frame != self._frame:
-            self._frame, self._done = frame, frame - self.first
+        if self._start is None:
+            self._start, self._began = done, now
+        if done != self._done:
+            self._done = done
         elif now - self._shown < (0.2 if self.terminal else 10):
             return
         self._shown = now
-        state = f"frame {frame + 1}/{self.windows + self.first} it {iteration} loss {total:.4g}"
+        again = "again " if done >= self.windows else ""
+        state = f"{again}frame {frame + 1}/{self.frames} it {iteration} loss {total:.4g}"
         detail = " ".join(f"{name[:3]} {value:.2g}" for name, value in terms.items() if value)
         if self.terminal:
             self._bar.update(
                 self._task,
-                completed=self._done + iteration / self.period,
+                completed=done + iteration / self.period,
                 state=f"{state} ({detail})",
             )
         else:
-            solved = self._done - self._start_window
+            solved = done - self._start
             left = (
-                f", {(now - self._began) / solved * (self.windows - self._done):.0f} s left"
+                f", {(now - self._began) / solved * (self.total - done):.0f} s left"
                 if solved
                 else ""
             )
@@ -77,4 +79,4 @@ class Progress:
     def stage(self, name):
         """What is being written after the tracking."""
         if self.terminal and not self.quiet:
-            self._bar.update(self._task, completed=self.windows, state=f"writing {name}")
+            self._bar.update(self._task, completed=self.total, state=f"writing {name}")

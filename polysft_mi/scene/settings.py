@@ -105,6 +105,13 @@ class Settings:
         " back and forth (gauss-newton); 0: no such pass",
         low=0,
     )
+    sweeps: int = _setting(
+        0,
+        "how often the tracked video is gone over again, backward and then forward: each frame is"
+        " solved anew from its neighbour's surface, and the surface of the lower cost is kept"
+        " (gauss-newton)",
+        low=0,
+    )
     patience: int = _setting(
         100, "iterations of adam without improvement after which the window moves on", low=1
     )

@@ -7,6 +7,8 @@ import math
 
 import mitsuba as mi
 
+from polysft_mi.errors import InputError
+
 from .solution import Solution
 
 
@@ -19,6 +21,11 @@ class Adam:
     """
 
     def __init__(self, settings):
+        if settings.sweeps > 0:
+            raise InputError(
+                f"setting sweeps = {settings.sweeps} with solver = adam; sweeps = 0, or solver ="
+                " gauss-newton, is needed"
+            )
         self.settings = settings
 
     def solve(self, problem, window, frames, report=None, past=()):

@@ -31,7 +31,7 @@ class GaussNewton:
     better. Where it ends with a misfit far above that of the frames before, other starts are tried.
     A relief over the jet, a height of each vertex, holds folds that no jet can. In a window of
     several frames the newest is solved so, and then all together; :meth:`revisit` looks both ways
-    from one frame.
+    from one frame, and :meth:`retry` solves it from another frame's surface.
     """
 
     def __init__(self, settings):
@@ -45,6 +45,11 @@ class GaussNewton:
             raise InputError(
                 f"setting smooth = {settings.smooth:g} with window = {settings.width}; one of them"
                 " looks both ways: window = 1, or smooth = 0, is needed"
+            )
+        if settings.sweeps > 0 and settings.width > 1:
+            raise InputError(
+                f"setting sweeps = {settings.sweeps} with window = {settings.width}; frames are"
+                " gone over one by one: window = 1, or sweeps = 0, is needed"
             )
         self._problem = None
         # BLAS's own threads cost more than they bring on blocks this small, and wait for Dr.Jit's
@@ -93,9 +98,35 @@ class GaussNewton:
             middle = a.extrapolated(b, -0.5)
             context = replace(self._context(frame, middle, [terms]), hold=weight)
             found = self._descent.descend(middle, context, self._descent.usual)
-            facts = self._facts(found, context, [terms])
-            facts |= {name: terms.get(name) for name in ("least_misfit", "light")}
-            return self._solution([found.state], [found], facts)
+            return self._solution([found.state], [found], self._same_noise(found, context, terms))
+
+    def retry(self, problem, frame, start, state, terms, past, report=None):
+        """Solve a frame anew from another frame's surface: a
+        :class:`polysft_mi.solvers.Solution`, or None where it costs no less than the surface that
+        the frame has.
+
+        ``start``, ``state``: arrays of ``Unknowns.to_numpy`` of the other frame, and of the frame
+        so far; ``terms``: terms and facts of the frame so far; ``past``, ``report``: as in
+        :meth:`solve`. Both surfaces are compared by the last stage's objective, held to the frame
+        before.
+        """
+        with self._blas.limit(limits=1, user_api="blas"):
+            self._prepare(problem, report)
+            self._expect(frame)
+            before = self._atlas.state(past[-1][0])
+            context = self._context(frame, before, [facts for _, facts in past])
+            found = self._descent.descend(self._atlas.state(start), context, self._descent.usual)
+            new = self._atlas.with_relief_in_jets(found.state)
+            if self._cost(new, context) >= self._cost(self._atlas.state(state), context):
+                return None
+            return self._solution([new], [found], self._same_noise(found, context, terms))
+
+    def _cost(self, state, context):
+        """The cost of a state at the last stage."""
+        stage = self._descent.usual[-1]
+        scale = context.scales.get(stage, self._descent.rules.first_scale)
+        appearance = self._descent.objective.appearance(state, stage, context.light)
+        return self._descent.model(state, context, stage, scale, appearance).cost
 
     # -- a frame ---------------------------------------------------------------
 
@@ -162,6 +193,13 @@ class GaussNewton:
             light = light.updated(self._images.shade(vertices, frame, seen, model.appearance))
         facts["light"] = light.numbers()
         return facts
+
+    def _same_noise(self, found, context, terms):
+        """The facts of a frame that is solved again; noise and light stay those of ``terms``, where
+        it was not lost.
+        """
+        facts, kept = self._facts(found, context, [terms]), ("least_misfit", "light")
+        return facts | {name: terms[name] for name in kept if terms.get(name) is not None}
 
     def _least_misfit(self, found, context, known):
         """The least misfit of the frames so far, the first one aside, of the texture as the

@@ -225,6 +225,8 @@ def test_malformed_setting(sheet, text):
         *((f"order={n}", f"order = '{n}'; a whole number is needed") for n in ("four", "2.5", "")),
         ("rgb_scale=0", "rgb_scale = 0.0; a finite number, above 0, is needed"),
         ("window=-1", "window = -1; a whole number, at least 0, is needed"),
+        ("sweeps=-1", "sweeps = -1; a whole number, at least 0, is needed"),
+        ("sweeps=1.5", "sweeps = '1.5'; a whole number is needed"),
         ("solver=newton", "solver = 'newton'; known values: gauss-newton, adam"),
         ("rgb_norm=l3", "rgb_norm = 'l3'; known values: l1, l2, charbonnier"),
         ("spp=3", "raster: spp = 3; a square number is needed"),
@@ -243,6 +245,8 @@ def test_bad_value(sheet, setting, words):
     "settings, words",
     [
         (["window=3", "smooth=1"], "window = 1, or smooth = 0, is needed"),
+        (["window=3", "sweeps=1"], "window = 1, or sweeps = 0, is needed"),
+        (["solver=adam", "sweeps=1"], "sweeps = 0, or solver = gauss-newton, is needed"),
         (
             ["brightness=gain"],
             "brightness = 'gain' with solver = gauss-newton; auto, local or none is needed",

@@ -228,6 +228,10 @@ def test_order_of_the_jet(tmp_path, rows, columns, asked, order):
 def test_settings_that_do_not_go_together():
     with pytest.raises(InputError, match="one of them looks both ways"):
         solvers.create(Settings(window=3, smooth=0.1))
+    with pytest.raises(InputError, match="window = 1, or sweeps = 0"):
+        solvers.create(Settings(window=3, sweeps=1))
+    with pytest.raises(InputError, match="sweeps = 1 with solver = adam"):
+        solvers.create(Settings(solver="adam", sweeps=1))
     with pytest.raises(InputError, match="gain"):
         solvers.create(Settings(brightness="gain"))
     assert Settings().width == 1 and Settings(solver="adam").width == 3

@@ -1,12 +1,16 @@
 """Several frames together, and looking both ways."""
 
+import copy
+import dataclasses
+
 import numpy as np
 import pytest
 from problems import dense, problem_of, some_state
 from scipy.linalg import block_diag
 
-from polysft_mi import solvers
+from polysft_mi import solvers, tracker
 from polysft_mi.images.light import Light
+from polysft_mi.objective.problem import TERMS
 from polysft_mi.objective.second_order import Context, SecondOrder
 from polysft_mi.solvers.gauss_newton.descent import Descent
 from polysft_mi.solvers.gauss_newton.window import Window
@@ -109,3 +113,91 @@ def test_looking_back_smooths_and_keeps_what_frames_know(truth, tracked, tmp_pat
         ),
     )
     assert least < smooth and smooth - least < 0.9 * (usual - least)
+
+
+def mislaid(problem, tracked, frame):
+    """A copy of a track whose ``frame`` bulges the wrong way: its surface, mirrored in depth about
+    its mean, and so nearly the same in the image.
+    """
+    solver = solvers.create(problem.settings)
+    solver._prepare(problem, None)
+    atlas, done = solver._atlas, copy.deepcopy(tracked)
+    state = atlas.state(done.states[frame])
+    wanted = atlas.surface(state).vertices.copy()
+    wanted[:, 2] = 2 * wanted[:, 2].mean() - wanted[:, 2]
+    for _ in range(10):
+        surface = atlas.surface(state)
+        missing = (wanted - surface.vertices)[..., None]
+        offset = state.offset + np.linalg.solve(surface.offset_jacobian, missing)[..., 0]
+        state = dataclasses.replace(state, offset=offset)
+    done.states[frame] = atlas.arrays(state)
+    return done
+
+
+def errors(problem, truth, done):
+    """Mean distances (T,) [m] to the true surfaces."""
+    found = [problem.surface(Unknowns.from_numpy(s)) for s in done.states]
+    return [np.linalg.norm(a - b, axis=1).mean() for a, b in zip(found, truth.vertices)]
+
+
+def test_a_sweep_finds_a_lost_frame(truth, tracked, tmp_path):
+    """It keeps the state of the frame before, and has no facts."""
+    problem, done = problem_of(truth.folder, sweeps=1), copy.deepcopy(tracked)
+    done.states[2], done.totals[2], done.lost = done.states[1], dict.fromkeys(TERMS), {2: "away"}
+    lost = errors(problem, truth, done)[2]
+    done.save(tmp_path / tracker.CHECKPOINT)
+    found = track(problem, solvers.create(problem.settings), 4, str(tmp_path), resume=True)
+    assert not found.lost and found.totals[2]["least_misfit"] > 0
+    assert errors(problem, truth, found)[2] < 0.5 * lost
+
+
+def test_a_sweep_cures_a_frame_by_its_later_neighbour_and_no_frame_costs_more(
+    truth, tracked, tmp_path, monkeypatch
+):
+    """Backward comes first, and alone lays a frame right that is on a wrong branch. An interrupted
+    sweep goes on where it was, with the same result.
+    """
+    problem, retry, gone_over, right = problem_of(truth.folder, sweeps=1), tracker._retry, [], []
+    wrong = mislaid(problem, tracked, 2)
+    usual, bad = (errors(problem, truth, done)[2] for done in (tracked, wrong))
+    assert bad > 3 * usual
+
+    def checked(problem, solver, done, k, neighbour, progress):
+        if len(gone_over) == stop_at:
+            raise KeyboardInterrupt
+        before = done.states[k]
+        retry(problem, solver, done, k, neighbour, progress)
+        anchor = solver._atlas.state(done.states[k - 1])
+        context = solver._context(k, anchor, done.totals[:k])
+        states = [solver._atlas.state(arrays) for arrays in (before, done.states[k])]
+        old, new = (solver._cost(state, context) for state in states)
+        assert new < old if done.states[k] is not before else new == old
+        gone_over.append((k, neighbour))
+        right.append(errors(problem, truth, done)[2] < 1.5 * usual)
+        facts = ("least_misfit", "light")
+        assert all(done.totals[k][name] == tracked.totals[k][name] for name in facts)
+
+    def sweep(folder):
+        solver, said = solvers.create(problem.settings), []
+        progress = lambda done, frame, *_: said.append((done, frame))
+        done = track(problem, solver, 4, str(folder), resume=True, progress=progress)
+        assert sorted(set(said)) == [(4 + j, gone_over[j][0]) for j in range(5)][-len(set(said)) :]
+        return done
+
+    monkeypatch.setattr(tracker, "_retry", checked)
+    for name in ("whole", "parts"):
+        (tmp_path / name).mkdir()
+        wrong.save(tmp_path / name / tracker.CHECKPOINT)
+    stop_at = None
+    whole = sweep(tmp_path / "whole")
+    assert gone_over == [(2, 3), (1, 2), (1, 0), (2, 1), (3, 2)] and all(right)
+    gone_over.clear()
+    stop_at = 3
+    with pytest.raises(KeyboardInterrupt):
+        sweep(tmp_path / "parts")
+    assert tracker.Track.load(tmp_path / "parts" / tracker.CHECKPOINT).swept == 3
+    stop_at = None
+    parts = sweep(tmp_path / "parts")
+    assert len(gone_over) == whole.swept == parts.swept == 5
+    for a, b in zip(whole.states, parts.states, strict=True):
+        assert all(np.array_equal(a[name], b[name]) for name in a)
