@@ -123,6 +123,7 @@ def set_variant(mode: str | None = None) -> str:
     mitsuba = sys.modules.get("mitsuba")
     current = mitsuba and mitsuba.variant()
     if current and (mode == current or mode is None) and current.endswith(_SUFFIX):
+        _ensure_two_threads()
         return current
     if mode is None:
         mode = DEFAULT
@@ -161,7 +162,16 @@ def set_variant(mode: str | None = None) -> str:
                 f"Dr.Jit already runs on LLVM {running[0]}: call polysft_mi.backend.set_variant"
                 f" before importing mitsuba or drjit, or set {VARIABLE}"
             )
+    _ensure_two_threads()
     return mode
+
+
+def _ensure_two_threads():
+    """With one, as on a machine of one core, Mitsuba would wait for ever for an EXR file."""
+    import drjit as dr
+
+    if dr.thread_count() < 2:
+        dr.set_thread_count(2)
 
 
 @functools.cache

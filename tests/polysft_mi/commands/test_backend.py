@@ -53,6 +53,7 @@ def python(code, **environment):
         capture_output=True,
         text=True,
         stdin=subprocess.DEVNULL,
+        timeout=100,
     )
 
 
@@ -306,3 +307,19 @@ def test_mode_on_the_command_line():
         == parser.parse_args(["--mode", "cuda_ad_rgb"]).mode
         == "cuda_ad_rgb"
     )
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="needs a way to take cores away")
+def test_an_exr_file_is_read_on_a_machine_of_one_core(tmp_path):
+    path = str(tmp_path / "image.exr")
+    code = f"""
+import os
+os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
+from polysft_mi.backend import set_variant
+set_variant()
+import mitsuba as mi
+mi.Bitmap(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, [8, 8]).write({path!r})
+print(mi.Bitmap({path!r}).size()[0])
+"""
+    done = python(code)
+    assert done.stdout.split() == ["8"], done.stderr
