@@ -166,7 +166,7 @@ def set_variant(mode: str | None = None) -> str:
     return mode
 
 
-def _ensure_two_threads():
+def _ensure_two_threads() -> None:
     """With one, as on a machine of one core, Mitsuba would wait for ever for an EXR file."""
     import drjit as dr
 
