@@ -144,8 +144,8 @@ def _edge_pair(layers: Layers, e: int, g: int, neighbourhood: float, reach: floa
     one, two = wp.min(e, g), wp.max(e, g)
     i, j = layers.edges[one, 0], layers.edges[one, 1]
     m, n = layers.edges[two, 0], layers.edges[two, 1]
-    apart = i != m and i != n and j != m and j != n
-    if not apart:
+    has_no_common_end = i != m and i != n and j != m and j != n
+    if not has_no_common_end:
         return
     x, r = layers.x, layers.rest
     along, other, between = x[j] - x[i], x[n] - x[m], x[i] - x[m]

@@ -45,7 +45,7 @@ class SelfContact:
         self._reaches = wp.zeros(len(rest), dtype=float, device="cpu")
         self._layered = wp.zeros(len(rest), dtype=int, device="cpu")
         self._found = [_room(len(rest)) for _ in range(_PARTS)]
-        self._sides = np.zeros(0, np.dtype((np.void, 20))), np.zeros((0, 3))  # keys and normals
+        self._before = np.zeros(0, np.dtype((np.void, 20))), np.zeros((0, 3))  # keys and normals
         self._others = ThreadPoolExecutor(_PARTS - 1)
 
     def find(self, x: np.ndarray, way: np.ndarray | float = 0.0) -> Contacts:
@@ -79,18 +79,19 @@ class SelfContact:
         )
 
     def _keep_sides(self, corners, weights, normal):
-        """Turns the normals of pairs that have passed through each other since the last time: those
-        of a vertex above a triangle, and of edges. Others have no sides.
+        """Turns each ``normal`` (P, 3) of pairs, with ``corners`` and ``weights`` (P, 4), that have
+        passed through each other since the last time: those of a vertex above a triangle, and of
+        edges. Others have no sides.
         """
         edges = weights[:, 1] > 0
         sided = np.flatnonzero(edges | (weights[:, 1:].max(1) < 0))
         rows = np.column_stack([edges, corners])[sided].astype(np.int32)
         keys = rows.view(np.dtype((np.void, 20))).ravel()
-        before, normals = self._sides
+        before, normals = self._before
         _, now, then = np.intersect1d(keys, before, return_indices=True)
         passed = np.einsum("ci,ci->c", normal[sided[now]], normals[then]) < 0
         normal[sided[now[passed]]] *= -1
-        self._sides = keys, normal[sided]
+        self._before = keys, normal[sided]
 
     def _search(self, kernel, count):
         """Launches a ``kernel`` for ``count`` vertices or edges, in parts, each in a thread."""
