@@ -136,17 +136,55 @@ def first_look(
         known[v] = wp.int32(wp.length_sq(p) > 0.0) * wp.where(d < 0.0, 2, 1)
 
 
+@wp.func
+def weighted(
+    values: wp.array(dtype=wp.vec3),
+    corners: wp.array2d(dtype=int),
+    weights: wp.array2d(dtype=float),
+    p: int,
+):
+    """sum_i weights[p, i] values[corners[p, i]]."""
+    total = wp.vec3(0.0, 0.0, 0.0)
+    for k in range(corners.shape[1]):
+        total += weights[p, k] * values[corners[p, k]]
+    return total
+
+
+@wp.kernel
+def points_looked_at(
+    body: Surface,
+    first: int,  # point
+    near: float,
+    clearance: float,
+    reach: float,
+    x: wp.array(dtype=wp.vec3),
+    corners: wp.array2d(dtype=int),  # points of large faces: sum_i weights[p, i] x[corners[p, i]]
+    weights: wp.array2d(dtype=float),
+    wanted: wp.array(dtype=wp.vec3),  # by how much a point is to be pushed
+    gap: wp.array(dtype=float),  # its signed distance from the body, ``reach`` at most
+):
+    """The first look at some points of the faces."""
+    p = first + wp.tid()
+    push, d = pushed(body, weighted(x, corners, weights, p), reach, near, clearance)
+    wanted[p] = push
+    gap[p] = d
+
+
 @wp.kernel
 def pushed_out(
     body: Surface,
     start: wp.array(dtype=int),  # the neighbours of vertex v are other[start[v]:start[v + 1]]
     other: wp.array(dtype=int),
-    corners: wp.array2d(dtype=int),  # points of large faces: sum_i weights[p, i] x[corners[p, i]]
+    corners: wp.array2d(dtype=int),  # of points, as points_looked_at has them
     weights: wp.array2d(dtype=float),
+    wanted: wp.array(dtype=wp.vec3),  # as points_looked_at says
+    gap: wp.array(dtype=float),  # likewise; later at most the distance from the body
     rounds: int,
     smoothing: int,
     clearance: float,
     deepest: float,
+    near: float,  # a point that is nearer is pushed
+    face_clearance: float,  # to so far from the body
     face_reach: float,
     x: wp.array(dtype=wp.vec3),
     push: wp.array(dtype=wp.vec3),  # as first_look says
@@ -192,14 +230,13 @@ def pushed_out(
                         queue[last] = n
                         last += 1
         for s in range(corners.shape[0]):
-            point = wp.vec3(0.0, 0.0, 0.0)
-            moved = wp.int32(turn == 0)
-            for k in range(corners.shape[1]):
-                point += weights[s, k] * x[corners[s, k]]
-                moved = moved + known[corners[s, k]]
-            if moved == 0:
-                continue
-            p, d = pushed(body, point, face_reach, 0.0, 0.5 * clearance)
+            p = wanted[s]
+            if turn > 0:
+                if gap[s] > near:
+                    continue
+                point = weighted(x, corners, weights, s)
+                p, d = pushed(body, point, face_reach, near, face_clearance)
+                gap[s] = d
             if wp.length_sq(p) > 0.0:
                 some = 1
                 for k in range(corners.shape[1]):
@@ -231,3 +268,5 @@ def pushed_out(
                     push[queue[i]] = smooth[queue[i]]
         for i in range(last):
             x[queue[i]] = x[queue[i]] + push[queue[i]]
+        for s in range(corners.shape[0]):  # what is moved comes nearer by no more than its way
+            gap[s] = gap[s] - wp.length(weighted(push, corners, weights, s))

@@ -24,8 +24,10 @@ _PUSHES = 5  # rounds
 _THINNEST = 0.02  # [m] of limbs: cloth no farther from the drape has not passed through one
 SMOOTHING = 6  # times, of the pushes of the first round
 DEEPEST = 0.08  # [m]; vertices deeper in the body than this stay there
-SPACING = 0.025  # [m] of the points of faces that are looked at beside the vertices
-_FACE_DEEPEST = 0.03  # [m], for these
+SPACING = 0.02  # [m] of the points of faces that are looked at beside the vertices
+# [m]: what of these is nearer to the body than the first is pushed to the second, for skin bulges
+# between them; and how deep they are looked for
+_FACE_NEAR, _FACE_CLEARANCE, _FACE_DEEPEST = 0.0015, 0.002, 0.03
 
 
 def pull(vertices, body, held):
@@ -63,9 +65,10 @@ class PostProcessing:
         corners, weights = _distinct(*samples(rest, faces, SPACING))
         self._points = self._array(corners, int, 2), self._array(weights, float, 2)
         self._pull = self._array(np.asarray(pull), float)
-        empty = lambda kind: self._wp.empty(self._count, dtype=kind, device="cpu")
-        self._work = [empty(self._wp.vec3) for _ in range(2)]
-        self._known, self._queue = (empty(self._wp.int32) for _ in range(2))
+        empty = lambda count, kind: self._wp.empty(count, dtype=kind, device="cpu")
+        self._found = [empty(len(corners), kind) for kind in (self._wp.vec3, float)]
+        self._work = [empty(self._count, self._wp.vec3) for _ in range(2)]
+        self._known, self._queue = (empty(self._count, self._wp.int32) for _ in range(2))
 
     def _array(self, values, kind, dimensions=1):
         return self._wp.array(values, dtype=kind, ndim=dimensions, device="cpu")
@@ -123,20 +126,25 @@ class PostProcessing:
         for. Points of the faces, SPACING from each other, push the face's corners.
         """
         push, smooth = self._work
+        body, counts = surface.of_kernels, (self._count, len(self._points[0]))
+        points = *self._points, *self._found
+        of_points = _FACE_NEAR, _FACE_CLEARANCE, _FACE_DEEPEST
 
-        def look(first, last):
+        def look(half):
+            (first, last), (start, end) = ([n * k // 2 for k in (half, half + 1)] for n in counts)
             settings = first, _THINNEST, CLEARANCE, reach, goal, x, push, self._known
+            self._launch(self._kernels.first_look, body, *settings, count=last - first)
+            settings = start, *of_points, x
             self._launch(
-                self._kernels.first_look, surface.of_kernels, *settings, count=last - first
+                self._kernels.points_looked_at, body, *settings, *points, count=end - start
             )
 
-        half = self._count // 2
-        other = self._pool.submit(look, 0, half)
-        look(half, self._count)
+        other = self._pool.submit(look, 0)
+        look(1)
         other.result()
-        settings = rounds, SMOOTHING, CLEARANCE, DEEPEST, _FACE_DEEPEST
-        arrays = *self._around, *self._points, *settings, x, push, self._known, smooth, self._queue
-        self._launch(self._kernels.pushed_out, surface.of_kernels, *arrays)
+        settings = rounds, SMOOTHING, CLEARANCE, DEEPEST, *of_points
+        arrays = *self._around, *points, *settings, x, push, self._known, smooth, self._queue
+        self._launch(self._kernels.pushed_out, body, *arrays)
 
     def _followed(self, bodies):
         """The surface of each frame; that of the next follows meanwhile."""
