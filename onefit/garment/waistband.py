@@ -9,6 +9,7 @@ wide skirts fall. Others pin the upper vertices of lower garments by hand (Berti
 import numpy as np
 
 from onefit.body import skeleton
+from polyfit import mesh
 
 from .remesh import loops, nearest_on_segments
 
@@ -27,8 +28,20 @@ def held(vertices, faces, joints):
     1, (N,); ``joints`` (J, 3) [m] of the body.
 
     A garment that reaches as high as the shoulder joints hangs from them, and nothing of it is
-    held. Of any other one it is what lies along the highest loop of its boundary.
+    held. Of any other one it is what lies along the highest loop of its boundary. Each part that is
+    not sewn to the others is a garment of its own: trousers below a shirt.
     """
+    out = np.zeros(len(vertices))
+    part = mesh.components(len(vertices), mesh.edges_of(faces)[0])
+    for k in np.unique(part[faces]):
+        own = part == k
+        number = np.cumsum(own) - 1
+        out[own] = _held(vertices[own], number[faces[own[faces[:, 0]]]], joints)
+    return out
+
+
+def _held(vertices, faces, joints):
+    """As :func:`held`, of one part."""
     out, rim = np.zeros(len(vertices)), highest_rim(vertices, faces)
     if rim is None or vertices[:, 2].max() > joints[_SHOULDERS, 2].mean():
         return out

@@ -189,6 +189,9 @@ def test_garments_are_held_at_the_waist_or_hang_from_the_shoulders(body):
         np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]]),
     )
     assert not held(*box, joints).any()  # no boundary at all
+    # in a file of both, the skirt is held, and the dress that it came from is not
+    both = held(np.concatenate([V, V[used]]), np.concatenate([F, skirt + len(V)]), joints)
+    assert not both[: len(V)].any() and np.array_equal(both[len(V) :], found)
 
 
 def test_a_band_gives_way_but_does_not_slide(body):
