@@ -26,7 +26,7 @@ class Settings:
     """
 
     substeps: int = 10
-    iterations: int = 12
+    iterations: int = 40
     lead: float = 0.6
     hold: float = 0.2
     gap: float = 0.004

@@ -6,8 +6,8 @@ garment on the same body, by a simulator that shares no code with OneFit.
     python benchmarks/onefit_reference.py CACHE --garments tshirt circle_skirt \\
         --motions dance box --picture side.jpg --video side.mp4
 
-Simulations are kept in CACHE; one that is cut short goes on where it was. 2 s take 5 minutes for
-the skirt and 8 for the dress, on one core. The rows of the table: *skinning* is plain skinning of
+Simulations are kept in CACHE; one that is cut short goes on where it was. 2 s take 9 minutes for
+the skirt and 14 for the dress, on one core. The rows of the table: *skinning* is plain skinning of
 the template; each network of ``--weights`` as it is, and with ``--finish`` STEPS also finished;
 *simulation* is Newton's vertex block descent (:mod:`cloth_simulation`).
 
