@@ -18,9 +18,12 @@ from polyfit import mesh
 from .clusters import NORMAL_WEIGHTS, connected, merged, relaxed
 from .unity import shares
 
-# A face is steep over its patch's plane beyond this cosine; a patch holds a surface of which no
-# larger share of the area is steep
+# A face is steep over its patch's plane beyond this cosine; patches hold a surface of which no larger
+# share of the area is steep, so that a collar or a hem that is folded in needs none of its own
 STEEP, STEEP_SHARE = 0.45, 0.1
+# The way between two points of a patch is longer along it than through the air by no more radii of a
+# disc of its area: both legs of trousers, or a sleeve and the side below it, are no patch.
+DETOUR = 2.0
 _OVERLAP = 0.4  # width of the overlap, in radii of a disc of the patch's area
 FINE = 128  # clusters that vertices are merged to before patches are sought
 
@@ -109,8 +112,12 @@ def _few(vertices, faces, vectors):
     local[inside] = np.arange(len(inside))
     edges, points = local[mesh.edges_of(faces)[0]], vertices[inside]
     normals, area = normals[inside], np.maximum(area[inside], 1e-9 * area[inside].mean())
-    own, faces = np.zeros(len(inside), dtype=np.int64), local[faces]
-    if (_steep(own, faces, vectors) <= STEEP_SHARE).all():
+    faces = local[faces]
+
+    def held(own):
+        return _steep(own, faces, vectors) <= STEEP_SHARE
+
+    if held(np.zeros(len(inside), dtype=np.int64)):
         return label
 
     def clusters(start, count, weight):
@@ -125,10 +132,35 @@ def _few(vertices, faces, vectors):
     for wanted in range(2, FINE):
         for weight in NORMAL_WEIGHTS:
             own = clusters(fine, wanted, weight)
-            if (_steep(own, faces, vectors) <= STEEP_SHARE).all():
-                label[inside] = own
+            if held(own):
+                label[inside] = _compact(own, points, edges, area)
                 return label
     label[inside] = fine
+    return label
+
+
+def _compact(label, points, edges, area):
+    """The clusters ``label`` (N,) of points (N, 3), those with a detour above DETOUR cut in two
+    halfway along it, until there are none.
+    """
+    label, length = label.copy(), np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
+    k = 0
+    while k <= label.max():
+        own = np.flatnonzero(label == k)
+        inner = (label[edges] == k).all(1)
+        graph = sp.coo_matrix((length[inner], edges[inner].T), 2 * (len(points),)).tocsr()
+        x, along = points[own], lambda start: dijkstra(graph, directed=False, indices=start)[own]
+        end = np.linalg.norm(x - x.mean(0), axis=1).argmax()
+        far = along(own[end])
+        for _ in range(3):  # from one end of a detour to the other
+            start, near = end, far
+            end = (near - np.linalg.norm(x - x[start], axis=1)).argmax()
+            far = along(own[end])
+        detour = near[end] - np.linalg.norm(x[end] - x[start])
+        if detour > DETOUR * np.sqrt(area[own].sum() / np.pi):
+            label[own[far < near]] = label.max() + 1
+        else:
+            k += 1
     return label
 
 
@@ -142,12 +174,7 @@ def _normals(label, faces, vectors):
 
 
 def _steep(label, faces, vectors):
-    """Share (K,) of each cluster's area that is steep over its plane."""
+    """Share of the area that is steep over the planes of the clusters."""
     normal, area = _normals(label, faces, vectors), np.linalg.norm(vectors, axis=1)
-    corner = label[faces]
-    steep = np.einsum("fk,fck->fc", vectors, normal[corner]) < STEEP * area[:, None]
-    total, part = (
-        np.bincount(corner.ravel(), (w * area[:, None]).ravel())
-        for w in (np.ones(corner.shape), steep)
-    )
-    return part / np.maximum(total, 1e-300)
+    steep = np.einsum("fk,fck->fc", vectors, normal[label[faces]]) < STEEP * area[:, None]
+    return steep.mean(1) @ area / max(area.sum(), 1e-300)

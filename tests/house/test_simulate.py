@@ -147,3 +147,26 @@ def test_a_folder_that_exists_is_refused(tmp_path):
     (tmp_path / "flag").mkdir()
     with pytest.raises(InputError, match="exists already; another OUT is needed"):
         simulate.main([str(tmp_path), "--only", "flag"])
+
+
+def test_a_drape_fills_the_image_and_has_its_front_on_the_left_of_the_texture(
+    tmp_path, monkeypatch
+):
+    drapes = load("benchmarks/drape_sequence.py")
+    monkeypatch.setattr(drapes, "FRAMES", 3)
+    monkeypatch.setattr(drapes, "VERTICES", 300)
+    with pytest.raises(InputError, match="shorts: GARMENT:MOTION is needed"):
+        drapes.main([str(tmp_path), "--drapes", "shorts"])
+    drapes.main([str(tmp_path), "--drapes", "shorts:squat"])
+    truth = np.load(tmp_path / "shorts_squat" / "gt.npz")
+    x, seen = truth["vertices"].astype(float), truth["seen"]
+    pixel = pictures.FOCAL * x[..., :2] / x[..., 2:] + np.array(pictures.SIZE) / 2
+    assert (pixel > 0).all() and (pixel < pictures.SIZE).all()
+    assert np.ptp(pixel, axis=(0, 1))[1] > 0.6 * pictures.SIZE[1] and 0.2 < seen.mean() < 0.6
+    settings = {"data": str(tmp_path / "shorts_squat")}
+    template = scene.load(str(ROOT / "scenes" / "tube.xml"), settings).template
+    assert len(template) >= 2  # patches
+    centre = template.vertices[template.faces].mean(1)
+    front = centre[:, 2] < np.median(centre[:, 2]) - 0.05
+    u = template.texcoords.corners[..., 0]
+    assert front.sum() > 50 and u[front].max() <= 0.5
