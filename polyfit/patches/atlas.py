@@ -18,11 +18,11 @@ from polyfit import mesh
 from .clusters import NORMAL_WEIGHTS, connected, merged, relaxed
 from .unity import shares
 
-# A face is steep over its patch's plane beyond this cosine; patches hold a surface of which no larger
-# share of the area is steep, so that a collar or a hem that is folded in needs none of its own
+# A face is steep over its patch's plane beyond this cosine; of the surface no larger share is, so
+# that a collar or a hem that is folded in needs no patch of its own
 STEEP, STEEP_SHARE = 0.45, 0.1
-# The way between two points of a patch is longer along it than through the air by no more radii of a
-# disc of its area: both legs of trousers, or a sleeve and the side below it, are no patch.
+# The way along a patch is longer than the way through the air by no more radii of a disc of its
+# area: both legs of trousers, or a sleeve and the side below it, are no patch
 DETOUR = 2.0
 _OVERLAP = 0.4  # width of the overlap, in radii of a disc of the patch's area
 FINE = 128  # clusters that vertices are merged to before patches are sought
