@@ -23,7 +23,7 @@ from .unity import shares
 STEEP, STEEP_SHARE = 0.45, 0.1
 # The way along a patch is longer than the way through the air by no more radii of a disc of its
 # area: both legs of trousers, or a sleeve and the side below it, are no patch
-DETOUR = 2.0
+_DETOUR = 2.0
 _OVERLAP = 0.4  # width of the overlap, in radii of a disc of the patch's area
 FINE = 128  # clusters that vertices are merged to before patches are sought
 
@@ -140,7 +140,7 @@ def _few(vertices, faces, vectors):
 
 
 def _compact(label, points, edges, area):
-    """The clusters ``label`` (N,) of points (N, 3), those with a detour above DETOUR cut in two
+    """The clusters ``label`` (N,) of points (N, 3), those with a detour above _DETOUR cut in two
     halfway along it, until there are none.
     """
     label, length = label.copy(), np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
@@ -157,7 +157,7 @@ def _compact(label, points, edges, area):
             end = (near - np.linalg.norm(x - x[start], axis=1)).argmax()
             far = along(own[end])
         detour = near[end] - np.linalg.norm(x[end] - x[start])
-        if detour > DETOUR * np.sqrt(area[own].sum() / np.pi):
+        if detour > _DETOUR * np.sqrt(area[own].sum() / np.pi):
             label[own[far < near]] = label.max() + 1
         else:
             k += 1
