@@ -30,7 +30,7 @@ def render(parts, *, size=(640, 480), spp=16, azimuth=25.0, elevation=8.0, follo
     """Images (H, W, 3) uint8 sRGB, one a frame, of moving meshes on a floor.
 
     ``parts``: of each mesh its vertices (T, N, 3) [m, z up], its faces (F, 3) and its colour,
-    linear RGB; a mesh of fewer than :data:`FINE` faces is drawn as Loop's smooth surface.
+    linear RGB; a mesh of fewer than :data:`FINE` faces is drawn as a smooth surface.
     ``size``: (height, width) [pixels]; ``spp``: samples a pixel, on a square grid; ``azimuth``
     [degrees] to the side of the -y axis that the camera stands on, ``elevation`` above the floor.
     The camera keeps all in the picture; with ``follow`` it goes along with what moves. ``near``:
@@ -217,14 +217,31 @@ class Stage:
 
 
 def _smooth(vertices, faces, colour):
-    """The part with each face cut in four by Loop's rules, if it has fewer than FINE faces."""
-    vertices, faces = np.asarray(vertices, np.float32), np.asarray(faces)
+    """The part with each face cut in four, as :func:`_through` says, if it has fewer than FINE
+    faces.
+    """
+    vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
     if len(faces) >= FINE:
-        return vertices, faces, colour
+        return vertices.astype(np.float32), faces, colour
+    finer = [_through(v, faces) for v in vertices]
+    return np.array([v for v, _ in finer], np.float32), np.asarray(finer[0][1]), colour
+
+
+def _through(vertices, faces, near=0.0005, rounds=8):
+    """Loop's smooth surface as ``near`` [m] to vertices (N, 3) [m] as ``rounds`` make it: vertices,
+    faces (4F, 3). His own passes inside them, in a coarse sleeve by millimetres, and the arm would
+    show.
+    """
     from trimesh.remesh import subdivide_loop
 
-    finer = [subdivide_loop(v.astype(np.float64), faces) for v in vertices]
-    return np.array([v for v, _ in finer], np.float32), np.asarray(finer[0][1]), colour
+    corners = vertices
+    for _ in range(rounds):
+        finer, cut = subdivide_loop(corners, faces)
+        missing = vertices - finer[: len(vertices)]
+        if np.abs(missing).max() < near:
+            break
+        corners = corners + missing
+    return finer, cut
 
 
 def _normals(V, F):

@@ -80,3 +80,11 @@ def test_the_camera_keeps_what_moves_in_the_picture():
         assert len(where) and where.min() > 0 and (where.max(0) < [59, 79]).all()
     assert abs(fixed[1][:, 1].mean() - fixed[0][:, 1].mean()) > 20
     assert np.abs(followed[1].mean(0) - followed[0].mean(0)).max() < 1
+
+
+def test_a_coarse_mesh_is_drawn_through_its_vertices():
+    V, F = ball(radius=0.05, height=0, n=6)
+    (finer,), faces, _ = stage._smooth(V[None], F, COLOUR)
+    assert len(faces) == 4 * len(F) and np.abs(finer[: len(V)] - V).max() < 0.0005
+    radius = np.linalg.norm(finer, axis=1)
+    assert 0.0485 < radius.min() and radius.max() < 0.0515  # the middles of edges are at 0.046
