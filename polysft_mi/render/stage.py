@@ -11,6 +11,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from polyfit import mesh
+
 MARGIN = 1.12  # of the picture around what moves
 _FOV = 28.0  # degrees, of the picture's height
 FLOOR = np.array([0.36, 0.37, 0.39])  # linear RGB
@@ -227,21 +229,21 @@ def _smooth(vertices, faces, colour):
     return np.array([v for v, _ in finer], np.float32), np.asarray(finer[0][1]), colour
 
 
-def _through(vertices, faces, near=0.0005, rounds=8):
-    """Loop's smooth surface as ``near`` [m] to vertices (N, 3) [m] as ``rounds`` make it: vertices,
-    faces (4F, 3). His own passes inside them, in a coarse sleeve by millimetres, and the arm would
-    show.
+def _through(vertices, faces, rounds=3):
+    """Loop's smooth surface of vertices (N, 3), moved out to where they are: vertices, faces
+    (4F, 3). His own passes inside a coarse sleeve by millimetres, and the arm would show. Means
+    over neighbours move it, so that small folds stay as smooth as he makes them.
     """
     from trimesh.remesh import subdivide_loop
 
+    a, b = mesh.edges_of(faces)[0].T
+    around = lambda x: np.bincount(a, x[b], len(x)) + np.bincount(b, x[a], len(x))
+    count = np.maximum(around(np.ones(len(vertices))), 1)
     corners = vertices
     for _ in range(rounds):
-        finer, cut = subdivide_loop(corners, faces)
-        missing = vertices - finer[: len(vertices)]
-        if np.abs(missing).max() < near:
-            break
-        corners = corners + missing
-    return finer, cut
+        missing = vertices - subdivide_loop(corners, faces)[0][: len(vertices)]
+        corners = corners + np.stack([around(x) / count for x in missing.T], 1)
+    return subdivide_loop(corners, faces)
 
 
 def _normals(V, F):
