@@ -229,7 +229,7 @@ def _smooth(vertices, faces, colour):
     return np.array([v for v, _ in finer], np.float32), np.asarray(finer[0][1]), colour
 
 
-def _through(vertices, faces, rounds=3):
+def _through(vertices, faces):
     """Loop's smooth surface of vertices (N, 3), moved out to where they are: vertices, faces
     (4F, 3). His own passes inside a coarse sleeve by millimetres, and the arm would show. Means
     over neighbours move it, so that small folds stay as smooth as he makes them.
@@ -239,11 +239,9 @@ def _through(vertices, faces, rounds=3):
     a, b = mesh.edges_of(faces)[0].T
     around = lambda x: np.bincount(a, x[b], len(x)) + np.bincount(b, x[a], len(x))
     count = np.maximum(around(np.ones(len(vertices))), 1)
-    corners = vertices
-    for _ in range(rounds):
-        missing = vertices - subdivide_loop(corners, faces)[0][: len(vertices)]
-        corners = corners + np.stack([around(x) / count for x in missing.T], 1)
-    return subdivide_loop(corners, faces)
+    missing = vertices - subdivide_loop(vertices, faces)[0][: len(vertices)]
+    moved = vertices + np.stack([around(x) / count for x in missing.T], 1)
+    return subdivide_loop(moved, faces)
 
 
 def _normals(V, F):
