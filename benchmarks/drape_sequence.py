@@ -26,13 +26,13 @@ from polyfit.mesh import TexCoords, face_vectors
 from polysft_mi.backend import set_variant
 from polysft_mi.errors import InputError, cli
 
-FRAMES, VERTICES = 45, 1200
-FILLED = 0.8  # of the image
+FRAMES, VERTICES = 45, 1200  # of a sequence; a finer garment is remeshed to so many
+FILLED = 0.8  # share of the image that the garment fills, over all frames
 DRAPES = ["trousers:walk", "long_sleeve_top:arms_up", "tshirt:twist"]
 
 
 def texcoords(vertices, faces):
-    """Front and back side by side, of vertices (N, 3) in the camera's frame."""
+    """A :class:`TexCoords`, front and back side by side, of vertices (N, 3) [m, camera frame]."""
     low, size = vertices[:, :2].min(0), np.ptp(vertices[:, :2], axis=0)
     u, v = ((vertices[:, :2] - low) / size).T
     back = face_vectors(vertices, faces)[:, 2] > 0

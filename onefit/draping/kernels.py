@@ -141,12 +141,12 @@ def weighted(
     values: wp.array(dtype=wp.vec3),
     corners: wp.array2d(dtype=int),
     weights: wp.array2d(dtype=float),
-    p: int,
+    s: int,
 ):
-    """sum_i weights[p, i] values[corners[p, i]]."""
+    """sum_i weights[s, i] values[corners[s, i]]."""
     total = wp.vec3(0.0, 0.0, 0.0)
     for k in range(corners.shape[1]):
-        total += weights[p, k] * values[corners[p, k]]
+        total += weights[s, k] * values[corners[s, k]]
     return total
 
 
@@ -154,20 +154,20 @@ def weighted(
 def points_looked_at(
     body: Surface,
     first: int,  # point
-    near: float,
-    clearance: float,
+    near: float,  # a point that is nearer to the body is to be pushed
+    clearance: float,  # to so far from it
     reach: float,
     x: wp.array(dtype=wp.vec3),
-    corners: wp.array2d(dtype=int),  # points of large faces: sum_i weights[p, i] x[corners[p, i]]
+    corners: wp.array2d(dtype=int),  # points of large faces: sum_i weights[s, i] x[corners[s, i]]
     weights: wp.array2d(dtype=float),
     wanted: wp.array(dtype=wp.vec3),  # by how much a point is to be pushed
     gap: wp.array(dtype=float),  # its signed distance from the body, ``reach`` at most
 ):
     """The first look at some points of the faces."""
-    p = first + wp.tid()
-    push, d = pushed(body, weighted(x, corners, weights, p), reach, near, clearance)
-    wanted[p] = push
-    gap[p] = d
+    s = first + wp.tid()
+    p, d = pushed(body, weighted(x, corners, weights, s), reach, near, clearance)
+    wanted[s] = p
+    gap[s] = d
 
 
 @wp.kernel

@@ -66,6 +66,7 @@ class PostProcessing:
         self._points = self._array(corners, int, 2), self._array(weights, float, 2)
         self._pull = self._array(np.asarray(pull), float)
         empty = lambda count, kind: self._wp.empty(count, dtype=kind, device="cpu")
+        # of the points: the wanted push [m], and how near to the body each is at least [m]
         self._found = [empty(len(corners), kind) for kind in (self._wp.vec3, float)]
         self._work = [empty(self._count, self._wp.vec3) for _ in range(2)]
         self._known, self._queue = (empty(self._count, self._wp.int32) for _ in range(2))
@@ -123,7 +124,8 @@ class PostProcessing:
         is lost and none made. What that leaves inside is pushed again, unsmoothed, in at most
         ``rounds`` rounds. That a vertex is not within ``reach`` [m] of the body is quickly told;
         only beside those found inside, and among those that were pushed, deeper ones are looked
-        for. Points of the faces, SPACING from each other, push the face's corners.
+        for. Points of the faces, SPACING from each other, push the face's corners
+        where they come nearer to the body than _FACE_NEAR.
         """
         push, smooth = self._work
         body, counts = surface.of_kernels, (self._count, len(self._points[0]))

@@ -140,8 +140,9 @@ def _few(vertices, faces, vectors):
 
 
 def _compact(label, points, edges, area):
-    """The clusters ``label`` (N,) of points (N, 3), those with a detour above _DETOUR cut in two
-    halfway along it, until there are none.
+    """The clusters ``label`` (N,) of points (N, 3) [m] with ``edges`` (E, 2) and an ``area`` (N,)
+    [m^2] each; those with a detour above _DETOUR are cut in two halfway along it, until there are
+    none.
     """
     label, length = label.copy(), np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
     k = 0
@@ -149,13 +150,14 @@ def _compact(label, points, edges, area):
         own = np.flatnonzero(label == k)
         inner = (label[edges] == k).all(1)
         graph = sp.coo_matrix((length[inner], edges[inner].T), 2 * (len(points),)).tocsr()
-        x, along = points[own], lambda start: dijkstra(graph, directed=False, indices=start)[own]
+        along = lambda i: dijkstra(graph, directed=False, indices=own[i])[own]
+        x = points[own]
         end = np.linalg.norm(x - x.mean(0), axis=1).argmax()
-        far = along(own[end])
+        far = along(end)
         for _ in range(3):  # from one end of a detour to the other
             start, near = end, far
             end = (near - np.linalg.norm(x - x[start], axis=1)).argmax()
-            far = along(own[end])
+            far = along(end)
         detour = near[end] - np.linalg.norm(x[end] - x[start])
         if detour > _DETOUR * np.sqrt(area[own].sum() / np.pi):
             label[own[far < near]] = label.max() + 1
@@ -174,7 +176,7 @@ def _normals(label, faces, vectors):
 
 
 def _steep(label, faces, vectors):
-    """Share of the area that is steep over the planes of the clusters."""
+    """Share of the area that is steep over the planes of the clusters ``label`` (N,)."""
     normal, area = _normals(label, faces, vectors), np.linalg.norm(vectors, axis=1)
     steep = np.einsum("fk,fck->fc", vectors, normal[label[faces]]) < STEEP * area[:, None]
     return steep.mean(1) @ area / max(area.sum(), 1e-300)
