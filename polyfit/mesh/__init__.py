@@ -8,7 +8,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
         "meshio": ["read_mesh", "read_textured", "write_ply"],
-        "subdivision": ["child", "refined", "subdivided"],
+        "subdivision": ["child", "refined", "subdivided", "subdivided_loop"],
         "texcoords": ["TexCoords"],
         "triangles": [
             "areas",

@@ -3,8 +3,11 @@
 ``F`` (F, 3) int are faces; barycentric coordinates are in the order of a face's corners.
 """
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.sparse import coo_array
 
 from .triangles import edges_of
 
@@ -20,6 +23,34 @@ def subdivided(F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     (a, b, c), (ab, bc, ca) = F.T, (side + int(F.max()) + 1).T
     children = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (bc, ca, ab)]
     return np.stack([np.stack(child, axis=1) for child in children], axis=1).reshape(-1, 3), edges
+
+
+def subdivided_loop(F: np.ndarray, count: int) -> tuple[np.ndarray, Any]:
+    """The faces of :func:`subdivided`, and the matrix (``count`` + E, ``count``), sparse, that
+    gives their vertices on Loop's smooth surface of ``count`` vertices (Loop, 1987). An edge of one
+    face, or of more than two, is a boundary: a curve of its own.
+    """
+    finer, edges = subdivided(F)
+    side = edges_of(F)[1]
+    inside = np.bincount(side.ravel(), minlength=len(edges)) == 2
+    (a, b), middle = edges.T, count + np.arange(len(edges))
+    across, opposite = side.ravel(), np.roll(F, 1, axis=1).ravel()  # corner k + 2 of side k
+    across, opposite = across[inside[across]], opposite[inside[across]]
+    rim = np.zeros(count, bool)
+    rim[edges[~inside]] = True
+    start, end = np.concatenate([a, b]), np.concatenate([b, a])
+    kept = np.tile(~inside, 2) | ~rim[start]  # a boundary's vertex has neighbours along it alone
+    start, end = start[kept], end[kept]
+    k = np.maximum(np.bincount(start, minlength=count), 1)
+    inner = 0.625 - (0.375 + 0.25 * np.cos(2 * np.pi / k)) ** 2
+    moved = np.where(rim, 0.25, inner)  # share of the neighbours
+    ends = np.where(inside, 0.375, 0.5)
+    row = [middle, middle, count + across, np.arange(count), start]
+    column = [a, b, opposite, np.arange(count), end]
+    value = [ends, ends, np.full(len(across), 0.125), 1 - moved, (moved / k)[start]]
+    shape = (count + len(edges), count)
+    at = (np.concatenate(row), np.concatenate(column))
+    return finer, coo_array((np.concatenate(value), at), shape).tocsr()
 
 
 def child(face: ArrayLike, barycentric: ArrayLike, levels: int) -> tuple[np.ndarray, np.ndarray]:

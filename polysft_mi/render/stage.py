@@ -1,8 +1,8 @@
 """A stage: moving meshes, a floor and soft light. How drapes of OneFit become pictures and videos.
 
-The light is found at the vertices, by Mitsuba's rays in directions that are the same for all, and
-runs smoothly between them; only what the camera sees is asked for each sample of a pixel. So a
-picture has no grain, and costs a fraction of a traced path's.
+The light is found at the corners of the faces that the camera sees, by Mitsuba's rays in directions
+that are the same for all, and runs smoothly between. So a picture has no grain, and costs a
+fraction of a traced path's.
 
 Import only after a Mitsuba variant is set.
 """
@@ -10,6 +10,7 @@ Import only after a Mitsuba variant is set.
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy import sparse
 
 from polyfit import mesh
 
@@ -58,8 +59,8 @@ def render(parts, *, size=(640, 480), spp=16, azimuth=25.0, elevation=8.0, follo
     stage = Stage(everything[0], faces, colours, floor, a, part)
     for t, vertices in enumerate(everything):
         target = (low[t] + high[t]) / 2 if follow else middle
-        stage.light(vertices, target)
-        yield stage.seen(target + away, target, size, spp)
+        stage.move(vertices)
+        yield stage.picture(target + away, target, size, spp)
 
 
 class Stage:
@@ -88,31 +89,38 @@ class Stage:
         towards = np.array([cos * x - sin * y, sin * x + cos * y, z])
         self.sun = _cap(towards, _KEY_RADIUS, _KEY_RAYS)
 
-    def light(self, vertices, target):
-        """The vertices are at (N, 3) [m] from now on, and light falls on them, and on the floor
-        around ``target``.
-        """
+    def move(self, vertices):
+        """The vertices are at (N, 3) [m] from now on."""
         self.params[self.key] = mi.Float(vertices.astype(np.float32).ravel())
         self.params.update()
-        self.normals = _normals(vertices, self.faces)
-        front, back, key = self._uncovered(vertices, *self._irradiance(vertices, self.normals))
-        self.front, self.back = (mi.Color3f(x.T.astype(np.float32)) for x in (front, back))
-        self.shadow, self.normal = mi.Float(key), mi.Vector3f(self.normals.T.astype(np.float32))
+        self.vertices, self.normals = vertices, _normals(vertices, self.faces)
+        self.normal = mi.Vector3f(self.normals.T.astype(np.float32))
+
+    def light(self, target, asked=None):
+        """Light falls on the vertices, on those ``asked`` (N,) alone if given, and on the floor
+        around ``target``.
+        """
+        asked = np.ones(len(self.vertices), bool) if asked is None else asked
+        light = self._uncovered(asked)
+        light = light.T.astype(np.float32)
+        self.front, self.back = mi.Color3f(light[:3]), mi.Color3f(light[3:6])
+        self.shadow = mi.Float(light[6])
         self.centre = np.asarray(target, np.float64)[:2]
         x = np.linspace(-_REACH, _REACH, GRID)
         y, x = np.meshgrid(self.centre[1] + x, self.centre[0] + x, indexing="ij")
         ground = np.stack([x, y, np.full_like(x, self.floor - _LIFT)], -1).reshape(-1, 3)
         up = np.tile([0.0, 0.0, 1.0], (len(ground), 1))
-        front, _, key = self._irradiance(ground, up)
-        lit = FLOOR * (front + KEY * (key * self.sun.mean(1)[2])[:, None])
+        light = self._irradiance(ground, up)
+        lit = FLOOR * (light[:, :3] + KEY * (light[:, 6:] * self.sun.mean(1)[2]))
         self.ground = mi.Texture2f(mi.TensorXf(lit.reshape(GRID, GRID, 3).astype(np.float32)))
         self.open = FLOOR * (SKY + KEY * self.sun.mean(1)[2])
 
-    def _uncovered(self, vertices, *light):
-        """The ``light`` of each vertex; of those that another part covers, skin below cloth, what
-        uncovered neighbours have: so no darkness leaks out at the rim of a sleeve.
+    def _uncovered(self, asked):
+        """Front, back and key light (N, 7) of the vertices ``asked`` (N,); those that another part
+        covers, skin below cloth, have what their uncovered neighbours have: so no darkness leaks
+        out at the rim of a sleeve.
         """
-        p, normal = (mi.Point3f(x.T.astype(np.float32)) for x in (vertices, self.normals))
+        p, normal = (mi.Point3f(x.T.astype(np.float32)) for x in (self.vertices, self.normals))
         ray = mi.Ray3f(p + _LIFT * normal, mi.Vector3f(normal))
         hit = self.scene.ray_intersect_preliminary(ray)
         other = dr.gather(mi.UInt32, self.part_of_face, hit.prim_index, hit.is_valid())
@@ -120,19 +128,24 @@ class Stage:
         seen = ~np.array(covered)
         start, end = self.faces.ravel(), np.roll(self.faces, -1, axis=1).ravel()
         start, end = np.concatenate([start, end]), np.concatenate([end, start])
-        light = np.column_stack(light)
-        for _ in range(2):
+        asked, rings = asked.copy(), 2
+        for _ in range(rings):
+            asked[end[asked[start] & ~seen[start]]] = True
+        light = np.zeros((len(asked), 7))
+        light[asked] = self._irradiance(self.vertices[asked], self.normals[asked])
+        for _ in range(rings):
             give = seen[end] & ~seen[start]
             count = np.bincount(start[give], minlength=len(seen))
             for k in range(light.shape[1]):
                 total = np.bincount(start[give], light[end[give], k], len(seen))
                 light[:, k] = np.where(count > 0, total / np.maximum(count, 1), light[:, k])
             seen = seen | (count > 0)
-        return light[:, :3], light[:, 3:6], light[:, 6]
+        return light
 
     def _irradiance(self, points, normals):
-        """At points (n, 3) with normals (n, 3): the sky's irradiance over pi on the front and on
-        the back, (n, 3) each, and the share of the key light that is not hidden, (n,).
+        """At points (n, 3) with normals (n, 3), in the columns of (n, 7): the sky's irradiance over
+        pi on the front and on the back, three each, and the share of the key light that is not
+        hidden.
         """
         n = len(points)
         p = mi.Point3f(points.T.astype(np.float32))
@@ -161,9 +174,9 @@ class Stage:
         hidden = self.scene.ray_test(mi.Ray3f(at + side * _LIFT * normal, d))
         key = dr.zeros(mi.Float, n)
         dr.scatter_reduce(dr.ReduceOp.Add, key, dr.select(hidden, 0.0, 1.0 / rays), point)
-        return found[0], found[1], np.array(key)
+        return np.column_stack([found[0], found[1], np.array(key)])
 
-    def seen(self, origin, target, size, spp):
+    def picture(self, origin, target, size, spp):
         """Image (H, W, 3) uint8 sRGB from ``origin`` [m] towards ``target``."""
         height, width = size
         side = max(1, round(np.sqrt(spp)))
@@ -181,6 +194,11 @@ class Stage:
         d = dr.normalize(ahead + u * right + v * up)
         o = mi.Point3f(*map(float, origin))
         hit = self.scene.ray_intersect_preliminary(mi.Ray3f(o, d), coherent=True)
+        looked_at = dr.zeros(mi.Bool, len(self.faces))
+        dr.scatter(looked_at, mi.Bool(True), hit.prim_index, hit.is_valid())
+        asked = np.zeros(len(self.vertices), bool)
+        asked[self.faces[np.array(looked_at)]] = True
+        self.light(target, asked)
         colour = dr.select(hit.is_valid(), self._cloth(hit, d), self._behind(o, d))
         samples = np.array(dr.clip(colour, 0, 1)).T.reshape(height, side, width, side, 3)
         linear = samples.mean(axis=(1, 3))
@@ -225,23 +243,23 @@ def _smooth(vertices, faces, colour):
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
     if len(faces) >= FINE:
         return vertices.astype(np.float32), faces, colour
-    finer = [_through(v, faces) for v in vertices]
-    return np.array([v for v, _ in finer], np.float32), np.asarray(finer[0][1]), colour
+    finer, loop = mesh.subdivided_loop(faces, vertices.shape[1])
+    through = _through(faces, loop)
+    return np.array([through @ v for v in vertices], np.float32), finer, colour
 
 
-def _through(vertices, faces):
-    """Loop's smooth surface of vertices (N, 3), moved out to where they are: vertices, faces
-    (4F, 3). His own passes inside a coarse sleeve by millimetres, and the arm would show. Means
-    over neighbours move it, so that small folds stay as smooth as he makes them.
+def _through(faces, loop):
+    """The ``loop`` matrix (N', N) of Loop's smooth surface, moved out to the vertices. His own
+    passes inside a coarse sleeve by millimetres, and the arm would show. Means over neighbours move
+    it, so that small folds stay as smooth as he makes them.
     """
-    from trimesh.remesh import subdivide_loop
-
+    n = loop.shape[1]
     a, b = mesh.edges_of(faces)[0].T
-    around = lambda x: np.bincount(a, x[b], len(x)) + np.bincount(b, x[a], len(x))
-    count = np.maximum(around(np.ones(len(vertices))), 1)
-    missing = vertices - subdivide_loop(vertices, faces)[0][: len(vertices)]
-    moved = vertices + np.stack([around(x) / count for x in missing.T], 1)
-    return subdivide_loop(moved, faces)
+    around = sparse.coo_array((np.ones(len(a)), (a, b)), (n, n))
+    around = (around + around.T).tocsr()
+    around /= np.maximum(around.sum(1), 1)[:, None]
+    one = sparse.eye_array(n)
+    return loop @ (one + around @ (one - loop[:n]))
 
 
 def _normals(V, F):

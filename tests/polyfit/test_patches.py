@@ -233,3 +233,16 @@ def test_bad_meshes_and_counts_are_named():
         with pytest.raises(InputError) as error:
             Patches.cut(*args, where="shirt.obj")
         assert str(error.value).startswith("shirt.obj: ") and message in str(error.value)
+
+
+@pytest.mark.parametrize("shape", ["tube", "sphere"])
+def test_loops_smooth_surface_is_that_of_trimesh(shape):
+    V, F = getattr(surfaces, shape)()[:2]
+    V = V + 0.01 * np.random.default_rng(3).normal(size=V.shape)
+    faces, matrix = mesh.subdivided_loop(F, len(V))
+    expected, _ = trimesh.remesh.subdivide_loop(V, F)
+    fine = matrix @ V
+    assert len(fine) == len(expected) and fine[: len(V)] == pytest.approx(expected[: len(V)])
+    at = lambda x: x[np.lexsort(np.round(x, 9).T)]  # the middles of edges in any order
+    assert at(fine) == pytest.approx(at(expected))
+    assert matrix.sum(1) == pytest.approx(1) and faces.max() == len(fine) - 1

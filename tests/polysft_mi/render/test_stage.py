@@ -43,7 +43,8 @@ def test_the_open_top_of_a_ball_has_the_sky_and_the_key_light(picture):
     """An upward face sees all of the sky and, nearly, all of the key light."""
     V, F = ball()
     lit = stage.Stage(V.astype(np.float32), F, np.tile(COLOUR, (len(V), 1)), 0.0)
-    lit.light(V.astype(np.float32), np.array([0, 0, 0.7]))
+    lit.move(V.astype(np.float32))
+    lit.light(np.array([0, 0, 0.7]))
     front = np.array(lit.front)
     assert front[:, 0] == pytest.approx(stage.SKY, rel=0.02)  # the highest vertex
     assert front[:, -1].max() < 0.5 * stage.SKY.max()  # the lowest sees the floor alone
