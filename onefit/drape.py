@@ -9,7 +9,8 @@ OUT receives
     drape.npz               vertices (T, N, 3) [m, z up], faces, rest, the body's vertices and
                             faces, fps
     figures.json            what was measured
-    garment.usd, body.usd   animations that Blender and usdview open
+    garment.usd, body.usd   animations that Blender and usdview open; of a mesh file its own
+                            vertices, faces and texture coordinates
     frames/NNN.png          rendered by Mitsuba; drape.mp4 is their video
     meshes/NNN.obj          one mesh a frame, with --meshes obj (or ply)
 """

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 
 from onefit.body import AnnyBody, ClosestSurface, skinning
@@ -28,6 +29,7 @@ from .post import PostProcessing, pull
 
 if TYPE_CHECKING:
     from onefit.body import Body, BodyModel
+    from onefit.garment import RenderMesh
     from onefit.objective import Measures
 
 FPS = 30.0  # that the networks know
@@ -40,7 +42,8 @@ POINTS = 400_000  # vertices times frames, at most, likewise
 class Drape:
     """A draped garment: ``vertices`` (T, N, 3) [m] in the world, ``faces`` (F, 3), ``rest`` (N, 3)
     [m], the garment graded to the shape; the ``body``'s vertices (T, V, 3) [m], its ``body_faces``
-    and the root's place ``root`` (T, 3) [m]; ``fps`` frames a second.
+    and the root's place ``root`` (T, 3) [m]; ``fps`` frames a second. ``render_mesh``: the mesh of
+    the garment's file (:class:`onefit.garment.RenderMesh`); None for a template.
     """
 
     vertices: torch.Tensor
@@ -50,6 +53,14 @@ class Drape:
     body_faces: torch.Tensor
     root: torch.Tensor
     fps: float
+    render_mesh: RenderMesh | None = None
+
+    def render_vertices(self) -> np.ndarray:
+        """Vertices of the garment's file in each frame, (T, M, 3) [m]; of a template its own."""
+        cloth, faces = self.vertices.numpy(), self.faces.numpy()
+        if self.render_mesh is None:
+            return cloth
+        return np.stack([self.render_mesh.carried(x, faces) for x in cloth]).astype(np.float32)
 
     def measures(self) -> Measures:
         """The :class:`onefit.objective.measures.Measures` of this drape."""
@@ -204,7 +215,8 @@ class Draper:
                 cut=garment.cut.numpy() if cut else None,
             )  # fmt: skip
             vertices = torch.stack([(frame, advance())[0] for frame in made])
-        return Drape(vertices, faces, rest, bodies, body_faces, root, FPS)
+        mesh_of_file = garment.render_mesh
+        return Drape(vertices, faces, rest, bodies, body_faces, root, FPS, mesh_of_file)
 
     def _skinned(self, garment, rest, body, motion):
         """A garment at ``rest`` (N, 3) [m] by plain skinning, (T, N, 3) [m], and the body's

@@ -109,9 +109,13 @@ def _render(drape, folder, size, spp, advance):
     from polysft_mi.pictures import write_video
     from polysft_mi.render import stage
 
+    seen = drape.render_vertices()
+    kept, faces = np.arange(seen.shape[1]), drape.faces.numpy()
+    if drape.render_mesh is not None:
+        kept, faces = drape.render_mesh.welded(seen[0])
     parts = [
         (drape.body.numpy(), drape.body_faces.numpy(), BODY_COLOUR),
-        (drape.vertices.numpy(), drape.faces.numpy(), GARMENT_COLOUR),
+        (seen[:, kept], faces, GARMENT_COLOUR),
     ]
     frames = folder / "frames"
     frames.mkdir()
@@ -134,13 +138,18 @@ def write(drape, folder, *, skip=(), meshes=None, size=(480, 360), spp=16, advan
         name: getattr(drape, name).numpy()
         for name in ("vertices", "faces", "rest", "body", "body_faces", "root")
     }
+    seen, faces, texcoords = arrays["vertices"], arrays["faces"], None
+    if drape.render_mesh is not None:
+        seen = drape.render_vertices()
+        faces, texcoords = drape.render_mesh.faces, drape.render_mesh.texcoords
     with aside(folder / "drape.npz") as temporary:
         np.savez_compressed(temporary, fps=drape.fps, **arrays)
     if "usd" not in skip:
         write_usd(
             folder / "garment.usd",
-            arrays["vertices"],
-            arrays["faces"],
+            seen,
+            faces,
+            texcoords,
             fps=drape.fps,
             up="z",
             name="garment",
@@ -154,6 +163,6 @@ def write(drape, folder, *, skip=(), meshes=None, size=(480, 360), spp=16, advan
             name="body",
         )
     if meshes:
-        write_frames(folder / "meshes", meshes, arrays["vertices"], arrays["faces"], up="z")
+        write_frames(folder / "meshes", meshes, seen, faces, texcoords, up="z")
     if "render" not in skip:
         _render(drape, folder, size, spp, advance)

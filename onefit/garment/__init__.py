@@ -11,5 +11,6 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "charts": ["Deformation", "PatchedGarment", "SparseMatrix"],
         "garment": ["FOLDER", "Garment", "LOOSE", "TEMPLATES"],
         "remesh": ["neighbour_mean"],
+        "render_mesh": ["RenderMesh"],
     },
 )

@@ -15,11 +15,12 @@ import torch
 from onefit.body import Body, ClosestSurface
 from polyfit import mesh
 from polyfit.errors import InputError
-from polyfit.mesh import read_mesh
+from polyfit.mesh import TexCoords, read_textured
 
 from . import fitting, remesh
 from .binding import Binding, standard_body, standard_surface, vertex_normals
 from .mending import check, mended, parts
+from .render_mesh import RenderMesh
 
 TEMPLATES = (
     "tshirt",
@@ -44,6 +45,8 @@ class Garment:
     outwards; ``blend_weights`` (N, 24), rows that sum to one; ``repairs``, sentences on what was
     changed when it was read. ``cut`` (N, 3) float32 [m]: the cloth as it was cut, before it fell
     and hung in folds, whose lengths are its lengths at rest; None: the garment is its own cut.
+    ``render_mesh``: the mesh of the file that the garment was read from, which it carries; None for
+    a template.
     """
 
     name: str
@@ -52,6 +55,7 @@ class Garment:
     blend_weights: torch.Tensor
     repairs: tuple = ()
     cut: torch.Tensor | None = None
+    render_mesh: RenderMesh | None = field(default=None, repr=False, compare=False)
     _binding: Any = field(default=None, repr=False, compare=False)
 
     @classmethod
@@ -102,11 +106,12 @@ class Garment:
         dresses) leaves the legs' pose out. Raises InputError, in one line, for a mesh that is no
         garment or does not lie on the body.
         """
-        V, F, _ = read_mesh(path, "garment")
+        V, F, texcoords = read_textured(path, "garment")
         return cls.of_mesh(
             name or Path(path).stem,
             fitting.placed(V, scale, up, turn, offset),
             F,
+            texcoords,
             made_for=made_for,
             loose=loose,
             where=str(path),
@@ -118,13 +123,14 @@ class Garment:
         name: str,
         vertices: np.ndarray,
         faces: np.ndarray,
+        texcoords: TexCoords | None = None,
         *,
         made_for: Body | str | None = None,
         loose: bool = False,
         where: str = "garment",
     ) -> Garment:
-        """The garment of any triangle mesh (N, 3) [m], (F, 3) in OneFit's axes; otherwise as
-        :meth:`read`.
+        """The garment of any triangle mesh (N, 3) [m], (F, 3) in OneFit's axes, with its texture
+        coordinates or None; otherwise as :meth:`read`.
         """
         made_for = (
             fitting.t_posed()
@@ -138,13 +144,14 @@ class Garment:
         surface = standard_surface() if made_for is None else fitting.surface_of(made_for)
         check(vertices, faces, where)
         fitting.check_place(vertices[np.unique(faces)], surface, where, tell_pose=made_for is None)
-        V, F, told = mended(vertices, faces, where)
+        V, F, told = mended(vertices, faces, where, surface)
+        render_mesh = RenderMesh.bound(vertices, faces, texcoords, V, F)
         if made_for is not None:
             F, turned = _outward(V, F, surface)
             V, told = fitting.to_standard(V, F, made_for.to("cpu"), loose), told + turned
         F, turned = _outward(V, F, standard_surface())
         V, pushed = fitting.pushed_out(V, F, where)
-        return cls.bound(name, V, F, told + turned + pushed)
+        return cls.bound(name, V, F, told + turned + pushed, render_mesh=render_mesh)
 
     @classmethod
     def bound(
@@ -154,9 +161,10 @@ class Garment:
         faces: np.ndarray,
         repairs: tuple = (),
         cut: np.ndarray | None = None,
+        render_mesh: RenderMesh | None = None,
     ) -> Garment:
         """The garment of a clean mesh (N, 3) [m], (F, 3) around the standard body, with blend
-        weights from there; ``cut`` (N, 3) [m] as in the class.
+        weights from there; ``cut`` (N, 3) [m] and ``render_mesh`` as in the class.
         """
         V, F = np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64)
         binding = Binding(V, F)
@@ -170,6 +178,7 @@ class Garment:
             weights,
             tuple(repairs),
             None if cut is None else torch.as_tensor(cut, dtype=torch.float32),
+            render_mesh,
             binding,
         )
 
@@ -231,7 +240,10 @@ class Garment:
                 at = ClosestSurface(W, G)(cut)
                 V = np.einsum("nk,nkd->nd", at.barycentric, V[G[at.face]])
         V, pushed = fitting.pushed_out(V, F, self.name)
-        return Garment.bound(self.name, V, F, self.repairs + pushed, cut)
+        render_mesh = self.render_mesh and self.render_mesh.rebound(
+            self.vertices.cpu().numpy(), self.faces.cpu().numpy(), V, F
+        )
+        return Garment.bound(self.name, V, F, self.repairs + pushed, cut, render_mesh)
 
 
 def _outward(V, F, surface):

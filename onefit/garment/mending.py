@@ -3,16 +3,19 @@ alike, with openings. NumPy.
 
 The rules, in this order; whatever is changed is told in a sentence:
 
+What is dropped here goes on in the garment's :class:`onefit.garment.RenderMesh`.
+
 1. Faces whose corners coincide, faces that repeat others, and vertices in no face are dropped.
 2. Where edges of the boundary lie on one another (a seam of the texture, a soup of triangles),
    their vertices are merged.
 3. At an edge of three or more faces the two that continue each other straightest stay joined; parts
    that touch in a point come apart.
-4. Of separate parts, those below 5 % of the area (buttons, labels, pockets) are dropped; the others
-   stay, each for itself. Refused if less than 80 % of the area would be left.
-5. A part without an opening is refused: a solid, or cloth with a thickness. So is one with a single
-   side (a Moebius strip).
-6. Faces wound against the others of their part are turned.
+4. Of separate parts, those below 5 % of the area (buttons, labels, pockets) are no cloth; the
+   others stay, each for itself. Refused if less than 80 % of the area would be left.
+5. Faces wound against the others of their part are turned. A part with a single side is refused (a
+   Moebius strip).
+6. Of a part without an opening the outer side is taken, where it is cloth with a thickness
+   (:mod:`onefit.garment.thickness`); a solid is refused.
 7. Holes of less than 10 cm around are filled.
 """
 
@@ -22,6 +25,7 @@ from polyfit import mesh
 from polyfit.errors import InputError
 
 from .remesh import loops
+from .thickness import outer_side
 
 _COINCIDENT = 2e-5  # vertices closer than this lie on one another [m]
 _SMALL_PART_SHARE, _LEAST_SHARE = (
@@ -31,9 +35,10 @@ _SMALL_PART_SHARE, _LEAST_SHARE = (
 _SMALL_HOLE_LENGTH = 0.10  # around [m]
 
 
-def mended(V, F, where="garment"):
-    """``(vertices (N', 3), faces (F', 3), sentences)`` of a mesh in metres. Raises InputError, in
-    one line that starts with ``where``.
+def mended(V, F, where="garment", body=None):
+    """``(vertices (N', 3), faces (F', 3), sentences)`` of a mesh in metres around a ``body``, its
+    :class:`onefit.body.ClosestSurface`; without one, cloth with a thickness is refused. Raises
+    InputError, in one line that starts with ``where``.
     """
     V, F = np.asarray(V, dtype=np.float64), np.asarray(F, dtype=np.int64)
     check(V, F, where)
@@ -44,6 +49,9 @@ def mended(V, F, where="garment"):
     V, F = _cut_apart(V, F, told)
     V, F = _large_parts(V, F, where, told)
     F = _wound_alike(V, F, where, told)
+    V, F = _outer_sides(V, F, body, where, told)
+    if (count := parts(F).max() + 1) > 1:
+        told.append(f"has {count} separate parts, which move each for itself")
     V, F = _filled(V, F, told)
     return V, F, tuple(told)
 
@@ -185,19 +193,10 @@ def _large_parts(V, F, where, told):
     if not keep.all():
         few = "a part" if (~keep).sum() == 1 else f"{(~keep).sum()} parts"
         told.append(
-            f"dropped {few} of {(~keep[part]).sum()} faces, {100 * share[~keep].sum():.2g} % of the"
-            " area"
+            f"{few} of {(~keep[part]).sum()} faces, {100 * share[~keep].sum():.2g} % of the area,"
+            " go along with the cloth"
         )
-    if keep.sum() > 1:
-        told.append(f"has {keep.sum()} separate parts, which move each for itself")
-    V, F = _used(V, F[keep[part]])
-    edges, uses = _uses(F)
-    part = parts(F)
-    open_parts = np.unique(part[np.isin(F, edges[uses == 1]).any(axis=1)])
-    if len(open_parts) < part.max() + 1:
-        found = "a closed surface without openings (a solid, or cloth with a thickness)"
-        raise InputError(f"{where}: {found}; a single layer of cloth is needed")
-    return V, F
+    return _used(V, F[keep[part]])
 
 
 def _wound_alike(V, F, where, told):
@@ -212,6 +211,31 @@ def _wound_alike(V, F, where, told):
     if turned.any():
         told.append(f"turned {turned.sum()} faces that were wound against their neighbours")
     return F
+
+
+def _outer_sides(V, F, body, where, told):
+    edges, uses = _uses(F)
+    part = parts(F)
+    closed = np.setdiff1d(part, part[np.isin(F, edges[uses == 1]).any(axis=1)])
+    keep, thickness = np.ones(len(F), dtype=bool), []
+    for k in closed:
+        faces = np.flatnonzero(part == k)
+        found = None if body is None else outer_side(*_used(V, F[faces]), body)
+        if found is None:
+            raise InputError(
+                f"{where}: a closed surface without openings, not cloth with a thickness below"
+                " 2 cm; cloth is needed"
+            )
+        keep[faces] = found[0]
+        thickness.append(found[1])
+    if not thickness:
+        return V, F
+    told.append(
+        f"took the outer side of cloth that is {1000 * max(thickness):.1f} mm thick, without"
+        f" {(~keep).sum()} faces of the inner side"
+    )
+    V, F = _used(V, F[keep])
+    return _large_parts(V, F, where, [])
 
 
 def _filled(V, F, told):

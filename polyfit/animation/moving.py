@@ -74,7 +74,11 @@ def checked(vertices, faces, uv, fps):
             raise InputError(
                 f"animation: uv of {len(uv.faces)} faces; those of the {len(F)} are needed"
             )
-        uv = TexCoords(np.nan_to_num(np.asarray(uv.coordinates, np.float32)), uv.faces)
+        coordinates = np.nan_to_num(np.asarray(uv.coordinates, np.float32))
+        bare = uv.faces < 0  # corners without a coordinate take (0, 0)
+        if bare.any():
+            coordinates = np.concatenate([coordinates, np.zeros((1, 2), np.float32)])
+        uv = TexCoords(coordinates, np.where(bare, len(coordinates) - 1, uv.faces))
     return V, F, uv
 
 

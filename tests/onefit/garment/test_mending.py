@@ -28,6 +28,24 @@ def punched(V, F, at, faces=1):
     return V, np.delete(F, np.argsort(d, kind="stable")[:faces], axis=0)
 
 
+def thickened(V, F, thickness, rows=1):
+    """A closed surface: the mesh, the same ``thickness`` [m] below it, wound the other way, and
+    ``rows`` of faces along the rims.
+    """
+    below = -thickness * vertex_normals(V, F)
+    rim = np.concatenate([np.stack([x, np.roll(x, -1)], 1) for x in loops(F)])
+    vertices, faces, last = [V, V + below], [F, F[:, ::-1] + len(V)], rim + len(V)
+    for k in range(1, rows + 1):
+        count = sum(map(len, vertices))
+        row = rim if k == rows else np.searchsorted(np.unique(rim), rim) + count
+        if k < rows:
+            vertices.append((V + (1 - k / rows) * below)[np.unique(rim)])
+        faces.append(np.stack([row[:, 1], row[:, 0], last[:, 0]], 1))
+        faces.append(np.stack([row[:, 1], last[:, 0], last[:, 1]], 1))
+        last = row
+    return np.concatenate(vertices), np.concatenate(faces)
+
+
 def flipped(F, rows):
     G = F.copy()
     G[rows] = G[rows, ::-1]
@@ -104,15 +122,29 @@ class TestRepairs:
             np.concatenate([V, outer]),
             np.concatenate([F, extra]),
             "cut apart at 5 edges",
-            "dropped 5 parts of 5 faces",
+            "5 parts of 5 faces, .* go along with the cloth",
         )
         assert len(g) == len(V)
 
     def test_buttons_are_dropped(self, tank):
         button, G = sphere(0.006, 1)
         self.check(
-            *joined(tank, (button + [0, -0.16, 0.3], G)), f"dropped a part of {len(G)} faces"
+            *joined(tank, (button + [0, -0.16, 0.3], G)), f"a part of {len(G)} faces, .* go along"
         )
+
+    def test_cloth_with_a_thickness_is_its_outer_side(self, tank):
+        V, F = tank
+        W, G = thickened(V, F, 0.003)
+        told = f"outer side of cloth that is 3.0 mm thick, without {len(G) - len(F)} faces"
+        g = self.check(W, G, told)
+        assert np.allclose(g.vertices.numpy(), V, atol=1e-6) and np.array_equal(g.faces.numpy(), F)
+
+    def test_folds_and_a_bevelled_rim_of_thick_cloth(self):
+        g = Garment.template("circle_skirt")
+        V, F = g.vertices.double().numpy(), g.faces.numpy()
+        W, G = thickened(V, F, 0.004, rows=3)
+        thick = Garment.of_mesh("thick", W, G)
+        assert np.array_equal(thick.faces.numpy(), F), thick.repairs
 
     def test_separate_parts_stay(self, templates, tank):
         shorts = templates["shorts"]
@@ -171,15 +203,7 @@ class TestRefusals:
         )
         body = standard_body()
         self.refused(body.vertices.numpy(), body.faces.numpy(), "closed surface without openings")
-        rim = np.concatenate([np.stack([x, np.roll(x, -1)], 1) for x in loops(F)])
-        walls = [
-            np.stack([rim[:, 1], rim[:, 0], rim[:, 0] + len(V)], 1),
-            np.stack([rim[:, 1], rim[:, 0] + len(V), rim[:, 1] + len(V)], 1),
-        ]
-        thick = np.concatenate([F, F[:, ::-1] + len(V), *walls])
-        self.refused(
-            np.concatenate([V, V + 0.003 * vertex_normals(V, F)]), thick, "cloth with a thickness"
-        )
+        self.refused(*thickened(V, F, -0.05), "closed surface without openings")
 
     def test_moebius_strip(self):
         a = np.linspace(0, 2 * np.pi, 60, endpoint=False)
