@@ -7,7 +7,8 @@ What is dropped here goes on in the garment's :class:`onefit.garment.RenderMesh`
 
 1. Faces whose corners coincide, faces that repeat others, and vertices in no face are dropped.
 2. Where edges of the boundary lie on one another (a seam of the texture, a soup of triangles),
-   their vertices are merged.
+   their vertices are merged. Along seams of panels that were meshed each for itself, edges are cut
+   where vertices of the other panel lie on them (:mod:`onefit.garment.zip`).
 3. At an edge of three or more faces the two that continue each other straightest stay joined; parts
    that touch in a point come apart.
 4. Of separate parts, those below 5 % of the area (buttons, labels, pockets) are no cloth; the
@@ -26,6 +27,7 @@ from polyfit.errors import InputError
 
 from .remesh import loops
 from .thickness import outer_side
+from .zip import zipped
 
 _COINCIDENT = 2e-5  # vertices closer than this lie on one another [m]
 _SMALL_PART_SHARE, _LEAST_SHARE = (
@@ -44,6 +46,7 @@ def mended(V, F, where="garment", body=None):
     check(V, F, where)
     told = []
     V, F = _without_slivers(V, F, where, told)
+    V, F = zipped(V, F, told)
     V, F = _sewn(V, F, told)
     V, F = _without_slivers(V, F, where, told)
     V, F = _cut_apart(V, F, told)

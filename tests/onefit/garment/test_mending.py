@@ -13,7 +13,7 @@ from onefit.garment import Garment, fitting, standard_body, standard_surface
 from onefit.garment.binding import vertex_normals
 from onefit.garment.mending import mended
 from onefit.garment.remesh import loops
-from polyfit import write_ply
+from polyfit import mesh, write_ply
 from polyfit.errors import InputError
 
 
@@ -95,6 +95,31 @@ class TestRepairs:
         V, F = tank
         g = self.check(*soup(V, F), f"merged {F.size - len(V)} vertices")
         assert len(g) == len(V)
+
+    def test_panels_meshed_each_for_itself_are_sewn(self, tank):
+        V, F = tank
+        left = V[F].mean(axis=1)[:, 0] < 0
+        seam = np.intersect1d(F[left], F[~left])
+        right, rng, extra = F[~left] + len(V), np.random.default_rng(5), []
+        cut = set()
+        edges, side = mesh.edges_of(right)
+        once = np.bincount(side.ravel(), minlength=len(edges)) == 1
+        for f, k in np.argwhere(once[side] & np.isin(right - len(V), seam)):
+            a, b, c = np.roll(right[f], -k)
+            if (
+                f not in cut and b - len(V) in seam
+            ):  # an edge of the seam gets a vertex, a little off it
+                t, number = rng.uniform(0.35, 0.65), 2 * len(V) + len(extra)
+                extra.append(t * V[a - len(V)] + (1 - t) * V[b - len(V)] + rng.normal(0, 1e-4, 3))
+                right[f] = a, number, c
+                cut.add(f)
+                right = np.concatenate([right, [[number, b, c]]])
+        assert len(extra) > 50
+        W, G = np.concatenate([V, V, extra]), np.concatenate([F[left], right])
+        g = self.check(W, G, "no face", f"cut the boundary at {len(extra)} places", "merged")
+        assert len(g) == len(V) + len(extra)
+        area = mesh.areas(g.vertices.double().numpy(), g.faces.numpy()).sum()
+        assert area == pytest.approx(mesh.areas(V, F).sum(), rel=1e-3)
 
     def test_faces_wound_against_the_others_and_inwards(self, tank):
         V, F = tank
@@ -197,7 +222,7 @@ class TestRefusals:
         self.refused(np.zeros_like(V), F, "no area")
         loose, G = soup(V, F)
         self.refused(
-            loose + np.random.default_rng(0).normal(0, 3e-4, loose.shape),
+            0.7 * loose + 0.3 * np.repeat(V[F].mean(axis=1), 3, axis=0),
             G,
             f"falls apart into {len(F)} parts, 100 % of its area",
         )
