@@ -158,13 +158,13 @@ def pictures(drapes, skinned, frames, size, spp):
     from polysft_mi.backend import set_variant
 
     set_variant()
-    from onefit.draping.output import BODY_COLOUR, GARMENT_COLOUR
+    from onefit.draping.output import BODY_COLOUR, GARMENT_COLOURS
     from polysft_mi.render import stage
 
     body = (skinned.body[frames].numpy(), skinned.body_faces.numpy(), BODY_COLOUR)
     rows = [
         stage.render(
-            [body, (x[frames].numpy(), skinned.faces.numpy(), GARMENT_COLOUR)],
+            [body, (x[frames].numpy(), skinned.faces.numpy(), GARMENT_COLOURS[0])],
             size=size, spp=spp, follow=True,
         )
         for x in drapes.values()

@@ -23,7 +23,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "draping.draper": ["Drape", "Draper", "load"],
         "garment.charts.patched": ["PatchedGarment"],
         "garment.garment": ["LOOSE", "TEMPLATES", "Garment"],
-        "garment.render_mesh": ["RenderMesh"],
+        "garment.reading.render_mesh": ["RenderMesh"],
         "motion.motion": ["Motion"],
         "network.network": ["OneFit"],
         "network.weights": ["pretrained"],

@@ -212,7 +212,7 @@ class Draper:
                 guide, rest, faces, self._held(garment), moving, body_faces,
                 material=material, steps=finish, fps=FPS, settings=settings, first=first,
                 sides=garment.sides(rest).double().numpy() if cut else None,
-                cut=garment.cut.numpy() if cut else None,
+                cut=garment.cut.numpy() if cut else None, stitches=garment.stitches,
             )  # fmt: skip
             vertices = torch.stack([(frame, advance())[0] for frame in made])
         mesh_of_file = garment.render_mesh
@@ -244,6 +244,10 @@ class Draper:
             self._surfaces = ClosestSurface(at, faces), ClosestSurface(at, faces)
         edges = mesh.edges_of(garment.faces.cpu().numpy())[0]
         lengths = garment.rest_lengths(torch.as_tensor(edges), rest.cpu())
+        if garment.stitches:
+            threads, long = garment.stitches.edges(rest.cpu().numpy())
+            edges = np.concatenate([edges, threads])
+            lengths = torch.cat([lengths, torch.as_tensor(long).to(lengths)])
         return PostProcessing(rest, garment.faces, edges, lengths, self._pulls[key], self._surfaces)
 
     def codes(self, garment: Garment) -> torch.Tensor:

@@ -13,7 +13,16 @@ import torch
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from onefit.physics import BodyContact, Cloth, Material, SelfContact, Settings, Sheet
+from onefit.garment import Stitches
+from onefit.physics import (
+    BodyContact,
+    Cloth,
+    Material,
+    SelfContact,
+    Settings,
+    Sheet,
+    ThreadContact,
+)
 
 
 def finished(
@@ -31,6 +40,7 @@ def finished(
     first: int = 0,
     sides: np.ndarray | None = None,
     cut: np.ndarray | None = None,
+    stitches: Stitches | None = None,
 ) -> Iterator[torch.Tensor]:
     """The garment's vertices (N, 3) [m] in one frame after the other, from the ``first`` on: those
     before lead to it, and are not given.
@@ -39,7 +49,8 @@ def finished(
     the garment graded to the body; ``held`` (N,): how firmly each vertex is held, as
     :func:`onefit.garment.waistband.held` says; ``bodies`` (T, V, 3) [m], ``body_faces``; ``steps``
     in a frame, in which the body moves along straight lines; ``sides`` (F, 3) [m]: the lengths of
-    the faces at rest, and ``cut`` (N, 3) [m], of a garment that was cut otherwise than it hangs.
+    the faces at rest, and ``cut`` (N, 3) [m], of a garment that was cut otherwise than it hangs;
+    ``stitches``: what else holds it together.
     """
     settings = settings or Settings()
     order = _order(faces.numpy(), len(rest))
@@ -49,7 +60,13 @@ def finished(
     start, moving = guide.double().numpy()[:, order], bodies.double().numpy()
     body = BodyContact(sheet, bodies[0], body_faces, settings)
     itself = SelfContact(sheet, settings, len(body))
-    cloth = Cloth(sheet, start[0], settings, len(body) + len(sheet))
+    keys, sewn = len(body) + len(sheet), []
+    if stitches:
+        ends = number[stitches.start], number[stitches.corners], stitches.barycentric
+        lengths = np.maximum(stitches.lengths, settings.apart)
+        sewn.append(ThreadContact(*ends, lengths, settings.contact * material.stretch, keys))
+        keys += len(stitches)
+    cloth = Cloth(sheet, start[0], settings, keys)
     pull = settings.draw * sheet.mass + material.stretch * np.asarray(held)[order]
     dt = 1 / fps / steps
     body.find(cloth.x)
@@ -57,6 +74,7 @@ def finished(
 
     def step(now, target):
         contacts = [body.follow(now), itself.find(cloth.x, dt * cloth.v)]
+        contacts += [threads.find(cloth.x) for threads in sewn]
         cloth.step(dt, contacts, target, pull)
         body.find(cloth.x)
         cloth.x = body.pushed_out(cloth.x)

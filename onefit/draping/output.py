@@ -9,13 +9,15 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from onefit.garment import parts
 from polyfit.animation import write_frames, write_usd
 from polyfit.errors import InputError
 from polyfit.files import aside, folder_aside
 
 from .draper import FPS
 
-GARMENT_COLOUR, BODY_COLOUR = (0.08, 0.19, 0.42), (0.5, 0.48, 0.46)  # linear RGB
+BODY_COLOUR = (0.5, 0.48, 0.46)  # linear RGB
+GARMENT_COLOURS = (0.08, 0.19, 0.42), (0.42, 0.12, 0.06), (0.10, 0.28, 0.13), (0.42, 0.30, 0.06)
 
 
 @dataclass(frozen=True)
@@ -99,6 +101,19 @@ def drape_into(folder, draper, garment, motion, shape, *, about, how=None, **fil
     return outcome
 
 
+def _coloured(drape):
+    """The garment as the stage takes it; of an outfit, each part in a colour of its own."""
+    seen, faces = drape.render_vertices(), drape.faces.numpy()
+    part = parts(faces)
+    if drape.render_mesh is not None:
+        part = part[drape.render_mesh.face]
+        kept, faces = drape.render_mesh.welded(seen[0])
+        seen, part = seen[:, kept], part[kept][faces[:, 0]]
+    for k in np.unique(part):
+        used, own = np.unique(faces[part == k], return_inverse=True)
+        yield seen[:, used], own.reshape(-1, 3), GARMENT_COLOURS[k % len(GARMENT_COLOURS)]
+
+
 def _render(drape, folder, size, spp, advance):
     """PNG frames and a video; Mitsuba is loaded here alone."""
     from polysft_mi.backend import set_variant
@@ -109,19 +124,12 @@ def _render(drape, folder, size, spp, advance):
     from polysft_mi.pictures import write_video
     from polysft_mi.render import stage
 
-    seen = drape.render_vertices()
-    kept, faces = np.arange(seen.shape[1]), drape.faces.numpy()
-    if drape.render_mesh is not None:
-        kept, faces = drape.render_mesh.welded(seen[0])
-    parts = [
-        (drape.body.numpy(), drape.body_faces.numpy(), BODY_COLOUR),
-        (seen[:, kept], faces, GARMENT_COLOUR),
-    ]
+    meshes = [(drape.body.numpy(), drape.body_faces.numpy(), BODY_COLOUR), *_coloured(drape)]
     frames = folder / "frames"
     frames.mkdir()
 
     def pictures():
-        for k, image in enumerate(stage.render(parts, size=size, spp=spp)):
+        for k, image in enumerate(stage.render(meshes, size=size, spp=spp)):
             cv2.imwrite(str(frames / f"{k:03d}.png"), image[..., ::-1])
             advance()
             yield image

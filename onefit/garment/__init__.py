@@ -10,7 +10,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "binding": ["standard_body", "standard_surface"],
         "charts": ["Deformation", "PatchedGarment", "SparseMatrix"],
         "garment": ["FOLDER", "Garment", "LOOSE", "TEMPLATES"],
+        "reading": ["RenderMesh", "Stitches", "parts"],
         "remesh": ["neighbour_mean"],
-        "render_mesh": ["RenderMesh"],
     },
 )

@@ -19,8 +19,7 @@ from polyfit.mesh import TexCoords, read_textured
 
 from . import fitting, remesh
 from .binding import Binding, standard_body, standard_surface, vertex_normals
-from .mending import check, mended, parts
-from .render_mesh import RenderMesh
+from .reading import RenderMesh, Stitches, check, mended, parts, stitched
 
 TEMPLATES = (
     "tshirt",
@@ -46,7 +45,7 @@ class Garment:
     changed when it was read. ``cut`` (N, 3) float32 [m]: the cloth as it was cut, before it fell
     and hung in folds, whose lengths are its lengths at rest; None: the garment is its own cut.
     ``render_mesh``: the mesh of the file that the garment was read from, which it carries; None for
-    a template.
+    a template. ``stitches``: what its buttons and buckles hold together.
     """
 
     name: str
@@ -56,6 +55,7 @@ class Garment:
     repairs: tuple = ()
     cut: torch.Tensor | None = None
     render_mesh: RenderMesh | None = field(default=None, repr=False, compare=False)
+    stitches: Stitches | None = field(default=None, repr=False, compare=False)
     _binding: Any = field(default=None, repr=False, compare=False)
 
     @classmethod
@@ -96,7 +96,7 @@ class Garment:
         offset: Any = (0.0, 0.0, 0.0),
     ) -> Garment:
         """The garment of an OBJ or PLY file of triangles or quads, repaired by the rules of
-        :mod:`onefit.garment.mending`.
+        :mod:`onefit.garment.reading.mending`.
 
         ``scale``, ``up``, ``turn`` [degrees], ``offset`` [m]: as in
         :func:`onefit.garment.fitting.placed`, from the file's units and axes to metres and
@@ -164,7 +164,8 @@ class Garment:
         render_mesh: RenderMesh | None = None,
     ) -> Garment:
         """The garment of a clean mesh (N, 3) [m], (F, 3) around the standard body, with blend
-        weights from there; ``cut`` (N, 3) [m] and ``render_mesh`` as in the class.
+        weights from there; ``cut`` (N, 3) [m] and ``render_mesh`` as in the class. Buttons and
+        buckles of the ``render_mesh`` become stitches.
         """
         V, F = np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64)
         binding = Binding(V, F)
@@ -179,6 +180,7 @@ class Garment:
             tuple(repairs),
             None if cut is None else torch.as_tensor(cut, dtype=torch.float32),
             render_mesh,
+            None if render_mesh is None else stitched(render_mesh, V, F),
             binding,
         )
 

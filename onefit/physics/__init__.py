@@ -8,7 +8,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
         "cloth": ["Cloth"],
-        "contact": ["BodyContact"],
+        "contact": ["BodyContact", "ThreadContact"],
         "layers": ["SelfContact"],
         "material": ["MATERIALS", "Material"],
         "settings": ["Settings"],

@@ -38,6 +38,29 @@ def weighted(x: np.ndarray, weights: np.ndarray) -> np.ndarray:
     return np.einsum("cki,ck->ci", x, weights)
 
 
+class ThreadContact:
+    """Threads between two places of a sheet, from the vertex ``start`` (S,) to the point
+    ``barycentric`` (S, 3) of a triangle with ``corners`` (S, 3): no longer than ``lengths`` (S,)
+    [m]. The keys start at ``first``, one a thread.
+    """
+
+    def __init__(self, start, corners, barycentric, lengths, stiffness: float, first: int) -> None:
+        self.corners = np.column_stack([start, corners])
+        self.weights = np.column_stack([np.ones(len(start)), -barycentric])
+        self.lengths, self.stiffness = lengths, stiffness
+        self.keys = first + np.arange(len(start))
+
+    def find(self, x: np.ndarray) -> Contacts:
+        """The contacts of vertices at (N, 3) [m]."""
+        thread = weighted(x[self.corners], self.weights)
+        long = np.linalg.norm(thread, axis=1, keepdims=True)
+        towards = -thread / np.maximum(long, 1e-9)
+        still = np.zeros((len(thread), 3))
+        return Contacts(
+            self.keys, self.corners, self.weights, towards, -self.lengths, still, self.stiffness
+        )
+
+
 class BodyContact:
     """Contacts of a sheet with a body that moves: ``vertices`` (V, 3) [m] at first, ``faces``.
 

@@ -6,7 +6,7 @@ import torch
 from scipy.spatial import ConvexHull
 
 from onefit.garment import LOOSE, Garment, standard_body, standard_surface
-from onefit.garment.mending import mended
+from onefit.garment.reading.mending import mended
 from onefit.garment.remesh import loops
 from onefit.garment.sewing import fall, loose
 from polyfit import mesh

@@ -11,7 +11,7 @@ from surfaces import joined, sphere, tube
 from onefit.body import skeleton, skinning
 from onefit.garment import Garment, fitting, standard_body, standard_surface
 from onefit.garment.binding import vertex_normals
-from onefit.garment.mending import mended
+from onefit.garment.reading.mending import mended
 from onefit.garment.remesh import loops
 from polyfit import mesh, write_ply
 from polyfit.errors import InputError

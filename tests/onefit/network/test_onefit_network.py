@@ -175,10 +175,12 @@ def test_an_untrained_network_is_plain_skinning(model, walk):
 
 
 def test_draping_in_batches_is_draping_at_once(draper, walk, monkeypatch):
-    whole = draper.drape("tank", walk).vertices
+    whole, alone = (draper.drape("tank", walk, post=post).vertices for post in (True, False))
     assert whole.shape == (len(walk), len(Garment.template("tank")), 3)
     monkeypatch.setattr(onefit.draping.draper, "POINTS", 5 * whole.shape[1])
-    assert torch.allclose(draper.drape("tank", walk).vertices, whole, atol=1e-5)
+    assert torch.allclose(draper.drape("tank", walk, post=False).vertices, alone, atol=1e-5)
+    # a vertex on the verge of being pushed out may go either way by rounding
+    assert (draper.drape("tank", walk).vertices - whole).abs().mean() < 1e-5
     assert (whole - draper.drape("tank", walk, skinning_only=True).vertices).abs().max() > 1e-3
 
 

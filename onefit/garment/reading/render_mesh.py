@@ -13,9 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from onefit.body import ClosestSurface
+from onefit.garment.binding import vertex_normals
 from polyfit.mesh import TexCoords
-
-from .binding import vertex_normals
 
 
 @dataclass(frozen=True)
@@ -53,7 +52,7 @@ class RenderMesh:
         return self._hung(self.carried(cloth, cloth_faces), other, other_faces)
 
     def _hung(self, vertices, cloth, cloth_faces):
-        at = ClosestSurface(cloth, cloth_faces)(vertices)
+        at = ClosestSurface(cloth, cloth_faces)(vertices, 1e9)  # wherever loose ones lie
         barycentric = at.barycentric.astype(np.float64)
         on_cloth = replace(
             self, face=at.face, barycentric=barycentric, offset=np.zeros((len(vertices), 3))

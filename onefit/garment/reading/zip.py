@@ -47,7 +47,8 @@ def _lying_on(V, F, face, corner):
     edge = np.repeat(np.arange(len(a)), [len(x) for x in near])
     vertex = on[np.concatenate([np.asarray(x, dtype=np.int64) for x in near])]
     along = (V[b] - V[a])[edge]
-    t = np.einsum("nd,nd->n", V[vertex] - V[a][edge], along) / length[edge] ** 2
+    t = np.einsum("nd,nd->n", V[vertex] - V[a][edge], along)
+    t /= np.maximum(length[edge], 1e-12) ** 2
     off = np.linalg.norm(V[a][edge] + t[:, None] * along - V[vertex], axis=1)
     lies = (t > 0) & (t < 1) & (off < np.minimum(_REACH, _SHARE * length[edge]))
     lies &= (F[face[edge]] != vertex[:, None]).all(axis=1)

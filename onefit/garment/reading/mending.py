@@ -8,7 +8,7 @@ What is dropped here goes on in the garment's :class:`onefit.garment.RenderMesh`
 1. Faces whose corners coincide, faces that repeat others, and vertices in no face are dropped.
 2. Where edges of the boundary lie on one another (a seam of the texture, a soup of triangles),
    their vertices are merged. Along seams of panels that were meshed each for itself, edges are cut
-   where vertices of the other panel lie on them (:mod:`onefit.garment.zip`).
+   where vertices of the other panel lie on them (:mod:`onefit.garment.reading.zip`).
 3. At an edge of three or more faces the two that continue each other straightest stay joined; parts
    that touch in a point come apart.
 4. Of separate parts, those below 5 % of the area (buttons, labels, pockets) are no cloth; the
@@ -16,21 +16,21 @@ What is dropped here goes on in the garment's :class:`onefit.garment.RenderMesh`
 5. Faces wound against the others of their part are turned. A part with a single side is refused (a
    Moebius strip).
 6. Of a part without an opening the outer side is taken, where it is cloth with a thickness
-   (:mod:`onefit.garment.thickness`); a solid is refused.
+   (:mod:`onefit.garment.reading.thickness`); a solid is refused.
 7. Holes of less than 10 cm around are filled.
 """
 
 import numpy as np
 
+from onefit.garment.remesh import loops
 from polyfit import mesh
 from polyfit.errors import InputError
 
-from .remesh import loops
 from .thickness import outer_side
 from .zip import zipped
 
 _COINCIDENT = 2e-5  # vertices closer than this lie on one another [m]
-_SMALL_PART_SHARE, _LEAST_SHARE = (
+SMALL_PART_SHARE, _LEAST_SHARE = (
     0.05,
     0.80,
 )  # of the area: parts that are dropped, and what has to be left
@@ -186,7 +186,7 @@ def _cut_apart(V, F, told):
 def _large_parts(V, F, where, told):
     part, area = parts(F), mesh.areas(V, F)
     share = np.bincount(part, area) / area.sum()
-    keep = share >= _SMALL_PART_SHARE
+    keep = share >= SMALL_PART_SHARE
     if share[keep].sum() < _LEAST_SHARE:
         found = (
             f"falls apart into {len(share)} parts, {100 * share[~keep].sum():.0f} % of its area in"
