@@ -175,9 +175,9 @@ def reconstruct(
     from .surface.meshio import size_note
 
     experiment = experiments.load(scene, overrides)
-    note = size_note(experiment.template.vertices, scene)
-    if note:
-        print(note, file=sys.stderr)
+    for note in experiment.note, size_note(experiment.template.vertices, scene):
+        if note:
+            print(note, file=sys.stderr)
     s = experiment.settings
     sequence = experiment.sequence()
     problem = Problem(experiment, sequence)

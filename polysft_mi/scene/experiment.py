@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial import cKDTree
 
-from polyfit.mesh import TexCoords
+from polyfit.mesh import TexCoords, read_textured
 from polysft_mi.errors import InputError
 from polysft_mi.surface import Template, meshio
 
@@ -33,7 +33,8 @@ class Experiment:
     the settings.
 
     ``corner`` (V,) is the template vertex of each vertex that Mitsuba renders (its loaders split
-    vertices along texture seams); ``defaults`` maps each ``<default>`` to the value in force.
+    vertices along texture seams); ``defaults`` maps each ``<default>`` to the value in force;
+    ``note``: what was left out of the template's file, in a line.
     """
 
     path: str
@@ -47,6 +48,7 @@ class Experiment:
     masks: str
     settings: Settings
     defaults: dict = field(default_factory=dict)
+    note: str | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -99,7 +101,7 @@ def load(
         raise InputError(f'{path}: {len(meshes)} meshes; give the template\'s shape id="template"')
     experiment, mesh = scene.integrator(), meshes[0]
     settings = experiment.settings
-    template, corner = _template(mesh, source, settings, template)
+    template, corner, note = _template(mesh, source, settings, template)
     return Experiment(
         path,
         scene,
@@ -112,6 +114,7 @@ def load(
         experiment.masks,
         settings,
         defaults,
+        note,
     )
 
 
@@ -186,8 +189,8 @@ def _check_nodes(path, overrides):
 
 
 def _source(props):
-    """(file, vertices (N, 3), faces (F, 3), texture coordinates) of the template's shape in its
-    file's own order, None where it has no file.
+    """(file, vertices (N, 3), faces (F, 3), texture coordinates, which of the file's faces these
+    are, note) of the template's shape in its file's own order, None where it has no file.
 
     Read and checked before Mitsuba loads the scene, for its loaders tell less, and take files that
     are no meshes.
@@ -195,17 +198,24 @@ def _source(props):
     if props is None or "filename" not in props:
         return None
     where = props["filename"]
-    vertices, faces, texcoords = meshio.read_textured_template(where)
+    vertices, faces, texcoords = read_textured(where, what="template")
     if "to_world" in props:
         m = np.array(props["to_world"].matrix, dtype=np.float64).reshape(4, 4)
         vertices = vertices @ m[:3, :3].T + m[:3, 3]
+    return _clean(where, vertices, faces, texcoords)
+
+
+def _clean(where, vertices, faces, texcoords):
+    """:func:`_source` of arrays."""
+    vertices, faces, texcoords, kept, note = meshio.cleaned(vertices, faces, texcoords)
     meshio.check_template(vertices, faces, texcoords, where)
-    return where, vertices, faces, texcoords
+    return where, vertices, faces, texcoords, kept, note and f"note: {where}: {note}"
 
 
 def _template(mesh, source, settings, template):
     """The template that the mesh shows, in its file's own vertex order (fitted, where it is not
-    given), and the map from rendered vertices to it.
+    given), the map from rendered vertices to it, and a note. What is left out of the template
+    leaves the mesh too.
     """
     rendered = np.array(mesh.vertex_positions_buffer(), dtype=np.float64).reshape(-1, 3)
     shown = np.array(mesh.faces_buffer(), dtype=np.int64).reshape(-1, 3)
@@ -217,14 +227,20 @@ def _template(mesh, source, settings, template):
     if source is None:
         uv = np.array(mesh.vertex_texcoords_buffer(), dtype=np.float64).reshape(-1, 2)
         texcoords = TexCoords(uv * (1, -1) + (0, 1), shown)  # Mitsuba's v runs down, a file's up
-        source = f"template {mesh.id()!r}", rendered, shown, texcoords
-        meshio.check_template(rendered, shown, texcoords, source[0])
-    where, vertices, faces, texcoords = source
+        source = _clean(f"template {mesh.id()!r}", rendered, shown, texcoords)
+    where, vertices, faces, texcoords, kept, note = source
+    if len(shown) != len(kept):  # one of both readers has left out some already
+        kept = meshio.cleaned(rendered, shown, None)[3]
+    if not kept.all():
+        shown = shown[kept]
+        of_mesh = mi.traverse(mesh)
+        of_mesh["faces"] = mi.UInt32(shown.astype(np.uint32).ravel())
+        of_mesh.update()
     if not np.isfinite(rendered).all():
         raise InputError(f"{where}: positions are not finite (NaN)")
     corner = _corners(rendered, shown, vertices, faces, where)
     if template is not None:
-        return template, corner
+        return template, corner, note
     template = Template.fit(
         vertices,
         faces,
@@ -233,23 +249,23 @@ def _template(mesh, source, settings, template):
         exact=settings.order > 0,
         where=where,
     )
-    return template, corner
+    return template, corner, note
 
 
 def _corners(rendered, shown, vertices, faces, where):
     """The template's vertex at each vertex (V, 3) that Mitsuba renders: its loaders split vertices
     along seams, but keep the order of the faces.
     """
-    limit = 1e-4 * np.ptp(vertices, axis=0).max()
+    limit, used = 1e-4 * np.ptp(vertices, axis=0).max(), np.unique(shown)
     if shown.shape == faces.shape:
         corner = np.zeros(len(rendered), dtype=np.int64)
         corner[shown] = faces
-        if np.abs(vertices[corner] - rendered).max() <= limit:
+        if np.abs(vertices[corner] - rendered)[used].max() <= limit:
             return corner
     distance, corner = cKDTree(vertices).query(rendered)
-    if distance.max() > limit:
+    farthest = distance[used].max()
+    if farthest > limit:
         raise InputError(
-            f"{where}: its vertices are not those that Mitsuba loads (up to {distance.max():.3g} m"
-            " apart)"
+            f"{where}: its vertices are not those that Mitsuba loads (up to {farthest:.3g} m apart)"
         )
     return corner

@@ -6,11 +6,12 @@ Texture coordinates are those of OBJ files: (0, 0) is the texture's bottom left,
 
 import numpy as np
 
-from polyfit.mesh import TexCoords, read_mesh, read_textured, write_ply
+from polyfit.mesh import TexCoords, areas, read_mesh, read_textured, write_ply
 from polysft_mi.errors import InputError
 
 __all__ = [
     "check_template",
+    "cleaned",
     "read_template",
     "read_textured_template",
     "size_note",
@@ -25,8 +26,34 @@ def read_template(path):
 
 
 def read_textured_template(path):
-    """:func:`polyfit.mesh.read_textured` of a template."""
-    return read_textured(path, what="template")
+    """:func:`polyfit.mesh.read_textured` of a template, as :func:`cleaned` leaves it."""
+    vertices, faces, texcoords, _, _ = cleaned(*read_textured(path, what="template"))
+    return vertices, faces, texcoords
+
+
+def cleaned(vertices, faces, texcoords):
+    """``(vertices, faces, texcoords, kept (F,), note)`` without faces that have no area and
+    vertices in no face: which faces were kept, and what was left out, in words, or None. The others
+    keep their order. ``texcoords``: :class:`polyfit.mesh.TexCoords` or None.
+    """
+    kept = np.ones(len(faces), dtype=bool)
+    if len(faces) == 0 or faces.min() < 0 or faces.max() >= len(vertices):
+        return vertices, faces, texcoords, kept, None  # :func:`check_template` says what is wrong
+    used = vertices[np.unique(faces)]
+    with np.errstate(invalid="ignore"):  # coordinates that are not finite
+        kept = ~(areas(vertices, faces) <= 1e-12 * np.ptp(used, axis=0).max() ** 2)
+    if not kept.any():
+        return vertices, faces, texcoords, np.ones(len(faces), dtype=bool), None
+    in_use = np.unique(faces[kept])
+    counts = (~kept).sum(), len(vertices) - len(in_use)
+    if not any(counts):
+        return vertices, faces, texcoords, kept, None
+    number = np.full(len(vertices), -1)
+    number[in_use] = np.arange(len(in_use))
+    if texcoords is not None:
+        texcoords = TexCoords(texcoords.coordinates, texcoords.faces[kept])
+    note = f"left out {counts[0]} faces without area and {counts[1]} vertices in no other face"
+    return vertices[in_use], number[faces[kept]], texcoords, kept, note
 
 
 def write_obj(path, vertices, faces, uv):
@@ -63,7 +90,7 @@ def check_template(vertices, faces, uv, where="template"):
     """Raise InputError, in one line that starts with ``where``, unless the mesh can be a template.
 
     ``uv``: a finite texture coordinate a vertex, (N, 2), or :class:`polyfit.mesh.TexCoords`. A
-    template has at least three vertices, each of them in some face, and triangles of positive area.
+    template has at least three vertices, each of them in some face, as :func:`cleaned` leaves it.
     It may be open or closed, of several components, with seams, and wound in any way.
     """
     V, F = np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64)
@@ -97,8 +124,8 @@ def check_template(vertices, faces, uv, where="template"):
         uv = TexCoords(uv, F)
     bad = ~np.isfinite(uv.coordinates).all(axis=1)
     _refuse(bad, where, "texture coordinates are not finite", "coordinate")
-    area = 0.5 * np.linalg.norm(np.cross(V[F[:, 1]] - V[F[:, 0]], V[F[:, 2]] - V[F[:, 0]]), axis=1)
-    _refuse(area <= 1e-12 * np.ptp(V, axis=0).max() ** 2, where, "faces have no area", "face")
+    if not (areas(V, F) > 1e-12 * np.ptp(V, axis=0).max() ** 2).any():
+        raise InputError(f"{where}: its faces have no area")
 
 
 def _refuse(bad, where, what, element):

@@ -11,10 +11,12 @@ import trimesh
 from places import ROOT
 
 from polyfit.files import aside
+from polyfit.mesh import TexCoords
 from polysft_mi.errors import InputError
 from polysft_mi.surface.atlas import Atlas
 from polysft_mi.surface.meshio import (
     check_template,
+    cleaned,
     read_template,
     read_textured_template,
     write_ply,
@@ -216,6 +218,8 @@ def _change(kind):
         F[2, 1] = len(V)
     elif kind == "repeated corner":
         F = np.concatenate([F, [[0, 0, 1]]])
+    elif kind == "flat":
+        V = V * (1, 0, 0)
     elif kind == "zero area":
         V[1] = V[0]
     elif kind == "fin":
@@ -249,8 +253,7 @@ def _change(kind):
         ("empty", "0 vertices"),
         ("no faces", "no faces"),
         ("index", "0 to 11 exist"),
-        ("repeated corner", "1 faces have no area (the first is face 12"),
-        ("zero area", "faces have no area"),
+        ("flat", "its faces have no area"),
         ("loose vertex", "1 vertices are in no face (the first is vertex 12"),
     ],
 )
@@ -262,6 +265,21 @@ def test_refuses_what_cannot_be_a_template(kind, words):
         and words in str(error.value)
         and "\n" not in str(error.value)
     )
+
+
+@pytest.mark.parametrize(
+    "kind, faces, vertices",
+    [("repeated corner", 1, 0), ("zero area", 1, 1), ("loose vertex", 0, 1)],
+)
+def test_what_has_no_area_is_left_out(kind, faces, vertices):
+    V, F, uv = _change(kind)
+    W, G, texcoords, kept, note = cleaned(V, F, TexCoords(uv, F))
+    check_template(W, G, texcoords)
+    assert note == (f"left out {faces} faces without area and {vertices} vertices in no other face")
+    assert len(kept) == len(F) and (~kept).sum() == faces and len(W) == len(V) - vertices
+    np.testing.assert_array_equal(W[G], V[F[kept]])
+    np.testing.assert_array_equal(texcoords.corners, uv[F[kept]])
+    assert cleaned(W, G, texcoords)[4] is None
 
 
 @pytest.mark.parametrize("kind", ["fin", "flipped face", "two sheets", "bow tie"])
