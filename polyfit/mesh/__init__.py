@@ -16,6 +16,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
             "components",
             "edges_of",
             "face_vectors",
+            "in_use",
             "sheets",
             "winding",
         ],

@@ -14,11 +14,12 @@ from polyfit.errors import InputError
 
 
 def checked(
-    vertices: ArrayLike, faces: ArrayLike, where: str = "mesh"
+    vertices: ArrayLike, faces: ArrayLike, where: str = "mesh", drop_loose: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
     """``(vertices float64, faces int64)`` of a mesh that can be cut. Faces that name a vertex
-    twice, and those that repeat another's vertices, are dropped. Raises InputError, in one line
-    that starts with ``where``, for anything else that is wrong.
+    twice, and those that repeat another's vertices, are dropped; with ``drop_loose`` vertices in no
+    face, too: the others keep their order. Raises InputError, in one line that starts with
+    ``where``, for anything else that is wrong.
     """
     V, F = np.asarray(vertices, dtype=np.float64), np.asarray(faces)
     if V.ndim != 2 or V.shape[1] != 3 or len(V) == 0:
@@ -32,14 +33,24 @@ def checked(
         raise InputError(
             f"{where}: faces name vertices {F.min()} to {F.max()}; 0 to {len(V) - 1} exist"
         )
+    if drop_loose:
+        V, F = in_use(V, F)
     _refuse(~np.isfinite(V).all(axis=1), where, "vertices have coordinates that are not finite")
     F = F[(np.roll(F, 1, axis=1) != F).all(axis=1)]
     _, first = np.unique(np.sort(F, axis=1), axis=0, return_index=True)
     F = F[np.sort(first)]
+    if drop_loose:
+        V, F = in_use(V, F)
     _refuse(np.bincount(F.ravel(), minlength=len(V)) == 0, where, "vertices are in no face")
     if not areas(V, F).sum() > 1e-12 * np.ptp(V, axis=0).max() ** 2:
         raise InputError(f"{where}: its faces have no area")
     return V, F
+
+
+def in_use(V: np.ndarray, F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The mesh without vertices in no face; the others keep their order."""
+    used, F = np.unique(F, return_inverse=True)
+    return V[used], F.reshape(-1, 3)
 
 
 def _refuse(bad: Any, where: str, what: str) -> None:

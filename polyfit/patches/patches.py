@@ -73,9 +73,9 @@ class Patches:
         components, and sheets that meet in an edge of three or more faces, share no patch: each has
         at least one, and the default count is raised where that needs more. Raises InputError for a
         mesh that :func:`polyfit.mesh.checked` refuses, and for a count that its components or its
-        vertices do not allow.
+        vertices do not allow. Vertices in no face are left out.
         """
-        V, given = mesh.checked(vertices, faces, where)
+        V, given = mesh.checked(vertices, faces, where, drop_loose=True)
         split = mesh.sheets(given)
         side = mesh.winding(split)
         part = _components_of_faces(split)

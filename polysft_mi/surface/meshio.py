@@ -6,7 +6,7 @@ Texture coordinates are those of OBJ files: (0, 0) is the texture's bottom left,
 
 import numpy as np
 
-from polyfit.mesh import TexCoords, areas, read_mesh, read_textured, write_ply
+from polyfit.mesh import TexCoords, areas, in_use, read_mesh, read_textured, write_ply
 from polysft_mi.errors import InputError
 
 __all__ = [
@@ -44,16 +44,14 @@ def cleaned(vertices, faces, texcoords):
         kept = ~(areas(vertices, faces) <= 1e-12 * np.ptp(used, axis=0).max() ** 2)
     if not kept.any():
         return vertices, faces, texcoords, np.ones(len(faces), dtype=bool), None
-    in_use = np.unique(faces[kept])
-    counts = (~kept).sum(), len(vertices) - len(in_use)
+    V, F = in_use(vertices, faces[kept])
+    counts = (~kept).sum(), len(vertices) - len(V)
     if not any(counts):
         return vertices, faces, texcoords, kept, None
-    number = np.full(len(vertices), -1)
-    number[in_use] = np.arange(len(in_use))
     if texcoords is not None:
         texcoords = TexCoords(texcoords.coordinates, texcoords.faces[kept])
     note = f"left out {counts[0]} faces without area and {counts[1]} vertices in no other face"
-    return vertices[in_use], number[faces[kept]], texcoords, kept, note
+    return V, F, texcoords, kept, note
 
 
 def write_obj(path, vertices, faces, uv):

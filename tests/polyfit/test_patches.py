@@ -199,10 +199,13 @@ def test_number_of_patches_of_the_paper():
     assert len(Patches.cut(*surfaces.sheet(n=5))) == 25  # no more patches than vertices
 
 
-def test_faces_without_area_and_double_faces_do_no_harm():
+def test_faces_without_area_double_faces_and_loose_vertices_do_no_harm():
     V, F = surfaces.sphere()
     noisy = np.concatenate([F, F[:5], F[7:9, ::-1], [[3, 3, 5], [4, 4, 4]]])
-    p, q = Patches.cut(V, F, 20), Patches.cut(V, noisy, 20)
+    p = Patches.cut(V, F, 20)
+    loose = np.concatenate([[[np.nan, 0, 0]], V, V[:1]])
+    q = Patches.cut(loose, noisy + 1, 20)
+    assert (p.vertices == q.vertices).all()
     assert (p.given == q.given).all() and (p.label == q.label).all()
 
 
@@ -219,7 +222,6 @@ def test_bad_meshes_and_counts_are_named():
         "no faces; a triangle mesh is needed": (V, F[:0]),
         "1 vertices have coordinates that are not finite (the first is vertex 7": (hole, F),
         "faces name vertices 0 to 24; 0 to 23 exist": (V[:24], F),
-        "1 vertices are in no face (the first is vertex 25": (np.concatenate([V, V[:1]]), F),
         "faces of shape (8, 4)": (V, np.zeros((8, 4), dtype=int)),
         "vertices of shape (25, 2)": (V[:, :2], F),
         "its faces have no area": (V * (1, 0, 0), F),

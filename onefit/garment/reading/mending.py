@@ -79,18 +79,11 @@ def parts(F):
     return mesh.components(int(F.max()) + 1, np.concatenate([F[:, :2], F[:, 1:]]))[F[:, 0]]
 
 
-def _used(V, F):
-    used = np.unique(F)
-    index = np.full(len(V), -1)
-    index[used] = np.arange(len(used))
-    return V[used], index[F]
-
-
 def _without_slivers(V, F, where, told):
     loose = len(V) - len(np.unique(F))
     if loose:
         told.append(f"dropped {loose} vertices that are in no face")
-    V, F = _used(V, F)
+    V, F = mesh.in_use(V, F)
     e = mesh.edges_of(F)[0]
     short = e[np.linalg.norm(V[e[:, 0]] - V[e[:, 1]], axis=1) < _COINCIDENT]
     V, G = _merged(V, F, short)
@@ -105,7 +98,7 @@ def _without_slivers(V, F, where, told):
     G = G[whole & once]
     if not len(G) or not mesh.areas(V, G).sum() > 1e-8:
         raise InputError(f"{where}: its faces have no area")
-    return _used(V, G)
+    return mesh.in_use(V, G)
 
 
 def _merged(V, F, pairs):
@@ -199,7 +192,7 @@ def _large_parts(V, F, where, told):
             f"{few} of {(~keep[part]).sum()} faces, {100 * share[~keep].sum():.2g} % of the area,"
             " go along with the cloth"
         )
-    return _used(V, F[keep[part]])
+    return mesh.in_use(V, F[keep[part]])
 
 
 def _wound_alike(V, F, where, told):
@@ -223,7 +216,7 @@ def _outer_sides(V, F, body, where, told):
     keep, thickness = np.ones(len(F), dtype=bool), []
     for k in closed:
         faces = np.flatnonzero(part == k)
-        found = None if body is None else outer_side(*_used(V, F[faces]), body)
+        found = None if body is None else outer_side(*mesh.in_use(V, F[faces]), body)
         if found is None:
             raise InputError(
                 f"{where}: a closed surface without openings, not cloth with a thickness below"
@@ -237,7 +230,7 @@ def _outer_sides(V, F, body, where, told):
         f"took the outer side of cloth that is {1000 * max(thickness):.1f} mm thick, without"
         f" {(~keep).sum()} faces of the inner side"
     )
-    V, F = _used(V, F[keep])
+    V, F = mesh.in_use(V, F[keep])
     return _large_parts(V, F, where, [])
 
 
