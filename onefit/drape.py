@@ -32,7 +32,7 @@ def parser():
     p.add_argument(
         "garment",
         metavar="GARMENT",
-        help="a template's name, or a mesh (.obj, .ply) around the standard body",
+        help="a template's name, or a mesh (.obj, .ply, .glb) around the standard body",
     )
     p.add_argument(
         "motion",

@@ -6,8 +6,8 @@
 With --teacher LESSONS the network learns finished drapes by regression; physics alone goes on from
 there with --from OUT/weights.safetensors.
 
-GARMENT are names of the package's templates (tshirt, dress, ...) or meshes (.obj, .ply); without
-any, the six templates of the paper. OUT receives
+GARMENT are names of the package's templates (tshirt, dress, ...) or meshes (.obj, .ply, .glb);
+without any, the six templates of the paper. OUT receives
 
     weights.safetensors     the trained network, for ``onefit.load``, and weights.json: what made it
     log.jsonl               a line every 50 steps: the loss and each of its terms

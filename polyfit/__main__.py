@@ -12,7 +12,7 @@ def main(argv=None):
         prog="python -m polyfit",
         description="Fit patches of jets to a mesh, write their surface at any resolution.",
     )
-    parser.add_argument("mesh", help="an .obj or .ply file [m]")
+    parser.add_argument("mesh", help="an .obj, .ply or .glb file [m]")
     parser.add_argument("-o", "--output", required=True, help="the .ply file to write")
     parser.add_argument(
         "--patches", type=int, help="number of patches (default: the paper's, by the mesh's area)"

@@ -4,8 +4,8 @@
                             [--families jet trigonometric gaussian bessel]
     torchrun --nproc-per-node 2 -m polyfit.train ...
 
-Each MESH is a garment (.obj, .ply). It is cut into patches, which are deformed at random. Without
-any, the training sees the analytic families alone. OUT receives
+Each MESH is a garment (.obj, .ply, .glb). It is cut into patches, which are deformed at random.
+Without any, the training sees the analytic families alone. OUT receives
 
     weights.safetensors     the trained network, for ``PolyFit.load``
     weights.json            what made it
@@ -30,7 +30,7 @@ def parser():
     p = Parser(prog="python -m polyfit.train", description=__doc__.splitlines()[0])
     default = Settings()
     p.add_argument(
-        "meshes", nargs="*", metavar="MESH", help="garments (.obj, .ply) to cut and deform"
+        "meshes", nargs="*", metavar="MESH", help="garments (.obj, .ply, .glb) to cut and deform"
     )
     p.add_argument("-o", "--output", required=True, metavar="OUT", help="folder of the results")
     p.add_argument(

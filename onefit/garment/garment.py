@@ -78,7 +78,7 @@ class Garment:
         if not Path(name).suffix and not Path(name).exists():
             raise InputError(
                 f"garment '{name}': no such template; there are {', '.join(TEMPLATES + LOOSE)}; or"
-                " give an .obj or .ply file"
+                " give an .obj, .ply or .glb file"
             )
         return cls.read(name, **options)
 
@@ -95,7 +95,7 @@ class Garment:
         turn: float = 0.0,
         offset: Any = (0.0, 0.0, 0.0),
     ) -> Garment:
-        """The garment of an OBJ or PLY file of triangles or quads, repaired by the rules of
+        """The garment of an OBJ, PLY or GLB file of triangles or quads, repaired by the rules of
         :mod:`onefit.garment.reading.mending`.
 
         ``scale``, ``up``, ``turn`` [degrees], ``offset`` [m]: as in

@@ -1,4 +1,5 @@
-"""Meshes in and out: OBJ and PLY in the file's own vertex order, PLY with uv.
+"""Meshes in and out: OBJ and PLY in the file's own vertex order, glTF with all of its meshes as
+one, and PLY with uv.
 
 Texture coordinates are those of OBJ files: (0, 0) is the texture's bottom left, v goes up.
 """
@@ -50,13 +51,15 @@ def write_ply(
 
 
 def read_mesh(path: str | os.PathLike[str], what: str = "mesh") -> _MeshArrays:
-    """``(vertices (N, 3) float64, faces (F, 3) int64, uv (N, 2) float64 or None)`` of an OBJ or PLY
-    file.
+    """``(vertices (N, 3) float64, faces (F, 3) int64, uv (N, 2) float64 or None)`` of an OBJ, PLY
+    or glTF file (.glb, .gltf).
 
     Vertices keep the file's order. Polygons of an OBJ file become fans of triangles around their
-    first corner, in the file's order; those of a PLY file triangles in trimesh's order. uv is None
-    where the file has none for some corner, or several for one vertex (a seam). Raises InputError
-    in one line, in which the mesh is called ``what``.
+    first corner, in the file's order; those of a PLY file triangles in trimesh's order. The meshes
+    of a glTF file are one, each in its place in the scene, without the vertices that seams of the
+    texture split; their axes stay, y up. uv is None where the file has none for some corner, or
+    several for one vertex (a seam). Raises InputError in one line, in which the mesh is called
+    ``what``.
     """
     vertices, faces, texcoords = read_textured(path, what)
     count = len(vertices)
@@ -71,11 +74,11 @@ def read_textured(path: str | os.PathLike[str], what: str = "mesh") -> _Textured
     """
     path = os.fspath(path)
     extension = os.path.splitext(path)[1].lower()
-    if extension not in (".obj", ".ply"):
-        raise InputError(f"{path}: {what} of type '{extension}'; .obj or .ply is needed")
+    if extension not in (".obj", ".ply", ".glb", ".gltf"):
+        raise InputError(f"{path}: {what} of type '{extension}'; .obj, .ply or .glb is needed")
     if not os.path.isfile(path):
-        raise InputError(f"{path}: no such file; a {what} is an .obj or .ply file")
-    return _read_obj(path) if extension == ".obj" else _read_ply(path)
+        raise InputError(f"{path}: no such file; a {what} is an .obj, .ply or .glb file")
+    return _read_obj(path) if extension == ".obj" else _read_by_trimesh(path, extension[1:])
 
 
 def _read_obj(path: str) -> _TexturedMesh:
@@ -135,7 +138,7 @@ def _from_zero(index: int, count: int) -> int:
     return index - 1 if index > 0 else count + index
 
 
-def _read_ply(path: str) -> _TexturedMesh:
+def _read_by_trimesh(path: str, kind: str) -> _TexturedMesh:
     import trimesh
 
     log = logging.getLogger("trimesh")
@@ -144,10 +147,12 @@ def _read_ply(path: str) -> _TexturedMesh:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            mesh = trimesh.load(path, file_type="ply", process=False, maintain_order=True)
+            mesh = trimesh.load(path, file_type=kind, process=False, maintain_order=True)
+            if isinstance(mesh, trimesh.Scene):
+                mesh = mesh.to_geometry()
     except Exception as error:  # trimesh raises anything: KeyError, UnicodeDecodeError, ...
         raise InputError(
-            f"{path}: not a readable PLY file ({type(error).__name__}: {error})"
+            f"{path}: not a readable {kind.upper()} file ({type(error).__name__}: {error})"
         ) from None
     finally:
         log.disabled = was_disabled
@@ -161,6 +166,16 @@ def _read_ply(path: str) -> _TexturedMesh:
         raise InputError(
             f"{path}: faces name vertices {F.min()} to {F.max()}; 0 to {len(V) - 1} exist"
         )
-    if uv is None or len(uv) != len(V):
-        return V, F, None
-    return V, F, TexCoords(np.array(uv, dtype=np.float64), F)
+    texcoords = None
+    if uv is not None and len(uv) == len(V):
+        texcoords = TexCoords(np.array(uv, dtype=np.float64), F)
+    return (V, F, texcoords) if kind == "ply" else (*_welded(V, F), texcoords)
+
+
+def _welded(V: np.ndarray, F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The mesh with vertices in one place made one: glTF splits them along seams of the texture."""
+    _, first, index = np.unique(V, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    number = np.empty(len(order), dtype=np.int64)
+    number[order] = np.arange(len(order))
+    return V[first[order]], number[index.ravel()][F]

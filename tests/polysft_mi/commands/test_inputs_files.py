@@ -169,5 +169,5 @@ def test_template_that_cannot_be_read(sheet):
     )
     has(
         refused(edited(sheet, "template.obj", "texture.png")),
-        "texture.png: template of type '.png'; .obj or .ply is needed",
+        "texture.png: template of type '.png'; .obj, .ply or .glb is needed",
     )

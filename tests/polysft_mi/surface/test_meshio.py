@@ -10,8 +10,9 @@ import pytest
 import trimesh
 from places import ROOT
 
+from polyfit import animation
 from polyfit.files import aside
-from polyfit.mesh import TexCoords
+from polyfit.mesh import TexCoords, read_textured
 from polysft_mi.errors import InputError
 from polysft_mi.surface.atlas import Atlas
 from polysft_mi.surface.meshio import (
@@ -164,7 +165,7 @@ def test_shared_quads_with_normals_keep_order_and_uv():
         ("a.obj", OBJ + "f 1 2 b\n", "not OBJ"),
         ("a.ply", "not a ply", "not a readable PLY"),
         ("a.ply", "ply\nformat ascii 1.0\nelement vertex 9\nproperty float x\n", "a.ply: "),
-        ("a.stl", "solid", "'.stl'; .obj or .ply is needed"),
+        ("a.stl", "solid", "'.stl'; .obj, .ply or .glb is needed"),
     ],
 )
 def test_unreadable_files_are_one_line(tmp_path, name, content, words):
@@ -172,6 +173,19 @@ def test_unreadable_files_are_one_line(tmp_path, name, content, words):
     with pytest.raises(InputError) as error:
         read_template(tmp_path / name)
     assert words in str(error.value) and str(tmp_path / name) in str(error.value)
+
+
+def test_gltf_is_read_without_the_vertices_that_seams_split(tmp_path):
+    V, F, uv = sheet()
+    texcoords = TexCoords(np.concatenate([uv, uv + 1]), np.where(F[:, :1] % 2, F, F + len(V)))
+    animation.write_glb(tmp_path / "a.glb", V[None].astype(np.float32), F, texcoords)
+    W, G, read = read_textured(tmp_path / "a.glb")
+    assert len(W) == len(V)
+    np.testing.assert_allclose(W[G], V[F], atol=1e-6)
+    np.testing.assert_allclose(read.corners, texcoords.corners, atol=1e-6)
+    (tmp_path / "b.glb").write_text("not a glTF")
+    with pytest.raises(InputError, match="b.glb: not a readable GLB file"):
+        read_textured(tmp_path / "b.glb")
 
 
 def test_missing_file_and_folder(tmp_path):
