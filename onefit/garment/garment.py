@@ -145,11 +145,10 @@ class Garment:
         check(vertices, faces, where)
         fitting.check_place(vertices[np.unique(faces)], surface, where, tell_pose=made_for is None)
         V, F, told = mended(vertices, faces, where, surface)
+        F, turned = _outward(V, F, surface)
         render_mesh = RenderMesh.bound(vertices, faces, texcoords, V, F)
         if made_for is not None:
-            F, turned = _outward(V, F, surface)
-            V, told = fitting.to_standard(V, F, made_for.to("cpu"), loose), told + turned
-        F, turned = _outward(V, F, standard_surface())
+            V = fitting.to_standard(V, F, made_for.to("cpu"), loose)
         V, pushed = fitting.pushed_out(V, F, where)
         return cls.bound(name, V, F, told + turned + pushed, render_mesh=render_mesh)
 

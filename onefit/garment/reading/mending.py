@@ -5,7 +5,8 @@ The rules, in this order; whatever is changed is told in a sentence:
 
 What is dropped here goes on in the garment's :class:`onefit.garment.RenderMesh`.
 
-1. Faces whose corners coincide, faces that repeat others, and vertices in no face are dropped.
+1. Faces whose corners coincide, faces that repeat others (the other side of a double-sided mesh),
+   and vertices in no face are dropped.
 2. Where edges of the boundary lie on one another (a seam of the texture, a soup of triangles),
    their vertices are merged. Along seams of panels that were meshed each for itself, edges are cut
    where vertices of the other panel lie on them (:mod:`onefit.garment.reading.zip`).
@@ -15,10 +16,12 @@ What is dropped here goes on in the garment's :class:`onefit.garment.RenderMesh`
    others stay, each for itself. Refused if less than 80 % of the area would be left.
 5. Faces wound against the others of their part are turned. A part with a single side is refused (a
    Moebius strip).
-6. Of a part without an opening the outer side is taken, where it is cloth with a thickness
-   (:mod:`onefit.garment.reading.thickness`); a solid is refused.
+6. Of cloth with a thickness the outer side is taken (:mod:`onefit.garment.reading.thickness`); a
+   solid is refused.
 7. Holes of less than 10 cm around are filled.
 """
+
+import contextlib
 
 import numpy as np
 
@@ -46,8 +49,22 @@ def mended(V, F, where="garment", body=None):
     check(V, F, where)
     told = []
     V, F = _without_slivers(V, F, where, told)
-    V, F = zipped(V, F, told)
-    V, F = _sewn(V, F, told)
+    V, F, merged = _sewn(V, F)
+    W, G, cuts = zipped(V, F)
+    if cuts or not np.array_equal(W, V):
+        W, G, more = _sewn(W, G)
+        with contextlib.suppress(InputError):  # boundaries that are near each other may be no seam
+            return _one_layer(W, G, merged + more, cuts, body, where, told)
+    return _one_layer(V, F, merged, 0, body, where, told)
+
+
+def _one_layer(V, F, merged, cuts, body, where, told):
+    """:func:`mended` from the third rule on; ``merged`` and ``cuts``: what the second did."""
+    told = [*told]
+    if cuts:
+        told.append(f"cut the boundary at {cuts} places where vertices of another one lie on it")
+    if merged:
+        told.append(f"merged {merged} vertices of the boundary with others that lie on them")
     V, F = _without_slivers(V, F, where, told)
     V, F = _cut_apart(V, F, told)
     V, F = _large_parts(V, F, where, told)
@@ -88,7 +105,8 @@ def _without_slivers(V, F, where, told):
     short = e[np.linalg.norm(V[e[:, 0]] - V[e[:, 1]], axis=1) < _COINCIDENT]
     V, G = _merged(V, F, short)
     whole = (np.roll(G, 1, axis=1) != G).all(axis=1)
-    _, first = np.unique(np.sort(G, axis=1), axis=0, return_index=True)
+    place = mesh.components(len(V), _coinciding(V))
+    _, first = np.unique(np.sort(place[G], axis=1), axis=0, return_index=True)
     once = np.zeros(len(G), dtype=bool)
     once[first] = True
     if (~whole).any():
@@ -99,6 +117,13 @@ def _without_slivers(V, F, where, told):
     if not len(G) or not mesh.areas(V, G).sum() > 1e-8:
         raise InputError(f"{where}: its faces have no area")
     return mesh.in_use(V, G)
+
+
+def _coinciding(V):
+    """Pairs (P, 2) of vertices that lie on one another."""
+    from scipy.spatial import cKDTree
+
+    return cKDTree(V).query_pairs(_COINCIDENT, output_type="ndarray").reshape(-1, 2)
 
 
 def _merged(V, F, pairs):
@@ -113,19 +138,12 @@ def _uses(F):
     return edges, np.bincount(side.ravel(), minlength=len(edges))
 
 
-def _sewn(V, F, told):
-    from scipy.spatial import cKDTree
-
+def _sewn(V, F):
     edges, uses = _uses(F)
     rim_edges = edges[uses == 1]
     rim = np.unique(rim_edges)
-    pairs = (
-        rim[cKDTree(V[rim]).query_pairs(_COINCIDENT, output_type="ndarray")]
-        if len(rim)
-        else np.empty((0, 2), dtype=np.int64)
-    )
-    if not len(pairs):
-        return V, F
+    if not len(rim) or not len(pairs := rim[_coinciding(V[rim])]):
+        return V, F, 0
     # only where two edges of the boundary coincide: parts that touch in a point stay apart
     place = mesh.components(len(V), pairs)
     _, which, times = np.unique(
@@ -134,11 +152,7 @@ def _sewn(V, F, told):
     seam = np.unique(rim_edges[(times > 1)[which.ravel()]])
     pairs = pairs[np.isin(pairs, seam).all(axis=1)]
     W, G = _merged(V, F, pairs)
-    if len(W) < len(V):
-        told.append(
-            f"merged {len(V) - len(W)} vertices of the boundary with others that lie on them"
-        )
-    return W, G
+    return W, G, len(V) - len(W)
 
 
 def _cut_apart(V, F, told):
@@ -212,18 +226,19 @@ def _wound_alike(V, F, where, told):
 def _outer_sides(V, F, body, where, told):
     edges, uses = _uses(F)
     part = parts(F)
-    closed = np.setdiff1d(part, part[np.isin(F, edges[uses == 1]).any(axis=1)])
+    open_parts = part[np.isin(F, edges[uses == 1]).any(axis=1)]
     keep, thickness = np.ones(len(F), dtype=bool), []
-    for k in closed:
+    for k in range(part.max() + 1):
         faces = np.flatnonzero(part == k)
         found = None if body is None else outer_side(*mesh.in_use(V, F[faces]), body)
-        if found is None:
+        if found is None and k not in open_parts:
             raise InputError(
                 f"{where}: a closed surface without openings, not cloth with a thickness below"
                 " 2 cm; cloth is needed"
             )
-        keep[faces] = found[0]
-        thickness.append(found[1])
+        if found is not None:
+            keep[faces] = found[0]
+            thickness.append(found[1])
     if not thickness:
         return V, F
     told.append(

@@ -1,5 +1,5 @@
-"""Cloth with a thickness: a closed surface of two sides that lie near each other. One side is the
-cloth. NumPy.
+"""Cloth with a thickness: a surface of two sides that lie near each other. One side is the cloth.
+NumPy.
 """
 
 import numpy as np
@@ -10,13 +10,14 @@ from polyfit import mesh
 _THICKEST = 0.02  # cloth is thinner [m]
 _THIN_SHARE = 0.8  # of the area that has to be thinner
 _OPPOSITE, _SMOOTH = -0.5, 0.65  # cosines: of two sides' normals at most, across an edge at least
+_SOME = 500  # faces that are looked at first
 _ROUNDS = 10  # in which faces without a face opposite join the side that they continue
 
 
 def outer_side(V, F, body):
-    """``(faces (F,) bool, thickness [m])``: which faces of a closed part, V (N, 3) [m], F (F, 3)
-    wound alike, are its outer side, and how thick it is; None for a solid. ``body``: the
-    :class:`onefit.body.ClosestSurface` below.
+    """``(faces (F,) bool, thickness [m])``: which faces of a part, V (N, 3) [m], F (F, 3) wound
+    alike, are its outer side, and how thick it is; None for a single layer, and for a solid.
+    ``body``: the :class:`onefit.body.ClosestSurface` below.
 
     A face has two sides of cloth where another one lies opposite, nearer than 2 cm; at a rim it has
     none. So rims part the sides, and the side that looks away from the body is the outer one.
@@ -26,17 +27,29 @@ def outer_side(V, F, body):
     outward = np.sign(np.einsum("fd,fd->", V[F[:, 0]] - V.mean(axis=0), vector))
     normal = outward * vector / np.maximum(2 * area, 1e-300)[:, None]
     looks = 2 * _THICKEST * normal  # so that a face which looks the same way is no nearest
-    _, other = cKDTree(np.hstack([centre, looks])).query(np.hstack([centre, -looks]))
-    away = centre - centre[other]
-    across = np.einsum("fd,fd->f", away, normal)
-    thin = (across > 0) & (np.einsum("fd,fd->f", normal, normal[other]) < _OPPOSITE)
-    thin &= np.linalg.norm(away, axis=1) < _THICKEST + np.sqrt(area)
+    tree, asked = cKDTree(np.hstack([centre, looks])), np.hstack([centre, -looks])
+
+    def opposite(faces):
+        """The face opposite to each of some faces, how far across, and whether that is near."""
+        other = tree.query(asked[faces])[1]
+        away = centre[faces] - centre[other]
+        across = np.einsum("fd,fd->f", away, normal[faces])
+        near = np.linalg.norm(away, axis=1) < _THICKEST + np.sqrt(area[faces])
+        cosine = np.einsum("fd,fd->f", normal[faces], normal[other])
+        return other, across, near & (across > 0) & (cosine < _OPPOSITE)
+
+    some = np.arange(0, len(F), max(1, len(F) // _SOME))
+    if opposite(some)[2].mean() < _THIN_SHARE / 2:  # which is quickly told
+        return None
+    other, across, thin = opposite(np.arange(len(F)))
     if area[thin].sum() < _THIN_SHARE * area.sum():
         return None
     thickness = np.median(across[thin])
     thin &= across > thickness / 3  # else it lies beside, at a rim
-    order = np.argsort(mesh.edges_of(F)[1].ravel(), kind="stable") // 3
-    one, two = order[::2], order[1::2]  # the faces of each edge: two, for the part is closed
+    edge = mesh.edges_of(F)[1].ravel()
+    order = np.argsort(edge, kind="stable")
+    first = np.flatnonzero(np.diff(edge[order]) == 0)
+    one, two = order[first] // 3, order[first + 1] // 3  # the two faces of each inner edge
     side = mesh.components(len(F), np.stack([one, two], 1)[thin[one] & thin[two]])
     found = body(centre)
     distance = np.where(np.abs(found.distance) > 1e-6, found.distance, np.inf)

@@ -11,22 +11,20 @@ _REACH, _SHARE = 0.001, 0.3  # [m], and of an edge's length: how near the other 
 _ROUNDS = 3  # a triangle is cut along one side a round
 
 
-def zipped(V, F, told):
-    """``(vertices, faces)`` with boundary vertices that lie near each other at one place, and with
-    boundary edges cut where vertices of another boundary lie on them.
+def zipped(V, F):
+    """``(vertices, faces, count)`` with boundary vertices that lie near each other at one place,
+    and with boundary edges cut where vertices of another boundary lie on them, at ``count`` places.
     """
     rim = _rim(F)
     if not len(rim[0]):
-        return V, F
+        return V, F, 0
     V, cuts = _snapped(V, F, *rim), 0
     for _ in range(_ROUNDS):
         V, F, count = _cut(V, F, *_rim(F))
         cuts += count
         if not count:
             break
-    if cuts:
-        told.append(f"cut the boundary at {cuts} places where vertices of another one lie on it")
-    return V, F
+    return V, F, cuts
 
 
 def _rim(F):

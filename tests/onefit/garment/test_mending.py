@@ -164,6 +164,14 @@ class TestRepairs:
         g = self.check(W, G, told)
         assert np.allclose(g.vertices.numpy(), V, atol=1e-6) and np.array_equal(g.faces.numpy(), F)
 
+        at = np.argmin(np.linalg.norm(V - [0, -0.13, 0.2], axis=1))
+        self.check(*punched(W, G, at), told[:40], "filled 1 hole")
+
+    def test_a_double_sided_mesh_is_one_layer(self, tank):
+        V, F = tank
+        g = self.check(*joined(tank, (V, F[:, ::-1])), f"dropped {len(F)} faces that repeat")
+        assert len(g) == len(V)
+
     def test_folds_and_a_bevelled_rim_of_thick_cloth(self):
         g = Garment.template("circle_skirt")
         V, F = g.vertices.double().numpy(), g.faces.numpy()

@@ -42,6 +42,12 @@ def test_at_rest_it_is_the_file(garment, file_mesh, tank):
     assert np.array_equal(mesh.faces, F) and np.array_equal(mesh.texcoords.faces, F)
 
 
+def test_a_garment_wound_inwards_carries_its_file(tank):
+    V, F = tank
+    garment = Garment.of_mesh("top", V, F[:, ::-1])
+    assert np.abs(garment.render_mesh.carried(*arrays(garment)) - V).max() < 1e-6
+
+
 def test_it_turns_with_the_cloth(garment, file_mesh):
     V, _ = file_mesh
     cloth, faces = arrays(garment)
