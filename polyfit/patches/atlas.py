@@ -18,7 +18,7 @@ from polyfit import mesh
 from .clusters import NORMAL_WEIGHTS, connected, merged, relaxed
 from .unity import shares
 
-# A face is steep over its patch's plane beyond this cosine; of the surface no larger share is, so
+# A face is steep over a patch's plane beyond this cosine; of the surface no larger share is, so
 # that a collar or a hem that is folded in needs no patch of its own
 STEEP, STEEP_SHARE = 0.45, 0.1
 # The way along a patch is longer than the way through the air by no more radii of a disc of its
@@ -26,6 +26,7 @@ STEEP, STEEP_SHARE = 0.45, 0.1
 _DETOUR = 2.0
 _OVERLAP = 0.4  # width of the overlap, in radii of a disc of the patch's area
 FINE = 128  # clusters that vertices are merged to before patches are sought
+_ENOUGH = 4000  # vertices; where fewer do not do, patches are sought on a finer mesh
 
 
 @dataclass(frozen=True)
@@ -129,6 +130,12 @@ def _few(vertices, faces, vectors):
         return np.unique(found, return_inverse=True)[1]
 
     fine = clusters(np.arange(len(inside)), FINE, NORMAL_WEIGHTS[0])
+    if not held(fine) and len(points) < _ENOUGH:  # of long faces, as on the side of a low-poly can
+        finer, cut = mesh.subdivided(faces)
+        halved = np.concatenate([points, points[cut].mean(1)])
+        own = _few(halved, finer, mesh.face_vectors(halved, finer) / 2)[: len(points)]
+        label[inside] = np.unique(own, return_inverse=True)[1]
+        return label
     for wanted in range(2, FINE):
         for weight in NORMAL_WEIGHTS:
             own = clusters(fine, wanted, weight)
@@ -176,7 +183,9 @@ def _normals(label, faces, vectors):
 
 
 def _steep(label, faces, vectors):
-    """Share of the area that is steep over the planes of the clusters ``label`` (N,)."""
+    """Share of the area that is steep over the planes of the clusters ``label`` (N,): over that of
+    each cluster that has a corner of the face.
+    """
     normal, area = _normals(label, faces, vectors), np.linalg.norm(vectors, axis=1)
     steep = np.einsum("fk,fck->fc", vectors, normal[label[faces]]) < STEEP * area[:, None]
-    return steep.mean(1) @ area / max(area.sum(), 1e-300)
+    return steep.all(1) @ area / max(area.sum(), 1e-300)
