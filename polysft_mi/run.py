@@ -172,10 +172,12 @@ def reconstruct(
     from .render import threads
     from .results import outputs
     from .scene import experiment as experiments
-    from .surface.meshio import size_note
+    from .surface.meshio import seam_note, size_note
 
     experiment = experiments.load(scene, overrides)
-    for note in experiment.note, size_note(experiment.template.vertices, scene):
+    mesh = experiment.template
+    notes = size_note(mesh.vertices, scene), seam_note(mesh.vertices, mesh.faces, scene)
+    for note in (experiment.note, *notes):
         if note:
             print(note, file=sys.stderr)
     s = experiment.settings

@@ -5,8 +5,9 @@ Texture coordinates are those of OBJ files: (0, 0) is the texture's bottom left,
 """
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from polyfit.mesh import TexCoords, areas, in_use, read_mesh, read_textured, write_ply
+from polyfit.mesh import TexCoords, areas, edges_of, in_use, read_mesh, read_textured, write_ply
 from polysft_mi.errors import InputError
 
 __all__ = [
@@ -14,6 +15,7 @@ __all__ = [
     "cleaned",
     "read_template",
     "read_textured_template",
+    "seam_note",
     "size_note",
     "write_obj",
     "write_ply",
@@ -81,6 +83,22 @@ def size_note(vertices, where="template"):
     return (
         f"note: {where}: the template is {extent:.4g} m large, since lengths are read as metres; if"
         f" it is in {unit}, scale it by {factor:g}, to {factor * extent:.3g} m"
+    )
+
+
+def seam_note(vertices, faces, where="template"):
+    """A line about boundary vertices (N, 3) [m] that lie on one another, so that the surface comes
+    apart there; None without any.
+    """
+    edges, side = edges_of(faces)
+    rim = np.unique(edges[np.bincount(side.ravel(), minlength=len(edges)) == 1])
+    near = 1e-7 * np.ptp(vertices, axis=0).max()
+    pairs = cKDTree(vertices[rim]).query_pairs(near) if len(rim) else ()
+    if not pairs:
+        return None
+    return (
+        f"note: {where}: the surface is open where {len(pairs)} vertices lie on others; if that is"
+        " a seam of the texture, an OBJ keeps it closed (f v/vt)"
     )
 
 

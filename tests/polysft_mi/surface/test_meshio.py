@@ -12,7 +12,7 @@ from places import ROOT
 
 from polyfit import animation
 from polyfit.files import aside
-from polyfit.mesh import TexCoords, read_textured
+from polyfit.mesh import TexCoords, in_use, read_textured
 from polysft_mi.errors import InputError
 from polysft_mi.surface.atlas import Atlas
 from polysft_mi.surface.meshio import (
@@ -20,6 +20,7 @@ from polysft_mi.surface.meshio import (
     cleaned,
     read_template,
     read_textured_template,
+    seam_note,
     write_ply,
 )
 from polysft_mi.surface.template import Template
@@ -186,6 +187,16 @@ def test_gltf_is_read_without_the_vertices_that_seams_split(tmp_path):
     (tmp_path / "b.glb").write_text("not a glTF")
     with pytest.raises(InputError, match="b.glb: not a readable GLB file"):
         read_textured(tmp_path / "b.glb")
+
+
+def test_a_surface_cut_along_a_seam_is_told():
+    V, F, _ = sheet()
+    assert seam_note(V, F) is None
+    left = np.arange(len(F)) < len(F) // 2
+    cut = np.where(left[:, None], F, F + len(V))
+    W, G = in_use(np.concatenate([V, V]), cut)
+    both = len(np.intersect1d(F[left], F[~left]))
+    assert f"the surface is open where {both} vertices lie on others" in seam_note(W, G)
 
 
 def test_missing_file_and_folder(tmp_path):
