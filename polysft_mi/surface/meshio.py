@@ -5,7 +5,6 @@ Texture coordinates are those of OBJ files: (0, 0) is the texture's bottom left,
 """
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from polyfit.mesh import TexCoords, areas, edges_of, in_use, read_mesh, read_textured, write_ply
 from polysft_mi.errors import InputError
@@ -90,6 +89,8 @@ def seam_note(vertices, faces, where="template"):
     """A line about boundary vertices (N, 3) [m] that lie on one another, so that the surface comes
     apart there; None without any.
     """
+    from scipy.spatial import cKDTree
+
     edges, side = edges_of(faces)
     rim = np.unique(edges[np.bincount(side.ravel(), minlength=len(edges)) == 1])
     near = 1e-7 * np.ptp(vertices, axis=0).max()
