@@ -6,7 +6,8 @@ Texture coordinates are those of OBJ files: (0, 0) is the texture's bottom left,
 
 import numpy as np
 
-from polyfit.mesh import TexCoords, areas, edges_of, in_use, read_mesh, read_textured, write_ply
+from polyfit import mesh
+from polyfit.mesh import TexCoords, read_mesh, read_textured, write_ply
 from polysft_mi.errors import InputError
 
 __all__ = [
@@ -42,10 +43,10 @@ def cleaned(vertices, faces, texcoords):
         return vertices, faces, texcoords, kept, None  # :func:`check_template` says what is wrong
     used = vertices[np.unique(faces)]
     with np.errstate(invalid="ignore"):  # coordinates that are not finite
-        kept = ~(areas(vertices, faces) <= 1e-12 * np.ptp(used, axis=0).max() ** 2)
+        kept = ~(mesh.areas(vertices, faces) <= 1e-12 * np.ptp(used, axis=0).max() ** 2)
     if not kept.any():
         return vertices, faces, texcoords, np.ones(len(faces), dtype=bool), None
-    V, F = in_use(vertices, faces[kept])
+    V, F = mesh.in_use(vertices, faces[kept])
     counts = (~kept).sum(), len(vertices) - len(V)
     if not any(counts):
         return vertices, faces, texcoords, kept, None
@@ -91,7 +92,7 @@ def seam_note(vertices, faces, where="template"):
     """
     from scipy.spatial import cKDTree
 
-    edges, side = edges_of(faces)
+    edges, side = mesh.edges_of(faces)
     rim = np.unique(edges[np.bincount(side.ravel(), minlength=len(edges)) == 1])
     near = 1e-7 * np.ptp(vertices, axis=0).max()
     pairs = cKDTree(vertices[rim]).query_pairs(near) if len(rim) else ()
@@ -141,7 +142,7 @@ def check_template(vertices, faces, uv, where="template"):
         uv = TexCoords(uv, F)
     bad = ~np.isfinite(uv.coordinates).all(axis=1)
     _refuse(bad, where, "texture coordinates are not finite", "coordinate")
-    if not (areas(V, F) > 1e-12 * np.ptp(V, axis=0).max() ** 2).any():
+    if not (mesh.areas(V, F) > 1e-12 * np.ptp(V, axis=0).max() ** 2).any():
         raise InputError(f"{where}: its faces have no area")
 
 
