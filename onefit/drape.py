@@ -90,6 +90,12 @@ def parser():
         help="T-pose: the standard body with its arms stretched out",
     )
     group.add_argument(
+        "--vertices",
+        type=int,
+        metavar="N",
+        help="drape about N vertices of cloth, which carry the file's mesh (default: its own)",
+    )
+    group.add_argument(
         "--loose", action="store_true", help="a skirt or dress: the legs' pose is not followed"
     )
     p.add_argument(
@@ -157,6 +163,8 @@ def main(argv=None):
     Material.named(args.material)
     if args.finish < 0:
         raise InputError(f"--finish {args.finish}: steps a frame, 0 or more")
+    if args.vertices is not None and args.vertices < 100:
+        raise InputError(f"--vertices {args.vertices}: at least 100 are needed")
     model = inputs.body_model(args.body)
     draper = load(args.weights, model=model, device=device_of(args.device))
     garment = Garment.named(
@@ -168,6 +176,8 @@ def main(argv=None):
         turn=args.turn,
         offset=tuple(args.offset),
     )
+    if args.vertices:
+        garment = garment.remeshed(args.vertices)
     motion = inputs.motion_of(
         args.motion, seconds=args.seconds, seed=args.seed, fps=args.fps, up=args.motion_up
     )

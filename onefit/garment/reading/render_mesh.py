@@ -3,7 +3,9 @@
 Mending drops, merges and cuts: buttons, the inner side of thick cloth, vertices along a seam of the
 texture. What drapes is clean cloth. What is handed back is the file's own mesh, with its vertices
 in their order, its faces and its texture coordinates: each vertex is held by the nearest point of
-the cloth, in the frame there (a *wrap deformer*). NumPy.
+the cloth, in the frame there (a *wrap deformer*). The cloth's triangles are rounded between their
+corners' planes (Boubekeur and Alexa 2008, "Phong tessellation"), so that a fine mesh stays smooth
+on coarse cloth. NumPy.
 """
 
 from __future__ import annotations
@@ -15,6 +17,8 @@ import numpy as np
 from onefit.body import ClosestSurface
 from onefit.garment.binding import vertex_normals
 from polyfit.mesh import TexCoords
+
+_ROUND = 0.75  # of the way to the mean of the corners' planes
 
 
 @dataclass(frozen=True)
@@ -72,12 +76,15 @@ class RenderMesh:
         columns.
         """
         corners = cloth_faces[self.face]
-        mixed = lambda x: np.einsum("mk,mkd->md", self.barycentric, x[corners])
+        mixed = lambda x: np.einsum("mk,mkd->md", self.barycentric, x)
         unit = lambda x: x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-12)
-        normal = unit(mixed(vertex_normals(cloth, cloth_faces)))
-        side = cloth[corners[:, 1]] - cloth[corners[:, 0]]
+        x, n = cloth[corners], vertex_normals(cloth, cloth_faces)[corners]
+        flat, normal = mixed(x), unit(mixed(n))
+        beyond = np.einsum("mkd,mkd->mk", flat[:, None] - x, n)  # the planes of the corners
+        point = flat - _ROUND * mixed(beyond[..., None] * n)
+        side = x[:, 1] - x[:, 0]
         along = unit(side - (side * normal).sum(axis=1, keepdims=True) * normal)
-        return mixed(cloth), np.stack([along, np.cross(normal, along), normal], axis=2)
+        return point, np.stack([along, np.cross(normal, along), normal], axis=2)
 
     def welded(self, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """``(kept (K,), faces (G', 3))``: the vertices of (M, 3) [m] that lie apart from each other

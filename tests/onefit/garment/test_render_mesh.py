@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from surfaces import joined, sphere
 
-from onefit.garment import Garment
+from onefit.garment import Garment, RenderMesh
 from polyfit.mesh import TexCoords
 from polysft_mi.surface.meshio import write_obj
 
@@ -73,6 +73,17 @@ def test_a_seam_stays_closed_and_can_be_welded(garment, tank):
     assert np.abs(moved[:n] - moved[n : 2 * n]).max() < 1e-6
     kept, welded = garment.render_mesh.welded(moved)
     assert len(kept) == len(moved) - n and welded.max() < len(kept)
+
+
+def test_a_fine_mesh_stays_round_on_coarse_cloth():
+    """A ball on a coarse ball, both stretched: the fine one is five times as round."""
+    fine, coarse = sphere(0.1, 4), sphere(0.1, 2)
+    held = RenderMesh.bound(*fine, None, *coarse)
+    radius = lambda x: np.linalg.norm(x / [1, 1, 2], axis=1)
+    seen = held.carried(coarse[0] * [1, 1, 2], coarse[1])
+    flat = (coarse[0] * [1, 1, 2])[coarse[1]].mean(axis=1)
+    assert 0.1 - radius(seen).min() < 0.2 * (0.1 - radius(flat).min())
+    assert held.carried(*coarse) == pytest.approx(fine[0], abs=1e-6)
 
 
 def test_another_resolution_carries_the_same_mesh(garment, file_mesh):

@@ -97,6 +97,7 @@ def test_what_is_there_is_not_lost(out, network):
         ),
         (("tuxedo.obj", "walk"), "tuxedo.obj: no such file"),
         (("tuxedo", "walk"), "garment 'tuxedo': no such template; there are tshirt, dress, tank"),
+        (("shorts", "walk", "--vertices", "10"), "--vertices 10: at least 100 are needed"),
         (("shorts", "walk", "--finish", "-1"), "--finish -1: steps a frame, 0 or more"),
         (("shorts", "walk", "--material", "wool"), "material 'wool': choose among cotton, silk"),
         (("shorts", "walk", "--shape", "girth=3"), "--shape girth=3: choose among gender, age"),
