@@ -1,9 +1,8 @@
 """Meshes of garments made clean, or refused: one layer of cloth, at most two faces an edge, wound
 alike, with openings. NumPy.
 
-The rules, in this order; whatever is changed is told in a sentence:
-
-What is dropped here goes on in the garment's :class:`onefit.garment.RenderMesh`.
+The rules, in this order; whatever is changed is told in a sentence, and what is left out goes along
+as a part of the garment's :class:`onefit.garment.RenderMesh`:
 
 1. Faces whose corners coincide, faces that repeat others (the other side of a double-sided mesh),
    and vertices in no face are dropped.
@@ -33,10 +32,8 @@ from .thickness import outer_side
 from .zip import zipped
 
 _COINCIDENT = 2e-5  # vertices closer than this lie on one another [m]
-SMALL_PART_SHARE, _LEAST_SHARE = (
-    0.05,
-    0.80,
-)  # of the area: parts that are dropped, and what has to be left
+# Shares of the area: parts that are no cloth, and what has to be left
+SMALL_PART_SHARE, _LEAST_SHARE = 0.05, 0.80
 _SMALL_HOLE_LENGTH = 0.10  # around [m]
 
 
