@@ -21,11 +21,12 @@ BUTTONS, FRAMES, SIZE = 7, (8, 20, 29), (420, 330)
 CLOTH, BUTTON, BODY = (0.06, 0.16, 0.35), (0.75, 0.73, 0.68), (0.5, 0.48, 0.46)
 
 
-def shirt(buttons):
-    """``(vertices, faces, cloth's faces)`` of a mesh: the package's shirt, its front cut open, with
-    6 mm between, and so many buttons on it.
+def cut_open(template, buttons):
+    """``(vertices (N, 3) [m], faces (F, 3), count, sides (2, S))`` of a mesh: a template,
+    its front cut open, with 6 mm between, and so many buttons on it. The first ``count`` faces are
+    cloth; ``sides``: its vertices left and right of the cut.
     """
-    garment = onefit.Garment.template("shirt")
+    garment = onefit.Garment.template(template)
     V, F = garment.vertices.double().numpy(), garment.faces.numpy()
     centre = V[F].mean(axis=1)
     front, right = centre[:, 1] < -0.02, centre[:, 0] > 0
@@ -40,7 +41,8 @@ def shirt(buttons):
         button = trimesh.creation.icosphere(2, 0.008)
         faces.append(button.faces + sum(map(len, vertices)))
         vertices.append(button.vertices * [1, 0.3, 1] + place)
-    return np.concatenate(vertices), np.concatenate(faces), len(F)
+    sides = np.stack([cut, other[cut]])
+    return np.concatenate(vertices), np.concatenate(faces), len(F), sides
 
 
 def main(argv=None):
@@ -50,7 +52,7 @@ def main(argv=None):
     draper, motion = onefit.load(), onefit.Motion.generate("dance", seconds=1, seed=1_000_005)
     rows = []
     for buttons in (BUTTONS, 0):
-        vertices, faces, cloth = shirt(buttons)
+        vertices, faces, cloth, _ = cut_open("shirt", buttons)
         garment = onefit.Garment.of_mesh("shirt", vertices, faces)
         drape = draper.drape(garment, motion, finish=2)
         seen, chosen = drape.render_vertices(), list(FRAMES)

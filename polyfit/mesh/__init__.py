@@ -18,6 +18,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
             "face_vectors",
             "in_use",
             "sheets",
+            "welded",
             "winding",
         ],
     },

@@ -141,6 +141,8 @@ def _from_zero(index: int, count: int) -> int:
 def _read_by_trimesh(path: str, kind: str) -> _TexturedMesh:
     import trimesh
 
+    from .triangles import welded  # SciPy is slow to load
+
     log = logging.getLogger("trimesh")
     was_disabled = log.disabled
     log.disabled = True  # it prints a traceback where a TextureFile is missing
@@ -169,13 +171,7 @@ def _read_by_trimesh(path: str, kind: str) -> _TexturedMesh:
     texcoords = None
     if uv is not None and len(uv) == len(V):
         texcoords = TexCoords(np.array(uv, dtype=np.float64), F)
-    return (V, F, texcoords) if kind == "ply" else (*_welded(V, F), texcoords)
-
-
-def _welded(V: np.ndarray, F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The mesh with vertices in one place made one: glTF splits them along seams of the texture."""
-    _, first, index = np.unique(V, axis=0, return_index=True, return_inverse=True)
-    order = np.argsort(first)
-    number = np.empty(len(order), dtype=np.int64)
-    number[order] = np.arange(len(order))
-    return V[first[order]], number[index.ravel()][F]
+    if kind == "ply":
+        return V, F, texcoords
+    kept, F = welded(V, F)  # glTF splits vertices along seams of the texture
+    return V[kept], F, texcoords

@@ -31,6 +31,7 @@ def subdivided_loop(F: np.ndarray, count: int) -> tuple[np.ndarray, Any]:
     face, or of more than two, is a boundary: a curve of its own.
     """
     finer, edges = subdivided(F)
+    finer = np.where(finer > F.max(), finer + count - 1 - F.max(), finer)  # past loose vertices
     side = edges_of(F)[1]
     inside = np.bincount(side.ravel(), minlength=len(edges)) == 2
     (a, b), middle = edges.T, count + np.arange(len(edges))

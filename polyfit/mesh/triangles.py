@@ -47,6 +47,18 @@ def checked(
     return V, F
 
 
+def welded(V: np.ndarray, F: np.ndarray, grid: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """``(kept (K,), faces (F, 3))``: the first vertex in each place, in their order, and the faces
+    on these. Places are the same that round to the same point of a ``grid`` [m]; 0: that are equal.
+    """
+    places = V if grid == 0 else np.round(V / grid).astype(np.int64)
+    _, first, index = np.unique(places, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    number = np.empty(len(order), dtype=np.int64)
+    number[order] = np.arange(len(order))
+    return first[order], number[index.ravel()][F]
+
+
 def in_use(V: np.ndarray, F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The mesh without vertices in no face; the others keep their order."""
     used, F = np.unique(F, return_inverse=True)

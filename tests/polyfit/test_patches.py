@@ -247,4 +247,7 @@ def test_loops_smooth_surface_is_that_of_trimesh(shape):
     assert len(fine) == len(expected) and fine[: len(V)] == pytest.approx(expected[: len(V)])
     at = lambda x: x[np.lexsort(np.round(x, 9).T)]  # the middles of edges in any order
     assert at(fine) == pytest.approx(at(expected))
+    loose, more = mesh.subdivided_loop(F, len(V) + 2)
+    padded = more @ np.concatenate([V, V[:2]])
+    assert padded[loose] == pytest.approx(fine[faces])
     assert matrix.sum(1) == pytest.approx(1) and faces.max() == len(fine) - 1

@@ -16,7 +16,7 @@ import numpy as np
 
 from onefit.body import ClosestSurface
 from onefit.garment.binding import vertex_normals
-from polyfit.mesh import TexCoords
+from polyfit.mesh import TexCoords, welded
 
 _ROUND = 0.75  # of the way to the mean of the corners' planes
 
@@ -87,14 +87,8 @@ class RenderMesh:
         return point, np.stack([along, np.cross(normal, along), normal], axis=2)
 
     def welded(self, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """``(kept (K,), faces (G', 3))``: the vertices of (M, 3) [m] that lie apart from each other
-        and the faces on them: without the seams that some formats cut.
+        """``(kept (K,), faces (G', 3))``: which of the ``vertices`` (M, 3) [m] lie apart from each
+        other, and the faces on these: without the seams that some formats cut.
         """
-        _, kept, index = np.unique(
-            np.round(vertices / 2e-5).astype(np.int64),
-            axis=0,
-            return_index=True,
-            return_inverse=True,
-        )
-        faces = index.ravel()[self.faces]
+        kept, faces = welded(vertices, self.faces, grid=2e-5)
         return kept, faces[(np.roll(faces, 1, axis=1) != faces).all(axis=1)]

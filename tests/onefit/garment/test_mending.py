@@ -151,7 +151,7 @@ class TestRepairs:
         )
         assert len(g) == len(V)
 
-    def test_buttons_are_dropped(self, tank):
+    def test_buttons_are_no_cloth(self, tank):
         button, G = sphere(0.006, 1)
         self.check(
             *joined(tank, (button + [0, -0.16, 0.3], G)), f"a part of {len(G)} faces, .* go along"

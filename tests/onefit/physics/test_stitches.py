@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import scripts
 from surfaces import joined, sheet, sphere
 
 import onefit
@@ -54,28 +55,9 @@ def test_parts_that_touch_are_one_buckle():
     assert len(found(cloth, lower, middle, upper)) == 1
 
 
-def open_at_the_front(buttons):
-    """The tank top, cut open along the middle of its front, with 6 mm between; a file's mesh, and
-    the vertices on both sides of the cut.
-    """
-    g = Garment.template("tank")
-    V, F = g.vertices.double().numpy(), g.faces.numpy()
-    front, right = V[F].mean(axis=1)[:, 1] < -0.02, V[F].mean(axis=1)[:, 0] > 0
-    cut = np.intersect1d(F[front & right], F[front & ~right])
-    other = np.arange(len(V))
-    other[cut] = len(V) + np.arange(len(cut))
-    G = np.where((front & right)[:, None], other[F], F)
-    W = np.concatenate([V, V[cut] + [0.003, 0, 0]])
-    W[cut] -= [0.003, 0, 0]
-    low, high = V[cut, 2].min() + 0.02, V[cut, 2].max() - 0.02
-    places = [V[cut[np.abs(V[cut, 2] - z).argmin()]] for z in np.linspace(low, high, buttons)]
-    mesh = joined((W, G), *(button(p - [0, 0.003, 0], 0.008) for p in places))
-    return (*mesh, cut, other[cut])
-
-
 @pytest.mark.parametrize("buttons", [0, 5])
 def test_a_buttoned_front_stays_closed(buttons):
-    V, F, left, right = open_at_the_front(buttons)
+    V, F, _, (left, right) = scripts.load("docs/onefit_file.py").cut_open("tank", buttons)
     garment = Garment.of_mesh("top", V, F)
     assert len(garment.stitches) == buttons
     quick = Settings(lead=0.3, settling=0.1)
