@@ -213,6 +213,7 @@ class Draper:
                 material=material, steps=finish, fps=FPS, settings=settings, first=first,
                 sides=garment.sides(rest).double().numpy() if cut else None,
                 cut=garment.cut.numpy() if cut else None, stitches=garment.stitches,
+                patches=self.patched(garment).vertex_patch,
             )  # fmt: skip
             vertices = torch.stack([(frame, advance())[0] for frame in made])
         mesh_of_file = garment.render_mesh

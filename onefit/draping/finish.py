@@ -41,6 +41,7 @@ def finished(
     sides: np.ndarray | None = None,
     cut: np.ndarray | None = None,
     stitches: Stitches | None = None,
+    patches: np.ndarray | None = None,
 ) -> Iterator[torch.Tensor]:
     """The garment's vertices (N, 3) [m] in one frame after the other, from the ``first`` on: those
     before lead to it, and are not given.
@@ -50,7 +51,7 @@ def finished(
     :func:`onefit.garment.waistband.held` says; ``bodies`` (T, V, 3) [m], ``body_faces``; ``steps``
     in a frame, in which the body moves along straight lines; ``sides`` (F, 3) [m]: the lengths of
     the faces at rest, and ``cut`` (N, 3) [m], of a garment that was cut otherwise than it hangs;
-    ``stitches``: what else holds it together.
+    ``stitches``: what else holds it together; ``patches`` (N,): the patch of each vertex.
     """
     settings = settings or Settings()
     order = _order(faces.numpy(), len(rest))
@@ -66,7 +67,8 @@ def finished(
         lengths = np.maximum(stitches.lengths, settings.apart)
         sewn.append(ThreadContact(*ends, lengths, settings.contact * material.stretch, keys))
         keys += len(stitches)
-    cloth = Cloth(sheet, start[0], settings, keys)
+    of = None if patches is None else patches[order]
+    cloth = Cloth(sheet, start[0], settings, keys, of)
     pull = settings.draw * sheet.mass + material.stretch * np.asarray(held)[order]
     dt = 1 / fps / steps
     body.find(cloth.x)

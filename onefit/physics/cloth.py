@@ -7,7 +7,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.sparse import bsr_matrix
 
 from . import kernels
 from .contact import Contacts, weighted
@@ -15,6 +14,7 @@ from .kernels import wp
 from .material import AIR, GRAVITY
 from .settings import Settings
 from .sheet import Sheet
+from .solver import Solver
 
 
 def _ints(a):
@@ -47,7 +47,8 @@ class _Touch:
 
 class Cloth:
     """A ``sheet`` at ``x`` (N, 3) [m] with velocities ``v`` (N, 3) [m/s]; ``keys``: how many
-    contacts can be told from each other.
+    contacts can be told from each other; ``patches`` (N,): the patch of each vertex, by whose motions
+    the solver is deflated.
 
     Baraff and Witkin's scheme (SIGGRAPH 1998). With y = x + dt v + dt^2 g, the free flight, a step
     lowers m / (2 dt^2) |x - y|^2 + stretching + bending + air + contacts + friction, linearised at
@@ -55,7 +56,12 @@ class Cloth:
     """
 
     def __init__(
-        self, sheet: Sheet, x: np.ndarray, settings: Settings | None = None, keys: int = 0
+        self,
+        sheet: Sheet,
+        x: np.ndarray,
+        settings: Settings | None = None,
+        keys: int = 0,
+        patches: np.ndarray | None = None,
     ) -> None:
         self.sheet, self.settings = sheet, settings or Settings()
         self.x = np.array(x, dtype=np.float64)
@@ -68,7 +74,6 @@ class Cloth:
         pairs = np.concatenate([E, E[:, ::-1], np.stack([each, each], 1)])
         where = np.unique(pairs[:, 0] * N + pairs[:, 1])
         at = lambda i, j: np.searchsorted(where, i * N + j)
-        self._middle = at(each, each)
         beside = [
             (p, q) for i, j in ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3)) for p, q in ((i, j), (j, i))
         ]
@@ -76,16 +81,14 @@ class Cloth:
         of_hinges = [at(H[:, i], H[:, i]) for i in range(4)]
         of_hinges += [at(H[:, p], H[:, q]) for p, q in beside]
         material = sheet.material
-        self._rows = [_ints(np.searchsorted(where // N, np.arange(N + 1))), _ints(self._middle)]
-        self._rows.append(_ints(where % N))
+        first = np.searchsorted(where // N, np.arange(N + 1))
+        self._solver = Solver(first, where % N, patches)
+        self._middle = _ints(self._solver.middle)
         self._faces, self._of_faces = _ints(F), _ints(of_faces)
         self._hinges = _ints(H), _reals(sheet.angles), _reals(sheet.stiffness)
         self._of_hinges = _ints(np.stack(of_hinges, 1).reshape(-1, 14))
         self._stretch = _reals(sheet.gradients, kernels.vec2), _reals(material.stretch * sheet.area)
-        self._matrix = _reals(np.zeros((len(where), 3, 3)), kernels.mat3)
-        self._inverse = _reals(np.zeros((N, 3, 3)), kernels.mat3)
-        self._vectors = [_reals(np.zeros((N, 3)), kernels.vec3) for _ in range(9)]
-        self._done = _ints([0])
+        self._vectors = [_reals(np.zeros((N, 3)), kernels.vec3) for _ in range(4)]
 
     def touches(self, contacts: Sequence[Contacts], dt: float) -> list[_Touch]:
         """The ``contacts`` of a step of ``dt`` [s], as :meth:`assemble` takes them."""
@@ -97,17 +100,12 @@ class Cloth:
         """The gradient (N, 3) [N] at ``y`` (N, 3) [m] of all but inertia and weight. The matrix
         stays here, with the masses / dt^2.
         """
-        x, before, velocity, force = self._vectors[:4]
-        x.numpy()[:], before.numpy()[:], velocity.numpy()[:], force.numpy()[:] = (
-            y,
-            self.x,
-            self.v,
-            0,
-        )
-        matrix = self._matrix.numpy()
-        matrix[:] = 0
-        matrix[self._middle] = (self.sheet.mass / dt**2)[:, None, None] * np.eye(3)
-        into = [force, self._matrix]
+        x, before, velocity, force = self._vectors
+        for vector, value in zip(self._vectors, (y, self.x, self.v, 0)):
+            vector.numpy()[:] = value
+        self._solver.block.numpy()[:] = 0
+        self._add(self.sheet.mass / dt**2)
+        into = [force, self._solver.block]
         launch = lambda kernel, size, arguments: wp.launch(kernel, size, arguments, device="cpu")
         count, material = len(self.sheet.faces), self.sheet.material
         launch(kernels.stretching, count, [x, self._faces, *self._stretch, self._of_faces, *into])
@@ -119,26 +117,23 @@ class Cloth:
         air = [material.drag * AIR / 2, dt, self._of_faces]
         launch(kernels.drag, count, [x, before, velocity, self._faces, *air, *into])
         for touch in touches:
-            size, places = len(touch.gap), [x, before, *touch.arrays, self._rows[1]]
+            size, places = len(touch.gap), [x, before, *touch.arrays, self._middle]
             launch(kernels.contact, size, [*places, *touch.found, *into])
         none = (np.zeros((0, 4)), np.zeros((0, 4)), np.zeros((0, 3, 3)))
         parts = [none, *(touch.coupled() for touch in touches)]
-        corners, weights, blocks = (np.concatenate(a) for a in zip(*parts))
-        self._coupled = _ints(corners), _reals(weights), _reals(blocks, kernels.mat3)
+        self._solver.couple(*(np.concatenate(a) for a in zip(*parts)))
         return force.numpy()
 
     def product(self, vector: np.ndarray) -> np.ndarray:
         """The matrix that was last assembled times ``vector`` (N, 3)."""
-        first, _, column = (a.numpy() for a in self._rows)
-        size = 3 * len(self.sheet)
-        matrix = bsr_matrix((self._matrix.numpy(), column, first), shape=(size, size))
-        out = (matrix @ np.ravel(vector)).reshape(-1, 3)
-        corners, weights, block = (a.numpy() for a in self._coupled)
-        at = np.einsum("ck,ckd->cd", weights, vector[corners])[:, None]
-        one_by_one = weights[:, :, None] * vector[corners]
-        of_corners = np.einsum("cde,cke->ckd", block, at - one_by_one) * weights[:, :, None]
-        np.add.at(out, corners, of_corners)
-        return out
+        return self._solver.product(vector)
+
+    def _add(self, stiffness):
+        """Adds springs (N,) [N/m], the same in all directions, to the matrix."""
+        middle = self._solver.block.numpy()[self._solver.middle]
+        self._solver.block.numpy()[self._solver.middle] = middle + stiffness[
+            :, None, None
+        ] * np.eye(3)
 
     def flight(self, dt: float) -> np.ndarray:
         """Where the vertices (N, 3) [m] would be after a step of ``dt`` [s] without any force but
@@ -159,23 +154,21 @@ class Cloth:
         stiffness ``pull`` (N,) [N/m].
         """
         y = self.flight(dt)
-        pull = np.broadcast_to(pull, len(y))[:, None]
+        pull = np.broadcast_to(pull, len(y))
         target = y if target is None else target
-        inertia = self.sheet.mass[:, None] / dt**2
-        b, move, *work = self._vectors[3:]
-        limits = [self.settings.iterations, self.settings.tolerance]
-        solve = [*self._rows, self._matrix, self._inverse]
+        inertia = self.sheet.mass / dt**2
+        settings = self.settings
         after, start, self.iterations = y, self._forced, 0
         touches = self.touches(contacts, dt)
-        for _ in range(self.settings.newton):
+        for _ in range(settings.newton):
             gradient = self.assemble(after, dt, touches)
-            gradient = gradient + inertia * (after - y) + pull * (after - target)
-            self._matrix.numpy()[self._middle] += pull[:, :, None] * np.eye(3)
-            b.numpy()[:], move.numpy()[:] = -gradient, start
-            arrays = [*solve, *self._coupled, *limits, b, move, *work, self._done]
-            wp.launch(kernels.conjugate_gradients, 1, arrays, device="cpu")
-            self.iterations += int(self._done.numpy()[0])
-            after, start = after + move.numpy(), np.zeros_like(y)
+            gradient = gradient + inertia[:, None] * (after - y) + pull[:, None] * (after - target)
+            self._add(pull)
+            move, done = self._solver.solve(
+                -gradient, start, settings.iterations, settings.tolerance
+            )
+            self.iterations += done
+            after, start = after + move, np.zeros_like(y)
         self._forced = after - y
         self._remember(after, touches)
         self.v, self.x = (after - self.x) / dt, after

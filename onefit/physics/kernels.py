@@ -1,5 +1,5 @@
-"""Warp kernels of the implicit step: gradient and Hessian of a sheet's energies, and conjugate
-gradients. On the CPU each is one compiled loop.
+"""Warp kernels of the implicit step: gradient and Hessian of a sheet's energies. On the CPU each is
+one compiled loop.
 
 Matrices have 3 x 3 blocks, at the diagonal and where two vertices share an edge. Double precision:
 in single precision the rounding of a coordinate of 1 m is a strain of 1e-5.
@@ -177,7 +177,7 @@ def contact(
 ):
     """stiffness / 2 gap^2 where the gap is below 0, and drag / 2 slip^2. Where the weights sum to
     one, the other side is not the sheet, and the Hessian is lumped, as masses are; where they sum
-    to zero, it is exact, with what couples the corners in :func:`_coupled`.
+    to zero, it is exact, with what couples the corners in :mod:`onefit.physics.solver`.
     """
     c = wp.tid()
     n = normal[c]
@@ -205,102 +205,3 @@ def contact(
                 force[v] += weights[c, i] * g
                 share = wp.where(total > real(0.5), real(1.0), weights[c, i])
                 matrix[middle[v]] += share * weights[c, i] * block[c]
-
-
-@wp.func
-def _coupled(
-    corners: wp.array2d(dtype=int),
-    weights: wp.array2d(dtype=real),
-    block: wp.array(dtype=mat3),
-    x: wp.array(dtype=vec3),
-    out: wp.array(dtype=vec3),
-):
-    """Contacts of several corners, less their blocks of each corner with itself, times x."""
-    for i in range(out.shape[0]):
-        out[i] = vec3()
-    for c in range(corners.shape[0]):
-        at = vec3()
-        for k in range(4):
-            at += weights[c, k] * x[corners[c, k]]
-        for k in range(4):
-            v = corners[c, k]
-            out[v] = out[v] + block[c] * (weights[c, k] * (at - weights[c, k] * x[v]))
-
-
-@wp.kernel
-def conjugate_gradients(
-    first: wp.array(dtype=int),  # (N + 1,): row i has the blocks first[i] to first[i + 1]
-    middle: wp.array(dtype=int),  # (N,): where its diagonal block lies
-    column: wp.array(dtype=int),
-    matrix: wp.array(dtype=mat3),
-    inverse: wp.array(dtype=mat3),  # receives those of the diagonal blocks
-    corners: wp.array2d(dtype=int),  # (C, 4), of contacts that couple vertices
-    weights: wp.array2d(dtype=real),
-    block: wp.array(dtype=mat3),
-    iterations: int,
-    tolerance: real,  # of the residual's norm, relative to the right-hand side's
-    b: wp.array(dtype=vec3),  # overwritten
-    x: wp.array(dtype=vec3),  # start, and result
-    p: wp.array(dtype=vec3),
-    t: wp.array(dtype=vec3),
-    w: wp.array(dtype=vec3),
-    u: wp.array(dtype=vec3),
-    done: wp.array(dtype=int),  # receives the number of iterations
-):
-    """(matrix + contacts) x = b, preconditioned by a symmetric Gauss-Seidel sweep, in Eisenstat's
-    form (1981): a sweep back and one forward do for the product with the matrix, too. One thread.
-
-    With A = L + D + L^T + C: CG on (D + L)^-1 A (D + L^T)^-1, preconditioned by D. C is what
-    contacts couple beyond the mesh's edges: a product more.
-    """
-    n = x.shape[0]
-    zero = real(0.0)
-    size = zero
-    for i in range(n):
-        inverse[i] = wp.inverse(matrix[middle[i]])
-        size += wp.dot(b[i], inverse[i] * b[i])
-    _coupled(corners, weights, block, x, u)
-    for i in range(n):
-        r = b[i] - u[i]
-        for k in range(first[i], first[i + 1]):
-            r -= matrix[k] * x[column[k]]
-        t[i] = r
-    for i in range(n):
-        r = t[i]
-        for k in range(first[i], middle[i]):
-            r -= matrix[k] * b[column[k]]
-        b[i] = inverse[i] * r
-    rho = zero
-    for i in range(n):
-        p[i] = matrix[middle[i]] * b[i]
-        rho += wp.dot(b[i], p[i])
-    done[0] = 0
-    limit = tolerance * tolerance * size
-    for turn in range(iterations):
-        if rho <= limit or rho <= real(1.0e-30):
-            break
-        for back in range(n):
-            i = n - 1 - back
-            r = p[i]
-            for k in range(middle[i] + 1, first[i + 1]):
-                r -= matrix[k] * t[column[k]]
-            t[i] = inverse[i] * r
-        curvature = zero
-        _coupled(corners, weights, block, t, u)
-        for i in range(n):
-            r = p[i] - matrix[middle[i]] * t[i] + u[i]
-            for k in range(first[i], middle[i]):
-                r -= matrix[k] * w[column[k]]
-            w[i] = inverse[i] * r
-            curvature += wp.dot(p[i], t[i] + w[i])
-        alpha = rho / curvature
-        after = zero
-        for i in range(n):
-            x[i] = x[i] + alpha * t[i]
-            b[i] = b[i] - alpha * (t[i] + w[i])
-            after += wp.dot(b[i], matrix[middle[i]] * b[i])
-        beta = after / rho
-        for i in range(n):
-            p[i] = matrix[middle[i]] * b[i] + beta * p[i]
-        rho = after
-        done[0] = turn + 1

@@ -28,7 +28,7 @@ class Settings:
     """
 
     newton: int = 2
-    iterations: int = 20
+    iterations: int = 10
     tolerance: float = 1e-5
     clearance: float = 0.003
     least: float = 0.001
