@@ -47,8 +47,8 @@ class _Touch:
 
 class Cloth:
     """A ``sheet`` at ``x`` (N, 3) [m] with velocities ``v`` (N, 3) [m/s]; ``keys``: how many
-    contacts can be told from each other; ``patches`` (N,): the patch of each vertex, by whose motions
-    the solver is deflated.
+    contacts can be told from each other; ``patches`` (N,): the patch of each vertex, by whose
+    motions the solver is deflated.
 
     Baraff and Witkin's scheme (SIGGRAPH 1998). With y = x + dt v + dt^2 g, the free flight, a step
     lowers m / (2 dt^2) |x - y|^2 + stretching + bending + air + contacts + friction, linearised at
