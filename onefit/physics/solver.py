@@ -8,7 +8,8 @@ iteration (Nicolaides 1987), by a dense system with a block for each pair of pat
 On the CPU each kernel is one compiled loop; matrices have 3 x 3 blocks.
 """
 
-# mypy: disable-error-code="valid-type"  # Warp's kernels have its own types
+# Warp's kernels have its own types
+# mypy: disable-error-code="valid-type"
 import numpy as np
 from scipy.sparse import bsr_matrix
 
