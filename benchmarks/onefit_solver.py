@@ -19,13 +19,13 @@ from onefit.physics import cloth
 from onefit.physics.solver import Solver
 from polyfit.errors import cli
 
-EVERY = 23  # systems one is kept
+EVERY = 23  # one system in so many is kept
 ITERATIONS = (5, 10, 20, 40, 60)
 HEAD = "| garment | motion | iterations | error, no patches | ms | error, patches | ms |"
 
 
-class Kept(Solver):
-    """Keeps some of the systems that it solves."""
+class _Keeping(Solver):
+    """A solver that keeps some of the systems that it solves."""
 
     systems: list = []
     count = 0
@@ -39,15 +39,15 @@ class Kept(Solver):
         self.pairs = pairs
 
     def solve(self, b, start, *limits):
-        Kept.count += 1
-        if Kept.count % EVERY == 0:
+        _Keeping.count += 1
+        if _Keeping.count % EVERY == 0:
             arrays = self.block.numpy(), b, start
-            Kept.systems.append((self.of, self.pairs, *(a.copy() for a in arrays)))
+            _Keeping.systems.append((self.of, self.pairs, *(a.copy() for a in arrays)))
         return super().solve(b, start, *limits)
 
 
 def solved(system, iterations, patches, tolerance=0.0):
-    """The solution of a system, its relative error as a function, and the seconds it took."""
+    """The solution (N, 3) [m] of a system, the seconds it took, and the solver."""
     (first, column, of), pairs, block, b, start = system
     solver = Solver(first, column, of if patches else None)
     solver.block.numpy()[:] = block
@@ -60,14 +60,14 @@ def solved(system, iterations, patches, tolerance=0.0):
 def rows(garment, motion):
     """A row for each of ITERATIONS."""
     exact = []
-    for system in Kept.systems:
+    for system in _Keeping.systems:
         x, _, solver = solved(system, 2000, True, 1e-12)
         exact.append((x, np.vdot(x, solver.product(x))))
     for iterations in ITERATIONS:
         cells = []
         for patches in (False, True):
             errors, times = [], []
-            for system, (x, size) in zip(Kept.systems, exact):
+            for system, (x, size) in zip(_Keeping.systems, exact):
                 found, seconds, solver = solved(system, iterations, patches)
                 left = found - x
                 errors.append(np.vdot(left, solver.product(left)) / size)
@@ -82,10 +82,10 @@ def main(argv=None):
     parser.add_argument("--motions", nargs="+", default=["jumping_jack", "box"], metavar="KIND")
     parser.add_argument("--seconds", type=float, default=0.7, help="of a motion (default: 0.7)")
     args = parser.parse_args(argv)
-    draper, cloth.Solver = onefit.load(), Kept
+    draper, cloth.Solver = onefit.load(), _Keeping
     print(HEAD, "|---" * (HEAD.count("|") - 1) + "|", sep="\n")
     for garment, kind in zip(args.garments, args.motions):
-        Kept.systems.clear()
+        _Keeping.systems.clear()
         motion = onefit.Motion.generate(kind, seconds=args.seconds, seed=SEED)
         draper.drape(garment, motion, finish=2)
         rows(garment, kind)

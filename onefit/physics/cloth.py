@@ -10,19 +10,11 @@ import numpy as np
 
 from . import kernels
 from .contact import Contacts, weighted
-from .kernels import wp
+from .kernels import ints, reals, wp
 from .material import AIR, GRAVITY
 from .settings import Settings
 from .sheet import Sheet
 from .solver import Solver
-
-
-def _ints(a):
-    return wp.array(np.ascontiguousarray(a, dtype=np.int32), dtype=int, device="cpu")
-
-
-def _reals(a, dtype=kernels.real):
-    return wp.array(np.ascontiguousarray(a, dtype=np.float64), dtype=dtype, device="cpu")
 
 
 class _Touch:
@@ -32,10 +24,10 @@ class _Touch:
 
     def __init__(self, contacts: Contacts, drag: np.ndarray) -> None:
         c, self.contacts, self.drag, count = contacts, contacts, drag, len(contacts.key)
-        self.arrays = [_ints(c.corners), _reals(c.weights), _reals(c.normal, kernels.vec3)]
-        self.arrays += [_reals(c.offset), _reals(c.moved, kernels.vec3), c.stiffness, _reals(drag)]
-        gap, slip = _reals(np.zeros(count)), _reals(np.zeros(count))
-        self.found = [gap, slip, _reals(np.zeros((count, 3, 3)), kernels.mat3)]
+        self.arrays = [ints(c.corners), reals(c.weights), reals(c.normal, kernels.vec3)]
+        self.arrays += [reals(c.offset), reals(c.moved, kernels.vec3), c.stiffness, reals(drag)]
+        gap, slip = reals(np.zeros(count)), reals(np.zeros(count))
+        self.found = [gap, slip, reals(np.zeros((count, 3, 3)), kernels.mat3)]
         self.gap, self.slip, self.block = (a.numpy() for a in self.found)
         self.coupling = c.weights.sum(1) < 0.5  # or the Hessian is lumped
 
@@ -47,8 +39,8 @@ class _Touch:
 
 class Cloth:
     """A ``sheet`` at ``x`` (N, 3) [m] with velocities ``v`` (N, 3) [m/s]; ``keys``: how many
-    contacts can be told from each other; ``patches`` (N,): the patch of each vertex, by whose
-    motions the solver is deflated.
+    contacts can be told from each other; ``patches`` (N,): the patch of each vertex, by which
+    the :class:`onefit.physics.solver.Solver` is deflated.
 
     Baraff and Witkin's scheme (SIGGRAPH 1998). With y = x + dt v + dt^2 g, the free flight, a step
     lowers m / (2 dt^2) |x - y|^2 + stretching + bending + air + contacts + friction, linearised at
@@ -83,12 +75,12 @@ class Cloth:
         material = sheet.material
         first = np.searchsorted(where // N, np.arange(N + 1))
         self._solver = Solver(first, where % N, patches)
-        self._middle = _ints(self._solver.middle)
-        self._faces, self._of_faces = _ints(F), _ints(of_faces)
-        self._hinges = _ints(H), _reals(sheet.angles), _reals(sheet.stiffness)
-        self._of_hinges = _ints(np.stack(of_hinges, 1).reshape(-1, 14))
-        self._stretch = _reals(sheet.gradients, kernels.vec2), _reals(material.stretch * sheet.area)
-        self._vectors = [_reals(np.zeros((N, 3)), kernels.vec3) for _ in range(4)]
+        self._middle = ints(self._solver.middle)
+        self._faces, self._of_faces = ints(F), ints(of_faces)
+        self._hinges = ints(H), reals(sheet.angles), reals(sheet.stiffness)
+        self._of_hinges = ints(np.stack(of_hinges, 1).reshape(-1, 14))
+        self._stretch = reals(sheet.gradients, kernels.vec2), reals(material.stretch * sheet.area)
+        self._vectors = [reals(np.zeros((N, 3)), kernels.vec3) for _ in range(4)]
 
     def touches(self, contacts: Sequence[Contacts], dt: float) -> list[_Touch]:
         """The ``contacts`` of a step of ``dt`` [s], as :meth:`assemble` takes them."""
@@ -130,10 +122,8 @@ class Cloth:
 
     def _add(self, stiffness):
         """Adds springs (N,) [N/m], the same in all directions, to the matrix."""
-        middle = self._solver.block.numpy()[self._solver.middle]
-        self._solver.block.numpy()[self._solver.middle] = middle + stiffness[
-            :, None, None
-        ] * np.eye(3)
+        blocks = self._solver.block.numpy()
+        blocks[self._solver.middle] += stiffness[:, None, None] * np.eye(3)
 
     def flight(self, dt: float) -> np.ndarray:
         """Where the vertices (N, 3) [m] would be after a step of ``dt`` [s] without any force but

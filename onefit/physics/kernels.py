@@ -5,6 +5,8 @@ Matrices have 3 x 3 blocks, at the diagonal and where two vertices share an edge
 in single precision the rounding of a coordinate of 1 m is a strain of 1e-5.
 """
 
+import numpy as np
+
 from onefit.body.quietwarp import warp as ready
 
 wp = ready()
@@ -17,6 +19,16 @@ mat3 = wp.types.matrix(shape=(3, 3), dtype=real)
 _mat32 = wp.types.matrix(shape=(3, 2), dtype=real)
 _mat43 = wp.types.matrix(shape=(4, 3), dtype=real)
 wp.set_module_options({"enable_backward": False})
+
+
+def ints(a):
+    """``a``, an array of whole numbers, for kernels."""
+    return wp.array(np.ascontiguousarray(a, dtype=np.int32), dtype=int, device="cpu")
+
+
+def reals(a, dtype=real):
+    """``a``, an array of numbers, for kernels: of vectors or matrices by their ``dtype``."""
+    return wp.array(np.ascontiguousarray(a, dtype=np.float64), dtype=dtype, device="cpu")
 
 
 @wp.kernel

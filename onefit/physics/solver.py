@@ -1,11 +1,12 @@
 """The linear system of an implicit step: conjugate gradients, preconditioned by symmetric
 Gauss-Seidel sweeps, and deflated by the motions of the garment's patches.
 
-Sweeps carry a force from a vertex to its neighbours; what pulls a whole sleeve takes as many
-iterations as the sleeve has rows. So the patches' translations are solved for exactly, in each
-iteration (Nicolaides 1987), by a dense system with a block for each pair of patches that touch.
+A sweep carries a force from a vertex to its neighbours only: a pull on a cuff needs as many
+iterations as the sleeve has rows of vertices. So each iteration also solves, exactly, for one
+translation of each patch (Nicolaides 1987): a small system, with a block for each pair of patches
+that touch.
 
-On the CPU each kernel is one compiled loop; matrices have 3 x 3 blocks.
+All matrices have 3 x 3 blocks [N/m]. On the CPU each kernel is one compiled loop.
 """
 
 # Warp's kernels have its own types
@@ -13,7 +14,7 @@ On the CPU each kernel is one compiled loop; matrices have 3 x 3 blocks.
 import numpy as np
 from scipy.sparse import bsr_matrix
 
-from .kernels import mat3, real, vec3, wp
+from .kernels import ints, mat3, real, reals, vec3, wp
 
 wp.set_module_options({"enable_backward": False})
 
@@ -56,7 +57,7 @@ class _Patches:
 
 @wp.func
 def _patch(pairs: _Pairs, patches: _Patches, c: int, k: int):
-    """Of corner k of contact c."""
+    """The patch of corner k of contact c."""
     return patches.of[pairs.corners[c, k]]
 
 
@@ -74,21 +75,17 @@ def _add_coupled(pairs: _Pairs, x: wp.array(dtype=vec3), out: wp.array(dtype=vec
 
 
 @wp.func
-def _take_moved(mesh: _Mesh, pairs: _Pairs, patches: _Patches, out: wp.array(dtype=vec3)):
-    """out -= (A + C) Z y."""
+def _take_moved(
+    pairs: _Pairs, patches: _Patches, back: wp.array(dtype=vec3), out: wp.array(dtype=vec3)
+):
+    """out -= (A + C) Z y; ``back`` receives -Z y."""
     for i in range(out.shape[0]):
+        back[i] = -patches.y[patches.of[i]]
         r = out[i]
         for k in range(patches.first[i], patches.first[i + 1]):
             r -= patches.block[k] * patches.y[patches.column[k]]
         out[i] = r
-    for c in range(pairs.corners.shape[0]):
-        at = vec3()
-        for k in range(4):
-            at += pairs.weights[c, k] * patches.y[_patch(pairs, patches, c, k)]
-        for k in range(4):
-            v = pairs.corners[c, k]
-            weight = pairs.weights[c, k]
-            out[v] = out[v] - pairs.block[c] * (weight * (at - weight * patches.y[patches.of[v]]))
+    _add_coupled(pairs, back, out)
 
 
 @wp.func
@@ -210,7 +207,7 @@ def _conjugate_gradients(
     _solve_patches(patches)
     for i in range(n):
         x[i] = x[i] + patches.y[patches.of[i]]
-    _take_moved(mesh, pairs, patches, t)
+    _take_moved(pairs, patches, w, t)
     rho = zero
     for i in range(n):
         r = t[i]
@@ -234,7 +231,7 @@ def _conjugate_gradients(
         _add_coupled(pairs, t, u)
         _gather(patches, u, t)
         _solve_patches(patches)
-        _take_moved(mesh, pairs, patches, u)
+        _take_moved(pairs, patches, w, u)
         curvature = zero
         for i in range(n):
             r = p[i] - mesh.block[mesh.middle[i]] * t[i] + u[i]
@@ -262,20 +259,18 @@ def _conjugate_gradients(
         x[i] = x[i] + change[i] - patches.y[patches.of[i]]
 
 
-def _ints(a):
-    return wp.array(np.ascontiguousarray(a, dtype=np.int32), dtype=int, device="cpu")
-
-
 def _zeros(shape, dtype):
     return wp.zeros(shape, dtype=dtype, device="cpu")
 
 
 class Solver:
-    """Of N vertices whose rows have the blocks ``first`` (N + 1,) to the next, at ``column``,
-    rising. ``patches`` (N,): the patch of each vertex; None: all are in one.
+    """Solves (A + C) x = b [N] for x [m], of N vertices: A has a block where two vertices share an
+    edge, C where contacts couple others. Row i of A has the blocks ``first[i]`` to ``first[i + 1]``
+    (N + 1,), in the rising columns ``column`` (M,). ``patches`` (N,): the patch of each vertex;
+    None: all are in one.
 
-    ``block``, a Warp array of 3 x 3 matrices, is for others to fill, the contacts' blocks of each
-    corner with itself included.
+    Who uses it fills ``block``, a Warp array of the M blocks; ``middle`` (N,) is where those of the
+    diagonal lie. They hold the contacts' blocks of each corner with itself, too.
     """
 
     def __init__(
@@ -285,36 +280,38 @@ class Solver:
         row = np.repeat(np.arange(count), np.diff(first))
         self.middle = np.flatnonzero(row == column)
         mesh = self._mesh = _Mesh()
-        mesh.first, mesh.middle, mesh.column = _ints(first), _ints(self.middle), _ints(column)
+        mesh.first, mesh.middle, mesh.column = ints(first), ints(self.middle), ints(column)
         mesh.block, mesh.inverse = _zeros(len(column), mat3), _zeros(count, mat3)
         self.block = mesh.block
         of = _in_order(np.zeros(count, int) if patches is None else patches)
         K = int(of.max()) + 1
         where, into = np.unique(row * K + of[column], return_inverse=True)
         p = self._patches = _Patches()
-        p.of, p.into, p.column = _ints(of), _ints(into), _ints(where % K)
-        p.first = _ints(np.searchsorted(where // K, np.arange(count + 1)))
+        p.of, p.into, p.column = ints(of), ints(into), ints(where % K)
+        p.first = ints(np.searchsorted(where // K, np.arange(count + 1)))
         p.block, p.factor = _zeros(len(where), mat3), _zeros((K, K), mat3)
         p.inverse, p.y, p.start = _zeros(K, mat3), _zeros(K, vec3), _zeros(K, int)
         least = np.arange(K)
         np.minimum.at(least, of[where // K], where % K)
-        p.least = _ints(least)
+        p.least = ints(least)
         self._vectors = [_zeros(count, vec3) for _ in range(7)]
         self._done = _zeros(1, int)
         self.couple(np.zeros((0, 4)), np.zeros((0, 4)), np.zeros((0, 3, 3)))
 
     def couple(self, corners: np.ndarray, weights: np.ndarray, blocks: np.ndarray) -> None:
-        """The contacts (P, 4), (P, 4), (P, 3, 3) that couple vertices beyond the mesh's edges."""
+        """Sets C, by contacts' ``corners`` (P, 4), ``weights`` (P, 4) and ``blocks`` (P, 3, 3)
+        [N/m]: what a contact adds between its corners i and j is weight_i weight_j block.
+        """
         pairs = self._pairs = _Pairs()
-        pairs.corners = _ints(corners)
-        pairs.weights = wp.array(np.ascontiguousarray(weights, float), dtype=real, device="cpu")
-        pairs.block = wp.array(np.ascontiguousarray(blocks, float), dtype=mat3, device="cpu")
+        pairs.corners = ints(corners)
+        pairs.weights = reals(weights)
+        pairs.block = reals(blocks, mat3)
 
     def solve(
         self, b: np.ndarray, start: np.ndarray, iterations: int, tolerance: float
     ) -> tuple[np.ndarray, int]:
-        """x (N, 3) of A x = ``b`` (N, 3), and the iterations that it took from ``start``; at most
-        so many, or until the residual is below ``tolerance`` times ``b``.
+        """x (N, 3) [m] for ``b`` (N, 3) [N], and how many iterations it took from ``start`` (N, 3)
+        [m]: ``iterations`` at most, fewer where the residual falls below ``tolerance`` times ``b``.
         """
         right, x, *work = self._vectors
         right.numpy()[:], x.numpy()[:] = b, start
@@ -325,7 +322,7 @@ class Solver:
         return x.numpy().copy(), int(self._done.numpy()[0])
 
     def product(self, vector: np.ndarray) -> np.ndarray:
-        """A times ``vector`` (N, 3): slow and readable."""
+        """(A + C) times ``vector`` (N, 3): slow and readable."""
         mesh, pairs, size = self._mesh, self._pairs, 3 * len(vector)
         blocks = self.block.numpy(), mesh.column.numpy(), mesh.first.numpy()
         out = (bsr_matrix(blocks, shape=(size, size)) @ np.ravel(vector)).reshape(-1, 3)
