@@ -64,12 +64,20 @@ def lengths_restored(
     degree: wp.array(dtype=float),  # edges at each vertex, at least 1
     rounds: int,
     radius: float,
+    clearance: float,
+    body: Surface,
+    touched: wp.array(dtype=int),  # the body's face in front of which a vertex stays; -1: none
+    at: wp.array(dtype=wp.vec3),  # barycentric coordinates of the place in it
     x: wp.array(dtype=wp.vec3),
     old: wp.array(dtype=wp.vec3),  # work: the vertices a round ago
     pull: wp.array(dtype=wp.vec3),  # work
+    normal: wp.array(dtype=wp.vec3),  # work: of the body's face
+    height: wp.array(dtype=float),  # work: the vertex' least, along the normal
 ):
     """Iterations of Jacobi's method for the sum of (|e| - length)^2 [m^2], accelerated by
     Chebyshev's polynomials; (|e|^2 - length^2) / (|e|^2 + length^2) stands for 1 - length / |e|.
+    After each, a vertex that would come nearer than ``clearance`` to the plane of the face that it
+    touches is put there.
 
     Wang 2015, "A Chebyshev semi-iterative approach for accelerating projective and position-based
     dynamics"; ``radius``: what it takes a round's spectral radius to be.
@@ -78,6 +86,11 @@ def lengths_restored(
     for v in range(x.shape[0]):
         old[v] = x[v]
         pull[v] = wp.vec3(0.0, 0.0, 0.0)
+        if touched[v] >= 0:
+            n = wp.mesh_eval_face_normal(body.mesh, touched[v])
+            place = wp.mesh_eval_position(body.mesh, touched[v], at[v][0], at[v][1])
+            normal[v] = n
+            height[v] = wp.dot(n, place) + clearance
     for turn in range(rounds):
         for e in range(edges.shape[0]):
             ends = edges[e]
@@ -92,7 +105,10 @@ def lengths_restored(
             ahead = 1.0 / (1.0 - 0.25 * radius * radius * ahead)
         for v in range(x.shape[0]):
             here = x[v]
-            x[v] = old[v] + ahead * (here + pull[v] / degree[v] - old[v])
+            there = old[v] + ahead * (here + pull[v] / degree[v] - old[v])
+            if touched[v] >= 0:
+                there += wp.max(height[v] - wp.dot(normal[v], there), 0.0) * normal[v]
+            x[v] = there
             old[v] = here
             pull[v] = wp.vec3(0.0, 0.0, 0.0)
 
@@ -105,13 +121,15 @@ def pushed(
     near: float,  # what is nearer than this is pushed
     clearance: float,  # to so far from the body
 ):
-    """(push, signed distance) of a point [m]."""
+    """(push, signed distance) of a point [m], the nearest face, -1 without one, and barycentric
+    coordinates in it.
+    """
     face, found = closest(body, point, reach)
     push = wp.vec3(0.0, 0.0, 0.0)
     if face >= 0 and found[6] < near:
         for k in range(3):
             push[k] = found[3 + k] + clearance * found[7 + k] - point[k]
-    return push, found[6]
+    return push, found[6], face, wp.vec3(found[0], found[1], found[2])
 
 
 @wp.kernel
@@ -125,13 +143,18 @@ def first_look(
     x: wp.array(dtype=wp.vec3),
     push: wp.array(dtype=wp.vec3),
     known: wp.array(dtype=int),  # 1 where a vertex is pushed, 2 where it was inside
+    touched: wp.array(dtype=int),  # the nearest face, -1 where none is within ``reach``
+    at: wp.array(dtype=wp.vec3),  # barycentric coordinates in it
 ):
     """The first look of :meth:`onefit.draping.post.PostProcessing.push_out`, at some vertices."""
     v = first + wp.tid()
     push[v] = _stopped(body, goal[v], x[v], thinnest, clearance) - x[v]
     known[v] = wp.int32(wp.length_sq(push[v]) > 0.0)
+    touched[v] = -1
     if known[v] == 0:
-        p, d = pushed(body, x[v], reach, clearance, clearance)
+        p, d, face, b = pushed(body, x[v], reach, clearance, clearance)
+        touched[v] = face
+        at[v] = b
         push[v] = p
         known[v] = wp.int32(wp.length_sq(p) > 0.0) * wp.where(d < 0.0, 2, 1)
 
@@ -165,7 +188,7 @@ def points_looked_at(
 ):
     """The first look at some points of the faces."""
     s = first + wp.tid()
-    p, d = pushed(body, weighted(x, corners, weights, s), reach, near, clearance)
+    p, d, _f, _b = pushed(body, weighted(x, corners, weights, s), reach, near, clearance)
     wanted[s] = p
     gap[s] = d
 
@@ -189,6 +212,8 @@ def pushed_out(
     x: wp.array(dtype=wp.vec3),
     push: wp.array(dtype=wp.vec3),  # as first_look says
     known: wp.array(dtype=int),  # likewise; then > 0 where a vertex was asked deeply, or moved
+    touched: wp.array(dtype=int),  # as first_look says
+    at: wp.array(dtype=wp.vec3),  # likewise
     smooth: wp.array(dtype=wp.vec3),  # work
     queue: wp.array(dtype=int),  # work
 ):
@@ -211,7 +236,9 @@ def pushed_out(
                 else:
                     # no deeper than it was moved, for before it was outside, or to come there
                     far = wp.min(deepest, clearance + 2.0 * wp.length(push[v]))
-                    p, d = pushed(body, x[v], far, 0.5 * clearance, clearance)
+                    p, d, face, b = pushed(body, x[v], far, 0.5 * clearance, clearance)
+                    touched[v] = face
+                    at[v] = b
                     push[v] = p
                     if wp.length_sq(p) > 0.0:
                         some = 1
@@ -224,7 +251,9 @@ def pushed_out(
                 n = other[k]
                 if known[n] == 0:
                     known[n] = 1
-                    p, d = pushed(body, x[n], deepest, clearance, clearance)
+                    p, d, face, b = pushed(body, x[n], deepest, clearance, clearance)
+                    touched[n] = face
+                    at[n] = b
                     push[n] = p
                     if d < 0.0:
                         queue[last] = n
@@ -235,7 +264,7 @@ def pushed_out(
                 if gap[s] > near:
                     continue
                 point = weighted(x, corners, weights, s)
-                p, d = pushed(body, point, face_reach, near, face_clearance)
+                p, d, _f, _b = pushed(body, point, face_reach, near, face_clearance)
                 gap[s] = d
             if wp.length_sq(p) > 0.0:
                 some = 1
@@ -270,3 +299,6 @@ def pushed_out(
             x[queue[i]] = x[queue[i]] + push[queue[i]]
         for s in range(corners.shape[0]):  # what is moved comes nearer by no more than its way
             gap[s] = gap[s] - wp.length(weighted(push, corners, weights, s))
+        if turn == rounds - 1:
+            for i in range(last):
+                touched[queue[i]] = -1

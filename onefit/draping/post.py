@@ -27,7 +27,7 @@ DEEPEST = 0.08  # [m]; vertices deeper in the body than this stay there
 SPACING = 0.02  # [m] of the points of faces that are looked at beside the vertices
 # [m]: what of these is nearer to the body than the first is pushed to the second, for skin bulges
 # between them; and how deep they are looked for
-_FACE_NEAR, _FACE_CLEARANCE, _FACE_DEEPEST = 0.0015, 0.002, 0.03
+_OF_POINTS = 0.0015, 0.002, 0.03
 
 
 def pull(vertices, body, held):
@@ -70,6 +70,9 @@ class PostProcessing:
         self._found = [empty(len(corners), kind) for kind in (self._wp.vec3, float)]
         self._work = [empty(self._count, self._wp.vec3) for _ in range(2)]
         self._known, self._queue = (empty(self._count, self._wp.int32) for _ in range(2))
+        # where each vertex touches the body: the face, and barycentric coordinates
+        self._touched = self._array(np.full(self._count, -1), int), empty(self._count, self._wp.vec3)
+        self._planes = empty(self._count, self._wp.vec3), empty(self._count, float)
 
     def _array(self, values, kind, dimensions=1):
         return self._wp.array(values, dtype=kind, ndim=dimensions, device="cpu")
@@ -95,7 +98,9 @@ class PostProcessing:
             x = frames[t]
             if before is not None:
                 self.move(x, before, was, 1 / fps)
-            self.restore_lengths(x)
+            else:
+                self.look(x, goals[t], surface)
+            self.restore_lengths(x, surface)
             self.push_out(x, goals[t], surface)
             was, before = out[0] - begins if before is None else before, x
         return out.to(guide)
@@ -108,11 +113,12 @@ class PostProcessing:
         arrays = self._pull, DRAG, dt, *self._around, _SWING_SMOOTHING, *self._work
         self._launch(self._kernels.moved, x, before, was, *arrays)
 
-    def restore_lengths(self, x, rounds=_ROUNDS):
+    def restore_lengths(self, x, surface, rounds=_ROUNDS):
         """Edges come nearer to their lengths: errors that span about ten edges are mended, and the
         cloth as a whole hardly moves.
         """
-        arrays = *self._edges, self._degree, rounds, RADIUS, x, *self._work
+        of_body = CLEARANCE, surface.of_kernels, *self._touched
+        arrays = *self._edges, self._degree, rounds, RADIUS, *of_body, x, *self._work, *self._planes
         self._launch(self._kernels.lengths_restored, *arrays)
 
     def push_out(self, x, goal, surface, rounds=_PUSHES, reach=CLEARANCE):
@@ -127,26 +133,36 @@ class PostProcessing:
         for. Points of the faces, SPACING from each other, push the face's corners
         where they come nearer to the body than _FACE_NEAR.
         """
+        self.look(x, goal, surface, reach)
         push, smooth = self._work
+        settings = rounds, SMOOTHING, CLEARANCE, DEEPEST, *_OF_POINTS
+        points = *self._points, *self._found
+        arrays = *self._around, *points, *settings, x, push, self._known, *self._touched
+        self._launch(
+            self._kernels.pushed_out, surface.of_kernels, *arrays, smooth, self._queue
+        )
+
+    def look(self, x, goal, surface, reach=CLEARANCE):
+        """The first look of :meth:`push_out`, on two threads: which vertices are to be pushed, and
+        where the body is within ``reach`` [m] of them.
+        """
         body, counts = surface.of_kernels, (self._count, len(self._points[0]))
         points = *self._points, *self._found
-        of_points = _FACE_NEAR, _FACE_CLEARANCE, _FACE_DEEPEST
 
-        def look(half):
+        def part(half):
             (first, last), (start, end) = ([n * k // 2 for k in (half, half + 1)] for n in counts)
-            settings = first, _THINNEST, CLEARANCE, reach, goal, x, push, self._known
-            self._launch(self._kernels.first_look, body, *settings, count=last - first)
-            settings = start, *of_points, x
+            settings = first, _THINNEST, CLEARANCE, reach, goal, x, self._work[0], self._known
+            self._launch(
+                self._kernels.first_look, body, *settings, *self._touched, count=last - first
+            )
+            settings = start, *_OF_POINTS, x
             self._launch(
                 self._kernels.points_looked_at, body, *settings, *points, count=end - start
             )
 
-        other = self._pool.submit(look, 0)
-        look(1)
+        other = self._pool.submit(part, 0)
+        part(1)
         other.result()
-        settings = rounds, SMOOTHING, CLEARANCE, DEEPEST, *of_points
-        arrays = *self._around, *points, *settings, x, push, self._known, smooth, self._queue
-        self._launch(self._kernels.pushed_out, body, *arrays)
 
     def _followed(self, bodies):
         """The surface of each frame; that of the next follows meanwhile."""
