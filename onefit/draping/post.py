@@ -1,5 +1,5 @@
 """Post-processing of drapes, frame after frame, on the CPU: the cloth keeps its motion, edges come
-back towards their lengths, and vertices are pushed out of the body.
+back towards their lengths in front of the skin, and vertices are pushed out of the body.
 
 A network says what cloth does on average. A mean of folds has shorter edges than cloth, and a mean
 of swings is a smaller one.
@@ -17,7 +17,7 @@ PULL = 50.0  # [1/s^2]: acceleration towards the drape, for a unit distance: a p
 NEAR = 0.06  # [m] from the body at rest, where skin doubles the pull
 DRAG = 4.0  # [1/m] of the air, times velocity squared: 1.2 kg/m^3 over twice cotton's 0.15 kg/m^2
 _SWING_SMOOTHING = 2  # times in a frame
-_ROUNDS = 16  # of the lengths
+_ROUNDS = 24  # of the lengths
 RADIUS = 0.985  # spectral radius of a round, as the acceleration takes it to be
 CLEARANCE = 0.003  # [m] from the body
 _PUSHES = 5  # rounds
@@ -27,7 +27,8 @@ DEEPEST = 0.08  # [m]; vertices deeper in the body than this stay there
 SPACING = 0.02  # [m] of the points of faces that are looked at beside the vertices
 # [m]: what of these is nearer to the body than the first is pushed to the second, for skin bulges
 # between them; and how deep they are looked for
-_OF_POINTS = 0.0015, 0.002, 0.03
+_FACE_NEAR, _FACE_CLEARANCE, _FACE_DEEPEST = 0.0015, 0.002, 0.03
+_OF_POINTS = _FACE_NEAR, _FACE_CLEARANCE, _FACE_DEEPEST
 
 
 def pull(vertices, body, held):
@@ -71,7 +72,10 @@ class PostProcessing:
         self._work = [empty(self._count, self._wp.vec3) for _ in range(2)]
         self._known, self._queue = (empty(self._count, self._wp.int32) for _ in range(2))
         # where each vertex touches the body: the face, and barycentric coordinates
-        self._touched = self._array(np.full(self._count, -1), int), empty(self._count, self._wp.vec3)
+        self._touched = (
+            self._array(np.full(self._count, -1), int),
+            empty(self._count, self._wp.vec3),
+        )
         self._planes = empty(self._count, self._wp.vec3), empty(self._count, float)
 
     def _array(self, values, kind, dimensions=1):
@@ -87,7 +91,8 @@ class PostProcessing:
     def __call__(self, guide, bodies, fps, past=None):
         """Vertices (T, N, 3) [m]: ``guide`` (T, N, 3), a network's drape at ``fps`` frames a
         second, post-processed; ``bodies`` (T, V, 3) [m]; ``past`` (2, N, 3) [m], the cloth in the
-        two frames before. Without a past the motion begins at once, and the cloth is in it.
+        two frames before, as the last call left it. Without a past the motion begins at once,
+        and the cloth is in it.
         """
         out = guide.detach().float().cpu().clone()
         goals = self._wp.from_torch(out.clone(), dtype=self._wp.vec3)
@@ -115,7 +120,9 @@ class PostProcessing:
 
     def restore_lengths(self, x, surface, rounds=_ROUNDS):
         """Edges come nearer to their lengths: errors that span about ten edges are mended, and the
-        cloth as a whole hardly moves.
+        cloth as a whole hardly moves. Vertices that touched the body at the last :meth:`look` or
+        :meth:`push_out` stay in front of the planes of the faces that they touched, which have
+        moved with the body's ``surface``: what is tight slides along the skin.
         """
         of_body = CLEARANCE, surface.of_kernels, *self._touched
         arrays = *self._edges, self._degree, rounds, RADIUS, *of_body, x, *self._work, *self._planes
@@ -138,13 +145,11 @@ class PostProcessing:
         settings = rounds, SMOOTHING, CLEARANCE, DEEPEST, *_OF_POINTS
         points = *self._points, *self._found
         arrays = *self._around, *points, *settings, x, push, self._known, *self._touched
-        self._launch(
-            self._kernels.pushed_out, surface.of_kernels, *arrays, smooth, self._queue
-        )
+        self._launch(self._kernels.pushed_out, surface.of_kernels, *arrays, smooth, self._queue)
 
     def look(self, x, goal, surface, reach=CLEARANCE):
         """The first look of :meth:`push_out`, on two threads: which vertices are to be pushed, and
-        where the body is within ``reach`` [m] of them.
+        which touch the body, for it is within ``reach`` [m] of them.
         """
         body, counts = surface.of_kernels, (self._count, len(self._points[0]))
         points = *self._points, *self._found

@@ -31,12 +31,21 @@ def pushed_out(x, cloth, body, faces, **settings):
     return x
 
 
-def test_lengths_come_back_as_in_a_slow_reference():
+@pytest.mark.parametrize("radius", [0.01, 0.098])
+def test_lengths_come_back_as_in_a_slow_reference(radius):
+    """Beside a body far away, and around one."""
     rng = np.random.default_rng(0)
     x, faces = ball(0.1, 2)
-    edges, lengths = lengths_of(x, faces)
+    (body, body_faces), (edges, lengths) = ball(radius), lengths_of(x, faces)
     degree = np.bincount(edges.ravel())[:, None]
     given = x + torch.as_tensor(rng.normal(size=x.shape) * 2e-3).float()
+    surface, process, found = ClosestSurface(body, body_faces), processing(x, faces), given.clone()
+    process.look(found, found.clone(), surface)
+    touched = surface(given, CLEARANCE).face
+    assert (touched >= 0).any() == (radius > 0.05)
+    first, second, third = body[body_faces[touched]].double().unbind(1)
+    normal = torch.linalg.cross(second - first, third - first)
+    normal /= normal.norm(dim=-1, keepdim=True)
     before, now, ahead = given.double().numpy(), given.double().numpy(), 1.0
     for turn in range(6):
         pull = np.zeros_like(now)
@@ -48,11 +57,30 @@ def test_lengths_come_back_as_in_a_slow_reference():
         if turn:
             ahead = 1 / (1 - RADIUS**2 / 2) if turn == 1 else 1 / (1 - RADIUS**2 * ahead / 4)
         before, now = now, before + ahead * (now + pull / degree - before)
-    process, found, same = processing(x, faces), given.clone(), x.clone()
-    process.restore_lengths(found, rounds=6)
+        height = ((torch.as_tensor(now) - first) * normal).sum(-1)
+        missing = (CLEARANCE - height).clamp(min=0) * (touched >= 0)
+        now = now + (missing[:, None] * normal).numpy()
+    process.restore_lengths(found, surface, rounds=6)
     assert np.abs(now - found.numpy()).max() < 1e-6
-    process.restore_lengths(same)
+    far, same = ClosestSurface(body + 1, body_faces), x.clone()
+    process.look(same, same.clone(), far)
+    process.restore_lengths(same, far)
     assert torch.allclose(same, x, atol=1e-6)
+
+
+def test_tight_cloth_stays_in_front_of_the_skin_and_goes_with_it():
+    """Cloth around a ball, too narrow for it by a tenth, while the ball moves."""
+    way = torch.tensor([0.02, 0.0, 0.0])
+    (body, faces), (x, cloth) = ball(0.1, 4), ball(0.102, 4)
+    edges, lengths = lengths_of(x, cloth)
+    process = PostProcessing(x, cloth, edges, 0.9 * lengths, np.zeros(len(x)))
+    surface, held, free = ClosestSurface(body, faces), x + way, x + way
+    for other, found in ((surface, held), (ClosestSurface(body + 1, faces), free)):
+        process.look(x, x.clone(), other)  # it touches the one, and not the other
+        surface.follow(body + way)
+        process.restore_lengths(found, surface)
+    assert surface(held, 0.1).distance.min() > 0.9 * CLEARANCE
+    assert surface(free, 0.1).distance.max() < 0
 
 
 def test_cloth_keeps_its_motion_and_is_pulled_to_the_drape():
