@@ -65,6 +65,7 @@ def lengths_restored(
     rounds: int,
     radius: float,
     clearance: float,
+    farthest: float,  # from the place that it touched, that a vertex is held in front of it
     body: Surface,
     touched: wp.array(dtype=int),  # the body's face in front of which a vertex stays; -1: none
     at: wp.array(dtype=wp.vec3),  # barycentric coordinates of the place in it
@@ -91,6 +92,8 @@ def lengths_restored(
             place = wp.mesh_eval_position(body.mesh, touched[v], at[v][0], at[v][1])
             normal[v] = n
             height[v] = wp.dot(n, place) + clearance
+            if wp.length(x[v] - place) > farthest:
+                touched[v] = -1
     for turn in range(rounds):
         for e in range(edges.shape[0]):
             ends = edges[e]

@@ -20,8 +20,10 @@ _SWING_SMOOTHING = 2  # times in a frame
 _ROUNDS = 24  # of the lengths
 RADIUS = 0.985  # spectral radius of a round, as the acceleration takes it to be
 CLEARANCE = 0.003  # [m] from the body
+REACH = 0.006  # [m] from the body, within which cloth touches it
 _PUSHES = 5  # rounds
-_THINNEST = 0.02  # [m] of limbs: cloth no farther from the drape has not passed through one
+# [m] of limbs: cloth no farther from the drape, or from where it touched, has not passed one
+_THINNEST = 0.02
 SMOOTHING = 6  # times, of the pushes of the first round
 DEEPEST = 0.08  # [m]; vertices deeper in the body than this stay there
 SPACING = 0.02  # [m] of the points of faces that are looked at beside the vertices
@@ -122,13 +124,14 @@ class PostProcessing:
         """Edges come nearer to their lengths: errors that span about ten edges are mended, and the
         cloth as a whole hardly moves. Vertices that touched the body at the last :meth:`look` or
         :meth:`push_out` stay in front of the planes of the faces that they touched, which have
-        moved with the body's ``surface``: what is tight slides along the skin.
+        moved with the body's ``surface``: what is tight slides along the skin. A vertex that has
+        gone _THINNEST from there is free.
         """
-        of_body = CLEARANCE, surface.of_kernels, *self._touched
+        of_body = CLEARANCE, _THINNEST, surface.of_kernels, *self._touched
         arrays = *self._edges, self._degree, rounds, RADIUS, *of_body, x, *self._work, *self._planes
         self._launch(self._kernels.lengths_restored, *arrays)
 
-    def push_out(self, x, goal, surface, rounds=_PUSHES, reach=CLEARANCE):
+    def push_out(self, x, goal, surface, rounds=_PUSHES, reach=REACH):
         """Vertices are pushed to CLEARANCE from the body's ``surface``.
 
         Where the body lies between the network's drape, ``goal`` (N, 3) [m], and the cloth, the
@@ -147,7 +150,7 @@ class PostProcessing:
         arrays = *self._around, *points, *settings, x, push, self._known, *self._touched
         self._launch(self._kernels.pushed_out, surface.of_kernels, *arrays, smooth, self._queue)
 
-    def look(self, x, goal, surface, reach=CLEARANCE):
+    def look(self, x, goal, surface, reach=REACH):
         """The first look of :meth:`push_out`, on two threads: which vertices are to be pushed, and
         which touch the body, for it is within ``reach`` [m] of them.
         """

@@ -179,8 +179,8 @@ def test_draping_in_batches_is_draping_at_once(draper, walk, monkeypatch):
     assert whole.shape == (len(walk), len(Garment.template("tank")), 3)
     monkeypatch.setattr(onefit.draping.draper, "POINTS", 5 * whole.shape[1])
     assert torch.allclose(draper.drape("tank", walk, post=False).vertices, alone, atol=1e-5)
-    # a vertex on the verge of being pushed out may go either way by rounding
-    assert (draper.drape("tank", walk).vertices - whole).abs().mean() < 1e-5
+    # a vertex on the verge of being pushed out may go either way by rounding, and others follow
+    assert (draper.drape("tank", walk).vertices - whole).abs().mean() < 1e-4
     assert (whole - draper.drape("tank", walk, skinning_only=True).vertices).abs().max() > 1e-3
 
 
@@ -197,9 +197,11 @@ def test_place_and_direction_of_a_motion_only_move_the_drape(draper, walk):
         poses=poses,
         translation=(walk.translation + place) @ turn.T - place + torch.tensor([1.0, 2.0, 0]),
     )
-    a, b = draper.drape("tank", walk), draper.drape("tank", other)
-    expected = a.vertices @ turn.T + torch.tensor([1.0, 2.0, 0])
-    assert torch.allclose(b.vertices, expected, atol=1e-3)
+    for post in (False, True):
+        a, b = (draper.drape("tank", motion, post=post).vertices for motion in (walk, other))
+        away = (b - a @ turn.T - torch.tensor([1.0, 2.0, 0])).norm(dim=-1)
+        # rounding decides which way a vertex on the verge of being pushed out goes
+        assert away.mean() < 1e-4 if post else away.max() < 1e-4
 
 
 def test_the_memory_sees_the_root_move():
@@ -296,8 +298,8 @@ def test_weights_in_eight_bits_drape_alike(draper, model, walk, tmp_path):
     loaded = onefit.load(path, model=model)
     assert loaded.trained.garments == ("tank",)
     a, b, c = (
-        draper.drape("tank", walk, eased=False),
-        loaded.drape("tank", walk, eased=False),
+        draper.drape("tank", walk, eased=False, post=False),
+        loaded.drape("tank", walk, eased=False, post=False),
         draper.drape("tank", walk, skinning_only=True),
     )
     # eight bits cost a few per cent of the deformation
@@ -347,5 +349,5 @@ def test_a_body_of_another_kind_is_draped_too(draper, walk, tmp_path):
         parents=np.array(body.parents),
     )
     other = Draper(draper.trained, onefit.PlainBody(path))
-    a, b = (d.drape("tank", walk, eased=False) for d in (draper, other))
+    a, b = (d.drape("tank", walk, eased=False, post=False) for d in (draper, other))
     assert (a.vertices - b.vertices).norm(dim=-1).max() < 0.005

@@ -9,7 +9,7 @@ from surfaces import ball
 
 from onefit.body import ClosestSurface
 from onefit.draping import post
-from onefit.draping.post import CLEARANCE, DEEPEST, DRAG, NEAR, PULL, RADIUS, PostProcessing
+from onefit.draping.post import CLEARANCE, DEEPEST, DRAG, NEAR, PULL, RADIUS, REACH, PostProcessing
 from onefit.physics.sheet import samples
 from polyfit.mesh import edges_of
 
@@ -41,7 +41,7 @@ def test_lengths_come_back_as_in_a_slow_reference(radius):
     given = x + torch.as_tensor(rng.normal(size=x.shape) * 2e-3).float()
     surface, process, found = ClosestSurface(body, body_faces), processing(x, faces), given.clone()
     process.look(found, found.clone(), surface)
-    touched = surface(given, CLEARANCE).face
+    touched = surface(given, REACH).face
     assert (touched >= 0).any() == (radius > 0.05)
     first, second, third = body[body_faces[touched]].double().unbind(1)
     normal = torch.linalg.cross(second - first, third - first)
