@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from onefit.body import AnnyBody, ClosestSurface, skinning
+from onefit.body import AnnyBody, ClosestSurface, Flesh, skinning
 from onefit.garment import Garment, PatchedGarment, standard_body, waistband
 from onefit.motion import Motion
 from onefit.network import DEFAULT, Trained
@@ -208,6 +208,9 @@ class Draper:
                 lead = self._skinned(garment, rest, body, led[:first])
                 guide, moving = torch.cat([lead[0], vertices]), torch.cat([lead[1], bodies])
             cut = garment.cut is not None
+            if settings.room:
+                moving = Flesh(body, settings.room)(moving)
+                bodies = moving[first:]
             made = finished(
                 guide, rest, faces, self._held(garment), moving, body_faces,
                 material=material, steps=finish, fps=FPS, settings=settings, first=first,

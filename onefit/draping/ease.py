@@ -12,8 +12,8 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from onefit.body import ClosestSurface
-from onefit.garment import SparseMatrix, neighbour_mean
+from onefit.body import ClosestSurface, spread
+from polyfit.mesh import neighbour_mean
 
 from .post import DEEPEST
 
@@ -71,18 +71,6 @@ def ease(rest, faces, body, frames):
     )[:, None]
     at_rest = replace(at_rest, face=at_rest.face[:count], normal=at_rest.normal[:count])
     moved = (missing > 0) & (at_rest.face >= 0)[:, None]
-    mean = SparseMatrix(neighbour_mean(faces.cpu().numpy(), len(rest)), rest.device)
-    return spread(torch.where(moved, missing * at_rest.normal, 0.0), mean)
-
-
-def spread(push, mean):
-    """Pushes (N, 3) [m], smoothed over the mesh; none becomes shorter. ``mean``: a matrix (N, N)
-    that takes the mean of each vertex's neighbours
-    (:func:`onefit.garment.remesh.neighbour_mean`).
-    """
-    for _ in range(SMOOTHING):
-        around = mean @ push
-        push = torch.where(
-            push.norm(dim=-1, keepdim=True) > around.norm(dim=-1, keepdim=True), push, around
-        )
-    return push
+    push = torch.where(moved, missing * at_rest.normal, 0.0).cpu().numpy()
+    mean = neighbour_mean(faces.cpu().numpy(), len(rest))
+    return torch.as_tensor(spread(push, mean, SMOOTHING)).to(rest)

@@ -11,6 +11,5 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "charts": ["Deformation", "PatchedGarment", "SparseMatrix"],
         "garment": ["FOLDER", "Garment", "LOOSE", "TEMPLATES"],
         "reading": ["RenderMesh", "Stitches", "parts"],
-        "remesh": ["neighbour_mean"],
     },
 )

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from onefit.body import skeleton, skinning
+from polyfit import mesh
 from polyfit.errors import InputError
 
 from .binding import (
@@ -25,7 +26,6 @@ from .binding import (
     surface_of,
     vertex_normals,
 )
-from .remesh import neighbour_mean
 
 _PUSHED_DEPTH = 0.03  # vertices inside the body by less than this are pushed out [m]
 CLEARANCE, _PUSH_RADIUS = (
@@ -247,7 +247,7 @@ def to_standard(V, F, made_for, loose=False):
     target = standard if not loose else in_pose(standard, pose)
     difference = _counterpart(stands, target) - stands.vertices.numpy()
     V = V + Binding(V, F, surface_of(stands)).displacement(difference)
-    return 0.5 * (V + neighbour_mean(F, len(V), boundary_apart=True) @ V)
+    return 0.5 * (V + mesh.neighbour_mean(F, len(V), boundary_apart=True) @ V)
 
 
 def _counterpart(source, target):

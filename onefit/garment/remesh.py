@@ -5,24 +5,16 @@
 import warnings
 
 import numpy as np
-from scipy.sparse import coo_matrix
 
 from onefit.body import ClosestSurface
 from polyfit import mesh
-
-
-def _boundary_edges(F):
-    """Directed edges (B, 2) that have one face only, as the face walks them."""
-    edges, side = mesh.edges_of(F)
-    once = np.bincount(side.ravel(), minlength=len(edges))[side] == 1
-    return np.stack([F, np.roll(F, -1, axis=1)], axis=-1)[once]
 
 
 def loops(F):
     """The boundary of a manifold mesh as a list of vertex indices, in the order in which their
     faces walk them; the longest first.
     """
-    after = dict(_boundary_edges(F).tolist())
+    after = dict(mesh.boundary_edges(F).tolist())
     found = []
     while after:
         loop = [next(iter(after))]
@@ -30,22 +22,6 @@ def loops(F):
             loop.append(following)
         found.append(np.array(loop))
     return sorted(found, key=len, reverse=True)
-
-
-def neighbour_mean(F, count, boundary_apart=False):
-    """Sparse (count, count) matrix that takes the mean of each vertex's neighbours; with
-    ``boundary_apart`` boundary vertices have those along their loop only.
-    """
-    e = mesh.edges_of(F)[0]
-    if boundary_apart:
-        b = _boundary_edges(F)
-        on = np.zeros(count, dtype=bool)
-        on[b] = True
-        pairs = np.concatenate([e[~on[e[:, 0]]], e[~on[e[:, 1]]][:, ::-1], b, b[:, ::-1]])
-    else:
-        pairs = np.concatenate([e, e[:, ::-1]])
-    weight = 1 / np.bincount(pairs[:, 0], minlength=count)[pairs[:, 0]]
-    return coo_matrix((weight, (pairs[:, 0], pairs[:, 1])), shape=(count, count)).tocsr()
 
 
 def nearest_on_segments(points, a, b):
@@ -116,12 +92,12 @@ def remeshed(V, F, count, steps=40):
         made = clusters.create_mesh()
     x, f = np.array(made.points, dtype=np.float64), made.regular_faces.astype(np.int64)
     f = np.where(mesh.winding(f)[:, None] < 0, f[:, ::-1], f)
-    surface, rim = ClosestSurface(V, F), _boundary_edges(np.asarray(F))
-    own = np.unique(_boundary_edges(f))
+    surface, rim = ClosestSurface(V, F), mesh.boundary_edges(np.asarray(F))
+    own = np.unique(mesh.boundary_edges(f))
     for step in range(steps):
         if step % 10 == 0:
             f = _delaunay(x, f)
-            mean = neighbour_mean(f, len(x), boundary_apart=True)
+            mean = mesh.neighbour_mean(f, len(x), boundary_apart=True)
         y = mean @ x
         x = np.array(surface(0.5 * (x + y)).point, dtype=np.float64)
         if len(own):

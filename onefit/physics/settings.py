@@ -18,13 +18,14 @@ class Settings:
     nearer. ``reach`` [m]: cloth and body that come nearer to each other than this in a step are
     seen, and so far does cloth look for other cloth at most. ``contact`` and ``layers`` [1]: the
     stiffness of a contact with the body and of cloth with itself, in units of the material's
-    stretch stiffness. ``sticking`` [m/s]: a slower slip is not friction's full force. ``apart``
-    [m]: what folds keep from each other. ``spacing`` [m]: of points of the faces that must stay out
-    of the body, as vertices must. ``draw`` [1/s^2]: acceleration towards the drape that is
-    finished, for a unit distance. ``lead`` [s]: how long the body takes, before the motion, from
-    its rest, in which garments are made, to the first pose; ``settling`` [s]: how long that is held
-    then, for the cloth to come to rest. In each step of both, velocities are multiplied by
-    ``damping``.
+    stretch stiffness. ``room`` [m]: between the skins of two limbs, or of a limb and the trunk, to
+    which flesh yields (:class:`onefit.body.Flesh`); 0: a rigid body. ``sticking`` [m/s]: a slower
+    slip is not friction's full force. ``apart`` [m]: what folds keep from each other. ``spacing``
+    [m]: of points of the faces that must stay out of the body, as vertices must. ``draw`` [1/s^2]:
+    acceleration towards the drape that is finished, for a unit distance. ``lead`` [s]: how long the
+    body takes, before the motion, from its rest, in which garments are made, to the first pose;
+    ``settling`` [s]: how long that is held then, for the cloth to come to rest. In each step of
+    both, velocities are multiplied by ``damping``.
     """
 
     newton: int = 2
@@ -35,6 +36,7 @@ class Settings:
     reach: float = 0.03
     contact: float = 0.5
     layers: float = 0.2
+    room: float = 0.003
     sticking: float = 0.005
     apart: float = 0.003
     spacing: float = 0.02

@@ -12,11 +12,13 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "texcoords": ["TexCoords"],
         "triangles": [
             "areas",
+            "boundary_edges",
             "checked",
             "components",
             "edges_of",
             "face_vectors",
             "in_use",
+            "neighbour_mean",
             "sheets",
             "welded",
             "winding",

@@ -1,4 +1,5 @@
-"""Checks of a triangle mesh, its areas, edges and manifold sheets. NumPy and SciPy only.
+"""Checks of a triangle mesh, its areas, edges, neighbours and manifold sheets. NumPy and SciPy
+only.
 
 ``vertices`` (N, 3) float [m], ``faces`` (F, 3) int.
 """
@@ -7,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.sparse import coo_matrix
+from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from polyfit.errors import InputError
@@ -91,6 +92,29 @@ def edges_of(F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     size = int(F.max()) + 1
     key, index = np.unique(side[..., 0] * size + side[..., 1], return_inverse=True)
     return np.stack([key // size, key % size], axis=1), index.reshape(F.shape)
+
+
+def boundary_edges(F: np.ndarray) -> np.ndarray:
+    """Directed edges (B, 2) that have one face only, as the face walks them."""
+    edges, side = edges_of(F)
+    once = np.bincount(side.ravel(), minlength=len(edges))[side] == 1
+    return np.stack([F, np.roll(F, -1, axis=1)], axis=-1)[once]
+
+
+def neighbour_mean(F: np.ndarray, count: int, boundary_apart: bool = False) -> csr_matrix:
+    """Sparse (count, count) matrix that takes the mean of each vertex's neighbours; with
+    ``boundary_apart`` boundary vertices have those along their loop only.
+    """
+    e = edges_of(F)[0]
+    if boundary_apart:
+        b = boundary_edges(F)
+        on = np.zeros(count, dtype=bool)
+        on[b] = True
+        pairs = np.concatenate([e[~on[e[:, 0]]], e[~on[e[:, 1]]][:, ::-1], b, b[:, ::-1]])
+    else:
+        pairs = np.concatenate([e, e[:, ::-1]])
+    weight = 1 / np.bincount(pairs[:, 0], minlength=count)[pairs[:, 0]]
+    return coo_matrix((weight, (pairs[:, 0], pairs[:, 1])), shape=(count, count)).tocsr()
 
 
 def sheets(F: np.ndarray) -> np.ndarray:
