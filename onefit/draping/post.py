@@ -20,10 +20,9 @@ _SWING_SMOOTHING = 2  # times in a frame
 _ROUNDS = 24  # of the lengths
 RADIUS = 0.985  # spectral radius of a round, as the acceleration takes it to be
 CLEARANCE = 0.003  # [m] from the body
-REACH = 0.006  # [m] from the body, within which cloth touches it
+REACH, _LET_GO = 0.006, 0.03  # [m] from the body: cloth touches it, or has gone from there
 _PUSHES = 5  # rounds
-# [m] of limbs: cloth no farther from the drape, or from where it touched, has not passed one
-_THINNEST = 0.02
+_THINNEST = 0.02  # [m] of limbs: cloth no farther from the drape has not passed through one
 SMOOTHING = 6  # times, of the pushes of the first round
 DEEPEST = 0.08  # [m]; vertices deeper in the body than this stay there
 SPACING = 0.02  # [m] of the points of faces that are looked at beside the vertices
@@ -125,9 +124,9 @@ class PostProcessing:
         cloth as a whole hardly moves. Vertices that touched the body at the last :meth:`look` or
         :meth:`push_out` stay in front of the planes of the faces that they touched, which have
         moved with the body's ``surface``: what is tight slides along the skin. A vertex that has
-        gone _THINNEST from there is free.
+        gone _LET_GO from there is free.
         """
-        of_body = CLEARANCE, _THINNEST, surface.of_kernels, *self._touched
+        of_body = CLEARANCE, _LET_GO, surface.of_kernels, *self._touched
         arrays = *self._edges, self._degree, rounds, RADIUS, *of_body, x, *self._work, *self._planes
         self._launch(self._kernels.lengths_restored, *arrays)
 
