@@ -79,6 +79,8 @@ class Flesh:
             for column, values in zip(columns, skin):
                 near &= (column > values.min() - self.room) & (column < values.max() + self.room)
             some = np.flatnonzero(near)
+            if not len(some):
+                continue
             found = part.surface(x[some].astype(np.float32), DEEPEST)
             some, found = some[found.face >= 0], _of(found, found.face >= 0)
             corners = part.faces[found.face]

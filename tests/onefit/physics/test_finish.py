@@ -29,7 +29,9 @@ def test_what_leads_to_the_first_frame_is_not_given(draped):
     for name in ("finished", "at once"):
         drape = draped[name]
         assert drape.vertices.shape == network.vertices.shape
-        assert (drape.body == network.body).all() and (drape.root == network.root).all()
+        assert (drape.root == network.root).all()
+        yielded = (drape.body - network.body).norm(dim=-1)  # where limbs and trunk meet
+        assert yielded.max() < 0.02 and (yielded > 0).float().mean() < 0.1
         far = (drape.vertices - network.vertices).norm(dim=-1)
         assert 1e-3 < far.mean() < 0.03
         assert drape.measures().collision == 0
