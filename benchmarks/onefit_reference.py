@@ -165,7 +165,7 @@ def pictures(drapes, skinned, frames, size, spp):
     rows = [
         stage.render(
             [body, (x[frames].numpy(), skinned.faces.numpy(), GARMENT_COLOURS[0])],
-            size=size, spp=spp, follow=True,
+            size=size, spp=spp, follow=True, near=1,
         )
         for x in drapes.values()
     ]  # fmt: skip
@@ -195,7 +195,8 @@ def parser():
     p.add_argument("--weights", nargs="+", default=[DEFAULT], metavar="WEIGHTS")
     p.add_argument("--finish", type=int, default=0, metavar="STEPS")
     p.add_argument("--material", default="cotton", choices=list(MATERIALS))
-    p.add_argument("--picture", metavar="FILE.jpg", help="four frames of all, side by side")
+    p.add_argument("--picture", metavar="FILE.jpg", help="moments of all, side by side")
+    p.add_argument("--moments", type=int, default=4, help="of a motion in the picture (default: 4)")
     p.add_argument("--video", metavar="FILE.mp4", help="all frames, side by side")
     return p
 
@@ -227,7 +228,7 @@ def main(argv=None):
                     cells = " | ".join(f"{n:.{d}f}" for n, d in zip(row, DIGITS))
                     lines.append(f"| {garment.name} | {kind} | {name} | {cells} |")
                 if args.picture:
-                    frames = np.linspace(8, len(x) - 1, 4).astype(int)
+                    frames = np.linspace(8, len(x) - 1, args.moments + 1)[1:].astype(int)
                     shown = pictures(vertices, skinned, frames, (420, 330), 128)
                     strips.append(np.vstack([np.hstack(row) for row in shown]))
                 if args.video:

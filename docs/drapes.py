@@ -1,7 +1,7 @@
 """Draws docs/onefit.jpg: garments draped by a network of the package and finished by the physics of
 cloth, in held-out motions, from near.
 
-python docs/drapes.py [OUT.jpg] [--weights NAME]          (five minutes on two cores)
+python docs/drapes.py [OUT.jpg] [--weights NAME]          (a minute on two cores)
 """
 
 import argparse
