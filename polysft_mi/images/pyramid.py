@@ -9,20 +9,19 @@ import numpy as np
 
 POOL = 4  # local statistics are taken on an image this many times smaller
 MAX_CONTOUR_DISTANCE = 30.0  # pixels of the grid beyond which a silhouette is pulled no harder
-# local standard deviation below which an area counts as flat: it is not blown up to the contrast of
-# the rest
-_MIN_DEVIATION = 0.02
+FLOOR = 0.02  # added to the local deviation, as squares: no flat area is blown up to the rest
 
 
 @dataclass(frozen=True)
 class Level:
     """How images are compared: blurred by ``sigma``, freed from lighting under a window of
-    ``window`` (standard deviations, pixels of the video), on a grid of every ``stride``-th
-    pixel."""
+    ``window`` (standard deviations, pixels of the video), on a grid of every ``stride``-th pixel;
+    what deviates from its surroundings by less than ``floor`` (linear, of 1) says little."""
 
     sigma: float
     stride: int = 1
     window: float = 8.0
+    floor: float = FLOOR
 
 
 @dataclass
@@ -44,7 +43,7 @@ def level_image(image, mask, level, normalise=True):
     """A frame (H, W, 3), linear, with its mask (H, W) or None, at a :class:`Level`."""
     (y, x), near = _slices_around(mask, level)
     image, mask = image[near], mask[near] if mask is not None else None
-    colour = compared(image, mask, level.sigma, level.window, normalise)
+    colour = compared(image, mask, level.sigma, level.window, normalise, level.floor)
     inside = (
         np.ones(image.shape[:2], np.float32) if mask is None else (mask > 0.5).astype(np.float32)
     )
@@ -77,11 +76,12 @@ def _slices_around(mask, level):
     return (at[0][0], at[1][0]), tuple(slice(*x) for x in at)
 
 
-def compared(image, weight, sigma, window, normalise):
+def compared(image, weight, sigma, window, normalise, floor=FLOOR):
     """The image as it is compared: blurred by ``sigma`` and, with ``normalise``, freed from
-    lighting under ``window`` [pixels]; only what is inside ``weight`` (H, W) counts."""
+    lighting under ``window`` [pixels] over the ``floor``; only what is inside ``weight`` (H, W)
+    counts."""
     image = blur(image, sigma, weight)
-    return normalised(image, window, weight) if normalise else image
+    return normalised(image, window, weight, floor) if normalise else image
 
 
 def blur(image, sigma, weight=None):
@@ -99,9 +99,33 @@ def blur(image, sigma, weight=None):
     )
 
 
-def normalised(image, sigma, weight=None):
-    """(H, W, C) less its local mean, over its local standard deviation (one for all channels),
-    under a window of ``sigma`` [pixels].
+def normalised(image, sigma, weight=None, floor=FLOOR):
+    """(H, W, C) less its local mean, over its local standard deviation (one for all channels) and
+    the ``floor``, under a window of ``sigma`` [pixels].
+    """
+    height, width = image.shape[:2]
+    mean, variance = _local(image, sigma, weight)
+    scale = 1 / np.sqrt(variance + floor**2)
+    both = cv2.resize(
+        np.concatenate([mean * scale[..., None], scale[..., None]], -1),
+        (width, height),
+        interpolation=cv2.INTER_LINEAR,
+    )
+    return image * both[..., 3:] - both[..., :3]
+
+
+def contrast(image, sigma, weight):
+    """The median of an image's local standard deviations under a window of ``sigma`` [pixels],
+    inside ``weight`` (H, W).
+    """
+    _, variance = _local(image, sigma, weight)
+    small = variance.shape[::-1]
+    return float(np.sqrt(np.median(variance[cv2.resize(weight, small) > 0.5])))
+
+
+def _local(image, sigma, weight):
+    """Mean (h, w, C) and variance (h, w), one for all channels, under a window of ``sigma``
+    [pixels] of an image (H, W, C), on a smaller grid.
     """
     pool = int(min(POOL, max(1, sigma // 2)))
     height, width = image.shape[:2]
@@ -115,14 +139,7 @@ def normalised(image, sigma, weight=None):
     weighted = image if weight is None else image * w[..., None]
     mean = local(weighted) / share[..., None]
     power = local(np.einsum("hwc,hwc->hw", weighted, image) / image.shape[2]) / share
-    variance = power - (mean * mean).mean(-1)
-    scale = 1 / np.sqrt(np.maximum(variance, 0) + _MIN_DEVIATION**2)
-    both = cv2.resize(
-        np.concatenate([mean * scale[..., None], scale[..., None]], -1),
-        (width, height),
-        interpolation=cv2.INTER_LINEAR,
-    )
-    return image * both[..., 3:] - both[..., :3]
+    return mean, np.maximum(power - (mean * mean).mean(-1), 0)
 
 
 def _gaussian(image, sigma):

@@ -22,7 +22,7 @@ from . import pixels
 from .frames import Frames
 from .gather import Gather, Images
 from .light import Brightness
-from .pyramid import POOL, Level, compared
+from .pyramid import FLOOR, POOL, Level, compared
 from .texture import Texture, packed_image
 
 _SHEET = 225.0  # side [pixels] of the sheet that blurs and windows are given for
@@ -113,6 +113,10 @@ class Registration:
         self._unit = max(1.0, math.sqrt(_shown_area(position, self.faces)) / _SHEET)
         self._frames = Frames(problem.sequence, self.normalise)
         self._levels, self._last, self._brightness = {}, None, None
+        self._floor = FLOOR
+        finest = self._level(self._rules.blurs[-1])
+        if self.normalise and self.texture.contrast(finest) < self._rules.plain:
+            self._floor, self._levels = self._rules.plain_floor, {}
 
     def _level(self, blur):
         if isinstance(blur, Level):
@@ -120,7 +124,7 @@ class Registration:
         if blur not in self._levels:
             sigma = blur * self._unit
             window = max(self._rules.window * self._unit, 3 * sigma)
-            self._levels[blur] = Level(sigma, max(1, int(0.8 * sigma)), window)
+            self._levels[blur] = Level(sigma, max(1, int(0.8 * sigma)), window, self._floor)
         return self._levels[blur]
 
     # -- what is known before a frame is looked at ---------------------------
@@ -339,6 +343,7 @@ class Registration:
             level.sigma / level.stride,
             level.window / level.stride,
             self.normalise,
+            level.floor,
         )
         (top, _), (left, _) = pads
         return wide[top : top + inside.shape[0], left : left + inside.shape[1]], inside

@@ -1,11 +1,14 @@
 """What images say of a surface: gradients against autodiff through the renderer."""
 
+import dataclasses
+
 import cv2
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 import synthetic
+from problems import problem_of
 
 from polysft_mi import prepare
 from polysft_mi.images import pyramid
@@ -162,3 +165,31 @@ def test_a_sheet_out_of_view_explains_nothing(problem, shift):
     vertices = problem.template.vertices + shift
     found = Registration(problem).evaluate(vertices, 1, 1.0, 0.3)
     assert (found.misfit, found.outlier_share, found.photometric) == (1, 1, 0)
+
+
+def test_what_is_fainter_than_the_floor_stays_faint():
+    faint = 0.5 + 0.01 * RNG.standard_normal((120, 160, 3)).astype(np.float32)
+    strong = 0.5 + 20 * (faint - 0.5)
+    for image, least, most in ((faint, 0.08, 0.12), (strong, 0.85, 0.95)):
+        spread = pyramid.normalised(image, 8.0, floor=0.1).std()
+        assert least < spread < most
+
+
+def test_the_contrast_is_the_local_deviation_inside():
+    image = 0.5 + 0.1 * RNG.standard_normal((120, 160, 3)).astype(np.float32)
+    image[:, 80:] *= 0.1
+    inside = np.zeros((120, 160), np.float32)
+    inside[:, :60] = 1
+    assert pyramid.contrast(image, 8.0, inside) == pytest.approx(0.1, rel=0.1)
+    assert pyramid.contrast(image, 8.0, np.ones_like(inside)) < 0.1
+
+
+def test_a_plain_texture_is_compared_over_a_higher_floor(truth, problem, monkeypatch):
+    local, rules = problem_of(truth.folder, brightness="local"), problem.rules
+    assert Registration(local)._level(1.0).floor == pyramid.FLOOR
+    for each in (local, problem):
+        monkeypatch.setattr(each, "rules", dataclasses.replace(rules, plain=1.0))
+    plain, vertices = Registration(local), truth.vertices[2]
+    assert {plain._level(blur).floor for blur in rules.blurs} == {rules.plain_floor}
+    assert plain.misfit(vertices, 2, 1.0) < 0.5 * plain.misfit(vertices + [0.02, 0, 0], 2, 1.0)
+    assert Registration(problem)._level(1.0).floor == pyramid.FLOOR  # colours as they are
