@@ -119,8 +119,8 @@ def contrast(image, sigma, weight):
     inside ``weight`` (H, W).
     """
     _, variance = _local(image, sigma, weight)
-    small = variance.shape[::-1]
-    return float(np.sqrt(np.median(variance[cv2.resize(weight, small) > 0.5])))
+    share = cv2.resize(weight, variance.shape[::-1], interpolation=cv2.INTER_AREA)
+    return float(np.sqrt(np.median(variance[share >= min(0.5, share.max())])))
 
 
 def _local(image, sigma, weight):

@@ -182,6 +182,9 @@ def test_the_contrast_is_the_local_deviation_inside():
     inside[:, :60] = 1
     assert pyramid.contrast(image, 8.0, inside) == pytest.approx(0.1, rel=0.1)
     assert pyramid.contrast(image, 8.0, np.ones_like(inside)) < 0.1
+    thin = np.zeros_like(inside)
+    thin[60, :60] = 1  # never half of a pixel of the smaller grid
+    assert pyramid.contrast(image, 8.0, thin) == pytest.approx(0.1, rel=0.2)
 
 
 def test_a_plain_texture_is_compared_over_a_higher_floor(truth, problem, monkeypatch):
