@@ -26,6 +26,7 @@ _SKY_RAYS, _KEY_RAYS = 128, 32  # from each vertex
 GRID, _REACH = 96, 1.5  # cells of the floor's light along a side, and half of its side [m]
 FINE = 20_000  # faces
 _COVER = 0.025  # [m]; what lies so near before a vertex covers it
+_BESIDE = 0.012  # [m]; the same, at 45 degrees to the side: what lies along a rim
 _LIFT = 2e-3  # [m] by which rays start above a surface
 
 
@@ -117,14 +118,21 @@ class Stage:
 
     def _uncovered(self, asked):
         """Front, back and key light (N, 7) of the vertices ``asked`` (N,); those that another part
-        covers, skin below cloth, have what their uncovered neighbours have: so no darkness leaks
-        out at the rim of a sleeve.
+        covers, skin below cloth or right along its rim, have what their uncovered neighbours have:
+        so no darkness leaks out at a sleeve or a strap.
         """
         p, normal = (mi.Point3f(x.T.astype(np.float32)) for x in (self.vertices, self.normals))
-        ray = mi.Ray3f(p + _LIFT * normal, mi.Vector3f(normal))
-        hit = self.scene.ray_intersect_preliminary(ray)
-        other = dr.gather(mi.UInt32, self.part_of_face, hit.prim_index, hit.is_valid())
-        covered = hit.is_valid() & (hit.t < _COVER) & (other != mi.UInt32(self.part))
+        axis, part, covered = (
+            dr.normalize(mi.Vector3f(normal)),
+            mi.UInt32(self.part),
+            mi.Bool(False),
+        )
+        frame, around = mi.Frame3f(axis), np.arange(8) * np.pi / 4
+        sides = [float(np.cos(a)) * frame.s + float(np.sin(a)) * frame.t for a in around]
+        for d, reach in [(axis, _COVER), *((dr.normalize(axis + x), _BESIDE) for x in sides)]:
+            hit = self.scene.ray_intersect_preliminary(mi.Ray3f(p + _LIFT * axis, d))
+            other = dr.gather(mi.UInt32, self.part_of_face, hit.prim_index, hit.is_valid())
+            covered |= hit.is_valid() & (hit.t < reach) & (other != part)
         seen = ~np.array(covered)
         start, end = self.faces.ravel(), np.roll(self.faces, -1, axis=1).ravel()
         start, end = np.concatenate([start, end]), np.concatenate([end, start])

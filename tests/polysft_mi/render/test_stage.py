@@ -57,6 +57,26 @@ def test_the_open_top_of_a_ball_has_the_sky_and_the_key_light(picture):
     assert ground[0, -1] == pytest.approx(stage.FLOOR * (stage.SKY + stage.KEY * up), rel=0.1)
 
 
+def test_a_rim_that_lies_on_skin_does_not_darken_it():
+    """The skin 3 mm beside a cap, 6 mm above it, has the light of skin without a cap, nearly."""
+    skin, faces = ball(n=128)
+    cap, over = ball(0.506, n=88)
+    rim = 17 * np.pi / 88
+    over = over[(cap[over, 2] > 0.7 + 0.506 * np.cos(rim + 0.01)).all(1)]
+    V = np.concatenate([skin, cap]).astype(np.float32)
+    part = np.repeat([0, 1], [len(skin), len(cap)])
+    found = []
+    for F in (faces, np.concatenate([faces, over + len(skin)])):
+        lit = stage.Stage(V, F, np.tile(COLOUR, (len(V), 1)), 0.0, 0.0, part)
+        lit.move(V)
+        lit.light(np.array([0, 0, 0.7]))
+        found.append(np.array(lit.front)[:, : len(skin)])
+    polar = np.arccos(np.clip((skin[:, 2] - 0.7) / 0.5, -1, 1))
+    beside = np.abs(polar - 25 * np.pi / 128) < 0.01
+    assert beside.sum() == 256
+    assert found[1][:, beside] == pytest.approx(found[0][:, beside], rel=0.1)
+
+
 def test_the_picture_has_the_balls_colour_and_no_grain(picture):
     x = linear(picture.astype(float))
     middle = x[40:56, 40:56]
