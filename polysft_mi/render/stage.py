@@ -25,8 +25,7 @@ _KEY_RADIUS = 8.0  # degrees, as the key light is seen
 _SKY_RAYS, _KEY_RAYS = 128, 32  # from each vertex
 GRID, _REACH = 96, 1.5  # cells of the floor's light along a side, and half of its side [m]
 FINE = 20_000  # faces
-_COVER = 0.025  # [m]; what lies so near before a vertex covers it
-_BESIDE = 0.012  # [m]; the same, at 45 degrees to the side: what lies along a rim
+_COVER = 0.025  # [m]; what lies so near before a vertex covers it, and half so near aside
 _LIFT = 2e-3  # [m] by which rays start above a surface
 
 
@@ -129,7 +128,7 @@ class Stage:
         )
         frame, around = mi.Frame3f(axis), np.arange(8) * np.pi / 4
         sides = [float(np.cos(a)) * frame.s + float(np.sin(a)) * frame.t for a in around]
-        for d, reach in [(axis, _COVER), *((dr.normalize(axis + x), _BESIDE) for x in sides)]:
+        for d, reach in [(axis, _COVER), *((dr.normalize(axis + x), _COVER / 2) for x in sides)]:
             hit = self.scene.ray_intersect_preliminary(mi.Ray3f(p + _LIFT * axis, d))
             other = dr.gather(mi.UInt32, self.part_of_face, hit.prim_index, hit.is_valid())
             covered |= hit.is_valid() & (hit.t < reach) & (other != part)
