@@ -115,6 +115,13 @@ class JetAtlas:
                 found += layer.weight * self._points(layer, unknowns)
         return mi.Point3f(found)
 
+    def patch_points(self, unknowns):
+        """Where each patch that holds a vertex has it, undisplaced: pairs of the patch's share in
+        the N vertices (Float of N, 0 where there is none) and points (Point3f of N [m, camera
+        frame]).
+        """
+        return [(layer.weight, self._points(layer, unknowns)) for layer in self._layers]
+
     def tangents(self, unknowns):
         """Derivatives of the jets, without relief, along u and along v at the vertices, Vector3f of
         N each [m per chart unit, camera frame], in their own patches.
