@@ -84,7 +84,10 @@ class JetAtlas(Deformation):
         the N vertices (Float of N, 0 where there is none) and points (Point3f of N [m, camera
         frame]).
         """
-        return [(layer.weight, self._points(layer, unknowns)) for layer in self._layers]
+        return [
+            (layer.weight, mi.Point3f(*self._points(layer, unknowns, displaced=False)))
+            for layer in self._layers
+        ]
 
     def tangents(self, unknowns):
         """As :meth:`Deformation.tangents`, Vector3f of N each."""
