@@ -118,6 +118,8 @@ def find_libllvm(folders: Iterable[str] | None = None) -> tuple[str, _Version]:
                 return path, versions[path]
             unusable.add(versions[path][0])
     found = f" (only LLVM {', '.join(str(v) for v in sorted(unusable))})" if unusable else ""
+    if folders is None and _of_package():  # its links are made by the first start of Python
+        found += f" (that of {_PACKAGE} cannot be loaded: start Python once as its installer)"
     raise InputError(
         f"no usable LLVM found{found}, which rendering on the CPU needs: install one (Linux on"
         f" x86-64: pip install {_PACKAGE}; Debian, Ubuntu: apt-get install libllvm19; Fedora: dnf"

@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from places import ROOT
@@ -186,6 +187,10 @@ def test_the_packages_llvm_is_taken_before_the_systems(tmp_path, monkeypatch):
     os.remove(own)  # as where it was installed, and cannot be loaded
     assert backend.find_libllvm() == (systems, (22, 1, 0))
     assert backend.llvm_line() == f"LLVM 22.1.0: {systems} (the system's)"
+    monkeypatch.setattr(backend, "_search_folders", list)
+    Path(own).write_text("no library")
+    with pytest.raises(InputError, match="that of karellen-llvm-core cannot be loaded: start Py"):
+        backend.find_libllvm()
     monkeypatch.setenv(backend.VARIABLE, systems)
     assert backend.llvm_line() == f"LLVM 22.1.0: {systems} (DRJIT_LIBLLVM_PATH)"
 
