@@ -1,6 +1,6 @@
 """Whether the tests pass on other processors, with other numbers of threads, and with other LLVMs.
 
-    python benchmarks/portability.py [-o out/portability] [--only NAME ...] [--llvm FILE ...]
+    python benchmarks/portability.py [-o out/portability] [--only NAME] ... [--llvm FILE] ...
         [arguments of pytest ...]
 
 Runs the tests once in each environment and prints a table: how many passed and failed, and which
@@ -188,7 +188,9 @@ def parser():
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     p.add_argument("-o", "--output", default="out/portability", metavar="OUT")
-    p.add_argument("--only", nargs="+", metavar="NAME", help="these environments alone")
+    p.add_argument(
+        "--only", action="append", metavar="NAME", help="this environment alone; may be repeated"
+    )
     p.add_argument(
         "--llvm", action="append", default=[], metavar="FILE", help="another libLLVM, once for each"
     )
