@@ -1,6 +1,7 @@
-# make demo, make demo-shirt, make drape, make gpu, make test, make docs, make lint: each installs
-# into .venv what it needs and is not there yet (seconds where nothing is missing), and runs.
+# make demo, demo-shirt, drape, gpu, test, docs, lint, dist: each installs into .venv what it needs
+# and is not there yet (seconds where nothing is missing), and runs.
 # PYTHON=python3.12 takes another Python for a new .venv; TORCH=any takes torch with CUDA too.
+# LLVM comes with it on Linux on x86-64; elsewhere every command says what to install.
 
 PYTHON ?= python3
 PY := .venv/bin/python
@@ -13,35 +14,48 @@ EXTRAS_drape := learn,usd
 EXTRAS_test := test
 EXTRAS_docs := docs
 EXTRAS_lint := lint
+EXTRAS_dist := dist
 
-.PHONY: demo demo-shirt drape gpu test docs lint llvm clean
+.PHONY: demo demo-shirt drape gpu test docs lint dist clean
 .PRECIOUS: .venv/with-%
 .NOTPARALLEL:
 
-demo: .venv/with-demo llvm
-	$(PY) -m polysft_mi.run scenes/demo.xml -o out/demo --overwrite
+demo: .venv/with-demo
+	$(PY) -m polysft_mi demo -o out/demo --overwrite
 
-demo-shirt: .venv/with-demo llvm
+demo-shirt: .venv/with-demo
 	$(PY) -m polysft_mi.run scenes/demo_shirt.xml -o out/demo-shirt --overwrite
 
-drape: .venv/with-drape llvm
+drape: .venv/with-drape
 	$(PY) -m onefit.drape dress dance -o out/drape --seconds 2 --overwrite
 
 # What runs on an NVIDIA GPU, and how fast; out/benchmarks/gpu/gpu.md has the result
-gpu: .venv/with-test llvm
+gpu: .venv/with-test
 	$(PY) benchmarks/gpu.py
 
-test: .venv/with-test llvm
+test: .venv/with-test
 	$(PY) -m pytest -q -n 2 --dist loadfile
 
 # The pages of docs/ as HTML, in out/docs, with the API reference; a warning is an error
-docs: .venv/with-docs llvm
+docs: .venv/with-docs
 	$(PY) -m sphinx -W --keep-going -q -b html docs out/docs
 
 lint: .venv/with-lint
 	$(PY) -m ruff check
 	$(PY) -m ruff format --check
 	$(PY) -m mypy
+
+# Source distribution and wheel, in dist; and whether the wheel works, in an environment that has
+# nothing else and a folder that is empty
+dist: .venv/with-dist
+	rm -rf dist build out/installed
+	$(PY) -m build -o dist >/dev/null
+	$(PY) -m twine check --strict dist/*
+	$(PY) -m venv --without-pip out/installed/venv
+	$(PY) -m pip --python out/installed/venv/bin/python install -q --disable-pip-version-check \
+	    -c constraints.txt dist/*.whl
+	mkdir out/installed/empty
+	cd out/installed/empty && ../venv/bin/polysft --version && ../venv/bin/polysft demo -q
 
 .venv/with-%: pyproject.toml constraints.txt | $(PY)
 	@$(if $(filter learn% test docs,$(EXTRAS_$*)),$(no_surprise))
@@ -76,26 +90,5 @@ find_cuda := 'import json, sys; \
     needs = [r for p in found for r in p["metadata"].get("requires_dist", [])]; \
     sys.exit(not any(r.startswith(("nvidia", "cuda")) for r in needs))'
 
-# Rendering on the CPU needs a libLLVM, which no Python package brings.
-llvm: | $(PY)
-	@$(PY) -m polysft_mi.backend >/dev/null 2>&1 || { $(install_llvm); $(PY) -m polysft_mi.backend; }
-
-# 19 first, for it is tested most. Does nothing where apt-get is not there or may not be used: the
-# line above then says what to install.
-define install_llvm
-if [ -z "$$DRJIT_LIBLLVM_PATH" ] && command -v apt-get >/dev/null; then \
-    if [ "$$(id -u)" = 0 ]; then as_root='env DEBIAN_FRONTEND=noninteractive'; \
-    elif sudo -n true 2>/dev/null; then as_root='sudo -n env DEBIAN_FRONTEND=noninteractive'; \
-    else as_root=; fi; \
-    if [ -n "$$as_root" ]; then \
-        echo 'installing libLLVM with apt-get'; $$as_root apt-get update -qq; \
-        for version in 19 20 18 17; do \
-            $$as_root apt-get install -qq -y --no-install-recommends -o DPkg::Lock::Timeout=300 \
-                libllvm$$version >/dev/null && break; \
-        done; \
-    fi; \
-fi
-endef
-
 clean:
-	rm -rf .venv out build *.egg-info .pytest_cache .ruff_cache .mypy_cache
+	rm -rf .venv out build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache

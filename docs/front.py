@@ -1,6 +1,6 @@
 """Draws docs/front.jpg, the picture of the front page, from a run on the whole demo.
 
-    polysft run scenes/demo.xml -D last=-1 -o out/front     # half a minute
+    polysft demo -D last=-1 -o out/front     # half a minute
     python docs/front.py out/front
 
 Left: frames of the video. Middle: the found surface as a grid on the frame. Right: the surface from

@@ -199,6 +199,7 @@ def main(argv=None):
     )
     print(outcome.as_text(), end="", file=sys.stderr)
     print(outcome.folder)
+    print(f"next: {outcome.next_step()}")
 
 
 if __name__ == "__main__":

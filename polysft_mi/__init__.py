@@ -15,7 +15,7 @@ imports neither Mitsuba nor Dr.Jit and sets no variant: :func:`set_variant` does
 
 import lazy_loader
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,

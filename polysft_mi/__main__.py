@@ -5,6 +5,7 @@ import importlib
 import sys
 
 from . import __version__
+from .backend import llvm_line
 from .commands import COMMANDS
 from .errors import InputError, cli
 
@@ -17,11 +18,11 @@ commands:
 {commands}
 
 examples:
-  polysft run scenes/demo.xml -o out/demo        reconstruct; then open out/demo/report.html
-  polysft evaluate out/demo scenes/demo          how far the surface is from the truth
-  polysft compare out/demo scenes/demo -o errors where it is, in false colours
-  polysft export out/demo --format glb           for browsers and Blender
-  polysft COMMAND --help                         the options of a command, with examples
+  polysft demo                          reconstruct a poster; then open out/demo/report.html
+  polysft prepare clip.mp4 --texture photo.jpg --size A4 --fov 65 -o OUT
+  polysft run OUT/scene.xml -o RESULT   reconstruct the sheet in your own video
+  polysft export RESULT --format glb    for browsers and Blender
+  polysft COMMAND --help                the options of a command, with examples
 
 Each command is also a module: python -m polysft_mi.run ...
 Exit status: 0 for success, 2 for a bad input (one line on stderr names it), 130 for Ctrl-C.
@@ -42,6 +43,10 @@ def main(arguments=None):
         return 0 if arguments else 2
     if arguments[0] in ("-V", "--version"):
         print(f"polysft {__version__}")
+        try:
+            print(llvm_line())
+        except InputError as error:  # the version is told all the same
+            print(error)
         return 0
     name, rest = arguments[0], arguments[1:]
     if name not in COMMANDS:

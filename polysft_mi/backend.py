@@ -3,11 +3,14 @@
 Dr.Jit compiles its CPU kernels with a libLLVM that it loads at run time, and takes the first one
 that it finds. LLVM 14 is refused, and LLVM 15 and 16 end the process in the middle of a render,
 past any ``try`` (x86-64: "Cannot select: fminimum"); so the library is chosen here, before Dr.Jit
-starts. Command lines, tests and library users all call :func:`set_variant`. Importing this module
-has no side effect and needs the standard library alone; ``python -m polysft_mi.backend`` prints the
-library that would be used.
+starts: the one that the user names, else that of the Python package ``karellen-llvm-core``, which
+is the same on every machine and comes with this package where it exists, else the system's.
+Command lines, tests and library users all call :func:`set_variant`. Importing this module has no
+side effect and needs the standard library alone; ``python -m polysft_mi.backend`` and
+``polysft --version`` print the library that would be used.
 """
 
+import contextlib
 import ctypes
 import functools
 import glob
@@ -19,23 +22,27 @@ import sys
 import tempfile
 from argparse import ArgumentParser
 from collections.abc import Iterable
+from importlib import metadata
 
 from .errors import InputError, cli
 
 _Version = tuple[int, ...]
 
 OLDEST_LLVM = 16  # the first that tells its version; an older one is not tried
-PROVEN_LLVM = (19, 22)  # what the tests passed with; any other is tried before it is used
+PROVEN_LLVM = (19, 22, 23)  # what the tests passed with; any other is tried before it is used
 VARIABLE = "DRJIT_LIBLLVM_PATH"  # Dr.Jit's own
+_PACKAGE = "karellen-llvm-core"  # the Python package that brings a libLLVM
 DEFAULT = "llvm_ad_rgb"  # the one that the tests passed on
 # what the code needs of a variant: Dr.Jit arrays with derivatives, three colour channels
 _SUFFIX = "_ad_rgb"
 
 # libLLVM-15.so.1, libLLVM-14.0.6.so.1, libLLVM.so.19.1, libLLVM.so, libLLVM.dylib; not libLLVM-C.so
-# (a part of the interface alone)
-_NAME = re.compile(r"libLLVM(?:-(?P<before>\d[\d.]*))?\.(?:so|dylib)(?:\.(?P<after>\d[\d.]*))?")
+# (a part of the interface alone). Windows: LLVM-C.dll, the whole of it
+_NAME = re.compile(
+    r"libLLVM(?:-(?P<before>\d[\d.]*))?\.(?:so|dylib)(?:\.(?P<after>\d[\d.]*))?|LLVM-C\.dll"
+)
 
-# Where packages of Linux distributions, FreeBSD and Homebrew put it
+# Where packages of Linux distributions, FreeBSD, Homebrew and LLVM's installer for Windows put it
 _FOLDERS = (
     "/usr/local/lib*",
     "/usr/lib/*-linux-gnu*",
@@ -47,6 +54,7 @@ _FOLDERS = (
     "/usr/local/llvm*/lib",
     "/usr/local/opt/llvm*/lib",
     "/opt/homebrew/opt/llvm*/lib",
+    "C:/Program Files/LLVM/bin",
 )
 
 # In a process of its own: loading two LLVMs into one process, or one whose own libraries are
@@ -77,12 +85,14 @@ print(all(abs(x - y) < 1e-4 for x, y in zip(found, (4, 8, 4, 0))))  # processors
 
 
 def find_libllvm(folders: Iterable[str] | None = None) -> tuple[str, _Version]:
-    """The newest libLLVM that Dr.Jit can use.
+    """The libLLVM that Dr.Jit shall use.
 
-    ``DRJIT_LIBLLVM_PATH`` goes before everything, and must then hold; else the files of ``folders``
-    (by default: the environment's, the system's usual ones, and what ``ldconfig`` knows) are each
-    asked for their version. One that is not in ``PROVEN_LLVM`` must compile and run a kernel first.
-    Asking and trying happen in processes of their own.
+    ``DRJIT_LIBLLVM_PATH`` goes before everything, and must then hold. Else it is that of the Python
+    package ``karellen-llvm-core``, where it is installed and works; else the newest usable one in
+    the environment's folders, the system's usual ones, and what ``ldconfig`` knows. With
+    ``folders``, only these are searched. Each file is asked for its version. One that is not in
+    ``PROVEN_LLVM`` must compile and run a kernel first. Asking and trying happen in processes of
+    their own.
 
     Returns (path, version): the file's real path, and its version as a tuple of three ints. Raises
     :class:`InputError` where ``DRJIT_LIBLLVM_PATH`` names what cannot be used, or where nothing is
@@ -91,23 +101,43 @@ def find_libllvm(folders: Iterable[str] | None = None) -> tuple[str, _Version]:
     chosen = os.environ.get(VARIABLE)
     if chosen:
         return chosen, _check_chosen(chosen)
-    versions, unusable = {}, set()
-    for path in _libraries(_search_folders() if folders is None else folders):
-        version = _version(path)
-        if version and version[0] >= OLDEST_LLVM:
-            versions[path] = version
-        elif version:
-            unusable.add(version[0])
-    for path in sorted(versions, key=versions.__getitem__, reverse=True):
-        if _usable(path, versions[path]):
-            return path, versions[path]
-        unusable.add(versions[path][0])
+    unusable: set[int] = set()
+    for paths in (
+        _of_package() if folders is None else [],
+        _libraries(_search_folders() if folders is None else folders),
+    ):
+        versions = {}
+        for path in paths:
+            version = _version(path)
+            if version and version[0] >= OLDEST_LLVM:
+                versions[path] = version
+            elif version:
+                unusable.add(version[0])
+        for path in sorted(versions, key=versions.__getitem__, reverse=True):
+            if _usable(path, versions[path]):
+                return path, versions[path]
+            unusable.add(versions[path][0])
     found = f" (only LLVM {', '.join(str(v) for v in sorted(unusable))})" if unusable else ""
+    if folders is None and _of_package():  # its links are made by the first start of Python
+        found += f" (that of {_PACKAGE} cannot be loaded: start Python once as its installer)"
     raise InputError(
-        f"no usable LLVM found{found}, which rendering on the CPU needs: install one (Debian,"
-        " Ubuntu: apt-get install libllvm19; Fedora: dnf install llvm-libs; macOS: brew install"
-        f" llvm), or set {VARIABLE} to the file of its libLLVM"
+        f"no usable LLVM found{found}, which rendering on the CPU needs: install one (Linux on"
+        f" x86-64: pip install {_PACKAGE}; Debian, Ubuntu: apt-get install libllvm19; Fedora: dnf"
+        " install llvm-libs; macOS: brew install llvm; Windows: winget install LLVM.LLVM), or set"
+        f" {VARIABLE} to the file of its libLLVM"
     )
+
+
+def llvm_line() -> str:
+    """The LLVM that would be used, in a line for people: version, file, and who brought it. Raises
+    :class:`InputError` as :func:`find_libllvm` does.
+    """
+    path, version = find_libllvm()
+    if os.environ.get(VARIABLE):
+        origin = VARIABLE
+    else:
+        origin = _PACKAGE if path in _of_package() else "the system's"
+    return f"LLVM {'.'.join(str(number) for number in version)}: {path} ({origin})"
 
 
 def set_variant(mode: str | None = None) -> str:
@@ -118,8 +148,10 @@ def set_variant(mode: str | None = None) -> str:
     ``llvm_ad_rgb``. ``cuda_ad_rgb`` is taken only where it is asked for: no test has run on it.
 
     Returns the variant's name. Raises :class:`InputError` where the mode is unknown or does not
-    fit, a GPU is asked for and none works, or LLVM is missing.
+    fit, a GPU is asked for and none works, LLVM is missing, or this process was forked from one
+    that had rendered.
     """
+    _refuse_fork()
     mitsuba = sys.modules.get("mitsuba")
     current = mitsuba and mitsuba.variant()
     if current and (mode == current or mode is None) and current.endswith(_SUFFIX):
@@ -164,6 +196,28 @@ def set_variant(mode: str | None = None) -> str:
             )
     _ensure_two_threads()
     return mode
+
+
+_process = None  # the one in which set_variant was last called
+
+
+def _refuse_fork() -> None:
+    """A forked child has no threads but its own, and Dr.Jit would wait for ever for those that its
+    parent computed with.
+    """
+    global _process
+    dr = sys.modules.get("drjit")
+    if dr and any(dr.detail.launch_stats()):
+        forked = _process not in (None, os.getpid())
+        with contextlib.suppress(OSError):  # Linux's alone; for those who rendered without us
+            forked = forked or len(os.listdir("/proc/self/task")) == 1
+        if forked:
+            raise InputError(
+                "this process was forked from one that had rendered, and Dr.Jit would wait for ever"
+                " for threads that stayed there: start it with multiprocessing's 'spawn', or"
+                " render nothing before the fork"
+            )
+    _process = os.getpid()
 
 
 def _ensure_two_threads() -> None:
@@ -256,10 +310,24 @@ def _usable(path: str, version: _Version) -> bool:
     )
 
 
+def _of_package() -> list[str]:
+    """The libLLVM files of the Python package ``_PACKAGE``, real paths; none where it is not
+    installed.
+    """
+    try:
+        files = metadata.distribution(_PACKAGE).files or []
+    except metadata.PackageNotFoundError:
+        return []
+    located = [str(file.locate()) for file in files if _NAME.fullmatch(file.name)]
+    return list(dict.fromkeys(os.path.realpath(path) for path in located if os.path.isfile(path)))
+
+
 def _search_folders() -> list[str]:
     prefixes = [os.environ.get("CONDA_PREFIX"), sys.prefix, sys.base_prefix]
-    folders = [os.path.join(prefix, "lib") for prefix in prefixes if prefix]
-    folders += [folder for folder in os.environ.get("LD_LIBRARY_PATH", "").split(":") if folder]
+    below = ("Library", "bin") if sys.platform == "win32" else ("lib",)
+    folders = [os.path.join(prefix, *below) for prefix in prefixes if prefix]
+    variable = "PATH" if sys.platform == "win32" else "LD_LIBRARY_PATH"
+    folders += [folder for folder in os.environ.get(variable, "").split(os.pathsep) if folder]
     for pattern in _FOLDERS:
         folders += sorted(glob.glob(pattern))
     ldconfig = shutil.which(
@@ -281,7 +349,7 @@ def _libraries(folders: Iterable[str]) -> list[str]:
     """The libLLVM files in the folders, each real file once, in the folders' order."""
     found: dict[str, None] = {}
     for folder in folders:
-        for path in sorted(glob.glob(os.path.join(glob.escape(folder), "libLLVM*"))):
+        for path in sorted(glob.glob(os.path.join(glob.escape(folder), "*LLVM*"))):
             if _NAME.fullmatch(os.path.basename(path)) and os.path.isfile(path):
                 found.setdefault(os.path.realpath(path), None)
     return list(found)
@@ -319,8 +387,7 @@ def _version(path: str) -> _Version | None:
 
 
 def main() -> None:
-    path, version = find_libllvm()
-    print(f"LLVM {'.'.join(str(number) for number in version)}: {path}")
+    print(llvm_line())
 
 
 if __name__ == "__main__":

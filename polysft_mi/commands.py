@@ -7,6 +7,7 @@ from polyfit.errors import InputError, Parser
 
 # name: what it is for, in a line of `polysft --help`
 COMMANDS = {
+    "demo": "reconstruct the poster that the package brings",
     "prepare": "make a scene from a video or from a sequence's folder",
     "run": "reconstruct the surface in every frame",
     "evaluate": "figures against ground truth",

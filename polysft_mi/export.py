@@ -19,6 +19,14 @@ _EXAMPLES = [
     ("out/demo --format npz --up camera", "arrays, in the camera frame"),
 ]
 
+_NEXT = {
+    "usd": "open {} in Blender (File, Import, Universal Scene Description), or in usdview",
+    "glb": "open {} in Blender (File, Import, glTF 2.0), or in a viewer of glTF",
+    "obj": "open the files of {}, one a frame, in any mesh editor",
+    "ply": "open the files of {}, one a frame, in any mesh editor",
+    "npz": "read {} by numpy.load",
+}
+
 
 def parser():
     p = commands.parser(
@@ -55,7 +63,9 @@ def main(arguments=None):
     if not options.quiet:
         print(
             f"written: {path}, {len(run.frames)} frames of {run.vertices.shape[1]} vertices,"
-            f" {_size(path)}"
+            f" {_size(path)}",
+            f"next: {_NEXT[options.format].format(path)}",
+            sep="\n",
         )
     return 0
 

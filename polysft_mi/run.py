@@ -30,8 +30,6 @@ _EXAMPLES = [
 
 
 def parser():
-    from .backend import add_mode_argument
-
     p = commands.parser(
         "run",
         "Reconstruct the surface of a textured template in every frame of a video.",
@@ -41,6 +39,14 @@ def parser():
         "scene", metavar="scene.xml", help="Mitsuba scene with a polysft integrator (docs/scene.md)"
     )
     p.add_argument("-o", "--output", metavar="OUT", required=True, help="folder for the results")
+    add_options(p)
+    return p
+
+
+def add_options(p):
+    """Add the options of a run to the parser ``p``, all but the scene and ``--output``."""
+    from .backend import add_mode_argument
+
     commands.add_define_argument(p)
     add_mode_argument(p)
     again = p.add_mutually_exclusive_group()
@@ -58,11 +64,17 @@ def parser():
     p.add_argument("--no-report", action="store_true", help="do not write report.html at the end")
     p.add_argument("-q", "--quiet", action="store_true", help="no progress, only the result")
     p.add_argument("--json", action="store_true", help="the result as one JSON object on stdout")
-    return p
 
 
 def main(arguments=None):
     options = parser().parse_args(arguments)
+    return execute("run", options.scene, options)
+
+
+def execute(name, scene, options):
+    """Reconstruct ``scene`` as the parsed ``options`` of :func:`add_options` say, for the command
+    ``name``, and print the result. Returns the exit status.
+    """
     overrides = commands.definitions(options.define)
     try:
         exr_frames = sys.maxsize if options.exr == "all" else int(options.exr)
@@ -74,7 +86,7 @@ def main(arguments=None):
             " rate, are needed"
         ) from None
     outcome = reconstruct(
-        options.scene,
+        scene,
         options.output,
         overrides,
         variant=options.mode,
@@ -84,7 +96,7 @@ def main(arguments=None):
         fps=options.fps,
         report=not options.no_report,
         quiet=options.quiet,
-        command=f"python -m polysft_mi.run {shlex.join(sys.argv[1:])}",
+        command=shlex.join(["python", "-m", f"polysft_mi.{name}", *sys.argv[1:]]),
     )
     if options.json and outcome.summary:
         print(json.dumps(outcome.as_json(), default=float))
@@ -113,7 +125,7 @@ class Outcome:
         return {"out": self.out, "seconds": self.seconds, "report": self.report, **self.summary}
 
     def as_text(self) -> str:
-        """What the command prints: one fact a line, last the file to open."""
+        """What the command prints: one fact a line, last what to do next."""
         if not self.summary:
             return ""
         s = self.summary
@@ -126,7 +138,10 @@ class Outcome:
             f"surfaces: {os.path.join(self.out, 'surface.npz')}",
             f"meshes: {os.path.join(self.out, 'meshes')}",
             f"pictures: {os.path.join(self.out, 'comparison.png')}",
-            f"report: {self.report}" if self.report else f"video: {s['video']}",
+            f"video: {s['video']}",
+            "next: the same command with --resume, for the frames that are missing"
+            if self.interrupted
+            else f"next: open {self.report or s['video']}",
         ]
         return "".join(line + "\n" for line in lines)
 
@@ -161,7 +176,8 @@ def reconstruct(
     from .backend import set_variant
     from .scene import resolved_defaults
 
-    began, overrides = time.perf_counter(), overrides or {}
+    began = time.perf_counter()
+    overrides = {name: str(value) for name, value in (overrides or {}).items()}
     folder.check_output(out, resume=resume, overwrite=overwrite)
     resolved_defaults(scene, overrides)  # a wrong name is told before anything heavy is loaded
     set_variant(variant)

@@ -2,7 +2,7 @@
 ``polysft_mi.capture``.
 
 ``SCENES`` holds what differs between them. The data of a scene that is no demo is given by ``-D
-data=FOLDER``.
+data=FOLDER``. ``demo.xml`` and ``demo/`` are links to the data of the package ``polysft_mi``.
 """
 
 import os
@@ -60,16 +60,16 @@ SCENES = {
 
 
 DEMOS = {
-    "demo": "A poster that bends, frames 0 to 11 of 45 (-D last=-1: all)",
-    "demo_shirt": "A T-shirt, whose texture has seams, 12 frames",
+    "demo": "A poster that bends, frames 0 to 11 of 45 (-D last=-1: all): polysft demo -o OUT",
+    "demo_shirt": "A T-shirt, whose texture has seams, 12 frames: polysft run"
+    " scenes/demo_shirt.xml -o OUT",
 }
 
 
 def text(name):
     """The text of the scene file ``name``.xml."""
     if name in DEMOS:
-        comment = f"{DEMOS[name]}: python -m polysft_mi.run scenes/{name}.xml -o OUT"
-        return scene_xml(SCENES[name], name, comment=comment)
+        return scene_xml(SCENES[name], name, comment=DEMOS[name])
     comment = (
         f"The sequence {name}, in the form {SCENES[name].form}: python -m polysft_mi.run"
         f" scenes/{name}.xml -D data=FOLDER -o OUT"

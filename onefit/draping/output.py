@@ -44,6 +44,14 @@ class Outcome:
             f"inside the body: {self.figures['collision']:.2f} % of the vertices\n"
         )
 
+    def next_step(self):
+        """What to do with the result, in a line."""
+        usd, video = self.folder / "garment.usd", self.folder / "drape.mp4"
+        blender = f"import {usd} and body.usd in Blender"
+        if video.exists():
+            return f"open {video}" + (f", or {blender}" if usd.exists() else "")
+        return blender if usd.exists() else f"read {self.folder / 'drape.npz'} by numpy.load"
+
 
 def check_folder(folder, overwrite):
     """Raises InputError where ``folder`` holds something that a drape must not replace."""

@@ -30,6 +30,7 @@ def versions():
         "polysft_mi": __version__,
         "mitsuba": mi.__version__,
         "drjit": dr.__version__,
+        "llvm": ".".join(map(str, dr.detail.llvm_version())),
         "python": platform.python_version(),
         "variant": mi.variant(),
         "machine": f"{platform.machine()}, {os.cpu_count()} cores",

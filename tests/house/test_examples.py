@@ -1,5 +1,11 @@
 """The examples run, and show what they say."""
 
+import importlib.util
+import json
+import re
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from places import ROOT
@@ -37,6 +43,33 @@ def test_one_patch_moves_and_the_rest_stays(tmp_path):
     moved = np.linalg.norm(after - before, axis=1)
     assert 0.005 < moved.max() < 0.1 and 0 < (moved > 1e-6).mean() < 0.3
     assert (tmp_path / "before.ply").stat().st_size == (tmp_path / "after.ply").stat().st_size
+
+
+def test_the_notebook_runs_from_top_to_bottom(tmp_path, monkeypatch):
+    """In a Jupyter kernel where there is nbclient, else as Python alone."""
+    text = (ROOT / "examples" / "first_steps.ipynb").read_text(encoding="utf-8")
+    cells = [c for c in json.loads(text)["cells"] if c["cell_type"] == "code"]
+    assert all(c["outputs"] == [] and c["execution_count"] is None for c in cells)  # none is stored
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    if all(map(importlib.util.find_spec, ("nbclient", "ipykernel"))):
+        import nbclient
+        import nbformat
+
+        notebook = nbformat.reads(text, as_version=4)
+        where = {"metadata": {"path": str(tmp_path)}}
+        nbclient.NotebookClient(notebook, timeout=300, resources=where).execute()
+        printed = "".join(
+            output.get("text", "") for cell in notebook.cells for output in cell.get("outputs", [])
+        )
+    else:
+        monkeypatch.chdir(tmp_path)
+        code = "\n".join("".join(cell["source"]) for cell in cells)
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        printed = done.stdout
+    assert float(re.search(r"([\d.]+) mm, in the worst frame", printed)[1]) < 5
+    assert (tmp_path / "out" / "first_steps" / "export" / "surface.glb").stat().st_size > 100_000
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "examples").glob("*.py")), ids=lambda p: p.stem)

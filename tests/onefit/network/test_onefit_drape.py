@@ -9,6 +9,7 @@ from processes import python
 
 from onefit import drape
 from onefit.body import AnnyBody
+from onefit.draping.output import Outcome
 from onefit.network import OneFit, weights
 from polyfit.errors import InputError
 
@@ -79,6 +80,13 @@ def test_pictures_show_body_and_garment(out):
     assert image.std() > 10
 
 
+def test_what_is_next_names_files_that_are_there(out):
+    words = Outcome(out, 3, 9, 1.0, 0.0, {}).next_step().replace(",", "").split()
+    named = [word for word in words if word.endswith((".mp4", ".usd"))]
+    assert named == [str(out / "drape.mp4"), str(out / "garment.usd"), "body.usd"]
+    assert all((out / name).exists() for name in named)
+
+
 def test_what_is_there_is_not_lost(out, network):
     with pytest.raises(InputError, match="not empty; give another -o, or --overwrite"):
         drape.main(["shorts", "walk", "-o", str(out), "--weights", network])
@@ -120,7 +128,9 @@ def test_the_summary_is_in_lines_that_fit_a_terminal(network, tmp_path, capsys, 
         "--finish", "0", "--skip", "usd", "render",
     ])  # fmt: skip
     said = capsys.readouterr()
-    assert said.out.strip() == str(tmp_path / "out")
+    folder, following = said.out.splitlines()
+    assert folder == str(tmp_path / "out")
+    assert following == f"next: read {tmp_path / 'out' / 'drape.npz'} by numpy.load"
     lines = [line for line in said.err.splitlines() if line.strip()]
     assert [line.partition(":")[0] for line in lines] == ["frames", "speed", "inside the body"]
     assert max(map(len, lines)) < 80

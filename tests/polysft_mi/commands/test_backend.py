@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from places import ROOT
@@ -115,9 +116,9 @@ def test_unusable_files_are_passed_over(tmp_path):
 
 @needs_compiler
 def test_a_version_that_is_not_proven_must_run_a_kernel_first(tmp_path):
-    library(tmp_path, "libLLVM.so.23.1", (23, 1, 0))  # tells a version, compiles nothing
+    library(tmp_path, "libLLVM.so.24.1", (24, 1, 0))  # tells a version, compiles nothing
     library(tmp_path, "libLLVM-16.so.1", (16, 0, 6))
-    with pytest.raises(InputError, match=r"only LLVM 16, 23"):
+    with pytest.raises(InputError, match=r"only LLVM 16, 24"):
         backend.find_libllvm([str(tmp_path)])
     proven = library(tmp_path, "libLLVM.so.19.1", (19, 1, 7))
     assert backend.find_libllvm([str(tmp_path)])[0] == proven
@@ -149,11 +150,49 @@ def test_none_found_names_the_older_ones_and_what_to_install(tmp_path):
 def test_none_found_ends_the_command_in_one_line(tmp_path):
     message = one_line_and_status_2(
         python(
-            "from polysft_mi import backend; backend._search_folders = lambda:"
-            f" [{str(tmp_path)!r}]; backend.cli(backend.main)"
+            "from polysft_mi import backend; backend._of_package = list; backend._search_folders ="
+            f" lambda: [{str(tmp_path)!r}]; backend.cli(backend.main)"
         )
     )
     assert "no usable LLVM found" in message and "libllvm19" in message
+
+
+def installed(folder, *files):
+    """The folder of an installation of the package that brings an LLVM, with ``files`` [paths from
+    there].
+    """
+    about = folder / "karellen_llvm_core-1.0.dist-info"
+    about.mkdir(parents=True)
+    (about / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: karellen-llvm-core\nVersion: 1.0\n"
+    )
+    (about / "RECORD").write_text("".join(f"{file},,\n" for file in files))
+    return folder
+
+
+@needs_compiler
+def test_the_packages_llvm_is_taken_before_the_systems(tmp_path, monkeypatch):
+    (tmp_path / "system").mkdir()
+    (tmp_path / "lib").mkdir()
+    systems = library(tmp_path / "system", "libLLVM.so.22.1", (22, 1, 0))
+    own = library(tmp_path / "lib", "libLLVM.so.19.1", (19, 1, 7))
+    os.symlink(own, tmp_path / "lib" / "libLLVM.so")
+    library(tmp_path / "lib", "libLTO.so.19.1", (23, 0, 0))
+    monkeypatch.setattr(backend, "_search_folders", lambda: [str(tmp_path / "system")])
+    names = "libLLVM.so", "libLLVM.so.19.1", "libLTO.so.19.1", "libLLVM-gone.so"
+    site = installed(tmp_path / "python" / "site", *(f"../../lib/{name}" for name in names))
+    monkeypatch.syspath_prepend(str(site))
+    assert backend.find_libllvm() == (own, (19, 1, 7))
+    assert backend.llvm_line() == f"LLVM 19.1.7: {own} (karellen-llvm-core)"
+    os.remove(own)  # as where it was installed, and cannot be loaded
+    assert backend.find_libllvm() == (systems, (22, 1, 0))
+    assert backend.llvm_line() == f"LLVM 22.1.0: {systems} (the system's)"
+    monkeypatch.setattr(backend, "_search_folders", list)
+    Path(own).write_text("no library")
+    with pytest.raises(InputError, match="that of karellen-llvm-core cannot be loaded: start Py"):
+        backend.find_libllvm()
+    monkeypatch.setenv(backend.VARIABLE, systems)
+    assert backend.llvm_line() == f"LLVM 22.1.0: {systems} (DRJIT_LIBLLVM_PATH)"
 
 
 @needs_compiler

@@ -77,9 +77,11 @@ def test_no_command_and_a_wrong_one(capsys):
     assert polysft.main([]) == 2
     with pytest.raises(InputError, match="exprot: no such command, did you mean export"):
         polysft.main(["exprot"])
-    assert polysft.main(["--version"]) == 0 and capsys.readouterr().out.splitlines()[-1].startswith(
-        "polysft "
-    )
+    capsys.readouterr()
+    assert polysft.main(["--version"]) == 0
+    version, llvm = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(r"polysft \d+\.\d+\.\d+", version)
+    assert re.fullmatch(r"LLVM \d+\.\d+\.\d+: \S*LLVM\S* \(.+\)", llvm)
 
 
 @pytest.mark.parametrize(

@@ -2,8 +2,10 @@
 known.
 """
 
+import dataclasses
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -17,7 +19,7 @@ import trimesh
 from places import ROOT
 from problems import replay_paths
 
-from polysft_mi import prepare, run
+from polysft_mi import demo, prepare, run
 from polysft_mi.pictures import exr
 from polysft_mi.results import metrics
 from polysft_mi.results.evaluation import evaluate, score
@@ -152,6 +154,29 @@ def test_depth_of_the_exr_is_that_of_the_surface(result):
     ok = np.isfinite(z)
     assert ok.mean() > 0.99
     assert np.abs(z - layers["depth"][y, x, 0])[ok].max() < 1e-4
+
+
+def test_overrides_may_be_numbers_and_the_last_line_says_what_is_next(sequence, tmp_path):
+    scene, settings = sequence.folder / "scene.xml", {"last": 1, "k_mi": 0.5, "solver": "adam"}
+    outcome = run.reconstruct(scene, tmp_path / "out", settings | {"period": 4}, report=False)
+    assert outcome.summary["frames"] == 2
+    text = (tmp_path / "out" / "scene.xml").read_text()
+    assert re.search(r'name="k_mi" value="0.5" ?/>', text)
+    video = tmp_path / "out" / "comparison.mp4"
+    assert outcome.as_text().splitlines()[-1] == f"next: open {video}" and video.exists()
+    stopped = dataclasses.replace(outcome, interrupted=True)
+    assert "--resume" in stopped.as_text().splitlines()[-1]
+
+
+def test_the_demo_runs_from_the_package_and_from_anywhere(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert demo.main(["-q", "-D", "last=0", "-D", "solver=adam", "-D", "period=2"]) == 0
+    *_, last = capsys.readouterr().out.splitlines()
+    assert last == f"next: open {os.path.join('out', 'demo', 'report.html')}"
+    assert os.path.getsize(last.removeprefix("next: open ")) > 100_000
+    figures = evaluate("out/demo", os.path.join(os.path.dirname(demo.SCENE), "demo"))
+    assert figures["rmse_mm"] < 20
+    assert os.path.samefile(demo.SCENE, ROOT / "scenes" / "demo.xml")  # one place for the data
 
 
 def test_resolved_scene_runs_from_anywhere(result, tmp_path, monkeypatch):

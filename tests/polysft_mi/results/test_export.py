@@ -38,6 +38,17 @@ def command(run, *arguments):
     assert export.main([run.folder, *map(str, arguments), "--fps", str(FPS), "-q"]) == 0
 
 
+@pytest.mark.parametrize("kind", export.FORMATS)
+def test_the_last_line_says_what_to_do_with_the_file(run, kind, tmp_path, capsys):
+    if kind == "usd":
+        pytest.importorskip("pxr")
+    path = tmp_path / f"a.{'usdz' if kind == 'usd' else kind}"
+    assert export.main([run.folder, "--format", kind, "-o", str(path)]) == 0
+    written, following = capsys.readouterr().out.splitlines()
+    assert written.startswith(f"written: {path}, ") and path.exists()
+    assert following.startswith("next: ") and str(path) in following
+
+
 def read_glb(path):
     """(JSON, accessor(k) -> array) of a .glb file, by the specification alone."""
     data = path.read_bytes()
