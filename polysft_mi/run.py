@@ -172,12 +172,13 @@ def reconstruct(
     from .render import threads
     from .results import outputs
     from .scene import experiment as experiments
-    from .surface.meshio import seam_note, size_note
+    from .surface.meshio import seam_note, size_note, uv_note
 
     experiment = experiments.load(scene, overrides)
     mesh = experiment.template
     notes = size_note(mesh.vertices, scene), seam_note(mesh.vertices, mesh.faces, scene)
-    for note in (experiment.note, *notes):
+    far = uv_note(mesh.texcoords, scene)
+    for note in (experiment.note, *notes, far and f"note: {far}"):
         if note:
             print(note, file=sys.stderr)
     s = experiment.settings
