@@ -23,7 +23,7 @@ __all__ = [
 ]
 
 
-UV_MARGIN = 0.02  # how far beyond the image texture coordinates may reach, the edge repeated
+_UV_MARGIN = 0.02  # how far beyond the image texture coordinates may reach, the edge repeated
 
 
 def read_template(path):
@@ -110,11 +110,11 @@ def seam_note(vertices, faces, where="template"):
 
 def uv_note(texcoords, where="template"):
     """A line about texture coordinates far outside the image, :class:`polyfit.mesh.TexCoords`; None
-    where they lie within 0 to 1, but for :data:`UV_MARGIN`.
+    where they lie within 0 to 1, but for a margin.
     """
     used = texcoords.coordinates[np.unique(texcoords.faces)]
     low, high = used.min(axis=0), used.max(axis=0)
-    if (low >= -UV_MARGIN).all() and (high <= 1 + UV_MARGIN).all():
+    if (low >= -_UV_MARGIN).all() and (high <= 1 + _UV_MARGIN).all():
         return None
     spans = " and ".join(f"{a:.4g} to {b:.4g}" for a, b in zip(low, high))
     return (
