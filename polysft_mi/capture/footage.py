@@ -14,6 +14,10 @@ from polysft_mi.errors import InputError
 
 from . import hdr
 
+# FFmpeg's numbers of what a container says of its fields: that of the top lines is shown first, or
+# that of the bottom ones. Where it says nothing, each frame does.
+_FIELD_ORDERS = {2: "tff", 5: "tff", 3: "bff", 4: "bff"}
+
 
 @dataclass
 class Film:
@@ -128,7 +132,8 @@ def _progressive(frames, stream, film):
                 format=frame.format,
                 time_base=frame.time_base or stream.time_base or Fraction(1, 1000),
             )
-            each = graph.add("bwdif", "mode=send_frame:deint=interlaced")
+            first = _FIELD_ORDERS.get(getattr(stream.codec_context, "field_order", 0), "auto")
+            each = graph.add("bwdif", f"mode=send_frame:deint=interlaced:parity={first}")
             sink = graph.add("buffersink")
             source.link_to(each)
             each.link_to(sink)

@@ -174,9 +174,9 @@ def test_interlaced_frames_are_brought_to_one_moment(kind, tmp_path):
     ]
     inner = lambda image, wanted: np.abs(image.astype(int) - wanted)[8:-8, 8:-8].mean()
     combed = inner(frames[0], texture(0))
-    # which field comes first, the file says
     moments = [max(inner(x, texture(6 * k + t)) for k, x in enumerate(images)) for t in (0, 3)]
-    assert min(moments) < 0.45 * combed
+    # the first field's, as the container says; where it says nothing, as the encoder does
+    assert (moments[0] if kind == "libx264" else min(moments)) < 0.45 * combed
     some, _ = read(path, first=2, last=4, stride=2)
     np.testing.assert_array_equal(some, [images[2], images[4]])
     plain, film = read(write(tmp_path / "b.mov", [texture(0)] * 3, "libx264", "yuv444p"))
