@@ -19,7 +19,8 @@ class Likely:
 
     - ``slowest``, ``fastest``: frames a second of a file. ``rotation`` [rad]: length of a joint's
       rotation vector.
-    - ``root`` [m/s]: the root's speed, in nine frames of ten. ``slide`` [m/s]: speed of the slower
+    - ``root`` [m/s]: the root's speed, in nine frames of ten, over ``window`` [s], for places that
+      tremble have none. ``slide`` [m/s]: speed of the slower
       foot, in the median, from which on a body slides, if a translation a hundredth as large would
       lower it to a ``share`` of that.
     - ``above`` [m]: how far the head is above the feet of who stands or sits, in the share
@@ -32,7 +33,8 @@ class Likely:
     fastest: float = 1000.0
     rotation: float = 2 * np.pi
     root: float = 25.0
-    slide: float = 1.0
+    window: float = 0.2
+    slide: float = 0.7
     share: float = 0.3
     above: float = 0.25
     standing: float = 0.35
@@ -123,7 +125,8 @@ def _lies(path, direction, other):
 def _check_ways(path, poses, translation, fps):
     if len(poses) < 2:
         return
-    speed = lambda x: np.linalg.norm(np.diff(x, axis=0), axis=-1) * fps
+    n = int(np.clip(round(_LIKELY.window * fps), 1, len(poses) - 1))
+    speed = lambda x: np.linalg.norm(x[n:] - x[:-n], axis=-1) * fps / n
     fastest = np.percentile(speed(translation), 90)
     if fastest > _LIKELY.root:
         unit = "; in centimetres? then divide trans by 100" if fastest < 100 * _LIKELY.root else ""

@@ -125,30 +125,39 @@ class _Document:
         return V[kept], F, texcoords
 
     @cached_property
-    def _worlds(self) -> list[np.ndarray | None]:
-        """The matrix (4, 4) of each node to the scene's axes; None for one outside the scene."""
-        nodes = self.json.get("nodes", [])
+    def _worlds(self) -> list[np.ndarray]:
+        """The matrix (4, 4) of each node to the axes of its root."""
+        nodes = self.json["nodes"]
         children = {child for node in nodes for child in node.get("children", ())}
-        roots = [k for k in range(len(nodes)) if k not in children]
-        scenes = self.json.get("scenes", [])
-        if scenes:
-            roots = scenes[self.json.get("scene", 0)].get("nodes", [])
-        worlds: list[np.ndarray | None] = [None] * len(nodes)
-        pending = [(k, np.eye(4)) for k in reversed(roots)]
+        worlds: dict[int, np.ndarray] = {}
+        pending = [(k, np.eye(4)) for k in range(len(nodes)) if k not in children]
         while pending:
             k, above = pending.pop()
-            if worlds[k] is not None:
+            if k in worlds:
                 raise ValueError(f"node {k} hangs on several others")
-            world = worlds[k] = above @ _local(nodes[k])
-            pending.extend((child, world) for child in reversed(nodes[k].get("children", ())))
-        return worlds
+            worlds[k] = above @ _local(nodes[k])
+            pending.extend((child, worlds[k]) for child in nodes[k].get("children", ()))
+        if len(worlds) < len(nodes):
+            raise ValueError("nodes hang on one another in a circle")
+        return [worlds[k] for k in range(len(nodes))]
 
     def _placed(self) -> list[tuple[dict[str, Any], np.ndarray]]:
-        """(node, its matrix (4, 4)); meshes of a file without nodes lie as they are."""
-        if not self.json.get("nodes"):
+        """(node, its matrix (4, 4)) of the scene, in the file's order; meshes of a file without
+        nodes lie as they are.
+        """
+        nodes = self.json.get("nodes", [])
+        if not nodes:
             return [({"mesh": k}, np.eye(4)) for k in range(len(self.json.get("meshes", ())))]
-        pairs = zip(self.json["nodes"], self._worlds)
-        return [(node, world) for node, world in pairs if world is not None]
+        scenes = self.json.get("scenes", [])
+        if not scenes:
+            return list(zip(nodes, self._worlds))
+        worlds, inside = self._worlds, set()
+        pending = list(scenes[self.json.get("scene", 0)].get("nodes", []))
+        while pending:
+            k = pending.pop()
+            inside.add(k)
+            pending.extend(nodes[k].get("children", ()))
+        return [(nodes[k], worlds[k]) for k in sorted(inside)]
 
     def _parts(self, node: dict[str, Any], world: np.ndarray) -> Any:
         """Yield (vertices, faces, uv or None) of each primitive of a node's mesh that has
@@ -189,13 +198,7 @@ class _Document:
         if "skin" not in node or "JOINTS_0" not in attributes:
             return V @ world[:3, :3].T + world[:3, 3], np.linalg.det(world[:3, :3]) < 0
         skin = self.json["skins"][node["skin"]]
-        joints = []
-        for k in skin["joints"]:
-            joint = self._worlds[k]
-            if joint is None:
-                raise ValueError(f"joint {k} is not in the scene")
-            joints.append(joint)
-        matrices = np.stack(joints)
+        matrices = np.stack([self._worlds[k] for k in skin["joints"]])
         if "inverseBindMatrices" in skin:
             inverse = self._accessor(skin["inverseBindMatrices"]).reshape(-1, 4, 4)
             matrices = matrices @ inverse.transpose(0, 2, 1)[: len(matrices)]  # columns first
@@ -207,9 +210,8 @@ class _Document:
             share = self._accessor(attributes[f"WEIGHTS_{k}"])
             mixed += np.einsum("nk,nkij->nij", share, matrices[joint])
             total += share.sum(axis=1)
-        if not (total > 0).all():
-            raise ValueError(f"{(total <= 0).sum()} vertices hang on no joint")
-        mixed /= total[:, None, None]
+        mixed[total <= 0] = matrices[0]  # which hang on no joint: on the first, as in viewers
+        mixed /= np.where(total > 0, total, 1)[:, None, None]
         placed = np.einsum("nij,nj->ni", mixed[:, :3, :3], V) + mixed[:, :3, 3]
         return placed, np.median(np.linalg.det(mixed[:, :3, :3])) < 0
 

@@ -373,6 +373,20 @@ def test_gltf_skins_stand_in_the_pose_of_the_file(tmp_path, component):
     read_as_it_is(file.write(tmp_path / "a.glb"))
 
 
+def test_gltf_skins_whose_joints_are_elsewhere_and_weights_missing(tmp_path):
+    """Joints outside the scene count; a vertex on no joint hangs on the first, as in viewers."""
+    file = File()
+    file.json["nodes"] = [{"mesh": 0, "skin": 0}, {"scale": [0.5] * 3}, {"scale": [9] * 3}]
+    file.attributes["POSITION"] = file.accessor(V * 2, FLOAT, "VEC3")
+    file.attributes["JOINTS_0"] = file.accessor([[1, 0, 0, 0]] * 4, UBYTE, "VEC4")
+    file.attributes["WEIGHTS_0"] = file.accessor(np.zeros((4, 4)), FLOAT, "VEC4")
+    file.json["skins"] = [{"joints": [1, 2]}]
+    read_as_it_is(file.write(tmp_path / "a.glb"))
+    file.json["nodes"][1]["children"] = [1]
+    with pytest.raises(InputError, match=r"not a readable GLB file .*circle"):
+        read_mesh(file.write(tmp_path / "a.glb"))
+
+
 def test_gltf_uv_are_those_of_the_base_colour(tmp_path):
     file = File()
     file.attributes["TEXCOORD_1"] = file.accessor(UV * (1, -1) + (0, 1), FLOAT, "VEC2")
