@@ -41,8 +41,13 @@ def main(argv=None):
         if getattr(args, name) < least:
             raise InputError(f"--{name} {getattr(args, name)}; at least {least} is needed")
     from . import PatchedSurface, read_mesh, write_ply
+    from .mesh import centred
 
     vertices, faces, _ = read_mesh(args.mesh)
+    vertices, moved = centred(vertices)
+    if moved is not None:
+        by = ", ".join(f"{x:.9g}" for x in moved)
+        print(f"note: {args.mesh}: moved by ({by}): single precision ends so far from the origin")
     surface = PatchedSurface.from_mesh(vertices, faces, args.patches, args.order, where=args.mesh)
     fine, fine_faces = surface.resampled(args.resolution, args.smoothing)
     write_ply(args.output, fine.numpy(), fine_faces.numpy())

@@ -1,11 +1,15 @@
-"""The one exception for a user's mistake, and how a command line ends on it."""
+"""The one exception for a user's mistake, how a command line ends on it, and that nothing speaks
+there but we.
+"""
 
 import argparse
 import contextlib
 import importlib.util
+import logging
 import os
 import signal
 import sys
+import warnings
 from collections.abc import Callable, Iterator
 from typing import NoReturn
 
@@ -15,6 +19,10 @@ class InputError(ValueError):
 
     The message is one line: it names the file or property, its value, and what would be accepted.
     """
+
+
+class Notice(RuntimeWarning):
+    """A warning of ours, which a user of a command sees."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -63,12 +71,24 @@ def optional_imports(name: str) -> Iterator[None]:
         sys.exit(_fail(_advice(error.name)))
 
 
+def silence_others() -> None:
+    """From here on the process shows no warning but a :class:`Notice`, and no line of a log: what
+    other packages have to say is no news for a user of a command. ``python -W`` or
+    ``PYTHONWARNINGS`` brings it back.
+    """
+    if not sys.warnoptions:
+        logging.disable(logging.CRITICAL)
+        warnings.simplefilter("ignore")
+        warnings.simplefilter("always", Notice)
+
+
 def cli(main: Callable[[], int | None]) -> NoReturn:
     """Run ``main()`` as a process: its return value is the exit status.
 
     An :class:`InputError`, a missing extra (``EXTRAS``) or an ``OSError`` that names a file ends in
-    one line on stderr and exit status 2, Ctrl-C in 130.
+    one line on stderr and exit status 2, Ctrl-C in 130. Other packages are silenced.
     """
+    silence_others()
     try:
         status = main()
     except InputError as error:

@@ -1,7 +1,8 @@
-"""Files that are either whole or not there: written aside, then renamed. And image files that are
-read without a word of the decoders.
+"""Files that are either whole or not there: written aside, then renamed. Text files in whatever
+encoding programs write. And image files that are read without a word of the decoders.
 """
 
+import codecs
 import contextlib
 import errno
 import os
@@ -14,6 +15,29 @@ from .errors import InputError
 
 # Numbers of the OSErrors that say that no more can be written
 DISK_FULL_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+_MARKS = (
+    (codecs.BOM_UTF8, "utf-8-sig"),
+    (codecs.BOM_UTF32_LE, "utf-32"),  # before UTF-16, whose mark it begins with
+    (codecs.BOM_UTF32_BE, "utf-32"),
+    (codecs.BOM_UTF16_LE, "utf-16"),
+    (codecs.BOM_UTF16_BE, "utf-16"),
+)
+
+
+def text_encoding(path: str | os.PathLike[str]) -> str:
+    """The encoding of a text file: by its byte order mark; without one UTF-16, if every other of
+    its first bytes is zero, or UTF-8.
+    """
+    with open(path, "rb") as file:
+        head = file.read(64)
+    for mark, name in _MARKS:
+        if head.startswith(mark):
+            return name
+    if len(head) > 1 and not any(head[1::2]):
+        return "utf-16-le"
+    return "utf-16-be" if len(head) > 1 and not any(head[::2]) else "utf-8"
 
 
 @contextlib.contextmanager

@@ -59,7 +59,10 @@ def add_options(p):
         help="comparison EXRs for at most N frames, or 'all' (default: 20)",
     )
     p.add_argument(
-        "--fps", type=float, default=15, help="frames a second of comparison.mp4 (default: 15)"
+        "--fps",
+        type=float,
+        help="frames a second of comparison.mp4 and exports (default: the scene's"
+        " fps, over its stride)",
     )
     p.add_argument("--no-report", action="store_true", help="do not write report.html at the end")
     p.add_argument("-q", "--quiet", action="store_true", help="no progress, only the result")
@@ -78,12 +81,12 @@ def execute(name, scene, options):
     overrides = commands.definitions(options.define)
     try:
         exr_frames = sys.maxsize if options.exr == "all" else int(options.exr)
-        if exr_frames < 0 or not 0 < options.fps <= 1000:
+        if exr_frames < 0 or not (options.fps is None or 0 < options.fps <= 1000):
             raise ValueError
     except ValueError:
         raise InputError(
-            f"--exr {options.exr} --fps {options.fps}: a number of frames or 'all', and a positive"
-            " rate, are needed"
+            f"--exr {options.exr} --fps {options.fps}: a number of frames or 'all', and a rate"
+            " above 0, at most 1000, are needed"
         ) from None
     outcome = reconstruct(
         scene,
@@ -155,7 +158,7 @@ def reconstruct(
     resume: bool = False,
     overwrite: bool = False,
     exr_frames: int = 20,
-    fps: float = 15,
+    fps: float | None = None,
     report: bool = True,
     quiet: bool = True,
     command: str | None = "polysft_mi.reconstruct",
@@ -166,8 +169,8 @@ def reconstruct(
     value of the scene's defaults; ``variant``: Mitsuba's, as
     :func:`polysft_mi.backend.set_variant` takes it. ``resume`` goes on with the run that ``out``
     holds, ``overwrite`` replaces it. ``exr_frames``: comparison EXRs at most; ``fps``: frames a
-    second of the video; ``report``: whether report.html is written; ``quiet``: no progress on
-    stderr; ``command``: what run.json and the report say made the result.
+    second of the result, by default the scene's; ``report``: whether report.html is written;
+    ``quiet``: no progress on stderr; ``command``: what run.json and the report say made the result.
 
     Returns the :class:`Outcome`; Ctrl-C ends the run early and keeps the frames that are done.
     Raises InputError.
@@ -187,16 +190,18 @@ def reconstruct(
     from .render import threads
     from .results import outputs
     from .scene import experiment as experiments
-    from .surface.meshio import seam_note, size_note
+    from .surface.meshio import seam_note, size_note, uv_note
     from .tracker import FrameTracker
 
     experiment = experiments.load(scene, overrides)
     mesh = experiment.template
     notes = size_note(mesh.vertices, scene), seam_note(mesh.vertices, mesh.faces, scene)
-    for note in (experiment.note, *notes):
+    far = uv_note(mesh.texcoords, scene)
+    for note in (experiment.note, *notes, far and f"note: {far}"):
         if note:
             print(note, file=sys.stderr)
     s = experiment.settings
+    fps = s.rate if fps is None else fps
     sequence = experiment.sequence()
     problem = Problem(experiment, sequence)
     problem.check_start()

@@ -146,6 +146,8 @@ class Garment:
         fitting.check_place(vertices[np.unique(faces)], surface, where, tell_pose=made_for is None)
         V, F, told = mended(vertices, faces, where, surface)
         F, turned = _outward(V, F, surface)
+        if texcoords is not None and (bare := (texcoords.faces < 0).any(axis=1)).any():
+            told += (f"{bare.sum()} faces have no texture coordinates, and take (0, 0)",)
         render_mesh = RenderMesh.bound(vertices, faces, texcoords, V, F)
         if made_for is not None:
             V = fitting.to_standard(V, F, made_for.to("cpu"), loose)

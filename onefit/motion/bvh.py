@@ -10,8 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from onefit.body import skeleton
 from polyfit.errors import InputError
+from polyfit.files import text_encoding
 
-from .placing import placed, require_finite
+from .likely import check_rate, to_z
+from .placing import require_finite
 
 # Names of bones, without case, separators, prefixes as in "mixamorig:", and sides, for each joint:
 # the first that a file has counts. Mixamo, CMU and MotionBuilder; Blender's Rigify; Poser and Daz;
@@ -30,19 +32,21 @@ _OPTIONAL = ("foot", "collar", "wrist")
 
 
 def read_bvh(path, fps=None, up=None):
-    """``(poses (T, 24, 3) [rad], translation (T, 3) [m], fps)`` of a BVH file.
+    """``(poses (T, 24, 3) [rad], translation (T, 3) [m], fps, what may be up instead)`` of a BVH
+    file, as :func:`onefit.motion.likely.stood` takes them.
 
     The file's zero pose has to be a stand (T-pose, A-pose, arms down): how it is turned from the
     T-pose is found as for bodies (:func:`onefit.body.skeleton.rest_pose`), and rotations are
     counted from the T-pose from then on. Lengths are scaled by the legs', so that any unit will do.
     A rotation of a bone that the 24 joints do not have goes to the next joint outwards; fingers and
-    faces are left out; up is where the head is in the zero pose. Raises InputError where the file
+    faces are left out; up is where the head is in the zero pose; ``up`` ("y" or "z"): what it is
+    in the motion, where that differs. Raises InputError where the file
     cannot be read, a limb is not found, or the zero pose is no stand.
     """
     names, parents, offsets, channels, frames, period = _parse(path)
     joint_of = _joints(path, names, parents, offsets)
     rest = _places(parents, offsets)
-    turn = _axes(path, rest, joint_of, up)
+    turn = _axes(rest, joint_of)
     rest = rest @ turn.T
     joints = _standing(path, rest, joint_of)
     if fps is None:
@@ -50,12 +54,18 @@ def read_bvh(path, fps=None, up=None):
             raise InputError(
                 f"{path}: a frame time of {period}; give the rate: fps=30, or --fps 30"
             )
+        check_rate(path, 1 / period, period)
         fps = 1 / period
         fps = round(fps) if abs(fps - round(fps)) < 0.01 else fps
+    check_rate(path, fps)
 
     world, root = _posed(
         path, parents, channels, frames
     )  # rotations of bones (bones, T) and places (T, 3), in the file's axes
+    given = np.eye(3)[2] if up is None else turn @ np.eye(3)["xyz".index(up)]
+    if given[2] == 0:  # the motion's up is not that of the zero pose
+        over = Rotation.from_matrix(turn.T @ to_z(given).as_matrix() @ turn)
+        world, root = [over * r for r in world], over.apply(root)
     C = Rotation.from_matrix(turn)
     stand = skeleton.chained_rotations(skeleton.rest_pose(joints)).numpy()
     target = [None] * 24
@@ -73,7 +83,9 @@ def read_bvh(path, fps=None, up=None):
         1,
     )
     scale = skeleton.leg_length(skeleton.standard_joints()) / skeleton.leg_length(joints)
-    return *placed(poses, root @ turn.T * scale), float(fps)
+    other = "y" if turn[2, 2] != 0 else "z"
+    axis = turn @ np.eye(3)["xyz".index(other)]
+    return poses, root @ turn.T * scale, fps, (other, axis)
 
 
 def _parse(path):
@@ -81,7 +93,7 @@ def _parse(path):
     sites are bones named ``None``.
     """
     try:
-        with open(path, encoding="utf-8", errors="replace") as file:
+        with open(path, encoding=text_encoding(path), errors="replace") as file:
             text = file.read()
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
@@ -121,7 +133,7 @@ def _parse(path):
         if count == 0 or len(values) == 0 or len(values) % count:
             raise ValueError(f"{len(values)} numbers for {count} channels")
         frames = values.reshape(-1, count)
-        if len(frames) != int(found[1]):
+        if len(frames) - int(found[1]) not in (0, 1):  # some count without the first, the zero pose
             raise ValueError(f"{found[1]} frames are announced, {len(frames)} are there")
         if parents.count(-1) != 1 or not np.isfinite(offsets).all():
             raise ValueError("one root and finite offsets are needed")
@@ -208,14 +220,14 @@ def _places(parents, offsets):
     return places
 
 
-def _axes(path, places, joint_of, up):
+def _axes(places, joint_of):
     """The rotation (3, 3) from the file's axes to OneFit's, its axes along the file's, told from
     the zero pose.
     """
     head = places[joint_of.get("head", joint_of.get("neck", joint_of["left_shoulder"]))]
     hips = 0.5 * (places[joint_of["left_hip"]] + places[joint_of["right_hip"]])
     nearest = lambda v: np.sign(v[np.abs(v).argmax()]) * np.eye(3)[np.abs(v).argmax()]
-    z = nearest(head - hips) if up is None else np.eye(3)["xyz".index(up)]
+    z = nearest(head - hips)
     x = places[joint_of["left_hip"]] - places[joint_of["right_hip"]]
     x = nearest(x - (x @ z) * z)
     return np.stack([x, np.cross(z, x), z])

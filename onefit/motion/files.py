@@ -16,13 +16,13 @@ from scipy.spatial.transform import Rotation
 
 from polyfit.errors import InputError
 
+from . import likely
 from .bvh import read_bvh
 from .placing import placed, require_finite
 
 _C = Rotation.from_euler("x", 90, degrees=True)  # from SMPL's body axes, or any world with y up
 _RATES = ("mocap_framerate", "mocap_frame_rate", "fps", "frame_rate", "framerate")
 _COUNTS = {22: 22, 24: 24, 52: 22, 55: 22}  # joints in a file, and how many of them are the body's
-_FASTEST = 25.0  # [m/s]: no one's root moves faster
 
 
 def read(path, fps=None, up=None):
@@ -33,14 +33,19 @@ def read(path, fps=None, up=None):
     name = os.path.splitext(os.path.basename(path))[0]
     if up not in (None, "y", "z"):
         raise InputError(f"up = {up!r}; y or z is needed")
-    if path.lower().endswith(".npz"):
-        return *_read_npz(path, fps, up), name
-    if path.lower().endswith(".bvh"):
-        return *read_bvh(path, fps, up), name
-    raise InputError(f"{path}: a motion is read from .npz (AMASS, Neural Cloth Simulation) or .bvh")
+    readers = {".npz": _read_npz, ".bvh": read_bvh}
+    reader = readers.get(os.path.splitext(path)[1].lower())
+    if reader is None:
+        raise InputError(
+            f"{path}: a motion is read from .npz (AMASS, Neural Cloth Simulation) or .bvh"
+        )
+    poses, translation, rate, other = reader(path, fps, up)
+    poses, translation = likely.stood(path, poses, translation, rate, up, other)
+    return *placed(poses, translation), float(rate), name
 
 
 def _read_npz(path, fps, up):
+    """(poses (T, 24, 3) [rad], translation (T, 3) [m], fps, what may be up instead)."""
     try:
         with np.load(path, allow_pickle=False) as file:
             data = {key: file[key] for key in ("poses", "trans", *_RATES) if key in file.files}
@@ -66,6 +71,7 @@ def _read_npz(path, fps, up):
                 f"{path}: no frame rate ({', '.join(_RATES)}); give it: fps=30, or --fps 30"
             )
         fps = float(np.asarray(data[rate]).ravel()[0])
+    likely.check_rate(path, fps)
     if up is None:  # AMASS names its rate after its motion capture
         up = "z" if rate is None or rate.startswith("mocap") else "y"
     quaternions = poses.ndim == 3 and poses.shape[2] == 4
@@ -83,34 +89,10 @@ def _read_npz(path, fps, up):
     local = np.zeros((len(poses), 24, 3))
     body = _COUNTS[int(count)]
     local[:, :body] = poses.reshape(len(poses), -1, 3)[:, :body]
+    likely.check_rotations(path, local)
     world = _C if up == "y" else Rotation.identity()
     root = world * Rotation.from_rotvec(local[:, 0]) * _C.inv()
     local = _C.apply(local.reshape(-1, 3)).reshape(local.shape)
     local[:, 0] = root.as_rotvec()
-    _upright(path, root, up)
-    trans = world.apply(trans)
-    fastest = (
-        np.percentile(np.linalg.norm(np.diff(trans, axis=0), axis=1), 90) * fps
-        if len(trans) > 1
-        else 0.0
-    )
-    if fastest > _FASTEST:
-        unit = "; in centimetres? then divide trans by 100" if fastest < 100 * _FASTEST else ""
-        raise InputError(
-            f"{path}: its root moves at {fastest:.3g} m/s; metres and frames a second are"
-            f" needed{unit}"
-        )
-    return *placed(local, trans), float(fps)
-
-
-def _upright(path, root, up):
-    """Refuses a motion whose body lies on its side all the time, and would stand with the other
-    axis up.
-    """
-    mean = root.apply([0.0, 0.0, 1.0]).mean(0)
-    if abs(mean[2]) < 0.3 and abs(mean[1]) > 0.85:
-        other = "z" if up == "y" else "y"
-        raise InputError(
-            f"{path}: with {up} up, its body lies down in all frames; give up={other!r}, or"
-            f" --motion-up {other}"
-        )
+    other = ("z", world.apply([0.0, 0, 1])) if up == "y" else ("y", np.array([0.0, 1, 0]))
+    return local, world.apply(trans), fps, other

@@ -85,7 +85,8 @@ class Motion:
         taken over joint by joint, in OneFit's axes (:mod:`onefit.motion.files`); a BVH skeleton is
         retargeted (:mod:`onefit.motion.bvh`). The motion starts at x = y = 0 with its lowest foot
         on the standard body's ground. Raises InputError for what cannot be used: not finite,
-        another number of joints, no frame rate, another unit.
+        another number of joints, no frame rate, another unit, a body that lies
+        (:mod:`onefit.motion.likely`).
         """
         return cls(*files.read(path, fps, up))
 

@@ -13,6 +13,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "triangles": [
             "areas",
             "boundary_edges",
+            "centred",
             "checked",
             "components",
             "edges_of",

@@ -8,7 +8,7 @@ import numpy as np
 @dataclass(frozen=True)
 class TexCoords:
     """``coordinates`` (M, 2), (0, 0) at the image's bottom left, v up; ``faces`` (F, 3): the one of
-    each corner of each face.
+    each corner of each face, -1 for a corner that has none.
     """
 
     coordinates: np.ndarray
@@ -16,8 +16,15 @@ class TexCoords:
 
     @property
     def corners(self) -> np.ndarray:
-        """The coordinates of the faces' corners, (F, 3, 2)."""
-        return self.coordinates[self.faces]
+        """The coordinates of the faces' corners, (F, 3, 2); NaN for those without."""
+        return self._at(self.faces)
+
+    def _at(self, index: np.ndarray) -> np.ndarray:
+        """The coordinates (..., 2) with the numbers ``index`` (...,)."""
+        if not (index < 0).any():
+            return self.coordinates[index]
+        missing = np.full((1, 2), np.nan)
+        return np.concatenate([self.coordinates, missing])[index]
 
     def split(self, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Vertices split along the seams, for files that take one coordinate a vertex.
@@ -31,7 +38,7 @@ class TexCoords:
             return np.arange(len(per_vertex)), per_vertex, faces
         pairs = np.stack([faces.ravel(), self.faces.ravel()], 1)
         found, index = np.unique(pairs, axis=0, return_inverse=True)
-        return found[:, 0], self.coordinates[found[:, 1]], index.reshape(faces.shape)
+        return found[:, 0], self._at(found[:, 1]), index.reshape(faces.shape)
 
     def of_vertices(self, faces: np.ndarray, count: int | None = None) -> np.ndarray | None:
         """(N, 2), one a vertex of the mesh with ``faces`` (F, 3) and N = ``count`` vertices, NaN

@@ -60,6 +60,21 @@ def welded(V: np.ndarray, F: np.ndarray, grid: float = 0.0) -> tuple[np.ndarray,
     return first[order], number[index.ravel()][F]
 
 
+_FARTHEST = 1000.0  # from the origin, in extents: there single precision keeps 1/16,000 of one
+
+
+def centred(V: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """``(vertices, moved)``: vertices (N, 3) that lie too far from the origin for single precision,
+    as in a map's coordinates, moved by ``moved`` (3,) so that their middle is there; all others as
+    they are, with None.
+    """
+    low, high = V.min(axis=0, initial=np.inf), V.max(axis=0, initial=-np.inf)
+    middle = (low + high) / 2
+    if not np.abs(middle).max() > _FARTHEST * (high - low).max() > 0:
+        return V, None
+    return V - middle, -middle
+
+
 def in_use(V: np.ndarray, F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The mesh without vertices in no face; the others keep their order."""
     used, F = np.unique(F, return_inverse=True)

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from polyfit import jets, mesh
+from polyfit.errors import InputError
 from polyfit.jets import CanonicalFrame
 
 from .patches import Patches
@@ -100,13 +101,16 @@ class PatchedSurface:
     ) -> "PatchedSurface":
         """Cut the mesh (N, 3) [m], (F, 3) into patches (:meth:`polyfit.patches.Patches.cut`),
         :meth:`fit` them with ``options``, and let the boundaries move to where the jets fit best,
-        ``rounds`` times (:func:`polyfit.patches.refine.refined`).
+        ``rounds`` times (:func:`polyfit.patches.refine.refined`). Raises InputError for a mesh that
+        lies too far from the origin for single precision (:func:`polyfit.mesh.centred`).
         """
-        return refined(
-            cls.fit(Patches.cut(vertices, faces, count, where=where), order, **options),
-            rounds,
-            **options,
-        )
+        patches = Patches.cut(vertices, faces, count, where=where)
+        if mesh.centred(patches.vertices)[1] is not None:
+            raise InputError(
+                f"{where}: it lies more than 1000 times its extent from the origin, too far for"
+                " single precision; move it there (polyfit.mesh.centred)"
+            )
+        return refined(cls.fit(patches, order, **options), rounds, **options)
 
     @property
     def residual(self) -> Tensor:

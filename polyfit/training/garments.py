@@ -90,6 +90,7 @@ def cut_meshes(paths, counts, points, seed):
     parts = []
     for path in paths:
         vertices, faces = read_mesh(path)[:2]
+        vertices = mesh.centred(vertices)[0]
         parts += [
             GarmentPatches.cut(vertices, faces, count, points, generator, str(path))
             for count in counts

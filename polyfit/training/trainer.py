@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from polyfit.baselines import chamfer, normalised
-from polyfit.mesh import read_mesh
+from polyfit.mesh import centred, read_mesh
 from polyfit.network import read_weights, write_weights
 
 from . import deformations, garments, training_set
@@ -139,6 +139,7 @@ def _prepare(settings, folder, processes, progress):
         generator, points = np.random.default_rng(settings.seed), []
         for path in settings.meshes:
             vertices, faces = read_mesh(path)[:2]
+            vertices = centred(vertices)[0]
             points.append(
                 garments.GarmentPatches.cut(
                     vertices, faces, None, 64, generator, str(path)

@@ -17,6 +17,7 @@ from polysft_mi.surface import meshio
 from . import pictures, sheet
 from .camera import Lens, Undistortion, read_lens
 from .camera.calibration import calibrate as calibrate_camera
+from .footage import Film
 from .frames import focal_length, read_frames
 from .layouts import Layout
 from .masked_frames import GivenMasks, write_frames
@@ -85,13 +86,17 @@ def prepare_video(
     masks = GivenMasks(masks) if isinstance(masks, str) else masks
     found = {"video": video, "command": command}
 
-    stream = read_frames(video, first, last, stride)
+    film = Film()
+    stream = read_frames(video, first, last, stride, film)
     index, frame = next(stream)
     taken = frame.shape[1::-1]
     lens, board_picture = _lens(video, texture, camera, fov, calibrate, board, taken)
     straight = Undistortion(lens, scale)
     view, frame = straight.camera, straight.image(frame)
     found["camera"] = {**lens.as_json(), "from": lens.source}
+    for line in film.notes:
+        say(f"note: {video}: {line}")
+    told = len(film.notes)
     say(
         f"camera: {view.fx:.1f} pixels focal length, {view.width}x{view.height},"
         f" {'undistorted, ' if any(lens.distortion) else ''}from {lens.source}"
@@ -145,14 +150,18 @@ def prepare_video(
         expected = silhouette(view.project(placed), mesh.faces, frame.shape[1::-1])
         written = write_frames(partial, frames(), masks, expected, straight, progress, registration)
         found |= {"frames": len(written.indices), "indices": written.indices}
+        found["fps"], uneven = film.rate(stride)
+        for line in [*film.notes[told:], *filter(None, [uneven])]:
+            say(f"note: {video}: {line}")
         if written.figures:
             found["masks"] = written.figures
+        speed = f", {found['fps']:.4g} a second" if found["fps"] else ""
         for line in (
-            f"frames: {len(written.indices)} of {view.width}x{view.height}",
+            f"frames: {len(written.indices)} of {view.width}x{view.height}{speed}",
             *written.lines,
         ):
             say(line)
-        _write_scene(partial, view, written.masked, photo, placed, mesh)
+        _write_scene(partial, view, written.masked, photo, placed, mesh, found["fps"])
         write_json(os.path.join(partial, REPORT, "prepare.json"), found)
     return os.path.join(out, "scene.xml"), found
 
@@ -176,8 +185,10 @@ def _folder(out):
         raise
 
 
-def _write_scene(folder, view, masked, photo, placed, mesh):
-    """The files that the scene names beside frames and masks, and the scene itself."""
+def _write_scene(folder, view, masked, photo, placed, mesh, fps):
+    """The files that the scene names beside frames and masks, and the scene itself; ``fps``: frames
+    a second, or None.
+    """
     finest = 2048  # pixels of the texture's longer side; what is finer no frame shows
     write_png(os.path.join(folder, "texture.png"), pictures.shrunk(photo, finest)[0])
     meshio.write_obj(os.path.join(folder, "template.obj"), *mesh.mesh(placed))
@@ -185,6 +196,7 @@ def _write_scene(folder, view, masked, photo, placed, mesh):
     layout = Layout(
         "cloth", view, "frames", "masks" if masked else "", "texture.png", "template.obj"
     )
+    layout = replace(layout, settings={"fps": round(fps, 6)} if fps else {})
     comment = "A video prepared by python -m polysft_mi.prepare; prepare/ shows what it found."
     with open(os.path.join(folder, "scene.xml"), "w", encoding="utf-8") as file:
         file.write(scene_xml(layout, ".", comment=comment))

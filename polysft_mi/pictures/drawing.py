@@ -16,6 +16,8 @@ from functools import partial
 
 import numpy as np
 
+from polyfit.errors import silence_others
+
 from .panels import evenly_spaced
 
 _album = None  # of the drawing process
@@ -84,7 +86,9 @@ class Drawing:
                 problem.sequence,
                 self._album,
             )
-            self._pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"))
+            self._pool = ProcessPoolExecutor(
+                1, multiprocessing.get_context("spawn"), initializer=silence_others
+            )
             self._submit()  # starts the process
 
     def _chosen(self, count):

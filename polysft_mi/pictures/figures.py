@@ -12,6 +12,7 @@ import warnings
 
 import numpy as np
 
+from polyfit.errors import Notice
 from polyfit.files import DISK_FULL_ERRORS, aside
 
 from .panels import PEAKS
@@ -44,7 +45,7 @@ def _kept_safe(draw):
                 raise
             warnings.warn(
                 f"{path}: picture not written ({type(error).__name__}: {error})",
-                RuntimeWarning,
+                Notice,
                 stacklevel=2,
             )
             return None

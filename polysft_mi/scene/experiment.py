@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import os
 import re
+import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -85,19 +85,29 @@ def load(
             f"{path}: data = {defaults['data']}: no such folder, neither beside the scene nor here;"
             " give -D data=FOLDER"
         )
-    source = _source(_check_nodes(path, given))
+    config, state, shape = _parsed(path, given)
+    source = _source(shape)
     try:
-        scene = mi.load_file(path, optimize=False, **given)
+        scene = _instance(path, config, state)
+        plain = source is None or _loaded_as_read(scene, source)
     except Exception as error:  # whatever a plugin raised reaches us wrapped by the parser
-        raise InputError(_mitsuba_message(error, path)) from None
+        if source is None or "shape plugin" not in str(error):
+            raise InputError(_mitsuba_message(error, path)) from None
+        plain = False
+    if not plain:
+        with tempfile.TemporaryDirectory(prefix="polysft_mi-") as folder:
+            config, state, shape = _parsed(path, given)
+            shape["filename"] = _plain_copy(shape["filename"], folder)
+            try:
+                scene = _instance(path, config, state)
+            except Exception as error:
+                raise InputError(_mitsuba_message(error, path)) from None
 
     if len(scene.sensors()) != 1:
         raise InputError(f"{path}: {len(scene.sensors())} sensors; exactly one is needed")
     if not mi.has_flag(scene.sensors()[0].film().flags(), mi.FilmFlags.Alpha):
         raise InputError(f"{path}: the film has no alpha channel; pixel_format rgba is needed")
-    meshes = [s for s in scene.shapes() if s.is_mesh() and s.id() == "template"] or [
-        s for s in scene.shapes() if s.is_mesh()
-    ]
+    meshes = _template_meshes(scene)
     if len(meshes) != 1:
         raise InputError(f'{path}: {len(meshes)} meshes; give the template\'s shape id="template"')
     experiment, mesh = scene.integrator(), meshes[0]
@@ -117,6 +127,55 @@ def load(
         defaults,
         note,
     )
+
+
+def _instance(path, config, state):
+    """The scene of the parsed file ``path``; relative paths in it count from its folder."""
+    resolver = mi.file_resolver()
+    places = [resolver[k] for k in range(len(resolver))]
+    resolver.prepend(os.path.dirname(os.path.abspath(path)))
+    try:
+        mi.parser.transform_all(config, state)
+        return mi.parser.instantiate(config, state)
+    finally:
+        resolver.clear()
+        for place in places:
+            resolver.append(place)
+
+
+def _template_meshes(scene):
+    """The meshes that may be the template: those of its name, else all."""
+    meshes = [s for s in scene.shapes() if s.is_mesh()]
+    return [s for s in meshes if s.id() == "template"] or meshes
+
+
+def _loaded_as_read(scene, source):
+    """Whether Mitsuba has the template's faces as we read them from its file, which its loaders
+    understand less well (:mod:`polyfit.mesh`). Faces that are left out do not count.
+    """
+    _, vertices, faces, _, kept, _ = source
+    for mesh in _template_meshes(scene):
+        shown = np.array(mesh.faces_buffer(), dtype=np.int64).reshape(-1, 3)
+        if len(shown) != len(kept):
+            return True  # it leaves out some, too
+        rendered = np.array(mesh.vertex_positions_buffer(), dtype=np.float64).reshape(-1, 3)
+        apart = np.abs(rendered[shown[kept]] - vertices[faces]).max()
+        return not apart > 1e-4 * np.ptp(vertices, axis=0).max()
+    return True
+
+
+def _plain_copy(path, folder):
+    """A file in ``folder`` with the template of another, its vertices and triangles in their
+    order, that any loader understands.
+    """
+    vertices, faces, texcoords = read_textured(path, what="template")
+    copy = os.path.join(folder, f"template{os.path.splitext(path)[1].lower()}")
+    if copy.endswith(".obj"):
+        meshio.write_obj(copy, vertices, faces, texcoords)
+    else:
+        index, uv, split = texcoords.split(faces)
+        meshio.write_ply(copy, vertices[index], split, uv)
+    return copy
 
 
 def _mitsuba_message(error, path):
@@ -140,11 +199,13 @@ def _mitsuba_message(error, path):
     )
 
 
-def _check_nodes(path, overrides):
+def _parsed(path, overrides):
     """Parse the file, check its integrator, its sensor and that the files it names are there;
-    return the properties of the template's shape (or None).
+    return the parser's configuration, its state, and the properties of the template's shape (or
+    None).
     """
     config = mi.parser.ParserConfig(mi.variant())
+    config.merge_meshes = config.merge_equivalent = False
     try:
         state = mi.parser.parse_file(config, path, **overrides)
     except Exception as error:
@@ -186,7 +247,8 @@ def _check_nodes(path, overrides):
                 )  # Mitsuba's libraries tell of a broken file in lines of their own
         if props.plugin_name() in ("obj", "ply", "serialized", "varol_template"):
             shapes.append(props)
-    return next((p for p in shapes if p.id() == "template"), shapes[0] if shapes else None)
+    template = next((p for p in shapes if p.id() == "template"), shapes[0] if shapes else None)
+    return config, state, template
 
 
 def _source(props):

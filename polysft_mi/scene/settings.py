@@ -57,6 +57,13 @@ class Settings:
     first: int = _setting(0, "first image to use, counted from 0 in the sorted list", low=0)
     last: int = _setting(-1, "last image to use, inclusive; -1 for the end of the video", low=-1)
     stride: int = _setting(1, "use every stride-th image", low=1)
+    fps: float = _setting(
+        0.0,
+        "frames a second of the images; comparison.mp4 and exports have that over stride; 0: not"
+        " known, they have 15",
+        low=0,
+        high=1000,
+    )
     order: int = _setting(
         0,
         "order n of the jets; 0: 8, or 5 where the template has several patches, or less if the"
@@ -218,6 +225,11 @@ class Settings:
     lr_rigid: float = _setting(
         1e-4, "Adam's step size of rotation and translation", low=0, solver="adam"
     )
+
+    @property
+    def rate(self) -> float:
+        """Frames a second of the images that are used."""
+        return self.fps / self.stride if self.fps else 15.0
 
     def jet_order(self, patches: int) -> int:
         """The order of the jets of so many patches, where the template's vertices determine it."""

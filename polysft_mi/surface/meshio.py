@@ -17,9 +17,13 @@ __all__ = [
     "read_textured_template",
     "seam_note",
     "size_note",
+    "uv_note",
     "write_obj",
     "write_ply",
 ]
+
+
+_UV_MARGIN = 0.02  # how far beyond the image texture coordinates may reach, the edge repeated
 
 
 def read_template(path):
@@ -104,6 +108,21 @@ def seam_note(vertices, faces, where="template"):
     )
 
 
+def uv_note(texcoords, where="template"):
+    """A line about texture coordinates far outside the image, :class:`polyfit.mesh.TexCoords`; None
+    where they lie within 0 to 1, but for a margin.
+    """
+    used = texcoords.coordinates[np.unique(texcoords.faces)]
+    low, high = used.min(axis=0), used.max(axis=0)
+    if (low >= -_UV_MARGIN).all() and (high <= 1 + _UV_MARGIN).all():
+        return None
+    spans = " and ".join(f"{a:.4g} to {b:.4g}" for a, b in zip(low, high))
+    return (
+        f"{where}: texture coordinates from {spans}; the image fills 0 to 1, and there are no"
+        " other tiles (UDIM)"
+    )
+
+
 def check_template(vertices, faces, uv, where="template"):
     """Raise InputError, in one line that starts with ``where``, unless the mesh can be a template.
 
@@ -140,6 +159,8 @@ def check_template(vertices, faces, uv, where="template"):
                 f"{where}: texture coordinates of shape {uv.shape}; ({len(V)}, 2) is needed"
             )
         uv = TexCoords(uv, F)
+    bare = (uv.faces < 0).any(axis=1)
+    _refuse(bare, where, "faces have no texture coordinates, as others have", "face")
     bad = ~np.isfinite(uv.coordinates).all(axis=1)
     _refuse(bad, where, "texture coordinates are not finite", "coordinate")
     if not (mesh.areas(V, F) > 1e-12 * np.ptp(V, axis=0).max() ** 2).any():

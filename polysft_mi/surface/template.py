@@ -87,8 +87,8 @@ class Template:
 
     @property
     def is_closed(self):
-        """Whether the mesh has no boundary: each edge has two faces."""
-        return 2 * len(self.edges) == self.faces.size
+        """Whether the mesh encloses a volume: each edge has exactly two faces."""
+        return bool((np.bincount(edges_of(self.faces)[1].ravel()) == 2).all())
 
     @classmethod
     def fit(

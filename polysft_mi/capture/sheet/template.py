@@ -126,6 +126,8 @@ def from_obj(path):
 
     vertices, faces, texcoords = meshio.read_textured_template(path)
     meshio.check_template(vertices, faces, texcoords, path)
+    texcoords = _on_photo(texcoords, path)
+    vertices = vertices - vertices[np.unique(faces)].mean(0)  # before anything is single precision
     extent = np.ptp(vertices, axis=0).max()
     if not SMALLEST <= extent <= LARGEST:
         hint = "in millimetres? write it in metres" if extent > LARGEST else "write it in metres"
@@ -136,10 +138,22 @@ def from_obj(path):
     patches = len(Template.fit(vertices, faces, texcoords, 4, exact=False, where=path))
     source, uv, split = texcoords.split(faces)
     return Sheet(
-        (vertices - vertices.mean(0))[source],
+        vertices[source],
         split,
         uv,
         f"{path}, {len(vertices)} vertices" + (f" in {patches} patches" if patches > 1 else ""),
         source,
         patches == 1,
     )
+
+
+def _on_photo(texcoords, path):
+    """The texture coordinates on the one photo: those of one tile of several (UDIM) are moved to
+    it. Raises InputError where they reach into more tiles than one.
+    """
+    used = texcoords.coordinates[np.unique(texcoords.faces)]
+    tile = np.floor((used.min(0) + used.max(0)) / 2)
+    moved = TexCoords(texcoords.coordinates - tile, texcoords.faces)
+    if meshio.uv_note(moved):
+        raise InputError(f"{meshio.uv_note(texcoords, path)}; scale them to the photo")
+    return moved

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from clips import CAMERA, HEIGHT, WIDTH, placed, refused
 
-from polysft_mi.capture.sheet import Matches, from_matches, grid, parse_size
+from polysft_mi.capture.sheet import Matches, from_matches, from_obj, grid, parse_size
 from polysft_mi.capture.sheet.placing import MAX_FLAT_RESIDUAL
+from polysft_mi.surface import meshio
 
 
 @pytest.mark.parametrize(
@@ -80,3 +81,24 @@ def test_bent_first_frame_is_said(tmp_path):
         lines.append(missed > MAX_FLAT_RESIDUAL)
         assert after.agree.sum() >= 10
     assert lines == [False, True]
+
+
+def test_a_template_of_ones_own_is_centred_and_its_tile_is_the_photo(tmp_path):
+    """Far out, as on a map, and with texture coordinates in another tile: the same sheet."""
+    flat, path = grid(WIDTH, HEIGHT, 12), tmp_path / "a.obj"
+
+    def written(vertices, uv):
+        rows = ["v {:.9f} {:.9f} {:.9f}".format(*p) for p in vertices]
+        rows += ["vt {} {}".format(*t) for t in uv]
+        rows += ["f {0}/{0} {1}/{1} {2}/{2}".format(*f) for f in flat.faces + 1]
+        path.write_text("\n".join(rows))
+        return path
+
+    far = from_obj(written(flat.vertices + [5e5, 4e6, 100], flat.uv + [2, -1]))
+    np.testing.assert_allclose(far.vertices, flat.vertices, atol=1e-8)
+    np.testing.assert_allclose(far.uv, flat.uv, atol=1e-9)
+    meshio.write_obj(tmp_path / "b.obj", *far.mesh(far.vertices))
+    back = from_obj(tmp_path / "b.obj")
+    np.testing.assert_allclose(back.vertices, flat.vertices, atol=1e-8)
+    said = refused(from_obj, written(flat.vertices, flat.uv * [2, 1]))
+    assert "a.obj: texture coordinates from 0 to 2 and 0 to 1; the image fills 0 to 1" in said

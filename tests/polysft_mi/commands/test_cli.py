@@ -105,6 +105,30 @@ def test_a_mistake_ends_the_process_with_status_2():
     assert "invalid choice: 'fbx'" in said
 
 
+_OTHERS = """
+import logging, warnings
+from polyfit.errors import Notice, cli
+
+def main():
+    warnings.warn("a function that will go", DeprecationWarning)
+    warnings.warn("some user warning")
+    logging.getLogger("matplotlib.font_manager").warning("building the font cache")
+    logging.getLogger("trimesh").exception("unable to load image!")
+    warnings.warn("loss.png: picture not written", Notice)
+
+cli(main)
+"""
+
+
+def test_what_other_packages_say_reaches_nobody():
+    done = python("-c", _OTHERS)
+    assert done.returncode == 0 and done.stdout == ""
+    assert "picture not written" in done.stderr
+    for word in ("function", "user warning", "font cache", "image"):
+        assert word not in done.stderr
+    assert "a function that will go" in python("-W", "default", "-c", _OTHERS).stderr
+
+
 def test_json_is_all_that_stdout_holds(finished_run, tmp_path, capsys, monkeypatch):
     truth, out = finished_run
     monkeypatch.setattr(sys, "argv", sys.argv)

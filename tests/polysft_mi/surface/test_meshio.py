@@ -21,6 +21,7 @@ from polysft_mi.surface.meshio import (
     read_template,
     read_textured_template,
     seam_note,
+    uv_note,
     write_ply,
 )
 from polysft_mi.surface.template import Template
@@ -197,6 +198,22 @@ def test_a_surface_cut_along_a_seam_is_told():
     W, G = in_use(np.concatenate([V, V]), cut)
     both = len(np.intersect1d(F[left], F[~left]))
     assert f"the surface is open where {both} vertices lie on others" in seam_note(W, G)
+
+
+def test_coordinates_beyond_the_image_are_told():
+    _, F, uv = sheet()
+    assert uv_note(TexCoords(uv, F)) is None and uv_note(TexCoords(1.02 * uv - 0.01, F)) is None
+    said = uv_note(TexCoords(uv * (2, 1), F), "a.obj")
+    assert said.startswith(
+        "a.obj: texture coordinates from 0 to 2 and 0 to 1; the image fills 0 to"
+    )
+
+
+def test_a_template_without_texture_on_some_faces_is_refused(tmp_path):
+    (tmp_path / "a.obj").write_text(OBJ + "f 2/2 5/5 6/6 3/3\nf 1 2 3 4\n")
+    mesh = read_textured_template(tmp_path / "a.obj")
+    with pytest.raises(InputError, match="2 faces have no texture coordinates, as others have"):
+        check_template(*mesh)
 
 
 def test_missing_file_and_folder(tmp_path):

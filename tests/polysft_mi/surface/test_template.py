@@ -168,6 +168,14 @@ def test_closed_or_not():
     assert not Template.fit(*tube, tube[0][:, :2], 3).is_closed
 
 
+def test_doubled_faces_close_nothing():
+    """A tetrahedron without one side and with another twice has two faces an edge in the mean."""
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
+    faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [1, 2, 3]])
+    template = Template.fit(vertices, faces, vertices[:, :2], 1, exact=False)
+    assert 2 * len(template.edges) == faces.size and not template.is_closed
+
+
 def test_a_ball_in_one_frame_is_refused():
     vertices, faces = surfaces.sphere(subdivisions=2)
     frame = CanonicalFrame.from_points(torch.as_tensor(vertices))
