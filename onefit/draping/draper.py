@@ -9,7 +9,8 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -43,7 +44,8 @@ class Drape:
     """A draped garment: ``vertices`` (T, N, 3) [m] in the world, ``faces`` (F, 3), ``rest`` (N, 3)
     [m], the garment graded to the shape; the ``body``'s vertices (T, V, 3) [m], its ``body_faces``
     and the root's place ``root`` (T, 3) [m]; ``fps`` frames a second. ``render_mesh``: the mesh of
-    the garment's file (:class:`onefit.garment.RenderMesh`); None for a template.
+    the garment's file (:class:`onefit.garment.RenderMesh`); None for a template. ``material``: what
+    the cloth is made of; None for a network's drape, which does not know it.
     """
 
     vertices: torch.Tensor
@@ -54,6 +56,7 @@ class Drape:
     root: torch.Tensor
     fps: float
     render_mesh: RenderMesh | None = None
+    material: Material | None = None
 
     def render_vertices(self) -> np.ndarray:
         """Vertices of the garment's file in each frame, (T, M, 3) [m]; of a template its own."""
@@ -63,7 +66,9 @@ class Drape:
         return np.stack([self.render_mesh.carried(x, faces) for x in cloth]).astype(np.float32)
 
     def measures(self) -> Measures:
-        """The :class:`onefit.objective.measures.Measures` of this drape."""
+        """The :class:`onefit.objective.measures.Measures` of this drape; its masses are those of
+        the ``material``, or, without one, of the cloth that networks are trained for.
+        """
         from onefit.objective import measure
 
         return measure(
@@ -74,6 +79,7 @@ class Drape:
             ClosestSurface(self.body[0], self.body_faces),
             self.root,
             self.fps,
+            **({"density": self.material.density} if self.material else {}),
         )
 
 
@@ -92,10 +98,8 @@ class Draper:
         self.network = trained.network.to(self.device).eval()
         self.model = model or AnnyBody()
         self._garments: dict = {}
-        self._patched: dict = {}
-        self._codes: dict = {}
-        self._ease: dict = {}
-        self._pulls: dict = {}
+        # what was made of each garment, by name, as long as that lives
+        self._made: WeakKeyDictionary[Garment, dict[str, Any]] = WeakKeyDictionary()
         self._surfaces: tuple = ()
 
     @cached_property
@@ -115,12 +119,15 @@ class Draper:
 
     def patched(self, garment: Garment) -> PatchedGarment:
         """The :class:`onefit.PatchedGarment` of a garment, cut once."""
-        key = id(garment)
-        if key not in self._patched:
-            self._patched[key] = PatchedGarment(
-                garment, self.standard, order=self.network.order
-            ).to(self.device)
-        return self._patched[key]
+        cut = lambda: PatchedGarment(garment, self.standard, order=self.network.order)
+        return self._once(garment, "patched", lambda: cut().to(self.device))
+
+    def _once(self, garment, name, make):
+        """What ``make()`` makes of a garment, its ``name``; it must not hold the garment."""
+        made = self._made.setdefault(garment, {})
+        if name not in made:
+            made[name] = make()
+        return made[name]
 
     def drape(
         self,
@@ -150,8 +157,8 @@ class Draper:
         (one of :data:`onefit.physics.MATERIALS` by its name, or a
         :class:`onefit.physics.Material`), solved as :class:`onefit.physics.Settings` say; two steps
         are enough, and 0 leaves it out.
-        ``advance`` is called after each finished frame. Raises InputError for a garment, motion,
-        shape or material that cannot be used.
+        ``advance`` is called once for each frame that is done. Raises InputError for a garment,
+        motion, shape or material that cannot be used.
         """
         if finish < 0:
             raise InputError(f"finish = {finish}; steps a frame, 0 or more")
@@ -193,6 +200,8 @@ class Draper:
             for vertices, bodies in ahead.map(batch, batches):
                 past = done[-1][0][-2:] if done else None
                 done.append((post_processed(vertices, bodies, FPS, past), bodies))
+                for _ in bodies if not finish else ():
+                    advance()
         vertices, bodies = (torch.cat(parts) for parts in zip(*done))
         root = skinning.posed_joints(body, transforms)[:, 0]
         found = (vertices, garment.faces, rest, bodies, body.faces, root)
@@ -219,8 +228,9 @@ class Draper:
                 patches=self.patched(garment).vertex_patch,
             )  # fmt: skip
             vertices = torch.stack([(frame, advance())[0] for frame in made])
+        of = material if finish else None
         mesh_of_file = garment.render_mesh
-        return Drape(vertices, faces, rest, bodies, body_faces, root, FPS, mesh_of_file)
+        return Drape(vertices, faces, rest, bodies, body_faces, root, FPS, mesh_of_file, of)
 
     def _skinned(self, garment, rest, body, motion):
         """A garment at ``rest`` (N, 3) [m] by plain skinning, (T, N, 3) [m], and the body's
@@ -240,9 +250,8 @@ class Draper:
         """The :class:`onefit.draping.post.PostProcessing` of a garment graded to a ``body``, its
         vertices at ``rest`` (N, 3) [m].
         """
-        key, vertices = id(garment), garment.vertices.cpu().numpy()
-        if key not in self._pulls:
-            self._pulls[key] = pull(vertices, self.standard, self._held(garment))
+        vertices = garment.vertices.cpu().numpy()
+        drawn = lambda: pull(vertices, self.standard, self._held(garment))
         if not self._surfaces:  # made once for a body model
             at, faces = body.vertices.cpu(), body.faces.cpu()
             self._surfaces = ClosestSurface(at, faces), ClosestSurface(at, faces)
@@ -252,17 +261,18 @@ class Draper:
             threads, long = garment.stitches.edges(rest.cpu().numpy())
             edges = np.concatenate([edges, threads])
             lengths = torch.cat([lengths, torch.as_tensor(long).to(lengths)])
-        return PostProcessing(rest, garment.faces, edges, lengths, self._pulls[key], self._surfaces)
+        pulls = self._once(garment, "pull", drawn)
+        return PostProcessing(rest, garment.faces, edges, lengths, pulls, self._surfaces)
 
     def codes(self, garment: Garment) -> torch.Tensor:
         """Z_T (K, width) of the garment's patches, found once."""
-        key = id(garment)
-        if key not in self._codes:
+
+        def encoded():
+            joints = self.standard.joints.to(self.device)
             with torch.no_grad():
-                self._codes[key] = self.network.patches(
-                    *self.patched(garment).features, self.standard.joints.to(self.device)
-                )
-        return self._codes[key]
+                return self.network.patches(*self.patched(garment).features, joints)
+
+        return self._once(garment, "codes", encoded)
 
     def _displacement(self, garment, embedding):
         """Displacements of the vertices in the rest space, (N, T, 3) [m], for embeddings (T,
@@ -277,16 +287,13 @@ class Draper:
         """The offset of the garment's vertices in the rest space, (N, 3) [m], found once:
         :func:`onefit.draping.ease.ease`.
         """
-        key = id(garment)
-        if key not in self._ease:
+
+        def found():
+            rest, body = garment.vertices.to(self.device), self.standard.to(self.device)
             with torch.no_grad():
-                rest, faces, body = (
-                    garment.vertices.to(self.device),
-                    garment.faces,
-                    self.standard.to(self.device),
-                )
-                self._ease[key] = ease.ease(rest, faces, body, self._trial(garment, rest, body))
-        return self._ease[key]
+                return ease.ease(rest, garment.faces, body, self._trial(garment, rest, body))
+
+        return self._once(garment, "ease", found)
 
     def _trial(self, garment, rest, body):
         """The frames that :func:`onefit.draping.ease.ease` looks at, of ``rest`` (N, 3) [m] on the
