@@ -1,11 +1,11 @@
-"""How fast the linear systems of a finish are solved, with and without the garment's patches.
+"""How fast the linear systems of a simulation are solved, with and without the garment's patches.
 
     python benchmarks/onefit_solver.py                  # skirt in a jumping jack, T-shirt boxing
     python benchmarks/onefit_solver.py --garments shirt.obj --motions dance
 
-Every so many systems of a finish are kept, and solved again from the same starts. Columns: *error*,
-the energy norm of what is left, relative to that of the solution, a geometric mean; *ms* of a
-solution on one thread, the median.
+Every so many systems of a simulation are kept, and solved again from the same starts. Columns:
+*error*, the energy norm of what is left, relative to that of the solution, a geometric mean; *ms*
+of a solution on one thread, the median.
 """
 
 import argparse
@@ -87,7 +87,7 @@ def main(argv=None):
     for garment, kind in zip(args.garments, args.motions):
         _Keeping.systems.clear()
         motion = onefit.Motion.generate(kind, seconds=args.seconds, seed=SEED)
-        draper.drape(garment, motion, finish=2)
+        draper.simulate(garment, motion)
         rows(garment, kind)
 
 

@@ -8,7 +8,7 @@ on PolyFit's patches::
 
 A garment goes through these packages in this order: ``body`` and ``motion`` (what it is worn on),
 ``garment`` (its mesh, cut into patches), ``network`` (how its patches deform), ``draping`` (all
-frames), ``physics`` (which finishes them); ``objective`` and ``training`` make the network.
+frames), ``physics`` (which simulates them); ``objective`` and ``training`` make the network.
 Importing the package loads neither torch nor Mitsuba. ``docs/api.md`` lists the public names; other
 packages may change without notice.
 """

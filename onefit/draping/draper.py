@@ -7,7 +7,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
@@ -83,6 +83,19 @@ class Drape:
         )
 
 
+@dataclass(frozen=True)
+class _Worn:
+    """A garment on a body in a motion: ``rest`` (N, 3) [m], graded to the body; ``transforms`` (T,
+    J, 3, 4) of the joints.
+    """
+
+    garment: Garment
+    motion: Motion
+    body: Body
+    rest: torch.Tensor
+    transforms: torch.Tensor
+
+
 class Draper:
     """A trained network and a body model, ready to drape any garment. Made by :func:`onefit.load`.
 
@@ -138,51 +151,106 @@ class Draper:
         post: bool = True,
         eased: bool = True,
         skinning_only: bool = False,
-        finish: int = 0,
-        material: Material | str = "cotton",
-        settings: Settings | None = None,
         advance: Callable[[], object] = lambda: None,
     ) -> Drape:
-        """A :class:`Drape`: ``garment`` (as :meth:`garment` takes it) on the body of ``shape`` (S,)
-        in each frame of ``motion`` (a :class:`Motion` or a file of one), at 30 frames a second.
-        With a shape, the way is scaled by the length of its legs.
+        """A :class:`Drape` by the network, in milliseconds a frame: ``garment`` (as :meth:`garment`
+        takes it) on the body of ``shape`` (S,) in each frame of ``motion`` (a :class:`Motion` or a
+        file of one), at 30 frames a second. With a shape, the way is scaled by the length of its
+        legs.
 
         ``post``: post-processing (:class:`onefit.draping.post.PostProcessing`): the cloth keeps its
         motion, edges come back towards their lengths at rest, and vertices are pushed out of the
         body. ``eased``: with the garment's :meth:`ease`, which costs seconds once, and nothing a
         frame; without it and ``post`` a drape is what the network alone makes. ``skinning_only``:
         plain skinning of the template, what OneFit is held against, without any of these.
-        ``finish``: implicit steps of physics a frame on the garment's own mesh
-        (:func:`onefit.draping.finish.finished`), in place of post-processing, of a ``material``
-        (one of :data:`onefit.physics.MATERIALS` by its name, or a
-        :class:`onefit.physics.Material`), solved as :class:`onefit.physics.Settings` say; two steps
-        are enough, and 0 leaves it out.
         ``advance`` is called once for each frame that is done. Raises InputError for a garment,
-        motion, shape or material that cannot be used.
+        motion or shape that cannot be used.
         """
-        if finish < 0:
-            raise InputError(f"finish = {finish}; steps a frame, 0 or more")
-        material = Material.named(material)
+        worn = self._worn(garment, motion, shape)
+        post_processed = lambda vertices, *_: vertices
+        if post and not skinning_only:
+            post_processed = self.post_processing(worn.garment, worn.rest, worn.body)
+        made = self._draped(worn, skinning_only, eased, post_processed, advance)
+        return self._drape_of(worn, *made)
+
+    def simulate(
+        self,
+        garment: Garment | str | os.PathLike[str],
+        motion: Motion | str | os.PathLike[str],
+        shape: torch.Tensor | None = None,
+        *,
+        material: Material | str = "cotton",
+        steps: int = 2,
+        settings: Settings | None = None,
+        advance: Callable[[], object] = lambda: None,
+    ) -> Drape:
+        """A :class:`Drape` by implicit steps of cloth on the garment's own mesh
+        (:func:`onefit.draping.simulation.simulated`), in tens of milliseconds a frame, which begins
+        with the network's drape and is weakly drawn to it; ``garment``, ``motion``, ``shape`` and
+        ``advance`` as in :meth:`drape`.
+
+        ``material``: one of :data:`onefit.physics.MATERIALS` by its name, or a
+        :class:`onefit.physics.Material`. ``steps`` a frame, two are enough, solved as
+        :class:`onefit.physics.Settings` say. Raises InputError, also for a material that there is
+        not.
+        """
+        from .simulation import simulated
+
+        if steps < 1:
+            raise InputError(f"steps = {steps}; steps a frame, 1 or more")
+        material, settings = Material.named(material), settings or Settings()
+        worn = self._worn(garment, motion, shape)
+        garment, rest = worn.garment, worn.rest.cpu()
+        guide, moving = self._draped(worn)
+        led = worn.motion.led_in(worn.body, settings.lead)
+        first = len(led) - len(worn.motion)
+        if first:
+            there = skinning.transforms(worn.body, led.poses[:first], led.translation[:first])
+            lead = self._draped(replace(worn, transforms=there), skinning_only=True)
+            guide, moving = torch.cat([lead[0], guide]), torch.cat([lead[1], moving])
+        if settings.room:
+            moving = Flesh(worn.body, settings.room)(moving)
+        cut = garment.cut is not None
+        made = simulated(
+            guide, rest, garment.faces.cpu(), self._held(garment), moving, worn.body.faces.cpu(),
+            material=material, steps=steps, fps=FPS, settings=settings, first=first,
+            sides=garment.sides(rest).double().numpy() if cut else None,
+            cut=garment.cut.numpy() if cut else None, stitches=garment.stitches,
+            patches=self.patched(garment).vertex_patch,
+        )  # fmt: skip
+        vertices = torch.stack([(frame, advance())[0] for frame in made])
+        return self._drape_of(worn, vertices, moving[first:], material)
+
+    def _worn(self, garment, motion, shape):
+        """The :class:`_Worn` of what :meth:`drape` takes."""
         garment = self.garment(garment)
-        motion = (
-            (motion if isinstance(motion, Motion) else Motion.read(motion))
-            .resampled(FPS)
-            .to(self.device)
-        )
+        motion = motion if isinstance(motion, Motion) else Motion.read(motion)
+        motion = motion.resampled(FPS).to(self.device)
         body = self.model.body(shape)
-        motion = motion if shape is None else motion.fitted(body.to(self.device))
-        rest = garment.graded(body).to(self.device)
-        offset = self.ease(garment) if eased and not skinning_only else 0
-        body = body.to(self.device)
-        weights = garment.blend_weights.to(self.device)
+        rest, body = garment.graded(body).to(self.device), body.to(self.device)
+        motion = motion if shape is None else motion.fitted(body)
         transforms = skinning.transforms(body, motion.poses, motion.translation)
+        return _Worn(garment, motion, body, rest, transforms)
+
+    def _draped(
+        self,
+        worn,
+        skinning_only=False,
+        eased=True,
+        post_processed=lambda vertices, *_: vertices,
+        advance=lambda: None,
+    ):
+        """Vertices (T, N, 3) and the body's (T, V, 3) [m], on the CPU."""
+        garment, body, transforms = worn.garment, worn.body, worn.transforms
+        offset = self.ease(garment) if eased and not skinning_only else 0
+        weights = garment.blend_weights.to(self.device)
         with torch.inference_mode():
-            embedding = None if skinning_only else self.embedding(motion, body)
+            embedding = None if skinning_only else self.embedding(worn.motion, body)
 
         def batch(first):
             """The drape (n, N, 3) and the bodies (n, V, 3), before post-processing."""
             with torch.inference_mode():
-                points, some = (rest + offset)[:, None], slice(first, first + step)
+                points, some = (worn.rest + offset)[:, None], slice(first, first + step)
                 if embedding is not None:
                     points = points + self._displacement(garment, embedding[some])
                 return (
@@ -190,56 +258,23 @@ class Draper:
                     skinning.skin(body.vertices, body.blend_weights, transforms[some]).contiguous(),
                 )
 
-        step = max(2, min(BATCH, POINTS // len(rest)))
-        batches = range(0, len(motion.poses), step)
+        step = max(2, min(BATCH, POINTS // len(worn.rest)))
+        batches = range(0, len(transforms), step)
         done: list[tuple[torch.Tensor, torch.Tensor]] = []
-        post_processed = lambda vertices, *_: vertices
-        if post and not finish and not skinning_only:
-            post_processed = self.post_processing(garment, rest, body)
         with ThreadPoolExecutor(1) as ahead:  # the network does not wait for post-processing
             for vertices, bodies in ahead.map(batch, batches):
                 past = done[-1][0][-2:] if done else None
                 done.append((post_processed(vertices, bodies, FPS, past), bodies))
-                for _ in bodies if not finish else ():
+                for _ in bodies:
                     advance()
-        vertices, bodies = (torch.cat(parts) for parts in zip(*done))
-        root = skinning.posed_joints(body, transforms)[:, 0]
-        found = (vertices, garment.faces, rest, bodies, body.faces, root)
-        vertices, faces, rest, bodies, body_faces, root = (x.cpu() for x in found)
-        if finish:
-            from .finish import finished
+        return [torch.cat(parts).cpu() for parts in zip(*done)]
 
-            settings = settings or Settings()
-            led = motion.led_in(body, settings.lead)
-            first = len(led) - len(motion)
-            guide, moving = vertices, bodies
-            if first:
-                lead = self._skinned(garment, rest, body, led[:first])
-                guide, moving = torch.cat([lead[0], vertices]), torch.cat([lead[1], bodies])
-            cut = garment.cut is not None
-            if settings.room:
-                moving = Flesh(body, settings.room)(moving)
-                bodies = moving[first:]
-            made = finished(
-                guide, rest, faces, self._held(garment), moving, body_faces,
-                material=material, steps=finish, fps=FPS, settings=settings, first=first,
-                sides=garment.sides(rest).double().numpy() if cut else None,
-                cut=garment.cut.numpy() if cut else None, stitches=garment.stitches,
-                patches=self.patched(garment).vertex_patch,
-            )  # fmt: skip
-            vertices = torch.stack([(frame, advance())[0] for frame in made])
-        of = material if finish else None
-        mesh_of_file = garment.render_mesh
-        return Drape(vertices, faces, rest, bodies, body_faces, root, FPS, mesh_of_file, of)
-
-    def _skinned(self, garment, rest, body, motion):
-        """A garment at ``rest`` (N, 3) [m] by plain skinning, (T, N, 3) [m], and the body's
-        vertices (T, V, 3) [m].
-        """
-        transforms = skinning.transforms(body, motion.poses, motion.translation)
-        weights = garment.blend_weights.to(self.device)
-        cloth = posed(rest[:, None].to(self.device), weights, transforms).transpose(0, 1)
-        return cloth.cpu(), skinning.skin(body.vertices, body.blend_weights, transforms).cpu()
+    def _drape_of(self, worn, vertices, bodies, material=None):
+        garment, body = worn.garment, worn.body
+        root = skinning.posed_joints(body, worn.transforms)[:, 0]
+        found = (vertices, garment.faces, worn.rest, bodies, body.faces, root)
+        on_cpu = [x.cpu() for x in found]
+        return Drape(*on_cpu, FPS, render_mesh=garment.render_mesh, material=material)
 
     def _held(self, garment):
         """How firmly each vertex is held at a waistband, (N,)."""

@@ -22,7 +22,7 @@ class Settings:
     which flesh yields (:class:`onefit.body.Flesh`); 0: a rigid body. ``sticking`` [m/s]: a slower
     slip is not friction's full force. ``apart`` [m]: what folds keep from each other. ``spacing``
     [m]: of points of the faces that must stay out of the body, as vertices must. ``draw`` [1/s^2]:
-    acceleration towards the drape that is finished, for a unit distance. ``lead`` [s]: how long the
+    acceleration towards the network's drape, for a unit distance. ``lead`` [s]: how long the
     body takes, before the motion, from its rest, in which garments are made, to the first pose;
     ``settling`` [s]: how long that is held then, for the cloth to come to rest. In each step of
     both, velocities are multiplied by ``damping``.

@@ -1,4 +1,4 @@
-"""The finish: implicit steps of the cloth's physics on the garment's own mesh, from frame to frame.
+"""Simulation: implicit steps of the cloth's physics on the garment's own mesh, from frame to frame.
 
 A network's drape, or plain skinning, is where the cloth starts, what holds its waistband, and what
 it is weakly drawn to; all else are the material, the air, the moving body and the cloth itself.
@@ -25,7 +25,7 @@ from onefit.physics import (
 )
 
 
-def finished(
+def simulated(
     guide: torch.Tensor,
     rest: torch.Tensor,
     faces: torch.Tensor,
@@ -46,8 +46,8 @@ def finished(
     """The garment's vertices (N, 3) [m] in one frame after the other, from the ``first`` on: those
     before lead to it, and are not given.
 
-    ``guide`` (T, N, 3) [m]: the drape that is finished; ``rest`` (N, 3) [m] and ``faces`` (F, 3) of
-    the garment graded to the body; ``held`` (N,): how firmly each vertex is held, as
+    ``guide`` (T, N, 3) [m]: the drape that leads the cloth; ``rest`` (N, 3) [m] and ``faces``
+    (F, 3) of the garment graded to the body; ``held`` (N,): how firmly each vertex is held, as
     :func:`onefit.garment.waistband.held` says; ``bodies`` (T, V, 3) [m], ``body_faces``; ``steps``
     in a frame, in which the body moves along straight lines; ``sides`` (F, 3) [m]: the lengths of
     the faces at rest, and ``cut`` (N, 3) [m], of a garment that was cut otherwise than it hangs;
