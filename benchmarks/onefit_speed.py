@@ -20,10 +20,9 @@ import time
 import torch
 
 import onefit
-from onefit.body import Flesh
+from onefit.contact import ContactSettings, Flesh
 from onefit.draping.draper import FPS
 from onefit.network import DEFAULT
-from onefit.physics import Settings
 from polyfit.errors import cli
 
 FRAMES = 90
@@ -114,7 +113,7 @@ def main(argv=None):
             )
         )
     bodies = draper.drape(shirt, motion, skinning_only=True).body
-    flesh = Flesh(draper.model.body(), Settings().room)
+    flesh = Flesh(draper.model.body(), ContactSettings().room)
     yielding = [x / len(bodies) for x in timed(lambda: flesh(bodies), "cpu", 3)]
     print("\nflesh, before a simulation: {:.2f} ({:.2f}; {:.2f})".format(*yielding))
     if args.output:

@@ -15,7 +15,8 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import torch
 
-from onefit.body import AnnyBody, ClosestSurface, Flesh, skinning
+from onefit.body import AnnyBody, ClosestSurface, skinning
+from onefit.contact import Flesh
 from onefit.garment import Garment, PatchedGarment, standard_body, waistband
 from onefit.motion import Motion
 from onefit.network import DEFAULT, Trained
@@ -208,8 +209,8 @@ class Draper:
             there = skinning.transforms(worn.body, led.poses[:first], led.translation[:first])
             lead = self._draped(replace(worn, transforms=there), skinning_only=True)
             guide, moving = torch.cat([lead[0], guide]), torch.cat([lead[1], moving])
-        if settings.room:
-            moving = Flesh(worn.body, settings.room)(moving)
+        if settings.contact.room:
+            moving = Flesh(worn.body, settings.contact.room)(moving)
         cut = garment.cut is not None
         made = simulated(
             guide, rest, garment.faces.cpu(), self._held(garment), moving, worn.body.faces.cpu(),

@@ -14,15 +14,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from onefit.garment import Stitches
-from onefit.physics import (
-    BodyContact,
-    Cloth,
-    Material,
-    SelfContact,
-    Settings,
-    Sheet,
-    ThreadContact,
-)
+from onefit.physics import Material, Settings, Sheet, WornCloth
 
 
 def simulated(
@@ -58,28 +50,18 @@ def simulated(
     number = np.argsort(order)
     cut = None if cut is None else cut[order]
     sheet = Sheet(rest.double().numpy()[order], number[faces.numpy()], material, sides, cut)
-    start, moving = guide.double().numpy()[:, order], bodies.double().numpy()
-    body = BodyContact(sheet, bodies[0], body_faces, settings)
-    itself = SelfContact(sheet, settings, len(body))
-    keys, sewn = len(body) + len(sheet), []
+    start, moving = guide.double().numpy()[:, order], bodies.numpy()
+    threads = None
     if stitches:
         ends = number[stitches.start], number[stitches.corners], stitches.barycentric
-        lengths = np.maximum(stitches.lengths, settings.apart)
-        sewn.append(ThreadContact(*ends, lengths, settings.contact * material.stretch, keys))
-        keys += len(stitches)
+        threads = *ends, stitches.lengths
     of = None if patches is None else patches[order]
-    cloth = Cloth(sheet, start[0], settings, keys, of)
+    worn = WornCloth(sheet, start[0], moving[0], body_faces.numpy(), settings, of, threads)
+    cloth, dt = worn.cloth, 1 / fps / steps
     pull = settings.draw * sheet.mass + material.stretch * np.asarray(held)[order]
-    dt = 1 / fps / steps
-    body.find(cloth.x)
-    cloth.x = body.pushed_out(cloth.x)
 
     def step(now, target):
-        contacts = [body.follow(now), itself.find(cloth.x, dt * cloth.v)]
-        contacts += [threads.find(cloth.x) for threads in sewn]
-        cloth.step(dt, contacts, target, pull)
-        body.find(cloth.x)
-        cloth.x = body.pushed_out(cloth.x)
+        worn.step(dt, now, target, pull)
 
     def slowly(now, target):
         step(now, target)

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from onefit.body import skinning
+from onefit.contact import ContactSettings
 from onefit.garment import Garment
 from onefit.physics import Settings
 from polyfit.errors import InputError
@@ -23,7 +24,7 @@ from .projection import unposed
 
 FPS = 30.0
 # A lesson's faces are of 2 cm, and a third of its time would go into points between their corners
-SETTINGS = Settings(spacing=0.05)
+SETTINGS = Settings(contact=ContactSettings(spacing=0.05))
 _BETWEEN = "--"  # the names of garment and motion, in those of files
 
 
