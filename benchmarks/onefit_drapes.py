@@ -102,6 +102,7 @@ def main(argv=None):
     parser.add_argument("--garments", nargs="+", default=[*STANDARD, "skirt", "jumpsuit"])
     parser.add_argument("--weights", nargs="+", default=[DEFAULT], help="of networks")
     parser.add_argument("--steps", type=int, default=2, help="of cloth, a frame; 0: no simulation")
+    parser.add_argument("--no-ease", dest="eased", action="store_false", help="of the drapes")
     parser.add_argument("--material", default="cotton", choices=list(MATERIALS))
     parser.add_argument("--motions", nargs="+", default=list(generate.HELD_OUT), metavar="KIND")
     parser.add_argument("--seconds", type=float, default=1.0, help="of a motion (default: 1)")
@@ -124,8 +125,8 @@ def main(argv=None):
             plain, ends = draper.drape(garment, motion, body, skinning_only=True), []
             drapes = {"skinning": plain}
             for of, other in drapers.items():
-                drapes[of] = other.drape(garment, motion, body, post=False)
-                drapes[f"{of}, post"] = other.drape(garment, motion, body)
+                drapes[of] = other.drape(garment, motion, body, post=False, eased=args.eased)
+                drapes[f"{of}, post"] = other.drape(garment, motion, body, eased=args.eased)
             if args.steps:
                 ends.append(time.perf_counter())
                 tick = lambda: ends.append(time.perf_counter())

@@ -190,7 +190,8 @@ def pushed_out(
             if wp.length_sq(p) > 0.0:
                 some = 1
                 for k in range(corners.shape[1]):
-                    if wp.length_sq(p) > wp.length_sq(push[corners[s, k]]):
+                    longer = wp.length_sq(p) > wp.length_sq(push[corners[s, k]])
+                    if weights[s, k] > 0.0 and longer:
                         push[corners[s, k]] = p
         if some == 0:
             break

@@ -23,10 +23,11 @@ from .settings import ContactSettings
 class SkinContact:
     """Contact of a garment with ``faces`` (F, 3), at ``rest`` (N, 3) [m], arrays, with skin.
 
-    A look goes as far as ``reach`` [m]. Vertices nearer than ``least`` [m] are pushed so far out;
-    points of faces nearer than ``point_near`` to ``point_least`` [m]. The pushes of the first of
-    ``rounds`` are smoothed so many times (``smoothing``) over the mesh; what that leaves inside is
-    pushed again. Vertices are float32 tensors (N, 3) [m] on the CPU, or Warp arrays of them.
+    A look goes as far as ``reach`` [m], beside vertices inside as ``deepest``. Vertices nearer than
+    ``least`` [m] are pushed so far out; points of faces nearer than ``point_near`` to
+    ``point_least`` [m]. The pushes of the first of ``rounds`` are smoothed so many times
+    (``smoothing``) over the mesh; what that leaves inside is pushed again. Vertices are float32
+    tensors (N, 3) [m] on the CPU, or Warp arrays of them.
     """
 
     def __init__(
@@ -36,6 +37,7 @@ class SkinContact:
         settings: ContactSettings,
         *,
         reach: float,
+        deepest: float,
         least: float,
         point_near: float,
         point_least: float,
@@ -58,7 +60,7 @@ class SkinContact:
         first = np.concatenate([[0], np.cumsum(np.bincount(start, minlength=count))])
         #: the neighbours of vertex v: ``around[1][around[0][v]:around[0][v + 1]]``
         self.around = [self._array(a, int) for a in (first, end[np.argsort(start, kind="stable")])]
-        self._reach, self._least = reach, least
+        self._reach, self._deepest, self._least = reach, deepest, least
         self._of_points = point_near, point_least, settings.reach
         self._rounds, self._smoothing = rounds, smoothing
         empty = lambda size, kind: self._wp.empty(size, dtype=kind, device="cpu")
@@ -119,7 +121,7 @@ class SkinContact:
         the reach is quickly told; only beside those found inside, and among those that were pushed,
         deeper ones are looked for. Points of faces push the face's corners.
         """
-        limits = self._rounds, self._smoothing, self._least, self.settings.deepest, *self._of_points
+        limits = self._rounds, self._smoothing, self._least, self._deepest, *self._of_points
         points, work = (*self._of_faces, *self._found), (self._work, self._queue)
         vertices = self._on_cpu(x), self._push, self._known, *self.touched
         arguments = [surface.of_kernels, *self.around, *points, *limits, *vertices, *work]

@@ -53,6 +53,7 @@ class PostProcessing:
             faces.cpu().numpy(),
             CONTACT,
             reach=CONTACT.touching,
+            deepest=CONTACT.deepest,
             least=CONTACT.clearance,
             point_near=CONTACT.point_near,
             point_least=CONTACT.point_clearance,

@@ -30,8 +30,9 @@ class WornCloth:
         threads: tuple | None = None,
     ) -> None:
         contact, stretch = settings.contact, sheet.material.stretch
-        least = dict.fromkeys(("least", "point_near", "point_least"), contact.least)
-        self._skin = SkinContact(sheet.rest, sheet.faces, contact, reach=contact.reach, **least)
+        limits = dict.fromkeys(("least", "point_near", "point_least"), contact.least)
+        limits |= dict.fromkeys(("reach", "deepest"), contact.reach)
+        self._skin = SkinContact(sheet.rest, sheet.faces, contact, **limits)
         self._surface, self._firm = ClosestSurface(body, body_faces), contact.stiffness * stretch
         between, keys = contact.layer_stiffness * stretch, len(self._skin)
         self._itself = SelfContact(sheet.cut, sheet.faces, contact, between, keys)

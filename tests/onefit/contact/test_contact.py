@@ -3,7 +3,7 @@ import pytest
 import trimesh
 
 from onefit.body import ClosestSurface
-from onefit.contact import Contacts, ContactSettings
+from onefit.contact import Contacts, ContactSettings, SkinContact
 from onefit.contact.points import samples
 from onefit.physics import MATERIALS, Settings, Sheet, WornCloth
 from onefit.physics.cloth import Cloth
@@ -107,3 +107,16 @@ def test_the_matrix_of_contacts_between_cloth_and_cloth_is_their_gradients_deriv
     cloth.assemble(V, 1 / 60, touches)
     assert np.abs(expected).max() > 1
     assert np.abs(cloth.product(step) - alone - expected).max() < 1e-6 * np.abs(expected).max()
+
+
+def test_a_point_of_an_edge_moves_the_edge_and_not_the_corner_beside_it():
+    ball = trimesh.creation.icosphere(3, 0.01)
+    x = np.array([[-0.02, 0, 0.008], [0.02, 0, 0.008], [0, 0.06, 0.008]])
+    limits = dict.fromkeys(("least", "point_near", "point_least"), 0.001)
+    skin = SkinContact(
+        x, np.array([[0, 1, 2]]), ContactSettings(), reach=0.03, deepest=0.03, **limits
+    )
+    surface, at = ClosestSurface(ball.vertices, ball.faces), skin.vertices(x)
+    skin.look(at, surface)
+    push = skin.push_out(at, surface)
+    assert push[:2, 2] == pytest.approx(0.003, abs=2e-4) and not push[2].any()
