@@ -4,11 +4,11 @@ import numpy as np
 
 
 def samples(
-    vertices: np.ndarray, faces: np.ndarray, spacing: float
+    vertices: np.ndarray, faces: np.ndarray, spacing: float, once: bool = True
 ) -> tuple[np.ndarray, np.ndarray]:
     """``(corners (P, 4), weights (P, 4))`` of points of the ``faces`` (F, 3) and their edges that
     lie ``spacing`` [m] from each other and from the ``vertices`` (N, 3) [m], or nearer; triangles
-    that are small enough have none. A point of an edge is there once for both its faces.
+    that are small enough have none. A point of an edge is there for each of its faces, or ``once``.
     """
     x = vertices[faces]
     longest = np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2).max(1)
@@ -21,7 +21,8 @@ def samples(
         chosen = faces[parts == n]
         corners.append(np.repeat(chosen[:, [0, 1, 2, 2]], len(grid), axis=0))
         weights.append(np.tile(grid, (len(chosen), 1)))
-    return _distinct(np.concatenate(corners), np.concatenate(weights))
+    found = np.concatenate(corners), np.concatenate(weights)
+    return _distinct(*found) if once else found
 
 
 def _distinct(corners, weights):

@@ -26,8 +26,9 @@ class SkinContact:
     A look goes as far as ``reach`` [m], beside vertices inside as ``deepest``. Vertices nearer than
     ``least`` [m] are pushed so far out; points of faces nearer than ``point_near`` to
     ``point_least`` [m]. The pushes of the first of ``rounds`` are smoothed so many times
-    (``smoothing``) over the mesh; what that leaves inside is pushed again. Vertices are float32
-    tensors (N, 3) [m] on the CPU, or Warp arrays of them.
+    (``smoothing``) over the mesh; what that leaves inside is pushed again. A point of an edge is
+    there for each of its faces, which lean on it, or ``once``. Vertices are float32 tensors (N, 3)
+    [m] on the CPU, or Warp arrays of them.
     """
 
     def __init__(
@@ -43,13 +44,14 @@ class SkinContact:
         point_least: float,
         rounds: int = 1,
         smoothing: int = 0,
+        once: bool = False,
     ) -> None:
         from . import kernels  # compiled at the first use
 
         self._kernels, self._wp, self.settings = kernels, kernels.wp, settings
         self.count = count = len(rest)
         self._pool = ThreadPoolExecutor(1)  # a second thread
-        corners, weights = samples(rest, faces, settings.spacing)
+        corners, weights = samples(rest, faces, settings.spacing, once)
         own = np.repeat(np.arange(count)[:, None], 4, axis=1)
         #: (P, 4): the vertices, and the points of faces below them: sum_i weights_i x_corners_i
         self.corners = np.concatenate([own, corners])

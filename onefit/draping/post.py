@@ -59,6 +59,7 @@ class PostProcessing:
             point_least=CONTACT.point_clearance,
             rounds=_PUSHES,
             smoothing=_SMOOTHING,
+            once=True,
         )
         degree = np.bincount(np.asarray(edges).ravel(), minlength=self._count)
         squares = np.asarray(lengths) ** 2
