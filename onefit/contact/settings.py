@@ -36,14 +36,14 @@ class ContactSettings:
     thinnest: float = 0.02
     #: [m] between folds: cloth's thickness and hairs, and what a step's errors take
     apart: float = 0.003
-    #: [m] between skin and skin, to which flesh yields (:class:`onefit.contact.Flesh`), so that
-    #: cloth has room; 0: a rigid body
-    room: float = 0.003
+    #: [m] between skin and skin, to which flesh yields (:class:`onefit.contact.Flesh`): two layers
+    #: of cloth have their clearances, and what keeps them apart; 0: a rigid body
+    room: float = 0.009
     #: [1] of a contact with the skin, in units of the material's stretch stiffness: less, and cloth
     #: is pressed in; more, and the linear systems are harder
     stiffness: float = 0.5
-    #: [1], the same of cloth with itself: less, for both sides give way
-    layer_stiffness: float = 0.2
+    #: [1], the same of cloth with itself: as much, or skin presses one layer through another
+    layer_stiffness: float = 0.5
     #: [m/s]: a slower slip does not have friction's full force, which has no direction at rest
     sticking: float = 0.005
 
