@@ -7,9 +7,9 @@
 
 A sleeve or a leg moves on its own, by centimetres a frame: what a sheet never does. Each folder has
 the form of those of ``simulate.py``. The garment is denim, for the tracker's cloth hardly
-stretches, in a finished drape of 45 frames on the standard body, which stays where it is and is not
-drawn. The texture's left half lies on the garment's front, its right half on its back. The seed
-decides motion, light and texture.
+stretches, simulated for 45 frames on the standard body, which stays where it is and is not drawn.
+The texture's left half lies on the garment's front, its right half on its back. The seed decides
+motion, light and texture.
 """
 
 import argparse
@@ -45,7 +45,7 @@ def drape(draper, name, kind, seed):
     garment = draper.garment(name)
     garment = garment.remeshed(VERTICES) if len(garment) > VERTICES else garment
     motion = onefit.Motion.generate(kind, seconds=FRAMES / FPS, seed=seed)
-    found = draper.drape(garment, motion, finish=2, material="denim")
+    found = draper.simulate(garment, motion, material="denim")
     x = (found.vertices - found.root[:, None])[:FRAMES].double().numpy()
     x = np.stack([x[..., 0], -x[..., 2], x[..., 1]], axis=-1)  # the body faces the camera
     low, high = x.min((0, 1)), x.max((0, 1))

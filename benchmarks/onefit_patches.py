@@ -1,4 +1,4 @@
-"""How much of a drape patches can hold: finished drapes, projected onto the garments' patches.
+"""How much of a drape patches can hold: simulated drapes, projected onto the garments' patches.
 
     python benchmarks/onefit_patches.py
     python benchmarks/onefit_patches.py --garments skirt --motions dance box --patches 60
@@ -40,7 +40,7 @@ def main(argv=None):
         for kind in args.motions:
             motion = onefit.Motion.generate(kind, seconds=args.seconds, seed=SEED)
             plain = draper.drape(garment, motion, skinning_only=True)
-            drape = draper.drape(garment, motion, finish=2)
+            drape = draper.simulate(garment, motion)
             motion = motion.resampled(drape.fps)
             maps = skinning.transforms(draper.standard, motion.poses, motion.translation)
             at_rest = unposed(drape.vertices, garment.blend_weights, maps)

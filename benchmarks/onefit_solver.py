@@ -1,18 +1,25 @@
-"""How fast the linear systems of a finish are solved, with and without the garment's patches.
+"""How fast the linear systems of a simulation are solved: by conjugate gradients, with the
+garment's patches and without, and by sparse direct factorisations.
 
+    pip install qdldl cholespy                          # for this benchmark only, each if wanted
     python benchmarks/onefit_solver.py                  # skirt in a jumping jack, T-shirt boxing
     python benchmarks/onefit_solver.py --garments shirt.obj --motions dance
 
-Every so many systems of a finish are kept, and solved again from the same starts. Columns: *error*,
-the energy norm of what is left, relative to that of the solution, a geometric mean; *ms* of a
-solution on one thread, the median.
+Every so many systems of a simulation are kept, and solved again from the same starts. Columns:
+*residual*, its norm relative to the right-hand side's, and *error*, the energy norm of what is
+left, relative to that of the solution, geometric means; *ms* of the processor for a solution, the
+median. A factorisation's has its ordering, for each step has other contacts. SuperLU comes with
+SciPy; CHOLMOD is that of the package cholespy.
 """
 
 import argparse
+import importlib.util
 import time
 
 import numpy as np
 from onefit_accuracy import SEED
+from scipy.sparse import bsr_matrix, coo_matrix, triu
+from scipy.sparse.linalg import splu
 
 import onefit
 from onefit.physics import cloth
@@ -21,7 +28,7 @@ from polyfit.errors import cli
 
 EVERY = 23  # one system in so many is kept
 ITERATIONS = (5, 10, 20, 40, 60)
-HEAD = "| garment | motion | iterations | error, no patches | ms | error, patches | ms |"
+HEAD = "| garment | motion | solver | residual | error | ms |"
 
 
 class _Keeping(Solver):
@@ -52,28 +59,87 @@ def solved(system, iterations, patches, tolerance=0.0):
     solver = Solver(first, column, of if patches else None)
     solver.block.numpy()[:] = block
     solver.couple(*pairs)
-    began = time.perf_counter()
+    began = time.process_time()
     x, _ = solver.solve(b, start, iterations, tolerance)
-    return x, time.perf_counter() - began, solver
+    return x, time.process_time() - began, solver
+
+
+def matrix(system):
+    """The sparse matrix (3 N, 3 N) of a system, with what contacts couple."""
+    (first, column, _), (corners, weights, between), block, b, _ = system
+    one, two = np.nonzero(~np.eye(4, dtype=bool))
+    shares = (weights[:, one] * weights[:, two])[:, :, None, None] * between[:, None]
+    place = lambda which, axis: (
+        3 * corners[:, which, None, None].astype(int)
+        + np.expand_dims(np.arange(3), 1 - axis)
+        + np.zeros((3, 3), int)
+    ).ravel()
+    size = 3 * len(b)
+    pairs = coo_matrix((shares.ravel(), (place(one, 0), place(two, 1))), (size, size))
+    return (bsr_matrix((block, column, first), shape=(size, size)) + pairs).tocsc()
+
+
+def superlu(A, b):
+    factor = splu(
+        A, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+    )
+    return factor.solve(b)
+
+
+def by_qdldl(A, b):
+    import qdldl
+
+    return qdldl.Solver(triu(A, format="csc"), upper=True).solve(b)
+
+
+def cholmod(A, b):
+    import cholespy
+
+    coo, x = A.tocoo(), np.zeros_like(b)
+    rows, columns = coo.row.astype(np.int32), coo.col.astype(np.int32)
+    solver = cholespy.CholeskySolverD(len(b), rows, columns, coo.data, cholespy.MatrixType.COO)
+    solver.solve(b, x)
+    return x
+
+
+DIRECT = {"SuperLU": superlu, "qdldl": by_qdldl, "CHOLMOD": cholmod}
+PACKAGES = {"qdldl": "qdldl", "CHOLMOD": "cholespy"}
 
 
 def rows(garment, motion):
-    """A row for each of ITERATIONS."""
-    exact = []
+    """A row for each way to solve."""
+    exact, found = [], {}
     for system in _Keeping.systems:
         x, _, solver = solved(system, 2000, True, 1e-12)
-        exact.append((x, np.vdot(x, solver.product(x))))
+        A, b = matrix(system), system[3]
+        assert np.allclose(A @ x.ravel(), solver.product(x).ravel(), atol=1e-9 * abs(b).max())
+        exact.append((x, A, np.vdot(x, solver.product(x))))
+
+    def note(name, x, seconds, of):
+        right, A, size = of
+        left = (x - right).ravel()
+        b = A @ right.ravel()
+        residual = np.linalg.norm(A @ left) / np.linalg.norm(b)
+        error = np.sqrt(max(left @ (A @ left), 1e-32 * size) / size)
+        found.setdefault(name, []).append((max(residual, 1e-16), error, seconds))
+
     for iterations in ITERATIONS:
-        cells = []
         for patches in (False, True):
-            errors, times = [], []
-            for system, (x, size) in zip(_Keeping.systems, exact):
-                found, seconds, solver = solved(system, iterations, patches)
-                left = found - x
-                errors.append(np.vdot(left, solver.product(left)) / size)
-                times.append(1e3 * seconds)
-            cells += [f"{np.exp(np.log(errors).mean() / 2):.4f}", f"{np.median(times):.1f}"]
-        print(f"| {garment} | {motion} | {iterations} | {' | '.join(cells)} |", flush=True)
+            name = f"{iterations} iterations{', patches' if patches else ''}"
+            for system, of in zip(_Keeping.systems, exact):
+                x, seconds, _ = solved(system, iterations, patches)
+                note(name, x, seconds, of)
+    for name, solve in DIRECT.items():
+        if importlib.util.find_spec(PACKAGES.get(name, "scipy")) is None:
+            continue
+        for system, of in zip(_Keeping.systems, exact):
+            b, began = system[3].ravel(), time.process_time()
+            x = solve(of[1], b)
+            note(name, x.reshape(-1, 3), time.process_time() - began, of)
+    for name, values in found.items():
+        residual, error = np.exp(np.log(values).mean(axis=0))[:2]
+        cells = f"{residual:.1e} | {error:.1e} | {1e3 * np.median(values, axis=0)[2]:.1f}"
+        print(f"| {garment} | {motion} | {name} | {cells} |", flush=True)
 
 
 def main(argv=None):
@@ -87,7 +153,7 @@ def main(argv=None):
     for garment, kind in zip(args.garments, args.motions):
         _Keeping.systems.clear()
         motion = onefit.Motion.generate(kind, seconds=args.seconds, seed=SEED)
-        draper.drape(garment, motion, finish=2)
+        draper.simulate(garment, motion)
         rows(garment, kind)
 
 

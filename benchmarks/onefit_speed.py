@@ -4,10 +4,10 @@
 
 Milliseconds a frame, the median of repeated drapes of a motion of 90 frames in batches, without
 rendering: all of ``Draper.drape``, the network alone, and post-processing; then the T-shirt at
-about 1,000, 4,000, 16,000 and 64,000 vertices; last, the flesh that yields before a finish. Cutting
-a garment into patches comes once and stands apart. The clock shows what else the machine does; the
-least of the repetitions is given beside the median, and the processor's time, of all threads
-together.
+about 1,000, 4,000, 16,000 and 64,000 vertices; last, the flesh that yields before a simulation.
+Cutting a garment into patches comes once and stands apart. The clock shows what else the machine
+does; the least of the repetitions is given beside the median, and the processor's time, of all
+threads together.
 """
 
 import argparse
@@ -20,10 +20,9 @@ import time
 import torch
 
 import onefit
-from onefit.body import Flesh
+from onefit.contact import ContactSettings, Flesh
 from onefit.draping.draper import FPS
 from onefit.network import DEFAULT
-from onefit.physics import Settings
 from polyfit.errors import cli
 
 FRAMES = 90
@@ -114,9 +113,9 @@ def main(argv=None):
             )
         )
     bodies = draper.drape(shirt, motion, skinning_only=True).body
-    flesh = Flesh(draper.model.body(), Settings().room)
+    flesh = Flesh(draper.model.body(), ContactSettings().room)
     yielding = [x / len(bodies) for x in timed(lambda: flesh(bodies), "cpu", 3)]
-    print("\nflesh, before a finish: {:.2f} ({:.2f}; {:.2f})".format(*yielding))
+    print("\nflesh, before a simulation: {:.2f} ({:.2f}; {:.2f})".format(*yielding))
     if args.output:
         with open(args.output, "w", encoding="utf-8") as file:
             json.dump(dict(import_seconds=seconds, rows=rows, flesh=yielding), file, indent=2)

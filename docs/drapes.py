@@ -1,5 +1,5 @@
-"""Draws docs/onefit.jpg: garments draped by a network of the package and finished by the physics of
-cloth, in held-out motions, from near.
+"""Draws docs/onefit.jpg: garments simulated from the drapes of a network of the package, in
+held-out motions, from near.
 
 python docs/drapes.py [OUT.jpg] [--weights NAME]          (a minute on two cores)
 """
@@ -23,7 +23,7 @@ ROWS = [  # garment, motion, shape, colour
     ("boxy_tshirt", "box", (0.1, 0.6, 0.6, 0.6, 0.6, 0.5), (0.06, 0.16, 0.35)),
     ("shirt", "pick_up", (0.0, 0.65, 0.5, 0.45, 0.5, 0.5), (0.25, 0.27, 0.30)),
 ]
-FRAMES, SIZE, FINISH = 4, (400, 400), 2
+FRAMES, SIZE = 4, (400, 400)
 BODY = (0.5, 0.48, 0.46)
 
 
@@ -34,12 +34,8 @@ def main(argv=None):
     args = parser.parse_args(argv)
     draper, rows = onefit.load(args.weights), []
     for garment, motion, shape, colour in ROWS:
-        drape = draper.drape(
-            garment,
-            onefit.Motion.generate(motion, seconds=2, seed=1_000_005),
-            shape,
-            finish=FINISH,
-        )
+        moving = onefit.Motion.generate(motion, seconds=2, seed=1_000_005)
+        drape = draper.simulate(garment, moving, shape)
         chosen = np.linspace(10, len(drape.vertices) - 1, FRAMES).astype(int)
         parts = [
             (drape.body[chosen].numpy(), drape.body_faces.numpy(), BODY),

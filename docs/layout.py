@@ -38,6 +38,7 @@ WAY = {
     "onefit": {
         "body": "shape and pose → skinned body",
         "motion": "file or kind → poses over time",
+        "contact": "cloth and body → pushes and planes",
         "garment": "mesh → garment, bound and in patches",
         "network": "patches and motion → deformations",
         "objective": "a drape → losses and measures",

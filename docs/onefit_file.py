@@ -54,7 +54,7 @@ def main(argv=None):
     for buttons in (BUTTONS, 0):
         vertices, faces, cloth, _ = cut_open("shirt", buttons)
         garment = onefit.Garment.of_mesh("shirt", vertices, faces)
-        drape = draper.drape(garment, motion, finish=2)
+        drape = draper.simulate(garment, motion)
         seen, chosen = drape.render_vertices(), list(FRAMES)
         parts = [(drape.body[chosen].numpy(), drape.body_faces.numpy(), BODY)]
         for some, colour in ((faces[:cloth], CLOTH), (faces[cloth:], BUTTON)):

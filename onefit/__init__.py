@@ -7,8 +7,9 @@ on PolyFit's patches::
     drape.vertices  # (T, N, 3), metres
 
 A garment goes through these packages in this order: ``body`` and ``motion`` (what it is worn on),
-``garment`` (its mesh, cut into patches), ``network`` (how its patches deform), ``draping`` (all
-frames), ``physics`` (which finishes them); ``objective`` and ``training`` make the network.
+``contact`` (what keeps cloth out of a body), ``garment`` (its mesh, cut into patches), ``network``
+(how its patches deform), ``physics`` (steps of cloth), ``draping`` (all frames, by the network or
+by steps of cloth); ``objective`` and ``training`` make the network.
 Importing the package loads neither torch nor Mitsuba. ``docs/api.md`` lists the public names; other
 packages may change without notice.
 """

@@ -1,4 +1,4 @@
-"""Makes lessons for networks: finished drapes of generated motions.
+"""Makes lessons for networks: simulated drapes of generated motions.
 
     python -m onefit.teach dress tshirt -o LESSONS --seeds 2     # the training's kinds of motion
     python -m onefit.teach -o LESSONS --cuts 160 --each 2        # random cuts, two kinds for each
@@ -33,9 +33,9 @@ def parser():
     p.add_argument("--each", type=int, help="kinds of a garment, taken in turn (default: all)")
     p.add_argument("--seconds", type=float, default=6.0, help="of a motion (default: 6)")
     p.add_argument("--shapes", type=int, default=12, help="random bodies (default: 12)")
-    p.add_argument("--finish", type=int, default=2, help="steps a frame (default: 2)")
+    p.add_argument("--steps", type=int, default=2, help="of cloth, a frame (default: 2)")
     p.add_argument("--material", default="cotton", help=f"one of {', '.join(MATERIALS)}")
-    p.add_argument("--weights", default="six-garments", help="what drapes before the finish")
+    p.add_argument("--weights", default="six-garments", help="what drapes before the simulation")
     return p
 
 
@@ -52,7 +52,7 @@ def main(argv=None):
     from .training import STANDARD, teacher
 
     Material.named(args.material)
-    for name, least in dict(finish=1, seeds=1, vertices=100, shapes=0, cuts=0, each=1).items():
+    for name, least in dict(steps=1, seeds=1, vertices=100, shapes=0, cuts=0, each=1).items():
         given = getattr(args, name)
         if given is not None and given < least:
             raise InputError(f"--{name} {given}: {least} or more")
@@ -88,7 +88,7 @@ def main(argv=None):
                 turn = k // len(garments) + k % len(garments)
                 shape = shapes[1 + turn // 2 % args.shapes if turn % 2 and args.shapes else 0]
                 made = teacher.lesson(
-                    draper, garment, motion, shape, finish=args.finish, material=args.material
+                    draper, garment, motion, shape, steps=args.steps, material=args.material
                 )
                 teacher.write(path, made)
             progress.advance(task)

@@ -3,7 +3,7 @@
     python -m onefit.train [GARMENT ...] -o OUT [--motions FILE ...] [--from WEIGHTS] [--resume]
     torchrun --nproc-per-node 2 -m onefit.train ...
 
-With --teacher LESSONS the network learns finished drapes by regression; physics alone goes on from
+With --teacher LESSONS the network learns simulated drapes by regression; physics alone goes on from
 there with --from OUT/weights.safetensors.
 
 GARMENT are names of the package's templates (tshirt, dress, ...) or meshes (.obj, .ply, .glb);

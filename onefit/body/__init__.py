@@ -8,8 +8,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
         "body": ["AnnyBody", "Body", "BodyModel"],
-        "flesh": ["Flesh", "spread"],
-        "nearest": ["ClosestSurface"],
+        "nearest": ["ClosestSurface", "Nearest"],
         "smpl": ["PlainBody", "SmplBody"],
     },
 )

@@ -7,14 +7,16 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
 
-from onefit.body import AnnyBody, ClosestSurface, Flesh, skinning
+from onefit.body import AnnyBody, ClosestSurface, skinning
+from onefit.contact import Flesh
 from onefit.garment import Garment, PatchedGarment, standard_body, waistband
 from onefit.motion import Motion
 from onefit.network import DEFAULT, Trained
@@ -43,7 +45,8 @@ class Drape:
     """A draped garment: ``vertices`` (T, N, 3) [m] in the world, ``faces`` (F, 3), ``rest`` (N, 3)
     [m], the garment graded to the shape; the ``body``'s vertices (T, V, 3) [m], its ``body_faces``
     and the root's place ``root`` (T, 3) [m]; ``fps`` frames a second. ``render_mesh``: the mesh of
-    the garment's file (:class:`onefit.garment.RenderMesh`); None for a template.
+    the garment's file (:class:`onefit.garment.RenderMesh`); None for a template. ``material``: what
+    the cloth is made of; None for a network's drape, which does not know it.
     """
 
     vertices: torch.Tensor
@@ -54,6 +57,7 @@ class Drape:
     root: torch.Tensor
     fps: float
     render_mesh: RenderMesh | None = None
+    material: Material | None = None
 
     def render_vertices(self) -> np.ndarray:
         """Vertices of the garment's file in each frame, (T, M, 3) [m]; of a template its own."""
@@ -63,7 +67,9 @@ class Drape:
         return np.stack([self.render_mesh.carried(x, faces) for x in cloth]).astype(np.float32)
 
     def measures(self) -> Measures:
-        """The :class:`onefit.objective.measures.Measures` of this drape."""
+        """The :class:`onefit.objective.measures.Measures` of this drape; its masses are those of
+        the ``material``, or, without one, of the cloth that networks are trained for.
+        """
         from onefit.objective import measure
 
         return measure(
@@ -74,7 +80,21 @@ class Drape:
             ClosestSurface(self.body[0], self.body_faces),
             self.root,
             self.fps,
+            **({"density": self.material.density} if self.material else {}),
         )
+
+
+@dataclass(frozen=True)
+class _Worn:
+    """A garment on a body in a motion: ``rest`` (N, 3) [m], graded to the body; ``transforms`` (T,
+    J, 3, 4) of the joints.
+    """
+
+    garment: Garment
+    motion: Motion
+    body: Body
+    rest: torch.Tensor
+    transforms: torch.Tensor
 
 
 class Draper:
@@ -92,10 +112,8 @@ class Draper:
         self.network = trained.network.to(self.device).eval()
         self.model = model or AnnyBody()
         self._garments: dict = {}
-        self._patched: dict = {}
-        self._codes: dict = {}
-        self._ease: dict = {}
-        self._pulls: dict = {}
+        # what was made of each garment, by name, as long as that lives
+        self._made: WeakKeyDictionary[Garment, dict[str, Any]] = WeakKeyDictionary()
         self._surfaces: tuple = ()
 
     @cached_property
@@ -115,12 +133,15 @@ class Draper:
 
     def patched(self, garment: Garment) -> PatchedGarment:
         """The :class:`onefit.PatchedGarment` of a garment, cut once."""
-        key = id(garment)
-        if key not in self._patched:
-            self._patched[key] = PatchedGarment(
-                garment, self.standard, order=self.network.order
-            ).to(self.device)
-        return self._patched[key]
+        cut = lambda: PatchedGarment(garment, self.standard, order=self.network.order)
+        return self._once(garment, "patched", lambda: cut().to(self.device))
+
+    def _once(self, garment, name, make):
+        """What ``make()`` makes of a garment, its ``name``; it must not hold the garment."""
+        made = self._made.setdefault(garment, {})
+        if name not in made:
+            made[name] = make()
+        return made[name]
 
     def drape(
         self,
@@ -131,51 +152,106 @@ class Draper:
         post: bool = True,
         eased: bool = True,
         skinning_only: bool = False,
-        finish: int = 0,
-        material: Material | str = "cotton",
-        settings: Settings | None = None,
         advance: Callable[[], object] = lambda: None,
     ) -> Drape:
-        """A :class:`Drape`: ``garment`` (as :meth:`garment` takes it) on the body of ``shape`` (S,)
-        in each frame of ``motion`` (a :class:`Motion` or a file of one), at 30 frames a second.
-        With a shape, the way is scaled by the length of its legs.
+        """A :class:`Drape` by the network, in milliseconds a frame: ``garment`` (as :meth:`garment`
+        takes it) on the body of ``shape`` (S,) in each frame of ``motion`` (a :class:`Motion` or a
+        file of one), at 30 frames a second. With a shape, the way is scaled by the length of its
+        legs.
 
         ``post``: post-processing (:class:`onefit.draping.post.PostProcessing`): the cloth keeps its
         motion, edges come back towards their lengths at rest, and vertices are pushed out of the
         body. ``eased``: with the garment's :meth:`ease`, which costs seconds once, and nothing a
         frame; without it and ``post`` a drape is what the network alone makes. ``skinning_only``:
         plain skinning of the template, what OneFit is held against, without any of these.
-        ``finish``: implicit steps of physics a frame on the garment's own mesh
-        (:func:`onefit.draping.finish.finished`), in place of post-processing, of a ``material``
-        (one of :data:`onefit.physics.MATERIALS` by its name, or a
-        :class:`onefit.physics.Material`), solved as :class:`onefit.physics.Settings` say; two steps
-        are enough, and 0 leaves it out.
-        ``advance`` is called after each finished frame. Raises InputError for a garment, motion,
-        shape or material that cannot be used.
+        ``advance`` is called once for each frame that is done. Raises InputError for a garment,
+        motion or shape that cannot be used.
         """
-        if finish < 0:
-            raise InputError(f"finish = {finish}; steps a frame, 0 or more")
-        material = Material.named(material)
+        worn = self._worn(garment, motion, shape)
+        post_processed = lambda vertices, *_: vertices
+        if post and not skinning_only:
+            post_processed = self.post_processing(worn.garment, worn.rest, worn.body)
+        made = self._draped(worn, skinning_only, eased, post_processed, advance)
+        return self._drape_of(worn, *made)
+
+    def simulate(
+        self,
+        garment: Garment | str | os.PathLike[str],
+        motion: Motion | str | os.PathLike[str],
+        shape: torch.Tensor | None = None,
+        *,
+        material: Material | str = "cotton",
+        steps: int = 2,
+        settings: Settings | None = None,
+        advance: Callable[[], object] = lambda: None,
+    ) -> Drape:
+        """A :class:`Drape` by implicit steps of cloth on the garment's own mesh
+        (:func:`onefit.draping.simulation.simulated`), in tens of milliseconds a frame, which begins
+        with the network's drape and is weakly drawn to it; ``garment``, ``motion``, ``shape`` and
+        ``advance`` as in :meth:`drape`.
+
+        ``material``: one of :data:`onefit.physics.MATERIALS` by its name, or a
+        :class:`onefit.physics.Material`. ``steps`` a frame, two are enough, solved as
+        :class:`onefit.physics.Settings` say. Raises InputError, also for a material that there is
+        not.
+        """
+        from .simulation import simulated
+
+        if steps < 1:
+            raise InputError(f"steps = {steps}; steps a frame, 1 or more")
+        material, settings = Material.named(material), settings or Settings()
+        worn = self._worn(garment, motion, shape)
+        garment, rest = worn.garment, worn.rest.cpu()
+        guide, moving = self._draped(worn)
+        led = worn.motion.led_in(worn.body, settings.lead)
+        first = len(led) - len(worn.motion)
+        if first:
+            there = skinning.transforms(worn.body, led.poses[:first], led.translation[:first])
+            lead = self._draped(replace(worn, transforms=there), skinning_only=True)
+            guide, moving = torch.cat([lead[0], guide]), torch.cat([lead[1], moving])
+        if settings.contact.room:
+            moving = Flesh(worn.body, settings.contact.room)(moving)
+        cut = garment.cut is not None
+        made = simulated(
+            guide, rest, garment.faces.cpu(), self._held(garment), moving, worn.body.faces.cpu(),
+            material=material, steps=steps, fps=FPS, settings=settings, first=first,
+            sides=garment.sides(rest).double().numpy() if cut else None,
+            cut=garment.cut.numpy() if cut else None, stitches=garment.stitches,
+            patches=self.patched(garment).vertex_patch,
+        )  # fmt: skip
+        vertices = torch.stack([(frame, advance())[0] for frame in made])
+        return self._drape_of(worn, vertices, moving[first:], material)
+
+    def _worn(self, garment, motion, shape):
+        """The :class:`_Worn` of what :meth:`drape` takes."""
         garment = self.garment(garment)
-        motion = (
-            (motion if isinstance(motion, Motion) else Motion.read(motion))
-            .resampled(FPS)
-            .to(self.device)
-        )
+        motion = motion if isinstance(motion, Motion) else Motion.read(motion)
+        motion = motion.resampled(FPS).to(self.device)
         body = self.model.body(shape)
-        motion = motion if shape is None else motion.fitted(body.to(self.device))
-        rest = garment.graded(body).to(self.device)
-        offset = self.ease(garment) if eased and not skinning_only else 0
-        body = body.to(self.device)
-        weights = garment.blend_weights.to(self.device)
+        rest, body = garment.graded(body).to(self.device), body.to(self.device)
+        motion = motion if shape is None else motion.fitted(body)
         transforms = skinning.transforms(body, motion.poses, motion.translation)
+        return _Worn(garment, motion, body, rest, transforms)
+
+    def _draped(
+        self,
+        worn,
+        skinning_only=False,
+        eased=True,
+        post_processed=lambda vertices, *_: vertices,
+        advance=lambda: None,
+    ):
+        """Vertices (T, N, 3) and the body's (T, V, 3) [m], on the CPU."""
+        garment, body, transforms = worn.garment, worn.body, worn.transforms
+        offset = self.ease(garment) if eased and not skinning_only else 0
+        weights = garment.blend_weights.to(self.device)
         with torch.inference_mode():
-            embedding = None if skinning_only else self.embedding(motion, body)
+            embedding = None if skinning_only else self.embedding(worn.motion, body)
 
         def batch(first):
             """The drape (n, N, 3) and the bodies (n, V, 3), before post-processing."""
             with torch.inference_mode():
-                points, some = (rest + offset)[:, None], slice(first, first + step)
+                points, some = (worn.rest + offset)[:, None], slice(first, first + step)
                 if embedding is not None:
                     points = points + self._displacement(garment, embedding[some])
                 return (
@@ -183,53 +259,23 @@ class Draper:
                     skinning.skin(body.vertices, body.blend_weights, transforms[some]).contiguous(),
                 )
 
-        step = max(2, min(BATCH, POINTS // len(rest)))
-        batches = range(0, len(motion.poses), step)
+        step = max(2, min(BATCH, POINTS // len(worn.rest)))
+        batches = range(0, len(transforms), step)
         done: list[tuple[torch.Tensor, torch.Tensor]] = []
-        post_processed = lambda vertices, *_: vertices
-        if post and not finish and not skinning_only:
-            post_processed = self.post_processing(garment, rest, body)
         with ThreadPoolExecutor(1) as ahead:  # the network does not wait for post-processing
             for vertices, bodies in ahead.map(batch, batches):
                 past = done[-1][0][-2:] if done else None
                 done.append((post_processed(vertices, bodies, FPS, past), bodies))
-        vertices, bodies = (torch.cat(parts) for parts in zip(*done))
-        root = skinning.posed_joints(body, transforms)[:, 0]
-        found = (vertices, garment.faces, rest, bodies, body.faces, root)
-        vertices, faces, rest, bodies, body_faces, root = (x.cpu() for x in found)
-        if finish:
-            from .finish import finished
+                for _ in bodies:
+                    advance()
+        return [torch.cat(parts).cpu() for parts in zip(*done)]
 
-            settings = settings or Settings()
-            led = motion.led_in(body, settings.lead)
-            first = len(led) - len(motion)
-            guide, moving = vertices, bodies
-            if first:
-                lead = self._skinned(garment, rest, body, led[:first])
-                guide, moving = torch.cat([lead[0], vertices]), torch.cat([lead[1], bodies])
-            cut = garment.cut is not None
-            if settings.room:
-                moving = Flesh(body, settings.room)(moving)
-                bodies = moving[first:]
-            made = finished(
-                guide, rest, faces, self._held(garment), moving, body_faces,
-                material=material, steps=finish, fps=FPS, settings=settings, first=first,
-                sides=garment.sides(rest).double().numpy() if cut else None,
-                cut=garment.cut.numpy() if cut else None, stitches=garment.stitches,
-                patches=self.patched(garment).vertex_patch,
-            )  # fmt: skip
-            vertices = torch.stack([(frame, advance())[0] for frame in made])
-        mesh_of_file = garment.render_mesh
-        return Drape(vertices, faces, rest, bodies, body_faces, root, FPS, mesh_of_file)
-
-    def _skinned(self, garment, rest, body, motion):
-        """A garment at ``rest`` (N, 3) [m] by plain skinning, (T, N, 3) [m], and the body's
-        vertices (T, V, 3) [m].
-        """
-        transforms = skinning.transforms(body, motion.poses, motion.translation)
-        weights = garment.blend_weights.to(self.device)
-        cloth = posed(rest[:, None].to(self.device), weights, transforms).transpose(0, 1)
-        return cloth.cpu(), skinning.skin(body.vertices, body.blend_weights, transforms).cpu()
+    def _drape_of(self, worn, vertices, bodies, material=None):
+        garment, body = worn.garment, worn.body
+        root = skinning.posed_joints(body, worn.transforms)[:, 0]
+        found = (vertices, garment.faces, worn.rest, bodies, body.faces, root)
+        on_cpu = [x.cpu() for x in found]
+        return Drape(*on_cpu, FPS, render_mesh=garment.render_mesh, material=material)
 
     def _held(self, garment):
         """How firmly each vertex is held at a waistband, (N,)."""
@@ -240,9 +286,8 @@ class Draper:
         """The :class:`onefit.draping.post.PostProcessing` of a garment graded to a ``body``, its
         vertices at ``rest`` (N, 3) [m].
         """
-        key, vertices = id(garment), garment.vertices.cpu().numpy()
-        if key not in self._pulls:
-            self._pulls[key] = pull(vertices, self.standard, self._held(garment))
+        vertices = garment.vertices.cpu().numpy()
+        drawn = lambda: pull(vertices, self.standard, self._held(garment))
         if not self._surfaces:  # made once for a body model
             at, faces = body.vertices.cpu(), body.faces.cpu()
             self._surfaces = ClosestSurface(at, faces), ClosestSurface(at, faces)
@@ -252,17 +297,18 @@ class Draper:
             threads, long = garment.stitches.edges(rest.cpu().numpy())
             edges = np.concatenate([edges, threads])
             lengths = torch.cat([lengths, torch.as_tensor(long).to(lengths)])
-        return PostProcessing(rest, garment.faces, edges, lengths, self._pulls[key], self._surfaces)
+        pulls = self._once(garment, "pull", drawn)
+        return PostProcessing(rest, garment.faces, edges, lengths, pulls, self._surfaces)
 
     def codes(self, garment: Garment) -> torch.Tensor:
         """Z_T (K, width) of the garment's patches, found once."""
-        key = id(garment)
-        if key not in self._codes:
+
+        def encoded():
+            joints = self.standard.joints.to(self.device)
             with torch.no_grad():
-                self._codes[key] = self.network.patches(
-                    *self.patched(garment).features, self.standard.joints.to(self.device)
-                )
-        return self._codes[key]
+                return self.network.patches(*self.patched(garment).features, joints)
+
+        return self._once(garment, "codes", encoded)
 
     def _displacement(self, garment, embedding):
         """Displacements of the vertices in the rest space, (N, T, 3) [m], for embeddings (T,
@@ -277,16 +323,13 @@ class Draper:
         """The offset of the garment's vertices in the rest space, (N, 3) [m], found once:
         :func:`onefit.draping.ease.ease`.
         """
-        key = id(garment)
-        if key not in self._ease:
+
+        def found():
+            rest, body = garment.vertices.to(self.device), self.standard.to(self.device)
             with torch.no_grad():
-                rest, faces, body = (
-                    garment.vertices.to(self.device),
-                    garment.faces,
-                    self.standard.to(self.device),
-                )
-                self._ease[key] = ease.ease(rest, faces, body, self._trial(garment, rest, body))
-        return self._ease[key]
+                return ease.ease(rest, garment.faces, body, self._trial(garment, rest, body))
+
+        return self._once(garment, "ease", found)
 
     def _trial(self, garment, rest, body):
         """The frames that :func:`onefit.draping.ease.ease` looks at, of ``rest`` (N, 3) [m] on the

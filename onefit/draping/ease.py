@@ -12,10 +12,11 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from onefit.body import ClosestSurface, spread
+from onefit.body import ClosestSurface
+from onefit.contact import spread
 from polyfit.mesh import neighbour_mean
 
-from .post import DEEPEST
+from .post import CONTACT
 
 MOTIONS = (
     "idle",
@@ -30,9 +31,6 @@ MOTIONS = (
 SECONDS = 1.0  # [s] of each motion
 FRAME_STEP = 6  # one frame in so many is looked at
 _CLEAR_SHARE = 0.95  # of those frames in which a vertex is to lie far enough out
-CLEARANCE = (
-    0.007  # [m] from the body, where the garment was made with as much and skinning leaves as much
-)
 SMOOTHING = 4  # times
 # [m]; of triangles with a longer side the centre is looked at, too: a limb comes through between
 # their vertices
@@ -45,24 +43,23 @@ def ease(rest, faces, body, frames):
 
     ``frames``: for each frame, the vertices as the network drapes them and as plain skinning does
     (N, 3), and the body's (V, 3) [m]. A vertex should lie as far out of the body as in the rest
-    pose and under plain skinning, whichever is less, or CLEARANCE where both are more. It is moved
-    along the body's normal at rest, so far that this holds in _CLEAR_SHARE of the frames, and its
-    neighbours go along. What the centre of a triangle with a side above _LONG_SIDE misses, all its
-    vertices are moved by.
+    pose and under plain skinning, whichever is less, or the contact's ``eased`` where both are
+    more. It is moved along the body's normal at rest, so far that this holds in _CLEAR_SHARE of the
+    frames, and its neighbours go along. What the centre of a triangle with a side above _LONG_SIDE
+    misses, all its vertices are moved by.
     """
     surface = ClosestSurface(body.vertices, body.faces)
     faces, count = faces.to(rest.device), len(rest)
     corners = rest[faces]
     coarse = faces[(corners - corners.roll(1, 1)).norm(dim=-1).amax(1) > _LONG_SIDE]
     places = lambda x: torch.cat([x, x[coarse].mean(1)])
-    at_rest = surface(places(rest), DEEPEST)
+    at_rest = surface(places(rest), CONTACT.deepest)
     missing = []
     for draped, skinned, vertices in frames:
         surface.follow(vertices)
-        wanted = torch.minimum(at_rest.distance, surface(places(skinned), DEEPEST).distance).clamp(
-            max=CLEARANCE
-        )
-        missing.append((wanted - surface(places(draped), DEEPEST).distance).clamp(min=0))
+        of_skinning = surface(places(skinned), CONTACT.deepest).distance
+        wanted = torch.minimum(at_rest.distance, of_skinning).clamp(max=CONTACT.eased)
+        missing.append((wanted - surface(places(draped), CONTACT.deepest).distance).clamp(min=0))
     missing = torch.as_tensor(
         np.quantile(torch.stack(missing).cpu().numpy(), _CLEAR_SHARE, axis=0)
     ).to(rest)  # torch's has a largest size

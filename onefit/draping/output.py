@@ -14,8 +14,6 @@ from polyfit.animation import write_frames, write_usd
 from polyfit.errors import InputError
 from polyfit.files import aside, folder_aside
 
-from .draper import FPS
-
 BODY_COLOUR = (0.5, 0.48, 0.46)  # linear RGB
 GARMENT_COLOURS = (0.08, 0.19, 0.42), (0.42, 0.12, 0.06), (0.10, 0.28, 0.13), (0.42, 0.30, 0.06)
 
@@ -23,8 +21,8 @@ GARMENT_COLOURS = (0.08, 0.19, 0.42), (0.42, 0.12, 0.06), (0.10, 0.28, 0.13), (0
 @dataclass(frozen=True)
 class Outcome:
     """What a drape took and how good it is. ``folder``: where it lies; ``frames``, ``vertices``:
-    how many; ``seconds``: what draping took, the finish and its settling included; ``figures``:
-    its measures by name.
+    how many; ``seconds``: what it took in all, and what a simulation took of them before its first
+    frame, ``settling``; ``figures``: its measures by name.
     """
 
     folder: Path
@@ -63,38 +61,34 @@ def check_folder(folder, overwrite):
             raise InputError(f"{folder}: holds no drape; --overwrite replaces nothing else")
 
 
-def drape_into(folder, draper, garment, motion, shape, *, about, how=None, **files):
+def drape_into(folder, make, verb, frames, *, about, **files):
     """Drape and write all files; returns the :class:`Outcome`.
 
-    ``folder``: new, empty or holding a drape, which is replaced at the end. ``draper``,
-    ``garment``, ``motion``, ``shape``, and ``how``, a dict of ``post``, ``finish`` and
-    ``material``: as :meth:`onefit.Draper.drape` takes them. ``about``: names for figures.json;
-    ``files``: options of :func:`write`. Progress goes to stderr.
+    ``folder``: new, empty or holding a drape, which is replaced at the end. ``make``, a function of
+    ``advance``: :meth:`onefit.Draper.drape` or :meth:`onefit.Draper.simulate`, as ``verb`` says, of
+    all the rest; ``frames``: how many it makes. ``about``: names for figures.json; ``files``:
+    options of :func:`write`. Progress goes to stderr.
     """
-    folder, how = Path(folder), how or {}
-    draper.ease(garment)  # cut and tried on once for all motions, so it does not count
+    folder, ends = Path(folder), [time.perf_counter()]
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
         TimeRemainingColumn(),
     )
-    finished: list = []  # when each frame was
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        frames = len(motion.resampled(FPS).poses)
-        task = progress.add_task("finishing", total=frames, visible=how.get("finish", 0) > 0)
+        task = progress.add_task(verb, total=frames)
 
         def advance():
-            finished.append(time.perf_counter())
+            ends.append(time.perf_counter())
             progress.advance(task)
 
-        start = time.perf_counter()
-        drape = draper.drape(garment, motion, shape, **how, advance=advance)
-        seconds = time.perf_counter() - start
-    settling = finished[0] - start if finished else 0.0
+        drape = make(advance=advance)
+        seconds = time.perf_counter() - ends[0]
+    settling = ends[1] - ends[0] if verb == "simulate" else 0.0
     T, N = drape.vertices.shape[:2]
     outcome = Outcome(folder, T, N, seconds, settling, drape.measures().as_dict())
-    about = about | dict(shape=shape.tolist(), vertices=N, frames=T) | how | outcome.figures
+    about = dict(verb=verb, **about, vertices=N, frames=T, **outcome.figures)
     folder.parent.mkdir(parents=True, exist_ok=True)
     with (
         Progress(*columns, console=Console(stderr=True)) as progress,

@@ -9,12 +9,13 @@ from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import splu
 
 from onefit.body import ClosestSurface
+from onefit.contact import ContactSettings
 from polyfit import mesh
 
 # Lengths over which the weights and the displacements of a shape are smoothed where the garment
 # touches the body [m]; they grow with the distance from it, doubled at 1.7 times this one.
 _WEIGHTS_LENGTH, _SHAPE_LENGTH, _TOUCHING_DISTANCE = 0.010, 0.008, 0.007
-CLEARANCE = 0.003  # that grading leaves between body and cloth [m]
+_CLEARANCE = ContactSettings().clearance
 
 
 @lru_cache(maxsize=1)
@@ -88,12 +89,12 @@ class Binding:
     def moved(self, V, before, after):
         """Vertices ``V`` (N, 3) [m] displaced with those of the body from ``before`` to ``after``
         (V, 3). Where the cloth touches the body, it stays as far above the plane at its point there
-        as it was, or CLEARANCE if that is less.
+        as it was, or the contact's clearance if that is less.
         """
         moved = V + self.displacement(after - before)
         above, normal = self._above_body(moved, after)
         moved[self._touching] += (
-            np.maximum(np.minimum(self._above, CLEARANCE) - above, 0)[:, None] * normal
+            np.maximum(np.minimum(self._above, _CLEARANCE) - above, 0)[:, None] * normal
         )
         return moved
 

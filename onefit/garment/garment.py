@@ -36,7 +36,7 @@ LOOSE = ("boxy_tshirt", "shirt", "waisted_dress", "circle_skirt", "wide_trousers
 FOLDER = Path(__file__).parents[1] / "data" / "garments"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Garment:
     """A garment at rest on the standard body.
 
@@ -54,9 +54,9 @@ class Garment:
     blend_weights: torch.Tensor
     repairs: tuple = ()
     cut: torch.Tensor | None = None
-    render_mesh: RenderMesh | None = field(default=None, repr=False, compare=False)
-    stitches: Stitches | None = field(default=None, repr=False, compare=False)
-    _binding: Any = field(default=None, repr=False, compare=False)
+    render_mesh: RenderMesh | None = field(default=None, repr=False)
+    stitches: Stitches | None = field(default=None, repr=False)
+    _binding: Any = field(default=None, repr=False)
 
     @classmethod
     def template(cls, name: str) -> Garment:

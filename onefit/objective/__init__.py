@@ -1,5 +1,5 @@
 """What a drape costs: positions of cloth and body in some frames go in; the losses that train a
-network, and the measures of a finished drape, come out.
+network, and the measures of a drape, come out.
 """
 
 import lazy_loader

@@ -39,17 +39,18 @@ def lengths(vertices, edges):
     return (vertices[:, edges[:, 0]] - vertices[:, edges[:, 1]]).norm(dim=-1)
 
 
-def _physical_energy(vertices, rest, faces, root, dt, k_mi=losses.Weights.k_mi):
+def _physical_energy(vertices, rest, faces, root, dt, density):
     """Stretching, gravity and inertia [J], each (T - 2,), of vertices (T, N, 3) of a garment that
     rests at ``rest`` (N, 3).
 
-    They are the terms of the training's objective, frame by frame: k_mi sum of squared changes of
-    edge lengths; m g (z - z of the ``root`` (T, 3)); m |second difference|^2 / (2 dt^2).
+    They are the terms of the paper's objective, frame by frame: k_mi sum of squared changes of edge
+    lengths; m g (z - z of the ``root`` (T, 3)); m |second difference|^2 / (2 dt^2).
     """
     edges = torch.as_tensor(mesh.edges_of(faces.numpy())[0])
-    stretch = k_mi * (lengths(vertices[2:], edges) - lengths(rest[None], edges)).square().sum(1)
+    change = lengths(vertices[2:], edges) - lengths(rest[None], edges)
+    stretch = losses.Weights.k_mi * change.square().sum(1)
     face_area = areas(rest[None], faces)[0]
-    mass = losses.DENSITY * torch.zeros(len(rest)).index_add(
+    mass = density * torch.zeros(len(rest)).index_add(
         0, faces.flatten(), (face_area / 3).repeat_interleave(3)
     )
     gravity = losses.GRAVITY * ((vertices[2:, :, 2] - root[2:, None, 2]) * mass).sum(1)
@@ -58,10 +59,10 @@ def _physical_energy(vertices, rest, faces, root, dt, k_mi=losses.Weights.k_mi):
     return stretch, gravity, inertia
 
 
-def measure(vertices, faces, rest, body_vertices, collider, root, fps):
+def measure(vertices, faces, rest, body_vertices, collider, root, fps, density=losses.DENSITY):
     """:class:`Measures` of the vertices (T, N, 3) [m] of a garment with ``faces`` (F, 3), at
     ``rest`` (N, 3), on bodies (T, V, 3) whose roots are at ``root`` (T, 3), in at least three
-    frames."""
+    frames; ``density`` [kg/m^2] of the cloth."""
     edges = torch.as_tensor(mesh.edges_of(faces.numpy())[0])
     inside = (
         torch.stack(
@@ -71,7 +72,7 @@ def measure(vertices, faces, rest, body_vertices, collider, root, fps):
         .mean()
     )
     change = lambda now, then: ((now - then).abs() / then).mean()
-    energy = sum(_physical_energy(vertices, rest, faces, root, 1 / fps)).mean()
+    energy = sum(_physical_energy(vertices, rest, faces, root, 1 / fps, density)).mean()
     second = (vertices[2:] - 2 * vertices[1:-1] + vertices[:-2]).norm(dim=-1).mean()
     return Measures(
         100 * float(inside),

@@ -8,10 +8,9 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
         "cloth": ["Cloth"],
-        "contact": ["BodyContact", "ThreadContact"],
-        "layers": ["SelfContact"],
         "material": ["MATERIALS", "Material"],
         "settings": ["Settings"],
-        "sheet": ["Sheet", "samples"],
+        "sheet": ["Sheet"],
+        "worn": ["WornCloth"],
     },
 )

@@ -5,11 +5,13 @@ linear system conjugate gradients solve, started from what the step before found
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
+from onefit.contact import Contacts, weighted
+
 from . import kernels
-from .contact import Contacts, weighted
 from .kernels import ints, reals, wp
 from .material import AIR, GRAVITY
 from .settings import Settings
@@ -62,6 +64,9 @@ class Cloth:
         self.iterations = 0  # of the last step
         self._forced = np.zeros_like(self.x)  # by what forces moved the cloth in the last step
         N, E, F, H = len(sheet), sheet.edges, sheet.faces, sheet.hinges
+        of_face, self._face_parts = _in_halves(F, N)
+        of_hinge, self._hinge_parts = _in_halves(H, N)
+        F, H = F[of_face], H[of_hinge]
         each = np.arange(N)
         pairs = np.concatenate([E, E[:, ::-1], np.stack([each, each], 1)])
         where = np.unique(pairs[:, 0] * N + pairs[:, 1])
@@ -77,37 +82,55 @@ class Cloth:
         self._solver = Solver(first, where % N, patches)
         self._middle = ints(self._solver.middle)
         self._faces, self._of_faces = ints(F), ints(of_faces)
-        self._hinges = ints(H), reals(sheet.angles), reals(sheet.stiffness)
+        angles, stiffness = sheet.angles[of_hinge], sheet.stiffness[of_hinge]
+        self._hinges = ints(H), reals(angles), reals(stiffness)
         self._of_hinges = ints(np.stack(of_hinges, 1).reshape(-1, 14))
-        self._stretch = reals(sheet.gradients, kernels.vec2), reals(material.stretch * sheet.area)
+        gradients, weight = sheet.gradients[of_face], material.stretch * sheet.area[of_face]
+        self._stretch = reals(gradients, kernels.vec2), reals(weight)
         self._vectors = [reals(np.zeros((N, 3)), kernels.vec3) for _ in range(4)]
+        self._springs = reals(np.zeros(N))
+        self._other = ThreadPoolExecutor(1)  # a second thread
 
     def touches(self, contacts: Sequence[Contacts], dt: float) -> list[_Touch]:
         """The ``contacts`` of a step of ``dt`` [s], as :meth:`assemble` takes them."""
-        slow, friction = self.settings.sticking * dt, self.sheet.material.friction
+        slow, friction = self.settings.contact.sticking * dt, self.sheet.material.friction
         drag = lambda c: friction * self.load[c.key] / np.maximum(self.slip[c.key], slow)
         return [_Touch(c, drag(c)) for c in contacts]
 
-    def assemble(self, y: np.ndarray, dt: float, touches: Sequence[_Touch] = ()) -> np.ndarray:
-        """The gradient (N, 3) [N] at ``y`` (N, 3) [m] of all but inertia and weight. The matrix
-        stays here, with the masses / dt^2.
+    def assemble(
+        self,
+        y: np.ndarray,
+        dt: float,
+        touches: Sequence[_Touch] = (),
+        pull: np.ndarray | float = 0.0,
+    ) -> np.ndarray:
+        """The gradient (N, 3) [N] at ``y`` (N, 3) [m] of all but inertia, weight and pull. The
+        matrix stays here, with the masses / dt^2 and the ``pull`` (N,) [N/m].
         """
         x, before, velocity, force = self._vectors
         for vector, value in zip(self._vectors, (y, self.x, self.v, 0)):
             vector.numpy()[:] = value
         self._solver.block.numpy()[:] = 0
-        self._add(self.sheet.mass / dt**2)
+        self._springs.numpy()[:] = self.sheet.mass / dt**2 + pull
         into = [force, self._solver.block]
         launch = lambda kernel, size, arguments: wp.launch(kernel, size, arguments, device="cpu")
-        count, material = len(self.sheet.faces), self.sheet.material
-        launch(kernels.stretching, count, [x, self._faces, *self._stretch, self._of_faces, *into])
-        launch(
-            kernels.bending,
-            len(self.sheet.hinges),
-            [x, *self._hinges, self._of_hinges, *into],
-        )
-        air = [material.drag * AIR / 2, dt, self._of_faces]
-        launch(kernels.drag, count, [x, before, velocity, self._faces, *air, *into])
+        launch(kernels.springs, len(y), [self._springs, self._middle, into[1]])
+        air = [self.sheet.material.drag * AIR / 2, dt, self._of_faces]
+        energies = [
+            (kernels.bending, self._hinge_parts, [x, *self._hinges, self._of_hinges]),
+            (kernels.stretching, self._face_parts, [x, self._faces, *self._stretch, air[2]]),
+            (kernels.drag, self._face_parts, [x, before, velocity, self._faces, *air]),
+        ]
+
+        def part(which):
+            for kernel, ends, arguments in energies:
+                first, last = ends[which : which + 2]
+                launch(kernel, last - first, [first, *arguments, *into])
+
+        half = self._other.submit(part, 0)  # no vertex is of both halves
+        part(1)
+        half.result()
+        part(2)
         for touch in touches:
             size, places = len(touch.gap), [x, before, *touch.arrays, self._middle]
             launch(kernels.contact, size, [*places, *touch.found, *into])
@@ -119,11 +142,6 @@ class Cloth:
     def product(self, vector: np.ndarray) -> np.ndarray:
         """The matrix that was last assembled times ``vector`` (N, 3)."""
         return self._solver.product(vector)
-
-    def _add(self, stiffness):
-        """Adds springs (N,) [N/m], the same in all directions, to the matrix."""
-        blocks = self._solver.block.numpy()
-        blocks[self._solver.middle] += stiffness[:, None, None] * np.eye(3)
 
     def flight(self, dt: float) -> np.ndarray:
         """Where the vertices (N, 3) [m] would be after a step of ``dt`` [s] without any force but
@@ -151,9 +169,8 @@ class Cloth:
         after, start, self.iterations = y, self._forced, 0
         touches = self.touches(contacts, dt)
         for _ in range(settings.newton):
-            gradient = self.assemble(after, dt, touches)
+            gradient = self.assemble(after, dt, touches, pull)
             gradient = gradient + inertia[:, None] * (after - y) + pull[:, None] * (after - target)
-            self._add(pull)
             move, done = self._solver.solve(
                 -gradient, start, settings.iterations, settings.tolerance
             )
@@ -164,16 +181,27 @@ class Cloth:
         self.v, self.x = (after - self.x) / dt, after
 
     def _remember(self, after, touches):
-        """Loads and slips of the contacts, for the next step's friction: what those bear that were
-        in touch when the step was last linearised.
+        """Loads and slips of the contacts, for the next step's friction: of those that were in
+        touch when the step was last linearised.
         """
         load, slip = np.zeros_like(self.load), np.zeros_like(self.slip)
         for touch in touches:
-            c = touch.contacts
+            c = touch.contacts.of(touch.gap < 0)
             point = weighted(after[c.corners], c.weights)
             gap = np.einsum("ci,ci->c", point, c.normal) - c.offset
             slid = point - weighted(self.x[c.corners], c.weights) - c.moved
             slid -= np.einsum("ci,ci->c", slid, c.normal)[:, None] * c.normal
-            np.maximum.at(load, c.key, c.stiffness * np.maximum(-gap, 0) * (touch.gap < 0))
+            np.maximum.at(load, c.key, c.stiffness * np.maximum(-gap, 0))
             np.maximum.at(slip, c.key, np.linalg.norm(slid, axis=1))
         self.load, self.slip = load, slip
+
+
+def _in_halves(corners, count):
+    """An order (E,) of elements with ``corners`` (E, K) of ``count`` vertices in which those of the
+    first half of the vertices come first, then those of the second, then those of both; and where
+    each part begins and ends, (4,).
+    """
+    second = corners >= count // 2
+    part = np.where(second.all(1), 1, 2 * second.any(1))
+    order = np.argsort(part, kind="stable")
+    return order, np.searchsorted(part[order], range(4)).tolist()

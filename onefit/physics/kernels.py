@@ -33,6 +33,7 @@ def reals(a, dtype=real):
 
 @wp.kernel
 def stretching(
+    first: int,  # face
     x: wp.array(dtype=vec3),
     faces: wp.array2d(dtype=int),
     gradients: wp.array2d(dtype=vec2),
@@ -46,7 +47,7 @@ def stretching(
     With F = R S, S = sum_i s_i v_i v_i^T and n the normal: in the plane all modes have 1, but the
     rotation of F in its plane 1 - 2 / (s_1 + s_2); out of it 1 - 1 / s_i.
     """
-    f = wp.tid()
+    f = first + wp.tid()
     one, two, half = real(1.0), real(2.0), real(0.5)
     F = _mat32()
     for a in range(3):
@@ -92,6 +93,7 @@ def _angle_between(one: vec3, two: vec3, edge: vec3):
 
 @wp.kernel
 def bending(
+    first: int,  # hinge
     x: wp.array(dtype=vec3),
     hinges: wp.array2d(dtype=int),
     angles: wp.array(dtype=real),
@@ -104,7 +106,7 @@ def bending(
     corners share no edge: 2 (u_2 x_2)(u_3 x_3) there is replaced by (u_2 x_2)^2 + (u_3 x_3)^2,
     which is never less, and almost the same where both move alike.
     """
-    h = wp.tid()
+    h = first + wp.tid()
     x0, x1 = x[hinges[h, 0]], x[hinges[h, 1]]
     x2, x3 = x[hinges[h, 2]], x[hinges[h, 3]]
     e = x1 - x0
@@ -141,6 +143,7 @@ def bending(
 
 @wp.kernel
 def drag(
+    first: int,  # face
     x: wp.array(dtype=vec3),
     before: wp.array(dtype=vec3),
     velocity: wp.array(dtype=vec3),  # at the start of the step [m/s]
@@ -154,7 +157,7 @@ def drag(
     """The air's drag normal to each triangle, coefficient * area * |v.n| v.n n, with |v.n| of the
     start of the step.
     """
-    f = wp.tid()
+    f = first + wp.tid()
     a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
     normal = wp.cross(x[b] - x[a], x[c] - x[a])
     double = wp.length(normal)
@@ -167,6 +170,16 @@ def drag(
     for i in range(3):
         force[faces[f, i]] += k * moved * n
         matrix[blocks[f, 4 * i]] += k * nn
+
+
+@wp.kernel
+def springs(
+    stiffness: wp.array(dtype=real),  # (N,) [N/m], the same in all directions
+    middle: wp.array(dtype=int),
+    matrix: wp.array(dtype=mat3),
+):
+    i = wp.tid()
+    matrix[middle[i]] += stiffness[i] * wp.identity(n=3, dtype=real)
 
 
 @wp.kernel

@@ -137,24 +137,3 @@ def bending(x, sheet):
 def potential(x, sheet):
     """Potential energy (T,) [J] of points (N, T, 3) [m] above z = 0."""
     return GRAVITY * (torch.as_tensor(sheet.mass).to(x)[:, None] * x[..., 2]).sum(0)
-
-
-def samples(
-    vertices: np.ndarray, faces: np.ndarray, spacing: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """``(corners (P, 4), weights (P, 4))`` of points of the ``faces`` (F, 3) and their edges that
-    lie ``spacing`` [m] from each other and from the ``vertices`` (N, 3) [m], or nearer; triangles
-    that are small enough have none.
-    """
-    x = vertices[faces]
-    longest = np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2).max(1)
-    parts = np.ceil(longest / spacing).astype(int)
-    corners, weights = [np.zeros((0, 4), int)], [np.zeros((0, 4))]
-    for n in np.unique(parts[parts > 1]):
-        i, j = (k.ravel() for k in np.mgrid[: n + 1, : n + 1])
-        grid = np.stack([i, j, n - i - j, 0 * i], 1) / n
-        grid = grid[(grid.min(1) >= 0) & (grid.max(1) < 1)]
-        chosen = faces[parts == n]
-        corners.append(np.repeat(chosen[:, [0, 1, 2, 2]], len(grid), axis=0))
-        weights.append(np.tile(grid, (len(chosen), 1)))
-    return np.concatenate(corners), np.concatenate(weights)

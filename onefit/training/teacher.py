@@ -1,4 +1,4 @@
-"""A teacher: finished drapes of generated motions. A network learns them by regression, beside the
+"""A teacher: simulated drapes of generated motions. A network learns them by regression, beside the
 objective or before it.
 
 A folder of lessons has a file for each garment, as it was draped, and one for each of its drapes.
@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from onefit.body import skinning
+from onefit.contact import ContactSettings
 from onefit.garment import Garment
 from onefit.physics import Settings
 from polyfit.errors import InputError
@@ -23,7 +24,7 @@ from .projection import unposed
 
 FPS = 30.0
 # A lesson's faces are of 2 cm, and a third of its time would go into points between their corners
-SETTINGS = Settings(spacing=0.05)
+SETTINGS = Settings(contact=ContactSettings(spacing=0.05))
 _BETWEEN = "--"  # the names of garment and motion, in those of files
 
 
@@ -40,13 +41,12 @@ class Lesson:
     displacement: torch.Tensor
 
 
-def lesson(draper, garment, motion, shape, *, finish, material, advance=lambda: None) -> Lesson:
-    """What the finished drape of ``garment`` in ``motion`` on a body of ``shape`` (S,) teaches; the
-    arguments as :meth:`onefit.Draper.drape` takes them.
+def lesson(draper, garment, motion, shape, *, material, steps=2, advance=lambda: None) -> Lesson:
+    """What a simulation of ``garment`` in ``motion`` on a body of ``shape`` (S,) teaches; the
+    arguments as :meth:`onefit.Draper.simulate` takes them.
     """
-    drape = draper.drape(
-        garment, motion, shape, finish=finish, material=material, settings=SETTINGS, advance=advance
-    )
+    how = dict(material=material, steps=steps, settings=SETTINGS, advance=advance)
+    drape = draper.simulate(garment, motion, shape, **how)
     body = draper.model.body(shape)
     motion = motion.resampled(FPS).fitted(body)
     maps = skinning.transforms(body, motion.poses, motion.translation)

@@ -43,6 +43,7 @@ def test_polysft_imports_without_any_extra():
         ("polyfit scenes/demo/template.obj -o OUT.ply", "torch"),
         ("onefit.train dress -o OUT", "torch"),
         ("onefit.drape dress walk -o OUT", "torch"),
+        ("onefit.simulate dress walk -o OUT", "torch"),
         ("onefit.tailor -o OUT", "torch"),
     ],
 )

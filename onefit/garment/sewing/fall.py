@@ -4,14 +4,17 @@ with slack. The physics is :mod:`onefit.physics`.
 
 import numpy as np
 
+from onefit.contact import ContactSettings
 from onefit.garment.binding import standard_body
 from onefit.garment.waistband import held
-from onefit.physics import BodyContact, Cloth, Material, SelfContact, Settings, Sheet
+from onefit.physics import Material, Settings, Sheet, WornCloth
 
 _MATERIAL = "cotton"
 STEP, SECONDS = 1 / 120, 2.5  # [s] of a step, and of the whole fall
 _SLOWING = 0.88  # of velocities in each step: the cloth comes to rest, as if it fell through honey
-SETTINGS = Settings(clearance=0.006, least=0.0045, newton=2, iterations=150, tolerance=3e-4)
+# templates lie twice as far from the skin as cloth comes to it in motion
+CONTACT = ContactSettings(clearance=0.006, least=0.0045)
+SETTINGS = Settings(iterations=150, tolerance=3e-4, contact=CONTACT)
 
 
 def fallen(cut, seconds=SECONDS, advance=lambda cloth: None):
@@ -22,17 +25,11 @@ def fallen(cut, seconds=SECONDS, advance=lambda cloth: None):
     corners = cut.vertices[cut.faces]
     sides = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
     sheet = Sheet(cut.start, cut.faces, Material.named(_MATERIAL), sides, cut.vertices)
-    surface = body.vertices.double().numpy()
-    skin = BodyContact(sheet, body.vertices, body.faces, SETTINGS)
-    itself = SelfContact(sheet, SETTINGS, len(skin))
-    cloth = Cloth(sheet, cut.start, SETTINGS, keys=len(skin) + len(sheet))
+    surface, faces = body.vertices.numpy(), body.faces.numpy()
+    worn = WornCloth(sheet, cut.start, surface, faces, SETTINGS)
     pull = sheet.material.stretch * held(cut.start, cut.faces, body.joints.double().numpy())
-    skin.find(cloth.x)
     for _ in range(round(seconds / STEP)):
-        contacts = [skin.follow(surface), itself.find(cloth.x, STEP * cloth.v)]
-        cloth.step(STEP, contacts, cut.start, pull)
-        skin.find(cloth.x)
-        cloth.x = skin.pushed_out(cloth.x)
-        cloth.v *= _SLOWING
-        advance(cloth)
-    return cloth.x
+        worn.step(STEP, surface, cut.start, pull)
+        worn.cloth.v *= _SLOWING
+        advance(worn.cloth)
+    return worn.cloth.x

@@ -7,7 +7,7 @@ import torch
 from places import ROOT
 from processes import python
 
-from onefit import drape
+from onefit import drape, simulate
 from onefit.body import AnnyBody
 from onefit.draping.output import Outcome
 from onefit.network import OneFit, weights
@@ -25,7 +25,7 @@ def network(tmp_path_factory):
 @pytest.fixture(scope="module")
 def out(network, tmp_path_factory):
     folder = tmp_path_factory.mktemp("drapes") / "out"
-    drape.main([
+    simulate.main([
         "shorts", "walk", "-o", str(folder), "--weights", network, "--seconds", "0.1", "--size",
         "90", "60", "--spp", "4", "--meshes", "ply", "--shape", "height=0.6", "weight=0.4",
     ])  # fmt: skip
@@ -48,7 +48,7 @@ def test_arrays_and_figures(out):
     assert about["garment"] == "shorts" and about["frames"] == T and about["vertices"] == N
     assert about["shape"] == pytest.approx([0.5, 0.5, 0.5, 0.4, 0.6, 0.5])
     assert {"collision", "edge", "area", "energy", "jitter"} <= set(about)
-    assert about["finish"] == 2 and about["material"] == "cotton"
+    assert about["verb"] == "simulate" and about["steps"] == 2 and about["material"] == "cotton"
     assert about["collision"] == 0 and about["edge"] < 1.5
 
 
@@ -106,8 +106,11 @@ def test_what_is_there_is_not_lost(out, network):
         (("tuxedo.obj", "walk"), "tuxedo.obj: no such file"),
         (("tuxedo", "walk"), "garment 'tuxedo': no such template; there are tshirt, dress, tank"),
         (("shorts", "walk", "--vertices", "10"), "--vertices 10: at least 100 are needed"),
-        (("shorts", "walk", "--finish", "-1"), "--finish -1: steps a frame, 0 or more"),
-        (("shorts", "walk", "--material", "wool"), "material 'wool': choose among cotton, silk"),
+        (
+            ("shorts", "walk", "--material", "silk"),
+            "--material: python -m onefit.simulate takes it",
+        ),
+        (("shorts", "walk", "--steps", "2"), "--steps: python -m onefit.simulate takes it"),
         (("shorts", "walk", "--shape", "girth=3"), "--shape girth=3: choose among gender, age"),
         (("shorts", "walk", "--shape", "weight=heavy"), "--shape weight=heavy: a number is needed"),
         (("shorts", "walk", "--shape", "weight=2"), "weight = 2; phenotypes go from 0 to 1"),
@@ -121,11 +124,37 @@ def test_refused_in_one_line(arguments, message, network, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (("--steps", "0"), "--steps 0: steps a frame, 1 or more"),
+        (("--material", "wool"), "material 'wool': choose among cotton, silk"),
+        (("--no-post",), "--no-post: python -m onefit.drape takes it"),
+    ],
+)
+def test_a_simulation_refuses_what_it_has_not(arguments, message, network, tmp_path):
+    out = ["-o", str(tmp_path / "out"), "--weights", network]
+    with pytest.raises(InputError, match=message):
+        simulate.main(["shorts", "walk", *arguments, *out])
+    assert not (tmp_path / "out").exists()
+
+
+def test_both_verbs_take_the_same_arguments_but_their_own():
+    flags = lambda verb: {
+        flag for action in verb.parser()._actions for flag in action.option_strings
+    }
+    shown = lambda verb: verb.parser().format_help()
+    assert flags(drape) == flags(simulate) | {"--no-post"}
+    assert "--no-post" in shown(drape) and "--no-post" not in shown(simulate)
+    for flag in ("--material", "--steps"):
+        assert flag in shown(simulate) and f"{flag} " not in shown(drape)
+
+
 def test_the_summary_is_in_lines_that_fit_a_terminal(network, tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     drape.main([
         "shorts", "walk", "-o", str(tmp_path / "out"), "--weights", network, "--seconds", "0.1",
-        "--finish", "0", "--skip", "usd", "render",
+        "--skip", "usd", "render",
     ])  # fmt: skip
     said = capsys.readouterr()
     folder, following = said.out.splitlines()
@@ -155,8 +184,6 @@ def test_what_a_motion_file_does_not_say_is_said_by_flags(network, tmp_path):
         str(tmp_path / "still.npz"),
         "--weights",
         network,
-        "--finish",
-        "0",
         "--skip",
         "usd",
         "render",
@@ -188,8 +215,6 @@ def test_a_mesh_in_centimetres_with_y_up(network, tmp_path):
         network,
         "--seconds",
         "0.1",
-        "--finish",
-        "0",
         "--skip",
         "usd",
         "render",

@@ -8,9 +8,9 @@ import torch
 from surfaces import ball
 
 from onefit.body import ClosestSurface
+from onefit.contact.points import samples
 from onefit.draping import post
-from onefit.draping.post import CLEARANCE, DEEPEST, DRAG, NEAR, PULL, RADIUS, REACH, PostProcessing
-from onefit.physics.sheet import samples
+from onefit.draping.post import CONTACT, DRAG, NEAR, PULL, RADIUS, PostProcessing
 from polyfit.mesh import edges_of
 
 
@@ -24,10 +24,16 @@ def processing(x, faces, pull=0.0, surfaces=()):
     return PostProcessing(x, faces, *lengths_of(x, faces), np.full(len(x), pull), surfaces)
 
 
-def pushed_out(x, cloth, body, faces, **settings):
-    """Vertices ``x`` (N, 3) pushed out of a body (V, 3), as :class:`PostProcessing` does."""
+def push_out(process, x, goal, surface):
+    """Vertices ``x`` (N, 3) are pushed out of a body's surface, as :class:`PostProcessing` does."""
+    process.skin.look(x, surface, goal)
+    process.skin.push_out(x, surface)
+
+
+def pushed_out(x, cloth, body, faces):
+    """The same of a body (V, 3)."""
     x = x.clone()
-    processing(x, cloth).push_out(x, x.clone(), ClosestSurface(body, faces), **settings)
+    push_out(processing(x, cloth), x, x.clone(), ClosestSurface(body, faces))
     return x
 
 
@@ -40,8 +46,8 @@ def test_lengths_come_back_as_in_a_slow_reference(radius):
     degree = np.bincount(edges.ravel())[:, None]
     given = x + torch.as_tensor(rng.normal(size=x.shape) * 2e-3).float()
     surface, process, found = ClosestSurface(body, body_faces), processing(x, faces), given.clone()
-    process.look(found, found.clone(), surface)
-    touched = surface(given, REACH).face
+    process.skin.look(found, surface, found.clone())
+    touched = surface(given, CONTACT.touching).face
     assert (touched >= 0).any() == (radius > 0.05)
     first, second, third = body[body_faces[touched]].double().unbind(1)
     normal = torch.linalg.cross(second - first, third - first)
@@ -58,12 +64,12 @@ def test_lengths_come_back_as_in_a_slow_reference(radius):
             ahead = 1 / (1 - RADIUS**2 / 2) if turn == 1 else 1 / (1 - RADIUS**2 * ahead / 4)
         before, now = now, before + ahead * (now + pull / degree - before)
         height = ((torch.as_tensor(now) - first) * normal).sum(-1)
-        missing = (CLEARANCE - height).clamp(min=0) * (touched >= 0)
+        missing = (CONTACT.clearance - height).clamp(min=0) * (touched >= 0)
         now = now + (missing[:, None] * normal).numpy()
     process.restore_lengths(found, surface, rounds=6)
     assert np.abs(now - found.numpy()).max() < 1e-6
     far, same = ClosestSurface(body + 1, body_faces), x.clone()
-    process.look(same, same.clone(), far)
+    process.skin.look(same, far, same.clone())
     process.restore_lengths(same, far)
     assert torch.allclose(same, x, atol=1e-6)
 
@@ -76,10 +82,10 @@ def test_tight_cloth_stays_in_front_of_the_skin_and_goes_with_it():
     process = PostProcessing(x, cloth, edges, 0.9 * lengths, np.zeros(len(x)))
     surface, held, free = ClosestSurface(body, faces), x + way, x + way
     for other, found in ((surface, held), (ClosestSurface(body + 1, faces), free)):
-        process.look(x, x.clone(), other)  # it touches the one, and not the other
+        process.skin.look(x, other, x.clone())  # it touches the one, and not the other
         surface.follow(body + way)
         process.restore_lengths(found, surface)
-    assert surface(held, 0.1).distance.min() > 0.9 * CLEARANCE
+    assert surface(held, 0.1).distance.min() > 0.9 * CONTACT.clearance
     assert surface(free, 0.1).distance.max() < 0
 
 
@@ -110,11 +116,11 @@ def test_cloth_stays_on_the_side_of_the_body_on_which_the_drape_is():
     goal = x + torch.tensor([0.2, 0.0, 0.0])
     behind = x - torch.tensor([0.2, 0.0, 0.0])  # the body has passed through the cloth
     process, surface = processing(x, cloth), ClosestSurface(body, faces)
-    process.push_out(behind, goal, surface)
+    push_out(process, behind, goal, surface)
     assert (behind[:, 0] > 0.03).all() and surface(behind, 0.1).distance.min() > 0.002
     before = goal - torch.tensor([0.1, 0.0, 0.0])  # nothing lies between
     same = before.clone()
-    process.push_out(same, goal, surface)
+    push_out(process, same, goal, surface)
     assert torch.equal(same, before)
 
 
@@ -142,7 +148,7 @@ def test_skin_and_waistband_hold_the_cloth():
     found = post.pull(where.numpy(), Standard(body, faces), np.array([0, 0, 0, 1]))
     assert found[0] == pytest.approx(2 * PULL, rel=0.05)
     assert found[1] == pytest.approx(PULL, rel=0.05)
-    assert found[2] == pytest.approx(PULL * (1 + (NEAR / CLEARANCE) ** 2), rel=0.05)
+    assert found[2] == pytest.approx(PULL * (1 + (NEAR / CONTACT.clearance) ** 2), rel=0.05)
     assert found[3] > 1e5
 
 
@@ -169,7 +175,10 @@ def test_pushing_out_finds_deep_vertices_from_their_neighbours():
     out = pushed_out(x, cloth, body, faces)
     assert surface(out, 0.1).distance.min() > 0
     # as when every vertex is asked how deep it is
-    assert torch.allclose(pushed_out(x, cloth, body, faces, reach=DEEPEST), out, atol=1e-5)
+    process, asked = processing(x, cloth), x.clone()
+    process.skin._reach = CONTACT.deepest
+    push_out(process, asked, x, surface)
+    assert torch.allclose(asked, out, atol=1e-5)
 
 
 def test_large_faces_are_pushed_out_of_what_passes_between_their_vertices():
@@ -188,19 +197,19 @@ def test_what_a_push_brings_to_the_body_is_looked_at_again():
     surface = ClosestSurface(body, torch.cat([faces, faces + len(one)]))
     x[x[:, 2].argmax(), 2] = 0.05  # its push takes its neighbours along, into the other ball
     process = processing(x, cloth)
-    corners, weights = (torch.as_tensor(a.numpy()) for a in process._points)
-    points = lambda: surface((weights[..., None] * x[corners]).sum(1), post._FACE_DEEPEST).distance
+    corners, weights = (torch.as_tensor(a.numpy()) for a in process.skin._of_faces)
+    points = lambda: surface((weights[..., None] * x[corners]).sum(1), CONTACT.reach).distance
     assert points().min() < -0.01
-    process.push_out(x, x.clone(), surface)
+    push_out(process, x, x.clone(), surface)
     assert points().min() > 0
     # what is known of a point without another look is never too much
-    assert (torch.as_tensor(process._found[1].numpy()) <= points() + 1e-5).all()
+    assert (torch.as_tensor(process.skin._found[1].numpy()) <= points() + 1e-5).all()
 
 
 def test_a_point_of_an_edge_is_looked_at_once():
     x = 0.04 * torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     faces = np.array([[0, 1, 2], [0, 2, 3]])
-    corners, weights = post._distinct(*samples(x.numpy(), faces, 0.03))
+    corners, weights = samples(x.numpy(), faces, 0.03)
     points = (weights[..., None] * x.numpy()[corners]).sum(1)
     known = {tuple(point) for point in np.round(points, 6)}
     assert len(known) == len(points) and (0.02, 0.02, 0.0) in {tuple(k) for k in known}

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from test_sheet import COTTON, lattice
 
+from onefit.contact import Contacts
 from onefit.physics.cloth import Cloth
-from onefit.physics.contact import Contacts
 from onefit.physics.settings import Settings
 from onefit.physics.sheet import Sheet
 

@@ -1,4 +1,4 @@
-"""Buttons and buckles hold cloth together, from the file to the finish."""
+"""Buttons and buckles hold cloth together, from the file to the simulation."""
 
 import numpy as np
 import pytest
@@ -62,7 +62,7 @@ def test_a_buttoned_front_stays_closed(buttons):
     assert len(garment.stitches) == buttons
     quick = Settings(lead=0.3, settling=0.1)
     motion = onefit.Motion.generate("dance", seconds=0.3)
-    drape = onefit.load().drape(garment, motion, finish=2, settings=quick)
+    drape = onefit.load().simulate(garment, motion, settings=quick)
     seen = drape.render_vertices()
     gap = np.linalg.norm(seen[:, left] - seen[:, right], axis=2).mean(axis=1)
     assert gap[-1] < 0.015 if buttons else gap[-1] > 0.05

@@ -13,7 +13,7 @@ from onefit.objective import Weights
 from onefit.objective.objective import posed
 from onefit.training import OneFitTraining, Settings, TrainingData, data
 from onefit.training.projection import Projection, unposed
-from onefit.training.teacher import garment_of, lesson, lessons, path_of, taught
+from onefit.training.teacher import SETTINGS, garment_of, lesson, lessons, path_of, taught
 from polyfit.errors import InputError
 from polyfit.training import Processes
 
@@ -25,7 +25,7 @@ ARGUMENTS = ["shorts", "--kinds", "walk", "--seconds", "0.3", "--vertices", "600
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("lessons")
-    teach.main([*ARGUMENTS, "-o", str(folder), "--finish", "1", "--seeds", "2"])
+    teach.main([*ARGUMENTS, "-o", str(folder), "--steps", "1", "--seeds", "2"])
     return folder
 
 
@@ -76,8 +76,9 @@ def test_a_lesson_gives_the_drape_back():
     draper = onefit.load()
     garment, shape = draper.garment("shorts"), torch.full((6,), 0.6)
     motion = onefit.Motion.generate("walk", seconds=0.3)
-    made = lesson(draper, garment, motion, shape, finish=0, material="cotton")
-    drape = draper.drape(garment, motion, shape)
+    made = lesson(draper, garment, motion, shape, steps=1, material="silk")
+    how = dict(steps=1, material="silk", settings=SETTINGS)
+    drape = draper.simulate(garment, motion, shape, **how)
     maps = skinning.transforms(draper.model.body(shape), made.poses, made.translation)
     moved = drape.rest[:, None] + made.displacement.float()
     again = posed(moved, garment.blend_weights, maps).transpose(0, 1)
@@ -94,7 +95,7 @@ def test_lessons_that_are_there_are_kept(folder):
 def test_cuts_are_taught_by_their_names(tmp_path, monkeypatch):
     monkeypatch.setattr(cuts, "Block", partial(cuts.Block, spacing=0.024))  # thrice as coarse
     arguments = ["--cuts", "1", "--kinds", "idle", "walk", "--each", "1", "--seconds", "0.1"]
-    arguments += ["--vertices", "500", "--finish", "1", "--shapes", "0"]
+    arguments += ["--vertices", "500", "--steps", "1", "--shapes", "0"]
     teach.main([*arguments, "-o", str(tmp_path)])
     (name,) = taught(tmp_path)
     assert name == "tshirt__cut_0"

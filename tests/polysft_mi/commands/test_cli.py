@@ -62,7 +62,7 @@ def test_help_of_a_command_teaches_by_examples_that_parse(name, capsys, monkeypa
     [
         *(f"polysft_mi.{name}" for name in commands.COMMANDS),
         *("polyfit.__main__", "polyfit.train"),
-        *("onefit.drape", "onefit.train", "onefit.tailor", "onefit.teach"),
+        *("onefit.drape", "onefit.simulate", "onefit.train", "onefit.tailor", "onefit.teach"),
     ],
 )
 def test_every_command_ends_as_one_and_tells_of_a_wrong_option(name):

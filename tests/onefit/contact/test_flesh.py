@@ -5,9 +5,10 @@ import pytest
 import torch
 from surfaces import ball
 
-from onefit.body import Body, Flesh, skinning
-from onefit.body.flesh import DEEPEST
+from onefit.body import AnnyBody, Body, skinning
 from onefit.body.skeleton import INDEX, JOINTS
+from onefit.contact import Flesh
+from onefit.contact.flesh import DEEPEST
 from onefit.motion import Motion
 
 ROOM = 0.003
@@ -64,7 +65,8 @@ def test_what_lies_too_deep_does_not_yield(balls):
     assert torch.equal(Flesh(balls, ROOM)(x[None])[0], x)
 
 
-def test_the_body_at_rest_is_one_skin_and_an_arm_at_the_side_gets_room(model):
+def test_the_body_at_rest_is_one_skin_and_an_arm_at_the_side_gets_room():
+    model = AnnyBody()
     body = model.body()
     flesh = Flesh(body, ROOM)
     assert torch.equal(flesh(body.vertices[None])[0], body.vertices)

@@ -9,10 +9,9 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from . import layer_kernels
-from .contact import Contacts
 from .layer_kernels import wp
-from .settings import Settings
-from .sheet import Sheet
+from .planes import Contacts
+from .settings import ContactSettings
 
 _PARTS = 2  # in which pairs are looked for at once
 
@@ -22,15 +21,22 @@ def _array(a, dtype):
 
 
 class SelfContact:
-    """Contacts of a sheet with itself: of vertices with triangles, and of edges with edges. The
-    keys start at ``first``, one a vertex.
+    """Contacts of a sheet with itself, of ``stiffness`` [N/m]: of vertices with triangles, and of
+    edges with edges. ``cut`` (N, 3) [m]: where it has no folds; ``faces`` (F, 3). The keys start at
+    ``first``, one a vertex.
     """
 
-    def __init__(self, sheet: Sheet, settings: Settings, first: int) -> None:
-        self.settings, self.first = settings, first
-        self.stiffness = settings.layers * sheet.material.stretch
+    def __init__(
+        self,
+        cut: np.ndarray,
+        faces: np.ndarray,
+        settings: ContactSettings,
+        stiffness: float,
+        first: int,
+    ) -> None:
+        self.settings, self.first, self.stiffness = settings, first, stiffness
         self._neighbourhood = 2 * settings.apart
-        rest, faces = sheet.cut.astype(np.float32), sheet.faces
+        rest = cut.astype(np.float32)
         of = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], -1), -1).reshape(-1, 2)
         edges, owner, number = np.unique(of, axis=0, return_index=True, return_inverse=True)
         layers = layer_kernels.Layers()
@@ -44,6 +50,7 @@ class SelfContact:
         self._layers = layers
         self._reaches = wp.zeros(len(rest), dtype=float, device="cpu")
         self._layered = wp.zeros(len(rest), dtype=int, device="cpu")
+        self._edge_reaches = wp.zeros(len(edges), dtype=float, device="cpu")
         self._found = [_room(len(rest)) for _ in range(_PARTS)]
         self._before = np.zeros(0, np.dtype((np.void, 20))), np.zeros((0, 3))  # keys and normals
         self._others = ThreadPoolExecutor(_PARTS - 1)
@@ -61,8 +68,13 @@ class SelfContact:
         while True:
             for found in self._found:
                 found.count.numpy()[:] = 0
-            self._search(layer_kernels.vertices_near, len(x))
-            self._search(layer_kernels.edges_near, self._layers.edges.shape[0])
+            near = self._neighbourhood, self._reaches, self._layered
+            self._search(layer_kernels.vertices_near, len(x), *near)
+            edges = self._layers.edges.shape[0]
+            arguments = [self._layers, self._reaches, self._layered, self._edge_reaches]
+            wp.launch(layer_kernels.edge_reaches, edges, arguments, device="cpu")
+            of_edges = self._neighbourhood, self._edge_reaches
+            self._search(layer_kernels.edges_near, edges, *of_edges)
             counts = [int(found.count.numpy()[0]) for found in self._found]
             if all(count <= len(found.corners) for count, found in zip(counts, self._found)):
                 break
@@ -93,15 +105,14 @@ class SelfContact:
         normal[sided[now[passed]]] *= -1
         self._before = keys, normal[sided]
 
-    def _search(self, kernel, count):
+    def _search(self, kernel, count, *near):
         """Launches a ``kernel`` for ``count`` vertices or edges, in parts, each in a thread."""
         ends = np.linspace(0, count, _PARTS + 1).astype(int)
 
         def part(k):
             first = int(ends[k])
-            near = [self._neighbourhood, self._reaches, self._layered, self._found[k]]
-            size = int(ends[k + 1]) - first
-            wp.launch(kernel, size, [first, self._layers, *near], device="cpu")
+            size, arguments = int(ends[k + 1]) - first, [self._layers, *near, self._found[k]]
+            wp.launch(kernel, size, [first, *arguments], device="cpu")
 
         others = [self._others.submit(part, k) for k in range(1, _PARTS)]
         part(0)

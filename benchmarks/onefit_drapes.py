@@ -1,13 +1,13 @@
-"""What the finish makes of every garment: collisions of vertices and faces, strain, jitter, folds,
+"""Drapes and simulations of every garment: collisions of vertices and faces, strain, jitter, folds,
 swing, and its time.
 
-    python benchmarks/onefit_finish.py
-    python benchmarks/onefit_finish.py --garments skirt shirt.obj --finish 3 --material denim
-    python benchmarks/onefit_finish.py --finish 0        # the network alone: quick
+    python benchmarks/onefit_drapes.py
+    python benchmarks/onefit_drapes.py --garments skirt shirt.obj --steps 3 --material denim
+    python benchmarks/onefit_drapes.py --steps 0        # without simulations: quick
 
 Every garment is draped in each held-out kind of motion, on the standard body and on others drawn at
-random in turn: by skinning, by the networks without and with post-processing, and by the first of
-them with a finish. Columns:
+random in turn: by skinning, by the networks without and with post-processing, and by a simulation
+that starts from the first of them. Columns:
 *inside* [%] of the vertices; *faces* [%] of points of the faces, no farther apart than 5 mm, in
 every third frame; *room* [%], those of them that lie where cloth has room, which it has not where
 the body overlaps itself, or skin faces skin at less than 12 mm; *strain* [%], *wave* [degrees],
@@ -101,7 +101,8 @@ def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--garments", nargs="+", default=[*STANDARD, "skirt", "jumpsuit"])
     parser.add_argument("--weights", nargs="+", default=[DEFAULT], help="of networks")
-    parser.add_argument("--finish", type=int, default=2, help="steps a frame; 0: none")
+    parser.add_argument("--steps", type=int, default=2, help="of cloth, a frame; 0: no simulation")
+    parser.add_argument("--no-ease", dest="eased", action="store_false", help="of the drapes")
     parser.add_argument("--material", default="cotton", choices=list(MATERIALS))
     parser.add_argument("--motions", nargs="+", default=list(generate.HELD_OUT), metavar="KIND")
     parser.add_argument("--seconds", type=float, default=1.0, help="of a motion (default: 1)")
@@ -116,7 +117,7 @@ def main(argv=None):
         for k, kind in enumerate(args.motions)
     ]
     print(HEAD, "|---" * HEAD.count(" |") + "|", sep="\n")
-    finish = dict(finish=args.finish, material=material)
+    how = dict(steps=args.steps, material=material)
     for name in args.garments:
         garment, table, times = draper.garment(name), {}, None
         for k, motion in enumerate(motions):
@@ -124,19 +125,18 @@ def main(argv=None):
             plain, ends = draper.drape(garment, motion, body, skinning_only=True), []
             drapes = {"skinning": plain}
             for of, other in drapers.items():
-                drapes[of] = other.drape(garment, motion, body, post=False)
-                drapes[f"{of}, post"] = other.drape(garment, motion, body)
-            if args.finish:
+                drapes[of] = other.drape(garment, motion, body, post=False, eased=args.eased)
+                drapes[f"{of}, post"] = other.drape(garment, motion, body, eased=args.eased)
+            if args.steps:
                 ends.append(time.perf_counter())
                 tick = lambda: ends.append(time.perf_counter())
-                drapes[f"{first}, finished"] = draper.drape(
-                    garment, motion, body, **finish, advance=tick
-                )
+                made = draper.simulate(garment, motion, body, **how, advance=tick)
+                drapes[f"{first}, simulated"] = made
                 times = times or (1e3 * float(np.median(np.diff(ends[1:]))), ends[1] - ends[0])
             for row, found in drapes.items():
                 table.setdefault(row, []).append(figures(found, plain, garment, material))
         for row, found in table.items():
-            last = f"{times[0]:.0f} | {times[1]:.1f}" if row.endswith("finished") else " | "
+            last = f"{times[0]:.0f} | {times[1]:.1f}" if row.endswith("simulated") else " | "
             cells = [f"{x:.{n}f}" for x, n in zip(np.mean(found, axis=0), DIGITS)]
             print(
                 "| " + " | ".join([garment.name, row, *cells, last]) + " |",

@@ -8,25 +8,24 @@ from onefit.physics import Settings
 @pytest.fixture(scope="module")
 def draped():
     draper, motion = onefit.load(), onefit.Motion.generate("dance", seconds=0.1, seed=1_000_003)
-    make = lambda **how: draper.drape("shorts", motion, **how)
-    quick = dict(lead=0.3, settling=0.1)
+    make = lambda **how: draper.simulate("shorts", motion, settings=Settings(settling=0.1, **how))
     return {
-        "network": make(),
-        "finished": make(finish=2, settings=Settings(**quick)),
-        "at once": make(finish=2, settings=Settings(**quick | {"lead": 0.0})),
+        "network": draper.drape("shorts", motion),
+        "simulated": make(lead=0.3),
+        "at once": make(lead=0.0),
     }
 
 
-def test_a_finish_begins_as_the_garment_was_made_not_as_the_network_folds_it(draped):
+def test_a_simulation_begins_as_the_garment_was_made_not_as_the_network_folds_it(draped):
     of = lambda name: crossings(draped[name].vertices[0].numpy(), draped[name].faces.numpy())
     assert of("network") > 10
-    assert of("finished") == 0
+    assert of("simulated") == 0
     assert of("at once") > 0  # what has passed through stays
 
 
 def test_what_leads_to_the_first_frame_is_not_given(draped):
     network = draped["network"]
-    for name in ("finished", "at once"):
+    for name in ("simulated", "at once"):
         drape = draped[name]
         assert drape.vertices.shape == network.vertices.shape
         assert (drape.root == network.root).all()

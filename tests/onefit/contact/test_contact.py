@@ -1,12 +1,12 @@
 import numpy as np
 import pytest
-import torch
 import trimesh
 
-from onefit.physics import MATERIALS, Settings
+from onefit.body import ClosestSurface
+from onefit.contact import Contacts, ContactSettings, SkinContact
+from onefit.contact.points import samples
+from onefit.physics import MATERIALS, Settings, Sheet, WornCloth
 from onefit.physics.cloth import Cloth
-from onefit.physics.contact import BodyContact, Contacts
-from onefit.physics.sheet import Sheet, samples
 
 COTTON = MATERIALS["cotton"]
 
@@ -22,25 +22,26 @@ def grid(columns, rows, side):
     return np.concatenate([V, np.zeros((len(V), 1))], 1), F
 
 
-def on_body(sheet, x, body, faces, steps, settings=None, moving=lambda t: 0.0, pull=None):
-    """The cloth after steps of 1 / 60 s on a body that is moved by ``moving(t)`` (3,) [m]."""
-    settings = settings or Settings()
-    contact = BodyContact(sheet, torch.as_tensor(body), torch.as_tensor(faces), settings)
-    cloth = Cloth(sheet, x, settings, len(contact))
-    contact.find(cloth.x)
+def on_body(sheet, x, body, faces, steps, moving=lambda t: 0.0):
+    """The cloth after steps of 1 / 60 s on a body that is moved by ``moving(t)`` (3,) [m], and how
+    far its vertices and points of its faces are from the body [m].
+    """
+    worn = WornCloth(sheet, x, body, faces, Settings())
     for k in range(steps):
-        cloth.step(1 / 60, [contact.follow(body + moving((k + 1) / 60))])
-        contact.find(cloth.x)
-        cloth.x = contact.pushed_out(cloth.x)
-    return cloth, contact
+        worn.step(1 / 60, body + moving((k + 1) / 60), x, 0.0)
+    corners, weights = samples(sheet.rest, sheet.faces, ContactSettings().spacing)
+    x = worn.cloth.x
+    points = np.concatenate([x, np.einsum("sk,ski->si", weights, x[corners])])
+    surface = ClosestSurface(body + moving(steps / 60), faces)
+    return worn.cloth, surface(points, 1.0).distance
 
 
 def test_no_point_of_a_face_is_in_a_ball_that_cloth_falls_on():
     V, F = grid(15, 15, 0.03)  # coarser than the ball's curvature: chords of 42 mm
     sheet = Sheet(V, F, COTTON)
     ball = trimesh.creation.icosphere(4, 0.1)
-    cloth, contact = on_body(sheet, V + [0, 0, 0.11], ball.vertices, ball.faces, 60)
-    assert contact.distance.min() > 0
+    cloth, distance = on_body(sheet, V + [0, 0, 0.11], ball.vertices, ball.faces, 60)
+    assert distance.min() > 0
     fine = np.random.default_rng(0).dirichlet((1, 1, 1), 40)
     points = np.einsum("sk,fkd->fsd", fine, cloth.x[F]).reshape(-1, 3)
     assert np.linalg.norm(points, axis=1).min() > 0.1 - 5e-4
@@ -55,7 +56,7 @@ def test_friction_holds_cloth_on_a_slope_or_does_not(friction, held):
     turn = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
     box = trimesh.creation.box((2, 2, 0.2)).subdivide().subdivide()
     material = type(COTTON)(**(vars(COTTON) | {"friction": friction, "drag": 0.0}))
-    x = (V + [0, 0, 0.1 + Settings().clearance]) @ turn.T
+    x = (V + [0, 0, 0.1 + ContactSettings().clearance]) @ turn.T
     cloth, _ = on_body(Sheet(V, F, material), x, box.vertices @ turn.T, box.faces, 60)
     slid = np.linalg.norm((cloth.x - x).mean(0))
     expected = 9.81 * (s - friction * c) / 2
@@ -66,10 +67,10 @@ def test_a_fast_body_takes_cloth_along():
     V, F = grid(8, 8, 0.015)
     ball = trimesh.creation.icosphere(4, 0.1)
     fast = lambda t: np.array([0.0, 0.0, 4.0 * t])  # 67 mm a step, two thirds of the radius
-    cloth, contact = on_body(
+    cloth, distance = on_body(
         Sheet(V, F, COTTON), V + [0, 0, 0.105], ball.vertices, ball.faces, 15, moving=fast
     )
-    assert contact.distance.min() > 0
+    assert distance.min() > 0
     assert (cloth.x[:, 2] - 1.0).min() > 0  # on the side on which it was
 
 
@@ -106,3 +107,16 @@ def test_the_matrix_of_contacts_between_cloth_and_cloth_is_their_gradients_deriv
     cloth.assemble(V, 1 / 60, touches)
     assert np.abs(expected).max() > 1
     assert np.abs(cloth.product(step) - alone - expected).max() < 1e-6 * np.abs(expected).max()
+
+
+def test_a_point_of_an_edge_moves_the_edge_and_not_the_corner_beside_it():
+    ball = trimesh.creation.icosphere(3, 0.01)
+    x = np.array([[-0.02, 0, 0.008], [0.02, 0, 0.008], [0, 0.06, 0.008]])
+    limits = dict.fromkeys(("least", "point_near", "point_least"), 0.001)
+    skin = SkinContact(
+        x, np.array([[0, 1, 2]]), ContactSettings(), reach=0.03, deepest=0.03, **limits
+    )
+    surface, at = ClosestSurface(ball.vertices, ball.faces), skin.vertices(x)
+    skin.look(at, surface)
+    push = skin.push_out(at, surface)
+    assert push[:2, 2] == pytest.approx(0.003, abs=2e-4) and not push[2].any()

@@ -167,17 +167,21 @@ def _edge_pair(layers: Layers, e: int, g: int, neighbourhood: float, reach: floa
                 )
 
 
-@wp.func
-def _edge_reach(
-    layers: Layers, e: int, reaches: wp.array(dtype=float), layered: wp.array(dtype=int)
+@wp.kernel
+def edge_reaches(
+    layers: Layers,
+    reaches: wp.array(dtype=float),  # [m] of the vertices
+    layered: wp.array(dtype=int),  # as :func:`vertices_near` leaves it
+    of_edges: wp.array(dtype=float),  # receives them
 ):
-    """How far the edge e looks for others [m]: as its ends do, if one of them is near a layer, or
+    """How far each edge looks for others [m]: as its ends do, if one of them is near a layer, or
     the edge is so long that its middle may be; else 0.
     """
+    e = wp.tid()
     i, j = layers.edges[e, 0], layers.edges[e, 1]
     reach = wp.max(reaches[i], reaches[j])
     is_long = wp.length(layers.rest[i] - layers.rest[j]) > 2.0 * reach
-    return wp.where(is_long or layered[i] + layered[j] > 0, reach, 0.0)
+    of_edges[e] = wp.where(is_long or layered[i] + layered[j] > 0, reach, 0.0)
 
 
 @wp.kernel
@@ -185,15 +189,14 @@ def edges_near(
     first: int,
     layers: Layers,
     neighbourhood: float,
-    reaches: wp.array(dtype=float),
-    layered: wp.array(dtype=int),  # as :func:`vertices_near` leaves it
+    reaches: wp.array(dtype=float),  # [m] of the edges
     found: Found,
 ):
-    """For each edge from ``first`` on, if one of its ends is near a layer, or it is long, the
-    edges of layers within reach, where both are nearest to each other between their ends.
+    """For each edge from ``first`` on that looks for others the edges of layers within its reach,
+    where both are nearest to each other between their ends.
     """
     e = first + wp.tid()
-    reach = _edge_reach(layers, e, reaches, layered)
+    reach = reaches[e]
     if reach == 0.0:
         return
     i, j = layers.edges[e, 0], layers.edges[e, 1]
@@ -204,7 +207,7 @@ def edges_near(
     while wp.mesh_query_aabb_next(query, f):
         for k in range(3):
             g = layers.edges_of[f, k]
-            if layers.owner[g] == f and g != e:
-                other = _edge_reach(layers, g, reaches, layered)
-                if other < reach or (other == reach and g > e):  # that which looks farther finds it
-                    _edge_pair(layers, e, g, neighbourhood, reach, found)
+            other = reaches[g]
+            # each pair once: that which looks farther finds it
+            if layers.owner[g] == f and (other < reach or (other == reach and g > e)):
+                _edge_pair(layers, e, g, neighbourhood, reach, found)

@@ -2,12 +2,20 @@ import numpy as np
 import pytest
 from test_contact import COTTON, grid
 
+from onefit.contact import SelfContact
 from onefit.objective.crossings import crossings
-from onefit.physics import SelfContact, Settings
+from onefit.physics import Settings
 from onefit.physics.cloth import Cloth
 from onefit.physics.sheet import Sheet
 
 SETTINGS = Settings()
+CONTACT = SETTINGS.contact
+
+
+def of(sheet):
+    """The contact of a sheet with itself."""
+    stiffness = CONTACT.layer_stiffness * sheet.material.stretch
+    return SelfContact(sheet.cut, sheet.faces, CONTACT, stiffness, 0)
 
 
 def two(one, other):
@@ -20,16 +28,15 @@ def test_a_layer_that_falls_on_another_stays_on_it():
     V, F = grid(10, 10, 0.012)
     V2 = V * [0.6, 0.6, 1] + [0, 0, 0.015]
     sheet = Sheet(np.concatenate([V, V2]), np.concatenate([F, F + len(V)]), COTTON)
-    settings = Settings()
-    itself = SelfContact(sheet, settings, 0)
+    itself = of(sheet)
     x = sheet.rest - [0, 0, 0.009] * (np.arange(len(sheet)) >= len(V))[:, None]  # 6 mm above it
-    cloth = Cloth(sheet, x, settings, len(sheet))
+    cloth = Cloth(sheet, x, SETTINGS, len(sheet))
     fixed = np.where(np.arange(len(sheet)) < len(V), 1e3, 0.0)
     for _ in range(40):
         contacts = itself.find(cloth.x, cloth.v / 60)
         cloth.step(1 / 60, [contacts], sheet.rest, fixed)
     above = cloth.x[len(V) :, 2] - cloth.x[: len(V), 2].mean()
-    assert above.min() > 0 and above.max() < 2 * settings.apart
+    assert above.min() > 0 and above.max() < 2 * CONTACT.apart
 
 
 def test_a_narrow_strip_that_falls_across_another_is_held_by_its_edges():
@@ -39,14 +46,14 @@ def test_a_narrow_strip_that_falls_across_another_is_held_by_its_edges():
     faces = np.array([[0, 2, 1], [1, 2, 3]])
     V, F = two((one, faces), (other, faces))
     sheet = Sheet(V, F, COTTON)
-    itself, x = SelfContact(sheet, SETTINGS, 0), V - [0, 0, 0.195] * (V[:, 2:] > 0.1)
+    itself, x = of(sheet), V - [0, 0, 0.195] * (V[:, 2:] > 0.1)
     cloth = Cloth(sheet, x, SETTINGS, len(sheet))
     fixed = np.where(np.arange(8) < 4, 1e4, 0.0)
     for _ in range(30):
         contacts = itself.find(cloth.x, cloth.v / 60)
         assert (np.sign(contacts.weights) == [1, 1, -1, -1]).all() and len(contacts.key) >= 4
         cloth.step(1 / 60, [contacts], x, fixed)
-    assert cloth.x[4:, 2].min() > 0 and cloth.x[4:, 2].max() < 2 * SETTINGS.apart
+    assert cloth.x[4:, 2].min() > 0 and cloth.x[4:, 2].max() < 2 * CONTACT.apart
     assert crossings(cloth.x, F) == 0
 
 
@@ -56,7 +63,7 @@ def test_strips_whose_edges_alone_meet_do_not_pass_through_each_other(speed):
     across = V[:, [1, 0, 2]] * [0.03, 0.01, 0]  # along x
     edge_on = V[:, [2, 1, 0]] * [0, 0.03, 0.02] + [0, 0, 0.04]  # upright, along y, 3 cm up
     sheet = Sheet(*two((across, F), (edge_on, F)), COTTON)
-    itself = SelfContact(sheet, SETTINGS, 0)
+    itself = of(sheet)
     falls = np.arange(len(sheet)) >= len(V)
     x = sheet.rest - [0, 0, 0.024] * falls[:, None]  # 6 mm
     cloth = Cloth(sheet, x, SETTINGS, len(sheet))
@@ -89,12 +96,12 @@ def pairs_of(sheet, x, way):
     """
     rest, F, found = sheet.cut, sheet.faces, {}
     beside = np.zeros(len(x), bool)
-    reach = 2 * SETTINGS.apart + np.linalg.norm(way - way.mean(0), axis=1)
-    reach = np.minimum(reach, SETTINGS.reach)
+    reach = 2 * CONTACT.apart + np.linalg.norm(way - way.mean(0), axis=1)
+    reach = np.minimum(reach, CONTACT.reach)
 
     def is_layer(away, at_rest, reach):
         distance = np.linalg.norm(away)
-        far = max(2 * distance, 2 * SETTINGS.apart)
+        far = max(2 * distance, 2 * CONTACT.apart)
         return distance < reach and np.linalg.norm(at_rest) > far
 
     for i in range(len(x)):
@@ -136,7 +143,7 @@ def test_pairs_are_those_that_a_search_of_all_against_all_finds(seed):
     x = V - [0, 0, 0.992] * (np.arange(len(V)) >= 49)[:, None]
     x += rng.normal(size=x.shape) * [0.002, 0.002, 0.002]
     way = rng.normal(size=x.shape) * 0.003 * rng.uniform(0, 3, (len(x), 1))
-    contacts = SelfContact(sheet, SETTINGS, 0).find(x, way)
+    contacts = of(sheet).find(x, way)
     found = {}
     for corners, weights, normal in zip(contacts.corners, contacts.weights, contacts.normal):
         vector = weights @ x[corners]
@@ -159,8 +166,8 @@ def test_what_has_slipped_through_is_drawn_back():
     V[49:] += [0.001, 0.002, 1.0]
     sheet = Sheet(V, F, COTTON)
     at = lambda height: V - [0, 0, 1.0 - height] * (np.arange(len(V)) >= 49)[:, None]
-    slipped = SelfContact(sheet, SETTINGS, 0).find(at(-0.001))
-    itself = SelfContact(sheet, SETTINGS, 0)
+    slipped = of(sheet).find(at(-0.001))
+    itself = of(sheet)
     itself.find(at(0.002))
     again = itself.find(at(-0.001))
     upwards = lambda c: np.sign((c.weights * (c.corners >= 49)).sum(1) * c.normal[:, 2])
@@ -169,13 +176,13 @@ def test_what_has_slipped_through_is_drawn_back():
     assert sided.sum() > 50 and (upwards(again)[sided] == 1).all()
     vectors = np.einsum("ck,ckd->cd", again.weights, at(-0.001)[again.corners])
     gap = np.einsum("cd,cd->c", vectors, again.normal) - again.offset
-    assert gap[sided] == pytest.approx(-0.001 - SETTINGS.apart, abs=1e-6)
+    assert gap[sided] == pytest.approx(-0.001 - CONTACT.apart, abs=1e-6)
 
 
 def test_neighbours_do_not_touch_and_a_tight_fold_does():
     V, F = grid(40, 6, 0.01)
     sheet = Sheet(V, F, COTTON)
-    itself, radius = SelfContact(sheet, SETTINGS, 0), 0.0025
+    itself, radius = of(sheet), 0.0025
     assert len(itself.find(sheet.rest).key) == 0
     s, x = V[:, 0], V.copy()  # around half a circle
     turn = np.clip(s / radius, -np.pi / 2, np.pi / 2)
@@ -195,7 +202,7 @@ def test_a_cut_in_folds_rests_on_its_folds():
     folded = np.abs(V[:, 0]) > 0.05
     corners = V[F]
     sides = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
-    of_rest = SelfContact(Sheet(hung, F, COTTON), SETTINGS, 0).find(hung)
-    of_cut = SelfContact(Sheet(hung, F, COTTON, sides, V), SETTINGS, 0).find(hung)
+    of_rest = of(Sheet(hung, F, COTTON)).find(hung)
+    of_cut = of(Sheet(hung, F, COTTON, sides, V)).find(hung)
     assert len(of_rest.key) == 0
     assert set(np.flatnonzero(folded)) <= set(of_cut.corners[:, 0])

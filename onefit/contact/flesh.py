@@ -10,11 +10,8 @@ import numpy as np
 import torch
 from scipy.sparse import csr_matrix
 
+from onefit.body import Body, ClosestSurface, Nearest, skeleton
 from polyfit.mesh import boundary_edges, neighbour_mean
-
-from . import skeleton
-from .body import Body
-from .nearest import ClosestSurface, Nearest
 
 DEEPEST = 0.03  # [m] that a vertex may lie in another part to yield
 _PASSES = 3  # in a frame, at most
@@ -59,13 +56,13 @@ class Flesh:
         same where there is room.
         """
         out = bodies.cpu().clone()
-        for frame in out:
+        for frame in out.numpy():  # torch's threads would wait for each other at each step
             for _ in range(_PASSES):
-                x = frame.double().numpy()
+                x = frame.astype(float)
                 ways = self.missing(x)
                 if not ways.any():
                     break
-                frame.copy_(torch.as_tensor(x + spread(ways, self._mean, _SMOOTHING)))
+                frame[:] = x + spread(ways, self._mean, _SMOOTHING)
         return out.to(bodies)
 
     def missing(self, x: np.ndarray) -> np.ndarray:

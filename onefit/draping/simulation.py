@@ -1,4 +1,4 @@
-"""The finish: implicit steps of the cloth's physics on the garment's own mesh, from frame to frame.
+"""Simulation: implicit steps of the cloth's physics on the garment's own mesh, from frame to frame.
 
 A network's drape, or plain skinning, is where the cloth starts, what holds its waistband, and what
 it is weakly drawn to; all else are the material, the air, the moving body and the cloth itself.
@@ -14,18 +14,10 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from onefit.garment import Stitches
-from onefit.physics import (
-    BodyContact,
-    Cloth,
-    Material,
-    SelfContact,
-    Settings,
-    Sheet,
-    ThreadContact,
-)
+from onefit.physics import Material, Settings, Sheet, WornCloth
 
 
-def finished(
+def simulated(
     guide: torch.Tensor,
     rest: torch.Tensor,
     faces: torch.Tensor,
@@ -46,8 +38,8 @@ def finished(
     """The garment's vertices (N, 3) [m] in one frame after the other, from the ``first`` on: those
     before lead to it, and are not given.
 
-    ``guide`` (T, N, 3) [m]: the drape that is finished; ``rest`` (N, 3) [m] and ``faces`` (F, 3) of
-    the garment graded to the body; ``held`` (N,): how firmly each vertex is held, as
+    ``guide`` (T, N, 3) [m]: the drape that leads the cloth; ``rest`` (N, 3) [m] and ``faces``
+    (F, 3) of the garment graded to the body; ``held`` (N,): how firmly each vertex is held, as
     :func:`onefit.garment.waistband.held` says; ``bodies`` (T, V, 3) [m], ``body_faces``; ``steps``
     in a frame, in which the body moves along straight lines; ``sides`` (F, 3) [m]: the lengths of
     the faces at rest, and ``cut`` (N, 3) [m], of a garment that was cut otherwise than it hangs;
@@ -58,28 +50,18 @@ def finished(
     number = np.argsort(order)
     cut = None if cut is None else cut[order]
     sheet = Sheet(rest.double().numpy()[order], number[faces.numpy()], material, sides, cut)
-    start, moving = guide.double().numpy()[:, order], bodies.double().numpy()
-    body = BodyContact(sheet, bodies[0], body_faces, settings)
-    itself = SelfContact(sheet, settings, len(body))
-    keys, sewn = len(body) + len(sheet), []
+    start, moving = guide.double().numpy()[:, order], bodies.numpy()
+    threads = None
     if stitches:
         ends = number[stitches.start], number[stitches.corners], stitches.barycentric
-        lengths = np.maximum(stitches.lengths, settings.apart)
-        sewn.append(ThreadContact(*ends, lengths, settings.contact * material.stretch, keys))
-        keys += len(stitches)
+        threads = *ends, stitches.lengths
     of = None if patches is None else patches[order]
-    cloth = Cloth(sheet, start[0], settings, keys, of)
+    worn = WornCloth(sheet, start[0], moving[0], body_faces.numpy(), settings, of, threads)
+    cloth, dt = worn.cloth, 1 / fps / steps
     pull = settings.draw * sheet.mass + material.stretch * np.asarray(held)[order]
-    dt = 1 / fps / steps
-    body.find(cloth.x)
-    cloth.x = body.pushed_out(cloth.x)
 
     def step(now, target):
-        contacts = [body.follow(now), itself.find(cloth.x, dt * cloth.v)]
-        contacts += [threads.find(cloth.x) for threads in sewn]
-        cloth.step(dt, contacts, target, pull)
-        body.find(cloth.x)
-        cloth.x = body.pushed_out(cloth.x)
+        worn.step(dt, now, target, pull)
 
     def slowly(now, target):
         step(now, target)

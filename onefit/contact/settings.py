@@ -1,0 +1,53 @@
+"""The numbers of contact: of cloth with skin, of cloth with itself, of skin with skin."""
+
+from dataclasses import dataclass
+
+from polyfit.errors import InputError
+
+
+@dataclass(frozen=True)
+class ContactSettings:
+    """How near cloth and skin come to each other. Raises InputError for a number below 0."""
+
+    #: [m] that cloth keeps from the skin, in drapes, simulations and grading: what a chord of 2 cm
+    #: misses of a limb
+    clearance: float = 0.003
+    #: [m] that a garment's file gets where it lies in the body: more, for smoothing takes some
+    made: float = 0.004
+    #: [m] that a garment that is tried on gets, if it was made with as much: more, for what comes
+    #: nearer in some poses
+    eased: float = 0.007
+    #: [m] to which cloth is pushed at the end of a simulation's step that brought it nearer: less,
+    #: for a push is sudden where the contact's force is not
+    least: float = 0.001
+    #: [m] between the points of large faces that are kept out, too: a limb shows through there
+    spacing: float = 0.02
+    #: [m]: in drapes such a point is pushed where it is nearer than the first, to the second: less
+    #: than a vertex, for skin bulges between these
+    point_near: float = 0.0015
+    point_clearance: float = 0.002
+    #: [m]: cloth that is so near touches the skin: twice the clearance
+    touching: float = 0.006
+    #: [m]: what comes nearer in a step is seen, and cloth that went so far is free: 2 m/s at 60 Hz
+    reach: float = 0.03
+    #: [m] in the body that cloth is looked for: deeper, the nearest skin is another side's
+    deepest: float = 0.08
+    #: [m] of limbs: cloth that moves by less has not passed through one
+    thinnest: float = 0.02
+    #: [m] between folds: cloth's thickness and hairs, and what a step's errors take
+    apart: float = 0.003
+    #: [m] between skin and skin, to which flesh yields (:class:`onefit.contact.Flesh`): two layers
+    #: of cloth have their clearances, and what keeps them apart; 0: a rigid body
+    room: float = 0.009
+    #: [1] of a contact with the skin, in units of the material's stretch stiffness: less, and cloth
+    #: is pressed in; more, and the linear systems are harder
+    stiffness: float = 0.5
+    #: [1], the same of cloth with itself: as much, or skin presses one layer through another
+    layer_stiffness: float = 0.5
+    #: [m/s]: a slower slip does not have friction's full force, which has no direction at rest
+    sticking: float = 0.005
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not 0 <= value < float("inf"):
+                raise InputError(f"{name} = {value}: a number, 0 or more")

@@ -1,0 +1,60 @@
+"""What a draper keeps of garments, what it tells while it drapes, and what a drape measures."""
+
+import weakref
+from dataclasses import replace
+
+import pytest
+
+import onefit
+from onefit.garment import Garment
+
+
+@pytest.fixture(scope="module")
+def draper():
+    return onefit.load()
+
+
+@pytest.fixture(scope="module")
+def coarse():
+    return Garment.template("shorts").remeshed(300)
+
+
+def in_its_place(place, garment):
+    """A garment like ``garment`` that lies in memory where another one was, at ``place``."""
+    others = []
+    for _ in range(10_000):
+        others.append(replace(garment))
+        if id(others[-1]) == place:
+            return others[-1]
+    raise AssertionError("the place was not used again")
+
+
+def test_a_garment_gets_no_patches_of_one_that_is_gone(draper, coarse):
+    gone = replace(Garment.template("tank"))
+    patches, place = weakref.ref(draper.patched(gone)), id(gone)
+    draper.codes(gone)
+    del gone
+    assert patches() is None  # nothing is kept of it
+    other = in_its_place(place, coarse)
+    assert len(draper.patched(other).vertex_patch) == len(other)
+    assert len(draper.codes(other)) == len(draper.patched(other))
+    assert draper.patched(other) is draper.patched(other)
+
+
+def test_each_frame_is_told(draper, coarse):
+    told = []
+    motion = onefit.Motion.generate("walk", seconds=0.7)
+    drape = draper.drape(coarse, motion, eased=False, advance=lambda: told.append(1))
+    assert len(told) == len(drape.vertices) > 16  # more than one batch
+
+
+def test_energies_are_of_the_material(draper, coarse):
+    drape = draper.drape(coarse, onefit.Motion.generate("walk", seconds=0.1), eased=False)
+    assert drape.material is None
+    of = lambda name: replace(drape, material=name and onefit.Material.named(name)).measures()
+    jersey, cotton, denim = of("jersey"), of("cotton"), of("denim")
+    heavier = (denim.energy - cotton.energy) / (jersey.energy - cotton.energy)
+    assert heavier == pytest.approx((0.40 - 0.15) / (0.18 - 0.15), rel=1e-3)
+    assert of(None).energy == pytest.approx(
+        cotton.energy + (jersey.energy - cotton.energy) * 5 / 3, rel=1e-3
+    )  # 0.2 kg/m^2
