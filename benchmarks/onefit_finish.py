@@ -3,11 +3,11 @@ swing, and its time.
 
     python benchmarks/onefit_finish.py
     python benchmarks/onefit_finish.py --garments skirt shirt.obj --finish 3 --material denim
-    python benchmarks/onefit_finish.py --finish 0        # the network alone: quick
+    python benchmarks/onefit_finish.py --finish 0        # without the finish: quick
 
 Every garment is draped in each held-out kind of motion, on the standard body and on others drawn at
-random in turn: by skinning, by the networks without and with post-processing, and by the first of
-them with a finish. Columns:
+random in turn: by skinning, by the networks alone (without ease), by the networks with ease and
+post-processing, and by the first of them with a finish. Columns:
 *inside* [%] of the vertices; *faces* [%] of points of the faces, no farther apart than 5 mm, in
 every third frame; *room* [%], those of them that lie where cloth has room, which it has not where
 the body overlaps itself, or skin faces skin at less than 12 mm; *strain* [%], *wave* [degrees],
@@ -124,7 +124,7 @@ def main(argv=None):
             plain, ends = draper.drape(garment, motion, body, skinning_only=True), []
             drapes = {"skinning": plain}
             for of, other in drapers.items():
-                drapes[of] = other.drape(garment, motion, body, post=False)
+                drapes[of] = other.drape(garment, motion, body, post=False, eased=False)
                 drapes[f"{of}, post"] = other.drape(garment, motion, body)
             if args.finish:
                 ends.append(time.perf_counter())

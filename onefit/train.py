@@ -67,8 +67,15 @@ def parser():
         metavar="LESSONS",
         help="learn these lessons of onefit.teach by regression, beside the objective",
     )
-    p.add_argument("--objective", choices=OBJECTIVES, default=default.objective)
-    p.add_argument("--material", default=default.material, help="of the objective (cotton)")
+    p.add_argument(
+        "--objective",
+        choices=OBJECTIVES,
+        default="",
+        help="(default: material with --teacher, else paper)",
+    )
+    p.add_argument(
+        "--material", default=default.material, help="of the objective material (default: cotton)"
+    )
     for name, text in {
         "order": "order of the jets", "epochs": "",
         "batch": "patches of a step, all frames together",

@@ -19,8 +19,9 @@ class Settings:
     (the paper's 20,000); ``lr`` for the first ``lr_epochs`` epochs, a tenth of it for the rest; an
     epoch has ``epoch_steps`` steps (0: as many as show each window of the motions once); ``cuts``:
     how many random cuts (:mod:`onefit.garment.sewing.cuts`) are trained on beside the garments;
-    ``objective``: "material", the energies of ``material``, or "paper"; ``teacher``: a folder of
-    lessons (:mod:`onefit.training.teacher`) to learn as well.
+    ``objective``: "paper", or "material", the energies of ``material``; where it is not named, the
+    latter beside lessons, else the paper's; ``teacher``: a folder of lessons
+    (:mod:`onefit.training.teacher`) to learn as well.
     """
 
     garments: tuple = ()
@@ -28,7 +29,7 @@ class Settings:
     fps: float | None = None
     motion_up: str | None = None
     start: str = ""
-    objective: str = "material"
+    objective: str = ""
     material: str = "cotton"
     teacher: str = ""
     order: int = 4
@@ -44,6 +45,8 @@ class Settings:
     weights: Weights = field(default_factory=Weights)
 
     def __post_init__(self):
+        if not self.objective:
+            object.__setattr__(self, "objective", "material" if self.teacher else "paper")
         for name in ("batch", "epochs", "seeds"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} = {getattr(self, name)}; at least 1 is needed")

@@ -127,9 +127,16 @@ def test_each_loss_has_a_switch(small, data):
 def test_the_objective_of_the_material_has_its_own_terms(small, data):
     energies = {"stretching", "bending", "gravity", "inertia"}
     for off, names in (({}, energies | {"collision"}), (dict(k_c=0.0), energies)):
-        training = OneFitTraining(replace(small, weights=Weights(**off)), data, Processes("cpu"))
+        training = OneFitTraining(
+            replace(small, objective="material", weights=Weights(**off)), data, Processes("cpu")
+        )
         with torch.no_grad():
             assert set(training.loss(torch.Generator().manual_seed(0))) == names
+
+
+def test_without_lessons_the_objective_is_the_paper_s():
+    assert Settings().objective == "paper" and Settings(teacher="LESSONS").objective == "material"
+    assert Settings(teacher="LESSONS", objective="paper").objective == "paper"
 
 
 def test_the_rate_falls_to_a_tenth(small, data):
