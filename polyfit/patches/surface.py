@@ -95,18 +95,17 @@ class PatchedSurface:
         order: int = 4,
         *,
         rounds: int = 5,
+        acvd: bool = False,
         where: str = "mesh",
         **options: Any,
     ) -> "PatchedSurface":
         """Cut the mesh (N, 3) [m], (F, 3) into patches (:meth:`polyfit.patches.Patches.cut`),
         :meth:`fit` them with ``options``, and let the boundaries move to where the jets fit best,
-        ``rounds`` times (:func:`polyfit.patches.refine.refined`).
+        ``rounds`` times (:func:`polyfit.patches.refine.refined`). ``acvd``: by plain ACVD, whose
+        boundaries stay, as in the paper.
         """
-        return refined(
-            cls.fit(Patches.cut(vertices, faces, count, where=where), order, **options),
-            rounds,
-            **options,
-        )
+        patches = Patches.cut(vertices, faces, count, acvd=acvd, where=where)
+        return refined(cls.fit(patches, order, **options), 0 if acvd else rounds, **options)
 
     @property
     def residual(self) -> Tensor:

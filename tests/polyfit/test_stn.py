@@ -53,6 +53,23 @@ def test_answers_are_unit_quaternions_and_the_first_is_pca_s_frame():
     assert q[:, 1:].std(0).min() > 1e-3
 
 
+def test_the_paper_s_transformer_answers_with_one_quaternion(tmp_path):
+    fresh = SpatialTransformer(turns=1, pca=False)
+    with torch.no_grad():
+        fresh.head[-1].weight.zero_()
+    x = torch.randn(7, 100, 3)
+    assert torch.allclose(fresh(x), torch.tensor([0.0, 0, 0, 1]).expand(7, 1, 4))
+    model = PolyFit(3, random_network(turns=1, pca=False))
+    points, _ = bent_sheets(7)
+    frame, pca = model.frame(points), CanonicalFrame.from_points(points)
+    turn = rotation_matrix(model.stn(pca.to_chart(points))[:, 0].double())
+    assert torch.allclose(frame.R, pca.R @ turn, atol=1e-6)
+    assert (turn - torch.eye(3)).abs().amax((1, 2)).min() > 1e-3
+    model.save(tmp_path / "one.safetensors")
+    again = PolyFit.load(tmp_path / "one.safetensors", 3)
+    assert torch.allclose(again.frame(points).R, frame.R)
+
+
 def test_thinned_takes_points_evenly_and_none_that_the_mask_leaves_out():
     x = torch.arange(2 * 11 * 3, dtype=torch.float32).reshape(2, 11, 3)
     assert torch.equal(subsampled(x, 20), x)
