@@ -6,7 +6,7 @@ import importlib.util
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NoReturn
 
 
@@ -33,7 +33,9 @@ class Parser(argparse.ArgumentParser):
         about = "other defaults; what is given beside it wins"
         self.add_argument("--preset", choices=sorted(presets), help=about)
 
-    def parse_args(self, args=None, namespace=None):  # type: ignore[override]
+    def parse_args(  # type: ignore[override]
+        self, args: Sequence[str] | None = None, namespace: Any = None
+    ) -> argparse.Namespace:
         found = super().parse_args(args, namespace)
         preset = getattr(found, "preset", None)
         if preset and self._presets:

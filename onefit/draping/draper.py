@@ -117,9 +117,9 @@ class Draper:
         """The :class:`onefit.PatchedGarment` of a garment, cut once."""
         key = id(garment)
         if key not in self._patched:
-            self._patched[key] = PatchedGarment(
-                garment, self.standard, order=self.network.order
-            ).to(self.device)
+            self._patched[key] = PatchedGarment(garment, self.standard, **self.network.patching).to(
+                self.device
+            )
         return self._patched[key]
 
     def drape(

@@ -8,7 +8,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
         "binding": ["standard_body", "standard_surface"],
-        "charts": ["Deformation", "PatchedGarment", "SparseMatrix"],
+        "charts": ["FRAMES", "Deformation", "PatchedGarment", "SparseMatrix"],
         "garment": ["FOLDER", "Garment", "LOOSE", "TEMPLATES"],
         "reading": ["RenderMesh", "Stitches", "parts"],
     },
