@@ -17,6 +17,7 @@ import statistics
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import torch
 
@@ -72,7 +73,7 @@ def main(argv=None):
     parser.add_argument("--weights", default=DEFAULT)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--counts", type=int, nargs="+", default=[1000, 4000, 16_000, 64_000])
-    parser.add_argument("-o", "--output", help="a JSON file of the figures")
+    parser.add_argument("-o", "--output", help="a folder for onefit_speed.json")
     args = parser.parse_args(argv)
     start = time.perf_counter()
     subprocess.run([sys.executable, "-c", "import onefit"], check=True)
@@ -136,8 +137,10 @@ def main(argv=None):
     yielding = [x / len(bodies) for x in timed(lambda: flesh(bodies), "cpu", 3)]
     print("\nflesh, before a finish: {:.2f} ({:.2f}; {:.2f})".format(*yielding))
     if args.output:
-        with open(args.output, "w", encoding="utf-8") as file:
-            json.dump(dict(import_seconds=seconds, rows=rows, flesh=yielding), file, indent=2)
+        found = dict(threads=torch.get_num_threads(), device=args.device, rows=rows, flesh=yielding)
+        path = Path(args.output) / "onefit_speed.json"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     return 0
 
 
