@@ -8,7 +8,7 @@ from .errors import InputError, Parser, cli
 
 _SAME_AXIS = 0.99999  # cosine of two z axes: 0.3 degrees
 # The paper: plain ACVD, the frame of PCA and the spatial transformer, jets of order 4
-PRESETS = {"paper": dict(patches=None, order=4, cuts="acvd", frames="stn")}
+PRESETS = {"paper": dict(patches=None, order=4, cuts="acvd", frames="stn", weights="paper")}
 
 
 def main(argv=None):
@@ -37,7 +37,9 @@ def main(argv=None):
         help="the patches' frames: of PCA, or refined by the spatial transformer (default: pca)",
     )
     parser.add_argument(
-        "--weights", metavar="FILE", help="of the transformer (default: those of the package)"
+        "--weights",
+        metavar="WEIGHTS",
+        help="of the transformer: polyfit, paper (one quaternion), or a file (default: polyfit)",
     )
     parser.add_argument(
         "--resolution",
@@ -65,12 +67,13 @@ def main(argv=None):
     import numpy as np
 
     from . import PatchedSurface, PolyFit, read_mesh, write_ply
+    from .network import PRETRAINED
 
     vertices, faces, _ = read_mesh(args.mesh)
     refine = None
     if args.frames == "stn":
-        load = PolyFit.load if args.weights else PolyFit.pretrained
-        refine = load(*filter(None, [args.weights]), args.order).requires_grad_(False)
+        path = PRETRAINED.get(args.weights or "polyfit", args.weights)
+        refine = PolyFit.load(path, args.order).requires_grad_(False)
     surface = PatchedSurface.from_mesh(
         vertices, faces, args.patches, args.order, acvd=args.cuts == "acvd", polyfit=refine,
         where=args.mesh,

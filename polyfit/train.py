@@ -59,7 +59,7 @@ def parser():
         dest="start",
         default="",
         metavar="WEIGHTS",
-        help="weights to fine-tune: a file, or polyfit, those of the package",
+        help="weights to fine-tune: a file, or polyfit or paper, those of the package",
     )
     p.add_argument(
         "--loss",

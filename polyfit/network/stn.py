@@ -29,7 +29,9 @@ from polyfit.jets import CanonicalFrame, rotation_matrix
 from .weights import load_into, read_weights, write_weights
 
 WEIGHTS_VERSION = 1  # of the network's shape and the meaning of its weights
-PRETRAINED = Path(__file__).parents[1] / "data" / "polyfit.safetensors"
+_DATA = Path(__file__).parents[1] / "data"
+# Weights of the package: ours, and what the paper's own training made here
+PRETRAINED = {name: _DATA / f"{name}.safetensors" for name in ("polyfit", "paper")}
 _IDENTITY = (0.0, 0.0, 0.0, 1.0)
 _INITIAL_TILT = math.radians(55)  # between the PCA frame's z and the first guesses'
 
@@ -199,13 +201,15 @@ class PolyFit(torch.nn.Module):
         )
 
     @classmethod
-    def pretrained(cls, order: int = 4) -> "PolyFit":
-        """PolyFit with the weights that ship in the package (``polyfit/data``; the JSON file there
-        says what made them).
+    def pretrained(cls, order: int = 4, name: str = "polyfit") -> "PolyFit":
+        """PolyFit with weights that ship in the package (``polyfit/data``; the JSON files there say
+        what made them): "polyfit", or "paper", with one quaternion, by the paper's own training.
 
-        Raises InputError for an order that they are not for.
+        Raises InputError for a name that there is not, and for an order that they are not for.
         """
-        return cls.load(PRETRAINED, order)
+        if name not in PRETRAINED:
+            raise InputError(f"weights {name}: choose among {', '.join(PRETRAINED)}")
+        return cls.load(PRETRAINED[name], order)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], order: int | None = None) -> "PolyFit":

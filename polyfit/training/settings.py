@@ -36,7 +36,7 @@ class Settings:
     heights and normals of jets along many axes, tabulated once; or "height", the heights of the
     jets that the network's own frames get, with the gradient through frame and fit. ``decay``: the
     rate ``lr`` falls as a cosine; else it stays. ``start``: weights to go on from, a file, or
-    "polyfit", those of the package.
+    "polyfit" or "paper", those of the package.
     """
 
     model: str = "polyfit"
@@ -104,7 +104,7 @@ class Settings:
         if self.start:
             kinds = dict(polyfit=PolyFit, pointnet=PointNet, dgcnn=DGCNN, atlasnet=AtlasNet)
             order = () if self.model == "atlasnet" else (self.order,)
-            path = PRETRAINED if self.start == "polyfit" else self.start
+            path = PRETRAINED.get(self.start, self.start)
             return kinds[self.model].load(path, *order).train()
         if self.model == "polyfit":
             stn = SpatialTransformer(points=self.reads, turns=self.turns, pca=self.pca)

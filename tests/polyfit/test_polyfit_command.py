@@ -36,11 +36,12 @@ def test_cuts_and_frames_are_the_paper_s_by_its_preset(tmp_path, capsys):
     write_ply(tmp_path / "tube.ply", V, F)
     file = ["-o", str(tmp_path / "out.ply"), "--resolution", "1"]
     said = []
-    for flags in ([], ["--cuts", "acvd", "--frames", "stn"], ["--preset", "paper"]):
+    paper = ["--cuts", "acvd", "--frames", "stn", "--weights", "paper"]
+    for flags in ([], paper, ["--preset", "paper"], paper[:4]):
         main([str(tmp_path / "tube.ply"), *flags, "--patches", "12", *file])
         said.append(capsys.readouterr().out)
     assert "transformer" not in said[0]
-    assert said[1] == said[2] and "the transformer turned the z axis of" in said[1]
+    assert said[1] == said[2] != said[3] and "the transformer turned the z axis" in said[1]
     main([str(tmp_path / "tube.ply"), "--preset", "paper", *file])
     assert capsys.readouterr().out.startswith("100 patches")
     with pytest.raises(InputError, match="for --frames stn"):

@@ -236,14 +236,19 @@ def test_shipped_weights_turn_narrow_valleys_the_right_way_up(model):
         ), figure
 
 
-def test_what_made_the_shipped_weights_is_beside_them(model):
+@pytest.mark.parametrize("name", ["polyfit", "paper"])
+def test_what_made_the_shipped_weights_is_beside_them(name):
     from polyfit.network import PRETRAINED
 
-    about = json.loads(PRETRAINED.with_suffix(".json").read_text(encoding="utf-8"))
+    model, path = PolyFit.pretrained(name=name), PRETRAINED[name]
+    assert (model.stn.shape["turns"], model.stn.pca) == ((5, True) if name == "polyfit" else (1, 0))
+    about = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
     assert about["command"].startswith("python -m polyfit.train ")
     assert {"seed", "minutes", "machine", "meshes"} <= set(about)
     assert about["parameters"] == sum(p.numel() for p in model.parameters())
-    assert PRETRAINED.stat().st_size < 1e6
+    assert path.stat().st_size < 1e6
+    with pytest.raises(InputError, match="choose among polyfit, paper"):
+        PolyFit.pretrained(name="deepfit")
 
 
 def test_discrepancy_of_a_tilted_plane_is_its_distance_and_its_angle():
