@@ -320,6 +320,19 @@ SECTIONS = {
             "in the first of them are enough.",
         ),
         Entry(
+            "OneFit, garment preprocessing",
+            "Garments of CLOTH3D are aligned with the average body in the T-pose: each vertex goes "
+            "with the nearest body vertex, then one Laplacian iteration; loose ones by shape only.",
+            (
+                "python -m onefit.align Tshirt.obj -o tshirt.ply --body SMPL.pkl --shape beta0=1.2",
+                "python -m onefit.align Dress.obj -o dress.ply --body SMPL.pkl --loose",
+                "python -m onefit.drape tshirt.ply walk -o OUT --made-for T-pose",
+            ),
+            None,
+            "They do not, up to the average body, which is Anny's. From the T-pose a garment is "
+            "brought to the stand with lowered arms by skinning.",
+        ),
+        Entry(
             "OneFit, resolutions",
             "Meshes of any resolution take about the same time.",
             (f"{ONEFIT} --tables resolutions",),
