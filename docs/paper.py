@@ -24,6 +24,7 @@ One word asks for the paper and nothing else; every option beside it wins over i
     python -m polyfit garment.obj -o surface.ply --preset paper
     python -m polyfit.train MESH ... -o OUT --preset paper
     python -m onefit.train -o OUT --preset paper
+    python -m onefit.drape dress dance -o OUT --preset paper
 
 `make demo-paper` runs the first of them, with its report. DATA is a folder with the sequences and
 garments, RUNS one for trained networks; neither comes with this project. *Not measured yet* means

@@ -209,7 +209,11 @@ SECTIONS = {
         Entry(
             "Figures 7 and 8",
             "Loose and tight garments, beside other methods.",
-            ("python -m onefit.drape dress dance -o OUT --weights RUNS/six/weights.safetensors",),
+            (
+                "python -m onefit.drape dress dance -o OUT --preset paper "
+                "--weights RUNS/six/weights.safetensors",
+                "python -m onefit.drape dress dance -o OUT --preset paper --post",
+            ),
             None,
             "No other method is part of this project; a simulation stands beside ours "
             "([onefit_reference.md](onefit_reference.md)).",
@@ -218,7 +222,8 @@ SECTIONS = {
             "Figure 9",
             "Extreme poses: a high kick in a dress, a cobra in a tank top.",
             (
-                "python -m onefit.drape dress kick -o OUT --weights RUNS/six/weights.safetensors",
+                "python -m onefit.drape dress kick -o OUT --preset paper "
+                "--weights RUNS/six/weights.safetensors",
                 f"{ONEFIT} --tables poses",
             ),
             figures.poses,

@@ -22,6 +22,9 @@ from onefit.network import DEFAULT
 from onefit.physics import MATERIALS, Material
 from polyfit.errors import InputError, Parser, cli, require
 
+# The paper: what the network alone makes; --post beside it pushes cloth out of the body
+PRESETS = {"paper": dict(finish=0, post=False, ease=False)}
+
 
 def parser():
     p = Parser(
@@ -111,10 +114,16 @@ def parser():
     )
     p.add_argument("--seed", type=int, default=0, help="seed of a generated motion (default: 0)")
     p.add_argument(
-        "--no-post",
-        dest="post",
-        action="store_false",
-        help="with --finish 0: what the network alone makes, without post-processing",
+        "--post",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="post-processing, where there is no finish (default: on)",
+    )
+    p.add_argument(
+        "--ease",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="the garment is tried on first (default: on)",
     )
     p.add_argument(
         "--finish",
@@ -143,6 +152,7 @@ def parser():
     p.add_argument("--spp", type=int, default=16, help="samples a pixel (default: 16)")
     p.add_argument("--device", default="cpu", help="cpu or cuda, for the network (default: cpu)")
     p.add_argument("--overwrite", action="store_true", help="replace an earlier drape in OUT")
+    p.add_presets(PRESETS)
     return p
 
 
@@ -191,7 +201,7 @@ def main(argv=None):
         motion,
         shape,
         about=dict(garment=args.garment, motion=motion.name, weights=args.weights),
-        how=dict(post=args.post, finish=args.finish, material=args.material),
+        how=dict(post=args.post, eased=args.ease, finish=args.finish, material=args.material),
         skip=args.skip,
         meshes=args.meshes,
         size=args.size,
