@@ -39,7 +39,7 @@ class OneFitTraining(Training):
             if settings.start
             else _network(settings, len(data.standard.joints), data.shapes.shape[1])
         )
-        plain = json.loads(json.dumps(asdict(settings)))
+        plain = json.loads(json.dumps(asdict(settings) | dict(objective=settings.lowered)))
         network = network.to(processes.device).train()
         windows = min(self._windows(garment, processes) for garment, *_ in data.garments)
         self.epoch_steps = settings.epoch_steps or -(-len(data) // windows)
@@ -128,7 +128,7 @@ class OneFitTraining(Training):
         of (poses, translation, number of the shape).
         """
         garment, scene = self.data.garments[number][0], self.data.scene(number, *frame)
-        if self.given.objective == "material":
+        if self.given.lowered == "material":
             sheets = self.data.sheets(number, frame[2])
             return material.evaluate(
                 garment, deformation, scene, sheets, self.given.weights, past, 1 / FPS, generator

@@ -61,15 +61,13 @@ class Settings:
     weights: Weights = field(default_factory=Weights)
 
     def __post_init__(self):
-        if not self.objective:
-            object.__setattr__(self, "objective", "material" if self.teacher else "paper")
         for name in ("batch", "epochs", "seeds"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} = {getattr(self, name)}; at least 1 is needed")
         for name in ("epoch_steps", "lr_epochs", "shapes", "cuts"):
             if getattr(self, name) < 0:
                 raise InputError(f"{name} = {getattr(self, name)}; at least 0 is needed")
-        if self.objective not in OBJECTIVES:
+        if self.objective and self.objective not in OBJECTIVES:
             raise InputError(f"objective '{self.objective}': choose {' or '.join(OBJECTIVES)}")
         unknown = [name for name in self.extras if name not in EXTRAS]
         if unknown:
@@ -83,3 +81,8 @@ class Settings:
             raise InputError(f"order = {self.order}; the order of OneFit's jets is 2 to 10")
         if not self.lr > 0:
             raise InputError(f"lr = {self.lr}; more than 0 is needed")
+
+    @property
+    def lowered(self):
+        """The objective in force, one of :data:`OBJECTIVES`."""
+        return self.objective or ("material" if self.teacher else "paper")

@@ -136,8 +136,9 @@ def test_the_objective_of_the_material_has_its_own_terms(small, data):
 
 
 def test_without_lessons_the_objective_is_the_paper_s():
-    assert Settings().objective == "paper" and Settings(teacher="LESSONS").objective == "material"
-    assert Settings(teacher="LESSONS", objective="paper").objective == "paper"
+    assert Settings().lowered == "paper"
+    assert replace(Settings(), teacher="LESSONS").lowered == "material"
+    assert Settings(teacher="LESSONS", objective="paper").lowered == "paper"
 
 
 def test_the_rate_falls_to_a_tenth(small, data):
