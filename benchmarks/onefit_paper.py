@@ -113,6 +113,7 @@ class Bench:
             about = json.loads((self.runs / name / "weights.json").read_text(encoding="utf-8"))
             kept = ("command", "steps", "batch", "minutes", "machine", "processes", "date")
             made[name] = {key: about[key] for key in kept}
+            made[name]["command"] = about["command"].replace(str(self.runs), "RUNS")
         return made
 
     def collisions(self):

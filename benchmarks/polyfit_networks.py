@@ -101,6 +101,7 @@ def making(runs):
             about = json.loads(path.read_text(encoding="utf-8"))
             kept = ("command", "steps", "batch", "patches", "minutes", "machine", "date")
             found[name] = {key: about[key] for key in kept}
+            found[name]["command"] = about["command"].replace(str(runs), "RUNS")
     return found
 
 
