@@ -1,5 +1,5 @@
-# make demo, make demo-shirt, make drape, make test, make docs, make lint: each installs into .venv what it needs and
-# is not there yet (seconds where nothing is missing), and runs.
+# make demo, make demo-shirt, make drape, make gpu, make test, make docs, make lint: each installs
+# into .venv what it needs and is not there yet (seconds where nothing is missing), and runs.
 # PYTHON=python3.12 takes another Python for a new .venv; TORCH=any takes torch with CUDA too.
 
 PYTHON ?= python3
@@ -14,7 +14,7 @@ EXTRAS_test := test
 EXTRAS_docs := docs
 EXTRAS_lint := lint
 
-.PHONY: demo demo-shirt drape test docs lint llvm clean
+.PHONY: demo demo-shirt drape gpu test docs lint llvm clean
 .PRECIOUS: .venv/with-%
 .NOTPARALLEL:
 
@@ -26,6 +26,10 @@ demo-shirt: .venv/with-demo llvm
 
 drape: .venv/with-drape llvm
 	$(PY) -m onefit.drape dress dance -o out/drape --seconds 2 --overwrite
+
+# What runs on an NVIDIA GPU, and how fast; out/benchmarks/gpu/gpu.md has the result
+gpu: .venv/with-test llvm
+	$(PY) benchmarks/gpu.py
 
 test: .venv/with-test llvm
 	$(PY) -m pytest -q -n 2 --dist loadfile

@@ -37,7 +37,6 @@ from polyfit.files import aside
 from polysft_mi.backend import add_mode_argument, set_variant
 from polysft_mi.errors import InputError, cli
 from polysft_mi.scene.rules import Rules
-from polysft_mi.scene.settings import Settings
 
 SEQUENCES = tuple(
     "demo flag bend paper curtain corner hand poster".split()
@@ -62,19 +61,21 @@ ORDER = (*SEQUENCES, *(f"{name} {seed}" for name, seed in SIMULATED))  # of the 
 @dataclass(frozen=True)
 class Switch:
     """How a rule is switched off: fields of the rules and settings that take other values;
-    ``rounded``: whether the rule is of surfaces of several patches alone.
+    ``chance``: a share by which k_mi changes; ``rounded``: whether the rule is of surfaces of
+    several patches alone.
     """
 
     rule: str
     fields: dict = field(default_factory=dict)
     settings: dict = field(default_factory=dict)
+    chance: float = 0.0
     rounded: bool = False
 
 
 SWITCHES = (
     Switch(BASELINE),
     # changes that mean nothing: how far results move by themselves
-    *(Switch(rule, settings={"k_mi": Settings().k_mi * (1 + s)}) for rule, s in CHANCES.items()),
+    *(Switch(rule, chance=share) for rule, share in CHANCES.items()),
     Switch("appearance", {"appearance": False}),
     Switch("shading", settings={"k_shading": 0}),
     Switch("exposure", {"exposure": False}),
@@ -91,11 +92,11 @@ SWITCHES = (
     Switch("more iterations there", {"far_iterations": 6}),
     Switch("small step ends a stage", {"small_step": 0.0}),
     Switch("texture fit", settings={"texture_fit": "none"}),
-    Switch("joints", {"joint": 0.0}, rounded=True),
+    Switch("joints", settings={"k_coupling": 0.0}, rounded=True),
     Switch("unseen parts are held", {"unseen": 1.0}, rounded=True),
-    Switch("softer lengths", {"rounded_stiffness": 1.0}, rounded=True),
-    Switch("firmer outline", {"rounded_silhouette": 1.0}, rounded=True),
-    Switch("softer relief", {"rounded_relief": 1.0}, rounded=True),
+    Switch("softer lengths", settings={"k_mi": 100.0}, rounded=True),
+    Switch("firmer outline", settings={"k_silhouette": 0.1}, rounded=True),
+    Switch("softer relief", settings={"k_relief": 1e-3}, rounded=True),
 )
 
 
@@ -119,7 +120,7 @@ def run(switch, scene_file, data, template=None):
     """One sequence with one rule off: its figures, ``lost`` frames and ``cpu`` seconds a frame;
     with a :class:`Template`, where one is given, instead of the scene's.
     """
-    from polysft_mi import solvers, tracker
+    from polysft_mi import tracker
     from polysft_mi.objective.problem import Problem
     from polysft_mi.results.evaluation import score
     from polysft_mi.results.truth import find_truth
@@ -127,14 +128,15 @@ def run(switch, scene_file, data, template=None):
     from polysft_mi.surface.patch import Unknowns
 
     experiment = scene.load(scene_file, {"data": data, **switch.settings}, template)
-    s = experiment.settings
     sequence = experiment.sequence()
     rules = dataclasses.replace(Rules(), **switch.fields)
     problem = Problem(experiment, sequence, rules)
     problem.check_start()
-    solver, began = solvers.create(s), time.process_time()
+    s = problem.settings
+    problem.settings = dataclasses.replace(s, k_mi=s.k_mi * (1 + switch.chance))
+    began = time.process_time()
     with tempfile.TemporaryDirectory() as out:
-        done = tracker.track(problem, solver, len(sequence.indices), out)
+        done = tracker.track(tracker.FrameTracker(problem), len(sequence.indices), out)
     seconds = time.process_time() - began
     states = [problem.surface(Unknowns.from_numpy(state)) for state in done.states]
     surface = {

@@ -84,9 +84,9 @@ def held(template, folder, every):
 
 def tracked(template, name, folder, chance, sheet):
     """(error, CPU seconds a frame) of tracking with a template, ``k_mi`` changed by a share."""
-    rules = ("rounded_stiffness", "rounded_silhouette", "rounded_relief", "unseen")
-    fields = dict.fromkeys(rules, 1.0) if sheet else {}
-    switch = Switch("", fields, {"k_mi": Settings().k_mi * (1 + chance)})
+    one = Settings().for_patches(1)
+    weights = {name: getattr(one, name) for name in ("k_mi", "k_silhouette", "k_relief")}
+    switch = Switch("", {"unseen": 1.0} if sheet else {}, weights if sheet else {}, chance)
     result = run(switch, scene_of(name), folder, template)
     figures = result["figures"]
     return figures.get("e3d_proc_seen", figures["e3d_proc"]), result["cpu"]

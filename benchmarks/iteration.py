@@ -42,17 +42,17 @@ def measured(path, overrides, turns):
     import mitsuba as mi
     from threadpoolctl import threadpool_limits
 
-    from polysft_mi.objective.problem import Problem
-    from polysft_mi.objective.second_order import SecondOrder
+    from polysft_mi.objective import Objective, Problem
+    from polysft_mi.objective.quadratic import Assembly, EdgeRows
     from polysft_mi.scene import experiment as scene
-    from polysft_mi.solvers.gauss_newton.descent import Descent
+    from polysft_mi.solvers.linear import Reduced
 
     experiment = scene.load(path, {**overrides, "solver": "gauss-newton"})
     problem = Problem(experiment, experiment.sequence())
-    objective = SecondOrder(problem)
-    descent, atlas, images = Descent(objective), objective.atlas, objective.images
-    level = images._level(descent.usual[-1].blur)
-    d = 3 if objective.has_relief else 2
+    objective = Objective(problem)
+    atlas, images = objective.atlas, objective.data
+    level = images.level(objective.usual[-1].blur)
+    d, patterns = 3 if objective.has_relief else 2, objective.inputs.operators.patterns
     rest = atlas.state(problem.patch.rest().to_numpy())
     rest.translation += 0.005
     surface = atlas.surface(rest)
@@ -71,9 +71,10 @@ def measured(path, overrides, turns):
         pairs = images._outline(*outline)[1] if outline else None
         sums = table, figures, vertices, 1.0, 1.0, at.area, level.stride, pairs
         gathered = images.gather.images(*sums)
-        assembly, lengths = objective._assembly, objective.lengths
-        normal, _ = assembly.normal(surface, gathered, lengths, 1.0, objective.patterns[d], d)
-        reduced = descent.reduced(normal, 1e-3, np.float32)
+        assembly = Assembly(images.pattern, images.gather, atlas)
+        edges = EdgeRows(np.ones(len(problem.template.edges)), 1.0)
+        normal, _ = assembly.normal(surface, gathered, edges, [], patterns[d], d)
+        reduced = Reduced.of(patterns, normal, 1e-3, np.float32)
     recorded = assembly._in_unknowns
 
     def look():
@@ -86,7 +87,7 @@ def measured(path, overrides, turns):
         assembly._in_unknowns = recorded
 
     def equations():
-        return assembly.normal(surface, gathered, lengths, 1.0, objective.patterns[d], d)
+        return assembly.normal(surface, gathered, edges, [], patterns[d], d)
 
     def silhouette():
         if outline:
@@ -101,7 +102,7 @@ def measured(path, overrides, turns):
         "sums at the vertices": lambda: dr.eval(images.gather.images(*sums)),
         "normal equations": equations,
         "normal equations, traced": traced,
-        "elimination": lambda: descent.reduced(normal, 1e-3, np.float32),
+        "elimination": lambda: Reduced.of(patterns, normal, 1e-3, np.float32),
         "step": reduced.step,
     }
     times = {name: [] for name in parts}

@@ -5,11 +5,11 @@ frame.
     0.003] [--smoothing 19] [--overwrite]
 
 The scene, the video, the renderer and the objective are those of ``python -m polysft_mi.run -D
-solver=adam``: photometric and silhouette losses and inextensibility of the mesh, with the scene's
-weights. Nothing couples the frames but the start: each begins where the one before it ended, the
-first from the template. The unknowns are the positions' differential form under
-``mi.ad.LargeSteps`` (Nicolet et al. 2021), minimised by ``mi.ad.Adam`` with ``uniform=True``, as
-its authors advise. Of the ``--iterations`` of a frame the best is kept.
+preset=paper``: photometric and silhouette losses and inextensibility of the mesh. Nothing couples
+the frames but the start: each begins where the one before it ended, the first from the template.
+The unknowns are the positions' differential form under ``mi.ad.LargeSteps`` (Nicolet et al. 2021),
+minimised by ``mi.ad.Adam`` with ``uniform=True``, as its authors advise. Of the ``--iterations`` of
+a frame the best is kept.
 
 Writes ``surface.npz`` (``docs/conventions.md``) and ``metrics.json`` into OUT, no pictures: where
 whole commands are timed, that is in this script's favour. ``mi.ad.LargeSteps`` needs the package
@@ -17,7 +17,6 @@ whole commands are timed, that is in this script's favour. ``mi.ad.LargeSteps`` 
 """
 
 import argparse
-import dataclasses
 import importlib.util
 import math
 import os
@@ -73,23 +72,31 @@ class Vertices:
 
 
 def load(scene, overrides, smoothing=SMOOTHING):
-    """The :class:`polysft_mi.objective.problem.Problem` of a scene, with vertices for unknowns."""
+    """The :class:`polysft_mi.objective.objective.Objective` of a scene, with vertices for
+    unknowns.
+    """
     if importlib.util.find_spec("cholespy") is None:
         raise InputError("mi.ad.LargeSteps needs the package cholespy: pip install cholespy")
-    from polysft_mi.objective.problem import Problem
+    from polysft_mi.objective import Objective, Problem
     from polysft_mi.scene import experiment as scenes
 
-    experiment = scenes.load(scene, overrides)
-    s = dataclasses.replace(experiment.settings, solver="adam")  # whose objective it is
-    experiment = dataclasses.replace(experiment, settings=s)
+    frame_by_frame = {"canonical_frame": "pca", "patches": "0", "window": "1", "k_tc": "0"}
+    experiment = scenes.load(scene, {"preset": "paper", **frame_by_frame, **overrides})
     sequence = experiment.sequence()
     problem = Problem(experiment, sequence)
     problem.check_start()
     problem.patch = Vertices(problem.template, smoothing)
-    return problem
+    return Objective(problem)
 
 
-def solve(problem, frame, start, iterations, step):
+def frozen(objective, frame):
+    """The objective of a frame, as solvers take it."""
+    from polysft_mi.objective import FrameContext
+
+    return objective.frozen([FrameContext(frame)], objective.usual[-1], [])
+
+
+def solve(objective, frame, start, iterations, step):
     """Minimise one frame (counted in the selection) from the unknown ``start``: (unknown, losses),
     the best, and each iteration's loss.
 
@@ -101,12 +108,13 @@ def solve(problem, frame, start, iterations, step):
 
     optimizer = mi.ad.Adam(lr=step, uniform=True)
     optimizer["u"] = start
-    best, least, losses, seed = mi.Float(start), math.inf, [], problem.settings.seed
+    best, least, losses, seed = mi.Float(start), math.inf, [], objective.settings.seed
+    objective = frozen(objective, frame)
     for iteration in range(iterations):
         unknown = optimizer["u"]
         try:
-            loss, _ = problem.evaluate(
-                [unknown], [frame], backward=True, seed=(seed + 7919 * iteration) % 2**31
+            loss, _ = objective.evaluate(
+                [unknown], backward=True, seed=(seed + 7919 * iteration) % 2**31
             )
         except BadFrame:
             break
@@ -118,16 +126,17 @@ def solve(problem, frame, start, iterations, step):
     return best, losses
 
 
-def track(problem, iterations, step, say=lambda text: None):
-    """All frames of a problem: vertices (T, N, 3) float32 [m, camera frame], and a dict of losses,
-    iterations and seconds for each.
+def track(objective, iterations, step, say=lambda text: None):
+    """All frames of an objective's video: vertices (T, N, 3) float32 [m, camera frame], and a dict
+    of losses, iterations and seconds for each.
     """
     import drjit as dr
 
+    problem = objective.problem
     unknown, surfaces, rows = problem.patch.rest(), [], []
     for frame, index in enumerate(problem.sequence.indices):
         began = time.perf_counter()
-        unknown, losses = solve(problem, frame, unknown, iterations, step)
+        unknown, losses = solve(objective, frame, unknown, iterations, step)
         unknown = dr.detach(unknown)
         surfaces.append(problem.camera.to_camera(problem.surface(unknown)).astype(np.float32))
         first, least = (losses[0], min(losses)) if losses else (None, None)
@@ -225,12 +234,17 @@ def main(arguments=None):
     if os.path.exists(os.path.join(options.out, "surface.npz")) and not options.overwrite:
         raise InputError(f"{options.out}: holds another result; give --overwrite to replace it")
     set_variant(options.mode)
-    problem = load(options.scene, overrides, options.smoothing)
+    objective = load(options.scene, overrides, options.smoothing)
     os.makedirs(options.out, exist_ok=True)
     say = (lambda text: None) if options.quiet else lambda text: print(text, file=sys.stderr)
-    surfaces, rows = track(problem, options.iterations, options.step, say)
+    surfaces, rows = track(objective, options.iterations, options.step, say)
     summary = write(
-        problem, surfaces, rows, options.out, step=options.step, smoothing=options.smoothing
+        objective.problem,
+        surfaces,
+        rows,
+        options.out,
+        step=options.step,
+        smoothing=options.smoothing,
     )
     print(
         f"{summary['frames']} frames, {summary['seconds_per_frame']:.2f} s a frame; surfaces:"

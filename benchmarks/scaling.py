@@ -85,7 +85,9 @@ def make(folder, surface, size, frames):
     experiment = scene.load(os.path.join(folder, "scene.xml"), {"spp": str(SAMPLES)})
     problem = Problem(experiment, experiment.sequence())
     for k, vertices in enumerate(truth):
-        rgb, alpha = problem.image(mi.Point3f(np.ascontiguousarray(vertices.T, dtype=np.float32)))
+        rgb, alpha = problem.placed.image(
+            mi.Point3f(np.ascontiguousarray(vertices.T, dtype=np.float32))
+        )
         alpha = np.array(alpha).reshape(size[1], size[0])
         linear = np.array(rgb) + 0.05 * (1 - alpha[..., None])
         write("frames", k, np.round(255 * srgb(linear)).astype(np.uint8))
@@ -96,11 +98,10 @@ def measure(folder):
     """Seconds (of the clock, of all threads) and evaluations of each frame, memory [MB] before the
     scene and at most, and distances from the truth [mm].
     """
-    from polysft_mi import solvers
     from polysft_mi.objective.problem import Problem
     from polysft_mi.scene import experiment as scene
     from polysft_mi.surface.patch import Unknowns
-    from polysft_mi.tracker import track
+    from polysft_mi.tracker import FrameTracker, track
 
     with open("/proc/self/statm") as file:
         started = int(file.read().split()[1]) * resource.getpagesize() / 1e6
@@ -111,9 +112,7 @@ def measure(folder):
     def tick(before, *_):
         ticks[before] = time.process_time()  # after the last evaluation of a frame
 
-    done = track(
-        problem, solvers.create(experiment.settings), len(problem.sequence), folder, progress=tick
-    )
+    done = track(FrameTracker(problem), len(problem.sequence), folder, progress=tick)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
     with np.load(os.path.join(folder, "gt.npz")) as truth:
         found = np.stack([problem.surface(Unknowns.from_numpy(s)) for s in done.states])

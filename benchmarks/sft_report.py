@@ -98,7 +98,7 @@ def page(results, picture):
         ),
         *(f"- {machine}" for machine in machines or ["no machine yet"]),
         "The methods and figures:",
-        "- `gauss-newton` is our solver, the default. `adam` is the paper's.",
+        "- `gauss-newton` is the default. `adam` is the paper's way (`preset` = `paper`).",
         (
             "- `per-vertex` is what a Mitsuba user would write without jets"
             " (`benchmarks/per_vertex.py`): the same renderer and objective, with the template's"

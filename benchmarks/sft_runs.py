@@ -18,6 +18,12 @@ from polysft_mi.results.evaluation import evaluate, score
 from polysft_mi.results.truth import find_truth, load_npz
 from polysft_mi.surface import meshio
 
+# of the paper's solver everything but one patch and a trained frame, so that any template is taken
+_METHODS = {
+    "gauss-newton": ["solver=gauss-newton"],
+    "adam": ["preset=paper", "patches=0", "canonical_frame=pca"],
+}
+
 
 def command(sequence, method, folder, out, setup):
     """The command line of one result, a list; ``setup`` as :func:`setup_of` makes it."""
@@ -28,7 +34,7 @@ def command(sequence, method, folder, out, setup):
         line = [sys.executable, os.path.join(ROOT, "benchmarks", "per_vertex.py")]
     else:
         line = [sys.executable, "-m", "polysft_mi.run"]
-        define.append(f"solver={method}")
+        define += _METHODS[method]
     line += [scene_of(sequence), "-o", out, "--overwrite", "-q"]
     if setup["mode"]:
         line += ["-m", setup["mode"]]

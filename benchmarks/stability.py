@@ -32,24 +32,24 @@ CURVE = 25  # iterations between points of the curves
 
 
 class Watched:
-    """A problem whose solver is watched: what it has found, and where it is, after some numbers of
-    evaluations.
+    """An objective whose solver is watched: what it has found, and where it is, after some numbers
+    of evaluations.
 
-    Solvers see a problem only through its methods, so this works for any. ``found`` and ``latest``
-    map a count to the unknowns of the newest frame: the best of so many evaluations, and those of
-    the last one. ``losses`` maps it to (best, last).
+    Solvers see an objective only through its methods, so this works for any that takes gradients.
+    ``found`` and ``latest`` map a count to the unknowns of the newest frame: the best of so many
+    evaluations, and those of the last one. ``losses`` maps it to (best, last).
     """
 
-    def __init__(self, problem, counts):
-        self._problem, self._counts = problem, set(counts)
+    def __init__(self, frozen, counts):
+        self._frozen, self._counts = frozen, set(counts)
         self._best, self._best_loss, self._evaluated = None, math.inf, 0
         self.found, self.latest, self.losses = {}, {}, {}
 
     def __getattr__(self, name):
-        return getattr(self._problem, name)
+        return getattr(self._frozen, name)
 
-    def evaluate(self, window, frames, **options):
-        total, terms = self._problem.evaluate(window, frames, **options)
+    def evaluate(self, window, **options):
+        total, terms = self._frozen.evaluate(window, **options)
         self._evaluated += 1
         if total < self._best_loss:
             self._best, self._best_loss = window[-1].copy(), total
@@ -70,31 +70,31 @@ def run(scene, overrides, counts, folder, say=print):
     frame]; count to (best, latest) loss. ``folder``, which exists, takes the checkpoints of the run
     up to there.
     """
-    from polysft_mi import solvers
-    from polysft_mi.objective.problem import Problem
+    from polysft_mi.objective import FrameContext, Problem
     from polysft_mi.scene import experiment as scenes
-    from polysft_mi.surface.patch import Unknowns
-    from polysft_mi.tracker import track
+    from polysft_mi.solvers.adam import Adam
+    from polysft_mi.tracker import FrameTracker, track
 
-    experiment = scenes.load(scene, {"solver": "adam", **overrides})
+    experiment = scenes.load(scene, {"preset": "paper", **overrides})
     s = experiment.settings
     sequence = experiment.sequence()
     problem = Problem(experiment, sequence)
     problem.check_start()
     frame = len(sequence.indices) - 1
-    states = [problem.patch.rest().to_numpy()]
+    tracker, states = FrameTracker(problem), [problem.patch.rest().to_numpy()]
     if frame > 0:
         say(f"frames 0 to {frame - 1} of the selection as usual ...")
-        states = track(problem, solvers.create(s), frame, folder).states
+        states = track(tracker, frame, folder).states
         states.append(states[-1])  # each new frame is started from the last
-    window = [Unknowns.from_numpy(state) for state in states[-s.width :]]
+    window = [problem.atlas.state(state) for state in states[-s.window :]]
     members = list(range(frame + 1 - len(window), frame + 1))
     last = max(counts)
     say(f"frames {members[0]} to {frame}: {last} iterations ...")
-    watched = Watched(problem, {*counts, *range(CURVE, last + 1, CURVE)})
-    solvers.create(dataclasses.replace(s, patience=last, period=last)).solve(
-        watched, window, members
-    )
+    objective = tracker.objective
+    contexts = [FrameContext(k) for k in members]
+    frozen = objective.frozen(contexts, objective.usual[-1], window)
+    watched = Watched(frozen, {*counts, *range(CURVE, last + 1, CURVE)})
+    Adam(dataclasses.replace(s, patience=last, period=last)).minimise(watched, window)
     missing = sorted(set(counts) - set(watched.found))
     if missing:
         raise InputError(f"--counts {' '.join(map(str, missing))}: solver {s.solver} ended before")

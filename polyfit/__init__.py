@@ -1,5 +1,4 @@
-"""PolyFit: surfaces as patches, each a jet in a canonical frame (paper, section "PolyFit"), in
-torch.
+"""PolyFit: surfaces as patches, each a jet in a canonical frame (paper, section "PolyFit").
 
 A mesh goes in, its patches and a surface of any resolution come out::
 
@@ -9,7 +8,8 @@ A mesh goes in, its patches and a surface of any resolution come out::
     surface = polyfit.PatchedSurface.from_mesh(vertices, faces)
     fine, fine_faces = surface.resampled(4)
 
-``docs/api.md`` lists the public names; torch is loaded when the first of them is used.
+``docs/api.md`` lists the public names. torch is loaded where the first of them that needs it is
+used: networks, and fits of batches.
 """
 
 import lazy_loader
@@ -18,6 +18,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
         "errors": ["InputError"],
+        "jets.batches": ["fit"],
         "jets.frames": ["CanonicalFrame", "rotation_matrix"],
         "jets.jet": [
             "height",
@@ -30,7 +31,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
             "tangents",
             "turned_over",
         ],
-        "jets.least_squares": ["JetFit", "fit"],
+        "jets.least_squares": ["JetFit"],
         "jets.monomials": ["exponents"],
         "mesh.meshio": ["read_mesh", "write_ply"],
         "network.stn": ["PolyFit", "SpatialTransformer"],

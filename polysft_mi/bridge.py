@@ -92,7 +92,7 @@ def rendering(
 
     @_in_drjit
     def render(vertices: mi.TensorXf) -> tuple[mi.TensorXf, mi.TensorXf]:
-        rgb, alpha = problem.image(_points(vertices.array), seed)
+        rgb, alpha = problem.placed.image(_points(vertices.array), seed, problem.settings.spp)
         return rgb, mi.TensorXf(alpha, (problem.height, problem.width))
 
     return lambda vertices: render(vertices.to(torch.float32).contiguous())

@@ -166,13 +166,13 @@ def reconstruct(
     resolved_defaults(scene, overrides)  # a wrong name is told before anything heavy is loaded
     set_variant(variant)
 
-    from . import solvers
     from .objective import Problem
     from .pictures import Drawing
     from .render import threads
     from .results import outputs
     from .scene import experiment as experiments
     from .surface.meshio import seam_note, size_note
+    from .tracker import FrameTracker
 
     experiment = experiments.load(scene, overrides)
     mesh = experiment.template
@@ -184,7 +184,7 @@ def reconstruct(
     sequence = experiment.sequence()
     problem = Problem(experiment, sequence)
     problem.check_start()
-    solver = solvers.create(s)
+    tracker = FrameTracker(problem)
     text = outputs.resolved_scene(experiment)
     if resume:
         folder.check_same(out, text)
@@ -197,12 +197,12 @@ def reconstruct(
     gc.freeze()  # what is loaded by now stays: the collector need not go through it again and again
     about = {"scene": os.path.abspath(experiment.path), **outputs.versions()}
     with (
-        threads(0.5) if s.solver == "gauss-newton" else contextlib.nullcontext(),
+        threads(0.5) if tracker.solver.name == "gauss-newton" else contextlib.nullcontext(),
         Progress(len(sequence.indices), s, quiet) as progress,
         Drawing(problem, overrides, out, exr_frames=exr_frames, about=about) as drawing,
     ):
         progress.say(_beginning(problem))
-        done, interrupted = _track(problem, solver, out, resume, progress, drawing)
+        done, interrupted = _track(tracker, out, resume, progress, drawing)
         if not done.states:
             return Outcome(out, interrupted=interrupted)
         summary, plotted = outputs.write(
@@ -227,18 +227,16 @@ def _beginning(problem):
     )
 
 
-def _track(problem, solver, out, resume, progress, drawing):
+def _track(tracker, out, resume, progress, drawing):
     """The :class:`polysft_mi.tracker.Track`, and whether Ctrl-C ended it early."""
-    from .tracker import Track, track
+    from .tracker import CHECKPOINT, Track, track
 
-    count = len(problem.sequence.indices)
+    count = len(tracker.problem.sequence.indices)
     try:
-        done = track(
-            problem, solver, count, out, resume=resume, progress=progress, solved=drawing.frame
-        )
+        done = track(tracker, count, out, resume=resume, progress=progress, solved=drawing.frame)
         return done, False
     except KeyboardInterrupt:
-        path = os.path.join(out, "checkpoint.npz")
+        path = os.path.join(out, CHECKPOINT)
         done = Track.load(path) if os.path.exists(path) else Track()
         progress.say(
             f"interrupted: {len(done.states)} of {count} frames are kept; --resume continues"

@@ -28,7 +28,7 @@ def _demo(**settings):
 
 
 SCENES = {
-    "demo": _demo(last=11, period=150, patience=50),
+    "demo": _demo(last=11),
     "demo_shirt": _demo(),
     "flag": _cloth(),
     "bend": _cloth(),

@@ -6,7 +6,7 @@ import synthetic
 from scipy.spatial.transform import Rotation
 
 from polysft_mi import prepare
-from polysft_mi.objective.problem import Problem
+from polysft_mi.objective import Objective, Problem
 from polysft_mi.scene import experiment as scene
 from polysft_mi.surface.atlas import State
 from polysft_mi.surface.template import Template
@@ -42,6 +42,11 @@ def problem_of(folder, rules=None, **settings):
     prepare.main([str(folder), "--overwrite"])
     experiment = scene.load(str(folder / "scene.xml"), settings)
     return Problem(experiment, experiment.sequence(), rules)
+
+
+def data_of(problem):
+    """The :class:`polysft_mi.images.data_term.DataTerm` of a problem."""
+    return Objective(problem).data
 
 
 def grid_template(rows=6, columns=7, order=4, bend=4.0):

@@ -1,5 +1,6 @@
 """Points of a patch go in; its canonical frame and its jet come out, and the jet's geometry in
-closed form: points, normals, metric, curvatures. In torch; the monomials need NumPy alone.
+closed form: points, normals, metric, curvatures. Each formula is written once, for arrays of
+NumPy, torch and Dr.Jit; the fit of batches alone (``fit``) needs torch.
 """
 
 import lazy_loader
@@ -7,7 +8,9 @@ import lazy_loader
 __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
-        "frames": ["CanonicalFrame", "rotation_matrix"],
+        "backends": ["namespace"],
+        "batches": ["fit"],
+        "frames": ["CanonicalFrame", "rotation_matrix", "rotation_rows"],
         "jet": [
             "basis",
             "derivatives",
@@ -15,6 +18,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
             "height",
             "height_derivatives",
             "matrix",
+            "mean_curvature",
             "metric",
             "nearest",
             "normal",
@@ -25,7 +29,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
             "tangents",
             "turned_over",
         ],
-        "least_squares": ["JetFit", "fit"],
-        "monomials": ["DETERMINED_RMS", "MIN_BOX_RATIO", "exponents", "order_of", "size_of"],
+        "least_squares": ["JetFit", "fit_points"],
+        "monomials": ["exponents", "order_of", "size_of"],
     },
 )

@@ -1,14 +1,15 @@
 """Canonical frames: the orientations O = (s, R, T) that take patches to their charts and back
-(paper, section "PolyFit").
+(paper, section "PolyFit"), of arrays of NumPy or torch; and rotations by quaternions.
 """
 
 from dataclasses import dataclass
 from typing import Any
 
-import torch
-from torch import Tensor
+import numpy as np
 
 from polyfit.errors import InputError
+
+from .backends import namespace
 
 
 @dataclass(frozen=True)
@@ -16,17 +17,15 @@ class CanonicalFrame:
     """p = s R x + T, with x in the chart (u, v, z) and p in the surface's own frame [m].
 
     ``s`` (...,) [m], ``R`` (..., 3, 3) rotations whose columns are the chart's axes, ``T`` (..., 3)
-    the charts' origins [m]: one frame, or a batch of them.
+    the charts' origins [m]: one frame, or a batch of them, of NumPy or torch.
     """
 
-    s: Tensor
-    R: Tensor
-    T: Tensor
+    s: Any
+    R: Any
+    T: Any
 
     @classmethod
-    def from_points(
-        cls, points: Tensor, mask: Tensor | None = None, *, weights: Tensor | None = None
-    ) -> "CanonicalFrame":
+    def from_points(cls, points: Any, mask: Any = None, *, weights: Any = None) -> "CanonicalFrame":
         """By principal components of points (..., P, 3): T is their mean, s their largest distance
         from it, z the direction of least spread.
 
@@ -38,45 +37,60 @@ class CanonicalFrame:
         a choice of coordinates. Raises InputError where a patch has no points, or points that are
         not finite or all the same.
         """
-        with torch.no_grad():
-            dtype, points = points.dtype, points.detach().to(torch.float64)
+        xp = namespace(points)
+        m, where = xp.module, xp.module.where
+        with xp.no_grad():
+            dtype, points = points.dtype, m.asarray(points, dtype=m.float64)
             if points.shape[-2] == 0:
                 raise InputError("patches without points")
-            w = (
-                points.new_ones(points.shape[:-1])
-                if weights is None
-                else weights.detach().to(torch.float64)
-            )
+            w = None if weights is None else m.asarray(weights, dtype=m.float64)
             if mask is not None:
-                w = torch.where(mask, w, 0)
-                points = torch.where(mask[..., None], points, 0)
-            w = w / w.sum(-1, keepdim=True)
-            T = (w[..., None, :] @ points)[..., 0, :]
+                w = where(mask, m.ones_like(points[..., 0]) if w is None else w, 0)
+                points = where(mask[..., None], points, 0)
+            w = None if w is None else w / w.sum(-1)[..., None]
+            T = points.mean(-2) if w is None else (w[..., None, :] @ points)[..., 0, :]
             centred = points - T[..., None, :]
-            distance = centred.square().sum(-1)
+            distance = (centred**2).sum(-1)
             if mask is not None:
-                distance = torch.where(mask, distance, 0)
-            s = distance.amax(-1).sqrt()
+                distance = where(mask, distance, 0)
+            s = m.sqrt(m.amax(distance, -1))
             _check(points, mask, s)
             x = centred / s[..., None, None]
-            _, axes = torch.linalg.eigh((w[..., None] * x).mT @ x)
-            u, v = axes[..., 2], axes[..., 1]
+            spread = x.mT @ x / x.shape[-2] if w is None else (w[..., None] * x).mT @ x
+            axes = m.linalg.eigh(spread)[1]
+            if mask is not None:
+                x = where(mask[..., None], x, 0)
             # float32 points are symmetric only to their rounding
-            level = 1e-9 if dtype == torch.float64 else 1e-6
-            u = u * _side(x, u, w, mask, level)
-            v = v * _side(x, v, w, mask, level)
-            R = torch.stack([u, v, torch.linalg.cross(u, v)], -1)
-            return cls(s.to(dtype), R.to(dtype), T.to(dtype))
+            level = 1e-9 if dtype == m.float64 else 1e-6
+            u, v = (_pointed(x, axes[..., k], w, level) for k in (2, 1))
+            R = xp.stack([u, v, m.linalg.cross(u, v)])
+            return cls(*(m.asarray(a, dtype=dtype) for a in (s, R, T)))
 
-    def to_chart(self, points: Tensor) -> Tensor:
+    @classmethod
+    def over(cls, points: np.ndarray, normal: np.ndarray, radius: float) -> "CanonicalFrame":
+        """Of points (P, 3) of NumPy with z along the unit ``normal`` (3,): T is their mean, u their
+        largest extent across z, s their largest distance from T across z, or ``radius`` [m] where
+        that is 0.
+        """
+        T = points.mean(0)
+        centred = points - T
+        flat = centred - (centred @ normal)[:, None] * normal
+        s = np.sqrt((flat**2).sum(1).max())
+        u = np.linalg.eigh(flat.T @ flat)[1][:, 2] if s > 0 else np.eye(3)[np.abs(normal).argmin()]
+        u = _pointed(centred, u, None, 1e-9)
+        u = u - (u @ normal) * normal
+        u /= np.linalg.norm(u)
+        return cls(s if s > 0 else radius, np.stack([u, np.cross(normal, u), normal], 1), T)
+
+    def to_chart(self, points: Any) -> Any:
         """Chart coordinates (..., P, 3) of points (..., P, 3) [m]."""
         return (points - self.T[..., None, :]) @ self.R / self.s[..., None, None]
 
-    def from_chart(self, x: Tensor) -> Tensor:
+    def from_chart(self, x: Any) -> Any:
         """Points (..., P, 3) [m] of chart coordinates (..., P, 3)."""
         return self.s[..., None, None] * x @ self.R.mT + self.T[..., None, :]
 
-    def rotated(self, quaternion: Tensor) -> "CanonicalFrame":
+    def rotated(self, quaternion: Any) -> "CanonicalFrame":
         """The frame whose chart is turned by the unit quaternion (..., 4) in the order (x, y, z,
         w): R Q, so that a point of chart coordinates x has Q^T x in the new chart. Differentiable;
         the quaternion is divided by its norm.
@@ -87,50 +101,59 @@ class CanonicalFrame:
         """The frame with v and z pointing the other way: a half turn about u.
         :func:`polyfit.jets.turned_over` does it to a jet.
         """
-        return CanonicalFrame(self.s, self.R * self.R.new_tensor([1, -1, -1]), self.T)
+        xp = namespace(self.R)
+        u, v, z = xp.parts(self.R)
+        return CanonicalFrame(self.s, xp.stack([u, -v, -z]), self.T)
 
     def __getitem__(self, index: Any) -> "CanonicalFrame":
         return CanonicalFrame(self.s[index], self.R[index], self.T[index])
 
     def to(self, *args: Any, **kwargs: Any) -> "CanonicalFrame":
-        """The frame with another dtype or on another device."""
+        """The frame, of torch, with another dtype or on another device."""
         return CanonicalFrame(*(x.to(*args, **kwargs) for x in (self.s, self.R, self.T)))
 
 
-def rotation_matrix(quaternion: Tensor) -> Tensor:
+def rotation_matrix(quaternion: Any) -> Any:
     """Rotations (..., 3, 3) of quaternions (..., 4) in the order (x, y, z, w), which are divided by
     their norm.
     """
-    x, y, z, w = torch.nn.functional.normalize(quaternion, dim=-1).unbind(-1)
-    rows = [
-        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
-        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
-        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
+    xp = namespace(quaternion)
+    return xp.matrix(rotation_rows(*xp.parts(quaternion)))
+
+
+def rotation_rows(x: Any, y: Any, z: Any, w: Any) -> list[tuple[Any, Any, Any]]:
+    """The rows of :func:`rotation_matrix`, of numbers of NumPy, torch or Dr.Jit."""
+    twice = 2 / (x * x + y * y + z * z + w * w)
+    return [
+        (1 - twice * (y * y + z * z), twice * (x * y - z * w), twice * (x * z + y * w)),
+        (twice * (x * y + z * w), 1 - twice * (x * x + z * z), twice * (y * z - x * w)),
+        (twice * (x * z - y * w), twice * (y * z + x * w), 1 - twice * (x * x + y * y)),
     ]
-    return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
 
-def _side(x: Tensor, axis: Tensor, w: Tensor, mask: Tensor | None, level: float) -> Tensor:
-    """1 or -1, (..., 1): the side of ``axis`` (..., 3) that it should point to."""
+def _pointed(x: Any, axis: Any, w: Any, level: float) -> Any:
+    """``axis`` (..., 3), or the opposite, as the points x (..., P, 3) of weights w lie along it;
+    third moments up to ``level`` are none.
+    """
+    m = namespace(x).module
     along = (x @ axis[..., None])[..., 0]
-    if mask is not None:
-        along = torch.where(mask, along, 0)
-    skew = (w * along**3).sum(-1)
-    far = along.abs() >= 0.5 * along.abs().amax(-1, keepdim=True)
-    first = along.gather(-1, far.to(torch.uint8).argmax(-1, keepdim=True))[..., 0]
-    side = torch.where(skew.abs() > level, skew, first)
-    return torch.where(side < 0, -1.0, 1.0).to(axis.dtype)[..., None]
+    skew = (along**3).mean(-1) if w is None else (w * along**3).sum(-1)
+    far = abs(along) >= 0.5 * m.amax(abs(along), -1)[..., None]
+    first = m.where(far & (far.cumsum(-1) == 1), along, 0).sum(-1)
+    side = m.where(abs(skew) > level, skew, first)
+    return m.where((side < 0)[..., None], -axis, axis)
 
 
-def _check(points: Tensor, mask: Tensor | None, s: Tensor) -> None:
-    bad = ~(s > 1e-12 * points.abs().amax((-1, -2))) | ~s.isfinite()
+def _check(points: Any, mask: Any, s: Any) -> None:
+    m = namespace(points).module
+    bad = ~((s > 1e-12 * m.amax(abs(points), (-1, -2))) & m.isfinite(s))
     if not bad.any():
         return
-    at = tuple(int(i) for i in bad.nonzero()[0])
+    at = tuple(np.argwhere(bad.tolist())[0].tolist())
     name = f"patch {at[0] if len(at) == 1 else at}" if at else "the patch"
     count = int(mask[at].sum()) if mask is not None else points.shape[-2]
     if count == 0:
         raise InputError(f"{name} has no points")
-    if not points[at].isfinite().all():
+    if not m.isfinite(points[at]).all():
         raise InputError(f"{name} has points that are not finite")
     raise InputError(f"{name}: its {count} points coincide")

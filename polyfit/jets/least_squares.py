@@ -1,26 +1,14 @@
-"""The jets that fit points best: weighted least squares for batches of patches (Cazals & Pouget
-2003).
-
-Each patch is fitted in the bounding box of its own points, in products of Chebyshev polynomials.
-The Gram matrix of this basis follows from moments: T_a T_c = (T_{a+c} + T_{|a-c|}) / 2. So no
-matrix of points times coefficients is ever made, and the systems stay well conditioned up to order
-10. Sums and solves are in float64, whatever dtype the points have.
+"""The jet that fits points best, in NumPy: least squares (Cazals & Pouget 2003) in products of
+Chebyshev polynomials in the points' box. :mod:`polyfit.jets.batches` fits batches, in torch.
 """
 
 from dataclasses import dataclass
-from functools import lru_cache, reduce
 from typing import Any
 
 import numpy as np
-import torch
-from numpy.polynomial import chebyshev
-from scipy.special import binom
-from torch import Tensor
 
-from polyfit.errors import InputError
-
-from . import jet
-from .monomials import DETERMINED_RMS, MIN_BOX_RATIO, exponents, size_of
+from .chebyshev import DETERMINED_RMS, Box, determined_order, values
+from .monomials import exponents, size_of
 
 
 @dataclass(frozen=True)
@@ -28,225 +16,26 @@ class JetFit:
     """``alpha`` (..., A): the coefficients, zero beyond the order fitted. ``order`` (...,) int64:
     the order that the points determine, at most the one asked for; 0 is a constant."""
 
-    alpha: Tensor
-    order: Tensor
+    alpha: Any
+    order: Any
 
 
-def fit(
-    points: Tensor, order: int, *, weights: Tensor | None = None, mask: Tensor | None = None
-) -> JetFit:
-    """Least-squares n-jets through ``points`` (..., P, 3), in charts with u and v of about 1: a
-    :class:`JetFit`.
-
-    ``weights`` (..., P) not negative; ``mask`` (..., P) bool: the points that exist, the others are
-    padding of any value. Points that are too few for ``order``, or that lie on a line or a small
-    grid, may not determine it. Then the patch gets the highest order that they determine.
-    Differentiable once in points and weights, at the cost of evaluating two jets. Raises InputError
-    where a patch has no points or weight, or where numbers are not finite.
+def fit_points(points: np.ndarray, order: int, ridge: float = 0.0) -> JetFit:
+    """The jet of ``order``, or of the highest order that they determine, through ``points`` (P, 3)
+    of a chart; ``ridge``, of the points' mean square, holds its coefficients in the basis.
     """
-    if not 1 <= order <= 10:
-        raise InputError(f"order = {order}; the order of a jet is 1 to 10")
-    if points.ndim < 2 or points.shape[-1] != 3:
-        raise InputError(f"points of shape {tuple(points.shape)}; (..., points, 3) is needed")
-    shape = points.shape[:-1]
-    if shape[-1] == 0:
-        raise InputError("patch 0 has no points")
-    flat = points.reshape(-1, *points.shape[-2:])
-    if mask is not None:
-        mask = mask.expand(shape).reshape(flat.shape[:2])
-    if weights is None:
-        weights = flat.new_ones(1, 1) if mask is None else mask.to(flat.dtype)
-        weights = weights.expand(flat.shape[:2])
-    else:
-        weights = weights.expand(shape).reshape(flat.shape[:2])
-        if mask is not None:
-            weights = torch.where(mask, weights, 0)
-    if mask is not None:
-        # padding moves onto a point of the patch, where it changes neither box nor sums
-        first = mask.to(torch.uint8).argmax(1)
-        flat = torch.where(
-            mask[..., None], flat, flat[torch.arange(len(flat), device=flat.device), first][:, None]
-        )
-    alpha, fitted = _LeastSquares.apply(flat, weights, order)
-    return JetFit(alpha.reshape(*shape[:-1], -1), fitted.reshape(shape[:-1]))
-
-
-class _LeastSquares(torch.autograd.Function):
-    """points (B, P, 3), weights (B, P), order -> alpha (B, A), order (B,)."""
-
-    @staticmethod
-    def forward(ctx: Any, points: Tensor, weights: Tensor, order: int) -> tuple[Tensor, Tensor]:
-        x = points.movedim(-1, 0).to(
-            torch.float64, memory_format=torch.contiguous_format, copy=True
-        )  # (3, B, P)
-        box = _Box.of(x[:2])
-        w, total = _normalised(weights, points)
-        tx, ty = _chebyshev(box.normalised(x[:2]), 2 * order).permute(
-            1, 2, 0, 3
-        )  # (B, 2n+1, P) of u and of v, each row contiguous
-        wty = ty if w is None else w[:, None] * ty
-        scale = 1 / points.shape[1] if w is None else 1
-        gram = _gram(tx @ wty.mT * scale, order)
-        right = (tx[:, : order + 1] * x[2, :, None]) @ wty[:, : order + 1].mT * scale
-        right = jet.from_matrix(right)
-        _check(box, right)
-        factor, fitted, kept = _factorise(gram, order)
-        solution = torch.cholesky_solve((right * kept)[..., None], factor)[..., 0]
-        alpha = box.to_monomials(solution, order)
-        ctx.save_for_backward(points, weights, alpha, factor, kept, total)
-        ctx.box, ctx.order = box, order
-        ctx.mark_non_differentiable(fitted)
-        return alpha.to(points.dtype), fitted
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad: Tensor, _: Any) -> tuple[Tensor, Tensor | None, None]:
-        # At the minimum sum w (z - c.b) b = 0 holds for the points' basis values b. Differentiated:
-        # dc = G^-1 d(sum w (z - c.b) b) at fixed c, and the gradient contracts it with y = G^-1
-        # grad, a jet like c itself.
-        points, weights, alpha, factor, kept, total = ctx.saved_tensors
-        right = ctx.box.to_monomials_transposed(grad.to(torch.float64), ctx.order) * kept
-        y = ctx.box.to_monomials(
-            torch.cholesky_solve(right[..., None], factor)[..., 0] * kept, ctx.order
-        )
-        dtype, uv = points.dtype, points[..., :2]
-        which = (0, 0), (1, 0), (0, 1)
-        c, cu, cv = jet.derivatives(alpha.to(dtype), uv, *which)
-        y, yu, yv = jet.derivatives(y.to(dtype), uv, *which)
-        residual = points[..., 2] - c
-        w = weights / total.to(dtype)
-        to_points = torch.stack(
-            [w * (residual * yu - cu * y), w * (residual * yv - cv * y), w * y], -1
-        )
-        to_weights = residual * y / total.to(dtype) if ctx.needs_input_grad[1] else None
-        return to_points, to_weights, None
-
-
-@dataclass(frozen=True)
-class _Box:
-    """Centre and half extent (B, 2) of the points' u and v, float64."""
-
-    centre: Tensor
-    half: Tensor
-
-    @classmethod
-    def of(cls, uv: Tensor) -> "_Box":
-        """Of coordinates (2, B, P)."""
-        low, high = torch.aminmax(uv, dim=2)
-        half = ((high - low) / 2).T
-        half = torch.maximum(half, MIN_BOX_RATIO * half.amax(1, keepdim=True))
-        return cls(((low + high) / 2).T, torch.where(half > 0, half, 1))
-
-    def normalised(self, uv: Tensor) -> Tensor:
-        """The coordinates (2, B, P) in the box, from -1 to 1."""
-        return (uv - self.centre.T[..., None]) * (1 / self.half.T[..., None])
-
-    def to_monomials(self, coefficients: Tensor, order: int) -> Tensor:
-        """Coefficients (B, A) of T_a(x) T_b(y) turned into those of u^a v^b."""
-        U, V = self._axes(order)
-        return jet.from_matrix(U.mT @ jet.matrix(coefficients) @ V)
-
-    def to_monomials_transposed(self, coefficients: Tensor, order: int) -> Tensor:
-        """The transposed map of :meth:`to_monomials`, for gradients."""
-        U, V = self._axes(order)
-        return jet.from_matrix(U @ jet.matrix(coefficients) @ V.mT)
-
-    def _axes(self, order: int) -> Tensor:
-        """For u and for v (B, n+1, n+1): row a holds T_a((u - centre) / half) in powers of u."""
-        chebyshev, binomial, power = _chebyshev_in_powers(order, self.centre.device)
-        shifted = jet.powers(-self.centre.T, order)[..., power] * binomial
-        scaled = shifted * jet.powers(1 / self.half.T, order)[..., None]
-        return chebyshev @ scaled
-
-
-@lru_cache
-def _chebyshev_in_powers(order: int, device: torch.device) -> tuple[Tensor, ...]:
-    """Chebyshev polynomials in powers of x; and of (x - c)^m, for each power x^i, the binomial
-    coefficient and the power of -c: (n+1, n+1) each."""
-    rows = np.zeros((order + 1, order + 1))
-    for k in range(order + 1):
-        rows[k, : k + 1] = chebyshev.cheb2poly(np.eye(order + 1)[k])[: k + 1]
-    m, i = np.indices(rows.shape)
-    power = np.maximum(m - i, 0)
-    return tuple(torch.as_tensor(x, device=device) for x in (rows, binom(m, i), power))
-
-
-def _chebyshev(x: Tensor, order: int) -> Tensor:
-    """T_0 .. T_n of x (...): (n+1, ...)."""
-    out = x.new_empty(order + 1, *x.shape)
-    out[0], out[1] = 1, x
-    twice = 2 * x
-    for k in range(2, order + 1):
-        torch.mul(twice, out[k - 1], out=out[k]).sub_(out[k - 2])
-    return out
-
-
-def _normalised(weights: Tensor, points: Tensor) -> tuple[Tensor | None, Tensor]:
-    """The weights divided by their sum, float64, or None where all are 1; and the sum, (B, 1)."""
-    if weights.stride() == (0, 0) and weights.numel():
-        return None, weights.new_full((len(points), 1), points.shape[1], dtype=torch.float64)
-    weights = weights.to(torch.float64)
-    total = weights.sum(1, keepdim=True)
-    bad = ~((total > 0) & total.isfinite() & (weights >= 0).all(1, keepdim=True))
-    if bad.any():
-        k = int(bad[:, 0].to(torch.uint8).argmax())
-        what = (
-            "no points"
-            if not weights[k].abs().sum() > 0
-            else "weights that are negative or not finite"
-        )
-        raise InputError(f"patch {k} has {what}")
-    return weights / total, total
-
-
-def _check(box: "_Box", right: Tensor) -> None:
-    good = box.centre.isfinite().all(1) & box.half.isfinite().all(1) & right.isfinite().all(1)
-    if not good.all():
-        raise InputError(
-            f"patch {int((~good).to(torch.uint8).argmax())} has points that are not finite"
-        )
-
-
-@lru_cache
-def _products(order: int, device: torch.device) -> Tensor:
-    """Indices (4, A^2) into the flat moments (2n+1)^2, whose mean are the moments of the products
-    of two basis functions.
-    """
-    e = exponents(order)
-    a, b = e[:, None, :], e[None, :, :]
-    n = 2 * order + 1
-    index = [
-        p[..., 0] * n + q[..., 1] for p in (a + b, np.abs(a - b)) for q in (a + b, np.abs(a - b))
-    ]
-    return torch.as_tensor(np.stack(index).reshape(4, -1), device=device)
-
-
-def _gram(moments: Tensor, order: int) -> Tensor:
-    """Gram matrices (B, A, A) of the products T_a(x) T_b(y), from the moments (B, 2n+1, 2n+1)."""
-    flat = moments.flatten(1).T.contiguous()  # whole rows of a moment each are gathered
-    parts = (flat.index_select(0, index) for index in _products(order, moments.device))
-    total = reduce(torch.add, parts) / 4
-    return total.T.unflatten(1, (size_of(order),) * 2)
-
-
-def _factorise(gram: Tensor, order: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Cholesky factors (B, A, A) of the leading blocks that the points determine, the orders (B,),
-    and the coefficients kept (B, A).
-    """
-    degree = torch.as_tensor(exponents(order).sum(1), device=gram.device)
-    fitted = torch.full((len(gram),), order, device=gram.device)
-    eye = torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)
-    factor, info = torch.linalg.cholesky_ex(gram)
-    while True:
-        short = (factor.diagonal(dim1=1, dim2=2) < DETERMINED_RMS) | (
-            torch.arange(1, len(degree) + 1, device=gram.device) == info[:, None]
-        )
-        low = torch.where(short, degree, order + 1).amin(1) - 1
-        again = (low < fitted).nonzero()[:, 0]
-        if not len(again):
-            return factor, fitted, degree <= fitted[:, None]
-        fitted[again] = low[again]
-        kept = degree <= fitted[again, None]
-        factor[again], info[again] = torch.linalg.cholesky_ex(
-            torch.where(kept[:, :, None] & kept[:, None, :], gram[again], eye)
-        )
+    x, (a, b) = points.T, exponents(order).T
+    box = Box.of(x[:2])
+    tu, tv = values(box.normalised(x[:2]), order).swapaxes(0, 1)
+    basis = (tu[a] * tv[b]).T / np.sqrt(len(points))
+    kept = np.zeros(len(a))
+    diagonal = np.abs(np.diagonal(np.linalg.qr(basis, mode="r")))
+    kept[: len(diagonal)] = diagonal
+    fitted = int(determined_order(kept < DETERMINED_RMS, order))
+    size = size_of(fitted)
+    rows = np.concatenate([basis[:, :size], np.sqrt(ridge) * np.eye(size)[: size if ridge else 0]])
+    right = np.zeros(len(rows))
+    right[: len(points)] = x[2] / np.sqrt(len(points))
+    solution = np.zeros(len(a))
+    solution[:size] = np.linalg.lstsq(rows, right, rcond=None)[0]
+    return JetFit(box.to_monomials(solution, order), fitted)

@@ -1,18 +1,8 @@
-"""The monomials of an n-jet and their order (paper, section "PolyFit"). NumPy only:
-:mod:`polyfit.jets` has the jets, in torch.
-"""
+"""The monomials of an n-jet and their order (paper, section "PolyFit"). NumPy only."""
 
 from functools import lru_cache
 
 import numpy as np
-
-# Facts of the jets' least squares, here and for a tracker's template.
-# A coefficient counts as determined where its basis function, over the weighted points, keeps this
-# RMS after those before it are projected out.
-DETERMINED_RMS = 1e-5
-# The box of the points is at least this wide, as a share of its longer side: rounding across a
-# straight line is not stretched into a patch.
-MIN_BOX_RATIO = 1e-2
 
 
 @lru_cache

@@ -122,6 +122,7 @@ class Light:
         for _ in range(self.rules.light_refits):
             weighted = (area / (1 + ((value - rows @ found) / self.scale) ** 2))[:, None] * rows
             matrix, right = weighted.T @ rows, weighted.T @ value
+            matrix = np.triu(matrix) + np.triu(matrix, 1).T  # as a checkpoint has it
             found = np.linalg.solve(held + matrix, held @ before + right)
         change = found - before
         return Fit(found, value - rows @ found, area, float(change @ held @ change), matrix, right)

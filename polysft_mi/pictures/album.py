@@ -66,8 +66,9 @@ class Renderings:
         """
         problem = self.problem
         with dr.suspend_grad():
-            rgb, alpha = problem.image(
-                mi.Point3f(np.ascontiguousarray(vertices.T, dtype=np.float32))
+            rgb, alpha = problem.placed.image(
+                mi.Point3f(np.ascontiguousarray(vertices.T, dtype=np.float32)),
+                spp=problem.settings.spp,
             )
             render = np.array(rgb)
             more = self._geometry() if geometry else {}
@@ -178,7 +179,7 @@ class Album:
         """
         if texcoords is not None and not np.array_equal(texcoords, self._texcoords):
             self._texcoords = texcoords
-            self.problem.set_texcoords(mi.Float(texcoords))
+            self.problem.placed.set_texcoords(mi.Float(texcoords))
         surface = self.problem.camera.to_camera(vertices)
         if self._view is None:
             self._view = figures.View.around(surface).wider(self.settings.view)

@@ -118,7 +118,7 @@ class Drawing:
         self._given[k] = vertices, k in self._exr
 
     def _call(self, k, vertices):
-        return "draw", k, vertices, self.problem.texcoords, k in self._exr
+        return "draw", k, vertices, self.problem.placed.texcoords, k in self._exr
 
     def finish(self, vertices, surfaces, fps):
         """Have the rest drawn, all bound, and plots made: what ``finish``, ``bind`` and ``plot`` of

@@ -10,6 +10,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     submod_attrs={
         "device": ["frozen", "interruptible", "on_device", "threads"],
         "pinhole": ["MIN_DEPTH", "Pinhole"],
+        "placed": ["PlacedMesh"],
         "projective": ["SilhouetteProjective"],
         "raster": ["RasterIntegrator"],
         "silhouette": ["blend"],

@@ -129,12 +129,15 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
         "order": template.order,
         "template_residual_rms_mm": 1e3 * template.residual_rms,
         "template_residual_max_mm": 1e3 * template.residual_max,
-        "solver": problem.settings.solver,
+        "solver": track.solver,
     }
     windows = [
         {"frame": int(indices[count - len(track.iterations) + k]), "iterations": n, "seconds": t}
-        | {name: x for name, x in terms.items() if not isinstance(x, list)}
-        for k, (n, t, terms) in enumerate(zip(track.iterations, track.seconds, track.totals))
+        | terms
+        | ({"misfit": memory.misfit, "outlier_share": memory.outlier_share} if memory else {})
+        for k, (n, t, terms, memory) in enumerate(
+            zip(track.iterations, track.seconds, track.totals, track.memories)
+        )
     ]
     write_json(
         os.path.join(out, "metrics.json"),

@@ -12,7 +12,7 @@ class Progress:
     """
 
     def __init__(self, frames, settings, quiet):
-        self.frames, self.windows = frames, frames - min(settings.width, frames) + 1
+        self.frames, self.windows = frames, frames - min(settings.window, frames) + 1
         # a sweep goes over all frames but the first and the last, and then over all but the first
         self.total = self.windows + settings.sweeps * max(0, 2 * frames - 3)
         self.period, self.quiet, self.terminal = settings.period, quiet, sys.stderr.isatty()

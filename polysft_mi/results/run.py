@@ -11,11 +11,11 @@ from functools import cached_property
 
 import numpy as np
 
+from polyfit import jets
 from polyfit.mesh import TexCoords
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError
 from polysft_mi.scene import known_defaults, located
-from polysft_mi.surface.template import matrix
 
 from .truth import load_npz, read_surface, texcoords_of
 
@@ -141,7 +141,6 @@ class Run:
         patch; positive where the surface bulges to the side that the patch nearest to the camera
         shows there, by its pose in the first frame.
         """
-        from numpy.polynomial.polynomial import polyder, polyval2d
         from scipy.spatial.transform import Rotation
 
         p = self.params
@@ -153,17 +152,9 @@ class Run:
             own = p["patch"][:, 0] == k
             to_chart = p["frame_rotation"][k].T @ p["axes"][own] * (p["scale"] / radius)
             offset = np.stack([p[f"delta_{name}"][:, own] for name in "uvw"], -1)
-            u, v = np.moveaxis(
-                p["chart"][own, 0] + np.einsum("nij,tnj->tni", to_chart[:, :2], offset), 2, 0
-            )
-            for t, delta in enumerate(p["delta_alpha"][:, k]):
-                z = matrix(alpha + delta)
-                zu, zv, zuu, zuv, zvv = (
-                    polyval2d(u[t], v[t], polyder(polyder(z, i), j, axis=1))
-                    for i, j in ((1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
-                )
-                bend = (1 + zv**2) * zuu - 2 * zu * zv * zuv + (1 + zu**2) * zvv
-                out[t, own] = bend / (2 * radius * (1 + zu**2 + zv**2) ** 1.5)
+            uv = p["chart"][own, 0] + np.einsum("nij,tnj->tni", to_chart[:, :2], offset)
+            moved = alpha + p["delta_alpha"][:, k]
+            out[:, own] = jets.mean_curvature(moved, uv) / radius
         return np.sign(up[2]) * out
 
 

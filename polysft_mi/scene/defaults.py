@@ -25,9 +25,10 @@ def known_defaults(path):
 
 
 def resolved_defaults(path, overrides):
-    """The defaults of a scene file with ``overrides`` (name to text) in force. Raises InputError
-    for a name that the file does not have, and for a value that its setting does not take (Mitsuba
-    reads an empty number as 0)."""
+    """The defaults of a scene file with a preset and ``overrides`` (name to text) in force: a
+    preset wins over the scene's own values, ``overrides`` over it. Raises InputError for a name
+    that the file does not have, and for a value that its setting does not take (Mitsuba reads an
+    empty number as 0)."""
     known = known_defaults(path)
     for name in overrides:
         if name not in known:
@@ -37,7 +38,18 @@ def resolved_defaults(path, overrides):
                 f"-D {name}: {path} has no such setting{hint}; known:"
                 f" {', '.join(sorted(known)) or 'none'}"
             )
-    resolved = {**known, **overrides}
+    preset = {**known, **overrides}.get("preset") or "none"
+    if preset not in settings.PRESETS:
+        raise InputError(
+            f"{path}: setting preset = {preset!r}; known values: {', '.join(settings.PRESETS)}"
+        )
+    chosen = {name: str(value) for name, value in settings.PRESETS[preset].items()}
+    if missing := sorted(set(chosen) - set(known)):
+        raise InputError(
+            f"{path}: preset = {preset} sets {missing[0]}, which the scene has no <default> of;"
+            " write the scene again with polysft prepare"
+        )
+    resolved = {**known, **chosen, **overrides}
     try:
         settings.from_properties(
             {name: text for name, text in resolved.items() if text is not None and "$" not in text}

@@ -24,7 +24,7 @@ from . import plugins
 from .defaults import located, resolved_defaults
 from .images import checked_size
 from .sequence import Sequence
-from .settings import Settings
+from .settings import PRESETS, Settings
 
 
 @dataclass
@@ -76,15 +76,16 @@ def load(
     """
     path = os.fspath(path)
     overrides = {k: str(v) for k, v in (overrides or {}).items()}
-    given: dict[str, Any] = dict(overrides)
     defaults = resolved_defaults(path, overrides)
+    preset = PRESETS[defaults.get("preset") or "none"]
+    given: dict[str, Any] = {name: defaults[name] for name in (*preset, *overrides)}
     plugins.register()
     if defaults.get("data") and not os.path.isdir(located(path, defaults["data"])):
         raise InputError(
             f"{path}: data = {defaults['data']}: no such folder, neither beside the scene nor here;"
             " give -D data=FOLDER"
         )
-    source = _source(_check_nodes(path, overrides))
+    source = _source(_check_nodes(path, given))
     try:
         scene = mi.load_file(path, optimize=False, **given)
     except Exception as error:  # whatever a plugin raised reaches us wrapped by the parser

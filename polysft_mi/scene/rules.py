@@ -32,7 +32,7 @@ class Rules:
     )
     far_blur: float = _rule(6.0, "pixels", "blur of the stage for a sheet that moved far, likewise")
     stiffness: tuple = _rule(
-        (1e2, 3e2, 1e3), "", "factor of `k_mi` at the three stages: soft edges register first"
+        (0.1, 0.3, 1.0), "share", "of `k_mi` at the three stages: soft edges register first"
     )
     iterations: tuple = _rule((6, 4, 3), "", "iterations of the three stages")
     window: float = _rule(
@@ -47,35 +47,11 @@ class Rules:
         0.1, "linear", "that is added to the local deviation then, as squares, in place of 0.02"
     )
     # surfaces of several patches
-    joint: float = _rule(
-        1.0,
-        "",
-        "weight of the squared distances of overlapping patches, over the template's radius",
-        row="joints",
-    )
     unseen: float = _rule(
         10.0,
         "",
         "factor of the weights of smoothness where no pixel sees such a surface",
         row="unseen parts are held",
-    )
-    rounded_stiffness: float = _rule(
-        0.3,
-        "",
-        "factor of `k_mi` there: a sheet bends and keeps its lengths, a closed surface cannot",
-        row="softer lengths",
-    )
-    rounded_silhouette: float = _rule(
-        10.0,
-        "",
-        "factor of `k_silhouette` there: the outline shows a bend that no texture shows",
-        row="firmer outline",
-    )
-    rounded_relief: float = _rule(
-        0.1,
-        "",
-        "factor of `k_relief` there: the jets leave more of a bend to the relief",
-        row="softer relief",
     )
     # how sure a vertex is
     sigma_strain: float = _rule(
@@ -91,9 +67,6 @@ class Rules:
     )
     damping: tuple = _rule(
         (1e-4, 3e-3), "", "Levenberg-Marquardt damping at a stage's start, without and with relief"
-    )
-    first_scale: float = _rule(
-        0.3, "deviations", "robust scale of the first frame's residuals, in local deviations"
     )
     scale_bounds: tuple = _rule(
         (0.2, 1.0), "deviations", "bounds of the robust scale", row="robust scale"
@@ -129,7 +102,6 @@ class Rules:
     relief_vertices: int = _rule(
         3000, "vertices", "of the template, above which there is no relief: it costs too much time"
     )
-    relief: float = _rule(1.0, "share", "of `k_relief`")
     relief_bend: float = _rule(
         3e-3, "share", "of the relief's weight, for its bending", row="relief's bending"
     )
@@ -168,12 +140,6 @@ class Rules:
     border: float = _rule(
         2.0, "windows", "from the sheet's border where images without masks are not corrected so"
     )
-    # the silhouette
-    silhouette: float = _rule(
-        0.1, "share", "of `k_silhouette`: masks are ragged, and normalised residuals small"
-    )
-    # time
-    temporal: float = _rule(1e-3, "share", "of `k_tc`, here in a stiffer basis than monomials")
     # shading
     shading_blur: float = _rule(0.45, "triangles", "blur of texture and frames, in triangle sides")
     shading_inside: tuple = _rule(
@@ -198,14 +164,7 @@ class Rules:
 
     def for_patches(self, count: int) -> "Rules":
         """The rules for a template of so many patches: a sheet is one."""
-        if count == 1:
-            return dataclasses.replace(self, unseen=1.0)
-        return dataclasses.replace(
-            self,
-            stiffness=tuple(self.rounded_stiffness * x for x in self.stiffness),
-            silhouette=self.rounded_silhouette * self.silhouette,
-            relief=self.rounded_relief * self.relief,
-        )
+        return dataclasses.replace(self, unseen=1.0) if count == 1 else self
 
     def caution(self, noise):
         """The factor by which weights grow with the ``noise`` (a misfit; NaN: none is known)."""

@@ -1,8 +1,8 @@
 """The settings of an experiment: names, types, defaults and meanings, in one place.
 
-A scene file carries each of them as a ``<default>`` and hands it to the ``polysft`` plugin; ``-D
-name=value`` overrides it. ``python -m polysft_mi.scene.settings`` prints them as the table in
-``docs/scene.md``.
+A scene file carries each of them as a ``<default>`` and hands it to the ``polysft`` plugin; a
+preset overrides those of a scene, and ``-D name=value`` overrides both. ``python -m
+polysft_mi.scene.settings`` prints them as the table in ``docs/scene.md``.
 """
 
 from __future__ import annotations
@@ -10,14 +10,38 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass, field
+from typing import Any
 
 from polysft_mi.errors import InputError
 
+AUTO = -1.0  # of a weight: what suits the template
 
-def _setting(default, doc, *, choices=None, low=-math.inf, high=math.inf, above=None):
+
+def _setting(
+    default,
+    doc,
+    *,
+    choices=None,
+    low=-math.inf,
+    high=math.inf,
+    above=None,
+    auto=False,
+    solver=None,
+):
+    """A field; ``auto``: whether :data:`AUTO` is accepted too; ``solver``: the only one that reads
+    it.
+    """
     return field(
         default=default,
-        metadata={"doc": doc, "choices": choices, "low": low, "high": high, "above": above},
+        metadata={
+            "doc": doc,
+            "choices": choices,
+            "low": low,
+            "high": high,
+            "above": above,
+            "auto": auto,
+            "solver": solver,
+        },
     )
 
 
@@ -27,116 +51,198 @@ class Settings:
     and its bounds.
     """
 
+    preset: str = _setting(
+        "none", "values of many settings at once; paper: the paper's", choices=("none", "paper")
+    )
     first: int = _setting(0, "first image to use, counted from 0 in the sorted list", low=0)
     last: int = _setting(-1, "last image to use, inclusive; -1 for the end of the video", low=-1)
     stride: int = _setting(1, "use every stride-th image", low=1)
     order: int = _setting(
         0,
-        "order n of the jets; 0: 8 for gauss-newton, 5 where the template has several patches, 4"
-        " (the paper's) for adam, or less if the template has too few vertices",
+        "order n of the jets; 0: 8, or 5 where the template has several patches, or less if the"
+        " template has too few vertices",
         low=0,
         high=10,
     )
+    patches: int = _setting(
+        0,
+        "jets that hold the template; 0: as few as can; 1: one (refused where the template is no"
+        " height graph)",
+        low=0,
+        high=1,
+    )
+    canonical_frame: str = _setting(
+        "pca",
+        "frame of a single jet: by principal components, or from there by the trained spatial"
+        " transformer (needs the extra learn)",
+        choices=("pca", "stn"),
+    )
     k_rgb: float = _setting(1.0, "weight of the photometric loss", low=0)
-    k_silhouette: float = _setting(1.0, "weight of the silhouette loss (needs masks)", low=0)
+    k_silhouette: float = _setting(
+        AUTO,
+        "weight of the silhouette loss (needs masks); -1: 0.1, for masks are ragged, or 1 where the"
+        " template has several patches: an outline shows a bend that no texture shows",
+        low=0,
+        auto=True,
+    )
     k_shading: float = _setting(
         9.0,
         "weight of shading: the triangles' brightness under a light that is learned along with the"
-        " video (gauss-newton); 0: off",
+        " video; 0: off",
         low=0,
     )
-    k_mi: float = _setting(0.1, "weight of mesh inextensibility", low=0)
+    k_mi: float = _setting(
+        AUTO,
+        "weight of mesh inextensibility; -1: 100, or 30 where the template has several patches: a"
+        " sheet bends and keeps its lengths, a closed surface cannot",
+        low=0,
+        auto=True,
+    )
     k_volume: float = _setting(
         0.0,
-        "weight of the squared relative change of the volume within a closed template; counts as"
-        " inextensibility",
+        "weight of the squared relative change of the volume within a closed template",
         low=0,
     )
-    k_tc: float = _setting(0.05, "weight of temporal consistency", low=0)
-    k_bend: float = _setting(
-        1e-6, "weight of the jet's mean squared second derivatives (gauss-newton)", low=0
+    k_tc: float = _setting(5e-5, "weight of temporal consistency", low=0)
+    k_bend: float = _setting(1e-6, "weight of the jets' mean squared second derivatives", low=0)
+    k_coupling: float = _setting(
+        1.0,
+        "weight of the squared distances of overlapping patches, over the template's radius",
+        low=0,
     )
-    k_uv: float = _setting(
-        1e-4, "weight of the differences of neighbours' uv displacements (gauss-newton)", low=0
-    )
+    k_uv: float = _setting(1e-4, "weight of the differences of neighbours' uv displacements", low=0)
     k_relief: float = _setting(
-        1e-3,
+        AUTO,
         "weight of the slopes of the relief, the vertices' heights over the jet; its bending has a"
-        " few thousandths of this weight (gauss-newton, templates of at most 3,000 vertices); 0: no"
-        " relief",
+        " few thousandths of this weight (templates of at most 3,000 vertices); 0: no relief; -1:"
+        " 0.001, or 0.0001 where the template has several patches, whose jets leave it more of a"
+        " bend",
         low=0,
+        auto=True,
     )
     rgb_norm: str = _setting(
-        "l1", "norm of the photometric residual", choices=("l1", "l2", "charbonnier")
+        "cauchy",
+        "norm of the photometric residual",
+        choices=("cauchy", "l1", "l2", "charbonnier"),
     )
     rgb_scale: float = _setting(
-        0.1, "residual at which the Charbonnier norm turns from quadratic to linear", above=0
+        0.3,
+        "residual at which the norms cauchy and charbonnier turn robust, in local deviations with"
+        " brightness = local; of cauchy in the first frame, later it follows the residuals",
+        above=0,
+    )
+    rgb_region: str = _setting(
+        "sheet",
+        "pixels that are compared: those that the sheet and the mask both fill, or the whole image,"
+        " the sheet over black and the frame cut out by its mask",
+        choices=("sheet", "image"),
     )
     brightness: str = _setting(
-        "auto",
-        "lighting compensation before images are compared; auto: local for gauss-newton, none"
-        " for adam",
-        choices=("auto", "none", "gain", "local"),
+        "local",
+        "lighting compensation before images are compared: local means and deviations are taken"
+        " out, one gain is, or nothing",
+        choices=("local", "gain", "none"),
+    )
+    mi_norm: str = _setting(
+        "charbonnier",
+        "norm of an edge's stretch: charbonnier lets cloth give where it hangs from a point",
+        choices=("charbonnier", "l2"),
+    )
+    tc_basis: str = _setting(
+        "legendre",
+        "basis in which temporal consistency measures coefficients",
+        choices=("legendre", "monomial"),
+    )
+    tc_ties: str = _setting(
+        "before",
+        "what ties the first frame of a window: the frame before it, or nothing",
+        choices=("before", "window"),
     )
     texture_fit: str = _setting(
         "auto",
-        "auto: gauss-newton moves the texture on the template if the first image shows it"
-        " elsewhere",
+        "auto: moves the texture on the template if the first image shows it elsewhere",
         choices=("auto", "none"),
     )
     blur: float = _setting(
-        0.0,
-        "standard deviation of the Gaussian blur of both images before they are compared [pixels]",
+        AUTO,
+        "standard deviation of the Gaussian blur of both images before they are compared [pixels];"
+        " -1: coarse to fine, in three stages, by the size of the sheet",
         low=0,
+        auto=True,
     )
-    spp: int = _setting(1, "samples a pixel; raster takes square numbers (1, 4, 9, ...)", low=1)
-    seed: int = _setting(0, "seed of the renderer's random numbers (path replay)", low=0)
+    starts: str = _setting(
+        "auto",
+        "where a frame begins: auto also tries where the motion leads and, where that does not"
+        " explain the image, farther away and at the pose that features tell (where all terms have"
+        " a quadratic model); previous: at the frame before, all frames of a window together",
+        choices=("auto", "previous"),
+    )
+    spp: int = _setting(
+        1, "samples a pixel; raster takes square numbers (1, 4, 9, ...)", low=1, solver="adam"
+    )
+    seed: int = _setting(
+        0, "seed of the renderer's random numbers (path replay)", low=0, solver="adam"
+    )
     solver: str = _setting(
-        "gauss-newton", "solver of each window", choices=("gauss-newton", "adam")
+        "auto",
+        "solver of each window; auto: gauss-newton where each term has a quadratic model, else"
+        " adam",
+        choices=("auto", "gauss-newton", "adam"),
     )
-    window: int = _setting(
-        0,
-        "frames W of the sliding window, solved together; 0: 1 for gauss-newton, 3 for adam",
-        low=0,
-    )
+    window: int = _setting(1, "frames W of the sliding window, solved together", low=1)
     smooth: float = _setting(
         0.0,
         "weight that holds each frame to the mean of its neighbours, in a last pass over the video,"
-        " back and forth (gauss-newton); 0: no such pass",
+        " back and forth; 0: no such pass",
         low=0,
     )
     sweeps: int = _setting(
         0,
         "how often the tracked video is gone over again, backward and then forward: each frame is"
-        " solved anew from its neighbour's surface, and the surface of the lower cost is kept"
-        " (gauss-newton)",
+        " solved anew from its neighbour's surface, and the surface of the lower cost is kept",
         low=0,
     )
     patience: int = _setting(
-        100, "iterations of adam without improvement after which the window moves on", low=1
+        100,
+        "iterations of adam without improvement after which the window moves on",
+        low=1,
+        solver="adam",
     )
-    period: int = _setting(500, "largest number of iterations of adam in a window", low=1)
-    lr_uv: float = _setting(1e-3, "Adam's step size of the uv displacements", low=0)
-    lr_alpha: float = _setting(1e-2, "Adam's step size of the jet coefficients", low=0)
-    lr_rigid: float = _setting(1e-4, "Adam's step size of rotation and translation", low=0)
-
-    @property
-    def width(self) -> int:
-        """Frames that are solved together."""
-        return self.window or {"gauss-newton": 1, "adam": 3}[self.solver]
-
-    @property
-    def lighting(self) -> str:
-        """The compensation of lighting: none, gain or local."""
-        return (
-            self.brightness
-            if self.brightness != "auto"
-            else {"gauss-newton": "local", "adam": "none"}[self.solver]
-        )
+    period: int = _setting(
+        500, "largest number of iterations of adam in a window", low=1, solver="adam"
+    )
+    lr_uv: float = _setting(1e-3, "Adam's step size of the displacements", low=0, solver="adam")
+    lr_alpha: float = _setting(
+        1e-2, "Adam's step size of the jet coefficients", low=0, solver="adam"
+    )
+    lr_rigid: float = _setting(
+        1e-4, "Adam's step size of rotation and translation", low=0, solver="adam"
+    )
 
     def jet_order(self, patches: int) -> int:
         """The order of the jets of so many patches, where the template's vertices determine it."""
-        return self.order or (4 if self.solver == "adam" else 8 if patches == 1 else 5)
+        return self.order or (8 if patches == 1 else 5)
+
+    def for_patches(self, patches: int) -> Settings:
+        """The same, with what is left to the template's number of patches decided."""
+        several = int(patches > 1)
+        values = {"k_silhouette": (0.1, 1.0), "k_mi": (100.0, 30.0), "k_relief": (1e-3, 1e-4)}
+        decided: dict[str, Any] = {
+            name: value[several] for name, value in values.items() if getattr(self, name) == AUTO
+        }
+        return dataclasses.replace(self, **decided)
+
+    def check_read(self, solver: str, where: str) -> None:
+        """Raise InputError where a value that is not the default is for another solver; ``where``:
+        the scene's path.
+        """
+        for f in dataclasses.fields(self):
+            value, reader = getattr(self, f.name), f.metadata["solver"]
+            if reader not in (None, solver) and value != f.default:
+                raise InputError(
+                    f"{where}: setting {f.name} = {value:g} is read by solver = {reader} alone, and"
+                    f" this is {solver}; leave it at {f.default:g}, or take solver = {reader}"
+                )
 
     def __post_init__(self):
         for f in dataclasses.fields(self):
@@ -147,12 +253,47 @@ class Settings:
                 )
             if f.type in ("int", "float", int, float):
                 inside = math.isfinite(value) and meta["low"] <= value <= meta["high"]
+                inside |= meta["auto"] and value == AUTO
                 if not inside or (meta["above"] is not None and value <= meta["above"]):
                     raise InputError(
                         f"setting {f.name} = {value!r}; {_NOUN[_type_name(f)]}, {_accepted(meta)},"
                         " is needed"
                     )
 
+
+#: what the presets set; what the paper leaves open stands in docs/conventions.md
+PRESETS: dict[str, dict[str, object]] = {
+    "none": {},
+    "paper": {
+        "solver": "adam",
+        "order": 4,
+        "patches": 1,
+        "canonical_frame": "stn",
+        "window": 3,
+        "patience": 100,
+        "period": 500,
+        "lr_uv": 1e-3,
+        "lr_alpha": 1e-2,
+        "lr_rigid": 1e-4,
+        "k_rgb": 1.0,
+        "k_silhouette": 1.0,
+        "k_mi": 0.1,
+        "k_tc": 0.05,
+        **dict.fromkeys(("k_shading", "k_volume", "k_bend", "k_coupling", "k_uv", "k_relief"), 0.0),
+        "rgb_norm": "l1",
+        "rgb_region": "image",
+        "brightness": "none",
+        "mi_norm": "l2",
+        "tc_basis": "monomial",
+        "tc_ties": "window",
+        "texture_fit": "none",
+        "blur": 0.0,
+        "starts": "previous",
+        "spp": 1,
+        "smooth": 0.0,
+        "sweeps": 0,
+    },
+}
 
 _NOUN = {"int": "a whole number", "float": "a finite number", "str": "a text"}
 _XML_TYPE = {"int": "integer", "float": "float", "str": "string"}
@@ -215,6 +356,8 @@ def _accepted(meta):
         return ", ".join(f"`{c}`" for c in meta["choices"])
     if meta["above"] is not None:
         return f"above {meta['above']}"
+    if meta["auto"]:
+        return f"at least {meta['low']}, or -1"
     if math.isinf(meta["high"]):
         return f"at least {meta['low']}" if math.isfinite(meta["low"]) else "any"
     return f"{meta['low']} to {meta['high']}"

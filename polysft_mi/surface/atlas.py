@@ -2,7 +2,8 @@
 unknown: what second-order solvers work on. NumPy and SciPy only.
 
 The unknowns of a frame are a :class:`State`; an :class:`Atlas` turns it into a :class:`Surface`.
-:mod:`polysft_mi.surface.patch` is the same surface on the device.
+:mod:`polysft_mi.surface.deformation` has the same surface without derivatives, for arrays of any
+kind.
 """
 
 import itertools
@@ -90,17 +91,12 @@ class Atlas:
     def __init__(self, template):
         self.template = t = template
         self.order = template.order
-        powers = exponents(self.order)
-        self._u, self._v = powers.T
+        self._u, self._v = exponents(self.order).T
         self.to_monomials = _legendre_to_monomials(self.order)
         self._from_monomials = np.linalg.inv(self.to_monomials)
         self._alpha = template.alpha @ self._from_monomials.T
         # the derivative of sum c_k P_k has the coefficients D c
-        derivative = [
-            np.pad(legendre.legder(row), (0, self.order + 1))[: self.order + 1]
-            for row in np.eye(self.order + 1)
-        ]
-        self._derivative = np.array(derivative).T
+        self._derivative = np.pad(legendre.legder(np.eye(self.order + 1)), ((0, 1), (0, 0)))
         #: (A, A): the mean square of a jet's second derivatives, as a form of its coefficients
         self.bending = self._bending()
         self._list_entries(t)
@@ -171,9 +167,7 @@ class Atlas:
         """The reverse of :meth:`state`."""
         return {
             "delta_alpha": state.alpha @ self.to_monomials.T,
-            "delta_u": state.offset[:, 0],
-            "delta_v": state.offset[:, 1],
-            "delta_w": state.offset[:, 2],
+            **dict(zip(("delta_u", "delta_v", "delta_w"), state.offset.T)),
             "rotation": state.rotation.as_quat(),
             "translation": state.translation,
         }
@@ -231,11 +225,10 @@ class Atlas:
     def _slope(self, alpha, values):
         """Derivatives (P, 2) of the jets ``alpha`` (P, A)."""
         pu, pv = values
-        du, dv = pu @ self._derivative, pv @ self._derivative
         return np.stack(
             [
-                np.einsum("pa,pa,pa->p", alpha, du[:, self._u], pv[:, self._v]),
-                np.einsum("pa,pa,pa->p", alpha, pu[:, self._u], dv[:, self._v]),
+                np.einsum("pa,pa,pa->p", alpha, along_u[:, self._u], along_v[:, self._v])
+                for along_u, along_v in ((pu @ self._derivative, pv), (pu, pv @ self._derivative))
             ],
             1,
         )
@@ -306,9 +299,7 @@ def _legendre_to_monomials(order):
     """The matrix (A, A) that takes coefficients of P_{i-j}(u) P_j(v), products of Legendre
     polynomials, to those of the monomials.
     """
-    powers = exponents(order)
-    leg = [
-        np.pad(legendre.leg2poly(row), (0, order - k))
-        for k, row in enumerate(np.eye(k + 1)[k] for k in range(order + 1))
-    ]
-    return np.array([[leg[a][i] * leg[b][j] for a, b in powers] for i, j in powers])
+    u, v = exponents(order).T
+    in_powers = (legendre.leg2poly(np.eye(k + 1)[k]) for k in range(order + 1))
+    leg = np.stack([np.pad(row, (0, order + 1 - len(row))) for row in in_powers])
+    return (leg[np.ix_(u, u)] * leg[np.ix_(v, v)]).T.copy()

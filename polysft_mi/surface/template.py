@@ -4,19 +4,15 @@
 A sheet is one patch. What no height graph over one plane can hold is cut into as few patches as can
 (:mod:`polyfit.patches.atlas`). What the jets leave of the mesh is kept, so that the undeformed
 template is the mesh that was given.
-
-The frame and the fit of one patch are those of :class:`polyfit.CanonicalFrame` and
-:func:`polyfit.jets.fit`: to load torch would take longer than the rest of a run's start.
 """
 
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.polynomial import Chebyshev, Polynomial, chebyshev
-from numpy.polynomial.polynomial import polyder
 
-from polyfit.jets import DETERMINED_RMS, MIN_BOX_RATIO, exponents, order_of, size_of
+from polyfit import jets
+from polyfit.jets import CanonicalFrame
 from polyfit.mesh import TexCoords, components, edges_of, face_vectors, sheets, winding
 from polyfit.patches import Cover, is_graph
 from polysft_mi.errors import InputError
@@ -65,7 +61,7 @@ class Template:
     @property
     def order(self):
         """The order of the jets."""
-        return order_of(self.alpha.shape[1])
+        return jets.order_of(self.alpha.shape[1])
 
     @cached_property
     def edges(self):
@@ -99,8 +95,9 @@ class Template:
         cls, vertices, faces, uv, order, *, exact=True, frame=None, cover=None, where="template"
     ):
         """Fit jets of ``order`` to the mesh: one in ``frame``, a :class:`polyfit.CanonicalFrame` in
-        float64, or else in its PCA frame; several where the mesh is no height graph there, or a
-        steep one; or those of ``cover``, a :class:`polyfit.patches.Cover` of the mesh.
+        float64 (of torch or NumPy), or else in its PCA frame; several where the mesh is no height
+        graph there, or a steep one; or those of ``cover``, a :class:`polyfit.patches.Cover` of the
+        mesh.
 
         ``uv``: texture coordinates (N, 2), or :class:`polyfit.mesh.TexCoords`. ``order`` may be a
         function of the number of patches. Where not ``exact``, vertices that determine less get the
@@ -111,21 +108,19 @@ class Template:
         points, faces = np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64)
         if not isinstance(uv, TexCoords):
             uv = TexCoords(np.asarray(uv, dtype=np.float64), faces)
-        scale, rotation, origin = (
-            _principal_frame(points)
-            if frame is None
-            else (np.asarray(x) for x in (frame.s, frame.R, frame.T))
-        )
+        whole = _frame_of(points) if frame is None else frame
+        whole = CanonicalFrame(*(np.asarray(x) for x in (whole.s, whole.R, whole.T)))
+        scale = float(whole.s)
         alike = np.where(winding(sheets(faces))[:, None] < 0, faces[:, ::-1], faces)
-        graph = is_graph(points, alike, rotation[:, 2]) and _components_of(faces) == 1
+        graph = is_graph(points, alike, whole.R[:, 2]) and _components_of(faces) == 1
         graph = graph and cover is None
         if cover is None and frame is None:
             # a skirt is a graph over the plane of its hem, but a steep one
             cover = Cover.of(points, alike)
         if graph and (frame is not None or len(cover) == 1):
             patch, weight = np.zeros((len(points), 1), dtype=np.int64), np.ones((len(points), 1))
-            frames = [(float(scale), rotation, origin)]
-            axes = np.tile(rotation, (len(points), 1, 1))
+            frames = [whole]
+            axes = np.tile(whole.R, (len(points), 1, 1))
         elif frame is not None:
             raise InputError(
                 f"{where}: one jet cannot hold it in the frame that is given: triangles fold over"
@@ -134,21 +129,20 @@ class Template:
         else:
             patch, weight = cover.patch, cover.weight
             frames = [
-                _frame_over(points[((patch == k) & (weight > 0)).any(1)], normal, float(scale))
+                CanonicalFrame.over(points[((patch == k) & (weight > 0)).any(1)], normal, scale)
                 for k, normal in enumerate(cover.normal)
             ]
-            axes = _tangent_axes(points, alike, patch[:, 0], np.stack([R for _, R, _ in frames]))
+            axes = _tangent_axes(points, alike, patch[:, 0], np.stack([f.R for f in frames]))
         order = order(len(frames)) if callable(order) else order
-        radius, rotation, origin = (np.array(x) for x in zip(*frames))
-        x = np.einsum("nmij,nmi->nmj", rotation[patch], points[:, None] - origin[patch])
-        x /= radius[patch][..., None]
+        radius, rotation, origin = (np.array(x) for x in zip(*((f.s, f.R, f.T) for f in frames)))
+        x = CanonicalFrame(radius, rotation, origin)[patch].to_chart(points[:, None, None])[:, :, 0]
         alpha, rest = _jets(x, patch, weight > 0, len(frames), order, exact, where)
         texcoords = TexCoords(np.asarray(uv.coordinates, np.float64), np.asarray(uv.faces))
         return cls(
             points,
             faces,
             texcoords,
-            float(scale),
+            scale,
             radius,
             rotation,
             origin,
@@ -175,34 +169,28 @@ def _jets(x, patch, held, count, order, exact, where):
     ridge, found = _RIDGE if count > 1 else 0.0, []
     for k in range(count):
         points = x[held & (patch == k)]
-        coefficients, fitted = _fitted(points, order, ridge)
-        if fitted < order and exact:
-            wanted = f"a jet of order {order} has {size_of(order)} coefficients"
-            few = f"the {len(points)} vertices determine no more than order {fitted}"
+        found.append(jets.fit_points(points, order, ridge))
+        if found[-1].order < order and exact:
+            wanted = f"a jet of order {order} has {jets.size_of(order)} coefficients"
+            few = f"the {len(points)} vertices determine no more than order {found[-1].order}"
             raise InputError(f"{where}: order = {order} is too high: {wanted}, and {few}")
-        found.append((coefficients, fitted))
-    most = max(fitted for _, fitted in found)  # coefficients beyond a jet's own order are 0
-    alpha = np.stack([coefficients[: size_of(most)] for coefficients, _ in found])
+    most = max(jet.order for jet in found)  # coefficients beyond a jet's own order are 0
+    alpha = np.stack([jet.alpha[: jets.size_of(most)] for jet in found])
     rest = np.zeros(patch.shape)
     for k in range(count):
         at = held & (patch == k)
-        height = np.polynomial.polynomial.polyval2d(*x[at][:, :2].T, matrix(alpha[k]))
-        rest[at] = x[at][:, 2] - height
+        rest[at] = x[at][:, 2] - jets.height(alpha[k], x[at][:, :2])
     return alpha, rest
 
 
-def _frame_over(points, normal, scale):
-    """(s, R, T) of the points (P, 3) of a patch, with z along ``normal`` (3,) and u along their
-    largest extent across it; ``scale``: for a single point.
-    """
-    origin = points.mean(0)
-    centred = points - origin
-    flat = centred - (centred @ normal)[:, None] * normal
-    extent = np.sqrt((flat**2).sum(1).max())
-    u = np.linalg.eigh(flat.T @ flat)[1][:, 2] if extent > 0 else np.eye(3)[np.abs(normal).argmin()]
-    u = (u - (u @ normal) * normal) * _side(centred @ u)
-    u /= np.linalg.norm(u)
-    return extent if extent > 0 else scale, np.stack([u, np.cross(normal, u), normal], 1), origin
+def _frame_of(points):
+    """The PCA frame of the vertices (N, 3)."""
+    try:
+        return CanonicalFrame.from_points(points)
+    except InputError:
+        raise InputError(
+            f"the template's {len(points)} vertices are not finite, or coincide"
+        ) from None
 
 
 def _tangent_axes(points, faces, patch, rotation):
@@ -228,74 +216,7 @@ def _lift(chart, patch, alpha, rotation, axes):
     third = np.einsum("nij,ni->nj", rotation[patch], axes[..., 2])
     lift = third[:, 2].copy()
     for k, coefficients in enumerate(alpha):
-        at, z = patch == k, matrix(coefficients)
-        for axis in (0, 1):
-            slope = np.polynomial.polynomial.polyval2d(*chart[at].T, polyder(z, axis=axis))
-            lift[at] -= slope * third[at][:, axis]
+        at = patch == k
+        slopes = jets.height_derivatives(coefficients, chart[at])
+        lift[at] -= (np.stack(slopes, 1) * third[at][:, :2]).sum(1)
     return lift
-
-
-def _principal_frame(points):
-    """(s, R, T) of points (P, 3) by their principal components, signs by the data, as
-    ``CanonicalFrame.from_points`` has them.
-    """
-    origin = points.mean(0)
-    centred = points - origin
-    scale = np.sqrt((centred**2).sum(1).max())
-    if not np.isfinite(scale) or not scale > 1e-12 * np.abs(points).max():
-        raise InputError(f"the template's {len(points)} vertices are not finite, or coincide")
-    x = centred / scale
-    _, axes = np.linalg.eigh(x.T @ x / len(x))
-    u, v = (axis * _side(x @ axis) for axis in (axes[:, 2], axes[:, 1]))
-    return scale, np.stack([u, v, np.cross(u, v)], 1), origin
-
-
-def _side(along):
-    """1 or -1: where the third moment of coordinates (P,) lies; of symmetric ones, where the first
-    lies that is half as far out as the farthest."""
-    skew = (along**3).mean()
-    far = np.abs(along) >= 0.5 * np.abs(along).max()
-    return -1.0 if (skew if abs(skew) > 1e-9 else along[far.argmax()]) < 0 else 1.0
-
-
-def _fitted(x, order, ridge=0.0):
-    """(coefficients (A,), order) of the least-squares jet of ``order`` through points x (P, 3) of a
-    chart, or of the highest order that they determine: products of Chebyshev polynomials in the
-    points' box, turned into monomials; ``ridge`` holds their coefficients."""
-    powers = exponents(order)
-    low, high = x[:, :2].min(0), x[:, :2].max(0)
-    centre, half = (low + high) / 2, (high - low) / 2
-    half = np.maximum(half, max(MIN_BOX_RATIO * half.max(), 1e-6))
-    values = [
-        chebyshev.chebvander((x[:, k] - centre[k]) / half[k], order)[:, powers[:, k]]
-        for k in (0, 1)
-    ]
-    basis = values[0] * values[1] / np.sqrt(len(x))
-    kept = np.zeros(len(powers))
-    diagonal = np.abs(np.diagonal(np.linalg.qr(basis, mode="r")))
-    kept[: len(diagonal)] = diagonal
-    fitted = int(min(powers.sum(1)[kept < DETERMINED_RMS], default=order + 1)) - 1
-    size = size_of(fitted)
-    solution = np.zeros(len(powers))
-    rows = np.concatenate([basis[:, :size], np.sqrt(ridge) * np.eye(size)[: size if ridge else 0]])
-    right = np.concatenate([x[:, 2] / np.sqrt(len(x)), np.zeros(len(rows) - len(x))])
-    solution[:size] = np.linalg.lstsq(rows, right, rcond=None)[0]
-    axes = [
-        [
-            Chebyshev.basis(n, domain=[c - h, c + h]).convert(kind=Polynomial).coef
-            for n in range(order + 1)
-        ]
-        for c, h in zip(centre, half)
-    ]
-    to_u, to_v = (
-        np.stack([np.pad(row, (0, order + 1 - len(row))) for row in rows]) for rows in axes
-    )
-    return (to_u.T @ matrix(solution) @ to_v)[tuple(powers.T)], fitted
-
-
-def matrix(alpha):
-    """Coefficients (A,) as a matrix over the powers of u and v."""
-    order = order_of(len(alpha))
-    out = np.zeros((order + 1, order + 1))
-    out[tuple(exponents(order).T)] = alpha
-    return out

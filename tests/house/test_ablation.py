@@ -29,7 +29,7 @@ def test_every_switch_changes_what_is_there(switch):
     for values, defaults in ((switch.fields, Rules()), (switch.settings, Settings())):
         for name, value in values.items():
             assert getattr(defaults, name) != value
-    assert switch.fields or switch.settings
+    assert switch.fields or switch.settings or switch.chance
 
 
 def test_a_rule_names_the_row_that_switches_it_off():

@@ -104,7 +104,7 @@ def test_example_scene_runs(tmp_path):
     sequence = experiment.sequence()
     problem = Problem(experiment, sequence)
     assert experiment.settings == settings.Settings(last=0)
-    _, alpha = problem.image(problem.patch.vertices(problem.patch.rest()))
+    _, alpha = problem.placed.image(problem.patch.vertices(problem.patch.rest()))
     mask = sequence.mask(0)
     assert np.abs(np.array(alpha).reshape(mask.shape) - mask).mean() < 0.1 * mask.mean()
 

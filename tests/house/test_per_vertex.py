@@ -20,7 +20,7 @@ def large_steps():
 
 
 def test_baseline_starts_from_the_template_and_moves_what_its_unknowns_move(sheet, large_steps):
-    problem = per_vertex.load(str(sheet.folder / "scene.xml"), {})
+    problem = per_vertex.load(str(sheet.folder / "scene.xml"), {}).problem
     rest = problem.patch.rest()
     assert problem.surface(rest) == pytest.approx(sheet.vertices[0], abs=1e-6)
     moved = sheet.vertices[1]  # any other place: the differential form and back
@@ -29,7 +29,7 @@ def test_baseline_starts_from_the_template_and_moves_what_its_unknowns_move(shee
 
 
 def test_objective_of_the_baseline_is_adams(large_steps, tmp_path):
-    from polysft_mi.objective.problem import Problem
+    from polysft_mi.objective import Objective, Problem
     from polysft_mi.scene import experiment as scene
 
     # an even number of rows: none lies on the centres of a row of pixels, where a ray may slip
@@ -37,18 +37,18 @@ def test_objective_of_the_baseline_is_adams(large_steps, tmp_path):
     sheet = synthetic.cloth(tmp_path / "flag", frames=2, rows=10, bend=1.5, shift=0.005)
     prepare.main([str(sheet.folder)])
     baseline = per_vertex.load(str(sheet.folder / "scene.xml"), {})
-    experiment = scene.load(str(sheet.folder / "scene.xml"), {"solver": "adam"})
+    paper = {"preset": "paper", "canonical_frame": "pca", "k_tc": "0"}
+    experiment = scene.load(str(sheet.folder / "scene.xml"), paper)
     problem = Problem(experiment, experiment.sequence())
     # moved off the template's place, where the sheet's edges lie along pixel centres
     rest = problem.patch.rest().to_numpy()
     moved = {**rest, "translation": rest["translation"] + np.float32([0.013, 0.007, 0.011])}
     moved = type(problem.patch.rest()).from_numpy(moved)
     points = problem.surface(moved) - sheet.vertices[0].mean(0)
-    form = baseline.patch._form.to_differential(
-        baseline.patch._flat(points / problem.template.scale)
-    )
-    mine, terms = baseline.evaluate([form], [1])
-    theirs, wanted = problem.evaluate([moved], [1])
+    patch = baseline.problem.patch
+    form = patch._form.to_differential(patch._flat(points / problem.template.scale))
+    mine, terms = per_vertex.frozen(baseline, 1).evaluate([form])
+    theirs, wanted = per_vertex.frozen(Objective(problem), 1).evaluate([moved])
     assert mine == pytest.approx(theirs, rel=1e-3) and mine > 0
     assert terms["silhouette"] == pytest.approx(wanted["silhouette"], rel=1e-3)
 

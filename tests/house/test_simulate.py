@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 from places import ROOT
+from problems import data_of
 from scripts import load
 
 from polyfit.mesh import edges_of
 from polysft_mi.errors import InputError
-from polysft_mi.images.registration import Registration
 from polysft_mi.objective.problem import Problem
 from polysft_mi.scene import experiment as scene
 
@@ -62,7 +62,7 @@ def test_frames_show_the_texture_on_the_true_surface(bent):
     folder, vertices = bent
     experiment = scene.load(str(ROOT / "scenes" / "bend.xml"), {"data": str(folder)})
     problem = Problem(experiment, experiment.sequence())
-    registration = Registration(problem)
+    registration = data_of(problem)
     finest = problem.rules.blurs[-1]
     for t, x in enumerate(vertices):
         assert registration.misfit(x, t, finest) < 0.08

@@ -1,10 +1,11 @@
-"""Jets in torch and in Dr.Jit, and the deforming patch."""
+"""Jets in NumPy, torch and Dr.Jit, and the deforming patch."""
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 import torch
+from processes import python
 from scipy.spatial.transform import Rotation
 
 from polyfit import jets
@@ -128,26 +129,66 @@ def test_a_jet_turned_over_is_the_same_surface():
     assert (over - jets.point(alpha, uv)).abs().max() < 1e-12
 
 
+def in_numpy(x):
+    """Numbers, vectors and matrices of Dr.Jit, the points along the first axis."""
+    if isinstance(x, tuple):
+        return np.stack(np.broadcast_arrays(*map(in_numpy, x)), 1)
+    return np.array(x)
+
+
 @pytest.mark.parametrize("order", [1, 4, 10])
-def test_drjit_and_torch_agree(order):
-    from polysft_mi.surface import jet
-
+def test_numpy_torch_and_drjit_agree(order):
     uv, alpha = chart(), random_alpha(order)
-    u, v = (mi.Float(uv[:, k].numpy().astype(np.float32)) for k in (0, 1))
-    a = mi.Float(alpha.numpy().astype(np.float32))
-    scale = alpha.abs().sum().item()
+    rounding = 1e-14 * (max(1, order) * alpha.abs().sum().item()) ** 2
+    in_drjit = (
+        tuple(mi.Float64(a) for a in alpha.tolist()),
+        tuple(mi.Float64(x.numpy()) for x in uv.T.contiguous()),
+    )
+    everywhere = (
+        *(jets.height, jets.point, jets.normal, jets.metric),
+        *(lambda *at, k=k: jets.tangents(*at)[k] for k in (0, 1)),
+    )
+    for function in everywhere:
+        expected = function(alpha, uv).numpy()
+        assert np.abs(in_numpy(function(*in_drjit)) - expected).max() < rounding
+    for function in (*everywhere, jets.second_fundamental_form, jets.mean_curvature):
+        found, expected = function(alpha.numpy(), uv.numpy()), function(alpha, uv).numpy()
+        assert found.dtype == np.float64 and np.abs(found - expected).max() < rounding
 
-    def close(x, y):
-        assert np.abs(np.array(x).T - y.numpy()).max() < 3e-6 * max(1, order) * scale**2
 
-    close(jet.height(a, u, v), jets.height(alpha, uv))
-    close(jet.point(a, u, v), jets.point(alpha, uv))
-    for x, y in zip(jet.tangents(a, u, v), jets.tangents(alpha, uv)):
-        close(x, y)
-    close(jet.normal(a, u, v), jets.normal(alpha, uv))
-    g = jets.metric(alpha, uv)
-    for x, y in zip(jet.metric(a, u, v), (g[:, 0, 0], g[:, 0, 1], g[:, 1, 1])):
-        close(x, y)
+def test_numpy_and_torch_have_the_same_frames_and_feet():
+    points = RNG.normal(size=(3, 50, 3)) * (3, 2, 1)
+    weights, mask = RNG.random((3, 50)), RNG.random((3, 50)) < 0.8
+    q = RNG.normal(size=(3, 4))
+    for options in ({}, {"mask": mask}, {"mask": mask, "weights": weights}):
+        a = jets.CanonicalFrame.from_points(points, **options)
+        b = jets.CanonicalFrame.from_points(
+            torch.tensor(points), **{name: torch.tensor(x) for name, x in options.items()}
+        )
+        for name in ("s", "R", "T"):
+            assert np.abs(getattr(a, name) - getattr(b, name).numpy()).max() < 1e-12
+        turned = a.rotated(q).turned_over().to_chart(points)
+        expected = b.rotated(torch.tensor(q)).turned_over().to_chart(torch.tensor(points))
+        assert np.abs(turned - expected.numpy()).max() < 1e-12
+        assert np.abs(a.from_chart(a.to_chart(points)) - points).max() < 1e-12
+    alpha = 0.2 * RNG.normal(size=15)
+    found = jets.nearest(torch.tensor(alpha), torch.tensor(points / 5)).numpy()
+    assert np.abs(jets.nearest(alpha, points / 5) - found).max() < 1e-12
+    over = jets.turned_over(torch.tensor(alpha)).numpy()
+    assert np.array_equal(jets.turned_over(alpha), over)
+
+
+def test_jets_of_numpy_need_neither_torch_nor_drjit():
+    code = """
+import sys, numpy as np, polyfit, polysft_mi
+from polyfit import CanonicalFrame, jets
+x = np.random.default_rng(0).normal(size=(50, 3)) * (3, 2, 1)
+x = CanonicalFrame.from_points(x).to_chart(x)
+jets.principal_curvatures(jets.fit_points(x, 3).alpha, jets.point(np.ones(6), x[:, :2])[:, :2])
+print({"torch", "drjit", "mitsuba"} & set(sys.modules))
+"""
+    done = python("-c", code)
+    assert done.stdout == "set()\n", done.stderr
 
 
 @pytest.fixture
@@ -182,19 +223,22 @@ def test_patch_at_rest_is_the_template(patch):
 def test_patch_against_plain_numpy(patch):
     patch, unknowns, x = patch
     t = patch.template
-    uv = torch.as_tensor(t.chart[:, 0] + np.stack([x["delta_u"], x["delta_v"]], 1))
-    alpha = torch.as_tensor(t.alpha + x["delta_alpha"])[0]
-    canonical = jets.point(alpha, uv).numpy()
+    uv = t.chart[:, 0] + np.stack([x["delta_u"], x["delta_v"]], 1)
+    alpha = (t.alpha + x["delta_alpha"])[0]
+    canonical = jets.point(alpha, uv)
     canonical[:, 2] += t.rest[:, 0] + x["delta_w"]
     R = Rotation.from_quat(x["rotation"]).as_matrix()
     out = t.rotation[0]
     expected = t.scale * (canonical @ R.T + x["translation"]) @ out.T + t.origin
     assert np.abs(np.array(patch.vertices(unknowns)).T - expected).max() < 1e-6
-    normal = jets.normal(alpha, uv).numpy() @ R.T @ out.T
+    normal = jets.normal(alpha, uv) @ R.T @ out.T
     assert np.abs(np.array(patch.normals(unknowns)).T - normal).max() < 1e-5
+    g = t.scale**2 * jets.metric(alpha, uv)
+    for value, expected in zip(patch.metric(unknowns), (g[:, 0, 0], g[:, 0, 1], g[:, 1, 1])):
+        assert np.abs(np.array(value) - expected).max() < 1e-5 * g.max()
 
 
-def test_patch_tangents_and_metric_against_finite_differences(patch):
+def test_patch_tangents_against_finite_differences(patch):
     patch, unknowns, x = patch
     tangents = [np.array(t).T for t in patch.tangents(unknowns)]
     h = 1e-2
@@ -208,10 +252,6 @@ def test_patch_tangents_and_metric_against_finite_differences(patch):
             np.abs((ends[0] - ends[1]) / (2 * h) - tangents[k]).max()
             < 1e-3 * np.abs(tangents[k]).max()
         )
-    E, F, G = (np.array(g) for g in patch.metric(unknowns))
-    for value, (a, b) in ((E, (0, 0)), (F, (0, 1)), (G, (1, 1))):
-        expected = (tangents[a] * tangents[b]).sum(1)
-        assert np.abs(value - expected).max() < 1e-5 * np.abs(E).max()
 
 
 def test_gradient_of_vertices_to_every_unknown(patch):

@@ -24,12 +24,11 @@ def tracked(truth, tmp_path_factory):
     """The :class:`polysft_mi.tracker.Track` of ``truth`` under the default settings."""
     from problems import problem_of
 
-    from polysft_mi import solvers
-    from polysft_mi.tracker import track
+    from polysft_mi.tracker import FrameTracker, track
 
     problem = problem_of(truth.folder)
     folder = str(tmp_path_factory.mktemp("tracked"))
-    return track(problem, solvers.create(problem.settings), 4, folder)
+    return track(FrameTracker(problem), 4, folder)
 
 
 @pytest.fixture(scope="module")

@@ -2,8 +2,14 @@
 and gives the step. NumPy and SciPy only.
 """
 
+from functools import lru_cache
+
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
+
+from .tridiagonal import Blocks
+
+_blocks = lru_cache(8)(Blocks)  # their ordering is made once for a pattern
 
 
 class Reduced:
@@ -14,6 +20,12 @@ class Reduced:
     kept or not, in half the time. Raises LinAlgError where the damped local block is not positive
     definite.
     """
+
+    @classmethod
+    def of(cls, patterns, normal, damping, dtype=np.float64):
+        """From ``patterns``: number of local unknowns to the pattern of their blocks."""
+        d = normal.local.shape[-1]
+        return cls(_blocks(patterns[d], d), normal, damping, dtype)
 
     def __init__(self, blocks, normal, damping, dtype=np.float64):
         self.blocks = blocks

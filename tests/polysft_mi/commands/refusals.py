@@ -8,7 +8,7 @@ import pytest
 from polysft_mi import errors, run
 
 SIZE = (48, 36)
-QUICK = ["-q", "--exr", "2", "-D", "period=2", "-D", "last=1", "-D", "window=2"]
+QUICK = ["-q", "--exr", "2", "-D", "last=1", "-D", "window=2"]
 
 
 def contents(out):

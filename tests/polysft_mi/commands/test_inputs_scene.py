@@ -98,9 +98,9 @@ def test_xml_that_mitsuba_refuses(sheet, old, new, at, words):
 
 def test_integrator(sheet):
     has(
-        refused(sheet / "scene.xml", "-D", "integrator=depth"),
-        "solver gauss-newton renders with raster",
-        "give solver=adam",
+        refused(sheet / "scene.xml", "-D", "integrator=depth", "-D", "solver=gauss-newton"),
+        "solver gauss-newton needs a quadratic model of each term",
+        "rgb is rendered by DepthIntegrator; raster is needed, or solver = adam",
     )
     has(
         refused(sheet / "scene.xml", "-D", "integrator=foo"),
@@ -109,7 +109,7 @@ def test_integrator(sheet):
         '"foo" not found',
     )
     has(
-        refused(sheet / "scene.xml", "-D", "integrator=depth", "-D", "solver=adam"),
+        refused(sheet / "scene.xml", "-D", "integrator=depth"),
         "DepthIntegrator gives no gradients; raster or prb_projective is needed",
     )
     message = refused(edited(sheet, '<integrator type="polysft">', '<integrator type="path">'))
@@ -198,7 +198,7 @@ def test_unknown_setting_lists_the_known_ones_and_the_nearest(sheet):
     has(
         message,
         "-D ordre: ",
-        "did you mean order?; known: blur, brightness, data,",
+        "did you mean order?; known: blur, brightness, canonical_frame, data,",
         "k_mi",
         "window",
     )
@@ -215,21 +215,20 @@ def test_malformed_setting(sheet, text):
     [
         ("k_mi=abc", "setting k_mi = 'abc'; a finite number is needed"),
         ("k_mi=", "setting k_mi = ''; a finite number is needed"),
-        ("k_mi=nan", "k_mi = nan; a finite number, at least 0, is needed"),
-        ("k_mi=1e999", "k_mi = inf; a finite number, at least 0, is needed"),
+        ("k_mi=nan", "k_mi = nan; a finite number, at least 0, or -1, is needed"),
+        ("k_mi=1e999", "k_mi = inf; a finite number, at least 0, or -1, is needed"),
         *(
             (f"{name}=-0.5", f"{name} = -0.5; a finite number, at least 0, is needed")
-            for name in ("k_rgb", "k_silhouette", "k_mi", "k_tc", "lr_uv")
+            for name in ("k_rgb", "k_shading", "k_tc", "lr_uv")
         ),
         *((f"order={n}", f"order = {n}; a whole number, 0 to 10, is needed") for n in (-1, 11)),
         *((f"order={n}", f"order = '{n}'; a whole number is needed") for n in ("four", "2.5", "")),
         ("rgb_scale=0", "rgb_scale = 0.0; a finite number, above 0, is needed"),
-        ("window=-1", "window = -1; a whole number, at least 0, is needed"),
+        ("window=0", "window = 0; a whole number, at least 1, is needed"),
         ("sweeps=-1", "sweeps = -1; a whole number, at least 0, is needed"),
         ("sweeps=1.5", "sweeps = '1.5'; a whole number is needed"),
-        ("solver=newton", "solver = 'newton'; known values: gauss-newton, adam"),
-        ("rgb_norm=l3", "rgb_norm = 'l3'; known values: l1, l2, charbonnier"),
-        ("spp=3", "raster: spp = 3; a square number is needed"),
+        ("solver=newton", "solver = 'newton'; known values: auto, gauss-newton, adam"),
+        ("rgb_norm=l3", "rgb_norm = 'l3'; known values: cauchy, l1, l2, charbonnier"),
         ("first=3", "first = 3; "),
         ("last=3", "last = 3; it must lie in [0, 2]"),
         ("data=/nowhere", "data = /nowhere: no such folder"),
@@ -246,15 +245,22 @@ def test_bad_value(sheet, setting, words):
     [
         (["window=3", "smooth=1"], "window = 1, or smooth = 0, is needed"),
         (["window=3", "sweeps=1"], "window = 1, or sweeps = 0, is needed"),
-        (["solver=adam", "sweeps=1"], "sweeps = 0, or solver = gauss-newton, is needed"),
+        (["rgb_norm=l1", "sweeps=1"], "rgb has rgb_norm = l1; cauchy is needed, or sweeps = 0"),
         (
-            ["brightness=gain"],
-            "brightness = 'gain' with solver = gauss-newton; auto, local or none is needed",
+            ["brightness=gain", "solver=gauss-newton"],
+            "rgb has brightness = gain; local or none is needed, or solver = adam",
         ),
+        (["period=7"], "period = 7 is read by solver = adam alone, and this is gauss-newton"),
+        (["preset=newest"], "preset = 'newest'; known values: none, paper"),
     ],
 )
 def test_values_that_do_not_go_together(sheet, settings, words):
     has(refused(sheet / "scene.xml", *(part for text in settings for part in ("-D", text))), words)
+
+
+def test_samples_that_raster_does_not_take(sheet):
+    words = refused(sheet / "scene.xml", "-D", "spp=3", "-D", "solver=adam")
+    has(words, "raster: spp = 3; a square number is needed")
 
 
 def test_order_too_high_for_the_vertices(tmp_path):

@@ -17,14 +17,16 @@ import trimesh
 from places import ROOT
 from problems import replay_paths
 
-from polysft_mi import prepare, run, tracker
+from polysft_mi import prepare, run
 from polysft_mi.pictures import exr
 from polysft_mi.results import metrics
 from polysft_mi.results.evaluation import evaluate, score
 from polysft_mi.scene import experiment as scene
+from polysft_mi.tracker import FrameTracker
 
 GAUSS_NEWTON = ["--no-report"]
-QUICK = [*GAUSS_NEWTON, "-D", "solver=adam", "-D", "period=4"]
+PAPER = ["-D", "preset=paper", "-D", "canonical_frame=pca"]
+QUICK = [*GAUSS_NEWTON, *PAPER, "-D", "period=4"]
 SOLVERS = {"adam": QUICK, "gauss-newton": GAUSS_NEWTON}
 
 
@@ -164,21 +166,21 @@ def test_resume_ends_with_the_same_result(sequence, tmp_path, monkeypatch, solve
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     assert run.main([*arguments, "-o", str(whole)]) == 0
 
-    advance, calls = tracker._advance, []
+    solve, calls = FrameTracker.solve, []
 
     def interrupted(*args):
         calls.append(args)
         if len(calls) == 2:
             raise KeyboardInterrupt
-        advance(*args)
+        return solve(*args)
 
-    monkeypatch.setattr(tracker, "_advance", interrupted)
+    monkeypatch.setattr(FrameTracker, "solve", interrupted)
     assert run.main([*arguments, "-o", str(parts)]) == 130
     assert (
         surface(parts)["vertices"].shape[0] == kept
     )  # one window, of three frames or of one: valid, and shorter
     assert json.loads((parts / "metrics.json").read_text())["frames"] == kept
-    monkeypatch.setattr(tracker, "_advance", advance)
+    monkeypatch.setattr(FrameTracker, "solve", solve)
     assert run.main([*arguments, "-o", str(parts), "--resume"]) == 0
     a, b = surface(whole), surface(parts)
     assert a["vertices"].shape == b["vertices"].shape
@@ -249,16 +251,16 @@ def test_a_surface_that_leaves_the_image_is_reported_and_held(
 ):
     from polysft_mi.solvers.adam import Adam
 
-    solve, thrown = Adam.solve, []
+    minimise, thrown = Adam.minimise, []
 
-    def thrown_out(self, problem, window, frames, report=None, past=()):
-        solution = solve(self, problem, window, frames, report, past)
-        if frames[-1] == 3 and not thrown:
+    def thrown_out(self, objective, start, **options):
+        result = minimise(self, objective, start, **options)
+        if objective.contexts[-1].frame == 3 and not thrown:
             thrown.append(True)
-            solution.window[-1].translation = solution.window[-1].translation + 100
-        return solution
+            result.states[-1].translation += 100
+        return result
 
-    monkeypatch.setattr(Adam, "solve", thrown_out)
+    monkeypatch.setattr(Adam, "minimise", thrown_out)
     out = tmp_path / "out"
     assert (
         run.main([str(sequence.folder / "scene.xml"), "-o", str(out), "-q", *QUICK, "-D", "last=3"])
@@ -300,7 +302,7 @@ def test_path_replay_runs_from_the_same_scene(sequence, tmp_path):
         text.replace('name="data" value="."', f'name="data" value="{sequence.folder}"')
     )
     replay_paths(scene)
-    settings = "--no-report -D solver=adam -D last=1 -D window=2 -D period=6".split()
+    settings = [*PAPER, *"--no-report -D last=1 -D window=2 -D period=6".split()]
     assert run.main([str(scene), "-o", str(out), "-q", *settings]) == 0
     records = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
     first = [r for r in records if r["frame"] == 1]

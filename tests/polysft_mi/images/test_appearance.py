@@ -2,7 +2,6 @@
 slanted, lit sheets against their own images.
 """
 
-import dataclasses
 import math
 
 import drjit as dr
@@ -10,18 +9,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import synthetic
-from problems import problem_of
+from problems import data_of, problem_of
 from scipy.spatial.transform import Rotation
 
-from polysft_mi import solvers
 from polysft_mi.images import pixels
-from polysft_mi.images.light import Light
 from polysft_mi.images.pyramid import Level, level_image
-from polysft_mi.images.registration import Registration
-from polysft_mi.objective.second_order import Context, SecondOrder
-from polysft_mi.solvers.gauss_newton.descent import Descent
 from polysft_mi.surface.patch import Unknowns
-from polysft_mi.tracker import track
+from polysft_mi.tracker import FrameTracker, track
 
 LIGHT = np.array([0.6, 0.45, 0.0, -0.3])
 LEVELS = [Level(1.0, 1, 8.0), Level(2.5, 2, 8.0)]
@@ -81,7 +75,7 @@ def compared(known, vertices, frame, level, appearance):
         seen = residual + dr.gather(mi.Vector4f, at.texels, pixel, inside)
     x0, y0, *_ = (int(k[0]) for k in view.region)
     w, h = view.size
-    rows, columns = known._problem.height // level.stride, known._problem.width // level.stride
+    rows, columns = known.camera.height // level.stride, known.camera.width // level.stride
     colour, where = np.zeros((rows, columns, 3)), np.zeros((rows, columns), bool)
     colour[y0 : y0 + h, x0 : x0 + w] = np.array(seen).T[:, :3].reshape(h, w, 3)
     where[y0 : y0 + h, x0 : x0 + w] = np.array(weight).reshape(h, w) > 0
@@ -90,12 +84,12 @@ def compared(known, vertices, frame, level, appearance):
 
 @pytest.mark.parametrize("level", LEVELS)
 def test_it_is_a_rendering_made_what_frames_are_made(problem, level):
-    known = Registration(problem)
+    known = data_of(problem)
     vertices = slanted(problem.template.vertices)
     appearance = known.appearance(vertices, level)
     with dr.suspend_grad():
         known._view(vertices, Level(1.0))
-        image = np.array(known._raster.image(known._scene, known._sensor, spp=36))
+        image = np.array(known._raster.image(problem.placed.scene, problem.placed.sensor, spp=36))
     cover = (image[..., 3] > 0.5).astype(np.float32)
     colour = (image[..., :3] / np.maximum(image[..., 3:], 1e-3) * cover[..., None]).astype(
         np.float32
@@ -122,7 +116,7 @@ def test_it_is_a_rendering_made_what_frames_are_made(problem, level):
 
 @pytest.mark.parametrize("level", LEVELS)
 def test_a_frame_is_explained_by_the_surface_that_it_shows(problem, truth, level):
-    known = Registration(problem)
+    known = data_of(problem)
     light = np.array([*LIGHT, 0, 0, 0])
     found = {}
     for name, appearance in (
@@ -135,7 +129,7 @@ def test_a_frame_is_explained_by_the_surface_that_it_shows(problem, truth, level
 
 
 def test_gradient_and_curvature_are_those_of_a_frame_that_has_the_excess(problem, truth):
-    level, known, frame = LEVELS[0], Registration(problem), 2
+    level, known, frame = LEVELS[0], data_of(problem), 2
     vertices = truth.vertices[2]
     appearance = known.appearance(vertices + [0.001, 0, 0.002], level)
     mine = known.evaluate(vertices, frame, level, 0.3, appearance)
@@ -164,7 +158,7 @@ def test_gradient_and_curvature_are_those_of_a_frame_that_has_the_excess(problem
 
 def test_without_masks_only_what_is_far_from_the_border(unmasked):
     problem = problem_of(unmasked.folder)
-    known, level = Registration(problem), Level(1.0, 1, 6.0)
+    known, level = data_of(problem), Level(1.0, 1, 6.0)
     appearance = known.appearance(problem.template.vertices, level)
     extra = appearance.excess
     w, h, x, y = (int(k[0]) for k in (extra.width, extra.height, extra.x, extra.y))
@@ -182,7 +176,7 @@ def test_without_masks_only_what_is_far_from_the_border(unmasked):
 
 
 def test_the_last_view_is_kept_and_no_other(problem, truth):
-    known, level = Registration(problem), LEVELS[0]
+    known, level = data_of(problem), LEVELS[0]
     first = known._view(truth.vertices[1], level)
     assert known._view(truth.vertices[1].copy(), level) is first
     assert known._view(truth.vertices[1], LEVELS[1]) is not first
@@ -194,32 +188,10 @@ def test_the_last_view_is_kept_and_no_other(problem, truth):
     assert known.evaluate(moved, 1, level, 0.3).photometric != values[0]
 
 
-def test_each_stage_begins_with_what_the_sheet_looks_like(problem, monkeypatch):
-    descent = Descent(SecondOrder(problem))
-    chart, images, seen = descent.objective.atlas, descent.objective.images, []
-    rest, original = chart.state(problem.patch.rest().to_numpy()), images.appearance
-
-    def appearance(vertices, blur, light, shaded):
-        seen.append((blur, shaded))
-        return original(vertices, blur, light, shaded)
-
-    monkeypatch.setattr(images, "appearance", appearance)
-    blurs = problem.rules.blurs
-    usual = [(blur, blur == blurs[-1]) for blur in blurs]
-    # all that is left is what iterations cannot lower
-    context = Context(1, rest, 1.0, Light.unknown(problem.rules), {}, explained=1.0)
-    descent.descend(rest, context, (descent.far, *descent.usual))
-    assert seen == usual
-    seen.clear()
-    monkeypatch.setattr(descent, "rules", dataclasses.replace(problem.rules, explained=0.0))
-    descent.descend(rest, dataclasses.replace(context, explained=0.0), descent.usual)
-    assert seen[:5] == [*usual, *usual[1:]]  # what is not explained is looked at again
-
-
 def test_slanted_and_lit_sheets_are_followed(truth, tmp_path):
     """A sheet rolled by up to 76 degrees at its ends, under a light from the side."""
     problem = problem_of(truth.folder)
-    done = track(problem, solvers.create(problem.settings), 4, str(tmp_path))
+    done = track(FrameTracker(problem), 4, str(tmp_path))
     error = np.linalg.norm(
         problem.surface(Unknowns.from_numpy(done.states[-1])) - truth.vertices[-1], axis=1
     )

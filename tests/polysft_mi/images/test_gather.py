@@ -9,12 +9,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from problems import problem_of, small_cloth
+from problems import data_of, problem_of, small_cloth
 from scipy.spatial.transform import Rotation
 
 from polysft_mi.images import pixels
 from polysft_mi.images.pyramid import MAX_CONTOUR_DISTANCE, Level
-from polysft_mi.images.registration import Registration
 from polysft_mi.render.device import on_device
 
 LEVEL = Level(1.0, 1, 8.0)
@@ -41,7 +40,7 @@ def surfaces(problem):
 
 
 def test_sums_over_each_triangles_pixels(problem):
-    known, rng = Registration(problem), np.random.default_rng(2)
+    known, rng = data_of(problem), np.random.default_rng(2)
     for vertices in surfaces(problem):
         view = known._view(vertices, LEVEL)
         triangle = np.array(view.triangle)
@@ -67,7 +66,7 @@ def test_sums_over_each_triangles_pixels(problem):
 
 
 def test_a_triangle_behind_the_camera_misses_no_pixel_of_the_others(problem):
-    known = Registration(problem)
+    known = data_of(problem)
     vertices = problem.template.vertices.copy()
     vertices[0, 2] = -0.5
     view = known._view(vertices, LEVEL)
@@ -81,7 +80,7 @@ def test_a_triangle_behind_the_camera_misses_no_pixel_of_the_others(problem):
 
 def test_what_is_recorded_is_what_is_traced(problem):
     """Of regions, frames and outlines of any size, by the same record."""
-    known = Registration(problem)
+    known = data_of(problem)
     levels = LEVEL, Level(2.0, 2, 8.0)
     sizes = set()
     for (k, vertices), level in itertools.product(enumerate(surfaces(problem)), levels):
@@ -137,7 +136,7 @@ def flat(found):
 
 def test_pixels_of_a_silhouette_pull_alike_in_every_run(problem):
     """Threads add to vertices in any order."""
-    known = Registration(problem)
+    known = data_of(problem)
     vertices = surfaces(problem)[2]
     runs = [known.evaluate(vertices, 1, LEVEL, 0.3).images for _ in range(20)]
     for name in ("gradient", "second"):
@@ -150,7 +149,7 @@ def test_a_silhouettes_step_goes_far(problem, shift):
     """Beside its mask, a sheet is moved back by half of what it is off, or more; plain Gauss-Newton
     would go one pixel.
     """
-    known = Registration(problem)
+    known = data_of(problem)
     pixel = (
         problem.template.vertices[:, 2:].mean()
         / known.camera.intrinsics().fx
@@ -169,7 +168,7 @@ def test_a_silhouettes_step_goes_far(problem, shift):
 
 def test_beyond_the_surroundings_of_the_mask_a_silhouette_is_as_far_as_counts(problem):
     known, mask = (
-        Registration(problem),
+        data_of(problem),
         pixels.Image.of(on_device(np.zeros(400), mi.Float), (20, 20), (2, 3)),
     )
     with dr.suspend_grad():

@@ -8,15 +8,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import synthetic
-from problems import problem_of
+from problems import data_of, problem_of
 
-from polysft_mi import solvers
 from polysft_mi.images.light import Brightness, Light, residuals
-from polysft_mi.images.registration import Registration
-from polysft_mi.objective.second_order import Context, SecondOrder
+from polysft_mi.objective import FrameContext, FrameMemory, Objective
 from polysft_mi.scene.rules import Rules
-from polysft_mi.solvers.gauss_newton.descent import Descent
-from polysft_mi.tracker import track
+from polysft_mi.solvers.linear import Reduced
+from polysft_mi.tracker import FrameTracker, track
 
 LIGHT = np.array([0.6, 0.3, -0.2, -0.35, 0.05, -0.08, 0.04])
 K = np.array([[200.0, 0, 80], [0, 200, 60], [0, 0, 1]])
@@ -274,14 +272,14 @@ def tracked(truth, tmp_path_factory):
     """All frames, followed under a light that is learned."""
     problem = problem_of(truth.folder)
     folder = str(tmp_path_factory.mktemp("whole"))
-    return track(problem, solvers.create(problem.settings), 5, folder)
+    return track(FrameTracker(problem), 5, folder)
 
 
 def test_the_tracker_learns_the_light_and_follows_it(truth, tracked, tmp_path):
     problem = problem_of(truth.folder, k_shading=0.0)
-    off = track(problem, solvers.create(problem.settings), 3, str(tmp_path)).totals[-1]
-    assert Light.of(off["light"], Rules()).frames == 0 and off["shading"] == 0
-    found = Light.of(tracked.totals[-1]["light"], Rules())
+    off = track(FrameTracker(problem), 3, str(tmp_path))
+    assert off.memories[-1].light.frames == 0 and "shading" not in off.totals[-1]
+    found = tracked.memories[-1].light
     assert found.frames == 5
     assert tracked.totals[0]["shading"] == 0 < tracked.totals[-1]["shading"]
     # the sheet rolls about the image's upright: that is where the light's slope shows
@@ -300,9 +298,9 @@ def test_what_is_known_of_the_light_survives_an_interruption(truth, tracked, tmp
             raise Interrupted
 
     with pytest.raises(Interrupted):
-        track(problem, solvers.create(problem.settings), 5, str(tmp_path), solved=stop)
-    resumed = track(problem, solvers.create(problem.settings), 5, str(tmp_path), resume=True)
-    assert resumed.totals[-1]["light"] == tracked.totals[-1]["light"]
+        track(FrameTracker(problem), 5, str(tmp_path), solved=stop)
+    resumed = track(FrameTracker(problem), 5, str(tmp_path), resume=True)
+    assert resumed.memories[-1].light.numbers() == tracked.memories[-1].light.numbers()
     assert all(
         np.array_equal(a[name], b[name])
         for a, b in zip(tracked.states, resumed.states)
@@ -312,7 +310,7 @@ def test_what_is_known_of_the_light_survives_an_interruption(truth, tracked, tmp
 
 def test_a_texture_that_moves_takes_its_brightness_along(truth):
     problem = problem_of(truth.folder)
-    images = Registration(problem)
+    images = data_of(problem)
     before, chart = images.brightness.texture, problem.template.chart[:, 0]
     assert images.move_texture(chart, chart + 0.1)
     assert np.abs(images.brightness.texture - before).max() > 0.05
@@ -321,21 +319,21 @@ def test_a_texture_that_moves_takes_its_brightness_along(truth):
 @pytest.mark.parametrize("stage", [0, 1, 2])
 def test_only_the_last_stage_is_shaded_and_a_step_goes_where_the_shading_leads(truth, stage):
     problem = problem_of(truth.folder, k_rgb=0.0, k_silhouette=0.0, k_mi=0.0, k_relief=0.0, order=4)
-    descent = Descent(SecondOrder(problem))
-    stage = descent.usual[stage]
-    rest = descent.objective.atlas.state(problem.patch.rest().to_numpy())
+    objective = Objective(problem)
+    stage, rest = objective.usual[stage], problem.atlas.state(problem.patch.rest().to_numpy())
     # what an image shows at another place is no derivative
     light = known(LIGHT * (1, 1, 1, 1, 0, 0, 0))
-    context = Context(1, rest, np.nan, light, {})
-    model = descent.model(rest, context, stage, 0.5)
+    context = FrameContext(1, rest, FrameMemory(light=light))
+    frozen = objective.frozen([context], stage, [rest])
+    (model,) = frozen.quadratic([rest])
     shading, normal = model.terms["shading"], model.normal
     assert (shading > 0) == stage.last == bool(np.abs(normal.gradient).max() > 1e-9)
     if shading:
-        step, _ = descent.reduced(normal, 1e-3).step()
+        step, _ = Reduced.of(objective.inputs.operators.patterns, normal, 1e-3).step()
         slope = step[0] @ normal.gradient + (step[1] * normal.local_gradient).sum()
-        found = descent.model(rest.after_step(step, 0.1), context, stage, 0.5).terms["shading"]
+        (there,) = frozen.quadratic([rest.after_step(step, 0.1)])
         # less than the slope says, for the exposure follows
-        assert 0.1 * slope < found - shading < 0.02 * slope < 0
+        assert 0.1 * slope < there.terms["shading"] - shading < 0.02 * slope < 0
 
 
 def test_what_a_light_makes_of_each_triangle():

@@ -1,7 +1,11 @@
-"""Each term of the objective: its value on a case worked out by hand, and its gradient against
-finite differences.
+"""The objective by automatic differentiation: its norms and comparisons on cases worked out by
+hand, and its gradient through Mitsuba's renderer against finite differences.
 """
 
+import itertools
+import json
+
+import cv2
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -9,13 +13,17 @@ import pytest
 import synthetic
 from problems import replay_paths
 
-from polysft_mi import capture
-from polysft_mi.objective import terms as objective
-from polysft_mi.objective.problem import Problem
+from polysft_mi import capture, prepare
+from polysft_mi.images import differentiable, pyramid
+from polysft_mi.images.pyramid import Level
+from polysft_mi.objective import FrameContext, Objective, Problem
+from polysft_mi.objective.terms.inextensibility import edge_lengths
+from polysft_mi.objective.terms.photometric import gain, robust
 from polysft_mi.scene import experiment as scene
 from polysft_mi.surface.patch import Unknowns
 
 RNG = np.random.default_rng(1)
+PAPER = {"preset": "paper", "canonical_frame": "pca", "patches": 0}
 
 
 def floats(x):
@@ -40,154 +48,73 @@ def check_gradient(f, x, h=1e-2, rel=0.01):
 @pytest.mark.parametrize(
     "norm, expected",
     [
-        ("l2", (0.09 + 0.36) / 2),
-        ("l1", (0.3 + 0.6) / 2),
-        ("charbonnier", 0.02 * (10**0.5 - 1 + 37**0.5 - 1) / 2),
+        ("l2", [0.09, 0.36, 0]),
+        ("l1", [0.3, 0.6, 0]),
+        ("charbonnier", [0.02 * (10**0.5 - 1), 0.02 * (37**0.5 - 1), 0]),
+        ("cauchy", [0.01 * np.log(10), 0.01 * np.log(37), 0]),
     ],
 )
-def test_photometric_value_and_gradient(norm, expected):
-    target = [floats([0.1, 0.2, 0.9])] * 3
-    render = [floats([0.4, 0.8, 0.9])] * 3
-    weight, area = floats([1, 1, 0]), mi.Float(2)
-    value = objective.photometric(render, target, weight, area, norm=norm, scale=0.1)
-    assert value[0] == pytest.approx(expected, rel=1e-4)
-    x = RNG.random(12)
-    goal = [floats(RNG.random(4)) for _ in range(3)]
-    index = dr.arange(mi.UInt32, 4)
-
-    def f(v):
-        channels = [dr.gather(mi.Float, v, 3 * index + c) for c in range(3)]
-        return objective.photometric(
-            channels, goal, floats([1, 0.5, 0, 1]), mi.Float(2.5), norm=norm, scale=0.1
-        )
-
-    check_gradient(f, x, h=1e-3, rel=0.02)
-
-
-def test_silhouette_value_and_gradient():
-    mask = floats([1, 1, 0, 0])
-    assert objective.silhouette(floats([1, 0.5, 0.5, 0]), mask, mi.Float(2))[0] == pytest.approx(
-        0.25
+def test_norms_of_residuals(norm, expected):
+    squared = floats([0.09, 0.36, 0])
+    assert np.allclose(np.array(robust(squared, norm, 0.1)), expected, rtol=1e-4, atol=2e-6)
+    goal = floats(RNG.random(12))
+    check_gradient(
+        lambda v: dr.sum(robust(dr.square(v - goal), norm, 0.1)), RNG.random(12), h=1e-3, rel=0.02
     )
-    check_gradient(lambda v: objective.silhouette(v, mask, mi.Float(2)), RNG.random(4))
 
 
-def test_inextensibility_value_and_gradient():
-    # a unit square's diagonal pulled from sqrt(2) to 2, one side from 1 to sqrt(2) and one to
-    # sqrt(2): points (0,0), (1,0), (1+a, 1+b)
-    edges = (mi.UInt32([0, 1, 0]), mi.UInt32([1, 2, 2]))
-    rest = floats([1, 1, 2**0.5])
+def test_lengths_of_edges_and_their_gradient():
+    edges = mi.UInt32([0, 1, 0]), mi.UInt32([1, 2, 2])
     points = mi.Point3f([0, 1, 2], [0, 0, 1], [0, 0, 0])
-    expected = (2**0.5 - 1) ** 2 + (5**0.5 - 2**0.5) ** 2
-    assert objective.inextensibility(points, edges, rest, mi.Float(1))[0] == pytest.approx(
-        expected, rel=1e-5
-    )
-    assert objective.inextensibility(points, edges, rest, mi.Float(2))[0] == pytest.approx(
-        expected / 4, rel=1e-5
-    )
+    assert np.allclose(np.array(edge_lengths(points, edges)), [1, 2**0.5, 5**0.5], rtol=1e-6)
 
     def f(v):
-        return objective.inextensibility(
-            dr.gather(mi.Point3f, v, dr.arange(mi.UInt32, 3)), edges, rest, mi.Float(0.7)
-        )
+        found = edge_lengths(dr.gather(mi.Point3f, v, dr.arange(mi.UInt32, 3)), edges)
+        return mi.Float(dr.sum(dr.square(found - 1)))
 
     check_gradient(f, [0, 0, 0, 1.1, 0.2, 0, 1.3, 0.9, 0.4], h=1e-3)
 
 
-def test_isometries_are_free():
-    edges = (mi.UInt32([0, 1]), mi.UInt32([1, 2]))
-    flat = mi.Point3f([0, 1, 2], [0, 0, 0], [1, 1, 1])
-    bent = mi.Point3f([0, 1, 1], [0, 0, 0], [1, 1, 2])
-    rest = objective.edge_lengths(flat, edges)
-    assert objective.inextensibility(bent, edges, rest, mi.Float(1))[0] == pytest.approx(
-        0, abs=1e-12
-    )
-
-
-def window_of(values):
-    rows = values.reshape(3, 7)
-    return [
-        Unknowns(
-            floats(r[:3]),
-            floats(r[3:5]),
-            floats(r[5:7]),
-            floats([0, 0]),
-            floats([0, 0, 0, 1]),
-            floats([0, 0, 0]),
-        )
-        for r in rows
-    ]
-
-
-def test_temporal_value_and_gradient():
-    x = RNG.normal(size=21)
-    rows = x.reshape(3, 7)
-    assert objective.temporal(window_of(x))[0] == pytest.approx(
-        (np.diff(rows, axis=0) ** 2).sum() / 2, rel=1e-5
-    )
-    assert objective.temporal(window_of(x)[:1])[0] == 0
-    index = dr.arange(mi.UInt32, 7)
-
-    def f(v):
-        rows = [dr.gather(mi.Float, v, 7 * k + index) for k in range(3)]
-        zero = floats([0, 0, 0])  # relief, rotation and translation do not count
-        part = lambda r, a, n: dr.gather(mi.Float, r, a + dr.arange(mi.UInt32, n))
-        return objective.temporal(
-            [Unknowns(part(r, 0, 3), part(r, 3, 2), part(r, 5, 2), zero, zero, zero) for r in rows]
-        )
-
-    check_gradient(f, x)
-
-
 def test_gain_is_the_least_squares_one():
-    render, target, weight = (
-        RNG.random((3, 50)),
-        RNG.random((3, 50)),
-        (RNG.random(50) > 0.3).astype(float),
-    )
-    found = objective.gain(
-        [floats(c) for c in render], [floats(c) for c in target], floats(weight)
-    )[0]
-    assert found == pytest.approx(
-        (weight * render * target).sum() / (weight * render**2).sum(), rel=1e-4
-    )
+    render, target = RNG.random((3, 50)), RNG.random((3, 50))
+    weight = (RNG.random(50) > 0.3).astype(float)
+    found = gain([floats(c) for c in render], [floats(c) for c in target], floats(weight))[0]
+    expected = (weight * render * target).sum() / (weight * render**2).sum()
+    assert found == pytest.approx(expected, rel=1e-4)
 
 
 def test_blur_keeps_the_sum_and_its_width():
     image = np.zeros((41, 41, 2), np.float32)
     image[20, 20] = 1, 2
-    out = np.array(objective.blur(mi.TensorXf(image), 1.5))
+    out = np.array(differentiable.blur(mi.TensorXf(image), 1.5))
     assert out.sum((0, 1)) == pytest.approx([1, 2], rel=1e-4)
     x = np.arange(41) - 20
-    assert (out[..., 0].sum(0) * x**2).sum() == pytest.approx(
-        1.5**2, rel=0.06
-    )  # the Gaussian is cut off
-    assert objective.blur(mi.TensorXf(image), 0).array is not None
+    width = (out[..., 0].sum(0) * x**2).sum()
+    assert width == pytest.approx(1.5**2, rel=0.06)  # the Gaussian is cut off
 
 
-def test_gradient_of_local_normalisation():
-    weight = mi.TensorXf(RNG.random((24, 32, 1)).astype(np.float32))
-    goal = floats(RNG.normal(size=24 * 32 * 3))
-    check_gradient(
-        lambda v: dr.sum(
-            goal * objective.normalise_locally(mi.TensorXf(v, (24, 32, 3)), weight).array
-        ),
-        RNG.random(24 * 32 * 3),
-        h=2e-3,
-    )
-
-
-def test_local_normalisation_takes_out_gain_and_offset():
+@pytest.mark.parametrize("level", [Level(0.0), Level(1.5)])
+def test_images_are_compared_alike_on_the_device_and_on_the_host(level):
+    """Inside a mask, away from the image's border; with its gradient."""
     y, x = np.mgrid[:48, :64] / 10
     image = 0.5 + 0.2 * np.stack([np.sin(3 * x + y), np.cos(4 * y), np.sin(2 * x * y)], -1)
-    weight = mi.TensorXf(np.ones((48, 64, 1), np.float32))
-    lit = image * (0.6 + 0.004 * x[..., None]) + 0.1
-    a, b = (
-        np.array(objective.normalise_locally(mi.TensorXf(i.astype(np.float32)), weight))
-        for i in (image, lit)
+    mask = np.zeros((48, 64), np.float32)
+    mask[10:40, 12:50] = 1
+    image = (image * mask[..., None]).astype(np.float32)
+    found, weight = mi.TensorXf(image), mi.TensorXf(mask[..., None])
+    mine = np.array(differentiable.compared(found, weight, level, True))
+    host = pyramid.compared(image, mask, level.sigma, level.window, True, level.floor)
+    inside = mask > 0
+    assert np.abs(host[inside]).mean() > 0.5 and not mine[~inside].any()
+    assert np.abs(mine - host)[inside].mean() < 0.03 * np.abs(host[inside]).mean()
+    goal = floats(RNG.normal(size=image.size))
+    check_gradient(
+        lambda v: dr.sum(
+            goal * differentiable.compared(mi.TensorXf(v, image.shape), weight, level, True).array
+        ),
+        image + 0.05 * RNG.random(image.shape) * mask[..., None],
+        h=2e-3,
     )
-    assert np.abs(a).mean() > 0.5
-    assert np.abs(a - b)[8:-8, 8:-8].mean() < 0.03 * np.abs(a).mean()
 
 
 # ---- the objective of a frame --------------------------------------------------------------------
@@ -200,11 +127,20 @@ def problem(folder, masks=True, replayed=False, **overrides):
     path.write_text(capture.scene_xml(layout, str(truth.folder)))
     if replayed:
         replay_paths(path)
-    experiment = scene.load(path, {"solver": "adam", **overrides})
-    return (
-        Problem(experiment, experiment.sequence()),
-        truth,
-    )
+    experiment = scene.load(path, {**PAPER, **overrides})
+    return Problem(experiment, experiment.sequence()), truth
+
+
+def frozen_of(problem, *frames):
+    """The objective of frames of which nothing is known before."""
+    objective = Objective(problem)
+    rest = problem.atlas.state(problem.patch.rest().to_numpy())
+    contexts = [FrameContext(frame) for frame in frames]
+    return objective.frozen(contexts, objective.usual[-1], [rest] * len(frames))
+
+
+def energy(problem, unknowns, frame, **options):
+    return frozen_of(problem, frame).evaluate([unknowns], **options)
 
 
 @pytest.mark.parametrize(
@@ -214,6 +150,7 @@ def problem(folder, masks=True, replayed=False, **overrides):
         {"k_mi": 0, "blur": 1.0, "rgb_norm": "charbonnier"},
         {"k_mi": 0, "brightness": "gain"},
         {"k_mi": 0, "brightness": "local"},
+        {"k_mi": 0, "brightness": "local", "rgb_norm": "cauchy", "rgb_region": "sheet", "blur": 1},
         {"k_rgb": 0, "k_silhouette": 0},
         {"k_mi": 0, "integrator": "raster", "spp": 4},
     ],
@@ -223,64 +160,93 @@ def test_gradient_of_the_whole_objective(tmp_path, masks, overrides):
     if not masks and overrides.get("brightness") == "local":
         pytest.skip("the window of the local statistics jumps with the interior, which is detached")
     p, _ = problem(tmp_path, masks, **overrides)
+    rng = np.random.default_rng(2)
     rest = p.patch.rest().to_numpy()
     rest["delta_alpha"] = (0.02 * np.sin(np.arange(15))).astype(np.float32)[None]
     rest["translation"] = np.array([[0.01, -0.013, 0.02]], np.float32)
     unknowns = Unknowns.from_numpy(rest)
     for _, value in unknowns.items():
         dr.enable_grad(value)
-    total, terms = p.evaluate([unknowns], [2], backward=True)
+    total, terms = energy(p, unknowns, 2, backward=True)
     assert total == pytest.approx(sum(terms.values())) and total > 0
-    assert (terms["silhouette"] > 0) == (masks and overrides.get("k_silhouette", 1) > 0)
+    assert (terms.get("silhouette", 0) > 0) == (masks and overrides.get("k_silhouette", 1) > 0)
     for name, size in (("delta_alpha", 15), ("translation", 3)):
-        direction = RNG.normal(size=(1, size))
+        direction = rng.normal(size=(1, size))
         direction /= np.linalg.norm(direction)
         ad = float(np.array(dr.grad(getattr(unknowns, name))) @ direction[0])
         slopes = []
         for h in (1e-3, 2e-3, 4e-3):
             ends = [
-                p.evaluate(
-                    [Unknowns.from_numpy({**rest, name: rest[name] + s * h * direction})], [2]
-                )[0]
+                energy(p, Unknowns.from_numpy({**rest, name: rest[name] + s * h * direction}), 2)[0]
                 for s in (1, -1)
             ]
             slopes.append((ends[0] - ends[1]) / (2 * h))
         # 96x72 pixels leave kinks at every pixel that changes sheets, and without masks the
         # interior jumps by whole pixels
-        assert ad == pytest.approx(np.median(slopes), rel=0.15, abs=0.03 * max(1, total)), (
+        near = dict(rel=0.15, abs=0.03) if masks else dict(rel=0.3, abs=0.05)
+        assert ad == pytest.approx(np.median(slopes), **near), (
             name,
             slopes,
         )
+
+
+def test_a_windows_terms_are_means_and_the_frames_are_tied(tmp_path):
+    """The mean over frames of their terms; k_tc times the mean over pairs of |δα|^2 + |δuv|^2 in
+    the paper's coefficients (eq. tc), and its gradient.
+    """
+    p, _ = problem(tmp_path, k_tc=0.7, k_silhouette=0, k_rgb=0)
+    rows = [p.patch.rest().to_numpy() for _ in range(3)]
+    for row in rows:
+        for name in ("delta_alpha", "delta_u", "delta_v"):
+            row[name] += (0.05 * RNG.normal(size=row[name].shape)).astype(np.float32)
+    window = [Unknowns.from_numpy(row) for row in rows]
+    for unknowns in window:
+        dr.enable_grad(unknowns)
+    frozen = frozen_of(p, 0, 1, 2)
+    _, terms = frozen.evaluate(window, backward=True)
+    names = "delta_alpha", "delta_u", "delta_v"
+    ties = [sum(((b[n] - a[n]) ** 2).sum() for n in names) for a, b in itertools.pairwise(rows)]
+    assert terms["temporal"] == pytest.approx(0.7 * sum(ties) / 2, rel=1e-4)
+    alone = [energy(p, unknowns, k)[1]["inextensibility"] for k, unknowns in enumerate(window)]
+    assert terms["inextensibility"] == pytest.approx(np.mean(alone), rel=1e-5)
+    direction = RNG.normal(size=rows[1]["delta_u"].shape)
+
+    def total(h):
+        moved = {**rows[1], "delta_u": (rows[1]["delta_u"] + h * direction).astype(np.float32)}
+        return frozen.evaluate([window[0], Unknowns.from_numpy(moved), window[2]])[0]
+
+    slope = (total(1e-3) - total(-1e-3)) / 2e-3
+    assert np.array(dr.grad(window[1].delta_u)) @ direction == pytest.approx(slope, rel=0.01)
+    assert energy(p, window[0], 0)[1]["temporal"] == 0
 
 
 def test_truth_is_nearly_a_minimum(tmp_path):
     """The bent sheet's own surface explains the image better than the flat template and than its
     mirror image in depth.
     """
-    from polysft_mi.surface.template import Template
-
     p, truth = problem(tmp_path)
+    target = p.sequence.frame(4) * p.sequence.mask(4)[..., None]
 
     def loss(vertices):
-        rgb, _alpha = p.image(mi.Point3f(np.ascontiguousarray(vertices.T, dtype=np.float32)))
-        target = p.target(4)
-        return float(np.mean((np.array(rgb) - np.array(target.rgb)) ** 2))
+        rgb, _ = p.placed.image(mi.Point3f(np.ascontiguousarray(vertices.T, dtype=np.float32)))
+        return float(np.mean((np.array(rgb) - target) ** 2))
 
     bent = truth.vertices[4]
     mirrored = bent * (1, 1, -1) + (0, 0, 2 * bent[:, 2].mean())
     assert loss(bent) < 0.1 * loss(truth.vertices[0]) and loss(bent) < 0.1 * loss(mirrored)
-    assert isinstance(p.template, Template)
 
 
 def test_without_masks_the_background_does_not_matter(tmp_path):
-    p, _ = problem(tmp_path, masks=False)
-    before = p.evaluate([p.patch.rest()], [0])[0]
-    target = p.target(0)
-    alpha = np.array(p.image(p.patch.vertices(p.patch.rest()))[1]).reshape(p.height, p.width)
-    image = np.array(target.rgb)
-    image[alpha == 0] = 1
-    target.rgb = mi.TensorXf(image)
-    assert p.evaluate([p.patch.rest()], [0])[0] == pytest.approx(before, rel=1e-6)
+    p, truth = problem(tmp_path, masks=False)
+    rest = p.patch.rest()
+    before = energy(p, rest, 0)[0]
+    alpha = np.array(p.placed.image(p.patch.vertices(rest))[1]).reshape(p.height, p.width)
+    path = sorted((truth.folder / "frames").iterdir())[0]
+    image = cv2.imread(str(path))
+    image[alpha == 0] = 255
+    cv2.imwrite(str(path), image)
+    again = Problem(p.experiment, p.experiment.sequence())
+    assert energy(again, rest, 0)[0] == pytest.approx(before, rel=1e-6)
 
 
 def test_padding_does_not_change_the_loss(tmp_path):
@@ -291,8 +257,6 @@ def test_padding_does_not_change_the_loss(tmp_path):
     for name, _size in (("small", (96, 72)), ("large", (160, 120))):
         truth = synthetic.cloth(tmp_path / name, size=(96, 72))
         if name == "large":
-            import cv2
-
             for kind in ("frames", "masks"):
                 for f in sorted((truth.folder / kind).iterdir()):
                     image = cv2.imread(str(f), cv2.IMREAD_UNCHANGED)
@@ -302,8 +266,6 @@ def test_padding_does_not_change_the_loss(tmp_path):
                     big[24:96, 32:128] = image
                     cv2.imwrite(str(f), big)
             K = truth.K
-            import json
-
             (truth.folder / "camera.json").write_text(
                 json.dumps(
                     {
@@ -318,9 +280,9 @@ def test_padding_does_not_change_the_loss(tmp_path):
             )
         path = tmp_path / f"{name}.xml"
         path.write_text(capture.scene_xml(capture.recognise(str(truth.folder)), str(truth.folder)))
-        experiment = scene.load(path, {"solver": "adam"})
+        experiment = scene.load(path, PAPER)
         p = Problem(experiment, experiment.sequence())
-        totals.append(p.evaluate([p.patch.rest()], [4])[0])
+        totals.append(energy(p, p.patch.rest(), 4)[0])
     assert totals[1] == pytest.approx(totals[0], rel=1e-3)
 
 
@@ -339,7 +301,9 @@ def test_path_replay_gives_the_gradient_of_raster(tmp_path):
         dr.enable_grad(unknowns.translation)
         gradients[integrator] = {}
         for name in ("rgb", "silhouette"):
-            dr.backward(p.frame_terms(unknowns, 2)[name])
+            frozen = frozen_of(p, 2)
+            frozen.objective.terms = [t for t in frozen.objective.terms if t.name == name]
+            frozen.evaluate([unknowns], backward=True)
             gradients[integrator][name] = np.array(dr.grad(unknowns.translation))
             dr.clear_grad(unknowns.translation)
     for name in ("rgb", "silhouette"):
@@ -352,13 +316,11 @@ def test_gradients_of_several_patches(tmp_path, integrator):
     """Of a tube, whose texture has a seam: by the jets and the motions of its patches, against
     finite differences; path replay's against those of raster, which has no noise.
     """
-    from polysft_mi import prepare
-
     truth = synthetic.cloth(tmp_path / "tube", rows=13, columns=24, frames=2, shape=synthetic.tube)
     prepare.main([str(truth.folder), "-q"])
 
     def of(spp):
-        settings = {"solver": "adam", "k_mi": 0, "order": 3, "spp": spp}
+        settings = {**PAPER, "k_mi": 0, "order": 3, "spp": spp}
         experiment = scene.load(truth.folder / "scene.xml", settings)
         return Problem(experiment, experiment.sequence())
 
@@ -373,7 +335,7 @@ def test_gradients_of_several_patches(tmp_path, integrator):
     unknowns = Unknowns.from_numpy(rest)
     for _, value in unknowns.items():
         dr.enable_grad(value)
-    p.evaluate([unknowns], [1], backward=True)
+    energy(p, unknowns, 1, backward=True)
     for name in ("delta_alpha", "translation"):
         gradient = np.array(dr.grad(getattr(unknowns, name))).reshape(rest[name].shape)
         assert (np.abs(gradient).max(1) > 0).sum() >= 2  # the patches that are in view
@@ -381,7 +343,7 @@ def test_gradients_of_several_patches(tmp_path, integrator):
         slopes = []
         for h in (1e-3, 2e-3, 4e-3):
             ends = [
-                sharp.evaluate([Unknowns.from_numpy({**rest, name: x})], [1])[0]
+                energy(sharp, Unknowns.from_numpy({**rest, name: x}), 1)[0]
                 for x in (rest[name] + h * direction, rest[name] - h * direction)
             ]
             slopes.append((ends[0] - ends[1]) / (2 * h))

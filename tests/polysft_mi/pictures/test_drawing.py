@@ -195,7 +195,7 @@ def test_nothing_is_drawn_any_more_after_an_error(sheet, tmp_path, monkeypatch):
 def test_texture_that_was_moved_is_moved_in_the_pictures(sheet, here, tmp_path):
     problem = problem_of(sheet)
     moved = np.array(problem.experiment.mesh.vertex_texcoords_buffer()) + 0.03
-    problem.set_texcoords(mi.Float(moved))
+    problem.placed.set_texcoords(mi.Float(moved))
     other = drawn(sheet, tmp_path / "out", problem=problem)
     assert all(a["psnr_mask"] < b["psnr_mask"] - 3 for a, b in zip(other[0], here[0]))
 

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from problems import problem_of, small_cloth
 
-from polysft_mi import solvers
 from polysft_mi.render.device import frozen, interruptible, on_device
 from polysft_mi.render.raster import RasterIntegrator
-from polysft_mi.tracker import Track, track
+from polysft_mi.tracker import FrameTracker, Track, track
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +57,7 @@ def test_ctrl_c_in_the_middle_of_a_loop_or_a_recording(where, kind):
 def test_ctrl_c_in_the_middle_of_an_evaluation_ends_the_track_as_anywhere(
     problem, tmp_path, monkeypatch
 ):
-    solver, solved, original = solvers.create(problem.settings), [], RasterIntegrator.crossings
+    tracker, solved, original = FrameTracker(problem), [], RasterIntegrator.crossings
 
     def crossings(self, view, outline=False):
         if len(solved) == 2:
@@ -70,9 +69,7 @@ def test_ctrl_c_in_the_middle_of_an_evaluation_ends_the_track_as_anywhere(
 
     monkeypatch.setattr(RasterIntegrator, "crossings", crossings)
     with pytest.raises(KeyboardInterrupt):
-        track(
-            problem, solver, 3, str(tmp_path), solved=lambda frame, vertices: solved.append(frame)
-        )
+        track(tracker, 3, str(tmp_path), solved=lambda frame, vertices: solved.append(frame))
     assert len(Track.load(str(tmp_path / "checkpoint.npz")).states) == 2
 
 

@@ -17,7 +17,7 @@ from raster_scenes import (
 )
 from scipy.spatial.transform import Rotation
 
-from polysft_mi.objective import terms as objective
+from polysft_mi.images import differentiable
 from polysft_mi.scene import plugins
 from polysft_mi.surface.patch import JetAtlas, Unknowns
 from polysft_mi.surface.template import Template
@@ -138,7 +138,7 @@ def test_gradients_against_finite_differences(tmp_path, kind):
         # blurred, so that the loss is smooth where the image has a kink at every pixel that
         # changes sheets
         difference = mi.TensorXf(sheet.image(unknowns).array - target.array, target.shape)
-        squared = dr.square(objective.blur(difference, 2.0).array)
+        squared = dr.square(differentiable.blur(difference, 2.0).array)
         return dr.sum(colour * squared), dr.sum((1 - colour) * squared)
 
     # the median over steps, for single pixels jump where triangles are seen edge-on

@@ -5,7 +5,7 @@ import pytest
 from problems import dense, grid_template
 from scipy.linalg import LinAlgError
 
-from polysft_mi.objective.assembly import Normal
+from polysft_mi.objective.quadratic import NormalEquations
 from polysft_mi.solvers.linear import Blocks, Reduced, tridiagonal
 from polysft_mi.surface.bending import hinges
 from polysft_mi.surface.pattern import Pattern
@@ -32,7 +32,9 @@ def random_normal(pattern, size=9, d=2):
             cross[d * a : d * a + d] += np.outer(ja, g)
             cross[d * b : d * b + d] += np.outer(jb, g)
             glob += np.outer(g, g)
-    return Normal(blocks, cross, glob, RNG.normal(size=(pattern.count, d)), RNG.normal(size=size))
+    return NormalEquations(
+        blocks, cross, glob, RNG.normal(size=(pattern.count, d)), RNG.normal(size=size)
+    )
 
 
 @pytest.mark.parametrize("alone", [0, 1000])  # rows a block below which one thread does it all

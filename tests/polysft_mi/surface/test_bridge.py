@@ -121,7 +121,7 @@ def test_a_rendering_loss_reaches_the_network(bent, network):
 def test_rendering_in_torch_is_the_problems(bent):
     problem, points = bent
     rgb, alpha = bridge.rendering(problem)(points)
-    expected, mask = problem.image(mi.Point3f(points.numpy().T))
+    expected, mask = problem.placed.image(mi.Point3f(points.numpy().T))
     assert np.abs(rgb.numpy() - np.array(expected)).max() == 0
     assert np.abs(alpha.numpy().ravel() - np.array(mask)).max() == 0
     assert alpha.sum() > 100

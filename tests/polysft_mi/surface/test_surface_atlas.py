@@ -1,7 +1,11 @@
-"""The atlas on the host: against the device and polyfit, derivatives by finite differences."""
+"""The atlas on the host: against the one formula of the surface in NumPy, torch and Dr.Jit, its
+derivatives against Dr.Jit's.
+"""
 
 import dataclasses
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 import synthetic
@@ -9,48 +13,43 @@ import torch
 from problems import at_rest, grid_template, some_state, tube_template
 from scipy.spatial.transform import Rotation
 
-from polyfit import jets
 from polysft_mi.surface.atlas import Atlas, State
 from polysft_mi.surface.bending import hinges, slides
+from polysft_mi.surface.deformation import Deformation
 from polysft_mi.surface.patch import JetAtlas, Unknowns
 
 RNG = np.random.default_rng(4)
 TEMPLATES = {"sheet": lambda order: grid_template(13, 14, order=order), "tube": tube_template}
 
 
+def in_double(array):
+    """An array of NumPy as one of Dr.Jit, in double precision."""
+    indices = array.dtype.kind == "i"
+    return mi.UInt32(array.astype(np.uint32)) if indices else mi.Float64(np.array(array))
+
+
+BACKENDS = {"numpy": np.array, "torch": torch.tensor, "drjit": in_double}
+
+
+def unknowns_of(chart, state, array):
+    return Unknowns(**{name: array(x.ravel()) for name, x in chart.arrays(state).items()})
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize(
     "shape, order", [*(("sheet", n) for n in (1, 4, 7, 10)), *(("tube", n) for n in (1, 4, 7))]
 )
-def test_atlas_blends_the_jets_of_polyfit(shape, order):
-    """The formula of :mod:`polysft_mi.surface.patch`, patch by patch, in plain NumPy."""
-    template = TEMPLATES[shape](order=order)
-    chart = Atlas(template)
+def test_atlas_is_the_one_formula(shape, order, backend):
+    template, array = TEMPLATES[shape](order=order), BACKENDS[backend]
+    chart, deformation = Atlas(template), Deformation(template, array)
     state = some_state(chart, RNG)
-    arrays = chart.arrays(state)
-    unit = template.scale / template.radius
-
-    def point(vertex, slot, offset):
-        """The vertex as the patch in that slot has it, displaced by the offset."""
-        k = template.patch[vertex, slot]
-        s, R, T = (x[k] for x in (template.radius, template.rotation, template.origin))
-        uv = template.chart[vertex, slot]
-        uv = uv + unit[k] * (R.T @ template.axes[vertex] @ offset)[:2]
-        alpha = torch.as_tensor(template.alpha[k] + arrays["delta_alpha"][k])
-        z = float(jets.height(alpha, torch.as_tensor(uv)[None])) + template.rest[vertex, slot]
-        z += unit[k] * template.lift[vertex] * offset[2]
-        motion = s * state.rotation[k].as_matrix() @ [*uv, z]
-        return R @ (motion + template.scale * state.translation[k]) + T
-
-    expected = np.zeros_like(template.vertices)
-    for vertex, offset in enumerate(state.offset):
-        expected[vertex] = point(vertex, 0, offset) - point(vertex, 0, np.zeros(3))
-        for slot in np.flatnonzero(template.weight[vertex]):
-            expected[vertex] += template.weight[vertex, slot] * point(vertex, slot, np.zeros(3))
-    assert np.abs(chart.surface(state).vertices - expected).max() < 1e-9
-    back = chart.state(arrays)
-    assert np.abs(back.alpha - state.alpha).max() < 1e-9 and np.array_equal(
-        back.offset, state.offset
-    )
+    unknowns = unknowns_of(chart, state, array)
+    found = np.stack([np.asarray(x) for x in deformation.vertices(unknowns)], 1)
+    assert found.dtype == np.float64
+    assert np.abs(found - chart.surface(state).vertices).max() < 1e-12
+    back = chart.state(chart.arrays(state))
+    assert np.abs(back.alpha - state.alpha).max() < 1e-9
+    assert np.array_equal(back.offset, state.offset)
     assert (back.rotation * state.rotation.inv()).magnitude().max() < 1e-7
 
 
@@ -69,6 +68,26 @@ def test_atlas_agrees_with_the_device(shape):
         assert np.abs(back.translation - state.translation).max() < 1e-6
 
 
+def by_drjit(chart, state, step):
+    """The derivatives (N, 3) of the vertices along a step, by Dr.Jit's forward mode."""
+    g, q = step[0].reshape(len(chart), -1), state.rotation.as_quat()
+    turn = np.cross(g[:, -6:-3], q[:, :3]) + q[:, 3:] * g[:, -6:-3]
+    real = -(g[:, -6:-3] * q[:, :3]).sum(1, keepdims=True)
+    along = {
+        "delta_alpha": g[:, :-6] @ chart.to_monomials.T,
+        **{f"delta_{name}": step[1][:, k] for k, name in enumerate("uvw")},
+        "rotation": np.concatenate([turn, real], 1) / 2,  # of rotvec * q
+        "translation": g[:, -3:],
+    }
+    unknowns = unknowns_of(chart, state, in_double)
+    for name, value in unknowns.items():
+        dr.enable_grad(value)
+        dr.set_grad(value, in_double(along[name].ravel()))
+    found = Deformation(chart.template, in_double).vertices(unknowns)
+    dr.forward_to(found)
+    return np.stack([np.array(dr.grad(x)) for x in found], 1)
+
+
 @pytest.mark.parametrize("shape", TEMPLATES)
 @pytest.mark.parametrize("order", [4, 7])
 def test_derivatives_of_the_surface(order, shape):
@@ -85,10 +104,10 @@ def test_derivatives_of_the_surface(order, shape):
         g = step[0][k * size : (k + 1) * size]
         linear[chart.entry_vertex[part]] += (s.basis[part] @ g[:-6])[:, None] * s.up[k]
         linear[chart.entry_vertex[part]] += s.motion_jacobian[part] @ g[-6:]
-    numeric = (
-        chart.surface(state.after_step(step)).vertices
-        - chart.surface(state.after_step(step, -1)).vertices
-    ) / 2
+    found = by_drjit(chart, state, step)
+    assert np.abs(linear - found).max() < 1e-12 * np.abs(found).max()
+    ends = [chart.surface(state.after_step(step, sign)).vertices for sign in (1, -1)]
+    numeric = (ends[0] - ends[1]) / 2
     assert np.abs(linear - numeric).max() < 1e-6 * np.abs(numeric).max()
     # the columns along rows are the same derivatives
     rows = RNG.normal(size=numeric.shape)

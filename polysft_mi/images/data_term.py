@@ -1,0 +1,346 @@
+"""What the images say of a surface, to second order: how well it explains a frame, and how that
+changes with each vertex.
+
+Visibility comes from Mitsuba: one ray a pixel (:meth:`RasterIntegrator.view`). The texture is the
+template's, blurred like the frame. Residuals and their derivatives are closed forms
+(:mod:`polysft_mi.images.pixels`), summed on the device for each triangle and gathered at the
+vertices (:mod:`polysft_mi.images.gather`). Import only after a Mitsuba variant is set.
+"""
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from polysft_mi.render import frozen, on_device
+from polysft_mi.surface import Pattern
+
+from . import pixels
+from .frames import Frames
+from .gather import Gather, Images
+from .light import Brightness
+from .pyramid import FLOOR, POOL, Level, compared
+from .texture import Texture, packed_image
+
+_SHEET = 225.0  # side [pixels] of the sheet that blurs and windows are given for
+
+
+@dataclass
+class Evaluation:
+    """A frame's images against a surface. Energies are weighted like the objective; a pixel is one
+    of the level's grid.
+
+    ``photometric``, ``silhouette``: energies; ``images``: a
+    :class:`polysft_mi.images.gather.Images`, what they say at the vertices; ``outlier_share``: the
+    mean of r^2 / (r^2 + scale^2) over the pixels that are compared; ``misfit``: the same with a
+    fixed scale (both are 1 where none is); ``seen`` (F,): pixels of the video that see each
+    triangle; ``noise``: the variance of a residual, as the
+    residuals' own size says it.
+    """
+
+    photometric: float
+    silhouette: float
+    outlier_share: float
+    misfit: float
+    images: Images
+    seen: np.ndarray
+    noise: float
+
+
+@dataclass
+class Appearance:
+    """How a sheet looks in a frame, beyond what its blurred texture tells.
+
+    ``excess``: colours of the texture less those of the sheet's image, a
+    :class:`polysft_mi.images.pixels.Image` on a part of the level's grid; ``misfit``: what it alone
+    would be as a misfit; ``luminance`` (F,): of the triangles' texture as the image shows it, over
+    its mean, or None.
+    """
+
+    excess: pixels.Image
+    misfit: float
+    luminance: np.ndarray | None = None
+
+
+class DataTerm:
+    """The frames of a ``sequence`` (:class:`polysft_mi.scene.sequence.Sequence`) against the
+    texture of a ``template``, whose mesh is ``placed``
+    (:class:`polysft_mi.render.placed.PlacedMesh`) in the scene.
+
+    ``normalise``: whether images are freed from lighting. A ``blur`` [pixels, on a sheet of 225
+    pixels] names the level at which images are compared; a
+    :class:`polysft_mi.images.pyramid.Level` may be given in its place. Vertices are (N, 3) [m,
+    world].
+    """
+
+    def __init__(self, placed, template, sequence, rules, normalise):
+        self._placed, self._template, self._rules = placed, template, rules
+        self.camera = placed.camera
+        self._raster = placed.renderer if placed.is_raster else mi.load_dict({"type": "raster"})
+        self._corner, self.faces = placed.corner, placed.faces
+        self.pattern = Pattern(self.faces, template.edges, len(template.vertices))
+        self.gather = Gather(self.pattern, self.camera)
+        self._corner_of = on_device(self._corner, mi.UInt32)
+        self._triangle = on_device(np.arange(len(self.faces)), mi.UInt32)
+        self._sums, self._outline = frozen(pixels.triangle_sums), frozen(pixels.silhouette_terms)
+        self.normalise, self._masked = normalise, sequence.mask_files is not None
+        position, _ = self.camera.project(template.vertices)
+        self.texture = Texture(
+            placed.mesh,
+            placed.rendered_faces,
+            position[self._corner],
+            self._rules.texels,
+            self._masked,
+            self.normalise,
+            len(template) > 1,
+        )
+        self._unit = max(1.0, math.sqrt(_shown_area(position, self.faces)) / _SHEET)
+        self._frames = Frames(sequence, normalise)
+        self._levels, self._last, self._brightness = {}, None, None
+        self._floor = FLOOR
+        finest = self.level(self._rules.blurs[-1])
+        if normalise and self.texture.contrast(finest) < self._rules.plain:
+            self._floor, self._levels = self._rules.plain_floor, {}
+
+    def level(self, blur):
+        """The :class:`polysft_mi.images.pyramid.Level` that a ``blur`` names."""
+        if isinstance(blur, Level):
+            return blur
+        if blur not in self._levels:
+            sigma = blur * self._unit
+            window = max(self._rules.window * self._unit, 3 * sigma)
+            self._levels[blur] = Level(sigma, max(1, int(0.8 * sigma)), window, self._floor)
+        return self._levels[blur]
+
+    # -- what is known before a frame is looked at ---------------------------
+
+    def prefetch(self, frames, blurs, shading):
+        """Read ``frames`` ahead in a second thread, for what follows at ``blurs``, and with
+        ``shading`` for :meth:`shade`; those beyond the video are left out.
+        """
+        # made here, because the thread must not touch the device
+        brightness = self.brightness if shading else None
+        self._frames.prefetch(frames, [self.level(blur) for blur in blurs], brightness)
+
+    @property
+    def brightness(self):
+        """The :class:`polysft_mi.images.light.Brightness` of the template and the video."""
+        if self._brightness is None:
+            vertices, texture = self._template.vertices, self.texture
+            position, _ = self.camera.project(vertices)
+            self._brightness = Brightness(
+                self.faces, vertices, position, texture, self._masked, self._rules
+            )
+        return self._brightness
+
+    def on_template(self, texels):
+        """Points (K, 3) [m, world] of the undeformed template at ``texels`` (K, 2) of the baked
+        texture; NaN beyond it.
+        """
+        from scipy.interpolate import LinearNDInterpolator  # a tenth of the start, seldom needed
+
+        at = self._template.vertices[self._corner]
+        return LinearNDInterpolator(self.texture.texels(), at)(texels)
+
+    def move_texture(self, chart, displaced):
+        """Show what lies at ``chart`` (N, 2) at ``displaced`` (N, 2) instead; see
+        :meth:`polysft_mi.images.texture.Texture.move`.
+        """
+        if not self.texture.move(self._corner, chart, displaced):
+            return False
+        self._brightness = None
+        self._placed.set_texcoords(self.texture.coordinates)
+        return True
+
+    # -- a surface against a frame -------------------------------------------
+
+    def seen_vertices(self, vertices, blur):
+        """Which vertices of a surface belong to a triangle that a pixel sees, (N,) bool."""
+        with dr.suspend_grad():
+            triangle = np.array(self._view(vertices, self.level(blur)).triangle)
+        seen = np.zeros(len(vertices), dtype=bool)
+        seen[self.faces[np.unique(triangle[triangle >= 0])]] = True
+        return seen
+
+    def misfit(self, vertices, frame, blur):
+        """The mean of r^2 / (r^2 + c^2) over the pixels that are compared, 0 to 1, with a fixed c;
+        1 where there are none.
+        """
+        squared = self.residuals(vertices, frame, blur)
+        return float((squared / (squared + pixels.MISFIT**2)).mean()) if len(squared) else 1.0
+
+    def residuals(self, vertices, frame, blur):
+        """Squared residuals r^2 = |T - I|^2 / 3 of the pixels that are compared, (P,) float32."""
+        level = self.level(blur)
+        with dr.suspend_grad():
+            view = self._view(vertices, level)
+            squared, weight = pixels.squares(*self._residual_arguments(view, frame, level))
+            return np.array(squared)[np.array(weight) > 0]
+
+    def evaluate(self, vertices, frame, blur, scale, appearance=None, k_rgb=1.0, k_silhouette=1.0):
+        """The :class:`Evaluation` of a surface against a frame, under the robust ``scale`` [local
+        standard deviations] and the weights ``k_rgb`` and ``k_silhouette``; the frame is corrected
+        by an ``appearance``.
+        """
+        level = self.level(blur)
+        shown = self._frames.level(frame, level)
+        with dr.suspend_grad():
+            view = self._view(vertices, level)
+            table, figures = self._sums(
+                *self._residual_arguments(view, frame, level, appearance),
+                dr.opaque(mi.Float, scale),
+            )
+            masked, error, pairs = k_silhouette > 0 and shown.mask is not None, None, None
+            if masked:
+                # where a sheet passes before the sheet itself, alpha does not change
+                crossings = self._raster.crossings(view, outline=True)
+                error, pairs = self._outline(
+                    view.seen(), crossings, shown.mask, shown.distance, self._corner_of
+                )
+            mask_weight = k_silhouette / shown.area if masked else 0.0
+            images = self.gather.images(
+                table, figures, vertices, k_rgb, mask_weight, shown.area, level.stride, pairs
+            )
+            # waits for the device: by now it knows all that it has to do
+            figures = np.array(figures).reshape(-1, pixels.FIGURES).astype(np.float64)
+            energy, count, outlier_share, misfit = figures.sum(0).tolist()
+            weight = k_rgb / (shown.area or max(count, 1.0))
+            silhouette = 0.0
+            if masked:  # the squares are of the whole frame, the errors, less these, of the region
+                squares = shown.squares + float(np.array(error).sum(dtype=np.float64))
+                silhouette = mask_weight * squares
+        outlier_share, misfit = (outlier_share / count, misfit / count) if count else (1.0, 1.0)
+        photometric, compared_pixels = weight * energy, count * level.stride**2
+        # pixels closer than the blur are no evidence of their own
+        noise = 2 * photometric / (3 * max(compared_pixels, 1.0))
+        noise *= max(1.0, 4 * math.pi * level.sigma**2)
+        return Evaluation(
+            photometric,
+            silhouette,
+            outlier_share,
+            misfit,
+            images,
+            figures[:, 1] * level.stride**2,
+            noise,
+        )
+
+    def shade(self, vertices, frame, seen, appearance=None):
+        """The triangles' :class:`polysft_mi.images.light.Shade` in a frame; ``seen`` as in
+        :class:`Evaluation`. The texture's luminance is that of the ``appearance`` where it has one.
+        """
+        luminance = self._frames.luminance(frame, self.brightness)
+        position, _ = self.camera.project(vertices)
+        known = appearance.luminance if appearance else None
+        return self.brightness.of(luminance, vertices, self.camera.origin, position, seen, known)
+
+    def appearance(self, vertices, blur, light=None, shaded=False):
+        """The :class:`Appearance` of a sheet.
+
+        A frame is blurred, and freed from lighting, in the image; the texture on the template, once
+        for all. Where the sheet is seen at a slant, or hides a part of itself, these differ. So the
+        sheet is rendered, under the ``light`` (7,) of :class:`polysft_mi.images.light.Light` where
+        it is known, and then treated like a frame. ``shaded``: with the triangles' luminance.
+        """
+        level = self.level(blur)
+        lit = np.ones(len(self.faces))
+        if light is not None:
+            lit = self.brightness.irradiance(vertices, self.camera.origin, light)
+        lit = on_device(lit, mi.Float)
+        with dr.suspend_grad():
+            view = self._view(vertices, level)
+            found, template = pixels.rendered(
+                view.seen(),
+                self._sheet,
+                self.texture.level(level),
+                self.texture.footprint_texture(level.stride),
+                lit,
+            )
+            corner, (w, h) = (int(view.region[0][0]), int(view.region[1][0])), view.size
+            found, template = (
+                np.ascontiguousarray(np.array(x).T).reshape(h, w, 4) for x in (found, template)
+            )
+            image, inside = self._treated_like_a_frame(
+                found[..., :3] * found[..., 3:], found[..., 3] > 0, corner, level
+            )
+            known = inside
+            if not self._masked:  # near the border the background is in a frame's local statistics
+                padded = np.pad(inside.astype(np.uint8), 1)
+                distance = cv2.distanceTransform(padded, cv2.DIST_L2, 3)[1:-1, 1:-1]
+                border = self._rules.border * level.window / level.stride
+                known = (distance > border).astype(np.float32)
+            known = (known > 0)[..., None] & (template[..., 3:] > 0.5)
+            excess = np.where(known, template[..., :3] - image, 0)
+            squared = (excess**2).sum(-1) / 3
+            misfit = float((squared / (squared + pixels.MISFIT**2)).sum() / max(inside.sum(), 1.0))
+            excess = pixels.Image.of(packed_image(excess, np.zeros_like(inside)), (h, w), corner)
+        luminance = None
+        if shaded:
+            position, _ = self.camera.project(vertices)
+            at = position / level.stride - corner
+            luminance = self.brightness.texture_luminance(found[..., :3], inside, level.stride, at)
+        return Appearance(excess, misfit, luminance)
+
+    # -- parts ----------------------------------------------------------------
+
+    def _view(self, vertices, level):
+        """The :class:`polysft_mi.render.view.View` of the sheet on a level's grid; the last is
+        kept.
+        """
+        last = self._last
+        if last is None or last[0] != level.stride or not np.array_equal(last[1], vertices):
+            self._placed.place(mi.Point3f(np.ascontiguousarray(vertices.T, dtype=np.float32)))
+            position, before = self.camera.project(vertices)
+            box = (*position.min(0), *position.max(0)) if before.all() else None
+            view = self._raster.view(self._placed.scene, self._placed.sensor, 1 / level.stride, box)
+            self._last = level.stride, vertices.copy(), view
+        return self._last[2]
+
+    @property
+    def _sheet(self):
+        faces, texture = self._raster.topology(self._placed.scene).faces, self.texture
+        return pixels.Sheet(
+            self._triangle, faces, texture.coordinates, texture.scale, texture.shift
+        )
+
+    def _residual_arguments(self, view, frame, level, appearance=None):
+        """What :func:`polysft_mi.images.pixels.residuals` takes."""
+        return (
+            view.seen(),
+            self._sheet,
+            self.texture.level(level),
+            self._frames.level(frame, level).image,
+            appearance and appearance.excess,
+        )
+
+    def _treated_like_a_frame(self, colour, inside, corner, level):
+        """An image (h, w, 3) of the sheet, ``inside`` (h, w) of it, made what frames are made at a
+        level, on whose grid it begins at ``corner`` (x, y); and inside as float32.
+        """
+        margin = int(2 * level.window / level.stride) + 1  # of nothing, as around a mask
+        pads = [
+            (k - (k - margin) // POOL * POOL, -((-k - n - margin) // POOL) * POOL - k - n)
+            for k, n in zip(corner[::-1], inside.shape, strict=True)
+        ]
+        inside = inside.astype(np.float32)
+        wide = compared(
+            np.pad(colour, (*pads, (0, 0))),
+            np.pad(inside, pads),
+            level.sigma / level.stride,
+            level.window / level.stride,
+            self.normalise,
+            level.floor,
+        )
+        (top, _), (left, _) = pads
+        return wide[top : top + inside.shape[0], left : left + inside.shape[1]], inside
+
+
+def _shown_area(position, faces):
+    """Area [pixels^2] of the side of a surface that is turned to the camera, its vertices at
+    ``position`` (N, 2) [pixels]: the larger one, for a sheet may be wound either way."""
+    a, b, c = (position[faces[:, k]] for k in range(3))
+    ab, ac = b - a, c - a
+    signed = 0.5 * (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0])
+    return max(signed[signed > 0].sum(), -signed[signed < 0].sum())

@@ -1,0 +1,73 @@
+"""Mesh inextensibility: edges keep the template's lengths (paper, eq. isometry_mesh). Import only
+after a Mitsuba variant is set.
+"""
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..quadratic import EdgeRows
+from .term import Term
+
+
+class Inextensibility(Term):
+    """k_mi times the sum over edges of ((e_P - e_T) / s)^2, s the template's scale.
+
+    With ``mi_norm`` = charbonnier, an edge that is stretched by more than the strain ``give``
+    hardly pulls harder (:class:`polysft_mi.objective.quadratic.EdgeRows`): cloth that hangs from a
+    point is stretched there by a tenth, and by squares that would turn the whole sheet. What is
+    compressed buckles; its costs are squares.
+    """
+
+    name, setting = "inextensibility", "k_mi"
+
+    def __init__(self, inputs):
+        super().__init__(inputs)
+        self._rules, template = inputs.rules, inputs.template
+        self._gives = inputs.settings.mi_norm == "charbonnier"
+        self._unit = template.scale**2
+        edges = template.edges
+        # of the surface as the device has it: what it rounds is no strain
+        with dr.suspend_grad():
+            rest = np.array(inputs.surface.vertices(inputs.surface.rest()), dtype=np.float64).T
+        lengths = np.linalg.norm(rest[edges[:, 0]] - rest[edges[:, 1]], axis=1)
+        #: (E,) [m]
+        self.lengths = lengths.astype(np.float32).astype(np.float64)
+        self._edges = tuple(
+            mi.UInt32(np.ascontiguousarray(edges[:, k], dtype=np.uint32)) for k in (0, 1)
+        )
+        self._rest = mi.Float64(self.lengths)
+
+    def _give(self, context, stage):
+        """The strain from which on stretched edges pull no harder: more where there is noise."""
+        if not (self._gives and stage.gives):
+            return math.inf
+        r = self._rules
+        return r.give * (r.caution(context.memory.noise) if r.strain_caution else 1.0)
+
+    def energy(self, at):
+        excess = edge_lengths(at.vertices, self._edges) - self._rest
+        give = self._give(at.context, at.stage)
+        squared = dr.square(excess)
+        if math.isfinite(give):
+            over = dr.square(dr.maximum(excess, 0) / (give * self._rest))
+            squared *= 2 / (1 + dr.sqrt(1 + over))
+        return mi.Float(self.weight * at.stage.stiffness / self._unit * dr.sum(squared))
+
+    def rows(self, at):
+        stiffness = self.weight * at.stage.stiffness / self._unit
+        at.edges = EdgeRows(self.lengths, stiffness, self._give(at.context, at.stage))
+
+    def add(self, at):
+        return at.edge_energy
+
+
+def edge_lengths(points, edges):
+    """Lengths of the edges (pair of UInt32 of E) between points (Point3f of N [m]): a Float64 of E.
+    In double, so that the gradient of a vertex does not depend on the order of its edges.
+    """
+    flat = mi.Float64(dr.ravel(points))
+    a, b = (dr.gather(mi.Point3d, flat, i) for i in edges)
+    return dr.norm(a - b)

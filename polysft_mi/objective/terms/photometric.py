@@ -1,0 +1,147 @@
+"""The photometric term: the rendering against the frame (paper, section "PolySfT", Losses; there as
+in φ-SfT).
+
+What the paper leaves open are options, here and nowhere else (``docs/conventions.md`` repeats it):
+the norm (``rgb_norm``), what light does (``brightness``), the blur, and which pixels count
+(``rgb_region``). Images are linear RGB. The sum over pixels is divided by the area of the surface
+in the image (the target mask's, or the rendered interior's where there are no masks), so that
+neither the background nor the resolution weighs in. Import only after a Mitsuba variant is set.
+"""
+
+from collections import OrderedDict
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from polysft_mi.images import Level, differentiable
+
+from .term import Term
+
+_INTERIOR = 0.999  # alpha above which a pixel counts as filled by the surface
+_CACHED_FRAMES = 8
+
+
+class Photometric(Term):
+    """k_rgb / area times the sum over pixels of rho(|I - T|^2 / 3)."""
+
+    name, setting = "rgb", "k_rgb"
+
+    def __init__(self, inputs):
+        super().__init__(inputs)
+        s, self._inputs = inputs.settings, inputs
+        self._norm, self._brightness, self._region = s.rgb_norm, s.brightness, s.rgb_region
+        self._scale = s.rgb_scale
+        width, height = inputs.placed.size
+        self._shape, self._count = (height, width), width * height
+        self._targets = OrderedDict()
+
+    def energy(self, at):
+        rgb, alpha = at.image
+        level = self._level(at.stage)
+        frame, mask, area = self._target(at.context.frame)
+        inside = interior(alpha)
+        if mask is None:
+            # both cut out alike, else a band inside the silhouette would compare with the
+            # background
+            weight, area, cut = inside, dr.maximum(dr.sum(inside), 1), self._image_of(inside)
+            rgb, target, covered = _times(rgb, cut), _times(frame, cut), cut
+        else:
+            weight, target, covered = dr.ones(mi.Float, self._count), frame, self._image_of(mask)
+            cut = self._image_of(alpha)
+        if self._region == "sheet":
+            weight = inside * (dr.select(mask > 0.5, mi.Float(1), 0) if mask is not None else 1)
+            a = differentiable.compared(rgb, cut, level, self._brightness == "local")
+            b = differentiable.compared(target, covered, level, self._brightness == "local")
+        else:
+            a, b = (differentiable.blur(x, level.sigma) for x in (rgb, target))
+            if self._brightness == "local":
+                a = differentiable.normalised(a, cut, level.window, level.floor)
+                b = differentiable.normalised(b, covered, level.window, level.floor)
+        a, b = self._channels(a), self._channels(b)
+        if self._brightness == "gain":
+            g = gain([dr.detach(x) for x in a], b, inside)
+            a = [g * x for x in a]
+        squared = sum(dr.square(x - y) for x, y in zip(a, b)) / 3
+        scale = at.context.memory.scales.get(at.stage, self._scale)
+        rho = robust(squared, self._norm, scale)
+        return self.weight * dr.sum(weight * rho) / area
+
+    def add(self, at):
+        return at.evaluation.photometric
+
+    @property
+    def without_block(self):
+        for name, value, known in (
+            ("rgb_norm", self._norm, ("cauchy",)),
+            ("brightness", self._brightness, ("local", "none")),
+            ("rgb_region", self._region, ("sheet",)),
+        ):
+            if value not in known:
+                return f"{name} = {value}; {' or '.join(known)} is needed"
+        return None
+
+    def _level(self, stage):
+        return stage.blur if isinstance(stage.blur, Level) else self._inputs.data.level(stage.blur)
+
+    def _target(self, frame):
+        """(image (H, W, 3), cut out by its mask, mask Float or None, its area [pixels])."""
+        if frame not in self._targets:
+            rgb, mask = (
+                read(frame) for read in (self._inputs.sequence.frame, self._inputs.sequence.mask)
+            )
+            area = None
+            if mask is not None:
+                rgb, area = rgb * mask[..., None], mi.Float(max(1.0, float(mask.sum())))
+                mask = mi.Float(np.ascontiguousarray(mask, dtype=np.float32).ravel())
+            image = mi.TensorXf(np.ascontiguousarray(rgb, dtype=np.float32))
+            dr.eval(image, mask, area)
+            self._targets[frame] = image, mask, area
+            while len(self._targets) > _CACHED_FRAMES:
+                self._targets.popitem(last=False)
+        return self._targets[frame]
+
+    def _image_of(self, values):
+        return mi.TensorXf(values, (*self._shape, 1))
+
+    def _channels(self, tensor):
+        index = dr.arange(mi.UInt32, self._count) * 3
+        return [
+            dr.gather(mi.Float, tensor.array, index + c, mode=dr.ReduceMode.Permute)
+            for c in range(3)
+        ]
+
+
+def robust(squared, norm, scale):
+    """rho of squared residuals r^2: r^2 (``l2``), |r| (``l1``), or, r^2 near 0, 2 scale^2 (sqrt(1 +
+    r^2/scale^2) - 1) (``charbonnier``), scale^2 log(1 + r^2/scale^2) (``cauchy``).
+    """
+    if norm == "l2":
+        return squared
+    if norm == "l1":
+        return dr.sqrt(squared + 1e-12)
+    if norm == "charbonnier":
+        return 2 * scale * scale * (dr.sqrt(1 + squared / (scale * scale)) - 1)
+    return scale * scale * dr.log(1 + squared / (scale * scale))
+
+
+def interior(alpha):
+    """1 where the surface fills the pixel, else 0, detached; Float of P."""
+    return dr.select(dr.detach(alpha) > _INTERIOR, mi.Float(1), 0)
+
+
+def gain(render, target, weight):
+    """The gain g (Float of 1, detached) for which g render fits target best in the least-squares
+    sense where weight is 1.
+    """
+    with dr.suspend_grad():
+        top = sum(dr.sum(weight * a * b) for a, b in zip(render, target))
+        bottom = sum(dr.sum(weight * a * a) for a in render)
+        return dr.clip(top / dr.maximum(bottom, 1e-12), 0.25, 4)
+
+
+def _times(image, weight):
+    """An image (H, W, C) times a weight (H, W, 1)."""
+    channels = image.shape[2]
+    at = dr.arange(mi.UInt32, channels * dr.width(weight.array)) // channels
+    return mi.TensorXf(image.array * dr.gather(mi.Float, weight.array, at), image.shape)

@@ -1,0 +1,122 @@
+"""What a term of the objective is, and what it is made of. Import only after a Mitsuba variant is
+set.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import mitsuba as mi
+
+if TYPE_CHECKING:
+    from polysft_mi.images import Appearance, DataTerm
+    from polysft_mi.render import PlacedMesh
+    from polysft_mi.scene import Rules, Sequence, Settings
+    from polysft_mi.surface import Atlas, Template, Unknowns
+
+    from ..context import FrameContext, Stage
+    from ..operators import Operators
+    from ..quadratic import Linearisation
+
+
+@dataclass
+class Inputs:
+    """What terms are made of.
+
+    ``surface``: makes vertices (Point3f of N [m, world]) of unknowns, as
+    :class:`polysft_mi.surface.patch.JetAtlas` does; ``atlas``: the same on the host; ``data``: the
+    frames against the baked texture, in closed form; ``where``: the scene's path, for messages.
+    """
+
+    settings: Settings
+    rules: Rules
+    template: Template
+    surface: Any
+    atlas: Atlas
+    placed: PlacedMesh
+    sequence: Sequence
+    where: str
+
+    @cached_property
+    def data(self) -> DataTerm:
+        from polysft_mi.images import DataTerm
+
+        normalise = self.settings.brightness == "local"
+        return DataTerm(self.placed, self.template, self.sequence, self.rules, normalise)
+
+    @cached_property
+    def operators(self) -> Operators:
+        from ..operators import Operators
+
+        data = self.data
+        return Operators(self.atlas, data.faces, data.pattern, self.rules.relief_bend)
+
+
+class DeviceFrame:
+    """A frame's surface on the device, attached to its ``unknowns``: what energies are computed
+    of. It is rendered once, where a term asks for it; ``look`` tells its :attr:`appearance`.
+    """
+
+    def __init__(
+        self,
+        inputs: Inputs,
+        unknowns: Unknowns,
+        context: FrameContext,
+        stage: Stage,
+        look: Callable[[], Appearance | None],
+        seed: int,
+    ) -> None:
+        self.unknowns, self.context, self.stage = unknowns, context, stage
+        self.vertices = inputs.surface.vertices(unknowns)
+        self._placed, self._seed, self._spp = inputs.placed, seed, inputs.settings.spp
+        self._look = look
+
+    @property
+    def appearance(self) -> Appearance | None:
+        """How the sheet looks where the stage begins."""
+        return self._look()
+
+    @cached_property
+    def image(self) -> tuple[mi.TensorXf, mi.Float]:
+        """(rgb (H, W, 3), linear, over black, and alpha, Float of H W)."""
+        return self._placed.image(self.vertices, self._seed, self._spp)
+
+
+class Term:
+    """A weighted energy of a frame.
+
+    ``name``: of its figure in logs and reports; ``setting``: its weight's, where 0 leaves the term
+    out. A term has its :meth:`energy` on Dr.Jit arrays, for any solver that takes gradients. Where
+    it is also known in closed form to second order, it has :meth:`add`, and :meth:`rows` for what
+    acts on vertices; the tests hold both forms together.
+    """
+
+    name: ClassVar[str]
+    setting: ClassVar[str]
+
+    def __init__(self, inputs: Inputs) -> None:
+        self.weight = getattr(inputs.settings, self.setting)
+
+    @classmethod
+    def is_used(cls, settings: Settings) -> bool:
+        """Whether the objective has the term under these settings."""
+        return getattr(settings, cls.setting) > 0
+
+    def energy(self, at: DeviceFrame) -> mi.Float:
+        """The weighted energy, a Float of 1, attached."""
+        raise NotImplementedError
+
+    def rows(self, at: Linearisation) -> None:
+        """Set residuals of edges or triangles in ``at``."""
+
+    def add(self, at: Linearisation) -> float:
+        """Add gradient and curvature to ``at.normal``; returns the weighted energy."""
+        raise NotImplementedError
+
+    @property
+    def without_block(self) -> str | None:
+        """Why there is no :meth:`add` under these settings, in words; None where there is one."""
+        return None

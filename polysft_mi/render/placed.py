@@ -1,0 +1,143 @@
+"""The template's mesh in its Mitsuba scene: vertices go in, an image and its alpha come out,
+attached. Import only after a Mitsuba variant is set.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from polysft_mi.errors import InputError
+
+from .pinhole import Pinhole
+from .raster import RasterIntegrator
+
+_MASK_SPP = 16  # samples a pixel at which a projective mask is usable
+
+
+class PlacedMesh:
+    """The rendered ``mesh`` of a scene, seen by its sensor through a differentiable ``renderer``.
+
+    ``corner`` (V,): the template's vertex of each rendered one (loaders split vertices along
+    texture seams); ``where``: the scene's path, for messages. Raises InputError where the sensor is
+    no pinhole, or not one that the renderer takes.
+    """
+
+    def __init__(
+        self,
+        scene: mi.Scene,
+        sensor: mi.Sensor,
+        renderer: Any,
+        mesh: mi.Mesh,
+        corner: np.ndarray,
+        where: str = "scene",
+    ) -> None:
+        self.scene, self.sensor, self.renderer, self.mesh = scene, sensor, renderer, mesh
+        self.corner, self.camera = corner, Pinhole(sensor)
+        #: (F, 3): the rendered vertices of the triangles
+        self.rendered_faces = np.array(mesh.faces_buffer(), dtype=np.int64).reshape(-1, 3)
+        #: (F, 3): the template's vertices at the corners of the rendered triangles
+        self.faces = corner[self.rendered_faces]
+        #: (2V,): texture coordinates that replaced the mesh's own, or None
+        self.texcoords: np.ndarray | None = None
+        self._corner = mi.UInt32(corner.astype(np.uint32))
+        self._is_identity = np.array_equal(corner, np.arange(len(corner)))
+        # through the scene, not the mesh alone: only so does the scene rebuild what it traces rays
+        # with
+        self._params = mi.traverse(scene)
+        self._key = _positions_key(self._params, mesh)
+        # what is behind the surface is black, with a silhouette's gradient towards black
+        renderer.hide_emitters = True
+        self.is_raster = isinstance(renderer, RasterIntegrator)
+        self._mask_renderer = None
+        if not self.is_raster:
+            if not str(sensor).startswith("PerspectiveCamera"):
+                raise InputError(
+                    f"{where}: {renderer.class_name()} takes Mitsuba's perspective sensor only"
+                    " (fx = fy); use raster"
+                )
+            self._mask_renderer = mi.load_dict({"type": "silhouette_projective"})
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) of the image [pixels]."""
+        return self.camera.width, self.camera.height
+
+    def place(self, vertices: mi.Point3f) -> None:
+        """Put the template's ``vertices`` (Point3f of N [m, world], attached or not) into the
+        scene.
+        """
+        points = vertices
+        if not (
+            self._is_identity and dr.width(vertices) == len(self.corner)
+        ):  # gradients sum in double
+            flat = mi.Float64(dr.ravel(vertices))
+            points = mi.Point3f(dr.gather(mi.Point3d, flat, self._corner))
+        self._params[self._key] = dr.ravel(points)
+        self._params.update()
+
+    def set_texcoords(self, texcoords: mi.Float) -> None:
+        """Replace the texture coordinates (Float of 2V, of the rendered vertices)."""
+        self.texcoords = np.array(texcoords)
+        self._params[self._key.removesuffix("positions") + "texcoords"] = texcoords
+        self._params.update()
+
+    def image(
+        self, vertices: mi.Point3f, seed: int = 0, spp: int = 1
+    ) -> tuple[mi.TensorXf, mi.Float]:
+        """Render the surface: (rgb (H, W, 3), linear, over black, and alpha, Float of H W),
+        attached to the vertices (Point3f of N [m, world]).
+        """
+        self.place(vertices)
+        width, height = self.size
+        count = width * height
+        if self.is_raster:
+            image = self.renderer.image(self.scene, self.sensor, seed, spp)
+            channels = image.shape[2]
+            alpha = _channel(image, 3, count, channels)
+        else:
+            image = mi.render(
+                self.scene,
+                self._params,
+                sensor=self.sensor,
+                integrator=self.renderer,
+                spp=spp,
+                seed=seed,
+            )
+            mask = mi.render(
+                self.scene,
+                self._params,
+                sensor=self.sensor,
+                integrator=self._mask_renderer,
+                spp=max(spp, _MASK_SPP),
+                seed=~seed & 0xFFFFFFFF,
+            )
+            channels = image.shape[2]
+            alpha = _channel(mask, 0, count, mask.shape[2])
+        pixel = dr.arange(mi.UInt32, 3 * count)
+        rgb = dr.gather(
+            mi.Float, image.array, pixel // 3 * channels + pixel % 3, mode=dr.ReduceMode.Permute
+        )
+        return mi.TensorXf(rgb, (height, width, 3)), alpha
+
+
+def _channel(image, channel, count, channels):
+    at = dr.arange(mi.UInt32, count) * channels + channel
+    return dr.gather(mi.Float, image.array, at, mode=dr.ReduceMode.Permute)
+
+
+def _positions_key(params, mesh):
+    """The key of the mesh's vertex positions among a scene's parameters. (Mitsuba names meshes by
+    id, or by address where they have none.)
+    """
+    keys = [k for k in params.keys() if k.endswith("vertex_positions")]
+    for key in keys:
+        if len(keys) == 1 or key.split(".")[0] == mesh.id():
+            return key
+    raise InputError(
+        f"template {mesh.id()!r}: not found among the scene's parameters; give its shape"
+        ' id="template"'
+    )

@@ -1,0 +1,143 @@
+"""The state of a run, and its file."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from polyfit.files import aside
+from polysft_mi.errors import InputError
+from polysft_mi.images import Light
+from polysft_mi.objective import FrameMemory, Stage
+from polysft_mi.scene import Rules
+from polysft_mi.surface import Unknowns
+
+CHECKPOINT = "checkpoint.npz"
+_NUMBERS = ("misfit", "outlier_share", "least_misfit", "explained")  # of a memory
+
+
+@dataclass
+class Track:
+    """The state of a run: unknowns of the frames reached so far, and what each window took.
+
+    ``states``: one dict of arrays (:meth:`Unknowns.to_numpy`) a frame; ``next_window``: first frame
+    of the next window to solve; ``iterations``, ``seconds``: one entry a solved window; ``totals``:
+    its terms at the minimum; ``memories``: what its newest frame tells those that follow, None
+    where it was lost; ``lost``: frame -> reason for those that keep the state of the frame before;
+    ``unusable``: those among them whose image breaks the objective; ``sigma``: frame -> standard
+    deviation of each vertex along its ray [m], where it is known; ``swept``: frames gone over by
+    the setting ``sweeps``, each as often as it was; ``finished``: whether the tracker has looked
+    back over the whole; ``solver``: its name.
+    """
+
+    states: list = field(default_factory=list)
+    next_window: int = 0
+    iterations: list = field(default_factory=list)
+    seconds: list = field(default_factory=list)
+    totals: list = field(default_factory=list)
+    memories: list = field(default_factory=list)
+    lost: dict = field(default_factory=dict)
+    unusable: dict = field(default_factory=dict)
+    sigma: dict = field(default_factory=dict)
+    swept: int = 0
+    finished: bool = False
+    solver: str = ""
+
+    def save(self, path: str | os.PathLike[str], stages: Sequence[Stage]) -> None:
+        """Write it; ``stages``: those that memories have robust scales of."""
+        arrays: dict[str, Any] = {
+            name: np.stack([s[name] for s in self.states]) for name in Unknowns.NAMES
+        }
+        meta = {k: getattr(self, k) for k in _META}
+        known = sorted(self.sigma)
+        if known:
+            arrays["sigma_frames"] = np.array(known, dtype=np.int64)
+            arrays["sigma"] = np.stack([self.sigma[k] for k in known])
+        with aside(path) as temporary:
+            np.savez(
+                temporary, meta=json.dumps(meta), **arrays, **_memory_arrays(self.memories, stages)
+            )
+
+    @classmethod
+    def load(
+        cls, path: str | os.PathLike[str], stages: Sequence[Stage] = (), rules: Rules | None = None
+    ) -> Track:
+        """Read it; ``stages``: as they were saved, ``rules``: of the light. Without them memories
+        are left out. Raises InputError where the file is no checkpoint.
+        """
+        try:
+            with np.load(path) as data:
+                meta = json.loads(str(data["meta"]))
+                arrays = {name: data[name] for name in Unknowns.NAMES}
+                memories = _memories(data, stages, rules or Rules())
+                sigma = (
+                    dict(zip(data["sigma_frames"].tolist(), data["sigma"]))
+                    if "sigma" in data
+                    else {}
+                )
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            raise InputError(
+                f"{path}: not a checkpoint of a run ({error}); start again with --overwrite"
+            ) from None
+        for name in ("lost", "unusable"):
+            meta[name] = {int(k): v for k, v in meta[name].items()}
+        count = len(arrays["rotation"])
+        return cls(
+            states=[{name: arrays[name][k] for name in arrays} for k in range(count)],
+            sigma=sigma,
+            memories=memories,
+            **meta,
+        )
+
+
+_META = (
+    "next_window",
+    "iterations",
+    "seconds",
+    "totals",
+    "lost",
+    "unusable",
+    "swept",
+    "finished",
+    "solver",
+)
+
+
+def _memory_arrays(memories, stages):
+    """Memories as float64 arrays of a row each, NaN where nothing is known."""
+    rows: dict[str, Any] = {f"memory_{name}": [] for name in (*_NUMBERS, "scales", "light")}
+    size = len(Light.unknown(Rules()).numbers())
+    for memory in memories:
+        known = memory or FrameMemory(explained=math.nan)
+        for name in _NUMBERS:
+            rows[f"memory_{name}"].append(getattr(known, name))
+        scales = [known.scales.get(stage, math.nan) for stage in stages]
+        rows["memory_scales"].append(scales)
+        light = known.light.numbers() if known.light else [math.nan] * size
+        rows["memory_light"].append(light)
+    return {name: np.array(row, dtype=np.float64) for name, row in rows.items()}
+
+
+def _memories(data, stages, rules):
+    found = []
+    for k, explained in enumerate(data["memory_explained"]):
+        if math.isnan(explained):
+            found.append(None)
+            continue
+        numbers = {name: float(data[f"memory_{name}"][k]) for name in _NUMBERS}
+        light, scales = data["memory_light"][k].tolist(), data["memory_scales"][k].tolist()
+        found.append(
+            FrameMemory(
+                **numbers,
+                light=None if math.isnan(light[-1]) else Light.of(light, rules),
+                scales={s: x for s, x in zip(stages, scales) if not math.isnan(x)},
+            )
+        )
+    return found

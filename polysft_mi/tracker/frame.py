@@ -1,0 +1,247 @@
+"""What happens to a frame: what is known of it before, where it begins, coarse to fine, and what it
+tells the frames after it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from polysft_mi import solvers
+from polysft_mi.errors import InputError
+from polysft_mi.objective import FrameContext, FrameMemory, Objective
+from polysft_mi.solvers import Report, Solver
+from polysft_mi.surface import State
+
+from .sigma import along_rays
+from .stages import Found, Stages
+from .starts import Starts
+from .texture_fit import fit_texture
+
+if TYPE_CHECKING:
+    from polysft_mi.objective import Problem
+
+#: a frame that was solved: its state, and what it tells; None where it was lost
+Past = Sequence[tuple[State, FrameMemory | None]]
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Frames as they were solved: ``states``, the mean of their ``terms``, ``evaluations`` of the
+    objective; the ``memory`` of the newest, None where nothing is learned; ``sigma``: of each, the
+    standard deviation (N,) [m] of each vertex along its ray, or None where the objective has no
+    quadratic model.
+    """
+
+    states: list[State]
+    terms: dict[str, float]
+    evaluations: int
+    memory: FrameMemory | None
+    sigma: list[np.ndarray] | None
+
+
+class FrameTracker:
+    """Solves the frames of a ``problem``, window by window, by a ``solver``, or by the one that the
+    settings name.
+
+    A frame starts from the one before or, with ``starts`` = auto, from where its motion leads,
+    whichever explains the image better; where it ends with a misfit far above that of the frames
+    before, other starts are tried. In a window of several frames the newest is solved so, and then
+    all together. With ``starts`` = previous it is the paper's: all together, from the frame before
+    (supplement, "Adaptive Window Optimization"). :meth:`revisit` looks both ways from one frame,
+    and :meth:`retry` solves it from another frame's surface. Raises InputError where the solver
+    cannot minimise the objective.
+    """
+
+    def __init__(self, problem: Problem, solver: Solver | None = None) -> None:
+        self.problem, self.settings = problem, problem.settings
+        self.objective = Objective(problem)
+        self.solver = solver or solvers.create(self.objective)
+        self._check_settings()
+        # what frames are compared by, and how sure they are, needs the closed form
+        self._learns = self.objective.without_block is None
+        self._stages = Stages(self.objective, self.solver, self._learns)
+        self._starts = Starts(problem, self._stages)
+        self._atlas, self._is_prepared = problem.atlas, False
+
+    def _check_settings(self):
+        s, path = self.settings, self.problem.experiment.path
+        for name in ("smooth", "sweeps"):
+            value = getattr(s, name)
+            if value > 0 and s.window > 1:
+                raise InputError(
+                    f"{path}: setting {name} = {value:g} with window = {s.window}; frames are gone"
+                    f" over one by one: window = 1, or {name} = 0, is needed"
+                )
+            if value > 0 and (reason := self.objective.without_block):
+                raise InputError(
+                    f"{path}: setting {name} = {value:g} compares surfaces by the terms' quadratic"
+                    f" models, and {reason}, or {name} = 0"
+                )
+
+    def solve(
+        self,
+        window: Sequence[State],
+        frames: Sequence[int],
+        past: Past = (),
+        report: Report | None = None,
+    ) -> Solution:
+        """Minimise over the last of ``frames``, then over all of them.
+
+        ``window``: their states; ``past``: all frames before the last, oldest first; without it
+        every frame of the window is new.
+        """
+        self._prepare(report)
+        states, known = list(window), [memory for _, memory in past]
+        before = [state for state, _ in past[: max(0, len(past) + 1 - len(frames))]][-2:]
+        found, context = None, self._context(frames[-1], None, known)
+        alone = range(len(frames) - 1 if past else 0, len(frames))
+        for k in alone if self.settings.starts == "auto" and self._learns else ():
+            start = states[k] if past or k == 0 else states[k - 1]
+            history = (before + states[:k])[-2:]
+            found, context = self._newest(start, frames[k], history, known)
+            states[k] = self._atlas.with_relief_in_jets(found.state)
+            known.append(self._memory(found, context, known))
+        results = [found] if found else []
+        if len(frames) > 1 or not found:
+            contexts = [replace(context, frame=frame, anchor=None) for frame in frames]
+            if before and self.settings.tc_ties == "before":
+                contexts[0] = replace(contexts[0], anchor=before[-1])
+            results = self._stages.minimise(contexts, self.objective.usual[-1], states)
+            states = [result.state for result in results]
+            if not found:
+                known.append(self._memory(results[-1], context, known))
+        return self._solution(states, results, known[-1])
+
+    def revisit(
+        self, frame: int, before: State, after: State, memory: FrameMemory | None, weight: float
+    ) -> Solution:
+        """Solve a frame again, held to the middle of the states ``before`` and ``after`` it;
+        ``memory``: of the frame so far; ``weight``: of the squared difference to the middle.
+        """
+        self._prepare(None)
+        middle = before.extrapolated(after, -0.5)
+        context = replace(self._context(frame, middle, [memory]), hold=weight)
+        found = self._stages.descend(middle, context, self.objective.usual)
+        return self._solution([found.state], [found], self._same_noise(found, context, memory))
+
+    def retry(
+        self,
+        frame: int,
+        start: State,
+        state: State,
+        memory: FrameMemory | None,
+        past: Past,
+        report: Report | None = None,
+    ) -> Solution | None:
+        """Solve a frame anew from another frame's surface; None where it costs no less than the
+        surface that the frame has.
+
+        ``start``, ``state``: of the other frame, and of the frame so far; ``memory``: of the frame
+        so far. Both surfaces are compared by the last stage's objective, held to the frame before.
+        """
+        self._prepare(report)
+        self._expect(frame)
+        context = self._context(frame, past[-1][0], [memory for _, memory in past])
+        found = self._stages.descend(start, context, self.objective.usual)
+        new = self._atlas.with_relief_in_jets(found.state)
+        if self._cost(new, context) >= self._cost(state, context):
+            return None
+        return self._solution([new], [found], self._same_noise(found, context, memory))
+
+    def _cost(self, state, context):
+        """The cost of a state at the last stage."""
+        frozen = self.objective.frozen([context], self.objective.usual[-1], [state])
+        (model,) = frozen.quadratic([state])
+        return self._stages.cost(Found(state, None, model))
+
+    # -- a frame ---------------------------------------------------------------
+
+    def _prepare(self, report):
+        if not self._is_prepared:
+            self._is_prepared = True
+            if self.settings.texture_fit == "auto" and self._learns:
+                rest = self._atlas.state(self.problem.patch.rest().to_numpy())
+                self._expect(0)
+                fit_texture(self.problem, self.objective, self._context(0, rest, []))
+        self._stages.report, self._stages.count = report, 0
+
+    def _newest(self, start, frame, history, known):
+        """(found, context) of a frame after those whose memory is ``known``."""
+        self._expect(frame)
+        context = self._context(frame, history[-1] if history else start, known)
+        usual = [memory.misfit for memory in known if memory is not None]
+        return self._starts.solve(start, context, history, usual), context
+
+    def _expect(self, frame):
+        """Have this frame and the next one read in a second thread."""
+        if self._learns:
+            frames = [k for k in (frame, frame + 1) if k < len(self.problem.sequence)]
+            blurs = [stage.blur for stage in self.objective.usual]
+            self.objective.data.prefetch(frames, blurs, self.settings.k_shading > 0)
+
+    def _context(self, frame, anchor, known):
+        """The :class:`FrameContext` of a frame after those whose memory is ``known``."""
+        visibility = None
+        if self._learns and anchor is not None:
+            visibility = self.objective.visibility(anchor)
+        return FrameContext(frame, anchor, FrameMemory.of(known), visibility)
+
+    def _memory(self, found, context, known):
+        """What the frames that follow want to know of this one; None where nothing is learned."""
+        if found.model is None:
+            return None
+        model, before = found.model, context.memory
+        light = context.light(self.objective.rules)
+        if self.settings.k_shading > 0:
+            vertices, seen = model.surface.vertices, model.evaluation.seen
+            shade = self.objective.data.shade(vertices, context.frame, seen, model.appearance)
+            light = light.updated(shade)
+        return FrameMemory(
+            misfit=found.misfit,
+            outlier_share=model.evaluation.outlier_share,
+            least_misfit=self._least_misfit(found, context, known),
+            explained=found.misfit if found.more_is_vain else before.explained,
+            light=light,
+            scales=found.scales,
+        )
+
+    def _same_noise(self, found, context, memory):
+        """The memory of a frame that is solved again; noise and light stay those of ``memory``,
+        where it was not lost.
+        """
+        new = self._memory(found, context, [memory])
+        if memory is None:
+            return new
+        least = new.least_misfit if math.isnan(memory.least_misfit) else memory.least_misfit
+        return replace(new, least_misfit=least, light=memory.light)
+
+    def _least_misfit(self, found, context, known):
+        """The least misfit of the frames so far, the first one aside, of the texture as the
+        template has it: what the camera's blur makes of it is no noise. Of a surface of several
+        patches, less what its slant accounts for, which is large at its rims. NaN in the first
+        frame.
+        """
+        if not known:
+            return math.nan
+        least = FrameMemory.of(known).least_misfit
+        if found.misfit > least:
+            return least
+        blur, vertices = self.objective.usual[-1].blur, found.model.surface.vertices
+        bare = self.objective.data.misfit(vertices, context.frame, blur)
+        appearance = found.model.appearance
+        slant = appearance.misfit if appearance and len(self._atlas) > 1 else 0.0
+        return float(np.fmin(least, max(found.misfit, bare - slant) if slant else bare))
+
+    def _solution(self, states, results: Sequence[Found], memory):
+        """The :class:`Solution` of a window, with the memory of its newest frame."""
+        sigma = None
+        if self._learns:
+            origin = self.problem.camera.origin
+            sigma = [along_rays(self.objective, result.model, origin) for result in results]
+        terms = results[-1].result.terms
+        return Solution(states, terms, self._stages.count, memory, sigma)

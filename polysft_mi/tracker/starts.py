@@ -1,0 +1,93 @@
+"""Where a frame begins: at the frame before, where its motion leads, or, where that does not
+explain the image, farther away or at the pose that features tell.
+"""
+
+import math
+
+import numpy as np
+
+from polysft_mi.surface import State
+
+from .relocate import Relocator
+
+
+def motion_starts(start, history):
+    """``start``, and where the motion from the last but one to the last state of ``history`` leads:
+    half as far again, and as far again.
+    """
+    if len(history) < 2:
+        return [start]
+    return [start, *(history[-2].extrapolated(history[-1], factor) for factor in (0.5, 1.0))]
+
+
+class Starts:
+    """Chooses starts for :class:`polysft_mi.tracker.stages.Stages`."""
+
+    def __init__(self, problem, stages):
+        self._problem, self._stages, self._rules = problem, stages, stages.rules
+        self._relocator = None
+
+    def nearest(self, starts, frame, stage):
+        """The start that explains the frame best at a stage."""
+        objective = self._stages.objective
+        misfits = [
+            objective.data.misfit(objective.atlas.surface(state).vertices, frame, stage.blur)
+            for state in starts
+        ]
+        return starts[int(np.argmin(misfits))]
+
+    def solve(self, start, context, history, usual_misfits):
+        """The frame from the nearest start; where it ends suspect, also from others:
+        :class:`polysft_mi.tracker.stages.Found`.
+
+        ``history``: states of the one or two frames before; ``usual_misfits``: of the frames
+        before, oldest first.
+        """
+        stages, rules, frame = self._stages, self._rules, context.frame
+        objective = stages.objective
+        starts = motion_starts(start, history) if rules.motion_starts else [start]
+        best = stages.descend(
+            self.nearest(starts, frame, objective.usual[0]), context, objective.usual
+        )
+        limit = self._suspect_above(usual_misfits, context.memory.noise)
+        far = objective.far, *objective.usual
+        if best.misfit > limit:
+            objective.data.prefetch([frame], [objective.far.blur], self._has_shading)
+        for other in (lambda: self.nearest(starts, frame, far[0]), lambda: self._rigid(frame)):
+            if not best.misfit > limit:
+                break
+            if (other := other()) is None:
+                continue
+            found = stages.descend(other, context, far, rules.far_iterations)
+            if stages.cost(found) < stages.cost(best):
+                best = found
+        return best
+
+    @property
+    def _has_shading(self):
+        return self._problem.settings.k_shading > 0
+
+    def _suspect_above(self, usual, noise):
+        """The misfit above which a frame is suspect: infinite while those of the frames before are
+        too few to tell.
+        """
+        rules = self._rules
+        usual = usual[-rules.suspect_memory :]
+        if len(usual) < 3:
+            return math.inf
+        noise = min(noise, *usual)
+        above = rules.suspect_factor * (np.median(usual) - noise)
+        return noise + above + rules.suspect_margin
+
+    def _rigid(self, frame):
+        """The undeformed template in the pose that its features have in the frame; None where too
+        few are found.
+        """
+        objective = self._stages.objective
+        if self._relocator is None:
+            self._relocator = Relocator(objective.data)
+        motion = self._relocator.pose(self._problem.sequence.frame(frame))
+        if motion is None:
+            return None
+        rest = objective.atlas.state(self._problem.patch.rest().to_numpy())
+        return State(rest.alpha, rest.offset, *objective.atlas.rigid(*motion))

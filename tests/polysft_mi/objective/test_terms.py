@@ -1,0 +1,189 @@
+"""Each term's closed form, gradient and energy, against automatic differentiation of its energy;
+each curvature against the change of the gradient.
+"""
+
+import dataclasses
+
+import drjit as dr
+import numpy as np
+import pytest
+import surfaces
+import synthetic
+import trimesh
+from problems import dense, problem_of, some_state
+from scipy.spatial.transform import Rotation
+
+from polysft_mi.errors import InputError
+from polysft_mi.images import Light
+from polysft_mi.objective import TERMS, FrameContext, FrameMemory, Objective
+from polysft_mi.surface.patch import Unknowns
+
+GEOMETRY = "shading inextensibility temporal bending coupling sliding relief".split()
+WEIGHTS = dict(
+    k_rgb=0.0, k_silhouette=0.0, k_tc=0.3, k_bend=1e-2, k_uv=0.2, k_relief=0.4, k_shading=9.0
+)
+
+
+@pytest.fixture
+def rng():
+    """Each test's own, so that its draws do not depend on the tests before it."""
+    return np.random.default_rng(4)
+
+
+def objective_of(problem, *names, **settings):
+    """The objective of some terms of a problem, under settings."""
+    given = problem.settings
+    problem.settings = dataclasses.replace(given, **settings)
+    try:
+        objective = Objective(problem)
+    finally:
+        problem.settings = given
+    objective.terms = [term for term in objective.terms if term.name in names]
+    assert len(objective.terms) == len(names)
+    return objective
+
+
+def context_of(objective, rng, frame=1, hold=0.0):
+    """A frame after others: noise, a light that is known, and a part that no pixel sees."""
+    atlas, rules = objective.atlas, objective.rules
+    light = Light(
+        20 * np.eye(7), 20 * np.array([0.8, 0.1, 0.2, -0.4, 0.05, 0.0, 0.1]), 0.02, 1, rules
+    )
+    anchor = some_state(atlas, rng, 0.01)
+    memory = FrameMemory(misfit=0.06, least_misfit=0.06, light=light)
+    return FrameContext(frame, anchor, memory, objective.visibility(anchor), hold)
+
+
+def by_autodiff(frozen, state):
+    """(energy, gradient by the jets and motions (K, A + 6), by the displacements (N, 3)) of one
+    frame, as quadratic models have them.
+    """
+    atlas = frozen.atlas
+    unknowns = Unknowns.from_numpy(atlas.arrays(state))
+    dr.enable_grad(unknowns)
+    total, _ = frozen.evaluate([unknowns], backward=True)
+    grad = {name: np.array(dr.grad(x), dtype=np.float64) for name, x in unknowns.items()}
+    count = len(atlas)
+    alpha = grad["delta_alpha"].reshape(count, -1) @ atlas.to_monomials
+    quaternion, rotation = grad["rotation"].reshape(count, 4), np.zeros((count, 3))
+    for axis in range(3):  # the rotation goes on by a small turn about an axis of the world
+        turn = Rotation.from_rotvec(1e-6 * np.eye(3)[axis])
+        ahead, behind = ((t * state.rotation).as_quat() for t in (turn, turn.inv()))
+        ahead *= np.sign((ahead * state.rotation.as_quat()).sum(1, keepdims=True))
+        behind *= np.sign((behind * state.rotation.as_quat()).sum(1, keepdims=True))
+        rotation[:, axis] = (quaternion * (ahead - behind)).sum(1) / 2e-6
+    translation = grad["translation"].reshape(count, 3)
+    offset = np.stack([grad[f"delta_{c}"] for c in "uvw"], 1)
+    return total, np.concatenate([alpha, rotation, translation], 1), offset
+
+
+@pytest.fixture(params=["truth", "tube"])
+def problem(request):
+    """A sheet of one patch, and a sleeve of several."""
+    return problem_of(request.getfixturevalue(request.param).folder, order=4)
+
+
+@pytest.mark.parametrize("name", GEOMETRY)
+def test_closed_forms_are_those_of_automatic_differentiation(problem, name, rng):
+    several = len(problem.template) > 1
+    if name == "coupling" and not several:
+        pytest.skip("one patch is not coupled")
+    objective = objective_of(problem, name, **WEIGHTS)
+    hold = 0.7 if name == "temporal" else 0.0
+    context, state = context_of(objective, rng, hold=hold), some_state(objective.atlas, rng, 0.02)
+    frozen = objective.frozen([context], objective.usual[-1], [state])
+    total, by_globals, by_offset = by_autodiff(frozen, state)
+    (model,) = frozen.quadratic([state])
+    assert model.total == pytest.approx(total, rel=2e-4) and total > 0
+    mine = model.normal.gradient.reshape(by_globals.shape)
+    for part in (slice(0, -6), slice(-6, -3), slice(-3, None)):
+        scale = np.abs(by_globals).max() + 1e-12
+        assert np.abs(mine - by_globals)[:, part].max() < 3e-3 * scale
+    scale = np.abs(by_offset).max() + 1e-12
+    assert np.abs(model.normal.local_gradient - by_offset).max() < 3e-3 * scale
+    assert max(np.abs(by_globals).max(), np.abs(by_offset).max()) > 1e-6
+
+
+@pytest.mark.parametrize("name", [name for name in GEOMETRY if name != "shading"])
+def test_curvatures_promise_the_change(problem, name, rng):
+    """Where a term is a sum of squares, what its quadratic model promises of a small step is the
+    change of its energy; where its norm is robust, or it takes Gauss-Newton's part, no more.
+    """
+    if name == "coupling" and len(problem.template) == 1:
+        pytest.skip("one patch is not coupled")
+    objective = objective_of(problem, name, **WEIGHTS)
+    context, state = context_of(objective, rng), some_state(objective.atlas, rng, 0.02)
+    frozen = objective.frozen([context], objective.usual[-1], [state])
+    (model,) = frozen.quadratic([state])
+    normal, quadratic = model.normal, name in ("temporal", "bending", "sliding", "relief")
+    matrix, gradient = dense(objective.inputs.operators.patterns[3], normal)
+    assert np.abs(matrix - matrix.T).max() < 1e-9 * np.abs(matrix).max()
+    for size in (1e-6, 1e-2 if quadratic else 1e-5):
+        step = rng.normal(size=len(normal.gradient)), rng.normal(size=state.offset.shape)
+        if quadratic:  # linear in these; not in the rotations
+            step[0].reshape(len(objective.atlas), -1)[:, -6:-3] = 0
+        step = tuple(size * x for x in step)
+        along = np.concatenate([step[1].ravel(), step[0]])
+        (there,) = frozen.quadratic([state.after_step(step)])
+        (back,) = frozen.quadratic([state.after_step(step, -1)])
+        slope = (there.total - back.total) / 2
+        assert along @ gradient == pytest.approx(slope, rel=1e-3, abs=1e-12)
+        bend, promised = there.total + back.total - 2 * model.total, along @ matrix @ along
+        assert promised >= 0
+        if quadratic and size > 1e-5 and not (name == "relief" and len(objective.atlas) > 1):
+            assert bend == pytest.approx(promised, rel=1e-5)  # a tube's bends are bounded
+
+
+@pytest.mark.parametrize("name", ["rgb", "silhouette"])
+def test_images_in_closed_form_go_where_automatic_differentiation_goes(problem, name, rng):
+    """The photometric term compares a blurred texture where Mitsuba's gradient goes through the
+    blurred rendering: energy and slope along the surface's motions are alike.
+    """
+    weights = {"k_rgb": 0.0, "k_silhouette": 0.0, f"k_{name}": 1.0}
+    objective = objective_of(problem, name, **{**WEIGHTS, **weights})
+    context = dataclasses.replace(context_of(objective, rng), memory=FrameMemory(0.05))
+    state = objective.atlas.state(problem.patch.rest().to_numpy())
+    state.translation += 0.01
+    frozen = objective.frozen([context], objective.usual[-1], [state])
+    total, by_globals, _ = by_autodiff(frozen, state)
+    (model,) = frozen.quadratic([state])
+    mine = model.normal.gradient.reshape(by_globals.shape)
+    a, b = mine[:, -3:].ravel(), by_globals[:, -3:].ravel()
+    near = 1e-3 if name == "silhouette" else 0.2
+    assert model.total == pytest.approx(total, rel=near / 2)
+    assert np.linalg.norm(a - b) < near * np.linalg.norm(b)
+
+
+def test_a_closed_surface_keeps_its_volume(tmp_path, rng):
+    """Of a ball: closed form against automatic differentiation, and against finite differences."""
+    truth = synthetic.cloth(tmp_path / "ball", frames=1)
+    points, faces = surfaces.sphere(radius=0.1, subdivisions=2)
+    template = truth.folder / "template.obj"
+    synthetic.write_obj(template, points + truth.vertices[0].mean(0), 5 * points[:, :2], faces)
+    problem = problem_of(truth.folder, k_volume=5.0, order=3)
+    objective = objective_of(problem, "volume", **WEIGHTS)
+    (term,) = objective.terms
+    points, faces = problem.template.vertices, problem.template.faces
+    assert abs(term.rest) == pytest.approx(abs(trimesh.Trimesh(points, faces).volume), rel=1e-9)
+    context, state = context_of(objective, rng, 0), some_state(objective.atlas, rng, 0.02)
+    frozen = objective.frozen([context], objective.usual[-1], [state])
+    total, by_globals, by_offset = by_autodiff(frozen, state)
+    (model,) = frozen.quadratic([state])
+    assert model.total == pytest.approx(total, rel=1e-3) and total > 0
+    mine = model.normal.gradient.reshape(by_globals.shape)
+    assert np.abs(mine - by_globals).max() < 3e-3 * np.abs(by_globals).max()
+    offset = model.normal.local_gradient
+    assert np.abs(offset - by_offset).max() < 3e-3 * np.abs(by_offset).max()
+    step = rng.normal(size=mine.size) * 1e-6, rng.normal(size=offset.shape) * 1e-6
+    ahead, behind = (frozen.quadratic([state.after_step(step, h)])[0].total for h in (1, -1))
+    slope = step[0] @ mine.ravel() + (step[1] * offset).sum()
+    assert (ahead - behind) / 2 == pytest.approx(slope, rel=1e-4)
+
+
+def test_an_open_template_has_no_volume(truth):
+    with pytest.raises(InputError, match="k_volume = 2, but the template is open"):
+        Objective(problem_of(truth.folder, k_volume=2.0))
+
+
+def test_every_term_is_tested():
+    assert {kind.name for kind in TERMS} == {*GEOMETRY, "rgb", "silhouette", "volume"}
