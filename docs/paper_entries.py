@@ -122,8 +122,9 @@ SECTIONS = {
             (f"{RECONSTRUCTION} --tables paper", ACCURACY),
             figures.chamfer,
             "PolyFit is at the floor of the measure, two samplings of the same garment, here and "
-            "in the paper. Our AtlasNet is no rival: minutes of training on six garments, against "
-            "5,000 in the paper. The dress is not among the templates that SNUG publishes.",
+            "in the paper. Our AtlasNet, where it was trained, is no rival: minutes on six "
+            "garments, against 5,000 in the paper ([polyfit.md](polyfit.md#training)). The dress "
+            "is not among the templates that SNUG publishes.",
         ),
     ),
     "Experiments: PolySfT": (
@@ -297,7 +298,8 @@ SECTIONS = {
             "PointNet and DGCNN that regress α.",
             (ACCURACY,),
             figures.networks,
-            "Two cores of a CPU, minutes of training each.",
+            "Minutes of training each. The times are of two cores of a CPU that others used, too; "
+            "on idle ones a fifth ([polyfit.md](polyfit.md#training)).",
         ),
         Entry(
             "Table, families",
