@@ -248,7 +248,8 @@ SECTIONS = {
                 f"{ONEFIT} --tables losses",
             ),
             figures.losses,
-            "Trained for minutes. What our inputs and patches bring is the last row.",
+            "Trained for minutes, 120 steps each. What our inputs and patches bring is a row more, "
+            "`--train tank-ours`.",
         ),
         Entry(
             "Table 7",
