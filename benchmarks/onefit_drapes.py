@@ -6,8 +6,8 @@ swing, and its time.
     python benchmarks/onefit_drapes.py --steps 0        # without simulations: quick
 
 Every garment is draped in each held-out kind of motion, on the standard body and on others drawn at
-random in turn: by skinning, by the networks without and with post-processing, and by a simulation
-that starts from the first of them. Columns:
+random in turn: by skinning, by the networks alone (without ease), by the networks with ease and
+post-processing, and by a simulation that starts from the first of them. Columns:
 *inside* [%] of the vertices; *faces* [%] of points of the faces, no farther apart than 5 mm, in
 every third frame; *room* [%], those of them that lie where cloth has room, which it has not where
 the body overlaps itself, or skin faces skin at less than 12 mm; *strain* [%], *wave* [degrees],
@@ -125,7 +125,7 @@ def main(argv=None):
             plain, ends = draper.drape(garment, motion, body, skinning_only=True), []
             drapes = {"skinning": plain}
             for of, other in drapers.items():
-                drapes[of] = other.drape(garment, motion, body, post=False, eased=args.eased)
+                drapes[of] = other.drape(garment, motion, body, post=False, eased=False)
                 drapes[f"{of}, post"] = other.drape(garment, motion, body, eased=args.eased)
             if args.steps:
                 ends.append(time.perf_counter())

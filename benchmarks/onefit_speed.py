@@ -3,11 +3,11 @@
     python benchmarks/onefit_speed.py [--weights NAME] [--device cuda]
 
 Milliseconds a frame, the median of repeated drapes of a motion of 90 frames in batches, without
-rendering: all of ``Draper.drape``, the network alone, and post-processing; then the T-shirt at
-about 1,000, 4,000, 16,000 and 64,000 vertices; last, the flesh that yields before a simulation.
-Cutting a garment into patches comes once and stands apart. The clock shows what else the machine
-does; the least of the repetitions is given beside the median, and the processor's time, of all
-threads together.
+rendering: all of ``Draper.drape``; the patches' deformations; the network alone, which is these and
+the vertices, without ease; and post-processing. All of them for the T-shirt at about 1,000, 4,000,
+16,000 and 64,000 vertices; last, the flesh that yields before a simulation. Cutting a garment into
+patches comes once and stands apart. The clock shows what else the machine does; the least of the
+repetitions is given beside the median, and the processor's time, of all threads together.
 """
 
 import argparse
@@ -16,13 +16,16 @@ import statistics
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import torch
 
 import onefit
+from onefit.body import skinning
 from onefit.contact import ContactSettings, Flesh
-from onefit.draping.draper import FPS
+from onefit.draping.draper import BATCH, FPS
 from onefit.network import DEFAULT
+from onefit.objective import posed
 from polyfit.errors import cli
 
 FRAMES = 90
@@ -44,15 +47,24 @@ def timed(function, device, repeats=9):
     return statistics.median(found), min(found), statistics.median(busy)
 
 
-def network_alone(draper, garment, motion):
-    """The embedding of the motion and the decoding of every patch in every frame, no vertex among
-    it.
+def network_alone(draper, garment, motion, vertices=True):
+    """What the network alone makes, without ease: the embedding of the motion, the deformation of
+    every patch in every frame, and, with ``vertices``, all vertices (T, N, 3) [m] of the cloth in
+    the world.
     """
-    body = draper.model.body().to(draper.device)
+    body, patched = draper.model.body().to(draper.device), draper.patched(garment)
+    weights = garment.blend_weights.to(draper.device)
+    rest = garment.vertices.to(draper.device)[:, None]
+    found = []
     with torch.inference_mode():
         embedding = draper.embedding(motion, body)
-        for part in embedding.split(32):
-            draper.patched(garment).changes(draper.network.decoder(draper.codes(garment), part))
+        maps = skinning.transforms(body, motion.poses, motion.translation)
+        for part, some in zip(embedding.split(BATCH), maps.split(BATCH)):
+            changes = patched.changes(draper.network.decoder(draper.codes(garment), part))
+            if vertices:
+                moved = rest + patched.displacement(changes)
+                found.append(posed(moved, weights, some).transpose(0, 1))
+    return torch.cat(found) if vertices else None
 
 
 def main(argv=None):
@@ -60,7 +72,7 @@ def main(argv=None):
     parser.add_argument("--weights", default=DEFAULT)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--counts", type=int, nargs="+", default=[1000, 4000, 16_000, 64_000])
-    parser.add_argument("-o", "--output", help="a JSON file of the figures")
+    parser.add_argument("-o", "--output", help="a folder for onefit_speed.json")
     args = parser.parse_args(argv)
     start = time.perf_counter()
     subprocess.run([sys.executable, "-c", "import onefit"], check=True)
@@ -73,8 +85,8 @@ def main(argv=None):
     motion = onefit.Motion.generate("walk", seconds=FRAMES / FPS, seed=1).to(draper.device)
     shirt = draper.garment("tshirt")
     print(
-        "| vertices | patches | cut and eased, once [s] | drape [ms a frame] | network alone |"
-        " post-processing |\n|---|---|---|---|---|---|"
+        "| vertices | patches | cut and eased, once [s] | drape [ms a frame] | patches alone |"
+        " network alone | post-processing |\n|---|---|---|---|---|---|---|"
     )
     rows = []
     for count in args.counts:
@@ -85,9 +97,15 @@ def main(argv=None):
         cut = time.perf_counter() - start
         T = len(motion.poses)
         whole = [x / T for x in timed(lambda: draper.drape(garment, motion), args.device)]
-        network = [
-            x / T for x in timed(lambda: network_alone(draper, garment, motion), args.device)
-        ]
+        deformation, network = (
+            [
+                x / T
+                for x in timed(
+                    lambda: network_alone(draper, garment, motion, vertices), args.device
+                )
+            ]
+            for vertices in (False, True)
+        )
         drape = draper.drape(garment, motion, post=False)
         process = draper.post_processing(garment, drape.rest, draper.standard)
         post = [
@@ -99,7 +117,7 @@ def main(argv=None):
             )
         ]
         cells = [f"{len(garment)}", f"{len(patched)}", f"{cut:.1f}"] + [
-            f"{a:.2f} ({b:.2f}; {c:.2f})" for a, b, c in (whole, network, post)
+            f"{a:.2f} ({b:.2f}; {c:.2f})" for a, b, c in (whole, deformation, network, post)
         ]
         print("| " + " | ".join(cells) + " |", flush=True)
         rows.append(
@@ -108,6 +126,7 @@ def main(argv=None):
                 patches=len(patched),
                 cut=cut,
                 drape=whole,
+                patches_alone=deformation,
                 network=network,
                 post=post,
             )
@@ -117,8 +136,10 @@ def main(argv=None):
     yielding = [x / len(bodies) for x in timed(lambda: flesh(bodies), "cpu", 3)]
     print("\nflesh, before a simulation: {:.2f} ({:.2f}; {:.2f})".format(*yielding))
     if args.output:
-        with open(args.output, "w", encoding="utf-8") as file:
-            json.dump(dict(import_seconds=seconds, rows=rows, flesh=yielding), file, indent=2)
+        found = dict(threads=torch.get_num_threads(), device=args.device, rows=rows, flesh=yielding)
+        path = Path(args.output) / "onefit_speed.json"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     return 0
 
 

@@ -29,7 +29,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from polyfit_held_out import CLOUD_POINTS, HELD_OUT, POINTS, cloud, kinds
-from polyfit_networks import ORDER, BestAxis, Tilted, train_missing, trained
+from polyfit_networks import ORDER, BestAxis, Tilted, making, train_missing, trained
 from scipy.spatial import cKDTree
 
 from polyfit.baselines import DGCNN, AtlasNet, PointNet
@@ -84,7 +84,7 @@ def measure(data, runs):
     patches = kinds(data)
     main = trained(runs, "main", PolyFit.load) or PolyFit.pretrained(ORDER)
     every = {kind: str(len(p)) for kind, p in patches.items()}
-    report = {"patches": {kind: len(p) for kind, p in patches.items()}}
+    report = {"patches": {kind: len(p) for kind, p in patches.items()}, "trained": making(runs)}
 
     def on_all(model):
         return {kind: figures(model, p) for kind, p in patches.items()}
@@ -98,6 +98,8 @@ def measure(data, runs):
         "with the STN": main,
         "search over 65 axes": BestAxis(),
     }
+    if by_preset := trained(runs, "paper", PolyFit.load):
+        frames["one quaternion, by the preset"] = by_preset
     report["frames"] = {name: on_all(m) for name, m in frames.items()}
     rows = []
     for kind in patches:
@@ -241,7 +243,8 @@ def main(argv=None):
         aside(os.path.join(args.output, "polyfit_accuracy.json")) as temporary,
         open(temporary, "w", encoding="utf-8") as file,
     ):
-        json.dump(report, file, indent=2)
+        json.dump(report, file, indent=1)
+        file.write("\n")
 
 
 if __name__ == "__main__":

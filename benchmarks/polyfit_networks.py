@@ -14,7 +14,7 @@ from sequences import ROOT
 from polyfit import jets
 from polyfit.errors import InputError
 from polyfit.jets import CanonicalFrame
-from polyfit.network import PatchFit, SpatialTransformer
+from polyfit.network import PRETRAINED, PatchFit, SpatialTransformer
 from polyfit.training.training_set import axes, rotations_to
 
 TRAINED_ON = [
@@ -25,6 +25,7 @@ SHORT = ["--steps", "800", "--patches", "15000"]
 ATLASNET = ["--model", "atlasnet", "--batch", "8", "--steps", "1000"]
 TRAININGS = {  # folder in RUNS: options of python -m polyfit.train, whether on garments
     "main": ([], True),
+    "paper": (["--preset", "paper"], True),
     "pointnet": (["--model", "pointnet"], True),
     "dgcnn": (
         ["--model", "dgcnn", "--steps", "600"],
@@ -87,6 +88,21 @@ def trained(runs, name, load):
             f"{path}: trained on {', '.join(sorted(seen))}, which this benchmark holds out"
         )
     return load(path, ORDER)
+
+
+def making(runs):
+    """What made each of the networks that are there: steps, batch, minutes, machine."""
+    found = {}
+    for name in TRAININGS:
+        path = Path(runs) / name / "weights.json"
+        if name == "main" and not path.exists():
+            path = PRETRAINED["polyfit"].with_suffix(".json")
+        if path.exists():
+            about = json.loads(path.read_text(encoding="utf-8"))
+            kept = ("command", "steps", "batch", "patches", "minutes", "machine", "date")
+            found[name] = {key: about[key] for key in kept}
+            found[name]["command"] = about["command"].replace(str(runs), "RUNS")
+    return found
 
 
 def train_missing(data, runs, say=print):

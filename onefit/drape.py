@@ -17,26 +17,38 @@ arguments. OUT receives
     meshes/NNN.obj          one mesh a frame, with --meshes obj (or ply)
 """
 
+import argparse
+
 from onefit.draping import command
 from polyfit.errors import cli
+
+# The paper: what the network alone makes; --post beside it pushes cloth out of the body
+PRESETS = {"paper": dict(post=False, ease=False)}
 
 
 def parser():
     p = command.parser("onefit.drape", __doc__)
     p.add_argument(
-        "--no-post",
-        dest="post",
-        action="store_false",
-        help="what the network alone makes, without post-processing",
+        "--post",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="post-processing of what the network makes (default: on)",
+    )
+    p.add_argument(
+        "--ease",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="the garment is tried on first (default: on)",
     )
     for name in ("material", "steps"):
         command.refuse(p, f"--{name}", "python -m onefit.simulate takes it, a drape has none")
+    p.add_presets(PRESETS)
     return p
 
 
 def main(argv=None):
     args = parser().parse_args(argv)
-    command.run("drape", args, post=args.post)
+    command.run("drape", args, post=args.post, eased=args.ease)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """Trains OneFit: without any data but garments and motions, by physics (paper, section "OneFit").
 
     python -m onefit.train [GARMENT ...] -o OUT [--motions FILE ...] [--from WEIGHTS] [--resume]
+    python -m onefit.train -o OUT --preset paper     # the paper's network, losses and schedule
     torchrun --nproc-per-node 2 -m onefit.train ...
 
 With --teacher LESSONS the network learns simulated drapes by regression; physics alone goes on from
@@ -16,6 +17,7 @@ without any, the six templates of the paper. OUT receives
                             where an uninterrupted run would have
 """
 
+import argparse
 import shlex
 import sys
 from dataclasses import fields
@@ -25,8 +27,10 @@ from polyfit.errors import Parser, cli, optional_imports
 with optional_imports(__name__):
     from polyfit.training import add_run_arguments, run
 
+    from .garment import FRAMES
+    from .network import EXTRAS
     from .objective import Weights
-    from .training import OBJECTIVES, Settings, train
+    from .training import OBJECTIVES, PRESETS, Settings, train
 
 
 def parser():
@@ -67,8 +71,15 @@ def parser():
         metavar="LESSONS",
         help="learn these lessons of onefit.teach by regression, beside the objective",
     )
-    p.add_argument("--objective", choices=OBJECTIVES, default=default.objective)
-    p.add_argument("--material", default=default.material, help="of the objective (cotton)")
+    p.add_argument(
+        "--objective",
+        choices=OBJECTIVES,
+        default="",
+        help="(default: material with --teacher, else paper)",
+    )
+    p.add_argument(
+        "--material", default=default.material, help="of the objective material (default: cotton)"
+    )
     for name, text in {
         "order": "order of the jets", "epochs": "",
         "batch": "patches of a step, all frames together",
@@ -86,6 +97,23 @@ def parser():
     p.add_argument(
         "--lr", type=float, default=default.lr, help=f"Adam's rate (default: {default.lr})"
     )
+    group = p.add_argument_group("the network and its patches (those of --from's weights with it)")
+    group.add_argument(
+        "--extras",
+        nargs="*",
+        choices=EXTRAS,
+        default=list(EXTRAS),
+        help=f"what it has beyond the paper's: {', '.join(EXTRAS)} (default: all)",
+    )
+    group.add_argument(
+        "--frames", choices=FRAMES, default=default.frames, help="of the patches (default: pca)"
+    )
+    group.add_argument(
+        "--acvd",
+        action=argparse.BooleanOptionalAction,
+        default=default.acvd,
+        help="garments are cut by plain ACVD",
+    )
     group = p.add_argument_group("the losses' weights (0 switches one off)")
     for f in fields(Weights):
         group.add_argument(
@@ -94,6 +122,7 @@ def parser():
             default=f.default,
             help=f"(default: {f.default})",
         )
+    p.add_presets(PRESETS)
     add_run_arguments(p)
     return p
 
@@ -102,7 +131,7 @@ def main(argv=None):
     args = parser().parse_args(argv)
     weights = Weights(**{f.name: getattr(args, f.name) for f in fields(Weights)})
     values = {f.name: getattr(args, f.name) for f in fields(Settings) if f.name != "weights"}
-    values |= dict(garments=tuple(args.garments), motions=tuple(args.motions))
+    values |= {name: tuple(getattr(args, name)) for name in ("garments", "motions", "extras")}
     command = "python -m onefit.train " + shlex.join(sys.argv[1:] if argv is None else argv)
     settings = Settings(**values, weights=weights)
     run(train, settings, args, command)

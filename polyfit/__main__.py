@@ -6,6 +6,10 @@ import os
 
 from .errors import InputError, Parser, cli
 
+_SAME_AXIS = 0.99999  # cosine of two z axes: 0.3 degrees
+# The paper: plain ACVD, the frame of PCA and the spatial transformer, jets of order 4
+PRESETS = {"paper": dict(patches=None, order=4, cuts="acvd", frames="stn", weights="paper")}
+
 
 def main(argv=None):
     parser = Parser(
@@ -21,6 +25,23 @@ def main(argv=None):
         "--order", type=int, default=4, help="order of the jets, 1 to 10 (default: 4)"
     )
     parser.add_argument(
+        "--cuts",
+        choices=("jets", "acvd"),
+        default="jets",
+        help="how the mesh is cut: as jets need it, or by plain ACVD (default: jets)",
+    )
+    parser.add_argument(
+        "--frames",
+        choices=("pca", "stn"),
+        default="pca",
+        help="the patches' frames: of PCA, or refined by the spatial transformer (default: pca)",
+    )
+    parser.add_argument(
+        "--weights",
+        metavar="WEIGHTS",
+        help="of the transformer: polyfit, paper (one quaternion), or a file (default: polyfit)",
+    )
+    parser.add_argument(
         "--resolution",
         type=int,
         default=4,
@@ -32,6 +53,7 @@ def main(argv=None):
         default=0,
         help="rounds of Laplacian smoothing along the patches' boundaries (default: 0)",
     )
+    parser.add_presets(PRESETS)
     args = parser.parse_args(argv)
     if not args.output.lower().endswith(".ply"):
         raise InputError(f"{args.output}: a .ply file is needed")
@@ -40,22 +62,39 @@ def main(argv=None):
     for name, least in (("resolution", 1), ("smoothing", 0)):
         if getattr(args, name) < least:
             raise InputError(f"--{name} {getattr(args, name)}; at least {least} is needed")
-    from . import PatchedSurface, read_mesh, write_ply
+    if args.weights and args.frames != "stn":
+        raise InputError(f"--weights {args.weights}: of the transformer, for --frames stn")
+    import numpy as np
+
+    from . import PatchedSurface, PolyFit, read_mesh, write_ply
     from .mesh import centred
+    from .network import PRETRAINED
 
     vertices, faces, _ = read_mesh(args.mesh)
     vertices, moved = centred(vertices)
     if moved is not None:
         by = ", ".join(f"{x:.9g}" for x in moved)
         print(f"note: {args.mesh}: moved by ({by}): single precision ends so far from the origin")
-    surface = PatchedSurface.from_mesh(vertices, faces, args.patches, args.order, where=args.mesh)
+    refine = None
+    if args.frames == "stn":
+        path = PRETRAINED.get(args.weights or "polyfit", args.weights)
+        refine = PolyFit.load(path, args.order).requires_grad_(False)
+    surface = PatchedSurface.from_mesh(
+        vertices, faces, args.patches, args.order, acvd=args.cuts == "acvd", polyfit=refine,
+        where=args.mesh,
+    )  # fmt: skip
     fine, fine_faces = surface.resampled(args.resolution, args.smoothing)
     write_ply(args.output, fine.numpy(), fine_faces.numpy())
-    rms = surface.residual.square().mean().sqrt()
+    rms = np.sqrt(np.average(surface.residual.square(), weights=surface.patches.entry_weight))
     print(
-        f"{len(surface)} patches, {surface.parameters} numbers, {1e3 * float(rms):.3f} mm RMS from"
+        f"{len(surface)} patches, {surface.parameters} numbers, {1e3 * float(rms):.4f} mm RMS from"
         " the mesh"
     )
+    if refine is not None:
+        of_pca = PatchedSurface.fit(surface.patches, args.order).frame.R
+        cosine = (of_pca[:, :, 2] * surface.frame.R[:, :, 2]).sum(-1)
+        turned = int((cosine < _SAME_AXIS).sum())
+        print(f"the transformer turned the z axis of {turned} of them")
     print(f"written: {args.output}, {len(fine)} vertices")
 
 

@@ -10,8 +10,8 @@ import os
 import signal
 import sys
 import warnings
-from collections.abc import Callable, Iterator
-from typing import NoReturn
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NoReturn
 
 
 class InputError(ValueError):
@@ -30,8 +30,26 @@ class Parser(argparse.ArgumentParser):
     are.
     """
 
+    _presets: dict[str, dict[str, Any]] | None = None
+
     def error(self, message: str) -> NoReturn:
         raise InputError(f"{message}; {self.prog} --help lists the options")
+
+    def add_presets(self, presets: dict[str, dict[str, Any]]) -> None:
+        """Add ``--preset NAME``: other defaults, by the names of the parsed arguments."""
+        self._presets = presets
+        about = "other defaults; what is given beside it wins"
+        self.add_argument("--preset", choices=sorted(presets), help=about)
+
+    def parse_args(  # type: ignore[override]
+        self, args: Sequence[str] | None = None, namespace: Any = None
+    ) -> argparse.Namespace:
+        found = super().parse_args(args, namespace)
+        preset = getattr(found, "preset", None)
+        if preset and self._presets:
+            self.set_defaults(**self._presets[preset])
+            found = super().parse_args(args, namespace)
+        return found
 
 
 # What a plain `pip install polysft-mi` leaves out: module, and the extra that brings it

@@ -2,9 +2,12 @@
 
     python -m polyfit.train [MESH ...] -o OUT [--model polyfit] [--steps 2500] [--resume]
                             [--families jet trigonometric gaussian bessel]
+    python -m polyfit.train MESH ... -o OUT --preset paper    # as the paper trains
+    python -m polyfit.train MESH ... -o OUT --from polyfit    # fine-tuning
     torchrun --nproc-per-node 2 -m polyfit.train ...
 
-Each MESH is a garment (.obj, .ply, .glb). It is cut into patches, which are deformed at random.
+Each MESH is a garment (.obj, .ply, .glb). It is cut into patches, which are deformed at random; by
+the paper's preset they stay as they are.
 Without any, the training sees the analytic families alone. OUT receives
 
     weights.safetensors     the trained network, for ``PolyFit.load``
@@ -15,6 +18,7 @@ Without any, the training sees the analytic families alone. OUT receives
     set.safetensors         the patches (polyfit.training.training_set), for --resume
 """
 
+import argparse
 import os
 import shlex
 import sys
@@ -23,7 +27,7 @@ from dataclasses import fields
 from .errors import Parser, cli, optional_imports
 
 with optional_imports(__name__):
-    from .training import MODELS, Settings, add_run_arguments, run, train
+    from .training import LOSSES, MODELS, PRESETS, Settings, add_run_arguments, run, train
 
 
 def parser():
@@ -45,25 +49,57 @@ def parser():
     p.add_argument(
         "--cuts",
         nargs="+",
-        type=int,
+        type=_cut,
         default=list(default.cuts),
-        help="numbers of patches; each mesh is cut into each",
+        metavar="N",
+        help="numbers of patches, or paper, its number by the area; each mesh is cut into each",
     )
-    for name in ("order", "patches", "points", "reads", "steps", "batch", "charts", "seed"):
+    p.add_argument(
+        "--from",
+        dest="start",
+        default="",
+        metavar="WEIGHTS",
+        help="weights to fine-tune: a file, or polyfit or paper, those of the package",
+    )
+    p.add_argument(
+        "--loss",
+        choices=LOSSES,
+        default=default.loss,
+        help="axes: a table of heights and normals; height: the paper's (default: axes)",
+    )
+    p.add_argument(
+        "--subdivided", type=int, metavar="N", help="subdivide meshes N times before they are cut"
+    )
+    for name, text in {
+        "order": "of the jets", "patches": "of the training set", "points": "kept of each patch",
+        "reads": "points that the network reads", "steps": "of the optimiser",
+        "batch": "patches a step", "turns": "quaternions that the network answers with",
+        "charts": "of AtlasNet", "seed": "of all random numbers",
+    }.items():  # fmt: skip
+        value = getattr(default, name)
+        p.add_argument(f"--{name}", type=int, default=value, help=f"{text} (default: {value})")
+    for name, text in {"lr": "Adam's rate", "garment-share": "of the patches"}.items():
+        value = getattr(default, name.replace("-", "_"))
+        p.add_argument(f"--{name}", type=float, default=value, help=f"{text} (default: {value})")
+    for name, text in {
+        "pca": "PCA's frame is one of the network's answers",
+        "acvd": "cut by plain ACVD",
+        "deformed": "garments' patches go through random maps",
+        "decay": "the rate falls to a hundredth as a cosine",
+    }.items():
         p.add_argument(
             f"--{name}",
-            type=int,
+            action=argparse.BooleanOptionalAction,
             default=getattr(default, name),
-            help=f"(default: {getattr(default, name)})",
+            help=text,
         )
-    p.add_argument(
-        "--lr",
-        type=float,
-        default=default.lr,
-        help=f"Adam's rate, which falls to a hundredth as a cosine (default: {default.lr})",
-    )
+    p.add_presets(PRESETS)
     add_run_arguments(p)
     return p
+
+
+def _cut(text):
+    return text if text == "paper" else int(text)
 
 
 def main(argv=None):

@@ -133,7 +133,7 @@ class Draper:
 
     def patched(self, garment: Garment) -> PatchedGarment:
         """The :class:`onefit.PatchedGarment` of a garment, cut once."""
-        cut = lambda: PatchedGarment(garment, self.standard, order=self.network.order)
+        cut = lambda: PatchedGarment(garment, self.standard, **self.network.patching)
         return self._once(garment, "patched", lambda: cut().to(self.device))
 
     def _once(self, garment, name, make):

@@ -7,8 +7,10 @@ import lazy_loader
 __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
+        "alignment": ["aligned", "pose_of"],
         "binding": ["standard_body", "standard_surface"],
-        "charts": ["Deformation", "PatchedGarment", "SparseMatrix"],
+        "charts": ["FRAMES", "Deformation", "PatchedGarment", "SparseMatrix"],
+        "fitting": ["placed"],
         "garment": ["FOLDER", "Garment", "LOOSE", "TEMPLATES"],
         "reading": ["RenderMesh", "Stitches", "parts"],
     },

@@ -9,7 +9,7 @@ DEFAULT = "taught"  # of the networks of the package, where none is named
 __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
-        "network": ["OneFit"],
+        "network": ["EXTRAS", "OneFit"],
         "weights": ["Trained"],
     },
 )

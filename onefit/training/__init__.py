@@ -7,6 +7,6 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     submod_attrs={
         "data": ["TrainingData"],
         "loop": ["OneFitTraining", "data_of", "train"],
-        "settings": ["OBJECTIVES", "STANDARD", "Settings"],
+        "settings": ["OBJECTIVES", "PRESETS", "STANDARD", "Settings"],
     },
 )

@@ -33,8 +33,9 @@ class Windows:
 class TrainingData:
     """``garments``: names of templates or :class:`onefit.Garment`; ``motions``: those to
     draw from, by default every training kind of :mod:`onefit.motion.generate` with the seeds 0 ..
-    ``seeds`` - 1; ``shapes``: how many random bodies beside the standard one. ``lessons``: those of
-    each garment, with their own motions and bodies; ``material`` of the cloth.
+    ``seeds`` - 1; ``shapes``: how many random bodies beside the standard one. ``patching``: how
+    garments are cut, arguments of :class:`onefit.PatchedGarment`. ``lessons``: those of each
+    garment, with their own motions and bodies; ``material`` of the cloth.
     """
 
     def __init__(
@@ -46,8 +47,7 @@ class TrainingData:
         seeds=4,
         seconds=6.0,
         shapes=48,
-        patches=None,
-        order=4,
+        patching=None,
         material="cotton",
         lessons=(),
         seed=0,
@@ -87,7 +87,7 @@ class TrainingData:
         )
         self.garments, self._sheets = [], {}
         for garment in garments:
-            patched = PatchedGarment(garment, self.standard, patches=patches, order=order)
+            patched = PatchedGarment(garment, self.standard, **patching or {})
             rest = torch.stack([garment.graded(b) for b in bodies], 1)
             self.garments.append((patched, rest, patched.field @ rest))  # (N, S, 3) and (3 P, S, 3)
             advance()

@@ -34,8 +34,12 @@ class OneFitTraining(Training):
     def __init__(self, settings, data, processes):
         self.given, self.data, self.bad, self.last = settings, data, 0, 0.0
         torch.manual_seed(settings.seed)
-        network = load(settings.start).network if settings.start else _network(settings, data)
-        plain = json.loads(json.dumps(asdict(settings)))
+        network = (
+            load(settings.start).network
+            if settings.start
+            else _network(settings, len(data.standard.joints), data.shapes.shape[1])
+        )
+        plain = json.loads(json.dumps(asdict(settings) | dict(objective=settings.lowered)))
         network = network.to(processes.device).train()
         windows = min(self._windows(garment, processes) for garment, *_ in data.garments)
         self.epoch_steps = settings.epoch_steps or -(-len(data) // windows)
@@ -124,7 +128,7 @@ class OneFitTraining(Training):
         of (poses, translation, number of the shape).
         """
         garment, scene = self.data.garments[number][0], self.data.scene(number, *frame)
-        if self.given.objective == "material":
+        if self.given.lowered == "material":
             sheets = self.data.sheets(number, frame[2])
             return material.evaluate(
                 garment, deformation, scene, sheets, self.given.weights, past, 1 / FPS, generator
@@ -164,8 +168,9 @@ class OneFitTraining(Training):
         return dict(loss=self.last, stepped_over=1.0)
 
 
-def _network(settings, data):
-    return OneFit(settings.order, len(data.standard.joints), data.shapes.shape[1])
+def _network(settings, joints, shape):
+    s = settings
+    return OneFit(s.order, joints, shape, s.extras, s.frames, s.acvd)
 
 
 def data_of(settings, folder, progress):
@@ -180,8 +185,7 @@ def data_of(settings, folder, progress):
     motions = [
         Motion.read(path, settings.fps, settings.motion_up) for path in settings.motions
     ] or None
-    if settings.start:
-        load(settings.start)
+    like = load(settings.start).network if settings.start else _network(settings, 24, 1)
     if settings.cuts:
         task = progress.add_task("cuts sewn", total=settings.cuts)
         garments += cuts(
@@ -193,7 +197,7 @@ def data_of(settings, folder, progress):
     task = progress.add_task("garments", total=len(garments))
     return TrainingData(
         garments, motions=motions, seeds=settings.seeds, shapes=settings.shapes,
-        order=settings.order, material=settings.material, lessons=learned, seed=settings.seed,
+        patching=like.patching, material=settings.material, lessons=learned, seed=settings.seed,
         advance=partial(progress.advance, task),
     )  # fmt: skip
 

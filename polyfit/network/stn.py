@@ -3,9 +3,10 @@ section "PolyFit").
 
 PCA takes the plane of least spread. For a large or folded patch this plane is wrong: over it the
 patch is no height graph. The transformer sees the patch in its PCA frame and answers with a few
-unit quaternions. Each is a turn of the frame; the PCA frame itself is always one of them. The turn
-whose jet leaves the least height is kept. So the refined frame is never worse than PCA at the
-points that were read. A patch with two plausible planes needs no guess between them.
+unit quaternions. Each is a turn of the frame; the PCA frame itself is one of them. The turn whose
+jet leaves the least height is kept. So the refined frame is never worse than PCA at the points that
+were read. A patch with two plausible planes needs no guess between them. The paper's transformer
+has one quaternion, and PCA's frame is no alternative: ``SpatialTransformer(turns=1, pca=False)``.
 
 Only the direction of z counts. A rotation within the plane changes nothing, because a jet of full
 degree spans the same heights in any (u, v).
@@ -28,7 +29,10 @@ from polyfit.jets import CanonicalFrame, rotation_matrix
 from .weights import load_into, read_weights, write_weights
 
 WEIGHTS_VERSION = 1  # of the network's shape and the meaning of its weights
-PRETRAINED = Path(__file__).parents[1] / "data" / "polyfit.safetensors"
+_DATA = Path(__file__).parents[1] / "data"
+# Weights of the package: ours, and what the paper's own training made here
+PRETRAINED = {name: _DATA / f"{name}.safetensors" for name in ("polyfit", "paper")}
+_IDENTITY = (0.0, 0.0, 0.0, 1.0)
 _INITIAL_TILT = math.radians(55)  # between the PCA frame's z and the first guesses'
 
 
@@ -37,7 +41,9 @@ class SpatialTransformer(torch.nn.Module):
 
     ``widths`` are those of the layers that see each point alone, ``hidden`` of the two layers after
     the maximum over points; at most ``points`` points are read, every so many-th of the patch's own
-    order. ``turns`` quaternions are learned; they start as tilts to all sides.
+    order. ``turns`` quaternions are learned; they start as tilts to all sides. With ``pca`` the
+    PCA frame's own, the identity, is one more answer. Without it the first of those that are
+    learned starts there: with one turn, this is the paper's transformer.
     """
 
     def __init__(
@@ -46,10 +52,11 @@ class SpatialTransformer(torch.nn.Module):
         hidden: int = 64,
         points: int = 64,
         turns: int = 5,
+        pca: bool = True,
     ) -> None:
         super().__init__()
-        self.shape = dict(widths=list(widths), hidden=hidden, points=points, turns=turns)
-        self.points = points
+        self.shape = dict(widths=list(widths), hidden=hidden, points=points, turns=turns, pca=pca)
+        self.points, self.pca = points, pca
         self.local = pointwise(widths)
         layers = [
             torch.nn.LayerNorm(widths[-1]),
@@ -68,13 +75,15 @@ class SpatialTransformer(torch.nn.Module):
             ],
             -1,
         )
+        if not pca:
+            first[0] = first.new_tensor(_IDENTITY)
         with torch.no_grad():
             last.weight.mul_(0.1)
             last.bias.copy_(first.flatten())
 
     def forward(self, x: Tensor, mask: Tensor | None = None) -> Tensor:
-        """Unit quaternions (B, turns + 1, 4) in the order (x, y, z, w), the first the identity, for
-        patches x (B, P, 3) in the chart of their PCA frame.
+        """Unit quaternions (B, H, 4) in the order (x, y, z, w) for patches x (B, P, 3) in the chart
+        of their PCA frame. H is ``turns``; with ``pca`` one more, and the first is the identity.
 
         ``mask`` (B, P) marks the points that count.
         """
@@ -82,7 +91,9 @@ class SpatialTransformer(torch.nn.Module):
         turns = torch.nn.functional.normalize(
             self.head(self.local(x).amax(1)).unflatten(-1, (-1, 4)), dim=-1
         )
-        return torch.cat([turns.new_tensor([0, 0, 0, 1]).expand(len(x), 1, 4), turns], 1)
+        if not self.pca:
+            return turns
+        return torch.cat([turns.new_tensor(_IDENTITY).expand(len(x), 1, 4), turns], 1)
 
 
 def pointwise(widths: Sequence[int], entries: int = 3) -> torch.nn.Sequential:
@@ -160,6 +171,8 @@ class PolyFit(torch.nn.Module):
             return frame
         x = frame.to_chart(points)
         turns = self.stn(x, mask)
+        if turns.shape[1] == 1:
+            return frame.rotated(turns[:, 0].to(frame.R.dtype))
         kept = self.least_height(
             subsampled(x, max(self.stn.points, 4 * jets.size_of(self.order)), mask), turns.detach()
         )
@@ -188,13 +201,15 @@ class PolyFit(torch.nn.Module):
         )
 
     @classmethod
-    def pretrained(cls, order: int = 4) -> "PolyFit":
-        """PolyFit with the weights that ship in the package (``polyfit/data``; the JSON file there
-        says what made them).
+    def pretrained(cls, order: int = 4, name: str = "polyfit") -> "PolyFit":
+        """PolyFit with weights that ship in the package (``polyfit/data``; the JSON files there say
+        what made them): "polyfit", or "paper", with one quaternion, by the paper's own training.
 
-        Raises InputError for an order that they are not for.
+        Raises InputError for a name that there is not, and for an order that they are not for.
         """
-        return cls.load(PRETRAINED, order)
+        if name not in PRETRAINED:
+            raise InputError(f"weights {name}: choose among {', '.join(PRETRAINED)}")
+        return cls.load(PRETRAINED[name], order)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], order: int | None = None) -> "PolyFit":

@@ -52,6 +52,11 @@ def clusters(points, normals, area, faces, edges, count):
     return np.unique(best, return_inverse=True)[1]
 
 
+def plain(points, area, faces, edges, count):
+    """The same by ACVD as it is, of positions alone: the paper's cut. A cluster may fold over."""
+    return np.unique(connected(_acvd(points, faces, count), edges, area), return_inverse=True)[1]
+
+
 def _folded(label, normals, area):
     """Share of the area that faces away from its cluster's mean normal."""
     mean = _sums(label, normals, area)[0]

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from polyfit import mesh
 from polyfit.errors import InputError
 
-from .clusters import clusters, split_in_two
+from .clusters import clusters, plain, split_in_two
 
 # Vertices that a mesh should have before it is cut: enough for the patches' outlines and jets
 _VERTICES_PER_PATCH = 100
@@ -64,12 +64,15 @@ class Patches:
         count: int | None = None,
         *,
         density: int = _VERTICES_PER_PATCH,
+        levels: int | None = None,
+        acvd: bool = False,
         where: str = "mesh",
     ) -> "Patches":
         """Cut the mesh (N, 3) [m], (F, 3) into ``count`` connected patches; by default
         :func:`patch_count` of them.
 
-        The mesh is subdivided until it has about ``density`` vertices a patch, and 10,000. Separate
+        The mesh is subdivided until it has about ``density`` vertices a patch, and 10,000; or
+        ``levels`` times. ``acvd``: by plain ACVD, of positions alone, as in the paper. Separate
         components, and sheets that meet in an edge of three or more faces, share no patch: each has
         at least one, and the default count is raised where that needs more. Raises InputError for a
         mesh that :func:`polyfit.mesh.checked` refuses, and for a count that its components or its
@@ -91,13 +94,15 @@ class Patches:
             raise InputError(
                 f"{where}: {count} patches, but it has {parts} separate parts, and each needs one"
             )
-        F, levels = given, _levels(len(V), area, count, density)
+        if levels is None:
+            levels = _levels(len(V), area, count, density)
+        F = given
         for _ in range(levels):
             F, edges = mesh.subdivided(F)
             V = np.concatenate([V, V[edges].mean(axis=1)])
             split = mesh.subdivided(split)[0]
         part, side = np.repeat(part, 4**levels), np.repeat(side, 4**levels)
-        label = _cluster(V, F, split, part, side, count)
+        label = _cluster(V, F, split, part, side, count, acvd)
         return cls(V, F, given, levels, split, label, side, *_entries(len(V), F, label[split]))
 
     def relabelled(self, label: np.ndarray) -> "Patches":
@@ -221,7 +226,13 @@ def _levels(vertices: int, area: np.ndarray, count: int, density: int) -> int:
 
 
 def _cluster(
-    V: np.ndarray, F: np.ndarray, split: np.ndarray, part: np.ndarray, side: np.ndarray, count: int
+    V: np.ndarray,
+    F: np.ndarray,
+    split: np.ndarray,
+    part: np.ndarray,
+    side: np.ndarray,
+    count: int,
+    acvd: bool,
 ) -> np.ndarray:
     """The patch of each vertex of ``split`` (G, 3): clusters of each part of the surface, ``part``
     (G,), as many as its share of the area."""
@@ -252,8 +263,11 @@ def _cluster(
         if share > 1:
             local[inside] = np.arange(len(inside))
             sides = local[edges[edges_by_part[edge_ends[k - 1] if k else 0 : edge_ends[k]]]]
-            found = clusters(
-                points[inside], normals[inside], area[inside], local[faces], sides, share
+            at, weight, corners = points[inside], area[inside], local[faces]
+            found = (
+                plain(at, weight, corners, sides, share)
+                if acvd
+                else clusters(at, normals[inside], weight, corners, sides, share)
             )
             while found.max() + 1 < share:
                 several = np.bincount(found) > 1

@@ -96,21 +96,23 @@ class PatchedSurface:
         order: int = 4,
         *,
         rounds: int = 5,
+        acvd: bool = False,
         where: str = "mesh",
         **options: Any,
     ) -> "PatchedSurface":
         """Cut the mesh (N, 3) [m], (F, 3) into patches (:meth:`polyfit.patches.Patches.cut`),
         :meth:`fit` them with ``options``, and let the boundaries move to where the jets fit best,
-        ``rounds`` times (:func:`polyfit.patches.refine.refined`). Raises InputError for a mesh that
-        lies too far from the origin for single precision (:func:`polyfit.mesh.centred`).
+        ``rounds`` times (:func:`polyfit.patches.refine.refined`). ``acvd``: by plain ACVD, whose
+        boundaries stay, as in the paper. Raises InputError for a mesh that lies too far from the
+        origin for single precision (:func:`polyfit.mesh.centred`).
         """
-        patches = Patches.cut(vertices, faces, count, where=where)
+        patches = Patches.cut(vertices, faces, count, acvd=acvd, where=where)
         if mesh.centred(patches.vertices)[1] is not None:
             raise InputError(
                 f"{where}: it lies more than 1000 times its extent from the origin, too far for"
                 " single precision; move it there (polyfit.mesh.centred)"
             )
-        return refined(cls.fit(patches, order, **options), rounds, **options)
+        return refined(cls.fit(patches, order, **options), 0 if acvd else rounds, **options)
 
     @property
     def residual(self) -> Tensor:

@@ -11,7 +11,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "loop": ["Training", "conduct"],
         "losses": ["Discrepancy", "share_behind", "discrepancy"],
         "processes": ["Processes", "add_run_arguments", "device_of", "run"],
-        "settings": ["MODELS", "Settings"],
+        "settings": ["LOSSES", "MODELS", "PRESETS", "Settings"],
         "trainer": ["train"],
     },
 )

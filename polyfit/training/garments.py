@@ -30,11 +30,14 @@ class GarmentPatches:
         return cls(torch.cat([p.points for p in parts]), torch.cat([p.normals for p in parts]))
 
     @classmethod
-    def cut(cls, vertices, faces, count, points, generator, where="mesh"):
+    def cut(cls, vertices, faces, count, points, generator, where="mesh", **how):
         """The mesh (N, 3) [m], (F, 3) cut into ``count`` patches (None: the paper's number), each
-        sampled at ``points`` places; ``generator`` is NumPy's.
+        sampled at ``points`` places; ``generator`` is NumPy's, ``how`` as in
+        :meth:`polyfit.patches.Patches.cut`.
         """
-        return cls.sample(Patches.cut(vertices, faces, count, where=where), points, generator)
+        return cls.sample(
+            Patches.cut(vertices, faces, count, where=where, **how), points, generator
+        )
 
     @classmethod
     def sample(cls, patches, points, generator, vertices=None):
@@ -68,6 +71,15 @@ class GarmentPatches:
         n /= np.maximum(np.linalg.norm(n, axis=-1, keepdims=True), 1e-300)
         return cls(torch.as_tensor(x, dtype=torch.float32), torch.as_tensor(n, dtype=torch.float32))
 
+    def drawn(self, count, generator):
+        """``count`` of the patches, drawn at random, as they are, with their points in a random
+        order.
+        """
+        index = torch.randint(len(self), (count,), generator=generator)
+        order = torch.rand(count, self.points.shape[1], generator=generator).argsort(1)
+        mixed = lambda x: x[index].gather(1, order[..., None].expand(-1, -1, 3))
+        return GarmentPatches(mixed(self.points), mixed(self.normals))
+
     def deformed(self, count, generator, **strength):
         """``count`` of the patches, drawn at random and each taken through a random smooth map in
         its own canonical frame; ``strength`` as in :func:`deformations.random`.
@@ -82,9 +94,10 @@ class GarmentPatches:
         )
 
 
-def cut_meshes(paths, counts, points, seed):
-    """:class:`GarmentPatches` of the mesh files ``paths``, each cut at every one of ``counts``.
-    Raises InputError for a file that is no mesh.
+def cut_meshes(paths, counts, points, seed, **how):
+    """:class:`GarmentPatches` of the mesh files ``paths``, each cut at every one of ``counts``
+    (None: the paper's number); ``how`` as in :meth:`polyfit.patches.Patches.cut`. Raises InputError
+    for a file that is no mesh.
     """
     generator = np.random.default_rng(seed)
     parts = []
@@ -92,7 +105,7 @@ def cut_meshes(paths, counts, points, seed):
         vertices, faces = read_mesh(path)[:2]
         vertices = mesh.centred(vertices)[0]
         parts += [
-            GarmentPatches.cut(vertices, faces, count, points, generator, str(path))
+            GarmentPatches.cut(vertices, faces, count, points, generator, str(path), **how)
             for count in counts
         ]
     return GarmentPatches.join(parts)

@@ -10,7 +10,9 @@ from dataclasses import asdict, fields
 import numpy as np
 import torch
 
+from polyfit import jets
 from polyfit.baselines import chamfer, normalised
+from polyfit.jets import rotation_matrix
 from polyfit.mesh import centred, read_mesh
 from polyfit.network import read_weights, write_weights
 
@@ -26,10 +28,14 @@ _CHOICE_HEIGHT = 0.01
 # of the smoothing of the table over directions, at the start and at the end; no unit
 _AXIS_SHARPNESS = (15.0, 80.0)
 CLOUD_POINTS = 1000  # points of a garment, and of its reconstruction
+_DECIDE_THE_SET = (
+    "order", "families", "meshes", "cuts", "subdivided", "acvd", "patches", "garment_share",
+    "deformed", "points", "loss", "seed",
+)  # fmt: skip
 
 
 class PolyFitTraining(Training):
-    """Adam with a rate that falls as a cosine, on the batches of ``data``."""
+    """Adam, with a rate that falls as a cosine or stays, on the batches of ``data``."""
 
     def __init__(self, settings, data, processes):
         self.given, self.data = settings, data
@@ -49,13 +55,18 @@ class PolyFitTraining(Training):
     def update(self):
         s, share = self.given, self.done / self.given.steps
         for group in self.optimiser.param_groups:
-            group["lr"] = s.lr * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * share)))
+            group["lr"] = s.lr * _falling(share) if s.decay else s.lr
         loss = self.data.loss(self.network, s, share, self.generator(), self.processes)
         self.optimiser.zero_grad()
         loss.backward()
         self.processes.average(self.network)
         self.optimiser.step()
         return self.processes.mean(dict(loss=loss.item()))
+
+
+def _falling(share):
+    """Of the rate after ``share`` of all steps: a cosine, from 1 to a hundredth."""
+    return 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * share))
 
 
 class PatchBatches:
@@ -65,15 +76,19 @@ class PatchBatches:
 
     def __init__(self, patches):
         self.patches = patches
-        gain = (patches.loss[:, 0] - patches.loss.amin(1)).cpu().to(torch.float64)
-        self.likely = gain / gain.sum() + 1 / len(gain)
+        self.likely = None
+        if patches.loss.shape[1]:
+            gain = (patches.loss[:, 0] - patches.loss.amin(1)).cpu().to(torch.float64)
+            self.likely = gain / gain.sum() + 1 / len(gain)
 
     def loss(self, network, settings, share, generator, processes):
-        if settings.model != "polyfit":
+        if settings.model != "polyfit" or settings.loss == "height":
             index = torch.randint(len(self.patches), (settings.batch,), generator=generator)
-            return self._of_regressor(
-                network, index[processes.rank :: processes.count].to(processes.device)
-            )
+            index = index[processes.rank :: processes.count].to(processes.device)
+            if settings.model != "polyfit":
+                return self._of_regressor(network, index, settings)
+            read = torch.randperm(settings.points, generator=generator)[: settings.reads]
+            return self._of_heights(network, index, read.to(processes.device))
         # half of the batch in proportion to what another axis than PCA's would gain: few patches
         # are folded, and they have the most to teach
         index = torch.multinomial(
@@ -93,10 +108,21 @@ class PatchBatches:
         # theirs
         return (torch.softmax(-height / _CHOICE_HEIGHT, 1) * loss).sum(1).mean()
 
-    def _of_regressor(self, network, index):
+    def _of_heights(self, network, index, read):
+        """The paper's: RMS of height of the jets in the frames that the network answers with; of
+        several, the lower ones count most.
+        """
+        x = self.patches.points[index]
+        y = x[:, None] @ rotation_matrix(network.stn(x[:, read]))
+        residual = jets.height(jets.fit(y, network.order).alpha, y[..., :2]) - y[..., 2]
+        height = (residual.square().mean(-1) + 1e-12).sqrt()
+        return (torch.softmax(-height.detach() / _CHOICE_HEIGHT, 1) * height).sum(1).mean()
+
+    def _of_regressor(self, network, index, settings):
         x = self.patches.points[index]
         d = discrepancy(network.alpha(x), x, self.patches.normals[index])
-        return (d.height + training_set.NORMAL_WEIGHT * (1 - d.cosine)).mean()
+        weight = training_set.NORMAL_WEIGHT if settings.loss == "axes" else 0.0
+        return (d.height + weight * (1 - d.cosine)).mean()
 
 
 class GarmentBatches:
@@ -153,24 +179,23 @@ def _prepare(settings, folder, processes, progress):
         )
     path = folder / "set.safetensors"
     names = [f.name for f in fields(training_set.TrainingSet)]
-    wanted = {
-        k: v
-        for k, v in _plain(settings).items()
-        if k in ("order", "families", "meshes", "cuts", "patches", "points", "seed")
-    }
+    wanted = {k: v for k, v in _plain(settings).items() if k in _DECIDE_THE_SET}
     if processes.rank == 0 and not (
         path.exists()
         and read_weights(path, "training set", _TRAINING_SET_VERSION)[1]["settings"] == wanted
     ):
-        cut = (
-            garments.cut_meshes(settings.meshes, settings.cuts, POINTS_PER_PATCH, settings.seed)
-            if settings.meshes
-            else None
-        )
+        cut = None
+        if settings.meshes:
+            counts = [None if count == "paper" else count for count in settings.cuts]
+            how = dict(levels=settings.subdivided, acvd=settings.acvd)
+            cut = garments.cut_meshes(
+                settings.meshes, counts, POINTS_PER_PATCH, settings.seed, **how
+            )
         task = progress.add_task("patches", total=settings.patches)
         made = training_set.build(
             settings.patches, settings.points, settings.order, settings.seed, garments=cut,
-            names=settings.families, device=processes.device,
+            names=settings.families, garment_share=settings.garment_share,
+            deformed=settings.deformed, table=settings.loss == "axes", device=processes.device,
             advance=lambda done: progress.update(task, completed=done),
         )  # fmt: skip
         write_weights(

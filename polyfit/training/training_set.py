@@ -20,9 +20,6 @@ from .losses import discrepancy
 
 _PATCHES_PER_CHUNK = 500  # patches made, and fitted, at a time
 _AXIS_COUNT = 65  # axes of the half sphere along which jets are fitted
-_GARMENT_SHARE = (
-    0.75  # of the patches, where there are garments; the analytic families are the rest
-)
 NORMAL_WEIGHT = 0.1  # weight of 1 - cosine of the normals against RMS of height
 
 
@@ -30,7 +27,7 @@ NORMAL_WEIGHT = 0.1  # weight of 1 - cosine of the normals against RMS of height
 class TrainingSet:
     """``points`` and ``normals`` (N, P, 3) in the charts of the PCA frames; ``height`` and ``loss``
     (N, D): RMS of height, and that plus ``NORMAL_WEIGHT`` (1 - cosine) between the normals, of jets
-    fitted with z along each of :func:`axes`. float32.
+    fitted with z along each of :func:`axes`; D is 0 where no table was asked for. float32.
     """
 
     points: torch.Tensor
@@ -79,31 +76,37 @@ def build(
     *,
     garments=None,
     names=families.FAMILIES,
+    garment_share=0.75,
+    deformed=True,
+    table=True,
     device="cpu",
     advance=lambda done: None,
 ):
     """:class:`TrainingSet` of ``count`` patches of ``points`` points each, for jets of ``order``.
 
-    ``garments`` (:class:`GarmentPatches` or None) are deformed at random; ``names`` are the
-    analytic families that are summed, or empty. ``advance`` is told how many patches there are so
-    far.
+    ``garments`` (:class:`GarmentPatches` or None) are ``deformed`` at random, or as they are, and
+    make up ``garment_share`` of the patches; ``names`` are the analytic families that are summed,
+    or empty. Without ``table`` no jets are fitted along the axes. ``advance`` is told how many
+    patches there are so far.
     """
     parts = []
-    turns = rotations_to(axes())
+    turns = rotations_to(axes()) if table else torch.empty(0, 3, 3)
     for first in range(0, count, _PATCHES_PER_CHUNK):
         size = min(_PATCHES_PER_CHUNK, count - first)
         generator = torch.Generator().manual_seed(seed * 1_000_003 + first)
-        deformed = 0 if garments is None else size if not names else round(_GARMENT_SHARE * size)
+        share = 0 if garments is None else garment_share if names else 1
+        of_garments = round(share * size)
         made = []
-        if deformed:
-            made.append(garments.deformed(deformed, generator))
-        if size > deformed:
+        if of_garments:
+            take = garments.deformed if deformed else garments.drawn
+            made.append(take(of_garments, generator))
+        if size > of_garments:
             samples = points if garments is None else garments.points.shape[1]
             made.append(
                 GarmentPatches(
                     *(
                         t.float()
-                        for t in families.sample(size - deformed, samples, generator, names)
+                        for t in families.sample(size - of_garments, samples, generator, names)
                     )
                 )
             )
@@ -125,10 +128,10 @@ def build(
 def _tabulated(points, normals, turns, order):
     frame = CanonicalFrame.from_points(points)
     x, n = frame.to_chart(points), normals @ frame.R
-    height, loss = [], []
+    height, loss = [x.new_empty(len(x), 0)], [x.new_empty(len(x), 0)]
     for turn in turns:
         y = x @ turn
         d = discrepancy(jets.fit(y, order).alpha, y, n @ turn)
-        height.append(d.height)
-        loss.append(d.height + NORMAL_WEIGHT * (1 - d.cosine))
-    return TrainingSet(x, n, torch.stack(height, 1), torch.stack(loss, 1))
+        height.append(d.height[:, None])
+        loss.append((d.height + NORMAL_WEIGHT * (1 - d.cosine))[:, None])
+    return TrainingSet(x, n, torch.cat(height, 1), torch.cat(loss, 1))

@@ -78,7 +78,7 @@ def load(
     overrides = {k: str(v) for k, v in (overrides or {}).items()}
     defaults = resolved_defaults(path, overrides)
     preset = PRESETS[defaults.get("preset") or "none"]
-    given: dict[str, Any] = {name: defaults[name] for name in (*preset, *overrides)}
+    given = {name: defaults[name] for name in (*preset, *overrides)}
     plugins.register()
     if defaults.get("data") and not os.path.isdir(located(path, defaults["data"])):
         raise InputError(

@@ -178,3 +178,18 @@ def test_poses_of_a_print_are_found_again(tmp_path):
     assert (
         rows[:, 0].min() > 1 and rows[:, 2].max() < 0.2 and (rows[:, 3] < 0.25 * rows[:, 1]).all()
     )
+
+
+def test_the_network_alone_is_timed_with_its_vertices():
+    import torch
+
+    import onefit
+
+    speed = load("benchmarks/onefit_speed.py")
+    draper = onefit.load("six-garments")
+    garment, motion = draper.garment("tank"), onefit.Motion.generate("walk", seconds=0.7, seed=1)
+    made = speed.network_alone(draper, garment, motion)
+    alone = draper.drape(garment, motion, post=False, eased=False).vertices
+    assert torch.allclose(made, alone, atol=1e-5)
+    assert not torch.allclose(alone, draper.drape(garment, motion, post=False).vertices, atol=1e-4)
+    assert speed.network_alone(draper, garment, motion, vertices=False) is None

@@ -188,6 +188,34 @@ def test_no_patch_goes_around_a_sleeve(count):
     assert area[(up < 0).any(axis=1)].sum() < 0.02 * area.sum()
 
 
+def test_plain_acvd_looks_at_positions_alone():
+    """Each vertex is nearest to the centroid of its own cluster, or nearly: so it is round, and
+    goes around a sleeve.
+    """
+    V, F = surfaces.tube()
+    plain, ours = Patches.cut(V, F, 6, acvd=True), Patches.cut(V, F, 6)
+    away = []
+    for p in (plain, ours):
+        assert len(p) == 6
+        x, own = p.vertices, p.vertex_patch
+        centre = np.stack([x[own == k].mean(0) for k in range(6)])
+        distance = np.linalg.norm(x[:, None] - centre, axis=2)
+        away.append((distance.argmin(1) == own).mean())
+    assert away[0] > 0.9
+    spread = [
+        min(np.linalg.eigvalsh(np.cov(p.vertices[p.vertex_patch == k].T))[0] for k in range(6))
+        for p in (ours, plain)
+    ]
+    assert spread[0] < spread[1]  # ours are the flatter ones
+
+
+def test_a_mesh_is_subdivided_as_often_as_is_asked_for():
+    V, F = surfaces.sheet(n=5)
+    for levels in (0, 1, 3):
+        p = Patches.cut(V, F, 4, levels=levels)
+        assert p.levels == levels and len(p.faces) == 4**levels * len(F)
+
+
 def test_number_of_patches_of_the_paper():
     assert [patch_count(a) for a in (0.1, 0.81, 0.92, 2, 5)] == [100, 101, 115, 250, 400]
     V, F = surfaces.sphere(0.3)  # 1.13 m^2

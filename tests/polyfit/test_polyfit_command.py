@@ -31,6 +31,23 @@ def test_the_surface_is_written(tmp_path, capsys):
     assert "8 patches, 176 numbers" in capsys.readouterr().out
 
 
+def test_cuts_and_frames_are_the_paper_s_by_its_preset(tmp_path, capsys):
+    V, F = surfaces.tube()
+    write_ply(tmp_path / "tube.ply", V, F)
+    file = ["-o", str(tmp_path / "out.ply"), "--resolution", "1"]
+    said = []
+    paper = ["--cuts", "acvd", "--frames", "stn", "--weights", "paper"]
+    for flags in ([], paper, ["--preset", "paper"], paper[:4]):
+        main([str(tmp_path / "tube.ply"), *flags, "--patches", "12", *file])
+        said.append(capsys.readouterr().out)
+    assert "transformer" not in said[0]
+    assert said[1] == said[2] != said[3] and "the transformer turned the z axis" in said[1]
+    main([str(tmp_path / "tube.ply"), "--preset", "paper", *file])
+    assert capsys.readouterr().out.startswith("100 patches")
+    with pytest.raises(InputError, match="for --frames stn"):
+        main([str(tmp_path / "tube.ply"), "--weights", "x.safetensors", *file])
+
+
 def test_bad_input_ends_in_one_line_and_writes_nothing(tmp_path):
     V, F = surfaces.sheet(n=5)
     write_ply(tmp_path / "sheet.ply", V, F)

@@ -52,3 +52,5 @@ def test_tables_at_a_small_size(tmp_path, monkeypatch, capsys):
     assert paper["patches"] == 100 and abs(paper["over_floor"]) < 0.2 and paper["rms_mm"] < 0.5
     assert size["numbers"] == 220 and 200 <= size["atlasnet_numbers"] <= 240
     assert size["rms_mm"] < 1 < size["atlasnet_rms_mm"]
+    turned = {row["way"]: row["turned"] for row in report["ways"]}
+    assert turned["ours"] == turned["plain ACVD"] == 0 and len(turned) == len(benchmark.WAYS)

@@ -53,6 +53,23 @@ def test_answers_are_unit_quaternions_and_the_first_is_pca_s_frame():
     assert q[:, 1:].std(0).min() > 1e-3
 
 
+def test_the_paper_s_transformer_answers_with_one_quaternion(tmp_path):
+    fresh = SpatialTransformer(turns=1, pca=False)
+    with torch.no_grad():
+        fresh.head[-1].weight.zero_()
+    x = torch.randn(7, 100, 3)
+    assert torch.allclose(fresh(x), torch.tensor([0.0, 0, 0, 1]).expand(7, 1, 4))
+    model = PolyFit(3, random_network(turns=1, pca=False))
+    points, _ = bent_sheets(7)
+    frame, pca = model.frame(points), CanonicalFrame.from_points(points)
+    turn = rotation_matrix(model.stn(pca.to_chart(points))[:, 0].double())
+    assert torch.allclose(frame.R, pca.R @ turn, atol=1e-6)
+    assert (turn - torch.eye(3)).abs().amax((1, 2)).min() > 1e-3
+    model.save(tmp_path / "one.safetensors")
+    again = PolyFit.load(tmp_path / "one.safetensors", 3)
+    assert torch.allclose(again.frame(points).R, frame.R)
+
+
 def test_thinned_takes_points_evenly_and_none_that_the_mask_leaves_out():
     x = torch.arange(2 * 11 * 3, dtype=torch.float32).reshape(2, 11, 3)
     assert torch.equal(subsampled(x, 20), x)
@@ -219,14 +236,19 @@ def test_shipped_weights_turn_narrow_valleys_the_right_way_up(model):
         ), figure
 
 
-def test_what_made_the_shipped_weights_is_beside_them(model):
+@pytest.mark.parametrize("name", ["polyfit", "paper"])
+def test_what_made_the_shipped_weights_is_beside_them(name):
     from polyfit.network import PRETRAINED
 
-    about = json.loads(PRETRAINED.with_suffix(".json").read_text(encoding="utf-8"))
+    model, path = PolyFit.pretrained(name=name), PRETRAINED[name]
+    assert (model.stn.shape["turns"], model.stn.pca) == ((5, True) if name == "polyfit" else (1, 0))
+    about = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
     assert about["command"].startswith("python -m polyfit.train ")
     assert {"seed", "minutes", "machine", "meshes"} <= set(about)
     assert about["parameters"] == sum(p.numel() for p in model.parameters())
-    assert PRETRAINED.stat().st_size < 1e6
+    assert path.stat().st_size < 1e6
+    with pytest.raises(InputError, match="choose among polyfit, paper"):
+        PolyFit.pretrained(name="deepfit")
 
 
 def test_discrepancy_of_a_tilted_plane_is_its_distance_and_its_angle():

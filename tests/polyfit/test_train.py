@@ -13,7 +13,15 @@ from safetensors.torch import load_file
 
 from polyfit import InputError, PolyFit, jets, train
 from polyfit.baselines import DGCNN, AtlasNet, PointNet
-from polyfit.training import Processes, Settings, Training, discrepancy, trainer, training_set
+from polyfit.training import (
+    Processes,
+    Settings,
+    Training,
+    discrepancy,
+    garments,
+    trainer,
+    training_set,
+)
 
 SMALL = Settings(
     families=("gaussian", "jet"), patches=120, points=40, reads=30, steps=8, batch=16, order=2
@@ -109,6 +117,86 @@ def test_command_leaves_weights_their_making_and_a_log(tmp_path, capsys):
     lines = [json.loads(line) for line in (tmp_path / "out" / "log.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines] == [8] and 0 < lines[0]["loss"] < 1
     assert not list((tmp_path / "out").glob(".*"))
+
+
+def test_the_paper_s_loss_turns_frames_to_where_jets_fit():
+    settings = replace(SMALL, turns=1, pca=False, loss="height", lr=3e-3, steps=60, batch=64)
+    made = training_set.build(300, 40, 2, 0, names=("gaussian", "jet"), table=False)
+    assert made.loss.shape == made.height.shape == (300, 0)
+    data = trainer.PatchBatches(made)
+    training = trainer.PolyFitTraining(settings, data, Processes("cpu"))
+
+    def height():
+        """Of all patches, in the frames of the network, by other means than the loss."""
+        with torch.no_grad():
+            fit = training.network(made.points)
+            x = fit.frame.to_chart(made.points)
+            d = discrepancy(fit.jet.alpha, x, made.normals @ fit.frame.R)
+            return d.height.mean().item()
+
+    pca = PolyFit(2)(made.points)
+    x = pca.frame.to_chart(made.points)
+    of_pca = discrepancy(pca.jet.alpha, x, made.normals @ pca.frame.R).height.mean().item()
+    before = height()
+    assert before == pytest.approx(of_pca, rel=0.2)  # it starts near PCA's frame
+    for _ in range(60):
+        training.step()
+    assert height() < 0.98 * min(before, of_pca)
+
+
+def test_the_gradient_of_the_paper_s_loss_is_that_of_finite_differences():
+    settings = replace(SMALL, turns=1, pca=False, loss="height", batch=30, reads=30)
+    made = training_set.build(60, 40, 2, 0, names=("gaussian", "jet"), table=False)
+    double = training_set.TrainingSet(
+        *(x.double() for x in (made.points, made.normals, made.height, made.loss))
+    )
+    data, processes = trainer.PatchBatches(double), Processes("cpu")
+    network = settings.network().double()
+    weights = list(network.parameters())
+
+    def loss():
+        return data.loss(network, settings, 0.0, torch.Generator().manual_seed(1), processes)
+
+    gradient = torch.autograd.grad(loss(), weights)
+    generator = torch.Generator().manual_seed(2)
+    way = [torch.randn(w.shape, generator=generator, dtype=torch.float64) for w in weights]
+    slope = sum((g * d).sum() for g, d in zip(gradient, way)).item()
+    values = []
+    with torch.no_grad():
+        for step in (-1e-6, 2e-6):
+            for w, d in zip(weights, way):
+                w.add_(d, alpha=step)
+            values.append(loss().item())
+    assert (values[1] - values[0]) / 2e-6 == pytest.approx(slope, rel=1e-4)
+
+
+def test_the_paper_s_preset(mesh, tmp_path):
+    args = train.parser().parse_args([mesh, "-o", "OUT", "--preset", "paper", "--lr", "0.1"])
+    assert (args.turns, args.pca, args.loss, args.cuts) == (1, False, "height", ["paper"])
+    assert (args.subdivided, args.acvd, args.deformed, args.decay) == (4, True, False, False)
+    assert (args.batch, args.patches * args.garment_share, args.lr) == (512, 100_000, 0.1)
+    small = "--patches 80 --points 40 --reads 30 --steps 3 --batch 16 --subdivided 2".split()
+    train.main([mesh, "-o", str(tmp_path / "out"), "--preset", "paper", *small])
+    model = PolyFit.load(tmp_path / "out" / "weights.safetensors", 4)
+    assert model.stn.shape["turns"] == 1 and not model.stn.pca
+    about = json.loads((tmp_path / "out" / "weights.json").read_text())
+    assert (about["loss"], about["cuts"], about["lr"]) == ("height", ["paper"], 1e-3)
+    # and on from there
+    more = [*small, "--from", str(tmp_path / "out" / "weights.safetensors"), "--lr", "1e-5"]
+    train.main([mesh, "-o", str(tmp_path / "more"), "--preset", "paper", *more])
+    first, then = (load_file(tmp_path / name / "weights.safetensors") for name in ("out", "more"))
+    apart = max(float((first[k] - then[k]).abs().max()) for k in first)
+    assert 0 < apart < 1e-4
+
+
+def test_patches_as_they_are_have_their_points_in_another_order():
+    points = torch.rand(3, 50, 3)
+    given = garments.GarmentPatches(points, torch.nn.functional.normalize(points, dim=-1))
+    drawn = given.drawn(20, torch.Generator().manual_seed(0))
+    for x, n in zip(drawn.points, drawn.normals):
+        of = [k for k in range(3) if sorted(x.tolist()) == sorted(points[k].tolist())]
+        assert len(of) == 1 and not torch.equal(x, points[of[0]])
+        assert torch.allclose(n, torch.nn.functional.normalize(x, dim=-1))
 
 
 @pytest.mark.parametrize("model", ["polyfit", "pointnet", "dgcnn"])

@@ -8,7 +8,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
         "deformation": ["Deformation"],
-        "patched": ["PatchedGarment"],
+        "patched": ["FRAMES", "PatchedGarment"],
         "sparse": ["SparseMatrix"],
     },
 )

@@ -22,6 +22,8 @@ from onefit.body import Body
 from onefit.garment.binding import surface_of
 from onefit.garment.waistband import held
 from polyfit import mesh
+from polyfit.errors import InputError
+from polyfit.network import PolyFit
 from polyfit.patches import PatchedSurface
 
 from .blending import blend_matrix, drift_planes, drift_scale, looseness_of
@@ -32,6 +34,8 @@ from .sparse import SparseMatrix
 
 if TYPE_CHECKING:
     from onefit.garment.garment import Garment
+
+FRAMES = ("pca", "stn")
 
 
 class PatchedGarment:
@@ -51,16 +55,27 @@ class PatchedGarment:
         *,
         patches: int | None = None,
         order: int = 4,
+        frames: str = "pca",
+        acvd: bool = False,
+        waistband: bool = True,
         seed: int = 0,
     ) -> None:
         """Cut ``garment`` into ``patches`` (by default as many as the paper has for its area);
         ``body``: the standard one.
+
+        ``frames``: "pca", or "stn", refined by PolyFit's spatial transformer; ``acvd``: cut by
+        plain ACVD; ``waistband``: garments that do not reach the shoulders are held along a rim.
+        Raises InputError for other ``frames``.
         """
+        if frames not in FRAMES:
+            raise InputError(f"frames '{frames}': choose {' or '.join(FRAMES)}")
         self.garment = garment
         vertices, faces = garment.vertices.double().numpy(), garment.faces.numpy()
+        stn = PolyFit.pretrained(order).requires_grad_(False) if frames == "stn" else None
         surface = PatchedSurface.from_mesh(
-            vertices, faces, patches, order, dtype=torch.float64, where=garment.name
-        )
+            vertices, faces, patches, order, acvd=acvd, polyfit=stn, dtype=torch.float64,
+            where=garment.name,
+        )  # fmt: skip
         p = surface.patches
         self._refinement = refinement(len(vertices), p.given, p.levels)
         weights = self._refinement @ garment.blend_weights.double().numpy()
@@ -91,7 +106,8 @@ class PatchedGarment:
         #: (N, K A), a SparseMatrix
         self.blend = SparseMatrix(blend_matrix(p, vertices, self.frame, order))
         surface = surface_of(body)
-        self._hold(p, vertices, held(vertices, faces, body.joints.cpu().double().numpy()), surface)
+        firmly = held(vertices, faces, body.joints.cpu().double().numpy())
+        self._hold(p, vertices, firmly if waistband else 0 * firmly, surface)
         self.looseness = looseness_of(p, surface)
         #: (K,) [m]: how far a patch goes with a drift of 1
         self.drift_scale = drift_scale(self.looseness)

@@ -6,12 +6,12 @@ import torch
 from charted import T, deformation
 
 from onefit.garment import TEMPLATES, Garment, standard_surface
-from onefit.garment.charts import PatchedGarment, SparseMatrix
+from onefit.garment.charts import Deformation, PatchedGarment, SparseMatrix
 from onefit.garment.charts.blending import DRIFT_WIDTH, SLOPE_RIDGE
 from onefit.garment.charts.frames import steady_jets
 from onefit.garment.remesh import loops
 from onefit.garment.waistband import BAND_WIDTH, held
-from polyfit import jets
+from polyfit import InputError, jets
 
 
 def points_of(patched, d, t, uv, patch):
@@ -325,3 +325,26 @@ def test_jets_of_strips_stay_within_reason():
     assert (jets.height(strip, uv) - z).square().mean().sqrt() < 0.012
     # cloth on all of the chart is fitted as it is
     assert (jets.height(whole, disc) - x[200:, 2]).abs().max() < 0.01
+
+
+def test_patches_as_the_paper_has_them(body):
+    shorts = Garment.template("shorts")
+    ours, paper = (
+        PatchedGarment(shorts, body),
+        PatchedGarment(shorts, body, frames="stn", acvd=True, waistband=False),
+    )
+    assert len(ours) == len(paper) and (ours.vertex_patch != paper.vertex_patch).any()
+    turned = PatchedGarment(shorts, body, frames="stn")
+    cosine = (turned.frame.R[:, :, 2] * ours.frame.R[:, :, 2]).sum(-1)
+    assert (cosine < 0.99999).any() and len(turned) == len(ours)
+    assert len(ours.band[0]) and ours.held.max() > 0.5
+    assert not len(paper.band[0]) and not paper.held.any()
+    # a garment without deformation stays the mesh, and one that is lifted is lifted everywhere
+    K = len(paper)
+    lift = torch.zeros(1, K, 3)
+    up = Deformation(torch.zeros(1, K, 15), lift, torch.zeros(1, K), lift)
+    assert not paper.displacement(paper.changes(up)).any()
+    up = replace(up, translation=torch.tensor([0.0, 0, 0.1]).expand(1, K, 3))
+    assert paper.displacement(paper.changes(up)).norm(dim=-1).min() > 1e-4
+    with pytest.raises(InputError, match="frames 'lda'"):
+        PatchedGarment(shorts, body, frames="lda")

@@ -7,6 +7,7 @@ import torch
 from places import ROOT
 from processes import python
 
+import onefit
 from onefit import drape, simulate
 from onefit.body import AnnyBody
 from onefit.draping.output import Outcome
@@ -225,3 +226,17 @@ def test_a_mesh_in_centimetres_with_y_up(network, tmp_path):
     with np.load(tmp_path / "right" / "drape.npz") as file:
         assert np.abs(file["rest"] - shorts.vertices.numpy()).max() < 1e-3
     assert sorted(p.name for p in (tmp_path / "right").iterdir()) == ["drape.npz", "figures.json"]
+
+
+def test_the_paper_s_preset_is_the_network_alone(tmp_path):
+    words = ["tank", "walk", "--seconds", "0.2", "--weights", "six-garments"]
+    words += ["--preset", "paper", "--skip", "usd", "render", "-o"]
+    drape.main([*words, str(tmp_path / "out")])
+    with np.load(tmp_path / "out" / "drape.npz") as file:
+        made = file["vertices"]
+    draper, motion = onefit.load("six-garments"), onefit.Motion.generate("walk", seconds=0.2)
+    alone = draper.drape("tank", motion, post=False, eased=False).vertices.numpy()
+    assert np.abs(made - alone).max() < 1e-5
+    assert np.abs(made - draper.drape("tank", motion, post=False).vertices.numpy()).max() > 1e-4
+    figures = json.loads((tmp_path / "out" / "figures.json").read_text())
+    assert (figures["post"], figures["eased"]) == (False, False)

@@ -12,7 +12,7 @@ from onefit.draping import Draper, ease
 from onefit.garment import Garment
 from onefit.garment.charts import PatchedGarment
 from onefit.motion import Motion
-from onefit.network import OneFit, weights
+from onefit.network import EXTRAS, OneFit, weights
 from onefit.network.network import LEAKY_SLOPE, Decoder, descriptors, encoded
 from polyfit.errors import InputError
 from polyfit.mesh import edges_of
@@ -121,6 +121,53 @@ def test_layers_are_those_of_the_paper():
     assert all(
         [b for _, b in widths(head)][:2] == [128, 64] for head in network.decoder.heads.values()
     )
+
+
+def test_the_paper_s_network_has_the_paper_s_inputs_alone(tmp_path, model):
+    torch.manual_seed(2)
+    paper, ours = OneFit(extras=()), OneFit()
+    sizes = [n.patches.first[0].in_features for n in (paper, ours)]
+    assert sizes[0] == 15 + 7 + 3 * 13 + 3 * 24 * 7 and sizes[1] == sizes[0] + 3 + 1 + 24
+    assert paper.body.moving[0].in_features == 32 * 24 and not paper.body.memory.bias
+    assert set(paper.decoder.heads) == {"alpha", "translation", "scale"}
+    assert not hasattr(paper.patches, "whole")
+    # looseness, held and blend weights change nothing, and no patch knows of another
+    g = torch.Generator().manual_seed(0)
+    inputs = [torch.randn(5, n, generator=g) for n in (15, 7, 3, 3, 1, 24)]
+    joints = torch.randn(24, 3, generator=g)
+    codes = paper.patches(*inputs, joints)
+    assert torch.equal(paper.patches(*inputs[:3], *(x + 1 for x in inputs[3:]), joints), codes)
+    alone = paper.patches(*(x[:1] for x in inputs), joints)
+    assert torch.allclose(alone, codes[:1], atol=1e-5)
+    # it is told where the body faces
+    poses = 0.3 * torch.randn(1, 4, 24, 3, generator=g)
+    turned = poses.clone()
+    turned[:, :, 0] = torch.tensor([0.0, 0, 1.3])
+    poses[:, :, 0] = 0
+    embed = lambda n, x: n.body(x, torch.zeros(1, 4, 3), torch.zeros(1, 6), 30.0)[0]
+    assert torch.allclose(embed(ours, poses), embed(ours, turned), atol=1e-5)
+    assert (embed(paper, poses) - embed(paper, turned)).abs().max() > 1e-3
+    # files know what it has; those of before have all
+    weights.save(tmp_path / "paper.safetensors", paper, model, ())
+    again = weights.load(tmp_path / "paper.safetensors").network
+    assert again.shape == paper.shape
+    assert again.patching == dict(order=4, frames="pca", acvd=False, waistband=False)
+    assert onefit.load("six-garments").network.shape["extras"] == list(EXTRAS)
+
+
+@pytest.mark.parametrize("extra", EXTRAS)
+def test_each_extra_has_a_switch(extra):
+    g = torch.Generator().manual_seed(1)
+    network = OneFit(extras=[name for name in EXTRAS if name != extra])
+    codes = network.patches(
+        *(torch.randn(5, n, generator=g) for n in (15, 7, 3, 3, 1, 24)), torch.zeros(24, 3)
+    )
+    poses = torch.randn(1, 3, 24, 3, generator=g)
+    embedding = network.body(poses, torch.zeros(1, 3, 3), torch.zeros(1, 6), 30.0)[0][0]
+    out = network.decoder(codes, embedding)
+    assert out.alpha.shape == (3, 5, 15) and out.drift.shape == (3, 5, 3)
+    whole, less = (sum(p.numel() for p in n.parameters()) for n in (OneFit(), network))
+    assert less < whole or extra == "free_heading"
 
 
 def test_a_body_at_rest_leaves_the_dynamic_encoding_at_zero():

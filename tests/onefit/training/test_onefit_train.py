@@ -1,4 +1,5 @@
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -127,9 +128,17 @@ def test_each_loss_has_a_switch(small, data):
 def test_the_objective_of_the_material_has_its_own_terms(small, data):
     energies = {"stretching", "bending", "gravity", "inertia"}
     for off, names in (({}, energies | {"collision"}), (dict(k_c=0.0), energies)):
-        training = OneFitTraining(replace(small, weights=Weights(**off)), data, Processes("cpu"))
+        training = OneFitTraining(
+            replace(small, objective="material", weights=Weights(**off)), data, Processes("cpu")
+        )
         with torch.no_grad():
             assert set(training.loss(torch.Generator().manual_seed(0))) == names
+
+
+def test_without_lessons_the_objective_is_the_paper_s():
+    assert Settings().lowered == "paper"
+    assert replace(Settings(), teacher="LESSONS").lowered == "material"
+    assert Settings(teacher="LESSONS", objective="paper").lowered == "paper"
 
 
 def test_the_rate_falls_to_a_tenth(small, data):
@@ -204,6 +213,40 @@ def test_a_resumed_training_ends_where_an_uninterrupted_one_does(small, tmp_path
     assert 0 < max(changes) < 0.01
 
 
+def test_the_paper_s_preset_has_the_paper_s_numbers():
+    args = train.parser().parse_args(["-o", "OUT", "--preset", "paper", "--k-c", "0"])
+    found = {name: getattr(args, name) for name in ("k_b", "k_mi", "k_g", "k_c", "k_i", "k_in")}
+    assert found == dict(k_b=5e3, k_mi=2.0, k_g=1.0, k_c=0.0, k_i=0.5, k_in=1.0)
+    assert (args.batch, args.lr, args.lr_epochs, args.objective) == (20_000, 1e-3, 10, "paper")
+    assert (args.extras, args.frames, args.acvd, args.cuts) == ([], "stn", True, 0)
+
+
+def test_a_training_of_the_paper_s_network_goes_on_from_its_checkpoint(motion, tmp_path):
+    flags = ["tank", "--preset", "paper", "--motions", motion, "--shapes", "1"]
+    flags += "--batch 300 --epochs 1 --epoch-steps 2".split()
+    folder = tmp_path / "out"
+    train.main([*flags, "-o", str(folder)])
+    first = load_file(folder / "weights.safetensors")
+    # as if the machine had been lost after a step: another goes on from its checkpoint
+    args = train.parser().parse_args([*flags, "-o", str(folder)])
+    weights = Weights(**{f: getattr(args, f) for f in Weights.__dataclass_fields__})
+    names = set(Settings.__dataclass_fields__) - {"weights"}
+    plain = {n: getattr(args, n) for n in names}
+    plain |= {n: tuple(plain[n]) for n in ("garments", "motions", "extras")}
+    assert loop.train(Settings(**plain, weights=weights), tmp_path / "lost", until=1) is None
+    shutil.copytree(tmp_path / "lost", tmp_path / "elsewhere")
+    train.main([*flags, "-o", str(tmp_path / "elsewhere"), "--resume"])
+    then = load_file(tmp_path / "elsewhere" / "weights.safetensors")
+    apart = [(first[k].float() - then[k].float()).abs().max() for k in first]
+    assert first.keys() == then.keys() and max(apart) <= 1  # eight bits; threads sum in any order
+    network = onefit.load(folder / "weights.safetensors").network
+    assert network.patching == dict(order=4, frames="stn", acvd=True, waistband=False)
+    # fine-tuning takes the network as it is
+    tuned = ["shorts", *flags[3:], "--from", str(folder / "weights.safetensors")]
+    train.main([*tuned, "-o", str(tmp_path / "tuned")])
+    assert onefit.load(tmp_path / "tuned" / "weights.safetensors").network.shape == network.shape
+
+
 def test_two_processes_have_the_curve_of_one(small, tmp_path):
     flags = "shorts --batch 600 --epochs 1 --epoch-steps 3 --shapes 1".split()
     flags += ["--motions", small.motions[0]]
@@ -248,6 +291,8 @@ class _Nothing:
         (dict(lr=0.0), "lr = 0.0; more than 0 is needed"),
         (dict(epoch_steps=-1), "epoch_steps = -1"),
         (dict(objective="beauty"), "objective 'beauty': choose material or paper"),
+        (dict(extras=("wings",)), "extras wings: choose among drift"),
+        (dict(frames="lda"), "frames 'lda': choose pca or stn"),
         (dict(material="tin"), "material 'tin': choose among"),
     ],
 )

@@ -19,6 +19,7 @@ from polyfit.training import Processes
 
 SMALL = Settings(batch=240, epochs=1, lr_epochs=1, epoch_steps=40, shapes=0)
 PATCHES = 30
+CUT = dict(patches=PATCHES)
 ARGUMENTS = ["shorts", "--kinds", "walk", "--seconds", "0.3", "--vertices", "600"]
 
 
@@ -32,7 +33,7 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def learned(folder):
     garment = garment_of(folder, "shorts")
-    return TrainingData([garment], lessons=[lessons(folder, garment)], shapes=3, patches=PATCHES)
+    return TrainingData([garment], lessons=[lessons(folder, garment)], shapes=3, patching=CUT)
 
 
 def test_lessons_are_files_of_every_frame(folder):
@@ -129,7 +130,7 @@ def test_regression_comes_nearer_to_the_lessons(folder, learned):
 def test_the_regression_is_none_where_the_lesson_is_what_the_network_says(learned, folder):
     # an untrained network is plain skinning
     still = [replace(x, displacement=0 * x.displacement) for x in learned.lessons[0]]
-    given = TrainingData([learned.garments[0][0].garment], lessons=[still], patches=PATCHES)
+    given = TrainingData([learned.garments[0][0].garment], lessons=[still], patching=CUT)
     training = OneFitTraining(replace(SMALL, teacher=str(folder)), given, Processes("cpu"))
     terms = training.loss(torch.Generator().manual_seed(0))
     assert terms["regression"] < 1e-8
@@ -138,7 +139,7 @@ def test_the_regression_is_none_where_the_lesson_is_what_the_network_says(learne
 
 def test_garments_are_drawn_by_their_lessons(learned, folder):
     garments = [learned.garments[0][0].garment] * 2
-    long = TrainingData(garments, lessons=[[], *learned.lessons], patches=PATCHES)
+    long = TrainingData(garments, lessons=[[], *learned.lessons], patching=CUT)
     assert len(long) == 18 and long.lesson_frames.tolist() == [0, 18]
     training = OneFitTraining(replace(SMALL, teacher=str(folder)), long, Processes("cpu"))
     assert "regression" in training.loss(torch.Generator().manual_seed(0))  # never of the first

@@ -1,0 +1,267 @@
+"""The figures of docs/paper.md: functions of what the benchmarks wrote to a table or a line, ""
+where they wrote nothing.
+"""
+
+GARMENTS = {
+    "tshirt": "T-shirt", "dress": "dress", "tank": "tank", "long_sleeve_top": "top",
+    "shorts": "shorts", "pants": "pants", "trousers": "pants",
+}  # fmt: skip
+CHAMFER = {  # the paper's, x 1e3
+    "PolyFit": (0.229, 0.168, 0.268, 0.092, 0.372, 0.237),
+    "AtlasNet, 5": (0.531, 1.039, 0.939, 0.481, 1.508, 0.963),
+    "AtlasNet, 25": (0.490, 1.060, 0.942, 0.420, 1.471, 0.992),
+    "AtlasNet, 125": (0.531, 1.111, 1.005, 0.490, 1.547, 0.858),
+}
+SIX = ("tshirt", "dress", "tank", "long_sleeve_top", "shorts", "pants")
+COLLISIONS = {  # epsilon_c in per cent
+    "dress": (0.330, 0.840, 2.834, 10.033, 6.271, 2.389),
+    "six": (0.422, 0.756, 0.481, 1.592, 1.749, 1.194),
+}
+JUMPSUIT = {"six": 2.397, "jumpsuit-tuned": 1.982, "jumpsuit": 1.845}
+LOSSES = {  # epsilon_e, epsilon_a, epsilon_c
+    "all losses": (7.828, 13.020, 0.227),
+    "no mesh inextensibility": (13.175, 24.011, 0.263),
+    "no inextensibility": (7.739, 12.760, 1.641),
+    "no collision": (8.004, 13.373, 0.387),
+}
+BACKBONES = {
+    "PolyFit": "0.0201 / 5.27°, 0.048 ms",
+    "PointNet": "0.0309 / 6.94°, 0.075 ms",
+    "DGCNN": "0.0290 / 6.41°, 0.063 ms",
+}
+FAMILIES = {
+    "Gaussians only": "0.0248 / 5.49°",
+    "4 families": "0.0239 / 5.42°",
+    "4 families + garment patches": "0.0201 / 5.32°",
+}
+SHEETS = ("flag", "bend", "paper", "curtain", "corner")
+
+
+def table(head, rows):
+    lines = [f"| {' | '.join(head)} |", f"|{'---|' * len(head)}"]
+    lines += [f"| {' | '.join(map(str, row))} |" for row in rows]
+    return "\n".join(lines)
+
+
+def both(found):
+    return f"{found['height']:.4f} / {found['angle']:.1f}°"
+
+
+def ways(data):
+    found = data["polyfit_reconstruction"].get("ways")
+    if not found:
+        return ""
+    names = list(dict.fromkeys(row["way"] for row in found))
+    rms = {(row["garment"], row["way"]): row["rms_mm"] for row in found}
+    garments = dict.fromkeys(row["garment"] for row in found)
+    rows = [(GARMENTS[g], *(f"{rms[g, way]:.3f}" for way in names)) for g in garments]
+    return table(("RMS from the mesh, mm", *names), rows)
+
+
+def turned(data):
+    rows = [r for r in data["polyfit_reconstruction"].get("ways", ()) if r["garment"] == "tank"]
+    by = {row["way"]: row for row in rows}
+    if not by:
+        return ""
+    pca, stn = by["ours"], by["ours, transformer"]
+    return (
+        f"Of the tank's {stn['patches']} patches the transformer turns the z axis of"
+        f" {stn['turned']}; RMS {pca['rms_mm']:.4f} to {stn['rms_mm']:.4f} mm."
+    )
+
+
+def polyfit_training(data):
+    found = data["polyfit_accuracy"].get("trained", {})
+    if not found:
+        return ""
+    rows = [("paper", "", "120", "")]
+    for name, about in found.items():
+        if name in ("main", "paper"):
+            way = "ours" if name == "main" else "by the preset"
+            rows.append((way, about["steps"], f"{about['minutes']:.0f}", about["machine"]))
+    return table(("training", "steps", "minutes", "machine"), rows)
+
+
+def chamfer(data):
+    found = {r["garment"]: r for r in data["polyfit_reconstruction"].get("paper", ())}
+    if not found:
+        return ""
+    cells = lambda values: [f"{v:.3f}" if v is not None else "" for v in values]
+    rows = []
+    for name, values in CHAMFER.items():
+        rows.append((name, "paper", *cells(values)))
+        if name == "PolyFit":
+            own = [found[g]["chamfer"] if g in found else None for g in SIX]
+            floor = [found[g]["floor"] if g in found else None for g in SIX]
+            rows += [(name, "ours", *cells(own)), ("floor", "ours", *cells(floor))]
+            continue
+        trained = data["polyfit_accuracy"].get("atlasnet", {}).get(name.split(", ")[1], {})
+        made = {path.split("/")[-1].split(".")[0]: value for path, value in trained.items()}
+        if made:
+            rows.append((name, "ours", *cells([made.get(g) for g in SIX])))
+    return table(("", "", *(GARMENTS[g] for g in SIX)), rows)
+
+
+def _sft(data, sequence, method):
+    whole = lambda r: not any(v for v in r["setup"].values())
+    found = [r for r in data["sft"].get("results", ()) if whole(r) and "figures" in r]
+    found = [r for r in found if (r["sequence"], r["method"]) == (sequence, method)]
+    return found[0] if found else None
+
+
+def kinect_paper(data):
+    rows = [("paper", "2.59", "", "", "")]
+    for method, name in (("paper", "preset"), ("adam", "adam"), ("gauss-newton", "default")):
+        if r := _sft(data, "kinect_paper", method):
+            f = r["figures"]
+            values = (f"{f[k]:.2f}" for k in ("depth_rmse_allpix_mm", "depth_rmse_mm"))
+            rows.append((name, *values, r["lost"], f"{r['seconds_a_frame']:.1f}"))
+    head = ("solver", "over all pixels, mm", "on the surface, mm", "frames lost", "s a frame")
+    return table(head, rows)
+
+
+def simulated(data):
+    rows = []
+    for sequence in SHEETS:
+        found = [_sft(data, sequence, method) for method in ("adam", "gauss-newton")]
+        if all(found):
+            values = [(r["figures"]["e3d_proc"], r["figures"]["en_deg"]) for r in found]
+            rows.append((sequence, *(f"{e:.4f} / {n:.1f}°" for e, n in values)))
+    return table(("e3d, aligned / e_n", "paper's solver", "default"), rows) if rows else ""
+
+
+def seconds(data):
+    found = {m: _sft(data, "kinect_paper", m) for m in ("adam", "gauss-newton")}
+    if not all(found.values()):
+        return ""
+    adam, ours = (found[m]["seconds_a_frame"] for m in ("adam", "gauss-newton"))
+    return f"The paper's solver {adam:.0f} s a frame, the default {ours:.1f} s."
+
+
+def stability(data):
+    found = data["stability"].get("counts")
+    if not found:
+        return ""
+    rows = [
+        (count, *(f"{row[k]:.3f}" if k in row else "" for k in ("change_rms_mm", "rmse_mm")))
+        for count, row in found.items()
+    ]
+    return table(("iterations", "moved by since, mm", "error, mm"), rows)
+
+
+def onefit_trainings(data):
+    found = data["onefit_paper"].get("trained", {})
+    rows = [
+        (name, f"`{row['command']}`", row["steps"], row["batch"], f"{row['minutes']:.0f}")
+        for name, row in found.items()
+    ]
+    return table(("network", "command", "steps", "batch", "minutes"), rows) if rows else ""
+
+
+def collisions(data):
+    found, rows = data["onefit_paper"].get("collisions", {}), []
+    for name, values in COLLISIONS.items():
+        rows.append((name, "paper", *(f"{v:.2f}" for v in values)))
+        if name in found:
+            own = [found[name]["trousers" if g == "pants" else g] for g in SIX]
+            rows.append((name, "ours", *(f"{v:.2f}" for v in own)))
+    return table(("ε_c %, trained on", "", *(GARMENTS[g] for g in SIX)), rows)
+
+
+def jumpsuit(data):
+    found = data["onefit_paper"].get("jumpsuit", {})
+    told = lambda name: f"{found[name]:.2f}" if name in found else "not measured yet"
+    return table(
+        ("ε_c %", "paper", "ours"), [(k, f"{v:.2f}", told(k)) for k, v in JUMPSUIT.items()]
+    )
+
+
+def losses(data):
+    found = data["onefit_paper"].get("losses", {})
+    rows = []
+    for name in dict.fromkeys([*LOSSES, *found]):
+        paper = " / ".join(f"{v:.2f}" for v in LOSSES[name]) if name in LOSSES else ""
+        own = [found[name][k] for k in ("edge", "area", "collision")] if name in found else []
+        rows.append((name, paper, " / ".join(f"{v:.2f}" for v in own) or "not measured yet"))
+    return table(("ε_e / ε_a / ε_c %", "paper", "ours"), rows)
+
+
+def styles(data):
+    found = data["onefit_paper"].get("styles", {})
+    rows = [
+        (name, *(f"{row[k]:.2f}" for k in ("edge", "area", "collision")))
+        for name, row in found.items()
+    ]
+    return table(("tank top", "ε_e %", "ε_a %", "ε_c %"), rows) if rows else ""
+
+
+def poses(data):
+    found = data["onefit_paper"].get("poses", {})
+    rows = [(name, f"{value:.2f}") for name, value in found.items()]
+    return table(("garment, motion", "ε_c %"), rows) if rows else ""
+
+
+def resolutions(data):
+    found = data["onefit_paper"].get("resolutions", [])
+    rows = [(r["vertices"], r["patches"], f"{r['ms']:.2f}", f"{r['collision']:.2f}") for r in found]
+    return table(("vertices", "patches", "ms a frame", "ε_c %"), rows) if rows else ""
+
+
+def speed(data):
+    found = data["onefit_speed"].get("rows", [])
+    if not found:
+        return ""
+    rows = [("paper, on a GPU", "", "0.48", "3 to 4")]
+    for row in found:
+        cells = (f"{row[k][1]:.2f}" for k in ("patches_alone", "network", "post"))
+        rows.append((f"{row['vertices']} vertices", *cells))
+    head = ("ms a frame, least", "patches alone", "network alone", "post-processing")
+    return table(head, rows)
+
+
+def orders(data):
+    found = data["polyfit_accuracy"].get("orders", {})
+    if not found:
+        return ""
+    kinds = list(next(iter(found.values())))
+    head = ("order", *(f"{kind}, {frame}" for kind in kinds for frame in ("PCA", "STN")))
+    rows = [
+        (order, *(both(row[kind][frame]) for kind in kinds for frame in ("PCA", "STN")))
+        for order, row in found.items()
+    ]
+    plot = "![Height and normals by the order of the jets](paper_orders.png)"
+    return f"{table(head, rows)}\n\n{plot}"
+
+
+def transformer(data):
+    return _by_kind(
+        data["polyfit_accuracy"].get("frames", {}),
+        {"PCA": "0.0259 / 5.47°", "with the STN": "0.0201 / 5.27°"},
+        "frame",
+    )
+
+
+def networks(data):
+    return _by_kind(data["polyfit_accuracy"].get("networks", {}), BACKBONES, "network", ms=True)
+
+
+def families(data):
+    return _by_kind(data["polyfit_accuracy"].get("sources", {}), FAMILIES, "trained on")
+
+
+def _by_kind(found, paper, first, ms=False):
+    """A row for each of ``found``: height / normals by the kind of patches, and the paper's."""
+    if not found:
+        return ""
+    kinds = [kind for kind in next(iter(found.values())) if kind != "ms"]
+    head = (first, *kinds, *(["ms a patch"] if ms else []), "paper, CLOTH3D")
+    rows = [
+        (
+            name,
+            *(both(row[kind]) for kind in kinds),
+            *([f"{row['ms']:.3f}"] if ms else []),
+            paper.get(name, ""),
+        )
+        for name, row in found.items()
+    ]
+    return table(head, rows)

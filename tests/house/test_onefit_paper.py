@@ -1,0 +1,69 @@
+"""The benchmark of the paper's tables of OneFit, at tiny sizes: it trains by the preset, goes on
+where it was, and measures the network alone.
+"""
+
+import json
+
+import pytest
+from scripts import load
+
+import onefit
+
+bench = load("benchmarks/onefit_paper.py")
+TINY = "--epochs 1 --epoch-steps 1 --batch 100 --seeds 1 --shapes 0".split()
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    return tmp_path_factory.mktemp("runs")
+
+
+@pytest.fixture(autouse=True)
+def tiny(monkeypatch):
+    monkeypatch.setattr(bench, "SHORT", TINY)
+    monkeypatch.setitem(bench.TRAININGS, "six", ["tank"])
+    tuned = ["tank", "--from", "RUNS/six/weights.safetensors"]
+    monkeypatch.setitem(bench.TRAININGS, "jumpsuit-tuned", tuned)
+    monkeypatch.setattr(bench, "COUNTS", (600,))
+    monkeypatch.setattr(bench, "POSES", (("tank", "bend"),))
+    monkeypatch.setattr(bench, "STYLES", {"cropped": dict(hem=0.12, count=700)})
+
+
+def test_every_training_has_a_command(capsys):
+    bench.main(["RUNS", "--commands"])
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == len(bench.TRAININGS)
+    assert all("--preset paper" in line and "-o RUNS/" in line for line in lines)
+
+
+def test_tables_of_what_is_trained(runs, tmp_path):
+    bench.main([str(runs), "--train", "jumpsuit-tuned", "tank-no-col", "--short"])
+    assert sorted(p.name for p in runs.iterdir()) == ["jumpsuit-tuned", "six", "tank-no-col"]
+    made = (runs / "six" / "weights.safetensors").stat().st_mtime_ns
+    bench.main([str(runs), "--train", "six", "--short"])  # is there already
+    assert (runs / "six" / "weights.safetensors").stat().st_mtime_ns == made
+    (tmp_path / "onefit_paper.json").write_text('{"jumpsuit": {"six": 7.0}, "styles": {"old": 1}}')
+    tables = ["trained", "losses", "styles", "poses", "resolutions"]
+    words = ["--tables", *tables, "--seconds", "0.1", "--shapes", "0", "-o", str(tmp_path)]
+    bench.main([str(runs), *words])
+    report = json.loads((tmp_path / "onefit_paper.json").read_text())
+    assert report["jumpsuit"] == {"six": 7.0} and report["styles"] == {"old": 1}  # no new ones
+    assert set(report["trained"]) == {"six", "jumpsuit-tuned", "tank-no-col"}
+    assert report["trained"]["tank-no-col"]["steps"] == 1
+    assert list(report["losses"]) == ["no collision"]
+    (row,) = report["resolutions"]
+    assert 400 < row["vertices"] < 900 and row["ms"] > 0
+    draper = onefit.load(runs / "six" / "weights.safetensors")
+    assert draper.network.shape["extras"] == []
+    motion = onefit.Motion.generate("bend", seconds=0.1, seed=bench.accuracy.SEED)
+    alone = draper.drape("tank", motion, post=False, eased=False).measures().collision
+    assert report["poses"] == {"tank, bend": pytest.approx(alone)}
+
+
+def test_other_styles_of_a_garment(runs):
+    tables = bench.Bench(runs, 0.1, 0)
+    tables.runs = runs
+    assert tables.styles() == {}
+    bench.make("tank", runs, short=True)
+    (style,) = tables.styles().values()
+    assert 0 <= style["collision"] < 20 and 0 < style["edge"] < 20
