@@ -311,7 +311,7 @@ SECTIONS = {
         Entry(
             "Adaptive window",
             "A window moves on when patience or period is over.",
-            ("python -m polysft_mi.run scenes/demo.xml -D solver=adam -D window=3 -o OUT",),
+            ("python -m polysft_mi.run scenes/demo.xml -D preset=paper -o OUT",),
             None,
             "They do not: [conventions.md](conventions.md#solver-and-window).",
         ),

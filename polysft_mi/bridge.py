@@ -47,19 +47,8 @@ def template(
     ``vertices`` (N, 3) [m], ``faces`` (F, 3), ``uv`` (N, 2) or :class:`polyfit.mesh.TexCoords`;
     ``options`` and errors are those of ``Template.fit``.
     """
-    points = torch.as_tensor(np.asarray(vertices))
-    with torch.no_grad():
-        frame = polyfit(points[None].float()).frame[0]
-    frame = frame.to(torch.float64)
-    left, _, right = torch.linalg.svd(frame.R)  # a rotation to the last digit again
-    return Template.fit(
-        vertices,
-        faces,
-        uv,
-        polyfit.order,
-        frame=type(frame)(frame.s, left @ right, frame.T),
-        **options,
-    )
+    frame = polyfit.frame_of(vertices)
+    return Template.fit(vertices, faces, uv, polyfit.order, frame=frame, **options)
 
 
 def surface(polyfit: PolyFit, points: torch.Tensor) -> torch.Tensor:
@@ -95,7 +84,11 @@ def rendering(
         rgb, alpha = problem.placed.image(_points(vertices.array), seed, problem.settings.spp)
         return rgb, mi.TensorXf(alpha, (problem.height, problem.width))
 
-    return lambda vertices: render(vertices.to(torch.float32).contiguous())
+    def of(vertices: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        rgb, alpha = render(_at_home(vertices))
+        return rgb.to(vertices.device), alpha.to(vertices.device)
+
+    return of
 
 
 def deformed(patch: JetAtlas) -> Callable[..., torch.Tensor]:
@@ -108,7 +101,13 @@ def deformed(patch: JetAtlas) -> Callable[..., torch.Tensor]:
         points = patch.vertices(Unknowns(*(x.array for x in unknowns)))
         return mi.TensorXf(dr.ravel(points), (dr.width(points), 3))  # type: ignore[call-overload]
 
-    return lambda *unknowns: vertices(*(x.to(torch.float32).contiguous() for x in unknowns))
+    return lambda *unknowns: vertices(*map(_at_home, unknowns)).to(unknowns[0].device)
+
+
+def _at_home(tensor: torch.Tensor) -> torch.Tensor:
+    """A tensor in single precision where the variant in force computes."""
+    device = "cuda" if mi.variant().startswith("cuda") else "cpu"
+    return tensor.to(device, torch.float32).contiguous()
 
 
 def _points(flat: mi.Float) -> mi.Point3f:

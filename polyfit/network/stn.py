@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -179,6 +180,16 @@ class PolyFit(torch.nn.Module):
         return frame.rotated(
             turns[torch.arange(len(turns), device=turns.device), kept].to(frame.R.dtype)
         )
+
+    @torch.no_grad()
+    def frame_of(self, points: np.ndarray) -> CanonicalFrame:
+        """The frame of one patch of points (P, 3), NumPy, in float64: its rotation is one to the
+        last digit.
+        """
+        found = self.frame(torch.as_tensor(np.asarray(points, dtype=np.float32))[None])[0]
+        s, R, T = (x.to(torch.float64).numpy() for x in (found.s, found.R, found.T))
+        left, _, right = np.linalg.svd(R)
+        return CanonicalFrame(s, left @ right, T)
 
     @torch.no_grad()
     def least_height(self, x: Tensor, turns: Tensor) -> Tensor:

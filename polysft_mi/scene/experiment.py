@@ -16,6 +16,8 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial import cKDTree
 
+from polyfit.errors import require
+from polyfit.jets import CanonicalFrame
 from polyfit.mesh import TexCoords, read_textured
 from polysft_mi.errors import InputError
 from polysft_mi.surface import Template, meshio
@@ -304,15 +306,28 @@ def _template(mesh, source, settings, template):
     corner = _corners(rendered, shown, vertices, faces, where)
     if template is not None:
         return template, corner, note
-    template = Template.fit(
-        vertices,
-        faces,
-        texcoords,
-        settings.jet_order,  # of as many patches as it turns out to need
-        exact=settings.order > 0,
-        where=where,
-    )
+    order, exact = settings.jet_order, settings.order > 0  # by the patches that it needs
+
+    def fit(frame):
+        return Template.fit(
+            vertices, faces, texcoords, order, exact=exact, frame=frame, where=where
+        )
+
+    one = settings.patches == 1
+    template = fit(CanonicalFrame.from_points(vertices) if one else None)
+    if settings.canonical_frame == "stn" and len(template) == 1:
+        template = fit(_transformed_frame(vertices))
     return template, corner, note
+
+
+def _transformed_frame(vertices):
+    """The frame of the vertices by the spatial transformer that the paper's training made. Raises
+    InputError where torch is not installed.
+    """
+    require("torch", "safetensors")
+    from polyfit.network import PolyFit
+
+    return PolyFit.pretrained(name="paper").frame_of(vertices)
 
 
 def _corners(rendered, shown, vertices, faces, where):
