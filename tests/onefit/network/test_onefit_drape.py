@@ -145,7 +145,8 @@ def test_both_verbs_take_the_same_arguments_but_their_own():
         flag for action in verb.parser()._actions for flag in action.option_strings
     }
     shown = lambda verb: verb.parser().format_help()
-    assert flags(drape) == flags(simulate) | {"--no-post"}
+    own = {"--post", "--no-post", "--ease", "--no-ease", "--preset"}
+    assert flags(drape) == flags(simulate) | own
     assert "--no-post" in shown(drape) and "--no-post" not in shown(simulate)
     for flag in ("--material", "--steps"):
         assert flag in shown(simulate) and f"{flag} " not in shown(drape)
@@ -193,7 +194,7 @@ def test_what_a_motion_file_does_not_say_is_said_by_flags(network, tmp_path):
     ]
     for flags, message in (
         ([], "no frame rate .*give it: .* --fps 30$"),
-        (["--fps", "60"], "lies down in all frames.* --motion-up y$"),
+        (["--fps", "60"], "lies down most of the time; give up='y', or --motion-up y"),
     ):
         with pytest.raises(InputError, match=message):
             drape.main([*arguments, *flags])
