@@ -106,7 +106,7 @@ def deformed(patch: JetAtlas) -> Callable[..., torch.Tensor]:
 
 def _at_home(tensor: torch.Tensor) -> torch.Tensor:
     """A tensor in single precision where the variant in force computes."""
-    device = "cuda" if mi.variant().startswith("cuda") else "cpu"
+    device = "cuda" if str(mi.variant()).startswith("cuda") else "cpu"
     return tensor.to(device, torch.float32).contiguous()
 
 
