@@ -40,6 +40,7 @@ class Problem:
             experiment.renderer,
             experiment.mesh,
             experiment.corner,
+            self.settings.sppi,
             experiment.path,
         )
         self.camera = self.placed.camera

@@ -22,8 +22,9 @@ class PlacedMesh:
     """The rendered ``mesh`` of a scene, seen by its sensor through a differentiable ``renderer``.
 
     ``corner`` (V,): the template's vertex of each rendered one (loaders split vertices along
-    texture seams); ``where``: the scene's path, for messages. Raises InputError where the sensor is
-    no pinhole, or not one that the renderer takes.
+    texture seams); ``sppi``: samples a pixel of edges met indirectly, where the renderer has such
+    and the scene does not say how many; ``where``: the scene's path, for messages. Raises
+    InputError where the sensor is no pinhole, or not one that the renderer takes.
     """
 
     def __init__(
@@ -33,6 +34,7 @@ class PlacedMesh:
         renderer: Any,
         mesh: mi.Mesh,
         corner: np.ndarray,
+        sppi: int = 0,
         where: str = "scene",
     ) -> None:
         self.scene, self.sensor, self.renderer, self.mesh = scene, sensor, renderer, mesh
@@ -51,6 +53,8 @@ class PlacedMesh:
         self._key = _positions_key(self._params, mesh)
         # what is behind the surface is black, with a silhouette's gradient towards black
         renderer.hide_emitters = True
+        if getattr(renderer, "sppi", 0) is None:
+            renderer.sppi = sppi
         self.is_raster = isinstance(renderer, RasterIntegrator)
         self._mask_renderer = None
         if not self.is_raster:
