@@ -239,9 +239,10 @@ def reconstruct(
 def _beginning(problem):
     experiment, template = problem.experiment, problem.template
     jets = "its jet" if len(template) == 1 else f"its {len(template)} jets"
+    residual = round(1e3 * template.residual_rms, 9)  # [mm]
     return (
         f"template: {len(template.vertices)} vertices\n"
-        f"{jets}: order {template.order}, residual {1e3 * template.residual_rms:.3g} mm RMS\n"
+        f"{jets}: order {template.order}, residual {residual:.3g} mm RMS\n"
         f"video: {len(problem.sequence.indices)} frames of"
         f" {experiment.size[0]}x{experiment.size[1]},"
         f" {'with' if experiment.masks else 'without'} masks"

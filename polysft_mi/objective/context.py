@@ -77,6 +77,10 @@ class FrameMemory:
         last = known[-1]
         return last if past[-1] is last else replace(last, scales={})
 
+    def scale(self, stage: Stage, first: float) -> float:
+        """The robust scale of a stage's residuals, ``first`` where none is known."""
+        return self.scales.get(stage, first)
+
     @property
     def noise(self) -> float:
         """The misfit that is noise; NaN where nothing is known, as in the first frame."""
@@ -90,7 +94,7 @@ class FrameContext:
     ``frame``: its number in the selection; ``anchor``: the state that it is tied to, that of the
     frame before, or None; ``memory``: of the frames before; ``visibility``: weights of what no
     pixel sees, None where all counts as seen; ``hold``: weight of the squared difference to the
-    anchor, motion included.
+    anchor, motion included; ``tie``: a factor of k_tc.
     """
 
     frame: int
@@ -98,6 +102,7 @@ class FrameContext:
     memory: FrameMemory = field(default_factory=FrameMemory)
     visibility: VisibilityWeights | None = None
     hold: float = 0.0
+    tie: float = 1.0
 
     @property
     def is_first(self) -> bool:

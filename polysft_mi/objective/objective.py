@@ -145,7 +145,7 @@ class Objective:
         """The robust scale of a frame's residuals: the one that fitted the frame before, or the
         setting's.
         """
-        return context.memory.scales.get(stage, self.settings.rgb_scale)
+        return context.memory.scale(stage, self.settings.rgb_scale)
 
     def frozen(
         self, contexts: Sequence[FrameContext], stage: Stage, start: Sequence[State]
@@ -180,7 +180,11 @@ class FrozenObjective:
         stage: Stage,
         start: Sequence[State],
     ) -> None:
-        self.objective, self.contexts, self.stage = objective, list(contexts), stage
+        count, outside = len(contexts), contexts[0].anchor is not None
+        #: a mean over the ties, where frames are averaged, too
+        self._tie = count / max(count - 1 + outside, 1)
+        self.contexts = [replace(context, tie=self._tie) for context in contexts]
+        self.objective, self.stage = objective, stage
         self.atlas, self._start = objective.atlas, list(start)
 
     @cached_property
@@ -223,9 +227,8 @@ class FrozenObjective:
             self._finish(values, backward, sums, self.contexts[k].frame)
         temporal = self.objective.temporal
         if temporal is not None and count > 1:
-            tied = self._ties(count)
             for k in range(1, count):
-                value = temporal.between(window[k - 1], window[k]) / tied
+                value = self._tie / count * temporal.between(window[k - 1], window[k])
                 self._finish({temporal.name: value}, backward, sums, self.contexts[k].frame)
         return sum(sums.values()), sums
 
@@ -234,15 +237,7 @@ class FrozenObjective:
         inputs, context = self.objective.inputs, self.contexts[k]
         look = lambda: self.appearances[k]
         frame = DeviceFrame(inputs, unknowns, context, self.stage, look, seed)
-        found = {term.name: term.energy(frame) for term in self.objective.terms}
-        temporal, count = self.objective.temporal, len(self.contexts)
-        if temporal is not None:  # a mean over the ties, not over the frames
-            found[temporal.name] *= count / self._ties(count)
-        return found
-
-    def _ties(self, count):
-        """How many pairs of frames are tied to each other, 1 at least."""
-        return max(count - 1 + (self.contexts[0].anchor is not None), 1)
+        return {term.name: term.energy(frame) for term in self.objective.terms}
 
     @staticmethod
     def _finish(terms, backward, sums, frame):
@@ -274,7 +269,7 @@ class FrozenObjective:
             )
         ]
         for earlier, later in itertools.pairwise(models):
-            self._tie(earlier, later)
+            self._couple(earlier, later)
         return models
 
     @property
@@ -284,12 +279,12 @@ class FrozenObjective:
         """
         temporal, count = self.objective.temporal, len(self.atlas)
         size = len(self.atlas.to_monomials)
-        form = np.zeros((size, size)) if temporal is None else 2 * temporal.weight * temporal.form
-        return np.kron(np.eye(count), form)
+        form = np.zeros((size, size)) if temporal is None else temporal.weight * temporal.form
+        return np.kron(np.eye(count), 2 * self._tie * form)
 
-    def _tie(self, earlier, later):
+    def _couple(self, earlier, later):
         """Add what holds the later frame to the earlier one to the equations of that."""
-        normal, weight = earlier.normal, 2 * self.objective.settings.k_tc
+        normal, weight = earlier.normal, 2 * self._tie * self.objective.settings.k_tc
         jets, a, b = jet_unknowns(earlier.state), earlier.state, later.state
         coupling = self.coupling
         normal.gradient[jets] -= coupling @ (b.alpha - a.alpha).ravel()

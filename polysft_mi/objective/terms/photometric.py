@@ -8,18 +8,14 @@ in the image (the target mask's, or the rendered interior's where there are no m
 neither the background nor the resolution weighs in. Import only after a Mitsuba variant is set.
 """
 
-from collections import OrderedDict
-
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from polysft_mi.images import Level, differentiable
 
 from .term import Term
 
 _INTERIOR = 0.999  # alpha above which a pixel counts as filled by the surface
-_CACHED_FRAMES = 8
 
 
 class Photometric(Term):
@@ -34,12 +30,12 @@ class Photometric(Term):
         self._scale = s.rgb_scale
         width, height = inputs.placed.size
         self._shape, self._count = (height, width), width * height
-        self._targets = OrderedDict()
 
     def energy(self, at):
         rgb, alpha = at.image
         level = self._level(at.stage)
-        frame, mask, area = self._target(at.context.frame)
+        shown = self._inputs.target(at.context.frame)
+        frame, mask, area = shown.image, shown.mask, shown.area
         inside = interior(alpha)
         if mask is None:
             # both cut out alike, else a band inside the silhouette would compare with the
@@ -63,7 +59,7 @@ class Photometric(Term):
             g = gain([dr.detach(x) for x in a], b, inside)
             a = [g * x for x in a]
         squared = sum(dr.square(x - y) for x, y in zip(a, b)) / 3
-        scale = at.context.memory.scales.get(at.stage, self._scale)
+        scale = at.context.memory.scale(at.stage, self._scale)
         rho = robust(squared, self._norm, scale)
         return self.weight * dr.sum(weight * rho) / area
 
@@ -83,23 +79,6 @@ class Photometric(Term):
 
     def _level(self, stage):
         return stage.blur if isinstance(stage.blur, Level) else self._inputs.data.level(stage.blur)
-
-    def _target(self, frame):
-        """(image (H, W, 3), cut out by its mask, mask Float or None, its area [pixels])."""
-        if frame not in self._targets:
-            rgb, mask = (
-                read(frame) for read in (self._inputs.sequence.frame, self._inputs.sequence.mask)
-            )
-            area = None
-            if mask is not None:
-                rgb, area = rgb * mask[..., None], mi.Float(max(1.0, float(mask.sum())))
-                mask = mi.Float(np.ascontiguousarray(mask, dtype=np.float32).ravel())
-            image = mi.TensorXf(np.ascontiguousarray(rgb, dtype=np.float32))
-            dr.eval(image, mask, area)
-            self._targets[frame] = image, mask, area
-            while len(self._targets) > _CACHED_FRAMES:
-                self._targets.popitem(last=False)
-        return self._targets[frame]
 
     def _image_of(self, values):
         return mi.TensorXf(values, (*self._shape, 1))

@@ -4,7 +4,6 @@ Losses). Frames without masks have none. Import only after a Mitsuba variant is 
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from .term import Term
 
@@ -16,15 +15,13 @@ class Silhouette(Term):
 
     def __init__(self, inputs):
         super().__init__(inputs)
-        self._sequence = inputs.sequence
+        self._inputs = inputs
 
     def energy(self, at):
-        mask = self._sequence.mask(at.context.frame)
-        if mask is None:
+        target = self._inputs.target(at.context.frame)
+        if target.mask is None:
             return mi.Float(0)
-        area = max(1.0, float(mask.sum()))
-        wanted = mi.Float(np.ascontiguousarray(mask, dtype=np.float32).ravel())
-        return self.weight * dr.sum(dr.square(at.image[1] - wanted)) / area
+        return self.weight * dr.sum(dr.square(at.image[1] - target.mask)) / target.area
 
     def add(self, at):
         return at.evaluation.silhouette

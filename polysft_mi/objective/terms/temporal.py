@@ -43,7 +43,7 @@ class Temporal(Term):
         from polysft_mi.surface import Unknowns
 
         anchor = Unknowns.from_numpy(self._atlas.arrays(at.context.anchor))
-        value = self.between(anchor, at.unknowns)
+        value = at.context.tie * self.between(anchor, at.unknowns)
         if at.context.hold:
             value += at.context.hold * self._motion(anchor, at.unknowns)
         return value
@@ -85,13 +85,14 @@ class Temporal(Term):
         patches, size = state.alpha.shape
         moved = state.difference(anchor)  # (K, A + 6)
         form = at.context.hold * np.eye(size + 6)
-        form[:size, :size] += self.weight * self.form
+        weight = self.weight * at.context.tie
+        form[:size, :size] += weight * self.form
         pull = moved @ form
         normal.glob += np.kron(np.eye(patches), 2 * form)
         normal.gradient += 2 * pull.ravel()
         energy = float((pull * moved).sum())
         slid = state.offset - anchor.offset
-        normal.local_gradient += 2 * self.weight * slid[:, : at.d]
+        normal.local_gradient += 2 * weight * slid[:, : at.d]
         for k in range(at.d):
-            normal.local[at.diagonal, k, k] += 2 * self.weight
-        return energy + self.weight * float((slid**2).sum())
+            normal.local[at.diagonal, k, k] += 2 * weight
+        return energy + weight * float((slid**2).sum())

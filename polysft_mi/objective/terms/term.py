@@ -4,12 +4,15 @@ set.
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
 
+import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 if TYPE_CHECKING:
     from polysft_mi.images import Appearance, DataTerm
@@ -20,6 +23,19 @@ if TYPE_CHECKING:
     from ..context import FrameContext, Stage
     from ..operators import Operators
     from ..quadratic import Linearisation
+
+_CACHED_FRAMES = 8
+
+
+@dataclass
+class Target:
+    """A frame on the device: ``image`` (H, W, 3), linear, cut out by its mask where there is one;
+    ``mask`` Float of H W and ``area`` [pixels], or None.
+    """
+
+    image: mi.TensorXf
+    mask: mi.Float | None
+    area: float | None
 
 
 @dataclass
@@ -39,6 +55,7 @@ class Inputs:
     placed: PlacedMesh
     sequence: Sequence
     where: str
+    _targets: OrderedDict[int, Target] = field(default_factory=OrderedDict, repr=False)
 
     @cached_property
     def data(self) -> DataTerm:
@@ -46,6 +63,20 @@ class Inputs:
 
         normalise = self.settings.brightness == "local"
         return DataTerm(self.placed, self.template, self.sequence, self.rules, normalise)
+
+    def target(self, frame: int) -> Target:
+        """The :class:`Target` of a frame; the last ones are kept."""
+        if frame not in self._targets:
+            image, mask, area = self.sequence.frame(frame), self.sequence.mask(frame), None
+            if mask is not None:
+                image, area = image * mask[..., None], max(1.0, float(mask.sum()))
+                mask = mi.Float(np.ascontiguousarray(mask, dtype=np.float32).ravel())
+            found = Target(mi.TensorXf(np.ascontiguousarray(image, np.float32)), mask, area)
+            dr.eval(found.image, found.mask)
+            self._targets[frame] = found
+            while len(self._targets) > _CACHED_FRAMES:
+                self._targets.popitem(last=False)
+        return self._targets[frame]
 
     @cached_property
     def operators(self) -> Operators:

@@ -13,6 +13,7 @@ from polysft_mi.errors import InputError
 from polysft_mi.objective import FrameContext, FrameMemory, Objective
 from polysft_mi.scene.rules import Rules
 from polysft_mi.scene.settings import Settings
+from polysft_mi.surface import Unknowns
 
 
 @pytest.fixture
@@ -76,6 +77,25 @@ def test_stretch_is_held_harder_where_it_may_be_noise(truth, noise, more):
     assert firm > 20 * gives
     found = term(stage, noise) / gives
     assert found == pytest.approx(1, abs=1e-3) if more == 1 else more <= found <= firm / gives
+
+
+@pytest.mark.parametrize("outside", [True, False])
+def test_a_window_is_the_same_to_both_forms(truth, outside, rng):
+    """Ties between frames weigh the same in the mean that is differentiated and in the sum of
+    quadratic models, with and without a frame before the window.
+    """
+    objective = Objective(problem_of(truth.folder, order=4, k_tc=0.5, k_rgb=0.0, k_silhouette=0.0))
+    before, *states = [some_state(objective.atlas, rng, 0.02) for _ in range(4)]
+    contexts = [FrameContext(k, memory=FrameMemory(0.05)) for k in range(3)]
+    if outside:
+        contexts[0] = dataclasses.replace(contexts[0], anchor=before)
+    frozen = objective.frozen(contexts, objective.usual[-1], states)
+    window = [Unknowns.from_numpy(objective.atlas.arrays(state)) for state in states]
+    total, terms = frozen.evaluate(window)
+    models = frozen.quadratic(states)
+    assert total == pytest.approx(np.mean([model.total for model in models]), rel=1e-3)
+    ties = np.mean([model.terms["temporal"] for model in models])
+    assert terms["temporal"] == pytest.approx(ties, rel=1e-4) and ties > 0
 
 
 def _in_plane(objective):
