@@ -96,13 +96,11 @@ class Stages:
 
     @staticmethod
     def cost(found: Found) -> float:
-        """What results of a frame are compared by."""
-        model = found.model
-        assert model is not None  # asked for where all terms have one
-        images = ("rgb", "silhouette", "shading", "temporal")
-        return model.evaluation.misfit + sum(
-            value for name, value in model.terms.items() if name not in images
-        )
+        """What results of a frame are compared by: the objective at the last stage, whose scales
+        are the same for all of them.
+        """
+        assert found.model is not None  # asked for where all terms have one
+        return found.model.total
 
     def _through(self, state, context, stages, iterations):
         scales: dict[Stage, float] = {}
