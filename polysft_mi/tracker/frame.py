@@ -98,7 +98,7 @@ class FrameTracker:
         self._prepare(report)
         states, known = list(window), [memory for _, memory in past]
         before = [state for state, _ in past[: max(0, len(past) + 1 - len(frames))]][-2:]
-        found, context = None, self._context(frames[-1], None, known)
+        found = context = None
         alone = range(len(frames) - 1 if past else 0, len(frames))
         for k in alone if self.settings.starts == "auto" and self._learns else ():
             start = states[k] if past or k == 0 else states[k - 1]
@@ -108,6 +108,7 @@ class FrameTracker:
             known.append(self._memory(found, context, known))
         results = [found] if found else []
         if len(frames) > 1 or not found:
+            context = context or self._context(frames[-1], states[0], known)
             contexts = [replace(context, frame=frame, anchor=None) for frame in frames]
             if before and self.settings.tc_ties == "before":
                 contexts[0] = replace(contexts[0], anchor=before[-1])

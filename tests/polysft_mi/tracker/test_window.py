@@ -34,6 +34,18 @@ def test_a_window_follows_the_sheet_and_couples_its_frames(truth, tracked, tmp_p
     assert moved[0] < 0.5 * moved[1]
 
 
+@pytest.mark.parametrize("solver", ["gauss-newton", "adam"])
+def test_windows_that_begin_at_the_frame_before_follow_the_sheet(truth, tmp_path, solver):
+    """The paper's way through a video, by either solver: all frames together, no other starts."""
+    adam = {"preset": "paper", "canonical_frame": "pca", "period": 150}
+    newton = {"starts": "previous", "window": 2, "blur": 1.0}
+    problem = problem_of(truth.folder, **(adam if solver == "adam" else newton))
+    done = track(FrameTracker(problem), 4, str(tmp_path))
+    assert done.solver == solver and not done.lost
+    still = np.linalg.norm(truth.vertices - truth.vertices[0], axis=2).mean(1)
+    assert (errors(problem, truth, done)[1:] < 0.6 * still[1:]).all()
+
+
 def test_looking_back_smooths_and_keeps_what_frames_know(truth, tracked, tmp_path):
     """``smooth`` holds every inner frame to the middle of its neighbours, and loses none of the
     facts that later frames go by.
