@@ -313,9 +313,9 @@ SECTIONS = {
             "A window moves on when patience or period is over.",
             ("python -m polysft_mi.run scenes/demo.xml -D preset=paper -o OUT",),
             None,
-            "They do not ([conventions.md](conventions.md#solver-and-window)). Twelve frames of the demo "
-            "take 1 min 25 s on two cores and end 8.7 mm RMSE from the truth (`polysft evaluate OUT "
-            "scenes/demo`); by default 10 s and 1.1 mm.",
+            "They do not ([conventions.md](conventions.md#solver-and-window)). Twelve frames of "
+            "the demo take 1 min 25 s on two cores and end 8.7 mm RMSE from the truth (`polysft "
+            "evaluate OUT scenes/demo`); by default 10 s and 1.1 mm.",
         ),
         Entry(
             "Figure, Paper-Bend",
