@@ -63,7 +63,7 @@ EXTRAS = {
     "torch": "learn",
     "warp": "learn",
     "pxr": "usd",
-    "polyscope": "view",
+    "viser": "view",
 }
 
 

@@ -1,45 +1,55 @@
-"""``python -m polysft_mi.view OUT``: a run in polyscope's window, to turn, play and colour."""
+"""``python -m polysft_mi.view OUT``: a run, or a drape, in the browser, to turn, play and colour;
+a run may still be at work.
+"""
 
 from . import commands
-from .errors import cli
-from .pictures import show
-from .results import Run
+from .errors import InputError, cli
+from .pictures import Source, Viewer
 
 _EXAMPLES = [
-    ("out/demo", "opens a window"),
-    (
-        "out/demo --frame 40 --screenshot view.png",
-        "writes a picture instead (needs a display too, or EGL)",
-    ),
+    ("out/demo", "then open the address that it prints"),
+    ("out/demo --frame 40", "begins with the frame of index 40"),
+    ("out/drape --port 9000 --host 0.0.0.0", "of onefit.drape; other machines may look, too"),
 ]
 
 
 def parser():
     p = commands.parser(
         "view",
-        "Look at a run in an interactive viewer (polyscope, of the optional extra 'view').",
+        "Look at a run or a drape in the browser, also while the run is at work (by viser, of the"
+        " optional extra 'view').",
         _EXAMPLES,
     )
-    p.add_argument("out", metavar="OUT", help="folder of a run")
+    p.add_argument("out", metavar="OUT", help="folder of a run, or of a drape")
     p.add_argument(
         "--frame",
         type=int,
         metavar="K",
-        help="frame to begin with, by its index (default: the first)",
+        help="frame to begin with, by its index (default: the first; of a run at work the newest)",
     )
     p.add_argument(
-        "--screenshot",
-        metavar="FILE",
-        help="write a .png of that frame instead of opening a window",
+        "--port", type=int, default=8080, help="the first port to try, of 20 (default: 8080)"
+    )
+    p.add_argument(
+        "--host",
+        default="127.0.0.1",
+        help="address to listen at; 0.0.0.0 lets other machines in (default: this one alone)",
     )
     return p
 
 
-def main(arguments=None):
+def open_viewer(arguments=None):
+    """The :class:`~polysft_mi.pictures.viewer.Viewer` that the arguments ask for, serving."""
     options = parser().parse_args(arguments)
-    show(Run.open(options.out), options.frame, options.screenshot)
-    if options.screenshot is not None:
-        print(f"written: {options.screenshot}")
+    if not 0 < options.port < 65516:
+        raise InputError(f"--port {options.port}: a port from 1 to 65515 is needed")
+    return Viewer(Source(options.out), host=options.host, port=options.port, frame=options.frame)
+
+
+def main(arguments=None):
+    viewer = open_viewer(arguments)
+    print(f"open {viewer.address} in a browser; Ctrl-C ends it", flush=True)
+    viewer.run()
     return 0
 
 

@@ -1,7 +1,8 @@
 """Pictures of a run: surfaces, images and figures in; PNG, EXR, video and one HTML page out.
 
-The album of a run is drawn while it tracks (:class:`Drawing`); its report, comparisons and the
-viewer read a finished run. matplotlib, plotly, polyscope and Mitsuba are loaded on use.
+The album of a run is drawn while it tracks (:class:`Drawing`); its report and comparisons read a
+finished run, the viewer also one at work, or a drape. matplotlib, plotly, viser and Mitsuba are
+loaded on use.
 """
 
 import lazy_loader
@@ -12,9 +13,10 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "comparison": ["write_comparison"],
         "drawing": ["Drawing"],
         "exr": ["read_exr", "write_exr"],
+        "moving": ["Source"],
         "report.page": ["write_report"],
         "shading": ["View", "seen", "shade_surface", "srgb"],
         "video": ["read_video", "write_video"],
-        "viewer": ["show"],
+        "viewer": ["Viewer"],
     },
 )

@@ -116,6 +116,32 @@ def panels(run):
         )
 
 
+def at_vertices(camera, vertices, values, box):
+    """The values (N,) where each vertex is seen, in a picture (h, w) of what ``box`` shows of the
+    image (a mean over 3x3 of its pixels); NaN outside it.
+    """
+    import cv2
+
+    values = cv2.blur(values, (3, 3))
+    before = vertices[:, 2] > 0
+    x, y = ((camera.project(vertices) - box[:2]) * (values.shape[1] / box.size[0])).T
+    inside = before & (x >= 0) & (y >= 0) & (x < values.shape[1]) & (y < values.shape[0])
+    out = np.full(len(vertices), np.nan, np.float32)
+    out[inside] = values[y[inside].astype(int), x[inside].astype(int)]
+    return out
+
+
+def residual_at_vertices(run):
+    """The residual (T, N) where each vertex of a run is seen, NaN where it is not, from its
+    pictures. Raises InputError where they, or the camera, are not there.
+    """
+    box, out = box_of(run), []
+    for vertices, pictures in zip(run.vertices, panels(run)):
+        values = heat_values(pictures["residual"], PEAKS["residual"])
+        out.append(at_vertices(run.camera, vertices, values, box))
+    return np.stack(out)
+
+
 def _pictures(run):
     path = run.path("comparison.mp4")
     if os.path.isfile(path):

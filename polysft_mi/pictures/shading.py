@@ -202,6 +202,15 @@ def patch_colours(patch, weight):
     return np.round(255 * np.einsum("nm,nmc->nc", weight, own[patch])).astype(np.uint8)
 
 
+def range_of(values, signed=False):
+    """(low, high) of a scale of colours for values (...), those that are not finite left out: from
+    0 to what 99 % of them stay below; with ``signed`` as far to the other side, too.
+    """
+    known = np.isfinite(values)
+    top = float(np.quantile(np.abs(values[known]), 0.99) if known.any() else 1) or 1.0
+    return (-top if signed else 0.0), top
+
+
 def _light(normals, look):
     """Light on unit normals (N, 3) of the view's frame: (N,)."""
     key, fill = (np.asarray(d) / np.linalg.norm(d) for d in (look.key, look.fill))

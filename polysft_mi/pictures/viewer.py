@@ -1,143 +1,256 @@
-"""A run in polyscope's window, to turn, play and colour; or one picture of it."""
+"""A moving surface in the browser, to turn, play and colour, by viser."""
 
-import ctypes
-import os
-import sys
+import contextlib
+import io
+import time
 
 import numpy as np
 
-from polyfit.errors import require
-from polysft_mi.errors import InputError
+from polyfit.animation import AXES_FROM_CAMERA
+from polyfit.errors import InputError, require
+from polysft_mi.results import vertex_normals
 
-from .shading import patch_colours
+_LOOK_AGAIN = 1.0  # [s] between two looks at a folder that may grow
+_LOADING = 0.1  # [s] that a browser has to load a frame
+_TEXTURE = "texture"
 
 
 class Viewer:
-    """The window of a run: ``show(k)`` puts its k-th frame there. polyscope holds one window a
-    process.
+    """A web server with the surface of ``source``, a
+    :class:`~polysft_mi.pictures.moving.Source`, in its scene.
+
+    ``server``: viser's, whose scene holds ``/surface/0`` and ``/surface/1``, which take turns
+    (``surface`` is the newer one, a GLB), ``/camera`` (a frustum with the frame's image) and, of a
+    drape, ``/body``. ``frame`` (a slider, counted from 0), ``playing``,
+    ``follow`` (the newest frame of a run at work) and ``colour`` are its controls: set their
+    ``value``. Nothing moves but in :meth:`step`, so that one thread draws. The ``frame`` to begin
+    with is given by its number in the video. Raises InputError where viser is not installed, or
+    that frame is not there.
     """
 
-    def __init__(self, run, ps):
-        from polyfit.animation import from_camera
+    def __init__(self, source, *, host="127.0.0.1", port=8080, frame=None):
+        require("viser")
+        import viser
 
-        self.run, self.ps = run, ps
-        self.vertices = from_camera(run.vertices, "y")
-        self.curvature = run.mean_curvature()
-        self.frame, self.playing, self._shown_at = 0, False, 0.0
-        ps.set_up_dir("y_up")
-        ps.set_front_dir("z_front")
-        ps.set_ground_plane_mode("none")
-        self.mesh = ps.register_surface_mesh(
-            "surface", self.vertices[0], run.faces, smooth_shade=True, back_face_policy="identical"
-        )
-        self.limits = np.quantile(np.abs(self.curvature), 0.99)
-        if run.texture and os.path.isfile(run.texture):
-            self._texture()
-        patch, weight = (run.params[name] for name in ("patch", "weight"))
-        if patch.max() > 0:
-            self.mesh.add_color_quantity("patches", patch_colours(patch, weight) / 255)
-        self.show(0)
-
-    def _texture(self):
-        import cv2
-
-        image = cv2.imread(self.run.texture)
-        if image is not None:
-            corners = self.run.texcoords.corners.reshape(-1, 2)
-            self.mesh.add_parameterization_quantity("uv", corners, defined_on="corners")
-            colours = image[..., ::-1].astype(np.float32) / 255
-            self.mesh.add_color_quantity(
-                "texture", colours, defined_on="texture", param_name="uv", enabled=True
+        self.source, self._moving = source, source.read()
+        order = {int(k): n for n, k in enumerate(self._moving.frames)}
+        if frame is not None and frame not in order:
+            raise InputError(
+                f"--frame {frame}: {source.folder} has frames {min(order)} to {max(order)}"
             )
 
-    def show(self, k):
-        self.frame = int(np.clip(k, 0, len(self.vertices) - 1))
-        self.mesh.update_vertex_positions(self.vertices[self.frame])
-        self.mesh.add_scalar_quantity(
-            "mean curvature [1/m]",
-            self.curvature[self.frame],
-            cmap="coolwarm",
-            vminmax=(-self.limits, self.limits),
-        )
-        if self.run.sigma is not None and np.isfinite(self.run.sigma[self.frame]).all():
-            top = 1e3 * float(np.nanquantile(self.run.sigma, 0.99))
-            self.mesh.add_scalar_quantity(
-                "sigma [mm]", 1e3 * self.run.sigma[self.frame], vminmax=(0, top)
-            )
+        with contextlib.redirect_stdout(io.StringIO()):  # the command says the address itself
+            label = f"polysft {source.folder}"
+            self.server = viser.ViserServer(host, port, label=label, verbose=False)
+        gui, scene = self.server.gui, self.server.scene
+        gui.configure_theme(control_width="small", show_share_button=False)
+        gui.set_panel_label("polysft view")
+        scene.set_up_direction("+z")
+        self._about = gui.add_markdown("")
+        self.frame = gui.add_slider("frame", min=0, max=0, step=1, initial_value=0)
+        self.playing = gui.add_checkbox("play", False)
+        at_work = self._moving.state.startswith("at work")
+        self.follow = gui.add_checkbox("follow the run", at_work, visible=at_work)
+        self.colour = gui.add_dropdown("colour", ["plain"])
+        self._legend = gui.add_markdown("")
+        self._nodes, self._shown, self._made = {}, None, {}
+        self.surface = self._before = None  # two nodes that take turns
+        self._hide_at = 0.0
+        self._looked = self._advanced = time.monotonic()
+        self._take(self._moving)
+        if frame is not None:
+            self.frame.value = order[frame]
+            self.follow.value = False
+        self._place()
+        self.step()
 
-    def controls(self):
-        """Drawn by polyscope in every frame of its own."""
-        import time
+    @property
+    def address(self):
+        """Where a browser finds it."""
+        return f"http://{self.server.get_host()}:{self.server.get_port()}"
 
-        import polyscope.imgui as imgui
+    def close(self):
+        """Stop the server."""
+        with contextlib.redirect_stdout(io.StringIO()):
+            self.server.stop()
 
-        moved, k = imgui.SliderInt("frame", self.frame, 0, len(self.vertices) - 1)
-        imgui.SameLine()
-        imgui.TextUnformatted(f"= {int(self.run.frames[k])}")
-        if imgui.Button("pause" if self.playing else "play"):
-            self.playing = not self.playing
+    def run(self):
+        """Serve until Ctrl-C."""
+        try:
+            while True:
+                self.step()
+                time.sleep(0.02)
+        finally:
+            self.close()
+
+    def step(self):
+        """Look for new frames, go on where it plays, and draw what the controls ask for, where that
+        is not shown yet.
+        """
         now = time.monotonic()
-        if moved:
-            self.playing = False
-            self.show(k)
-        elif self.playing and now - self._shown_at >= 1 / self.run.fps:
-            self._shown_at = now
-            self.show((self.frame + 1) % len(self.vertices))
+        if now - self._looked >= _LOOK_AGAIN:
+            self._looked = now
+            self.refresh()
+        count = len(self._moving.frames)
+        if self.playing.value and now - self._advanced >= 1 / self._moving.fps:
+            self._advanced = now
+            self.frame.value = (int(self.frame.value) + 1) % count
+        if self._before is not None and now >= self._hide_at:
+            self._before.visible = False
+        k = min(int(self.frame.value), count - 1)
+        wanted = (k, self.colour.value)
+        if wanted != self._shown:
+            self._draw(*wanted)
+            self._shown = wanted
+
+    def refresh(self):
+        """Read the folder again where a file in it was written; what cannot be read now, since it
+        is being replaced, is read later.
+        """
+        if self.source.changed():
+            with contextlib.suppress(InputError):
+                self._take(self.source.read())
+
+    def _take(self, moving):
+        """Show ``moving`` from now on."""
+        self._moving, self._made, self._shown = moving, {}, None
+        m, top = moving, len(moving.frames) - 1
+        self.frame.max = max(top, 1)
+        self.frame.disabled = top == 0
+        if self.follow.value:
+            self.frame.value = top
+        if not m.state.startswith("at work"):
+            self.follow.value = self.follow.visible = False
+        names = list(m.colourings)
+        self._picture = _picture(m.texture, 1024) if m.texture and m.texcoords else None
+        if self._picture is not None:
+            names.insert(0, _TEXTURE)
+        if tuple(names) != self.colour.options:
+            first = self.surface is None
+            self.colour.options = names
+            if first:
+                self.colour.value = names[0]
+        if m.texcoords is None:
+            self._split = np.arange(m.vertices.shape[1]), None, m.faces
+        else:
+            self._split = m.texcoords.split(m.faces)
+
+    def _place(self):
+        """The place that a browser begins at: it shows the surface in all frames, and the video's
+        camera.
+        """
+        points = self._moving.vertices.reshape(-1, 3)
+        low, high = points.min(0), points.max(0)
+        if self._moving.camera is not None:
+            low, high = np.minimum(low, 0.1 * low), np.maximum(high, 0.1 * high)
+        centre, size = (low + high) / 2, float(np.linalg.norm(high - low))
+        start = self.server.initial_camera
+        side = (0.8, -0.7, 0.5) if self._moving.body is None else (0.3, -1.0, 0.15)
+        start.position = tuple(centre + size * np.array(side))
+        start.look_at = tuple(centre)
+        start.fov = np.radians(45)
+
+    def _draw(self, k, colour):
+        m, scene = self._moving, self.server.scene
+        with self.server.atomic():
+            self._about.content = f"**frame {int(m.frames[k])}**, {m.state}"
+            self._show(self._glb(k, colour))
+            if m.body is not None:
+                if "body" not in self._nodes:
+                    self._nodes["body"] = scene.add_mesh_simple(
+                        "/body", m.body[0][k], m.body[1], color=(190, 180, 172)
+                    )
+                self._nodes["body"].vertices = m.body[0][k].astype(np.float32)
+            self._frustum(k)
+
+    def _show(self, data):
+        """Show the GLB ``data`` in the node that is out of sight. A browser needs a moment to load
+        it; for so long the other one stays (:meth:`step`).
+        """
+        self.surface, self._before = self._before, self.surface
+        if self.surface is None:
+            count = 0 if self._before is None else 1
+            self.surface = self.server.scene.add_glb(f"/surface/{count}", data)
+        else:
+            self.surface.glb_data = data
+            self.surface.visible = True
+        self._hide_at = time.monotonic() + min(_LOADING, 0.7 / self._moving.fps)
+
+    def _frustum(self, k):
+        from viser.transforms import SO3
+
+        m, c = self._moving, self._moving.camera
+        if c is None:
+            return
+        image = _picture(m.images[k], 640) if k < len(m.images) else None
+        image = None if image is None else np.asarray(image)
+        if "camera" in self._nodes:
+            self._nodes["camera"].image = image
+            return
+        distance = float(np.median(m.vertices[0, :, 1]))
+        self._nodes["camera"] = self.server.scene.add_camera_frustum(
+            "/camera",
+            fov=2 * np.arctan(c.height / (2 * c.fy)),
+            aspect=c.width * c.fy / (c.height * c.fx),
+            scale=0.12 * distance,
+            thickness=0.002 * distance,
+            image=image,
+            wxyz=SO3.from_matrix(AXES_FROM_CAMERA["z"]).wxyz,
+        )
+
+    def _glb(self, k, colour):
+        """The surface of frame k as glTF: with its texture, or with colours at its vertices."""
+        import trimesh
+        from trimesh.visual import TextureVisuals
+        from trimesh.visual.material import PBRMaterial
+
+        m, (source, uv, faces) = self._moving, self._split
+        textured = colour == _TEXTURE
+        material = PBRMaterial(
+            baseColorTexture=self._picture if textured else None,
+            metallicFactor=0.0,
+            roughnessFactor=1.0,
+            doubleSided=True,
+        )
+        visual = TextureVisuals(uv=np.nan_to_num(uv) if textured else None, material=material)
+        legend = ""
+        if not textured:
+            if colour not in self._made:
+                self._made[colour] = m.colourings[colour]()
+            rgb = self._made[colour].rgb
+            legend = self._made[colour].legend
+            visual.vertex_attributes["color"] = _linear(rgb[min(k, len(rgb) - 1)])[source]
+        self._legend.content = legend
+        mesh = trimesh.Trimesh(
+            m.vertices[k][source],
+            faces,
+            vertex_normals=vertex_normals(m.vertices[k].astype(np.float64), m.faces)[source],
+            visual=visual,
+            process=False,
+        )
+        return mesh.export(file_type="glb")
 
 
-_INSTEAD = "open report.html in the run's folder, or write a picture by --screenshot FILE"
+def _linear(rgb):
+    """Colours (N, 3) uint8 sRGB as glTF has them at vertices: (N, 4) uint8, linear, opaque."""
+    x = rgb / 255
+    linear = np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
+    return np.round(255 * np.pad(linear, ((0, 0), (0, 1)), constant_values=1)).astype(np.uint8)
 
 
-def _display():
-    """Whether a window could be opened, found out without polyscope, which ends untidily where it
-    cannot.
+def _picture(path, most):
+    """The image as a PIL image in JPEG's form, at most ``most`` pixels wide and high; None where it
+    is gone, or none.
     """
-    if not sys.platform.startswith("linux") or os.environ.get("WAYLAND_DISPLAY"):
-        return True
+    from PIL import Image
+
+    from polysft_mi.scene import read_rgb
+
     try:
-        x11 = ctypes.CDLL("libX11.so.6")
-    except OSError:
-        return False
-    x11.XOpenDisplay.restype = ctypes.c_void_p
-    return bool(os.environ.get("DISPLAY")) and bool(x11.XOpenDisplay(None))
-
-
-def show(run, frame=None, screenshot=None):
-    """Open the window of a :class:`~polysft_mi.results.run.Run` and wait until it is closed; or
-    write the picture ``screenshot`` (.png) instead.
-
-    ``frame``: the index of the frame to begin with, by default the first. Raises InputError.
-    """
-    order = {int(k): n for n, k in enumerate(run.frames)}
-    if frame is not None and frame not in order:
-        raise InputError(f"--frame {frame}: the run has frames {min(order)} to {max(order)}")
-    if screenshot is not None and not screenshot.lower().endswith(".png"):
-        raise InputError(f"--screenshot {screenshot}: a .png file is needed")
-    ps = _polyscope(screenshot is not None)
-    viewer = Viewer(run, ps)
-    viewer.show(order[frame] if frame is not None else 0)
-    if screenshot is not None:
-        ps.screenshot(screenshot, transparent_bg=False)
-    else:
-        ps.set_user_callback(viewer.controls)
-        ps.show()
-
-
-def _polyscope(screenshot):
-    """polyscope, started. Raises InputError where it is not installed or finds no display."""
-    if not screenshot and not _display():
-        raise InputError(f"view: no display (DISPLAY={os.environ.get('DISPLAY', '')}); {_INSTEAD}")
-    require("polyscope")
-    import polyscope as ps
-
-    ps.set_program_name("polysft")
-    ps.set_verbosity(0)
-    ps.set_use_prefs_file(False)
-    ps.set_allow_headless_backends(screenshot)
-    try:
-        ps.init()
-    except RuntimeError:
-        raise InputError(
-            f"view: cannot open a window, OpenGL or a display is missing; {_INSTEAD}"
-        ) from None
-    return ps
+        image = Image.fromarray(read_rgb(path))
+    except (InputError, OSError):
+        return None
+    image.thumbnail((most, most))
+    data = io.BytesIO()
+    image.save(data, "JPEG", quality=85)
+    return Image.open(data)

@@ -6,6 +6,7 @@ import json
 import os
 import re
 import xml.etree.ElementTree as ET
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -15,7 +16,7 @@ from polyfit import jets
 from polyfit.mesh import TexCoords
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError
-from polysft_mi.scene import known_defaults, located
+from polysft_mi.scene import known_defaults, list_images, located
 
 from .truth import load_npz, read_surface, texcoords_of
 
@@ -93,18 +94,34 @@ class Run:
         """The path of the template's texture as the scene names it, or None where it names none.
         The file may be gone.
         """
-        path = self.path("scene.xml")
-        defaults = self.settings
-        root = ET.parse(path).getroot()
+        return self.texture_of(self.path("scene.xml"))
+
+    @staticmethod
+    def texture_of(path: str) -> str | None:
+        """:attr:`texture` of the scene file ``path``."""
+        root, defaults = ET.parse(path).getroot(), known_defaults(path)
         shapes = root.findall("shape[@id='template']") or root.findall("shape")
         ids = {ref.get("id") for shape in shapes for ref in shape.iter("ref")}
         places = shapes + [e for e in root if e.get("id") in ids]
         for texture in (t for place in places for t in place.iter("texture")):
             name = texture.find("string[@name='filename']")
             if name is not None:
-                text = re.sub(r"\$(\w+)", lambda m: defaults.get(m[1], m[0]), name.get("value", ""))
-                return located(path, text)
+                return located(path, _filled(name.get("value", ""), defaults))
         return None
+
+    @cached_property
+    def images(self) -> list[str]:
+        """The paths of the frames' images (T,), as the scene names them; none where they are
+        gone.
+        """
+        path = self.path("scene.xml")
+        name = ET.parse(path).getroot().find("integrator/string[@name='frames']")
+        text = _filled(name.get("value", ""), self.settings) if name is not None else ""
+        try:
+            found = list_images(located(path, text))
+        except InputError:
+            return []
+        return [found[k] for k in self.frames] if self.frames.max() < len(found) else []
 
     @property
     def uv(self) -> np.ndarray | None:
@@ -181,6 +198,13 @@ def _of_one_patch(p: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         "radius": p["scale"].reshape(1),
         "axes": np.tile(p["frame_rotation"], (count, 1, 1)),
     }
+
+
+def _filled(text: str, defaults: Mapping[str, str]) -> str:
+    """The text with ``$name`` replaced, and what those name."""
+    for _ in range(8):  # $frames is $data/frames
+        text = re.sub(r"\$(\w+)", lambda m: defaults.get(m[1], m[0]), text)
+    return text
 
 
 def _read_json(path: str) -> dict:

@@ -1,4 +1,4 @@
-"""What a plain installation does without torch, USD and polyscope, and what a command says that
+"""What a plain installation does without torch, USD and viser, and what a command says that
 needs one of them."""
 
 import processes

@@ -168,7 +168,7 @@ def test_a_circle_is_found():
 
 
 def test_imports_are_those_of_the_file_that_has_the_name():
-    assert ("polysft_mi.results.run", "Run") in imports("polysft_mi.view")
+    assert ("polysft_mi.results.run", "Run") in imports("polysft_mi.export")
     assert home("polysft_mi", "Run") == "polysft_mi.results.run"
     inside_a_function = ("polysft_mi.results.outputs", None)
     assert inside_a_function in imports("polysft_mi.run")

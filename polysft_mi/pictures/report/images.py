@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from ..panels import COLUMNS, PEAKS, box_of, heat_values, panels
+from ..panels import COLUMNS, PEAKS, at_vertices, box_of, heat_values, panels
 
 # pictures are as large as the budget allows: width [pixels] and quality, the first that fits
 _SIZES = ((640, 80), (640, 70), (480, 75), (480, 60), (360, 60), (240, 50))
@@ -38,7 +38,7 @@ def images(run, shown, budget=9_000_000, threads=2):
                 )
             for name, peak in PEAKS.items() if run.camera is not None else ():
                 values = heat_values(pictures[name], peak)
-                seen[name].append(_at_vertices(run.camera, run.vertices[k], values, box))
+                seen[name].append(at_vertices(run.camera, run.vertices[k], values, box))
             waiting.append(pool.submit(_encoded, pictures.values(), *size))
             if len(waiting) > 2 * threads:
                 encoded.append(waiting.popleft().result())
@@ -64,19 +64,4 @@ def _encoded(panels, width, quality):
         # method 2: half the time of the default for 3 % more bytes
         Image.fromarray(np.ascontiguousarray(panel)).save(data, "WEBP", quality=quality, method=2)
         out.append(data.getvalue())
-    return out
-
-
-def _at_vertices(camera, vertices, values, box):
-    """The values (N,) where each vertex is seen, in a picture (h, w) of what ``box`` shows of the
-    image (a mean over 3x3 of its pixels); NaN outside it.
-    """
-    import cv2
-
-    values = cv2.blur(values, (3, 3))
-    before = vertices[:, 2] > 0
-    x, y = ((camera.project(vertices) - box[:2]) * (values.shape[1] / box.size[0])).T
-    inside = before & (x >= 0) & (y >= 0) & (x < values.shape[1]) & (y < values.shape[0])
-    out = np.full(len(vertices), np.nan, np.float32)
-    out[inside] = values[y[inside].astype(int), x[inside].astype(int)]
     return out

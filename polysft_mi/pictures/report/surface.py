@@ -5,7 +5,7 @@ import os
 
 import numpy as np
 
-from polysft_mi.pictures.shading import patch_colours
+from polysft_mi.pictures.shading import patch_colours, range_of
 
 
 def mesh(run, shown, triangles=24_000):
@@ -119,9 +119,7 @@ def _scalar(label, meaning, unit, values, colours, *, signed=False):
     import matplotlib
     from matplotlib.colors import to_hex
 
-    known = np.isfinite(values)
-    top = float(np.quantile(np.abs(values[known]), 0.99) if known.any() else 1) or 1.0
-    low = -top if signed else 0.0
+    known, (low, top) = np.isfinite(values), range_of(values, signed)
     raw = np.round(np.clip((np.where(known, values, 0) - low) / (top - low), 0, 1) * 254).astype(
         np.uint8
     )

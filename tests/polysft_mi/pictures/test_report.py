@@ -11,6 +11,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 import pytest
+from browser import BROWSER, needs_browser
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -18,18 +19,17 @@ from polysft_mi import report
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError
 from polysft_mi.pictures import video
-from polysft_mi.pictures.panels import PEAKS, Box, box_of, evenly_spaced, heat, heat_values
-from polysft_mi.pictures.report.images import _at_vertices
+from polysft_mi.pictures.panels import (
+    PEAKS,
+    Box,
+    at_vertices,
+    box_of,
+    evenly_spaced,
+    heat,
+    heat_values,
+)
 from polysft_mi.pictures.report.page import write_report
 from polysft_mi.results.run import Run
-
-BROWSER = next(
-    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))),
-    None,
-)
-needs_browser = pytest.mark.skipif(
-    BROWSER is None, reason="no Chromium is installed (Debian, Ubuntu: apt-get install chromium)"
-)
 
 
 @pytest.fixture(scope="module")
@@ -182,7 +182,7 @@ def test_error_where_each_vertex_is_seen():
         [[-0.1, 0, 1], [0.1, 0, 1], [0.5, 0, 1], [0.1, 0, -1], [-0.18, 0, 1], [0, 0.14, 1]]
     )
     values = heat_values(picture, PEAKS["error"])
-    error = _at_vertices(camera, vertices, values, Box(5, 3, 35, 33))
+    error = at_vertices(camera, vertices, values, Box(5, 3, 35, 33))
     wanted = [0, PEAKS["error"] / 3, np.nan, np.nan, np.nan, np.nan]
     np.testing.assert_allclose(error, wanted, atol=1e-6)
 

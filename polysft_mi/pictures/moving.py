@@ -1,0 +1,218 @@
+"""What the viewer shows: a run, ended or still at work, or a drape, as one moving surface."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+
+import numpy as np
+
+from polyfit.animation import from_camera
+from polyfit.mesh import TexCoords
+from polysft_mi.camera import Intrinsics
+from polysft_mi.errors import InputError
+from polysft_mi.results import Run, load_npz
+
+from .panels import residual_at_vertices
+from .shading import patch_colours, range_of
+
+_GREY = (176, 176, 176)
+_CLOTH = (106, 141, 182)
+
+
+@dataclass(frozen=True)
+class Colouring:
+    """Colours of the vertices, ``rgb`` (T, N, 3) uint8 sRGB, or (1, N, 3) where no frame changes
+    them; ``legend``: what they mean, in a line.
+    """
+
+    rgb: np.ndarray
+    legend: str
+
+
+@dataclass(frozen=True)
+class Moving:
+    """A surface that moves: ``vertices`` (T, N, 3) float32 [m, z up], ``faces`` (F, 3),
+    ``texcoords`` or None, ``texture``: the path of an image or None; ``frames`` (T,): the number
+    of each, ``fps`` of them a second.
+
+    ``camera``: that of the images, at the origin and looking along y, or None; ``images``: the
+    path of each frame's, or none. ``colourings``: by name, each a function that makes it. ``body``:
+    (vertices (T, B, 3), faces (C, 3)) of what the surface lies on, or None. ``state``: how far it
+    is, in a line.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    frames: np.ndarray
+    fps: float
+    state: str
+    texcoords: TexCoords | None = None
+    texture: str | None = None
+    camera: Intrinsics | None = None
+    images: list[str] = field(default_factory=list)
+    colourings: dict[str, Callable[[], Colouring]] = field(default_factory=dict)
+    body: tuple[np.ndarray, np.ndarray] | None = None
+
+
+class Source:
+    """A folder to look at. :meth:`read` gives what it holds now; :meth:`changed` says whether that
+    is more than was read. Raises InputError where it is neither a run's nor a drape's.
+    """
+
+    def __init__(self, folder: str | os.PathLike[str]) -> None:
+        self.folder = os.fspath(folder)
+        self._problem = None  # of a run at work
+        self._stamp: list[int | None] = []
+        drape = os.path.isfile(self._path("drape.npz"))
+        if not drape and not os.path.isfile(self._path("run.json")):
+            what = "is not the folder of a run or of a drape (it holds no run.json, no drape.npz)"
+            raise InputError(
+                f"{folder}: {what if os.path.isdir(self.folder) else 'no such folder'}"
+            )
+
+    def _path(self, name):
+        return os.path.join(self.folder, name)
+
+    def _stamps(self):
+        found = []
+        for name in ("metrics.json", "checkpoint.npz", "drape.npz"):
+            try:
+                found.append(os.stat(self._path(name)).st_mtime_ns)
+            except OSError:
+                found.append(None)
+        return found
+
+    def changed(self) -> bool:
+        """Whether a file was written since :meth:`read`."""
+        return self._stamps() != self._stamp
+
+    def read(self) -> Moving:
+        """The surface as it is now. A run that is still at work is loaded as a scene, by Mitsuba,
+        for until its end its folder holds nothing but unknowns.
+        """
+        stamp = self._stamps()
+        if os.path.isfile(self._path("drape.npz")):
+            found = _of_drape(self.folder)
+        elif os.path.isfile(self._path("metrics.json")):  # which a run writes last
+            found, self._problem = _of_run(Run.open(self.folder)), None
+        else:
+            found = self._at_work()
+        self._stamp = stamp
+        return found
+
+    def _at_work(self):
+        from polysft_mi.backend import set_variant
+
+        set_variant()
+        from polysft_mi.objective import Problem
+        from polysft_mi.scene import experiment as scenes
+        from polysft_mi.surface import Unknowns
+        from polysft_mi.tracker import CHECKPOINT, Track
+
+        if self._problem is None:
+            experiment = scenes.load(self._path("scene.xml"))
+            self._problem = Problem(experiment, experiment.sequence())
+        problem = self._problem
+        path, track = self._path(CHECKPOINT), Track()
+        if os.path.isfile(path):
+            track = Track.load(path)
+        states = [Unknowns.from_numpy(s) for s in track.states] or [problem.patch.rest()]
+        world = np.stack([problem.surface(state) for state in states])
+        files, template = problem.sequence.files, problem.template
+        sigma = None
+        if track.sigma:
+            unknown = np.full(world.shape[1], np.nan, np.float32)
+            sigma = np.stack([track.sigma.get(k, unknown) for k in range(len(states))])
+        texture = Run.texture_of(self._path("scene.xml"))
+        return Moving(
+            from_camera(problem.camera.to_camera(world).astype(np.float32), "z"),
+            template.faces,
+            np.asarray(problem.sequence.indices[: len(states)]),
+            problem.experiment.settings.rate,
+            f"at work: {len(track.states)} of {len(files)} frames",
+            template.texcoords,
+            _existing(texture),
+            problem.camera.intrinsics(),
+            files[: len(states)],
+            _colourings(template.patch, template.weight, sigma),
+        )
+
+
+def _of_run(run: Run) -> Moving:
+    """A run that has ended."""
+    p = run.params
+    colourings = _colourings(p["patch"], p["weight"], run.sigma)
+    if run.camera is not None:
+        legend = "rendering beside image, freed from lighting [local contrast]"
+        make = lambda: _scalar(residual_at_vertices(run), "inferno", legend)
+        colourings["residual"] = make
+    bent = "mean curvature of the jets [1/m]"
+    make = lambda: _scalar(run.mean_curvature(), "RdBu_r", bent, signed=True)
+    colourings["curvature"] = make
+    lost = run.metrics.get("lost", {})
+    return Moving(
+        from_camera(run.vertices, "z"),
+        run.faces,
+        run.frames,
+        run.fps,
+        f"{len(run.frames)} frames" + (f", {len(lost)} of them lost" if lost else ""),
+        run.texcoords,
+        _existing(run.texture),
+        run.camera,
+        run.images,
+        colourings,
+    )
+
+
+def _of_drape(folder: str) -> Moving:
+    """What onefit.drape or onefit.simulate left in a folder: the cloth, and the body under it."""
+    path = os.path.join(folder, "drape.npz")
+    a = load_npz(path)
+    missing = [n for n in ("vertices", "faces", "body", "body_faces", "fps") if n not in a]
+    if missing:
+        raise InputError(f"{path}: holds no {', '.join(missing)}; it is not the file of a drape")
+    count = len(a["vertices"])
+    return Moving(
+        a["vertices"],
+        a["faces"],
+        np.arange(count),
+        float(a["fps"]),
+        f"{count} frames",
+        colourings={"cloth": partial(_plain, a["vertices"].shape[1], _CLOTH)},
+        body=(a["body"], a["body_faces"]),
+    )
+
+
+def _scalar(values: np.ndarray, colours: str, meaning: str, *, signed: bool = False) -> Colouring:
+    """Values (T, N) in the ``colours`` of matplotlib, grey where they are not finite."""
+    import matplotlib
+
+    low, high = range_of(values, signed)
+    known = np.isfinite(values)
+    share = (np.where(known, values, low) - low) / (high - low)
+    rgb = matplotlib.colormaps[colours](np.clip(share, 0, 1), bytes=True)[..., :3]
+    rgb[~known] = _GREY
+    return Colouring(rgb, f"{meaning}: {low:.3g} to {high:.3g}")
+
+
+def _colourings(patch, weight, sigma):
+    """What is known of a run from its first frame on."""
+    out = {"plain": partial(_plain, len(patch), _GREY)}
+    if patch.max() > 0:
+        legend = f"the {patch.max() + 1} patches"
+        out["patches"] = lambda: Colouring(patch_colours(patch, weight)[None], legend)
+    if sigma is not None and np.isfinite(sigma).any():
+        meaning = "standard deviation along the ray [mm]"
+        out["sigma"] = lambda: _scalar(1e3 * sigma, "viridis", meaning)
+    return out
+
+
+def _plain(count, colour):
+    return Colouring(np.tile(np.uint8(colour), (1, count, 1)), "")
+
+
+def _existing(path):
+    return path if path is not None and os.path.isfile(path) else None
