@@ -9,7 +9,8 @@ For folds like a simulation's, and a material: python -m onefit.simulate, which 
 arguments. OUT receives
 
     drape.npz               vertices (T, N, 3) [m, z up], faces, rest, the body's vertices and
-                            faces, fps
+                            faces, fps; of a mesh file its own in motion, mesh_vertices and
+                            mesh_faces, with uv and uv_faces where it has them
     figures.json            what was measured
     garment.usd, body.usd   animations that Blender and usdview open; of a mesh file its own
                             vertices, faces and texture coordinates

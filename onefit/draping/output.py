@@ -152,6 +152,9 @@ def write(drape, folder, *, skip=(), meshes=None, size=(480, 360), spp=16, advan
     if drape.render_mesh is not None:
         seen = drape.render_vertices()
         faces, texcoords = drape.render_mesh.faces, drape.render_mesh.texcoords
+        arrays |= {"mesh_vertices": seen.astype(np.float32), "mesh_faces": faces}
+        if texcoords is not None:
+            arrays |= {"uv": texcoords.coordinates, "uv_faces": texcoords.faces}
     with aside(folder / "drape.npz") as temporary:
         np.savez_compressed(temporary, fps=drape.fps, **arrays)
     if "usd" not in skip:

@@ -174,14 +174,15 @@ def _of_drape(folder: str) -> Moving:
     missing = [n for n in ("vertices", "faces", "body", "body_faces", "fps") if n not in a]
     if missing:
         raise InputError(f"{path}: holds no {', '.join(missing)}; it is not the file of a drape")
-    count = len(a["vertices"])
+    kind = "mesh_" if "mesh_vertices" in a else ""  # that of the garment's file
+    vertices, count = a[f"{kind}vertices"], len(a["vertices"])
     return Moving(
-        a["vertices"],
-        a["faces"],
+        vertices,
+        a[f"{kind}faces"],
         np.arange(count),
         float(a["fps"]),
         f"{count} frames",
-        colourings={"cloth": partial(_plain, a["vertices"].shape[1], _CLOTH)},
+        colourings={"cloth": partial(_plain, vertices.shape[1], _CLOTH)},
         body=(a["body"], a["body_faces"]),
     )
 

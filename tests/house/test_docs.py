@@ -26,7 +26,7 @@ PAGES = [
     if p.exists()
 ]
 SCENE = (ROOT / "docs" / "scene.md").read_text(encoding="utf-8")
-FOLDERS = "polysft_mi|polyfit|onefit|scenes|tests|docs|benchmarks"
+FOLDERS = "polysft_mi|polyfit|onefit|scenes|tests|docs|benchmarks|blender"
 
 
 def _resolves(name):

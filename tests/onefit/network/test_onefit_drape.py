@@ -226,6 +226,9 @@ def test_a_mesh_in_centimetres_with_y_up(network, tmp_path):
     drape.main([*arguments, "-o", str(tmp_path / "right"), "--scale", "0.01", "--up", "y"])
     with np.load(tmp_path / "right" / "drape.npz") as file:
         assert np.abs(file["rest"] - shorts.vertices.numpy()).max() < 1e-3
+        assert file["mesh_vertices"].shape[1] == len(shorts.vertices)
+        apart = np.linalg.norm(file["mesh_vertices"] - file["vertices"], axis=2)
+        assert apart.max() < 1e-3 and (file["mesh_faces"] == file["faces"]).all()
     assert sorted(p.name for p in (tmp_path / "right").iterdir()) == ["drape.npz", "figures.json"]
 
 
