@@ -181,9 +181,9 @@ def drag(x, v, faces, wind):
     )
 
 
-def simulate(name, seed):
-    """Vertices (FRAMES, N, 3) [m, camera frame] of a sequence, and its
-    :class:`simulate_shapes.Shape`.
+def simulate(name, seed, frames=FRAMES):
+    """Vertices (``frames``, N, 3) [m, camera frame] of a sequence, and its
+    :class:`simulate_shapes.Shape`. Fewer frames are the first ones of the same motion.
     """
     try:
         import newton
@@ -231,7 +231,7 @@ def simulate(name, seed):
         faces = model.tri_indices.numpy().reshape(-1, 3)
         shape = Shape(rest, faces, uv, held, kind.size[0] / kind.size[1])
     dt, out = 1 / FPS / SUBSTEPS, [rest]
-    for step in range(1, (FRAMES - 1) * SUBSTEPS + 1):
+    for step in range(1, (frames - 1) * SUBSTEPS + 1):
         x, v = now.particle_q.numpy(), 0.999 * now.particle_qd.numpy()
         x[held], v[held] = weather.points(step * dt), 0.0
         now.particle_q.assign(x)
@@ -264,16 +264,21 @@ def main(argv=None):
         help=f"of {', '.join(KINDS)}",
     )
     parser.add_argument("--seed", type=int, default=3)
+    parser.add_argument(
+        "--frames", type=int, default=FRAMES, help=f"the first ones alone (default: {FRAMES})"
+    )
     parser.add_argument("--plain", action="store_true", help="textures with few details")
     args = parser.parse_args(argv)
     if args.seed < 0:
         raise InputError(f"--seed {args.seed}: 0 or more")
+    if not 1 <= args.frames <= FRAMES:
+        raise InputError(f"--frames {args.frames}: 1 to {FRAMES}")
     set_variant("llvm_ad_rgb")
     for name in args.only:
         folder = os.path.join(args.out, name)
         if os.path.exists(folder):
             raise InputError(f"{folder}: exists already; another OUT is needed")
-        vertices, shape = simulate(name, args.seed)
+        vertices, shape = simulate(name, args.seed, args.frames)
         rng = np.random.default_rng([args.seed, list(KINDS).index(name), 1])
         seen = render(folder, vertices, shape, rng, args.plain)
         faces = shape.faces

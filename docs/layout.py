@@ -24,7 +24,8 @@ WAY = {
         "solvers": "objective, start → where it is least",
         "tracker": "frames → unknowns, one after another",
         "results": "unknowns → files and figures",
-        "pictures": "a run → pictures, video, report",
+        "pictures": "a run → pictures, video, report, viewer",
+        "batches": "scenes → many runs, one table",
     },
     "polyfit": {
         "mesh": "files → checked triangles",

@@ -63,6 +63,7 @@ EXTRAS = {
     "torch": "learn",
     "warp": "learn",
     "pxr": "usd",
+    "ray": "batch",
     "viser": "view",
 }
 

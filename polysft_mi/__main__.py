@@ -22,10 +22,12 @@ examples:
   polysft prepare clip.mp4 --texture photo.jpg --size A4 --fov 65 -o OUT
   polysft run OUT/scene.xml -o RESULT   reconstruct the sheet in your own video
   polysft export RESULT --format glb    for browsers and Blender
+  polysft view RESULT                   look at it in the browser, also while it is at work
   polysft COMMAND --help                the options of a command, with examples
 
 Each command is also a module: python -m polysft_mi.run ...
-Exit status: 0 for success, 2 for a bad input (one line on stderr names it), 130 for Ctrl-C.
+Exit status: 0 for success, 2 for a bad input (one line on stderr names it), 130 for Ctrl-C, 1 where
+a scene of a batch failed.
 Colours only on a terminal, and not where NO_COLOR is set.
 """
 

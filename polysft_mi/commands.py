@@ -14,6 +14,7 @@ COMMANDS = {
     "report": "one page that shows a run: video, errors, surface in 3D, figures",
     "export": "the moving surface as USD, glTF, OBJ, PLY or arrays",
     "compare": "two runs, or a run and its ground truth: figures and pictures",
+    "batch": "reconstruct many scenes, several at a time, with one table",
     "view": "look at a run in the browser, also while it is at work",
 }
 

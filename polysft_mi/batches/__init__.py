@@ -1,0 +1,17 @@
+"""Many runs, each in a process of its own: scenes, or garments and motions, go in; their folders
+and one table come out.
+
+:mod:`jobs` says what there is to do and what was done before, :mod:`schedule` has ray do it,
+:mod:`table` writes the result.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach(
+    __name__,
+    submod_attrs={
+        "jobs": ["Job", "drapes", "runs"],
+        "schedule": ["work"],
+        "table": ["Table"],
+    },
+)
