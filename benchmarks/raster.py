@@ -1,5 +1,5 @@
-"""How fast ``raster`` is beside Mitsuba's path replay: one forward and backward pass, gradient to
-all vertex positions.
+"""How fast ``raster`` is beside Mitsuba's path replay and DEODR: a picture, and one forward and
+backward pass, gradient to all vertex positions.
 
     python benchmarks/raster.py [--sizes 160x120 640x480 ...] [--grids 33 72 225] [-o
     out/benchmarks] [-m llvm_ad_rgb]
@@ -11,6 +11,7 @@ The contenders:
     raster          ``render()`` under Dr.Jit's AD, as the solver calls it: RGB and alpha, unlit
     raster, mi      the same through ``mi.render``, which renders once more for the backward pass
     prb_projective  through ``mi.render``, 1 sample a pixel, depth 2, ``sppi = 0``: RGB alone
+    deodr           where it is installed (``pip install deodr``): RGB and alpha, one thread
 
 Depth 2 is one bounce, the emitter's light off the sheet, which is the texture's own colour wherever
 the sheet does not shadow itself: what raster shows (depth 1 would be black). ``sppi = 0`` leaves
@@ -20,9 +21,13 @@ long as raster at 160x120.
 
 All of a case's contenders run in one process, turn by turn; times are medians after a warm-up,
 ratios medians of the ratios within a turn, so that what else the machine does meanwhile falls on
-both. Moving the sheet (``params.update()``, which rebuilds what rays are traced with) is timed
+all. Moving the sheet (``params.update()``, which rebuilds what rays are traced with) is timed
 apart, for it is no part of either. Peak memory is measured in a process of its own for each
-contender and case; growth and compilation over many iterations too.
+contender and case; growth and compilation over many iterations too. The table of docs/raster.md,
+on one core, where times are those of the processor:
+
+    taskset -c 0 python benchmarks/raster.py --grids 33 -o docs \\
+        --sizes 256x256 512x512 1024x1024 2048x2048
 
 Writes ``raster.json`` and ``raster.png``, anew after every case, so that an interrupted run leaves
 the cases that it reached.
@@ -39,6 +44,7 @@ import time
 
 import numpy as np
 from cases import add_case_arguments, parse_size
+from raster_deodr import AVAILABLE, DeodrContender
 from raster_figures import (
     CONTENDERS,
     TARGET,
@@ -58,6 +64,9 @@ SIZES = ("160x120", "320x240", "640x480", "1280x720", "1920x1080")
 GRIDS = (33, 72, 225)  # vertices a side: 1,089 vertices, 10,082 and 100,352 triangles
 WARM_UP, LEAST_TURNS, MOST_TURNS = 2, 3, 60  # few where a turn takes seconds
 MEMORY_PASSES = 2
+# On one core, seconds of that core: what others do on it meanwhile does not count
+_CLOCK = time.process_time if len(os.sched_getaffinity(0)) == 1 else time.perf_counter
+NAMES = [name for name in CONTENDERS if name != "deodr" or AVAILABLE]
 
 _SCENE = """<scene version="3.0.0">
 {sensor}
@@ -163,13 +172,42 @@ class Contender:
         dr.sync_thread()
         return gradient
 
-    def turn(self, k):
-        """Move the sheet and take a gradient: seconds of each."""
-        began = time.perf_counter()
-        self.place(amount(k))
-        placed = time.perf_counter()
-        self.forward_backward(k)
-        return placed - began, time.perf_counter() - placed
+    def forward(self, seed):
+        """The picture alone, evaluated."""
+        import drjit as dr
+
+        with dr.suspend_grad():
+            image = self.render(seed).array
+        dr.eval(image)
+        dr.sync_thread()
+        return image
+
+
+def contender(name, size, points, folder):
+    """The contender of this name, with its sheet."""
+    if name != "deodr":
+        return Contender(name, size, points, folder)
+    import mitsuba as mi
+
+    vertices, faces, uv = sheet(points, size)
+    bitmap = mi.Bitmap(os.path.join(ROOT, "scenes", "demo", "texture.jpg"))
+    linear = bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False)
+    bend = np.zeros_like(vertices)
+    bend[:, 2] = vertices[:, 0] ** 2
+    return DeodrContender(vertices, faces, uv, camera(size), np.array(linear), bend)
+
+
+def turn(contender, k):
+    """Move the sheet, take a picture and a gradient: seconds of each."""
+    times = [_CLOCK()]
+    for do in (
+        lambda: contender.place(amount(k)),
+        lambda: contender.forward(k),
+        lambda: contender.forward_backward(k),
+    ):
+        do()
+        times.append(_CLOCK())
+    return np.diff(times).tolist()
 
 
 def amount(k):
@@ -190,37 +228,51 @@ def peak_resident():
 
 
 def measure_times(size, points, folder, seconds):
-    """Milliseconds of every turn, contender to list: ``passes`` and ``moves``; and how far the
-    pictures differ.
+    """Milliseconds of every turn, contender to list: ``passes``, ``pictures`` and ``moves``; and
+    how far the pictures differ.
     """
-    contenders = [Contender(name, size, points, folder) for name in CONTENDERS]
-    passes, moves = {name: [] for name in CONTENDERS}, {name: [] for name in CONTENDERS}
+    contenders = [contender(name, size, points, folder) for name in NAMES]
+    passes, pictures, moves = ({name: [] for name in NAMES} for _ in range(3))
     began = None
     for k in range(WARM_UP + MOST_TURNS):
         if k == WARM_UP:
             began = time.perf_counter()
         if k >= WARM_UP + LEAST_TURNS and time.perf_counter() - began > seconds:
             break
-        for contender in contenders if k % 2 else contenders[::-1]:
-            move, one_pass = contender.turn(k)
+        for one in contenders if k % 2 else contenders[::-1]:
+            move, picture, one_pass = turn(one, k)
             if k >= WARM_UP:
-                moves[contender.name].append(1e3 * move)
-                passes[contender.name].append(1e3 * one_pass)
-    return {"passes": passes, "moves": moves, **compare_pictures(contenders[0], contenders[2])}
+                moves[one.name].append(1e3 * move)
+                pictures[one.name].append(1e3 * picture)
+                passes[one.name].append(1e3 * one_pass)
+    by_name = {one.name: one for one in contenders}
+    return {
+        "passes": passes,
+        "pictures": pictures,
+        "moves": moves,
+        **compare_pictures(
+            **{name.split(",")[0]: by_name[name] for name in NAMES if "," not in name}
+        ),
+    }
 
 
-def compare_pictures(raster, path_replay):
-    """That both show the same: share of the image that the sheet covers, mean colour on it, and
-    mean difference of the two (of a 16-sample picture).
+def compare_pictures(raster, prb_projective, deodr=None):
+    """That all show the same: share of the image that the sheet covers, mean colour on it, and
+    mean difference of raster from path replay (16 samples), and from deodr where there is one.
     """
     import mitsuba as mi
 
-    for contender in (raster, path_replay):
-        contender.place(0)
+    found = {}
+    for one in filter(None, (raster, prb_projective, deodr)):
+        one.place(0)
     image = np.array(raster.render(0))
-    other = np.array(mi.render(path_replay.scene, integrator=path_replay.integrator, spp=16))
+    other = np.array(mi.render(prb_projective.scene, integrator=prb_projective.integrator, spp=16))
     inside = image[..., 3] > 0.999
+    if deodr is not None:
+        apart = np.abs(image[inside] - deodr.forward(0)[inside])
+        found["mean_absolute_difference_of_deodr"] = float(apart.mean())
     return {
+        **found,
         "coverage": float(image[..., 3].mean()),
         "mean_colour": float(image[inside, :3].mean()),
         "mean_difference": float((image[inside, :3] - other[inside]).mean()),
@@ -236,9 +288,9 @@ def measure_memory(size, points, folder, name):
     import mitsuba as mi
 
     started = resident()
-    contender = Contender(name, size, points, folder)
+    one = contender(name, size, points, folder)
     for k in range(MEMORY_PASSES):
-        contender.turn(k)
+        turn(one, k)
     backend = dr.JitBackend.CUDA if mi.variant().startswith("cuda") else dr.JitBackend.LLVM
     return {
         "started_mb": started,
@@ -249,9 +301,10 @@ def measure_memory(size, points, folder, name):
 
 def measure_growth(size, points, folder, iterations):
     """Memory of the process [MB] after each iteration of raster."""
-    contender, held = Contender("raster", size, points, folder), []
+    one, held = contender("raster", size, points, folder), []
     for k in range(iterations):
-        contender.turn(k)
+        one.place(amount(k))
+        one.forward_backward(k)
         held.append(resident())
     return {"resident_mb": held}
 
@@ -263,10 +316,11 @@ def measure_kernels(size, points, folder, iterations):
     import drjit as dr
 
     dr.set_flag(dr.JitFlag.KernelHistory, True)
-    contender, launched, new = Contender("raster", size, points, folder), [], []
+    one, launched, new = contender("raster", size, points, folder), [], []
     dr.kernel_history_clear()
     for k in range(iterations):
-        contender.turn(k)
+        one.place(amount(k))
+        one.forward_backward(k)
         history = [
             entry for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT
         ]  # reading clears it
@@ -366,6 +420,7 @@ def main(arguments=None):
     )
     report = {
         "versions": growth["versions"],
+        "cores": len(os.sched_getaffinity(0)),
         "load": [os.getloadavg()[0]],  # before the first case and after each
         "long_run": {"size": size, "vertices": grid**2, **judge_long_run(growth, kernels)},
         "cases": cases,
@@ -374,8 +429,7 @@ def main(arguments=None):
         for size in options.sizes:
             times = in_process("times", size, grid, options.mode, seconds=options.seconds)
             memory = {
-                name: in_process("memory", size, grid, options.mode, name=name)
-                for name in CONTENDERS
+                name: in_process("memory", size, grid, options.mode, name=name) for name in NAMES
             }
             cases.append(summarise(size, grid, times, memory))
             report["load"].append(os.getloadavg()[0])

@@ -11,7 +11,8 @@ from cases import parse_size
 
 from polyfit.files import aside
 
-CONTENDERS = ("raster", "raster, mi", "prb_projective")
+CONTENDERS = ("raster", "raster, mi", "prb_projective", "deodr")
+_BEGIN, _END = "<!-- speed -->\n", "\n<!-- /speed -->"
 TARGET = ("640x480", 33, 3.0)  # a case, and how many times faster raster is to be there
 
 
@@ -26,11 +27,12 @@ def summarise(size, grid, times, memory):
         "turns": len(passes["raster"]),
         "contenders": {},
     }
-    for name in CONTENDERS:
+    for name in passes:
         low, middle, high = np.percentile(passes[name], [25, 50, 75])
         case["contenders"][name] = {
             "ms": middle,
             "ms_quartiles": [low, high],
+            "picture_ms": float(np.median(times["pictures"][name])),
             "move_ms": float(np.median(times["moves"][name])),
             "ratio": float(np.median(passes[name] / passes["raster"])),
             "ratio_quartiles": list(np.percentile(passes[name] / passes["raster"], [25, 75])),
@@ -39,10 +41,7 @@ def summarise(size, grid, times, memory):
         }
     return {
         **case,
-        **{
-            k: times[k]
-            for k in ("coverage", "mean_colour", "mean_difference", "mean_absolute_difference")
-        },
+        **{k: v for k, v in times.items() if k == "coverage" or k.startswith("mean_")},
     }
 
 
@@ -78,12 +77,13 @@ def print_table(cases):
     )
     table.add_column("image")
     table.add_column("triangles", justify="right")
-    for name in CONTENDERS:
+    names = list(cases[0]["contenders"])
+    for name in names:
         table.add_column(name, justify="right")
     table.add_column("move, ms", justify="right")
     for case in cases:
         cells = []
-        for name in CONTENDERS:
+        for name in names:
             c = case["contenders"][name]
             ratio = "" if name == "raster" else f"  [bold]{c['ratio']:.1f}x[/bold]"
             cells.append(f"{c['ms']:.1f}{ratio}\n{c['peak_mb']:.0f} ({c['drjit_peak_mb']:.0f})")
@@ -102,11 +102,11 @@ def plot(path, cases):
     triangles = sorted({case["triangles"] for case in cases})
     figure = Figure(figsize=(4.2 * len(triangles) + 0.6, 4), dpi=110, layout="constrained")
     rows = figure.subplots(1, len(triangles), sharey=True, squeeze=False)[0]
-    colours = ("#c4572e", "#e0a58c", "#3b6ea5")
+    colours = ("#c4572e", "#e0a58c", "#3b6ea5", "#6a994e")
     for axes, count in zip(rows, triangles):
         chosen = [case for case in cases if case["triangles"] == count]
         at = [np.prod(parse_size(case["size"])) for case in chosen]
-        for name, colour in zip(CONTENDERS, colours):
+        for name, colour in zip(chosen[0]["contenders"], colours):
             ms = [case["contenders"][name]["ms"] for case in chosen]
             axes.plot(at, ms, color=colour, marker="o", markersize=4, label=name)
             if name == "prb_projective":
@@ -160,10 +160,40 @@ def print_end(report, out):
     )
 
 
+def page_table(report):
+    """The table of docs/raster.md, as text."""
+    names = list(report["cases"][0]["contenders"])
+    lines = [
+        f"| image | {' | '.join(names)} |",
+        "|---" * (1 + len(names)) + "|",
+    ]
+    for case in report["cases"]:
+        cells = []
+        for name in names:
+            c = case["contenders"][name]
+            memory = c["peak_mb"] - c["started_mb"]
+            cells.append(f"{c['picture_ms']:.0f} / {c['ms']:.0f} ms, {memory:.0f} MB")
+        lines.append(f"| {case['size'].replace('x', '×')} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
 def write(report, out):
+    """``raster.json`` and ``raster.png`` in the folder ``out``; where it has a page raster.md, as
+    docs/ has, its table too.
+    """
     with (
         aside(os.path.join(out, "raster.json")) as temporary,
         open(temporary, "w", encoding="utf-8") as file,
     ):
         json.dump(report, file, indent=1)
-    plot(os.path.join(out, "raster.png"), report["cases"])
+        file.write("\n")
+    page = os.path.join(out, "raster.md")
+    if not os.path.exists(page):
+        plot(os.path.join(out, "raster.png"), report["cases"])
+        return
+    with open(page, encoding="utf-8") as file:
+        text = file.read()
+    before, rest = text.split(_BEGIN)
+    after = rest.split(_END)[1]
+    with aside(page) as temporary, open(temporary, "w", encoding="utf-8") as file:
+        file.write(f"{before}{_BEGIN}{page_table(report)}{_END}{after}")

@@ -109,6 +109,14 @@ def test_example_scene_runs(tmp_path):
     assert np.abs(np.array(alpha).reshape(mask.shape) - mask).mean() < 0.1 * mask.mean()
 
 
+def test_example_of_the_rasteriser_ends_where_its_page_says():
+    page = (ROOT / "docs" / "raster.md").read_text(encoding="utf-8")
+    done = python("-c", re.search(r"```python\n(.*?)```", page, re.S)[1])
+    assert done.returncode == 0, done.stderr
+    found = [float(x) for x in re.findall(r"-?\d+\.?[\de-]*", done.stdout)[:3]]
+    np.testing.assert_allclose(found, [0.3, -0.2, 0], atol=0.01)
+
+
 def test_order_of_the_coefficients():
     from polyfit.jets import exponents
 
