@@ -3,8 +3,9 @@
 A network of the package drapes a T-shirt on a body that walks. Garment and body become two USD
 files of moving meshes, in metres.
 
-Look at them: in Blender, File > Import > Universal Scene Description, once for each file, then
-press the space bar.
+Look at them: in Blender, File > Import > Universal Scene Description, once for each file; set the
+scene's rate to 30 frames a second, which the import leaves as it was; then press the space bar. The
+add-on of docs/blender.md opens a folder that `python -m onefit.drape` wrote, with its rate.
 """
 
 import argparse

@@ -28,7 +28,7 @@ def parser():
         help="frame to begin with, by its index (default: the first; of a run at work the newest)",
     )
     p.add_argument(
-        "--port", type=int, default=8080, help="the first port to try, of 20 (default: 8080)"
+        "--port", type=int, default=8080, help="the first port to try; 0: any (default: 8080)"
     )
     p.add_argument(
         "--host",
@@ -41,8 +41,8 @@ def parser():
 def open_viewer(arguments=None):
     """The :class:`~polysft_mi.pictures.viewer.Viewer` that the arguments ask for, serving."""
     options = parser().parse_args(arguments)
-    if not 0 < options.port < 65516:
-        raise InputError(f"--port {options.port}: a port from 1 to 65515 is needed")
+    if not 0 <= options.port < 65536:
+        raise InputError(f"--port {options.port}: a port from 0 to 65535 is needed")
     return Viewer(Source(options.out), host=options.host, port=options.port, frame=options.frame)
 
 

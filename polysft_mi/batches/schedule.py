@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import signal
@@ -23,6 +24,9 @@ def work(jobs: Sequence[Job], workers: int) -> Iterator[tuple[Job, int, float]]:
     where ray is not installed.
     """
     require("ray")
+    for job in jobs:
+        with contextlib.suppress(FileNotFoundError):  # of a batch that was killed
+            os.remove(_mark(job.log))
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     import ray
 
@@ -46,7 +50,7 @@ def work(jobs: Sequence[Job], workers: int) -> Iterator[tuple[Job, int, float]]:
                 except ray.exceptions.RayError:  # its process was killed, out of memory
                     status, seconds = -signal.SIGKILL, 0.0
                 yield job, status, seconds
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, GeneratorExit):  # here, or in who takes what is yielded
             for ref in waiting:
                 ray.cancel(ref)
             # ray takes a task for ended as soon as it is told to end
