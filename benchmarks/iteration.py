@@ -58,7 +58,7 @@ def measured(path, overrides, turns):
     surface = atlas.surface(rest)
     vertices, at = surface.vertices, images._frames.level(1, level)
     with dr.suspend_grad():
-        view = images._view(vertices, level)
+        view = images.view(vertices, level)
         given = (
             *images._residual_arguments(view, 1, level, images.appearance(vertices, level)),
             dr.opaque(mi.Float, 0.3),
@@ -70,16 +70,16 @@ def measured(path, overrides, turns):
             outline = view.seen(), crossings, at.mask, at.distance, images._corner_of
         pairs = images._outline(*outline)[1] if outline else None
         sums = table, figures, vertices, 1.0, 1.0, at.area, level.stride, pairs
-        gathered = images.gather.images(*sums)
+        gathered = [(images.gather.images(*sums), images.gather.camera)]
         assembly = Assembly(images.pattern, images.gather, atlas)
         edges = EdgeRows(np.ones(len(problem.template.edges)), 1.0)
-        normal, _ = assembly.normal(surface, gathered, edges, [], patterns[d], d)
+        normal, _ = assembly.normal(surface, gathered, edges, None, patterns[d], d)
         reduced = Reduced.of(patterns, normal, 1e-3, np.float32)
     recorded = assembly._in_unknowns
 
     def look():
         images._last = None
-        images._view(vertices, level)
+        images.view(vertices, level)
 
     def traced():
         assembly._in_unknowns = recorded.__wrapped__
@@ -87,7 +87,7 @@ def measured(path, overrides, turns):
         assembly._in_unknowns = recorded
 
     def equations():
-        return assembly.normal(surface, gathered, edges, [], patterns[d], d)
+        return assembly.normal(surface, gathered, edges, None, patterns[d], d)
 
     def silhouette():
         if outline:

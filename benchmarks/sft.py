@@ -11,6 +11,10 @@ writes included: ``python -m polysft_mi.run`` with the solver ``gauss-newton`` o
 the truth is a mesh, they also say what the best jets of the order used make of it: those fitted to
 the true vertices of each frame.
 
+To see what a change does, run the code before and after it with ``--threads 1 --docs FOLDER`` of
+its own, and the second time with ``--against`` the first one's sft.json; ``--only flag bend paper
+curtain ball shirt`` takes some eight minutes, and the rest of ``docs/sft.md`` as long again.
+
 Writes ``sft.json``, ``sft.md`` and ``sft.png`` into ``docs``, where the results of whole videos
 stand already (``--docs FOLDER`` for another; for runs that are shortened or by other settings, into
 OUT).
@@ -24,7 +28,7 @@ import sys
 import sft_results
 import sft_runs
 from sequences import DATA, ROOT, folder_of
-from sft_report import report
+from sft_report import against, report
 from sft_results import JET, METHODS, SEQUENCES
 
 from polysft_mi.backend import add_mode_argument
@@ -79,6 +83,11 @@ def parser():
             "for sft.json, sft.md and sft.png (default: docs for whole runs by default settings,"
             " else OUT)"
         ),
+    )
+    p.add_argument(
+        "--against",
+        metavar="FILE",
+        help="an sft.json of other code: also print figures and seconds as ratios to its own",
     )
     add_mode_argument(p)
     return p
@@ -136,7 +145,11 @@ def main(arguments=None):
                 result = sft_runs.jet_result(sequence, folder, order, setup)
                 if result:
                     sft_results.add(path, result)
-    print(report([r for r in sft_results.read(path) if r["setup"] == setup], docs))
+    results = [r for r in sft_results.read(path) if r["setup"] == setup]
+    print(report(results, docs))
+    if options.against:
+        chosen = [r for r in results if r["sequence"] in options.only]
+        print(f"\n{against(chosen, sft_results.read(options.against))}")
     print(f"\nin {docs}: sft.json, sft.md, sft.png")
 
 

@@ -23,6 +23,31 @@ COLOURS = {
 }
 
 
+def against(results, others):
+    """Lines of Markdown: each result's figures and seconds beside those of the same sequence,
+    method and frames among ``others``, as ratios, and their geometric means.
+    """
+    lines = ["| sequence | method | figure | before | now | ratio | seconds |", _row(["---"] * 7)]
+    ratios, times = [], []
+    for r in results:
+        same = lambda o, r=r: all(o.get(k) == r.get(k) for k in ("sequence", "method", "frames"))
+        other = next((o for o in others if same(o) and "error" not in o), None)
+        shown = next((names for _, names in KINDS[::-1] if _shows(r, names[0])), None)
+        if other is None or shown is None or r["method"] == JET:
+            continue
+        seconds = r["seconds_a_frame"] / other["seconds_a_frame"]
+        times.append(seconds)
+        for name in shown[: 2 if "deg" in shown[1] else 1]:
+            before, now = other["figures"][name], r["figures"][name]
+            ratios.append(now / before)
+            numbers = f"{before:.4g}", f"{now:.4g}", f"{now / before:.3f}", f"{seconds:.2f}"
+            lines.append(_row([r["sequence"], r["method"], LABELS[name], *numbers]))
+    if ratios:
+        means = (f"{np.exp(np.mean(np.log(x))):.3f}" for x in (ratios, times))
+        lines.append(_row(["geometric mean", "", "", "", "", *means]))
+    return "\n".join(lines)
+
+
 def table(results):
     """Results as Markdown: a table for each kind of ground truth, sequences and methods in their
     order here.

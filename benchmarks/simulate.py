@@ -28,7 +28,7 @@ import os
 from dataclasses import dataclass
 
 import numpy as np
-from simulate_pictures import render
+from simulate_pictures import add_cameras, render
 from simulate_shapes import DEPTH, ROUNDED, Shape
 
 from polyfit.mesh import edges_of
@@ -268,6 +268,13 @@ def main(argv=None):
         "--frames", type=int, default=FRAMES, help=f"the first ones alone (default: {FRAMES})"
     )
     parser.add_argument("--plain", action="store_true", help="textures with few details")
+    parser.add_argument(
+        "--cameras",
+        type=int,
+        default=1,
+        choices=(1, 2, 3),
+        help="2, 3: further ones in OUT/KIND/cameras, 50 degrees to the right, and to the left",
+    )
     args = parser.parse_args(argv)
     if args.seed < 0:
         raise InputError(f"--seed {args.seed}: 0 or more")
@@ -281,6 +288,13 @@ def main(argv=None):
         vertices, shape = simulate(name, args.seed, args.frames)
         rng = np.random.default_rng([args.seed, list(KINDS).index(name), 1])
         seen = render(folder, vertices, shape, rng, args.plain)
+        add_cameras(
+            folder,
+            os.path.join(folder, "cameras"),
+            vertices,
+            [50, -50][: args.cameras - 1],
+            args.seed,
+        )
         faces = shape.faces
         np.savez_compressed(
             os.path.join(folder, "gt.npz"),

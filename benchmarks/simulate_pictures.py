@@ -90,25 +90,70 @@ def render(folder, vertices, shape, rng, plain=False):
     """
     import mitsuba as mi
 
-    for name in ("frames", "masks"):
-        os.makedirs(os.path.join(folder, name), exist_ok=True)
+    os.makedirs(folder, exist_ok=True)
     at = lambda *names: os.path.join(folder, *names)
     image = texture(rng, shape.aspect, plain)
     cv2.imwrite(at("texture.png"), image[..., ::-1])
     write_obj(at("template.obj"), vertices[0], shape.faces, shape.uv)
+    film(folder, folder, vertices, np.eye(4), rng)
+    cloth = {"type": "obj", "filename": at("template.obj")}
+    scene = mi.load_dict({"type": "scene", "cloth": cloth})
+    place = _placer(scene, vertices[0])
+    return np.array([visible(place(x), x) for x in vertices])
+
+
+def add_cameras(folder, out, vertices, angles, seed):
+    """Film vertices (T, N, 3) [m] of the template in ``folder`` from further ``angles`` [degrees],
+    into folders in ``out``, whose names are returned.
+    """
+    names = [f"{angle:+04.0f}" for angle in angles]
+    for k, (name, angle) in enumerate(zip(names, angles, strict=True)):
+        rng = np.random.default_rng([seed, k, 2])
+        film(folder, os.path.join(out, name), vertices, around(vertices, angle), rng)
+    return names
+
+
+def around(vertices, degrees):
+    """world_to_camera (4, 4) of a camera that looks at the middle of vertices (..., 3) [m] from as
+    far as the origin, turned about the upright axis.
+    """
+    middle = vertices.reshape(-1, 3).mean(0)
+    turn, _ = cv2.Rodrigues(np.array([0, np.radians(degrees), 0]))
+    at = middle - turn @ middle
+    forward = (middle - at) / np.linalg.norm(middle - at)
+    right = np.cross([0, 1, 0], forward)
+    right /= np.linalg.norm(right)
+    axes = np.stack([right, np.cross(forward, right), forward])
+    return np.vstack([np.column_stack([axes, -axes @ at]), (0, 0, 0, 1)])
+
+
+def film(folder, out, vertices, world_to_camera, rng):
+    """Write frames, masks and ``camera.json`` into ``out``: the vertices (T, N, 3) [m] of the
+    template in ``folder``, from a camera at ``world_to_camera`` (4, 4); ``rng`` draws light and
+    noise.
+    """
+    import mitsuba as mi
+
+    for name in ("frames", "masks"):
+        os.makedirs(os.path.join(out, name), exist_ok=True)
+    at = lambda *names: os.path.join(folder, *names)
     width, height = SIZE
-    with open(at("camera.json"), "w", encoding="utf-8") as file:
-        json.dump(
-            dict(width=width, height=height, fx=FOCAL, fy=FOCAL, cx=width / 2, cy=height / 2),
-            file,
-            indent=1,
-        )
+    camera = dict(width=width, height=height, fx=FOCAL, fy=FOCAL, cx=width / 2, cy=height / 2)
+    if not np.array_equal(world_to_camera, np.eye(4)):
+        camera["world_to_camera"] = np.round(world_to_camera, 9).tolist()
+    with open(os.path.join(out, "camera.json"), "w", encoding="utf-8") as file:
+        json.dump(camera, file, indent=1)
+    image = cv2.imread(at("texture.png"))
+    origin = -world_to_camera[:3, :3].T @ world_to_camera[:3, 3]
+    down, forward = world_to_camera[1, :3], world_to_camera[2, :3]
     scene = mi.load_dict({
         "type": "scene", "integrator": {"type": "path", "max_depth": 3},
         "sensor": {
             "type": "perspective", "fov": float(np.degrees(2 * np.arctan(width / 2 / FOCAL))),
             "fov_axis": "x",
-            "to_world": mi.ScalarTransform4f().look_at([0, 0, 0], [0, 0, 1], [0, -1, 0]),
+            "to_world": mi.ScalarTransform4f().look_at(
+                origin.tolist(), (origin + forward).tolist(), (-down).tolist()
+            ),
             "film": {
                 "type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"},
                 "pixel_format": "rgb"
@@ -130,33 +175,45 @@ def render(folder, vertices, shape, rng, plain=False):
         },
     })  # fmt: skip
     depth = mi.load_dict({"type": "aov", "aovs": "z:depth"})
-    parameters = mi.traverse(scene)
-    key = next(
-        k for k in parameters.keys() if k.startswith("cloth") and k.endswith("vertex_positions")
-    )
-    start = np.array(parameters[key]).reshape(-1, 3)
-    corner = np.linalg.norm(start[:, None] - vertices[0], axis=-1).argmin(
-        1
-    )  # Mitsuba orders an OBJ's vertices itself
-    gain, seen = None, []
+    place, gain = _placer(scene, vertices[0]), None
     for t, x in enumerate(vertices):
-        parameters[key] = x[corner].astype(np.float32).ravel()
-        parameters.update()
+        place(x)
+        nearest = (x @ forward + world_to_camera[2, 3]).min()
         light = np.array(mi.render(scene, spp=SAMPLES, seed=t))[..., :3]
         mask = (
             np.array(mi.render(scene, integrator=depth, spp=16, seed=t))[..., -1]
-            > 0.5 * x[:, 2].min()
+            > 0.5 * nearest
         )  # most of its rays meet the sheet
         gain = gain or 1.25 * (image.mean() / 255) ** 2.2 / np.median(light[mask].mean(-1))
         srgb = np.where(mask[..., None], np.clip(gain * light, 0, 1) ** (1 / 2.2), BACKGROUND)
         levels = 255 * srgb + rng.normal(0, NOISE, srgb.shape)
         cv2.imwrite(
-            at("frames", f"{t:03d}.png"),
+            os.path.join(out, "frames", f"{t:03d}.png"),
             np.clip(np.round(levels), 0, 255).astype(np.uint8)[..., ::-1],
         )
-        cv2.imwrite(at("masks", f"{t:03d}.png"), 255 * mask.astype(np.uint8))
-        seen.append(visible(scene, x))
-    return np.array(seen)
+        cv2.imwrite(os.path.join(out, "masks", f"{t:03d}.png"), 255 * mask.astype(np.uint8))
+
+
+def _placer(scene, rest):
+    """A function that puts vertices (N, 3) [m] into a scene whose cloth is loaded with those of
+    ``rest``, and returns the scene.
+    """
+    import mitsuba as mi
+
+    parameters = mi.traverse(scene)
+    key = next(
+        k for k in parameters.keys() if k.startswith("cloth") and k.endswith("vertex_positions")
+    )
+    start = np.array(parameters[key]).reshape(-1, 3)
+    # Mitsuba orders an OBJ's vertices itself
+    corner = np.linalg.norm(start[:, None] - rest, axis=-1).argmin(1)
+
+    def place(x):
+        parameters[key] = x[corner].astype(np.float32).ravel()
+        parameters.update()
+        return scene
+
+    return place
 
 
 def visible(scene, x):

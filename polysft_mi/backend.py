@@ -175,8 +175,6 @@ def set_variant(mode: str | None = None) -> str:
             f"mode {mode!r}: no working GPU (NVIDIA, with its driver and OptiX) was found; leave"
             " the mode out, or give llvm_ad_rgb"
         )
-    if mode.startswith("cuda"):
-        print(f"note: {mode} is untested; the tests run on {DEFAULT}", file=sys.stderr)
     try:
         mi.set_variant(mode)
     except ImportError as error:
@@ -271,7 +269,7 @@ def add_mode_argument(parser: ArgumentParser) -> None:
         "-m",
         "--mode",
         metavar="VARIANT",
-        help=f"Mitsuba variant (default: {DEFAULT}; cuda_ad_rgb needs a GPU and is untested)",
+        help=f"Mitsuba variant (default: {DEFAULT}; cuda_ad_rgb needs a GPU: docs/gpu.md)",
     )
 
 

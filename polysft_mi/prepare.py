@@ -77,6 +77,9 @@ def parser():
     )
     p.add_argument("-q", "--quiet", action="store_true", help="no progress, only errors")
     p.add_argument("--json", action="store_true", help="the result as one JSON object on stdout")
+    _add_evidence(
+        p.add_argument_group("what is known beside the images (docs/evidence.md), of every frame")
+    )
     _add_video(p.add_argument_group("from a video"))
     _add_camera(
         p.add_argument_group(
@@ -84,6 +87,42 @@ def parser():
         )
     )
     return p
+
+
+def _add_evidence(group):
+    group.add_argument(
+        "--tracks",
+        metavar="FILE",
+        help="point tracks, .npz as CoTracker, TAPIR, AllTracker have them: tracks (T, P, 2) in"
+        " pixels of the video, visible (T, P), queries (P, 3)",
+    )
+    group.add_argument(
+        "--track-centre",
+        type=float,
+        default=0.5,
+        metavar="C",
+        help="coordinate that they give the centre of the first pixel: 0.5 (default) or 0",
+    )
+    group.add_argument(
+        "--depth",
+        metavar="FOLDER",
+        help="depth images as the frames' camera sees them: 16 bit PNG, or EXR in metres; 0 is"
+        " unknown",
+    )
+    group.add_argument(
+        "--depth-unit",
+        type=float,
+        default=1e-3,
+        metavar="M",
+        help="metres that a whole number of them stands for (default: 0.001)",
+    )
+    group.add_argument(
+        "--depth-known-to",
+        choices=("metric", "affine", "disparity"),
+        default="metric",
+        help="affine, disparity: depth, or its inverse, as a network guesses it, up to a scale and"
+        " a shift (default: metric)",
+    )
 
 
 def _add_video(group):
@@ -189,6 +228,7 @@ def main(argv=None):
             args.overwrite,
             args.pose_fit,
             warn=lambda line: print(line, file=sys.stderr),
+            **_evidence(args),
         )
         found, lines = {"folder": args.folder}, [line]
     if args.json:
@@ -197,8 +237,19 @@ def main(argv=None):
         print(*lines, f"next: python -m polysft_mi.run {shlex.quote(scene)} -o OUT", sep="\n")
 
 
+def _evidence(args):
+    """Settings of what is given beside the images, by their names."""
+    known = {}
+    if args.tracks:
+        known |= {"tracks": args.tracks, "track_centre": args.track_centre}
+    if args.depth:
+        known |= {"depth": args.depth, "depth_unit": args.depth_unit}
+        known["depth_known_to"] = args.depth_known_to
+    return known
+
+
 def _from_video(args, command):
-    from .capture import prepare_video
+    from .capture import GivenEvidence, prepare_video
 
     if args.texture is None:
         raise InputError(
@@ -224,6 +275,7 @@ def _from_video(args, command):
             corners=corners,
             texture_corners=texture_corners,
             masks=args.masks or not args.no_masks,
+            evidence=GivenEvidence(**known) if (known := _evidence(args)) else None,
             say=(lambda line: None) if quiet else print,
             progress=progress,
             command=command,

@@ -9,6 +9,7 @@ import lazy_loader
 __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
+        "evidence": ["GivenEvidence"],
         "known_folder": ["prepare_folder"],
         "layouts": ["FORMS", "Layout", "recognise"],
         "masks": ["iou"],

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+from dataclasses import replace
 
 from polyfit.files import aside
 from polysft_mi.errors import InputError
@@ -14,12 +15,19 @@ from .scene_file import scene_xml
 
 
 def prepare_folder(
-    folder, out=None, resolution=33, overwrite=False, pose_fit="auto", warn=lambda line: None
+    folder,
+    out=None,
+    resolution=33,
+    overwrite=False,
+    pose_fit="auto",
+    warn=lambda line: None,
+    **evidence,
 ):
     """Write ``scene.xml`` for a sequence into ``out`` (default: the folder itself); for
     Kinect-Paper also ``template.obj``, of that ``resolution``, in its pose of
     :func:`polysft_mi.scene.kinect_paper.template`.
 
+    ``evidence``: settings of tracks and depth, by their names, with paths as the caller has them.
     Everything that the scene names is read and checked first; ``warn`` is given a line about a
     template whose size is unlikely. Returns (path of the scene, what was
     found, in lines). Raises InputError; then nothing is written.
@@ -28,8 +36,9 @@ def prepare_folder(
     layout = recognise(folder)
     camera = layout.camera
     masks = os.path.join(folder, layout.masks) if layout.masks else ""
+    known_to = evidence.pop("depth_known_to", "metric")
     sequence = Sequence.open(
-        os.path.join(folder, layout.frames), masks, size=(camera.width, camera.height)
+        os.path.join(folder, layout.frames), masks, size=(camera.width, camera.height), **evidence
     )
     checked_size(os.path.join(folder, layout.texture))
     template, where, said = None, "template.obj", []
@@ -54,16 +63,30 @@ def prepare_folder(
     note = meshio.size_note(vertices, where)
     if note:
         warn(note)
+    for name in ("tracks", "depth"):
+        if evidence.get(name):
+            evidence[name] = _from_data(evidence[name], folder)
+    if evidence.get("depth"):
+        evidence["depth_known_to"] = known_to
+    layout = replace(layout, settings=layout.settings | evidence)
     text = scene_xml(
         layout, "." if here else os.path.abspath(folder), "template.obj" if template else None
     )
     _write(target, text, template, "; give a folder that can be written by -o DIR" if here else "")
     recognised = (
         f"{folder}: a sequence in the form {layout.form}, {len(sequence)} frames of"
-        f" {camera.width}x{camera.height}, {'with' if masks else 'without'} masks, template of"
+        f" {camera.width}x{camera.height}, {'with' if masks else 'without'} masks,"
+        f"{' with tracks,' if sequence.tracks else ''}{' with depth,' if sequence.depth else ''}"
+        " template of"
         f" {len(vertices)} vertices ({layout.obj or f'subdivided to {resolution}x{resolution}'})"
     )
     return os.path.join(target, "scene.xml"), "\n".join([recognised, *said])
+
+
+def _from_data(path, folder):
+    """A path as a scene names it: from its data's folder where it lies there."""
+    inside = os.path.relpath(os.path.realpath(path), os.path.realpath(folder))
+    return os.path.abspath(path) if inside.startswith("..") else f"$data/{inside}"
 
 
 def _write(target, text, template, hint):

@@ -63,7 +63,7 @@ def replace_folder(partial, out):
 
 
 def write_png(path, image):
-    """Write an image (H, W, 3) uint8 RGB, or (H, W) uint8."""
+    """Write an image (H, W, 3) uint8 RGB, or (H, W) uint8 or uint16."""
     image = image[..., ::-1] if image.ndim == 3 else image
     _, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 3])
     with open(path, "wb") as file:

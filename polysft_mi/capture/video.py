@@ -44,6 +44,7 @@ def prepare_video(
     texture_corners=None,
     pose_fit="auto",
     masks=True,
+    evidence=None,
     first=0,
     last=-1,
     stride=1,
@@ -65,7 +66,8 @@ def prepare_video(
     - ``corners`` (4, 2): pixels of the sheet's corners in the frame ``first`` as it was taken, or
       "frame" for the picture's own; ``pose_fit``: "auto" to move the sheet from there to the edges
       in that frame, where they are clear, or "none".
-    - ``masks``: True to find them, a folder of them, or False for none.
+    - ``masks``: True to find them, a folder of them, or False for none; ``evidence``: a
+      :class:`polysft_mi.capture.evidence.GivenEvidence` where there is more than images.
     - ``first`` to ``last`` in steps of ``stride``: the frames; ``scale``: what they are scaled by.
     - ``say`` is given one line for each step, ``progress`` the number of frames done.
 
@@ -153,6 +155,11 @@ def prepare_video(
         found["fps"], uneven = film.rate(stride)
         for line in [*film.notes[told:], *filter(None, [uneven])]:
             say(f"note: {video}: {line}")
+        settings = {"fps": round(found["fps"], 6)} if found["fps"] else {}
+        if evidence:
+            known, lines = evidence.write(partial, written.indices, straight)
+            settings |= known
+            written.lines += lines
         if written.figures:
             found["masks"] = written.figures
         speed = f", {found['fps']:.4g} a second" if found["fps"] else ""
@@ -161,7 +168,7 @@ def prepare_video(
             *written.lines,
         ):
             say(line)
-        _write_scene(partial, view, written.masked, photo, placed, mesh, found["fps"])
+        _write_scene(partial, view, written.masked, photo, placed, mesh, settings)
         write_json(os.path.join(partial, REPORT, "prepare.json"), found)
     return os.path.join(out, "scene.xml"), found
 
@@ -185,9 +192,9 @@ def _folder(out):
         raise
 
 
-def _write_scene(folder, view, masked, photo, placed, mesh, fps):
-    """The files that the scene names beside frames and masks, and the scene itself; ``fps``: frames
-    a second, or None.
+def _write_scene(folder, view, masked, photo, placed, mesh, settings):
+    """The files that the scene names beside frames and masks, and the scene itself, with
+    ``settings``.
     """
     finest = 2048  # pixels of the texture's longer side; what is finer no frame shows
     write_png(os.path.join(folder, "texture.png"), pictures.shrunk(photo, finest)[0])
@@ -196,7 +203,7 @@ def _write_scene(folder, view, masked, photo, placed, mesh, fps):
     layout = Layout(
         "cloth", view, "frames", "masks" if masked else "", "texture.png", "template.obj"
     )
-    layout = replace(layout, settings={"fps": round(fps, 6)} if fps else {})
+    layout = replace(layout, settings=settings)
     comment = "A video prepared by python -m polysft_mi.prepare; prepare/ shows what it found."
     with open(os.path.join(folder, "scene.xml"), "w", encoding="utf-8") as file:
         file.write(scene_xml(layout, ".", comment=comment))

@@ -10,6 +10,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     submodules=["differentiable"],
     submod_attrs={
         "data_term": ["Appearance", "DataTerm", "Evaluation"],
+        "depth": ["DepthData", "DepthNoise"],
         "light": ["Light"],
         "pixels": ["packed"],
         "pyramid": ["Level", "POOL", "compared"],

@@ -57,12 +57,13 @@ class Appearance:
     ``excess``: colours of the texture less those of the sheet's image, a
     :class:`polysft_mi.images.pixels.Image` on a part of the level's grid; ``misfit``: what it alone
     would be as a misfit; ``luminance`` (F,): of the triangles' texture as the image shows it, over
-    its mean, or None.
+    its mean, or None; ``others``: of the same sheet, in other cameras.
     """
 
     excess: pixels.Image
     misfit: float
     luminance: np.ndarray | None = None
+    others: tuple = ()
 
 
 class DataTerm:
@@ -97,7 +98,9 @@ class DataTerm:
             self.normalise,
             len(template) > 1,
         )
-        self._unit = max(1.0, math.sqrt(_shown_area(position, self.faces)) / _SHEET)
+        #: of the template in the image [pixels]
+        self.area = _shown_area(position, self.faces)
+        self._unit = max(1.0, math.sqrt(self.area) / _SHEET)
         self._frames = Frames(sequence, normalise)
         self._levels, self._last, self._brightness = {}, None, None
         self._floor = FLOOR
@@ -155,12 +158,51 @@ class DataTerm:
         self._placed.set_texcoords(self.texture.coordinates)
         return True
 
+    # -- what the camera sees ------------------------------------------------
+
+    def view(self, vertices, level):
+        """The :class:`polysft_mi.render.view.View` of a surface on a level's grid; the last is
+        kept.
+        """
+        last = self._last
+        if last is None or last[0] != level.stride or not np.array_equal(last[1], vertices):
+            self._placed.place(mi.Point3f(np.ascontiguousarray(vertices.T, dtype=np.float32)))
+            position, before = self.camera.project(vertices)
+            box = (*position.min(0), *position.max(0)) if before.all() else None
+            view = self._raster.view(self._placed.scene, self._placed.sensor, 1 / level.stride, box)
+            self._last = level.stride, vertices.copy(), view
+        return self._last[2]
+
+    @property
+    def sheet(self):
+        """The rendered mesh, a :class:`polysft_mi.images.pixels.Sheet`."""
+        faces, texture = self._raster.topology(self._placed.scene).faces, self.texture
+        return pixels.Sheet(
+            self._triangle, faces, texture.coordinates, texture.scale, texture.shift
+        )
+
+    def at_pixels(self, vertices, positions):
+        """What a surface shows at ``positions`` (P, 2) [pixels]: the triangles (P,), -1 where there
+        is none, and the barycentric coordinates (P, 3) of the points on their planes.
+        """
+        with dr.suspend_grad():
+            view = self.view(vertices, Level(0.0))
+            triangle = np.array(view.triangle).reshape(view.size[::-1])
+        x, y = (np.floor(positions[:, k]).astype(int) - int(view.region[k][0]) for k in (0, 1))
+        inside = (x >= 0) & (x < view.size[0]) & (y >= 0) & (y < view.size[1])
+        found = np.full(len(positions), -1)
+        found[inside] = triangle[y[inside], x[inside]]
+        rays = np.column_stack([positions, np.ones(len(positions))]) @ self.camera.basis.T
+        corners = vertices[self.faces[np.maximum(found, 0)]] - self.camera.origin
+        weights = np.linalg.solve(corners.swapaxes(1, 2), rays[..., None])[..., 0]
+        return found, weights / weights.sum(1, keepdims=True)
+
     # -- a surface against a frame -------------------------------------------
 
     def seen_vertices(self, vertices, blur):
         """Which vertices of a surface belong to a triangle that a pixel sees, (N,) bool."""
         with dr.suspend_grad():
-            triangle = np.array(self._view(vertices, self.level(blur)).triangle)
+            triangle = np.array(self.view(vertices, self.level(blur)).triangle)
         seen = np.zeros(len(vertices), dtype=bool)
         seen[self.faces[np.unique(triangle[triangle >= 0])]] = True
         return seen
@@ -176,7 +218,7 @@ class DataTerm:
         """Squared residuals r^2 = |T - I|^2 / 3 of the pixels that are compared, (P,) float32."""
         level = self.level(blur)
         with dr.suspend_grad():
-            view = self._view(vertices, level)
+            view = self.view(vertices, level)
             squared, weight = pixels.squares(*self._residual_arguments(view, frame, level))
             return np.array(squared)[np.array(weight) > 0]
 
@@ -188,7 +230,7 @@ class DataTerm:
         level = self.level(blur)
         shown = self._frames.level(frame, level)
         with dr.suspend_grad():
-            view = self._view(vertices, level)
+            view = self.view(vertices, level)
             table, figures = self._sums(
                 *self._residual_arguments(view, frame, level, appearance),
                 dr.opaque(mi.Float, scale),
@@ -250,10 +292,10 @@ class DataTerm:
             lit = self.brightness.irradiance(vertices, self.camera.origin, light)
         lit = on_device(lit, mi.Float)
         with dr.suspend_grad():
-            view = self._view(vertices, level)
+            view = self.view(vertices, level)
             found, template = pixels.rendered(
                 view.seen(),
-                self._sheet,
+                self.sheet,
                 self.texture.level(level),
                 self.texture.footprint_texture(level.stride),
                 lit,
@@ -285,31 +327,11 @@ class DataTerm:
 
     # -- parts ----------------------------------------------------------------
 
-    def _view(self, vertices, level):
-        """The :class:`polysft_mi.render.view.View` of the sheet on a level's grid; the last is
-        kept.
-        """
-        last = self._last
-        if last is None or last[0] != level.stride or not np.array_equal(last[1], vertices):
-            self._placed.place(mi.Point3f(np.ascontiguousarray(vertices.T, dtype=np.float32)))
-            position, before = self.camera.project(vertices)
-            box = (*position.min(0), *position.max(0)) if before.all() else None
-            view = self._raster.view(self._placed.scene, self._placed.sensor, 1 / level.stride, box)
-            self._last = level.stride, vertices.copy(), view
-        return self._last[2]
-
-    @property
-    def _sheet(self):
-        faces, texture = self._raster.topology(self._placed.scene).faces, self.texture
-        return pixels.Sheet(
-            self._triangle, faces, texture.coordinates, texture.scale, texture.shift
-        )
-
     def _residual_arguments(self, view, frame, level, appearance=None):
         """What :func:`polysft_mi.images.pixels.residuals` takes."""
         return (
             view.seen(),
-            self._sheet,
+            self.sheet,
             self.texture.level(level),
             self._frames.level(frame, level).image,
             appearance and appearance.excess,

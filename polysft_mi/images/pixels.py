@@ -121,7 +121,7 @@ class RayHit:
         )
 
 
-def _ray_hits(seen, sheet):
+def ray_hits(seen, sheet):
     """:class:`RayHit` of all pixels of a :class:`polysft_mi.render.view.Seen`."""
     hit = seen.hit
     triangle = mi.UInt32(dr.select(hit, seen.triangle, 0))
@@ -158,7 +158,7 @@ def residuals(seen, sheet, texture, frame, excess):
     ``texture``: an :class:`Image` whose fourth channel tells where it is trusted; ``frame``: one
     with the weights in its fourth, which has the ``excess``, or None, beyond the texture.
     """
-    hit, found = seen.hit, _ray_hits(seen, sheet)
+    hit, found = seen.hit, ray_hits(seen, sheet)
     colour, by_x, by_y = texture.bilinear(found.at, hit)
     x, y = pixel_coordinates(seen)
     pixel, known = frame.at(x, y)
@@ -310,7 +310,7 @@ def rendered(seen, sheet, texture, fine, lit):
     ``fine``: the :class:`Image` that a pixel's footprint is averaged over; ``lit`` Float of F:
     light on the triangles.
     """
-    hit, found = seen.hit, _ray_hits(seen, sheet)
+    hit, found = seen.hit, ray_hits(seen, sheet)
     template = texture.bilinear(found.at, hit)[0]
     grad1, grad2, slide = found.plane()
     footprint = []

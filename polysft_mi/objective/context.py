@@ -58,7 +58,9 @@ class FrameMemory:
     ``misfit``: of its surface, 0 to 1; ``outlier_share``; ``least_misfit``: of the frames so far,
     but for the first one, which the texture was taken from; ``explained``: the highest misfit that
     more iterations could not lower; ``light``: what is known of it, None where it is not learned;
-    ``scales``: the robust scale by stage that fits the residuals. NaN is what is not known.
+    ``scales``: the robust scale by stage that fits the residuals; ``nat``: what one unit of
+    log-likelihood of the images costs; ``noises``: of the other kinds of evidence, what their
+    residuals say of their noise, by name. NaN is what is not known.
     """
 
     misfit: float = math.nan
@@ -67,6 +69,8 @@ class FrameMemory:
     explained: float = 0.0
     light: Light | None = None
     scales: dict[Stage, float] = field(default_factory=dict)
+    nat: float = math.nan
+    noises: dict[str, float] = field(default_factory=dict)
 
     @classmethod
     def of(cls, past: list[FrameMemory | None]) -> FrameMemory:

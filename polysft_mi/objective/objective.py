@@ -23,7 +23,7 @@ from polysft_mi.errors import BadFrame
 
 from .context import FrameContext, Stage, stages_of
 from .quadratic import Assembly, EdgeRows, Linearisation, QuadraticModel
-from .terms import TERMS, DeviceFrame, Inputs, Temporal, Term
+from .terms import TERMS, Cameras, DeviceFrame, Inputs, Temporal, Term
 from .visibility import VisibilityWeights
 
 if TYPE_CHECKING:
@@ -75,6 +75,11 @@ class Objective:
         return next((term for term in self.terms if isinstance(term, Temporal)), None)
 
     @property
+    def cameras(self) -> Cameras | None:
+        """The term of the cameras beside the scene's own, where there are some."""
+        return next((term for term in self.terms if isinstance(term, Cameras)), None)
+
+    @property
     def without_block(self) -> str | None:
         """The first term that has no quadratic model, and why, in words; None where all have."""
         if not self.problem.placed.is_raster:
@@ -95,8 +100,18 @@ class Objective:
         if self.rules.unseen == 1:
             return operators.all_seen
         vertices = self.atlas.surface(state).vertices
-        seen = self.data.seen_vertices(vertices, self.usual[-1].blur)
-        return VisibilityWeights.of(seen, self.rules.unseen, operators)
+        return VisibilityWeights.of(self.seen(vertices), self.rules.unseen, operators)
+
+    def seen(self, vertices: np.ndarray) -> np.ndarray:
+        """Which vertices (N, 3) [m, world] of a surface some camera sees, (N,) bool."""
+        views = [self.inputs, *(self.cameras.views if self.cameras else ())]
+        blur = self.usual[-1].blur
+        return np.any([view.data.seen_vertices(vertices, blur) for view in views], axis=0)
+
+    def move_texture(self, chart: np.ndarray, displaced: np.ndarray) -> None:
+        """Show what lies at ``chart`` (N, 2) at ``displaced`` (N, 2) instead, in all cameras."""
+        for view in [self.inputs, *(self.cameras.views if self.cameras else ())]:
+            view.data.move_texture(chart, displaced)
 
     def appearance(self, state: State, stage: Stage, light: Light) -> Appearance | None:
         """How a sheet looks at the start of a stage, under a ``light``; None where the sheet has
@@ -109,7 +124,10 @@ class Objective:
         coefficients = light.coefficients(len(self.data.faces)) if lit else None
         shaded = self.settings.k_shading > 0 and stage.last
         vertices = self.atlas.surface(state).vertices
-        return self.data.appearance(vertices, stage.blur, coefficients, shaded)
+        found = self.data.appearance(vertices, stage.blur, coefficients, shaded)
+        if self.cameras:
+            found.others = self.cameras.looks(vertices, stage)
+        return found
 
     def quadratic(
         self, state: State, context: FrameContext, stage: Stage, appearance: Appearance | None
@@ -130,10 +148,11 @@ class Objective:
         at = Linearisation(
             state, surface, context, stage, d, diagonal, evaluation, no_edges, appearance
         )
+        at.images.append((evaluation.images, self.data.gather.camera))
         for term in self.terms:
             term.rows(at)
         at.normal, at.edge_energy = self._assembly.normal(
-            surface, evaluation.images, at.edges, at.triangles, operators.patterns[d], d
+            surface, at.images, at.edges, at.triangles, operators.patterns[d], d
         )
         terms = {term.name: term.add(at) for term in self.terms}
         total = sum(terms.values())
@@ -154,6 +173,22 @@ class Objective:
         ``contexts`` at a stage.
         """
         return FrozenObjective(self, contexts, stage, start)
+
+    def observe(self, frame: int, vertices: np.ndarray) -> None:
+        """Take in the surface (N, 3) [m, world] of a frame that was solved; frames come in their
+        order.
+        """
+        for term in self.terms:
+            term.observe(frame, vertices)
+
+    def noises(self, context: FrameContext, vertices: np.ndarray) -> dict[str, float]:
+        """What the surface (N, 3) [m, world] that was found of a frame says of the noise of each
+        kind of evidence beside the images.
+        """
+        found: dict[str, float] = {}
+        for term in self.terms:
+            found |= term.noise(context, vertices, self.usual[-1])
+        return found
 
     def check_gradient(self) -> None:
         """Raise RuntimeError where the renderer cannot be differentiated; Mitsuba tells only when

@@ -2,7 +2,7 @@
 accumulated on the device.
 
 In: what the images say at the vertices (:mod:`polysft_mi.images.gather`), residuals of the edges'
-lengths and of the triangles. Out: :class:`NormalEquations`, for the linear algebra of
+lengths, quadratic models of the triangles. Out: :class:`NormalEquations`, for the linear algebra of
 :mod:`polysft_mi.solvers.linear`. Kernels are recorded once and launched again without tracing.
 Import only after a Mitsuba variant is set.
 """
@@ -66,17 +66,30 @@ class EdgeRows:
 
 
 @dataclass
-class TriangleRows:
-    """A term's residuals of the triangles, whose ``energy`` has the quadratic model of half the sum
-    of ``factor`` (F,) times ``residual`` (F,) squared, with derivatives ``by_corner`` (F, 3, 3)
-    [1/m] of the residuals by the corners.
+class TriangleForms:
+    """Quadratic models of the triangles in the positions of their corners: ``gradient`` (F, 3, 3)
+    [1/m], corner by axis, and ``curvature`` (F, 3, 3, 3, 3) [1/m^2], corner by corner by axis by
+    axis.
     """
 
-    name: str
-    energy: float
-    residual: np.ndarray
-    factor: np.ndarray
-    by_corner: np.ndarray
+    gradient: np.ndarray
+    curvature: np.ndarray
+
+    @classmethod
+    def of_residuals(
+        cls, residual: np.ndarray, factor: np.ndarray, by_corner: np.ndarray
+    ) -> TriangleForms:
+        """Of half the sum of ``factor`` (F,) times ``residual`` (F,) squared, whose derivatives by
+        the corners are ``by_corner`` (F, 3, 3) [1/m].
+        """
+        pull = factor[:, None, None] * by_corner
+        curvature = np.einsum("fak,fbm->fabkm", pull, by_corner)
+        return cls(residual[:, None, None] * pull, curvature)
+
+    def __add__(self, other: TriangleForms | None) -> TriangleForms:
+        if other is None:
+            return self
+        return TriangleForms(self.gradient + other.gradient, self.curvature + other.curvature)
 
 
 @dataclass
@@ -84,10 +97,13 @@ class Linearisation:
     """Where terms add what they know to second order, at a ``state`` whose vertices are of
     ``surface``.
 
-    First in space, where one kernel sums it up: ``evaluation`` holds what the images say; terms
-    set ``edges`` and append to ``triangles``. Then in the unknowns: ``normal``, in whose local
-    blocks ``diagonal`` (N,) are those of the vertices; ``edge_energy`` is that of the edges. ``d``:
-    local unknowns of a vertex (3 with its relief, or 2).
+    First in space, where one kernel sums it up: ``evaluation`` holds what the images say,
+    ``images`` is that, and terms add what other cameras' say, each with its camera as
+    :class:`polysft_mi.images.gather.Gather` has it; they set ``edges`` and add to ``triangles``.
+    Then in the unknowns: ``normal``, in whose local
+    blocks ``diagonal`` (N,) are those of the vertices; ``edge_energy`` is that of the edges,
+    ``energies`` those of the terms that act on triangles. ``d``: local unknowns of a vertex (3 with
+    its relief, or 2).
     """
 
     state: State
@@ -99,13 +115,16 @@ class Linearisation:
     evaluation: Evaluation
     edges: EdgeRows
     appearance: Appearance | None = None
-    triangles: list[TriangleRows] = field(default_factory=list)
+    images: list = field(default_factory=list)
+    triangles: TriangleForms | None = None
     edge_energy: float = 0.0
+    energies: dict[str, float] = field(default_factory=dict)
     normal: NormalEquations = field(init=False)
 
-    def energy_of(self, name: str) -> float:
-        """The energy of a term's rows of triangles, 0 where it has none."""
-        return sum(rows.energy for rows in self.triangles if rows.name == name)
+    def add_to_triangles(self, name: str, energy: float, forms: TriangleForms) -> None:
+        """Add the quadratic models of the term ``name``, whose energy is ``energy``."""
+        self.energies[name] = energy
+        self.triangles = forms + self.triangles
 
 
 @dataclass
@@ -170,7 +189,6 @@ def _vertex_sums_in_unknowns(
     halo,
     images,
     vertices,
-    camera,
     lengths,
     numbers,
     offset_jacobian,
@@ -181,17 +199,17 @@ def _vertex_sums_in_unknowns(
     size,
     triangles,
 ):
-    """Normal equations of the images, the edges and the triangles' residuals, in the unknowns of an
-    atlas.
+    """Normal equations of the images, the edges and the triangles, in the unknowns of an atlas.
 
-    ``halo``: :class:`Halo`; ``vertices`` Float64 of 3N [m]; ``lengths`` Float64 of E [m],
+    ``halo``: :class:`Halo`; ``images``: pairs of :class:`polysft_mi.images.gather.Images` and their
+    camera; ``vertices`` Float64 of 3N [m]; ``lengths`` Float64 of E [m],
     ``numbers`` Float64: stiffness [1/m^2], give; ``offset_jacobian`` Float64 of 9N, ``up`` of 3K,
     ``motion_jacobian`` of 18 and ``basis`` of A an entry: of
     :class:`polysft_mi.surface.atlas.Surface`; ``index``: 0, 1, ... of A H, and ``size``: A,
-    UInt32; ``triangles``: of each set of :class:`TriangleRows`, Float64: r h of F, h of F and
-    derivatives of 9F. Returns Float64: energies of the edges without their weight
-    (E), gradient (3N) in space; by (Δu, Δv, Δw): gradient (3N), curvature (9U) of the pairs; of
-    positions in space and, over the halo, the motions (18H) and the coefficients (3 of A H each).
+    UInt32; ``triangles``: Float64 of 9F and 81F, of :class:`TriangleForms`, or None. Returns
+    Float64: energies of the edges without their weight (E), gradient (3N) in space; by (Δu, Δv,
+    Δw): gradient (3N), curvature (9U) of the pairs; of positions in space and, over the halo, the
+    motions (18H) and the coefficients (3 of A H each).
     """
     vertex, pair = (
         dr.arange(mi.UInt32, dr.width(vertices) // 3),
@@ -206,40 +224,34 @@ def _vertex_sums_in_unknowns(
         return [*(sign * x for x in row[:3]), *row[3:]]
 
     *pull, xx, xy, xz, yy, yz, zz = add(tables.end_start, tables.end, ends, 9)
-    gradient = [x + y for x, y in zip(numbers_of(images.gradient, vertex, 3), pull)]
+    gradient = pull
+    for image, _ in images:
+        gradient = [x + y for x, y in zip(numbers_of(image.gradient, vertex, 3), gradient)]
     around = packed([xx, xy, xz, yy, yz, zz], vertex)
-    for pulls, _, by_corner in triangles:
-
-        def corner(entry):
-            factor = dr.gather(mi.Float64, pulls, entry // 3)
-            return [factor * x for x in numbers_of(by_corner, entry, 3)]
-
-        gradient = [
-            x + y for x, y in zip(gradient, add(tables.corner_start, tables.corner, corner, 3))
-        ]
+    if triangles is not None:
+        of_corners = add(
+            tables.corner_start, tables.corner, lambda entry: numbers_of(triangles[0], entry, 3), 3
+        )
+        gradient = [x + y for x, y in zip(gradient, of_corners)]
 
     # curvature in the positions, of each pair of neighbours: of the images by their projections
-    left, right = (projection(camera, vertices, k) for k in (tables.i, tables.j))
-    space = flattened(congruence(left, rows_of(numbers_of(images.second, pair, 4), 2), right))
+    space = None
+    for image, camera in images:
+        left, right = (projection(camera, vertices, k) for k in (tables.i, tables.j))
+        second = congruence(left, rows_of(numbers_of(image.second, pair, 4), 2), right)
+        added = flattened(second)
+        space = added if space is None else [x + y for x, y in zip(space, added)]
     same = tables.i == tables.j
     own = numbers_of(around, tables.i, 6)
     other = [
         dr.gather(mi.Float64, edges, 9 * mi.UInt32(tables.edge) + 3 + k, ~same) for k in range(6)
     ]
     space = [x + dr.select(same, own[k], -other[k]) for x, k in zip(space, _SYMMETRIC)]
-    for _, factors, by_corner in triangles:
-
-        def share(entry):
-            face = entry // 9
-            a = (entry - 9 * face) // 3
-            factor = dr.gather(mi.Float64, factors, face)
-            one, two = (
-                numbers_of(by_corner, 3 * face + a, 3),
-                numbers_of(by_corner, 3 * face + entry - 9 * face - 3 * a, 3),
-            )
-            return [factor * x * y for x in one for y in two]
-
-        space = [x + y for x, y in zip(space, add(tables.share_start, tables.share, share, 9))]
+    if triangles is not None:
+        of_pairs = add(
+            tables.share_start, tables.share, lambda entry: numbers_of(triangles[1], entry, 9), 9
+        )
+        space = [x + y for x, y in zip(space, of_pairs)]
 
     # each vertex moves by its own (u, v) and height, and by the jets and the motions that hold it
     left, right = (rows_of(numbers_of(offset_jacobian, k, 9), 3) for k in (tables.i, tables.j))
@@ -308,7 +320,7 @@ class Assembly:
     """
 
     def __init__(self, pattern, gather, atlas):
-        self.pattern, self._gather, self._atlas = pattern, gather, atlas
+        self.pattern, self._tables, self._atlas = pattern, gather.tables, atlas
         self._in_unknowns = frozen(_vertex_sums_in_unknowns)
         self._list_halo()
 
@@ -345,26 +357,22 @@ class Assembly:
                 if len(kept):
                     self._meetings.append((other, k, part.start + kept, at[kept]))
 
-    def normal(self, surface, images, edges, triangles=(), wide=None, d=2):
-        """(:class:`NormalEquations`, the edges' energy) of what the ``images``
-        (:class:`polysft_mi.images.gather.Images`), :class:`EdgeRows` and sets of
-        :class:`TriangleRows` say at the vertices of a ``surface``.
+    def normal(self, surface, images, edges, triangles=None, wide=None, d=2):
+        """(:class:`NormalEquations`, the edges' energy) of what ``images`` (pairs of
+        :class:`polysft_mi.images.gather.Images` and their camera), :class:`EdgeRows` and
+        :class:`TriangleForms` say at the vertices of a ``surface``.
 
         ``d``: local unknowns of a vertex; ``wide``: a pattern that holds this one, which the local
         block is to have.
         """
         pattern, count, basis = self.pattern, self.pattern.count, surface.basis
         size, patches = basis.shape[1], len(surface.up)
-        rows = [
-            tuple(flat(x) for x in (t.residual * t.factor, t.factor, t.by_corner))
-            for t in triangles
-        ]
+        forms = triangles and (flat(triangles.gradient), flat(triangles.curvature))
         found = self._in_unknowns(
-            self._gather.tables,
+            self._tables,
             self._halo,
             images,
             flat(surface.vertices),
-            self._gather.camera,
             flat(edges.lengths),
             flat([edges.stiffness, edges.give]),
             flat(surface.offset_jacobian),
@@ -373,7 +381,7 @@ class Assembly:
             flat(basis),
             dr.arange(mi.UInt32, size * self._index),
             dr.opaque(mi.UInt32, size),
-            rows,
+            forms,
         )
         energy, gradient, along, local, moved, *lifted = (np.array(x) for x in found)
         gradient, moved = gradient.reshape(-1, 3), moved.reshape(-1, 3, 6)

@@ -12,6 +12,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
         "defaults": ["known_defaults", "located", "resolved_defaults"],
+        "evidence": ["DepthImages", "Tracks"],
         "experiment": ["Experiment", "load"],
         "images": [
             "EXTENSIONS",

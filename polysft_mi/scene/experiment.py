@@ -23,6 +23,7 @@ from polysft_mi.errors import InputError
 from polysft_mi.surface import Template, meshio
 
 from . import plugins
+from .cameras import open_cameras
 from .defaults import located, resolved_defaults
 from .images import checked_size
 from .sequence import Sequence
@@ -61,9 +62,26 @@ class Experiment:
     def sequence(self) -> Sequence:
         """The :class:`Sequence` of the frames that the settings select. Raises InputError."""
         s = self.settings
-        return Sequence.open(
-            self.frames, self.masks, first=s.first, last=s.last, stride=s.stride, size=self.size
+        tracks, depth, cameras = (
+            os.path.normpath(located(self.path, name)) if name else ""
+            for name in (s.tracks, s.depth, s.cameras)
         )
+        sequence = Sequence.open(
+            self.frames,
+            self.masks,
+            first=s.first,
+            last=s.last,
+            stride=s.stride,
+            size=self.size,
+            tracks=tracks,
+            track_centre=s.track_centre,
+            depth=depth,
+            depth_unit=s.depth_unit,
+        )
+        if cameras:
+            selected = s.first, s.last, s.stride
+            sequence.cameras = open_cameras(cameras, len(sequence), *selected)
+        return sequence
 
 
 def load(

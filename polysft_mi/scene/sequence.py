@@ -1,17 +1,20 @@
-"""The video: images, and silhouettes where there are any, checked once at the start and read one
-frame at a time.
+"""The video: images, silhouettes where there are any, and what else is known of it, checked once at
+the start and read one frame at a time.
 """
 
 from __future__ import annotations
 
 import functools
 import os
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 
 from polysft_mi.errors import InputError
 
+from .evidence import DepthImages, Tracks
 from .images import checked_size, finite, list_images, read_pixels
 
 
@@ -20,8 +23,14 @@ class Sequence:
     ``len()`` is its length.
 
     ``files``, ``mask_files``: paths (``mask_files`` is None without masks); ``indices``: for each
-    selected frame its index in the sorted list of all images; ``size``: (width, height) [pixels].
+    selected frame its index in the sorted list of all images; ``size``: (width, height) [pixels];
+    ``tracks``, ``depth``: what is known beside the images, or None; ``cameras``: others than the
+    scene's own (:class:`polysft_mi.scene.cameras.OtherCamera`).
     """
+
+    tracks: Tracks | None = None
+    depth: DepthImages | None = None
+    cameras: Iterable[Any] = ()
 
     def __init__(
         self,
@@ -44,6 +53,10 @@ class Sequence:
         stride: int = 1,
         size: tuple[int, int] | None = None,
         drop_stray: bool = True,
+        tracks: str = "",
+        track_centre: float = 0.5,
+        depth: str = "",
+        depth_unit: float = 1e-3,
     ) -> Sequence:
         """Find, select and check the images.
 
@@ -51,6 +64,8 @@ class Sequence:
         names by value; masks pair with images in that order, ``""`` is for none. ``first`` to
         ``last`` (inclusive, -1 for the end) in steps of ``stride`` are used. ``size``: the (width,
         height) that the frames must have, None for any. ``drop_stray``: see :meth:`mask`.
+        ``tracks``, ``depth``: a file and a folder or pattern, ``""`` for none
+        (:mod:`polysft_mi.scene.evidence`).
 
         Every selected file is read here once, so that a bad one is known before the work starts.
         Raises InputError.
@@ -92,6 +107,10 @@ class Sequence:
                     " must be of that size"
                 )
         sequence = cls(files, mask_files, indices, wanted, drop_stray)
+        if tracks:
+            sequence.tracks = Tracks.read(tracks, len(paths), indices, track_centre)
+        if depth:
+            sequence.depth = DepthImages.open(depth, len(paths), indices, depth_unit)
         first_mask = sequence.mask(0)
         if mask_files and first_mask is not None and not first_mask.any():
             raise InputError(

@@ -64,6 +64,35 @@ class Settings:
         low=0,
         high=1000,
     )
+    tracks: str = _setting(
+        "",
+        "file of point tracks (.npz, as CoTracker, TAPIR, AllTracker have them), beside the scene;"
+        " empty: none",
+    )
+    track_centre: float = _setting(
+        0.5,
+        "coordinate that the tracks give the centre of the first pixel: 0.5 or 0",
+        low=0,
+        high=1,
+    )
+    cameras: str = _setting(
+        "",
+        "folder of further cameras, each with camera.json, frames and masks; empty: none",
+    )
+    depth: str = _setting(
+        "",
+        "folder of depth images, one a frame: 16 bit PNG, or EXR in metres; 0 is unknown; empty:"
+        " none",
+    )
+    depth_unit: float = _setting(
+        0.001, "metres that a whole number of a depth image stands for", above=0
+    )
+    depth_known_to: str = _setting(
+        "metric",
+        "what depth is known up to: nothing (metric); a scale and a shift, of depth (affine) or of"
+        " its inverse (disparity), as networks guess it",
+        choices=("metric", "affine", "disparity"),
+    )
     order: int = _setting(
         0,
         "order n of the jets; 0: 8, or 5 where the template has several patches, or less if the"
@@ -97,6 +126,13 @@ class Settings:
         "weight of shading: the triangles' brightness under a light that is learned along with the"
         " video; 0: off",
         low=0,
+    )
+    k_cameras: float = _setting(1.0, "weight of the further cameras; 1: as the scene's own", low=0)
+    k_tracks: float = _setting(
+        1.0, "weight of the tracks; 1: as their noise, and the images', says", low=0
+    )
+    k_depth: float = _setting(
+        1.0, "weight of the depth images; 1: as their noise, and the images', says", low=0
     )
     k_mi: float = _setting(
         AUTO,
@@ -305,6 +341,9 @@ PRESETS: dict[str, dict[str, object]] = {
         "mi_norm": "l2",
         "tc_basis": "monomial",
         "tc_ties": "window",
+        "cameras": "",
+        "tracks": "",
+        "depth": "",
         "texture_fit": "none",
         "blur": 0.0,
         "starts": "previous",

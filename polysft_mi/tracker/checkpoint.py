@@ -20,7 +20,7 @@ from polysft_mi.scene import Rules
 from polysft_mi.surface import Unknowns
 
 CHECKPOINT = "checkpoint.npz"
-_NUMBERS = ("misfit", "outlier_share", "least_misfit", "explained")  # of a memory
+_NUMBERS = ("misfit", "outlier_share", "least_misfit", "explained", "nat")  # of a memory
 
 
 @dataclass
@@ -113,6 +113,8 @@ _META = (
 def _memory_arrays(memories, stages):
     """Memories as float64 arrays of a row each, NaN where nothing is known."""
     rows: dict[str, Any] = {f"memory_{name}": [] for name in (*_NUMBERS, "scales", "light")}
+    kinds = sorted({kind for memory in memories if memory for kind in memory.noises})
+    rows |= {f"memory_noise_{kind}": [] for kind in kinds}
     size = len(Light.unknown(Rules()).numbers())
     for memory in memories:
         known = memory or FrameMemory(explained=math.nan)
@@ -120,24 +122,29 @@ def _memory_arrays(memories, stages):
             rows[f"memory_{name}"].append(getattr(known, name))
         scales = [known.scales.get(stage, math.nan) for stage in stages]
         rows["memory_scales"].append(scales)
+        for kind in kinds:
+            rows[f"memory_noise_{kind}"].append(known.noises.get(kind, math.nan))
         light = known.light.numbers() if known.light else [math.nan] * size
         rows["memory_light"].append(light)
     return {name: np.array(row, dtype=np.float64) for name, row in rows.items()}
 
 
 def _memories(data, stages, rules):
-    found = []
+    found, prefix = [], "memory_noise_"
+    kinds = [name.removeprefix(prefix) for name in data.files if name.startswith(prefix)]
     for k, explained in enumerate(data["memory_explained"]):
         if math.isnan(explained):
             found.append(None)
             continue
         numbers = {name: float(data[f"memory_{name}"][k]) for name in _NUMBERS}
+        noises = {kind: float(data[f"memory_noise_{kind}"][k]) for kind in kinds}
         light, scales = data["memory_light"][k].tolist(), data["memory_scales"][k].tolist()
         found.append(
             FrameMemory(
                 **numbers,
                 light=None if math.isnan(light[-1]) else Light.of(light, rules),
                 scales={s: x for s, x in zip(stages, scales) if not math.isnan(x)},
+                noises={kind: x for kind, x in noises.items() if not math.isnan(x)},
             )
         )
     return found

@@ -160,6 +160,10 @@ class FrameTracker:
         (model,) = frozen.quadratic([state])
         return self._stages.cost(Found(state, None, model))
 
+    def observe(self, frame: int, state: State) -> None:
+        """Take in the state of a frame that was solved; frames come in their order."""
+        self.objective.observe(frame, self._atlas.surface(state).vertices)
+
     # -- a frame ---------------------------------------------------------------
 
     def _prepare(self, report):
@@ -209,6 +213,8 @@ class FrameTracker:
             explained=found.misfit if found.more_is_vain else before.explained,
             light=light,
             scales=found.scales,
+            nat=model.evaluation.noise,
+            noises=self.objective.noises(context, model.surface.vertices),
         )
 
     def _same_noise(self, found, context, memory):

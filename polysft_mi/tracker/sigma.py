@@ -25,7 +25,7 @@ def along_rays(objective, model, origin):
     rules, template = objective.rules, objective.problem.template
     noise = _of_noise(objective, model, origin)
     strain = _strain(template, model.surface.vertices)
-    seen = objective.data.seen_vertices(model.surface.vertices, objective.usual[-1].blur)
+    seen = objective.seen(model.surface.vertices)
     found = rules.sigma_strain * np.sqrt(noise * strain * template.scale)
     found[~seen] *= rules.sigma_unseen
     return np.maximum(found, noise).astype(np.float32)

@@ -43,4 +43,4 @@ def fit_texture(problem, objective, context):
     if after < rules.texture_gain * before and near:
         template = problem.template
         flat, unit = template.chart[:, 0], template.scale / template.radius[0]
-        data.move_texture(flat, flat + unit * state.offset[:, :2])
+        objective.move_texture(flat, flat + unit * state.offset[:, :2])

@@ -65,8 +65,12 @@ def track(
         naming(log_path),
         open(log_path, "a", encoding="utf-8") as log,
     ):
+        for k in range(done.next_window + width - 1 if done.states else 0):
+            _observe(tracker, done, k)
         for start in range(done.next_window, frames - width + 1):
             _advance(tracker, done, start, width, log, progress)
+            for k in range(start + width - 1 if start else 0, start + width):
+                _observe(tracker, done, k)
             log.flush()
             done.save(checkpoint, stages)
             if solved:
@@ -85,6 +89,12 @@ def track(
 def _vertices(problem, arrays):
     """Vertices (N, 3) [m, world] of a state in arrays."""
     return problem.surface(Unknowns.from_numpy(arrays))
+
+
+def _observe(tracker, done, k):
+    """Tell the tracker of frame ``k``, where it was solved."""
+    if k not in done.lost:
+        tracker.observe(k, tracker.problem.atlas.state(done.states[k]))
 
 
 def _rounded(problem, state):

@@ -143,6 +143,17 @@ class Undistortion:
             )
         return image
 
+    def numbers(self, image):
+        """An image (H, W) of numbers that have no mean (depth, 0 where it is unknown), undistorted
+        and scaled: the nearest pixel of each.
+        """
+        if self._maps is not None:
+            image = cv2.remap(image, *self._maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
+        size = self.camera.width, self.camera.height
+        if size != image.shape[1::-1]:
+            image = cv2.resize(image, size, interpolation=cv2.INTER_NEAREST_EXACT)
+        return image
+
     def points(self, points):
         """Where pixels (N, 2) of the frame as it was taken lie in :meth:`image`; (0.5, 0.5) is the
         centre of the first pixel of both.

@@ -6,7 +6,9 @@ variant is set.
 """
 
 from .bending import Bending
+from .cameras import Cameras
 from .coupling import PatchCoupling
+from .depth import Depth
 from .inextensibility import Inextensibility
 from .photometric import Photometric
 from .shading import Shading
@@ -14,6 +16,7 @@ from .silhouette import Silhouette
 from .smoothness import Relief, Sliding
 from .temporal import Temporal
 from .term import DeviceFrame, Inputs, Term
+from .tracks import Tracks
 from .volume import Volume
 
 #: all terms, in the order of logs and reports
@@ -21,6 +24,9 @@ TERMS: tuple[type[Term], ...] = (
     Photometric,
     Silhouette,
     Shading,
+    Cameras,
+    Tracks,
+    Depth,
     Inextensibility,
     Volume,
     Temporal,
@@ -30,4 +36,4 @@ TERMS: tuple[type[Term], ...] = (
     Relief,
 )
 
-__all__ = ["TERMS", "DeviceFrame", "Inputs", "Temporal", "Term"]
+__all__ = ["TERMS", "Cameras", "DeviceFrame", "Inputs", "Temporal", "Term"]

@@ -9,7 +9,7 @@ import numpy as np
 from polysft_mi.images.light import residuals
 from polysft_mi.render import on_device
 
-from ..quadratic import TriangleRows
+from ..quadratic import TriangleForms
 from .term import Term
 
 
@@ -60,10 +60,11 @@ class Shading(Term):
         shade = self._inputs.data.shade(
             at.surface.vertices, at.context.frame, at.evaluation.seen, at.appearance
         )
-        at.triangles.append(TriangleRows(self.name, *residuals(shade, light, self.weight)))
+        energy, *rows = residuals(shade, light, self.weight)
+        at.add_to_triangles(self.name, energy, TriangleForms.of_residuals(*rows))
 
     def add(self, at):
-        return at.energy_of(self.name)
+        return at.energies.get(self.name, 0.0)
 
     @staticmethod
     def _counts(stage, light):

@@ -4,6 +4,7 @@ set.
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from ..quadratic import Linearisation
 
 _CACHED_FRAMES = 8
+_USUAL_NOISE = 0.1  # of a photometric residual, in local standard deviations
 
 
 @dataclass
@@ -78,6 +80,25 @@ class Inputs:
                 self._targets.popitem(last=False)
         return self._targets[frame]
 
+    def blur(self, stage: Stage) -> float:
+        """Standard deviation [pixels of the video] of the images' blur at a stage."""
+        return self.data.level(stage.blur).sigma
+
+    def nat(self, context: FrameContext) -> float:
+        """What one unit of log-likelihood costs in the objective: as the images of the frame before
+        say it, whose photometric residuals have the variance of their noise. Before that is known,
+        a tenth of the local deviations is taken for their standard deviation.
+        """
+        known = context.memory.nat
+        return self.usual_nat if math.isnan(known) else known
+
+    @cached_property
+    def usual_nat(self) -> float:
+        """:meth:`nat` where nothing is known."""
+        sigma = self.data.level(self.rules.blurs[-1]).sigma
+        independent = self.data.area / max(1.0, 4 * math.pi * sigma**2)
+        return 2 * _USUAL_NOISE**2 / (3 * independent)
+
     @cached_property
     def operators(self) -> Operators:
         from ..operators import Operators
@@ -102,7 +123,7 @@ class DeviceFrame:
     ) -> None:
         self.unknowns, self.context, self.stage = unknowns, context, stage
         self.vertices = inputs.surface.vertices(unknowns)
-        self._placed, self._seed, self._spp = inputs.placed, seed, inputs.settings.spp
+        self._placed, self.seed, self._spp = inputs.placed, seed, inputs.settings.spp
         self._look = look
 
     @property
@@ -113,7 +134,7 @@ class DeviceFrame:
     @cached_property
     def image(self) -> tuple[mi.TensorXf, mi.Float]:
         """(rgb (H, W, 3), linear, over black, and alpha, Float of H W)."""
-        return self._placed.image(self.vertices, self._seed, self._spp)
+        return self._placed.image(self.vertices, self.seed, self._spp)
 
 
 class Term:
@@ -141,11 +162,22 @@ class Term:
         raise NotImplementedError
 
     def rows(self, at: Linearisation) -> None:
-        """Set residuals of edges or triangles in ``at``."""
+        """Set what edges or triangles cost in ``at``."""
 
     def add(self, at: Linearisation) -> float:
         """Add gradient and curvature to ``at.normal``; returns the weighted energy."""
         raise NotImplementedError
+
+    def observe(self, frame: int, vertices: np.ndarray) -> None:
+        """Take in the surface (N, 3) [m, world] of a frame that was solved; frames come in their
+        order.
+        """
+
+    def noise(self, context: FrameContext, vertices: np.ndarray, stage: Stage) -> dict[str, float]:
+        """What the residuals say of their noise at the surface (N, 3) [m, world] that was found of
+        a frame: numbers by name, for :attr:`polysft_mi.objective.context.FrameMemory.noises`.
+        """
+        return {}
 
     @property
     def without_block(self) -> str | None:

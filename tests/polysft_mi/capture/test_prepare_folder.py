@@ -8,6 +8,7 @@ import os
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import synthetic
@@ -83,6 +84,28 @@ def test_every_setting_can_be_overridden(tmp_path):
     }
     s = loaded(path, order=3, k_mi=0.25, rgb_norm="l1", masks="").settings
     assert (s.order, s.k_mi, s.rgb_norm) == (3, 0.25, "l1")
+
+
+def test_tracks_and_depth_are_checked_and_named(tmp_path, capsys):
+    folder = synthetic.cloth(tmp_path / "a", frames=3).folder
+    np.savez(folder / "tracks.npz", tracks=np.full((3, 5, 2), 40.0))
+    (tmp_path / "depth").mkdir()
+    for k in range(3):
+        cv2.imwrite(str(tmp_path / "depth" / f"{k}.png"), np.full((72, 96), 600, np.uint16))
+    words = [str(folder), "--tracks", str(folder / "tracks.npz"), "--depth-known-to", "affine"]
+    prepare.main([*words, "--depth", str(tmp_path / "depth"), "--overwrite"])
+    assert "with tracks, with depth" in capsys.readouterr().out
+    text = (folder / "scene.xml").read_text()
+    assert '<default name="tracks" value="$data/tracks.npz"/>' in text
+    assert '<default name="depth_known_to" value="affine"/>' in text
+    sequence = loaded(str(folder / "scene.xml")).sequence()
+    assert sequence.tracks.positions.shape == (3, 5, 2)
+    assert np.allclose(sequence.depth.read(2), 0.6)
+    before = (folder / "scene.xml").read_bytes()
+    (tmp_path / "depth" / "2.png").unlink()
+    said = refused(str(folder), overwrite=True, depth=str(tmp_path / "depth"))
+    assert "2 depth images for 3 frames" in said
+    assert (folder / "scene.xml").read_bytes() == before
 
 
 def test_other_names_and_no_masks(tmp_path):

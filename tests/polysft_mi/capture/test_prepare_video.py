@@ -27,7 +27,8 @@ from scripts import load
 
 from polysft_mi import prepare
 from polysft_mi.camera import Intrinsics
-from polysft_mi.capture import iou, prepare_video
+from polysft_mi.capture import GivenEvidence, iou, prepare_video
+from polysft_mi.capture.camera import Undistortion, read_lens
 from polysft_mi.pictures.video import write_video
 from polysft_mi.scene.images import read_rgb
 from polysft_mi.surface import meshio
@@ -276,6 +277,56 @@ def test_given_masks(clip, tmp_path):
         masks=str(tmp_path / "none" / "x"),
         **given(clip),
     )
+    assert not (tmp_path / "b").exists()
+
+
+def test_given_tracks_and_depth(clip, tmp_path):
+    """They follow the frames: those that are used, undistorted, scaled; the scene names them."""
+    rng = np.random.default_rng(0)
+    positions = rng.uniform(20, 80, (12, 20, 2))
+    visible = rng.uniform(size=(12, 20)) < 0.8
+    np.savez(tmp_path / "tracks.npz", tracks=positions - 0.5, visible=visible)
+    for k in range(12):
+        depth = np.full((CAMERA.height // 2, CAMERA.width // 2), 500 + k, np.uint16)
+        depth[:, : CAMERA.width // 10] = 0  # a fifth
+        write_png(tmp_path / "depth" / f"{k}.png", depth)
+    bent = dict(given(clip))
+    camera = json.loads(Path(bent["camera"]).read_text()) | {"distortion": [-0.2, 0.05, 0, 0]}
+    bent["camera"] = str(tmp_path / "camera.json")
+    Path(bent["camera"]).write_text(json.dumps(camera))
+    evidence = GivenEvidence(str(tmp_path / "tracks.npz"), 0.0, str(tmp_path / "depth"))
+    lines = []
+    scene, found = prepare_video(
+        clip[0],
+        str(tmp_path / "out"),
+        evidence=evidence,
+        first=2,
+        last=8,
+        stride=3,
+        scale=0.5,
+        say=lines.append,
+        **bent,
+    )
+    assert any(line.startswith("tracks: 20 of") for line in lines)
+    assert any(line.startswith("depth: ") for line in lines)
+    experiment = loaded(scene)
+    sequence, used = experiment.sequence(), [2, 5, 8]
+    assert found["indices"] == used
+    straight = Undistortion(read_lens(bent["camera"], CAMERA.width, CAMERA.height), 0.5)
+    for k, frame in enumerate(used):
+        seen = sequence.tracks.visible[k]
+        assert np.array_equal(seen, visible[frame])
+        expected = straight.points(positions[frame])
+        assert np.abs(sequence.tracks.positions[k] - expected)[seen].max() < 1e-3
+        depth = sequence.depth.read(k)
+        assert depth.shape == (experiment.size[1], experiment.size[0])
+        middle = depth[:, depth.shape[1] // 3 : -depth.shape[1] // 3]
+        assert np.allclose(middle, (500 + frame) * 1e-3)
+        assert (depth[:, : depth.shape[1] // 12] == 0).all()
+    short = GivenEvidence(depth=str(tmp_path / "few"))
+    write_png(tmp_path / "few" / "0.png", np.full((CAMERA.height, CAMERA.width), 500, np.uint16))
+    said = refused(prepare_video, clip[0], str(tmp_path / "b"), evidence=short, **given(clip))
+    assert "1 depth images for more than 11 or 12 frames" in said
     assert not (tmp_path / "b").exists()
 
 

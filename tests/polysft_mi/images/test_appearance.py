@@ -66,7 +66,7 @@ def compared(known, vertices, frame, level, appearance):
     image.
     """
     with dr.suspend_grad():
-        view = known._view(vertices, level)
+        view = known.view(vertices, level)
         at = known._frames.level(frame, level).image
         residual, weight, *_ = pixels.residuals(
             *known._residual_arguments(view, frame, level, appearance)
@@ -88,7 +88,7 @@ def test_it_is_a_rendering_made_what_frames_are_made(problem, level):
     vertices = slanted(problem.template.vertices)
     appearance = known.appearance(vertices, level)
     with dr.suspend_grad():
-        known._view(vertices, Level(1.0))
+        known.view(vertices, Level(1.0))
         image = np.array(known._raster.image(problem.placed.scene, problem.placed.sensor, spp=36))
     cover = (image[..., 3] > 0.5).astype(np.float32)
     colour = (image[..., :3] / np.maximum(image[..., 3:], 1e-3) * cover[..., None]).astype(
@@ -177,13 +177,13 @@ def test_without_masks_only_what_is_far_from_the_border(unmasked):
 
 def test_the_last_view_is_kept_and_no_other(problem, truth):
     known, level = data_of(problem), LEVELS[0]
-    first = known._view(truth.vertices[1], level)
-    assert known._view(truth.vertices[1].copy(), level) is first
-    assert known._view(truth.vertices[1], LEVELS[1]) is not first
+    first = known.view(truth.vertices[1], level)
+    assert known.view(truth.vertices[1].copy(), level) is first
+    assert known.view(truth.vertices[1], LEVELS[1]) is not first
     values = [known.evaluate(x, 1, level, 0.3).photometric for x in truth.vertices[[1, 2, 1]]]
     assert values[0] == values[2] != values[1]
     moved = truth.vertices[1].copy()
-    known._view(moved, level)
+    known.view(moved, level)
     moved += 0.01  # in place
     assert known.evaluate(moved, 1, level, 0.3).photometric != values[0]
 

@@ -42,13 +42,13 @@ def surfaces(problem):
 def test_sums_over_each_triangles_pixels(problem):
     known, rng = data_of(problem), np.random.default_rng(2)
     for vertices in surfaces(problem):
-        view = known._view(vertices, LEVEL)
+        view = known.view(vertices, LEVEL)
         triangle = np.array(view.triangle)
         found = rng.random((3, len(triangle), 4)).astype(np.float32)
         arrays = [mi.Vector4f(*(on_device(x[:, k], mi.Float) for k in range(4))) for x in found]
         table, figures = (
             np.array(x).reshape(len(known.faces), -1)
-            for x in pixels.by_triangle(view.seen(), known._sheet, arrays)
+            for x in pixels.by_triangle(view.seen(), known.sheet, arrays)
         )
         expected = np.zeros((len(known.faces), 31))
         for t, second, slope, figure in zip(triangle, *found.astype(np.float64)):
@@ -69,11 +69,11 @@ def test_a_triangle_behind_the_camera_misses_no_pixel_of_the_others(problem):
     known = data_of(problem)
     vertices = problem.template.vertices.copy()
     vertices[0, 2] = -0.5
-    view = known._view(vertices, LEVEL)
+    view = known.view(vertices, LEVEL)
     ones = [
         mi.Vector4f(*(dr.select(view.hit, mi.Float(x), 0) for x in (0.0, 0.0, 0.0, 1.0)))
     ] * 2 + [mi.Vector4f(dr.select(view.hit, mi.Float(1), 0))]
-    _, figures = pixels.by_triangle(view.seen(), known._sheet, ones)
+    _, figures = pixels.by_triangle(view.seen(), known.sheet, ones)
     seen = np.bincount(np.array(view.triangle) + 1, minlength=len(known.faces) + 1)[1:]
     assert seen.any() and np.array_equal(np.array(figures).reshape(-1, 4)[:, 0], seen)
 
@@ -86,7 +86,7 @@ def test_what_is_recorded_is_what_is_traced(problem):
     for (k, vertices), level in itertools.product(enumerate(surfaces(problem)), levels):
         appearance = known.appearance(vertices + [0.003, 0, 0], level) if k else None
         with dr.suspend_grad():
-            view = known._view(vertices, level)
+            view = known.view(vertices, level)
             sizes.add(view.size)
             at, crossings = (
                 known._frames.level(1, level),
@@ -172,7 +172,7 @@ def test_beyond_the_surroundings_of_the_mask_a_silhouette_is_as_far_as_counts(pr
         pixels.Image.of(on_device(np.zeros(400), mi.Float), (20, 20), (2, 3)),
     )
     with dr.suspend_grad():
-        view = known._view(problem.template.vertices, LEVEL)
+        view = known.view(problem.template.vertices, LEVEL)
         crossings, distance = (
             known._raster.crossings(view, outline=True),
             on_device(np.full(400, 2.0), mi.Float),

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from polysft_mi.images import pixels
 from polysft_mi.images.gather import Gather
-from polysft_mi.objective.quadratic import Assembly, EdgeRows, TriangleRows
+from polysft_mi.objective.quadratic import Assembly, EdgeRows, TriangleForms
 from polysft_mi.render.device import on_device
 from polysft_mi.surface.atlas import Atlas
 from polysft_mi.surface.bending import hinges
@@ -171,9 +171,9 @@ def test_all_terms_are_those_of_their_dense_jacobians(make):
         )
         surface, wide = chart.surface(state), wider if d == 3 else pattern
         edges = EdgeRows(lengths, stiffness)
-        rows = [TriangleRows("shading", 0.0, *triangles)] if shaded else []
-        images_of = sums.images(gather, vertices)
-        normal, found = assembly.normal(surface, images_of, edges, rows, wide, d)
+        forms = TriangleForms.of_residuals(*triangles) if shaded else None
+        images_of = [(sums.images(gather, vertices), gather.camera)]
+        normal, found = assembly.normal(surface, images_of, edges, forms, wide, d)
         matrix, gradient = dense(wide, normal)
         expected = by.T @ (in_space + images.T @ sums.second @ images) @ by
         case = f"d = {d}, area {area}, silhouette {silhouette}, shading {shaded}"

@@ -137,9 +137,9 @@ def test_a_torch_loss_reaches_alpha(bent, network):
 
     @bridge.in_torch
     def loss(vertices):
-        frame = polyfit.CanonicalFrame.from_points(points)
-        alpha = jets.fit(frame.to_chart(vertices), 4).alpha
-        return (weight[0] * alpha).sum() + 0.1 * (weight[1] * alpha**2).sum()
+        frame = polyfit.CanonicalFrame.from_points(points.to(vertices.device))
+        alpha, w = jets.fit(frame.to_chart(vertices), 4).alpha, weight.to(vertices.device)
+        return (w[0] * alpha).sum() + 0.1 * (w[1] * alpha**2).sum()
 
     def value(delta):
         unknowns = patch.rest()

@@ -1,0 +1,126 @@
+"""What tracks, depth and further cameras bring: accuracy and processor's time, beside the video
+alone.
+
+    python benchmarks/evidence.py --evidence FOLDER [--data FOLDER ...] [--only tube ...]
+    [--kinds video tracks depth cameras ...] [--docs docs]
+
+FOLDER holds, for each sequence, a folder with ``tracks.npz``, ``depth`` and ``cameras``; what is
+missing is left out. Further cameras are made by ``further_cameras.py``. Each run is a command, as a
+user would give it, on one core; its figures are those of ``python -m polysft_mi.evaluate``. Each
+result goes into ``evidence.json`` in DOCS as soon as it is there, and the next call does what is
+missing (all of it with ``--again``); the table in ``evidence.md`` is drawn anew.
+"""
+
+import argparse
+import json
+import os
+import re
+import resource
+import sys
+import tempfile
+
+import sft_runs
+from sequences import DATA, ROOT, folder_of
+
+from polysft_mi.errors import InputError, cli
+
+#: kind of evidence: names of what is given, in the sequence's folder of evidence
+KINDS = {
+    "video": (),
+    "tracks": ("tracks",),
+    "depth": ("depth",),
+    "cameras": ("cameras",),
+    "tracks and depth": ("tracks", "depth"),
+}
+_FILES = {"tracks": "tracks.npz", "depth": "depth", "cameras": "cameras"}
+_SEQUENCES = ("flag", "curtain", "corner", "tube")
+_TABLE = re.compile(r"(<!-- evidence -->\n).*?(\n<!-- /evidence -->)", re.S)
+
+
+def definitions(kind, folder):
+    """``name=value`` of what a kind gives; None where something of it is missing."""
+    paths = {name: os.path.join(folder, _FILES[name]) for name in KINDS[kind]}
+    if not all(os.path.exists(path) for path in paths.values()):
+        return None
+    return [f"{name}={os.path.abspath(path)}" for name, path in paths.items()]
+
+
+def run(sequence, kind, data, define):
+    """A result, a dict: as of :func:`sft_runs.run`, with the processor's seconds."""
+    setup = {"frames": None, "threads": 1, "define": define, "mode": "", "iterations": None}
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    with tempfile.TemporaryDirectory(prefix="evidence-") as out:
+        result = sft_runs.run(sequence, "gauss-newton", data, os.path.join(out, "run"), setup)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    spent = sum(getattr(after, k) - getattr(before, k) for k in ("ru_utime", "ru_stime"))
+    if "error" in result:
+        raise InputError(f"{sequence}, {kind}: {result['error']}")
+    return {
+        "sequence": sequence,
+        "kind": kind,
+        "figures": {k: v for k, v in result["figures"].items() if isinstance(v, float)},
+        "lost": result["lost"],
+        "cpu_seconds_a_frame": spent / result["frames"],
+        "machine": result["machine"],
+    }
+
+
+def table(results):
+    """The results as a Markdown table."""
+    lines = [
+        "| sequence | given | e3d, in view | normals [deg] | RMSE [mm] | e3d, all | s a frame |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for r in sorted(
+        results, key=lambda r: (_SEQUENCES.index(r["sequence"]), list(KINDS).index(r["kind"]))
+    ):
+        f = r["figures"]
+        seen = lambda name, f=f: f.get(f"{name}_seen", f[name])
+        lines.append(
+            f"| {r['sequence']} | {r['kind']} | {seen('e3d_proc'):.5f} | {seen('en_deg'):.2f} |"
+            f" {seen('rmse_mm'):.2f} | {f['e3d_proc']:.5f} | {r['cpu_seconds_a_frame']:.2f} |"
+        )
+    return "\n".join(lines)
+
+
+def main(argv=None):
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(
+        prog="python benchmarks/evidence.py", description=__doc__, formatter_class=raw
+    )
+    parser.add_argument("--evidence", metavar="FOLDER", required=True)
+    parser.add_argument("--data", nargs="+", metavar="FOLDER", default=[DATA])
+    parser.add_argument("--only", nargs="+", choices=_SEQUENCES, default=list(_SEQUENCES))
+    parser.add_argument("--kinds", nargs="*", choices=list(KINDS), default=list(KINDS))
+    parser.add_argument("--docs", metavar="FOLDER", default=os.path.join(ROOT, "docs"))
+    parser.add_argument("--again", action="store_true", help="run what has a result, too")
+    args = parser.parse_args(argv)
+    where = os.path.join(args.docs, "evidence.json")
+    results = []
+    if os.path.exists(where):
+        with open(where, encoding="utf-8") as file:
+            results = json.load(file)
+    for sequence in args.only:
+        data = next(filter(None, (folder_of(place, sequence) for place in args.data)), None)
+        if data is None:
+            raise InputError(f"{sequence}: not in {', '.join(args.data)}")
+        for kind in args.kinds:
+            done = [r for r in results if (r["sequence"], r["kind"]) == (sequence, kind)]
+            define = definitions(kind, os.path.join(args.evidence, sequence))
+            if define is None or (done and not args.again):
+                continue
+            print(f"{sequence}, {kind} ...", file=sys.stderr, flush=True)
+            results = [r for r in results if r not in done] + [run(sequence, kind, data, define)]
+            with open(where, "w", encoding="utf-8") as file:
+                json.dump(results, file, indent=1)
+                file.write("\n")
+    page = os.path.join(args.docs, "evidence.md")
+    with open(page, encoding="utf-8") as file:
+        text = file.read()
+    with open(page, "w", encoding="utf-8") as file:
+        file.write(_TABLE.sub(lambda m: m[1] + table(results) + m[2], text))
+    print(table(results))
+
+
+if __name__ == "__main__":
+    cli(main)

@@ -1,0 +1,254 @@
+"""What a user knows of a video beside its images: tracks of points, and depth images. Read and
+checked once at the start. Needs no Mitsuba.
+"""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from polysft_mi.errors import InputError
+
+from .images import finite, list_images, read_pixels
+
+#: names of the arrays in files of tracks, as CoTracker, TAPIR and AllTracker are used to write them
+_POSITIONS = ("tracks", "pred_tracks", "trajs", "trajs_e", "points", "coords")
+_VISIBLE = ("visible", "visibility", "pred_visibility", "visibles", "vis", "visibs", "visconfs_e")
+_HIDDEN = ("occluded", "occlusion", "pred_occluded", "occlusions")
+_QUERIES = ("queries", "query_points")
+_SURE = 0.5  # of a visibility that is no yes or no
+# tracks whose motion foretells that of one amid them, rounds of their robust fit, and how many
+# times the usual distance from there (at least so many pixels) is not the surface's motion
+_AROUND, _ROUNDS, _LEAST, _STRANGE = 8, 3, 0.3, 8.0
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Tracks of P points of the surface over the T frames that are used.
+
+    ``positions`` (T, P, 2) [pixels, (0.5, 0.5) is the centre of the first one]; ``visible`` (T, P);
+    ``query`` (P,): the frame from which on a track says which point it follows, counted in the
+    selection (T for none).
+    """
+
+    positions: np.ndarray
+    visible: np.ndarray
+    query: np.ndarray
+
+    @classmethod
+    def read(
+        cls,
+        path: str | os.PathLike[str],
+        count: int | None,
+        selected: list[int],
+        centre: float = 0.5,
+    ) -> Tracks:
+        """The tracks of an ``.npz`` or ``.npy`` file.
+
+        Positions (T, P, 2), (P, T, 2) or (1, T, P, 2), of all ``count`` images (None: of as many as
+        the video has) or of those that are ``selected``; visibilities likewise, true or above 0.5
+        (or occlusions, the reverse); queries (P, 3), or (1, P, 3): the frame, and the place in it.
+        Without visibilities a finite position is one that is seen; without queries a track begins
+        where it is first seen. ``centre``: the coordinate that the file gives the centre of the
+        first pixel. From where a track moves otherwise than its neighbours it is not visible.
+        Raises InputError.
+        """
+        arrays = _arrays(path)
+        name, positions = _first(arrays, _POSITIONS)
+        if positions is None:
+            raise InputError(
+                f"{path}: no tracks; an array 'tracks' (T, P, 2) of pixels is needed, and the file"
+                f" has {', '.join(sorted(arrays)) or 'nothing'}"
+            )
+        frames = _Frames(count, selected)
+        positions = _by_frame(path, name, positions, frames, 3)
+        if positions.shape[-1] != 2 or not positions.shape[1]:
+            raise InputError(
+                f"{path}: {name} is {positions.shape}; x and y of at least one point are needed"
+            )
+        visible = _visibility(path, arrays, frames, positions)
+        query = _queries(path, arrays, positions.shape)
+        if len(positions) != len(selected) or count == len(selected):
+            # a query in a frame that is left out counts from the next one that is used
+            positions, visible = positions[selected], visible[selected]
+            query = np.searchsorted(selected, query)
+        visible = visible & np.isfinite(positions).all(-1)
+        visible &= ~_left_their_neighbours(positions, visible)
+        used = (np.arange(len(selected))[:, None] >= query) & visible
+        first = np.where(used.any(0), used.argmax(0), len(selected))
+        positions = np.where(visible[..., None], positions + (0.5 - centre), 0.0)
+        return cls(positions, visible, first)
+
+
+@dataclass(frozen=True)
+class DepthImages:
+    """Depth images, one a frame: ``files``, and the metres that one of their units is."""
+
+    files: list[str]
+    unit: float
+
+    @classmethod
+    def open(cls, folder: str, count: int | None, selected: list[int], unit: float) -> DepthImages:
+        """Those in a folder, or of a pattern, sorted like frames: one for each of the ``count``
+        images (None: of as many as the video has), or of those that are ``selected``. ``unit`` [m]:
+        of whole numbers; those with a fraction (EXR, TIFF) are metres. Raises InputError.
+        """
+        paths = list_images(folder, "depth images")
+        frames = _Frames(count, selected)
+        if len(paths) not in frames:
+            raise InputError(
+                f"{folder}: {len(paths)} depth images for {frames} frames; one a frame is needed"
+            )
+        if len(paths) != len(selected):
+            paths = [paths[k] for k in selected]
+        images = cls(paths, unit)
+        if not (images.read(0) > 0).any():
+            raise InputError(f"{paths[0]}: no depth in it; every pixel is 0 (nothing known)")
+        return images
+
+    def read(self, i: int) -> np.ndarray:
+        """Depth i along the camera's axis, (H, W) float32 [m], 0 where nothing is known."""
+        path = self.files[i]
+        image = read_pixels(path)
+        if image.ndim == 3:
+            image = image[..., 0]
+        if image.dtype.kind == "f":
+            depth = np.where(np.isfinite(image), image, 0).astype(np.float32)
+        elif image.dtype == np.uint8:
+            raise InputError(
+                f"{path}: 8 bits; depth is needed as 16 bit PNG in millimetres, or as EXR in metres"
+            )
+        else:
+            depth = finite(image, path).astype(np.float32) * np.float32(self.unit)
+        return np.maximum(depth, 0)
+
+
+def _left_their_neighbours(positions: np.ndarray, visible: np.ndarray) -> np.ndarray:
+    """(T, P): from the first frame on in which a track moves otherwise than those around it.
+
+    A frame's motion is compared with the affine one of the ``_AROUND`` nearest tracks that both
+    frames see; tracks of which too few are near are believed.
+    """
+    wrong = np.zeros(visible.shape, dtype=bool)
+    apart = np.full(visible.shape, np.nan)
+    for t in range(1, len(positions)):
+        both = np.flatnonzero(visible[t - 1] & visible[t])
+        if len(both) > _AROUND:
+            apart[t, both] = _from_affine(positions[t - 1, both], positions[t, both])
+    known = apart[np.isfinite(apart)]
+    if len(known):
+        usual = max(float(np.median(known)), _LEAST)
+        wrong = np.logical_or.accumulate(apart > _STRANGE * usual, axis=0)
+    return wrong
+
+
+def _from_affine(before, after):
+    """How far (P,) each point is from where the affine motion of those around takes it."""
+    _, near = cKDTree(before).query(before, _AROUND + 1)
+    moved = after - before
+    near = near[:, 1:]
+    a = np.concatenate([before[near] - before[:, None], np.ones((*near.shape, 1))], 2)
+    b, weight = moved[near], np.ones(near.shape)
+    for _ in range(_ROUNDS):
+        heavy = a * weight[..., None]
+        form = np.einsum("pki,pkj->pij", heavy, a) + 1e-6 * np.eye(3)
+        found = np.linalg.solve(form, np.einsum("pki,pkc->pic", heavy, b))
+        size = np.linalg.norm(b - a @ found, axis=2)
+        weight = 1 / (1 + np.square(size / np.maximum(np.median(size, 1), 0.1)[:, None]))
+    return np.linalg.norm(moved - found[:, 2], axis=1)
+
+
+def _arrays(path):
+    """Name to array of a file of tracks."""
+    try:
+        found = np.load(path, allow_pickle=False)
+        if isinstance(found, np.ndarray):
+            return {"tracks": found}
+        with found:
+            return {name: found[name] for name in found.files}
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file of tracks") from None
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile):
+        raise InputError(
+            f"{path}: not a file of tracks; .npz with 'tracks' (T, P, 2) and 'visible' (T, P) is"
+            " needed"
+        ) from None
+
+
+@dataclass(frozen=True)
+class _Frames:
+    """How many frames a file may be of: those of the whole video, or those that are used."""
+
+    count: int | None
+    selected: list[int]
+
+    def __contains__(self, size):
+        if size == len(self.selected):
+            return True
+        return size > self.selected[-1] if self.count is None else size == self.count
+
+    def __str__(self):
+        all_of = f"more than {self.selected[-1]}" if self.count is None else f"{self.count}"
+        used = len(self.selected)
+        return all_of if used == self.count else f"{all_of} or {used}"
+
+
+def _first(arrays, names):
+    return next(((name, arrays[name]) for name in names if name in arrays), (None, None))
+
+
+def _by_frame(path, name, array, frames, dimensions):
+    """An array with its frames first, without the axis of a batch of one."""
+    if array.ndim == dimensions + 1 and len(array) == 1:
+        array = array[0]
+    if array.ndim == dimensions and array.dtype.kind in "fiub":
+        if array.shape[0] in frames:
+            return array.astype(np.float64)
+        if array.shape[1] in frames:
+            return array.swapaxes(0, 1).astype(np.float64)
+    raise InputError(
+        f"{path}: {name} is {array.shape}; {frames} frames, the video's, by points are needed"
+    )
+
+
+def _visibility(path, arrays, frames, positions):
+    """Which positions are seen, (T, P)."""
+    name, seen = _first(arrays, _VISIBLE)
+    hidden_name, hidden = _first(arrays, _HIDDEN)
+    if seen is None and hidden is None:
+        return np.isfinite(positions).all(-1)
+    name, found = (name, seen) if seen is not None else (hidden_name, hidden)
+    if found.ndim >= 3 and found.shape[-1] in (1, 2) and found.ndim > positions.ndim - 1:
+        found = found[..., 0]  # of two, the second is how sure it is
+    found = _by_frame(path, name, found, frames, 2)
+    if found.shape != positions.shape[:2]:
+        raise InputError(
+            f"{path}: {name} is of {found.shape} frames and points, the tracks are of"
+            f" {positions.shape[:2]}"
+        )
+    return found > _SURE if seen is not None else found < _SURE
+
+
+def _queries(path, arrays, shape):
+    """The frame (P,) of all images from which on each track counts."""
+    name, queries = _first(arrays, _QUERIES)
+    if queries is None:
+        return np.zeros(shape[1], dtype=np.int64)
+    if queries.ndim == 3 and len(queries) == 1:
+        queries = queries[0]
+    if queries.shape != (shape[1], 3):
+        raise InputError(
+            f"{path}: {name} is {queries.shape}; frame, x and y of each of {shape[1]} points are"
+            " needed"
+        )
+    frames = np.asarray(queries[:, 0], dtype=np.float64)
+    if not ((frames >= 0) & (frames < shape[0]) & (frames == np.round(frames))).all():
+        raise InputError(
+            f"{path}: {name} names frames that are not among 0 to {shape[0] - 1}; its columns are"
+            " frame, x, y"
+        )
+    return frames.astype(np.int64)

@@ -1,0 +1,135 @@
+"""Files of tracks and depth images, in the forms that other programs write."""
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+
+from polysft_mi.errors import InputError
+from polysft_mi.scene.evidence import DepthImages, Tracks
+
+FRAMES, POINTS = 5, 3
+
+
+@pytest.fixture
+def known(rng):
+    """(positions (T, P, 2), visible (T, P))."""
+    visible = np.ones((FRAMES, POINTS), bool)
+    visible[2:, 1] = visible[0, 2] = False
+    return np.random.default_rng(0).uniform(0, 90, (FRAMES, POINTS, 2)), visible
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)
+
+
+def read(path, centre=0.5, selected=range(FRAMES), **arrays):
+    np.savez(path, **arrays)
+    return Tracks.read(path, FRAMES, list(selected), centre)
+
+
+def same(a, b):
+    return all(
+        np.array_equal(getattr(a, f.name), getattr(b, f.name)) for f in dataclasses.fields(a)
+    )
+
+
+def test_files_of_trackers_say_the_same(known, tmp_path):
+    """CoTracker has a batch, TAPIR points first and what is hidden, others a likelihood."""
+    positions, visible = known
+    path = tmp_path / "tracks.npz"
+    plain = read(path, tracks=positions, visible=visible)
+    assert np.array_equal(plain.positions[visible], positions[visible])
+    assert np.array_equal(plain.visible, visible)
+    assert plain.query.tolist() == [0, 0, 1]
+    others = (
+        {"pred_tracks": positions[None], "pred_visibility": visible[None, ..., None]},
+        {"tracks": positions.swapaxes(0, 1), "occluded": ~visible.T},
+        {"trajs": positions, "visibility": np.where(visible, 0.9, 0.2)},
+        {"tracks": np.where(visible[..., None], positions, np.nan)},
+    )
+    for arrays in others:
+        assert same(read(path, **arrays), plain), list(arrays)
+    np.save(tmp_path / "tracks.npy", np.where(visible[..., None], positions, np.nan))
+    assert same(Tracks.read(tmp_path / "tracks.npy", FRAMES, list(range(FRAMES))), plain)
+
+
+def test_a_pixels_centre_may_be_at_zero(known, tmp_path):
+    positions, visible = known
+    found = read(tmp_path / "t.npz", 0.0, tracks=positions, visible=visible)
+    assert np.allclose(found.positions[visible], positions[visible] + 0.5)
+
+
+def test_a_track_counts_from_its_query_on(known, tmp_path):
+    positions, _ = known
+    queries = np.column_stack([[0, 3, 4], positions[[0, 3, 4], range(POINTS)]])
+    given = {"tracks": positions, "queries": queries}
+    assert read(tmp_path / "t.npz", **given).query.tolist() == [0, 3, 4]
+    found = read(tmp_path / "t.npz", selected=[0, 2, 4], **given)
+    assert found.query.tolist() == [0, 2, 2]  # counted in the selection
+    assert np.array_equal(found.positions, positions[[0, 2, 4]])
+    part = Tracks.read(_saved(tmp_path, tracks=positions[:3]), FRAMES, [0, 2, 4])
+    assert np.array_equal(part.positions, positions[:3])  # of the frames that are used alone
+
+
+def _saved(folder, **arrays):
+    np.savez(folder / "part.npz", **arrays)
+    return folder / "part.npz"
+
+
+@pytest.mark.parametrize(
+    ("arrays", "said"),
+    [
+        ({"a": np.zeros(3)}, "an array 'tracks' .* the file has a"),
+        ({"tracks": np.zeros((4, 3, 2))}, "tracks is .4, 3, 2.; 5 frames"),
+        ({"tracks": np.zeros((5, 3, 3))}, "x and y"),
+        ({"tracks": np.zeros((5, 0, 2))}, "at least one point"),
+        ({"tracks": np.zeros((5, 3, 2)), "visible": np.ones((5, 4))}, "visible is of"),
+        ({"tracks": np.zeros((5, 3, 2)), "queries": np.zeros((2, 3))}, "queries is .2, 3."),
+        (
+            {"tracks": np.zeros((5, 3, 2)), "queries": np.full((3, 3), 7.0)},
+            "queries names frames that are not among 0 to 4",
+        ),
+    ],
+)
+def test_what_is_no_file_of_tracks_is_told(arrays, said, tmp_path):
+    with pytest.raises(InputError, match=said):
+        read(tmp_path / "t.npz", **arrays)
+
+
+def test_a_file_that_is_none_is_told(tmp_path):
+    with pytest.raises(InputError, match="no such file of tracks"):
+        Tracks.read(tmp_path / "none.npz", 1, [0])
+    (tmp_path / "text.npz").write_text("tracks")
+    with pytest.raises(InputError, match="not a file of tracks"):
+        Tracks.read(tmp_path / "text.npz", 1, [0])
+
+
+def test_depth_is_read_in_metres(tmp_path):
+    depth = np.array([[0, 500], [1500, 65535]], np.uint16)
+    for k in range(2):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), depth)
+    images = DepthImages.open(str(tmp_path), 2, [1], 1e-3)
+    assert np.allclose(images.read(0), [[0, 0.5], [1.5, 65.535]])
+    assert np.allclose(DepthImages.open(str(tmp_path), 2, [0], 2e-4).read(0)[0, 1], 0.1)
+    floats = tmp_path / "floats"
+    floats.mkdir()
+    cv2.imwrite(str(floats / "0.tiff"), np.array([[0.7, np.nan], [-1, np.inf]], np.float32))
+    found = DepthImages.open(str(floats), 1, [0], 1e-3).read(0)
+    assert np.allclose(found, [[0.7, 0], [0, 0]])
+
+
+def test_depth_that_says_nothing_is_told(tmp_path):
+    for name, pixels, said in (
+        ("empty", np.zeros((2, 2), np.uint16), "every pixel is 0"),
+        ("bytes", np.ones((2, 2), np.uint8), "8 bits"),
+    ):
+        folder = tmp_path / name
+        folder.mkdir()
+        cv2.imwrite(str(folder / "0.png"), pixels)
+        with pytest.raises(InputError, match=said):
+            DepthImages.open(str(folder), 1, [0], 1e-3)
+    with pytest.raises(InputError, match="1 depth images for 3 or 2 frames"):
+        DepthImages.open(str(tmp_path / "empty"), 3, [0, 1], 1e-3)
