@@ -181,8 +181,7 @@ def film(folder, out, vertices, world_to_camera, rng):
         nearest = (x @ forward + world_to_camera[2, 3]).min()
         light = np.array(mi.render(scene, spp=SAMPLES, seed=t))[..., :3]
         mask = (
-            np.array(mi.render(scene, integrator=depth, spp=16, seed=t))[..., -1]
-            > 0.5 * nearest
+            np.array(mi.render(scene, integrator=depth, spp=16, seed=t))[..., -1] > 0.5 * nearest
         )  # most of its rays meet the sheet
         gain = gain or 1.25 * (image.mean() / 255) ** 2.2 / np.median(light[mask].mean(-1))
         srgb = np.where(mask[..., None], np.clip(gain * light, 0, 1) ** (1 / 2.2), BACKGROUND)

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import os
+import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
 
-from polyfit.animation import from_camera
+from polyfit.animation import AXES_FROM_CAMERA, from_camera
 from polyfit.mesh import TexCoords
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError
 from polysft_mi.results import Run, load_npz
+from polysft_mi.scene import located, open_cameras
 
 from .panels import residual_at_vertices
 from .shading import patch_colours, range_of
@@ -33,15 +35,26 @@ class Colouring:
 
 
 @dataclass(frozen=True)
+class Filming:
+    """A camera that filmed: its ``name``, ``intrinsics``, its ``pose`` (4, 4) from its own frame
+    (OpenCV's axes) to the frame that is shown [m], and the path of each frame's image, or none.
+    """
+
+    name: str
+    intrinsics: Intrinsics
+    pose: np.ndarray
+    images: list[str]
+
+
+@dataclass(frozen=True)
 class Moving:
     """A surface that moves: ``vertices`` (T, N, 3) float32 [m, z up], ``faces`` (F, 3),
     ``texcoords`` or None, ``texture``: the path of an image or None; ``frames`` (T,): the number
     of each, ``fps`` of them a second.
 
-    ``camera``: that of the images, at the origin and looking along y, or None; ``images``: the
-    path of each frame's, or none. ``colourings``: by name, each a function that makes it. ``body``:
-    (vertices (T, B, 3), faces (C, 3)) of what the surface lies on, or None. ``state``: how far it
-    is, in a line.
+    ``cameras``: the scene's own, at the origin and looking along y, and further ones.
+    ``colourings``: by name, each a function that makes it. ``body``: (vertices (T, B, 3), faces (C,
+    3)) of what the surface lies on, or None. ``state``: how far it is, in a line.
     """
 
     vertices: np.ndarray
@@ -51,8 +64,7 @@ class Moving:
     state: str
     texcoords: TexCoords | None = None
     texture: str | None = None
-    camera: Intrinsics | None = None
-    images: list[str] = field(default_factory=list)
+    cameras: list[Filming] = field(default_factory=list)
     colourings: dict[str, Callable[[], Colouring]] = field(default_factory=dict)
     body: tuple[np.ndarray, np.ndarray] | None = None
 
@@ -135,8 +147,12 @@ class Source:
             f"at work: {len(track.states)} of {len(files)} frames",
             template.texcoords,
             _existing(texture),
-            problem.camera.intrinsics(),
-            files[: len(states)],
+            _cameras(
+                self._path("scene.xml"),
+                problem.camera.intrinsics(),
+                files[: len(states)],
+                problem.sequence.cameras,
+            ),
             _colourings(template.patch, template.weight, sigma),
         )
 
@@ -161,10 +177,50 @@ def _of_run(run: Run) -> Moving:
         f"{len(run.frames)} frames" + (f", {len(lost)} of them lost" if lost else ""),
         run.texcoords,
         _existing(run.texture),
-        run.camera,
-        run.images,
+        _cameras(run.path("scene.xml"), run.camera, run.images, _further(run))
+        if run.camera is not None
+        else [],
         colourings,
     )
+
+
+def _further(run):
+    """The further cameras of a run that has ended; none where their files are gone."""
+    s = run.settings
+    if not s.get("cameras"):
+        return []
+    first, last, stride = (int(s[name]) for name in ("first", "last", "stride"))
+    count = run.metrics.get("frames_wanted", len(run.frames))
+    try:
+        where = os.path.normpath(located(run.path("scene.xml"), s["cameras"]))
+        return open_cameras(where, count, first, last, stride)
+    except InputError:
+        return []
+
+
+def _cameras(scene, intrinsics, images, further):
+    """The scene's own camera, and the ``further`` ones, where the scene says where its own is by a
+    <lookat>, as all do that `prepare` writes.
+    """
+    upright = np.eye(4)
+    upright[:3, :3] = AXES_FROM_CAMERA["z"]
+    found = [Filming("own", intrinsics, upright, images)]
+    look = ET.parse(scene).getroot().find("sensor/transform/lookat")
+    if look is None:
+        return found
+    origin, target, up = (
+        np.array([float(x) for x in look.get(name, "").replace(",", " ").split()])
+        for name in ("origin", "target", "up")
+    )
+    forward = (target - origin) / np.linalg.norm(target - origin)
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    own = np.eye(4)  # from its frame, x right and y down, to the scene's world
+    own[:3] = np.stack([right, np.cross(forward, right), forward, origin], 1)
+    for camera in further:
+        pose = upright @ np.linalg.inv(camera.world_to_camera @ own)
+        found.append(Filming(camera.name, camera.intrinsics, pose, camera.sequence.files))
+    return found
 
 
 def _of_drape(folder: str) -> Moving:

@@ -6,7 +6,6 @@ import time
 
 import numpy as np
 
-from polyfit.animation import AXES_FROM_CAMERA
 from polyfit.errors import InputError, require
 from polysft_mi.results import vertex_normals
 
@@ -20,12 +19,12 @@ class Viewer:
     :class:`~polysft_mi.pictures.moving.Source`, in its scene.
 
     ``server``: viser's, whose scene holds ``/surface/0`` and ``/surface/1``, which take turns
-    (``surface`` is the newer one, a GLB), ``/camera`` (a frustum with the frame's image) and, of a
-    drape, ``/body``. ``frame`` (a slider, counted from 0), ``playing``,
-    ``follow`` (the newest frame of a run at work) and ``colour`` are its controls: set their
-    ``value``. Nothing moves but in :meth:`step`, so that one thread draws. The ``frame`` to begin
-    with is given by its number in the video. Raises InputError where viser is not installed, or
-    that frame is not there.
+    (``surface`` is the newer one, a GLB), ``/camera/own`` (a frustum with the frame's image),
+    ``/camera/NAME`` of further cameras, and, of a drape, ``/body``. ``frame`` (a slider, counted
+    from 0), ``playing``, ``follow`` (the newest frame of a run at work) and ``colour`` are its
+    controls: set their ``value``. Nothing moves but in :meth:`step`, so that one thread draws. The
+    ``frame`` to begin with is given by its number in the video. Raises InputError where viser is
+    not installed, or that frame is not there.
     """
 
     def __init__(self, source, *, host="127.0.0.1", port=8080, frame=None):
@@ -141,8 +140,9 @@ class Viewer:
         """
         points = self._moving.vertices.reshape(-1, 3)
         low, high = points.min(0), points.max(0)
-        if self._moving.camera is not None:
-            low, high = np.minimum(low, 0.1 * low), np.maximum(high, 0.1 * high)
+        for camera in self._moving.cameras:
+            at = 0.9 * camera.pose[:3, 3] + 0.1 * (low + high) / 2
+            low, high = np.minimum(low, at), np.maximum(high, at)
         centre, size = (low + high) / 2, float(np.linalg.norm(high - low))
         start = self.server.initial_camera
         side = (0.8, -0.7, 0.5) if self._moving.body is None else (0.3, -1.0, 0.15)
@@ -161,7 +161,7 @@ class Viewer:
                         "/body", m.body[0][k], m.body[1], color=(190, 180, 172)
                     )
                 self._nodes["body"].vertices = m.body[0][k].astype(np.float32)
-            self._frustum(k)
+            self._frustums(k)
 
     def _show(self, data):
         """Show the GLB ``data`` in the node that is out of sight. A browser needs a moment to load
@@ -176,27 +176,28 @@ class Viewer:
             self.surface.visible = True
         self._hide_at = time.monotonic() + min(_LOADING, 0.7 / self._moving.fps)
 
-    def _frustum(self, k):
+    def _frustums(self, k):
         from viser.transforms import SO3
 
-        m, c = self._moving, self._moving.camera
-        if c is None:
-            return
-        image = _picture(m.images[k], 640) if k < len(m.images) else None
-        image = None if image is None else np.asarray(image)
-        if "camera" in self._nodes:
-            self._nodes["camera"].image = image
-            return
+        m = self._moving
         distance = float(np.median(m.vertices[0, :, 1]))
-        self._nodes["camera"] = self.server.scene.add_camera_frustum(
-            "/camera",
-            fov=2 * np.arctan(c.height / (2 * c.fy)),
-            aspect=c.width * c.fy / (c.height * c.fx),
-            scale=0.12 * distance,
-            thickness=0.002 * distance,
-            image=image,
-            wxyz=SO3.from_matrix(AXES_FROM_CAMERA["z"]).wxyz,
-        )
+        for camera in m.cameras:
+            c, pose, name = camera.intrinsics, camera.pose, f"/camera/{camera.name}"
+            image = _picture(camera.images[k], 640) if k < len(camera.images) else None
+            image = None if image is None else np.asarray(image)
+            if name in self._nodes:
+                self._nodes[name].image = image
+                continue
+            self._nodes[name] = self.server.scene.add_camera_frustum(
+                name,
+                fov=2 * np.arctan(c.height / (2 * c.fy)),
+                aspect=c.width * c.fy / (c.height * c.fx),
+                scale=0.12 * distance,
+                thickness=0.002 * distance,
+                image=image,
+                wxyz=SO3.from_matrix(pose[:3, :3]).wxyz,
+                position=pose[:3, 3],
+            )
 
     def _glb(self, k, colour):
         """The surface of frame k as glTF: with its texture, or with colours at its vertices."""

@@ -1,6 +1,7 @@
 """The viewer in the browser: what its scene holds, how it follows a run, and what it refuses."""
 
 import io
+import json
 import shutil
 import subprocess
 import sys
@@ -9,8 +10,10 @@ import urllib.request
 
 import numpy as np
 import pytest
+import synthetic
 from browser import BROWSER, needs_browser
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from polyfit.animation import from_camera
 from polysft_mi import view
@@ -61,7 +64,7 @@ def test_shows_each_frame_with_its_texture_and_camera(finished_run, opened):
     texture = np.asarray(mesh.visual.material.baseColorTexture.convert("RGB"), int)
     wanted = read_pixels(run.texture)
     assert texture.shape == wanted.shape and np.abs(texture - wanted).mean() < 8
-    frustum, c = viewer.server.scene.get_handle_by_name("/camera"), run.camera
+    frustum, c = viewer.server.scene.get_handle_by_name("/camera/own"), run.camera
     assert np.isclose(2 * c.fy * np.tan(frustum.fov / 2), c.height)
     assert np.isclose(frustum.aspect, c.width / c.height)
     forward = viser.transforms.SO3(frustum.wxyz).as_matrix()[:, 2]
@@ -130,6 +133,30 @@ def test_follows_a_run_that_is_at_work(finished_run, opened, tmp_path):
     assert "residual" in viewer.colour.options and not viewer.follow.visible
 
 
+def test_further_cameras_stand_where_their_files_say(finished_run, opened, tmp_path):
+    run, out = Run.open(finished_run[1]), tmp_path / "out"
+    shutil.copytree(finished_run[1], out)
+    side = synthetic.cloth(tmp_path / "cameras" / "side", frames=4).folder
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_rotvec([0.1, 0.8, -0.2]).as_matrix()
+    pose[:3, 3] = 0.1, -0.2, 0.5
+    known = json.loads((side / "camera.json").read_text())
+    (side / "camera.json").write_text(json.dumps({**known, "world_to_camera": pose.tolist()}))
+    scene, without = (out / "scene.xml").read_text(), '<default name="cameras" value=""'
+    assert without in scene
+    (out / "scene.xml").write_text(scene.replace(without, without[:-1] + f'{side.parent}"'))
+    viewer = opened(out)
+    handle = viewer.server.scene.get_handle_by_name("/camera/side")
+    turn = viser.transforms.SO3(handle.wxyz).as_matrix()
+    x = run.vertices[0].astype(float)  # its camera's frame is the scene's world
+    there = (from_camera(x, "z") - handle.position) @ turn  # seen from the frustum
+    np.testing.assert_allclose(there, x @ pose[:3, :3].T + pose[:3, 3], atol=1e-6)
+    viewer.frame.value = 3
+    viewer.step()
+    image = read_pixels(sorted((side / "frames").iterdir())[3])
+    assert np.abs(handle.image.astype(int) - image).mean() < 6
+
+
 def test_shows_a_drape_and_its_body(opened, tmp_path):
     rng = np.random.default_rng(0)
     arrays = {"vertices": rng.normal(size=(3, 5, 3)), "body": rng.normal(size=(3, 4, 3))}
@@ -174,7 +201,7 @@ def test_a_browser_draws_the_surface(finished_run, opened, tmp_path):
             assert time.monotonic() < until, "the browser does not come"
             time.sleep(0.2)
         (client,) = viewer.server.get_clients().values()
-        viewer.server.scene.get_handle_by_name("/camera").visible = False
+        viewer.server.scene.get_handle_by_name("/camera/own").visible = False
         shares = {}
         for colour in ("texture", "plain"):
             viewer.colour.value = colour
