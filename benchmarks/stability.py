@@ -161,14 +161,14 @@ def picture(path, problem, frame, surfaces, counts, rows, usual, truth):
     """
     from matplotlib.figure import Figure
 
-    from polysft_mi.pictures import shading
-    from polysft_mi.pictures.shading import srgb
+    from polysft_mi.colours import srgb
+    from polysft_mi.render import SideView, Triangles
 
     template, image = problem.template, srgb(problem.sequence.frame(frame))
     shown = [(f"{n} iterations", surfaces[n]) for n in counts] + (
         [("truth", truth)] if truth is not None else []
     )
-    view = shading.View.around(np.stack([V for _, V in shown]))
+    view = SideView.around(np.stack([V for _, V in shown]))
     height, width = image.shape[:2]
     projected = [problem.camera.project(V)[0] for _, V in shown]
     low, high = np.concatenate(projected).min(axis=0), np.concatenate(projected).max(axis=0)
@@ -198,9 +198,7 @@ def picture(path, problem, frame, surfaces, counts, rows, usual, truth):
         over.set_xlim(low[0], high[0]), over.set_ylim(high[1], low[1])
         over.set_title(label, fontsize=10)
         beside.imshow(
-            shading.shade_surface(
-                V, template.faces, view, uv=template.texcoords.corners, size=(360, 300)
-            )
+            Triangles(V, template.faces).shaded(view, template.texcoords.corners, (360, 300))
         )
         if k < len(counts):
             row = rows[counts[k]]

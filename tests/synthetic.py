@@ -12,8 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from polyfit.mesh import TexCoords
-from polysft_mi.results.metrics import vertex_normals
+from polyfit.mesh import TexCoords, vertex_normals
 
 BACKGROUND = 0.03
 SUPERSAMPLING = 4

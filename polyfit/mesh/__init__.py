@@ -21,6 +21,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
             "in_use",
             "neighbour_mean",
             "sheets",
+            "vertex_normals",
             "welded",
             "winding",
         ],

@@ -94,6 +94,15 @@ def face_vectors(V: np.ndarray, F: np.ndarray) -> np.ndarray:
     return np.cross(V[F[:, 1]] - V[F[:, 0]], V[F[:, 2]] - V[F[:, 0]])
 
 
+def vertex_normals(V: np.ndarray, F: np.ndarray) -> np.ndarray:
+    """Unit normals (N, 3) of the vertices: the means of the adjacent faces' normals, weighted by
+    area (trimesh weights by angle). Zero where no face is.
+    """
+    N = [np.bincount(F.ravel(), np.repeat(x, 3), len(V)) for x in face_vectors(V, F).T]
+    total = np.stack(N, axis=1)
+    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
+
+
 def areas(V: np.ndarray, F: np.ndarray) -> np.ndarray:
     """Areas of the faces, (F,) [m^2]."""
     return 0.5 * np.linalg.norm(face_vectors(V, F), axis=1)

@@ -13,7 +13,6 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "drawing": ["Drawing"],
         "exr": ["read_exr", "write_exr"],
         "report.page": ["write_report"],
-        "shading": ["View", "seen", "shade_surface", "srgb"],
         "video": ["read_video", "write_video"],
         "viewer": ["show"],
     },

@@ -7,9 +7,8 @@ import sys
 import numpy as np
 
 from polyfit.errors import require
+from polysft_mi.colours import patch_colours
 from polysft_mi.errors import InputError
-
-from .shading import patch_colours
 
 
 class Viewer:

@@ -14,6 +14,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "projective": ["SilhouetteProjective"],
         "raster": ["RasterIntegrator"],
         "silhouette": ["blend"],
+        "stage": ["SideView", "Triangles"],
         "topology": ["Topology"],
         "view": ["Seen", "View", "point2"],
     },

@@ -9,6 +9,7 @@ import re
 import numpy as np
 
 from polyfit.files import silent_decoders
+from polysft_mi.colours import srgb
 from polysft_mi.errors import InputError
 
 EXTENSIONS = (
@@ -233,7 +234,7 @@ def _encoded(linear):
     colours = x[..., :3] if x.shape[2] >= 3 else x[..., :1]
     x = np.concatenate(
         [
-            np.where(colours <= 0.0031308, 12.92 * colours, 1.055 * colours ** (1 / 2.4) - 0.055),
+            srgb(colours),
             x[..., colours.shape[2] :],
         ],
         axis=2,

@@ -8,13 +8,14 @@ from surfaces import joined, sphere
 
 from onefit.body import ClosestSurface, skeleton, skinning
 from onefit.garment import TEMPLATES, Garment, standard_body, standard_surface
-from onefit.garment.binding import Binding, surface_of, vertex_normals
+from onefit.garment.binding import Binding, surface_of
 from onefit.garment.reading.mending import mended
 from onefit.garment.remesh import loops
 from onefit.garment.sewing.patterns import ramp, smooth_union
 from onefit.garment.sewing.sew import sewn
 from polyfit import mesh
 from polyfit.errors import InputError
+from polyfit.mesh import vertex_normals
 
 LOOPS = {
     "tshirt": 4,

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from polyfit.mesh import vertex_normals
 from polysft_mi.errors import InputError
 from polysft_mi.results import evaluation, metrics
 from polysft_mi.results.truth import Truth
@@ -73,7 +74,7 @@ def test_normals_of_a_cylinder_and_of_a_tilt():
     theta, y = np.meshgrid(np.linspace(-0.5, 0.5, 41), np.linspace(0, 1, 11))
     V = np.stack([np.sin(theta), y, 2 - np.cos(theta)], -1).reshape(-1, 3)
     _, F = grid(41, 11)
-    n = metrics.vertex_normals(V, F).reshape(11, 41, 3)[2:-2, 2:-2]
+    n = vertex_normals(V, F).reshape(11, 41, 3)[2:-2, 2:-2]
     want = np.stack([np.sin(theta), 0 * theta, -np.cos(theta)], -1)[2:-2, 2:-2]
     assert np.abs(np.abs((n * want).sum(-1)) - 1).max() < 1e-3
     G, F = grid()
