@@ -161,6 +161,7 @@ def picture(path, problem, frame, surfaces, counts, rows, usual, truth):
     """
     from matplotlib.figure import Figure
 
+    from polyfit.mesh import boundary_edges
     from polysft_mi.colours import srgb
     from polysft_mi.render import SideView, Triangles
 
@@ -193,7 +194,7 @@ def picture(path, problem, frame, surfaces, counts, rows, usual, truth):
                 colors="white",
                 linewidths=0.6,
             )
-        for edge in border(template.faces):
+        for edge in boundary_edges(template.faces):
             over.plot(xy[edge, 0], xy[edge, 1], color="#ffb000", linewidth=1.2)
         over.set_xlim(low[0], high[0]), over.set_ylim(high[1], low[1])
         over.set_title(label, fontsize=10)
@@ -237,16 +238,6 @@ def picture(path, problem, frame, surfaces, counts, rows, usual, truth):
         axes.legend(frameon=False, fontsize=8)
     with aside(path) as temporary:
         figure.savefig(temporary, format="png", facecolor="white")
-
-
-def border(faces):
-    """Edges (E, 2) that belong to one triangle alone."""
-    edges, count = np.unique(
-        np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1),
-        axis=0,
-        return_counts=True,
-    )
-    return edges[count == 1]
 
 
 def parser():

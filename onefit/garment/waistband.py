@@ -10,8 +10,9 @@ import numpy as np
 
 from onefit.body import skeleton
 from polyfit import mesh
+from polyfit.mesh import loops
 
-from .remesh import loops, nearest_on_segments
+from .remesh import nearest_on_segments
 
 _SHOULDERS = [skeleton.INDEX["left_shoulder"], skeleton.INDEX["right_shoulder"]]
 BAND_WIDTH = 0.02, 0.05  # [m]; cloth so near to the rim is held, farther away it is free

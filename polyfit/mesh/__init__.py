@@ -19,6 +19,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
             "edges_of",
             "face_vectors",
             "in_use",
+            "loops",
             "neighbour_mean",
             "sheets",
             "vertex_normals",

@@ -125,6 +125,20 @@ def boundary_edges(F: np.ndarray) -> np.ndarray:
     return np.stack([F, np.roll(F, -1, axis=1)], axis=-1)[once]
 
 
+def loops(F: np.ndarray) -> list[np.ndarray]:
+    """The boundary of a manifold mesh as a list of vertex indices, in the order in which their
+    faces walk them; the longest first.
+    """
+    after = dict(boundary_edges(F).tolist())
+    found = []
+    while after:
+        loop = [next(iter(after))]
+        while (following := after.pop(loop[-1], None)) is not None and following != loop[0]:
+            loop.append(following)
+        found.append(np.array(loop))
+    return sorted(found, key=len, reverse=True)
+
+
 def neighbour_mean(F: np.ndarray, count: int, boundary_apart: bool = False) -> csr_matrix:
     """Sparse (count, count) matrix that takes the mean of each vertex's neighbours; with
     ``boundary_apart`` boundary vertices have those along their loop only.

@@ -5,7 +5,7 @@ images.
 import cv2
 import numpy as np
 
-from polysft_mi.scene.outline import loops
+from polyfit.mesh import loops
 
 GREEN, _RED, _YELLOW = (60, 220, 90), (235, 70, 60), (255, 210, 40)
 

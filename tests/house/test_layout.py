@@ -33,7 +33,6 @@ NOT_YET = {
         "polysft_mi.results.comparison",
         "polysft_mi.results.evaluation",
         "polysft_mi.scene.kinect_paper",
-        "polysft_mi.scene.outline",
         "polysft_mi.surface.meshio",
         "polysft_mi.surface.template",
     },

@@ -10,12 +10,11 @@ from onefit.body import ClosestSurface, skeleton, skinning
 from onefit.garment import TEMPLATES, Garment, standard_body, standard_surface
 from onefit.garment.binding import Binding, surface_of
 from onefit.garment.reading.mending import mended
-from onefit.garment.remesh import loops
 from onefit.garment.sewing.patterns import ramp, smooth_union
 from onefit.garment.sewing.sew import sewn
 from polyfit import mesh
 from polyfit.errors import InputError
-from polyfit.mesh import vertex_normals
+from polyfit.mesh import loops, vertex_normals
 
 LOOPS = {
     "tshirt": 4,

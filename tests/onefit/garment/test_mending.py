@@ -11,10 +11,9 @@ from surfaces import joined, sphere, tube
 from onefit.body import skeleton, skinning
 from onefit.garment import Garment, fitting, standard_body, standard_surface
 from onefit.garment.reading.mending import mended
-from onefit.garment.remesh import loops
 from polyfit import mesh, write_ply
 from polyfit.errors import InputError
-from polyfit.mesh import vertex_normals
+from polyfit.mesh import loops, vertex_normals
 
 
 def soup(V, F):

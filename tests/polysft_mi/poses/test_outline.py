@@ -9,9 +9,9 @@ from scipy.optimize import check_grad
 from scipy.spatial.transform import Rotation
 from synthetic import grid_faces
 
+from polyfit.mesh import loops
 from polysft_mi.camera import Intrinsics
-from polysft_mi.scene import outline
-from polysft_mi.scene.outline import OutlineSettings, fitted, loops
+from polysft_mi.poses import OutlineSettings, fitted, outline
 
 CAMERA = Intrinsics(500.0, 500.0, 315.0, 242.0, 640, 480)
 WIDTH, HEIGHT = 0.3, 0.24

@@ -10,6 +10,8 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
+from polyfit.mesh import loops
+
 
 @dataclass(frozen=True)
 class OutlineSettings:
@@ -64,21 +66,6 @@ class Fit:
     def __call__(self, points):
         """Points (N, 3) [m], moved."""
         return points @ self.rotation.T + self.translation
-
-
-def loops(faces):
-    """The boundary of a mesh with faces (F, 3): of each loop its vertices, in their order."""
-    half = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    _, index, uses = np.unique(
-        np.sort(half, axis=1), axis=0, return_inverse=True, return_counts=True
-    )
-    following, found = dict(half[uses[index.ravel()] == 1].tolist()), []
-    while following:
-        loop = [next(iter(following))]
-        while loop[-1] in following:
-            loop.append(following.pop(loop[-1]))
-        found.append(np.array(loop[:-1] if loop[0] == loop[-1] else loop))
-    return found
 
 
 def fitted(vertices, faces, camera, image, settings=None):
