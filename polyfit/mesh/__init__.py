@@ -22,6 +22,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
             "loops",
             "neighbour_mean",
             "sheets",
+            "signed_areas",
             "vertex_normals",
             "welded",
             "winding",

@@ -108,6 +108,12 @@ def areas(V: np.ndarray, F: np.ndarray) -> np.ndarray:
     return 0.5 * np.linalg.norm(face_vectors(V, F), axis=1)
 
 
+def signed_areas(points: np.ndarray, F: np.ndarray) -> np.ndarray:
+    """Areas of the faces of a plane mesh, ``points`` (N, 2), (F,): above 0 where x turns to y."""
+    a, b = points[F[:, 1]] - points[F[:, 0]], points[F[:, 2]] - points[F[:, 0]]
+    return 0.5 * (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+
+
 def edges_of(F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Edges of the faces, each once and the smaller vertex first, (E, 2); and of which edge the
     side from corner k to the next is, (F, 3)."""

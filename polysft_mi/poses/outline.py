@@ -10,7 +10,7 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from polyfit.mesh import loops
+from polyfit.mesh import loops, signed_areas
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ def fitted(vertices, faces, camera, image, settings=None):
     if not around or vertices[:, 2].min() <= 0:
         return None
     position = camera.project(vertices)
-    size = math.sqrt(_area(position[faces]))
+    size = math.sqrt(np.abs(signed_areas(position, faces)).sum())
     unit = max(1.0, size / s.size)
     grey = cv2.GaussianBlur(
         cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255, (0, 0), s.blur * unit
@@ -102,12 +102,6 @@ def fitted(vertices, faces, camera, image, settings=None):
             for line in (None, "dark", "bright")
         ]
     return max(found, key=lambda fit: fit.clear)
-
-
-def _area(corner):
-    """Of triangles with corners (F, 3, 2) [pixels], their sum [pixels^2]."""
-    a, b = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
-    return 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum()
 
 
 def _straight(loop, position, tolerance):

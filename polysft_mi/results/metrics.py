@@ -128,15 +128,10 @@ def image_share(V, F, K, pixels=PIXELS):
     """Area of the mesh's triangles in the image, by its projection with K (3, 3), over the number
     of the image's pixels.
     """
+    from polyfit.mesh import signed_areas
+
     xy = V @ K.T
-    corner = (xy[:, :2] / xy[:, 2:])[F]
-    a, b = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
-    return float(0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum() / pixels)
-
-
-def depth_rmse_all_pixels(V, F, points, K, pixels=PIXELS):
-    """Depth RMSE [m] when the surface's squared errors are spread over all pixels of the image."""
-    return depth_rmse(V, F, points)[0] * float(np.sqrt(image_share(V, F, K, pixels)))
+    return float(np.abs(signed_areas(xy[:, :2] / xy[:, 2:], F)).sum() / pixels)
 
 
 # ---- point clouds --------------------------------------------------------------------------------

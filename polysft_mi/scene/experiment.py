@@ -115,20 +115,9 @@ def load(
     experiment, mesh = scene.integrator(), meshes[0]
     settings = experiment.settings
     template, corner, note = _template(mesh, source, settings, template)
-    return Experiment(
-        path,
-        scene,
-        scene.sensors()[0],
-        experiment.renderer,
-        mesh,
-        template,
-        corner,
-        experiment.frames,
-        experiment.masks,
-        settings,
-        defaults,
-        note,
-    )
+    shown = scene, scene.sensors()[0], experiment.renderer, mesh, template, corner
+    files = experiment.frames, experiment.masks
+    return Experiment(path, *shown, *files, settings, defaults, note)
 
 
 def _instance(path, config, state):

@@ -5,7 +5,6 @@ tests.
 import dataclasses
 import json
 
-import drjit as dr
 import numpy as np
 import pytest
 from clips import CAMERA, HEIGHT, WIDTH, photo, placed, rendered, write_png
@@ -36,57 +35,6 @@ def test_contenders_show_the_same_sheet_on_half_of_the_image(tmp_path):
     assert result["coverage"] == pytest.approx(0.5, abs=0.03)
     assert result["mean_difference"] == pytest.approx(0, abs=0.01)
     assert result["mean_absolute_difference"] < 0.1 * result["mean_colour"]
-
-
-def test_contenders_take_the_same_gradient(tmp_path):
-    gradients = {}
-    for name in raster.CONTENDERS:
-        contender = raster.Contender(name, SIZE, POINTS, str(tmp_path))
-        contender.place(-2.0)
-        gradients[name] = np.array(contender.forward_backward(0), dtype=np.float64)
-    g, through_mi, noisy = (gradients[name] for name in raster.CONTENDERS)
-    assert np.linalg.norm(g) > 0
-    assert through_mi == pytest.approx(g, rel=1e-3, abs=1e-3 * np.abs(g).max())
-    assert noisy.shape == g.shape and np.linalg.norm(noisy) > 0
-
-
-def test_iterations_of_raster_need_no_new_kernels(tmp_path):
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        result = raster.measure_kernels(SIZE, POINTS, str(tmp_path), 12)
-    summary = raster.judge_long_run({"resident_mb": [100.0] * 10 + [101.0, 103.0]}, result)
-    assert summary["kernels_an_iteration"] >= 2
-    assert summary["new_kernels_later"] == 0
-    assert summary["growth_mb"] == 3.0
-
-
-def test_kernels_that_come_late_are_counted():
-    summary = raster.judge_long_run(
-        {"resident_mb": [1.0] * 12}, {"launched": [5] * 12, "new": [5, 2, 0, 1] + [0] * 8}
-    )
-    assert (
-        summary["new_kernels_first_two"],
-        summary["new_kernels_later"],
-        summary["iterations_with_new_kernels"],
-    ) == (7, 1, [1, 2, 4])
-
-
-def test_ratios_are_those_within_a_turn():
-    times = dict(
-        passes={},
-        moves={},
-        coverage=0.5,
-        mean_colour=0.5,
-        mean_difference=0.0,
-        mean_absolute_difference=0.0,
-    )
-    for name, ms in zip(
-        raster.CONTENDERS, ([1, 10, 2], [1, 10, 2], [4, 40, 8])
-    ):  # the machine was busy in the second turn
-        times["passes"][name], times["moves"][name] = ms, [1, 1, 1]
-    case = raster.summarise("64x48", POINTS, times, {name: {} for name in raster.CONTENDERS})
-    assert case["contenders"]["prb_projective"]["ratio"] == 4
-    assert case["contenders"]["prb_projective"]["ratio_with_move"] == 3
-    assert case["triangles"] == 128
 
 
 DEMO = (str(ROOT / "scenes" / "demo.xml"), {"last": "1", "period": "4"})

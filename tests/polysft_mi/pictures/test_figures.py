@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from processes import python
 
-from polysft_mi.pictures import figures
-from polysft_mi.pictures.figures import contact_sheet, frame_plot, loss_plot
+from polysft_mi.pictures.figures import contact_sheet, frame_plot, loss_curves, loss_plot
 
 
 def image_of(path):
@@ -43,13 +42,9 @@ def test_loss_plot_shows_terms_and_survives_bad_values(tmp_path):
     )
     assert loss_plot(tmp_path / "odd.png", odd) is not None
     assert loss_plot(tmp_path / "one.png", RECORDS[:1]) is not None
+    _, step, _ = loss_curves(RECORDS[:3] + RECORDS[10:12])
+    assert step.tolist() == [1, 6, 11, 12, 17]  # records now and then keep their place
     assert sorted(os.listdir(tmp_path)) == ["loss.png", "odd.png", "one.png"]
-
-
-def test_records_now_and_then_keep_their_place():
-    assert figures._advance(None, RECORDS[0]) == 1
-    assert figures._advance(RECORDS[0], RECORDS[1]) == 5
-    assert figures._advance(RECORDS[9], RECORDS[10]) == 1
 
 
 def test_frame_plot_has_a_panel_a_figure(tmp_path):
@@ -76,7 +71,7 @@ def test_contact_sheet_holds_its_pictures(tmp_path):
     assert count((0, 0, 255)) / count((0, 255, 0)) == pytest.approx(6 / 2, rel=0.1)
 
 
-def test_a_picture_that_fails_is_a_warning(tmp_path, monkeypatch):
+def test_a_picture_that_fails_is_a_warning(tmp_path):
     with pytest.warns(RuntimeWarning, match="loss.png: picture not written"):
         assert loss_plot(tmp_path / "loss.png", []) is None
     with pytest.warns(RuntimeWarning, match="not written"):
