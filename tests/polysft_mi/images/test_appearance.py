@@ -2,18 +2,12 @@
 slanted, lit sheets against their own images.
 """
 
-import math
-
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 import pytest
 import synthetic
 from problems import data_of, problem_of
-from scipy.spatial.transform import Rotation
 
-from polysft_mi.images import pixels
-from polysft_mi.images.pyramid import Level, level_image
+from polysft_mi.images.pyramid import Level
 from polysft_mi.surface.patch import Unknowns
 from polysft_mi.tracker import FrameTracker, track
 
@@ -53,65 +47,6 @@ def unmasked(tmp_path_factory):
 @pytest.fixture(scope="module")
 def problem(truth):
     return problem_of(truth.folder)
-
-
-def slanted(vertices, degrees=62.0):
-    return Rotation.from_rotvec([0, math.radians(degrees), 0]).apply(
-        vertices - vertices.mean(0)
-    ) + vertices.mean(0)
-
-
-def compared(known, vertices, frame, level, appearance):
-    """(what is compared with a frame (h, w, 3), where (h, w)) of the level's grid of the whole
-    image.
-    """
-    with dr.suspend_grad():
-        view = known._view(vertices, level)
-        at = known._frames.level(frame, level).image
-        residual, weight, *_ = pixels.residuals(
-            *known._residual_arguments(view, frame, level, appearance)
-        )
-        pixel, inside = at.at(*pixels.pixel_coordinates(view))
-        seen = residual + dr.gather(mi.Vector4f, at.texels, pixel, inside)
-    x0, y0, *_ = (int(k[0]) for k in view.region)
-    w, h = view.size
-    rows, columns = known.camera.height // level.stride, known.camera.width // level.stride
-    colour, where = np.zeros((rows, columns, 3)), np.zeros((rows, columns), bool)
-    colour[y0 : y0 + h, x0 : x0 + w] = np.array(seen).T[:, :3].reshape(h, w, 3)
-    where[y0 : y0 + h, x0 : x0 + w] = np.array(weight).reshape(h, w) > 0
-    return colour, where
-
-
-@pytest.mark.parametrize("level", LEVELS)
-def test_it_is_a_rendering_made_what_frames_are_made(problem, level):
-    known = data_of(problem)
-    vertices = slanted(problem.template.vertices)
-    appearance = known.appearance(vertices, level)
-    with dr.suspend_grad():
-        known._view(vertices, Level(1.0))
-        image = np.array(known._raster.image(problem.placed.scene, problem.placed.sensor, spp=36))
-    cover = (image[..., 3] > 0.5).astype(np.float32)
-    colour = (image[..., :3] / np.maximum(image[..., 3:], 1e-3) * cover[..., None]).astype(
-        np.float32
-    )
-    reference = level_image(colour, cover, level)
-    x, y = reference.corner
-    rows, columns = reference.inside.shape
-    found, where = compared(known, vertices, 0, level, appearance)
-    plain, _ = compared(known, vertices, 0, level, None)
-    here = where[y : y + rows, x : x + columns] & (
-        reference.inside[: where.shape[0] - y, : where.shape[1] - x] > 0
-    )
-    error = [
-        np.abs(
-            k[y : y + rows, x : x + columns]
-            - reference.colour[: where.shape[0] - y, : where.shape[1] - x]
-        )[here].mean()
-        for k in (found, plain)
-    ]
-    assert here.sum() > 500 // level.stride**2 and error[0] < 0.1 and error[0] < 0.35 * error[1], (
-        error
-    )
 
 
 @pytest.mark.parametrize("level", LEVELS)

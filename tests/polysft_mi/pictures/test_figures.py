@@ -5,7 +5,6 @@ import os
 import cv2
 import numpy as np
 import pytest
-from processes import python
 
 from polysft_mi.pictures.figures import contact_sheet, frame_plot, loss_curves, loss_plot
 
@@ -79,14 +78,3 @@ def test_a_picture_that_fails_is_a_warning(tmp_path):
     with pytest.warns(RuntimeWarning, match="not written"):
         assert contact_sheet(tmp_path / "a.png", []) is None
     assert os.listdir(tmp_path) == []
-
-
-def test_importing_loads_no_heavy_module():
-    script = (
-        "import sys, polysft_mi.pictures.figures, polysft_mi.results.metrics,"
-        " polysft_mi.evaluate, polysft_mi.pictures.exr, polysft_mi.pictures.video,"
-        " polysft_mi.surface.meshio\nprint([m for m in ('matplotlib', 'OpenEXR',"
-        " 'trimesh', 'skimage', 'scipy', 'rich', 'mitsuba', 'torch', 'cv2') if m in sys.modules])"
-    )
-    done = python("-c", script)
-    assert done.stdout.strip() == "[]", done.stdout + done.stderr

@@ -118,13 +118,9 @@ def test_a_coarse_mesh_is_drawn_through_its_vertices():
 BACKGROUND = (243, 243, 243)
 
 
-def sheet(depth=lambda x, y: 0 * x, n=21):
-    x, y = np.meshgrid(np.linspace(-0.1, 0.1, n), np.linspace(-0.1, 0.1, n))
-    V = np.stack([x, y, 0.6 + depth(x, y)], -1).reshape(-1, 3)
-    k = np.arange(n * n).reshape(n, n)
-    a, b, c, d = (i.ravel() for i in (k[:-1, :-1], k[:-1, 1:], k[1:, :-1], k[1:, 1:]))
-    F = np.concatenate([np.stack([a, c, b], 1), np.stack([b, c, d], 1)])
-    return V, F
+def sheet(depth=lambda x, y: 0 * x):
+    V, F = surfaces.sheet(depth, 0.1, 21)
+    return V + (0, 0, 0.6), F[:, ::-1]
 
 
 def covered(image):
