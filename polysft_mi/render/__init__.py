@@ -1,5 +1,6 @@
 """The scene and the vertices of the surface go in; an image, what each pixel sees, and their
-gradients come out. Importing a name needs a Mitsuba variant.
+gradients come out. :mod:`stage` draws any mesh for pictures. Importing a name needs a Mitsuba
+variant.
 """
 
 import lazy_loader

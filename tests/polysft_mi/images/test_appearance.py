@@ -1,5 +1,5 @@
-"""What the camera's blur makes of a sheet: against a rendering of many samples, and frames of
-slanted, lit sheets against their own images.
+"""What the camera's blur makes of a sheet: frames of slanted, lit sheets, rendered with many
+samples, are explained by it.
 """
 
 import numpy as np

@@ -181,7 +181,7 @@ def test_gradient_against_finite_differences():
     )
     search = outline.OutlineSearch(ends, CAMERA, grey, 1.2, "dark")
     turn, shift = Rotation.from_rotvec((0.01, -0.02, 0.005)), np.array([1e-3, -2e-3, 4e-3])
-    cost, to_motion = search.costs(turn, shift, 2.5)
+    cost, _ = search.costs(turn, shift, 2.5)
     for seed in range(5):
         q = np.random.default_rng(seed).normal(size=6)
         assert check_grad(
