@@ -1,7 +1,8 @@
 """Pictures of a run: surfaces, images and figures in; PNG, EXR, video and one HTML page out.
 
 The album of a run is drawn while it tracks (:class:`Drawing`); its report, comparisons and the
-viewer read a finished run. Meshes are drawn by :mod:`polysft_mi.render.stage`. matplotlib, plotly, polyscope and Mitsuba are loaded on use.
+viewer read a finished run. Meshes are drawn by :mod:`polysft_mi.render.stage`.
+matplotlib, plotly, polyscope and Mitsuba are loaded on use.
 """
 
 import lazy_loader
