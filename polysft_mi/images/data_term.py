@@ -316,13 +316,8 @@ class DataTerm:
             for k, n in zip(corner[::-1], inside.shape, strict=True)
         ]
         inside = inside.astype(np.float32)
-        wide = compared(
-            np.pad(colour, (*pads, (0, 0))),
-            np.pad(inside, pads),
-            level.sigma / level.stride,
-            level.window / level.stride,
-            self.normalise,
-            level.floor,
-        )
+        padded = np.pad(colour, (*pads, (0, 0))), np.pad(inside, pads)
+        scales = level.sigma / level.stride, level.window / level.stride
+        wide = compared(*padded, *scales, self.normalise, level.floor)
         (top, _), (left, _) = pads
         return wide[top : top + inside.shape[0], left : left + inside.shape[1]], inside

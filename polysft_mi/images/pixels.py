@@ -17,14 +17,8 @@ from polysft_mi.render import blend, point2
 from .pyramid import MAX_CONTOUR_DISTANCE
 
 MISFIT = 0.5  # residual, in local standard deviations, that counts half a misfit
-CORNERS = (
-    (0, 0),
-    (1, 1),
-    (2, 2),
-    (0, 1),
-    (0, 2),
-    (1, 2),
-)  # pairs of a triangle's corners, as their curvatures are summed
+# pairs of a triangle's corners, as their curvatures are summed
+CORNERS = (0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)
 CURVATURES, SLOPES, FIGURES = 18, 9, 4  # sums over the pixels of a triangle
 TAPS = 2  # across a pixel's footprint on the texture, and along it
 # pixels by which a ray may pass the triangle that it meets: it and the projection round differently

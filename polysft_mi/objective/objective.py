@@ -44,16 +44,9 @@ class Objective:
     def __init__(self, problem: Problem, surface: Any = None) -> None:
         self.settings, self.rules = problem.settings, problem.rules
         self.problem, self.atlas = problem, problem.atlas
-        self.inputs = Inputs(
-            problem.settings,
-            problem.rules,
-            problem.template,
-            surface or problem.patch,
-            problem.atlas,
-            problem.placed,
-            problem.sequence,
-            problem.experiment.path,
-        )
+        p, moving = problem, surface or problem.patch
+        how, where = (p.settings, p.rules), (p.placed, p.sequence, p.experiment.path)
+        self.inputs = Inputs(*how, p.template, moving, p.atlas, *where)
         chosen = [kind for kind in TERMS if kind.is_used(self.settings)]
         self.terms: list[Term] = [kind(self.inputs) for kind in chosen]
         #: the stage for a sheet that moved far, and the usual ones, coarse to fine

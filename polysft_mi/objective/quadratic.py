@@ -346,21 +346,12 @@ class Assembly:
             tuple(flat(x) for x in (t.residual * t.factor, t.factor, t.by_corner))
             for t in triangles
         ]
+        of_edges = flat(edges.lengths), flat([edges.stiffness, edges.give])
+        derivatives = surface.offset_jacobian, surface.up, surface.motion_jacobian, basis
         found = self._in_unknowns(
-            self._gather.tables,
-            self._halo,
-            images,
-            flat(surface.vertices),
-            self._gather.camera,
-            flat(edges.lengths),
-            flat([edges.stiffness, edges.give]),
-            flat(surface.offset_jacobian),
-            flat(surface.up),
-            flat(surface.motion_jacobian),
-            flat(basis),
-            dr.arange(mi.UInt32, size * self._index),
-            dr.opaque(mi.UInt32, size),
-            rows,
+            *(self._gather.tables, self._halo, images),
+            *(flat(surface.vertices), self._gather.camera, *of_edges, *map(flat, derivatives)),
+            *(dr.arange(mi.UInt32, size * self._index), dr.opaque(mi.UInt32, size), rows),
         )
         energy, gradient, along, local, moved, *lifted = (np.array(x) for x in found)
         gradient, moved = gradient.reshape(-1, 3), moved.reshape(-1, 3, 6)

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from polyfit.errors import require
 from polyfit.jets import CanonicalFrame
-from polyfit.mesh import TexCoords, read_textured
+from polyfit.mesh import TexCoords, read_textured, write_ply
 from polysft_mi.errors import InputError
 from polysft_mi.surface import Template, meshio
 
@@ -165,7 +165,7 @@ def _plain_copy(path, folder):
         meshio.write_obj(copy, vertices, faces, texcoords)
     else:
         index, uv, split = texcoords.split(faces)
-        meshio.write_ply(copy, vertices[index], split, uv)
+        write_ply(copy, vertices[index], split, uv)
     return copy
 
 

@@ -46,14 +46,9 @@ class Relocator:
         rays = np.column_stack([pixels, np.ones(len(pixels))]) @ (to_camera @ camera.basis).T
         rays = rays[:, :2] / rays[:, 2:]
         focal = 1 / np.linalg.norm(camera.basis[:, 0])
+        how = dict(iterationsCount=300, flags=cv2.SOLVEPNP_EPNP)
         found, turn, shift, inliers = cv2.solvePnPRansac(
-            points,
-            rays,
-            np.eye(3),
-            None,
-            reprojectionError=_TOLERANCE / focal,
-            iterationsCount=300,
-            flags=cv2.SOLVEPNP_EPNP,
+            points, rays, np.eye(3), None, reprojectionError=_TOLERANCE / focal, **how
         )
         if not found or inliers is None or len(inliers) < _INLIERS:
             return None
