@@ -149,7 +149,7 @@ def rows_of(numbers, width):
     return [numbers[k : k + width] for k in range(0, len(numbers), width)]
 
 
-def at_vertices(tables, table, figures, vertices, camera, numbers, silhouette):
+def _at_vertices(tables, table, figures, vertices, camera, numbers, silhouette):
     """:class:`Images` of the sums ``table`` (Float of 27F) and ``figures`` (Float of 4F) of the
     triangles.
 
@@ -238,11 +238,11 @@ class Gather:
     def __init__(self, pattern, camera):
         self.tables = Tables.of(pattern)
         self.camera = flat(np.concatenate([camera.inverse.ravel(), camera.origin]))
-        self._at_vertices = frozen(at_vertices)
+        self._at_vertices = frozen(_at_vertices)
 
     def images(self, table, figures, vertices, weight, mask_weight, area, stride, silhouette):
-        """:class:`Images` of the triangles' sums and a silhouette. Arguments as :func:`at_vertices`
-        takes them; vertices (N, 3) [m]; ``area``: of the mask [pixels of the grid], or None.
+        """:class:`Images` of the triangles' sums and a silhouette. Arguments as the
+        kernel takes them; vertices (N, 3) [m]; ``area``: of the mask [pixels of the grid], or None.
         """
         numbers = flat([weight, mask_weight, area or 0, 1 / stride])
         return self._at_vertices(

@@ -82,9 +82,10 @@ def no_choice(monkeypatch):
     ],
 )
 def test_the_newest_is_found(tmp_path, newest, others):
+    path = library(tmp_path, *newest)
     for name, major in others.items():
         library(tmp_path, name, (major, 0, 0))
-    assert backend.find_libllvm([str(tmp_path)]) == (library(tmp_path, *newest), newest[1])
+    assert backend.find_libllvm([str(tmp_path)]) == (path, newest[1])
 
 
 @needs_compiler
