@@ -33,11 +33,11 @@ from sequences import ROOT
 from onefit.body import AnnyBody, skeleton, skinning
 from onefit.garment import TEMPLATES, Garment, fitting, standard_body, standard_surface
 from onefit.garment.binding import Binding, surface_of
-from onefit.garment.remesh import loops
 from onefit.motion import Motion, generate
 from polyfit import mesh
 from polyfit.errors import cli
 from polyfit.files import aside
+from polyfit.mesh import loops
 
 
 def lengths(V, F):

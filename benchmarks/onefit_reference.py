@@ -33,13 +33,13 @@ from onefit.body import ClosestSurface, skinning
 from onefit.draping import inputs
 from onefit.draping.draper import FPS
 from onefit.garment import waistband
-from onefit.garment.remesh import loops
 from onefit.network import DEFAULT
 from onefit.objective.crossings import crossings
 from onefit.objective.folds import folds, inner_edges
 from onefit.physics import MATERIALS, Material
 from polyfit.errors import InputError, cli
 from polyfit.files import aside
+from polyfit.mesh import loops
 
 SEED = 1_000_003  # of motions, that no training uses
 CHECKPOINT = 10  # frames

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from sequences import DATA
 
 from polysft_mi.camera import Intrinsics
+from polysft_mi.poses import fitted
 from polysft_mi.scene.images import list_images, read_rgb
-from polysft_mi.scene.outline import fitted
 from polysft_mi.surface import meshio
 
 SEQUENCES = "flag", "bend", "paper", "curtain", "corner"

@@ -113,12 +113,12 @@ class Contender:
         import drjit as dr
         import mitsuba as mi
 
-        from polysft_mi.surface import meshio
+        from polyfit.mesh import write_ply
 
         self.name, self.path_replay = name, name.startswith("prb")
         vertices, faces, uv = sheet(points, size)
         mesh = os.path.join(folder, "sheet.ply")
-        meshio.write_ply(mesh, vertices, faces, uv)
+        write_ply(mesh, vertices, faces, uv)
         sensor = camera(size).sensor_xml()
         if self.path_replay:
             sensor = sensor.replace("rgba", "rgb")

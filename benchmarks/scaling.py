@@ -51,8 +51,8 @@ def make(folder, surface, size, frames):
     import mitsuba as mi
 
     from polysft_mi import prepare
+    from polysft_mi.colours import srgb
     from polysft_mi.objective.problem import Problem
-    from polysft_mi.pictures.shading import srgb
     from polysft_mi.scene import experiment as scene
 
     faces, uv = surface.faces_and_uv()

@@ -161,14 +161,15 @@ def picture(path, problem, frame, surfaces, counts, rows, usual, truth):
     """
     from matplotlib.figure import Figure
 
-    from polysft_mi.pictures import shading
-    from polysft_mi.pictures.shading import srgb
+    from polyfit.mesh import boundary_edges
+    from polysft_mi.colours import srgb
+    from polysft_mi.render import SideView, Triangles
 
     template, image = problem.template, srgb(problem.sequence.frame(frame))
     shown = [(f"{n} iterations", surfaces[n]) for n in counts] + (
         [("truth", truth)] if truth is not None else []
     )
-    view = shading.View.around(np.stack([V for _, V in shown]))
+    view = SideView.around(np.stack([V for _, V in shown]))
     height, width = image.shape[:2]
     projected = [problem.camera.project(V)[0] for _, V in shown]
     low, high = np.concatenate(projected).min(axis=0), np.concatenate(projected).max(axis=0)
@@ -193,14 +194,12 @@ def picture(path, problem, frame, surfaces, counts, rows, usual, truth):
                 colors="white",
                 linewidths=0.6,
             )
-        for edge in border(template.faces):
+        for edge in boundary_edges(template.faces):
             over.plot(xy[edge, 0], xy[edge, 1], color="#ffb000", linewidth=1.2)
         over.set_xlim(low[0], high[0]), over.set_ylim(high[1], low[1])
         over.set_title(label, fontsize=10)
         beside.imshow(
-            shading.shade_surface(
-                V, template.faces, view, uv=template.texcoords.corners, size=(360, 300)
-            )
+            Triangles(V, template.faces).shaded(view, template.texcoords.corners, (360, 300))
         )
         if k < len(counts):
             row = rows[counts[k]]
@@ -239,16 +238,6 @@ def picture(path, problem, frame, surfaces, counts, rows, usual, truth):
         axes.legend(frameon=False, fontsize=8)
     with aside(path) as temporary:
         figure.savefig(temporary, format="png", facecolor="white")
-
-
-def border(faces):
-    """Edges (E, 2) that belong to one triangle alone."""
-    edges, count = np.unique(
-        np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1),
-        axis=0,
-        return_counts=True,
-    )
-    return edges[count == 1]
 
 
 def parser():

@@ -14,9 +14,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from polyfit import mesh
+from polysft_mi.backend import set_variant
 from polysft_mi.camera import Intrinsics
-from polysft_mi.pictures.shading import patch_colours, seen
-from polysft_mi.results.metrics import vertex_normals
+from polysft_mi.colours import patch_colours
 from polysft_mi.surface.meshio import read_textured_template
 from polysft_mi.surface.template import Template
 
@@ -29,6 +30,8 @@ CAMERA = Intrinsics(5.2 * PIXELS, 5.2 * PIXELS, PIXELS / 2, PIXELS / 2, PIXELS, 
 def picture(vertices, faces, colours, turn):
     """(SIDE, SIDE, 3) uint8: the mesh with colours (N, 3) uint8 of its vertices, turned by ``turn``
     [degrees] about its upright axis."""
+    from polysft_mi.render import Triangles
+
     angle = np.radians(turn)
     c, s = np.cos(angle), np.sin(angle)
     rotation = np.array([[1, 0, 0], [0, 0.97, -0.24], [0, 0.24, 0.97]]) @ [
@@ -39,10 +42,10 @@ def picture(vertices, faces, colours, turn):
     V = vertices - (vertices.max(0) + vertices.min(0)) / 2
     V = V @ rotation.T / np.linalg.norm(V, axis=1).max()
     V += (0, 0, 12)
-    toward = vertex_normals(V, faces) @ (0.35, -0.45, -0.82)
+    toward = mesh.vertex_normals(V, faces) @ (0.35, -0.45, -0.82)
     light = 0.55 + 0.45 * np.abs(toward)
     values = (colours * light[:, None]).T
-    depth, *planes = seen(V, faces, CAMERA, values)
+    depth, *planes = Triangles(V, faces).seen(CAMERA, values)
     image = np.where(np.isfinite(depth)[..., None], np.stack(planes, -1), 255)
     image = cv2.resize(image, (SIDE, SIDE), interpolation=cv2.INTER_AREA)
     return np.clip(np.round(image), 0, 255).astype(np.uint8)
@@ -72,6 +75,7 @@ def main():
     parser.add_argument("templates", nargs="*", default=[str(shirt)])
     parser.add_argument("-o", "--output", default=os.path.join(HERE, "atlas.jpg"))
     args = parser.parse_args()
+    set_variant()
     rows = []
     for path in args.templates:
         pictures, count = row(path)

@@ -14,10 +14,12 @@ import cv2
 import numpy as np
 
 from polysft_mi import Run, set_variant
-from polysft_mi.pictures.shading import seen, srgb
+from polysft_mi.colours import srgb
 
 set_variant()
 import mitsuba as mi  # noqa: E402
+
+from polysft_mi.render import Triangles  # noqa: E402
 
 ROOT = Path(__file__).parents[1]
 DEMO = ROOT / "scenes" / "demo"
@@ -44,7 +46,7 @@ def enlarged(image):
 def with_grid(image, run, vertices):
     """The frame, enlarged, with the lines of the surface that the camera sees."""
     camera = run.camera
-    (depth,) = seen(vertices, run.faces.astype(np.int64), camera)
+    (depth,) = Triangles(vertices, run.faces.astype(np.int64)).seen(camera)
     image = enlarged(image).copy()
     columns = len(np.unique(run.uv[:, 0].round(5)))
     grid = vertices.reshape(-1, columns, 3)

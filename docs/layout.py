@@ -16,6 +16,7 @@ PACKAGES = {"polysft_mi": "#dbe9f6", "polyfit": "#fbe3c8", "onefit": "#dff0d8"}
 WAY = {
     "polysft_mi": {
         "capture": "video and photo → a scene's folder",
+        "poses": "image → rigid pose of a template",
         "scene": "scene file → experiment",
         "surface": "mesh → template; unknowns → vertices",
         "render": "vertices → image, with gradients",

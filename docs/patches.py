@@ -34,14 +34,14 @@ def shaped(V, F, colours, smooth):
     (N, 3), linear RGB.
     """
     if len(colours) == len(F):
-        normals = vertex_normals(V, F)[F].reshape(-1, 3)
+        normals = mesh.vertex_normals(V, F)[F].reshape(-1, 3)
         V, colours, F = (
             V[F].reshape(-1, 3),
             np.repeat(colours, 3, axis=0),
             np.arange(3 * len(F)).reshape(-1, 3),
         )
     else:
-        normals = vertex_normals(V, F)
+        normals = mesh.vertex_normals(V, F)
     props = mi.Properties()
     colour = {"type": "mesh_attribute", "name": "vertex_color"}
     props["bsdf"] = mi.load_dict(
@@ -57,14 +57,6 @@ def shaped(V, F, colours, smooth):
         params["vertex_normals"] = mi.Float(normals.astype(np.float32).ravel())
     params.update()
     return out
-
-
-def vertex_normals(V, F):
-    n = mesh.face_vectors(V, F)
-    total = np.stack(
-        [np.bincount(F.ravel(), np.repeat(x, 3), minlength=len(V)) for x in n.T], axis=1
-    )
-    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
 
 
 def picture(shape, centre, distance, samples):

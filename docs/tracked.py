@@ -16,7 +16,7 @@ import numpy as np
 from polyfit.mesh import edges_of
 from polysft_mi import Run
 from polysft_mi.backend import set_variant
-from polysft_mi.pictures.shading import View, seen, shade_surface, srgb
+from polysft_mi.colours import srgb
 
 SIDE, ZOOM = 360, 2  # pixels of a picture; how much larger lines are drawn
 LINE = (255, 214, 64)  # RGB
@@ -34,8 +34,10 @@ def frame_of(run, k):
 
 def with_lines(image, run, vertices):
     """The image, enlarged, with the edges of the mesh that the camera sees."""
+    from polysft_mi.render import Triangles
+
     camera = run.camera
-    (depth,) = seen(vertices, run.faces.astype(np.int64), camera)
+    (depth,) = Triangles(vertices, run.faces.astype(np.int64)).seen(camera)
     depth = cv2.erode(np.nan_to_num(depth, nan=9.0), np.ones((3, 3)))
     image = cv2.resize(image, None, fx=ZOOM, fy=ZOOM, interpolation=cv2.INTER_LANCZOS4)
     xy = camera.project(vertices)
@@ -50,6 +52,8 @@ def with_lines(image, run, vertices):
 
 def row_of(folder, k):
     """The pictures of a run's frame, (SIDE, 4 SIDE, 3) uint8."""
+    from polysft_mi.render import SideView, Triangles
+
     run = Run.open(folder)
     vertices = run.vertices[list(run.frames).index(k)].astype(np.float64)
     image, xy = frame_of(run, k), run.camera.project(vertices)
@@ -61,8 +65,8 @@ def row_of(folder, k):
         part = picture[zoom * top : zoom * (top + side), zoom * left : zoom * (left + side)]
         pictures.append(cv2.resize(part, (SIDE, SIDE), interpolation=cv2.INTER_AREA))
     for turn in TURNS:
-        view = View.around(vertices, azimuth=turn, elevation=12.0)
-        pictures.append(shade_surface(vertices, run.faces, view, size=(SIDE, SIDE)))
+        view = SideView.around(vertices, azimuth=turn, elevation=12.0)
+        pictures.append(Triangles(vertices, run.faces).shaded(view, size=(SIDE, SIDE)))
     return np.hstack(pictures)
 
 

@@ -28,6 +28,7 @@ with optional_imports(__name__):
     from polyfit.training import add_run_arguments, run
 
     from .garment import FRAMES
+    from .motion import add_file_arguments
     from .network import EXTRAS
     from .objective import Weights
     from .training import OBJECTIVES, PRESETS, Settings, train
@@ -50,14 +51,7 @@ def parser():
         metavar="FILE",
         help="AMASS, NCS or BVH files (default: generated ones)",
     )
-    p.add_argument(
-        "--fps", type=float, help="frames a second of the motion files (default: as each file says)"
-    )
-    p.add_argument(
-        "--motion-up",
-        choices=("y", "z"),
-        help="the axis that points up in the motion files (default: that of their format)",
-    )
+    add_file_arguments(p)
     p.add_argument(
         "--from",
         dest="start",

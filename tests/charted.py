@@ -1,6 +1,8 @@
 """Deformations of patched garments, for tests."""
 
+import pytest
 import torch
+from slopes import slope
 
 from onefit.body import ClosestSurface, skinning
 from onefit.garment.charts import Deformation
@@ -30,3 +32,31 @@ def scene(body, patched, frames=T, seed=2, bend=0.15):
     return objective.Scene(
         transforms, posed, ClosestSurface(body.vertices, body.faces), rest, patched.field @ rest
     )
+
+
+def scene_and_past(body, patched, name):
+    """A scene, a deformation and two past positions, for the gradient of the term ``name``: little
+    moves for the collision, whose distance jumps where a point in the body has another part of it
+    for its nearest.
+    """
+    little = name == "collision"
+    s = scene(body, patched, bend=0.02 if little else 0.15)
+    before = [patched.changes(deformation(patched, 0.3, seed=k)) for k in (1, 2)]
+    past = [objective.vertices(patched, x, s.rest, s.transforms) for x in before]
+    return s, deformation(patched, 0.2 if little else 0.3), past
+
+
+def assert_gradient(value, d, name):
+    """The gradient of ``value`` (of alpha, translation, scale, drift) at a deformation, against
+    differences along directions in which it changes: random ones, leaning towards the gradient, for
+    float32 shows nothing else.
+    """
+    inputs = [x.clone().requires_grad_() for x in (d.alpha, d.translation, d.scale, d.drift)]
+    gradients = torch.autograd.grad(value(*inputs), inputs)
+    g = torch.Generator().manual_seed(7)
+    for k, gradient in enumerate(gradients):
+        chance = torch.randn(gradient.shape, generator=g)
+        direction = gradient / gradient.norm() + 0.3 * chance / chance.norm()
+        step = (1e-2 if name == "gravity" else 3e-4) / direction.abs().max().item()
+        expected = slope(value, inputs, k, direction, step)
+        assert float((gradient * direction).sum()) == pytest.approx(expected, rel=0.03), k

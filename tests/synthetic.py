@@ -11,9 +11,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from surfaces import grid as grid_faces
 
-from polyfit.mesh import TexCoords
-from polysft_mi.results.metrics import vertex_normals
+from polyfit.mesh import TexCoords, vertex_normals
 
 BACKGROUND = 0.03
 SUPERSAMPLING = 4
@@ -30,13 +30,6 @@ class Truth:
     faces: np.ndarray
     uv: np.ndarray | TexCoords
     K: np.ndarray
-
-
-def grid_faces(rows, columns):
-    """Two triangles a cell of a grid of points, row after row."""
-    k = np.arange(rows * columns).reshape(rows, columns)
-    a, b, c, d = (x.ravel() for x in (k[:-1, :-1], k[:-1, 1:], k[1:, :-1], k[1:, 1:]))
-    return np.stack([a, b, c, b, d, c], axis=1).reshape(-1, 3)
 
 
 def sheet(t, rows, columns, width=0.24, height=0.18, depth=0.5, bend=3.0, turn=0.15, shift=0.01):

@@ -4,6 +4,7 @@ import argparse
 import sys
 from functools import partial
 
+from onefit.motion import add_file_arguments
 from onefit.network import DEFAULT
 from polyfit.errors import InputError, Parser, require
 
@@ -84,14 +85,7 @@ def parser(name: str, text: str) -> Parser:
     group.add_argument(
         "--loose", action="store_true", help="a skirt or dress: the legs' pose is not followed"
     )
-    p.add_argument(
-        "--fps", type=float, help="frames a second of a motion file (default: as the file says)"
-    )
-    p.add_argument(
-        "--motion-up",
-        choices=("y", "z"),
-        help="the axis that points up in a motion file (default: that of its format)",
-    )
+    add_file_arguments(p)
     p.add_argument(
         "--seconds", type=float, default=3.0, help="length of a generated motion (default: 3)"
     )

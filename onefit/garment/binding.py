@@ -55,7 +55,7 @@ class Binding:
         self.distance = found.distance  # (N,) [m], negative inside the body
         self.barycentric = found.barycentric.astype(np.float64)  # (N, 3)
         self.corners = surface.faces[found.face]  # (N, 3) vertices of the body
-        facing = (found.normal * vertex_normals(V, F)).sum(axis=1)
+        facing = (found.normal * mesh.vertex_normals(V, F)).sum(axis=1)
         self._touching = np.flatnonzero((np.abs(self.distance) < 0.01) & (facing > 0.3))
         self._above = self._above_body(V, surface.vertices.astype(np.float64))[0]
         area, self._stiffness = cotangent_laplacian(V, F)
@@ -116,18 +116,6 @@ def smoother(trust, stiffness, length):
     system = (diags(trust) + length**2 * stiffness).tocsc()
     solver = splu(system, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
     return lambda y: solver.solve(trust[:, None] * y)
-
-
-def vertex_normals(V, F):
-    """Unit normals (N, 3), means of those of the faces around, weighted by their areas."""
-    N = np.stack(
-        [
-            np.bincount(F.ravel(), np.repeat(x, 3), minlength=len(V))
-            for x in mesh.face_vectors(V, F).T
-        ],
-        axis=1,
-    )
-    return N / np.maximum(np.linalg.norm(N, axis=1, keepdims=True), 1e-300)
 
 
 def cotangent_laplacian(V, F):

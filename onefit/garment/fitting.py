@@ -25,7 +25,6 @@ from .binding import (
     standard_body,
     standard_surface,
     surface_of,
-    vertex_normals,
 )
 
 _PUSHED_DEPTH = 0.03  # vertices inside the body by less than this are pushed out [m]
@@ -269,7 +268,7 @@ def _counterpart(source, target):
     for length in (0.08, 0.04, 0.02, 0.01):
         found = surface(x)
         area, stiffness = cotangent_laplacian(x, F)
-        facing = (found.normal * vertex_normals(x, F)).sum(axis=1)
+        facing = (found.normal * mesh.vertex_normals(x, F)).sum(axis=1)
         x = x + smoother(area * np.clip(facing, 1e-3, 1), stiffness, length)(found.point - x)
     return surface(x).point.astype(np.float64)
 

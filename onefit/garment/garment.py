@@ -18,7 +18,7 @@ from polyfit.errors import InputError
 from polyfit.mesh import TexCoords, read_textured
 
 from . import fitting, remesh
-from .binding import Binding, standard_body, standard_surface, vertex_normals
+from .binding import Binding, standard_body, standard_surface
 from .reading import RenderMesh, Stitches, check, mended, parts, stitched
 
 TEMPLATES = (
@@ -255,7 +255,8 @@ def _outward(V, F, surface):
     """
     part = parts(F)
     found = surface(V)
-    agree = (found.normal * vertex_normals(V, F)).sum(axis=1) / (1 + (found.distance / 0.02) ** 2)
+    agree = (found.normal * mesh.vertex_normals(V, F)).sum(axis=1)
+    agree /= 1 + (found.distance / 0.02) ** 2
     votes = np.bincount(part, mesh.areas(V, F) * agree[F].mean(axis=1))
     turned = votes[part] < 0
     if not turned.any():

@@ -10,20 +10,6 @@ from onefit.body import ClosestSurface
 from polyfit import mesh
 
 
-def loops(F):
-    """The boundary of a manifold mesh as a list of vertex indices, in the order in which their
-    faces walk them; the longest first.
-    """
-    after = dict(mesh.boundary_edges(F).tolist())
-    found = []
-    while after:
-        loop = [next(iter(after))]
-        while (following := after.pop(loop[-1], None)) is not None and following != loop[0]:
-            loop.append(following)
-        found.append(np.array(loop))
-    return sorted(found, key=len, reverse=True)
-
-
 def nearest_on_segments(points, a, b):
     """Of points (N, 3) the nearest point (N, 3) on any of the segments from a (S, 3) to b (S,
     3).

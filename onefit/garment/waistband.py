@@ -10,14 +10,15 @@ import numpy as np
 
 from onefit.body import skeleton
 from polyfit import mesh
+from polyfit.mesh import loops
 
-from .remesh import loops, nearest_on_segments
+from .remesh import nearest_on_segments
 
 _SHOULDERS = [skeleton.INDEX["left_shoulder"], skeleton.INDEX["right_shoulder"]]
 BAND_WIDTH = 0.02, 0.05  # [m]; cloth so near to the rim is held, farther away it is free
 
 
-def highest_rim(vertices, faces):
+def _highest_rim(vertices, faces):
     """The loop of the boundary that lies highest in the mean, vertex indices (R,); None without a
     boundary. ``vertices`` (N, 3) [m], NumPy, ``faces`` (F, 3)."""
     return max(loops(faces), key=lambda loop: vertices[loop, 2].mean(), default=None)
@@ -42,7 +43,7 @@ def held(vertices, faces, joints):
 
 def _held(vertices, faces, joints):
     """As :func:`held`, of one part."""
-    out, rim = np.zeros(len(vertices)), highest_rim(vertices, faces)
+    out, rim = np.zeros(len(vertices)), _highest_rim(vertices, faces)
     if rim is None or vertices[:, 2].max() > joints[_SHOULDERS, 2].mean():
         return out
     rim = vertices[rim]

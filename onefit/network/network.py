@@ -30,7 +30,7 @@ _MEMORY = 40.0  # frames that the slowest units of the memory keep, at first: a 
 EXTRAS = ("drift", "looseness", "held", "blend_weights", "whole", "free_heading", "memory")
 # Deformations that a unit of the decoder's output stands for: coefficients and translation in units
 # of the patch's radius, scale as a logarithm, drift in units of the patch's room.
-OUTPUT_UNIT = {"alpha": 0.2, "translation": 0.3, "scale": 0.05, "drift": 1.0}
+_OUTPUT_UNIT = {"alpha": 0.2, "translation": 0.3, "scale": 0.05, "drift": 1.0}
 
 
 def layers(widths, bias=True, last=True):
@@ -205,7 +205,7 @@ class Decoder(nn.Module):
         # needed
         x = nn.functional.leaky_relu(self.of_patch(Z_T) + self.of_body(Z_B)[:, None], LEAKY_SLOPE)
         x = self.trunk(x)
-        out = {name: head(x) * OUTPUT_UNIT[name] for name, head in self.heads.items()}
+        out = {name: head(x) * _OUTPUT_UNIT[name] for name, head in self.heads.items()}
         drift = out.get("drift", torch.zeros_like(out["translation"]))
         return Deformation(out["alpha"], out["translation"], out["scale"][..., 0], drift)
 

@@ -9,7 +9,7 @@ import torch
 from polyfit import mesh
 
 SMOOTHING = 10  # steps of half of the neighbours' mean: what is left are folds of some centimetres
-LOWEST = 1 / 3  # of the vertices, by their height under plain skinning in the first frame
+_LOWEST = 1 / 3  # of the vertices, by their height under plain skinning in the first frame
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,7 @@ class Folds:
     the mean over time of plain skinning's [degrees]; ``wave``: the same after :data:`SMOOTHING`
     steps of smoothing, folds of some centimetres and no noise; ``swing``: root mean square over
     time of the displacement from plain skinning less its mean [mm]; ``hang``: length of that mean
-    [mm]. These of the :data:`LOWEST` part. ``strain``: mean % by which the inner edges of the
+    [mm]. These of the lowest part. ``strain``: mean % by which the inner edges of the
     whole garment are longer or shorter than at rest.
     """
 
@@ -47,7 +47,7 @@ def folds(
     edges, sides = inner_edges(faces)
     vertices, skinned = vertices.double(), skinned.double()
     height = skinned[0, :, 2]
-    low = height < torch.quantile(height, LOWEST)
+    low = height < torch.quantile(height, _LOWEST)
     hinge = low[edges].all(1)
     smoothed = _smoother(edges, len(height))
     change = lambda f: _rms(

@@ -9,7 +9,7 @@ import numpy as np
 
 from polyfit.errors import InputError
 from polyfit.files import silent_decoders
-from polyfit.mesh import TexCoords, face_vectors
+from polyfit.mesh import TexCoords, vertex_normals
 
 # Rotations from OpenCV's camera axes to axes with y or z up
 AXES_FROM_CAMERA = {
@@ -32,13 +32,8 @@ def normals(vertices, faces):
     """Unit normals (T, N, 3) of the vertices, each the mean of its faces' normals by area; zero
     where there is none.
     """
-    out = np.zeros(np.shape(vertices), np.float64)
-    for V, n in zip(np.asarray(vertices, np.float64), out):
-        across = face_vectors(V, faces)
-        for k in range(3):
-            np.add.at(n, faces[:, k], across)
-        n /= np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-30)
-    return out.astype(np.float32)
+    V = np.asarray(vertices, np.float64)
+    return np.array([vertex_normals(v, faces) for v in V], np.float32).reshape(V.shape)
 
 
 def checked(vertices, faces, uv, fps):

@@ -94,9 +94,24 @@ def face_vectors(V: np.ndarray, F: np.ndarray) -> np.ndarray:
     return np.cross(V[F[:, 1]] - V[F[:, 0]], V[F[:, 2]] - V[F[:, 0]])
 
 
+def vertex_normals(V: np.ndarray, F: np.ndarray) -> np.ndarray:
+    """Unit normals (N, 3) of the vertices: the means of the adjacent faces' normals, weighted by
+    area (trimesh weights by angle). Zero where no face is.
+    """
+    N = [np.bincount(F.ravel(), np.repeat(x, 3), len(V)) for x in face_vectors(V, F).T]
+    total = np.stack(N, axis=1)
+    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
+
+
 def areas(V: np.ndarray, F: np.ndarray) -> np.ndarray:
     """Areas of the faces, (F,) [m^2]."""
     return 0.5 * np.linalg.norm(face_vectors(V, F), axis=1)
+
+
+def signed_areas(points: np.ndarray, F: np.ndarray) -> np.ndarray:
+    """Areas of the faces of a plane mesh, ``points`` (N, 2), (F,): above 0 where x turns to y."""
+    a, b = points[F[:, 1]] - points[F[:, 0]], points[F[:, 2]] - points[F[:, 0]]
+    return 0.5 * (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
 
 
 def edges_of(F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -114,6 +129,20 @@ def boundary_edges(F: np.ndarray) -> np.ndarray:
     edges, side = edges_of(F)
     once = np.bincount(side.ravel(), minlength=len(edges))[side] == 1
     return np.stack([F, np.roll(F, -1, axis=1)], axis=-1)[once]
+
+
+def loops(F: np.ndarray) -> list[np.ndarray]:
+    """The boundary of a manifold mesh as a list of vertex indices, in the order in which their
+    faces walk them; the longest first.
+    """
+    after = dict(boundary_edges(F).tolist())
+    found = []
+    while after:
+        loop = [next(iter(after))]
+        while (following := after.pop(loop[-1], None)) is not None and following != loop[0]:
+            loop.append(following)
+        found.append(np.array(loop))
+    return sorted(found, key=len, reverse=True)
 
 
 def neighbour_mean(F: np.ndarray, count: int, boundary_apart: bool = False) -> csr_matrix:

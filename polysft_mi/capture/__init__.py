@@ -1,7 +1,8 @@
 """From a video and a photo of the sheet, or from a folder that is there, to a scene file.
 
 In: what a person filmed, measured and photographed. Out: a folder with frames, masks, template,
-texture, camera and ``scene.xml``, which ``polysft run`` takes.
+texture, camera and ``scene.xml``, which ``polysft run`` takes. Where the sheet is,
+:mod:`polysft_mi.poses` tells.
 """
 
 import lazy_loader

@@ -6,6 +6,8 @@ Light is counted in shares of the white of a sheet of paper, 203 cd/m2 (ITU-R BT
 
 import numpy as np
 
+from polysft_mi.colours import srgb
+
 _CURVES = {16: "PQ", 18: "HLG"}  # FFmpeg's numbers of transfer characteristics
 _BT2020 = 9  # and of primaries
 _UNSPECIFIED = 2
@@ -54,9 +56,7 @@ def _of_hlg(signal):
 
 def _srgb_table(count=1 << 14):
     """8-bit sRGB (IEC 61966-2-1) of ``count`` even steps of light from 0 to 1."""
-    x = np.linspace(0, 1, count)
-    coded = np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
-    return np.round(255 * coded).astype(np.uint8)
+    return np.round(255 * srgb(np.linspace(0, 1, count))).astype(np.uint8)
 
 
 _LINEAR = {"PQ": _of_pq, "HLG": _of_hlg}

@@ -5,8 +5,7 @@ images.
 import cv2
 import numpy as np
 
-from polysft_mi.pictures import seen
-from polysft_mi.scene.outline import loops
+from polyfit.mesh import loops
 
 GREEN, _RED, _YELLOW = (60, 220, 90), (235, 70, 60), (255, 210, 40)
 
@@ -129,7 +128,9 @@ def photo_on_frame(frame, photo, sheet, placed, camera):
     """The frame (H, W, 3), and on it the photo where the camera sees it on the sheet, whose
     vertices are ``placed`` (N, 3) [m, camera frame].
     """
-    _, u, v = seen(placed, sheet.faces, camera, sheet.uv.T)
+    from polysft_mi.render import Triangles
+
+    _, u, v = Triangles(placed, sheet.faces).seen(camera, sheet.uv.T)
     rows, columns = np.nonzero(np.isfinite(u))
     extent = max(np.ptp(rows), np.ptp(columns)) if len(rows) else 1
     side = max(1.0, max(photo.shape[:2]) / max(extent, 1))

@@ -10,6 +10,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from polysft_mi.backend import set_variant
 from polysft_mi.errors import InputError
 from polysft_mi.scene import focal_35mm, read_rgb
 from polysft_mi.surface import meshio
@@ -104,6 +105,7 @@ def prepare_video(
         f" {'undistorted, ' if any(lens.distortion) else ''}from {lens.source}"
     )
 
+    set_variant()  # what hides a part of itself, and the pictures, need rays
     photo = _photo(texture, texture_corners, size)
     mesh = _sheet(size, template, resolution, photo, texture, say)
     if corners is not None:

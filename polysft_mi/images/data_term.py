@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from polyfit.mesh import signed_areas
 from polysft_mi.render import frozen, on_device
 from polysft_mi.surface import Pattern
 
@@ -89,17 +90,13 @@ class DataTerm:
         self._sums, self._outline = frozen(pixels.triangle_sums), frozen(pixels.silhouette_terms)
         self.normalise, self._masked = normalise, sequence.mask_files is not None
         position, _ = self.camera.project(template.vertices)
-        self.texture = Texture(
-            placed.mesh,
-            placed.rendered_faces,
-            position[self._corner],
-            self._rules.texels,
-            self._masked,
-            self.normalise,
-            len(template) > 1,
-        )
+        shown = placed.mesh, placed.rendered_faces, position[self._corner]
+        how = self._rules.texels, self._masked, self.normalise, len(template) > 1
+        self.texture = Texture(*shown, *how)
+        # of the side that is turned to the camera: the larger one, for a sheet has any winding
+        signed = signed_areas(position, self.faces)
         #: of the template in the image [pixels]
-        self.area = _shown_area(position, self.faces)
+        self.area = max(signed[signed > 0].sum(), -signed[signed < 0].sum())
         self._unit = max(1.0, math.sqrt(self.area) / _SHEET)
         self._frames = Frames(sequence, normalise)
         self._levels, self._last, self._brightness = {}, None, None
@@ -259,15 +256,8 @@ class DataTerm:
         # pixels closer than the blur are no evidence of their own
         noise = 2 * photometric / (3 * max(compared_pixels, 1.0))
         noise *= max(1.0, 4 * math.pi * level.sigma**2)
-        return Evaluation(
-            photometric,
-            silhouette,
-            outlier_share,
-            misfit,
-            images,
-            figures[:, 1] * level.stride**2,
-            noise,
-        )
+        energies, seen = (photometric, silhouette), figures[:, 1] * level.stride**2
+        return Evaluation(*energies, outlier_share, misfit, images, seen, noise)
 
     def shade(self, vertices, frame, seen, appearance=None):
         """The triangles' :class:`polysft_mi.images.light.Shade` in a frame; ``seen`` as in
@@ -347,22 +337,8 @@ class DataTerm:
             for k, n in zip(corner[::-1], inside.shape, strict=True)
         ]
         inside = inside.astype(np.float32)
-        wide = compared(
-            np.pad(colour, (*pads, (0, 0))),
-            np.pad(inside, pads),
-            level.sigma / level.stride,
-            level.window / level.stride,
-            self.normalise,
-            level.floor,
-        )
+        padded = np.pad(colour, (*pads, (0, 0))), np.pad(inside, pads)
+        scales = level.sigma / level.stride, level.window / level.stride
+        wide = compared(*padded, *scales, self.normalise, level.floor)
         (top, _), (left, _) = pads
         return wide[top : top + inside.shape[0], left : left + inside.shape[1]], inside
-
-
-def _shown_area(position, faces):
-    """Area [pixels^2] of the side of a surface that is turned to the camera, its vertices at
-    ``position`` (N, 2) [pixels]: the larger one, for a sheet may be wound either way."""
-    a, b, c = (position[faces[:, k]] for k in range(3))
-    ab, ac = b - a, c - a
-    signed = 0.5 * (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0])
-    return max(signed[signed > 0].sum(), -signed[signed < 0].sum())

@@ -69,30 +69,14 @@ class Tables:
         kept = np.flatnonzero(first <= second)
         edge = np.full(len(i), -1)
         edge[pattern.half_edges] = np.arange(len(edges))
-        half = np.empty(len(pattern.row), dtype=np.int64)
-        half[pattern.upper], half[pattern.lower] = 2 * np.arange(len(i)), 2 * pattern.mirrored + 1
         share_start, share = _listed(pattern.find_half(first[kept], second[kept]), kept, len(i))
         curvature = _WIDTH * (share // 9) + 3 * _PAIR[share % 9]
         corner_start, corner = _listed(faces.ravel(), np.arange(faces.size), count)
         end_start, end = _listed(edges.ravel(), np.arange(edges.size), count)
         pair_start = np.searchsorted(i, np.arange(count + 1))
-        arrays = (
-            i,
-            j,
-            pair_start,
-            share_start,
-            share,
-            curvature,
-            corner_start,
-            corner,
-            *edges.T,
-            edge,
-            end_start,
-            end,
-            pattern.start,
-            pattern.column,
-            half,
-        )
+        lists = pair_start, share_start, share, curvature, corner_start, corner
+        of_edges = *edges.T, edge, end_start, end
+        arrays = i, j, *lists, *of_edges, pattern.start, pattern.column, pattern.half
         return cls(*(on_device(x, f.type) for f, x in zip(fields(cls), arrays)))
 
 
@@ -165,7 +149,7 @@ def rows_of(numbers, width):
     return [numbers[k : k + width] for k in range(0, len(numbers), width)]
 
 
-def at_vertices(tables, table, figures, vertices, camera, numbers, silhouette):
+def _at_vertices(tables, table, figures, vertices, camera, numbers, silhouette):
     """:class:`Images` of the sums ``table`` (Float of 27F) and ``figures`` (Float of 4F) of the
     triangles.
 
@@ -175,13 +159,8 @@ def at_vertices(tables, table, figures, vertices, camera, numbers, silhouette):
     :func:`polysft_mi.images.pixels.silhouette_terms` gives them, or None.
     """
     weight, mask_weight, area, scale = (dr.gather(mi.Float64, numbers, k) for k in range(4))
-    count = dr.sum(
-        mi.Float64(
-            dr.gather(
-                mi.Float, figures, FIGURES * dr.arange(mi.UInt32, dr.width(figures) // FIGURES) + 1
-            )
-        )
-    )
+    face = dr.arange(mi.UInt32, dr.width(figures) // FIGURES)
+    count = dr.sum(mi.Float64(dr.gather(mi.Float, figures, FIGURES * face + 1)))
     weight = weight / dr.select(area > 0, area, dr.maximum(count, 1))
     vertex, pair = (
         dr.arange(mi.UInt32, dr.width(vertices) // 3),
@@ -259,11 +238,11 @@ class Gather:
     def __init__(self, pattern, camera):
         self.tables = Tables.of(pattern)
         self.camera = flat(np.concatenate([camera.inverse.ravel(), camera.origin]))
-        self._at_vertices = frozen(at_vertices)
+        self._at_vertices = frozen(_at_vertices)
 
     def images(self, table, figures, vertices, weight, mask_weight, area, stride, silhouette):
-        """:class:`Images` of the triangles' sums and a silhouette. Arguments as :func:`at_vertices`
-        takes them; vertices (N, 3) [m]; ``area``: of the mask [pixels of the grid], or None.
+        """:class:`Images` of the triangles' sums and a silhouette. Arguments as the
+        kernel takes them; vertices (N, 3) [m]; ``area``: of the mask [pixels of the grid], or None.
         """
         numbers = flat([weight, mask_weight, area or 0, 1 / stride])
         return self._at_vertices(

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from polyfit.mesh import signed_areas
 from polysft_mi.scene import Rules
 
 from .pyramid import blur, shrink
@@ -78,26 +79,18 @@ class Light:
     @property
     def scale(self):
         """The residual, over the texture's mean luminance, from which on one hardly counts."""
-        return (
-            float(
-                np.clip(
-                    self.rules.light_scale * self.deviations / self.frames,
-                    *self.rules.light_scale_bounds,
-                )
-            )
-            if self.frames
-            else self.rules.light_first_scale
-        )
+        if not self.frames:
+            return self.rules.light_first_scale
+        scale = self.rules.light_scale * self.deviations / self.frames
+        return float(np.clip(scale, *self.rules.light_scale_bounds))
 
     def coefficients(self, triangles):
         """(l_0, l, g) (7,), of a sheet of so many triangles; the same from all sides where nothing
         is known.
         """
-        return (
-            np.linalg.solve(self._prior_curvature(triangles), self.right)
-            if self.frames
-            else np.eye(_SIZE)[0]
-        )
+        if not self.frames:
+            return np.eye(_SIZE)[0]
+        return np.linalg.solve(self._prior_curvature(triangles), self.right)
 
     def _prior_curvature(self, triangles):
         """The curvature (7, 7) that holds the coefficients where they are, in squared residuals of
@@ -173,7 +166,9 @@ class Brightness:
     def __init__(self, faces, vertices, position, texture, masked, rules):
         self.faces, self.centre, self.rules = faces, vertices.mean(0), rules
         self.unit = float(np.abs(vertices - self.centre).max())
-        self.sigma = rules.shading_blur * math.sqrt(max(areas(position, faces).mean(), 1.0))
+        self.sigma = rules.shading_blur * math.sqrt(
+            max(np.abs(signed_areas(position, faces)).mean(), 1.0)
+        )
         sigma, inside, centroids = texture.density * self.sigma, texture.inside, texture.centroids()
         covered = cv2.GaussianBlur(inside, (0, 0), sigma)
         luminance = blur(texture.image @ _LUMINANCE, sigma, inside if masked else None)
@@ -279,15 +274,6 @@ def _exposure(value, lit):
 def _cross(a, b):
     """a x b of (F, 3) each; several times faster than numpy.cross."""
     return np.stack([a[:, i] * b[:, j] - a[:, j] * b[:, i] for i, j in ((1, 2), (2, 0), (0, 1))], 1)
-
-
-def areas(position, faces):
-    """Of triangles (F, 3) whose vertices lie at ``position`` (N, 2) [pixels] in an image: (F,)
-    [pixels^2].
-    """
-    corner = position[faces]
-    a, b = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
-    return 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
 
 
 def _sampled(image, points):

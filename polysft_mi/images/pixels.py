@@ -17,14 +17,8 @@ from polysft_mi.render import blend, point2
 from .pyramid import MAX_CONTOUR_DISTANCE
 
 MISFIT = 0.5  # residual, in local standard deviations, that counts half a misfit
-CORNERS = (
-    (0, 0),
-    (1, 1),
-    (2, 2),
-    (0, 1),
-    (0, 2),
-    (1, 2),
-)  # pairs of a triangle's corners, as their curvatures are summed
+# pairs of a triangle's corners, as their curvatures are summed
+CORNERS = (0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)
 CURVATURES, SLOPES, FIGURES = 18, 9, 4  # sums over the pixels of a triangle
 TAPS = 2  # across a pixel's footprint on the texture, and along it
 # pixels by which a ray may pass the triangle that it meets: it and the projection round differently
@@ -138,7 +132,7 @@ def ray_hits(seen, sheet):
     return RayHit(ray, triangle, b1, b2, e1, e2, at, c1 - c0, c2 - c0)
 
 
-def pixel_coordinates(seen):
+def _pixel_coordinates(seen):
     """The pixels' places (x, y) on the level's grid, Int32."""
     x0, y0, width, _ = seen.region
     local = dr.arange(mi.UInt32, dr.width(seen.triangle))
@@ -160,7 +154,7 @@ def residuals(seen, sheet, texture, frame, excess):
     """
     hit, found = seen.hit, ray_hits(seen, sheet)
     colour, by_x, by_y = texture.bilinear(found.at, hit)
-    x, y = pixel_coordinates(seen)
+    x, y = _pixel_coordinates(seen)
     pixel, known = frame.at(x, y)
     target = dr.gather(mi.Vector4f, frame.texels, pixel, hit & known)
     weight = dr.select(hit & (colour.w > 0.5), target.w, 0)
@@ -214,14 +208,14 @@ def triangle_sums(seen, sheet, texture, frame, excess, scale):
         weight * squared / (squared + c2),
         weight * squared / (squared + MISFIT**2),
     )
-    return by_triangle(
+    return _by_triangle(
         seen,
         sheet,
         (mi.Vector4f(xx, xy, yy, found.b1), mi.Vector4f(*first, found.b2), mi.Vector4f(*figures)),
     )
 
 
-def by_triangle(seen, sheet, found):
+def _by_triangle(seen, sheet, found):
     """Sums over the pixels that see each triangle: curvatures and slopes, Float of 27 F, and
     figures, Float of 4 F.
 
@@ -340,7 +334,7 @@ def silhouette_terms(seen, pairs, mask, distance, corner_of):
     term's slope here and its minimum at the mask's contour. A step then goes all the way, where
     plain Gauss-Newton, whose residuals are pixels, would go one pixel.
     """
-    x, y = pixel_coordinates(seen)
+    x, y = _pixel_coordinates(seen)
     pixel, known = mask.at(x, y)
     wanted, alpha = (
         dr.gather(mi.Float, mask.texels, pixel, known),

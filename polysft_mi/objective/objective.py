@@ -37,23 +37,16 @@ if TYPE_CHECKING:
 class Objective:
     """The terms of a :class:`polysft_mi.objective.problem.Problem`.
 
-    ``surface``: in place of the problem's jets, anything that makes vertices of unknowns; then the
-    terms of jets must have no weight. Raises InputError where a term does not fit the template.
+    The problem's ``patch`` may be anything that makes vertices of unknowns; then the terms of jets
+    must have no weight. Raises InputError where a term does not fit the template.
     """
 
-    def __init__(self, problem: Problem, surface: Any = None) -> None:
+    def __init__(self, problem: Problem) -> None:
         self.settings, self.rules = problem.settings, problem.rules
         self.problem, self.atlas = problem, problem.atlas
-        self.inputs = Inputs(
-            problem.settings,
-            problem.rules,
-            problem.template,
-            surface or problem.patch,
-            problem.atlas,
-            problem.placed,
-            problem.sequence,
-            problem.experiment.path,
-        )
+        p = problem
+        sheet, where = (p.template, p.patch, p.atlas), (p.placed, p.sequence, p.experiment.path)
+        self.inputs = Inputs(p.settings, p.rules, *sheet, *where)
         chosen = [kind for kind in TERMS if kind.is_used(self.settings)]
         self.terms: list[Term] = [kind(self.inputs) for kind in chosen]
         #: the stage for a sheet that moved far, and the usual ones, coarse to fine

@@ -34,15 +34,9 @@ class Problem:
         self.settings = experiment.settings.for_patches(len(self.template))
         self.rules = (rules or Rules()).for_patches(len(self.template))
         self.patch, self.atlas = JetAtlas(self.template), Atlas(self.template)
-        self.placed = PlacedMesh(
-            experiment.scene,
-            experiment.sensor,
-            experiment.renderer,
-            experiment.mesh,
-            experiment.corner,
-            self.settings.sppi,
-            experiment.path,
-        )
+        e = experiment
+        rendered = e.scene, e.sensor, e.renderer, e.mesh, e.corner
+        self.placed = PlacedMesh(*rendered, self.settings.sppi, e.path)
         self.camera = self.placed.camera
         self.width, self.height = experiment.size
 

@@ -260,15 +260,13 @@ def _vertex_sums_in_unknowns(
     own = rows_of(numbers_of(offset_jacobian, vertex, 9), 3)
     along = [sum(own[k][a] * gradient[k] for k in range(3)) for a in range(3)]
 
-    # the 3 x 3 of a neighbour in a halo, row by row, times its patch's up
-    flipped, first = (halo.block & 1) != 0, 9 * (halo.block // 2)
-    h = [
-        [
-            dr.gather(mi.Float64, space, first + dr.select(flipped, 3 * b + a, 3 * a + b))
-            for b in range(3)
-        ]
-        for a in range(3)
-    ]
+    def in_space(block):
+        """The 3 x 3 of a neighbour in a halo, its rows."""
+        flipped, first = (block & 1) != 0, 9 * (block // 2)
+        at = lambda a, b: first + dr.select(flipped, 3 * b + a, 3 * a + b)
+        return [[dr.gather(mi.Float64, space, at(a, b)) for b in range(3)] for a in range(3)]
+
+    h = in_space(halo.block)  # times its patch's up
     direction = numbers_of(up, halo.patch, 3)
     raised = packed(
         [sum(row[k] * direction[k] for k in range(3)) for row in h],
@@ -276,16 +274,8 @@ def _vertex_sums_in_unknowns(
     )
 
     def motion(k):
-        block = dr.gather(mi.UInt32, halo.block, k)
-        flipped, first = (block & 1) != 0, 9 * (block // 2)
+        h = in_space(dr.gather(mi.UInt32, halo.block, k))
         m = rows_of(numbers_of(motion_jacobian, dr.gather(mi.UInt32, halo.entry, k), 18), 6)
-        h = [
-            [
-                dr.gather(mi.Float64, space, first + dr.select(flipped, 3 * b + a, 3 * a + b))
-                for b in range(3)
-            ]
-            for a in range(3)
-        ]
         return [sum(row[k] * m[k][c] for k in range(3)) for row in h for c in range(6)]
 
     every = dr.arange(mi.UInt32, dr.width(halo.block))
@@ -326,9 +316,6 @@ class Assembly:
 
     def _list_halo(self):
         pattern, atlas = self.pattern, self._atlas
-        half = np.empty(len(pattern.row), dtype=np.int64)
-        half[pattern.upper] = 2 * np.arange(len(pattern.upper))
-        half[pattern.lower] = 2 * pattern.mirrored + 1
         entries = sp.csr_matrix(
             (np.arange(len(atlas.entry_vertex)) + 1, (atlas.entry_vertex, atlas.entry_patch)),
             (pattern.count, len(atlas)),
@@ -343,7 +330,7 @@ class Assembly:
         ends = np.searchsorted(halo_patch, np.arange(len(atlas) + 1))
         #: the vertices of each patch's halo, and its rows
         self._reached = [(vertex[a:b], slice(a, b)) for a, b in itertools.pairwise(ends)]
-        arrays = np.append(first, len(key)), half[block], entry, patch
+        arrays = np.append(first, len(key)), pattern.half[block], entry, patch
         self._halo = Halo(*(on_device(x, mi.UInt32) for x in arrays))
         self._index = len(pairs)
         # of the patches that meet: the entries of one that the other's halo has, and where
@@ -368,20 +355,12 @@ class Assembly:
         pattern, count, basis = self.pattern, self.pattern.count, surface.basis
         size, patches = basis.shape[1], len(surface.up)
         forms = triangles and (flat(triangles.gradient), flat(triangles.curvature))
+        of_edges = flat(edges.lengths), flat([edges.stiffness, edges.give])
+        derivatives = surface.offset_jacobian, surface.up, surface.motion_jacobian, basis
         found = self._in_unknowns(
-            self._tables,
-            self._halo,
-            images,
-            flat(surface.vertices),
-            flat(edges.lengths),
-            flat([edges.stiffness, edges.give]),
-            flat(surface.offset_jacobian),
-            flat(surface.up),
-            flat(surface.motion_jacobian),
-            flat(basis),
-            dr.arange(mi.UInt32, size * self._index),
-            dr.opaque(mi.UInt32, size),
-            forms,
+            *(self._tables, self._halo, images),
+            *(flat(surface.vertices), *of_edges, *map(flat, derivatives)),
+            *(dr.arange(mi.UInt32, size * self._index), dr.opaque(mi.UInt32, size), forms),
         )
         energy, gradient, along, local, moved, *lifted = (np.array(x) for x in found)
         gradient, moved = gradient.reshape(-1, 3), moved.reshape(-1, 3, 6)

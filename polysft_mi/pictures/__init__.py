@@ -1,8 +1,8 @@
 """Pictures of a run: surfaces, images and figures in; PNG, EXR, video and one HTML page out.
 
 The album of a run is drawn while it tracks (:class:`Drawing`); its report and comparisons read a
-finished run, the viewer also one at work, or a drape. matplotlib, plotly, viser and Mitsuba are
-loaded on use.
+finished run, the viewer also one at work, or a drape. Meshes are drawn by
+:mod:`polysft_mi.render.stage`. matplotlib, plotly, viser and Mitsuba are loaded on use.
 """
 
 import lazy_loader
@@ -15,7 +15,6 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "exr": ["read_exr", "write_exr"],
         "moving": ["Source"],
         "report.page": ["write_report"],
-        "shading": ["View", "seen", "shade_surface", "srgb"],
         "video": ["read_video", "write_video"],
         "viewer": ["Viewer"],
     },

@@ -15,14 +15,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from polysft_mi.colours import srgb
 from polysft_mi.images import compared
-from polysft_mi.render import RasterIntegrator
+from polysft_mi.render import RasterIntegrator, SideView, Triangles
 from polysft_mi.results import metrics
 
 from . import figures
 from .exr import write_exr
 from .panels import COLUMNS, PEAKS, Box, evenly_spaced, heat, heat_values
-from .shading import srgb
 from .video import write_video
 
 
@@ -163,6 +163,7 @@ class Album:
         self.problem, self.out, self.about, self.folder = problem, out, about, folder
         self.settings = settings or AlbumSettings()
         self._renderings, self._texcoords, self._view = Renderings(problem), None, None
+        self._sheet = None  # the surface, as it is seen from the side
         self._masked = problem.sequence.mask(0) is not None
         self._pool = ThreadPoolExecutor(self.settings.threads)
         self._drawn = {}  # frame: future of its figures
@@ -182,7 +183,7 @@ class Album:
             self.problem.placed.set_texcoords(mi.Float(texcoords))
         surface = self.problem.camera.to_camera(vertices)
         if self._view is None:
-            self._view = figures.View.around(surface).wider(self.settings.view)
+            self._view = SideView.around(surface).wider(self.settings.view)
         layers = self._renderings(vertices, frame, geometry=exr)
         waiting = [f for f in self._drawn.values() if not f.done()]
         if len(waiting) >= self.settings.waiting:
@@ -190,7 +191,8 @@ class Album:
         if frame in self._drawn:
             self._drawn[frame].result()
         self._place_of(frame, vertices)
-        self._drawn[frame] = self._pool.submit(self._draw, frame, surface, layers, exr)
+        self._write(frame, "surface", self._shaded(surface))
+        self._drawn[frame] = self._pool.submit(self._draw, frame, layers, exr)
 
     def _place_of(self, frame, vertices):
         """Set what the pictures of a frame show. Where the sheet will go is not known yet: room
@@ -207,7 +209,7 @@ class Album:
         if self._scale is None:
             self._scale = min(1.0, self.settings.width / box.size[0])
 
-    def _draw(self, frame, surface, layers, exr):
+    def _draw(self, frame, layers, exr):
         index = self.problem.sequence.indices[frame]
         layers["residual"] = residual(layers, self._masked)
         if exr:
@@ -221,7 +223,6 @@ class Album:
         for name, peak in PEAKS.items():
             parts[name] = heat(parts[name], peak)
         self._write(frame, "images", np.concatenate([parts[n] for n in COLUMNS[:-1]], axis=1))
-        self._write(frame, "surface", self._shaded(surface))
         return {"frame": int(index), **_figures(layers, self._masked)}
 
     def _shaded(self, surface):
@@ -230,9 +231,10 @@ class Album:
         """
         template, first = self.problem.template, next(iter(self._boxes.values()))
         side = max(16, round(min(first.size) * self._scale))
-        return figures.shade_surface(
-            surface, template.faces, self._view, uv=template.texcoords.corners, size=(side, side)
-        )
+        if self._sheet is None:
+            self._sheet = Triangles(surface, template.faces)
+        self._sheet.move(surface)
+        return self._sheet.shaded(self._view, template.texcoords.corners, (side, side))
 
     def _place(self, frame, name):
         return os.path.join(self.folder, f"{frame}-{name}.png")
@@ -286,12 +288,9 @@ class Album:
         for k in range(1, count):
             self.box = self.box.union(self._boxes[k])
         if not self._view.holds(surfaces):
-            self._view = figures.View.around(surfaces)
-
-            def shade(k):
+            self._view = SideView.around(surfaces)
+            for k in range(count):
                 self._write(k, "surface", self._shaded(surfaces[k]))
-
-            list(self._pool.map(shade, range(count)))
         self.rows = []
         for k in evenly_spaced(count, self.settings.rows):
             row = self._panels(k)

@@ -9,12 +9,12 @@ import re
 import numpy as np
 
 from polyfit.files import folder_aside
+from polysft_mi.backend import set_variant
 from polysft_mi.errors import InputError
 from polysft_mi.results.comparison import LABELS
 
 from . import exr, figures
 from .panels import box_of, evenly_spaced, panels
-from .shading import seen
 
 
 def write_comparison(comparison, out, *, count=20, scale=None):
@@ -25,6 +25,7 @@ def write_comparison(comparison, out, *, count=20, scale=None):
     ``scale``: the difference [mm] at which the colours end; by default 98 % of the pixels lie below
     it. Returns the number of frames drawn. Raises InputError.
     """
+    set_variant()
     run = comparison.run
     if run.camera is None:
         raise InputError(f"{run.folder}: holds no camera.json, which pictures need; run it again")
@@ -61,19 +62,22 @@ def difference_maps(comparison, frame):
     """Images (H, W) [m] of a frame, as A's camera sees it, NaN where a value is not known:
     ``depth_a``, and as far as B allows ``depth_b``, ``depth_difference`` and ``distance``.
     """
+    from polysft_mi.render import Triangles
+
     run, truth = comparison.run, comparison.truth
-    V, faces, G = comparison.vertices(frame), run.faces.astype(np.int64), truth.at(frame)
+    V, G = comparison.vertices(frame), truth.at(frame)
+    surface = Triangles(V, run.faces.astype(np.int64))
     if truth.kind == "clouds":
         from scipy.spatial import cKDTree
 
-        depth, distance = seen(V, faces, run.camera, [cKDTree(G).query(V)[0]])
+        depth, distance = surface.seen(run.camera, [cKDTree(G).query(V)[0]])
         return {"depth_a": depth, "distance": distance}
     if truth.kind == "points":
-        (depth_a,), distance, depth_b = seen(V, faces, run.camera), [], _splatted(G, run.camera)
+        (depth_a,), distance, depth_b = surface.seen(run.camera), [], _splatted(G, run.camera)
     else:
         values = [np.linalg.norm(V - G, axis=1)] if comparison.same_mesh else []
-        depth_a, *distance = seen(V, faces, run.camera, values)
-        (depth_b,) = seen(G, truth.faces, run.camera)
+        depth_a, *distance = surface.seen(run.camera, values)
+        (depth_b,) = Triangles(G, truth.faces).seen(run.camera)
     maps = {"depth_a": depth_a, "depth_b": depth_b, "depth_difference": depth_a - depth_b}
     return {**maps, "distance": distance[0]} if distance else maps
 

@@ -14,11 +14,9 @@ import numpy as np
 
 from polyfit.errors import Notice
 from polyfit.files import DISK_FULL_ERRORS, aside
+from polysft_mi.colours import linear
 
 from .panels import PEAKS
-from .shading import View, shade_surface
-
-__all__ = ["View", "contact_sheet", "frame_plot", "loss_plot", "shade_surface"]
 
 TERMS = {"loss": "total", "rgb": "photometric"} | {
     t: t for t in ("silhouette", "shading", "inextensibility", "smoothness", "temporal")
@@ -265,8 +263,7 @@ def false_colour(name, values, scale):
     _, colours, low = _MAPS[name]
     x = np.clip((values / scale - low) / (1 - low), 0, 1)
     rgb = matplotlib.colormaps[colours](np.nan_to_num(x))[..., :3]
-    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
-    return np.where(np.isfinite(values)[..., None], linear, 0)
+    return np.where(np.isfinite(values)[..., None], linear(rgb), 0)
 
 
 def false_colours(path, title, images, maps, scale, box):

@@ -13,12 +13,12 @@ import numpy as np
 from polyfit.animation import AXES_FROM_CAMERA, from_camera
 from polyfit.mesh import TexCoords
 from polysft_mi.camera import Intrinsics
+from polysft_mi.colours import patch_colours, range_of
 from polysft_mi.errors import InputError
 from polysft_mi.results import Run, load_npz
 from polysft_mi.scene import located, open_cameras
 
 from .panels import residual_at_vertices
-from .shading import patch_colours, range_of
 
 _GREY = (176, 176, 176)
 _CLOTH = (106, 141, 182)

@@ -7,7 +7,7 @@ import time
 import numpy as np
 
 from polyfit.errors import InputError, require
-from polysft_mi.results import vertex_normals
+from polyfit.mesh import vertex_normals
 
 _LOOK_AGAIN = 1.0  # [s] between two looks at a folder that may grow
 _LOADING = 0.1  # [s] that a browser has to load a frame

@@ -1,5 +1,6 @@
 """The scene and the vertices of the surface go in; an image, what each pixel sees, and their
-gradients come out. Importing a name needs a Mitsuba variant.
+gradients come out. :mod:`stage` draws any mesh for pictures. Importing a name needs a Mitsuba
+variant.
 """
 
 import lazy_loader
@@ -14,6 +15,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "projective": ["SilhouetteProjective"],
         "raster": ["RasterIntegrator"],
         "silhouette": ["blend"],
+        "stage": ["SideView", "Triangles"],
         "topology": ["Topology"],
         "view": ["Seen", "View", "point2"],
     },

@@ -4,6 +4,7 @@ attached. Import only after a Mitsuba variant is set.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -103,22 +104,10 @@ class PlacedMesh:
             channels = image.shape[2]
             alpha = _channel(image, 3, count, channels)
         else:
-            image = mi.render(
-                self.scene,
-                self._params,
-                sensor=self.sensor,
-                integrator=self.renderer,
-                spp=spp,
-                seed=seed,
-            )
-            mask = mi.render(
-                self.scene,
-                self._params,
-                sensor=self.sensor,
-                integrator=self._mask_renderer,
-                spp=max(spp, _MASK_SPP),
-                seed=~seed & 0xFFFFFFFF,
-            )
+            shown = partial(mi.render, self.scene, self._params, self.sensor)
+            image = shown(self.renderer, spp=spp, seed=seed)
+            more = dict(spp=max(spp, _MASK_SPP), seed=~seed & 0xFFFFFFFF)
+            mask = shown(self._mask_renderer, **more)
             channels = image.shape[2]
             alpha = _channel(mask, 0, count, mask.shape[2])
         pixel = dr.arange(mi.UInt32, 3 * count)

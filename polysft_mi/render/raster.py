@@ -217,15 +217,8 @@ class RasterIntegrator(mi.SamplingIntegrator):
             raise InputError(f"raster: spp = {spp}; a square number is needed (1, 4, 9, 16, ...)")
         view = self.view(scene, sensor, scale)
         topology, hit = self._topology, view.hit
-        si, z = interaction(
-            topology,
-            view.positions,
-            view.intersection.shape,
-            view.triangle,
-            view.ray,
-            view.length,
-            hit,
-        )
+        ray = view.triangle, view.ray, view.length, hit
+        si, z = interaction(topology, view.positions, view.intersection.shape, *ray)
         colour = (
             unlit(si, hit)
             if self.shading == "unlit"
@@ -319,15 +312,9 @@ class RasterIntegrator(mi.SamplingIntegrator):
             )
             visible = dr.gather(mi.Int32, view.triangle, other)
             ray = mi.Ray3f(view.origin, direction / length)
-            si, _ = interaction(
-                topology,
-                view.positions,
-                dr.reinterpret_array(mi.ShapePtr, shape),
-                visible,
-                ray,
-                length,
-                visible >= 0,
-            )
+            shape = dr.reinterpret_array(mi.ShapePtr, shape)
+            ray = visible, ray, length, visible >= 0
+            si, _ = interaction(topology, view.positions, shape, *ray)
             incoming = mi.Vector4d(*unlit(si, visible >= 0), incoming.w)
         difference = incoming - dr.gather(mi.Vector4d, rgba, target, mode=dr.ReduceMode.Local)
         out = rgba + 0

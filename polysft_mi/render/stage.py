@@ -1,11 +1,15 @@
-"""A stage: moving meshes, a floor and soft light. How drapes of OneFit become pictures and videos.
+"""Pictures of meshes, by Mitsuba's rays: what a camera sees of one (:meth:`Triangles.seen`), a
+matte view of its relief from any side (:meth:`Triangles.shaded`), and moving meshes on a floor in
+soft light (:func:`render`, :class:`Stage`), which is how drapes of OneFit become videos.
 
-The light is found at the corners of the faces that the camera sees, by Mitsuba's rays in directions
-that are the same for all, and runs smoothly between. So a picture has no grain, and costs a
-fraction of a traced path's.
+The soft light is found at the corners of the faces that the camera sees, by rays in directions that
+are the same for all, and runs smoothly between. So a picture has no grain, and costs a fraction of
+a traced path's.
 
-Import only after a Mitsuba variant is set.
+What is made here needs a Mitsuba variant.
 """
+
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -13,6 +17,7 @@ import numpy as np
 from scipy import sparse
 
 from polyfit import mesh
+from polysft_mi.colours import srgb
 
 MARGIN = 1.12  # of the picture around what moves
 _FOV = 28.0  # degrees, of the picture's height
@@ -63,25 +68,176 @@ def render(parts, *, size=(640, 480), spp=16, azimuth=25.0, elevation=8.0, follo
         yield stage.picture(target + away, target, size, spp)
 
 
-class Stage:
+class Triangles:
+    """A mesh that rays can meet: ``vertices`` (N, 3) [m], ``faces`` (F, 3)."""
+
+    def __init__(self, vertices, faces):
+        shape = mi.Mesh("mesh", len(vertices), len(faces))
+        params = mi.traverse(shape)
+        params["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
+        params["vertex_positions"] = mi.Float(np.float32(vertices).ravel())
+        params.update()
+        self.scene = mi.load_dict({"type": "scene", "mesh": shape})
+        self.params = mi.traverse(self.scene)
+        self.key = next(k for k in self.params.keys() if k.endswith("vertex_positions"))
+        self.vertices, self.faces = vertices, faces
+        self.corners = mi.Vector3u(faces.T.astype(np.uint32))
+
+    def move(self, vertices):
+        """The vertices are at (N, 3) [m] from now on."""
+        self.params[self.key] = mi.Float(np.float32(vertices).ravel())
+        self.params.update()
+        self.vertices = vertices
+
+    def seen(self, camera, values=()):
+        """What a camera sees: depth (H, W) [m], NaN beyond the mesh, and an image (H, W) of each of
+        ``values`` (N,), given at the vertices.
+
+        The vertices are in the camera's frame; ``camera``: :class:`polysft_mi.camera.Intrinsics`.
+        Interpolation is perspective, at the pixels' centres, in single precision.
+        """
+        x, y = _samples(camera.width, camera.height)
+        x, y = (x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy
+        hit = self._hit(mi.Point3f(0), mi.Vector3f(x, y, 1))
+        images = [hit.t, *(self._mixed(hit, mi.Float(np.float32(v))) for v in values)]
+        images = [np.array(dr.select(hit.is_valid(), x, dr.nan)) for x in images]
+        return tuple(x.reshape(camera.height, camera.width) for x in images)
+
+    def shaded(self, view=None, uv=None, size=(480, 480), look=None):
+        """A matte picture (height, width, 3) uint8 sRGB; ``size`` = (width, height), ``view``:
+        :class:`SideView`, by default one around the mesh.
+
+        Lambert shading with smooth normals under a key light from the left and a weak fill, warm on
+        the side from which the triangles' normals point to the viewer, cool on the other. With
+        ``uv`` (F, 3, 2), of the faces' corners, a thin grid of ten by ten cells is drawn. ``look``:
+        :class:`ShadingLook`.
+        """
+        look, view = look or ShadingLook(), view or SideView.around(self.vertices)
+        (width, height), side = size, look.supersample
+        x, y = _samples(width, height, side)
+        scale = 2 * view.radius / min(width, height)
+        right, down, ahead = (mi.Vector3f(*map(float, row)) for row in view.rotation)
+        near = ((self.vertices - view.centre) @ view.rotation[2]).min(initial=0.0) - view.radius
+        start = mi.Point3f(*map(float, view.centre + near * view.rotation[2]))
+        start += scale * (x - width / 2) * right + scale * (y - height / 2) * down
+        hit = self._hit(start, ahead)
+        normals = mesh.vertex_normals(self.vertices, self.faces) @ view.rotation.T
+        across = mesh.face_vectors(self.vertices, self.faces) @ view.rotation[2]
+        away = dr.gather(mi.Bool, mi.Bool(across > 0), hit.prim_index, hit.is_valid())
+        front, back = (
+            self._mixed(hit, mi.Float(np.float32(_light(n, look)))) for n in (normals, -normals)
+        )
+        light = dr.clip(dr.select(away, back, front), 0, 2)
+        for values in () if uv is None else np.moveaxis(np.asarray(uv, np.float64), 2, 0):
+            cells = 10 * (values - values.min()) / max(np.ptp(values), 1e-12)
+            at = self._mixed(hit, mi.Float(np.float32(cells).ravel()), of_corners=True)
+            light *= 1 - 0.17 * dr.clip(2 - dr.abs(at - dr.round(at)) / 0.03, 0, 1)
+        colour = light * dr.select(away, mi.Color3f(*look.back), mi.Color3f(*look.front))
+        colour = dr.select(hit.is_valid(), colour, mi.Color3f(look.background))
+        return _developed(colour, width, height, side)
+
+    def _hit(self, start, direction):
+        return self.scene.ray_intersect_preliminary(mi.Ray3f(start, direction), coherent=True)
+
+    def _mixed(self, hit, values, of_corners=False):
+        """A Dr.Jit array of ``values`` at the vertices, or at the corners of the faces (3 F), where
+        rays meet the mesh.
+        """
+        on, b = hit.is_valid(), hit.prim_uv
+        corner = 3 * hit.prim_index + mi.Vector3u(0, 1, 2)
+        if not of_corners:
+            corner = dr.gather(mi.Vector3u, self.corners, hit.prim_index, on)
+        share = 1 - b.x - b.y, b.x, b.y
+        return sum(dr.gather(type(values), values, corner[k], on) * share[k] for k in range(3))
+
+
+@dataclass(frozen=True)
+class ShadingLook:
+    """How a surface is shaded. Colours are linear RGB.
+
+    ``background``: grey; ``front``, ``back``: albedo of the two sides; ``key``, ``fill``: towards
+    the two lights, in the view's frame; ``supersample``: samples a pixel and axis.
+    """
+
+    background: float = 0.90
+    front: tuple = (0.80, 0.56, 0.33)
+    back: tuple = (0.30, 0.47, 0.66)
+    key: tuple = (-0.80, -0.50, -0.45)
+    fill: tuple = (0.60, -0.20, -0.80)
+    supersample: int = 2
+
+
+@dataclass(frozen=True)
+class SideView:
+    """An orthographic view: rows of ``rotation`` (3, 3) are the picture's right, down and forward
+    in the camera frame.
+
+    ``centre`` (3,) [m] lies in the middle of the picture and ``radius`` [m] reaches from it to the
+    nearer pair of borders.
+    """
+
+    rotation: np.ndarray
+    centre: np.ndarray
+    radius: float
+
+    @classmethod
+    def around(cls, points, azimuth=40.0, elevation=25.0):
+        """The view of points (..., 3) [m] after the camera went round them by ``azimuth`` to its
+        right and ``elevation`` up [degrees].
+
+        Give the points of all frames to see all frames from one place.
+        """
+        points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+        a, e = np.radians([azimuth, elevation])
+        turn = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
+        tilt = np.array([[1, 0, 0], [0, np.cos(e), -np.sin(e)], [0, np.sin(e), np.cos(e)]])
+        rotation = tilt @ turn
+        seen = points @ rotation.T
+        low, high = seen.min(axis=0), seen.max(axis=0)
+        return cls(rotation, (low + high) / 2 @ rotation, 0.55 * float(np.max((high - low)[:2])))
+
+    def wider(self, factor):
+        """The same view with ``factor`` times as much in it."""
+        return replace(self, radius=factor * self.radius)
+
+    def holds(self, points):
+        """Whether points (..., 3) [m] all lie in the picture, whatever its form."""
+        seen = (np.asarray(points, dtype=np.float64).reshape(-1, 3) - self.centre) @ self.rotation.T
+        return bool((np.abs(seen[:, :2]) <= self.radius).all())
+
+
+def _light(normals, look):
+    """Light on unit normals (N, 3) of the view's frame: (N,)."""
+    key, fill = (np.asarray(d) / np.linalg.norm(d) for d in (look.key, look.fill))
+    return 0.10 + 0.95 * np.maximum(normals @ key, 0) + 0.20 * np.maximum(normals @ fill, 0)
+
+
+def _samples(width, height, side=1):
+    """The places x, y [pixels] of ``side`` by ``side`` samples in each pixel, row after row; aside
+    by a thousandth, for a ray exactly along an edge can miss both of its faces.
+    """
+    index = dr.arange(mi.UInt32, height * side * width * side)
+    x, y = index % (width * side), index // (width * side)
+    return (mi.Float(x) + 0.501) / side, (mi.Float(y) + 0.5007) / side
+
+
+def _developed(colour, width, height, side):
+    """The picture (H, W, 3) uint8 sRGB of the linear colours of :func:`_samples`."""
+    samples = np.array(dr.clip(colour, 0, 1)).T.reshape(height, side, width, side, 3)
+    return np.round(255 * srgb(samples.mean(axis=(1, 3)))).astype(np.uint8)
+
+
+class Stage(Triangles):
     """One mesh, ``vertices`` (N, 3) [m], ``faces`` (F, 3), with a colour (N, 3) at each vertex, on
     a floor at the height ``floor`` [m]; the key light is turned with the camera, by ``azimuth``
     [rad]. ``part`` (N,): which thing a vertex belongs to; by default all are one.
     """
 
     def __init__(self, vertices, faces, colours, floor, azimuth=0.0, part=None):
-        mesh = mi.Mesh("stage", len(vertices), len(faces))
-        self.params = mi.traverse(mesh)
-        self.params["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
-        self.params["vertex_positions"] = mi.Float(vertices.ravel())
-        self.params.update()
-        self.scene = mi.load_dict({"type": "scene", "mesh": mesh})
-        self.params = mi.traverse(self.scene)
-        self.key = next(k for k in self.params.keys() if k.endswith("vertex_positions"))
-        self.faces, self.floor = faces, floor
+        super().__init__(vertices, faces)
+        self.floor = floor
         self.part = np.zeros(len(vertices), np.uint32) if part is None else part.astype(np.uint32)
         self.part_of_face = mi.UInt32(self.part[faces[:, 0]])
-        self.corners = mi.Vector3u(faces.T.astype(np.uint32))
         self.colour = mi.Color3f(colours.T.astype(np.float32))
         self.sky = _sphere(_SKY_RAYS)
         x, y, z = _TOWARDS_KEY / np.linalg.norm(_TOWARDS_KEY)
@@ -90,10 +246,8 @@ class Stage:
         self.sun = _cap(towards, _KEY_RADIUS, _KEY_RAYS)
 
     def move(self, vertices):
-        """The vertices are at (N, 3) [m] from now on."""
-        self.params[self.key] = mi.Float(vertices.astype(np.float32).ravel())
-        self.params.update()
-        self.vertices, self.normals = vertices, _normals(vertices, self.faces)
+        super().move(vertices)
+        self.normals = mesh.vertex_normals(np.float64(vertices), self.faces)
         self.normal = mi.Vector3f(self.normals.T.astype(np.float32))
 
     def light(self, target, asked=None):
@@ -193,39 +347,28 @@ class Stage:
         right /= np.linalg.norm(right)
         up = np.cross(right, ahead)
         scale = np.tan(np.deg2rad(_FOV / 2)) / (height / 2)
-        index = dr.arange(mi.UInt32, height * side * width * side)
-        x, y = index % (width * side), index // (width * side)
-        u = ((mi.Float(x) + 0.5) / side - width / 2) * scale
-        v = (height / 2 - (mi.Float(y) + 0.5) / side) * scale
+        x, y = _samples(width, height, side)
+        u, v = (x - width / 2) * scale, (height / 2 - y) * scale
         ahead, right, up = (mi.Vector3f(*map(float, x)) for x in (ahead, right, up))
         d = dr.normalize(ahead + u * right + v * up)
         o = mi.Point3f(*map(float, origin))
-        hit = self.scene.ray_intersect_preliminary(mi.Ray3f(o, d), coherent=True)
+        hit = self._hit(o, d)
         looked_at = dr.zeros(mi.Bool, len(self.faces))
         dr.scatter(looked_at, mi.Bool(True), hit.prim_index, hit.is_valid())
         asked = np.zeros(len(self.vertices), bool)
         asked[self.faces[np.array(looked_at)]] = True
         self.light(target, asked)
         colour = dr.select(hit.is_valid(), self._cloth(hit, d), self._behind(o, d))
-        samples = np.array(dr.clip(colour, 0, 1)).T.reshape(height, side, width, side, 3)
-        linear = samples.mean(axis=(1, 3))
-        srgb = np.where(linear < 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-        return np.round(255 * srgb).astype(np.uint8)
+        return _developed(colour, width, height, side)
 
     def _cloth(self, hit, d):
-        corner = dr.gather(mi.Vector3u, self.corners, hit.prim_index, hit.is_valid())
-        b = hit.prim_uv
-        share = mi.Vector3f(1 - b.x - b.y, b.x, b.y)
-        mixed = lambda kind, of: sum(
-            dr.gather(kind, of, corner[k], hit.is_valid()) * share[k] for k in range(3)
-        )
-        normal = dr.normalize(mixed(mi.Vector3f, self.normal))
+        normal = dr.normalize(self._mixed(hit, self.normal))
         front = dr.dot(normal, d) < 0
-        sky = dr.select(front, mixed(mi.Color3f, self.front), mixed(mi.Color3f, self.back))
+        sky = dr.select(front, self._mixed(hit, self.front), self._mixed(hit, self.back))
         sun = mi.Vector3f(*map(float, self.sun.mean(1)))
         facing = dr.maximum(dr.select(front, 1.0, -1.0) * dr.dot(normal, sun), 0)
-        key = mi.Color3f(*map(float, KEY)) * facing * mixed(mi.Float, self.shadow)
-        return mixed(mi.Color3f, self.colour) * (sky + key)
+        key = mi.Color3f(*map(float, KEY)) * facing * self._mixed(hit, self.shadow)
+        return self._mixed(hit, self.colour) * (sky + key)
 
     def _behind(self, o, d):
         """The floor as its grid is lit, and farther away the open floor, which becomes the sky."""
@@ -267,14 +410,6 @@ def _through(faces, loop):
     around /= np.maximum(around.sum(1), 1)[:, None]
     one = sparse.eye_array(n)
     return loop @ (one + around @ (one - loop[:n]))
-
-
-def _normals(V, F):
-    """Unit normals (N, 3) at the vertices (N, 3), means of the faces' (F, 3) by area."""
-    a, b, c = (V[F[:, k]].astype(np.float64) for k in range(3))
-    face = np.repeat(np.cross(b - a, c - a), 3, axis=0)
-    N = np.stack([np.bincount(F.ravel(), x, len(V)) for x in face.T], 1)
-    return N / np.maximum(np.linalg.norm(N, axis=1, keepdims=True), 1e-12)
 
 
 def _sphere(count):

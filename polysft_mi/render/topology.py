@@ -65,16 +65,13 @@ class Topology:
         """Texture coordinates of all vertices, a flat Float of 2V; zeros for meshes that have
         none.
         """
-        return _joined(
-            [
-                (
-                    s.vertex_texcoords_buffer()
-                    if s.has_vertex_texcoords()
-                    else dr.zeros(mi.Float, 2 * s.vertex_count())
-                )
-                for s in self.shapes
-            ]
-        )
+
+        def own(s):
+            if s.has_vertex_texcoords():
+                return s.vertex_texcoords_buffer()
+            return dr.zeros(mi.Float, 2 * s.vertex_count())
+
+        return _joined([own(s) for s in self.shapes])
 
 
 def _key(shapes):

@@ -12,7 +12,6 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "comparison": ["Comparison", "compare"],
         "evaluation": ["evaluate", "per_frame", "score"],
         "formats": ["FORMATS", "export"],
-        "metrics": ["vertex_normals"],
         "progress": ["Progress"],
         "run": ["Run"],
         "truth": ["Truth", "load_npz", "read_surface"],

@@ -45,22 +45,12 @@ def e3d_procrustes(V, G):
     return e3d(align_similarity(V, G), G)
 
 
-def vertex_normals(V, F):
-    """Unit normals (N, 3): the mean of the adjacent triangles' normals, weighted by their area.
-    Zero where no triangle is.
-    """
-    cross = np.cross(V[F[:, 1]] - V[F[:, 0]], V[F[:, 2]] - V[F[:, 0]])
-    total = np.stack(
-        [np.bincount(F.ravel(), np.repeat(cross[:, k], 3), minlength=len(V)) for k in range(3)],
-        axis=1,
-    )
-    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-20)
-
-
 def normal_angle(V, G, F, chosen=slice(None)):
     """Mean angle between corresponding vertex normals [degrees], of the ``chosen`` vertices,
     without alignment.
     """
+    from polyfit.mesh import vertex_normals
+
     cosine = np.sum(vertex_normals(V, F) * vertex_normals(G, F), axis=1)[chosen]
     return float(np.degrees(np.arccos(np.clip(cosine, -1, 1)).mean()))
 
@@ -138,15 +128,10 @@ def image_share(V, F, K, pixels=PIXELS):
     """Area of the mesh's triangles in the image, by its projection with K (3, 3), over the number
     of the image's pixels.
     """
+    from polyfit.mesh import signed_areas
+
     xy = V @ K.T
-    corner = (xy[:, :2] / xy[:, 2:])[F]
-    a, b = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
-    return float(0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum() / pixels)
-
-
-def depth_rmse_all_pixels(V, F, points, K, pixels=PIXELS):
-    """Depth RMSE [m] when the surface's squared errors are spread over all pixels of the image."""
-    return depth_rmse(V, F, points)[0] * float(np.sqrt(image_share(V, F, K, pixels)))
+    return float(np.abs(signed_areas(xy[:, :2] / xy[:, 2:], F)).sum() / pixels)
 
 
 # ---- point clouds --------------------------------------------------------------------------------

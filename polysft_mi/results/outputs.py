@@ -15,9 +15,10 @@ import mitsuba as mi
 import numpy as np
 
 from polyfit.files import aside
+from polyfit.mesh import write_ply
 from polysft_mi import __version__
 from polysft_mi.scene import located
-from polysft_mi.surface import Unknowns, meshio
+from polysft_mi.surface import Unknowns
 
 from .truth import uv_arrays
 
@@ -112,7 +113,7 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
     os.makedirs(os.path.join(out, "meshes"), exist_ok=True)
     source, uv, faces = template.texcoords.split(template.faces)
     for index, v in zip(indices, vertices):
-        meshio.write_ply(os.path.join(out, "meshes", f"{index:03d}.ply"), v[source], faces, uv)
+        write_ply(os.path.join(out, "meshes", f"{index:03d}.ply"), v[source], faces, uv)
     say("pictures")
     (per_frame, box), video = drawn(), bound()
 

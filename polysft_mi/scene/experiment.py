@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from polyfit.errors import require
 from polyfit.jets import CanonicalFrame
-from polyfit.mesh import TexCoords, read_textured
+from polyfit.mesh import TexCoords, read_textured, write_ply
 from polysft_mi.errors import InputError
 from polysft_mi.surface import Template, meshio
 
@@ -133,20 +133,9 @@ def load(
     experiment, mesh = scene.integrator(), meshes[0]
     settings = experiment.settings
     template, corner, note = _template(mesh, source, settings, template)
-    return Experiment(
-        path,
-        scene,
-        scene.sensors()[0],
-        experiment.renderer,
-        mesh,
-        template,
-        corner,
-        experiment.frames,
-        experiment.masks,
-        settings,
-        defaults,
-        note,
-    )
+    shown = scene, scene.sensors()[0], experiment.renderer, mesh, template, corner
+    files = experiment.frames, experiment.masks
+    return Experiment(path, *shown, *files, settings, defaults, note)
 
 
 def _instance(path, config, state):
@@ -194,7 +183,7 @@ def _plain_copy(path, folder):
         meshio.write_obj(copy, vertices, faces, texcoords)
     else:
         index, uv, split = texcoords.split(faces)
-        meshio.write_ply(copy, vertices[index], split, uv)
+        write_ply(copy, vertices[index], split, uv)
     return copy
 
 

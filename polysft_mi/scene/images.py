@@ -9,23 +9,10 @@ import re
 import numpy as np
 
 from polyfit.files import silent_decoders
+from polysft_mi.colours import srgb
 from polysft_mi.errors import InputError
 
-EXTENSIONS = (
-    ".png",
-    ".jpg",
-    ".jpeg",
-    ".jpe",
-    ".bmp",
-    ".tif",
-    ".tiff",
-    ".webp",
-    ".ppm",
-    ".pgm",
-    ".pnm",
-    ".exr",
-    ".hdr",
-)
+EXTENSIONS = tuple(".png .jpg .jpeg .jpe .bmp .tif .tiff .webp .ppm .pgm .pnm .exr .hdr".split())
 
 
 def list_images(pattern, what="images"):
@@ -178,9 +165,7 @@ def read_rgb(path):
     if pixels.dtype == np.uint16:
         pixels = ((pixels.astype(np.uint32) + 128) // 257).astype(np.uint8)
     elif pixels.dtype.kind == "f":
-        if not np.isfinite(pixels).all():
-            raise InputError(f"{path}: holds pixels that are not finite")
-        pixels = _encoded(pixels)
+        pixels = _encoded(finite(pixels, path))
     channels = pixels.shape[2]
     alpha = pixels[..., -1:] if channels in (2, 4) else None
     colour = pixels[..., 2::-1] if channels >= 3 else np.repeat(pixels[..., :1], 3, axis=2)
@@ -230,12 +215,6 @@ def _exif(path):
 def _encoded(linear):
     """Linear colours as 8-bit sRGB (IEC 61966-2-1); alpha, the fourth channel, as it is."""
     x = np.clip(linear, 0, 1)
-    colours = x[..., :3] if x.shape[2] >= 3 else x[..., :1]
-    x = np.concatenate(
-        [
-            np.where(colours <= 0.0031308, 12.92 * colours, 1.055 * colours ** (1 / 2.4) - 0.055),
-            x[..., colours.shape[2] :],
-        ],
-        axis=2,
-    )
+    colours = slice(3 if x.shape[2] >= 3 else 1)
+    x[..., colours] = srgb(x[..., colours])
     return np.round(255 * x).astype(np.uint8)

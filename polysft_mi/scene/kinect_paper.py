@@ -51,7 +51,7 @@ def template(folder, resolution=33, pose_fit="auto", say=lambda line: None):
     lists (from 0), and ``cam.ext`` the 3x4 matrix [R|T] [mm] that takes them to the camera; with
     ``pose_fit`` = ``auto`` the template is then moved, as a rigid body, until its outline lies on
     the edges in the first image that are near it, where these are clear
-    (:mod:`polysft_mi.scene.outline`); ``none`` leaves it. The grid is interpolated (cubic where it
+    (:func:`polysft_mi.poses.fitted`); ``none`` leaves it. The grid is interpolated (cubic where it
     has four points or more a side) at ``resolution`` points a side, evenly between the first and
     last row and column, so that at 33 the 9 x 9 grid's own points are kept. ``say`` takes a line
     about the pose.
@@ -62,8 +62,9 @@ def template(folder, resolution=33, pose_fit="auto", say=lambda line: None):
     """
     from scipy.interpolate import RectBivariateSpline
 
+    from polysft_mi.poses import fitted
+
     from .images import read_rgb
-    from .outline import fitted
 
     if resolution < 2:
         raise InputError(f"resolution = {resolution}; at least 2 vertices a side are needed")

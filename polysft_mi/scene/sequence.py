@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from polysft_mi.colours import linear
 from polysft_mi.errors import InputError
 
 from .evidence import DepthImages, Tracks
@@ -183,8 +184,7 @@ def _linear(image, path):
 @functools.lru_cache(maxsize=2)
 def _srgb_table(largest):
     """Linear value of each sRGB code 0..largest (IEC 61966-2-1), float32."""
-    x = np.arange(largest + 1) / largest
-    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4).astype(np.float32)
+    return linear(np.arange(largest + 1) / largest).astype(np.float32)
 
 
 def _text(size):

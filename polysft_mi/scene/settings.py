@@ -17,32 +17,13 @@ from polysft_mi.errors import InputError
 AUTO = -1.0  # of a weight: what suits the template
 
 
-def _setting(
-    default,
-    doc,
-    *,
-    choices=None,
-    low=-math.inf,
-    high=math.inf,
-    above=None,
-    auto=False,
-    solver=None,
-):
-    """A field; ``auto``: whether :data:`AUTO` is accepted too; ``solver``: the only one that reads
-    it.
+def _setting(default, doc, **more):
+    """A field; ``more``: its bounds or choices; ``auto``: whether :data:`AUTO` is accepted too;
+    ``solver``: the only one that reads it.
     """
-    return field(
-        default=default,
-        metadata={
-            "doc": doc,
-            "choices": choices,
-            "low": low,
-            "high": high,
-            "above": above,
-            "auto": auto,
-            "solver": solver,
-        },
-    )
+    usual = dict(choices=None, low=-math.inf, high=math.inf, above=None, auto=False, solver=None)
+    assert set(more) <= set(usual)
+    return field(default=default, metadata={"doc": doc, **usual, **more})
 
 
 @dataclass(frozen=True)

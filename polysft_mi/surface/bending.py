@@ -25,26 +25,14 @@ def hinges(points, faces):
         a, b = x[:, j] - x[:, i], x[:, k] - x[:, i]
         return np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(1)
 
-    (s2, c2), (s3, c3), (t2, d2), (t3, d3) = (
-        across(0, 1, 2),
-        across(0, 1, 3),
-        across(1, 0, 2),
-        across(1, 0, 3),
-    )
+    corners = (0, 1, 2), (0, 1, 3), (1, 0, 2), (1, 0, 3)
+    (s2, c2), (s3, c3), (t2, d2), (t3, d3) = (across(*at) for at in corners)
     area = np.maximum(0.5 * (s2 + s3), 1e-12)
-    from_0, from_1 = (
+    (a, b), (c, d) = (
         [c / np.maximum(s, 1e-12) for s, c in pair]
         for pair in (((s2, c2), (s3, c3)), ((t2, d2), (t3, d3)))
     )
-    rows = np.stack(
-        [
-            from_1[0] + from_1[1],
-            from_0[0] + from_0[1],
-            -from_0[0] - from_1[0],
-            -from_0[1] - from_1[1],
-        ],
-        1,
-    )
+    rows = np.stack([c + d, a + b, -a - c, -b - d], 1)
     rows /= np.sqrt(area)[:, None]
     matrix = sp.csr_matrix(
         (rows.ravel(), (np.repeat(np.arange(len(quads)), 4), quads.ravel())),

@@ -7,21 +7,8 @@ Texture coordinates are those of OBJ files: (0, 0) is the texture's bottom left,
 import numpy as np
 
 from polyfit import mesh
-from polyfit.mesh import TexCoords, read_mesh, read_textured, write_ply
+from polyfit.mesh import TexCoords, read_mesh, read_textured
 from polysft_mi.errors import InputError
-
-__all__ = [
-    "check_template",
-    "cleaned",
-    "read_template",
-    "read_textured_template",
-    "seam_note",
-    "size_note",
-    "uv_note",
-    "write_obj",
-    "write_ply",
-]
-
 
 _UV_MARGIN = 0.02  # how far beyond the image texture coordinates may reach, the edge repeated
 

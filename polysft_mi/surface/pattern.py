@@ -24,12 +24,14 @@ class Pattern:
         self.diagonal = self.find(each, each)
         # the U blocks on the diagonal of a symmetric matrix and above it, the others, and of which
         # of the first these are the transposed
-        self.upper, self.lower = (
-            np.flatnonzero(self.row <= self.column),
-            np.flatnonzero(self.row > self.column),
-        )
+        above = self.row <= self.column
+        self.upper, self.lower = np.flatnonzero(above), np.flatnonzero(~above)
         self._half_keys = self._keys[self.upper]
         self.mirrored = self.find_half(self.column[self.lower], self.row[self.lower])
+        #: (B,): 2 p, or 2 p + 1 where a block is the transposed of the p-th of the U
+        self.half = np.empty(len(self._keys), dtype=np.int64)
+        self.half[self.upper] = 2 * np.arange(len(self.upper))
+        self.half[self.lower] = 2 * self.mirrored + 1
         self.half_edges = self.find_half(*edges.T)
         self.difference = sp.csr_matrix(  # of the edges' ends, (E, N)
             (

@@ -13,7 +13,7 @@ import numpy as np
 
 from polyfit import jets
 from polyfit.jets import CanonicalFrame
-from polyfit.mesh import TexCoords, components, edges_of, face_vectors, sheets, winding
+from polyfit.mesh import TexCoords, components, edges_of, sheets, vertex_normals, winding
 from polyfit.patches import Cover, is_graph
 from polysft_mi.errors import InputError
 
@@ -138,22 +138,9 @@ class Template:
         x = CanonicalFrame(radius, rotation, origin)[patch].to_chart(points[:, None, None])[:, :, 0]
         alpha, rest = _jets(x, patch, weight > 0, len(frames), order, exact, where)
         texcoords = TexCoords(np.asarray(uv.coordinates, np.float64), np.asarray(uv.faces))
-        return cls(
-            points,
-            faces,
-            texcoords,
-            scale,
-            radius,
-            rotation,
-            origin,
-            alpha,
-            patch,
-            weight,
-            x[..., :2],
-            rest,
-            axes,
-            _lift(x[:, 0, :2], patch[:, 0], alpha, rotation, axes),
-        )
+        jets_of = radius, rotation, origin, alpha, patch, weight, x[..., :2], rest, axes
+        lift = _lift(x[:, 0, :2], patch[:, 0], alpha, rotation, axes)
+        return cls(points, faces, texcoords, scale, *jets_of, lift)
 
 
 def _components_of(faces):
@@ -197,10 +184,8 @@ def _tangent_axes(points, faces, patch, rotation):
     """Axes (N, 3, 3) at the vertices: the third is the normal, the first the projected u of its own
     chart.
     """
-    vectors = face_vectors(points, faces)
-    third = np.stack([np.bincount(faces.ravel(), np.repeat(x, 3)) for x in vectors.T], 1)
-    length = np.linalg.norm(third, axis=1, keepdims=True)
-    third = np.where(length > 0, third / np.maximum(length, 1e-300), rotation[patch][..., 2])
+    third = vertex_normals(points, faces)
+    third = np.where(third.any(1)[:, None], third, rotation[patch][..., 2])
     first = np.cross(rotation[patch][..., 1], third)
     flat = np.linalg.norm(first, axis=1) < 0.1  # the normal along the chart's v
     first[flat] = rotation[patch][flat][..., 0]

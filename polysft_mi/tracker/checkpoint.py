@@ -97,17 +97,7 @@ class Track:
         )
 
 
-_META = (
-    "next_window",
-    "iterations",
-    "seconds",
-    "totals",
-    "lost",
-    "unusable",
-    "swept",
-    "finished",
-    "solver",
-)
+_META = "next_window iterations seconds totals lost unusable swept finished solver".split()
 
 
 def _memory_arrays(memories, stages):

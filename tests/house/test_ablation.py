@@ -84,7 +84,3 @@ def test_page_is_made_from_the_file(tmp_path):
     assert "| relief | +100 | +0 | pays on 1 of 1; goes |" in text
     unknown = text[text.index("Not measured") : text.index("With all rules on")]
     assert "appearance" in unknown and "relief's bending" in unknown and "relief," not in unknown
-
-
-def test_rules_are_replaced_not_changed():
-    assert dataclasses.replace(Rules(), give=1.0) != Rules()

@@ -1,14 +1,9 @@
 """The comparison of cuts at a tiny size: patches are halved, jets are fitted to true surfaces."""
 
-import best_jets
 import numpy as np
 import pytest
-import surfaces
 import synthetic
 from scripts import load
-
-from polysft_mi.surface.atlas import Atlas
-from polysft_mi.surface.template import Template
 
 cuts = load("benchmarks/atlas_cuts.py")
 
@@ -28,16 +23,6 @@ def test_halves_hold_the_same_template(tube):
     count = np.bincount(half.patch[:, 0])
     assert count.min() > 0.4 * count.max()
     assert half.weight.sum(1) == pytest.approx(1, abs=1e-12)
-    atlas = Atlas(half)
-    still = best_jets._laid_over(atlas, whole.vertices)
-    assert atlas.surface(still).vertices == pytest.approx(whole.vertices, abs=1e-9)
-
-
-def test_a_sheet_is_halved_too():
-    vertices, faces = surfaces.sheet()
-    sheet = Template.fit(vertices, faces, vertices[:, :2] + 0.5, 4)
-    half = Template.fit(vertices, faces, vertices[:, :2] + 0.5, 4, cover=cuts.halved(sheet))
-    assert len(sheet) == 1 and len(half) == 2 and half.residual_max < 1e-9
 
 
 def test_jets_of_more_patches_or_a_higher_order_leave_less(tube):

@@ -5,7 +5,6 @@ tests.
 import dataclasses
 import json
 
-import drjit as dr
 import numpy as np
 import pytest
 from clips import CAMERA, HEIGHT, WIDTH, photo, placed, rendered, write_png
@@ -66,48 +65,6 @@ def test_the_page_has_the_table_of_its_figures():
     report = json.loads((ROOT / "docs" / "raster.json").read_text(encoding="utf-8"))
     assert report["cores"] == 1
     assert f"<!-- speed -->\n{raster_figures.page_table(report)}\n<!-- /speed -->" in page
-
-
-def test_iterations_of_raster_need_no_new_kernels(tmp_path):
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        result = raster.measure_kernels(SIZE, POINTS, str(tmp_path), 12)
-    summary = raster.judge_long_run({"resident_mb": [100.0] * 10 + [101.0, 103.0]}, result)
-    assert summary["kernels_an_iteration"] >= 2
-    assert summary["new_kernels_later"] == 0
-    assert summary["growth_mb"] == 3.0
-
-
-def test_kernels_that_come_late_are_counted():
-    summary = raster.judge_long_run(
-        {"resident_mb": [1.0] * 12}, {"launched": [5] * 12, "new": [5, 2, 0, 1] + [0] * 8}
-    )
-    assert (
-        summary["new_kernels_first_two"],
-        summary["new_kernels_later"],
-        summary["iterations_with_new_kernels"],
-    ) == (7, 1, [1, 2, 4])
-
-
-def test_ratios_are_those_within_a_turn():
-    times = dict(
-        passes={},
-        pictures={},
-        moves={},
-        coverage=0.5,
-        mean_colour=0.5,
-        mean_difference=0.0,
-        mean_absolute_difference=0.0,
-    )
-    for name, ms in zip(
-        raster.CONTENDERS, ([1, 10, 2], [1, 10, 2], [4, 40, 8])
-    ):  # the machine was busy in the second turn
-        times["passes"][name], times["moves"][name] = ms, [1, 1, 1]
-        times["pictures"][name] = [1, 3, 2]
-    case = raster.summarise("64x48", POINTS, times, {name: {} for name in raster.CONTENDERS})
-    assert case["contenders"]["raster"]["picture_ms"] == 2
-    assert case["contenders"]["prb_projective"]["ratio"] == 4
-    assert case["contenders"]["prb_projective"]["ratio_with_move"] == 3
-    assert case["triangles"] == 128
 
 
 DEMO = (str(ROOT / "scenes" / "demo.xml"), {"last": "1", "period": "4"})

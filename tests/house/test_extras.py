@@ -27,6 +27,48 @@ for module in pkgutil.walk_packages(polysft_mi.__path__, "polysft_mi."):
 """
 
 
+_JETS = """
+import numpy as np, polyfit, polysft_mi
+from polyfit import CanonicalFrame, jets
+x = np.random.default_rng(0).normal(size=(50, 3)) * (3, 2, 1)
+x = CanonicalFrame.from_points(x).to_chart(x)
+jets.principal_curvatures(jets.fit_points(x, 3).alpha, jets.point(np.ones(6), x[:, :2])[:, :2])
+"""
+_RUN = """
+from polysft_mi import backend; backend.set_variant("llvm_ad_rgb")
+import polysft_mi.run, polysft_mi.scene.experiment, polysft_mi.solvers, polysft_mi.report
+import numpy as np
+from polysft_mi.surface.template import Template
+x, y = (a.ravel() for a in np.meshgrid(np.linspace(0, 1, 4), np.linspace(0, 2, 4)))
+square = (0, 1, 4), (1, 5, 4)
+faces = [[4 * r + c + k for k in f] for r in range(3) for c in range(3) for f in square]
+Template.fit(np.stack([x, y, 0 * x], 1), np.array(faces), np.stack([x, y], 1), 2)
+"""
+_FIGURES = """
+import polysft_mi.pictures.figures, polysft_mi.results.metrics, polysft_mi.evaluate
+import polysft_mi.pictures.exr, polysft_mi.pictures.video, polysft_mi.surface.meshio
+"""
+_PUBLIC = "onefit.load, onefit.Garment, onefit.AnnyBody, onefit.Motion, onefit.SmplBody"
+LIGHT = {
+    "import polyfit; dir(polyfit)": "torch mitsuba drjit pyvista numpy",
+    "import polyfit; polyfit.PatchedSurface, polyfit.PolyFit": "mitsuba drjit polysft_mi onefit",
+    "import onefit": "torch numpy mitsuba drjit warp anny",
+    f"import onefit; {_PUBLIC}": "mitsuba",
+    "from onefit.body import AnnyBody; AnnyBody().body()": "warp mitsuba",
+    "import polysft_mi.__main__ as m; m.main(['--help'])": "numpy torch mitsuba plotly pxr",
+    _FIGURES: "matplotlib OpenEXR trimesh skimage scipy rich mitsuba torch cv2",
+    _JETS: "torch drjit mitsuba",
+    _RUN: "torch",
+}
+
+
+@pytest.mark.parametrize("code", LIGHT)
+def test_what_is_light_loads_nothing_heavy_and_says_nothing(code):
+    look = f"import sys; print(sorted({set(LIGHT[code].split())} & set(sys.modules)))"
+    done = processes.python("-c", f"{code}\n{look}")
+    assert done.stderr == "" and done.stdout.splitlines()[-1] == "[]", done.stdout
+
+
 def python(code, *arguments):
     return processes.python("-c", _BLOCKED + code, *arguments)
 

@@ -58,12 +58,3 @@ def test_tables_of_what_is_trained(runs, tmp_path):
     motion = onefit.Motion.generate("bend", seconds=0.1, seed=bench.accuracy.SEED)
     alone = draper.drape("tank", motion, post=False, eased=False).measures().collision
     assert report["poses"] == {"tank, bend": pytest.approx(alone)}
-
-
-def test_other_styles_of_a_garment(runs):
-    tables = bench.Bench(runs, 0.1, 0)
-    tables.runs = runs
-    assert tables.styles() == {}
-    bench.make("tank", runs, short=True)
-    (style,) = tables.styles().values()
-    assert 0 <= style["collision"] < 20 and 0 < style["edge"] < 20

@@ -93,16 +93,6 @@ def test_air_resists_along_the_normal_with_the_squared_speed():
     assert force.sum(0) == pytest.approx([0, 0, -1.1 / 2 * simulation.AIR * 0.5 * 2.0**2])
 
 
-def test_the_body_is_led_from_its_rest_into_the_motion():
-    body = standard_body()
-    motion = onefit.Motion.generate("walk", seconds=0.5, seed=3).resampled(30.0)
-    poses, translation, lead = reference._led_in(body, motion, simulation.Settings())
-    assert torch.equal(poses[0], body.rest_pose) and not translation[0].any()
-    assert torch.equal(poses[lead:], motion.poses)
-    assert torch.equal(translation[lead:], motion.translation)
-    assert (poses[1:] - poses[:-1]).abs().max() < 0.4
-
-
 @pytest.fixture(scope="module")
 def tank():
     draper, garment = onefit.load(), Garment.template("tank")
@@ -133,31 +123,3 @@ def test_without_the_simulator_one_line_says_what_to_install(tank, tmp_path):
             str(tmp_path), garment, motion, standard_body(), MATERIALS["cotton"],
             simulation.Settings(),
         )  # fmt: skip
-
-
-def test_a_finished_simulation_is_read_from_the_cache(tank, tmp_path, monkeypatch):
-    """The same arguments find the file that they wrote, another material does not."""
-    garment, motion, _ = tank
-
-    class Still:
-        """Newton's place: the cloth stays where it started, and each frame says which one it is."""
-
-        state = np.zeros((2, len(garment), 3), np.float32)
-
-        def __init__(self, vertices, *others):
-            self.vertices = vertices
-
-        def frame(self, body, held, time, fps):
-            return self.vertices + time
-
-    monkeypatch.setattr(simulation, "Simulation", Still)
-    monkeypatch.setattr(reference.cloth_simulation, "Simulation", Still)
-    arguments = str(tmp_path), garment, motion, standard_body()
-    cotton, silk = MATERIALS["cotton"], MATERIALS["silk"]
-    first = reference.simulated(*arguments, cotton, simulation.Settings())
-    assert len(first) == len(motion.resampled(30.0).poses)
-    monkeypatch.setattr(Still, "frame", None)  # it is not asked again
-    assert torch.equal(reference.simulated(*arguments, cotton, simulation.Settings()), first)
-    with pytest.raises(TypeError):
-        reference.simulated(*arguments, silk, simulation.Settings())
-    assert len(list(tmp_path.iterdir())) == 1

@@ -19,15 +19,6 @@ def large_steps():
     pytest.importorskip("cholespy", reason="mi.ad.LargeSteps needs cholespy")
 
 
-def test_baseline_starts_from_the_template_and_moves_what_its_unknowns_move(sheet, large_steps):
-    problem = per_vertex.load(str(sheet.folder / "scene.xml"), {}).problem
-    rest = problem.patch.rest()
-    assert problem.surface(rest) == pytest.approx(sheet.vertices[0], abs=1e-6)
-    moved = sheet.vertices[1]  # any other place: the differential form and back
-    x = problem.patch._flat((moved - sheet.vertices[0].mean(0)) / problem.template.scale)
-    assert problem.surface(problem.patch._form.to_differential(x)) == pytest.approx(moved, abs=1e-5)
-
-
 def test_objective_of_the_baseline_is_adams(large_steps, tmp_path):
     from polysft_mi.objective import Objective, Problem
     from polysft_mi.scene import experiment as scene

@@ -1,18 +1,15 @@
 """The comparison of solvers at tiny sizes: results are kept, shown and not made twice."""
 
-import math
 import shutil
 from pathlib import Path
 
 import best_jets
-import numpy as np
 import pytest
 import sequences
 import sft_report
 import sft_results
 import sft_runs
 import synthetic
-from scipy.spatial.transform import Rotation
 from scripts import load
 
 from polysft_mi.errors import InputError
@@ -85,28 +82,6 @@ def test_where_it_is_known_what_is_in_view_that_is_shown():
     assert rest.splitlines()[-1] == "| tube | `adam` | 4 | 45 | 0.01 | 5 | 0.02 | 5.25 | 150 |"
 
 
-def test_what_has_no_truth_is_said(sheet, tmp_path, monkeypatch):
-    scenes, data = tmp_path / "scenes", tmp_path / "flag"
-    scenes.mkdir()
-    shutil.copy(sheet.folder / "scene.xml", scenes / "flag.xml")
-    shutil.copytree(sheet.folder, data)
-    np.savez(data / "gt_points.npz", points=np.ones((1, 4, 3)), frames=[7])
-    (data / "gt.npz").unlink()
-    monkeypatch.setattr(sequences, "SCENES", str(scenes))
-    r = sft_runs.run(
-        "flag",
-        "adam",
-        str(data),
-        str(tmp_path / "out"),
-        {**SETUP, "frames": 1, "define": ["period=2"], "mode": "llvm_ad_rgb"},
-    )
-    assert r["seconds_a_frame"] > 0 and r["figures"] == {} and "no frame in common" in r["unscored"]
-    assert r["unscored"].startswith("flag/gt_points.npz")
-    assert "## Without figures" in sft_report.table(
-        [r]
-    ) and "no frame in common" in sft_report.table([r])
-
-
 def test_report_writes_page_and_plot(tmp_path):
     text = sft_report.report(
         [result(), result(method="gauss-newton", seconds_a_frame=0.5)], str(tmp_path / "docs")
@@ -114,26 +89,6 @@ def test_report_writes_page_and_plot(tmp_path):
     page = (tmp_path / "docs" / "sft.md").read_text()
     assert text in page and "Some CPU, 2 cores, `llvm_ad_rgb`" in page and "](sft.png)" in page
     assert (tmp_path / "docs" / "sft.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_a_sheet_that_was_lost_is_told_and_not_plotted(tmp_path):
-    lost = result(
-        "kinect_paper",
-        figures={
-            "depth_rmse_mm": math.inf,
-            "depth_rmse_mm_worst": math.inf,
-            "depth_rmse_allpix_mm": math.inf,
-        },
-    )
-    assert "| inf | inf | inf |" in sft_report.report([result(), lost], str(tmp_path))
-    assert "*inf*:" in (tmp_path / "sft.md").read_text() and (tmp_path / "sft.png").exists()
-    sft_report.report([result()], str(tmp_path))
-    assert "*inf*:" not in (tmp_path / "sft.md").read_text()
-
-
-def test_an_empty_report_has_no_plot(tmp_path):
-    sft_report.report([], str(tmp_path))
-    assert [p.name for p in tmp_path.iterdir()] == ["sft.md"]
 
 
 def test_results_replace_those_of_the_same_setup_only(tmp_path):
@@ -148,45 +103,6 @@ def test_results_replace_those_of_the_same_setup_only(tmp_path):
     assert sft_results.find(kept, "flag", "adam", short)["setup"] == short
     assert sft_results.find(kept, "flag", sft_results.JET, SETUP, 10)["orders"] == [10, 10]
     assert sft_results.find(kept, "flag", "per-vertex", SETUP) is None
-
-
-def test_what_is_done_is_not_run_again_but_what_failed_is(sheet, tmp_path, monkeypatch, capsys):
-    ran = []
-
-    def run(sequence, method, folder, out, setup):
-        ran.append((sequence, method))
-        assert Path(folder) == sheet.folder
-        if method == "adam" and ran.count((sequence, method)) == 1:
-            return {
-                "sequence": sequence,
-                "method": method,
-                "setup": setup,
-                "error": "error: no power",
-            }
-        return result(sequence, method, setup, orders=None)
-
-    monkeypatch.setattr(sft_runs, "run", run)
-    places = [
-        "--data",
-        str(sheet.folder.parent),
-        "-o",
-        str(tmp_path),
-        "--docs",
-        str(tmp_path / "docs"),
-    ]
-    arguments = [*places, "--methods", "adam", "gauss-newton"]
-    sft.main(arguments)
-    assert ran == [("flag", "adam"), ("flag", "gauss-newton")]
-    assert "error: no power" in (tmp_path / "docs" / "sft.md").read_text()
-    told = capsys.readouterr()
-    assert "bend: not in" in told.err and "`gauss-newton`" in told.out
-    sft.main(arguments)
-    assert ran[2:] == [("flag", "adam")]
-    assert "no power" not in (tmp_path / "docs" / "sft.md").read_text()
-    sft.main(arguments)
-    assert len(ran) == 3
-    sft.main([*arguments, "--again"])
-    assert len(ran) == 5
 
 
 def test_commands_are_those_of_a_user():
@@ -215,12 +131,6 @@ def test_commands_are_those_of_a_user():
     assert sft_runs.command("roll", "adam", "/data", "out", SETUP)[3].endswith("scenes/tube.xml")
 
 
-def test_a_shortened_run_leaves_the_documentation_alone():
-    assert sft_runs.is_whole(SETUP) and sft_runs.is_whole({**SETUP, "mode": "cuda_ad_rgb"})
-    for name, value in {"frames": 3, "threads": 1, "define": ["period=3"], "iterations": 5}.items():
-        assert not sft_runs.is_whole({**SETUP, name: value})
-
-
 def test_the_documentation_is_drawn_from_the_results_beside_it():
     docs = Path(sft.ROOT) / "docs"
     results = sft_results.read(docs / "sft.json")
@@ -232,12 +142,6 @@ def test_a_damaged_file_of_results_is_told(tmp_path):
     (tmp_path / "sft.json").write_text("{")
     with pytest.raises(InputError, match="not a file of results"):
         sft.main(["--data", str(tmp_path), "-o", str(tmp_path), "--docs", str(tmp_path)])
-
-
-def test_a_sequence_is_found_one_folder_down(tmp_path):
-    (tmp_path / "cloth" / "flag").mkdir(parents=True)
-    assert sequences.folder_of(str(tmp_path), "flag") == str(tmp_path / "cloth" / "flag")
-    assert sequences.folder_of(str(tmp_path), "bend") is None
 
 
 def test_one_command_is_run_timed_and_scored(sheet, tmp_path, monkeypatch):
@@ -273,24 +177,6 @@ def template_of(sheet, order):
     return Template.fit(sheet.vertices[0], sheet.faces, sheet.uv, order)
 
 
-def test_a_jet_that_was_turned_is_found_again(sheet):
-    from polysft_mi.surface.atlas import Atlas
-
-    template, rng = template_of(sheet, 4), np.random.default_rng(0)
-    atlas = Atlas(template)
-    arrays = {
-        "delta_alpha": 0.1 * rng.standard_normal((1, 15)),
-        **{name: np.zeros(99) for name in ("delta_u", "delta_v", "delta_w")},
-    }
-    turn = Rotation.from_euler("xyz", [0.3, -0.4, 0.2]).as_quat()
-    truth = atlas.surface(
-        atlas.state({**arrays, "rotation": turn, "translation": [[0.1, 0, 0.2]]})
-    ).vertices
-    start = atlas.surface(best_jets._laid_over(atlas, truth)).vertices
-    found = best_jets.best_jets(template, truth[None])[0]
-    assert metrics.rmse(found, truth) < 0.02 * metrics.rmse(start, truth)
-
-
 def test_best_jets_get_better_with_their_order(sheet):
     truth = synthetic.sheet(1.0, 9, 11, bend=11.0)  # a cylinder of 150 degrees
     distance = {}
@@ -306,10 +192,3 @@ def test_best_jet_of_a_sequence_is_scored_like_a_run(sheet):
     assert r["frames"] == 1 and r["orders"] == [4, 4] and r["figures"]["e3d_proc"] < 1e-5
     whole = sft_runs.jet_result("flag", str(sheet.folder), 4, SETUP)
     assert whole["frames"] == 2 and whole["figures"]["e3d_proc"] < 1e-3
-
-
-def test_without_true_meshes_there_is_no_best_jet(tmp_path):
-    truth = synthetic.cloth(tmp_path / "flag", frames=1)
-    np.savez(truth.folder / "points.npz", points=np.ones((1, 4, 3)), frames=np.zeros(1, int))
-    (truth.folder / "gt.npz").unlink()
-    assert sft_runs.jet_result("flag", str(truth.folder), 4, SETUP) is None

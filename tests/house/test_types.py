@@ -41,12 +41,3 @@ def test_public_functions_are_typed(package):
         if (missing := untyped(function))
     }
     assert found == {}
-
-
-def test_what_is_untyped_is_found():
-    class Half:
-        def known(self, a: int) -> int: ...
-        def unknown(self, a: int, b): ...
-
-    found = {name: untyped(function) for name, function in callables("Half", Half)}
-    assert found == {"Half.known": [], "Half.unknown": ["b", "return"]}

@@ -7,6 +7,7 @@ import struct
 
 import numpy as np
 import pytest
+import surfaces
 
 from polyfit import PatchedSurface
 from polyfit.errors import InputError
@@ -466,11 +467,7 @@ def test_gltf_with_harmless_extensions_and_without_faces(tmp_path):
 
 
 def test_coordinates_of_a_map_are_moved_before_they_are_rounded():
-    x, y = np.meshgrid(np.linspace(0, 0.3, 7), np.linspace(0, 0.2, 5))
-    points = np.stack([x, y, 0.05 * np.sin(9 * x)], -1).reshape(-1, 3)
-    k = np.arange(35).reshape(5, 7)
-    a, b, c, d = (i.ravel() for i in (k[:-1, :-1], k[:-1, 1:], k[1:, :-1], k[1:, 1:]))
-    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([b, d, c], 1)])
+    points, faces = surfaces.sheet(lambda x, y: 0.05 * np.sin(9 * x), 0.15, 7)
     far = points + [5e5, 4e6, 100.0]
     moved, shift = centred(far)
     assert np.abs(moved - (far + shift)).max() < 1e-9 and np.abs(moved).max() < 0.2

@@ -74,15 +74,3 @@ def test_a_process_ends_in_status_2(tmp_path):
     missing = tmp_path / "missing.obj"
     said = refusal(python("-m", "polyfit", missing, "-o", tmp_path / "out.ply"))
     assert "missing.obj: no such file" in said
-
-
-def test_import_is_light():
-    code = """
-import sys, polyfit
-dir(polyfit)
-print({"torch", "mitsuba", "drjit", "pyvista", "numpy"} & set(sys.modules))
-polyfit.PatchedSurface, polyfit.PolyFit
-print({"mitsuba", "drjit", "polysft_mi", "onefit"} & set(sys.modules))
-"""
-    done = python("-c", code)
-    assert done.stdout == "set()\nset()\n", done.stderr

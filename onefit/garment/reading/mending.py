@@ -24,9 +24,9 @@ import contextlib
 
 import numpy as np
 
-from onefit.garment.remesh import loops
 from polyfit import mesh
 from polyfit.errors import InputError
+from polyfit.mesh import loops
 
 from .thickness import outer_side
 from .zip import zipped

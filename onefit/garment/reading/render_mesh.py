@@ -15,8 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from onefit.body import ClosestSurface
-from onefit.garment.binding import vertex_normals
-from polyfit.mesh import TexCoords, welded
+from polyfit.mesh import TexCoords, vertex_normals, welded
 
 _ROUND = 0.75  # of the way to the mean of the corners' planes
 

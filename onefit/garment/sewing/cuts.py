@@ -12,10 +12,10 @@ import numpy as np
 
 from onefit.garment import Garment, standard_body
 from onefit.garment.fitting import pushed_out
-from onefit.garment.remesh import loops
 from polyfit import mesh
 from polyfit.errors import InputError
 from polyfit.files import aside
+from polyfit.mesh import loops
 
 from .block import Block
 from .sew import sewn

@@ -17,7 +17,7 @@ CONTACT = ContactSettings(clearance=0.006, least=0.0045)
 SETTINGS = Settings(iterations=150, tolerance=3e-4, contact=CONTACT)
 
 
-def fallen(cut, seconds=SECONDS, advance=lambda cloth: None):
+def fallen(cut, seconds=SECONDS):
     """Vertices (N, 3) [m] of a :class:`onefit.garment.sewing.loose.Cut` as it hangs on the standard
     body, held at its waistband if it does not hang from the shoulders.
     """
@@ -31,5 +31,4 @@ def fallen(cut, seconds=SECONDS, advance=lambda cloth: None):
     for _ in range(round(seconds / STEP)):
         worn.step(STEP, surface, cut.start, pull)
         worn.cloth.v *= _SLOWING
-        advance(worn.cloth)
     return worn.cloth.x

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from onefit.garment.remesh import loops
+from polyfit.mesh import loops
 
 from .block import armhole
 from .patterns import (

@@ -7,9 +7,9 @@ import os
 import numpy as np
 
 from onefit.garment.binding import standard_body
-from onefit.garment.remesh import loops
 from polyfit import mesh
 from polyfit.files import aside
+from polyfit.mesh import loops
 
 from .block import Block
 from .fall import fallen

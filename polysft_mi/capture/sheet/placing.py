@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from polysft_mi.errors import InputError
-from polysft_mi.scene.outline import fitted
+from polysft_mi.poses import fitted
 
 from .pose import Matches, MatchRules, Pose, from_corners, from_matches, match
 

@@ -2,7 +2,7 @@
 by its corners.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -10,6 +10,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from polysft_mi.errors import InputError
+from polysft_mi.poses import FeatureRules, detected, pairs
 
 
 @dataclass(frozen=True)
@@ -17,9 +18,8 @@ class MatchRules:
     """What counts as a match, and as a pose.
 
     - ``min_matches``: matches that must agree (four fix a plane's pose, and some agree by chance).
-    - ``ratio`` of the distances to the best and the second match, above which a match is ambiguous.
-    - ``features`` of an image at most; ``photo_side`` [pixels]: the longer side to which a photo is
-      shrunk before.
+    - ``features``: what is a feature, and a pair; ``photo_side`` [pixels]: the longer side to which
+      a photo is shrunk before.
     - ``tolerance``: how far a rigid pose may miss a match, as a share of the frame's diagonal (the
       sheet may be bent).
     - ``robust_scale`` [pixels]: residuals above it count less.
@@ -27,8 +27,7 @@ class MatchRules:
     """
 
     min_matches: int = 10
-    ratio: float = 0.8
-    features: int = 5000
+    features: FeatureRules = field(default_factory=FeatureRules)
     photo_side: int = 2000
     tolerance: float = 0.012
     robust_scale: float = 1.5
@@ -67,23 +66,13 @@ def match(photo, frame, rules=None):
     shrink = min(1.0, rules.photo_side / max(photo.shape[:2]))
     if shrink < 1:
         photo = cv2.resize(photo, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
-    detector = cv2.SIFT_create(nfeatures=rules.features, contrastThreshold=0.02)
-    (keys_a, a), (keys_b, b) = (
-        detector.detectAndCompute(cv2.cvtColor(x, cv2.COLOR_RGB2GRAY), None) for x in (photo, frame)
+    of_photo, of_frame = (
+        detected(cv2.cvtColor(x, cv2.COLOR_RGB2GRAY), rules.features) for x in (photo, frame)
     )
-    if len(keys_a) < 2 or len(keys_b) < 2:
-        return Matches(np.empty((0, 2)), np.empty((0, 2)), np.empty(0, bool))
-    there, back = (cv2.BFMatcher().knnMatch(x, y, k=2) for x, y in ((a, b), (b, a)))
-    good = [
-        m
-        for m, n in there
-        if m.distance < rules.ratio * n.distance and back[m.trainIdx][0].trainIdx == m.queryIdx
-    ]
-    at = np.array([keys_a[m.queryIdx].pt for m in good]).reshape(-1, 2) + 0.5
-    to = np.array([keys_b[m.trainIdx].pt for m in good]).reshape(-1, 2) + 0.5
-    uv = at / (photo.shape[1], photo.shape[0])
+    a, b = pairs(of_photo, of_frame, rules.features).T
+    uv = of_photo.places[a] / (photo.shape[1], photo.shape[0])
     uv[:, 1] = 1 - uv[:, 1]
-    return Matches(uv, to, np.zeros(len(good), bool))
+    return Matches(uv, of_frame.places[b], np.zeros(len(a), bool))
 
 
 def from_matches(matches, sheet, camera, rules=None):

@@ -6,7 +6,6 @@ import numpy as np
 
 from polyfit.mesh import TexCoords
 from polysft_mi.errors import InputError
-from polysft_mi.pictures import seen
 from polysft_mi.surface import meshio
 
 from .size import LARGEST, SMALLEST
@@ -49,7 +48,9 @@ class Sheet:
         """
         if self.one_sided:
             return self.faces
-        (depth,) = seen(placed, self.faces, camera)
+        from polysft_mi.render import Triangles
+
+        (depth,) = Triangles(placed, self.faces).seen(camera)
         middle = placed[self.faces].mean(1)
         x, y = np.floor(camera.project(middle)).astype(int).T
         inside = (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)

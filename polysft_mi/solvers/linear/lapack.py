@@ -69,34 +69,14 @@ def solve(factor, b, transposed=False, right=False):
     or b L^-T. ``factor`` (n, n) holds L in its lower triangle."""
     trsm, number = _routine(cython_blas, "trsm", b.dtype, 11)
     (a, apart), (address, between) = _matrix(factor), _matrix(b)
-    trsm(
-        b"R" if right else b"L",
-        b"L",
-        b"T" if transposed else b"N",
-        b"N",
-        _int(b.shape[0]),
-        _int(b.shape[1]),
-        ctypes.byref(number(1)),
-        a,
-        apart,
-        address,
-        between,
-    )
+    how = b"R" if right else b"L", b"L", b"T" if transposed else b"N", b"N"
+    sizes = _int(b.shape[0]), _int(b.shape[1])
+    trsm(*how, *sizes, ctypes.byref(number(1)), a, apart, address, between)
 
 
 def subtract_square(c, w):
     """The lower triangle of c (n, n) becomes that of c - w^T w; w (m, n)."""
     syrk, number = _routine(cython_blas, "syrk", c.dtype, 10)
     (a, apart), (address, between) = _matrix(w), _matrix(c)
-    syrk(
-        b"L",
-        b"T",
-        _int(len(c)),
-        _int(len(w)),
-        ctypes.byref(number(-1)),
-        a,
-        apart,
-        ctypes.byref(number(1)),
-        address,
-        between,
-    )
+    minus, plus = (ctypes.byref(number(k)) for k in (-1, 1))
+    syrk(b"L", b"T", _int(len(c)), _int(len(w)), minus, a, apart, plus, address, between)

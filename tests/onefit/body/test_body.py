@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from processes import python
 from standing import random_poses
 
 from onefit.body import skeleton, skinning
@@ -185,15 +184,6 @@ def test_shapes(model):
         model.body((0.5, 0.5))
     with pytest.raises(InputError, match="not finite"):
         model.body((0.5, 0.5, float("nan"), 0.4, 0.5, 0.5))
-
-
-def test_making_a_body_says_nothing_and_compiles_nothing():
-    code = (
-        "import sys; from onefit.body import AnnyBody; AnnyBody().body(); print([m for m in"
-        " ('warp', 'mitsuba') if m in sys.modules])"
-    )
-    done = python("-c", code)
-    assert (done.stdout, done.stderr) == ("[]\n", "")
 
 
 # --- skinning -------------------------------------------------------------------------------------

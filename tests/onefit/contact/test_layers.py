@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+import trimesh
 from test_contact import COTTON, grid
 
 from onefit.contact import SelfContact
@@ -75,19 +76,11 @@ def test_strips_whose_edges_alone_meet_do_not_pass_through_each_other(speed):
     assert (cloth.x - x)[falls, 2].mean() > -0.02  # it did not fall past
 
 
-def closest(p, a, b, c):
-    """Barycentric coordinates of the point of a triangle nearest to p, by trying all features."""
-    best, found = np.inf, None
-    for corners in ((0, 1, 2), (0, 1), (1, 2), (2, 0), (0,), (1,), (2,)):
-        x = np.stack([a, b, c])[list(corners)]
-        sides = (x[1:] - x[0]).T
-        t = np.linalg.lstsq(sides, p - x[0], rcond=None)[0] if len(corners) > 1 else np.zeros(0)
-        weights = np.concatenate([[1 - t.sum()], t])
-        away = np.linalg.norm(p - weights @ x)
-        if weights.min() >= 0 and away < best:
-            best, found = away, np.zeros(3)
-            found[list(corners)] = weights
-    return found
+def closest(p, *corners):
+    """Barycentric coordinates of the point of a triangle nearest to p."""
+    triangle = np.stack(corners)[None]
+    nearest = trimesh.triangles.closest_point(triangle, p[None])
+    return trimesh.triangles.points_to_barycentric(triangle, nearest)[0]
 
 
 def pairs_of(sheet, x, way):

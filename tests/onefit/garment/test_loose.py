@@ -7,9 +7,9 @@ from scipy.spatial import ConvexHull
 
 from onefit.garment import LOOSE, Garment, standard_body, standard_surface
 from onefit.garment.reading.mending import mended
-from onefit.garment.remesh import loops
 from onefit.garment.sewing import fall, loose
 from polyfit import mesh
+from polyfit.mesh import loops
 
 LOOPS = {
     "boxy_tshirt": 4, "shirt": 4, "waisted_dress": 4, "circle_skirt": 2, "wide_trousers": 3,

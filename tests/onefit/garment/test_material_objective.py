@@ -2,11 +2,10 @@
 
 import pytest
 import torch
-from charted import T, deformation, scene
-from slopes import slope
+from charted import T, assert_gradient, deformation, scene, scene_and_past
 
 from onefit.garment.charts import Deformation
-from onefit.objective import losses, material, objective
+from onefit.objective import losses, material
 from onefit.physics import MATERIALS, sheet
 
 
@@ -48,14 +47,7 @@ def test_each_body_has_its_own_sheet(patched, body, cloth, garment):
 
 @pytest.mark.parametrize("name", ["collision", "stretching", "bending", "gravity", "inertia"])
 def test_gradient_of_each_term(patched, body, cloth, name):
-    s = scene(body, patched, bend=0.02 if name == "collision" else 0.15)
-    d = deformation(patched, 0.2 if name == "collision" else 0.3)
-    past = [
-        objective.vertices(
-            patched, patched.changes(deformation(patched, 0.3, seed=k)), s.rest, s.transforms
-        )
-        for k in (1, 2)
-    ]
+    s, d, past = scene_and_past(body, patched, name)
 
     def value(*parts):
         generator = torch.Generator().manual_seed(5)
@@ -65,11 +57,4 @@ def test_gradient_of_each_term(patched, body, cloth, name):
         )  # fmt: skip
         return terms[name]
 
-    inputs = [x.clone().requires_grad_() for x in (d.alpha, d.translation, d.scale, d.drift)]
-    gradients = torch.autograd.grad(value(*inputs), inputs)
-    for k, gradient in enumerate(gradients):
-        direction = gradient / gradient.norm()
-        step = (1e-2 if name == "gravity" else 3e-4) / direction.abs().max().item()
-        assert float(gradient.norm()) == pytest.approx(
-            slope(value, inputs, k, direction, step), rel=0.03
-        )
+    assert_gradient(value, d, name)

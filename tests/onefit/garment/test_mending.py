@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 import torch
 from meshes import turned
-from surfaces import joined, sphere, tube
+from surfaces import joined, moebius, sphere, tube
 
 from onefit.body import skeleton, skinning
 from onefit.garment import Garment, fitting, standard_body, standard_surface
-from onefit.garment.binding import vertex_normals
 from onefit.garment.reading.mending import mended
-from onefit.garment.remesh import loops
 from polyfit import mesh, write_ply
 from polyfit.errors import InputError
+from polyfit.mesh import loops, vertex_normals
 
 
 def soup(V, F):
@@ -239,17 +238,8 @@ class TestRefusals:
         self.refused(*thickened(V, F, -0.05), "closed surface without openings")
 
     def test_moebius_strip(self):
-        a = np.linspace(0, 2 * np.pi, 60, endpoint=False)
-        w = np.array([-1.0, 0, 1])[:, None] * 0.06
-        r, z = 0.2 + w * np.cos(a / 2), w * np.sin(a / 2)
-        V = np.stack([r * np.cos(a), r * np.sin(a) - 0.03, z + 0.1], axis=-1)  # (3, 60, 3)
-        number = np.arange(180).reshape(3, 60)
-        number = np.concatenate([number, number[::-1, :1]], axis=1)
-        p, q, r, s = number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]
-        F = np.concatenate(
-            [np.stack([p, q, r], -1).reshape(-1, 3), np.stack([p, r, s], -1).reshape(-1, 3)]
-        )
-        self.refused(V.reshape(-1, 3), F, "one side only")
+        V, F = moebius()
+        self.refused(V + [0, -0.03, 0.1], F, "one side only")
 
     @pytest.mark.parametrize(
         "what, change, expected",

@@ -9,9 +9,9 @@ from onefit.garment import TEMPLATES, Garment, standard_surface
 from onefit.garment.charts import Deformation, PatchedGarment, SparseMatrix
 from onefit.garment.charts.blending import DRIFT_WIDTH, SLOPE_RIDGE
 from onefit.garment.charts.frames import steady_jets
-from onefit.garment.remesh import loops
 from onefit.garment.waistband import BAND_WIDTH, held
 from polyfit import InputError, jets
+from polyfit.mesh import loops
 
 
 def points_of(patched, d, t, uv, patch):

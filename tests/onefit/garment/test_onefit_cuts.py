@@ -6,10 +6,10 @@ import torch
 
 from onefit import train, training
 from onefit.garment import Garment, standard_surface
-from onefit.garment.remesh import loops
 from onefit.garment.sewing import cuts, patterns
 from polyfit import mesh
 from polyfit.errors import InputError
+from polyfit.mesh import loops
 
 NAMES = list(cuts.CUTS)
 

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from charted import deformation, scene
-from slopes import slope
+from charted import assert_gradient, deformation, scene, scene_and_past
 
 from onefit.body import AnnyBody, ClosestSurface, skinning
 from onefit.body.nearest import SEARCH_RADIUS
@@ -72,18 +71,7 @@ def test_without_deformation_the_objective_is_plain_skinning(patched, garment, b
     ["collision", "inextensibility", "mesh_inextensibility", "boundary", "gravity", "inertia"],
 )
 def test_gradient_of_the_whole_objective(patched, body, name):
-    # little for the collision: its distance jumps where a point in the body has another part of it
-    # for its nearest
-    s, d = (
-        scene(body, patched, bend=0.02 if name == "collision" else 0.15),
-        deformation(patched, 0.2 if name == "collision" else 0.3),
-    )
-    past = [
-        objective.vertices(
-            patched, patched.changes(deformation(patched, 0.3, seed=k)), s.rest, s.transforms
-        )
-        for k in (1, 2)
-    ]
+    s, d, past = scene_and_past(body, patched, name)
     switches = dict(
         collision="k_c",
         inextensibility="k_i",
@@ -104,24 +92,7 @@ def test_gradient_of_the_whole_objective(patched, body, name):
         assert list(terms) == [name]
         return terms[name]
 
-    inputs = [x.clone().requires_grad_() for x in (d.alpha, d.translation, d.scale, d.drift)]
-    gradients = torch.autograd.grad(value(*inputs), inputs)
-    g = torch.Generator().manual_seed(7)
-    # directions in which the value changes: random ones, leaning towards the gradient, for float32
-    # shows nothing else
-    for x, gradient in zip(range(4), gradients):
-        direction = gradient / gradient.norm() + 0.3 * torch.nn.functional.normalize(
-            torch.randn(gradient.shape, generator=g).flatten(), dim=0
-        ).view_as(gradient)
-        step = (1e-2 if name == "gravity" else 3e-4) / direction.abs().max().item()
-        assert float((gradient * direction).sum()) == pytest.approx(
-            slope(value, inputs, x, direction, step), rel=0.03
-        ), (
-            "alpha",
-            "translation",
-            "scale",
-            "drift",
-        )[x]
+    assert_gradient(value, d, name)
 
 
 def test_metric_points_lie_on_their_vertices(patched, garment):

@@ -16,58 +16,32 @@ from polyfit.errors import InputError
 PARTS = ("hip", "knee", "ankle", "foot", "collar", "shoulder", "elbow", "wrist")
 
 
+_LEGS = "{S}UpLeg {S}Leg {S}Foot {S}ToeBase {S}Shoulder {S}Arm {S}ForeArm {S}Hand"
+_THIGHS = "thigh.{s} shin.{s} foot.{s} toe.{s} shoulder.{s} upper_arm.{s} forearm.{s} hand.{s}"
+_POSER = "{l}Thigh {l}Shin {l}Foot {l}Toe {l}Collar {l}Shldr {l}ForeArm {l}Hand"
+_PLAIN = "{S}Hip {S}Knee {S}Ankle {S}Toe {S}Collar {S}Shoulder {S}Elbow {S}Wrist"
+_UNREAL = "thigh calf foot ball clavicle upperarm lowerarm hand"
 # names of pelvis, spine, neck and head, and of a side's bones; Euler order; axes; units a metre
 STYLES = {
-    "mixamo": (
-        ["Hips", "Spine", "Spine1", "Spine2", "Neck", "Head"],
-        [
-            "{S}UpLeg", "{S}Leg", "{S}Foot", "{S}ToeBase", "{S}Shoulder", "{S}Arm", "{S}ForeArm",
-            "{S}Hand"
-        ], "mixamorig:", "ZXY", "y", 100.0
-    ),
-    "cmu": (
-        ["Hips", "LowerBack", "Spine", "Spine1", "Neck", "Head"],
-        [
-            "{S}UpLeg", "{S}Leg", "{S}Foot", "{S}ToeBase", "{S}Shoulder", "{S}Arm", "{S}ForeArm",
-            "{S}Hand"
-        ], "", "ZYX", "y", 17.7
-    ),
-    "rigify": (
-        ["spine", "spine.001", "spine.002", "spine.003", "spine.004", "head"],
-        [
-            "thigh.{s}", "shin.{s}", "foot.{s}", "toe.{s}", "shoulder.{s}", "upper_arm.{s}",
-            "forearm.{s}", "hand.{s}"
-        ], "", "XYZ", "z", 1.0
-    ),
-    "poser": (
-        ["hip", "abdomen", "chest", "chest2", "neck", "head"],
-        [
-            "{l}Thigh", "{l}Shin", "{l}Foot", "{l}Toe", "{l}Collar", "{l}Shldr", "{l}ForeArm",
-            "{l}Hand"
-        ], "", "YZX", "y", 40.0
-    ),
-    "mocap": (
-        ["Hips", "Chest", "Chest2", "Chest3", "Neck", "Head"],
-        [
-            "{S}Hip", "{S}Knee", "{S}Ankle", "{S}Toe", "{S}Collar", "{S}Shoulder", "{S}Elbow",
-            "{S}Wrist"
-        ], "", "ZXY", "y", 100.0
-    ),
+    "mixamo": ("Hips Spine Spine1 Spine2 Neck Head", _LEGS, "mixamorig:", "ZXY", "y", 100.0),
+    "cmu": ("Hips LowerBack Spine Spine1 Neck Head", _LEGS, "", "ZYX", "y", 17.7),
+    "rigify": ("spine spine.001 spine.002 spine.003 spine.004 head", _THIGHS, "", "XYZ", "z", 1.0),
+    "poser": ("hip abdomen chest chest2 neck head", _POSER, "", "YZX", "y", 40.0),
+    "mocap": ("Hips Chest Chest2 Chest3 Neck Head", _PLAIN, "", "ZXY", "y", 100.0),
     "unreal": (
-        ["pelvis", "spine_01", "spine_02", "spine_03", "neck_01", "head"],
-        [
-            "thigh_{l}", "calf_{l}", "foot_{l}", "ball_{l}", "clavicle_{l}", "upperarm_{l}",
-            "lowerarm_{l}", "hand_{l}"
-        ], "", "ZYX", "z", 100.0
+        "pelvis spine_01 spine_02 spine_03 neck_01 head",
+        " ".join(f"{part}_{{l}}" for part in _UNREAL.split()),
+        *("", "ZYX", "z", 100.0),
     ),
-}  # fmt: skip
+}
 
 
 def bvh_names(style):
     trunk, limbs, prefix, *_ = STYLES[style]
-    names = dict(zip(("pelvis", "spine1", "spine2", "spine3", "neck", "head"), trunk, strict=True))
+    joints = "pelvis spine1 spine2 spine3 neck head"
+    names = dict(zip(joints.split(), trunk.split(), strict=True))
     for side in ("left", "right"):
-        for part, name in zip(PARTS, limbs, strict=True):
+        for part, name in zip(PARTS, limbs.split(), strict=True):
             names[f"{side}_{part}"] = name.format(S=side.capitalize(), s=side[0].upper(), l=side[0])
     return {joint: prefix + name for joint, name in names.items()}
 

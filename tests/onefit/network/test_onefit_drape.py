@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 import torch
 from places import ROOT
-from processes import python
 
 import onefit
 from onefit import drape, simulate
@@ -165,17 +164,6 @@ def test_the_summary_is_in_lines_that_fit_a_terminal(network, tmp_path, capsys, 
     lines = [line for line in said.err.splitlines() if line.strip()]
     assert [line.partition(":")[0] for line in lines] == ["frames", "speed", "inside the body"]
     assert max(map(len, lines)) < 80
-
-
-def test_importing_onefit_is_quick_and_loads_nothing_heavy():
-    code = """
-import sys, onefit
-print({"torch", "numpy", "mitsuba", "drjit", "warp", "anny"} & set(sys.modules))
-onefit.load, onefit.Garment, onefit.AnnyBody, onefit.Motion, onefit.SmplBody
-print("mitsuba" in sys.modules)
-"""
-    done = python("-c", code)
-    assert done.stdout == "set()\nFalse\n", done.stderr
 
 
 def test_what_a_motion_file_does_not_say_is_said_by_flags(network, tmp_path):

@@ -1,7 +1,6 @@
 """Frames of videos and single photos: upright, in their colours, of any depth."""
 
 import os
-import struct
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ from polysft_mi.pictures.video import write_video
 from polysft_mi.scene.images import read_rgb
 
 
-def test_frames_are_upright_and_in_their_colours(tmp_path):
+def test_frames_are_in_their_colours(tmp_path):
     image = np.zeros((48, 64, 3), np.uint8)
     image[:24, :32], image[:24, 32:], image[24:, :32], image[24:, 32:] = (
         (200, 40, 30),
@@ -27,15 +26,6 @@ def test_frames_are_upright_and_in_their_colours(tmp_path):
     assert len(got) == 3 and all(
         np.abs(x[8:40:31, 8:50:41].astype(int) - image[8:40:31, 8:50:41]).max() < 6 for x in got
     )
-    # as a telephone that was turned writes it: a quarter turn in the track's display matrix
-    data = bytearray((tmp_path / "a.mp4").read_bytes())
-    matrix = data.index(b"tkhd") + 44
-    one, whole = 1 << 16, 1 << 30
-    assert data[matrix : matrix + 36] == struct.pack(">9i", one, 0, 0, 0, one, 0, 0, 0, whole)
-    data[matrix : matrix + 36] = struct.pack(">9i", 0, -one, 0, one, 0, 0, 0, 0, whole)
-    (tmp_path / "b.mp4").write_bytes(data)
-    _, got = next(read_frames(tmp_path / "b.mp4"))
-    assert got.shape == (64, 48, 3) and np.abs(got.astype(int) - np.rot90(image)).mean() < 6
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))

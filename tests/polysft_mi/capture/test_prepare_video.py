@@ -37,23 +37,11 @@ from polysft_mi.surface import meshio
 def test_folder_of_a_video(clip, tmp_path):
     lines, out = [], str(tmp_path / "aus gabe é")
     scene_path, found = prepare_video(clip[0], out, say=lines.append, **given(clip))
-    assert sorted(os.listdir(out)) == [
-        "camera.json",
-        "frames",
-        "masks",
-        "prepare",
-        "scene.xml",
-        "template.obj",
-        "texture.png",
-    ]
+    wanted = "camera.json frames masks prepare scene.xml template.obj texture.png"
+    assert sorted(os.listdir(out)) == wanted.split()
     assert sorted(os.listdir(tmp_path)) == ["aus gabe é"]  # nothing beside it
-    assert sorted(os.listdir(f"{out}/prepare")) == [
-        "frames.png",
-        "masks.png",
-        "matches.png",
-        "pose.png",
-        "prepare.json",
-    ]
+    wanted = "frames.png masks.png matches.png pose.png prepare.json"
+    assert sorted(os.listdir(f"{out}/prepare")) == wanted.split()
     assert json.loads(Path(out, "prepare", "prepare.json").read_text()) == json.loads(
         json.dumps(found)
     )

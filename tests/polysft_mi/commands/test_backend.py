@@ -2,7 +2,6 @@
 of their own.
 """
 
-import argparse
 import os
 import shutil
 import subprocess
@@ -71,26 +70,22 @@ def no_choice(monkeypatch):
 
 
 @needs_compiler
-def test_newest_wins_by_number_and_not_by_text(tmp_path):
-    library(tmp_path, "libLLVM-9.so.1", (99, 0, 0))  # a name that says 9 is not even loaded
-    library(tmp_path, "libLLVM-16.so.1", (16, 0, 6))
-    newest = library(tmp_path, "libLLVM.so.19.1", (19, 1, 7))
-    library(tmp_path, "libLLVM.so.18.1", (18, 1, 8))
-    assert backend.find_libllvm([str(tmp_path)]) == (newest, (19, 1, 7))
-
-
-@needs_compiler
-def test_a_name_without_a_number_is_asked(tmp_path):
-    library(tmp_path, "libLLVM.so.19.1", (19, 1, 7))
-    plain = library(tmp_path, "libLLVM.so", (22, 1, 0))
-    assert backend.find_libllvm([str(tmp_path)]) == (plain, (22, 1, 0))
-
-
-@needs_compiler
-def test_what_the_library_tells_goes_before_its_name(tmp_path):
-    library(tmp_path, "libLLVM.so.22.1", (18, 1, 8))
-    newest = library(tmp_path, "libLLVM.so.19.1", (19, 1, 7))
-    assert backend.find_libllvm([str(tmp_path)])[0] == newest
+@pytest.mark.parametrize(
+    "newest, others",
+    [
+        # by number and not by text; a name that says 9 is not even loaded
+        (("libLLVM.so.19.1", (19, 1, 7)), {"libLLVM-9.so.1": 99, "libLLVM.so.18.1": 18}),
+        # a name without a number is asked
+        (("libLLVM.so", (22, 1, 0)), {"libLLVM.so.19.1": 19}),
+        # what the library tells goes before its name
+        (("libLLVM.so.19.1", (19, 1, 7)), {"libLLVM.so.22.1": 18}),
+    ],
+)
+def test_the_newest_is_found(tmp_path, newest, others):
+    path = library(tmp_path, *newest)
+    for name, major in others.items():
+        library(tmp_path, name, (major, 0, 0))
+    assert backend.find_libllvm([str(tmp_path)]) == (path, newest[1])
 
 
 @needs_compiler
@@ -145,16 +140,6 @@ def test_none_found_names_the_older_ones_and_what_to_install(tmp_path):
         ),
     ):
         backend.find_libllvm([str(tmp_path)])
-
-
-def test_none_found_ends_the_command_in_one_line(tmp_path):
-    message = one_line_and_status_2(
-        python(
-            "from polysft_mi import backend; backend._of_package = list; backend._search_folders ="
-            f" lambda: [{str(tmp_path)!r}]; backend.cli(backend.main)"
-        )
-    )
-    assert "no usable LLVM found" in message and "libllvm19" in message
 
 
 def installed(folder, *files):
@@ -335,17 +320,6 @@ def test_trying_a_variant_tells_working_from_broken(monkeypatch):
     assert not backend.variant_works("llvm_ad_rgb", timeout=0.01)
     monkeypatch.setenv(backend.VARIABLE, "/nonexistent/libLLVM.so")
     assert not backend.variant_works("llvm_ad_rgb")
-
-
-def test_mode_on_the_command_line():
-    parser = argparse.ArgumentParser()
-    backend.add_mode_argument(parser)
-    assert parser.parse_args([]).mode is None
-    assert (
-        parser.parse_args(["-m", "cuda_ad_rgb"]).mode
-        == parser.parse_args(["--mode", "cuda_ad_rgb"]).mode
-        == "cuda_ad_rgb"
-    )
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="needs a way to take cores away")

@@ -4,14 +4,12 @@ One line names the file, property or value and says what is accepted; the exit s
 untouched.
 """
 
-import re
 import shutil
 
-import cv2
 import numpy as np
 import pytest
 import synthetic
-from refusals import SIZE, edited, has, refused
+from refusals import edited, has, refused
 
 from polyfit import write_ply
 from polysft_mi import run
@@ -24,14 +22,6 @@ def test_image_that_cannot_be_read(sheet, name, kind):
     data = path.read_bytes()
     path.write_bytes({"truncated": data[: len(data) // 2], "garbage": b"hello", "empty": b""}[kind])
     has(refused(sheet / "scene.xml"), f"{name}: not a readable image")
-
-
-@pytest.mark.parametrize(
-    "name, words", [("frames", "3 masks for the 2 images"), ("masks", "2 masks for the 3 images")]
-)
-def test_an_image_is_missing(sheet, name, words):
-    (sheet / name / "001.png").unlink()
-    has(refused(sheet / "scene.xml"), str(sheet / "masks"), words, "one mask an image is needed")
 
 
 @pytest.mark.parametrize("name", ["texture.png", "frames", "masks"])
@@ -47,12 +37,6 @@ def test_files_are_missing(sheet, name):
     )
 
 
-@pytest.mark.parametrize("name", ["frames", "masks"])
-def test_image_of_another_size(sheet, name):
-    assert cv2.imwrite(str(sheet / name / "002.png"), np.full((30, 40, 3), 99, np.uint8))
-    has(refused(sheet / "scene.xml"), f"{name}/002.png: 40x30 pixels", "48x36")
-
-
 def test_film_of_another_size(sheet):
     message = refused(
         edited(sheet, '<integer name="width" value="48"/>', '<integer name="width" value="64"/>')
@@ -60,40 +44,11 @@ def test_film_of_another_size(sheet):
     has(message, "frames/000.png: 48x36 pixels; the camera's film has 64x36")
 
 
-def test_first_mask_is_empty(sheet):
-    assert cv2.imwrite(str(sheet / "masks" / "000.png"), np.zeros(SIZE[::-1], np.uint8))
-    has(refused(sheet / "scene.xml"), "masks/000.png: the mask is empty")
-
-
 def moved(truth, by=(0, 0, 0), scale=1.0):
     return truth.vertices[0] * scale + by, truth.uv, truth.faces
 
 
-def with_extra(truth, points, faces):
-    V, uv, F = moved(truth)
-    points, faces = np.reshape(points, (-1, 3)), np.reshape(faces, (-1, 3)).astype(int)
-    return (
-        np.concatenate([V, points]),
-        np.concatenate([uv, np.zeros((len(points), 2))]),
-        np.concatenate([F, faces]),
-    )
-
-
-def with_nan(truth, which):
-    arrays = [a.copy() for a in moved(truth)]
-    arrays[which][5] = np.nan
-    return arrays
-
-
 BAD_TEMPLATES = {
-    "nan": (
-        lambda t: with_nan(t, 0),
-        ["template.obj: 1 vertices have coordinates that are not finite (the first is vertex 5"],
-    ),
-    "uv nan": (
-        lambda t: with_nan(t, 1),
-        ["template.obj: 1 texture coordinates are not finite (the first is coordinate 5"],
-    ),
     "behind": (
         lambda t: moved(t, (0, 0, -1)),
         ["99 of 99 vertices behind the camera; it must stand in its pose of the first frame"],
@@ -139,29 +94,11 @@ def test_faces_without_area_and_loose_vertices_are_left_out(good, sheet, kind, c
         assert np.abs(clean["vertices"] - own["vertices"]).max() < 1e-6
 
 
-def test_template_without_uv(sheet):
-    path = sheet / "template.obj"
-    path.write_text(
-        "\n".join(
-            re.sub(r"/\d+", "", line)
-            for line in path.read_text().splitlines()
-            if not line.startswith("vt")
-        )
-    )
-    has(refused(sheet / "scene.xml"), f"{path}: no texture coordinates; without uv")
-
-
 def test_template_that_cannot_be_read(sheet):
     path = sheet / "template.obj"
     text = path.read_text()
-    for content, words in (
-        ("", "template.obj: 0 vertices; a template has at least 3"),
-        ("\x00garbage", "template.obj: 0 vertices"),
-        (text + "f 1/1 2/2 999/1\n", "template.obj: a face names number 999 of 99 vertices"),
-        (text + "v 1 two 3\n", "template.obj: line 359: 'v 1 two 3' is not OBJ"),
-    ):
-        path.write_text(content)
-        has(refused(sheet / "scene.xml"), words)
+    path.write_text(text + "v 1 two 3\n")
+    has(refused(sheet / "scene.xml"), "template.obj: line 359: 'v 1 two 3' is not OBJ")
     path.unlink()
     has(
         refused(sheet / "scene.xml"),

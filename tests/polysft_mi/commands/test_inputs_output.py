@@ -15,11 +15,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import synthetic
 from processes import python, refusal
-from refusals import QUICK, SIZE, has, line_of, refused
+from refusals import QUICK, has, line_of, refused
 
-from polysft_mi import errors, prepare, run
+from polysft_mi import errors, run
 from polysft_mi.pictures import exr
 from polysft_mi.pictures.video import read_video
 from polysft_mi.surface import meshio
@@ -126,40 +125,6 @@ for option in ("ordre=4", "order=four"):
 """
     done = python("-c", code, good.folder / "scene.xml", "-o", tmp_path / "out")
     assert done.stdout == "False\nFalse\n", done.stderr
-
-
-@pytest.mark.parametrize(
-    "values, words",
-    [
-        ({"fx": 0}, "not a pinhole; finite values and positive focal lengths are needed"),
-        ({"fy": float("nan")}, "not a pinhole"),
-        ({"cx": "middle"}, "are needed"),
-        ({"width": 0}, "0x36"),
-    ],
-)
-def test_camera_file_that_is_no_pinhole(sheet, values, words):
-    path = sheet / "camera.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | values))
-    with pytest.raises(errors.InputError) as caught:
-        prepare.main([str(sheet), "--overwrite"])
-    has(str(caught.value), str(path), words)
-
-
-@pytest.mark.parametrize(
-    "K, words",
-    [
-        ("50 9 24\n0 50 18\n0 0 1", "skew 9"),
-        ("50 0 24\n0 50 18\n0 0.1 1", "it must read [[fx, 0, cx]"),
-        ("50 0\n0 50", "3x3 is needed"),
-    ],
-)
-def test_matrix_that_is_no_pinhole(tmp_path, K, words):
-    truth = synthetic.kinect_paper(tmp_path / "paper", frames=1, size=SIZE)
-    (truth.folder / "cam.intr").write_text(K)
-    with pytest.raises(errors.InputError) as caught:
-        prepare.main([str(truth.folder)])
-    has(str(caught.value), "cam.intr: ", words)
-    assert not (truth.folder / "scene.xml").exists()
 
 
 def whole(out):

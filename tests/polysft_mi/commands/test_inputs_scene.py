@@ -34,63 +34,29 @@ def test_not_xml(tmp_path, text):
 
 
 # what is changed, into what, a text of the line that the message names, and words of the message
+INTEGRATOR, FRAMES = '<integrator type="$integrator"/>', '<string name="frames" value="$frames"/>'
+FOV, LIGHT = r'name="fov" value="[^"]*"', '<emitter type="constant"/>'
+MASKS, K_FOO = '<string name="masks"', '<float name="k_foo" value="1"/><string name="masks"'
 REFUSED_BY_MITSUBA = [
-    ('type="twosided"', 'type="twosidde"', "twosidde", ["bsdf", '"twosidde" not found']),
-    (
-        'name="wrap_mode"',
-        'name="wrap_mod"',
-        'type="bitmap"',
-        ["unknown property", '"bitmap"', '"wrap_mod": "clamp"'],
-    ),
-    (
-        '<string name="masks"',
-        '<float name="k_foo" value="1"/><string name="masks"',
-        'type="polysft"',
-        ["unknown property", '"polysft"', '"k_foo"'],
-    ),
-    ('<emitter type="constant"/>', '<emiter type="constant"/>', "<emiter", ["<emiter>"]),
-    (
-        '<emitter type="constant"/>',
-        '<include filename="nope.xml"/>',
-        "nope.xml",
-        ['"nope.xml" not found'],
-    ),
-    (
-        '<integrator type="$integrator"/>',
-        "",
-        'type="polysft"',
-        ["polysft: 0 nested integrators", 'e.g. <integrator type="raster"/>'],
-    ),
-    (
-        '<string name="frames" value="$frames"/>',
-        "",
-        'type="polysft"',
-        ["polysft: property 'frames' is missing; a folder of images"],
-    ),
-    ('value="$frames"', 'value="$framez"', "$framez", ["undefined parameter: $framez"]),
-    (' version="3.0.0"', "", None, ["missing version attribute"]),
-    (
-        r'name="fov" value="[^"]*"',
-        'name="fov" value="abc"',
-        'value="abc"',
-        ['floating point value "abc"'],
-    ),
-    (
-        r'name="fov" value="[^"]*"',
-        'name="fov" value="200"',
-        'type="perspective"',
-        ['"perspective"', "field of view", "[0, 180]"],
-    ),
+    ('type="twosided"', 'type="twosidde"', "twosidde", 'bsdf|"twosidde" not found'),
+    ('name="wrap_mode"', 'name="wrap_mod"', 'type="bitmap"', '"bitmap"|"wrap_mod": "clamp"'),
+    (MASKS, K_FOO, 'type="polysft"', 'unknown property|"polysft"|"k_foo"'),
+    (LIGHT, '<emiter type="constant"/>', "<emiter", "<emiter>"),
+    (LIGHT, '<include filename="nope.xml"/>', "nope.xml", '"nope.xml" not found'),
+    (INTEGRATOR, "", 'type="polysft"', 'polysft: 0 nested integrators|type="raster"/>'),
+    (FRAMES, "", 'type="polysft"', "polysft: property 'frames' is missing; a folder of images"),
+    ('value="$frames"', 'value="$framez"', "$framez", "undefined parameter: $framez"),
+    (' version="3.0.0"', "", None, "missing version attribute"),
+    (FOV, 'name="fov" value="abc"', 'value="abc"', 'floating point value "abc"'),
+    (FOV, 'name="fov" value="200"', 'type="perspective"', '"perspective"|field of view|[0, 180]'),
 ]
 
 
-@pytest.mark.parametrize(
-    "old, new, at, words", REFUSED_BY_MITSUBA, ids=[w[-1] for *_, w in REFUSED_BY_MITSUBA]
-)
+@pytest.mark.parametrize("old, new, at, words", REFUSED_BY_MITSUBA)
 def test_xml_that_mitsuba_refuses(sheet, old, new, at, words):
     path = edited(sheet, old, new, pattern=old.startswith("name="))
     message = refused(path)
-    has(message, *words)
+    has(message, *words.split("|"))
     if at:
         has(message, line_of(path, at))
     assert message.startswith(f"{path}: ") and message.count(str(path)) <= 2

@@ -20,9 +20,7 @@ from places import ROOT
 
 from polysft_mi import demo, prepare, run
 from polysft_mi.pictures import exr
-from polysft_mi.results import metrics
 from polysft_mi.results.evaluation import evaluate, score
-from polysft_mi.scene import experiment as scene
 from polysft_mi.tracker import FrameTracker
 
 GAUSS_NEWTON = ["--no-report"]
@@ -41,13 +39,13 @@ def sequence(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def result(sequence, tmp_path_factory):
-    out = tmp_path_factory.mktemp("out") / "full"
-    assert run.main([str(sequence.folder / "scene.xml"), "-o", str(out), "-q", "--exr", "3"]) == 0
+    return ran(sequence.folder, tmp_path_factory.mktemp("out") / "full", "--exr", "3")
+
+
+def ran(folder, out, *options):
+    """The folder ``out`` of a run, which ends well."""
+    assert run.main([str(folder / "scene.xml"), "-o", str(out), "-q", *options]) == 0
     return out
-
-
-def command(*arguments, cwd=ROOT):
-    return [sys.executable, "-m", "polysft_mi.run", *map(str, arguments)]
 
 
 def surface(out):
@@ -77,50 +75,18 @@ def test_surface_keeps_the_templates_vertices_and_faces(sequence, result):
     assert np.abs(s["uv"] - sequence.uv).max() < 1e-6
 
 
-def test_unknowns_make_the_surface(result):
-    """params.npz is complete: the surface follows from it by the paper's formula."""
-    import torch
-    from scipy.spatial.transform import Rotation
-
-    from polyfit import jets
-
-    with np.load(result / "params.npz") as p:
-        p = {k: p[k] for k in p}
-    for k, expected in enumerate(surface(result)["vertices"]):
-        uv = p["chart"][:, 0] + np.stack([p["delta_u"][k], p["delta_v"][k]], 1)
-        x = jets.point(
-            torch.as_tensor((p["alpha"] + p["delta_alpha"][k])[0]), torch.as_tensor(uv)
-        ).numpy()
-        x[:, 2] += p["delta_w"][k]
-        x = x @ Rotation.from_quat(p["rotation"][k][0]).as_matrix().T + p["translation"][k]
-        found = p["scale"] * x @ p["frame_rotation"][0].T + p["frame_origin"]
-        assert np.abs(found - expected).max() < 1e-5
-
-
 def test_files_of_a_run(sequence, result):
     assert sorted(f.name for f in (result / "meshes").iterdir()) == [
         f"{k:03d}.ply" for k in range(6)
     ]
     mesh = trimesh.load(result / "meshes" / "003.ply", process=False)
     assert np.abs(mesh.vertices - surface(result)["vertices"][3]).max() < 1e-6
-    assert sorted(f.name for f in (result / "comparison").iterdir()) == [
-        "000.exr",
-        "002.exr",
-        "005.exr",
-    ]
+    names = sorted(f.name for f in (result / "comparison").iterdir())
+    assert names == ["000.exr", "002.exr", "005.exr"]
     layers, header = exr.read_exr(result / "comparison" / "005.exr")
-    assert {k: v.shape for k, v in layers.items()} == {
-        "target": (72, 96, 3),
-        "render": (72, 96, 3),
-        "error": (72, 96, 1),
-        "residual": (72, 96, 1),
-        "mask_target": (72, 96, 1),
-        "mask_render": (72, 96, 1),
-        "depth": (72, 96, 1),
-        "normal": (72, 96, 3),
-        "uv": (72, 96, 2),
-        "patch": (72, 96, 1),
-    }
+    one = "error residual mask_target mask_render depth patch".split()
+    channels = dict.fromkeys(one, 1) | {"target": 3, "render": 3, "normal": 3, "uv": 2}
+    assert {k: v.shape for k, v in layers.items()} == {k: (72, 96, c) for k, c in channels.items()}
     inside = layers["mask_render"][..., 0] > 0.999
     V = surface(result)["vertices"][5]
     assert np.abs(layers["depth"][inside].ravel() - V[:, 2].mean()).max() < np.ptp(V[:, 2])
@@ -138,21 +104,6 @@ def test_files_of_a_run(sequence, result):
     )
     records = [json.loads(line) for line in (result / "log.jsonl").read_text().splitlines()]
     assert {r["frame"] for r in records} == set(range(6)) and sum("best" in r for r in records) == 6
-
-
-def test_depth_of_the_exr_is_that_of_the_surface(result):
-    layers, _ = exr.read_exr(result / "comparison" / "002.exr")
-    s = surface(result)
-    experiment = scene.load(result / "scene.xml")
-    from polysft_mi.render.pinhole import Pinhole
-
-    camera = Pinhole(experiment.sensor)
-    y, x = np.nonzero(layers["mask_render"][..., 0] > 0.999)
-    rays = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1) @ camera.basis.T
-    z = metrics.ray_depth(s["vertices"][2].astype(float), s["faces"], camera.to_camera(rays))
-    ok = np.isfinite(z)
-    assert ok.mean() > 0.99
-    assert np.abs(z - layers["depth"][y, x, 0])[ok].max() < 1e-4
 
 
 def test_overrides_may_be_numbers_and_the_last_line_says_what_is_next(sequence, tmp_path):
@@ -221,9 +172,10 @@ def test_resume_ends_with_the_same_result(sequence, tmp_path, monkeypatch, solve
 
 
 def test_ctrl_c_leaves_a_valid_shorter_result(sequence, tmp_path):
+    words = sys.executable, "-m", "polysft_mi.run"
     out, long = tmp_path / "out", ["-D", "patience=100000", "-D", "period=30"]
     process = subprocess.Popen(
-        command(sequence.folder / "scene.xml", "-o", out, *QUICK, *long),
+        [*words, sequence.folder / "scene.xml", "-o", out, *QUICK, *long],
         cwd=ROOT,
         stderr=subprocess.PIPE,
         stdout=subprocess.PIPE,
@@ -253,9 +205,7 @@ def test_a_frame_that_breaks_the_loss_is_reported_and_passed_over(
     monkeypatch.setattr(
         Sequence, "frame", lambda self, i: frame(self, i) * (np.nan if i == 3 else 1)
     )
-    out = tmp_path / "out"
-    words = [str(sequence.folder / "scene.xml"), "-o", str(out), "-q", "-D", "last=4"]
-    assert run.main([*words, *SOLVERS[solver]]) == 0
+    out = ran(sequence.folder, tmp_path / "out", "-D", "last=4", *SOLVERS[solver])
     err = capsys.readouterr().err
     assert (
         "frame 3: the loss is nan from the start; it keeps the state of the frame before" in err
@@ -285,11 +235,7 @@ def test_a_surface_that_leaves_the_image_is_reported_and_held(
         return result
 
     monkeypatch.setattr(Adam, "minimise", thrown_out)
-    out = tmp_path / "out"
-    assert (
-        run.main([str(sequence.folder / "scene.xml"), "-o", str(out), "-q", *QUICK, "-D", "last=3"])
-        == 0
-    )
+    out = ran(sequence.folder, tmp_path / "out", *QUICK, "-D", "last=3")
     assert (
         "frame 3: the surface left the image; it keeps the state of the frame before"
         in capsys.readouterr().err
@@ -299,31 +245,13 @@ def test_a_surface_that_leaves_the_image_is_reported_and_held(
 
 
 def test_fewer_frames_than_the_window(sequence, tmp_path):
-    out = tmp_path / "out"
-    assert (
-        run.main(
-            [
-                str(sequence.folder / "scene.xml"),
-                "-o",
-                str(out),
-                "-q",
-                *QUICK,
-                "-D",
-                "first=1",
-                "-D",
-                "last=1",
-            ]
-        )
-        == 0
-    )
+    out = ran(sequence.folder, tmp_path / "out", *QUICK, "-D", "first=1", "-D", "last=1")
     assert surface(out)["frames"].tolist() == [1]
 
 
 def test_path_replay_runs_from_the_same_scene(sequence, tmp_path):
-    scene, out = sequence.folder / "scene.xml", tmp_path / "out"
-    settings = [*PAPER, *"--no-report -D last=1 -D window=2 -D period=6".split()]
-    settings += ["-D", "integrator=prb_projective"]
-    assert run.main([str(scene), "-o", str(out), "-q", *settings]) == 0
+    settings = "--no-report -D last=1 -D window=2 -D period=6 -D integrator=prb_projective"
+    out = ran(sequence.folder, tmp_path / "out", *PAPER, *settings.split())
     records = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
     first = [r for r in records if r["frame"] == 1]
     assert first[-1]["loss"] < first[0]["loss"] and first[-1]["silhouette"] > 0
@@ -334,10 +262,8 @@ def test_no_masks(tmp_path):
         tmp_path / "sheet", frames=4, size=(240, 180), masks=False, bend=1.5, turn=0.1
     )
     prepare.main([str(truth.folder)])
-    out = tmp_path / "out"
-    words = [str(truth.folder / "scene.xml"), "-o", str(out), "-q", *GAUSS_NEWTON]
     # the smooth texture here has little that survives local normalisation
-    assert run.main([*words, "-D", "brightness=none"]) == 0
+    out = ran(truth.folder, tmp_path / "out", *GAUSS_NEWTON, "-D", "brightness=none")
     figures = score(surface(out), str(truth.folder / "gt.npz"))
     assert figures["rmse_mm"] < 4
 
@@ -345,8 +271,7 @@ def test_no_masks(tmp_path):
 def test_the_form_of_phi_sft_with_its_other_frame_and_pixels(tmp_path):
     truth = synthetic.phi_sft(tmp_path / "seq", frames=4, bend=1.0, turn=0.05)
     prepare.main([str(truth.folder)])
-    out = tmp_path / "out"
-    assert run.main([str(truth.folder / "scene.xml"), "-o", str(out), "-q", *GAUSS_NEWTON]) == 0
+    out = ran(truth.folder, tmp_path / "out", *GAUSS_NEWTON)
     # a small picture leaves the depth open; what it shows must fit all the same
     seen, true = (
         v[..., :2] / v[..., 2:] * truth.K[[0, 1], [0, 1]] + truth.K[:2, 2]
@@ -370,11 +295,7 @@ def test_a_camera_elsewhere_gives_the_same_surface(sequence, result, tmp_path):
         f'value="$data/template.obj"/><transform name="to_world">{move}</transform>',
     )
     (folder / "scene.xml").write_text(text)
-    out = tmp_path / "out"
-    assert (
-        run.main([str(folder / "scene.xml"), "-o", str(out), "-q", "-D", "last=2", *GAUSS_NEWTON])
-        == 0
-    )
+    out = ran(folder, tmp_path / "out", "-D", "last=2", *GAUSS_NEWTON)
     first = surface(result)["vertices"][2]
     assert (
         np.abs(surface(out)["vertices"][2] - first).max()

@@ -184,12 +184,12 @@ def test_the_contrast_is_the_local_deviation_inside():
     assert pyramid.contrast(image, 8.0, thin) == pytest.approx(0.1, rel=0.2)
 
 
-def test_a_plain_texture_is_compared_over_a_higher_floor(truth, problem, monkeypatch):
-    local, rules = problem_of(truth.folder, brightness="local"), problem.rules
-    assert data_of(local).level(1.0).floor == pyramid.FLOOR
-    for each in (local, problem):
-        monkeypatch.setattr(each, "rules", dataclasses.replace(rules, plain=1.0))
-    plain, vertices = data_of(local), truth.vertices[2]
-    assert {plain.level(blur).floor for blur in rules.blurs} == {rules.plain_floor}
-    assert plain.misfit(vertices, 2, 1.0) < 0.5 * plain.misfit(vertices + [0.02, 0, 0], 2, 1.0)
-    assert data_of(problem).level(1.0).floor == pyramid.FLOOR  # colours as they are
+def test_a_plain_texture_is_compared_over_a_higher_floor(truth, problem):
+    rules, vertices = dataclasses.replace(problem.rules, plain=1.0), truth.vertices[2]
+    local, colours, usual = (
+        data_of(problem_of(truth.folder, r, brightness=b))
+        for r, b in ((rules, "local"), (rules, "none"), (None, "local"))
+    )
+    assert {local.level(blur).floor for blur in rules.blurs} == {rules.plain_floor}
+    assert local.misfit(vertices, 2, 1.0) < 0.5 * local.misfit(vertices + [0.02, 0, 0], 2, 1.0)
+    assert usual.level(1.0).floor == colours.level(1.0).floor == pyramid.FLOOR

@@ -180,4 +180,3 @@ def test_all_terms_are_those_of_their_dense_jacobians(make):
         assert found == pytest.approx(energy, rel=1e-9), case
         assert np.abs(matrix - expected).max() < 1e-6 * np.abs(expected).max(), case
         assert np.abs(gradient - by.T @ slope.ravel()).max() < 1e-6 * np.abs(gradient).max(), case
-    assert assembly._in_unknowns.recorded.n_recordings == 2  # with triangles and without

@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 
@@ -18,9 +17,9 @@ from places import ROOT
 from polysft_mi import prepare
 from polysft_mi.objective.problem import Problem
 from polysft_mi.pictures import exr, video
-from polysft_mi.pictures.album import Album, AlbumSettings, residual
+from polysft_mi.pictures.album import Album, AlbumSettings, Renderings, residual
 from polysft_mi.pictures.drawing import Drawing
-from polysft_mi.pictures.panels import Box, evenly_spaced
+from polysft_mi.pictures.panels import COLUMNS, Box, evenly_spaced
 from polysft_mi.scene import experiment as scene
 
 
@@ -127,26 +126,6 @@ def test_a_killed_process_costs_nothing_but_time(sheet, here, tmp_path):
     assert_same(drawn(sheet, tmp_path / "out", kill), here)
 
 
-def test_an_error_in_the_process_has_all_drawn_here_after_its_end(
-    sheet, here, tmp_path, monkeypatch
-):
-    processes, usual = [], Drawing._draw_here
-
-    def fail(made):
-        made._jobs.append(made._submit(("no such method",)))
-        made._jobs[0].result()
-        processes.extend(made._pool._processes.values())
-
-    def alone(made, vertices):
-        assert processes and not any(
-            p.is_alive() for p in processes
-        )  # two would write the same files
-        usual(made, vertices)
-
-    monkeypatch.setattr(Drawing, "_draw_here", alone)
-    assert_same(drawn(sheet, tmp_path / "out", fail), here)
-
-
 def test_fewer_frames_than_expected(sheet, here, tmp_path):
     """As after Ctrl-C: the EXRs are spread over the frames that there are; others are removed, but
     none that is being written.
@@ -172,26 +151,6 @@ def test_fewer_frames_than_expected(sheet, here, tmp_path):
         assert x == pytest.approx(y, rel=1e-4)
 
 
-def test_nothing_is_drawn_any_more_after_an_error(sheet, tmp_path, monkeypatch):
-    """Drawn here: the plots are begun beside the video, which fails."""
-    begun, done = threading.Event(), []
-
-    def fail(*_):
-        assert begun.wait(30)
-        raise OSError("no space")
-
-    def plot(*_):
-        begun.set()
-        time.sleep(0.5)
-        done.append(True)
-
-    monkeypatch.setattr("polysft_mi.pictures.album.write_video", fail)
-    monkeypatch.setattr("polysft_mi.pictures.figures.contact_sheet", plot)
-    with pytest.raises(OSError, match="no space"):
-        drawn(sheet, tmp_path / "out", worth=10**6)
-    assert done
-
-
 def test_texture_that_was_moved_is_moved_in_the_pictures(sheet, here, tmp_path):
     problem = problem_of(sheet)
     moved = np.array(problem.experiment.mesh.vertex_texcoords_buffer()) + 0.03
@@ -207,9 +166,7 @@ def test_a_surface_that_leaves_the_view_of_the_first_is_shown_whole(sheet, tmp_p
     for k, v in enumerate(surfaces):
         album.draw(k, problem.camera.origin + v @ problem.camera.axes)
     assert len(album.finish(surfaces)[0]) == 9
-    assert album._view.holds(surfaces) and [row["label"] for row in album.rows] == [
-        f"frame {k}" for k in evenly_spaced(9, 5)
-    ]
+    assert [row["label"] for row in album.rows] == [f"frame {k}" for k in evenly_spaced(9, 5)]
     for row in album.rows:
         background = row["surface"][0, 0]
         shown = (row["surface"] != background).any(-1)
@@ -232,11 +189,14 @@ def test_pictures_are_cropped_to_the_sheet_wherever_it_goes(sheet, tmp_path):
     assert (box[:2] <= low).all() and (high <= box[2:]).all()
     assert (np.subtract(low, box[:2]) < 4).all() and (np.subtract(box[2:], high) < 4).all()
     assert box.size[0] < 0.9 * problem.width
-    for k in range(3):
-        panels = album._panels(k)
-        assert {p.shape for p in panels.values()} == {(box.size[1], box.size[0], 3)}
-        rgb = album._renderings(vertices[k], k, geometry=False)["render"][box.slices]
-        drawn = (panels["render"] > 30).any(-1)
+    renderings = Renderings(problem)
+    for k, row in enumerate(album.rows):
+        assert {row[name].shape for name in COLUMNS} == {
+            (box.size[1], box.size[0], 3),
+            box.size[::-1],
+        }
+        rgb = renderings(vertices[k], k, geometry=False)["render"][box.slices]
+        drawn = (row["render"] > 30).any(-1)
         assert (drawn == (rgb > (30 / 255 / 12.92)).any(-1)).mean() > 0.9
         assert drawn.sum() > 100
     album.close()

@@ -5,90 +5,8 @@ import os
 import cv2
 import numpy as np
 import pytest
-from processes import python
 
-from polysft_mi.pictures import figures
-from polysft_mi.pictures.figures import View, contact_sheet, frame_plot, loss_plot, shade_surface
-
-BACKGROUND = (243, 243, 243)
-
-
-def sheet(depth=lambda x, y: 0 * x, n=21):
-    x, y = np.meshgrid(np.linspace(-0.1, 0.1, n), np.linspace(-0.1, 0.1, n))
-    V = np.stack([x, y, 0.6 + depth(x, y)], -1).reshape(-1, 3)
-    k = np.arange(n * n).reshape(n, n)
-    a, b, c, d = (i.ravel() for i in (k[:-1, :-1], k[:-1, 1:], k[1:, :-1], k[1:, 1:]))
-    F = np.concatenate([np.stack([a, c, b], 1), np.stack([b, c, d], 1)])
-    return V, F
-
-
-def covered(image):
-    return (np.abs(image.astype(int) - BACKGROUND).max(-1) > 12).mean()
-
-
-def test_shaded_sheet_covers_its_area_and_is_even():
-    V, F = sheet()
-    front = View(np.eye(3), np.array([0, 0, 0.6]), 0.15)
-    image = shade_surface(V, F, front, size=(180, 120))
-    assert image.shape == (120, 180, 3) and image.dtype == np.uint8
-    assert covered(image) == pytest.approx((0.2 / 0.3 * 120) ** 2 / (180 * 120), rel=0.02)
-    assert np.ptp(image[30:90, 60:120].reshape(-1, 3), axis=0).max() <= 1
-    assert tuple(image[2, 2]) == BACKGROUND
-    back = shade_surface(V, F[:, ::-1], front, size=(180, 120))
-    assert (
-        back[60, 90, 2] > back[60, 90, 0] and image[60, 90, 0] > image[60, 90, 2]
-    )  # cool and warm
-    assert back[60, 90].max() > 150 and image[60, 90].max() > 150  # and both lit
-
-
-def test_relief_shows_by_shading():
-    V, F = sheet(lambda x, y: 0.02 * np.sin(60 * x))
-    image = shade_surface(
-        V, F, View(np.eye(3), np.array([0, 0, 0.6]), 0.15), size=(120, 120)
-    ).astype(int)
-    assert np.ptp(image[60, 25:95, 0]) > 40  # across the waves
-    assert np.ptp(image[25:95, 60, 0]) <= 2  # along them
-
-
-def test_the_nearer_surface_hides_the_other():
-    V, F = sheet()
-    both, faces = (
-        np.concatenate([V, 0.5 * V + (0, 0, 0.1)]),
-        np.concatenate([F, (F + len(V))[:, ::-1]]),
-    )
-    front = View(np.eye(3), np.array([0, 0, 0.6]), 0.15)
-    for order in (faces, faces[::-1]):
-        image = shade_surface(both, order, front, size=(120, 120)).astype(int)
-        assert image[60, 60, 2] > image[60, 60, 0]  # the small one in front, from behind
-        assert image[28, 60, 0] > image[28, 60, 2]
-
-
-def test_views_around_keep_the_surface_in_the_picture():
-    V, F = sheet(lambda x, y: 0.05 * np.cos(20 * x))
-    for azimuth, elevation in [(0, 0), (40, 25), (-70, -30), (180, 10)]:
-        view = View.around(V, azimuth, elevation)
-        np.testing.assert_allclose(view.rotation @ view.rotation.T, np.eye(3), atol=1e-12)
-        assert np.linalg.det(view.rotation) == pytest.approx(1)
-        image = shade_surface(V, F, view, size=(90, 90))
-        border = np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
-        assert (border == BACKGROUND).all() and covered(image) > 0.1
-        background = np.all(image == BACKGROUND, axis=-1).astype(np.uint8)
-        assert cv2.connectedComponents(background)[0] == 2  # no holes between triangles
-    right = View.around(V, 40, 0).rotation
-    assert (right @ (1, 0, 0))[2] < 0  # seen from the right, the right side is the nearer one
-    above = View.around(V, 0, 25).rotation
-    assert (above @ (0, -1, 0))[2] < 0  # and from above the upper one
-
-
-def test_grid_and_degenerate_triangles():
-    V, F = sheet()
-    front = View(np.eye(3), np.array([0, 0, 0.6]), 0.11)
-    plain = shade_surface(V, F, front, size=(200, 200)).astype(int)
-    faces = np.concatenate([F, [[0, 0, 1], [0, 1, 2]]])
-    lines = shade_surface(V, faces, front, uv=V[faces, :2], size=(200, 200)).astype(int)
-    dark = (plain - lines)[..., 0] > 10
-    assert 0.05 < dark.mean() < 0.4
-    assert shade_surface(V + (0, 0, 0), F[:0], front, size=(20, 20)).min() == 243
+from polysft_mi.pictures.figures import contact_sheet, frame_plot, loss_curves, loss_plot
 
 
 def image_of(path):
@@ -123,13 +41,9 @@ def test_loss_plot_shows_terms_and_survives_bad_values(tmp_path):
     )
     assert loss_plot(tmp_path / "odd.png", odd) is not None
     assert loss_plot(tmp_path / "one.png", RECORDS[:1]) is not None
+    _, step, _ = loss_curves(RECORDS[:3] + RECORDS[10:12])
+    assert step.tolist() == [1, 6, 11, 12, 17]  # records now and then keep their place
     assert sorted(os.listdir(tmp_path)) == ["loss.png", "odd.png", "one.png"]
-
-
-def test_records_now_and_then_keep_their_place():
-    assert figures._advance(None, RECORDS[0]) == 1
-    assert figures._advance(RECORDS[0], RECORDS[1]) == 5
-    assert figures._advance(RECORDS[9], RECORDS[10]) == 1
 
 
 def test_frame_plot_has_a_panel_a_figure(tmp_path):
@@ -156,7 +70,7 @@ def test_contact_sheet_holds_its_pictures(tmp_path):
     assert count((0, 0, 255)) / count((0, 255, 0)) == pytest.approx(6 / 2, rel=0.1)
 
 
-def test_a_picture_that_fails_is_a_warning(tmp_path, monkeypatch):
+def test_a_picture_that_fails_is_a_warning(tmp_path):
     with pytest.warns(RuntimeWarning, match="loss.png: picture not written"):
         assert loss_plot(tmp_path / "loss.png", []) is None
     with pytest.warns(RuntimeWarning, match="not written"):
@@ -164,14 +78,3 @@ def test_a_picture_that_fails_is_a_warning(tmp_path, monkeypatch):
     with pytest.warns(RuntimeWarning, match="not written"):
         assert contact_sheet(tmp_path / "a.png", []) is None
     assert os.listdir(tmp_path) == []
-
-
-def test_importing_loads_no_heavy_module():
-    script = (
-        "import sys, polysft_mi.pictures.figures, polysft_mi.results.metrics,"
-        " polysft_mi.evaluate, polysft_mi.pictures.exr, polysft_mi.pictures.video,"
-        " polysft_mi.surface.meshio\nprint([m for m in ('matplotlib', 'OpenEXR',"
-        " 'trimesh', 'skimage', 'scipy', 'rich', 'mitsuba', 'torch', 'cv2') if m in sys.modules])"
-    )
-    done = python("-c", script)
-    assert done.stdout.strip() == "[]", done.stdout + done.stderr

@@ -1,10 +1,13 @@
-"""The stage of drapes: how bright a ball and the floor below it are, and that there is no grain."""
+"""Pictures of meshes by what can be measured in them: relief from the side; on the stage of drapes
+how bright a ball and the floor below it are, and that there is no grain.
+"""
 
+import cv2
 import numpy as np
 import pytest
 import surfaces
 
-from polysft_mi.render import stage
+from polysft_mi.render import SideView, Triangles, stage
 
 
 def ball(radius=0.5, height=0.7, n=48):
@@ -110,3 +113,78 @@ def test_a_coarse_mesh_is_drawn_through_its_vertices():
     assert len(faces) == 4 * len(F) and np.abs(finer[: len(V)] - V).max() < 0.001
     radius = np.linalg.norm(finer, axis=1)
     assert radius.min() > 0.049 and radius.max() < 0.051
+
+
+BACKGROUND = (243, 243, 243)
+
+
+def sheet(depth=lambda x, y: 0 * x):
+    V, F = surfaces.sheet(depth, 0.1, 21)
+    return V + (0, 0, 0.6), F[:, ::-1]
+
+
+def covered(image):
+    return (np.abs(image.astype(int) - BACKGROUND).max(-1) > 12).mean()
+
+
+def test_shaded_sheet_covers_its_area_and_is_even():
+    V, F = sheet()
+    front = SideView(np.eye(3), np.array([0, 0, 0.6]), 0.15)
+    image = Triangles(V, F).shaded(front, size=(180, 120))
+    assert image.shape == (120, 180, 3) and image.dtype == np.uint8
+    assert covered(image) == pytest.approx((0.2 / 0.3 * 120) ** 2 / (180 * 120), rel=0.02)
+    assert np.ptp(image[30:90, 60:120].reshape(-1, 3), axis=0).max() <= 1
+    assert tuple(image[2, 2]) == BACKGROUND
+    back = Triangles(V, F[:, ::-1]).shaded(front, size=(180, 120))
+    assert (
+        back[60, 90, 2] > back[60, 90, 0] and image[60, 90, 0] > image[60, 90, 2]
+    )  # cool and warm
+    assert back[60, 90].max() > 150 and image[60, 90].max() > 150  # and both lit
+
+
+def test_relief_shows_by_shading():
+    V, F = sheet(lambda x, y: 0.02 * np.sin(60 * x))
+    front = SideView(np.eye(3), np.array([0, 0, 0.6]), 0.15)
+    image = Triangles(V, F).shaded(front, size=(120, 120)).astype(int)
+    assert np.ptp(image[60, 25:95, 0]) > 40  # across the waves
+    assert np.ptp(image[25:95, 60, 0]) <= 2  # along them
+
+
+def test_the_nearer_surface_hides_the_other():
+    V, F = sheet()
+    both, faces = (
+        np.concatenate([V, 0.5 * V + (0, 0, 0.1)]),
+        np.concatenate([F, (F + len(V))[:, ::-1]]),
+    )
+    front = SideView(np.eye(3), np.array([0, 0, 0.6]), 0.15)
+    for order in (faces, faces[::-1]):
+        image = Triangles(both, order).shaded(front, size=(120, 120)).astype(int)
+        assert image[60, 60, 2] > image[60, 60, 0]  # the small one in front, from behind
+        assert image[28, 60, 0] > image[28, 60, 2]
+
+
+def test_views_around_keep_the_surface_in_the_picture():
+    V, F = sheet(lambda x, y: 0.05 * np.cos(20 * x))
+    for azimuth, elevation in [(0, 0), (40, 25), (-70, -30), (180, 10)]:
+        view = SideView.around(V, azimuth, elevation)
+        np.testing.assert_allclose(view.rotation @ view.rotation.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(view.rotation) == pytest.approx(1)
+        image = Triangles(V, F).shaded(view, size=(90, 90))
+        border = np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
+        assert (border == BACKGROUND).all() and covered(image) > 0.1
+        background = np.all(image == BACKGROUND, axis=-1).astype(np.uint8)
+        assert cv2.connectedComponents(background)[0] == 2  # no holes between triangles
+    right = SideView.around(V, 40, 0).rotation
+    assert (right @ (1, 0, 0))[2] < 0  # seen from the right, the right side is the nearer one
+    above = SideView.around(V, 0, 25).rotation
+    assert (above @ (0, -1, 0))[2] < 0  # and from above the upper one
+
+
+def test_grid_and_degenerate_triangles():
+    V, F = sheet()
+    front = SideView(np.eye(3), np.array([0, 0, 0.6]), 0.11)
+    plain = Triangles(V, F).shaded(front, size=(200, 200)).astype(int)
+    faces = np.concatenate([F, [[0, 0, 1], [0, 1, 2]]])
+    lines = Triangles(V, faces).shaded(front, uv=V[faces, :2], size=(200, 200)).astype(int)
+    dark = (plain - lines)[..., 0] > 10
+    assert 0.05 < dark.mean() < 0.4

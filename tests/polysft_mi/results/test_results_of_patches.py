@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from polyfit import jets
 from polyfit.mesh import TexCoords
-from polysft_mi import compare, evaluate, export, report
+from polysft_mi import evaluate, export, report
 from polysft_mi.errors import InputError
 from polysft_mi.pictures.exr import read_exr
 from polysft_mi.results.run import Run
@@ -207,8 +207,3 @@ def test_figures_of_what_is_in_view(finished_tube, tmp_path, capsys):
     np.savez(bad, vertices=gt["vertices"], faces=gt["faces"], seen=gt["seen"][:1])
     with pytest.raises(InputError, match=r"gt.npz: seen \(1, 162\)"):
         evaluate.main([str(out), str(bad)])
-
-
-def test_a_run_beside_itself(finished_tube, tmp_path):
-    out = str(finished_tube[1])
-    assert compare.main([out, out, "-o", str(tmp_path / "same")]) == 0

@@ -12,7 +12,7 @@ from places import ROOT
 
 from polyfit import animation
 from polyfit.files import aside
-from polyfit.mesh import TexCoords, in_use, read_textured
+from polyfit.mesh import TexCoords, in_use, read_textured, write_ply
 from polysft_mi.errors import InputError
 from polysft_mi.surface.atlas import Atlas
 from polysft_mi.surface.meshio import (
@@ -22,7 +22,6 @@ from polysft_mi.surface.meshio import (
     read_textured_template,
     seam_note,
     uv_note,
-    write_ply,
 )
 from polysft_mi.surface.template import Template
 

@@ -7,7 +7,6 @@ import pytest
 import surfaces
 import torch
 from problems import at_rest, tube_template
-from processes import python
 from scipy.spatial.transform import Rotation
 
 from polyfit import jets
@@ -198,22 +197,6 @@ def test_edges_are_each_once():
     t = Template.fit(*grid(4, 3), 1)
     edges = {tuple(e) for e in t.edges}
     assert len(edges) == len(t.edges) == 4 * 2 + 3 * 3 + 6  # rows, columns, diagonals
-
-
-def test_a_run_does_without_torch():
-    code = """
-import sys, numpy as np
-from polysft_mi import backend; backend.set_variant("llvm_ad_rgb")
-import polysft_mi.run, polysft_mi.scene.experiment, polysft_mi.solvers, polysft_mi.report
-from polysft_mi.surface.template import Template
-x, y = (a.ravel() for a in np.meshgrid(np.linspace(0, 1, 4), np.linspace(0, 2, 4)))
-square = (0, 1, 4), (1, 5, 4)
-faces = [[4 * r + c + k for k in f] for r in range(3) for c in range(3) for f in square]
-Template.fit(np.stack([x, y, 0 * x], 1), np.array(faces), np.stack([x, y], 1), 2)
-print("torch" in sys.modules)
-"""
-    done = python("-c", code)
-    assert done.stdout == "False\n", done.stderr
 
 
 def test_a_steep_cone_is_no_sheet_and_small_patches_lower_no_other_order():

@@ -11,7 +11,6 @@ import pytest
 import synthetic
 from problems import data_of, problem_of
 
-from polysft_mi.errors import InputError
 from polysft_mi.objective import FrameContext, FrameMemory
 from polysft_mi.scene.rules import Rules
 from polysft_mi.surface.patch import Unknowns
@@ -186,25 +185,6 @@ def test_order_of_the_jet(tmp_path, rows, columns, asked, order):
 
 def tracker_of(folder, **settings):
     return FrameTracker(problem_of(folder, **settings))
-
-
-def test_settings_that_do_not_go_together(truth):
-    refused = {
-        "smooth = 0.1 with window = 3": {"window": 3, "smooth": 0.1},
-        "sweeps = 1 with window = 3; .* window = 1, or sweeps = 0": {"window": 3, "sweeps": 1},
-        "sweeps = 1 compares surfaces .*, and rgb has rgb_norm = l1": {
-            "rgb_norm": "l1",
-            "sweeps": 1,
-        },
-        "gauss-newton needs .* rgb has brightness = gain; local or none is needed": {
-            "brightness": "gain",
-            "solver": "gauss-newton",
-        },
-        "patience = 50 is read by solver = adam alone, and this is gauss-newton": {"patience": 50},
-    }
-    for message, settings in refused.items():
-        with pytest.raises(InputError, match=message):
-            tracker_of(truth.folder, **settings)
 
 
 def test_the_solver_follows_from_the_terms(truth):

@@ -10,6 +10,8 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
+from polyfit.mesh import loops, signed_areas
+
 
 @dataclass(frozen=True)
 class OutlineSettings:
@@ -66,21 +68,6 @@ class Fit:
         return points @ self.rotation.T + self.translation
 
 
-def loops(faces):
-    """The boundary of a mesh with faces (F, 3): of each loop its vertices, in their order."""
-    half = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    _, index, uses = np.unique(
-        np.sort(half, axis=1), axis=0, return_inverse=True, return_counts=True
-    )
-    following, found = dict(half[uses[index.ravel()] == 1].tolist()), []
-    while following:
-        loop = [next(iter(following))]
-        while loop[-1] in following:
-            loop.append(following.pop(loop[-1]))
-        found.append(np.array(loop[:-1] if loop[0] == loop[-1] else loop))
-    return found
-
-
 def fitted(vertices, faces, camera, image, settings=None):
     """The :class:`Fit` that takes a mesh's outline to the edges in an image that are near it; None
     where it has none before the camera.
@@ -100,7 +87,7 @@ def fitted(vertices, faces, camera, image, settings=None):
     if not around or vertices[:, 2].min() <= 0:
         return None
     position = camera.project(vertices)
-    size = math.sqrt(_area(position[faces]))
+    size = math.sqrt(np.abs(signed_areas(position, faces)).sum())
     unit = max(1.0, size / s.size)
     grey = cv2.GaussianBlur(
         cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255, (0, 0), s.blur * unit
@@ -115,12 +102,6 @@ def fitted(vertices, faces, camera, image, settings=None):
             for line in (None, "dark", "bright")
         ]
     return max(found, key=lambda fit: fit.clear)
-
-
-def _area(corner):
-    """Of triangles with corners (F, 3, 2) [pixels], their sum [pixels^2]."""
-    a, b = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
-    return 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum()
 
 
 def _straight(loop, position, tolerance):
