@@ -8,7 +8,8 @@ FOLDER holds, for each sequence, a folder with ``tracks.npz``, ``depth`` and ``c
 missing is left out. Further cameras are made by ``further_cameras.py``. Each run is a command, as a
 user would give it, on one core; its figures are those of ``python -m polysft_mi.evaluate``. Each
 result goes into ``evidence.json`` in DOCS as soon as it is there, and the next call does what is
-missing (all of it with ``--again``); the table in ``evidence.md`` is drawn anew.
+missing (all of it with ``--again``); the table in ``evidence.md``, and the picture of what is
+given, are made anew.
 """
 
 import argparse
@@ -19,6 +20,7 @@ import resource
 import sys
 import tempfile
 
+import numpy as np
 import sft_runs
 from sequences import DATA, ROOT, folder_of
 
@@ -83,6 +85,43 @@ def table(results):
     return "\n".join(lines)
 
 
+def picture(path, data, folder, frame=22):
+    """Write what is given of a sequence in a frame: its tracks, where they are and came from; its
+    depth; what a further camera sees.
+    """
+    import cv2
+
+    from polysft_mi.scene import DepthImages, Tracks, list_images, read_rgb
+
+    frames = list_images(os.path.join(data, "frames"))
+    image, count = read_rgb(frames[frame]), len(frames)
+    every = list(range(count))
+    shown = image // 2
+    tracks = Tracks.read(os.path.join(folder, _FILES["tracks"]), count, every)
+    for k in np.flatnonzero(tracks.visible[frame]):
+        past = np.arange(frame - 8, frame + 1)
+        before = tracks.positions[past[tracks.visible[past, k]], k]
+        line = np.round(8 * (before - 0.5)).astype(np.int32)
+        hue = np.uint8([[[int(180 * tracks.positions[0, k, 0] / image.shape[1]), 200, 255]]])
+        colour = cv2.cvtColor(hue, cv2.COLOR_HSV2RGB)[0, 0].tolist()
+        cv2.polylines(shown, [line], False, colour, 1, cv2.LINE_AA, 3)
+        cv2.circle(shown, line[-1].tolist(), 16, colour, -1, cv2.LINE_AA, 3)
+    depth = DepthImages.open(os.path.join(folder, _FILES["depth"]), count, every, 1e-3).read(frame)
+    low, high = np.quantile(depth[depth > 0], (0.01, 0.5))
+    grey = np.uint8(255 * np.clip((high + (high - low) - depth) / (2 * (high - low)), 0, 1))
+    coloured = cv2.applyColorMap(grey, cv2.COLORMAP_VIRIDIS)[..., ::-1]
+    coloured = np.where(depth[..., None] > 0, coloured, 0).astype(np.uint8)
+    parts = [image, shown, coloured]
+    cameras = os.path.join(folder, _FILES["cameras"])
+    if os.path.isdir(cameras):
+        name = sorted(os.listdir(cameras))[0]
+        parts.append(read_rgb(list_images(os.path.join(cameras, name, "frames"))[frame]))
+    row = np.hstack(parts)
+    size = 1600, round(row.shape[0] * 1600 / row.shape[1])
+    small = cv2.resize(row, size, interpolation=cv2.INTER_AREA)
+    cv2.imwrite(path, small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
+
+
 def main(argv=None):
     raw = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(
@@ -114,6 +153,10 @@ def main(argv=None):
             with open(where, "w", encoding="utf-8") as file:
                 json.dump(results, file, indent=1)
                 file.write("\n")
+    shown = os.path.join(args.evidence, "tube")
+    if "tube" in args.only and definitions("tracks and depth", shown):
+        data = next(filter(None, (folder_of(place, "tube") for place in args.data)), None)
+        picture(os.path.join(args.docs, "evidence.jpg"), data, shown)
     page = os.path.join(args.docs, "evidence.md")
     with open(page, encoding="utf-8") as file:
         text = file.read()
