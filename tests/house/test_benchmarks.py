@@ -96,11 +96,12 @@ def test_snapshots_are_what_shorter_runs_return(tmp_path):
     long = stability.run(*DEMO, [3, 40], str(tmp_path), say=str)
     (tmp_path / "log.jsonl").unlink()
     short = stability.run(*DEMO, [3], str(tmp_path), say=str)
-    _problem, frame, surfaces, _, losses = long
+    _problem, frame, surfaces, _, watched = long
     assert frame == 1
     assert np.abs(surfaces[3] - short[2][3]).max() < 1e-6
     assert np.abs(surfaces[40] - surfaces[3]).max() > 1e-5
-    assert losses[40][0] < losses[3][0]
+    assert watched.losses[40][0] < watched.losses[3][0]
+    assert 0 < watched.seconds[3] < watched.seconds[40]
 
 
 def test_stability_writes_figures_and_picture(tmp_path, capsys):

@@ -11,7 +11,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import synthetic
-from problems import replay_paths
 
 from polysft_mi import capture, prepare
 from polysft_mi.images import differentiable, pyramid
@@ -120,13 +119,11 @@ def test_images_are_compared_alike_on_the_device_and_on_the_host(level):
 # ---- the objective of a frame --------------------------------------------------------------------
 
 
-def problem(folder, masks=True, replayed=False, **overrides):
+def problem(folder, masks=True, **overrides):
     truth = synthetic.cloth(folder / "sequence", masks=masks)
     layout = capture.recognise(str(truth.folder))
     path = folder / "scene.xml"
     path.write_text(capture.scene_xml(layout, str(truth.folder)))
-    if replayed:
-        replay_paths(path)
     experiment = scene.load(path, {**PAPER, **overrides})
     return Problem(experiment, experiment.sequence()), truth
 
@@ -294,7 +291,7 @@ def test_path_replay_gives_the_gradient_of_raster(tmp_path):
     for integrator, spp in (("raster", 1), ("prb_projective", 64)):
         folder = tmp_path / integrator
         folder.mkdir()
-        p, _ = problem(folder, replayed=integrator != "raster", spp=spp, k_mi=0)
+        p, _ = problem(folder, integrator=integrator, spp=spp, k_mi=0)
         rest = p.patch.rest().to_numpy()
         rest["translation"] = np.array([[0.02, -0.03, 0.05]], np.float32)
         unknowns = Unknowns.from_numpy(rest)
@@ -319,15 +316,12 @@ def test_gradients_of_several_patches(tmp_path, integrator):
     truth = synthetic.cloth(tmp_path / "tube", rows=13, columns=24, frames=2, shape=synthetic.tube)
     prepare.main([str(truth.folder), "-q"])
 
-    def of(spp):
-        settings = {**PAPER, "k_mi": 0, "order": 3, "spp": spp}
+    def of(integrator, spp):
+        settings = {**PAPER, "k_mi": 0, "order": 3, "integrator": integrator, "spp": spp}
         experiment = scene.load(truth.folder / "scene.xml", settings)
         return Problem(experiment, experiment.sequence())
 
-    sharp = of(4)
-    if integrator == "prb_projective":
-        replay_paths(truth.folder / "scene.xml")
-    p = of(1 if integrator == "raster" else 64)
+    sharp, p = of("raster", 4), of(integrator, 1 if integrator == "raster" else 64)
     assert len(p.template) >= 3
     rest = p.patch.rest().to_numpy()
     rest["delta_alpha"] += (0.02 * RNG.normal(size=rest["delta_alpha"].shape)).astype(np.float32)
