@@ -5,9 +5,8 @@ with path replay, which knows both, and with an unlit rendering.
     python benchmarks/lit.py --make         # makes the video, the folder scenes/demo_lit
 
 The video is path-traced by Mitsuba from the scene file that is tracked, ``scenes/demo_lit.xml``:
-the light is the very same, with one reflection (``max_depth`` = 3). The sheet rolls up along a
-curve whose bend changes its sign, so its lengths stay. Its texture is plain, as
-``simulate.py --plain`` paints it: most of what shows the shape is the light.
+the light is the very same, with one reflection (``max_depth`` = 3). Waves grow in the sheet, whose
+lengths stay. Its print is plain: little but the light shows them.
 """
 
 import argparse
@@ -26,11 +25,11 @@ from polysft_mi.errors import cli
 SCENE, DATA = (os.path.join(ROOT, "scenes", name) for name in ("demo_lit.xml", "demo_lit"))
 LIT, UNLIT, USUAL = "path replay", "raster, the same solver", "raster, by default"
 COLOURS = "#c4572e", "#3b6ea5", "#7a9e4b"
-FRAMES, PATHS = 8, 1024  # paths a pixel
+FRAMES, PATHS = 6, 1024  # paths a pixel
 SIZE, CELLS = (0.26, 0.2), (20, 15)  # (width, height) [m], cells along them
 MIDDLE = np.array([0.0, 0.01, 0.58])  # of the flat sheet [m]
-TILT = 0.35  # angle of the axis it bends about with the image's vertical [rad]
-SLOPE, LENGTH, SHIFT = 0.85, 0.36, 0.4  # the wave's largest slope, length [m] and phase [rad]
+TILT = 0.35  # angle of the waves with the image's vertical [rad]
+SLOPE, LENGTH, SHIFT = 0.5, 0.24, 0.4  # of the waves: largest slope, length [m], phase [rad]
 
 
 def sheet(share):
@@ -47,14 +46,14 @@ def sheet(share):
     curve = np.cumsum(step * np.cos(angle)), np.cumsum(step * np.sin(angle))
     a, z = (np.interp(along, s, c - np.interp(0, s, c)) for c in curve)
     points = np.stack([cos * a - sin * across, sin * a + cos * across, z], -1)
-    return points + MIDDLE + share * np.array([0.01, -0.008, 0.02])
+    return points + MIDDLE
 
 
 def texture():
     """A plain one, sRGB, uint8: paper with three spots."""
     import cv2
 
-    image = np.full((120, 156, 3), (232, 228, 218), np.uint8)
+    image = np.full((120, 156, 3), (190, 187, 180), np.uint8)
     for at, axes, turn, colour in (
         ((34, 42), (20, 12), 20, (60, 110, 190)),
         ((118, 36), (13, 17), 0, (200, 70, 50)),
@@ -135,13 +134,22 @@ def track(out, last, variant):
 
 
 def figures_of(found, truth):
-    """The report: of each way the error of each frame, and its time."""
+    """The report: of each way the errors of each frame, as it is and after a similarity, and its
+    time.
+    """
     from polysft_mi.results import metrics
 
+    each = {
+        "rmse_mm": lambda a, b, _: 1e3 * metrics.rmse(a, b),
+        "aligned_mm": lambda a, b, _: 1e3 * metrics.rmse(metrics.align_similarity(a, b), b),
+        "normals_degrees": metrics.normal_angle,
+    }
     return {
         name: {
-            "rmse_mm": 1e3 * metrics.rmse(run.vertices, truth[: len(run.vertices)]),
-            "frames_mm": [1e3 * metrics.rmse(a, b) for a, b in zip(run.vertices, truth)],
+            **{
+                k: [f(a, b, run.faces) for a, b in zip(run.vertices, truth)]
+                for k, f in each.items()
+            },
             "seconds_a_frame": seconds,
         }
         for name, (run, seconds) in found.items()
@@ -185,18 +193,21 @@ def picture(path, found, figures, truth):
             if run is None:
                 axes.set_title(f"frame {k}", fontsize=9)
         line[0].set_ylabel(label, fontsize=8)
-    profile, error = below.subplots(1, 2)
+    profile, *errors = below.subplots(1, 3)
     middle = slice(CELLS[1] // 2 * (CELLS[0] + 1), (CELLS[1] // 2 + 1) * (CELLS[0] + 1))
     profile.plot(*1e3 * truth[last, middle][:, [0, 2]].T, color="0.2", label="truth")
     for (name, (run, _)), colour in zip(found.items(), COLOURS, strict=True):
         profile.plot(*1e3 * run.vertices[last, middle][:, [0, 2]].T, color=colour, label=name)
-        error.plot(figures[name]["frames_mm"], color=colour, label=name)
-    profile.set_title(f"the middle row from above, frame {last}: x, z [mm]", fontsize=9, loc="left")
+        for axes, key in zip(errors, ("aligned_mm", "normals_degrees"), strict=True):
+            axes.plot(figures[name][key], color=colour)
+    profile.set_title(f"middle row from above, frame {last} [mm]", fontsize=8, loc="left")
     profile.invert_yaxis()
-    error.set_title("RMSE of the vertices [mm]", fontsize=9, loc="left")
-    error.set_xlabel("frame", fontsize=8)
-    for axes in (profile, error):
-        axes.legend(frameon=False, fontsize=8)
+    profile.legend(frameon=False, fontsize=7)
+    for axes, title in zip(errors, ("RMSE, aligned [mm]", "normals [degrees]"), strict=True):
+        axes.set_title(f"{title}, by frame", fontsize=8, loc="left")
+        axes.set_ylim(bottom=0)
+    for axes in (profile, *errors):
+        axes.tick_params(labelsize=8)
         axes.grid(True, color="0.9", linewidth=0.6)
     with aside(path) as temporary:
         figure.savefig(temporary, format="jpg", facecolor="white", pil_kwargs={"quality": 88})
@@ -224,7 +235,10 @@ def main(arguments=None):
     picture(os.path.join(options.out, "lit.jpg"), found, figures, truth)
     outputs.write_json(os.path.join(options.out, "lit.json"), figures)
     for name, row in figures.items():
-        print(f"{name}: {row['rmse_mm']:.1f} mm, {row['seconds_a_frame']:.1f} s a frame")
+        print(
+            f"{name}: {row['rmse_mm'][-1]:.1f} mm, {row['aligned_mm'][-1]:.1f} mm aligned,"
+            f" {row['normals_degrees'][-1]:.1f}°, {row['seconds_a_frame']:.1f} s a frame"
+        )
 
 
 if __name__ == "__main__":

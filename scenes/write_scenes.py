@@ -38,8 +38,8 @@ def _lit(**settings):
 
 # The paper's objective and solver, a frame at a time. Noise asks for l2, whose gradient has no
 # bias, and plain paper for edges that hold.
-LIT = dict(PRESETS["paper"], canonical_frame="pca", window=1, spp=4, period=100, rgb_norm="l2")
-LIT |= dict(k_mi=10.0, lr_alpha=5e-3, lr_rigid=1e-3)
+LIT = dict(PRESETS["paper"], canonical_frame="pca", window=1, spp=4, period=150, rgb_norm="l2")
+LIT |= dict(k_mi=10.0, order=6)
 
 SCENES = {
     "demo": _demo(last=11),
@@ -79,7 +79,7 @@ DEMOS = {
     "demo_shirt": "A T-shirt, whose texture has seams, 12 frames: polysft run"
     " scenes/demo_shirt.xml -o OUT",
     "demo_lit": "A sheet between a lamp and a bright floor, rendered with the light that falls on"
-    " it, 8 frames: polysft run scenes/demo_lit.xml -o OUT",
+    " it, 6 frames: polysft run scenes/demo_lit.xml -o OUT",
 }
 
 #: what stands in place of light from everywhere, and of the integrator, in the scenes named here
@@ -92,7 +92,7 @@ LIGHTS = {
             <rotate x="1" angle="-65"/>
             <translate x="-0.35" y="-0.6" z="0.1"/>
         </transform>
-        <emitter type="area"><rgb name="radiance" value="7.0, 6.7, 6.2"/></emitter>
+        <emitter type="area"><rgb name="radiance" value="12.5, 12.0, 11.0"/></emitter>
     </shape>
     <shape type="rectangle">
         <transform name="to_world">

@@ -17,9 +17,9 @@ from polysft_mi.results.truth import load_npz
 from polysft_mi.scene import plugins
 
 SIZE, POINTS = (64, 48), 9
-iteration, outline, raster, scaling, stability = (
+iteration, lit, outline, raster, scaling, stability = (
     load(f"benchmarks/{name}.py")
-    for name in ("iteration", "outline", "raster", "scaling", "stability")
+    for name in ("iteration", "lit", "outline", "raster", "scaling", "stability")
 )
 
 
@@ -117,6 +117,16 @@ def test_stability_writes_figures_and_picture(tmp_path, capsys):
     )
     assert (tmp_path / "stability.png").read_bytes().startswith(b"\x89PNG")
     assert "stability.json" in capsys.readouterr().out
+
+
+def test_the_lit_sheet_keeps_its_lengths_and_is_the_truth():
+    truth = load_npz(ROOT / "scenes" / "demo_lit" / "gt.npz")
+    made = np.array([lit.sheet(t / (lit.FRAMES - 1)) for t in range(lit.FRAMES)])
+    assert np.abs(truth["vertices"] - made).max() < 1e-6
+    edges = np.diff(made[:, truth["faces"]], axis=2)
+    lengths = np.linalg.norm(edges, axis=3)
+    assert np.abs(lengths / lengths[0] - 1).max() < 0.01  # chords of a curve
+    assert np.ptp(made[-1], axis=0)[2] > 0.05
 
 
 def test_iteration_times_every_part(capsys):
