@@ -120,6 +120,15 @@ def kinect_paper(data):
     return table(head, rows)
 
 
+def readings(data):
+    found = data["readings"]
+    if not found:
+        return ""
+    frames = next(iter(found.values()))
+    rows = [(name, *(f"{row[k][1]:.2f}" for k in frames)) for name, row in found.items()]
+    return table(("loss left after 35 % of the way to frame", *frames), rows)
+
+
 def kinect_frames(data):
     found = _sft(data, "kinect_paper", "gauss-newton")
     each = found["figures"].get("per_frame_mm", {}) if found else {}
