@@ -152,10 +152,11 @@ SECTIONS = {
                 "python -m polysft_mi.run scenes/kinect_paper.xml -D data=DATA/kinect_paper -o RUN",
                 "python benchmarks/readings.py RUN -o docs",
                 "python -m polysft_mi.prepare 'DATA/kinect_paper/frame_*.png' "
-                "--texture first-frame --corners 228,99 514,120 503,366 207,343 --size 297mm 251mm --camera camera.json "
-                "-o OUT/kinect",
+                "--texture first-frame --corners 228,99 514,120 503,366 207,343 "
+                "--size 297mm 251mm --camera camera.json -o OUT/kinect",
                 "python -m polysft_mi.run scenes/kinect_paper.xml -D data=DATA/kinect_paper "
-                "-D preset=paper -D masks=OUT/kinect/masks -o OUT/run",
+                "-D preset=paper -D masks=OUT/kinect/masks -D rgb_norm=phi-sft "
+                "-D silhouette_norm=phi-sft -D mask_blur=5 -D k_silhouette=0.5 -o OUT/run",
             ),
             figures.readings,
             "φ-SfT's program takes the mean absolute difference of each channel of the pixel "

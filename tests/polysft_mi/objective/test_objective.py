@@ -11,18 +11,23 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import synthetic
+from scipy.ndimage import gaussian_filter
 
 from polysft_mi import capture, prepare
+from polysft_mi.errors import InputError
 from polysft_mi.images import differentiable, pyramid
 from polysft_mi.images.pyramid import Level
 from polysft_mi.objective import FrameContext, Objective, Problem
 from polysft_mi.objective.terms.inextensibility import edge_lengths
 from polysft_mi.objective.terms.photometric import gain, robust
+from polysft_mi.pictures.shading import srgb
 from polysft_mi.scene import experiment as scene
 from polysft_mi.surface.patch import Unknowns
+from polysft_mi.tracker import FrameTracker
 
 RNG = np.random.default_rng(1)
 PAPER = {"preset": "paper", "canonical_frame": "pca", "patches": 0}
+PHI_SFT = {"rgb_norm": "phi-sft", "silhouette_norm": "phi-sft"}
 
 
 def floats(x):
@@ -150,6 +155,7 @@ def energy(problem, unknowns, frame, **options):
         {"k_mi": 0, "brightness": "local", "rgb_norm": "cauchy", "rgb_region": "sheet", "blur": 1},
         {"k_rgb": 0, "k_silhouette": 0},
         {"k_mi": 0, "integrator": "raster", "spp": 4},
+        {"k_mi": 0, "k_rgb": 5, "k_silhouette": 5, "mask_blur": 1.5, **PHI_SFT},
     ],
 )
 @pytest.mark.parametrize("masks", [True, False])
@@ -281,6 +287,25 @@ def test_padding_does_not_change_the_loss(tmp_path):
         p = Problem(experiment, experiment.sequence())
         totals.append(energy(p, p.patch.rest(), 4)[0])
     assert totals[1] == pytest.approx(totals[0], rel=1e-3)
+
+
+def test_losses_of_phi_sft_are_means_over_the_image(tmp_path):
+    """Absolute differences of each channel as it is stored, and of blurred masks."""
+    settings = {**PHI_SFT, "k_silhouette": 0.5, "mask_blur": 2, "k_mi": 0}
+    p, _ = problem(tmp_path, **settings)
+    rest = p.patch.rest()
+    terms = energy(p, rest, 3)[1]
+    rgb, alpha = (np.array(x) for x in p.placed.image(p.patch.vertices(rest)))
+    mask = p.sequence.mask(3)
+    stored = [srgb(x) for x in (rgb, p.sequence.frame(3) * mask[..., None])]
+    assert terms["rgb"] == pytest.approx(np.abs(stored[0] - stored[1]).mean(), rel=1e-3)
+    difference = gaussian_filter(alpha.reshape(mask.shape) - mask, 2, mode="constant", truncate=2.5)
+    assert terms["silhouette"] == pytest.approx(0.5 * np.abs(difference).mean(), rel=0.01)
+    for name, value in {"silhouette_norm": "phi-sft", "mask_blur": 2}.items():
+        with pytest.raises(InputError, match=f"silhouette has {name} = .* is needed"):
+            FrameTracker(
+                problem(tmp_path / name, preset="none", solver="gauss-newton", **{name: value})[0]
+            )
 
 
 def test_path_replay_gives_the_gradient_of_raster(tmp_path):
