@@ -1,5 +1,5 @@
-# make demo, demo-paper, demo-shirt, drape, gpu, test, docs, lint, dist: each installs into .venv
-# what it needs and is not there yet (seconds where nothing is missing), and runs.
+# make demo, demo-paper, demo-lit, demo-shirt, drape, gpu, test, docs, lint, dist: each installs into
+# .venv what it needs and is not there yet (seconds where nothing is missing), and runs.
 # PYTHON=python3.12 takes another Python for a new .venv; TORCH=any takes torch with CUDA too.
 # LLVM comes with it on Linux on x86-64; elsewhere every command says what to install.
 
@@ -17,7 +17,7 @@ EXTRAS_docs := docs
 EXTRAS_lint := lint
 EXTRAS_dist := dist
 
-.PHONY: demo demo-paper demo-shirt drape gpu test docs lint dist clean
+.PHONY: demo demo-paper demo-lit demo-shirt drape gpu test docs lint dist clean
 .PRECIOUS: .venv/with-%
 .NOTPARALLEL:
 
@@ -27,6 +27,10 @@ demo: .venv/with-demo
 # The same by the paper's own way: Adam on its losses, frames in windows of three; some minutes
 demo-paper: .venv/with-demo-paper
 	$(PY) -m polysft_mi.run scenes/demo.xml -D preset=paper -o out/demo-paper --overwrite
+
+# A sheet whose light is in the rendering, by path replay; some minutes
+demo-lit: .venv/with-demo
+	$(PY) -m polysft_mi.run scenes/demo_lit.xml -o out/demo-lit --overwrite
 
 demo-shirt: .venv/with-demo
 	$(PY) -m polysft_mi.run scenes/demo_shirt.xml -o out/demo-shirt --overwrite

@@ -17,6 +17,7 @@ import dataclasses
 import math
 import os
 import tempfile
+import time
 
 import numpy as np
 from sequences import ROOT
@@ -37,13 +38,15 @@ class Watched:
 
     Solvers see an objective only through its methods, so this works for any that takes gradients.
     ``found`` and ``latest`` map a count to the unknowns of the newest frame: the best of so many
-    evaluations, and those of the last one. ``losses`` maps it to (best, last).
+    evaluations, and those of the last one. ``losses`` maps it to (best, last), ``seconds`` to the
+    processor's time until then, of all threads.
     """
 
     def __init__(self, frozen, counts):
         self._frozen, self._counts = frozen, set(counts)
         self._best, self._best_loss, self._evaluated = None, math.inf, 0
-        self.found, self.latest, self.losses = {}, {}, {}
+        self.found, self.latest, self.losses, self.seconds = {}, {}, {}, {}
+        self._began = time.process_time()
 
     def __getattr__(self, name):
         return getattr(self._frozen, name)
@@ -59,16 +62,17 @@ class Watched:
                 window[-1].copy(),
             )
             self.losses[self._evaluated] = (self._best_loss, total)
+            self.seconds[self._evaluated] = time.process_time() - self._began
         return total, terms
 
 
 def run(scene, overrides, counts, folder, say=print):
     """Solve the last window for as many iterations as the largest count.
 
-    Returns (problem, frame, surfaces, wandering, losses): the newest frame, counted in the
+    Returns (problem, frame, surfaces, wandering, watched): the newest frame, counted in the
     selection; the surfaces found and the solver's latest, count to vertices (N, 3) [m, camera
-    frame]; count to (best, latest) loss. ``folder``, which exists, takes the checkpoints of the run
-    up to there.
+    frame]; the :class:`Watched`. ``folder``, which exists, takes the checkpoints of the run up to
+    there.
     """
     from polysft_mi.objective import FrameContext, Problem
     from polysft_mi.scene import experiment as scenes
@@ -102,7 +106,7 @@ def run(scene, overrides, counts, folder, say=print):
         {n: problem.surface(u).astype(np.float64) for n, u in kept.items()}
         for kept in (watched.found, watched.latest)
     )
-    return problem, frame, surfaces, wandering, watched.losses
+    return problem, frame, surfaces, wandering, watched
 
 
 def truth_of(problem, frame, path):
@@ -131,15 +135,18 @@ def truth_of(problem, frame, path):
     return truth["vertices"][index].astype(np.float64)
 
 
-def figures_of(surfaces, wandering, losses, usual, truth):
-    """Count to figures: distance to the truth, and to the surface after ``usual`` iterations."""
+def figures_of(surfaces, wandering, watched, usual, truth):
+    """Count to figures: distance to the truth, and to the surface after ``usual`` iterations; time
+    of the processor.
+    """
     from polysft_mi.results import metrics
 
     out = {}
     for n, V in surfaces.items():
         moved = np.linalg.norm(V - surfaces[usual], axis=1)
         row = {
-            "loss": losses[n][0],
+            "loss": watched.losses[n][0],
+            "seconds": watched.seconds[n],
             "change_rms_mm": 1e3 * metrics.rmse(V, surfaces[usual]),
             "change_max_mm": 1e3 * float(moved.max()),
         }
@@ -288,11 +295,11 @@ def main(arguments=None):
 
     os.makedirs(options.out, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
-        problem, frame, surfaces, wandering, losses = run(
+        problem, frame, surfaces, wandering, watched = run(
             options.scene, overrides, [*counts, usual], folder
         )
     truth = truth_of(problem, frame, options.truth)
-    rows = figures_of(surfaces, wandering, losses, usual, truth)
+    rows = figures_of(surfaces, wandering, watched, usual, truth)
     picture(
         os.path.join(options.out, "stability.png"),
         problem,

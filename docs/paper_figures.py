@@ -120,6 +120,24 @@ def kinect_paper(data):
     return table(head, rows)
 
 
+def readings(data):
+    found = data["readings"]
+    if not found:
+        return ""
+    frames = next(iter(found.values()))
+    rows = [(name, *(f"{row[k][1]:.2f}" for k in frames)) for name, row in found.items()]
+    return table(("loss left after 35 % of the way to frame", *frames), rows)
+
+
+def kinect_frames(data):
+    found = _sft(data, "kinect_paper", "gauss-newton")
+    each = found["figures"].get("per_frame_mm", {}) if found else {}
+    if not each:
+        return ""
+    head = ("frame", *each)
+    return table(head, [("depth RMSE on the surface, mm", *(f"{v:.1f}" for v in each.values()))])
+
+
 def simulated(data):
     rows = []
     for sequence in SHEETS:
@@ -142,11 +160,13 @@ def stability(data):
     found = data["stability"].get("counts")
     if not found:
         return ""
+    names = ("change_rms_mm", "rmse_mm", "seconds")
     rows = [
-        (count, *(f"{row[k]:.3f}" if k in row else "" for k in ("change_rms_mm", "rmse_mm")))
+        (count, *(f"{row[k]:.1f}" if k in row else "" for k in names))
         for count, row in found.items()
     ]
-    return table(("iterations", "moved by since, mm", "error, mm"), rows)
+    head = ("iterations", "from the surface at 300, mm", "error, mm", "processor's time, s")
+    return f"{table(head, rows)}\n\n![Surfaces by iterations](stability.png)"
 
 
 def onefit_trainings(data):

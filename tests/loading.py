@@ -9,14 +9,14 @@ def loaded(path, **overrides):
     return scene.load(path, overrides)
 
 
-def difference(experiment):
+def difference(experiment, spp=1):
     """Mean absolute difference, inside the silhouette, of the rendered template and frame 0; and
-    the same for the two mirror images.
+    the same for the two mirror images. ``spp``: samples a pixel.
     """
     import mitsuba as mi
 
     frame = experiment.sequence().frame(0)
-    image = np.array(mi.render(experiment.scene, sensor=experiment.sensor, spp=1))
+    image = np.array(mi.render(experiment.scene, sensor=experiment.sensor, spp=spp))
     inside = image[..., 3] > 0.999
     rgb = image[..., :3]
     assert 0.02 < inside.mean() < 0.9

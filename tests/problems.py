@@ -26,17 +26,6 @@ def small_tube(folder, frames):
     )
 
 
-def replay_paths(scene):
-    """Have the scene file ``scene`` rendered by path replay, without the edges that are met
-    indirectly: under light from everywhere there are none, and to look for them takes most of the
-    time.
-    """
-    text, usual = scene.read_text(), '<integrator type="$integrator"/>'
-    assert text.count(usual) == 1
-    inner = '<integer name="sppi" value="0"/>'
-    scene.write_text(text.replace(usual, f'<integrator type="prb_projective">{inner}</integrator>'))
-
-
 def problem_of(folder, rules=None, **settings):
     """The problem of a folder of :mod:`synthetic`, under ``rules`` and settings."""
     prepare.main([str(folder), "--overwrite"])

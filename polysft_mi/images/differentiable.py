@@ -33,6 +33,13 @@ def blur(image, sigma):
     return dr.convolve(dr.convolve(image, taps, axis=0), taps, axis=1)
 
 
+def srgb(image):
+    """Linear colours, 0 to 1, as sRGB (IEC 61966-2-1); a tensor of the same shape."""
+    x = dr.clip(image.array, 0, 1)
+    power = 1.055 * dr.power(dr.maximum(x, 0.0031308), 1 / 2.4) - 0.055
+    return mi.TensorXf(dr.select(x <= 0.0031308, 12.92 * x, power), image.shape)
+
+
 def normalised(image, weight, window, floor=FLOOR):
     """(H, W, 3), premultiplied by its ``weight`` (H, W, 1), less its local mean, over its local
     standard deviation (one for all channels) and the ``floor``, under a window of standard

@@ -7,12 +7,11 @@ import lazy_loader
 
 __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
-    submodules=["device", "pinhole", "projective", "silhouette", "stage", "topology", "view"],
+    submodules=["device", "pinhole", "silhouette", "stage", "topology", "view"],
     submod_attrs={
         "device": ["frozen", "interruptible", "on_device", "threads"],
         "pinhole": ["MIN_DEPTH", "Pinhole"],
         "placed": ["PlacedMesh"],
-        "projective": ["SilhouetteProjective"],
         "raster": ["RasterIntegrator"],
         "silhouette": ["blend"],
         "stage": ["SideView", "Triangles"],

@@ -16,16 +16,16 @@ from polysft_mi.errors import InputError
 from .pinhole import Pinhole
 from .raster import RasterIntegrator
 
-_MASK_SPP = 16  # samples a pixel at which a projective mask is usable
-
 
 class PlacedMesh:
     """The rendered ``mesh`` of a scene, seen by its sensor through a differentiable ``renderer``.
 
     ``corner`` (V,): the template's vertex of each rendered one (loaders split vertices along
     texture seams); ``sppi``: samples a pixel of edges met indirectly, where the renderer has such
-    and the scene does not say how many; ``where``: the scene's path, for messages. Raises
-    InputError where the sensor is no pinhole, or not one that the renderer takes.
+    and the scene does not say how many; ``where``: the scene's path, for messages. Integrators of
+    Mitsuba's give alpha no gradient: there alpha is the ``raster`` image's of the mesh alone,
+    without what else the scene holds. Raises InputError where the sensor is no pinhole, or not one
+    that the renderer takes.
     """
 
     def __init__(
@@ -57,14 +57,16 @@ class PlacedMesh:
         if getattr(renderer, "sppi", 0) is None:
             renderer.sppi = sppi
         self.is_raster = isinstance(renderer, RasterIntegrator)
-        self._mask_renderer = None
         if not self.is_raster:
             if not str(sensor).startswith("PerspectiveCamera"):
                 raise InputError(
                     f"{where}: {renderer.class_name()} takes Mitsuba's perspective sensor only"
                     " (fx = fy); use raster"
                 )
-            self._mask_renderer = mi.load_dict({"type": "silhouette_projective"})
+            self._alone = mi.load_dict({"type": "scene", "template": mesh})
+            self._params_alone = mi.traverse(self._alone)
+            self._key_alone = _positions_key(self._params_alone, mesh)
+            self._silhouette = mi.load_dict({"type": "raster"})
 
     @property
     def size(self) -> tuple[int, int]:
@@ -83,6 +85,9 @@ class PlacedMesh:
             points = mi.Point3f(dr.gather(mi.Point3d, flat, self._corner))
         self._params[self._key] = dr.ravel(points)
         self._params.update()
+        if not self.is_raster:
+            self._params_alone[self._key_alone] = dr.ravel(points)
+            self._params_alone.update()
 
     def set_texcoords(self, texcoords: mi.Float) -> None:
         """Replace the texture coordinates (Float of 2V, of the rendered vertices)."""
@@ -106,10 +111,9 @@ class PlacedMesh:
         else:
             shown = partial(mi.render, self.scene, self._params, self.sensor)
             image = shown(self.renderer, spp=spp, seed=seed)
-            more = dict(spp=max(spp, _MASK_SPP), seed=~seed & 0xFFFFFFFF)
-            mask = shown(self._mask_renderer, **more)
+            mask = self._silhouette.image(self._alone, self.sensor, spp=1)
             channels = image.shape[2]
-            alpha = _channel(mask, 0, count, mask.shape[2])
+            alpha = _channel(mask, 3, count, mask.shape[2])
         pixel = dr.arange(mi.UInt32, 3 * count)
         rgb = dr.gather(
             mi.Float, image.array, pixel // 3 * channels + pixel % 3, mode=dr.ReduceMode.Permute

@@ -26,6 +26,6 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "plugins": ["register"],
         "rules": ["Rules"],
         "sequence": ["Sequence", "drop_stray_components"],
-        "settings": ["Settings", "defaults_xml", "properties_xml"],
+        "settings": ["PRESETS", "Settings", "defaults_xml", "properties_xml"],
     },
 )

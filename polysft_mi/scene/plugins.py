@@ -1,5 +1,5 @@
-"""Our Mitsuba plugins, and their registration: ``polysft``, ``raster``, ``silhouette_projective``,
-``pinhole``, ``varol_template``.
+"""Our Mitsuba plugins, and their registration: ``polysft``, ``raster``, ``pinhole``,
+``varol_template``.
 
 Import only after a Mitsuba variant is set; :func:`register` may be called any number of times.
 """
@@ -14,7 +14,7 @@ import numpy as np
 
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError
-from polysft_mi.render import RasterIntegrator, SilhouetteProjective
+from polysft_mi.render import RasterIntegrator
 
 from . import settings
 
@@ -203,7 +203,6 @@ def _varol_template(props):
 def register() -> None:
     """Register every plugin of ours with Mitsuba's current variant."""
     mi.register_integrator("raster", RasterIntegrator)
-    mi.register_integrator("silhouette_projective", SilhouetteProjective)
     mi.register_integrator("polysft", PolySfT)
     mi.register_sensor("pinhole", PinholeSensor)
     mi.register_shape("varol_template", _varol_template)

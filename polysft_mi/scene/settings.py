@@ -146,14 +146,26 @@ class Settings:
     )
     rgb_norm: str = _setting(
         "cauchy",
-        "norm of the photometric residual",
-        choices=("cauchy", "l1", "l2", "charbonnier"),
+        "norm of the photometric residual; phi-sft: the absolute difference of each channel of the"
+        " colours as sRGB, a mean over all pixels of the image, as in φ-SfT's program",
+        choices=("cauchy", "l1", "l2", "charbonnier", "phi-sft"),
     )
     rgb_scale: float = _setting(
         0.3,
         "residual at which the norms cauchy and charbonnier turn robust, in local deviations with"
         " brightness = local; of cauchy in the first frame, later it follows the residuals",
         above=0,
+    )
+    silhouette_norm: str = _setting(
+        "l2",
+        "norm of the masks' difference; phi-sft: the absolute difference, a mean over all pixels of"
+        " the image",
+        choices=("l2", "phi-sft"),
+    )
+    mask_blur: float = _setting(
+        0.0,
+        "standard deviation of the Gaussian blur of both masks before they are compared [pixels]",
+        low=0,
     )
     rgb_region: str = _setting(
         "sheet",

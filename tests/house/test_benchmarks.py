@@ -16,9 +16,9 @@ from polysft_mi.results.truth import load_npz
 from polysft_mi.scene import plugins
 
 SIZE, POINTS = (64, 48), 9
-iteration, outline, raster, raster_figures, scaling, stability = (
+iteration, lit, outline, raster, raster_figures, scaling, stability = (
     load(f"benchmarks/{name}.py")
-    for name in ("iteration", "outline", "raster", "raster_figures", "scaling", "stability")
+    for name in "iteration lit outline raster raster_figures scaling stability".split()
 )
 
 
@@ -74,11 +74,12 @@ def test_snapshots_are_what_shorter_runs_return(tmp_path):
     long = stability.run(*DEMO, [3, 40], str(tmp_path), say=str)
     (tmp_path / "log.jsonl").unlink()
     short = stability.run(*DEMO, [3], str(tmp_path), say=str)
-    _problem, frame, surfaces, _, losses = long
+    _problem, frame, surfaces, _, watched = long
     assert frame == 1
     assert np.abs(surfaces[3] - short[2][3]).max() < 1e-6
     assert np.abs(surfaces[40] - surfaces[3]).max() > 1e-5
-    assert losses[40][0] < losses[3][0]
+    assert watched.losses[40][0] < watched.losses[3][0]
+    assert 0 < watched.seconds[3] < watched.seconds[40]
 
 
 def test_stability_writes_figures_and_picture(tmp_path, capsys):
@@ -94,6 +95,16 @@ def test_stability_writes_figures_and_picture(tmp_path, capsys):
     )
     assert (tmp_path / "stability.png").read_bytes().startswith(b"\x89PNG")
     assert "stability.json" in capsys.readouterr().out
+
+
+def test_the_lit_sheet_keeps_its_lengths_and_is_the_truth():
+    truth = load_npz(ROOT / "scenes" / "demo_lit" / "gt.npz")
+    made = np.array([lit.sheet(t / (lit.FRAMES - 1)) for t in range(lit.FRAMES)])
+    assert np.abs(truth["vertices"] - made).max() < 1e-6
+    edges = np.diff(made[:, truth["faces"]], axis=2)
+    lengths = np.linalg.norm(edges, axis=3)
+    assert np.abs(lengths / lengths[0] - 1).max() < 0.01  # chords of a curve
+    assert np.ptp(made[-1], axis=0)[2] > 0.05
 
 
 def test_iteration_times_every_part(capsys):

@@ -81,7 +81,6 @@ def test_every_plugin_and_parameter_is_described():
     registered = {
         "polysft": plugins.PolySfT,
         "raster": plugins.RasterIntegrator,
-        "silhouette_projective": plugins.SilhouetteProjective,
         "pinhole": plugins.PinholeSensor,
         "varol_template": plugins._varol_template,
     }

@@ -5,7 +5,9 @@ What the paper leaves open are options, here and nowhere else (``docs/convention
 the norm (``rgb_norm``), what light does (``brightness``), the blur, and which pixels count
 (``rgb_region``). Images are linear RGB. The sum over pixels is divided by the area of the surface
 in the image (the target mask's, or the rendered interior's where there are no masks), so that
-neither the background nor the resolution weighs in. Import only after a Mitsuba variant is set.
+neither the background nor the resolution weighs in. ``rgb_norm`` = ``phi-sft`` does as that paper's
+program: pixel values as they are stored, and a mean over the image. Import only after a Mitsuba
+variant is set.
 """
 
 import drjit as dr
@@ -54,10 +56,15 @@ class Photometric(Term):
             if self._brightness == "local":
                 a = differentiable.normalised(a, cut, level.window, level.floor)
                 b = differentiable.normalised(b, covered, level.window, level.floor)
+        if self._norm == "phi-sft":
+            a, b, area = differentiable.srgb(a), differentiable.srgb(b), self._count
         a, b = self._channels(a), self._channels(b)
         if self._brightness == "gain":
             g = gain([dr.detach(x) for x in a], b, inside)
             a = [g * x for x in a]
+        if self._norm == "phi-sft":
+            rho = sum(dr.abs(x - y) for x, y in zip(a, b)) / 3
+            return self.weight * dr.sum(weight * rho) / area
         squared = sum(dr.square(x - y) for x, y in zip(a, b)) / 3
         scale = at.context.memory.scale(at.stage, self._scale)
         rho = robust(squared, self._norm, scale)

@@ -5,23 +5,40 @@ Losses). Frames without masks have none. Import only after a Mitsuba variant is 
 import drjit as dr
 import mitsuba as mi
 
+from polysft_mi.images import differentiable
+
 from .term import Term
 
 
 class Silhouette(Term):
-    """k_silhouette / area times the sum over pixels of (alpha - mask)^2; the mask's area."""
+    """k_silhouette / area times the sum over pixels of (alpha - mask)^2; the mask's area. Both may
+    be blurred before; as in φ-SfT's program it is the mean of |alpha - mask| over the image.
+    """
 
     name, setting = "silhouette", "k_silhouette"
 
     def __init__(self, inputs):
         super().__init__(inputs)
-        self._inputs = inputs
+        s, self._inputs = inputs.settings, inputs
+        self._norm, self._blur = s.silhouette_norm, s.mask_blur
+        width, height = inputs.placed.size
+        self._shape, self._count = (height, width, 1), width * height
 
     def energy(self, at):
         target = self._inputs.target(at.context.frame)
         if target.mask is None:
             return mi.Float(0)
-        return self.weight * dr.sum(dr.square(at.image[1] - target.mask)) / target.area
+        difference = mi.TensorXf(at.image[1] - target.mask, self._shape)
+        difference = differentiable.blur(difference, self._blur).array
+        if self._norm == "phi-sft":
+            return self.weight * dr.sum(dr.abs(difference)) / self._count
+        return self.weight * dr.sum(dr.square(difference)) / target.area
 
     def add(self, at):
         return at.evaluation.silhouette
+
+    @property
+    def without_block(self):
+        if self._norm != "l2":
+            return f"silhouette_norm = {self._norm}; l2 is needed"
+        return f"mask_blur = {self._blur:g}; 0 is needed" if self._blur else None

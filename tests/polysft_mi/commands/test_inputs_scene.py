@@ -194,7 +194,7 @@ def test_malformed_setting(sheet, text):
         ("sweeps=-1", "sweeps = -1; a whole number, at least 0, is needed"),
         ("sweeps=1.5", "sweeps = '1.5'; a whole number is needed"),
         ("solver=newton", "solver = 'newton'; known values: auto, gauss-newton, adam"),
-        ("rgb_norm=l3", "rgb_norm = 'l3'; known values: cauchy, l1, l2, charbonnier"),
+        ("rgb_norm=l3", "rgb_norm = 'l3'; known values: cauchy, l1, l2, charbonnier, phi-sft"),
         ("first=3", "first = 3; "),
         ("last=3", "last = 3; it must lie in [0, 2]"),
         ("data=/nowhere", "data = /nowhere: no such folder"),

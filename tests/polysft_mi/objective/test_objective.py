@@ -11,9 +11,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import synthetic
-from problems import replay_paths
+from polysft_mi.pictures.shading import srgb
+from scipy.ndimage import gaussian_filter
 
 from polysft_mi import capture, prepare
+from polysft_mi.errors import InputError
 from polysft_mi.images import differentiable, pyramid
 from polysft_mi.images.pyramid import Level
 from polysft_mi.objective import FrameContext, Objective, Problem
@@ -21,9 +23,11 @@ from polysft_mi.objective.terms.inextensibility import edge_lengths
 from polysft_mi.objective.terms.photometric import gain, robust
 from polysft_mi.scene import experiment as scene
 from polysft_mi.surface.patch import Unknowns
+from polysft_mi.tracker import FrameTracker
 
 RNG = np.random.default_rng(1)
 PAPER = {"preset": "paper", "canonical_frame": "pca", "patches": 0}
+PHI_SFT = {"rgb_norm": "phi-sft", "silhouette_norm": "phi-sft"}
 
 
 def floats(x):
@@ -120,13 +124,11 @@ def test_images_are_compared_alike_on_the_device_and_on_the_host(level):
 # ---- the objective of a frame --------------------------------------------------------------------
 
 
-def problem(folder, masks=True, replayed=False, **overrides):
+def problem(folder, masks=True, **overrides):
     truth = synthetic.cloth(folder / "sequence", masks=masks)
     layout = capture.recognise(str(truth.folder))
     path = folder / "scene.xml"
     path.write_text(capture.scene_xml(layout, str(truth.folder)))
-    if replayed:
-        replay_paths(path)
     experiment = scene.load(path, {**PAPER, **overrides})
     return Problem(experiment, experiment.sequence()), truth
 
@@ -153,6 +155,7 @@ def energy(problem, unknowns, frame, **options):
         {"k_mi": 0, "brightness": "local", "rgb_norm": "cauchy", "rgb_region": "sheet", "blur": 1},
         {"k_rgb": 0, "k_silhouette": 0},
         {"k_mi": 0, "integrator": "raster", "spp": 4},
+        {"k_mi": 0, "k_rgb": 5, "k_silhouette": 5, "mask_blur": 1.5, **PHI_SFT},
     ],
 )
 @pytest.mark.parametrize("masks", [True, False])
@@ -286,6 +289,25 @@ def test_padding_does_not_change_the_loss(tmp_path):
     assert totals[1] == pytest.approx(totals[0], rel=1e-3)
 
 
+def test_losses_of_phi_sft_are_means_over_the_image(tmp_path):
+    """Absolute differences of each channel as it is stored, and of blurred masks."""
+    settings = {**PHI_SFT, "k_silhouette": 0.5, "mask_blur": 2, "k_mi": 0}
+    p, _ = problem(tmp_path, **settings)
+    rest = p.patch.rest()
+    terms = energy(p, rest, 3)[1]
+    rgb, alpha = (np.array(x) for x in p.placed.image(p.patch.vertices(rest)))
+    mask = p.sequence.mask(3)
+    stored = [srgb(x) for x in (rgb, p.sequence.frame(3) * mask[..., None])]
+    assert terms["rgb"] == pytest.approx(np.abs(stored[0] - stored[1]).mean(), rel=1e-3)
+    difference = gaussian_filter(alpha.reshape(mask.shape) - mask, 2, mode="constant", truncate=2.5)
+    assert terms["silhouette"] == pytest.approx(0.5 * np.abs(difference).mean(), rel=0.01)
+    for name, value in {"silhouette_norm": "phi-sft", "mask_blur": 2}.items():
+        with pytest.raises(InputError, match=f"silhouette has {name} = .* is needed"):
+            FrameTracker(
+                problem(tmp_path / name, preset="none", solver="gauss-newton", **{name: value})[0]
+            )
+
+
 def test_path_replay_gives_the_gradient_of_raster(tmp_path):
     """On an unshadowed sheet under light from everywhere both integrators render the texture, so
     their gradients are the same but for noise.
@@ -294,7 +316,7 @@ def test_path_replay_gives_the_gradient_of_raster(tmp_path):
     for integrator, spp in (("raster", 1), ("prb_projective", 64)):
         folder = tmp_path / integrator
         folder.mkdir()
-        p, _ = problem(folder, replayed=integrator != "raster", spp=spp, k_mi=0)
+        p, _ = problem(folder, integrator=integrator, spp=spp, k_mi=0)
         rest = p.patch.rest().to_numpy()
         rest["translation"] = np.array([[0.02, -0.03, 0.05]], np.float32)
         unknowns = Unknowns.from_numpy(rest)
@@ -319,15 +341,12 @@ def test_gradients_of_several_patches(tmp_path, integrator):
     truth = synthetic.cloth(tmp_path / "tube", rows=13, columns=24, frames=2, shape=synthetic.tube)
     prepare.main([str(truth.folder), "-q"])
 
-    def of(spp):
-        settings = {**PAPER, "k_mi": 0, "order": 3, "spp": spp}
+    def of(integrator, spp):
+        settings = {**PAPER, "k_mi": 0, "order": 3, "integrator": integrator, "spp": spp}
         experiment = scene.load(truth.folder / "scene.xml", settings)
         return Problem(experiment, experiment.sequence())
 
-    sharp = of(4)
-    if integrator == "prb_projective":
-        replay_paths(truth.folder / "scene.xml")
-    p = of(1 if integrator == "raster" else 64)
+    sharp, p = of("raster", 4), of(integrator, 1 if integrator == "raster" else 64)
     assert len(p.template) >= 3
     rest = p.patch.rest().to_numpy()
     rest["delta_alpha"] += (0.02 * RNG.normal(size=rest["delta_alpha"].shape)).astype(np.float32)
