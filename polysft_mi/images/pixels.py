@@ -132,7 +132,7 @@ def ray_hits(seen, sheet):
     return RayHit(ray, triangle, b1, b2, e1, e2, at, c1 - c0, c2 - c0)
 
 
-def _pixel_coordinates(seen):
+def pixel_coordinates(seen):
     """The pixels' places (x, y) on the level's grid, Int32."""
     x0, y0, width, _ = seen.region
     local = dr.arange(mi.UInt32, dr.width(seen.triangle))
@@ -154,7 +154,7 @@ def residuals(seen, sheet, texture, frame, excess):
     """
     hit, found = seen.hit, ray_hits(seen, sheet)
     colour, by_x, by_y = texture.bilinear(found.at, hit)
-    x, y = _pixel_coordinates(seen)
+    x, y = pixel_coordinates(seen)
     pixel, known = frame.at(x, y)
     target = dr.gather(mi.Vector4f, frame.texels, pixel, hit & known)
     weight = dr.select(hit & (colour.w > 0.5), target.w, 0)
@@ -208,14 +208,14 @@ def triangle_sums(seen, sheet, texture, frame, excess, scale):
         weight * squared / (squared + c2),
         weight * squared / (squared + MISFIT**2),
     )
-    return _by_triangle(
+    return by_triangle(
         seen,
         sheet,
         (mi.Vector4f(xx, xy, yy, found.b1), mi.Vector4f(*first, found.b2), mi.Vector4f(*figures)),
     )
 
 
-def _by_triangle(seen, sheet, found):
+def by_triangle(seen, sheet, found):
     """Sums over the pixels that see each triangle: curvatures and slopes, Float of 27 F, and
     figures, Float of 4 F.
 
@@ -334,7 +334,7 @@ def silhouette_terms(seen, pairs, mask, distance, corner_of):
     term's slope here and its minimum at the mask's contour. A step then goes all the way, where
     plain Gauss-Newton, whose residuals are pixels, would go one pixel.
     """
-    x, y = _pixel_coordinates(seen)
+    x, y = pixel_coordinates(seen)
     pixel, known = mask.at(x, y)
     wanted, alpha = (
         dr.gather(mi.Float, mask.texels, pixel, known),
