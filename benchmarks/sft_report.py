@@ -39,7 +39,8 @@ def against(results, others):
         times.append(seconds)
         for name in shown[: 2 if "deg" in shown[1] else 1]:
             before, now = other["figures"][name], r["figures"][name]
-            ratios.append(now / before)
+            if np.isfinite([now, before]).all():
+                ratios.append(now / before)
             numbers = f"{before:.4g}", f"{now:.4g}", f"{now / before:.3f}", f"{seconds:.2f}"
             lines.append(_row([r["sequence"], r["method"], LABELS[name], *numbers]))
     if ratios:
