@@ -160,8 +160,8 @@ def picture(path, found, figures, truth):
     """Frames of the video, what both ways make of them, and how far they are from the truth."""
     import mitsuba as mi
     from matplotlib.figure import Figure
-    from polysft_mi.pictures.shading import srgb
 
+    from polysft_mi.colours import srgb
     from polysft_mi.render import PlacedMesh
     from polysft_mi.scene import load
 

@@ -28,7 +28,7 @@ def readings(image, alpha, frame, mask):
     """Each reading's loss of an image (H, W, 3), linear, with its alpha (H, W), against a frame
     and its mask; a mean over what the surface fills.
     """
-    from polysft_mi.pictures.shading import srgb
+    from polysft_mi.colours import srgb
 
     inside = alpha > 0.999
     difference = image - frame

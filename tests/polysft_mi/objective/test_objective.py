@@ -11,10 +11,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import synthetic
-from polysft_mi.pictures.shading import srgb
 from scipy.ndimage import gaussian_filter
 
 from polysft_mi import capture, prepare
+from polysft_mi.colours import srgb
 from polysft_mi.errors import InputError
 from polysft_mi.images import differentiable, pyramid
 from polysft_mi.images.pyramid import Level
