@@ -84,6 +84,7 @@ def run(sequence, method, folder, out, setup):
         text.replace(os.path.abspath(folder), sequence)
         .replace(folder, sequence)
         .replace(ROOT + os.sep, "")
+        .replace(out, os.path.join("OUT", os.path.basename(out)))
     )
     result = {
         "sequence": sequence,
