@@ -17,7 +17,8 @@ from . import pixels
 
 _CACHED = 8
 _ROUNDS = 10  # of the weighted fit of a scale and a shift
-_MOST = 20000  # pixels that it is made of
+_FEWEST, _MOST = 100, 20000  # pixels that it is made of
+_ALIKE = 0.5  # least correlation of a surface's depths with an image that is fitted to it
 
 
 @dataclass(frozen=True)
@@ -86,29 +87,36 @@ class DepthData:
         z, known = self._depths(vertices, frame, level)
         return z - self._metric(known, fit), z
 
-    def fitted(self, vertices, frame, level, noise):
-        """(scale, shift) of the depth image that come closest to a surface, robustly; those of an
-        image in metres are 1 and 0.
+    def fitted(self, vertices, frame, level):
+        """(scale, shift) by which the depth image comes closest to a surface, 1 and 0 of one in
+        metres; None where it does not tell, for too few pixels are compared, or its numbers hardly
+        go along with the surface's depths.
+
+        The image is what errs: so its numbers are fitted by the surface's depths (or their
+        inverses), robustly, and that is turned around.
         """
         if self.known_to == "metric":
             return 1.0, 0.0
         z, known = (x.ravel() for x in self._depths(vertices, frame, level))
         z, known = z[np.isfinite(z)], known[np.isfinite(z)]
         step = max(1, len(z) // _MOST)
-        z, known = z[::step], known[::step]
-        if len(z) < 3:
-            return 1.0, 0.0
-        target = 1 / z if self.known_to == "disparity" else z
-        weight = np.ones(len(z))
-        a = np.stack([known, np.ones(len(z))], 1)
+        x, known = z[::step], known[::step]
+        if len(x) < _FEWEST:
+            return None
+        x = 1 / x if self.known_to == "disparity" else x
+        weight = np.ones(len(x))
         for _ in range(_ROUNDS):
-            fit = np.linalg.lstsq(a * weight[:, None], target * weight, rcond=None)[0]
-            residual = z - self._metric(known, fit)
-            spread = max(1.4826 * np.median(np.abs(residual)), 1e-6)
-            weight = 1 / np.sqrt(1 + (residual / (2.5 * spread)) ** 2)
-            if self.known_to == "disparity":
-                weight *= z**2
-        return float(fit[0]), float(fit[1])
+            share = weight / weight.sum()
+            mean_x, mean = share @ x, share @ known
+            across, spread_x = share @ ((x - mean_x) * (known - mean)), share @ (x - mean_x) ** 2
+            slope = across / max(spread_x, 1e-30)
+            residual = known - mean - slope * (x - mean_x)
+            usual = max(1.4826 * np.median(np.abs(residual)), 1e-12)
+            weight = 1 / (1 + (residual / (2.5 * usual)) ** 2)
+        alike = across / max(np.sqrt(spread_x * (share @ (known - mean) ** 2)), 1e-30)
+        if alike < _ALIKE:
+            return None
+        return float(1 / slope), float(mean_x - mean / slope)
 
     def attached(self, points, vertices, frame, level, fit=(1.0, 0.0)):
         """Depths [m] of a surface and of the image, Float64 of P, the first attached, of the pixels

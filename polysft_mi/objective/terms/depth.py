@@ -30,7 +30,7 @@ class Depth(Term):
     neighbours says m = ((1 + rho) / (1 - rho))^2. The norm (Cauchy's) turns
     robust at c, 2.5 s and as far as images are blurred: what stands before the sheet, or behind it,
     hardly pulls at the last stage. Depth that is known up to a scale and a shift is fitted to the
-    surface at every step.
+    surface at every step; where it does not go along with the surface at all, it says nothing.
     """
 
     name, setting = "depth", "k_depth"
@@ -48,14 +48,16 @@ class Depth(Term):
         return bool(settings.depth) and super().is_used(settings)
 
     def noise(self, context, vertices, stage):
-        level, noise = self._level(stage), self._noise(context, stage)
-        fit = self._images.fitted(vertices, context.frame, level, noise)
+        level = self._level(stage)
+        before = {k: v for k, v in context.memory.noises.items() if k in (self.name, self._patch)}
+        fit = self._images.fitted(vertices, context.frame, level)
+        if fit is None:
+            return before
         residual, z = self._images.residuals(vertices, context.frame, level, fit)
         residual /= _FIRST + _SHARE * z
         known = np.isfinite(residual)
         if known.sum() < _FEWEST:
-            names = self.name, self._patch
-            return {k: v for k, v in context.memory.noises.items() if k in names}
+            return before
         sigma = np.median(np.abs(residual[known])) / _MEDIAN
         residual = np.clip(residual, -_TOLERANCE * sigma, _TOLERANCE * sigma)
         pairs = ((residual[:, 1:], residual[:, :-1]), (residual[1:], residual[:-1]))
@@ -71,7 +73,9 @@ class Depth(Term):
         context, level = at.context, self._level(at.stage)
         vertices = np.array(dr.detach(at.vertices), dtype=np.float64).T
         noise = self._noise(context, at.stage)
-        fit = self._images.fitted(vertices, context.frame, level, noise)
+        fit = self._images.fitted(vertices, context.frame, level)
+        if fit is None:
+            return mi.Float(0)
         z, image = self._images.attached(at.vertices, vertices, context.frame, level, fit)
         sigma, c2 = noise.sigma(dr.detach(z)), noise.squared_scale(dr.detach(z))
         over = dr.square(z - image) / c2
@@ -81,14 +85,16 @@ class Depth(Term):
     def rows(self, at):
         context, level = at.context, self._level(at.stage)
         noise, vertices = self._noise(context, at.stage), at.surface.vertices
-        fit = self._images.fitted(vertices, context.frame, level, noise)
+        fit = self._images.fitted(vertices, context.frame, level)
+        if fit is None:
+            return
         energy, *sums = self._images.sums(vertices, context.frame, level, noise, fit)
         factor = self._factor(context)
         forms = TriangleForms(*(factor * x for x in sums))
         at.add_to_triangles(self.name, factor * energy, forms)
 
     def add(self, at):
-        return at.energies[self.name]
+        return at.energies.get(self.name, 0.0)
 
     def _level(self, stage):
         return self._inputs.data.level(stage.blur)
