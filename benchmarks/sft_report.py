@@ -138,7 +138,7 @@ def page(results, picture):
         )
     text.append(
         "- Each row is one run. Rounding alone moves some of them: with `-D k_mi` changed in its"
-        " fifth digit, four or five runs each gave e3d of vertices in view from 0.0011 to 0.0022"
+        " fifth digit, three to six runs each gave e3d of vertices in view from 0.0011 to 0.0022"
         " for ball, 0.0020 to 0.0052 for roll, 0.0083 to 0.0124 for tube; curtain and corner move"
         " by a fifth and a half, the smooth sheets hardly."
     )
