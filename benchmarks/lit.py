@@ -32,6 +32,14 @@ TILT = 0.35  # angle of the waves with the image's vertical [rad]
 SLOPE, LENGTH, SHIFT = 0.5, 0.24, 0.4  # of the waves: largest slope, length [m], phase [rad]
 
 
+def placed_in(experiment):
+    """The template in an experiment's scene, a :class:`PlacedMesh`."""
+    from polysft_mi.render import PlacedMesh
+
+    e = experiment
+    return PlacedMesh(e.scene, e.sensor, e.renderer, e.mesh, e.corner)
+
+
 def sheet(share):
     """Vertices (N, 3) [m, camera frame], row by row, of the sheet at a ``share`` of its motion,
     0 to 1.
@@ -68,7 +76,6 @@ def make(folder):
     import cv2
     import mitsuba as mi
 
-    from polysft_mi.render import PlacedMesh
     from polysft_mi.scene import load
     from polysft_mi.surface.meshio import write_obj
 
@@ -86,13 +93,7 @@ def make(folder):
     with open(at("camera.json"), "w", encoding="utf-8") as file:
         json.dump(dict(width=160, height=120, fx=184, fy=184, cx=80, cy=60), file, indent=1)
     experiment = load(SCENE, {"data": folder})
-    placed = PlacedMesh(
-        experiment.scene,
-        experiment.sensor,
-        experiment.renderer,
-        experiment.mesh,
-        experiment.corner,
-    )
+    placed = placed_in(experiment)
     tracer = mi.load_dict({"type": "path", "max_depth": 3, "hide_emitters": True})
     for t, x in enumerate(vertices):
         placed.place(mi.Point3f(x.T.astype(np.float32)))
@@ -162,7 +163,6 @@ def picture(path, found, figures, truth):
     from matplotlib.figure import Figure
 
     from polysft_mi.colours import srgb
-    from polysft_mi.render import PlacedMesh
     from polysft_mi.scene import load
 
     last = len(found[LIT][0].vertices) - 1
@@ -176,13 +176,7 @@ def picture(path, found, figures, truth):
     video = lit.sequence()
     for (label, run), line in zip(rows.items(), grid):
         experiment = unlit if run is found[UNLIT][0] else lit
-        placed = PlacedMesh(
-            experiment.scene,
-            experiment.sensor,
-            experiment.renderer,
-            experiment.mesh,
-            experiment.corner,
-        )
+        placed = placed_in(experiment)
         for k, axes in zip(shown, line):
             image = video.frame(k)
             if run is not None:
