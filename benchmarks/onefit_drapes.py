@@ -28,7 +28,7 @@ import onefit
 from onefit.body import ClosestSurface
 from onefit.motion import generate
 from onefit.network import DEFAULT
-from onefit.objective.crossings import crossings
+from onefit.objective import crossings
 from onefit.objective.folds import folds, inner_edges
 from onefit.physics import MATERIALS, Material
 from onefit.physics.sheet import Sheet, bending, potential, stretching

@@ -34,7 +34,7 @@ from onefit.draping import inputs
 from onefit.draping.draper import FPS
 from onefit.garment import waistband
 from onefit.network import DEFAULT
-from onefit.objective.crossings import crossings
+from onefit.objective import crossings
 from onefit.objective.folds import folds, inner_edges
 from onefit.physics import MATERIALS, Material
 from polyfit.errors import InputError, cli

@@ -19,7 +19,8 @@ def parser(name: str, text: str) -> Parser:
     p.add_argument(
         "garment",
         metavar="GARMENT",
-        help="a template's name, or a mesh (.obj, .ply, .glb) around the standard body",
+        help="a template's name, a mesh (.obj, .ply, .glb) around the standard body, or a sewing"
+        " pattern (GarmentCode's *_specification.json)",
     )
     p.add_argument(
         "motion",
@@ -147,9 +148,8 @@ def run(verb: str, args: argparse.Namespace, **how) -> None:
         up=args.up,
         turn=args.turn,
         offset=tuple(args.offset),
+        count=args.vertices,
     )
-    if args.vertices:
-        garment = garment.remeshed(args.vertices)
     motion = inputs.motion_of(
         args.motion, seconds=args.seconds, seed=args.seed, fps=args.fps, up=args.motion_up
     )

@@ -26,6 +26,7 @@ from .binding import (
     standard_surface,
     surface_of,
 )
+from .reading import parts
 
 _PUSHED_DEPTH = 0.03  # vertices inside the body by less than this are pushed out [m]
 _MADE = ContactSettings().made
@@ -211,7 +212,18 @@ def _offset(V, surface):
     return offset + 0.0
 
 
-def to_standard(V, F, made_for, loose=False):
+def inward(V, F, surface):
+    """Which faces (F,) of V (N, 3) [m] are of a part whose normals, in most of it, are against
+    those of the nearest points of the body's ``surface``.
+    """
+    part = parts(F)
+    found = surface(V)
+    agree = (found.normal * mesh.vertex_normals(V, F)).sum(axis=1)
+    agree /= 1 + (found.distance / 0.02) ** 2
+    return (np.bincount(part, mesh.areas(V, F) * agree[F].mean(axis=1)) < 0)[part]
+
+
+def to_standard(V, F, made_for, loose=False, smooth=True):
     """Vertices (N, 3) [m] of a garment made on the body ``made_for``, in the stand and shape of the
     standard body.
 
@@ -219,7 +231,8 @@ def to_standard(V, F, made_for, loose=False):
     bodies. That shears sleeves where the stand differs, so the stand is changed by skinning with
     the garment's smoothed blend weights, and the rest, the difference in shape, by the displacement
     (smoothed too); one step of Laplacian smoothing follows. Of ``loose`` garments, which do not
-    follow the legs, the legs' pose is left as it is.
+    follow the legs, the legs' pose is left as it is. Without ``smooth`` that step is left out, for
+    cloth that hangs in folds.
     """
     standard = standard_body()
     pose = standard.rest_pose.clone()
@@ -245,6 +258,8 @@ def to_standard(V, F, made_for, loose=False):
     target = standard if not loose else in_pose(standard, pose)
     difference = _counterpart(stands, target) - stands.vertices.numpy()
     V = V + Binding(V, F, surface_of(stands)).displacement(difference)
+    if not smooth:
+        return V
     return 0.5 * (V + mesh.neighbour_mean(F, len(V), boundary_apart=True) @ V)
 
 

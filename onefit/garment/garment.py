@@ -19,7 +19,7 @@ from polyfit.mesh import TexCoords, read_textured
 
 from . import fitting, remesh
 from .binding import Binding, standard_body, standard_surface
-from .reading import RenderMesh, Stitches, check, mended, parts, stitched
+from .reading import RenderMesh, Stitches, check, mended, stitched
 
 TEMPLATES = (
     "tshirt",
@@ -45,7 +45,9 @@ class Garment:
     changed when it was read. ``cut`` (N, 3) float32 [m]: the cloth as it was cut, before it fell
     and hung in folds, whose lengths are its lengths at rest; None: the garment is its own cut.
     ``render_mesh``: the mesh of the file that the garment was read from, which it carries; None for
-    a template. ``stitches``: what its buttons and buckles hold together.
+    a template. ``stitches``: what its buttons and buckles hold together. ``lengths`` (F, 3) float32
+    [m]: the faces' sides at rest, of cloth that was sewn of panels; its ``cut`` only tells then
+    which parts are near to each other.
     """
 
     name: str
@@ -56,6 +58,7 @@ class Garment:
     cut: torch.Tensor | None = None
     render_mesh: RenderMesh | None = field(default=None, repr=False)
     stitches: Stitches | None = field(default=None, repr=False)
+    lengths: torch.Tensor | None = field(default=None, repr=False)
     _binding: Any = field(default=None, repr=False)
 
     @classmethod
@@ -74,11 +77,12 @@ class Garment:
         :meth:`read`. Raises InputError.
         """
         if name in TEMPLATES + LOOSE:
-            return cls.template(str(name))
+            garment, count = cls.template(str(name)), options.get("count")
+            return garment.remeshed(count) if count else garment
         if not Path(name).suffix and not Path(name).exists():
             raise InputError(
                 f"garment '{name}': no such template; there are {', '.join(TEMPLATES + LOOSE)}; or"
-                " give an .obj, .ply or .glb file"
+                " give an .obj, .ply or .glb file, or a sewing pattern (.json)"
             )
         return cls.read(name, **options)
 
@@ -94,20 +98,31 @@ class Garment:
         up: str = "z",
         turn: float = 0.0,
         offset: Any = (0.0, 0.0, 0.0),
+        count: int | None = None,
     ) -> Garment:
         """The garment of an OBJ, PLY or GLB file of triangles or quads, repaired by the rules of
-        :mod:`onefit.garment.reading.mending`.
+        :mod:`onefit.garment.reading.mending`; or of a sewing pattern, GarmentCode's
+        ``*_specification.json``, which is sewn (:mod:`onefit.garment.sewing.seams`), in half a
+        minute. ``count``: about how many vertices it shall have; of a mesh by default its own.
 
         ``scale``, ``up``, ``turn`` [degrees], ``offset`` [m]: as in
         :func:`onefit.garment.fitting.placed`, from the file's units and axes to metres and
         OneFit's. ``made_for``: the :class:`~onefit.Body` on which it lies, if that is not the
         standard body, or "T-pose" for the standard body in the T-pose; the garment is brought to
         the standard body as :func:`onefit.garment.fitting.to_standard` says, and ``loose`` (skirts,
-        dresses) leaves the legs' pose out. Raises InputError, in one line, for a mesh that is no
-        garment or does not lie on the body.
+        dresses) leaves the legs' pose out. A pattern says itself where it lies: of all these it
+        takes ``made_for``, a Body in the standard stand, by default one of GarmentCode's mean size.
+        Raises InputError, in one line, for a mesh that is no garment or does not lie on the body.
         """
+        if Path(path).suffix == ".json":
+            if (loose, scale, up, turn, *offset) != (False, 1.0, "z", 0.0, 0.0, 0.0, 0.0):
+                raise InputError(
+                    f"{path}: scale, up, turn, offset and loose are for meshes; a sewing pattern"
+                    " says its unit and place itself"
+                )
+            return cls._sewn(path, name, made_for, count)
         V, F, texcoords = read_textured(path, "garment")
-        return cls.of_mesh(
+        garment = cls.of_mesh(
             name or Path(path).stem,
             fitting.placed(V, scale, up, turn, offset),
             F,
@@ -116,6 +131,21 @@ class Garment:
             loose=loose,
             where=str(path),
         )
+        return garment.remeshed(count) if count else garment
+
+    @classmethod
+    def _sewn(cls, path, name, made_for, count):
+        from .sewing.seams import sewn
+
+        if made_for is not None and not isinstance(made_for, Body):
+            raise InputError(f"{path}: made_for={made_for!r}; of a sewing pattern a Body is needed")
+        made = sewn(path, count, made_for)
+        V, F, flat = made.vertices, made.cut.faces, made.cut.panels
+        places, of = np.unique(flat.reshape(-1, 2), axis=0, return_inverse=True)
+        texcoords = TexCoords(places / places.max(), of.reshape(-1, 3))
+        seen = RenderMesh.bound(V, F, texcoords, V, F)
+        of_cut = made.cut.vertices, seen, made.lengths
+        return cls.bound(name or made.name, V, F, made.repairs, *of_cut)
 
     @classmethod
     def of_mesh(
@@ -145,14 +175,17 @@ class Garment:
         check(vertices, faces, where)
         fitting.check_place(vertices[np.unique(faces)], surface, where, tell_pose=made_for is None)
         V, F, told = mended(vertices, faces, where, surface)
-        F, turned = _outward(V, F, surface)
+        turned = fitting.inward(V, F, surface)
+        if turned.any():
+            F = np.where(turned[:, None], F[:, ::-1], F)
+            told += (f"turned {turned.sum()} faces that were wound inwards",)
         if texcoords is not None and (bare := (texcoords.faces < 0).any(axis=1)).any():
             told += (f"{bare.sum()} faces have no texture coordinates, and take (0, 0)",)
         render_mesh = RenderMesh.bound(vertices, faces, texcoords, V, F)
         if made_for is not None:
             V = fitting.to_standard(V, F, made_for.to("cpu"), loose)
         V, pushed = fitting.pushed_out(V, F, where)
-        return cls.bound(name, V, F, told + turned + pushed, render_mesh=render_mesh)
+        return cls.bound(name, V, F, told + pushed, render_mesh=render_mesh)
 
     @classmethod
     def bound(
@@ -163,9 +196,10 @@ class Garment:
         repairs: tuple = (),
         cut: np.ndarray | None = None,
         render_mesh: RenderMesh | None = None,
+        lengths: np.ndarray | None = None,
     ) -> Garment:
         """The garment of a clean mesh (N, 3) [m], (F, 3) around the standard body, with blend
-        weights from there; ``cut`` (N, 3) [m] and ``render_mesh`` as in the class. Buttons and
+        weights from there; ``cut``, ``render_mesh`` and ``lengths`` as in the class. Buttons and
         buckles of the ``render_mesh`` become stitches.
         """
         V, F = np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64)
@@ -182,6 +216,7 @@ class Garment:
             None if cut is None else torch.as_tensor(cut, dtype=torch.float32),
             render_mesh,
             None if render_mesh is None else stitched(render_mesh, V, F),
+            None if lengths is None else torch.as_tensor(lengths, dtype=torch.float32),
             binding,
         )
 
@@ -209,25 +244,46 @@ class Garment:
 
     def rest_lengths(self, pairs: torch.Tensor, graded: torch.Tensor | None = None) -> torch.Tensor:
         """Lengths at rest (E,) [m] between the vertices of ``pairs`` (E, 2), each the corners of a
-        face: those of the cut, or of the garment itself. With ``graded`` (N, 3) [m], from
-        :meth:`graded`, as much longer as that has made them.
+        face: those of the cut, or of the garment itself; along a seam of panels, the mean of both
+        sides. With ``graded`` (N, 3) [m], from :meth:`graded`, as much longer as that has made
+        them.
         """
         length = lambda x: (x[pairs[:, 0]] - x[pairs[:, 1]]).norm(dim=-1)
         if self.cut is None:
             return length(self.vertices if graded is None else graded)
-        cut = length(self.cut)
+        cut = length(self.cut) if self.lengths is None else self._lengths_of(pairs)
         return cut if graded is None else cut * length(graded) / length(self.vertices)
 
     def sides(self, graded: torch.Tensor | None = None) -> torch.Tensor:
-        """:meth:`rest_lengths` (F, 3) [m] of the faces' sides, from each corner to the next."""
+        """:meth:`rest_lengths` (F, 3) [m] of the faces' sides, from each corner to the next; along
+        a seam of panels, each face has its own.
+        """
+        if self.lengths is not None:
+            side = lambda x: (x[self.faces.roll(-1, 1)] - x[self.faces]).norm(dim=-1)
+            return self.lengths * (1 if graded is None else side(graded) / side(self.vertices))
         pairs = torch.stack([self.faces, self.faces.roll(-1, 1)], -1)
         return self.rest_lengths(pairs.reshape(-1, 2), graded).reshape(-1, 3)
+
+    def _lengths_of(self, pairs):
+        """The lengths at rest (E,) of ``pairs`` (E, 2), sides of faces, by those of the faces."""
+        edges, side = mesh.edges_of(self.faces.cpu().numpy())
+        lengths = self.lengths.cpu().numpy().ravel()
+        mean = np.bincount(side.ravel(), lengths) / np.bincount(side.ravel())
+        key = lambda e: e.min(1).astype(np.int64) * len(self) + e.max(1)
+        order = np.argsort(key(edges))
+        at = order[np.searchsorted(key(edges)[order], key(pairs.cpu().numpy()))]
+        return torch.as_tensor(mean[at]).to(self.lengths)
 
     def remeshed(self, count: int) -> Garment:
         """The same garment with about ``count`` vertices: every face is cut in four as often as is
         needed for 0.7 times as many; where there are more than 1.4 times as many, even triangles
-        are made anew (ACVD).
+        are made anew (ACVD). Raises InputError for one that was sewn of panels: :meth:`read` takes
+        the ``count`` there.
         """
+        if self.lengths is not None:
+            raise InputError(
+                f"{self.name}: sewn of panels: Garment.read(..., count={count}) sews it anew"
+            )
         V, F = self.vertices.cpu().double().numpy(), self.faces.cpu().numpy()
         cut = None if self.cut is None else self.cut.cpu().double().numpy()
         while len(V) < 0.7 * count:
@@ -247,20 +303,3 @@ class Garment:
             self.vertices.cpu().numpy(), self.faces.cpu().numpy(), V, F
         )
         return Garment.bound(self.name, V, F, self.repairs + pushed, cut, render_mesh)
-
-
-def _outward(V, F, surface):
-    """``(faces, sentences)`` with each part wound so that its normals agree with those of the
-    nearest points of the body.
-    """
-    part = parts(F)
-    found = surface(V)
-    agree = (found.normal * mesh.vertex_normals(V, F)).sum(axis=1)
-    agree /= 1 + (found.distance / 0.02) ** 2
-    votes = np.bincount(part, mesh.areas(V, F) * agree[F].mean(axis=1))
-    turned = votes[part] < 0
-    if not turned.any():
-        return F, ()
-    return np.where(turned[:, None], F[:, ::-1], F), (
-        f"turned {turned.sum()} faces that were wound inwards",
-    )

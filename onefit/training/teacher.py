@@ -68,7 +68,8 @@ def write(path: Path, lesson: Lesson) -> None:
 
 def write_garment(folder, garment: Garment) -> None:
     """The garment of the lessons of its name in ``folder``."""
-    arrays = dict(vertices=garment.vertices, faces=garment.faces, cut=garment.cut)
+    names = "vertices", "faces", "cut", "lengths"
+    arrays = {name: getattr(garment, name) for name in names}
     with aside(path_of(folder, garment.name)) as temporary:
         np.savez(temporary, **{k: x.numpy() for k, x in arrays.items() if x is not None})
 
@@ -79,7 +80,8 @@ def garment_of(folder, name: str) -> Garment:
     if not path.exists():
         raise InputError(f"{folder}: no lesson of {name}; onefit.teach makes them")
     with np.load(path) as file:
-        return Garment.bound(path.stem, file["vertices"], file["faces"], cut=file.get("cut"))
+        of_cut = dict(cut=file.get("cut"), lengths=file.get("lengths"))
+        return Garment.bound(path.stem, file["vertices"], file["faces"], **of_cut)
 
 
 def taught(folder) -> tuple[str, ...]:

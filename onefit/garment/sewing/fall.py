@@ -2,8 +2,6 @@
 with slack. The physics is :mod:`onefit.physics`.
 """
 
-import numpy as np
-
 from onefit.contact import ContactSettings
 from onefit.garment.binding import standard_body
 from onefit.garment.waistband import held
@@ -22,9 +20,7 @@ def fallen(cut, seconds=SECONDS):
     body, held at its waistband if it does not hang from the shoulders.
     """
     body = standard_body()
-    corners = cut.vertices[cut.faces]
-    sides = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
-    sheet = Sheet(cut.start, cut.faces, Material.named(_MATERIAL), sides, cut.vertices)
+    sheet = Sheet(cut.start, cut.faces, Material.named(_MATERIAL), cut.sides, cut.vertices)
     surface, faces = body.vertices.numpy(), body.faces.numpy()
     worn = WornCloth(sheet, cut.start, surface, faces, SETTINGS)
     pull = sheet.material.stretch * held(cut.start, cut.faces, body.joints.double().numpy())

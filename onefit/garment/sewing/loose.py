@@ -29,12 +29,21 @@ from .sew import meshed
 @dataclass(frozen=True)
 class Cut:
     """A garment before it falls: ``vertices`` (N, 3) [m], the cloth as it is cut, ``faces`` (F, 3),
-    and ``start`` (N, 3) [m], where it begins to fall: around the body and outside of it.
+    and ``start`` (N, 3) [m], where it begins to fall: around the body and outside of it. Of cloth
+    that is cut in panels, ``panels`` (F, 3, 2) [m] are the corners of each face in its own, and
+    ``vertices`` only tell what is near to what.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     start: np.ndarray
+    panels: np.ndarray | None = None
+
+    @property
+    def sides(self) -> np.ndarray:
+        """The lengths at rest (F, 3) [m] of the faces' sides, from each corner to the next."""
+        corners = self.vertices[self.faces] if self.panels is None else self.panels
+        return np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
 
 
 def boxy_tshirt(b):

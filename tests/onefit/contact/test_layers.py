@@ -4,7 +4,7 @@ import trimesh
 from test_contact import COTTON, grid
 
 from onefit.contact import SelfContact
-from onefit.objective.crossings import crossings
+from onefit.objective import crossings
 from onefit.physics import Settings
 from onefit.physics.cloth import Cloth
 from onefit.physics.sheet import Sheet

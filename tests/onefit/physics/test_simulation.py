@@ -1,7 +1,7 @@
 import pytest
 
 import onefit
-from onefit.objective.crossings import crossings
+from onefit.objective import crossings
 from onefit.physics import Settings
 
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 from surfaces import ball
 
-from onefit.objective.crossings import crossings
+from onefit.objective import crossings
 from onefit.objective.folds import angles, folds, inner_edges
 from polyfit import mesh
 
