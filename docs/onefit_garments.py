@@ -5,6 +5,8 @@ python docs/onefit_garments.py                                        (half a mi
 python docs/onefit_garments.py --loose -o docs/onefit_loose.png       (those with slack)
 python docs/onefit_garments.py --cuts 18 -o docs/onefit_cuts.jpg      (two minutes: random cuts, as
 training draws them)
+python docs/onefit_garments.py --patterns tests/onefit/garment/patterns/*.json \
+    -o docs/onefit_patterns.png                                       (two minutes: sewn of panels)
 """
 
 import argparse
@@ -73,11 +75,14 @@ def main():
     parser.add_argument(
         "--loose", action="store_true", help="the garments with slack instead of the templates"
     )
+    parser.add_argument("--patterns", nargs="+", metavar="FILE", help="garments of sewing patterns")
     parser.add_argument("-o", "--output", default=os.path.join(HERE, "onefit_garments.png"))
     args = parser.parse_args()
     if args.cuts:
         with tempfile.TemporaryDirectory() as folder:
             garments = cuts(args.cuts, folder)
+    elif args.patterns:
+        garments = [Garment.read(path) for path in args.patterns]
     else:
         garments = [Garment.template(name) for name in (LOOSE if args.loose else TEMPLATES)]
     body = standard_body()
