@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -26,7 +26,7 @@ from onefit.physics import Material, Settings
 from polyfit import mesh
 from polyfit.errors import InputError
 
-from . import ease
+from . import ease, outfit
 from .post import PostProcessing, pull
 
 if TYPE_CHECKING:
@@ -167,12 +167,16 @@ class Draper:
         ``advance`` is called once for each frame that is done. Raises InputError for a garment,
         motion or shape that cannot be used.
         """
-        worn = self._worn(garment, motion, shape)
-        post_processed = lambda vertices, *_: vertices
-        if post and not skinning_only:
-            post_processed = self.post_processing(worn.garment, worn.rest, worn.body)
-        made = self._draped(worn, skinning_only, eased, post_processed, advance)
-        return self._drape_of(worn, *made)
+        worn, drapes = self._worn(garment, motion, shape), []
+        for one in worn:
+            post_processed = lambda vertices, *_: vertices
+            if post and not skinning_only:
+                under = outfit.beneath([(d.vertices, d.faces) for d in drapes]) if drapes else ()
+                post_processed = self.post_processing(one.garment, one.rest, one.body, under)
+            told = advance if one is worn[-1] else lambda: None
+            made = self._draped(one, skinning_only, eased, post_processed, told)
+            drapes.append(self._drape_of(one, *made))
+        return drapes if isinstance(garment, list | tuple) else drapes[0]
 
     def simulate(
         self,
@@ -201,37 +205,47 @@ class Draper:
             raise InputError(f"steps = {steps}; steps a frame, 1 or more")
         material, settings = Material.named(material), settings or Settings()
         worn = self._worn(garment, motion, shape)
-        garment, rest = worn.garment, worn.rest.cpu()
-        guide, moving = self._draped(worn)
-        led = worn.motion.led_in(worn.body, settings.lead)
-        first = len(led) - len(worn.motion)
-        if first:
-            there = skinning.transforms(worn.body, led.poses[:first], led.translation[:first])
-            lead = self._draped(replace(worn, transforms=there), skinning_only=True)
-            guide, moving = torch.cat([lead[0], guide]), torch.cat([lead[1], moving])
+        body, moved = worn[0].body, worn[0].motion
+        led = moved.led_in(body, settings.lead)
+        first = len(led) - len(moved)
+        there = skinning.transforms(body, led.poses[:first], led.translation[:first])
+        guides = []
+        for one in worn:
+            guide, moving = self._draped(one)
+            if first:
+                lead = self._draped(replace(one, transforms=there), skinning_only=True)
+                guide, moving = torch.cat([lead[0], guide]), torch.cat([lead[1], moving])
+            guides.append(guide)
         if settings.contact.room:
-            moving = Flesh(worn.body, settings.contact.room)(moving)
-        cut = garment.cut is not None
+            between = 2 * (len(worn) - 1) * settings.contact.apart
+            moving = Flesh(body, settings.contact.room + between)(moving)
+        garments, rests = [one.garment for one in worn], [one.rest.cpu() for one in worn]
+        patches = [self.patched(one).vertex_patch for one in garments]
         made = simulated(
-            guide, rest, garment.faces.cpu(), self._held(garment), moving, worn.body.faces.cpu(),
+            torch.cat(guides, 1), torch.cat(rests), bodies=moving, body_faces=body.faces.cpu(),
+            held=np.concatenate([self._held(one) for one in garments]),
             material=material, steps=steps, fps=FPS, settings=settings, first=first,
-            sides=garment.sides(rest).double().numpy() if cut else None,
-            cut=garment.cut.numpy() if cut else None, stitches=garment.stitches,
-            patches=self.patched(garment).vertex_patch,
+            patches=outfit.numbered(patches), **outfit.joined(garments, rests),
         )  # fmt: skip
         vertices = torch.stack([(frame, advance())[0] for frame in made])
-        return self._drape_of(worn, vertices, moving[first:], material)
+        parts = vertices.split([len(rest) for rest in rests], 1)
+        drapes = [self._drape_of(w, x, moving[first:], material) for w, x in zip(worn, parts)]
+        return drapes if isinstance(garment, list | tuple) else drapes[0]
 
     def _worn(self, garment, motion, shape):
-        """The :class:`_Worn` of what :meth:`drape` takes."""
-        garment = self.garment(garment)
+        """The :class:`_Worn` of each garment of what :meth:`drape` takes."""
+        garments = list(garment) if isinstance(garment, list | tuple) else [garment]
+        if not 1 <= len(garments) <= outfit.MOST:
+            raise InputError(f"{len(garments)} garments; 1 to {outfit.MOST} at once")
+        garments = [self.garment(one) for one in garments]
         motion = motion if isinstance(motion, Motion) else Motion.read(motion)
         motion = motion.resampled(FPS).to(self.device)
         body = self.model.body(shape)
-        rest, body = garment.graded(body).to(self.device), body.to(self.device)
+        rests, body = [one.graded(body).to(self.device) for one in garments], body.to(self.device)
+        rests = outfit.let_out(garments, rests)
         motion = motion if shape is None else motion.fitted(body)
         transforms = skinning.transforms(body, motion.poses, motion.translation)
-        return _Worn(garment, motion, body, rest, transforms)
+        return [_Worn(one, motion, body, rest, transforms) for one, rest in zip(garments, rests)]
 
     def _draped(
         self,
@@ -282,9 +296,16 @@ class Draper:
         vertices, faces = garment.vertices.cpu().numpy(), garment.faces.cpu().numpy()
         return waistband.held(vertices, faces, self.standard.joints.numpy())
 
-    def post_processing(self, garment: Garment, rest: torch.Tensor, body: Body) -> PostProcessing:
+    def post_processing(
+        self,
+        garment: Garment,
+        rest: torch.Tensor,
+        body: Body,
+        under: Iterable[Sequence[ClosestSurface]] = (),
+    ) -> PostProcessing:
         """The :class:`onefit.draping.post.PostProcessing` of a garment graded to a ``body``, its
-        vertices at ``rest`` (N, 3) [m].
+        vertices at ``rest`` (N, 3) [m]; ``under``: the surfaces of what it is worn over, besides,
+        in one frame after the other.
         """
         vertices = garment.vertices.cpu().numpy()
         drawn = lambda: pull(vertices, self.standard, self._held(garment))
@@ -298,7 +319,7 @@ class Draper:
             edges = np.concatenate([edges, threads])
             lengths = torch.cat([lengths, torch.as_tensor(long).to(lengths)])
         pulls = self._once(garment, "pull", drawn)
-        return PostProcessing(rest, garment.faces, edges, lengths, pulls, self._surfaces)
+        return PostProcessing(rest, garment.faces, edges, lengths, pulls, self._surfaces, under)
 
     def codes(self, garment: Garment) -> torch.Tensor:
         """Z_T (K, width) of the garment's patches, found once."""
