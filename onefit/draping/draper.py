@@ -234,10 +234,7 @@ class Draper:
 
     def _worn(self, garment, motion, shape):
         """The :class:`_Worn` of each garment of what :meth:`drape` takes."""
-        garments = list(garment) if isinstance(garment, list | tuple) else [garment]
-        if not 1 <= len(garments) <= outfit.MOST:
-            raise InputError(f"{len(garments)} garments; 1 to {outfit.MOST} at once")
-        garments = [self.garment(one) for one in garments]
+        garments = [self.garment(one) for one in outfit.several(garment)]
         motion = motion if isinstance(motion, Motion) else Motion.read(motion)
         motion = motion.resampled(FPS).to(self.device)
         body = self.model.body(shape)

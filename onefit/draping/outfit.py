@@ -20,7 +20,7 @@ from .post import CONTACT, pushes
 if TYPE_CHECKING:
     from onefit.garment import Garment
 
-MOST = 4  # garments
+_MOST = 4  # garments
 _AT_REST = replace(CONTACT, spacing=0.006)  # [m] between points of faces: it is done once
 _TRIED_ON = dict.fromkeys(("least", "point_near", "point_least"), CONTACT.eased)
 _TRIED_ON |= dict(reach=CONTACT.deepest)
@@ -37,8 +37,7 @@ class Under:
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
         start, end = mesh.boundary_edges(faces).T
-        count, sides = len(vertices), np.concatenate([faces, faces[:, [1, 2, 0]], faces[:, ::-1]])
-        links = np.stack([start, end], 1)
+        count, links = len(vertices), np.stack([start, end], 1)
         _, of = np.unique(mesh.components(count, links)[start], return_inverse=True)
         key = lambda a, b: a.astype(np.int64) * count + b
         ways = key(faces, np.roll(faces, -1, axis=1)).ravel()
@@ -70,6 +69,14 @@ class Under:
         return np.concatenate([x, centre + radius * mean(away)])
 
 
+def several(garments: Any) -> list[Any]:
+    """The garments of a list, or of one alone. Raises InputError for none, and for too many."""
+    garments = list(garments) if isinstance(garments, list | tuple) else [garments]
+    if not 1 <= len(garments) <= _MOST:
+        raise InputError(f"{len(garments)} garments; 1 to {_MOST} at once")
+    return garments
+
+
 def let_out(garments: Sequence[Garment], rests: Sequence[torch.Tensor]) -> list[torch.Tensor]:
     """The vertices of the garments at ``rests`` (N, 3) [m] each, graded once more, by what is worn
     under them: each is pushed out of those before it as cloth is pushed out of a body, as far as a
@@ -98,7 +105,7 @@ def let_out(garments: Sequence[Garment], rests: Sequence[torch.Tensor]) -> list[
 
 
 def numbered(parts: Sequence[np.ndarray]) -> np.ndarray:
-    """Numbers, each part's own from 0 on, as numbers in all: the next part's follow on the last's."""
+    """Numbers, each part's own from 0 on, in all: the next part's follow on the last's."""
     first = np.cumsum([0, *(part.max() + 1 for part in parts[:-1])])
     return np.concatenate([part + n for part, n in zip(parts, first)])
 

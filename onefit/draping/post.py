@@ -6,6 +6,7 @@ of swings is a smaller one.
 """
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -21,6 +22,7 @@ _ROUNDS = 24  # of the lengths
 RADIUS = 0.985  # spectral radius of a round, as the acceleration takes it to be
 _PUSHES, _SMOOTHING = 5, 6  # rounds; times, of the pushes of the first
 CONTACT = ContactSettings()
+_OVER_CLOTH = replace(CONTACT, spacing=0.01)  # [m]: folds are narrower than limbs
 
 
 def pull(vertices, body, held):
@@ -59,9 +61,9 @@ class PostProcessing:
         self._surfaces, self._under = surfaces, iter(under)
         self._pool = ThreadPoolExecutor(1)  # a second thread
         #: how the cloth touches the skin
-        touch = lambda: SkinContact(rest.cpu().numpy(), faces.cpu().numpy(), CONTACT, **pushes())
-        self.skin = touch()
-        self._cloth = touch() if under else None  # the same of what is under it
+        mesh = rest.cpu().numpy(), faces.cpu().numpy()
+        self.skin = SkinContact(*mesh, CONTACT, **pushes())
+        self._cloth = SkinContact(*mesh, _OVER_CLOTH, **pushes()) if under else None
         degree = np.bincount(np.asarray(edges).ravel(), minlength=self._count)
         squares = np.asarray(lengths) ** 2
         self._edges = self._array(edges, self._wp.vec2i), self._array(squares, float)
