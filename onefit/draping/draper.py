@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias, overload
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -97,6 +97,11 @@ class _Worn:
     transforms: torch.Tensor
 
 
+_Named: TypeAlias = Garment | str | os.PathLike[str]
+_Several: TypeAlias = list[Any] | tuple[Any, ...]
+_Moving: TypeAlias = Motion | str | os.PathLike[str]
+
+
 class Draper:
     """A trained network and a body model, ready to drape any garment. Made by :func:`onefit.load`.
 
@@ -143,21 +148,26 @@ class Draper:
             made[name] = make()
         return made[name]
 
+    @overload
+    def drape(self, garment: _Named, motion: _Moving, *args: Any, **how: Any) -> Drape: ...
+    @overload
+    def drape(self, garment: _Several, motion: _Moving, *args: Any, **how: Any) -> list[Drape]: ...
     def drape(
         self,
-        garment: Garment | str | os.PathLike[str],
-        motion: Motion | str | os.PathLike[str],
+        garment: _Named | _Several,
+        motion: _Moving,
         shape: torch.Tensor | None = None,
         *,
         post: bool = True,
         eased: bool = True,
         skinning_only: bool = False,
         advance: Callable[[], object] = lambda: None,
-    ) -> Drape:
+    ) -> Drape | list[Drape]:
         """A :class:`Drape` by the network, in milliseconds a frame: ``garment`` (as :meth:`garment`
         takes it) on the body of ``shape`` (S,) in each frame of ``motion`` (a :class:`Motion` or a
         file of one), at 30 frames a second. With a shape, the way is scaled by the length of its
-        legs.
+        legs. A list of garments, in the order in which they are put on, gives a list of drapes:
+        each is let out at rest to go over those before it, and ``post`` pushes it out of them.
 
         ``post``: post-processing (:class:`onefit.draping.post.PostProcessing`): the cloth keeps its
         motion, edges come back towards their lengths at rest, and vertices are pushed out of the
@@ -165,9 +175,9 @@ class Draper:
         frame; without it and ``post`` a drape is what the network alone makes. ``skinning_only``:
         plain skinning of the template, what OneFit is held against, without any of these.
         ``advance`` is called once for each frame that is done. Raises InputError for a garment,
-        motion or shape that cannot be used.
+        motion or shape that cannot be used, and for a garment that does not go over another.
         """
-        worn, drapes = self._worn(garment, motion, shape), []
+        worn, drapes = self._worn(garment, motion, shape), list[Drape]()
         for one in worn:
             post_processed = lambda vertices, *_: vertices
             if post and not skinning_only:
@@ -178,21 +188,27 @@ class Draper:
             drapes.append(self._drape_of(one, *made))
         return drapes if isinstance(garment, list | tuple) else drapes[0]
 
+    @overload
+    def simulate(self, garment: _Named, motion: _Moving, *args: Any, **how: Any) -> Drape: ...
+    @overload
+    def simulate(
+        self, garment: _Several, motion: _Moving, *args: Any, **how: Any
+    ) -> list[Drape]: ...
     def simulate(
         self,
-        garment: Garment | str | os.PathLike[str],
-        motion: Motion | str | os.PathLike[str],
+        garment: _Named | _Several,
+        motion: _Moving,
         shape: torch.Tensor | None = None,
         *,
         material: Material | str = "cotton",
         steps: int = 2,
         settings: Settings | None = None,
         advance: Callable[[], object] = lambda: None,
-    ) -> Drape:
+    ) -> Drape | list[Drape]:
         """A :class:`Drape` by implicit steps of cloth on the garment's own mesh
         (:func:`onefit.draping.simulation.simulated`), in tens of milliseconds a frame, which begins
         with the network's drape and is weakly drawn to it; ``garment``, ``motion``, ``shape`` and
-        ``advance`` as in :meth:`drape`.
+        ``advance`` as in :meth:`drape`. Garments of a list are one sheet, and feel each other.
 
         ``material``: one of :data:`onefit.physics.MATERIALS` by its name, or a
         :class:`onefit.physics.Material`. ``steps`` a frame, two are enough, solved as
@@ -220,9 +236,11 @@ class Draper:
             between = 2 * (len(worn) - 1) * settings.contact.apart
             moving = Flesh(body, settings.contact.room + between)(moving)
         garments, rests = [one.garment for one in worn], [one.rest.cpu() for one in worn]
+        faces = [one.faces.cpu() for one in garments]
         patches = [self.patched(one).vertex_patch for one in garments]
         made = simulated(
-            torch.cat(guides, 1), torch.cat(rests), bodies=moving, body_faces=body.faces.cpu(),
+            torch.cat(outfit.in_order(guides, faces), 1), torch.cat(rests),
+            bodies=moving, body_faces=body.faces.cpu(),
             held=np.concatenate([self._held(one) for one in garments]),
             material=material, steps=steps, fps=FPS, settings=settings, first=first,
             patches=outfit.numbered(patches), **outfit.joined(garments, rests),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 _MOST = 4  # garments
 _AT_REST = replace(CONTACT, spacing=0.006)  # [m] between points of faces: it is done once
-_TRIED_ON = dict.fromkeys(("least", "point_near", "point_least"), CONTACT.eased)
-_TRIED_ON |= dict(reach=CONTACT.deepest)
+_FAR = dict(reach=CONTACT.deepest)  # what lies in a garment as a whole is found, too
+_MADE = _FAR | dict.fromkeys(("least", "point_near", "point_least"), CONTACT.made)
 _LOOKS = 3  # at rest
 _MOST_INSIDE = 1.0  # [%] of a garment's vertices in one under it, or it does not go over that
 _APART = 10.0  # [m] between the garments where they are cut: what lies in two is never neighbours
@@ -79,15 +79,15 @@ def several(garments: Any) -> list[Any]:
 
 def let_out(garments: Sequence[Garment], rests: Sequence[torch.Tensor]) -> list[torch.Tensor]:
     """The vertices of the garments at ``rests`` (N, 3) [m] each, graded once more, by what is worn
-    under them: each is pushed out of those before it as cloth is pushed out of a body, as far as a
-    garment that is tried on is. Raises InputError where one does not go over another.
+    under them: each is pushed out of those before it as the garment of a file is pushed out of the
+    body. Raises InputError where one does not go over another.
     """
     made: list[torch.Tensor] = []
     under: list[Under] = []
     for garment, rest in zip(garments, rests):
         x, faces = rest.detach().float().cpu().clone(), garment.faces.cpu().numpy()
         if under:
-            skin = SkinContact(x.numpy(), faces, _AT_REST, **pushes(**_TRIED_ON))
+            skin = SkinContact(x.numpy(), faces, _AT_REST, **pushes(**_MADE))
         for other, layer in zip(garments, under):
             for _ in range(_LOOKS):
                 skin.look(x, layer.surface)
@@ -134,10 +134,26 @@ def joined(garments: Sequence[Garment], rests: Sequence[torch.Tensor]) -> dict[s
     )
 
 
-def beneath(worn: Sequence[tuple[torch.Tensor, torch.Tensor]]) -> Iterator[list[ClosestSurface]]:
+def beneath(worn: Iterable[tuple[torch.Tensor, torch.Tensor]]) -> Iterator[list[ClosestSurface]]:
     """The surfaces of garments, vertices (T, N, 3) [m] and faces (F, 3) each, in one frame after
     the other.
     """
+    worn = list(worn)
     layers = [Under(x[0].numpy(), faces.numpy()) for x, faces in worn]
     for frame in zip(*(x.numpy() for x, _ in worn)):
         yield [layer.follow(x) for layer, x in zip(layers, frame)]
+
+
+def in_order(guides: Sequence[torch.Tensor], faces: Sequence[torch.Tensor]) -> list[torch.Tensor]:
+    """The drapes ``guides`` (T, N, 3) [m] each, every one pushed out of those before it."""
+    made: list[torch.Tensor] = []
+    for guide, own in zip(guides, faces):
+        x = guide.clone()
+        if made:
+            skin = SkinContact(x[0].numpy(), own.numpy(), CONTACT, **pushes(**_FAR))
+        for frame, layers in zip(x, beneath(zip(made, faces))):
+            for layer in layers:
+                skin.look(frame, layer)
+                skin.push_out(frame, layer)
+        made.append(x)
+    return made
