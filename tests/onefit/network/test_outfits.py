@@ -61,7 +61,7 @@ def passed(drapes):
 def test_outer_garments_stay_over_inner_ones_in_drapes(draper, worn):
     apart = [draper.drape(one, MOTION, eased=False) for one in worn]
     made = draper.drape(worn, MOTION, eased=False)
-    assert beneath(*apart) > 0.02 and beneath(*made) < 0.002
+    assert beneath(*apart) > 0.02 and beneath(*made) < 0.005
     assert torch.equal(made[0].vertices, apart[0].vertices)  # the inner one does not know
     assert all(one.measures().collision < 0.3 for one in made)
     assert passed(made) < 0.2 * passed(apart)
