@@ -103,12 +103,12 @@ def main(argv=None):
     parser.add_argument("--seconds", type=float, default=1.0)
     args = parser.parse_args(argv)
     draper, rows = onefit.load(args.weights), []
-    for outfit in args.outfits:
-        names = outfit.split("+")
-        for name in names:
-            draper.drape(name, onefit.Motion.generate("walk", seconds=0.1))  # cut, eased, compiled
-        for kind in args.motions:
-            motion = onefit.Motion.generate(kind, seconds=args.seconds, seed=SEED)
+    for kind in args.motions:
+        motion = onefit.Motion.generate(kind, seconds=args.seconds, seed=SEED)
+        for outfit in args.outfits:
+            names = outfit.split("+")
+            for name in names:
+                draper.ease(draper.garment(name))  # cut and tried on once
             for verb in args.verbs:
                 act = getattr(draper, verb)
                 alone = [cost(act, name, motion) for name in names]
@@ -119,8 +119,10 @@ def main(argv=None):
                 row |= dict(ms=round(ms, 1), alone=round(sum(one for _, one in alone), 1))
                 rows.append(row)
                 print(json.dumps(row), flush=True)
-    if args.output:
-        Path(args.output).write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+                if args.output:
+                    Path(args.output).write_text(
+                        json.dumps(rows, indent=1) + "\n", encoding="utf-8"
+                    )
 
 
 if __name__ == "__main__":
