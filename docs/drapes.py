@@ -50,13 +50,15 @@ def main(argv=None):
     args = parser.parse_args(argv)
     draper, rows = onefit.load(args.weights), []
     for garments, motion, shape, colours in OUTFITS if args.outfits else ROWS:
-        moving = onefit.Motion.generate(motion, seconds=2, seed=1_000_005)
+        seconds = 1 if args.outfits else 2
+        moving = onefit.Motion.generate(motion, seconds=seconds, seed=1_000_005)
         drapes = draper.simulate(garments, moving, shape)
         chosen = np.linspace(10, len(drapes[0].vertices) - 1, FRAMES).astype(int)
         body = drapes[0].body[chosen].numpy(), drapes[0].body_faces.numpy(), BODY
         at = [(d.vertices[chosen].numpy(), d.faces.numpy()) for d in drapes]
         parts = [body, *((*part, colour) for part, colour in zip(at, colours))]
-        images = stage.render(parts, size=SIZE, spp=25, follow=True, near=1)
+        view = dict(size=(520, 400)) if args.outfits else dict(size=SIZE, near=1)
+        images = stage.render(parts, spp=25, follow=True, **view)
         rows.append(np.concatenate(list(images), axis=1))
     name = "onefit_outfits.jpg" if args.outfits else "onefit.jpg"
     output = args.output or str(Path(__file__).parent / name)
