@@ -85,10 +85,7 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
     vertices = problem.camera.to_camera(world).astype(np.float32)
     drawn, bound, plotted = drawing.finish(world, vertices, fps)
 
-    sigma = {}
-    if track.sigma:
-        unknown = np.full(vertices.shape[1], np.nan, np.float32)
-        sigma["sigma"] = np.stack([track.sigma.get(k, unknown) for k in range(count)])
+    certainty = dict(zip(("sigma", "score"), track.certainties(vertices.shape[1])))
     with aside(os.path.join(out, "surface.npz")) as temporary:
         np.savez_compressed(
             temporary,
@@ -96,7 +93,7 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
             faces=template.faces.astype(np.int32),
             **uv_arrays(template.texcoords, template.faces),
             frames=indices,
-            **sigma,
+            **certainty,
         )
     arrays = {name: np.stack([s[name] for s in track.states]) for name in Unknowns.NAMES}
     with aside(os.path.join(out, "params.npz")) as temporary:
