@@ -15,7 +15,7 @@ LABELS = {
     "rgb": "photometric loss",
     "inextensibility": "inextensibility loss",
     "order": "order of the jet",
-    "sigma_mm": "sigma, median [mm]",
+    "score_mm": "score, median [mm]",
     "rmse_mm": "distance to the truth, RMS [mm]",
     "e3d": "e3d",
     "e3d_proc": "e3d, aligned",
@@ -58,10 +58,10 @@ def figures(run, truth):
         distance = _distance(run, truth)
     metric = run.metrics
     add(("psnr_mask", "ssim_mask"), metric.get("per_frame", []))
-    if run.sigma is not None:
-        known = np.isfinite(run.sigma).any(axis=1)
-        columns["sigma_mm"] = [
-            float(1e3 * np.nanmedian(s)) if ok else None for s, ok in zip(run.sigma, known)
+    if run.score is not None:
+        known = np.isfinite(run.score).any(axis=1)
+        columns["score_mm"] = [
+            float(1e3 * np.nanmedian(s)) if ok else None for s, ok in zip(run.score, known)
         ]
     add(("rgb", "inextensibility", "iterations", "seconds", "order"), metric.get("windows", []))
     if len(set(columns.get("order", []))) == 1:
@@ -76,9 +76,9 @@ def figures(run, truth):
         for name, (label, form) in wanted.items()
         if name in metric
     ]
-    if "sigma_mm" in columns:
-        known = [s for s in columns["sigma_mm"] if s is not None] or [np.nan]
-        cards.append(("sigma along the ray, median", f"{np.median(known):.2f} mm"))
+    if "score_mm" in columns:
+        known = [s for s in columns["score_mm"] if s is not None] or [np.nan]
+        cards.append(("how far off it may be (score), median", f"{np.median(known):.2f} mm"))
     lost = metric.get("lost", {})
     cards.append(("lost frames", str(len(lost))))
     return columns, cards, distance
