@@ -1,0 +1,279 @@
+"""A baked drape: plain arrays, and their evaluation from poses by NumPy alone."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from polyfit.errors import InputError
+from polyfit.files import aside
+
+#: Free swings that the memory knows: period [s], and damping as a share of the critical one. Cloth
+#: that hangs by some decimetres swings in about a second; the short ones are how it lags behind
+SWINGS = ((0.35, 0.8), (0.6, 0.35), (0.9, 0.2), (1.3, 0.35))
+_BATCH = 8  # frames at once: what they need stays in a core's cache
+_LAYERS = 3  # of the network
+
+
+@dataclass(frozen=True, eq=False)
+class Baked:
+    """The drape of one garment on one body, as a game has it: joints, a skinned mesh, corrective
+    shapes, and a small network from poses to the shapes' weights.
+
+    ``name``; ``fps`` frames a second it was baked at; ``faces`` (F, 3) int64. In the rest space
+    [m]: ``mean`` (N, 3), the mesh with all weights zero, and ``shapes`` (R, N, 3), displacements.
+    Skinning: ``joint_of`` (N, 4) int64 and ``joint_weights`` (N, 4), rows that sum to one. The
+    skeleton: ``joints`` (24, 3) [m] at rest, ``parents`` (24,) int64, -1 of the root,
+    ``rest_rotations`` (24, 3, 3), of the joints in the world at rest, counted from the T-pose;
+    ``pace``, by which a motion's translation is multiplied. ``seen`` (J,) int64: the joints that
+    the network sees, each behind its parent. ``layers``: its matrices (in, out), and ``biases``
+    (out,). All float32 unless said otherwise.
+
+    A frame is skin(mean + Σ_i w_i shapes_i), with the weights w of :meth:`weights`.
+    """
+
+    name: str
+    fps: float
+    faces: np.ndarray
+    mean: np.ndarray
+    shapes: np.ndarray
+    joint_of: np.ndarray
+    joint_weights: np.ndarray
+    joints: np.ndarray
+    parents: np.ndarray
+    rest_rotations: np.ndarray
+    pace: float
+    seen: np.ndarray
+    layers: tuple[np.ndarray, ...]
+    biases: tuple[np.ndarray, ...]
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write all as arrays of a ``.npz``, those of the layers as ``layers0`` and so on."""
+        arrays: dict[str, Any] = {}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, tuple):
+                arrays |= {f"{field.name}{k}": x for k, x in enumerate(value)}
+            else:
+                arrays[field.name] = value
+        with aside(path) as temporary:
+            np.savez(temporary, **arrays)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Baked:
+        """A baked drape that :meth:`save` wrote. Raises InputError for another file."""
+        try:
+            with np.load(path) as file:
+                layered = lambda name: tuple(file[f"{name}{k}"] for k in range(_LAYERS))
+                values: dict[str, Any] = {
+                    f.name: layered(f.name) if f.name in ("layers", "biases") else file[f.name]
+                    for f in fields(cls)
+                }
+        except FileNotFoundError:
+            raise InputError(f"{path}: no such file; onefit.bake writes one") from None
+        except (ValueError, KeyError, EOFError) as error:
+            raise InputError(f"{path}: not a baked drape ({error})") from None
+        scalars = dict(name=str(values["name"]), fps=float(values["fps"]))
+        return cls(**(values | scalars | dict(pace=float(values["pace"]))))
+
+    def vertices(self, poses: Any, translation: Any, fps: float | None = None) -> np.ndarray:
+        """Vertices (T, N, 3) float32 [m] in the world of a motion: ``poses`` (T, 24, 3) [rad] and
+        ``translation`` (T, 3) [m] as :class:`onefit.Motion` has them, ``fps`` a second.
+        """
+        poses, translation = (np.asarray(x, np.float32) for x in (poses, translation))
+        features, placed = self.features(poses, translation, fps)
+        out = np.empty((len(poses), 3, len(self.mean)), np.float32)
+        weights, maps = self.weights(features), self.maps(placed)
+        for k in range(0, len(poses), _BATCH):
+            some = slice(k, k + _BATCH)
+            self._skinned(weights[some], maps[some], out[some])
+        return out.transpose(0, 2, 1)
+
+    def stream(self, fps: float | None = None) -> Stream:
+        """A :class:`Stream`, which takes poses one at a time, ``fps`` of them a second."""
+        return Stream(self, fps)
+
+    def features(
+        self, poses: np.ndarray, translation: np.ndarray, fps: float | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """What the network sees of each frame, (T, C), and the places (T, J + 1, 4, 4) of the
+        joints that it sees, in the world, counted from the T-pose (the last is the world's own).
+        Arguments as in :meth:`vertices`, float32.
+
+        In the root's axes: of each joint two columns of its rotation against its parent; which way
+        is up; the root's velocity [m/s] and turn [rad/s]; each joint's place [m]. Neither where the
+        root is, nor where it faces: cloth does not know. The last four are also remembered: they
+        push the :data:`SWINGS`, damped oscillators, which begin at rest.
+        """
+        rotations, placed = self.placed(poses, translation)
+        before = np.concatenate([placed[:1], placed[:-1]])
+        inputs = _inputs(placed, before, fps or self.fps)
+        turn, push = _oscillators(fps or self.fps)
+        memory = np.empty((len(poses), len(SWINGS), inputs.shape[-1]), np.complex64)
+        state = inputs[0].astype(np.complex64)
+        for t, u in enumerate(inputs):
+            memory[t] = state = turn * state + push * u
+        return _joined(rotations, inputs, memory), placed
+
+    def weights(self, features: np.ndarray) -> np.ndarray:
+        """Weights (..., R) of the shapes, from :meth:`features` (..., C)."""
+        x = features
+        for matrix, bias in zip(self.layers[:-1], self.biases):
+            x = np.maximum(x @ matrix + bias, 0)
+        return x @ self.layers[-1] + self.biases[-1]
+
+    def placed(
+        self, poses: np.ndarray, translation: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Rotations (..., J, 3, 3) against the parents, and places (..., J + 1, 4, 4) in the world,
+        of the joints that are seen, from poses (..., 24, 3) and translation (..., 3).
+        """
+        offsets, above = self._chain
+        rotations = _rotations(poses[..., self.seen, :])
+        placed = np.empty((*rotations.shape[:-3], *offsets.shape), np.float32)
+        placed[...] = offsets
+        placed[..., :-1, :3, :3] = rotations
+        placed[..., 0, :3, 3] += self.pace * translation
+        for up in above:
+            placed = placed[..., up, :, :] @ placed
+        return rotations, placed
+
+    def maps(self, placed: np.ndarray) -> np.ndarray:
+        """Maps (..., K, 12), by rows of (3, 4), from the rest space to the world, of the joints
+        that skin, from :meth:`placed`.
+        """
+        at, inverse, _ = self._skin
+        maps = placed[..., at, :3, :] @ inverse
+        return maps.reshape(*maps.shape[:-2], 12)
+
+    def _skinned(self, weights, maps, out):
+        """``out`` (..., 3, N) from weights (..., R) and maps (..., K, 12)."""
+        mean, shapes = self._flat
+        *lead, _, N = out.shape
+        points = weights @ shapes
+        points += mean
+        blended = maps.swapaxes(-1, -2) @ self._skin[2]
+        blended = blended.reshape(*lead, 3, 4, N)
+        np.einsum(
+            "...ijn,...jn->...in", blended[..., :3, :], points.reshape(*lead, 3, N), out=out
+        )
+        out += blended[..., 3, :]
+
+    @cached_property
+    def _flat(self):
+        """The mean (3 N,) and the shapes (R, 3 N), coordinate by coordinate."""
+        flat = lambda x: np.ascontiguousarray(x.swapaxes(-1, -2)).reshape(*x.shape[:-2], -1)
+        return flat(self.mean), flat(self.shapes)
+
+    @cached_property
+    def _skin(self):
+        """Joints (K,) that skin, as places in ``seen``; their inverse rest places (K, 4, 4); the
+        weights (K, N).
+        """
+        used = np.unique(self.joint_of[self.joint_weights > 0])
+        at = np.searchsorted(self.seen, used)
+        rest = np.tile(np.eye(4), (len(used), 1, 1))
+        rest[:, :3, :3], rest[:, :3, 3] = self.rest_rotations[used], self.joints[used]
+        dense = np.zeros((len(self.mean), len(self.parents)), np.float32)
+        np.put_along_axis(dense, self.joint_of, self.joint_weights, 1)
+        return at, np.linalg.inv(rest).astype(np.float32), np.ascontiguousarray(dense[:, used].T)
+
+    @cached_property
+    def _chain(self):
+        """Places (J + 1, 4, 4) of the joints at rest against their parents, without rotation, the
+        world's last; and, as often as is needed for the longest chain, which place stands above
+        each: first the parent, then the parent's parent, then that one's.
+        """
+        parent = self.parents[self.seen]
+        offsets = np.tile(np.eye(4, dtype=np.float32), (len(self.seen) + 1, 1, 1))
+        root = parent < 0
+        step = self.joints[self.seen] - np.where(root[:, None], 0, self.joints[parent])
+        back = np.where(root[:, None, None], np.eye(3), self.rest_rotations[parent])
+        offsets[:-1, :3, 3] = np.einsum("jki,jk->ji", back, step)
+        last = len(self.seen)
+        up = np.append(np.where(root, last, np.searchsorted(self.seen, parent)), last)
+        above = []
+        while (up != last).any():
+            above.append(up)
+            up = up[up]
+        return offsets, above
+
+
+class Stream:
+    """Poses of one body go in, one at a time, and vertices come out; remembers how the cloth
+    swings. ``fps``: poses a second, by default as many as the ``baked`` drape was made at. Made by
+    :meth:`Baked.stream`.
+    """
+
+    def __init__(self, baked: Baked, fps: float | None = None) -> None:
+        self._baked, self._fps = baked, fps or baked.fps
+        self._turn, self._push = _oscillators(self._fps)
+        self._before: np.ndarray | None = None
+        self._state: np.ndarray | None = None
+
+    def __call__(self, pose: np.ndarray, translation: np.ndarray) -> np.ndarray:
+        """Vertices (N, 3) float32 [m] in the world, for the next ``pose`` (24, 3) [rad] and
+        ``translation`` (3,) [m], float32.
+        """
+        baked = self._baked
+        rotations, placed = baked.placed(pose, translation)
+        before = placed if self._before is None else self._before
+        inputs = _inputs(placed, before, self._fps)
+        state = inputs if self._state is None else self._state
+        self._before, self._state = placed, self._turn * state + self._push * inputs
+        weights = baked.weights(_joined(rotations, inputs, self._state))
+        out = np.empty((3, len(baked.mean)), np.float32)
+        baked._skinned(weights, baked.maps(placed), out)
+        return out.T
+
+
+def _rotations(vectors):
+    """Matrices (..., 3, 3) of axis-angle vectors (..., 3) [rad]."""
+    square = np.einsum("...i,...i->...", vectors, vectors) + np.float32(1e-12)
+    angle = np.sqrt(square)
+    sine, versine = np.sin(angle) / angle, (1 - np.cos(angle)) / square
+    out = versine[..., None, None] * vectors[..., :, None] * vectors[..., None, :]
+    flat = out.reshape(*out.shape[:-2], 9)
+    flat[..., ::4] += np.cos(angle)[..., None]
+    turned = sine[..., None] * vectors
+    flat[..., [7, 2, 3]] += turned
+    flat[..., [5, 6, 1]] -= turned
+    return out
+
+
+def _inputs(placed, before, fps):
+    """What pushes the memory, (..., 9 + 3 (J - 1)), from the places now and in the frame before,
+    (..., J + 1, 4, 4): the root's velocity and turn, which way is up, the other joints' places.
+    """
+    root = placed[..., 0, :3, :3]
+    moved = placed[..., :-1, :3, 3] - placed[..., :1, :3, 3]
+    moved[..., 0, :] = fps * (placed[..., 0, :3, 3] - before[..., 0, :3, 3])
+    seen = moved @ root  # rows: R^T applied to each
+    step = before[..., 0, :3, :3].swapaxes(-1, -2) @ root
+    step = step.reshape(*step.shape[:-2], 9)
+    turn = (fps / 2) * (step[..., [7, 2, 3]] - step[..., [5, 6, 1]])
+    return np.concatenate([turn, root[..., 2, :], seen.reshape(*seen.shape[:-2], -1)], -1)
+
+
+def _oscillators(fps):
+    """By what an oscillator's state is multiplied in a frame, and by what its input is, each
+    (S, 1) complex64, so that a constant input is the state where it rests.
+    """
+    period, damping = np.array(SWINGS).T
+    pole = 2 * np.pi / period * (-damping + 1j * np.sqrt(1 - damping**2))
+    turn = np.exp(pole / fps).astype(np.complex64)[:, None]
+    return turn, 1 - turn
+
+
+def _joined(rotations, inputs, memory):
+    """The features (..., C): rotations (..., J, 3, 3) but the root's, inputs (..., U), memory
+    (..., S, U).
+    """
+    lead = inputs.shape[:-1]
+    memory = np.ascontiguousarray(memory).view(np.float32)
+    parts = rotations[..., 1:, :, :2].reshape(*lead, -1), inputs, memory.reshape(*lead, -1)
+    return np.concatenate(parts, -1)
