@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
@@ -12,9 +13,6 @@ import numpy as np
 from polyfit.errors import InputError
 from polyfit.files import aside
 
-#: Free swings that the memory knows: period [s], and damping as a share of the critical one. Cloth
-#: that hangs by some decimetres swings in about a second; the short ones are how it lags behind
-SWINGS = ((0.35, 0.8), (0.6, 0.35), (0.9, 0.2), (1.3, 0.35))
 _BATCH = 8  # frames at once: what they need stays in a core's cache
 _LAYERS = 3  # of the network
 
@@ -22,7 +20,7 @@ _LAYERS = 3  # of the network
 @dataclass(frozen=True, eq=False)
 class Baked:
     """The drape of one garment on one body, as a game has it: joints, a skinned mesh, corrective
-    shapes, and a small network from poses to the shapes' weights.
+    shapes, and the little that finds the shapes' weights from the poses.
 
     ``name``; ``fps`` frames a second it was baked at; ``faces`` (F, 3) int64. In the rest space
     [m]: ``mean`` (N, 3), the mesh with all weights zero, and ``shapes`` (R, N, 3), displacements.
@@ -30,10 +28,15 @@ class Baked:
     skeleton: ``joints`` (24, 3) [m] at rest, ``parents`` (24,) int64, -1 of the root,
     ``rest_rotations`` (24, 3, 3), of the joints in the world at rest, counted from the T-pose;
     ``pace``, by which a motion's translation is multiplied. ``seen`` (J,) int64: the joints that
-    the network sees, each behind its parent. ``layers``: its matrices (in, out), and ``biases``
-    (out,). All float32 unless said otherwise.
+    the network sees, each behind its parent.
 
-    A frame is skin(mean + Σ_i w_i shapes_i), with the weights w of :meth:`weights`.
+    ``layers``: the network's matrices (in, out), and ``biases`` (out,): from features of a pose to
+    G numbers, the *guide*. Pendulums: the vertices ``hung`` (P,) int64; where the guide has them at
+    rest, ``points`` (P, 3) [m] with all of it zero, and ``point_shapes`` (G, P, 3); ``pull`` (P,)
+    [1/s^2] towards there; ``drag`` [1/m] of the air. ``answer`` (G + 3 P, R), from the guide and
+    the pendulums to the weights of the shapes. All float32 unless said otherwise.
+
+    A frame is skin(mean + Σ_i w_i shapes_i).
     """
 
     name: str
@@ -50,6 +53,12 @@ class Baked:
     seen: np.ndarray
     layers: tuple[np.ndarray, ...]
     biases: tuple[np.ndarray, ...]
+    hung: np.ndarray
+    points: np.ndarray
+    point_shapes: np.ndarray
+    pull: np.ndarray
+    drag: float
+    answer: np.ndarray
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write all as arrays of a ``.npz``, those of the layers as ``layers0`` and so on."""
@@ -77,8 +86,8 @@ class Baked:
             raise InputError(f"{path}: no such file; onefit.bake writes one") from None
         except (ValueError, KeyError, EOFError) as error:
             raise InputError(f"{path}: not a baked drape ({error})") from None
-        scalars = dict(name=str(values["name"]), fps=float(values["fps"]))
-        return cls(**(values | scalars | dict(pace=float(values["pace"]))))
+        scalars: dict[str, Any] = {k: float(values[k]) for k in ("fps", "pace", "drag")}
+        return cls(**(values | scalars | {"name": str(values["name"])}))
 
     def vertices(self, poses: Any, translation: Any, fps: float | None = None) -> np.ndarray:
         """Vertices (T, N, 3) float32 [m] in the world of a motion: ``poses`` (T, 24, 3) [rad] and
@@ -86,8 +95,12 @@ class Baked:
         """
         poses, translation = (np.asarray(x, np.float32) for x in (poses, translation))
         features, placed = self.features(poses, translation, fps)
+        maps, guide = self.maps(placed), self.guide(features)
+        swung, swings = self.swings(fps), np.empty((len(poses), 3 * len(self.hung)), np.float32)
+        for t, (m, g) in enumerate(zip(maps, guide)):
+            swings[t] = swung(m, g)
+        weights = self.weights(guide, swings)
         out = np.empty((len(poses), 3, len(self.mean)), np.float32)
-        weights, maps = self.weights(features), self.maps(placed)
         for k in range(0, len(poses), _BATCH):
             some = slice(k, k + _BATCH)
             self._skinned(weights[some], maps[some], out[some])
@@ -100,35 +113,61 @@ class Baked:
     def features(
         self, poses: np.ndarray, translation: np.ndarray, fps: float | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """What the network sees of each frame, (T, C), and the places (T, J + 1, 4, 4) of the
-        joints that it sees, in the world, counted from the T-pose (the last is the world's own).
-        Arguments as in :meth:`vertices`, float32.
+        """What the network sees of each frame, (T, C), and the places (T, J + 1, 4, 4) of
+        :meth:`placed`; arguments as in :meth:`vertices`, float32.
 
-        In the root's axes: of each joint two columns of its rotation against its parent; which way
-        is up; the root's velocity [m/s] and turn [rad/s]; each joint's place [m]. Neither where the
-        root is, nor where it faces: cloth does not know. The last four are also remembered: they
-        push the :data:`SWINGS`, damped oscillators, which begin at rest.
+        In the root's axes: of each joint two columns of its rotation against its parent; the root's
+        turn [rad/s]; which way is up; the root's velocity [m/s]; each joint's place [m]. Neither
+        where the root is, nor where it faces: cloth does not know.
         """
         rotations, placed = self.placed(poses, translation)
         before = np.concatenate([placed[:1], placed[:-1]])
-        inputs = _inputs(placed, before, fps or self.fps)
-        turn, push = _oscillators(fps or self.fps)
-        memory = np.empty((len(poses), len(SWINGS), inputs.shape[-1]), np.complex64)
-        state = inputs[0].astype(np.complex64)
-        for t, u in enumerate(inputs):
-            memory[t] = state = turn * state + push * u
-        return _joined(rotations, inputs, memory), placed
+        return _features(rotations, placed, before, fps or self.fps), placed
 
-    def weights(self, features: np.ndarray) -> np.ndarray:
-        """Weights (..., R) of the shapes, from :meth:`features` (..., C)."""
+    def guide(self, features: np.ndarray) -> np.ndarray:
+        """The guide (..., G), from :meth:`features` (..., C): where cloth without mass would be."""
         x = features
         for matrix, bias in zip(self.layers[:-1], self.biases):
             x = np.maximum(x @ matrix + bias, 0)
         return x @ self.layers[-1] + self.biases[-1]
 
-    def placed(
-        self, poses: np.ndarray, translation: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def swings(self, fps: float | None = None) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+        """A function that is called frame after frame, with the joints' maps (K, 12) of
+        :meth:`maps` and the guide (G,), and says how far the pendulums are from the guide, (3 P,)
+        [m], turned back to the rest space.
+
+        As in post-processing (:mod:`onefit.draping.post`): a pendulum goes on as it did, slowed
+        down by the air, and is pulled to where the guide has its vertex, by one step of the
+        implicit Euler method. It begins there, and moves with it.
+        """
+        dt = 1 / (fps or self.fps)
+        share = (1 / (1 + self.pull * dt * dt)).astype(np.float32)
+        shapes = self.point_shapes.swapaxes(1, 2).reshape(len(self.point_shapes), -1)
+        points = np.ascontiguousarray(self.points.T).ravel()
+        dense = np.ascontiguousarray(self._skin[2][:, self.hung])
+        drag, count = np.float32(self.drag), len(self.hung)
+        at: list[np.ndarray] = []  # in the two frames before, (3, P) [m]
+
+        def swung(maps, guide):
+            blended = (maps.T @ dense).reshape(3, 4, count)
+            rest = (guide @ shapes + points).reshape(3, count)
+            goal = np.einsum("ijn,jn->in", blended[:, :3], rest) + blended[:, 3]
+            if not at:
+                at[:] = goal, None
+                return np.zeros(3 * count, np.float32)
+            way = at[0] - at[1] if at[1] is not None else goal - at[0]
+            length = np.sqrt(np.einsum("in,in->n", way, way))
+            away = share * (at[0] + way / (1 + drag * length) - goal)
+            at[:] = goal + away, at[0]
+            return np.einsum("ijn,in->jn", blended[:, :3], away).ravel()
+
+        return swung
+
+    def weights(self, guide: np.ndarray, swings: np.ndarray) -> np.ndarray:
+        """Weights (..., R) of the shapes, from the guide (..., G) and the swings (..., 3 P)."""
+        return np.concatenate([guide, swings], -1) @ self.answer
+
+    def placed(self, poses: np.ndarray, translation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rotations (..., J, 3, 3) against the parents, and places (..., J + 1, 4, 4) in the world,
         of the joints that are seen, from poses (..., 24, 3) and translation (..., 3).
         """
@@ -158,9 +197,7 @@ class Baked:
         points += mean
         blended = maps.swapaxes(-1, -2) @ self._skin[2]
         blended = blended.reshape(*lead, 3, 4, N)
-        np.einsum(
-            "...ijn,...jn->...in", blended[..., :3, :], points.reshape(*lead, 3, N), out=out
-        )
+        np.einsum("...ijn,...jn->...in", blended[..., :3, :], points.reshape(*lead, 3, N), out=out)
         out += blended[..., 3, :]
 
     @cached_property
@@ -211,9 +248,8 @@ class Stream:
 
     def __init__(self, baked: Baked, fps: float | None = None) -> None:
         self._baked, self._fps = baked, fps or baked.fps
-        self._turn, self._push = _oscillators(self._fps)
+        self._swings = baked.swings(self._fps)
         self._before: np.ndarray | None = None
-        self._state: np.ndarray | None = None
 
     def __call__(self, pose: np.ndarray, translation: np.ndarray) -> np.ndarray:
         """Vertices (N, 3) float32 [m] in the world, for the next ``pose`` (24, 3) [rad] and
@@ -222,12 +258,10 @@ class Stream:
         baked = self._baked
         rotations, placed = baked.placed(pose, translation)
         before = placed if self._before is None else self._before
-        inputs = _inputs(placed, before, self._fps)
-        state = inputs if self._state is None else self._state
-        self._before, self._state = placed, self._turn * state + self._push * inputs
-        weights = baked.weights(_joined(rotations, inputs, self._state))
+        self._before, maps = placed, baked.maps(placed)
+        guide = baked.guide(_features(rotations, placed, before, self._fps))
         out = np.empty((3, len(baked.mean)), np.float32)
-        baked._skinned(weights, baked.maps(placed), out)
+        baked._skinned(baked.weights(guide, self._swings(maps, guide)), maps, out)
         return out.T
 
 
@@ -245,35 +279,16 @@ def _rotations(vectors):
     return out
 
 
-def _inputs(placed, before, fps):
-    """What pushes the memory, (..., 9 + 3 (J - 1)), from the places now and in the frame before,
-    (..., J + 1, 4, 4): the root's velocity and turn, which way is up, the other joints' places.
+def _features(rotations, placed, before, fps):
+    """See :meth:`Baked.features`: (..., 6 (J - 1) + 6 + 3 J), from rotations (..., J, 3, 3) and
+    places now and in the frame before, (..., J + 1, 4, 4).
     """
-    root = placed[..., 0, :3, :3]
+    root, lead = placed[..., 0, :3, :3], placed.shape[:-3]
     moved = placed[..., :-1, :3, 3] - placed[..., :1, :3, 3]
     moved[..., 0, :] = fps * (placed[..., 0, :3, 3] - before[..., 0, :3, 3])
-    seen = moved @ root  # rows: R^T applied to each
     step = before[..., 0, :3, :3].swapaxes(-1, -2) @ root
-    step = step.reshape(*step.shape[:-2], 9)
+    step = step.reshape(*lead, 9)
     turn = (fps / 2) * (step[..., [7, 2, 3]] - step[..., [5, 6, 1]])
-    return np.concatenate([turn, root[..., 2, :], seen.reshape(*seen.shape[:-2], -1)], -1)
-
-
-def _oscillators(fps):
-    """By what an oscillator's state is multiplied in a frame, and by what its input is, each
-    (S, 1) complex64, so that a constant input is the state where it rests.
-    """
-    period, damping = np.array(SWINGS).T
-    pole = 2 * np.pi / period * (-damping + 1j * np.sqrt(1 - damping**2))
-    turn = np.exp(pole / fps).astype(np.complex64)[:, None]
-    return turn, 1 - turn
-
-
-def _joined(rotations, inputs, memory):
-    """The features (..., C): rotations (..., J, 3, 3) but the root's, inputs (..., U), memory
-    (..., S, U).
-    """
-    lead = inputs.shape[:-1]
-    memory = np.ascontiguousarray(memory).view(np.float32)
-    parts = rotations[..., 1:, :, :2].reshape(*lead, -1), inputs, memory.reshape(*lead, -1)
-    return np.concatenate(parts, -1)
+    columns = rotations[..., 1:, :, :2].reshape(*lead, -1)
+    seen = (moved @ root).reshape(*lead, -1)  # each by the root's rotation, transposed
+    return np.concatenate([columns, turn, root[..., 2, :], seen], -1)
