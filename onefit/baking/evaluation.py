@@ -100,10 +100,9 @@ class Baked:
         for t, (m, g) in enumerate(zip(maps, guide)):
             swings[t] = swung(m, g)
         weights = self.weights(guide, swings)
-        out = np.empty((len(poses), 3, len(self.mean)), np.float32)
+        out, skinned = np.empty((len(poses), 3, len(self.mean)), np.float32), self._skinning()
         for k in range(0, len(poses), _BATCH):
-            some = slice(k, k + _BATCH)
-            self._skinned(weights[some], maps[some], out[some])
+            skinned(weights[k : k + _BATCH], maps[k : k + _BATCH], out[k : k + _BATCH])
         return out.transpose(0, 2, 1)
 
     def stream(self, fps: float | None = None) -> Stream:
@@ -189,16 +188,24 @@ class Baked:
         maps = placed[..., at, :3, :] @ inverse
         return maps.reshape(*maps.shape[:-2], 12)
 
-    def _skinned(self, weights, maps, out):
-        """``out`` (..., 3, N) from weights (..., R) and maps (..., K, 12)."""
+    def _skinning(self):
+        """A function that fills ``out`` (n, 3, N), of at most _BATCH frames, from weights (n, R)
+        and maps (n, K, 12); it keeps its memory, for new memory costs more than the products.
+        """
         mean, shapes = self._flat
-        *lead, _, N = out.shape
-        points = weights @ shapes
-        points += mean
-        blended = maps.swapaxes(-1, -2) @ self._skin[2]
-        blended = blended.reshape(*lead, 3, 4, N)
-        np.einsum("...ijn,...jn->...in", blended[..., :3, :], points.reshape(*lead, 3, N), out=out)
-        out += blended[..., 3, :]
+        dense, count = self._skin[2], len(self.mean)
+        rest = np.ones((_BATCH, 4, count), np.float32)  # the fourth coordinate stays
+        shaped = rest.reshape(_BATCH, -1)[:, : 3 * count]
+        blended = np.empty((12, count), np.float32)
+
+        def skinned(weights, maps, out):
+            np.matmul(weights, shapes, out=shaped[: len(weights)])
+            for flat, points, m, x in zip(shaped, rest, maps, out):
+                flat += mean
+                np.matmul(m.T, dense, out=blended)
+                np.einsum("ijn,jn->in", blended.reshape(3, 4, count), points, out=x)
+
+        return skinned
 
     @cached_property
     def _flat(self):
@@ -248,7 +255,7 @@ class Stream:
 
     def __init__(self, baked: Baked, fps: float | None = None) -> None:
         self._baked, self._fps = baked, fps or baked.fps
-        self._swings = baked.swings(self._fps)
+        self._swings, self._skinned = baked.swings(self._fps), baked._skinning()
         self._before: np.ndarray | None = None
 
     def __call__(self, pose: np.ndarray, translation: np.ndarray) -> np.ndarray:
@@ -260,23 +267,31 @@ class Stream:
         before = placed if self._before is None else self._before
         self._before, maps = placed, baked.maps(placed)
         guide = baked.guide(_features(rotations, placed, before, self._fps))
-        out = np.empty((3, len(baked.mean)), np.float32)
-        baked._skinned(baked.weights(guide, self._swings(maps, guide)), maps, out)
-        return out.T
+        out = np.empty((1, 3, len(baked.mean)), np.float32)
+        weights = baked.weights(guide, self._swings(maps, guide))
+        self._skinned(weights[None], maps[None], out)
+        return out[0].T
+
+
+# Of a quaternion (w, x, y, z), the products of its parts two by two, row by row, to the matrix'
+# rows; and from a rotation's rows to twice its axis, by the sine of its angle
+_FROM_PRODUCTS, _AXIS = np.zeros((16, 9), np.float32), np.zeros((9, 3), np.float32)
+for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+    _FROM_PRODUCTS[[0, 5 * _i + 5, 5 * _j + 5, 5 * _k + 5], 4 * _i] = 1, 1, -1, -1
+    _FROM_PRODUCTS[4 * _i + _j + 5, [3 * _i + _j, 3 * _j + _i]] = 2
+    _FROM_PRODUCTS[_k + 1, [3 * _i + _j, 3 * _j + _i]] = -2, 2
+    _AXIS[[3 * _j + _i, 3 * _i + _j], _k] = 1, -1
 
 
 def _rotations(vectors):
     """Matrices (..., 3, 3) of axis-angle vectors (..., 3) [rad]."""
-    square = np.einsum("...i,...i->...", vectors, vectors) + np.float32(1e-12)
-    angle = np.sqrt(square)
-    sine, versine = np.sin(angle) / angle, (1 - np.cos(angle)) / square
-    out = versine[..., None, None] * vectors[..., :, None] * vectors[..., None, :]
-    flat = out.reshape(*out.shape[:-2], 9)
-    flat[..., ::4] += np.cos(angle)[..., None]
-    turned = sine[..., None] * vectors
-    flat[..., [7, 2, 3]] += turned
-    flat[..., [5, 6, 1]] -= turned
-    return out
+    angle = np.sqrt(np.einsum("...i,...i->...", vectors, vectors) + np.float32(1e-12))
+    half = np.float32(0.5) * angle
+    quaternions = np.empty((*angle.shape, 4), np.float32)
+    quaternions[..., 0] = np.cos(half)
+    np.multiply(vectors, (np.sin(half) / angle)[..., None], out=quaternions[..., 1:])
+    products = quaternions[..., :, None] * quaternions[..., None, :]
+    return (products.reshape(*angle.shape, 16) @ _FROM_PRODUCTS).reshape(*angle.shape, 3, 3)
 
 
 def _features(rotations, placed, before, fps):
@@ -287,8 +302,7 @@ def _features(rotations, placed, before, fps):
     moved = placed[..., :-1, :3, 3] - placed[..., :1, :3, 3]
     moved[..., 0, :] = fps * (placed[..., 0, :3, 3] - before[..., 0, :3, 3])
     step = before[..., 0, :3, :3].swapaxes(-1, -2) @ root
-    step = step.reshape(*lead, 9)
-    turn = (fps / 2) * (step[..., [7, 2, 3]] - step[..., [5, 6, 1]])
+    turn = step.reshape(*lead, 9) @ (np.float32(fps / 2) * _AXIS)
     columns = rotations[..., 1:, :, :2].reshape(*lead, -1)
     seen = (moved @ root).reshape(*lead, -1)  # each by the root's rotation, transposed
     return np.concatenate([columns, turn, root[..., 2, :], seen], -1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ import torch
 
 from onefit.body import ClosestSurface, skeleton, skinning
 from onefit.draping import Draper
-from onefit.draping.post import DRAG, pull
+from onefit.draping.post import DRAG, PULL, pull
 from onefit.garment import Garment
 from onefit.motion import Motion, generate
 
@@ -34,16 +35,16 @@ class Sampling:
     ``skin``: what a vertex deeper than that costs, against one as far from the teacher.
     """
 
-    seconds: float = 3.0
+    seconds: float = 2.5
     taught: int = 3
-    guided: int = 12
-    shapes: int = 32
+    guided: int = 16
+    shapes: int = 24
     guide: int = 24
     points: int = 48
     width: int = 128
     steps: int = 6000
-    clearance: float = 0.004
-    skin: float = 20.0
+    clearance: float = 0.005
+    skin: float = 200.0
 
 
 def bake(
@@ -72,20 +73,20 @@ def bake(
     goals = [(x - mean).flatten(1) @ basis for x in guides]
     hung = _spread(baked.mean, s.points)
     shaped = basis.T.reshape(s.guide, -1, 3)
-    drawn = pull(garment.vertices.numpy(), draper.standard, draper._held(garment))
     baked = replace(
         baked,
         hung=hung,
         points=baked.mean[hung] + mean.numpy()[hung],
         point_shapes=shaped[:, hung].numpy(),
-        pull=drawn[hung],
+        pull=samples.pull[hung],
     )
-    motions = list(samples.motions)
+    features = [baked.features(*_arrays(m))[0] for m in samples.motions]
     for motion, guide in samples.guided(baked):
-        motions.append(motion)
+        features.append(baked.features(*_arrays(motion))[0])
         goals.append((guide - mean).flatten(1) @ basis)
-    features = [baked.features(*_arrays(m))[0] for m in motions]
-    baked = _network(baked, np.concatenate(features), torch.cat(goals), s, advance)
+    new = len(generate.TRAINING)  # motions at the end, of which the network does not learn
+    baked = _network(baked, np.concatenate(features[:-new]), torch.cat(goals[:-new]), s, advance)
+    wrong = baked.guide(np.concatenate(features[-new:])) - torch.cat(goals[-new:]).numpy()
 
     offset, basis = _principal(teacher, s.shapes)
     weights = (teacher - offset).flatten(1) @ basis
@@ -97,7 +98,8 @@ def bake(
     answer = torch.linalg.solve(square, (known - centre).T @ (weights / unit))
     shapes = (basis * unit).T.reshape(s.shapes, -1, 3)
     offset = offset - ((centre @ answer) @ shapes.flatten(1)).reshape(-1, 3)
-    return _clear(baked, samples, known, teacher, offset, shapes, answer, s, advance)
+    wrong = torch.nn.functional.pad(torch.from_numpy(wrong), (0, known.shape[1] - s.guide))
+    return _clear(baked, samples, known, wrong, teacher, offset, shapes, answer, s, advance)
 
 
 class _Samples:
@@ -111,6 +113,8 @@ class _Samples:
         self._s, self._advance = s, advance
         self.body = draper.model.body(shape)
         self.rest = garment.graded(self.body)
+        held = draper._held(garment)
+        self.pull = pull(garment.vertices.numpy(), draper.standard, held)
         self.motions, self.drapes, self.alone, normals, heights = [], [], [], [], []
         kinds = [(k, n) for n in range(s.taught) for k in generate.TRAINING]
         surface = None
@@ -128,9 +132,7 @@ class _Samples:
             self.alone.append(alone)
             advance("draping", (k + 1) / len(kinds))
         lengths = np.cumsum([0] + [len(m) for m in self.motions])
-        self.frames = np.concatenate(
-            [np.arange(a, b, _PLANE_STEP) for a, b in zip(lengths, lengths[1:])]
-        )
+        self.frames = np.concatenate([np.arange(a, b, _PLANE_STEP) for a, b in pairwise(lengths)])
         self.planes = torch.stack(normals), torch.stack(heights)
 
     def _alone(self, kind, seed):
@@ -154,7 +156,7 @@ class _Samples:
             poses.append(drape[::24])
         weights, mean = _fitted(
             torch.cat(poses), torch.cat(maps)[:, used], self.rest,
-            self._garment.blend_weights[:, used],
+            self._garment.blend_weights[:, used], torch.from_numpy(self.pull),
         )  # fmt: skip
         largest = weights.topk(min(4, len(used)), 1)
         pad = lambda x: torch.nn.functional.pad(x, (0, 4 - x.shape[1]))
@@ -220,20 +222,21 @@ def _known(baked, motion):
     return np.concatenate([guide, np.stack(swings)], 1)
 
 
-def _fitted(vertices, maps, rest, weights, rounds=3, steps=150):
+def _fitted(vertices, maps, rest, weights, pull, rounds=3, steps=150):
     """Skinning weights (N, J), four a vertex at most, and places at rest (N, 3) [m], that bring
     joints with maps (T, J, 3, 4) nearest to vertices (T, N, 3) [m], from ``rest`` and ``weights``:
     by turns least squares for the places, and projected gradients (accelerated as Nesterov does)
-    for the weights.
+    for the weights, which stay the nearer to the first the more skin holds them: ``pull`` (N,).
     """
-    first, spring = weights, 4e-4  # [m^2]: towards the first weights
+    first, spring = weights, (4e-4 / PULL * pull.clamp(max=1e5))[:, None]  # [m^2]
     for k in range(rounds):
         moved = torch.einsum("tjab,nb->njta", maps[..., :3], rest) + maps[:, :, :, 3].transpose(
             0, 1
         )
         moved = moved.flatten(2)
         goal = vertices.transpose(0, 1).flatten(1)
-        square = moved @ moved.mT / len(maps) + spring * torch.eye(maps.shape[1])
+        square = moved @ moved.mT / len(maps)
+        square += spring[..., None] * torch.eye(maps.shape[1])
         right = (moved @ goal[..., None])[..., 0] / len(maps) + spring * first
         step = 1 / torch.linalg.matrix_norm(square, 2)[:, None]
         ahead, pace = weights, 1.0
@@ -276,7 +279,7 @@ def _unposed(vertices, maps, mean):
 
 
 def _principal(x, count):
-    """The mean (N, 3) and the first ``count`` principal components, (3 N, count), of x (T, N, 3)."""
+    """The mean (N, 3) and the first principal components (3 N, count) of x (T, N, 3)."""
     mean = x.mean(0)
     step = max(1, len(x) // 1500)
     return mean, torch.svd_lowrank((x[::step] - mean).flatten(1), count + 12, niter=2)[2][:, :count]
@@ -297,7 +300,7 @@ def _network(baked, features, goals, s, advance):
     mean, scale, unit = x.mean(0), x.std(0).clamp(min=1e-2), goals.std()
     x, goals = (x - mean) / scale, goals / unit
     sizes = [x.shape[1], s.width, s.width, goals.shape[1]]
-    linear = [torch.nn.Linear(a, b) for a, b in zip(sizes, sizes[1:])]
+    linear = [torch.nn.Linear(a, b) for a, b in pairwise(sizes)]
     relu = torch.nn.ReLU()
     network = torch.nn.Sequential(linear[0], relu, linear[1], relu, linear[2])
     optimiser = torch.optim.AdamW(network.parameters(), weight_decay=0.01)
@@ -320,10 +323,11 @@ def _network(baked, features, goals, s, advance):
     return replace(baked, layers=as_arrays(layers), biases=as_arrays(biases))
 
 
-def _clear(baked, samples, known, teacher, offset, shapes, answer, s, advance):
+def _clear(baked, samples, known, wrong, teacher, offset, shapes, answer, s, advance):
     """``baked`` with the ``offset`` (N, 3) of its mean, ``shapes`` (R, N, 3) and ``answer``, after
-    they learned together to be near to the ``teacher`` (T, N, 3) and outside of the body, from what
-    is ``known`` (T, G + 3 P).
+    they learned together to be near to the ``teacher`` (T, N, 3), from what is ``known`` (T, G + 3
+    P), and outside of the body also where that is ``wrong`` by (W, G + 3 P), as in motions that the
+    network does not know.
     """
     mean = torch.from_numpy(baked.mean)
     blended = torch.cat([samples.blended(baked, m)[::_PLANE_STEP] for m in samples.motions])
@@ -345,7 +349,9 @@ def _clear(baked, samples, known, teacher, offset, shapes, answer, s, advance):
     for k in range(steps):
         some = torch.randint(len(frames), (24,))
         d = (known[some] @ learned[2] @ learned[1]).unflatten(1, (-1, 3)) + learned[0]
-        deep = (s.clearance - (a[some] * d).sum(-1) - b[some]).clamp(min=0)
+        errors = 1.5 * wrong[torch.randint(len(wrong), (len(some),))]
+        off = d + (errors @ learned[2] @ learned[1]).unflatten(1, (-1, 3))
+        deep = (s.clearance - (a[some] * off).sum(-1) - b[some]).clamp(min=0)
         loss = (d - goals[some]).square().sum(-1).mean() + s.skin * deep.square().mean()
         optimiser.zero_grad()
         (1e4 * loss).backward()
