@@ -93,17 +93,23 @@ class Baked:
         """Vertices (T, N, 3) float32 [m] in the world of a motion: ``poses`` (T, 24, 3) [rad] and
         ``translation`` (T, 3) [m] as :class:`onefit.Motion` has them, ``fps`` a second.
         """
-        poses, translation = (np.asarray(x, np.float32) for x in (poses, translation))
-        features, placed = self.features(poses, translation, fps)
-        maps, guide = self.maps(placed), self.guide(features)
-        swung, swings = self.swings(fps), np.empty((len(poses), 3 * len(self.hung)), np.float32)
-        for t, (m, g) in enumerate(zip(maps, guide)):
-            swings[t] = swung(m, g)
-        weights = self.weights(guide, swings)
-        out, skinned = np.empty((len(poses), 3, len(self.mean)), np.float32), self._skinning()
-        for k in range(0, len(poses), _BATCH):
+        weights, maps = self._played(poses, translation, fps)
+        out, skinned = np.empty((len(maps), 3, len(self.mean)), np.float32), self._skinning()
+        for k in range(0, len(maps), _BATCH):
             skinned(weights[k : k + _BATCH], maps[k : k + _BATCH], out[k : k + _BATCH])
         return out.transpose(0, 2, 1)
+
+    def weights(self, poses: Any, translation: Any, fps: float | None = None) -> np.ndarray:
+        """Weights (T, R) of the shapes in a motion; arguments as in :meth:`vertices`."""
+        return self._played(poses, translation, fps)[0]
+
+    def _played(self, poses, translation, fps):
+        """Weights (T, R) and maps (T, K, 12) of a motion."""
+        poses, translation = (np.asarray(x, np.float32) for x in (poses, translation))
+        features, placed = self.features(poses, translation, fps)
+        maps, guide, swung = self.maps(placed), self.guide(features), self.swings(fps)
+        swings = [swung(m, g) for m, g in zip(maps, guide)]
+        return self.answered(guide, np.stack(swings)), maps
 
     def stream(self, fps: float | None = None) -> Stream:
         """A :class:`Stream`, which takes poses one at a time, ``fps`` of them a second."""
@@ -162,7 +168,7 @@ class Baked:
 
         return swung
 
-    def weights(self, guide: np.ndarray, swings: np.ndarray) -> np.ndarray:
+    def answered(self, guide: np.ndarray, swings: np.ndarray) -> np.ndarray:
         """Weights (..., R) of the shapes, from the guide (..., G) and the swings (..., 3 P)."""
         return np.concatenate([guide, swings], -1) @ self.answer
 
@@ -214,32 +220,44 @@ class Baked:
         return flat(self.mean), flat(self.shapes)
 
     @cached_property
+    def steps(self) -> np.ndarray:
+        """Each joint's place (24, 3) [m] from its parent, in the parent's axes; of the root, from
+        the world's origin.
+        """
+        root = self.parents[:, None] < 0
+        step = self.joints - np.where(root, 0, self.joints[self.parents])
+        turn = np.where(root[..., None], np.eye(3), self.rest_rotations[self.parents])
+        return np.einsum("jki,jk->ji", turn, step).astype(np.float32)
+
+    @cached_property
+    def inverse(self) -> np.ndarray:
+        """Maps (24, 4, 4) from the rest space to each joint's own axes there."""
+        rest = np.tile(np.eye(4), (len(self.joints), 1, 1))
+        rest[:, :3, :3], rest[:, :3, 3] = self.rest_rotations, self.joints
+        return np.linalg.inv(rest).astype(np.float32)
+
+    @cached_property
     def _skin(self):
-        """Joints (K,) that skin, as places in ``seen``; their inverse rest places (K, 4, 4); the
-        weights (K, N).
+        """Joints (K,) that skin, as places in ``seen``; their maps from the rest space (K, 4, 4);
+        the weights (K, N).
         """
         used = np.unique(self.joint_of[self.joint_weights > 0])
-        at = np.searchsorted(self.seen, used)
-        rest = np.tile(np.eye(4), (len(used), 1, 1))
-        rest[:, :3, :3], rest[:, :3, 3] = self.rest_rotations[used], self.joints[used]
         dense = np.zeros((len(self.mean), len(self.parents)), np.float32)
-        np.put_along_axis(dense, self.joint_of, self.joint_weights, 1)
-        return at, np.linalg.inv(rest).astype(np.float32), np.ascontiguousarray(dense[:, used].T)
+        rows = np.arange(len(dense))[:, None]
+        np.add.at(dense, (rows, self.joint_of), self.joint_weights)
+        at = np.searchsorted(self.seen, used)
+        return at, self.inverse[used], np.ascontiguousarray(dense[:, used].T)
 
     @cached_property
     def _chain(self):
-        """Places (J + 1, 4, 4) of the joints at rest against their parents, without rotation, the
-        world's last; and, as often as is needed for the longest chain, which place stands above
-        each: first the parent, then the parent's parent, then that one's.
+        """Places (J + 1, 4, 4) of the joints against their parents, without rotation, the world's
+        last; and, as often as is needed for the longest chain, which place stands above each: first
+        the parent, then the parent's parent, then that one's.
         """
-        parent = self.parents[self.seen]
-        offsets = np.tile(np.eye(4, dtype=np.float32), (len(self.seen) + 1, 1, 1))
-        root = parent < 0
-        step = self.joints[self.seen] - np.where(root[:, None], 0, self.joints[parent])
-        back = np.where(root[:, None, None], np.eye(3), self.rest_rotations[parent])
-        offsets[:-1, :3, 3] = np.einsum("jki,jk->ji", back, step)
-        last = len(self.seen)
-        up = np.append(np.where(root, last, np.searchsorted(self.seen, parent)), last)
+        last, parent = len(self.seen), self.parents[self.seen]
+        offsets = np.tile(np.eye(4, dtype=np.float32), (last + 1, 1, 1))
+        offsets[:-1, :3, 3] = self.steps[self.seen]
+        up = np.append(np.where(parent < 0, last, np.searchsorted(self.seen, parent)), last)
         above = []
         while (up != last).any():
             above.append(up)
@@ -268,7 +286,7 @@ class Stream:
         self._before, maps = placed, baked.maps(placed)
         guide = baked.guide(_features(rotations, placed, before, self._fps))
         out = np.empty((1, 3, len(baked.mean)), np.float32)
-        weights = baked.weights(guide, self._swings(maps, guide))
+        weights = baked.answered(guide, self._swings(maps, guide))
         self._skinned(weights[None], maps[None], out)
         return out[0].T
 
