@@ -1,8 +1,8 @@
 """Baked drapes beside the network's: size, time on one core, folds, cloth inside of the body, and
 how far they are apart, in held-out motions.
 
-    OMP_NUM_THREADS=1 python benchmarks/onefit_bake.py           # bakes, and writes docs/onefit_baked.json
-    python benchmarks/onefit_bake.py --baked FOLDER              # of GARMENT/baked.npz that onefit.bake wrote
+    OMP_NUM_THREADS=1 python benchmarks/onefit_bake.py    # bakes, and writes docs/onefit_baked.json
+    python benchmarks/onefit_bake.py --baked FOLDER       # of FOLDER/GARMENT/baked.npz
 
 Motions are of the kinds that no baking and no network has seen, with seeds that neither has.
 *wave* [degrees] and *swing* [mm] as :mod:`onefit.objective.folds` has them, of the network (with
@@ -98,19 +98,16 @@ def main(argv=None):
         " swing mm | inside % | error mm |\n" + "|---" * 10 + "|"
     )
     for name in args.garments:
-        garment, start = draper.garment(name), time.perf_counter()
-        if args.baked:
-            baked = Baked.load(args.baked / name / "baked.npz")
-        else:
-            baked = bake(draper, garment)
-        spent = None if args.baked else time.perf_counter() - start
+        garment = draper.garment(name)
+        path = args.baked and args.baked / name / "baked.npz"
+        baked = Baked.load(path) if path else bake(draper, garment)
         motions = [
             beside(draper, garment, baked, kind, SEED + k, args.seconds)
             for k, kind in enumerate(generate.HELD_OUT)
         ]
         mean = {k: float(np.mean([m[k] for m in motions])) for k in motions[0] if k != "kind"}
         took = times(baked, onefit.Motion.generate("dance", seconds=3, seed=SEED))
-        row = dict(garment=garment.name, **size(baked), baking_s=spent, **took, **mean)
+        row = dict(garment=garment.name, **size(baked), **took, **mean)
         rows.append(row | dict(motions=motions))
         print(
             f"| {row['garment']} | {row['vertices']} | {row['bytes'] / 1e6:.1f} |"

@@ -6,8 +6,8 @@ browsers evaluate in microseconds.
 
 It drapes the garment in some minutes of generated motion, and takes minutes itself. OUT receives
 
-    baked.npz       all of it as arrays: onefit.baking.Baked.load(...) evaluates them by NumPy alone
-    NAME.glb        of each motion: skinned meshes and morph targets, for any program that plays glTF
+    baked.npz       all of it as arrays, which onefit.baking.Baked evaluates by NumPy alone
+    NAME.glb        of each motion: skinned meshes with morph targets, which any viewer plays
     baked.html      a page that computes the cloth in the browser, from the poses of all motions
 """
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -10,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from onefit.body import ClosestSurface, skeleton, skinning
 from onefit.draping import Draper
@@ -21,6 +23,7 @@ from .evaluation import Baked
 
 _FPS = 30.0
 _RIDGE = 1e-3  # of the answer, as a share of the mean square of what it is found from
+_BLUR = 0.3  # of features, in units of their spread
 _PLANE_STEP = 6  # every so many frames' skin is held against the cloth
 _REACH = 0.04  # [m] from the skin, within which cloth is
 
@@ -29,7 +32,8 @@ _REACH = 0.04  # [m] from the skin, within which cloth is
 class Sampling:
     """How a drape is baked. ``seconds`` of each motion; ``taught``: seeds of each kind of motion in
     training whose drapes are the teacher's, with post-processing; ``guided``: seeds, these among
-    them, of which the network alone says the guide. ``shapes``: corrective shapes; ``guide``: its
+    them, of which the network alone says the guide; the motions of every second of the others are
+    mixed (:func:`mixed`). ``shapes``: corrective shapes; ``guide``: its
     numbers; ``points``: pendulums; ``width``: of the network; ``steps``: of its training, and a
     sixth as many of all together. ``clearance`` [m]: how far cloth shall be from the skin, and
     ``skin``: what a vertex deeper than that costs, against one as far from the teacher.
@@ -38,13 +42,13 @@ class Sampling:
     seconds: float = 2.5
     taught: int = 3
     guided: int = 16
-    shapes: int = 24
+    shapes: int = 32
     guide: int = 24
     points: int = 48
     width: int = 128
-    steps: int = 6000
+    steps: int = 5000
     clearance: float = 0.005
-    skin: float = 200.0
+    skin: float = 60.0
 
 
 def bake(
@@ -135,8 +139,9 @@ class _Samples:
         self.frames = np.concatenate([np.arange(a, b, _PLANE_STEP) for a, b in pairwise(lengths)])
         self.planes = torch.stack(normals), torch.stack(heights)
 
-    def _alone(self, kind, seed):
-        motion = Motion.generate(kind, seconds=self._s.seconds, seed=seed, fps=_FPS)
+    def _alone(self, kind, seed, mix=False):
+        make = mixed if mix else Motion.generate
+        motion = make(kind, seconds=self._s.seconds, seed=seed, fps=_FPS)
         drape = self._draper.drape(self._garment, motion, self._shape, post=False)
         return motion, drape.vertices
 
@@ -205,9 +210,29 @@ class _Samples:
         s = self._s
         kinds = [(k, n) for n in range(s.taught, s.guided) for k in generate.TRAINING]
         for k, (kind, seed) in enumerate(kinds):
-            motion, alone = self._alone(kind, seed)
+            motion, alone = self._alone(kind, seed, mix=seed % 2 == 1)
             yield motion, _unposed(alone, self.blended(baked, motion), baked.mean)
             self._advance("guides", (k + 1) / len(kinds))
+
+
+def mixed(kind: str, seconds: float, seed: int, fps: float) -> Motion:
+    """A :class:`onefit.Motion` with root and legs of a generated motion of ``kind`` and the rest of
+    one of another kind in training; rotations made larger or smaller, joints and root tilted a
+    little. No one moves so, but it shows what each joint does by itself.
+    """
+    rng = np.random.default_rng([zlib.crc32(kind.encode()), seed])
+    one = Motion.generate(kind, seconds, seed, fps)
+    two = Motion.generate(str(rng.choice(generate.TRAINING)), seconds, seed, fps)
+    legs = ("pelvis", "hip", "knee", "ankle", "foot")
+    upper = [j for j, name in enumerate(skeleton.JOINTS) if not name.endswith(legs)]
+    poses = one.poses.clone()
+    poses[:, upper] = two.poses[:, upper]
+    factor, tilt = rng.uniform(0.7, 1.3, (24, 1)), rng.normal(0, 0.12, (24, 3))
+    poses[:, 1:] = (poses * torch.tensor(factor) + torch.tensor(tilt)).float()[:, 1:]
+    leaning = Rotation.from_rotvec([*rng.normal(0, 0.2, 2), 0.0])
+    root = Rotation.from_rotvec(poses[:, 0].numpy()) * leaning
+    poses[:, 0] = torch.tensor(root.as_rotvec()).float()
+    return replace(one, poses=poses)
 
 
 def _arrays(motion):
@@ -295,7 +320,9 @@ def _spread(points, count):
 
 
 def _network(baked, features, goals, s, advance):
-    """``baked`` with the network that finds ``goals`` (T, G) from ``features`` (T, C)."""
+    """``baked`` with the network that finds ``goals`` (T, G) from ``features`` (T, C), which are
+    blurred, for the network shall not know single motions by heart.
+    """
     x = torch.from_numpy(features)
     mean, scale, unit = x.mean(0), x.std(0).clamp(min=1e-2), goals.std()
     x, goals = (x - mean) / scale, goals / unit
@@ -303,11 +330,12 @@ def _network(baked, features, goals, s, advance):
     linear = [torch.nn.Linear(a, b) for a, b in pairwise(sizes)]
     relu = torch.nn.ReLU()
     network = torch.nn.Sequential(linear[0], relu, linear[1], relu, linear[2])
-    optimiser = torch.optim.AdamW(network.parameters(), weight_decay=0.01)
+    optimiser = torch.optim.AdamW(network.parameters(), weight_decay=0.3)
     rate = torch.optim.lr_scheduler.OneCycleLR(optimiser, 3e-3, total_steps=s.steps)
     for k in range(s.steps):
         some = torch.randint(len(x), (512,))
-        loss = (network(x[some]) - goals[some]).square().mean()
+        blurred = x[some] + _BLUR * torch.randn(len(some), x.shape[1])
+        loss = (network(blurred) - goals[some]).square().mean()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
