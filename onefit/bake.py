@@ -51,8 +51,8 @@ def main(argv=None):
     args = _parser().parse_args(argv)
     require("torch", "anny", "pygltflib")
 
-    from onefit.baking import bake, files
-    from onefit.draping import inputs, load
+    from onefit.baking import bake, write_glb, write_page
+    from onefit.draping import body_model, load, motion_of, shape_of
     from onefit.garment import Garment
 
     folder = Path(args.output)
@@ -61,11 +61,9 @@ def main(argv=None):
             raise InputError(f"{folder}: not empty; give another -o, or --overwrite")
         if not (folder / "baked.npz").exists():
             raise InputError(f"{folder}: holds no baked drape; --overwrite replaces nothing else")
-    model = inputs.body_model("anny")
-    shape = inputs.shape_of(model, args.shape) if args.shape else None
-    motions = [
-        inputs.motion_of(name, seconds=args.seconds, seed=args.seed) for name in args.motions
-    ]
+    model = body_model("anny")
+    shape = shape_of(model, args.shape) if args.shape else None
+    motions = [motion_of(name, seconds=args.seconds, seed=args.seed) for name in args.motions]
     garment = Garment.named(args.garment, count=args.vertices)
     with _progress() as advance:
         draper = load(args.weights, model=model)
@@ -75,8 +73,8 @@ def main(argv=None):
     with folder_aside(folder, lambda name: True) as temporary:
         baked.save(Path(temporary) / "baked.npz")
         for motion in motions:
-            files.write_glb(Path(temporary) / f"{motion.name}.glb", baked, body, motion)
-        files.write_page(Path(temporary) / "baked.html", baked, body, motions)
+            write_glb(Path(temporary) / f"{motion.name}.glb", baked, body, motion)
+        write_page(Path(temporary) / "baked.html", baked, body, motions)
     print(folder)
     print(f"next: open {folder / 'baked.html'} in a browser")
 

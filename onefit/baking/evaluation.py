@@ -111,6 +111,12 @@ class Baked:
         swings = [swung(m, g) for m, g in zip(maps, guide)]
         return self.answered(guide, np.stack(swings)), maps
 
+    def size(self) -> int:
+        """Bytes of all its arrays."""
+        arrays = [getattr(self, f.name) for f in fields(self)]
+        arrays = [*arrays, *self.layers, *self.biases]
+        return sum(x.nbytes for x in arrays if isinstance(x, np.ndarray))
+
     def stream(self, fps: float | None = None) -> Stream:
         """A :class:`Stream`, which takes poses one at a time, ``fps`` of them a second."""
         return Stream(self, fps)

@@ -7,15 +7,13 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
 from onefit.body import ClosestSurface, skeleton, skinning
-from onefit.draping import Draper
-from onefit.draping.post import DRAG, PULL, pull
+from onefit.draping import DRAG, PULL, Draper
 from onefit.garment import Garment
 from onefit.motion import Motion, generate
 
@@ -117,8 +115,7 @@ class _Samples:
         self._s, self._advance = s, advance
         self.body = draper.model.body(shape)
         self.rest = garment.graded(self.body)
-        held = draper._held(garment)
-        self.pull = pull(garment.vertices.numpy(), draper.standard, held)
+        self.pull = draper.pull(garment)
         self.motions, self.drapes, self.alone, normals, heights = [], [], [], [], []
         kinds = [(k, n) for n in range(s.taught) for k in generate.TRAINING]
         surface = None
@@ -392,16 +389,4 @@ def _clear(baked, samples, known, wrong, teacher, offset, shapes, answer, s, adv
         mean=(mean + offset).numpy(),
         shapes=shapes.unflatten(1, (-1, 3)).numpy(),
         answer=answer.numpy(),
-    )
-
-
-def size(baked: Baked) -> dict[str, Any]:
-    """What it holds: bytes of all its arrays, and how many vertices, shapes and pendulums."""
-    arrays = [x for x in vars(baked).values() if isinstance(x, np.ndarray)]
-    arrays += [*baked.layers, *baked.biases]
-    return dict(
-        bytes=sum(x.nbytes for x in arrays),
-        vertices=len(baked.mean),
-        shapes=len(baked.shapes),
-        pendulums=len(baked.hung),
     )

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import onefit
 from onefit import bake as command
-from onefit.baking import Baked, Sampling, bake, files
+from onefit.baking import Baked, Sampling, bake, write_glb, write_page
 from onefit.body import ClosestSurface, skinning
 from polyfit.errors import InputError
 
@@ -124,7 +124,7 @@ def values(document, index):
 def test_gltf_plays_the_same_frames(baked, draper, motion, tmp_path):
     import pygltflib
 
-    files.write_glb(tmp_path / "walk.glb", baked, draper.model.body(), motion)
+    write_glb(tmp_path / "walk.glb", baked, draper.model.body(), motion)
     document = pygltflib.GLTF2().load(str(tmp_path / "walk.glb"))
     (skin,), (animation,) = document.skins, document.animations
     paths = {}
@@ -162,7 +162,7 @@ def test_gltf_plays_the_same_frames(baked, draper, motion, tmp_path):
 
 
 def test_a_page_needs_nothing_else_and_names_its_motions(baked, draper, motion, tmp_path):
-    files.write_page(tmp_path / "baked.html", baked, draper.model.body(), [motion])
+    write_page(tmp_path / "baked.html", baked, draper.model.body(), [motion])
     text = (tmp_path / "baked.html").read_text(encoding="utf-8")
     assert not re.search(r"""(src|href)\s*=\s*["']?(https?:)?//|@import|url\(|{{""", text)
     assert f'"name": "{motion.name}"' in text
@@ -170,7 +170,7 @@ def test_a_page_needs_nothing_else_and_names_its_motions(baked, draper, motion, 
 
 @needs_browser
 def test_a_browser_computes_the_same_vertices(baked, draper, motion, tmp_path):
-    files.write_page(tmp_path / "baked.html", baked, draper.model.body(), [motion])
+    write_page(tmp_path / "baked.html", baked, draper.model.body(), [motion])
     flags = (
         "--headless --no-sandbox --disable-gpu --use-angle=swiftshader --enable-unsafe-swiftshader"
         " --disable-quic --disable-dev-shm-usage --disable-background-networking --no-first-run"
