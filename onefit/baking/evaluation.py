@@ -13,7 +13,7 @@ import numpy as np
 from polyfit.errors import InputError
 from polyfit.files import aside
 
-_BATCH = 8  # frames at once: what they need stays in a core's cache
+_BATCH = 4  # frames at once: what they need stays in a core's cache
 _LAYERS = 3  # of the network
 
 
