@@ -35,10 +35,11 @@ FRAMES = 90
 
 def times(baked, motion):
     """Milliseconds of the processor's time a frame: the median and the 5th percentile, alone and
-    in a batch.
+    in a batch; and of the bare product of weights and shapes, which tells how fast the machine is.
     """
     poses, translation = (x.numpy()[:FRAMES] for x in (motion.poses, motion.translation))
-    alone, batch = [], []
+    alone, batch, product = [], [], []
+    shapes = np.ascontiguousarray(baked.shapes.reshape(len(baked.shapes), -1))
     with threadpool_limits(1):
         for _ in range(20):
             stream = baked.stream()
@@ -49,11 +50,16 @@ def times(baked, motion):
             start = time.thread_time()
             baked.vertices(poses, translation)
             batch.append((time.thread_time() - start) / len(poses))
+            start = time.thread_time()
+            for _ in poses:
+                np.dot(shapes[:, 0], shapes)
+            product.append((time.thread_time() - start) / len(poses))
     return dict(
         ms_alone=1e3 * float(np.median(alone)),
         ms_alone_least=1e3 * float(np.percentile(alone, 5)),
         ms_batch=1e3 * float(np.median(batch)),
         ms_batch_least=1e3 * float(np.percentile(batch, 5)),
+        ms_product=1e3 * float(np.median(product)),
     )
 
 
