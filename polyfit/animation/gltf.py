@@ -1,4 +1,4 @@
-"""A moving mesh as binary glTF 2.0: as it is in each frame, or skinned by the joints of a skeleton."""
+"""A moving mesh as binary glTF 2.0: as it is in each frame, or skinned by a skeleton's joints."""
 
 import os
 from dataclasses import dataclass, field
@@ -170,9 +170,9 @@ def write_glb(path, vertices, faces, uv=None, texture=None, *, fps=24.0, name="s
 @dataclass(frozen=True)
 class Skeleton:
     """Joints that move: their ``names`` (J,), ``parents`` (J,), each before its children, -1 of the
-    root; ``offsets`` (J, 3) [m] from the parent in its axes; ``inverse`` (J, 4, 4), from the meshes'
-    rest space to each joint's; ``rotations`` (T, J, 3) [rad], axis-angle vectors against the
-    parent; ``translation`` (T, 3) [m], added to the root's offset.
+    root; ``offsets`` (J, 3) [m] from the parent in its axes; ``inverse`` (J, 4, 4), from the rest
+    space of the meshes to each joint's; ``rotations`` (T, J, 3) [rad], axis-angle vectors against
+    the parent; ``translation`` (T, 3) [m], added to the root's offset.
     """
 
     names: Any
