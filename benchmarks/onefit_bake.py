@@ -95,7 +95,7 @@ def beside(draper, garment, baked, kind, seed, seconds):
 
 def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--garments", nargs="+", default=["tshirt", "skirt", "dress"])
+    parser.add_argument("--garments", nargs="+", default=["tshirt", "skirt"])
     parser.add_argument("--baked", type=Path, help="folder of GARMENT/baked.npz (default: bakes)")
     parser.add_argument("--seconds", type=float, default=3.0, help="of a motion (default: 3)")
     parser.add_argument("-o", "--output", type=Path, default=OUT, help=f"(default: {OUT.name})")
