@@ -4,6 +4,7 @@ an animation and a rendering of it.
     python -m onefit.drape dress walk -o OUT                   # a template, a generated motion
     python -m onefit.drape shirt.obj motion.npz -o OUT         # a mesh, a motion (AMASS, NCS, BVH)
     python -m onefit.drape tshirt dance -o OUT --shape weight=0.7 height=0.6 --skip render
+    python -m onefit.drape trousers tshirt walk -o OUT         # one over the other, in this order
 
 For folds like a simulation's, and a material: python -m onefit.simulate, which takes the same
 arguments. OUT receives
@@ -16,6 +17,9 @@ arguments. OUT receives
                             vertices, faces and texture coordinates
     frames/NNN.png          rendered by Mitsuba; drape.mp4 is their video
     meshes/NNN.obj          one mesh a frame, with --meshes obj (or ply)
+
+Of several garments each has these in a folder of its own, 1_trousers, 2_tshirt, ...; figures.json,
+frames and the video are of all.
 """
 
 import argparse

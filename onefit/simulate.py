@@ -3,6 +3,7 @@ drape, in tens of milliseconds a frame; writes the arrays, an animation and a re
 
     python -m onefit.simulate dress walk -o OUT
     python -m onefit.simulate shirt.obj motion.npz -o OUT --material denim
+    python -m onefit.simulate trousers tshirt walk -o OUT      # one over the other, in this order
 
 Where milliseconds count: python -m onefit.drape, which takes the same arguments and writes the
 same files into OUT (its --help lists them).

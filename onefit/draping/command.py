@@ -18,9 +18,11 @@ def parser(name: str, text: str) -> Parser:
     )
     p.add_argument(
         "garment",
+        nargs="+",
         metavar="GARMENT",
         help="a template's name, a mesh (.obj, .ply, .glb) around the standard body, or a sewing"
-        " pattern (GarmentCode's *_specification.json)",
+        " pattern (GarmentCode's *_specification.json); several are worn one over the other, in"
+        " the order in which they are put on",
     )
     p.add_argument(
         "motion",
@@ -132,7 +134,7 @@ def run(verb: str, args: argparse.Namespace, **how) -> None:
     from onefit.garment import Garment
     from polyfit.training import device_of
 
-    from . import inputs, load, output
+    from . import inputs, load, outfit, output
     from .draper import FPS
 
     output.check_folder(args.output, args.overwrite)
@@ -140,8 +142,8 @@ def run(verb: str, args: argparse.Namespace, **how) -> None:
         raise InputError(f"--vertices {args.vertices}: at least 100 are needed")
     model = inputs.body_model(args.body)
     draper = load(args.weights, model=model, device=device_of(args.device))
-    garment = Garment.named(
-        args.garment,
+    read = partial(
+        Garment.named,
         made_for=args.made_for,
         loose=args.loose,
         scale=args.scale,
@@ -150,25 +152,28 @@ def run(verb: str, args: argparse.Namespace, **how) -> None:
         offset=tuple(args.offset),
         count=args.vertices,
     )
+    garments = [read(name) for name in outfit.several(args.garment)]
     motion = inputs.motion_of(
         args.motion, seconds=args.seconds, seed=args.seed, fps=args.fps, up=args.motion_up
     )
     shape = inputs.shape_of(model, args.shape)
-    for repair in garment.repairs:
-        print(f"{args.garment}: {repair}", file=sys.stderr)
-    draper.ease(garment)  # cut and tried on once for all motions, so it does not count
+    for name, garment in zip(args.garment, garments):
+        for repair in garment.repairs:
+            print(f"{name}: {repair}", file=sys.stderr)
+        draper.ease(garment)  # cut and tried on once for all motions, so it does not count
     outcome = output.drape_into(
         args.output,
-        partial(getattr(draper, verb), garment, motion, shape, **how),
+        partial(getattr(draper, verb), garments, motion, shape, **how),
         verb,
         len(motion.resampled(FPS)),
         about=dict(
-            garment=args.garment,
+            garment=args.garment[0] if len(garments) == 1 else args.garment,
             motion=motion.name,
             weights=args.weights,
             shape=shape.tolist(),
             **how,
         ),
+        names=args.garment,
         skip=args.skip,
         meshes=args.meshes,
         size=args.size,

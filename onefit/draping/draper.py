@@ -5,11 +5,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias, overload
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -26,7 +26,7 @@ from onefit.physics import Material, Settings
 from polyfit import mesh
 from polyfit.errors import InputError
 
-from . import ease
+from . import ease, outfit
 from .post import PostProcessing, pull
 
 if TYPE_CHECKING:
@@ -97,6 +97,11 @@ class _Worn:
     transforms: torch.Tensor
 
 
+_Named: TypeAlias = Garment | str | os.PathLike[str]
+_Several: TypeAlias = list[Any] | tuple[Any, ...]
+_Moving: TypeAlias = Motion | str | os.PathLike[str]
+
+
 class Draper:
     """A trained network and a body model, ready to drape any garment. Made by :func:`onefit.load`.
 
@@ -143,21 +148,26 @@ class Draper:
             made[name] = make()
         return made[name]
 
+    @overload
+    def drape(self, garment: _Named, motion: _Moving, *args: Any, **how: Any) -> Drape: ...
+    @overload
+    def drape(self, garment: _Several, motion: _Moving, *args: Any, **how: Any) -> list[Drape]: ...
     def drape(
         self,
-        garment: Garment | str | os.PathLike[str],
-        motion: Motion | str | os.PathLike[str],
+        garment: _Named | _Several,
+        motion: _Moving,
         shape: torch.Tensor | None = None,
         *,
         post: bool = True,
         eased: bool = True,
         skinning_only: bool = False,
         advance: Callable[[], object] = lambda: None,
-    ) -> Drape:
+    ) -> Drape | list[Drape]:
         """A :class:`Drape` by the network, in milliseconds a frame: ``garment`` (as :meth:`garment`
         takes it) on the body of ``shape`` (S,) in each frame of ``motion`` (a :class:`Motion` or a
         file of one), at 30 frames a second. With a shape, the way is scaled by the length of its
-        legs.
+        legs. A list of garments, in the order in which they are put on, gives a list of drapes:
+        each is let out at rest to go over those before it, and ``post`` pushes it out of them.
 
         ``post``: post-processing (:class:`onefit.draping.post.PostProcessing`): the cloth keeps its
         motion, edges come back towards their lengths at rest, and vertices are pushed out of the
@@ -165,30 +175,40 @@ class Draper:
         frame; without it and ``post`` a drape is what the network alone makes. ``skinning_only``:
         plain skinning of the template, what OneFit is held against, without any of these.
         ``advance`` is called once for each frame that is done. Raises InputError for a garment,
-        motion or shape that cannot be used.
+        motion or shape that cannot be used, and for a garment that does not go over another.
         """
-        worn = self._worn(garment, motion, shape)
-        post_processed = lambda vertices, *_: vertices
-        if post and not skinning_only:
-            post_processed = self.post_processing(worn.garment, worn.rest, worn.body)
-        made = self._draped(worn, skinning_only, eased, post_processed, advance)
-        return self._drape_of(worn, *made)
+        worn, drapes = self._worn(garment, motion, shape), list[Drape]()
+        for one in worn:
+            post_processed = lambda vertices, *_: vertices
+            if post and not skinning_only:
+                under = outfit.beneath([(d.vertices, d.faces) for d in drapes]) if drapes else ()
+                post_processed = self.post_processing(one.garment, one.rest, one.body, under)
+            told = advance if one is worn[-1] else lambda: None
+            made = self._draped(one, skinning_only, eased, post_processed, told)
+            drapes.append(self._drape_of(one, *made))
+        return drapes if isinstance(garment, list | tuple) else drapes[0]
 
+    @overload
+    def simulate(self, garment: _Named, motion: _Moving, *args: Any, **how: Any) -> Drape: ...
+    @overload
+    def simulate(
+        self, garment: _Several, motion: _Moving, *args: Any, **how: Any
+    ) -> list[Drape]: ...
     def simulate(
         self,
-        garment: Garment | str | os.PathLike[str],
-        motion: Motion | str | os.PathLike[str],
+        garment: _Named | _Several,
+        motion: _Moving,
         shape: torch.Tensor | None = None,
         *,
         material: Material | str = "cotton",
         steps: int = 2,
         settings: Settings | None = None,
         advance: Callable[[], object] = lambda: None,
-    ) -> Drape:
+    ) -> Drape | list[Drape]:
         """A :class:`Drape` by implicit steps of cloth on the garment's own mesh
         (:func:`onefit.draping.simulation.simulated`), in tens of milliseconds a frame, which begins
         with the network's drape and is weakly drawn to it; ``garment``, ``motion``, ``shape`` and
-        ``advance`` as in :meth:`drape`.
+        ``advance`` as in :meth:`drape`. Garments of a list are one sheet, and feel each other.
 
         ``material``: one of :data:`onefit.physics.MATERIALS` by its name, or a
         :class:`onefit.physics.Material`. ``steps`` a frame, two are enough, solved as
@@ -201,37 +221,46 @@ class Draper:
             raise InputError(f"steps = {steps}; steps a frame, 1 or more")
         material, settings = Material.named(material), settings or Settings()
         worn = self._worn(garment, motion, shape)
-        garment, rest = worn.garment, worn.rest.cpu()
-        guide, moving = self._draped(worn)
-        led = worn.motion.led_in(worn.body, settings.lead)
-        first = len(led) - len(worn.motion)
-        if first:
-            there = skinning.transforms(worn.body, led.poses[:first], led.translation[:first])
-            lead = self._draped(replace(worn, transforms=there), skinning_only=True)
-            guide, moving = torch.cat([lead[0], guide]), torch.cat([lead[1], moving])
+        body, moved = worn[0].body, worn[0].motion
+        led = moved.led_in(body, settings.lead)
+        first = len(led) - len(moved)
+        there = skinning.transforms(body, led.poses[:first], led.translation[:first])
+        guides = []
+        for one in worn:
+            guide, moving = self._draped(one)
+            if first:
+                lead = self._draped(replace(one, transforms=there), skinning_only=True)
+                guide, moving = torch.cat([lead[0], guide]), torch.cat([lead[1], moving])
+            guides.append(guide)
         if settings.contact.room:
-            moving = Flesh(worn.body, settings.contact.room)(moving)
-        cut = garment.cut is not None
+            between = 2 * (len(worn) - 1) * settings.contact.apart
+            moving = Flesh(body, settings.contact.room + between)(moving)
+        garments, rests = [one.garment for one in worn], [one.rest.cpu() for one in worn]
+        faces = [one.faces.cpu() for one in garments]
+        patches = [self.patched(one).vertex_patch for one in garments]
         made = simulated(
-            guide, rest, garment.faces.cpu(), self._held(garment), moving, worn.body.faces.cpu(),
+            torch.cat(outfit.in_order(guides, faces), 1), torch.cat(rests),
+            bodies=moving, body_faces=body.faces.cpu(),
+            held=np.concatenate([self._held(one) for one in garments]),
             material=material, steps=steps, fps=FPS, settings=settings, first=first,
-            sides=garment.sides(rest).double().numpy() if cut else None,
-            cut=garment.cut.numpy() if cut else None, stitches=garment.stitches,
-            patches=self.patched(garment).vertex_patch,
+            patches=outfit.numbered(patches), **outfit.joined(garments, rests),
         )  # fmt: skip
         vertices = torch.stack([(frame, advance())[0] for frame in made])
-        return self._drape_of(worn, vertices, moving[first:], material)
+        parts = vertices.split([len(rest) for rest in rests], 1)
+        drapes = [self._drape_of(w, x, moving[first:], material) for w, x in zip(worn, parts)]
+        return drapes if isinstance(garment, list | tuple) else drapes[0]
 
     def _worn(self, garment, motion, shape):
-        """The :class:`_Worn` of what :meth:`drape` takes."""
-        garment = self.garment(garment)
+        """The :class:`_Worn` of each garment of what :meth:`drape` takes."""
+        garments = [self.garment(one) for one in outfit.several(garment)]
         motion = motion if isinstance(motion, Motion) else Motion.read(motion)
         motion = motion.resampled(FPS).to(self.device)
         body = self.model.body(shape)
-        rest, body = garment.graded(body).to(self.device), body.to(self.device)
+        rests, body = [one.graded(body).to(self.device) for one in garments], body.to(self.device)
+        rests = outfit.let_out(garments, rests)
         motion = motion if shape is None else motion.fitted(body)
         transforms = skinning.transforms(body, motion.poses, motion.translation)
-        return _Worn(garment, motion, body, rest, transforms)
+        return [_Worn(one, motion, body, rest, transforms) for one, rest in zip(garments, rests)]
 
     def _draped(
         self,
@@ -282,9 +311,16 @@ class Draper:
         vertices, faces = garment.vertices.cpu().numpy(), garment.faces.cpu().numpy()
         return waistband.held(vertices, faces, self.standard.joints.numpy())
 
-    def post_processing(self, garment: Garment, rest: torch.Tensor, body: Body) -> PostProcessing:
+    def post_processing(
+        self,
+        garment: Garment,
+        rest: torch.Tensor,
+        body: Body,
+        under: Iterable[Sequence[ClosestSurface]] = (),
+    ) -> PostProcessing:
         """The :class:`onefit.draping.post.PostProcessing` of a garment graded to a ``body``, its
-        vertices at ``rest`` (N, 3) [m].
+        vertices at ``rest`` (N, 3) [m]; ``under``: the surfaces of what it is worn over, besides,
+        in one frame after the other.
         """
         if not self._surfaces:  # made once for a body model
             at, faces = body.vertices.cpu(), body.faces.cpu()
@@ -296,7 +332,7 @@ class Draper:
             edges = np.concatenate([edges, threads])
             lengths = torch.cat([lengths, torch.as_tensor(long).to(lengths)])
         pulls = self.pull(garment)
-        return PostProcessing(rest, garment.faces, edges, lengths, pulls, self._surfaces)
+        return PostProcessing(rest, garment.faces, edges, lengths, pulls, self._surfaces, under)
 
     def pull(self, garment: Garment) -> np.ndarray:
         """How firmly post-processing draws each vertex of a garment to the network's drape, (N,)

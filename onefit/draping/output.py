@@ -3,6 +3,7 @@
 import json
 import time
 from dataclasses import dataclass
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -44,11 +45,12 @@ class Outcome:
 
     def next_step(self):
         """What to do with the result, in a line."""
-        usd, video = self.folder / "garment.usd", self.folder / "drape.mp4"
+        arrays = _arrays(self.folder)[0]
+        usd, video = arrays.with_name("garment.usd"), self.folder / "drape.mp4"
         blender = f"import {usd} and body.usd in Blender"
         if video.exists():
             return f"open {video}" + (f", or {blender}" if usd.exists() else "")
-        return blender if usd.exists() else f"read {self.folder / 'drape.npz'} by numpy.load"
+        return blender if usd.exists() else f"read {arrays} by numpy.load"
 
 
 def check_folder(folder, overwrite):
@@ -57,17 +59,30 @@ def check_folder(folder, overwrite):
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         if not overwrite:
             raise InputError(f"{folder}: not empty; give another -o, or --overwrite")
-        if not (folder / "drape.npz").exists():
+        if not _arrays(folder):
             raise InputError(f"{folder}: holds no drape; --overwrite replaces nothing else")
 
 
-def drape_into(folder, make, verb, frames, *, about, **files):
+def _arrays(folder):
+    """The drape.npz of a folder: its own, or those of the garments of an outfit."""
+    return [*folder.glob("drape.npz"), *sorted(folder.glob("*/drape.npz"))]
+
+
+def _folders(names):
+    """The folders of garments by their ``names``, in their order: none of one alone."""
+    if len(names) == 1:
+        return [""]
+    return [f"{k + 1}_{Path(name).stem}" for k, name in enumerate(names)]
+
+
+def drape_into(folder, make, verb, frames, *, names, about, **files):
     """Drape and write all files; returns the :class:`Outcome`.
 
     ``folder``: new, empty or holding a drape, which is replaced at the end. ``make``, a function of
     ``advance``: :meth:`onefit.Draper.drape` or :meth:`onefit.Draper.simulate`, as ``verb`` says, of
-    all the rest; ``frames``: how many it makes. ``about``: names for figures.json; ``files``:
-    options of :func:`write`. Progress goes to stderr.
+    a list of garments and all the rest; ``names``: what these are called; ``frames``: how many it
+    makes. ``about``: names for figures.json; ``files``: options of :func:`write`. Progress goes to
+    stderr.
     """
     folder, ends = Path(folder), [time.perf_counter()]
     columns = (
@@ -83,12 +98,18 @@ def drape_into(folder, make, verb, frames, *, about, **files):
             ends.append(time.perf_counter())
             progress.advance(task)
 
-        drape = make(advance=advance)
+        drapes = make(advance=advance)
         seconds = time.perf_counter() - ends[0]
     settling = ends[1] - ends[0] if verb == "simulate" else 0.0
-    T, N = drape.vertices.shape[:2]
-    outcome = Outcome(folder, T, N, seconds, settling, drape.measures().as_dict())
+    T, counts = len(drapes[0].vertices), [drape.vertices.shape[1] for drape in drapes]
+    found, N = [drape.measures().as_dict() for drape in drapes], sum(counts)
+    inside = [figures["collision"] for figures in found]
+    figures = dict(collision=float(np.average(inside, weights=counts))) if drapes[1:] else found[0]
+    outcome = Outcome(folder, T, N, seconds, settling, figures)
     about = dict(verb=verb, **about, vertices=N, frames=T, **outcome.figures)
+    if len(drapes) > 1:
+        each = (dict(vertices=n, **f) for n, f in zip(counts, found))
+        about["garments"] = dict(zip(_folders(names), each))
     folder.parent.mkdir(parents=True, exist_ok=True)
     with (
         Progress(*columns, console=Console(stderr=True)) as progress,
@@ -96,27 +117,29 @@ def drape_into(folder, make, verb, frames, *, about, **files):
     ):
         visible = "render" not in files.get("skip", ())
         task = progress.add_task("rendering", total=T, visible=visible)
-        write(drape, temporary, advance=lambda: progress.advance(task), **files)
+        write(drapes, names, temporary, advance=lambda: progress.advance(task), **files)
         (Path(temporary) / "figures.json").write_text(
             json.dumps(about, indent=2) + "\n", encoding="utf-8"
         )
     return outcome
 
 
-def _coloured(drape):
-    """The garment as the stage takes it; of an outfit, each part in a colour of its own."""
-    seen, faces = drape.render_vertices(), drape.faces.numpy()
-    part = parts(faces)
-    if drape.render_mesh is not None:
-        part = part[drape.render_mesh.face]
-        kept, faces = drape.render_mesh.welded(seen[0])
-        seen, part = seen[:, kept], part[kept][faces[:, 0]]
-    for k in np.unique(part):
-        used, own = np.unique(faces[part == k], return_inverse=True)
-        yield seen[:, used], own.reshape(-1, 3), GARMENT_COLOURS[k % len(GARMENT_COLOURS)]
+def _coloured(drapes):
+    """The garments as the stage takes them; each part of each in a colour of its own."""
+    colours = cycle(GARMENT_COLOURS)
+    for drape in drapes:
+        seen, faces = drape.render_vertices(), drape.faces.numpy()
+        part = parts(faces)
+        if drape.render_mesh is not None:
+            part = part[drape.render_mesh.face]
+            kept, faces = drape.render_mesh.welded(seen[0])
+            seen, part = seen[:, kept], part[kept][faces[:, 0]]
+        for k in np.unique(part):
+            used, own = np.unique(faces[part == k], return_inverse=True)
+            yield seen[:, used], own.reshape(-1, 3), next(colours)
 
 
-def _render(drape, folder, size, spp, advance):
+def _render(drapes, folder, size, spp, advance):
     """PNG frames and a video; Mitsuba is loaded here alone."""
     from polysft_mi.backend import set_variant
 
@@ -126,7 +149,8 @@ def _render(drape, folder, size, spp, advance):
     from polysft_mi.pictures import write_video
     from polysft_mi.render import stage
 
-    meshes = [(drape.body.numpy(), drape.body_faces.numpy(), BODY_COLOUR), *_coloured(drape)]
+    body = drapes[0].body.numpy(), drapes[0].body_faces.numpy(), BODY_COLOUR
+    meshes = [body, *_coloured(drapes)]
     frames = folder / "frames"
     frames.mkdir()
 
@@ -136,14 +160,34 @@ def _render(drape, folder, size, spp, advance):
             advance()
             yield image
 
-    write_video(folder / "drape.mp4", pictures(), drape.fps)
+    write_video(folder / "drape.mp4", pictures(), drapes[0].fps)
 
 
-def write(drape, folder, *, skip=(), meshes=None, size=(480, 360), spp=16, advance=lambda: None):
-    """The files of a :class:`onefit.Drape` in the empty ``folder``; ``skip``: any of "usd",
+def write(
+    drapes,
+    names,
+    folder,
+    *,
+    skip=(),
+    meshes=None,
+    size=(480, 360),
+    spp=16,
+    advance=lambda: None,
+):
+    """The files of each :class:`onefit.Drape` in the empty ``folder``: of one there, of several in
+    a folder each, after their ``names``, and one rendering of all. ``skip``: any of "usd",
     "render".
     """
     folder = Path(folder)
+    for drape, name in zip(drapes, _folders(names)):
+        (folder / name).mkdir(exist_ok=True)
+        _write(drape, folder / name, skip, meshes)
+    if "render" not in skip:
+        _render(drapes, folder, size, spp, advance)
+
+
+def _write(drape, folder, skip, meshes):
+    """The files of one drape, but for its rendering."""
     arrays = {
         name: getattr(drape, name).numpy()
         for name in ("vertices", "faces", "rest", "body", "body_faces", "root")
@@ -177,5 +221,3 @@ def write(drape, folder, *, skip=(), meshes=None, size=(480, 360), spp=16, advan
         )
     if meshes:
         write_frames(folder / "meshes", meshes, seen, faces, texcoords, up="z")
-    if "render" not in skip:
-        _render(drape, folder, size, spp, advance)

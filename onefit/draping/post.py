@@ -6,6 +6,7 @@ of swings is a smaller one.
 """
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -21,6 +22,7 @@ _ROUNDS = 24  # of the lengths
 RADIUS = 0.985  # spectral radius of a round, as the acceleration takes it to be
 _PUSHES, _SMOOTHING = 5, 6  # rounds; times, of the pushes of the first
 CONTACT = ContactSettings()
+_OVER_CLOTH = replace(CONTACT, spacing=0.01)  # [m]: folds are narrower than limbs
 
 
 def pull(vertices, body, held):
@@ -34,33 +36,34 @@ def pull(vertices, body, held):
     return (PULL * (1 + (NEAR / gap) ** 2) + 1e6 * np.asarray(held)).astype(np.float32)
 
 
+def pushes(**near):
+    """How a :class:`onefit.contact.SkinContact` pushes drapes out; ``near`` in place of what it is
+    for cloth in motion.
+    """
+    of_motion = dict(reach=CONTACT.touching, least=CONTACT.clearance)
+    of_motion |= dict(point_near=CONTACT.point_near, point_least=CONTACT.point_clearance)
+    how = dict(deepest=CONTACT.deepest, rounds=_PUSHES, smoothing=_SMOOTHING, once=True)
+    return of_motion | how | near
+
+
 class PostProcessing:
     """Post-processing of one garment with ``faces`` (F, 3): ``rest`` (N, 3) [m] graded to the body,
     ``lengths`` (E,) [m] at rest of its ``edges`` (E, 2), ``pull`` (N,) [1/s^2] as :func:`pull`
     says; two ``surfaces`` of the body, each a :class:`onefit.body.ClosestSurface`, will follow its
-    frames in turn. The methods change a frame ``x`` (N, 3) float32 [m].
+    frames in turn; ``under`` gives, for one frame after the other, the surfaces of what else it is
+    worn over. The methods change a frame ``x`` (N, 3) float32 [m].
     """
 
-    def __init__(self, rest, faces, edges, lengths, pull, surfaces=()):
+    def __init__(self, rest, faces, edges, lengths, pull, surfaces=(), under=()):
         from . import kernels  # compiled at the first use
 
         self._kernels, self._wp, self._count = kernels, kernels.wp, len(rest)
-        self._surfaces = surfaces
+        self._surfaces, self._under = surfaces, iter(under)
         self._pool = ThreadPoolExecutor(1)  # a second thread
         #: how the cloth touches the skin
-        self.skin = SkinContact(
-            rest.cpu().numpy(),
-            faces.cpu().numpy(),
-            CONTACT,
-            reach=CONTACT.touching,
-            deepest=CONTACT.deepest,
-            least=CONTACT.clearance,
-            point_near=CONTACT.point_near,
-            point_least=CONTACT.point_clearance,
-            rounds=_PUSHES,
-            smoothing=_SMOOTHING,
-            once=True,
-        )
+        mesh = rest.cpu().numpy(), faces.cpu().numpy()
+        self.skin = SkinContact(*mesh, CONTACT, **pushes())
+        self._cloth = SkinContact(*mesh, _OVER_CLOTH, **pushes()) if under else None
         degree = np.bincount(np.asarray(edges).ravel(), minlength=self._count)
         squares = np.asarray(lengths) ** 2
         self._edges = self._array(edges, self._wp.vec2i), self._array(squares, float)
@@ -100,6 +103,9 @@ class PostProcessing:
             self.restore_lengths(x, surface)
             self.skin.look(x, surface, goals[t])
             self.skin.push_out(x, surface)
+            for layer in next(self._under, ()):
+                self._cloth.look(x, layer)
+                self._cloth.push_out(x, layer)
             was, before = out[0] - begins if before is None else before, x
         return out.to(guide)
 

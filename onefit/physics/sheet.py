@@ -20,8 +20,9 @@ _LEAST = 1e-12  # of the roots below, so that a degenerate triangle has a gradie
 class Sheet:
     """``rest`` (N, 3) [m] and ``faces`` (F, 3), arrays, of ``material``. With ``sides`` (F, 3) [m],
     from each corner of a face to the next, the lengths at rest are these, not those of ``rest``,
-    and the sheet rests flat: cloth that hangs in folds, as it was cut; ``cut`` (N, 3) [m] is where
-    it has no folds yet, so that only neighbours are near to each other.
+    and the sheet rests flat: cloth that hangs in folds, as it was cut; NaN: of this face they are
+    those of ``rest``, as its angles are. ``cut`` (N, 3) [m] is where it has no folds yet, so that
+    only neighbours are near to each other.
 
     ``area`` (F,) [m^2]; ``mass`` (N,) [kg]; ``gradients`` (F, 3, 2) [1/m], those of the three
     corners' hat functions in the plane of the triangle, so that F = sum_a x_a g_a^T is the
@@ -44,7 +45,7 @@ class Sheet:
         self.cut = self.rest if cut is None else np.asarray(cut, dtype=np.float64)
         corners = self.rest[self.faces]
         of_rest = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
-        self.sides = of_rest if sides is None else np.asarray(sides, dtype=np.float64)
+        self.sides = of_rest if sides is None else np.where(np.isnan(sides), of_rest, sides)
         flat = flattened(self.sides)
         inverse = np.linalg.inv(flat)
         self.gradients = np.concatenate([-inverse.sum(1, keepdims=True), inverse], 1)
@@ -55,11 +56,9 @@ class Sheet:
         self.hinges, of = _hinges(self.faces)
         squared = self.sides.ravel()[of[:, 0]] ** 2
         self.stiffness = material.bending * squared / self.area[of // 3].sum(1)
-        if sides is None:
-            x = torch.as_tensor(self.rest)[:, None]
-            self.angles = _hinge_angles(x, self.hinges)[:, 0].numpy()
-        else:
-            self.angles = np.zeros(len(self.hinges))
+        self.angles = _hinge_angles(torch.as_tensor(self.rest)[:, None], self.hinges)[:, 0].numpy()
+        if sides is not None:
+            self.angles[~np.isnan(np.ravel(sides)[of[:, 0]])] = 0
 
     def __len__(self) -> int:
         return len(self.rest)

@@ -1,0 +1,140 @@
+"""Several garments at once: each stays over those before it."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+import onefit
+from onefit import drape
+from onefit.body import ClosestSurface
+from onefit.draping.outfit import Under, joined, let_out
+from onefit.garment import Garment
+from onefit.objective import crossings
+from onefit.physics import Settings
+from polyfit.errors import InputError
+from polyfit.mesh import boundary_edges
+
+
+@pytest.fixture(scope="module")
+def draper():
+    return onefit.load()
+
+
+@pytest.fixture(scope="module")
+def shorts():
+    return Garment.template("shorts").remeshed(500)
+
+
+@pytest.fixture(scope="module")
+def worn():
+    """Trousers, and a T-shirt that lies partly beneath them when both drape for themselves."""
+    return [Garment.template(name).remeshed(800) for name in ("trousers", "tshirt")]
+
+
+MOTION = onefit.Motion.generate("dance", seconds=0.3, seed=1_000_003)
+
+
+def beneath(inner, outer):
+    """The share of the vertices of a drape that lie on the inner side of another, beside its
+    rim.
+    """
+    faces, wrong = inner.faces.numpy(), []
+    surface = ClosestSurface(inner.vertices[0], faces)
+    rim = np.unique(boundary_edges(faces))
+    for x, y in zip(inner.vertices, outer.vertices.numpy()):
+        surface.follow(x)
+        found = surface(y, 0.05)
+        beside = (np.isin(faces[found.face], rim) | (found.barycentric < 1e-4)).all(1)
+        wrong.append((found.face >= 0) & ~beside & (found.distance < 0))
+    return np.mean(wrong)
+
+
+def passed(drapes):
+    """Pairs of faces of two garments, or of one, that pass through each other at the end."""
+    first = np.cumsum([0, *(d.vertices.shape[1] for d in drapes)])
+    faces = np.concatenate([d.faces.numpy() + n for d, n in zip(drapes, first)])
+    return crossings(np.concatenate([d.vertices[-1].numpy() for d in drapes]), faces)
+
+
+def test_outer_garments_stay_over_inner_ones_in_drapes(draper, worn):
+    apart = [draper.drape(one, MOTION, eased=False) for one in worn]
+    made = draper.drape(worn, MOTION, eased=False)
+    assert beneath(*apart) > 0.02 and beneath(*made) < 0.005
+    assert torch.equal(made[0].vertices, apart[0].vertices)  # the inner one does not know
+    assert all(one.measures().collision < 0.3 for one in made)
+    assert passed(made) < 0.2 * passed(apart)
+
+
+def test_outer_garments_stay_over_inner_ones_in_simulations(draper, worn):
+    how = dict(settings=Settings(settling=0.1, lead=0.3))
+    made = draper.simulate(worn, MOTION, **how)
+    assert beneath(*made) == 0 and passed(made) == 0
+    assert [len(one.rest) for one in made] == [len(one) for one in worn]
+    alone = draper.simulate(worn[0], MOTION, **how)
+    felt = (made[0].vertices - alone.vertices).norm(dim=-1)
+    assert felt.max() > 1e-3  # both ways
+
+
+@pytest.mark.parametrize("verb", ["drape", "simulate"])
+def test_a_list_of_one_is_that_one(draper, shorts, verb):
+    how = dict(eased=False) if verb == "drape" else dict(settings=Settings(settling=0, lead=0))
+    short = onefit.Motion.generate("walk", seconds=0.1)
+    one, [same] = (getattr(draper, verb)(what, short, **how) for what in (shorts, [shorts]))
+    assert torch.equal(one.vertices, same.vertices) and torch.equal(one.rest, same.rest)
+
+
+def test_a_garment_goes_over_itself(shorts):
+    rests = let_out([shorts] * 2, [shorts.vertices] * 2)
+    sheet = joined([shorts] * 2, rests)
+    assert torch.equal(rests[0], shorts.vertices)
+    both = torch.cat(rests).numpy()
+    assert crossings(both, sheet["faces"].numpy()) == 0
+    gap = Under(rests[0].numpy(), shorts.faces.numpy()).surface(rests[1].numpy()).distance
+    assert gap.min() > 0.002 and gap.max() < 0.02
+    apart = sheet["cut"][: len(shorts)] - sheet["cut"][len(shorts) :]
+    assert np.linalg.norm(apart, axis=1).min() > 1  # no neighbours where they are cut
+
+
+def test_what_is_worn_under_is_closed_beyond_its_rims():
+    """A tube along z: beyond its rim a place is inside below a slope of 45 degrees."""
+    turn, high = np.meshgrid(np.arange(40) * np.pi / 20, np.linspace(0, 0.4, 15))
+    tube = np.stack([0.1 * np.cos(turn), 0.1 * np.sin(turn), high], -1).reshape(-1, 3)
+    at = np.arange(len(tube)).reshape(high.shape)
+    a, b, c, d = at[:-1], np.roll(at, -1, 1)[:-1], np.roll(at, -1, 1)[1:], at[1:]
+    faces = np.concatenate([np.stack(f, -1).reshape(-1, 3) for f in ((a, b, c), (a, c, d))])
+    under = Under(tube, faces)
+    places = np.array([[0.105, 0, 0.2], [0.09, 0, 0.2], [0.095, 0, 0.42], [0.07, 0, 0.42]])
+    assert (np.sign(under.surface(places).distance) == [1, -1, 1, -1]).all()
+    moved = under.follow(tube + [0, 0, 1])
+    assert (np.sign(moved(places + [0, 0, 1]).distance) == [1, -1, 1, -1]).all()
+
+
+def test_refused_in_one_line(draper, shorts):
+    with pytest.raises(InputError, match="^0 garments; 1 to 4 at once$"):
+        draper.drape([], MOTION)
+    with pytest.raises(InputError, match="^5 garments; 1 to 4 at once$"):
+        draper.simulate([shorts] * 5, MOTION)
+    dress = Garment.template("dress").remeshed(800)
+    with pytest.raises(InputError, match="shorts does not go over dress: .* in which they are put"):
+        draper.drape([dress, shorts], MOTION)
+
+
+def test_the_command_takes_several_garments(tmp_path):
+    words = ["shorts", "tank", "walk", "--seconds", "0.1", "--vertices", "300"]
+    words += ["--skip", "usd", "render", "-o", str(tmp_path / "out")]
+    drape.main(words)
+    names = {"1_shorts", "2_tank"}
+    assert {p.name for p in (tmp_path / "out").iterdir()} == names | {"figures.json"}
+    sizes = {}
+    for name in names:
+        with np.load(tmp_path / "out" / name / "drape.npz") as file:
+            sizes[name] = file["vertices"].shape[1]
+    figures = json.loads((tmp_path / "out" / "figures.json").read_text())
+    assert figures["garment"] == ["shorts", "tank"]
+    assert {name: found["vertices"] for name, found in figures["garments"].items()} == sizes
+    assert figures["vertices"] == sum(sizes.values())
+    with pytest.raises(InputError, match="not empty; give another -o, or --overwrite"):
+        drape.main(words)
+    drape.main([*words, "--overwrite"])
