@@ -1,4 +1,6 @@
-"""Tracks and depth images that a person has beside a video, made fit to its folder's frames."""
+"""What a person has beside a video, made fit to its folder's frames: tracks, depth images, and
+further cameras.
+"""
 
 import os
 
@@ -8,6 +10,7 @@ from polysft_mi.errors import InputError
 from polysft_mi.scene import DepthImages, Tracks
 
 from .output import write_png
+from .rig import CAMERAS
 
 _TRACKS, _DEPTH = "tracks.npz", "depth/{:05d}.png"
 _UNIT = 1e-4  # metres of a whole number of the depth images that are written
@@ -16,8 +19,9 @@ _MOST = 65535  # what they hold; farther off there is no sheet
 
 class GivenEvidence:
     """``tracks``: a file, and the coordinate ``track_centre`` that it gives the first pixel's
-    centre; ``depth``: a folder or a pattern, its whole numbers in ``depth_unit`` [m]; None each for
-    none; ``depth_known_to``: as the setting of that name.
+    centre; ``depth``: a folder or a pattern, its whole numbers in ``depth_unit`` [m]; ``rig``: a
+    :class:`polysft_mi.capture.rig.GivenRig`; None each for none; ``depth_known_to``: as the setting
+    of that name.
     """
 
     def __init__(
@@ -27,14 +31,22 @@ class GivenEvidence:
         depth=None,
         depth_unit=1e-3,
         depth_known_to="metric",
+        rig=None,
     ):
         self._tracks, self._centre = tracks, track_centre
         self._depth, self._unit, self._known_to = depth, depth_unit, depth_known_to
+        self.rig = rig
+
+    @property
+    def inputs(self):
+        """The files and folders that are read."""
+        rig = self.rig.path if self.rig else None
+        return [path for path in (self._tracks, self._depth, rig) if path]
 
     def write(self, folder, indices, straight):
         """Write those of the frames ``indices`` into the folder, undistorted and scaled by
-        ``straight`` (:class:`polysft_mi.capture.camera.Undistortion`). Returns the settings that
-        name them, and lines for a person. Raises InputError.
+        ``straight`` (:class:`polysft_mi.capture.camera.Undistortion`), further cameras scaled
+        likewise. Returns the settings that name them, and lines for a person. Raises InputError.
         """
         settings, lines = {}, []
         if self._tracks:
@@ -67,6 +79,11 @@ class GivenEvidence:
                 "depth_known_to": self._known_to,
             }
             lines.append(f"depth: that of {self._depth}")
+        if self.rig:
+            scale = straight.camera.width / straight.size[0]
+            where = os.path.join(folder, CAMERAS)
+            lines += self.rig.write(where, indices, straight.camera, scale)
+            settings["cameras"] = CAMERAS
         return settings, lines
 
     @staticmethod

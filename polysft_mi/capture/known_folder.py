@@ -6,11 +6,13 @@ from dataclasses import replace
 
 from polyfit.files import aside
 from polysft_mi.errors import InputError
-from polysft_mi.scene import Sequence, checked_size
+from polysft_mi.scene import Sequence, checked_size, open_cameras
 from polysft_mi.scene.kinect_paper import template as kinect_paper_template
 from polysft_mi.surface import meshio
 
 from .layouts import recognise
+from .output import staged
+from .rig import CAMERAS
 from .scene_file import scene_xml
 
 
@@ -21,13 +23,16 @@ def prepare_folder(
     overwrite=False,
     pose_fit="auto",
     warn=lambda line: None,
+    rig=None,
     **evidence,
 ):
     """Write ``scene.xml`` for a sequence into ``out`` (default: the folder itself); for
     Kinect-Paper also ``template.obj``, of that ``resolution``, in its pose of
     :func:`polysft_mi.scene.kinect_paper.template`.
 
-    ``evidence``: settings of tracks and depth, by their names, with paths as the caller has them.
+    ``evidence``: settings of tracks and depth, by their names, with paths as the caller has them;
+    ``rig``: a :class:`polysft_mi.capture.rig.GivenRig`, whose cameras are written beside the scene
+    (a folder of cameras of ours stays where it is).
     Everything that the scene names is read and checked first; ``warn`` is given a line about a
     template whose size is unlikely. Returns (path of the scene, what was
     found, in lines). Raises InputError; then nothing is written.
@@ -60,23 +65,37 @@ def prepare_folder(
                 f"{os.path.join(target, name)}: is there already; give --overwrite to replace it,"
                 " or another folder by -o"
             )
+    if rig and rig.ours:
+        open_cameras(rig.path, len(sequence))
+        evidence["cameras"] = rig.path
+    elif rig:
+        _check_cameras(os.path.join(target, CAMERAS), rig.path, overwrite)
     note = meshio.size_note(vertices, where)
     if note:
         warn(note)
-    for name in ("tracks", "depth"):
+    for name in ("tracks", "depth", "cameras"):
         if evidence.get(name):
             evidence[name] = _from_data(evidence[name], folder)
     if evidence.get("depth"):
         evidence["depth_known_to"] = known_to
+    if rig and not rig.ours:
+        evidence["cameras"] = CAMERAS
     layout = replace(layout, settings=layout.settings | evidence)
     text = scene_xml(
         layout, "." if here else os.path.abspath(folder), "template.obj" if template else None
     )
-    _write(target, text, template, "; give a folder that can be written by -o DIR" if here else "")
+    cameras = None
+    if rig and not rig.ours:
+        cameras = lambda partial: said.extend(
+            rig.write(partial, sequence.indices, camera, whole=True)
+        )
+    hint = "; give a folder that can be written by -o DIR" if here else ""
+    _write(target, text, template, hint, cameras)
     recognised = (
         f"{folder}: a sequence in the form {layout.form}, {len(sequence)} frames of"
         f" {camera.width}x{camera.height}, {'with' if masks else 'without'} masks,"
         f"{' with tracks,' if sequence.tracks else ''}{' with depth,' if sequence.depth else ''}"
+        f"{' with further cameras,' if rig else ''}"
         " template of"
         f" {len(vertices)} vertices ({layout.obj or f'subdivided to {resolution}x{resolution}'})"
     )
@@ -89,22 +108,43 @@ def _from_data(path, folder):
     return os.path.abspath(path) if inside.startswith("..") else f"$data/{inside}"
 
 
-def _write(target, text, template, hint):
-    """Write the scene, and the template where there is one, into a folder: both or neither."""
+def _check_cameras(folder, rig, overwrite):
+    """Raise InputError where the cameras of ``rig`` may not be written to the folder."""
+    if not os.path.isdir(folder):
+        return
+    a, b = (os.path.join(os.path.realpath(path), "") for path in (rig, folder))
+    if a.startswith(b):
+        raise InputError(
+            f"{folder}: holds {rig}, which would be replaced; -o DIR is another folder"
+        )
+    ours = all(os.path.isfile(os.path.join(folder, n, "camera.json")) for n in os.listdir(folder))
+    if not overwrite or not ours:
+        hint = "give --overwrite to replace it, or" if ours else "not written by this command; give"
+        raise InputError(f"{folder}: is there already; {hint} another folder by -o")
+
+
+def _write(target, text, template, hint, cameras=None):
+    """Write the scene, the template where there is one, and, by ``cameras(folder)``, further
+    cameras into a folder: all or none.
+    """
     made = not os.path.isdir(target)
     try:
         os.makedirs(target, exist_ok=True)
         with contextlib.ExitStack() as stack:
+            if cameras:
+                cameras(stack.enter_context(staged(os.path.join(target, CAMERAS))))
             if template:
                 obj = stack.enter_context(aside(os.path.join(target, "template.obj")))
                 meshio.write_obj(obj, *template)
             scene = stack.enter_context(aside(os.path.join(target, "scene.xml")))
             with open(scene, "w", encoding="utf-8") as file:
                 file.write(text)
-    except OSError as error:
+    except (OSError, InputError) as error:
         if made:
             with contextlib.suppress(OSError):
                 os.rmdir(target)
+        if isinstance(error, InputError):
+            raise
         raise InputError(f"{target}: {error.strerror or error}{hint}") from None
 
 

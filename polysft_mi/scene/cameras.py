@@ -47,7 +47,9 @@ class OtherCamera:
         return mi.load_dict({"type": "pinhole", **focal, "to_world": transform, "film": film})
 
 
-def open_cameras(folder: str, count: int, first: int, last: int, stride: int) -> list[OtherCamera]:
+def open_cameras(
+    folder: str, count: int, first: int = 0, last: int = -1, stride: int = 1
+) -> list[OtherCamera]:
     """The cameras of a folder that holds a folder for each: ``camera.json`` (fx, fy, cx, cy, width,
     height [pixels], ``world_to_camera``), ``frames``, and ``masks`` where there are some. Of each
     the frames ``first`` to ``last`` in steps of ``stride`` are used, ``count`` in all. Raises
@@ -61,6 +63,7 @@ def open_cameras(folder: str, count: int, first: int, last: int, stride: int) ->
     if not names:
         raise InputError(
             f"{folder}: no cameras in it; a folder for each, with {_CAMERA} and frames, is needed"
+            " (polysft prepare --cameras makes them of a rig of COLMAP or nerfstudio)"
         )
     return [_open(os.path.join(folder, name), count, first, last, stride) for name in names]
 
@@ -100,6 +103,11 @@ def _read(where):
         ) from None
     except (OSError, ValueError, TypeError) as error:
         raise InputError(f"{where}: not a camera as JSON ({error})") from None
+    if np.any(known.get("distortion")):
+        raise InputError(
+            f"{where}: distortion; frames without are needed, as polysft prepare VIDEO --cameras"
+            " makes them"
+        )
     if pose.shape == (3, 4):
         pose = np.vstack([pose, (0, 0, 0, 1)])
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
