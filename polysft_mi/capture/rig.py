@@ -5,13 +5,13 @@ names.
 import glob
 import os
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from polysft_mi.errors import InputError
-from polysft_mi.scene import EXTENSIONS, read_rgb
+from polysft_mi.scene import EXTENSIONS, read_rgb, written
 
 from .camera import Lens, Undistortion
 from .camera.rigs import read_rig
@@ -107,8 +107,7 @@ class GivenRig:
         if camera.masks:
             os.makedirs(os.path.join(folder, os.path.dirname(MASK)))
             GivenMasks(self._found(camera.masks)).write(folder, indices, straight)
-        known = {**asdict(straight.camera), "world_to_camera": pose.tolist()}
-        write_json(os.path.join(folder, "camera.json"), known)
+        write_json(os.path.join(folder, "camera.json"), written(straight.camera, pose))
 
     def _lines(self, others, view):
         lines = [f"cameras: {', '.join(others)} of {self.path}"]

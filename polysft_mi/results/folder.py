@@ -8,6 +8,7 @@ from polysft_mi.errors import InputError
 FILES = (
     "scene.xml",
     "camera.json",
+    "cameras.json",
     "run.json",
     "checkpoint.npz",
     "log.jsonl",

@@ -17,7 +17,7 @@ import numpy as np
 from polyfit.files import aside
 from polyfit.mesh import write_ply
 from polysft_mi import __version__
-from polysft_mi.scene import located
+from polysft_mi.scene import located, written
 from polysft_mi.surface import Unknowns
 
 from .truth import uv_arrays
@@ -155,9 +155,10 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
     return {**summary, "video": video}, plotted
 
 
-def write_beginning(out, scene, camera, command, fps):
+def write_beginning(out, scene, camera, others, command, fps):
     """What stands in the folder from the first second: the resolved scene (text), the
-    :class:`polysft_mi.render.pinhole.Pinhole`, and what the run is.
+    :class:`polysft_mi.render.pinhole.Pinhole`, the ``others``
+    (:class:`polysft_mi.scene.cameras.OtherCamera`), and what the run is.
     """
     with (
         aside(os.path.join(out, "scene.xml")) as temporary,
@@ -165,6 +166,9 @@ def write_beginning(out, scene, camera, command, fps):
     ):
         file.write(scene)
     write_json(os.path.join(out, "camera.json"), dataclasses.asdict(camera.intrinsics()))
+    if others:
+        cameras = {c.name: written(c.intrinsics, c.world_to_camera) for c in others}
+        write_json(os.path.join(out, "cameras.json"), cameras)
     about = {
         "command": command,
         "started": time.strftime("%Y-%m-%dT%H:%M:%S"),
