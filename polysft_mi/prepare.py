@@ -113,7 +113,7 @@ def _add_evidence(group):
         "--depth",
         metavar="FOLDER",
         help="depth images as the frames' camera sees them: 16 bit PNG, or EXR in metres; 0 is"
-        " unknown",
+        " unknown. Or an export of Record3D, ScanNet or rs-convert (RealSense)",
     )
     group.add_argument(
         "--depth-unit",

@@ -10,6 +10,7 @@ from polysft_mi.scene import Sequence, checked_size, open_cameras
 from polysft_mi.scene.kinect_paper import template as kinect_paper_template
 from polysft_mi.surface import meshio
 
+from .depth import DEPTH, recognise_depth, write_depth
 from .layouts import recognise
 from .output import staged
 from .rig import CAMERAS
@@ -42,6 +43,9 @@ def prepare_folder(
     camera = layout.camera
     masks = os.path.join(folder, layout.masks) if layout.masks else ""
     known_to = evidence.pop("depth_known_to", "metric")
+    depth = recognise_depth(evidence["depth"]) if evidence.get("depth") else None
+    if depth:
+        evidence["depth"] = depth.images
     sequence = Sequence.open(
         os.path.join(folder, layout.frames), masks, size=(camera.width, camera.height), **evidence
     )
@@ -65,32 +69,37 @@ def prepare_folder(
                 f"{os.path.join(target, name)}: is there already; give --overwrite to replace it,"
                 " or another folder by -o"
             )
+    folders = {}
     if rig and rig.ours:
         open_cameras(rig.path, len(sequence))
         evidence["cameras"] = rig.path
     elif rig:
-        _check_cameras(os.path.join(target, CAMERAS), rig.path, overwrite)
+        known = lambda path: os.path.isfile(os.path.join(path, "camera.json"))
+        _check_folder(os.path.join(target, CAMERAS), rig.path, overwrite, known)
+        folders[CAMERAS] = lambda to: said.extend(
+            rig.write(to, sequence.indices, camera, whole=True)
+        )
+    if depth and not depth.is_seen_by(camera):
+        known = lambda path: path.endswith(".png")
+        _check_folder(os.path.join(target, DEPTH), depth.images, overwrite, known)
+        seen = lambda k: depth.seen_by(sequence.depth.read(k), camera)
+        folders[DEPTH] = lambda to: evidence.update(write_depth(to, sequence.depth, seen, known_to))
     note = meshio.size_note(vertices, where)
     if note:
         warn(note)
     for name in ("tracks", "depth", "cameras"):
         if evidence.get(name):
             evidence[name] = _from_data(evidence[name], folder)
-    if evidence.get("depth"):
+    if depth:
         evidence["depth_known_to"] = known_to
-    if rig and not rig.ours:
-        evidence["cameras"] = CAMERAS
-    layout = replace(layout, settings=layout.settings | evidence)
-    text = scene_xml(
-        layout, "." if here else os.path.abspath(folder), "template.obj" if template else None
+    evidence |= {name: name for name in folders}
+    text = lambda: scene_xml(
+        replace(layout, settings=layout.settings | evidence),
+        "." if here else os.path.abspath(folder),
+        "template.obj" if template else None,
     )
-    cameras = None
-    if rig and not rig.ours:
-        cameras = lambda partial: said.extend(
-            rig.write(partial, sequence.indices, camera, whole=True)
-        )
     hint = "; give a folder that can be written by -o DIR" if here else ""
-    _write(target, text, template, hint, cameras)
+    _write(target, text, template, hint, folders)
     recognised = (
         f"{folder}: a sequence in the form {layout.form}, {len(sequence)} frames of"
         f" {camera.width}x{camera.height}, {'with' if masks else 'without'} masks,"
@@ -108,37 +117,39 @@ def _from_data(path, folder):
     return os.path.abspath(path) if inside.startswith("..") else f"$data/{inside}"
 
 
-def _check_cameras(folder, rig, overwrite):
-    """Raise InputError where the cameras of ``rig`` may not be written to the folder."""
+def _check_folder(folder, source, overwrite, known):
+    """Raise InputError where what is made of ``source`` may not be written to the folder, for it
+    holds that, or what is not ``known(path)``.
+    """
     if not os.path.isdir(folder):
         return
-    a, b = (os.path.join(os.path.realpath(path), "") for path in (rig, folder))
+    a, b = (os.path.join(os.path.realpath(path), "") for path in (source, folder))
     if a.startswith(b):
         raise InputError(
-            f"{folder}: holds {rig}, which would be replaced; -o DIR is another folder"
+            f"{folder}: holds {source}, which would be replaced; -o DIR is another folder"
         )
-    ours = all(os.path.isfile(os.path.join(folder, n, "camera.json")) for n in os.listdir(folder))
+    ours = all(known(os.path.join(folder, name)) for name in os.listdir(folder))
     if not overwrite or not ours:
         hint = "give --overwrite to replace it, or" if ours else "not written by this command; give"
         raise InputError(f"{folder}: is there already; {hint} another folder by -o")
 
 
-def _write(target, text, template, hint, cameras=None):
-    """Write the scene, the template where there is one, and, by ``cameras(folder)``, further
-    cameras into a folder: all or none.
+def _write(target, text, template, hint, folders):
+    """Write what ``folders`` maps names of folders to (functions of a path), the template where
+    there is one, and the scene, ``text()``, into a folder: all or none.
     """
     made = not os.path.isdir(target)
     try:
         os.makedirs(target, exist_ok=True)
         with contextlib.ExitStack() as stack:
-            if cameras:
-                cameras(stack.enter_context(staged(os.path.join(target, CAMERAS))))
+            for name, write in folders.items():
+                write(stack.enter_context(staged(os.path.join(target, name))))
             if template:
                 obj = stack.enter_context(aside(os.path.join(target, "template.obj")))
                 meshio.write_obj(obj, *template)
             scene = stack.enter_context(aside(os.path.join(target, "scene.xml")))
             with open(scene, "w", encoding="utf-8") as file:
-                file.write(text)
+                file.write(text())
     except (OSError, InputError) as error:
         if made:
             with contextlib.suppress(OSError):

@@ -62,7 +62,7 @@ def prepare_video(
     - ``size``: words as :func:`polysft_mi.capture.sheet.parse_size` takes them, for a flat template
       with ``resolution`` vertices along its longer side; or ``template``, an OBJ.
     - The camera, by one of ``camera`` (a file), ``fov`` [degrees] and ``calibrate`` (a video of a
-      ``board``); else by the rig of ``evidence``, or by what the video or the photo says.
+      ``board``); else by what ``evidence`` says, or the video or the photo says.
     - ``corners`` (4, 2): pixels of the sheet's corners in the frame ``first`` as it was taken, or
       "frame" for the picture's own; ``pose_fit``: "auto" to move the sheet from there to the edges
       in that frame, where they are clear, or "none".
@@ -93,8 +93,7 @@ def prepare_video(
     stream = read_frames(video, first, last, stride, film)
     index, frame = next(stream)
     taken = frame.shape[1::-1]
-    rig = evidence.rig if evidence else None
-    lens, board_picture = _lens(video, texture, camera, fov, calibrate, board, taken, rig)
+    lens, board_picture = _lens(video, texture, camera, fov, calibrate, board, taken, evidence)
     straight = Undistortion(lens, scale)
     view, frame = straight.camera, straight.image(frame)
     found["camera"] = {**lens.as_json(), "from": lens.source}
@@ -195,7 +194,7 @@ def _write_scene(folder, view, masked, photo, placed, mesh, settings):
         file.write(scene_xml(layout, ".", comment=comment))
 
 
-def _lens(video, texture, camera, fov, calibrate, board, size, rig=None):
+def _lens(video, texture, camera, fov, calibrate, board, size, evidence):
     """(Lens, picture of the calibration or None) of frames of ``size`` (width, height)."""
     if camera is not None:
         return read_lens(camera, *size), None
@@ -204,7 +203,7 @@ def _lens(video, texture, camera, fov, calibrate, board, size, rig=None):
     if calibrate is not None:
         lens, picture = calibrate_camera(calibrate, board)
         return lens.resized(*size), picture
-    if rig is not None and (lens := rig.lens(*size)) is not None:
+    if evidence and (lens := evidence.lens(*size)) is not None:
         return lens, None
     focal, where = focal_length(video)
     if focal is None and texture != _FIRST_FRAME:

@@ -21,6 +21,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
             "focal_35mm",
             "image_size",
             "list_images",
+            "read_pixels",
             "read_rgb",
         ],
         "plugins": ["register"],
