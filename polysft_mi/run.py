@@ -230,6 +230,8 @@ def reconstruct(
         summary, plotted = outputs.write(
             problem, done, out, drawing, fps=fps, command=command, say=progress.stage
         )
+        if sequence.cameras:
+            plotted()  # the page shows their pictures
         page = _report(out, progress) if report else None
         plotted()
     for frame, reason in summary["lost"].items():

@@ -115,17 +115,13 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
     for index, v in zip(indices, vertices):
         write_ply(os.path.join(out, "meshes", f"{index:03d}.ply"), v[source], faces, uv)
     say("pictures")
-    (per_frame, box), video = drawn(), bound()
+    (per_frame, box, others), video = drawn(), bound()
 
-    finite = {
-        name: [p[name] for p in per_frame if np.isfinite(p[name])]
-        for name in ("psnr_mask", "ssim_mask")
-    }
     summary = {
         "frames": count,
         "frames_wanted": len(sequence.indices),
         "lost": {str(int(indices[k])): reason for k, reason in track.lost.items() if k < count},
-        **{name: float(np.mean(values)) for name, values in finite.items() if values},
+        **_means(per_frame),
         "seconds_per_frame": float(sum(track.seconds) / count),
         "iterations_per_window": float(np.mean(track.iterations)) if track.iterations else 0.0,
         "order": template.order,
@@ -133,6 +129,7 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
         "template_residual_max_mm": 1e3 * template.residual_max,
         "solver": track.solver,
     }
+    cameras = {name: {**_means(of), "per_frame": of} for name, of in others.items()}
     windows = [
         {"frame": int(indices[count - len(track.iterations) + k]), "iterations": n, "seconds": t}
         | terms
@@ -148,11 +145,19 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
             "versions": versions(),
             "pictures": {"box": list(box)},
             "per_frame": per_frame,
+            **({"cameras": cameras} if cameras else {}),
             "windows": windows,
             "command": command,
         },
     )
     return {**summary, "video": video}, plotted
+
+
+def _means(per_frame):
+    """The means of the figures of frames, where they are known."""
+    names = ("psnr_mask", "ssim_mask", "iou")
+    finite = {n: [p[n] for p in per_frame if n in p and np.isfinite(p[n])] for n in names}
+    return {name: float(np.mean(values)) for name, values in finite.items() if values}
 
 
 def write_beginning(out, scene, camera, others, command, fps):
