@@ -30,13 +30,15 @@ _STRAIGHT = 1e-3  # how far a pose may be from another's
 class DepthFolder:
     """``images``: a folder or a pattern; ``form``: what they are, in words; ``camera``: theirs,
     where it is known (:class:`polysft_mi.camera.Intrinsics`), at the colour camera's place, or None
-    where they show what the colour images do; ``colour``: that of the colour images, or None.
+    where they show what the colour images do; ``colour``: that of the colour images, or None;
+    ``note``: a line for a person, or "".
     """
 
     images: str
     form: str = ""
     camera: Intrinsics | None = None
     colour: Intrinsics | None = None
+    note: str = ""
 
     def is_seen_by(self, view):
         """Whether the images, scaled, show what a camera does."""
@@ -158,7 +160,11 @@ def _realsense(folder):
                 f"{min(files)}: rs-convert -p paints depth in colours, which do not tell it;"
                 " rs-convert -v writes it as numbers"
             )
-        return DepthFolder(os.path.join(folder, name), "RealSense")
+        note = (
+            f"note: {folder}: a RealSense sees depth as its left infrared camera does; frames of"
+            " that are needed, or depth that was aligned to colour"
+        )
+        return DepthFolder(os.path.join(folder, name), "RealSense", note=note)
     return None
 
 

@@ -87,6 +87,7 @@ class GivenEvidence:
             form = f", as of {source.form}" if source.form else ""
             moved = ", as the frames' camera sees it" if source.camera is not None else ""
             lines.append(f"depth: that of {self._depth}{form}{moved}")
+            lines += [source.note] if source.note else []
         if self.rig:
             scale = straight.camera.width / straight.size[0]
             where = os.path.join(folder, CAMERAS)

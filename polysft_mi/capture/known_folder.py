@@ -42,15 +42,17 @@ def prepare_folder(
     layout = recognise(folder)
     camera = layout.camera
     masks = os.path.join(folder, layout.masks) if layout.masks else ""
+    said = []
     known_to = evidence.pop("depth_known_to", "metric")
     depth = recognise_depth(evidence["depth"]) if evidence.get("depth") else None
     if depth:
         evidence["depth"] = depth.images
+        said += [depth.note] if depth.note else []
     sequence = Sequence.open(
         os.path.join(folder, layout.frames), masks, size=(camera.width, camera.height), **evidence
     )
     checked_size(os.path.join(folder, layout.texture))
-    template, where, said = None, "template.obj", []
+    template, where = None, "template.obj"
     if layout.obj is None:
         vertices, faces, uv = template = kinect_paper_template(
             folder, resolution, pose_fit, said.append

@@ -254,8 +254,9 @@ class Album:
             Renderings(problem, camera), self.settings, lambda k: self._place(k, name)
         )
         self._own, self._texcoords, self._view = strip("images"), None, None
-        #: of the further cameras, by name
-        self._others = {c.name: strip(f"of-{c.name}", c) for c in problem.sequence.cameras}
+        # others are drawn by raster alone: their sensors are not Mitsuba's perspective
+        others = problem.sequence.cameras if problem.placed.is_raster else ()
+        self._others = {c.name: strip(f"of-{c.name}", c) for c in others}
         self._sheet = None  # the surface, as it is seen from the side
         self._pool = ThreadPoolExecutor(self.settings.threads)
         self._drawn = {}  # frame: future of its figures, by camera, None for the own

@@ -15,6 +15,7 @@ from polysft_mi.errors import InputError
 from .sequence import Sequence
 
 _CAMERA = "camera.json"
+_HINT = " (polysft prepare --cameras makes one of a rig of COLMAP or nerfstudio)"
 _STRAIGHT = 1e-3  # how far a rotation may be from one
 
 
@@ -64,12 +65,12 @@ def open_cameras(
     """
     known = known or {}
     if not os.path.isdir(folder):
-        raise InputError(f"cameras: {folder}: no such folder")
+        raise InputError(f"cameras: {folder}: no such folder{_HINT}")
     names = sorted({*known, *(name for name in os.listdir(folder) if has_camera(folder, name))})
     if not names:
         raise InputError(
-            f"{folder}: no cameras in it; a folder for each, with {_CAMERA} and frames, is needed"
-            " (polysft prepare --cameras makes them of a rig of COLMAP or nerfstudio)"
+            f"{folder}: no cameras in it; a folder for each, with {_CAMERA} and frames, is"
+            f" needed{_HINT}"
         )
     return [
         _open(

@@ -153,7 +153,8 @@ def test_realsense(tmp_path):
         (tmp_path / f"a_Color_{time}.csv").write_text("1,2,3\n")
     (tmp_path / "out").mkdir()
     found, lines = written(tmp_path / "out", tmp_path)
-    assert "RealSense" in lines[0] and (found[:, :, :5] == 0).all()
+    assert "RealSense" in lines[0] and "left infrared camera" in lines[1]
+    assert (found[:, :, :5] == 0).all()
     for k in range(2):
         assert np.abs(found[k, :, 5:] - plane(COLOUR, k)[:, 5:]).max() < 0.0006
     pattern = str(tmp_path / "*_Depth_[0-9]*.csv")
