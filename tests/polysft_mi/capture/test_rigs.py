@@ -146,6 +146,14 @@ def test_cameras_stand_where_the_rig_says(kind, tmp_path):
     assert "left, right" in lines[0] and "0.25 m (--rig-scale)" in lines[0] and len(lines) == 1
     check(tmp_path / "out")
     assert rig.lens(96, 72).camera == OWN
+    # and so does what was written
+    again = GivenRig(str(tmp_path / "out"))
+    assert again.write(str(tmp_path / "again"), [0, 1, 2], OWN)[0].startswith(
+        "cameras: left, right"
+    )
+    check(tmp_path / "again")
+    assert again.lens(96, 72) is None
+    assert "--rig-scale" in refused(GivenRig, str(tmp_path / "out"), None, 2.0)
 
 
 def test_a_scene_is_prepared_with_them(tmp_path, capsys):
