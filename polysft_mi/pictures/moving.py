@@ -190,7 +190,7 @@ def _further(run):
     count = run.metrics.get("frames_wanted", len(run.frames))
     try:
         where = os.path.normpath(located(run.path("scene.xml"), s["cameras"]))
-        return open_cameras(where, count, first, last, stride)
+        return open_cameras(where, count, first, last, stride, run.cameras)
     except InputError:
         return []
 

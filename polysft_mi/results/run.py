@@ -16,7 +16,7 @@ from polyfit import jets
 from polyfit.mesh import TexCoords
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError
-from polysft_mi.scene import known_defaults, list_images, located
+from polysft_mi.scene import known_defaults, list_images, located, read_cameras
 
 from .truth import load_npz, read_surface, texcoords_of
 
@@ -86,6 +86,14 @@ class Run:
         """
         path = self.path("camera.json")
         return Intrinsics.from_json(path) if os.path.exists(path) else None
+
+    @cached_property
+    def cameras(self) -> dict[str, tuple[Intrinsics, np.ndarray]]:
+        """Intrinsics and world_to_camera (4, 4) [m] of the further cameras, by name; the world is
+        that of the scene.
+        """
+        path = self.path("cameras.json")
+        return read_cameras(path) if os.path.exists(path) else {}
 
     @cached_property
     def settings(self) -> dict[str, str]:

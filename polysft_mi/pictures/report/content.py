@@ -6,10 +6,11 @@ from polysft_mi.results import Truth, per_frame
 
 from ..figures import COLOURS, TERMS, loss_curves
 
-LABELS = {
+_LABELS = {
     "frame": "frame",
     "psnr_mask": "PSNR inside the surface [dB]",
     "ssim_mask": "SSIM inside the surface",
+    "iou": "silhouettes, IoU",
     "iterations": "iterations",
     "seconds": "seconds",
     "rgb": "photometric loss",
@@ -25,6 +26,38 @@ LABELS = {
     "hit": "share of points hit",
     "chamfer_1e4": "chamfer [1e-4 m²]",
 }
+
+
+_OF_IMAGES = ("psnr_mask", "ssim_mask", "iou")
+
+
+def _of(name, camera):
+    """What a figure of a further camera is called."""
+    return f"{name}, {camera}"
+
+
+def _named(row, camera):
+    return {n if n == "frame" else _of(n, camera): value for n, value in row.items()}
+
+
+def labels(run):
+    """Names of figures to texts."""
+    cameras = run.metrics.get("cameras", {})
+    further = {_of(n, c): f"{c}: {_LABELS[n]}" for c in cameras for n in _OF_IMAGES}
+    return _LABELS | further
+
+
+def further(run):
+    """Of each further camera its name, its figures as a text, and the path of its picture."""
+    texts = {"psnr_mask": "PSNR {:.2f} dB", "ssim_mask": "SSIM {:.3f}", "iou": "IoU {:.3f}"}
+    return [
+        (
+            name,
+            ", ".join(form.format(known[n]) for n, form in texts.items() if n in known),
+            run.path(f"comparison_{name}.png"),
+        )
+        for name, known in run.metrics.get("cameras", {}).items()
+    ]
 
 
 def figures(run, truth):
@@ -53,11 +86,16 @@ def figures(run, truth):
             [dict(zip(rows, values)) for values in zip(*rows.values())],
         )
         cards += [
-            (LABELS.get(n, n), f"{np.mean(rows[n]):.3g}") for n in rows if n not in ("frame", "hit")
+            (_LABELS.get(n, n), f"{np.mean(rows[n]):.3g}")
+            for n in rows
+            if n not in ("frame", "hit")
         ]
         distance = _distance(run, truth)
     metric = run.metrics
-    add(("psnr_mask", "ssim_mask"), metric.get("per_frame", []))
+    add(_OF_IMAGES, metric.get("per_frame", []))
+    for camera, known in metric.get("cameras", {}).items():
+        rows = [_named(row, camera) for row in known.get("per_frame", [])]
+        add([_of(name, camera) for name in _OF_IMAGES], rows)
     if run.score is not None:
         known = np.isfinite(run.score).any(axis=1)
         columns["score_mm"] = [
@@ -69,6 +107,7 @@ def figures(run, truth):
     wanted = {
         "psnr_mask": ("PSNR inside the surface", "{:.2f} dB"),
         "ssim_mask": ("SSIM inside the surface", "{:.3f}"),
+        "iou": ("IoU of the silhouettes", "{:.3f}"),
         "seconds_per_frame": ("seconds a frame", "{:.2f}"),
     }
     cards += [
