@@ -7,7 +7,7 @@ path tracer.
         --methods gauss-newton -o RESULTS
 
 Newton is NVIDIA's simulator on Warp; it runs on the CPU too. OUT receives the folders flag, bend,
-paper, curtain, skirt, pillow and roll, about two minutes each on one core.
+paper, curtain, skirt, pillow, roll and pushed, about two minutes each on one core.
 
 Each folder has the form that ``scenes/flag.xml`` and its sisters expect: ``template.obj`` (metres,
 camera frame), ``texture.png``, ``camera.json``, ``frames``, ``masks`` (480x360) and ``gt.npz``, the
@@ -21,6 +21,7 @@ light and texture.
     skirt    a cone that is open at both ends; its waist turns and sways
     pillow   closed; its two ends are pushed together and turned against each other
     roll     a sheet that is rolled up by 250 degrees, held along one edge, in wind
+    pushed   thinner than bend, its two ends pushed together by a fifth: it bulges either way
 """
 
 import argparse
@@ -66,6 +67,7 @@ KINDS = {
     "skirt": Kind(None, None, 3e-4, 9.81, 0.0, (0.3, 0.5), True),
     "pillow": Kind(None, None, 3e-3, 0.3, 0.12, (0.0, 0.6), True),
     "roll": Kind(None, None, 5e-3, 0.6, 0.0, (0.6, 0.8), True),
+    "pushed": Kind((0.31, 0.22), (36, 26), 1e-2, 0.3, 0.2, (0.0, 0.5)),
 }
 
 

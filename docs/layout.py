@@ -47,6 +47,7 @@ WAY = {
         "physics": "mesh, material, body → steps of cloth",
         "training": "garments and motions → weights",
         "draping": "garment, body, motion → a drape",
+        "baking": "drapes → bones and shapes for games",
     },
 }
 

@@ -19,7 +19,7 @@ from PIL import Image
 from polysft_mi.errors import InputError, cli
 from polysft_mi.view import open_viewer
 
-COLOURS, SIZE = ("texture", "sigma", "curvature"), (420, 460)  # (height, width) [pixels]
+COLOURS, SIZE = ("texture", "score", "curvature"), (420, 460)  # (height, width) [pixels]
 
 
 def pictures(run, frame, browser, patience=60):

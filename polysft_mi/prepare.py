@@ -30,6 +30,11 @@ _EXAMPLES = [
         "no photo: the first frame is the texture, and the sheet's corners in it are given",
     ),
     (
+        "left.mp4 --texture photo.jpg --size A4 --cameras rig/transforms.json --camera-name left"
+        " --rig-scale 0.35 -o OUT",
+        "several cameras at once, calibrated by COLMAP or nerfstudio",
+    ),
+    (
         "clip.mp4 --texture photo.jpg --size A4 --fov 65 --first 30 --last 229 --scale 0.5"
         " --no-masks -o OUT",
         "a part of a video, at half its size, and without masks",
@@ -80,6 +85,7 @@ def parser():
     _add_evidence(
         p.add_argument_group("what is known beside the images (docs/evidence.md), of every frame")
     )
+    _add_cameras(p.add_argument_group("further cameras, exposed with the one of the frames"))
     _add_video(p.add_argument_group("from a video"))
     _add_camera(
         p.add_argument_group(
@@ -107,7 +113,7 @@ def _add_evidence(group):
         "--depth",
         metavar="FOLDER",
         help="depth images as the frames' camera sees them: 16 bit PNG, or EXR in metres; 0 is"
-        " unknown",
+        " unknown. Or an export of Record3D, ScanNet or rs-convert (RealSense)",
     )
     group.add_argument(
         "--depth-unit",
@@ -122,6 +128,30 @@ def _add_evidence(group):
         default="metric",
         help="affine, disparity: depth, or its inverse, as a network guesses it, up to a scale and"
         " a shift (default: metric)",
+    )
+
+
+def _add_cameras(group):
+    group.add_argument(
+        "--cameras",
+        metavar="RIG",
+        help="a calibrated rig: nerfstudio's or instant-ngp's transforms.json, the folder of a"
+        " sparse model of COLMAP, or a folder of cameras with camera.json (docs/evidence.md)",
+    )
+    group.add_argument(
+        "--camera-name", metavar="NAME", help="the one of them that took the frames (default: none)"
+    )
+    group.add_argument(
+        "--rig-scale",
+        type=float,
+        default=1.0,
+        metavar="M",
+        help="metres of the rig's unit (default: 1)",
+    )
+    group.add_argument(
+        "--rig-images",
+        metavar="FOLDER",
+        help="the folder that its images' names count from (default: near the rig)",
     )
 
 
@@ -228,6 +258,7 @@ def main(argv=None):
             args.overwrite,
             args.pose_fit,
             warn=lambda line: print(line, file=sys.stderr),
+            rig=_rig(args),
             **_evidence(args),
         )
         found, lines = {"folder": args.folder}, [line]
@@ -246,6 +277,17 @@ def _evidence(args):
         known |= {"depth": args.depth, "depth_unit": args.depth_unit}
         known["depth_known_to"] = args.depth_known_to
     return known
+
+
+def _rig(args):
+    from .capture import GivenRig
+
+    if args.cameras is None:
+        for name in ("camera_name", "rig_images"):
+            if getattr(args, name) is not None:
+                raise InputError(f"--{name.replace('_', '-')}: is of a rig; --cameras names it")
+        return None
+    return GivenRig(args.cameras, args.camera_name, args.rig_scale, args.rig_images)
 
 
 def _from_video(args, command):
@@ -275,7 +317,7 @@ def _from_video(args, command):
             corners=corners,
             texture_corners=texture_corners,
             masks=args.masks or not args.no_masks,
-            evidence=GivenEvidence(**known) if (known := _evidence(args)) else None,
+            evidence=GivenEvidence(rig=_rig(args), **_evidence(args)),
             say=(lambda line: None) if quiet else print,
             progress=progress,
             command=command,

@@ -197,7 +197,7 @@ def reconstruct(
     mesh = experiment.template
     notes = size_note(mesh.vertices, scene), seam_note(mesh.vertices, mesh.faces, scene)
     far = uv_note(mesh.texcoords, scene)
-    for note in (experiment.note, *notes, far and f"note: {far}"):
+    for note in (*experiment.notes, *notes, far and f"note: {far}"):
         if note:
             print(note, file=sys.stderr)
     s = experiment.settings
@@ -213,7 +213,8 @@ def reconstruct(
         folder.clear(out)
     os.makedirs(out, exist_ok=True)
     if not resume:
-        outputs.write_beginning(out, text, problem.camera, command, fps)
+        cameras = problem.camera, sequence.cameras
+        outputs.write_beginning(out, text, *cameras, command, fps)
 
     gc.freeze()  # what is loaded by now stays: the collector need not go through it again and again
     about = {"scene": os.path.abspath(experiment.path), **outputs.versions()}
@@ -229,6 +230,8 @@ def reconstruct(
         summary, plotted = outputs.write(
             problem, done, out, drawing, fps=fps, command=command, say=progress.stage
         )
+        if sequence.cameras:
+            plotted()  # the page shows their pictures
         page = _report(out, progress) if report else None
         plotted()
     for frame, reason in summary["lost"].items():

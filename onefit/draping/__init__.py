@@ -6,5 +6,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
         "draper": ["Drape", "Draper", "load"],
+        "inputs": ["body_model", "motion_of", "shape_of"],
+        "post": ["DRAG", "PULL"],
     },
 )

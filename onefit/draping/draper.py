@@ -322,8 +322,6 @@ class Draper:
         vertices at ``rest`` (N, 3) [m]; ``under``: the surfaces of what it is worn over, besides,
         in one frame after the other.
         """
-        vertices = garment.vertices.cpu().numpy()
-        drawn = lambda: pull(vertices, self.standard, self._held(garment))
         if not self._surfaces:  # made once for a body model
             at, faces = body.vertices.cpu(), body.faces.cpu()
             self._surfaces = ClosestSurface(at, faces), ClosestSurface(at, faces)
@@ -333,8 +331,16 @@ class Draper:
             threads, long = garment.stitches.edges(rest.cpu().numpy())
             edges = np.concatenate([edges, threads])
             lengths = torch.cat([lengths, torch.as_tensor(long).to(lengths)])
-        pulls = self._once(garment, "pull", drawn)
+        pulls = self.pull(garment)
         return PostProcessing(rest, garment.faces, edges, lengths, pulls, self._surfaces, under)
+
+    def pull(self, garment: Garment) -> np.ndarray:
+        """How firmly post-processing draws each vertex of a garment to the network's drape, (N,)
+        [1/s^2], found once: :func:`onefit.draping.post.pull`.
+        """
+        vertices = garment.vertices.cpu().numpy()
+        drawn = lambda: pull(vertices, self.standard, self._held(garment))
+        return self._once(garment, "pull", drawn)
 
     def codes(self, garment: Garment) -> torch.Tensor:
         """Z_T (K, width) of the garment's patches, found once."""

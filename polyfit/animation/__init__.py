@@ -15,7 +15,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
         "frames": ["write_frames"],
-        "gltf": ["write_glb"],
+        "gltf": ["Skeleton", "SkinnedMesh", "write_glb", "write_skinned_glb"],
         "moving": ["AXES_FROM_CAMERA", "encoded", "from_camera", "normals"],
         "usd": ["write_usd"],
     },

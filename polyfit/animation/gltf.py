@@ -1,13 +1,116 @@
-"""A moving mesh as binary glTF 2.0."""
+"""A moving mesh as binary glTF 2.0: as it is in each frame, or skinned by a skeleton's joints."""
 
 import os
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from polyfit.errors import InputError
 from polyfit.files import aside
 
 from .moving import checked, encoded, normals
+
+GREY = (0.72, 0.72, 0.72)
+
+
+class _File:
+    """A glTF document that grows: ``out``, and the bytes of its buffer."""
+
+    def __init__(self):
+        import pygltflib as gltf
+
+        self.gltf, self.blob = gltf, bytearray()
+        self.out = gltf.GLTF2(asset=gltf.Asset(version="2.0", generator="polyfit"))
+
+    def view(self, raw, target=None):
+        self.blob.extend(b"\0" * (-len(self.blob) % 4))
+        self.out.bufferViews.append(
+            self.gltf.BufferView(
+                buffer=0, byteOffset=len(self.blob), byteLength=len(raw), target=target
+            )
+        )
+        self.blob.extend(raw)
+        return len(self.out.bufferViews) - 1
+
+    def accessor(self, array, form, target=None, component=None, bounds=False):
+        array = np.ascontiguousarray(array)
+        low, high = np.atleast_1d(array.min(0)), np.atleast_1d(array.max(0))
+        limits = {"min": low.tolist(), "max": high.tolist()} if bounds else {}
+        self.out.accessors.append(
+            self.gltf.Accessor(
+                bufferView=self.view(array.tobytes(), target),
+                componentType=component or self.gltf.FLOAT,
+                count=len(array),
+                type=form,
+                **limits,
+            )
+        )
+        return len(self.out.accessors) - 1
+
+    def geometry(self, positions, directions):
+        buffer, vec3 = self.gltf.ARRAY_BUFFER, self.gltf.VEC3
+        return self.gltf.Attributes(
+            POSITION=self.accessor(positions, vec3, buffer, bounds=True),
+            NORMAL=self.accessor(directions, vec3, buffer),
+        )
+
+    def indices(self, faces, count):
+        """The accessor of ``faces`` (F, 3) of ``count`` vertices."""
+        gltf, wide = self.gltf, count > 65535
+        return self.accessor(
+            faces.ravel().astype(np.uint32 if wide else np.uint16),
+            gltf.SCALAR,
+            gltf.ELEMENT_ARRAY_BUFFER,
+            gltf.UNSIGNED_INT if wide else gltf.UNSIGNED_SHORT,
+        )
+
+    def material(self, name, paint):
+        """The number of a material that both sides of cloth show; ``paint``: what of its PBR."""
+        paint = self.gltf.PbrMetallicRoughness(metallicFactor=0.0, roughnessFactor=0.9, **paint)
+        self.out.materials.append(
+            self.gltf.Material(
+                pbrMetallicRoughness=paint, doubleSided=True, name=name, alphaCutoff=None
+            )
+        )
+        return len(self.out.materials) - 1
+
+    def mesh(self, primitive, name, target_names):
+        """The number of a mesh; its morph targets, where there are some, have weights of 0."""
+        mesh = self.gltf.Mesh(primitives=[primitive], name=name)
+        if target_names:
+            mesh.weights, mesh.extras = [0.0] * len(target_names), {"targetNames": target_names}
+        self.out.meshes.append(mesh)
+        return len(self.out.meshes) - 1
+
+    def animate(self, channels, count, fps):
+        """The animation of ``count`` frames: ``channels`` of (node, path, values, form)."""
+        gltf = self.gltf
+        times = (np.arange(count) / fps).astype(np.float32)
+        times, samplers, targets = self.accessor(times, gltf.SCALAR, bounds=True), [], []
+        for node, path, values, form in channels:
+            output = self.accessor(np.asarray(values, np.float32), form)
+            samplers.append(
+                gltf.AnimationSampler(input=times, output=output, interpolation="LINEAR")
+            )
+            target = gltf.AnimationChannelTarget(node=node, path=path)
+            targets.append(gltf.AnimationChannel(sampler=len(samplers) - 1, target=target))
+        self.out.animations = [gltf.Animation(samplers=samplers, channels=targets, name="motion")]
+
+    def write(self, path, roots):
+        """The file of a scene with the nodes ``roots``."""
+        out = self.out
+        out.scenes, out.scene = [self.gltf.Scene(nodes=roots)], 0
+        out.buffers = [self.gltf.Buffer(byteLength=len(self.blob))]
+        out.set_binary_blob(bytes(self.blob))
+        with aside(path) as temporary:
+            out.save_binary(temporary)
+
+
+def _check_name(path):
+    if not os.fspath(path).lower().endswith(".glb"):
+        raise InputError(f"{path}: .glb is needed")
 
 
 def write_glb(path, vertices, faces, uv=None, texture=None, *, fps=24.0, name="surface"):
@@ -15,72 +118,27 @@ def write_glb(path, vertices, faces, uv=None, texture=None, *, fps=24.0, name="s
     one, and an animation of their weights, which blends each frame into the next. ``vertices`` have
     y up, as glTF has it; they are split along seams, for glTF has one uv a vertex. Needs pygltflib.
     """
-    import pygltflib as gltf
-
     vertices, faces, uv = checked(vertices, faces, uv, fps)
-    if not os.fspath(path).lower().endswith(".glb"):
-        raise InputError(f"{path}: .glb is needed")
+    _check_name(path)
     data, kind = encoded(texture) if texture is not None and uv is not None else (None, None)
-    out, blob = gltf.GLTF2(asset=gltf.Asset(version="2.0", generator="polyfit")), bytearray()
-
-    def view(raw, target=None):
-        blob.extend(b"\0" * (-len(blob) % 4))
-        out.bufferViews.append(
-            gltf.BufferView(buffer=0, byteOffset=len(blob), byteLength=len(raw), target=target)
-        )
-        blob.extend(raw)
-        return len(out.bufferViews) - 1
-
-    def accessor(array, form, target=None, component=gltf.FLOAT, bounds=False):
-        array = np.ascontiguousarray(array)
-        limits = (
-            {
-                "min": np.atleast_1d(array.min(0)).tolist(),
-                "max": np.atleast_1d(array.max(0)).tolist(),
-            }
-            if bounds
-            else {}
-        )
-        out.accessors.append(
-            gltf.Accessor(
-                bufferView=view(array.tobytes(), target),
-                componentType=component,
-                count=len(array),
-                type=form,
-                **limits,
-            )
-        )
-        return len(out.accessors) - 1
-
-    def geometry(positions, directions):
-        return gltf.Attributes(
-            POSITION=accessor(positions, gltf.VEC3, gltf.ARRAY_BUFFER, bounds=True),
-            NORMAL=accessor(directions, gltf.VEC3, gltf.ARRAY_BUFFER),
-        )
-
+    file = _File()
+    gltf, out = file.gltf, file.out
     n = normals(vertices, faces)
     if uv is not None:
         source, uv, faces = uv.split(faces)
         uv = np.nan_to_num(uv).astype(np.float32)
         vertices, n = vertices[:, source], n[:, source]
-    attributes = geometry(vertices[0], n[0])
+    attributes = file.geometry(vertices[0], n[0])
     if uv is not None:
-        attributes.TEXCOORD_0 = accessor(
+        attributes.TEXCOORD_0 = file.accessor(
             np.stack([uv[:, 0], 1 - uv[:, 1]], 1), gltf.VEC2, gltf.ARRAY_BUFFER
         )
-    targets = [geometry(V - vertices[0], d - n[0]) for V, d in zip(vertices[1:], n[1:])]
-    wide = vertices.shape[1] > 65535
-    index = accessor(
-        faces.ravel().astype(np.uint32 if wide else np.uint16),
-        gltf.SCALAR,
-        gltf.ELEMENT_ARRAY_BUFFER,
-        gltf.UNSIGNED_INT if wide else gltf.UNSIGNED_SHORT,
-    )
-    paint = gltf.PbrMetallicRoughness(metallicFactor=0.0, roughnessFactor=0.9)
+    targets = [file.geometry(V - vertices[0], d - n[0]) for V, d in zip(vertices[1:], n[1:])]
+    index = file.indices(faces, vertices.shape[1])
     if data:
         out.images = [
             gltf.Image(
-                bufferView=view(data),
+                bufferView=file.view(data),
                 mimeType={"png": "image/png", "jpg": "image/jpeg"}[kind],
                 name="texture",
             )
@@ -94,35 +152,116 @@ def write_glb(path, vertices, faces, uv=None, texture=None, *, fps=24.0, name="s
             )
         ]
         out.textures = [gltf.Texture(source=0, sampler=0)]
-        paint.baseColorTexture = gltf.TextureInfo(index=0)
+        paint = dict(baseColorTexture=gltf.TextureInfo(index=0))
     else:
-        paint.baseColorFactor = [0.72, 0.72, 0.72, 1.0]
-    out.materials = [
-        gltf.Material(pbrMetallicRoughness=paint, doubleSided=True, name=name, alphaCutoff=None)
-    ]
-    primitive = gltf.Primitive(attributes=attributes, indices=index, material=0, targets=targets)
-    mesh = gltf.Mesh(primitives=[primitive], name=name)
-    if targets:
-        mesh.weights, mesh.extras = (
-            [0.0] * len(targets),
-            {"targetNames": [str(k) for k in range(1, len(vertices))]},
-        )
-        times = accessor(
-            (np.arange(len(vertices)) / fps).astype(np.float32), gltf.SCALAR, bounds=True
-        )
-        weights = accessor(np.eye(len(vertices), dtype=np.float32)[:, 1:].ravel(), gltf.SCALAR)
-        sampler = gltf.AnimationSampler(input=times, output=weights, interpolation="LINEAR")
-        channel = gltf.AnimationChannel(
-            sampler=0, target=gltf.AnimationChannelTarget(node=0, path="weights")
-        )
-        out.animations = [gltf.Animation(samplers=[sampler], channels=[channel], name="motion")]
-    out.meshes, out.nodes, out.scenes, out.scene = (
-        [mesh],
-        [gltf.Node(mesh=0, name=name)],
-        [gltf.Scene(nodes=[0])],
-        0,
+        paint = dict(baseColorFactor=[*GREY, 1.0])
+    material = file.material(name, paint)
+    primitive = gltf.Primitive(
+        attributes=attributes, indices=index, material=material, targets=targets
     )
-    out.buffers = [gltf.Buffer(byteLength=len(blob))]
-    out.set_binary_blob(bytes(blob))
-    with aside(path) as temporary:
-        out.save_binary(temporary)
+    mesh = file.mesh(primitive, name, [str(k) for k in range(1, len(vertices))])
+    out.nodes = [gltf.Node(mesh=mesh, name=name)]
+    if targets:
+        weights = np.eye(len(vertices))[:, 1:].ravel()
+        file.animate([(0, "weights", weights, gltf.SCALAR)], len(vertices), fps)
+    file.write(path, [0])
+
+
+@dataclass(frozen=True)
+class Skeleton:
+    """Joints that move: their ``names`` (J,), ``parents`` (J,), each before its children, -1 of the
+    root; ``offsets`` (J, 3) [m] from the parent in its axes; ``inverse`` (J, 4, 4), from the rest
+    space of the meshes to each joint's; ``rotations`` (T, J, 3) [rad], axis-angle vectors against
+    the parent; ``translation`` (T, 3) [m], added to the root's offset.
+    """
+
+    names: Any
+    parents: Any
+    offsets: Any
+    inverse: Any
+    rotations: Any
+    translation: Any
+
+
+@dataclass(frozen=True)
+class SkinnedMesh:
+    """A mesh on a :class:`Skeleton`: ``vertices`` (N, 3) [m] at rest, ``faces`` (F, 3);
+    ``joint_of`` (N, 4) and ``joint_weights`` (N, 4), rows that sum to one; ``shapes`` (R, N, 3)
+    [m], added to the vertices by ``weights`` (T, R) before they are skinned; ``colour``, linear
+    RGB.
+    """
+
+    name: str
+    vertices: Any
+    faces: Any
+    joint_of: Any
+    joint_weights: Any
+    shapes: Any = ()
+    weights: Any = field(default=(), repr=False)
+    colour: Any = GREY
+
+
+def write_skinned_glb(path, meshes, skeleton, *, fps=24.0, up="z"):
+    """Write binary glTF 2.0 (``.glb``) of :class:`SkinnedMesh` meshes on one :class:`Skeleton`: a
+    skin, a morph target for each of a mesh's shapes, and one animation of the joints and of the
+    weights. ``up``: the axis that points up in all of it; a node above the root turns z up to y up.
+    A shape's normals are those of its first order, at the vertices with all weights 0. Needs
+    pygltflib.
+    """
+    _check_name(path)
+    for mesh in meshes:
+        checked(np.asarray(mesh.vertices)[None], mesh.faces, None, fps)
+    file, count = _File(), len(skeleton.rotations)
+    gltf, out = file.gltf, file.out
+    joints = range(len(skeleton.names))
+    parents = list(skeleton.parents)
+    for j in joints:
+        children = [k for k in joints if parents[k] == j]
+        node = gltf.Node(name=skeleton.names[j], children=children)
+        node.translation, node.rotation = np.asarray(skeleton.offsets[j]).tolist(), [0, 0, 0, 1]
+        out.nodes.append(node)
+    turn = [-np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)] if up == "z" else [0.0, 0.0, 0.0, 1.0]
+    top, root = len(out.nodes), parents.index(-1)
+    out.nodes.append(gltf.Node(name="skeleton", rotation=turn, children=[root]))
+    columns = np.asarray(skeleton.inverse, np.float32).swapaxes(-1, -2).reshape(-1, 16)
+    inverse = file.accessor(columns, gltf.MAT4)
+    out.skins = [gltf.Skin(joints=[*joints], inverseBindMatrices=inverse, skeleton=top)]
+    # one sign of the quaternion from frame to frame: they are blended as they stand
+    turns = np.asarray(skeleton.rotations, float).transpose(1, 0, 2)
+    turns = Rotation.from_rotvec(turns.reshape(-1, 3)).as_quat().reshape(len(joints), count, 4)
+    flips = np.where((turns[:, 1:] * turns[:, :-1]).sum(-1) < 0, -1.0, 1.0)
+    turns[:, 1:] *= np.cumprod(flips, 1)[..., None]
+    channels = [(j, "rotation", turns[j], gltf.VEC4) for j in joints]
+    place = np.asarray(skeleton.offsets[root]) + np.asarray(skeleton.translation)
+    channels.append((root, "translation", place, gltf.VEC3))
+    for mesh in meshes:
+        node = len(out.nodes)
+        out.nodes.append(gltf.Node(name=mesh.name, mesh=_skinned(file, mesh), skin=0))
+        if len(mesh.shapes):
+            channels.append((node, "weights", np.asarray(mesh.weights).ravel(), gltf.SCALAR))
+    file.animate(channels, count, fps)
+    file.write(path, [top, *range(top + 1, len(out.nodes))])
+
+
+def _skinned(file, mesh):
+    """The number of the mesh of a :class:`SkinnedMesh`."""
+    gltf = file.gltf
+    vertices, shapes = (np.asarray(x, np.float32) for x in (mesh.vertices, mesh.shapes))
+    faces = np.asarray(mesh.faces, np.int64)
+    n = normals(vertices[None], faces)[0]
+    attributes = file.geometry(vertices, n)
+    weights = np.asarray(mesh.joint_weights, np.float32)
+    joints = np.where(weights > 0, mesh.joint_of, 0).astype(np.uint8)
+    buffer, vec4 = gltf.ARRAY_BUFFER, gltf.VEC4
+    attributes.JOINTS_0 = file.accessor(joints, vec4, buffer, gltf.UNSIGNED_BYTE)
+    attributes.WEIGHTS_0 = file.accessor(weights, vec4, buffer)
+    step = 0.01  # of a weight
+    change = [(normals((vertices + step * s)[None], faces)[0] - n) / step for s in shapes]
+    targets = [file.geometry(s, c) for s, c in zip(shapes, change)]
+    primitive = gltf.Primitive(
+        attributes=attributes,
+        indices=file.indices(faces, len(vertices)),
+        material=file.material(mesh.name, dict(baseColorFactor=[*mesh.colour, 1.0])),
+        targets=targets,
+    )
+    return file.mesh(primitive, mesh.name, [f"shape {k}" for k in range(len(shapes))])

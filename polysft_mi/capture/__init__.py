@@ -14,6 +14,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "known_folder": ["prepare_folder"],
         "layouts": ["FORMS", "Layout", "recognise"],
         "masks": ["iou"],
+        "rig": ["GivenRig"],
         "scene_file": ["scene_xml"],
         "sheet": ["Sheet"],
         "video": ["prepare_video"],

@@ -1,4 +1,6 @@
-"""Tracks and depth images that a person has beside a video, made fit to its folder's frames."""
+"""What a person has beside a video, made fit to its folder's frames: tracks, depth images, and
+further cameras.
+"""
 
 import os
 
@@ -7,17 +9,18 @@ import numpy as np
 from polysft_mi.errors import InputError
 from polysft_mi.scene import DepthImages, Tracks
 
-from .output import write_png
+from .camera import Lens
+from .depth import DEPTH, recognise_depth, write_depth
+from .rig import CAMERAS
 
-_TRACKS, _DEPTH = "tracks.npz", "depth/{:05d}.png"
-_UNIT = 1e-4  # metres of a whole number of the depth images that are written
-_MOST = 65535  # what they hold; farther off there is no sheet
+_TRACKS = "tracks.npz"
 
 
 class GivenEvidence:
     """``tracks``: a file, and the coordinate ``track_centre`` that it gives the first pixel's
-    centre; ``depth``: a folder or a pattern, its whole numbers in ``depth_unit`` [m]; None each for
-    none; ``depth_known_to``: as the setting of that name.
+    centre; ``depth``: a folder or a pattern, its whole numbers in ``depth_unit`` [m]; ``rig``: a
+    :class:`polysft_mi.capture.rig.GivenRig`; None each for none; ``depth_known_to``: as the setting
+    of that name.
     """
 
     def __init__(
@@ -27,14 +30,31 @@ class GivenEvidence:
         depth=None,
         depth_unit=1e-3,
         depth_known_to="metric",
+        rig=None,
     ):
         self._tracks, self._centre = tracks, track_centre
         self._depth, self._unit, self._known_to = depth, depth_unit, depth_known_to
+        self.rig = rig
+
+    def lens(self, width, height):
+        """The :class:`polysft_mi.capture.camera.Lens` that it says the frames were taken with, for
+        frames of a size; None where it says nothing.
+        """
+        if self.rig and (lens := self.rig.lens(width, height)) is not None:
+            return lens
+        colour = recognise_depth(self._depth).colour if self._depth else None
+        return Lens(colour, (), self._depth).resized(width, height) if colour else None
+
+    @property
+    def inputs(self):
+        """The files and folders that are read."""
+        rig = self.rig.path if self.rig else None
+        return [path for path in (self._tracks, self._depth, rig) if path]
 
     def write(self, folder, indices, straight):
         """Write those of the frames ``indices`` into the folder, undistorted and scaled by
-        ``straight`` (:class:`polysft_mi.capture.camera.Undistortion`). Returns the settings that
-        name them, and lines for a person. Raises InputError.
+        ``straight`` (:class:`polysft_mi.capture.camera.Undistortion`), further cameras scaled
+        likewise. Returns the settings that name them, and lines for a person. Raises InputError.
         """
         settings, lines = {}, []
         if self._tracks:
@@ -52,21 +72,27 @@ class GivenEvidence:
             seen = 100 * known.visible.mean()
             lines.append(f"tracks: {len(known.query)} of {self._tracks}, {seen:.0f} % visible")
         if self._depth:
-            images = DepthImages.open(self._depth, None, indices, self._unit)
-            os.makedirs(os.path.join(folder, os.path.dirname(_DEPTH)))
-            for k in range(len(indices)):
-                depth = straight.numbers(self._sized(images, k, straight))
-                # what is fitted to each frame anyway is known to no scale
-                unit = _UNIT if self._known_to == "metric" else depth.max() / _MOST
-                whole = np.round(depth / max(unit, 1e-12))
-                whole = np.where(whole <= _MOST, whole, 0).astype(np.uint16)
-                write_png(os.path.join(folder, _DEPTH.format(k)), whole)
+            source, where = recognise_depth(self._depth), os.path.join(folder, DEPTH)
+            images = DepthImages.open(source.images, None, indices, self._unit)
+
+            def converted(k):
+                if source.camera is not None:
+                    return source.seen_by(images.read(k), straight.camera)
+                return straight.numbers(self._sized(images, k, straight))
+
             settings |= {
-                "depth": os.path.dirname(_DEPTH),
-                "depth_unit": _UNIT,
-                "depth_known_to": self._known_to,
+                "depth": DEPTH,
+                **write_depth(where, images, converted, self._known_to),
             }
-            lines.append(f"depth: that of {self._depth}")
+            form = f", as of {source.form}" if source.form else ""
+            moved = ", as the frames' camera sees it" if source.camera is not None else ""
+            lines.append(f"depth: that of {self._depth}{form}{moved}")
+            lines += [source.note] if source.note else []
+        if self.rig:
+            scale = straight.camera.width / straight.size[0]
+            where = os.path.join(folder, CAMERAS)
+            lines += self.rig.write(where, indices, straight.camera, scale)
+            settings["cameras"] = CAMERAS
         return settings, lines
 
     @staticmethod

@@ -6,11 +6,14 @@ from dataclasses import replace
 
 from polyfit.files import aside
 from polysft_mi.errors import InputError
-from polysft_mi.scene import Sequence, checked_size
+from polysft_mi.scene import Sequence, checked_size, open_cameras
 from polysft_mi.scene.kinect_paper import template as kinect_paper_template
 from polysft_mi.surface import meshio
 
+from .depth import DEPTH, recognise_depth, write_depth
 from .layouts import recognise
+from .output import staged
+from .rig import CAMERAS
 from .scene_file import scene_xml
 
 
@@ -21,13 +24,16 @@ def prepare_folder(
     overwrite=False,
     pose_fit="auto",
     warn=lambda line: None,
+    rig=None,
     **evidence,
 ):
     """Write ``scene.xml`` for a sequence into ``out`` (default: the folder itself); for
     Kinect-Paper also ``template.obj``, of that ``resolution``, in its pose of
     :func:`polysft_mi.scene.kinect_paper.template`.
 
-    ``evidence``: settings of tracks and depth, by their names, with paths as the caller has them.
+    ``evidence``: settings of tracks and depth, by their names, with paths as the caller has them;
+    ``rig``: a :class:`polysft_mi.capture.rig.GivenRig`, whose cameras are written beside the scene
+    (a folder of cameras of ours stays where it is).
     Everything that the scene names is read and checked first; ``warn`` is given a line about a
     template whose size is unlikely. Returns (path of the scene, what was
     found, in lines). Raises InputError; then nothing is written.
@@ -36,12 +42,17 @@ def prepare_folder(
     layout = recognise(folder)
     camera = layout.camera
     masks = os.path.join(folder, layout.masks) if layout.masks else ""
+    said = []
     known_to = evidence.pop("depth_known_to", "metric")
+    depth = recognise_depth(evidence["depth"]) if evidence.get("depth") else None
+    if depth:
+        evidence["depth"] = depth.images
+        said += [depth.note] if depth.note else []
     sequence = Sequence.open(
         os.path.join(folder, layout.frames), masks, size=(camera.width, camera.height), **evidence
     )
     checked_size(os.path.join(folder, layout.texture))
-    template, where, said = None, "template.obj", []
+    template, where = None, "template.obj"
     if layout.obj is None:
         vertices, faces, uv = template = kinect_paper_template(
             folder, resolution, pose_fit, said.append
@@ -60,23 +71,42 @@ def prepare_folder(
                 f"{os.path.join(target, name)}: is there already; give --overwrite to replace it,"
                 " or another folder by -o"
             )
+    folders = {}
+    if rig and rig.ours:
+        open_cameras(rig.path, len(sequence))
+        evidence["cameras"] = rig.path
+    elif rig:
+        known = lambda path: os.path.isfile(os.path.join(path, "camera.json"))
+        _check_folder(os.path.join(target, CAMERAS), rig.path, overwrite, known)
+        folders[CAMERAS] = lambda to: said.extend(
+            rig.write(to, sequence.indices, camera, whole=True)
+        )
+    if depth and not depth.is_seen_by(camera):
+        known = lambda path: path.endswith(".png")
+        _check_folder(os.path.join(target, DEPTH), depth.images, overwrite, known)
+        seen = lambda k: depth.seen_by(sequence.depth.read(k), camera)
+        folders[DEPTH] = lambda to: evidence.update(write_depth(to, sequence.depth, seen, known_to))
     note = meshio.size_note(vertices, where)
     if note:
         warn(note)
-    for name in ("tracks", "depth"):
+    for name in ("tracks", "depth", "cameras"):
         if evidence.get(name):
             evidence[name] = _from_data(evidence[name], folder)
-    if evidence.get("depth"):
+    if depth:
         evidence["depth_known_to"] = known_to
-    layout = replace(layout, settings=layout.settings | evidence)
-    text = scene_xml(
-        layout, "." if here else os.path.abspath(folder), "template.obj" if template else None
+    evidence |= {name: name for name in folders}
+    text = lambda: scene_xml(
+        replace(layout, settings=layout.settings | evidence),
+        "." if here else os.path.abspath(folder),
+        "template.obj" if template else None,
     )
-    _write(target, text, template, "; give a folder that can be written by -o DIR" if here else "")
+    hint = "; give a folder that can be written by -o DIR" if here else ""
+    _write(target, text, template, hint, folders)
     recognised = (
         f"{folder}: a sequence in the form {layout.form}, {len(sequence)} frames of"
         f" {camera.width}x{camera.height}, {'with' if masks else 'without'} masks,"
         f"{' with tracks,' if sequence.tracks else ''}{' with depth,' if sequence.depth else ''}"
+        f"{' with further cameras,' if rig else ''}"
         " template of"
         f" {len(vertices)} vertices ({layout.obj or f'subdivided to {resolution}x{resolution}'})"
     )
@@ -89,22 +119,45 @@ def _from_data(path, folder):
     return os.path.abspath(path) if inside.startswith("..") else f"$data/{inside}"
 
 
-def _write(target, text, template, hint):
-    """Write the scene, and the template where there is one, into a folder: both or neither."""
+def _check_folder(folder, source, overwrite, known):
+    """Raise InputError where what is made of ``source`` may not be written to the folder, for it
+    holds that, or what is not ``known(path)``.
+    """
+    if not os.path.isdir(folder):
+        return
+    a, b = (os.path.join(os.path.realpath(path), "") for path in (source, folder))
+    if a.startswith(b):
+        raise InputError(
+            f"{folder}: holds {source}, which would be replaced; -o DIR is another folder"
+        )
+    ours = all(known(os.path.join(folder, name)) for name in os.listdir(folder))
+    if not overwrite or not ours:
+        hint = "give --overwrite to replace it, or" if ours else "not written by this command; give"
+        raise InputError(f"{folder}: is there already; {hint} another folder by -o")
+
+
+def _write(target, text, template, hint, folders):
+    """Write what ``folders`` maps names of folders to (functions of a path), the template where
+    there is one, and the scene, ``text()``, into a folder: all or none.
+    """
     made = not os.path.isdir(target)
     try:
         os.makedirs(target, exist_ok=True)
         with contextlib.ExitStack() as stack:
+            for name, write in folders.items():
+                write(stack.enter_context(staged(os.path.join(target, name))))
             if template:
                 obj = stack.enter_context(aside(os.path.join(target, "template.obj")))
                 meshio.write_obj(obj, *template)
             scene = stack.enter_context(aside(os.path.join(target, "scene.xml")))
             with open(scene, "w", encoding="utf-8") as file:
-                file.write(text)
-    except OSError as error:
+                file.write(text())
+    except (OSError, InputError) as error:
         if made:
             with contextlib.suppress(OSError):
                 os.rmdir(target)
+        if isinstance(error, InputError):
+            raise
         raise InputError(f"{target}: {error.strerror or error}{hint}") from None
 
 

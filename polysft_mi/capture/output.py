@@ -1,5 +1,6 @@
 """The folder that a video becomes: its files, checked before the work and put in place after it."""
 
+import contextlib
 import json
 import os
 import shutil
@@ -48,7 +49,24 @@ def target_folder(video, out, inputs, overwrite):
     return out
 
 
-def replace_folder(partial, out):
+@contextlib.contextmanager
+def staged(out):
+    """A new folder beside ``out`` that takes its place at the end; nothing is left of it where the
+    work fails.
+    """
+    partial = os.path.join(os.path.dirname(out), f".{os.getpid()}.partial.{os.path.basename(out)}")
+    try:
+        os.makedirs(partial)
+        yield partial
+        _replace_folder(partial, out)
+    except BaseException as error:
+        shutil.rmtree(partial, ignore_errors=True)
+        if isinstance(error, OSError) and error.errno is not None:
+            raise InputError(f"{out}: {error.strerror or error}") from None
+        raise
+
+
+def _replace_folder(partial, out):
     """Rename a finished folder to ``out``; the folder that stood there is removed afterwards."""
     old = f"{partial}.old"
     if os.path.isdir(out):

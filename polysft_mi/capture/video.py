@@ -4,7 +4,6 @@ renamed.
 
 import contextlib
 import os
-import shutil
 from dataclasses import replace
 
 import cv2
@@ -23,7 +22,7 @@ from .frames import focal_length, read_frames
 from .layouts import Layout
 from .masked_frames import GivenMasks, write_frames
 from .masks import Registration, silhouette
-from .output import REPORT, replace_folder, target_folder, write_json, write_png
+from .output import REPORT, staged, target_folder, write_json, write_png
 from .scene_file import scene_xml
 
 _FIRST_FRAME = "first-frame"  # the word for a texture that is taken from the video
@@ -63,7 +62,7 @@ def prepare_video(
     - ``size``: words as :func:`polysft_mi.capture.sheet.parse_size` takes them, for a flat template
       with ``resolution`` vertices along its longer side; or ``template``, an OBJ.
     - The camera, by one of ``camera`` (a file), ``fov`` [degrees] and ``calibrate`` (a video of a
-      ``board``); else by what the video or the photo says.
+      ``board``); else by what ``evidence`` says, or the video or the photo says.
     - ``corners`` (4, 2): pixels of the sheet's corners in the frame ``first`` as it was taken, or
       "frame" for the picture's own; ``pose_fit``: "auto" to move the sheet from there to the edges
       in that frame, where they are clear, or "none".
@@ -85,6 +84,7 @@ def prepare_video(
         for x in (video, texture, template, camera, calibrate, masks)
         if isinstance(x, str) and x != _FIRST_FRAME
     ]
+    inputs += evidence.inputs if evidence else []
     out = target_folder(video, out, inputs, overwrite)
     masks = GivenMasks(masks) if isinstance(masks, str) else masks
     found = {"video": video, "command": command}
@@ -93,7 +93,7 @@ def prepare_video(
     stream = read_frames(video, first, last, stride, film)
     index, frame = next(stream)
     taken = frame.shape[1::-1]
-    lens, board_picture = _lens(video, texture, camera, fov, calibrate, board, taken)
+    lens, board_picture = _lens(video, texture, camera, fov, calibrate, board, taken, evidence)
     straight = Undistortion(lens, scale)
     view, frame = straight.camera, straight.image(frame)
     found["camera"] = {**lens.as_json(), "from": lens.source}
@@ -148,7 +148,9 @@ def prepare_video(
         pixels = view.project(placed[used]) * scale
         return Registration(photo, mesh.uv[used], np.searchsorted(used, in_view), pixels)
 
-    with _folder(out) as partial:
+    with staged(out) as partial:
+        for name in (REPORT, "frames"):
+            os.makedirs(os.path.join(partial, name))
         for name, image in shown.items():
             write_png(os.path.join(partial, REPORT, name), image)
         expected = silhouette(view.project(placed), mesh.faces, frame.shape[1::-1])
@@ -175,25 +177,6 @@ def prepare_video(
     return os.path.join(out, "scene.xml"), found
 
 
-@contextlib.contextmanager
-def _folder(out):
-    """A new folder beside ``out`` that takes its place at the end; nothing is left of it where the
-    work fails.
-    """
-    partial = os.path.join(os.path.dirname(out), f".{os.getpid()}.partial.{os.path.basename(out)}")
-    try:
-        os.makedirs(os.path.dirname(out) or ".", exist_ok=True)
-        os.makedirs(os.path.join(partial, REPORT))
-        os.makedirs(os.path.join(partial, "frames"))
-        yield partial
-        replace_folder(partial, out)
-    except BaseException as error:
-        shutil.rmtree(partial, ignore_errors=True)
-        if isinstance(error, OSError) and error.errno is not None:
-            raise InputError(f"{out}: {error.strerror or error}") from None
-        raise
-
-
 def _write_scene(folder, view, masked, photo, placed, mesh, settings):
     """The files that the scene names beside frames and masks, and the scene itself, with
     ``settings``.
@@ -211,7 +194,7 @@ def _write_scene(folder, view, masked, photo, placed, mesh, settings):
         file.write(scene_xml(layout, ".", comment=comment))
 
 
-def _lens(video, texture, camera, fov, calibrate, board, size):
+def _lens(video, texture, camera, fov, calibrate, board, size, evidence):
     """(Lens, picture of the calibration or None) of frames of ``size`` (width, height)."""
     if camera is not None:
         return read_lens(camera, *size), None
@@ -220,6 +203,8 @@ def _lens(video, texture, camera, fov, calibrate, board, size):
     if calibrate is not None:
         lens, picture = calibrate_camera(calibrate, board)
         return lens.resized(*size), picture
+    if evidence and (lens := evidence.lens(*size)) is not None:
+        return lens, None
     focal, where = focal_length(video)
     if focal is None and texture != _FIRST_FRAME:
         focal, where = focal_35mm(texture), f"{texture}, if it has the same camera and zoom"

@@ -26,6 +26,7 @@ from .light import Brightness
 from .pyramid import FLOOR, POOL, Level, compared
 from .texture import Texture, packed_image
 
+_ROBUST, _MEDIAN = 2.5, 0.6745  # deviations that count; the median size of a normal variable
 _SHEET = 225.0  # side [pixels] of the sheet that blurs and windows are given for
 
 
@@ -38,8 +39,8 @@ class Evaluation:
     :class:`polysft_mi.images.gather.Images`, what they say at the vertices; ``outlier_share``: the
     mean of r^2 / (r^2 + scale^2) over the pixels that are compared; ``misfit``: the same with a
     fixed scale (both are 1 where none is); ``seen`` (F,): pixels of the video that see each
-    triangle; ``noise``: the variance of a residual, as the
-    residuals' own size says it.
+    triangle; ``noise``: what one unit of log-likelihood costs, were the residuals of all pixels
+    independent of each other: their own size says it.
     """
 
     photometric: float
@@ -219,6 +220,33 @@ class DataTerm:
             squared, weight = pixels.squares(*self._residual_arguments(view, frame, level))
             return np.array(squared)[np.array(weight) > 0]
 
+    def pixels_as_one(self, vertices, frame, blur, appearance=None):
+        """How many pixels of the video count as one observation of a surface, 1 or more: the sum of
+        the residuals' correlation with those around, as far as the window of local brightness
+        reaches. Blur makes it, and whatever else is wrong alike in neighbours. Other arguments as
+        of :meth:`evaluate`.
+        """
+        level = self.level(blur)
+        with dr.suspend_grad():
+            view = self.view(vertices, level)
+            found = pixels.residuals(*self._residual_arguments(view, frame, level, appearance))
+            residual, weight = (np.array(x, dtype=np.float32) for x in found[:2])
+        known = weight > 0
+        if not known.any():
+            return 1.0
+        size = np.abs(residual[:3, known])
+        most = _ROBUST * float(np.median(size)) / _MEDIAN
+        clipped = np.where(known, np.clip(residual[:3], -most, most), 0)
+        shape, reach = view.size[::-1], round(level.window / level.stride)
+        images = np.dstack([x.reshape(shape) for x in (*clipped, known.astype(np.float32))])
+        side = 2 * reach + 1, 2 * reach + 1
+        around = cv2.boxFilter(images, -1, side, borderType=cv2.BORDER_CONSTANT)
+        inside, share = known.reshape(shape), around[..., 3]
+        alike = float((images[..., :3] * around[..., :3])[inside].sum(dtype=np.float64))
+        mean_share = float(share[inside].mean(dtype=np.float64))
+        power = max(float(np.square(clipped).sum(dtype=np.float64)), 1e-30)
+        return max(1.0, side[0] * side[1] * alike / (mean_share * power) * level.stride**2)
+
     def evaluate(self, vertices, frame, blur, scale, appearance=None, k_rgb=1.0, k_silhouette=1.0):
         """The :class:`Evaluation` of a surface against a frame, under the robust ``scale`` [local
         standard deviations] and the weights ``k_rgb`` and ``k_silhouette``; the frame is corrected
@@ -253,9 +281,7 @@ class DataTerm:
                 silhouette = mask_weight * squares
         outlier_share, misfit = (outlier_share / count, misfit / count) if count else (1.0, 1.0)
         photometric, compared_pixels = weight * energy, count * level.stride**2
-        # pixels closer than the blur are no evidence of their own
         noise = 2 * photometric / (3 * max(compared_pixels, 1.0))
-        noise *= max(1.0, 4 * math.pi * level.sigma**2)
         energies, seen = (photometric, silhouette), figures[:, 1] * level.stride**2
         return Evaluation(*energies, outlier_share, misfit, images, seen, noise)
 

@@ -159,6 +159,14 @@ class Objective:
         """
         return context.memory.scale(stage, self.settings.rgb_scale)
 
+    def nat(self, context: FrameContext, model: QuadraticModel) -> float:
+        """What one unit of log-likelihood of the images costs, by the residuals of a frame at the
+        last stage: their size, and how many pixels count as one.
+        """
+        vertices, blur = model.surface.vertices, self.usual[-1].blur
+        alike = self.data.pixels_as_one(vertices, context.frame, blur, model.appearance)
+        return model.evaluation.noise * alike
+
     def frozen(
         self, contexts: Sequence[FrameContext], stage: Stage, start: Sequence[State]
     ) -> FrozenObjective:

@@ -134,10 +134,7 @@ class Source:
         states = [Unknowns.from_numpy(s) for s in track.states] or [problem.patch.rest()]
         world = np.stack([problem.surface(state) for state in states])
         files, template = problem.sequence.files, problem.template
-        sigma = None
-        if track.sigma:
-            unknown = np.full(world.shape[1], np.nan, np.float32)
-            sigma = np.stack([track.sigma.get(k, unknown) for k in range(len(states))])
+        certainties = track.certainties(world.shape[1])
         texture = Run.texture_of(self._path("scene.xml"))
         return Moving(
             from_camera(problem.camera.to_camera(world).astype(np.float32), "z"),
@@ -153,14 +150,14 @@ class Source:
                 files[: len(states)],
                 problem.sequence.cameras,
             ),
-            _colourings(template.patch, template.weight, sigma),
+            _colourings(template.patch, template.weight, *certainties),
         )
 
 
 def _of_run(run: Run) -> Moving:
     """A run that has ended."""
     p = run.params
-    colourings = _colourings(p["patch"], p["weight"], run.sigma)
+    colourings = _colourings(p["patch"], p["weight"], run.sigma, run.score)
     if run.camera is not None:
         legend = "rendering beside image, freed from lighting [local contrast]"
         make = lambda: _scalar(residual_at_vertices(run), "inferno", legend)
@@ -193,7 +190,7 @@ def _further(run):
     count = run.metrics.get("frames_wanted", len(run.frames))
     try:
         where = os.path.normpath(located(run.path("scene.xml"), s["cameras"]))
-        return open_cameras(where, count, first, last, stride)
+        return open_cameras(where, count, first, last, stride, run.cameras)
     except InputError:
         return []
 
@@ -255,15 +252,18 @@ def _scalar(values: np.ndarray, colours: str, meaning: str, *, signed: bool = Fa
     return Colouring(rgb, f"{meaning}: {low:.3g} to {high:.3g}")
 
 
-def _colourings(patch, weight, sigma):
+def _colourings(patch, weight, sigma=None, score=None):
     """What is known of a run from its first frame on."""
     out = {"plain": partial(_plain, len(patch), _GREY)}
     if patch.max() > 0:
         legend = f"the {patch.max() + 1} patches"
         out["patches"] = lambda: Colouring(patch_colours(patch, weight)[None], legend)
-    if sigma is not None and np.isfinite(sigma).any():
-        meaning = "standard deviation along the ray [mm]"
-        out["sigma"] = lambda: _scalar(1e3 * sigma, "viridis", meaning)
+    for name, of, meaning in (
+        ("sigma", sigma, "standard deviation along the ray, by the noise [mm]"),
+        ("score", score, "how far off it may be along the ray [mm]"),
+    ):
+        if of is not None and np.isfinite(of).any():
+            out[name] = partial(_scalar, 1e3 * of, "viridis", meaning)
     return out
 
 

@@ -40,6 +40,7 @@ class PlacedMesh:
     ) -> None:
         self.scene, self.sensor, self.renderer, self.mesh = scene, sensor, renderer, mesh
         self.corner, self.camera = corner, Pinhole(sensor)
+        self._more = sppi, where
         #: (F, 3): the rendered vertices of the triangles
         self.rendered_faces = np.array(mesh.faces_buffer(), dtype=np.int64).reshape(-1, 3)
         #: (F, 3): the template's vertices at the corners of the rendered triangles
@@ -72,6 +73,10 @@ class PlacedMesh:
     def size(self) -> tuple[int, int]:
         """(width, height) of the image [pixels]."""
         return self.camera.width, self.camera.height
+
+    def seen_by(self, sensor: mi.Sensor) -> PlacedMesh:
+        """The same mesh, seen by another sensor."""
+        return PlacedMesh(self.scene, sensor, self.renderer, self.mesh, self.corner, *self._more)
 
     def place(self, vertices: mi.Point3f) -> None:
         """Put the template's ``vertices`` (Point3f of N [m, world], attached or not) into the

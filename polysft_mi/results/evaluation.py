@@ -42,9 +42,12 @@ LABELS = {
     "depth_rmse_allpix_mm": "depth RMSE over all pixels [mm]",
     "chamfer_1e4": "chamfer, squared, two-way [1e-4 m^2]",
     "chamfer_1e4_worst": "chamfer, worst frame [1e-4 m^2]",
+    "sigma_two": "share of the errors within two sigma",
     "sigma_factor": "factor at which sigma holds 68 % of the errors",
-    "sigma_two": "share of the errors within twice that",
     "sigma_rank": "rank correlation of sigma and error",
+    "score_two": "share of the errors within two scores",
+    "score_factor": "factor at which the score holds 68 % of the errors",
+    "score_rank": "rank correlation of score and error",
     "psnr": "PSNR [dB]",
     "ssim": "SSIM",
     "psnr_mask": "PSNR inside the mask [dB]",
@@ -85,9 +88,9 @@ def score(surface: Mapping[str, np.ndarray], truth: Truth | str | os.PathLike[st
     """The figures of a reconstruction: a dict of numbers, its keys by the kind of truth.
 
     ``surface`` maps ``vertices`` (T, N, 3) [m], ``faces`` (F, 3), ``frames`` (T,), and perhaps
-    ``sigma`` (T, N) [m]; ``truth``: a :class:`Truth`, or its path. A figure is the mean of those of
-    the frames; NAME_worst is that of the worst frame. Raises InputError where they cannot be
-    compared.
+    ``sigma`` and ``score`` (T, N) [m]; ``truth``: a :class:`Truth`, or its path. A figure is the
+    mean of those of the frames; NAME_worst is that of the worst frame. Raises InputError where they
+    cannot be compared.
     """
     truth = truth if isinstance(truth, Truth) else Truth.open(truth)
     columns = per_frame(surface, truth)
@@ -166,13 +169,13 @@ def against_mesh(V, G, faces, where, seen=None):
 
 
 def confidence(surface, truth):
-    """How ``sigma`` (T, N) [m] of a surface relates to its errors along the rays, where the truth
-    has the same vertices; {} where it cannot be told.
+    """How ``sigma`` and ``score`` (T, N) [m] of a surface relate to its errors along the rays,
+    where the truth has the same vertices; {} where it cannot be told.
 
-    ``sigma_factor``: what sigma has to be multiplied by for 68 % of the errors to lie within it;
-    ``sigma_two``: the share that then lies within twice as much (95 % were they Gaussian);
-    ``sigma_rank``: rank correlation of sigma and error. The first frame, where the template stands
-    in its place, is left out.
+    NAME_two: the share of the errors within twice as much (95 % were they Gaussian); NAME_factor:
+    what it has to be multiplied by for 68 % of the errors to lie within it; NAME_rank: rank
+    correlation with the errors. The first frame, where the template stands in its place, is left
+    out.
     """
     if "sigma" not in surface or truth.kind != "mesh":
         return {}
@@ -183,17 +186,21 @@ def confidence(surface, truth):
     if any(G.shape != found.shape[1:] for G in true) or not known:
         return {}
     ray = found / np.linalg.norm(found, axis=2, keepdims=True)
-    error = np.abs(((found - true) * ray).sum(2)).ravel()
-    sigma = np.asarray(surface["sigma"], dtype=np.float64)[known].ravel()
-    usable = np.isfinite(sigma) & (sigma > 0)
-    if usable.sum() < 2:
-        return {}
-    error, sigma = error[usable], sigma[usable]
-    ratio = error / sigma
-    factor = float(np.quantile(ratio, 0.68))
-    ranks = [np.argsort(np.argsort(x)) for x in (error, sigma)]
-    return {
-        "sigma_factor": factor,
-        "sigma_two": float((ratio <= 2 * factor).mean()),
-        "sigma_rank": float(np.corrcoef(*ranks)[0, 1]),
-    }
+    errors = np.abs(((found - true) * ray).sum(2)).ravel()
+    figures = {}
+    for name in ("sigma", "score"):
+        if name not in surface:
+            continue
+        told = np.asarray(surface[name], dtype=np.float64)[known].ravel()
+        usable = np.isfinite(told) & (told > 0)
+        if usable.sum() < 2:
+            continue
+        error, told = errors[usable], told[usable]
+        ratio = error / told
+        ranks = [np.argsort(np.argsort(x)) for x in (error, told)]
+        figures |= {
+            f"{name}_two": float((ratio <= 2).mean()),
+            f"{name}_factor": float(np.quantile(ratio, 0.68)),
+            f"{name}_rank": float(np.corrcoef(*ranks)[0, 1]),
+        }
+    return figures

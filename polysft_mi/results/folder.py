@@ -1,5 +1,6 @@
 """The folder that a run writes to: whether it may be used, and what of an earlier run goes."""
 
+import glob
 import os
 import shutil
 
@@ -8,6 +9,7 @@ from polysft_mi.errors import InputError
 FILES = (
     "scene.xml",
     "camera.json",
+    "cameras.json",
     "run.json",
     "checkpoint.npz",
     "log.jsonl",
@@ -48,7 +50,8 @@ def check_output(out, *, resume=False, overwrite=False):
 
 def clear(out):
     """Remove what an earlier run left in the folder ``out``; nothing else."""
-    for name in FILES:
+    of_cameras = glob.glob("comparison_*.png", root_dir=out)
+    for name in (*FILES, *of_cameras):
         if os.path.exists(os.path.join(out, name)):
             os.remove(os.path.join(out, name))
     for name in (*FOLDERS, "comparison.mp4", "export"):

@@ -17,7 +17,7 @@ import numpy as np
 from polyfit.files import aside
 from polyfit.mesh import write_ply
 from polysft_mi import __version__
-from polysft_mi.scene import located
+from polysft_mi.scene import located, written
 from polysft_mi.surface import Unknowns
 
 from .truth import uv_arrays
@@ -85,10 +85,7 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
     vertices = problem.camera.to_camera(world).astype(np.float32)
     drawn, bound, plotted = drawing.finish(world, vertices, fps)
 
-    sigma = {}
-    if track.sigma:
-        unknown = np.full(vertices.shape[1], np.nan, np.float32)
-        sigma["sigma"] = np.stack([track.sigma.get(k, unknown) for k in range(count)])
+    certainty = dict(zip(("sigma", "score"), track.certainties(vertices.shape[1])))
     with aside(os.path.join(out, "surface.npz")) as temporary:
         np.savez_compressed(
             temporary,
@@ -96,7 +93,7 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
             faces=template.faces.astype(np.int32),
             **uv_arrays(template.texcoords, template.faces),
             frames=indices,
-            **sigma,
+            **certainty,
         )
     arrays = {name: np.stack([s[name] for s in track.states]) for name in Unknowns.NAMES}
     with aside(os.path.join(out, "params.npz")) as temporary:
@@ -115,17 +112,13 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
     for index, v in zip(indices, vertices):
         write_ply(os.path.join(out, "meshes", f"{index:03d}.ply"), v[source], faces, uv)
     say("pictures")
-    (per_frame, box), video = drawn(), bound()
+    (per_frame, box, others), video = drawn(), bound()
 
-    finite = {
-        name: [p[name] for p in per_frame if np.isfinite(p[name])]
-        for name in ("psnr_mask", "ssim_mask")
-    }
     summary = {
         "frames": count,
         "frames_wanted": len(sequence.indices),
         "lost": {str(int(indices[k])): reason for k, reason in track.lost.items() if k < count},
-        **{name: float(np.mean(values)) for name, values in finite.items() if values},
+        **_means(per_frame),
         "seconds_per_frame": float(sum(track.seconds) / count),
         "iterations_per_window": float(np.mean(track.iterations)) if track.iterations else 0.0,
         "order": template.order,
@@ -133,6 +126,7 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
         "template_residual_max_mm": 1e3 * template.residual_max,
         "solver": track.solver,
     }
+    cameras = {name: {**_means(of), "per_frame": of} for name, of in others.items()}
     windows = [
         {"frame": int(indices[count - len(track.iterations) + k]), "iterations": n, "seconds": t}
         | terms
@@ -148,6 +142,7 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
             "versions": versions(),
             "pictures": {"box": list(box)},
             "per_frame": per_frame,
+            **({"cameras": cameras} if cameras else {}),
             "windows": windows,
             "command": command,
         },
@@ -155,9 +150,17 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
     return {**summary, "video": video}, plotted
 
 
-def write_beginning(out, scene, camera, command, fps):
+def _means(per_frame):
+    """The means of the figures of frames, where they are known."""
+    names = ("psnr_mask", "ssim_mask", "iou")
+    finite = {n: [p[n] for p in per_frame if n in p and np.isfinite(p[n])] for n in names}
+    return {name: float(np.mean(values)) for name, values in finite.items() if values}
+
+
+def write_beginning(out, scene, camera, others, command, fps):
     """What stands in the folder from the first second: the resolved scene (text), the
-    :class:`polysft_mi.render.pinhole.Pinhole`, and what the run is.
+    :class:`polysft_mi.render.pinhole.Pinhole`, the ``others``
+    (:class:`polysft_mi.scene.cameras.OtherCamera`), and what the run is.
     """
     with (
         aside(os.path.join(out, "scene.xml")) as temporary,
@@ -165,6 +168,9 @@ def write_beginning(out, scene, camera, command, fps):
     ):
         file.write(scene)
     write_json(os.path.join(out, "camera.json"), dataclasses.asdict(camera.intrinsics()))
+    if others:
+        cameras = {c.name: written(c.intrinsics, c.world_to_camera) for c in others}
+        write_json(os.path.join(out, "cameras.json"), cameras)
     about = {
         "command": command,
         "started": time.strftime("%Y-%m-%dT%H:%M:%S"),

@@ -16,7 +16,7 @@ from polyfit import jets
 from polyfit.mesh import TexCoords
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError
-from polysft_mi.scene import known_defaults, list_images, located
+from polysft_mi.scene import known_defaults, list_images, located, read_cameras
 
 from .truth import load_npz, read_surface, texcoords_of
 
@@ -25,7 +25,8 @@ from .truth import load_npz, read_surface, texcoords_of
 class Run:
     """A finished run: ``folder``; ``vertices`` (T, N, 3) float32 [m, camera frame], ``faces`` (F,
     3), ``texcoords``: its :class:`polyfit.mesh.TexCoords`, ``frames`` (T,) the index of each,
-    ``sigma`` (T, N) [m] or None; ``metrics`` and ``about``: its metrics.json and run.json.
+    ``sigma`` and ``score`` (T, N) [m] or None; ``metrics`` and ``about``: its metrics.json and
+    run.json.
     """
 
     folder: str
@@ -34,6 +35,7 @@ class Run:
     texcoords: TexCoords
     frames: np.ndarray
     sigma: np.ndarray | None = None
+    score: np.ndarray | None = None
     metrics: dict = field(default_factory=dict)
     about: dict = field(default_factory=dict)
 
@@ -63,6 +65,7 @@ class Run:
             texcoords_of(surface, os.path.join(folder, "surface.npz")),
             surface["frames"],
             sigma=surface.get("sigma"),
+            score=surface.get("score"),
             metrics=_read_json(os.path.join(folder, "metrics.json")),
             about=_read_json(os.path.join(folder, "run.json")),
         )
@@ -83,6 +86,14 @@ class Run:
         """
         path = self.path("camera.json")
         return Intrinsics.from_json(path) if os.path.exists(path) else None
+
+    @cached_property
+    def cameras(self) -> dict[str, tuple[Intrinsics, np.ndarray]]:
+        """Intrinsics and world_to_camera (4, 4) [m] of the further cameras, by name; the world is
+        that of the scene.
+        """
+        path = self.path("cameras.json")
+        return read_cameras(path) if os.path.exists(path) else {}
 
     @cached_property
     def settings(self) -> dict[str, str]:

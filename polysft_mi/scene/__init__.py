@@ -11,7 +11,7 @@ import lazy_loader
 __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
-        "cameras": ["open_cameras"],
+        "cameras": ["open_cameras", "read_cameras", "written"],
         "defaults": ["known_defaults", "located", "resolved_defaults"],
         "evidence": ["DepthImages", "Tracks"],
         "experiment": ["Experiment", "load"],
@@ -21,6 +21,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
             "focal_35mm",
             "image_size",
             "list_images",
+            "read_pixels",
             "read_rgb",
         ],
         "plugins": ["register"],

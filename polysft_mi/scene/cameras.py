@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from polysft_mi.errors import InputError
 from .sequence import Sequence
 
 _CAMERA = "camera.json"
+_HINT = " (polysft prepare --cameras makes one of a rig of COLMAP or nerfstudio)"
 _STRAIGHT = 1e-3  # how far a rotation may be from one
 
 
@@ -47,34 +49,69 @@ class OtherCamera:
         return mi.load_dict({"type": "pinhole", **focal, "to_world": transform, "film": film})
 
 
-def open_cameras(folder: str, count: int, first: int, last: int, stride: int) -> list[OtherCamera]:
+def open_cameras(
+    folder: str,
+    count: int,
+    first: int = 0,
+    last: int = -1,
+    stride: int = 1,
+    known: Mapping[str, tuple[Intrinsics, np.ndarray]] | None = None,
+) -> list[OtherCamera]:
     """The cameras of a folder that holds a folder for each: ``camera.json`` (fx, fy, cx, cy, width,
     height [pixels], ``world_to_camera``), ``frames``, and ``masks`` where there are some. Of each
-    the frames ``first`` to ``last`` in steps of ``stride`` are used, ``count`` in all. Raises
+    the frames ``first`` to ``last`` in steps of ``stride`` are used, ``count`` in all. ``known``:
+    intrinsics and world_to_camera (4, 4) of those that need no ``camera.json``, by name. Raises
     InputError.
     """
+    known = known or {}
     if not os.path.isdir(folder):
-        raise InputError(f"cameras: {folder}: no such folder")
-    names = sorted(
-        name for name in os.listdir(folder) if os.path.isfile(os.path.join(folder, name, _CAMERA))
-    )
+        raise InputError(f"cameras: {folder}: no such folder{_HINT}")
+    names = sorted({*known, *(name for name in os.listdir(folder) if has_camera(folder, name))})
     if not names:
         raise InputError(
-            f"{folder}: no cameras in it; a folder for each, with {_CAMERA} and frames, is needed"
+            f"{folder}: no cameras in it; a folder for each, with {_CAMERA} and frames, is"
+            f" needed{_HINT}"
         )
-    return [_open(os.path.join(folder, name), count, first, last, stride) for name in names]
+    return [
+        _open(
+            os.path.join(folder, name),
+            known.get(name) or _read(os.path.join(folder, name, _CAMERA)),
+            count,
+            (first, last, stride),
+        )
+        for name in names
+    ]
 
 
-def _open(folder, count, first, last, stride):
-    where = os.path.join(folder, _CAMERA)
-    intrinsics, pose = _read(where)
+def has_camera(folder: str, name: str) -> bool:
+    """Whether the folder of cameras says how the camera ``name`` stands."""
+    return os.path.isfile(os.path.join(folder, name, _CAMERA))
+
+
+def read_cameras(path: str) -> dict[str, tuple[Intrinsics, np.ndarray]]:
+    """Intrinsics and world_to_camera (4, 4) by name, of a file that :func:`written` is the content
+    of. Raises InputError.
+    """
+    try:
+        with open(path, encoding="utf-8") as file:
+            cameras = json.load(file)
+        return {name: _camera(values, f"{path}: {name}") for name, values in cameras.items()}
+    except (OSError, ValueError, AttributeError) as error:
+        raise InputError(f"{path}: not cameras as JSON ({error})") from None
+
+
+def written(intrinsics: Intrinsics, world_to_camera: np.ndarray) -> dict:
+    """What ``camera.json`` says of a camera; ``world_to_camera`` (4, 4) [m]."""
+    return {**asdict(intrinsics), "world_to_camera": world_to_camera.tolist()}
+
+
+def _open(folder, camera, count, selected):
+    intrinsics, pose = camera
     masks = os.path.join(folder, "masks")
     sequence = Sequence.open(
         os.path.join(folder, "frames"),
         masks if os.path.isdir(masks) else "",
-        first,
-        last,
-        stride,
+        *selected,
         (intrinsics.width, intrinsics.height),
     )
     if len(sequence) != count:
@@ -90,6 +127,14 @@ def _read(where):
     try:
         with open(where, encoding="utf-8") as file:
             known = json.load(file)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{where}: not a camera as JSON ({error})") from None
+    return _camera(known, where)
+
+
+def _camera(known, where):
+    """:func:`_read` of what the file holds."""
+    try:
         numbers = [float(known[name]) for name in ("fx", "fy", "cx", "cy")]
         size = [int(known[name]) for name in ("width", "height")]
         pose = np.array(known["world_to_camera"], dtype=np.float64)
@@ -98,8 +143,13 @@ def _read(where):
             f"{where}: {error.args[0]} is missing; fx, fy, cx, cy, width, height and"
             " world_to_camera are needed"
         ) from None
-    except (OSError, ValueError, TypeError) as error:
+    except (ValueError, TypeError) as error:
         raise InputError(f"{where}: not a camera as JSON ({error})") from None
+    if np.any(known.get("distortion")):
+        raise InputError(
+            f"{where}: distortion; frames without are needed, as polysft prepare VIDEO --cameras"
+            " makes them"
+        )
     if pose.shape == (3, 4):
         pose = np.vstack([pose, (0, 0, 0, 1)])
     if pose.shape != (4, 4) or not np.isfinite(pose).all():

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from polysft_mi.errors import InputError
 
-from .images import finite, list_images, read_pixels
+from .images import EXTENSIONS, finite, list_images, read_pixels
 
 #: names of the arrays in files of tracks, as CoTracker, TAPIR and AllTracker are used to write them
 _POSITIONS = ("tracks", "pred_tracks", "trajs", "trajs_e", "points", "coords")
@@ -95,9 +95,9 @@ class DepthImages:
     def open(cls, folder: str, count: int | None, selected: list[int], unit: float) -> DepthImages:
         """Those in a folder, or of a pattern, sorted like frames: one for each of the ``count``
         images (None: of as many as the video has), or of those that are ``selected``. ``unit`` [m]:
-        of whole numbers; those with a fraction (EXR, TIFF) are metres. Raises InputError.
+        of whole numbers; those with a fraction (EXR, TIFF, CSV) are metres. Raises InputError.
         """
-        paths = list_images(folder, "depth images")
+        paths = list_images(folder, "depth images", (*EXTENSIONS, ".csv"))
         frames = _Frames(count, selected)
         if len(paths) not in frames:
             raise InputError(
@@ -113,7 +113,7 @@ class DepthImages:
     def read(self, i: int) -> np.ndarray:
         """Depth i along the camera's axis, (H, W) float32 [m], 0 where nothing is known."""
         path = self.files[i]
-        image = read_pixels(path)
+        image = _table(path) if path.lower().endswith(".csv") else read_pixels(path)
         if image.ndim == 3:
             image = image[..., 0]
         if image.dtype.kind == "f":
@@ -125,6 +125,14 @@ class DepthImages:
         else:
             depth = finite(image, path).astype(np.float32) * np.float32(self.unit)
         return np.maximum(depth, 0)
+
+
+def _table(path):
+    """Numbers (H, W) float32, a line a row, with commas between."""
+    try:
+        return np.loadtxt(path, dtype=np.float32, delimiter=",", ndmin=2)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: not a table of depth in metres ({error})") from None
 
 
 def _left_their_neighbours(positions: np.ndarray, visible: np.ndarray) -> np.ndarray:

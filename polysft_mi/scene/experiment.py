@@ -20,10 +20,11 @@ from polyfit.errors import require
 from polyfit.jets import CanonicalFrame
 from polyfit.mesh import TexCoords, read_textured, write_ply
 from polysft_mi.errors import InputError
+from polysft_mi.render import Pinhole
 from polysft_mi.surface import Template, meshio
 
 from . import plugins
-from .cameras import open_cameras
+from .cameras import has_camera, open_cameras
 from .defaults import located, resolved_defaults
 from .images import checked_size
 from .sequence import Sequence
@@ -37,7 +38,9 @@ class Experiment:
 
     ``corner`` (V,) is the template vertex of each vertex that Mitsuba renders (its loaders split
     vertices along texture seams); ``defaults`` maps each ``<default>`` to the value in force;
-    ``note``: what was left out of the template's file, in a line.
+    ``sensors``: intrinsics and world_to_camera (4, 4) [m] of the scene's other sensors, by id;
+    ``notes``: what was left out of the template's file, and what of the scene is not used, a line
+    each.
     """
 
     path: str
@@ -51,7 +54,8 @@ class Experiment:
     masks: str
     settings: Settings
     defaults: dict = field(default_factory=dict)
-    note: str | None = None
+    sensors: dict = field(default_factory=dict)
+    notes: list = field(default_factory=list)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -79,8 +83,19 @@ class Experiment:
             depth_unit=s.depth_unit,
         )
         if cameras:
+            for name in self.sensors:
+                if has_camera(cameras, name):
+                    raise InputError(
+                        f"{self.path}: sensor {name!r}: {os.path.join(cameras, name)} has a"
+                        " camera.json, too; one of both is needed"
+                    )
+                if not os.path.isdir(os.path.join(cameras, name)):
+                    raise InputError(
+                        f"{self.path}: sensor {name!r}: {os.path.join(cameras, name)}: no such"
+                        " folder; its frames are needed there"
+                    )
             selected = s.first, s.last, s.stride
-            sequence.cameras = open_cameras(cameras, len(sequence), *selected)
+            sequence.cameras = open_cameras(cameras, len(sequence), *selected, self.sensors)
         return sequence
 
 
@@ -123,8 +138,9 @@ def load(
             except Exception as error:
                 raise InputError(_mitsuba_message(error, path)) from None
 
-    if len(scene.sensors()) != 1:
-        raise InputError(f"{path}: {len(scene.sensors())} sensors; exactly one is needed")
+    if not scene.sensors():
+        raise InputError(f"{path}: 0 sensors; one is needed")
+    sensors = _further(scene.sensors()[1:], path)
     if not mi.has_flag(scene.sensors()[0].film().flags(), mi.FilmFlags.Alpha):
         raise InputError(f"{path}: the film has no alpha channel; pixel_format rgba is needed")
     meshes = _template_meshes(scene)
@@ -135,7 +151,28 @@ def load(
     template, corner, note = _template(mesh, source, settings, template)
     shown = scene, scene.sensors()[0], experiment.renderer, mesh, template, corner
     files = experiment.frames, experiment.masks
-    return Experiment(path, *shown, *files, settings, defaults, note)
+    notes = [note] if note else []
+    if sensors and not settings.cameras:
+        notes.append(
+            f"note: {path}: its sensors {', '.join(sensors)} are not used; cameras names the folder"
+            " of their frames"
+        )
+    return Experiment(path, *shown, *files, settings, defaults, sensors, notes)
+
+
+def _further(sensors, path):
+    """Intrinsics and world_to_camera (4, 4) [m] of sensors, by id."""
+    found = {}
+    for sensor in sensors:
+        if not sensor.id():
+            raise InputError(
+                f"{path}: a further sensor has no id; the first one is the scene's own, and the id"
+                " of another is the name of its folder in cameras"
+            )
+        camera, pose = Pinhole(sensor), np.eye(4)
+        pose[:3, :3], pose[:3, 3] = camera.axes, -camera.axes @ camera.origin
+        found[sensor.id()] = camera.intrinsics(), pose
+    return found
 
 
 def _instance(path, config, state):

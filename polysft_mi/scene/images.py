@@ -15,9 +15,9 @@ from polysft_mi.errors import InputError
 EXTENSIONS = tuple(".png .jpg .jpeg .jpe .bmp .tif .tiff .webp .ppm .pgm .pnm .exr .hdr".split())
 
 
-def list_images(pattern, what="images"):
-    """The image files of a folder or a glob pattern, sorted by name, numbers in names by value.
-    Raises InputError where there are none.
+def list_images(pattern, what="images", endings=EXTENSIONS):
+    """The image files of a folder or a glob pattern, by their ``endings``, sorted by name, numbers
+    in names by value. Raises InputError where there are none.
     """
     pattern = os.fspath(pattern)
     if os.path.isdir(pattern):
@@ -36,7 +36,7 @@ def list_images(pattern, what="images"):
     images = [
         p
         for p in found
-        if p.lower().endswith(EXTENSIONS)
+        if p.lower().endswith(endings)
         and not os.path.basename(p).startswith(".")
         and os.path.isfile(p)
     ]

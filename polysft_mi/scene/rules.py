@@ -54,10 +54,10 @@ class Rules:
         row="unseen parts are held",
     )
     # how sure a vertex is
-    sigma_strain: float = _rule(
-        7.2, "", "factor of sigma, the geometric mean of the noise's and the strain around a vertex"
+    score_strain: float = _rule(
+        6.0, "", "factor of the score, the geometric mean of sigma and the strain around a vertex"
     )
-    sigma_unseen: float = _rule(3.3, "", "factor of sigma where no pixel sees the vertex")
+    score_unseen: float = _rule(3.3, "", "factor of the score where no pixel sees the vertex")
     # the step
     small_step: float = _rule(
         2e-3,

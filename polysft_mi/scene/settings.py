@@ -58,7 +58,8 @@ class Settings:
     )
     cameras: str = _setting(
         "",
-        "folder of further cameras, each with camera.json, frames and masks; empty: none",
+        "folder of further cameras: of each a folder with camera.json (or a <sensor> of its name),"
+        " frames and masks; empty: none",
     )
     depth: str = _setting(
         "",

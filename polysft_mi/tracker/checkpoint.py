@@ -31,10 +31,10 @@ class Track:
     of the next window to solve; ``iterations``, ``seconds``: one entry a solved window; ``totals``:
     its terms at the minimum; ``memories``: what its newest frame tells those that follow, None
     where it was lost; ``lost``: frame -> reason for those that keep the state of the frame before;
-    ``unusable``: those among them whose image breaks the objective; ``sigma``: frame -> standard
-    deviation of each vertex along its ray [m], where it is known; ``swept``: frames gone over by
-    the setting ``sweeps``, each as often as it was; ``finished``: whether the tracker has looked
-    back over the whole; ``solver``: its name.
+    ``unusable``: those among them whose image breaks the objective; ``certainty``: frame ->
+    standard deviation of each vertex along its ray and its score, (2, N) [m], where they are known;
+    ``swept``: frames gone over by the setting ``sweeps``, each as often as it was; ``finished``:
+    whether the tracker has looked back over the whole; ``solver``: its name.
     """
 
     states: list = field(default_factory=list)
@@ -45,10 +45,20 @@ class Track:
     memories: list = field(default_factory=list)
     lost: dict = field(default_factory=dict)
     unusable: dict = field(default_factory=dict)
-    sigma: dict = field(default_factory=dict)
+    certainty: dict = field(default_factory=dict)
     swept: int = 0
     finished: bool = False
     solver: str = ""
+
+    def certainties(self, count: int) -> list[np.ndarray]:
+        """``certainty`` of ``count`` vertices in all frames: sigma and score, (T, N) float32 [m],
+        NaN where they are not known; none where no frame has them.
+        """
+        if not self.certainty:
+            return []
+        unknown = np.full((2, count), np.nan, np.float32)
+        frames = [self.certainty.get(k, unknown) for k in range(len(self.states))]
+        return list(np.stack(frames, axis=1))
 
     def save(self, path: str | os.PathLike[str], stages: Sequence[Stage]) -> None:
         """Write it; ``stages``: those that memories have robust scales of."""
@@ -56,10 +66,10 @@ class Track:
             name: np.stack([s[name] for s in self.states]) for name in Unknowns.NAMES
         }
         meta = {k: getattr(self, k) for k in _META}
-        known = sorted(self.sigma)
+        known = sorted(self.certainty)
         if known:
-            arrays["sigma_frames"] = np.array(known, dtype=np.int64)
-            arrays["sigma"] = np.stack([self.sigma[k] for k in known])
+            arrays["certain_frames"] = np.array(known, dtype=np.int64)
+            arrays["certainty"] = np.stack([self.certainty[k] for k in known])
         with aside(path) as temporary:
             np.savez(
                 temporary, meta=json.dumps(meta), **arrays, **_memory_arrays(self.memories, stages)
@@ -77,9 +87,9 @@ class Track:
                 meta = json.loads(str(data["meta"]))
                 arrays = {name: data[name] for name in Unknowns.NAMES}
                 memories = _memories(data, stages, rules or Rules())
-                sigma = (
-                    dict(zip(data["sigma_frames"].tolist(), data["sigma"]))
-                    if "sigma" in data
+                certainty = (
+                    dict(zip(data["certain_frames"].tolist(), data["certainty"]))
+                    if "certainty" in data
                     else {}
                 )
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
@@ -91,7 +101,7 @@ class Track:
         count = len(arrays["rotation"])
         return cls(
             states=[{name: arrays[name][k] for name in arrays} for k in range(count)],
-            sigma=sigma,
+            certainty=certainty,
             memories=memories,
             **meta,
         )

@@ -17,7 +17,7 @@ from polysft_mi.objective import FrameContext, FrameMemory, Objective
 from polysft_mi.solvers import Report, Solver
 from polysft_mi.surface import State
 
-from .sigma import along_rays
+from .sigma import along_rays, score
 from .stages import Found, Stages
 from .starts import Starts
 from .texture_fit import fit_texture
@@ -32,16 +32,16 @@ Past = Sequence[tuple[State, FrameMemory | None]]
 @dataclass(frozen=True)
 class Solution:
     """Frames as they were solved: ``states``, the mean of their ``terms``, ``evaluations`` of the
-    objective; the ``memory`` of the newest, None where nothing is learned; ``sigma``: of each, the
-    standard deviation (N,) [m] of each vertex along its ray, or None where the objective has no
-    quadratic model.
+    objective; the ``memory`` of the newest, None where nothing is learned; ``certainty``: of each,
+    the standard deviation of each vertex along its ray and its score, (2, N) [m], or None where the
+    objective has no quadratic model.
     """
 
     states: list[State]
     terms: dict[str, float]
     evaluations: int
     memory: FrameMemory | None
-    sigma: list[np.ndarray] | None
+    certainty: list[np.ndarray] | None
 
 
 class FrameTracker:
@@ -213,7 +213,7 @@ class FrameTracker:
             explained=found.misfit if found.more_is_vain else before.explained,
             light=light,
             scales=found.scales,
-            nat=model.evaluation.noise,
+            nat=self.objective.nat(context, model),
             noises=self.objective.noises(context, model.surface.vertices),
         )
 
@@ -246,9 +246,13 @@ class FrameTracker:
 
     def _solution(self, states, results: Sequence[Found], memory):
         """The :class:`Solution` of a window, with the memory of its newest frame."""
-        sigma = None
+        certainty = None
         if self._learns:
-            origin = self.problem.camera.origin
-            sigma = [along_rays(self.objective, result.model, origin) for result in results]
+            certainty = [self._certainty(result.model, memory) for result in results]
         terms = results[-1].result.terms
-        return Solution(states, terms, self._stages.count, memory, sigma)
+        return Solution(states, terms, self._stages.count, memory, certainty)
+
+    def _certainty(self, model, memory):
+        """(2, N) of :class:`Solution`."""
+        sigma = along_rays(self.objective, model, memory.nat, self.problem.camera.origin)
+        return np.stack([sigma, score(self.objective, model.surface.vertices, sigma)])

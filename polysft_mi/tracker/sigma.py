@@ -1,8 +1,9 @@
-"""How sure each vertex is: the curvature of the whole objective at a minimum, and how far the
-surface is from what the objective takes it for.
+"""How sure each vertex is.
 
-The curvature knows of the noise of pixels alone. Where the surface strains its edges to follow the
-images, it is at odds with them, and by how much says more of its error.
+``sigma`` is what the normal equations say: the curvature of the whole objective at a minimum, by
+the noise of the images. It knows nothing of a wrong model. Where the surface strains its edges to
+follow the images, it is at odds with them, and by how much says more of its error: the ``score``,
+which is fitted to errors.
 """
 
 import numpy as np
@@ -14,25 +15,11 @@ _UNDAMPED = 1e-9
 _ROUNDS = 4  # of the mean over neighbours
 
 
-def along_rays(objective, model, origin):
+def along_rays(objective, model, nat, origin):
     """Standard deviation (N,) [m, float32] of each vertex along its ray from ``origin`` (3,) [m]:
-    NaN where the curvatures are singular.
-
-    With h that of the curvature, s the root of the mean squared strain around, and r the template's
-    scale, it is ``sigma_strain`` (h s r)^1/2, times ``sigma_unseen`` where no pixel sees the
-    vertex, and h at least.
+    the root of ``nat``, what one unit of log-likelihood costs, times the inverse of the curvature.
+    NaN where that is singular.
     """
-    rules, template = objective.rules, objective.problem.template
-    noise = _of_noise(objective, model, origin)
-    strain = _strain(template, model.surface.vertices)
-    seen = objective.seen(model.surface.vertices)
-    found = rules.sigma_strain * np.sqrt(noise * strain * template.scale)
-    found[~seen] *= rules.sigma_unseen
-    return np.maximum(found, noise).astype(np.float32)
-
-
-def _of_noise(objective, model, origin):
-    """(N,) [m]: from the inverse of the curvature, by the pixels' noise."""
     surface, local = model.surface, model.normal.local.shape[-1]
     atlas = objective.atlas
     ray = surface.vertices - origin
@@ -45,7 +32,21 @@ def _of_noise(objective, model, origin):
         variance = reduced.variance(by_local, by_global)
     except (LinAlgError, np.linalg.LinAlgError):
         variance = np.full(len(ray), np.nan)
-    return np.sqrt(model.evaluation.noise * variance)
+    return np.sqrt(nat * variance).astype(np.float32)
+
+
+def score(objective, vertices, sigma):
+    """How far off each of the ``vertices`` (N, 3) [m] may be along its ray, (N,) [m, float32], from
+    its ``sigma`` (N,) [m].
+
+    With s the root of the mean squared strain around, and r the template's scale, it is
+    ``score_strain`` (sigma s r)^1/2, times ``score_unseen`` where no pixel sees the vertex, and
+    sigma at least: a regression of errors.
+    """
+    rules, template = objective.rules, objective.problem.template
+    found = rules.score_strain * np.sqrt(sigma * _strain(template, vertices) * template.scale)
+    found[~objective.seen(vertices)] *= rules.score_unseen
+    return np.maximum(found, sigma).astype(np.float32)
 
 
 def _strain(template, vertices):

@@ -145,8 +145,8 @@ def _replace(done, k, arrays, solution):
     """Let frame ``k``, solved again, have this solution."""
     done.states[k], done.totals[k] = arrays, _numbers(solution.terms)
     done.memories[k] = solution.memory
-    if solution.sigma:
-        done.sigma[k] = solution.sigma[0]
+    if solution.certainty:
+        done.certainty[k] = solution.certainty[0]
     done.lost.pop(k, None)
 
 
@@ -211,12 +211,12 @@ def _advance(tracker, done, start, width, log, progress):
             done.unusable[error.frame] = f"{error} from the start"
             continue
         terms, memory, latest = solution.terms, solution.memory, solution.evaluations
-        sigma = solution.sigma or [None] * len(usable)
-        solved = dict(zip(usable, zip(solution.states, sigma)))
+        certainty = solution.certainty or [None] * len(usable)
+        solved = dict(zip(usable, zip(solution.states, certainty)))
         break
     record(latest, sum(terms.values()), terms, best=True)
 
-    for k, (state, sigma) in solved.items():
+    for k, (state, certainty) in solved.items():
         arrays = _rounded(problem, state)
         if not all(np.isfinite(x).all() for x in arrays.values()):
             failed[k] = "its state is not finite"
@@ -224,8 +224,8 @@ def _advance(tracker, done, start, width, log, progress):
             failed[k] = "the surface left the image"
         else:
             done.states[k] = arrays
-            if sigma is not None:
-                done.sigma[k] = sigma
+            if certainty is not None:
+                done.certainty[k] = certainty
     for k in members:
         if k > 0 and (k in failed or k in done.unusable):
             done.states[k] = dict(done.states[k - 1])

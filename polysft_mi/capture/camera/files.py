@@ -62,8 +62,8 @@ def _parsed(text, size):
         if "camera_matrix" in values:
             return _opencv(text, size)
         if any(key in values for key in ("fl_x", "camera_angle_x", "frames")):
-            return _nerfstudio(values, size)
-        return _own(values)
+            return nerfstudio_camera(values, size)
+        return own_camera(values)
     lines = [x.split() for x in text.splitlines() if x.strip() and not x.lstrip().startswith("#")]
     if lines and all(len(x) > 4 and x[0].isdigit() and x[1].isupper() for x in lines):
         return _colmap(lines)
@@ -83,7 +83,8 @@ def _numbers(values, names, default=None):
     return found
 
 
-def _own(values):
+def own_camera(values):
+    """(Intrinsics, distortion) of a camera file of ours. Raises InputError."""
     *pinhole, width, height = _numbers(values, ("fx", "fy", "cx", "cy", "width", "height"))
     distortion = values.get("distortion") or []
     try:
@@ -118,6 +119,17 @@ def _opencv(text, size):
 
 def _colmap(lines):
     """Lines of CAMERA_ID, MODEL, WIDTH, HEIGHT, parameters."""
+    if len({tuple(line[1:]) for line in lines}) > 1:
+        raise InputError(
+            f"{len(lines)} cameras that differ; keep the line of the one that took the frames"
+        )
+    return colmap_camera(lines[0][1], lines[0][2:])
+
+
+def colmap_camera(model, words):
+    """(Intrinsics, distortion) of a camera of COLMAP: the name of its model; width, height, and the
+    model's parameters, as words or numbers. Raises InputError.
+    """
     parameters = {
         "SIMPLE_PINHOLE": "f cx cy",
         "PINHOLE": "fx fy cx cy",
@@ -125,24 +137,21 @@ def _colmap(lines):
         "RADIAL": "f cx cy k1 k2",
         "OPENCV": "fx fy cx cy k1 k2 p1 p2",
     }
-    if len({tuple(line[1:]) for line in lines}) > 1:
-        raise InputError(
-            f"{len(lines)} cameras that differ; keep the line of the one that took the frames"
-        )
-    model, words = lines[0][1], lines[0][2:]
     if model not in parameters:
         raise InputError(f"camera model {model}; {', '.join(parameters)} can be used")
     names = parameters[model].split()
     try:
-        numbers = [float(word) for word in words]
+        values = [float(word) for word in words]
         width, height = int(words[0]), int(words[1])
     except ValueError:
-        raise InputError(f"{' '.join(lines[0])}: a word that is not a number") from None
-    if len(numbers) != len(names) + 2:
         raise InputError(
-            f"{len(numbers) - 2} parameters of the model {model}; {', '.join(names)} are needed"
+            f"{model} {' '.join(map(str, words))}: a word that is not a number"
+        ) from None
+    if len(values) != len(names) + 2:
+        raise InputError(
+            f"{len(values) - 2} parameters of the model {model}; {', '.join(names)} are needed"
         )
-    named = dict(zip(names, numbers[2:]))
+    named = dict(zip(names, values[2:]))
     focal = named.get("f")
     camera = Intrinsics(
         named.get("fx", focal), named.get("fy", focal), named["cx"], named["cy"], width, height
@@ -151,8 +160,10 @@ def _colmap(lines):
     return camera, distortion if any(distortion) else []
 
 
-def _nerfstudio(values, size):
-    """``transforms.json``; its frames' poses are not needed."""
+def nerfstudio_camera(values, size):
+    """(Intrinsics, distortion) of ``transforms.json``, or of one of its frames; ``size`` of the
+    frames, where it has none. Raises InputError.
+    """
     model = values.get("camera_model", "OPENCV")
     if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE") or values.get("is_fisheye"):
         raise InputError(

@@ -5,8 +5,6 @@ from dataclasses import replace
 
 import mitsuba as mi
 
-from polysft_mi.render import PlacedMesh
-
 from .photometric import Photometric
 from .silhouette import Silhouette
 from .term import DeviceFrame, Term
@@ -21,21 +19,12 @@ class Cameras(Term):
 
     def __init__(self, inputs):
         super().__init__(inputs)
-        main = inputs.placed
         self._settings = inputs.settings
         #: what the terms of each camera are made of
         self.views = [
             replace(
                 inputs,
-                placed=PlacedMesh(
-                    main.scene,
-                    camera.sensor(),
-                    main.renderer,
-                    main.mesh,
-                    main.corner,
-                    inputs.settings.sppi,
-                    inputs.where,
-                ),
+                placed=inputs.placed.seen_by(camera.sensor()),
                 sequence=camera.sequence,
                 _targets=OrderedDict(),
             )

@@ -6,16 +6,17 @@ from polysft_mi.results import Truth, per_frame
 
 from ..figures import COLOURS, TERMS, loss_curves
 
-LABELS = {
+_LABELS = {
     "frame": "frame",
     "psnr_mask": "PSNR inside the surface [dB]",
     "ssim_mask": "SSIM inside the surface",
+    "iou": "silhouettes, IoU",
     "iterations": "iterations",
     "seconds": "seconds",
     "rgb": "photometric loss",
     "inextensibility": "inextensibility loss",
     "order": "order of the jet",
-    "sigma_mm": "sigma, median [mm]",
+    "score_mm": "score, median [mm]",
     "rmse_mm": "distance to the truth, RMS [mm]",
     "e3d": "e3d",
     "e3d_proc": "e3d, aligned",
@@ -25,6 +26,38 @@ LABELS = {
     "hit": "share of points hit",
     "chamfer_1e4": "chamfer [1e-4 m²]",
 }
+
+
+_OF_IMAGES = ("psnr_mask", "ssim_mask", "iou")
+
+
+def _of(name, camera):
+    """What a figure of a further camera is called."""
+    return f"{name}, {camera}"
+
+
+def _named(row, camera):
+    return {n if n == "frame" else _of(n, camera): value for n, value in row.items()}
+
+
+def labels(run):
+    """Names of figures to texts."""
+    cameras = run.metrics.get("cameras", {})
+    further = {_of(n, c): f"{c}: {_LABELS[n]}" for c in cameras for n in _OF_IMAGES}
+    return _LABELS | further
+
+
+def further(run):
+    """Of each further camera its name, its figures as a text, and the path of its picture."""
+    texts = {"psnr_mask": "PSNR {:.2f} dB", "ssim_mask": "SSIM {:.3f}", "iou": "IoU {:.3f}"}
+    return [
+        (
+            name,
+            ", ".join(form.format(known[n]) for n, form in texts.items() if n in known),
+            run.path(f"comparison_{name}.png"),
+        )
+        for name, known in run.metrics.get("cameras", {}).items()
+    ]
 
 
 def figures(run, truth):
@@ -53,15 +86,20 @@ def figures(run, truth):
             [dict(zip(rows, values)) for values in zip(*rows.values())],
         )
         cards += [
-            (LABELS.get(n, n), f"{np.mean(rows[n]):.3g}") for n in rows if n not in ("frame", "hit")
+            (_LABELS.get(n, n), f"{np.mean(rows[n]):.3g}")
+            for n in rows
+            if n not in ("frame", "hit")
         ]
         distance = _distance(run, truth)
     metric = run.metrics
-    add(("psnr_mask", "ssim_mask"), metric.get("per_frame", []))
-    if run.sigma is not None:
-        known = np.isfinite(run.sigma).any(axis=1)
-        columns["sigma_mm"] = [
-            float(1e3 * np.nanmedian(s)) if ok else None for s, ok in zip(run.sigma, known)
+    add(_OF_IMAGES, metric.get("per_frame", []))
+    for camera, known in metric.get("cameras", {}).items():
+        rows = [_named(row, camera) for row in known.get("per_frame", [])]
+        add([_of(name, camera) for name in _OF_IMAGES], rows)
+    if run.score is not None:
+        known = np.isfinite(run.score).any(axis=1)
+        columns["score_mm"] = [
+            float(1e3 * np.nanmedian(s)) if ok else None for s, ok in zip(run.score, known)
         ]
     add(("rgb", "inextensibility", "iterations", "seconds", "order"), metric.get("windows", []))
     if len(set(columns.get("order", []))) == 1:
@@ -69,6 +107,7 @@ def figures(run, truth):
     wanted = {
         "psnr_mask": ("PSNR inside the surface", "{:.2f} dB"),
         "ssim_mask": ("SSIM inside the surface", "{:.3f}"),
+        "iou": ("IoU of the silhouettes", "{:.3f}"),
         "seconds_per_frame": ("seconds a frame", "{:.2f}"),
     }
     cards += [
@@ -76,9 +115,9 @@ def figures(run, truth):
         for name, (label, form) in wanted.items()
         if name in metric
     ]
-    if "sigma_mm" in columns:
-        known = [s for s in columns["sigma_mm"] if s is not None] or [np.nan]
-        cards.append(("sigma along the ray, median", f"{np.median(known):.2f} mm"))
+    if "score_mm" in columns:
+        known = [s for s in columns["score_mm"] if s is not None] or [np.nan]
+        cards.append(("how far off it may be (score), median", f"{np.median(known):.2f} mm"))
     lost = metric.get("lost", {})
     cards.append(("lost frames", str(len(lost))))
     return columns, cards, distance

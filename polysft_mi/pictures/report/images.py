@@ -2,6 +2,7 @@
 
 import base64
 import io
+import os
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 
@@ -48,6 +49,16 @@ def images(run, shown, budget=9_000_000, threads=2):
         for c, name in enumerate(COLUMNS[:-1])
     }
     return {"kind": "webp", **named}, {n: np.stack(v) for n, v in seen.items() if v}
+
+
+def picture(path, width=1280, quality=80):
+    """The picture in a file, base64 as those of :func:`images`; None where there is none."""
+    import cv2
+
+    image = cv2.imread(path) if os.path.isfile(path) else None
+    if image is None:
+        return None
+    return base64.b64encode(_encoded([image[..., ::-1]], width, quality)[0]).decode("ascii")
 
 
 def _encoded(panels, width, quality):

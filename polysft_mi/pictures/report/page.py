@@ -11,8 +11,8 @@ from polysft_mi.errors import InputError
 from polysft_mi.results import Run
 
 from ..panels import PEAKS, box_of, evenly_spaced
-from .content import LABELS, about, figures, loss, subtitle, warning
-from .images import images
+from .content import about, figures, further, labels, loss, subtitle, warning
+from .images import images, picture
 from .surface import mesh, scalars
 
 
@@ -51,7 +51,11 @@ def write_report(out, path=None, *, truth=None, frames=200, positions=450_000):
         "peaks": {name: f"{peak:g} or more" for name, peak in PEAKS.items()},
         "shows": _shows(run),
         "columns": columns,
-        "labels": LABELS,
+        "labels": labels(run),
+        "cameras": [
+            {"name": name, "text": text, "picture": picture(path)}
+            for name, text, path in further(run)
+        ],
         "images": pictures,
         "mesh": mesh(run, shown),
         "scalars": scalars(run, shown, errors, distance),

@@ -106,12 +106,13 @@ def scalars(run, shown, errors, distance):
         " first frame's camera, blue where it is hollow."
     )
     out.append(_scalar("curvature", meaning, "1/m", curvature, "RdBu_r", signed=True))
-    if run.sigma is not None and np.isfinite(run.sigma[shown]).any():
-        meaning = (
-            "Standard deviation of each vertex along its ray, as the solver estimates it; grey"
-            " where it is not known."
-        )
-        out.append(_scalar("sigma", meaning, "mm", 1e3 * run.sigma[shown], "viridis"))
+    for name, of, meaning in (
+        ("sigma", run.sigma, "Standard deviation of each vertex along its ray, by the noise alone"),
+        ("score", run.score, "How far off each vertex may be along its ray, fitted to errors"),
+    ):
+        if of is not None and np.isfinite(of[shown]).any():
+            meaning += "; grey where it is not known."
+            out.append(_scalar(name, meaning, "mm", 1e3 * of[shown], "viridis"))
     return out
 
 

@@ -11,7 +11,7 @@ import synthetic
 from problems import data_of, problem_of
 
 from polysft_mi import prepare
-from polysft_mi.images import pyramid
+from polysft_mi.images import pixels, pyramid
 from polysft_mi.images.pyramid import MAX_CONTOUR_DISTANCE, Level, level_image
 from polysft_mi.objective.problem import Problem
 from polysft_mi.objective.terms.photometric import interior as filled
@@ -193,3 +193,25 @@ def test_a_plain_texture_is_compared_over_a_higher_floor(truth, problem):
     assert {local.level(blur).floor for blur in rules.blurs} == {rules.plain_floor}
     assert local.misfit(vertices, 2, 1.0) < 0.5 * local.misfit(vertices + [0.02, 0, 0], 2, 1.0)
     assert usual.level(1.0).floor == colours.level(1.0).floor == pyramid.FLOOR
+
+
+def test_pixels_count_as_one_as_their_residuals_are_alike(problem):
+    data, blur, vertices = data_of(problem), 1.0, displaced(problem, 0.2)
+    level, view = data.level(blur), data.view(vertices, data.level(blur))
+    arguments = data._residual_arguments(view, 2, level)
+    residual, weight = (np.array(x) for x in pixels.residuals(*arguments)[:2])
+    height, width = view.size[::-1]
+    known = (weight > 0).reshape(height, width)
+    most = 2.5 * np.median(np.abs(residual[:3, weight > 0])) / 0.6745
+    residual = np.clip(residual[:3], -most, most).reshape(3, height, width) * known
+    reach, alike, pairs = round(level.window / level.stride), 0.0, 0
+    for dy in range(-reach, reach + 1):  # the slow way: of each offset the mean product
+        for dx in range(-reach, reach + 1):
+            a = tuple(slice(max(0, -k), n - max(0, k)) for k, n in ((dy, height), (dx, width)))
+            b = tuple(slice(max(0, k), n - max(0, -k)) for k, n in ((dy, height), (dx, width)))
+            alike += (residual[(..., *a)] * residual[(..., *b)]).sum() / 3
+            pairs += (known[a] & known[b]).sum()
+    power = (residual**2).sum() / 3 / known.sum()
+    expected = (2 * reach + 1) ** 2 * alike / pairs / power * level.stride**2
+    assert expected > 2 * np.pi * level.sigma**2  # blur alone makes 4 pi sigma^2
+    assert abs(data.pixels_as_one(vertices, 2, blur) / expected - 1) < 1e-3

@@ -53,7 +53,7 @@ def drawn(sheet, out, during=lambda drawing: None, *, problem=None, **options):
         during(made)
         (out / "log.jsonl").write_text('{"frame": 0, "iteration": 0, "loss": 1.0}\n')
         finished, bound, plotted = made.finish(vertices, surfaces, 15)
-        (figures, _box), path = finished(), bound()
+        (figures, *_), path = finished(), bound()
         plotted()
         folder = Path(made._folder.name)
     assert (
@@ -143,7 +143,7 @@ def test_fewer_frames_than_expected(sheet, here, tmp_path):
             made.frame(k, v)
         finished, bound, _ = made.finish(vertices, surfaces, 15)
         assert all(path.exists() for path in others)
-        figures, _box = finished()
+        figures, *_ = finished()
         assert len(list(video.read_video(bound()))) == 5
     names = sorted(p.name for p in (tmp_path / "comparison").iterdir())
     assert names == ["000.exr", "002.exr", "004.exr"]
@@ -183,7 +183,7 @@ def test_pictures_are_cropped_to_the_sheet_wherever_it_goes(sheet, tmp_path):
     vertices = [problem.camera.origin + v @ problem.camera.axes for v in surfaces]
     for k, v in enumerate(vertices):
         album.draw(k, v)
-    _, box = album.finish(surfaces)
+    _, box, _ = album.finish(surfaces)
     seen = np.concatenate([problem.camera.project(v)[0] for v in vertices])
     low, high = seen.min(0), seen.max(0)
     assert (box[:2] <= low).all() and (high <= box[2:]).all()

@@ -79,7 +79,14 @@ def read_pixels(path):
 
 def test_colours_say_what_the_run_knows(finished_run, finished_tube, opened):
     run, viewer = Run.open(finished_run[1]), opened(finished_run[1])
-    assert set(viewer.colour.options) == {"texture", "plain", "residual", "sigma", "curvature"}
+    assert set(viewer.colour.options) == {
+        "texture",
+        "plain",
+        "residual",
+        "sigma",
+        "score",
+        "curvature",
+    }
     seen = {name: show(viewer, 3, name).visual for name in ("plain", "residual", "sigma")}
     colours = {name: v.vertex_attributes["color"][:, :3].astype(int) for name, v in seen.items()}
     assert (np.ptp(colours["plain"], axis=0) == 0).all()

@@ -219,7 +219,7 @@ def test_confidence_says_how_far_sigma_is_off():
     figures = evaluation.confidence(surface, Truth("", "mesh", dict(enumerate(truth))))
     assert (
         abs(figures["sigma_factor"] - 3) < 0.2
-        and abs(figures["sigma_two"] - 0.954) < 0.02
+        and abs(figures["sigma_two"] - 0.495) < 0.04  # of a normal variable within 2/3
         and figures["sigma_rank"] > 0.7
     )
     assert (

@@ -2,15 +2,18 @@
 
 import json
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 import synthetic
+from loading import loaded
 from scipy.spatial.transform import Rotation
 
+from polysft_mi.capture import prepare_folder
 from polysft_mi.errors import InputError
 from polysft_mi.render.pinhole import Pinhole
-from polysft_mi.scene import register
+from polysft_mi.scene import read_cameras, register, written
 from polysft_mi.scene.cameras import open_cameras
 
 
@@ -68,6 +71,86 @@ def test_a_bad_file_is_told(other, said, folder):
     write(folder, **other)
     with pytest.raises(InputError, match=re.escape(said)):
         open_cameras(str(folder), 3, 0, -1, 1)
+
+
+def test_distortion_is_told(folder):
+    write(folder, distortion=[-0.1, 0, 0, 0])
+    with pytest.raises(InputError, match="distortion"):
+        open_cameras(str(folder), 3)
+
+
+SENSOR = """<sensor type="{kind}"{id}>
+    {lens}
+    <transform name="to_world"><matrix value="{matrix}"/></transform>
+    <film type="hdrfilm">
+        <integer name="width" value="96"/> <integer name="height" value="72"/>
+        <string name="pixel_format" value="rgba"/> <rfilter type="box"/>
+    </film>
+</sensor>
+</scene>"""
+
+
+@pytest.fixture
+def scene(tmp_path):
+    """A function that gives a scene file with a second sensor; its pose; and the sensor's K."""
+    data = synthetic.cloth(tmp_path / "data", frames=2).folder
+    path, _ = prepare_folder(str(data))
+    text = (data / "scene.xml").read_text()
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_rotvec([0.1, 0.8, -0.2]).as_matrix()
+    pose[:3, 3] = 0.1, -0.2, 0.5
+    lens = "".join(
+        f'<float name="{k}" value="{v}"/>'
+        for k, v in dict(fx=100.0, fy=95.0, cx=47.0, cy=37.0).items()
+    )
+    to_world = np.linalg.inv(pose) @ np.diag([-1.0, -1.0, 1.0, 1.0])
+    matrix = " ".join(map(repr, to_world.ravel().tolist()))
+
+    def make(id=' id="left"', kind="pinhole"):
+        sensor = SENSOR.format(id=id, kind=kind, lens=lens, matrix=matrix)
+        (data / "scene.xml").write_text(text.replace("</scene>", sensor))
+        return path
+
+    return make, pose
+
+
+def test_a_second_sensor_is_a_further_camera(scene):
+    make, pose = scene
+    path = make()
+    experiment = loaded(path)
+    assert list(experiment.sequence().cameras) == []
+    assert "sensors left are not used" in experiment.notes[0]
+    folder = Path(path).parent
+    synthetic.cloth(folder / "cameras" / "left", frames=2)
+    with pytest.raises(InputError, match=r"has a camera\.json, too"):
+        loaded(path, cameras="cameras").sequence()
+    (folder / "cameras" / "left" / "camera.json").unlink()
+    experiment = loaded(path, cameras="cameras")
+    (camera,) = experiment.sequence().cameras
+    assert experiment.notes == [] and camera.name == "left"
+    np.testing.assert_allclose(camera.world_to_camera, pose, atol=1e-5)
+    c = camera.intrinsics
+    np.testing.assert_allclose((c.fx, c.fy, c.cx, c.cy), (100, 95, 47, 37), rtol=1e-5)
+    assert (c.width, c.height) == (96, 72) and camera.sequence.mask(0) is not None
+    # the own camera is still the first one
+    own = Pinhole(experiment.sensor).intrinsics()
+    assert own.fx == pytest.approx(1.15 * 96, rel=1e-5)
+    # what is written of it is read back
+    path = folder / "cameras.json"
+    path.write_text(json.dumps({"left": written(camera.intrinsics, camera.world_to_camera)}))
+    intrinsics, again = read_cameras(str(path))["left"]
+    assert intrinsics == c and np.array_equal(again, camera.world_to_camera)
+
+
+def test_bad_further_sensors_are_told(scene):
+    make, _ = scene
+    with pytest.raises(InputError, match="a further sensor has no id"):
+        loaded(make(id=""))
+    with pytest.raises(InputError, match="'thinlens' is not a pinhole"):
+        loaded(make(kind="thinlens"))
+    (Path(make()).parent / "cameras" / "right").mkdir(parents=True)
+    with pytest.raises(InputError, match=r"sensor 'left': .*cameras.left: no such folder"):
+        loaded(make(), cameras="cameras").sequence()
 
 
 def test_a_folder_without_cameras_is_told(tmp_path):

@@ -48,8 +48,8 @@ def test_tracks_a_bending_sheet_and_says_how_sure_it_is(truth, tracked, tmp_path
     ]
     flat = np.linalg.norm(truth.vertices[-1] - truth.vertices[0], axis=1)
     assert max(x.mean() for x in error) < 0.003 and error[-1].mean() < 0.15 * flat.mean()
-    assert set(tracked.sigma) == {0, 1, 2, 3} and all(
-        s.shape == (108,) and (s > 0).all() for s in tracked.sigma.values()
+    assert set(tracked.certainty) == {0, 1, 2, 3} and all(
+        s.shape == (2, 108) and (s > 0).all() for s in tracked.certainty.values()
     )
     again = track(FrameTracker(problem), 4, str(tmp_path))
     for a, b in zip(tracked.states, again.states, strict=True):

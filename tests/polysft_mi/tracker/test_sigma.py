@@ -1,4 +1,4 @@
-"""How sure a vertex is: of noise, of the strain around it, and of whether a pixel sees it."""
+"""How sure a vertex is: by the noise, and by a score of strain and of whether a pixel sees it."""
 
 import dataclasses
 from types import SimpleNamespace
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from polysft_mi.objective import FrameContext, FrameMemory, Objective
-from polysft_mi.tracker.sigma import _of_noise, _strain, along_rays
+from polysft_mi.tracker.sigma import _strain, along_rays, score
 
 
 @pytest.fixture(scope="module")
@@ -49,22 +49,44 @@ def test_strain_is_the_mean_over_the_edges_smoothed_over_neighbours(solved):
     assert found[right].min() > 3 * found[left].max()
 
 
-def test_strain_and_what_is_unseen_make_it_unsure_and_noise_is_the_least(solved):
+def test_score_grows_with_strain_and_where_nothing_is_seen_and_is_sigma_at_least(solved):
     objective, model, origin = solved
-    noise, sigma = _of_noise(objective, model, origin), along_rays(objective, model, origin)
-    assert sigma.dtype == np.float32 and (sigma >= noise.astype(np.float32)).all()
-    seen = objective.data.seen_vertices(model.surface.vertices, objective.usual[-1].blur)
+    nat = objective.nat(FrameContext(0), model)
+    x, template = model.surface.vertices, objective.problem.template
+    sigma = along_rays(objective, model, nat, origin)
+    found = score(objective, x, sigma)
+    assert found.dtype == np.float32 and (found >= sigma).all()
+    seen = objective.data.seen_vertices(x, objective.usual[-1].blur)
     assert 0.2 < seen.mean() < 0.8
-    template = objective.problem.template
-    expected = objective.rules.sigma_strain * np.sqrt(
-        noise * _strain(template, model.surface.vertices) * template.scale
-    )
-    expected *= np.where(seen, 1, objective.rules.sigma_unseen)
-    more = expected > noise
-    assert more.any() and np.allclose(sigma[more], expected[more], rtol=1e-5)
+    expected = objective.rules.score_strain * np.sqrt(sigma * _strain(template, x) * template.scale)
+    expected *= np.where(seen, 1, objective.rules.score_unseen)
+    more = expected > sigma
+    assert more.any() and np.allclose(found[more], expected[more], rtol=1e-5)
+
+
+def test_sigma_is_that_of_the_whole_inverse(solved):
+    objective, model, origin = solved
+    atlas, normal, x = objective.atlas, model.normal, model.surface.vertices
+    count, d = normal.local_gradient.shape
+    pattern = objective.inputs.operators.patterns[d]
+    local = np.zeros((count, d, count, d))
+    for row, column, block in zip(pattern.row, pattern.column, normal.local):
+        local[row, :, column] = block
+    local = local.reshape(count * d, -1)
+    whole = np.block([[local, normal.cross], [normal.cross.T, normal.glob]])
+    whole += 1e-9 * np.diag(np.diag(whole))
+    ray = (x - origin) / np.linalg.norm(x - origin, axis=1, keepdims=True)
+    own = np.einsum("nk,nka->na", ray, model.surface.offset_jacobian)[:, :d]
+    moves = np.zeros((count, count, d))
+    moves[np.arange(count), np.arange(count)] = own
+    moves = np.hstack([moves.reshape(count, -1), atlas.global_columns(model.surface, ray)])
+    variance = np.einsum("ij,ji->i", moves, np.linalg.solve(whole, moves.T))
+    found = along_rays(objective, model, 2.5e-6, origin)
+    assert np.allclose(found, np.sqrt(2.5e-6 * variance), rtol=0.02)
 
 
 def test_singular_curvatures_give_no_number(solved):
     objective, model, origin = solved
     normal = SimpleNamespace(**{k: 0 * v for k, v in vars(model.normal).items()})
-    assert np.isnan(along_rays(objective, dataclasses.replace(model, normal=normal), origin)).all()
+    none = dataclasses.replace(model, normal=normal)
+    assert np.isnan(along_rays(objective, none, 1e-6, origin)).all()

@@ -19,7 +19,7 @@ def test_a_window_follows_the_sheet_and_couples_its_frames(truth, tracked, tmp_p
     """
     problem = problem_of(truth.folder, window=3, k_tc=k_tc)
     done = track(FrameTracker(problem), 4, str(tmp_path))
-    assert len(done.states) == 4 and len(done.totals) == 2 and set(done.sigma) == {0, 1, 2, 3}
+    assert len(done.states) == 4 and len(done.totals) == 2 and set(done.certainty) == {0, 1, 2, 3}
     error = [
         np.linalg.norm(problem.surface(Unknowns.from_numpy(s)) - t, axis=1).mean()
         for s, t in zip(done.states, truth.vertices)
@@ -54,7 +54,7 @@ def test_looking_back_smooths_and_keeps_what_frames_know(truth, tracked, tmp_pat
     problem = problem_of(truth.folder, smooth=10.0)
     back = track(FrameTracker(problem), 4, str(tmp_path))
     assert back.finished and not tracked.finished
-    assert len(back.totals) == len(back.sigma) == 4
+    assert len(back.totals) == len(back.certainty) == 4
     assert all(m.least_misfit > 0 and m.light.frames for m in back.memories[1:])
     least, usual, smooth = (
         rough(truth.vertices),

@@ -1,0 +1,105 @@
+"""Bakes a garment's drape into bones, corrective shapes and a small network, which games and
+browsers evaluate in microseconds.
+
+    python -m onefit.bake skirt -o OUT
+    python -m onefit.bake shirt.obj -o OUT --vertices 4000 --motions dance walk motion.npz
+
+It drapes the garment in some minutes of generated motion, and takes minutes itself. OUT receives
+
+    baked.npz       all of it as arrays, which onefit.baking.Baked evaluates by NumPy alone
+    NAME.glb        of each motion: skinned meshes with morph targets, which any viewer plays
+    baked.html      a page that computes the cloth in the browser, from the poses of all motions
+"""
+
+import argparse
+from pathlib import Path
+
+from onefit.network import DEFAULT
+from polyfit.errors import InputError, Parser, cli, require
+from polyfit.files import folder_aside
+
+
+def _parser():
+    raw = argparse.RawDescriptionHelpFormatter
+    p = Parser(prog="python -m onefit.bake", description=__doc__, formatter_class=raw)
+    p.add_argument(
+        "garment", metavar="GARMENT", help="a template's name, a mesh or a sewing pattern"
+    )
+    p.add_argument("-o", "--output", required=True, metavar="OUT", help="folder of the results")
+    p.add_argument(
+        "--motions",
+        nargs="+",
+        default=["dance", "walk", "jumping_jack"],
+        metavar="MOTION",
+        help="what glTF and the page show: files, or generated kinds (default: dance walk"
+        " jumping_jack)",
+    )
+    p.add_argument("--seconds", type=float, default=6.0, help="of a generated motion (default: 6)")
+    p.add_argument("--seed", type=int, default=1_000_000, help="of one (default: 1000000)")
+    p.add_argument(
+        "--vertices", type=int, metavar="N", help="about so many of the garment (default: its own)"
+    )
+    p.add_argument(
+        "--shape", nargs="*", default=[], metavar="NAME=VALUE", help="of the body: weight=0.7"
+    )
+    p.add_argument("--weights", default=DEFAULT, help=f"of the network (default: {DEFAULT})")
+    p.add_argument("--overwrite", action="store_true", help="replace an earlier one in OUT")
+    return p
+
+
+def main(argv=None):
+    args = _parser().parse_args(argv)
+    require("torch", "anny", "pygltflib")
+
+    from onefit.baking import bake, write_glb, write_page
+    from onefit.draping import body_model, load, motion_of, shape_of
+    from onefit.garment import Garment
+
+    folder = Path(args.output)
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        if not args.overwrite:
+            raise InputError(f"{folder}: not empty; give another -o, or --overwrite")
+        if not (folder / "baked.npz").exists():
+            raise InputError(f"{folder}: holds no baked drape; --overwrite replaces nothing else")
+    model = body_model("anny")
+    shape = shape_of(model, args.shape) if args.shape else None
+    motions = [motion_of(name, seconds=args.seconds, seed=args.seed) for name in args.motions]
+    garment = Garment.named(args.garment, count=args.vertices)
+    with _progress() as advance:
+        draper = load(args.weights, model=model)
+        baked = bake(draper, garment, shape, advance=advance)
+    body = model.body(shape)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with folder_aside(folder, lambda name: True) as temporary:
+        baked.save(Path(temporary) / "baked.npz")
+        for motion in motions:
+            write_glb(Path(temporary) / f"{motion.name}.glb", baked, body, motion)
+        write_page(Path(temporary) / "baked.html", baked, body, motions)
+    print(folder)
+    print(f"next: open {folder / 'baked.html'} in a browser")
+
+
+def _progress():
+    from contextlib import contextmanager
+
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    @contextmanager
+    def running():
+        columns = TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn()
+        with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+            tasks = {}
+
+            def advance(stage, share):
+                if stage not in tasks:
+                    tasks[stage] = progress.add_task(stage, total=1.0)
+                progress.update(tasks[stage], completed=share)
+
+            yield advance
+
+    return running()
+
+
+if __name__ == "__main__":
+    cli(main)
