@@ -10,6 +10,6 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "losses": ["Weights"],
         "measures": ["Measures", "measure"],
         "objective": ["posed"],
-        "piercing": ["crossings"],
+        "piercing": ["crossing_faces", "crossings"],
     },
 )

@@ -5,8 +5,13 @@ from scipy.spatial import cKDTree
 
 
 def crossings(vertices: np.ndarray, faces: np.ndarray) -> int:
-    """Pairs of faces (F, 3) without a common corner that pass through each other, of a surface with
-    its vertices at (N, 3) [m]: a side of one pierces the other.
+    """How many :func:`crossing_faces` there are."""
+    return len(crossing_faces(vertices, faces))
+
+
+def crossing_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Pairs (P, 2) of faces (F, 3) without a common corner that pass through each other, of a
+    surface with its vertices at (N, 3) [m]: a side of one pierces the other.
     """
     corners = np.asarray(vertices, dtype=float)[faces]
     centre = corners.mean(1)
@@ -15,7 +20,8 @@ def crossings(vertices: np.ndarray, faces: np.ndarray) -> int:
     near = np.linalg.norm(centre[one] - centre[two], axis=1) < radius[one] + radius[two]
     apart = ~(faces[one][:, :, None] == faces[two][:, None]).any((1, 2))
     one, two = one[near & apart], two[near & apart]
-    return int((_pierces(corners[one], corners[two]) | _pierces(corners[two], corners[one])).sum())
+    through = _pierces(corners[one], corners[two]) | _pierces(corners[two], corners[one])
+    return np.column_stack([one, two])[through]
 
 
 def _pierces(one, two):
