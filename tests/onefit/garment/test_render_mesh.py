@@ -101,7 +101,7 @@ def test_a_drape_hands_the_file_back(garment, file_mesh, tmp_path):
     write_obj(tmp_path / "top.obj", V, F, TexCoords(V[:, ::2], F))
     drape = onefit.load().drape(tmp_path / "top.obj", onefit.Motion.generate("walk", seconds=0.1))
     assert drape.render_vertices().shape == (3, *V.shape)
-    output.write(drape, tmp_path, skip=("usd", "render"), meshes="obj")
+    output.write([drape], ["top"], tmp_path, skip=("usd", "render"), meshes="obj")
     W, G, texcoords = read_textured(tmp_path / "meshes" / "002.obj")
     assert np.array_equal(G, F) and np.abs(W - drape.render_vertices()[2]).max() < 1e-6
     assert texcoords.corners == pytest.approx(V[F][..., ::2], abs=1e-6)
