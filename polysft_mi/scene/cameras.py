@@ -6,6 +6,7 @@ import json
 import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
@@ -137,7 +138,7 @@ def _camera(known, where):
     try:
         numbers = [float(known[name]) for name in ("fx", "fy", "cx", "cy")]
         size = [int(known[name]) for name in ("width", "height")]
-        pose = np.array(known["world_to_camera"], dtype=np.float64)
+        pose = known["world_to_camera"]
     except KeyError as error:
         raise InputError(
             f"{where}: {error.args[0]} is missing; fx, fy, cx, cy, width, height and"
@@ -150,11 +151,25 @@ def _camera(known, where):
             f"{where}: distortion; frames without are needed, as polysft prepare VIDEO --cameras"
             " makes them"
         )
+    return Intrinsics(*numbers, *size), rigid_pose(pose, f"{where}: world_to_camera")
+
+
+def rigid_pose(values: Any, where: str) -> np.ndarray:
+    """A rotation and translation, (4, 4) float64, of lists, 3 x 4 or 4 x 4. Raises InputError,
+    which begins with ``where``, for anything else.
+    """
+    try:
+        pose = np.array(values, dtype=np.float64)
+        finite = pose.ndim > 0 and np.isfinite(pose).all()
+    except (TypeError, ValueError):
+        finite = False
+    if not finite:
+        raise InputError(f"{where} is no matrix of 4 x 4, or 3 x 4, finite numbers")
     if pose.shape == (3, 4):
         pose = np.vstack([pose, (0, 0, 0, 1)])
-    if pose.shape != (4, 4) or not np.isfinite(pose).all():
-        raise InputError(f"{where}: world_to_camera is {pose.shape}; 3 x 4 or 4 x 4 is needed")
+    if pose.shape != (4, 4):
+        raise InputError(f"{where} is {pose.shape}; 3 x 4 or 4 x 4 is needed")
     turn = pose[:3, :3]
     if np.abs(turn @ turn.T - np.eye(3)).max() > _STRAIGHT or np.linalg.det(turn) < 0:
-        raise InputError(f"{where}: world_to_camera is no rotation and translation")
-    return Intrinsics(*numbers, *size), pose
+        raise InputError(f"{where} is no rotation and translation")
+    return pose

@@ -14,12 +14,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from polysft_mi.errors import InputError
+from polysft_mi.scene import rigid_pose
 
 from .files import colmap_camera, nerfstudio_camera, own_camera
 from .lens import Lens
 
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # x right, y up, z back, to x right, y down, z forward
-_STRAIGHT = 1e-3  # how far a rotation may be from one
 _FORMS = (
     "nerfstudio's transforms.json, the folder of a sparse model of COLMAP (cameras, images as .txt"
     " or .bin), or a folder of cameras with camera.json"
@@ -95,7 +95,7 @@ def _own(folder, name):
     values = _json(where)
     if "world_to_camera" not in values:
         raise InputError(f"{where}: world_to_camera is missing")
-    pose = _pose(values["world_to_camera"], f"{where}: world_to_camera")
+    pose = rigid_pose(values["world_to_camera"], f"{where}: world_to_camera")
     masks = os.path.join(name, "masks")
     masks = masks if os.path.isdir(os.path.join(folder, masks)) else None
     read = lambda width, height: own_camera(values)
@@ -113,7 +113,7 @@ def _nerfstudio(path):
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
             raise InputError(f"{where}: file_path is missing")
         where = f"{path}: {frame['file_path']}"
-        to_world = _pose(frame.get("transform_matrix"), f"{where}: transform_matrix") @ _OPENGL
+        to_world = rigid_pose(frame.get("transform_matrix"), f"{where}: transform_matrix") @ _OPENGL
         own = {**values, **frame}
         read = lambda width, height, own=own: nerfstudio_camera(own, (width, height))
         pose = _inverse(to_world)
@@ -241,22 +241,6 @@ def _json(path):
     if not isinstance(values, dict):
         raise InputError(f"{path}: not a JSON object")
     return values
-
-
-def _pose(values, where):
-    """A rotation and translation (4, 4) of lists. Raises InputError."""
-    try:
-        pose = np.array(values, dtype=np.float64)
-    except (TypeError, ValueError):
-        pose = np.empty(0)
-    if pose.shape == (3, 4):
-        pose = np.vstack([pose, (0, 0, 0, 1)])
-    if pose.shape != (4, 4) or not np.isfinite(pose).all():
-        raise InputError(f"{where} is no matrix of 4 x 4, or 3 x 4, finite numbers")
-    turn = pose[:3, :3]
-    if np.abs(turn @ turn.T - np.eye(3)).max() > _STRAIGHT or np.linalg.det(turn) < 0:
-        raise InputError(f"{where} is no rotation and translation")
-    return pose
 
 
 def _inverse(pose):
