@@ -93,9 +93,9 @@ class Intrinsics:
                 f"{path}: {error} missing or not a number; fx, fy, cx, cy, width, height are needed"
             ) from None
 
-    def sensor_xml(self, indent: str = "    ") -> str:
+    def sensor_xml(self, indent: str = "    ", world_to_camera: np.ndarray | None = None) -> str:
         """The ``<sensor>`` element: Mitsuba's ``perspective`` where the pixels are square, else our
-        ``pinhole``.
+        ``pinhole``; it stands where ``world_to_camera`` (4, 4) says, or at the world's origin.
 
         Only ``perspective`` is accepted by path replay with moving silhouettes
         (``prb_projective``).
@@ -121,9 +121,16 @@ class Intrinsics:
                 f'    <float name="{k}" value="{getattr(self, k):.12g}"/>'
                 for k in ("fx", "fy", "cx", "cy")
             ]
+        place = 'origin="0, 0, 0" target="0, 0, 1" up="0, -1, 0"'
+        if world_to_camera is not None:
+            rotation = np.asarray(world_to_camera, dtype=np.float64)[:3, :3]
+            origin = -rotation.T @ np.asarray(world_to_camera, dtype=np.float64)[:3, 3]
+            points = {"origin": origin, "target": origin + rotation[2], "up": -rotation[1]}
+            text = lambda x: ", ".join(f"{value:.12g}" for value in x + 0.0)
+            place = " ".join(f'{name}="{text(x)}"' for name, x in points.items())
         lines = lens + [
             '    <transform name="to_world">',
-            '        <lookat origin="0, 0, 0" target="0, 0, 1" up="0, -1, 0"/>',
+            f"        <lookat {place}/>",
             "    </transform>",
             '    <film type="hdrfilm">',
             f'        <integer name="width" value="{self.width}"/>',

@@ -7,6 +7,8 @@ size are the folder's own.
 import os
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError
 from polysft_mi.scene import EXTENSIONS, kinect_paper
@@ -26,7 +28,8 @@ class Layout:
     ``frames``, ``masks``: as :meth:`polysft_mi.scene.sequence.Sequence.open` takes them;
     ``texture``: an image; ``obj``: the template's file, None where the form has none; ``flip``:
     whether x and y of the template are negated to reach the camera frame; ``settings``: values of
-    :class:`polysft_mi.scene.settings.Settings` that are not the defaults.
+    :class:`polysft_mi.scene.settings.Settings` that are not the defaults; ``world_to_camera``
+    (4, 4) [m]: where the camera stands, None at the world's origin.
     """
 
     form: str
@@ -37,6 +40,7 @@ class Layout:
     obj: str | None = None
     flip: bool = False
     settings: dict = field(default_factory=dict)
+    world_to_camera: np.ndarray | None = None
 
 
 def recognise(folder):

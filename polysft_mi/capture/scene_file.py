@@ -43,7 +43,7 @@ def scene_xml(layout, data, template=None, comment=""):
         <integrator type="$integrator"/>
     </integrator>
 
-{layout.camera.sensor_xml()}
+{layout.camera.sensor_xml(world_to_camera=layout.world_to_camera)}
 
 {_template_xml(layout, template)}
 

@@ -76,11 +76,12 @@ class DataTerm:
     ``normalise``: whether images are freed from lighting. A ``blur`` [pixels, on a sheet of 225
     pixels] names the level at which images are compared; a
     :class:`polysft_mi.images.pyramid.Level` may be given in its place. Vertices are (N, 3) [m,
-    world].
+    world], those where the first frame begins are ``start``.
     """
 
-    def __init__(self, placed, template, sequence, rules, normalise):
+    def __init__(self, placed, template, start, sequence, rules, normalise):
         self._placed, self._template, self._rules = placed, template, rules
+        self._start = start
         self.camera = placed.camera
         self._raster = placed.renderer if placed.is_raster else mi.load_dict({"type": "raster"})
         self._corner, self.faces = placed.corner, placed.faces
@@ -90,7 +91,7 @@ class DataTerm:
         self._triangle = on_device(np.arange(len(self.faces)), mi.UInt32)
         self._sums, self._outline = frozen(pixels.triangle_sums), frozen(pixels.silhouette_terms)
         self.normalise, self._masked = normalise, sequence.mask_files is not None
-        position, _ = self.camera.project(template.vertices)
+        position, _ = self.camera.project(start)
         shown = placed.mesh, placed.rendered_faces, position[self._corner]
         how = self._rules.texels, self._masked, self.normalise, len(template) > 1
         self.texture = Texture(*shown, *how)
@@ -130,7 +131,7 @@ class DataTerm:
     def brightness(self):
         """The :class:`polysft_mi.images.light.Brightness` of the template and the video."""
         if self._brightness is None:
-            vertices, texture = self._template.vertices, self.texture
+            vertices, texture = self._start, self.texture
             position, _ = self.camera.project(vertices)
             self._brightness = Brightness(
                 self.faces, vertices, position, texture, self._masked, self._rules
@@ -138,12 +139,12 @@ class DataTerm:
         return self._brightness
 
     def on_template(self, texels):
-        """Points (K, 3) [m, world] of the undeformed template at ``texels`` (K, 2) of the baked
+        """Points (K, 3) [m, world] of the template, as it stands first, at ``texels`` (K, 2) of the baked
         texture; NaN beyond it.
         """
         from scipy.interpolate import LinearNDInterpolator  # a tenth of the start, seldom needed
 
-        at = self._template.vertices[self._corner]
+        at = self._start[self._corner]
         return LinearNDInterpolator(self.texture.texels(), at)(texels)
 
     def move_texture(self, chart, displaced):

@@ -33,7 +33,8 @@ class Problem:
         self.template = experiment.template
         self.settings = experiment.settings.for_patches(len(self.template))
         self.rules = (rules or Rules()).for_patches(len(self.template))
-        self.patch, self.atlas = JetAtlas(self.template), Atlas(self.template)
+        carrier = sequence.carrier
+        self.patch, self.atlas = JetAtlas(self.template, carrier), Atlas(self.template, carrier)
         e = experiment
         rendered = e.scene, e.sensor, e.renderer, e.mesh, e.corner
         self.placed = PlacedMesh(*rendered, self.settings.sppi, e.path)
@@ -57,7 +58,8 @@ class Problem:
         """Raise InputError where the template, as the scene places it, cannot be seen in the first
         frame.
         """
-        position, before = self.camera.project(self.template.vertices)
+        start = Unknowns.from_numpy(self.atlas.arrays(self.atlas.start))
+        position, before = self.camera.project(self.atlas.surface(self.atlas.start).vertices)
         where = f"{self.experiment.path}: the template"
         if not before.all():
             raise InputError(
@@ -65,7 +67,7 @@ class Problem:
                 " it must stand in its pose of the first frame"
             )
         low, high = position.min(0).round(), position.max(0).round()
-        if self.visible_share(self.surface(self.patch.rest())) == 0:
+        if self.visible_share(self.surface(start)) == 0:
             raise InputError(
                 f"{where} is out of view in the first frame: it projects to x"
                 f" {low[0]:g}..{high[0]:g}, y {low[1]:g}..{high[1]:g} of an image of"
@@ -73,7 +75,7 @@ class Problem:
             )
         mask = self.sequence.mask(0)
         if mask is not None:
-            alpha = np.array(self.placed.image(self.patch.vertices(self.patch.rest()))[1])
+            alpha = np.array(self.placed.image(self.patch.vertices(start))[1])
             if float((alpha.reshape(mask.shape) * mask).sum()) == 0:
                 raise InputError(
                     f"{where} does not meet the mask of the first frame: it projects to x"

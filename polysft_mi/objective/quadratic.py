@@ -198,6 +198,7 @@ def _vertex_sums_in_unknowns(
     index,
     size,
     triangles,
+    linear,
 ):
     """Normal equations of the images, the edges and the triangles, in the unknowns of an atlas.
 
@@ -206,10 +207,12 @@ def _vertex_sums_in_unknowns(
     ``numbers`` Float64: stiffness [1/m^2], give; ``offset_jacobian`` Float64 of 9N, ``up`` of 3K,
     ``motion_jacobian`` of 18 and ``basis`` of A an entry: of
     :class:`polysft_mi.surface.atlas.Surface`; ``index``: 0, 1, ... of A H, and ``size``: A,
-    UInt32; ``triangles``: Float64 of 9F and 81F, of :class:`TriangleForms`, or None. Returns
+    UInt32; ``triangles``: Float64 of 9F and 81F, of :class:`TriangleForms`, or None; ``linear``:
+    Float64 of 9N, that of a carried surface, or None. Returns
     Float64: energies of the edges without their weight (E), gradient (3N) in space; by (Δu, Δv,
-    Δw): gradient (3N), curvature (9U) of the pairs; of positions in space and, over the halo, the
-    motions (18H) and the coefficients (3 of A H each).
+    Δw): gradient (3N), curvature (9U) of the pairs; of positions at rest and, over the halo, the
+    motions (18H) and the coefficients (3 of A H each); and the curvature (9U) of the pairs in
+    space, None where the surface is not carried.
     """
     vertex, pair = (
         dr.arange(mi.UInt32, dr.width(vertices) // 3),
@@ -253,12 +256,21 @@ def _vertex_sums_in_unknowns(
         )
         space = [x + y for x, y in zip(space, of_pairs)]
 
+    # a body carries each vertex from where it is at rest
+    at_rest, in_world = gradient, None
+    if linear is not None:
+        in_world = packed(space, pair)
+        left, right = (rows_of(numbers_of(linear, k, 9), 3) for k in (tables.i, tables.j))
+        space = flattened(congruence(left, rows_of(space, 3), right))
+        own = rows_of(numbers_of(linear, vertex, 9), 3)
+        at_rest = [sum(own[k][a] * gradient[k] for k in range(3)) for a in range(3)]
+
     # each vertex moves by its own (u, v) and height, and by the jets and the motions that hold it
     left, right = (rows_of(numbers_of(offset_jacobian, k, 9), 3) for k in (tables.i, tables.j))
     local = packed(flattened(congruence(left, rows_of(space, 3), right)), pair)
     space = packed(space, pair)
     own = rows_of(numbers_of(offset_jacobian, vertex, 9), 3)
-    along = [sum(own[k][a] * gradient[k] for k in range(3)) for a in range(3)]
+    along = [sum(own[k][a] * at_rest[k] for k in range(3)) for a in range(3)]
 
     def in_space(block):
         """The 3 x 3 of a neighbour in a halo, its rows."""
@@ -299,6 +311,7 @@ def _vertex_sums_in_unknowns(
         local,
         packed(moved, dr.arange(mi.UInt32, dr.width(halo.start) - 1)),
         *lifted,
+        in_world,
     )
 
 
@@ -361,7 +374,9 @@ class Assembly:
             *(self._tables, self._halo, images),
             *(flat(surface.vertices), *of_edges, *map(flat, derivatives)),
             *(dr.arange(mi.UInt32, size * self._index), dr.opaque(mi.UInt32, size), forms),
+            None if surface.linear is None else flat(surface.linear),
         )
+        *found, in_world = found
         energy, gradient, along, local, moved, *lifted = (np.array(x) for x in found)
         gradient, moved = gradient.reshape(-1, 3), moved.reshape(-1, 3, 6)
         lifted = [x.reshape(-1, size) for x in lifted]
@@ -385,7 +400,35 @@ class Assembly:
             np.ascontiguousarray(along.reshape(-1, 3)[:, :d]),
             self._atlas.to_globals(surface, gradient),
         )
+        if surface.by_pose is not None:
+            self._add_pose(normal, surface, np.array(in_world).reshape(-1, 3, 3), d)
         return normal, edges.stiffness * float(energy.sum())
+
+    def _add_pose(self, normal, surface, pairs, d):
+        """Add the curvatures by the body's pose, from those of the ``pairs`` (U, 3, 3) in space."""
+        pattern, columns = self.pattern, surface.by_pose
+        i, j = pattern.row[pattern.upper], pattern.column[pattern.upper]
+        count, size = len(columns), columns.shape[2]
+        upper = sp.bsr_matrix(
+            (pairs, j, np.searchsorted(i, np.arange(count + 1))), (3 * count, 3 * count)
+        )
+        diagonal = np.zeros_like(pairs)
+        diagonal[i == j] = pairs[i == j]
+        own = sp.bsr_matrix((diagonal, j, upper.indptr), upper.shape)
+        flat_columns = columns.reshape(3 * count, size)
+        pulled = upper @ flat_columns + upper.T @ flat_columns - own @ flat_columns
+        pulled = pulled.reshape(count, 3, size)
+        at_rest = np.einsum("nka,nkp->nap", surface.linear, pulled)
+        cross = np.einsum("nka,nkp->nap", surface.offset_jacobian[:, :, :d], at_rest)
+        by_jets = []
+        for k, part in enumerate(self._atlas.entries):
+            of_patch = at_rest[self._atlas.entry_vertex[part]]
+            by_jets.append(surface.basis[part].T @ np.einsum("k,nkp->np", surface.up[k], of_patch))
+            by_jets.append(np.einsum("nkm,nkp->mp", surface.motion_jacobian[part], of_patch))
+        by_jets = np.concatenate(by_jets)
+        own = flat_columns.T @ pulled.reshape(3 * count, size)
+        normal.cross = np.concatenate([normal.cross, cross.reshape(count * d, size)], 1)
+        normal.glob = np.block([[normal.glob, by_jets], [by_jets.T, own]])
 
     def _glob(self, surface, lifted, moved):
         """The curvature (G, G) by the jets and the motions."""

@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 from polyfit.errors import require
 from polyfit.jets import CanonicalFrame
 from polyfit.mesh import TexCoords, read_textured, write_ply
+from polysft_mi.body import BodyMotion, put_on
 from polysft_mi.errors import InputError
 from polysft_mi.render import Pinhole
 from polysft_mi.surface import Template, meshio
@@ -66,9 +67,9 @@ class Experiment:
     def sequence(self) -> Sequence:
         """The :class:`Sequence` of the frames that the settings select. Raises InputError."""
         s = self.settings
-        tracks, depth, cameras = (
+        tracks, depth, cameras, body = (
             os.path.normpath(located(self.path, name)) if name else ""
-            for name in (s.tracks, s.depth, s.cameras)
+            for name in (s.tracks, s.depth, s.cameras, s.body)
         )
         sequence = Sequence.open(
             self.frames,
@@ -96,6 +97,9 @@ class Experiment:
                     )
             selected = s.first, s.last, s.stride
             sequence.cameras = open_cameras(cameras, len(sequence), *selected, self.sensors)
+        if body:
+            motion = BodyMotion.read(body, sequence.count, sequence.indices)
+            sequence.carrier = put_on(self.template.vertices, self.template.faces, motion)
         return sequence
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from polysft_mi.colours import linear
+from polysft_mi.body import Carrier
 from polysft_mi.errors import InputError
 
 from .evidence import DepthImages, Tracks
@@ -26,12 +27,15 @@ class Sequence:
     ``files``, ``mask_files``: paths (``mask_files`` is None without masks); ``indices``: for each
     selected frame its index in the sorted list of all images; ``size``: (width, height) [pixels];
     ``tracks``, ``depth``: what is known beside the images, or None; ``cameras``: others than the
-    scene's own (:class:`polysft_mi.scene.cameras.OtherCamera`).
+    scene's own (:class:`polysft_mi.scene.cameras.OtherCamera`); ``count``: of all images; ``carrier``: what carries the
+    template with a body (:class:`polysft_mi.body.carrier.Carrier`), or None.
     """
 
     tracks: Tracks | None = None
     depth: DepthImages | None = None
     cameras: Iterable[Any] = ()
+    carrier: Carrier | None = None
+    count: int = 0
 
     def __init__(
         self,
@@ -108,6 +112,7 @@ class Sequence:
                     " must be of that size"
                 )
         sequence = cls(files, mask_files, indices, wanted, drop_stray)
+        sequence.count = len(paths)
         if tracks:
             sequence.tracks = Tracks.read(tracks, len(paths), indices, track_centre)
         if depth:

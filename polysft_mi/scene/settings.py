@@ -75,6 +75,11 @@ class Settings:
         " its inverse (disparity), as networks guess it",
         choices=("metric", "affine", "disparity"),
     )
+    body: str = _setting(
+        "",
+        "file of a body's motion (.npz: poses, translation), in whose rest pose the template is"
+        " given, and which carries it; empty: none",
+    )
     order: int = _setting(
         0,
         "order n of the jets; 0: 8, or 5 where the template has several patches, or less if the"
@@ -115,6 +120,12 @@ class Settings:
     )
     k_depth: float = _setting(
         1.0, "weight of the depth images; 1: as their noise, and the images', says", low=0
+    )
+    k_drape: float = _setting(
+        1.0, "weight of the drape on a body; 1: as its error, and the images', says", low=0
+    )
+    k_pose: float = _setting(
+        1.0, "weight of a body's poses as given; 1: as their error, and the images', says", low=0
     )
     k_mi: float = _setting(
         AUTO,
@@ -338,6 +349,7 @@ PRESETS: dict[str, dict[str, object]] = {
         "cameras": "",
         "tracks": "",
         "depth": "",
+        "body": "",
         "texture_fit": "none",
         "blur": 0.0,
         "starts": "previous",

@@ -95,17 +95,19 @@ class GaussNewton:
         parts = np.split(g, start[1:-1])
         steps = [(part, r.following(part)) for part, r in zip(parts, reduced, strict=True)]
         for step in steps:
-            check_step(step, len(models[0].state.alpha))
+            check_step(step, models[0].state.alpha.shape)
         return steps, sum(r.promised(part) for r, part in zip(reduced, parts, strict=True))
 
 
-def check_step(step, patches):
-    """Raise LinAlgError where a step (global (G,), local (N, d)) of so many ``patches`` is not
-    finite, or goes farther than any model is good for.
+def check_step(step, shape):
+    """Raise LinAlgError where a step (global (G,), local (N, d)) is not finite, or goes farther
+    than any model is good for; ``shape``: (K, A), patches and coefficients of each.
     """
-    g, local = step
-    motion = g.reshape(patches, -1)[:, -6:]
-    if not max(np.abs(motion).max(), np.abs(local).max()) < _FARTHEST_STEP:
+    (g, local), (patches, size) = step, shape
+    jets, pose = np.split(g, [patches * (size + 6)])
+    motion = jets.reshape(patches, -1)[:, -6:]
+    farthest = max(np.abs(x).max(initial=0) for x in (motion, local, pose))
+    if not farthest < _FARTHEST_STEP:
         raise LinAlgError("the step is not finite, or too long")
 
 

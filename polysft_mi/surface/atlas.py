@@ -7,7 +7,8 @@ kind.
 """
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -22,34 +23,45 @@ _SAME = 1e-4  # of the template's scale: surfaces that are the same
 class State:
     """Unknowns of a frame on the host, float64: ``alpha`` (K, A), the offsets of the coefficients
     in the basis of :class:`Atlas`; ``offset`` (N, 3), (Δu, Δv, Δw); ``rotation``: K of them, R_k;
-    ``translation`` (K, 3): T_k; lengths in the template's scale."""
+    ``translation`` (K, 3): T_k; lengths in the template's scale. ``pose``: of the body that carries
+    the surface (:class:`polysft_mi.body.carrier.Pose`), or None."""
 
     alpha: np.ndarray
     offset: np.ndarray
     rotation: Rotation
     translation: np.ndarray
+    pose: Any = None
 
     def after_step(self, step, factor=1.0):
-        """The state after a step (global (K (A + 6),), local (N, d)), whose global part has A
-        coefficients, 3 of rotation and 3 of translation a patch; with d = 2 the relief stays."""
+        """The state after a step (global (K (A + 6) + P,), local (N, d)), whose global part has A
+        coefficients, 3 of rotation and 3 of translation a patch, and then P of the body's pose,
+        where there is one; with d = 2 the relief stays."""
         g, local = step
-        g, offset = factor * g.reshape(len(self.alpha), -1), self.offset.copy()
+        (patches, size), pose = self.alpha.shape, self.pose
+        g, of_pose = np.split(factor * g, [patches * (size + 6)])
+        if pose is not None and len(of_pose):
+            pose = pose.after_step(of_pose)
+        g, offset = g.reshape(patches, -1), self.offset.copy()
         offset[:, : local.shape[1]] += factor * local
         return State(
             self.alpha + g[:, :-6],
             offset,
             Rotation.from_rotvec(g[:, -6:-3]) * self.rotation,
             self.translation + g[:, -3:],
+            pose,
         )
 
     def extrapolated(self, other, factor):
-        """The state that goes on from this one past ``other``: other + factor (other - self)."""
+        """The state that goes on from this one past ``other``: other + factor (other - self); a
+        body's pose is the other's.
+        """
         turn = (other.rotation * self.rotation.inv()).as_rotvec()
         return State(
             other.alpha + factor * (other.alpha - self.alpha),
             other.offset + factor * (other.offset - self.offset),
             Rotation.from_rotvec(factor * turn) * other.rotation,
             other.translation + factor * (other.translation - self.translation),
+            other.pose,
         )
 
     def difference(self, other):
@@ -68,6 +80,11 @@ class Surface:
     vertices: by its coefficients by ``up`` (K, 3) times ``basis`` (E, A), by its rotation and
     translation by ``motion_jacobian`` (E, 3, 6); and its entries' points by ``rest_basis`` and
     ``rest_motion``, which are None where there is one patch.
+
+    Where a body carries the surface, all of this but ``vertices`` is at the body's rest;
+    ``linear`` (N, 3, 3) takes derivatives from there to the world, ``by_pose`` (N, 3, P) are
+    those of the vertices by the body's pose, and ``at_rest`` (N, 3) [m] is where they are carried
+    from.
     """
 
     vertices: np.ndarray
@@ -78,6 +95,17 @@ class Surface:
     motion_jacobian: np.ndarray
     rest_basis: np.ndarray | None = None
     rest_motion: np.ndarray | None = None
+    linear: np.ndarray | None = None
+    by_pose: np.ndarray | None = None
+    at_rest: np.ndarray | None = None
+
+    def to_rest(self, rows):
+        """Derivatives ``rows`` (N, 3) by the vertices, as those by the vertices at rest."""
+        return rows if self.linear is None else np.einsum("nk,nkm->nm", rows, self.linear)
+
+    def by_offset(self, rows):
+        """The derivatives (N, 3) of ``rows`` (N, 3) . vertices by (Δu, Δv, Δw)."""
+        return np.einsum("nk,nka->na", self.to_rest(rows), self.offset_jacobian)
 
 
 class Atlas:
@@ -85,11 +113,13 @@ class Atlas:
     well conditioned to order 14.
 
     ``entry_patch`` (E,), rising, ``entry_vertex`` (E,), ``entry_weight`` (E,): the entries;
-    ``entries``: of each patch, a slice.
+    ``entries``: of each patch, a slice. ``carrier``: what carries the surface of a state that has a
+    pose (:class:`polysft_mi.body.carrier.Carrier`), or None.
     """
 
-    def __init__(self, template):
-        self.template = t = template
+    def __init__(self, template, carrier=None):
+        self.template, self.carrier = template, carrier
+        t = template
         self.order = template.order
         self._u, self._v = exponents(self.order).T
         self.to_monomials = _legendre_to_monomials(self.order)
@@ -143,6 +173,25 @@ class Atlas:
             parts.append(factor * pu[:, self._u] * pv[:, self._v])
         return sum(p.T @ p for p in parts) / len(x)
 
+    @property
+    def start(self):
+        """The :class:`State` that the first frame begins with: of the undeformed template, or, on a
+        body, of its drape.
+        """
+        (patches, size), count = self._alpha.shape, len(self.template.vertices)
+        zeros = np.zeros((patches, size)), np.zeros((count, 3))
+        still = Rotation.identity(patches), np.zeros((patches, 3))
+        return self.posed(State(*zeros, *still), 0)
+
+    def posed(self, state, frame, like=None):
+        """The state in a ``frame``, whose body stands there as is known, or corrected as that of
+        the state ``like`` is; without a body the same.
+        """
+        if self.carrier is None:
+            return state
+        corrected = None if like is None or like.pose is None else self.carrier.correction(like.pose)
+        return replace(state, pose=self.carrier.at(frame, corrected))
+
     def state(self, arrays):
         """A :class:`State` from the arrays of ``Unknowns.to_numpy``."""
         a = {name: np.asarray(x, dtype=np.float64) for name, x in arrays.items()}
@@ -151,6 +200,7 @@ class Atlas:
             np.stack([a["delta_u"], a["delta_v"], a["delta_w"]], 1),
             Rotation.from_quat(a["rotation"].reshape(-1, 4)),
             a["translation"].reshape(-1, 3),
+            self.carrier.pose(a["pose"]) if len(a.get("pose", ())) else None,
         )
 
     def rigid(self, rotation, translation):
@@ -170,10 +220,21 @@ class Atlas:
             **dict(zip(("delta_u", "delta_v", "delta_w"), state.offset.T)),
             "rotation": state.rotation.as_quat(),
             "translation": state.translation,
+            "pose": np.zeros(0) if state.pose is None else state.pose.to_numpy(),
         }
 
     def surface(self, state):
         """The :class:`Surface` of a state."""
+        found = self._surface(state)
+        if state.pose is None:
+            return found
+        maps = self.carrier.maps(state.pose)
+        by_pose = self.carrier.columns(state.pose, found.vertices)
+        carried, rest = maps(found.vertices), found.vertices
+        return replace(found, vertices=carried, linear=maps.linear, by_pose=by_pose, at_rest=rest)
+
+    def _surface(self, state):
+        """The :class:`Surface` before a body carries it."""
         t, own, patch = self.template, self._own, self.entry_patch
         moved = self._unit * np.einsum("nij,nj->ni", self._to_chart, state.offset)
         chart = self._chart[own] + moved[:, :2]
@@ -242,33 +303,54 @@ class Atlas:
             out[self.entry_vertex[part]] += values[part]
         return out
 
-    def global_columns(self, surface, rows):
-        """The derivatives (N, G) of ``rows`` (N, 3) . vertices by all jets and motions, patch by
-        patch.
+    def rest_columns(self, surface):
+        """The derivatives (N, 3, K (A + 6)) of the vertices, before a body carries them, by all
+        jets and motions, patch by patch.
         """
         size = surface.basis.shape[1] + 6
+        out = np.zeros((len(surface.vertices), 3, size * len(self)))
+        for k, part in enumerate(self.entries):
+            at, first = self.entry_vertex[part], k * size
+            by_jet = surface.up[k][:, None] * surface.basis[part][:, None]
+            out[at, :, first : first + size - 6] = by_jet
+            out[at, :, first + size - 6 : first + size] = surface.motion_jacobian[part]
+        return out
+
+    def global_columns(self, surface, rows):
+        """The derivatives (N, G) of ``rows`` (N, 3) . vertices by all jets and motions, patch by
+        patch, and by the body's pose.
+        """
+        size, world = surface.basis.shape[1] + 6, rows
+        rows = surface.to_rest(rows)
         out = np.zeros((len(rows), size * len(self)))
         for k, part in enumerate(self.entries):
             at = self.entry_vertex[part]
             by_jet = (rows[at] @ surface.up[k])[:, None] * surface.basis[part]
             by_motion = np.einsum("nk,nkm->nm", rows[at], surface.motion_jacobian[part])
             out[at, k * size : (k + 1) * size] = np.concatenate([by_jet, by_motion], 1)
-        return out
+        if surface.by_pose is None:
+            return out
+        return np.concatenate([out, np.einsum("nk,nkp->np", world, surface.by_pose)], 1)
 
     def to_globals(self, surface, gradient):
-        """The gradient (G,) by the jets and the motions, of that in space (N, 3)."""
-        parts = []
+        """The gradient (G,) by the jets, the motions and the body's pose, of that in space (N,
+        3).
+        """
+        parts, world = [], gradient
+        gradient = surface.to_rest(gradient)
         for up, part in zip(surface.up, self.entries, strict=True):
             g = gradient[self.entry_vertex[part]]
             parts.append(surface.basis[part].T @ (g @ up))
             parts.append(np.einsum("nk,nkm->m", g, surface.motion_jacobian[part]))
+        if surface.by_pose is not None:
+            parts.append(np.einsum("nk,nkp->p", world, surface.by_pose))
         return np.concatenate(parts)
 
     def with_relief_in_jets(self, state, ridge=1e-6):
         """The state of the same surface with as much of the relief as the jets can hold in the
         coefficients instead; ``ridge`` holds those that the vertices do not determine.
         """
-        surface, size = self.surface(state), state.alpha.shape[1]
+        surface, size = self._surface(state), state.alpha.shape[1]
         normal = surface.offset_jacobian[:, :, 2] / self.template.scale
         normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
         columns = self.global_columns(surface, normal).reshape(len(normal), len(self), -1)
@@ -279,16 +361,14 @@ class Atlas:
         part = np.linalg.solve(square, columns.T @ (lift * state.offset[:, 2]))
         offset = state.offset.copy()
         offset[:, 2] -= columns @ part / lift
-        found = State(
-            state.alpha + part.reshape(len(self), -1), offset, state.rotation, state.translation
-        )
+        found = replace(state, alpha=state.alpha + part.reshape(len(self), -1), offset=offset)
         if len(self) > 1:  # charts at an angle: what the heights leave is taken by all three
             for _ in range(2):
-                now = self.surface(found)
+                now = self._surface(found)
                 missing = surface.vertices - now.vertices
                 change = np.linalg.solve(now.offset_jacobian, missing[..., None])[..., 0]
                 found.offset = found.offset + change
-            left = np.abs(self.surface(found).vertices - surface.vertices).max()
+            left = np.abs(self._surface(found).vertices - surface.vertices).max()
             less = (found.offset**2).sum() < (state.offset**2).sum()
             if not (less and left < _SAME * self.template.scale):
                 return state

@@ -4,7 +4,7 @@
 Import only after a Mitsuba variant is set.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import drjit as dr
 import mitsuba as mi
@@ -20,7 +20,9 @@ class Unknowns:
     ``delta_alpha`` Float of K A [charts' units]; ``delta_u``, ``delta_v``, ``delta_w`` Floats of N,
     the last the relief, a height over the jets; ``rotation`` Float of 4 K, the quaternions (x, y,
     z, w) of the R_k, normalised where they are used; ``translation`` Float of 3 K, the T_k. All are
-    listed patch by patch.
+    listed patch by patch. ``pose``: of the body that carries the surface, as numbers
+    (:meth:`polysft_mi.body.carrier.Pose.to_numpy`), of length 0 where there is none; surfaces have
+    no gradient by it.
     """
 
     delta_alpha: mi.Float
@@ -29,8 +31,9 @@ class Unknowns:
     delta_w: mi.Float
     rotation: mi.Float
     translation: mi.Float
+    pose: mi.Float = field(default_factory=lambda: dr.zeros(mi.Float, 0))
 
-    NAMES = ("delta_alpha", "delta_u", "delta_v", "delta_w", "rotation", "translation")
+    NAMES = ("delta_alpha", "delta_u", "delta_v", "delta_w", "rotation", "translation", "pose")
     DRJIT_STRUCT = dict.fromkeys(NAMES, mi.Float)
 
     @classmethod
@@ -65,10 +68,13 @@ class Unknowns:
 
 
 class JetAtlas(Deformation):
-    """The template's jets on the device, and their deformations, in single precision."""
+    """The template's jets on the device, and their deformations, in single precision; carried by a
+    ``carrier`` as :class:`polysft_mi.surface.atlas.Atlas` is.
+    """
 
-    def __init__(self, template):
+    def __init__(self, template, carrier=None):
         super().__init__(template, _on_device)
+        self._carrier = carrier
 
     def rest(self):
         """The unknowns of the undeformed template."""
@@ -76,7 +82,18 @@ class JetAtlas(Deformation):
         return Unknowns.zero(t.alpha.size, len(t.vertices), len(t))
 
     def vertices(self, unknowns):
-        """Positions of the vertices, Point3f of N [m, camera frame]."""
+        """Positions of the vertices, Point3f of N [m, world]."""
+        found = self.at_rest(unknowns)
+        if not dr.width(unknowns.pose):
+            return found
+        pose = self._carrier.pose(np.array(dr.detach(unknowns.pose), dtype=np.float64))
+        maps = self._carrier.maps(pose)
+        rows = [[_on_device(maps.linear[:, a, b]) for b in range(3)] for a in range(3)]
+        shift = mi.Vector3f(*(_on_device(maps.shift[:, a]) for a in range(3)))
+        return mi.Point3f(*(sum(m * x for m, x in zip(row, found)) for row in rows)) + shift
+
+    def at_rest(self, unknowns):
+        """:meth:`vertices` before a body carries them."""
         return mi.Point3f(*super().vertices(unknowns))
 
     def patch_points(self, unknowns):

@@ -70,6 +70,15 @@ class FrameTracker:
 
     def _check_settings(self):
         s, path = self.settings, self.problem.experiment.path
+        if s.body and (reason := self.objective.without_block):
+            raise InputError(
+                f"{path}: setting body = {s.body} needs a quadratic model of each term, and {reason}"
+            )
+        if s.body and (s.window > 1 or self.solver.name != "gauss-newton"):
+            raise InputError(
+                f"{path}: setting body = {s.body}: its poses are corrected frame by frame; solver ="
+                " gauss-newton and window = 1 are needed"
+            )
         for name in ("smooth", "sweeps"):
             value = getattr(s, name)
             if value > 0 and s.window > 1:
@@ -96,7 +105,8 @@ class FrameTracker:
         every frame of the window is new.
         """
         self._prepare(report)
-        states, known = list(window), [memory for _, memory in past]
+        states = [self._atlas.posed(x, frame, x) for x, frame in zip(window, frames, strict=True)]
+        known = [memory for _, memory in past]
         before = [state for state, _ in past[: max(0, len(past) + 1 - len(frames))]][-2:]
         found = context = None
         alone = range(len(frames) - 1 if past else 0, len(frames))
@@ -125,7 +135,7 @@ class FrameTracker:
         ``memory``: of the frame so far; ``weight``: of the squared difference to the middle.
         """
         self._prepare(None)
-        middle = before.extrapolated(after, -0.5)
+        middle = self._atlas.posed(before.extrapolated(after, -0.5), frame, after)
         context = replace(self._context(frame, middle, [memory]), hold=weight)
         found = self._stages.descend(middle, context, self.objective.usual)
         return self._solution([found.state], [found], self._same_noise(found, context, memory))
@@ -148,6 +158,7 @@ class FrameTracker:
         self._prepare(report)
         self._expect(frame)
         context = self._context(frame, past[-1][0], [memory for _, memory in past])
+        start = self._atlas.posed(start, frame, state)
         found = self._stages.descend(start, context, self.objective.usual)
         new = self._atlas.with_relief_in_jets(found.state)
         if self._cost(new, context) >= self._cost(state, context):
@@ -170,9 +181,9 @@ class FrameTracker:
         if not self._is_prepared:
             self._is_prepared = True
             if self.settings.texture_fit == "auto" and self._learns:
-                rest = self._atlas.state(self.problem.patch.rest().to_numpy())
                 self._expect(0)
-                fit_texture(self.problem, self.objective, self._context(0, rest, []))
+                start = self._context(0, self._atlas.start, [])
+                fit_texture(self.problem, self.objective, start)
         self._stages.report, self._stages.count = report, 0
 
     def _newest(self, start, frame, history, known):
@@ -193,7 +204,7 @@ class FrameTracker:
         """The :class:`FrameContext` of a frame after those whose memory is ``known``."""
         visibility = None
         if self._learns and anchor is not None:
-            visibility = self.objective.visibility(anchor)
+            visibility = self.objective.visibility(self._atlas.posed(anchor, frame, anchor))
         return FrameContext(frame, anchor, FrameMemory.of(known), visibility)
 
     def _memory(self, found, context, known):

@@ -25,7 +25,7 @@ def along_rays(objective, model, nat, origin):
     ray = surface.vertices - origin
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     by_global = atlas.global_columns(surface, ray)
-    by_local = np.einsum("nk,nka->na", ray, surface.offset_jacobian)[:, :local]
+    by_local = surface.by_offset(ray)[:, :local]
     try:
         patterns = objective.inputs.operators.patterns
         reduced = Reduced.of(patterns, model.normal, _UNDAMPED)

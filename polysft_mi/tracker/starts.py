@@ -46,6 +46,7 @@ class Starts:
         stages, rules, frame = self._stages, self._rules, context.frame
         objective = stages.objective
         starts = motion_starts(start, history) if rules.motion_starts else [start]
+        starts = [objective.atlas.posed(state, frame, start) for state in starts]
         best = stages.descend(
             self.nearest(starts, frame, objective.usual[0]), context, objective.usual
         )
@@ -84,6 +85,8 @@ class Starts:
         few are found.
         """
         objective = self._stages.objective
+        if objective.atlas.carrier is not None:  # nothing on a body is rigid
+            return None
         if self._relocator is None:
             self._relocator = Relocator(objective.data)
         motion = self._relocator.pose(self._problem.sequence.frame(frame))

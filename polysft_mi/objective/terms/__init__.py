@@ -9,8 +9,10 @@ from .bending import Bending
 from .cameras import Cameras
 from .coupling import PatchCoupling
 from .depth import Depth
+from .drape import Drape
 from .inextensibility import Inextensibility
 from .photometric import Photometric
+from .pose import Pose
 from .shading import Shading
 from .silhouette import Silhouette
 from .smoothness import Relief, Sliding
@@ -27,6 +29,8 @@ TERMS: tuple[type[Term], ...] = (
     Cameras,
     Tracks,
     Depth,
+    Drape,
+    Pose,
     Inextensibility,
     Volume,
     Temporal,

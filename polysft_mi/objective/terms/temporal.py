@@ -88,8 +88,9 @@ class Temporal(Term):
         weight = self.weight * at.context.tie
         form[:size, :size] += weight * self.form
         pull = moved @ form
-        normal.glob += np.kron(np.eye(patches), 2 * form)
-        normal.gradient += 2 * pull.ravel()
+        jets = slice(0, moved.size)
+        normal.glob[jets, jets] += np.kron(np.eye(patches), 2 * form)
+        normal.gradient[jets] += 2 * pull.ravel()
         energy = float((pull * moved).sum())
         slid = state.offset - anchor.offset
         normal.local_gradient += 2 * weight * slid[:, : at.d]

@@ -64,7 +64,8 @@ class Inputs:
         from polysft_mi.images import DataTerm
 
         normalise = self.settings.brightness == "local"
-        return DataTerm(self.placed, self.template, self.sequence, self.rules, normalise)
+        start = self.atlas.surface(self.atlas.start).vertices
+        return DataTerm(self.placed, self.template, start, self.sequence, self.rules, normalise)
 
     def target(self, frame: int) -> Target:
         """The :class:`Target` of a frame; the last ones are kept."""

@@ -53,7 +53,7 @@ class Volume(Term):
                 by_vertex[:, axis] += np.bincount(self.faces[:, k], column, len(x))
         by_vertex /= 6 * self.rest
         change = self.of(x) / self.rest - 1
-        along = np.einsum("nk,nka->na", by_vertex, at.surface.offset_jacobian)[:, : at.d]
+        along = at.surface.by_offset(by_vertex)[:, : at.d]
         columns = atlas.to_globals(at.surface, by_vertex)
         normal.local_gradient += 2 * self.weight * change * along
         normal.gradient += 2 * self.weight * change * columns

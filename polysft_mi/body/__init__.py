@@ -1,0 +1,15 @@
+"""The body under a garment. In: its motion, and a template in its rest pose. Out: maps that carry
+the template into each frame, with their derivatives by the body's pose; OneFit's drape; the body's
+surface. Needs OneFit, and with it torch, where a body is put on; importing it needs NumPy alone.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach(
+    __name__,
+    submod_attrs={
+        "carrier": ["Carrier", "Maps", "Pose"],
+        "motion": ["BodyMotion"],
+        "wearer": ["put_on"],
+    },
+)
