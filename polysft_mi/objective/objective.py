@@ -85,8 +85,11 @@ class Objective:
 
     def d(self, context: FrameContext, stage: Stage) -> int:
         """Local unknowns of a vertex: 3 where its relief moves, or 2."""
-        known = context.is_first and self.atlas.carrier is None  # as the template has it
-        return 3 if self.has_relief and stage.relief and not known else 2
+        return 3 if self.has_relief and stage.relief and not self.is_known(context) else 2
+
+    def is_known(self, context: FrameContext) -> bool:
+        """Whether the surface has the template's shape in a frame: the first, but on a body."""
+        return context.is_first and self.atlas.carrier is None
 
     def visibility(self, state: State) -> VisibilityWeights:
         """The weights of what no pixel sees of a surface."""

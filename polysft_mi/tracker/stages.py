@@ -84,7 +84,7 @@ class Stages:
         best = self._through(start, context, stages, iterations)
         for count in range(rules.fine_passes if fine else 0):
             explained = max(rules.explained, context.memory.explained)
-            if context.is_first or not best.misfit > explained:
+            if self.objective.is_known(context) or not best.misfit > explained:
                 break
             found = self._through(best.state, context, fine, iterations)
             gain = 1 - self.cost(found) / self.cost(best)

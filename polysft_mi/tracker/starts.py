@@ -47,6 +47,10 @@ class Starts:
         objective = stages.objective
         starts = motion_starts(start, history) if rules.motion_starts else [start]
         starts = [objective.atlas.posed(state, frame, start) for state in starts]
+        if context.is_first and not objective.is_known(context):
+            # a body's pose is far off, and no frame before says by how much
+            far = objective.far, *objective.usual
+            return stages.descend(start, context, far, rules.far_iterations)
         best = stages.descend(
             self.nearest(starts, frame, objective.usual[0]), context, objective.usual
         )

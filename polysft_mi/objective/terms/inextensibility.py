@@ -28,17 +28,29 @@ class Inextensibility(Term):
         self._rules, template = inputs.rules, inputs.template
         self._gives = inputs.settings.mi_norm == "charbonnier"
         self._unit = template.scale**2
-        edges = template.edges
+        self._template_edges = edges = template.edges
         # of the surface as the device has it: what it rounds is no strain
         with dr.suspend_grad():
             rest = np.array(inputs.surface.vertices(inputs.surface.rest()), dtype=np.float64).T
         lengths = np.linalg.norm(rest[edges[:, 0]] - rest[edges[:, 1]], axis=1)
         #: (E,) [m]
         self.lengths = lengths.astype(np.float32).astype(np.float64)
+        self._atlas, self._of_drapes = inputs.atlas, {}
         self._edges = tuple(
             mi.UInt32(np.ascontiguousarray(edges[:, k], dtype=np.uint32)) for k in (0, 1)
         )
-        self._rest = mi.Float64(self.lengths)
+
+    def lengths_in(self, frame):
+        """The edges' lengths (E,) [m] in a frame where nothing strains them: the template's, or, on
+        a body, those of the drape, which its weight has stretched.
+        """
+        if self._atlas.carrier is None:
+            return self.lengths
+        if frame not in self._of_drapes:
+            draped = self._atlas.surface(self._atlas.posed(self._atlas.start, frame)).vertices
+            a, b = (draped[k] for k in self._template_edges.T)
+            self._of_drapes = {frame: np.linalg.norm(a - b, axis=1)}
+        return self._of_drapes[frame]
 
     def _give(self, context, stage):
         """The strain from which on stretched edges pull no harder: more where there is noise."""
@@ -48,17 +60,19 @@ class Inextensibility(Term):
         return r.give * (r.caution(context.memory.noise) if r.strain_caution else 1.0)
 
     def energy(self, at):
-        excess = edge_lengths(at.vertices, self._edges) - self._rest
+        rest = mi.Float64(self.lengths_in(at.context.frame))
+        excess = edge_lengths(at.vertices, self._edges) - rest
         give = self._give(at.context, at.stage)
         squared = dr.square(excess)
         if math.isfinite(give):
-            over = dr.square(dr.maximum(excess, 0) / (give * self._rest))
+            over = dr.square(dr.maximum(excess, 0) / (give * rest))
             squared *= 2 / (1 + dr.sqrt(1 + over))
         return mi.Float(self.weight * at.stage.stiffness / self._unit * dr.sum(squared))
 
     def rows(self, at):
         stiffness = self.weight * at.stage.stiffness / self._unit
-        at.edges = EdgeRows(self.lengths, stiffness, self._give(at.context, at.stage))
+        lengths = self.lengths_in(at.context.frame)
+        at.edges = EdgeRows(lengths, stiffness, self._give(at.context, at.stage))
 
     def add(self, at):
         return at.edge_energy
