@@ -67,15 +67,18 @@ class Carrier:
     ``joints`` (J, 3) [m], ``parents`` (J,), ``rest_pose`` (J, 3) [rad]: the skeleton at rest;
     ``weights`` (N, J), rows that sum to one; ``poses`` (T, J, 3) [rad], ``translation`` (T, 3) [m]:
     what is known of its motion. ``draped`` (T, N, 3) [m, rest], or None: by what the garment's
-    drape differs from the template in each frame, before it is carried. Maps, as
+    drape differs from the template in each frame, before it is carried. ``skin``: the body itself:
+    vertices at rest (V, 3) [m], their weights (V, J), and faces (F, 3), or None. Maps, as
     :mod:`onefit.body.skinning` has them, are from the rest pose to a frame.
     """
 
-    def __init__(self, joints, parents, rest_pose, weights, poses, translation, draped=None):
+    def __init__(
+        self, joints, parents, rest_pose, weights, poses, translation, draped=None, skin=None
+    ):
         self.joints, self.weights = np.asarray(joints, float), np.asarray(weights, float)
         self.parents = tuple(parents)
         self.poses, self.translation = np.asarray(poses, float), np.asarray(translation, float)
-        self.draped = draped
+        self.draped, self.skin = draped, skin
         self._rest = self._chained(Rotation.from_rotvec(rest_pose).as_matrix())
         count = len(self.parents)
         #: (J, J): whether the first joint moves the second one
@@ -122,6 +125,14 @@ class Carrier:
         if self.draped is not None:
             shift = shift + np.einsum("nij,nj->ni", linear, self.draped[pose.frame])
         return Maps(linear, shift)
+
+    def body(self, pose: Pose) -> np.ndarray:
+        """The body's vertices (V, 3) [m, world]."""
+        vertices, weights, _ = self.skin
+        _, linear, shift, _ = self._joint_maps(pose)
+        each = np.concatenate([linear, shift[..., None]], 2).reshape(len(linear), -1)
+        maps = (weights @ each).reshape(-1, 3, 4)
+        return np.einsum("vij,vj->vi", maps[..., :3], vertices) + maps[..., 3]
 
     def columns(self, pose: Pose, points: np.ndarray) -> np.ndarray:
         """Derivatives (N, 3, 3 F + 3) of the carried vertices, at ``points`` (N, 3) [m, rest] before

@@ -52,6 +52,14 @@ def put_on(vertices: np.ndarray, faces: np.ndarray, motion: BodyMotion) -> Carri
         weights / weights.sum(1, keepdims=True),
         motion.poses,
         motion.translation,
+        skin=tuple(
+            x.numpy().astype(kind)
+            for x, kind in (
+                (body.vertices, float),
+                (body.blend_weights, float),
+                (body.faces, np.int64),
+            )
+        ),
     )
     worn = draper.simulate(garment, as_onefit, shape).render_vertices().astype(float)
     at = np.arange(len(motion.poses)) * (_NETWORK_FPS / motion.fps)

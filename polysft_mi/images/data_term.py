@@ -8,7 +8,7 @@ vertices (:mod:`polysft_mi.images.gather`). Import only after a Mitsuba variant 
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import drjit as dr
@@ -27,6 +27,7 @@ from .pyramid import FLOOR, POOL, Level, compared
 from .texture import Texture, packed_image
 
 _ROBUST, _MEDIAN = 2.5, 0.6745  # deviations that count; the median size of a normal variable
+_BEHIND = 0.03  # [m] that a surface is behind what hides it
 _SHEET = 225.0  # side [pixels] of the sheet that blurs and windows are given for
 
 
@@ -102,6 +103,7 @@ class DataTerm:
         self._unit = max(1.0, math.sqrt(self.area) / _SHEET)
         self._frames = Frames(sequence, normalise)
         self._levels, self._last, self._brightness = {}, None, None
+        self._before = None  # what hides the surface
         self._floor = FLOOR
         finest = self.level(self._rules.blurs[-1])
         if normalise and self.texture.contrast(finest) < self._rules.plain:
@@ -159,6 +161,31 @@ class DataTerm:
 
     # -- what the camera sees ------------------------------------------------
 
+    def hide(self, depth, frame, reach):
+        """Let what stands before the surface hide it in ``frame``, where no mask says that it is
+        seen: something at ``depth`` (H, W) [m], infinite where there is nothing, which may be
+        ``reach`` pixels from there.
+        """
+        size = 2 * round(reach) + 1
+        nearest = cv2.erode(depth, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)))
+        mask = self._frames.mask(frame)
+        if mask is not None:
+            nearest[mask > 0.5] = np.inf
+        nearest = mi.Float(np.ascontiguousarray(nearest).ravel())
+        self._before, self._last = pixels.Image.of(nearest, depth.shape), None
+
+    def _hidden(self, view, level):
+        """The view without what is behind that."""
+        if self._before is None:
+            return view
+        x, y = (
+            mi.Int32(mi.Float(2 * k + 1) * (level.stride / 2)) for k in pixels.pixel_coordinates(view)
+        )
+        pixel, known = self._before.at(x, y)
+        before = dr.gather(mi.Float, self._before.texels, pixel, known)
+        hidden = known & (view.depth > before + _BEHIND)
+        return replace(view, triangle=dr.select(hidden, mi.Int32(-1), view.triangle))
+
     def view(self, vertices, level):
         """The :class:`polysft_mi.render.view.View` of a surface on a level's grid; the last is
         kept.
@@ -169,6 +196,8 @@ class DataTerm:
             position, before = self.camera.project(vertices)
             box = (*position.min(0), *position.max(0)) if before.all() else None
             view = self._raster.view(self._placed.scene, self._placed.sensor, 1 / level.stride, box)
+            with dr.suspend_grad():
+                view = self._hidden(view, level)
             self._last = level.stride, vertices.copy(), view
         return self._last[2]
 

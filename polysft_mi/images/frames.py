@@ -76,6 +76,10 @@ class Frames:
         while len(self._kept) > _CACHED * max(1, len(jobs)):
             self._kept.popitem(last=False)
 
+    def mask(self, frame):
+        """The mask (H, W) of a frame, or None."""
+        return self._decoded(frame)[1]
+
     def _level_image(self, frame, level):
         return level_image(*self._decoded(frame), level, self._normalise)
 

@@ -20,6 +20,7 @@ import drjit as dr
 import numpy as np
 
 from polysft_mi.errors import BadFrame
+from polysft_mi.render import Occluder
 
 from .context import FrameContext, Stage, stages_of
 from .quadratic import Assembly, EdgeRows, Linearisation, QuadraticModel
@@ -32,6 +33,9 @@ if TYPE_CHECKING:
     from polysft_mi.surface import State
 
     from .problem import Problem
+
+
+_POSE_ERROR = 0.02  # [m] by which a body's limbs may stand elsewhere
 
 
 class Objective:
@@ -56,6 +60,7 @@ class Objective:
         few = len(problem.template.vertices) <= self.rules.relief_vertices
         self.has_relief = self.settings.k_relief > 0 and few
         self._assembly: Assembly | None = None
+        self._occluders: list[Occluder] | None = None
 
     @property
     def data(self) -> DataTerm:
@@ -91,8 +96,24 @@ class Objective:
         """Whether the surface has the template's shape in a frame: the first, but on a body."""
         return context.is_first and self.atlas.carrier is None
 
+    def _place_body(self, state):
+        """Let the body that carries a state hide the surface, in all cameras."""
+        carrier = self.atlas.carrier
+        if carrier is None or state.pose is None:
+            return
+        vertices, faces = carrier.body(state.pose), carrier.skin[2]
+        views = [self.inputs, *(self.cameras.views if self.cameras else ())]
+        if self._occluders is None:
+            self._occluders = [Occluder(faces, len(vertices), x.placed.sensor) for x in views]
+        for view, occluder in zip(views, self._occluders, strict=True):
+            depth = occluder.depth(vertices)
+            away = np.linalg.norm(vertices.mean(0) - view.placed.camera.origin)
+            reach = _POSE_ERROR * view.placed.camera.focal / away
+            view.data.hide(depth, state.pose.frame, reach)
+
     def visibility(self, state: State) -> VisibilityWeights:
         """The weights of what no pixel sees of a surface."""
+        self._place_body(state)
         operators = self.inputs.operators
         if self.rules.unseen == 1:
             return operators.all_seen
@@ -177,6 +198,8 @@ class Objective:
         """What a solver minimises from the states ``start`` on: the objective of the frames of
         ``contexts`` at a stage.
         """
+        for state in start:
+            self._place_body(state)
         return FrozenObjective(self, contexts, stage, start)
 
     def observe(self, frame: int, vertices: np.ndarray) -> None:

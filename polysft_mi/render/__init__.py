@@ -11,6 +11,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     submod_attrs={
         "device": ["frozen", "interruptible", "on_device", "threads"],
         "pinhole": ["MIN_DEPTH", "Pinhole"],
+        "occluder": ["Occluder"],
         "placed": ["PlacedMesh"],
         "raster": ["RasterIntegrator"],
         "silhouette": ["blend"],

@@ -55,6 +55,11 @@ class Pinhole:
         # rows: right, down and forward of the OpenCV camera frame, in the world
         self.axes = np.stack([np.cross(axis, matrix[:3, 1]), -matrix[:3, 1], axis])
 
+    @property
+    def focal(self):
+        """The focal length along x [pixels]."""
+        return float(1 / np.linalg.norm(self.basis[:, 0]))
+
     def project(self, points):
         """Pixels (N, 2) of world points (N, 3) in the crop window, and whether each lies before the
         camera (N,).

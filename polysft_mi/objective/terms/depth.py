@@ -41,7 +41,7 @@ class Depth(Term):
         self._inputs = inputs
         known_to = inputs.settings.depth_known_to
         self._images = DepthData(inputs.data, inputs.sequence, known_to)
-        self._focal = 1 / np.linalg.norm(inputs.placed.camera.basis[:, 0])
+        self._focal = inputs.placed.camera.focal
 
     @classmethod
     def is_used(cls, settings):
