@@ -22,7 +22,8 @@ class Stage:
     """How strictly a frame is compared: the ``blur`` of the images [pixels, on a sheet of 225
     pixels; or a level], the ``stiffness`` (a share of k_mi, 1 in the last stage), how many
     ``iterations`` are usual, whether the ``relief`` moves, whether the stage is the ``last``, where
-    shading counts, and whether stretched edges may give (``gives``).
+    shading counts, whether stretched edges may give (``gives``), and whether nothing moves but the
+    body (``bodily``).
     """
 
     blur: float | Level
@@ -31,6 +32,7 @@ class Stage:
     relief: bool = True
     last: bool = True
     gives: bool = True
+    bodily: bool = False
 
 
 def stages_of(settings: Settings, rules: Rules) -> tuple[Stage, tuple[Stage, ...]]:

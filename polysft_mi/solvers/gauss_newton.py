@@ -80,6 +80,8 @@ class GaussNewton:
         """The steps of all frames, and the decrease that they promise. Raises LinAlgError where the
         equations are singular, or a step is too long.
         """
+        if objective.stage.bodily:
+            return _bodily(models, damping)
         # single precision will do for a step, which is tried and then kept or not
         patterns = objective.objective.inputs.operators.patterns
         reduced = [Reduced.of(patterns, m.normal, damping, np.float32) for m in models]
@@ -97,6 +99,20 @@ class GaussNewton:
         for step in steps:
             check_step(step, models[0].state.alpha.shape)
         return steps, sum(r.promised(part) for r, part in zip(reduced, parts, strict=True))
+
+
+def _bodily(models, damping):
+    """As :meth:`GaussNewton._steps`, of the bodies' poses alone."""
+    steps, promised = [], 0.0
+    for model in models:
+        normal, count = model.normal, model.surface.by_pose.shape[2]
+        form, pull = normal.glob[-count:, -count:], normal.gradient[-count:]
+        form = form + damping * np.diag(np.diag(form))
+        g = np.zeros(len(normal.gradient))
+        g[-count:] = -cho_solve(cho_factor(form), pull)
+        steps.append((g, np.zeros_like(normal.local_gradient)))
+        promised -= 0.5 * float(g[-count:] @ pull)
+    return steps, promised
 
 
 def check_step(step, shape):

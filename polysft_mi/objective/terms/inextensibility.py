@@ -57,7 +57,9 @@ class Inextensibility(Term):
         if not (self._gives and stage.gives):
             return math.inf
         r = self._rules
-        return r.give * (r.caution(context.memory.noise) if r.strain_caution else 1.0)
+        # a drape says how much cloth stretches, however noisy the images are
+        cautious = r.strain_caution and self._atlas.carrier is None
+        return r.give * (r.caution(context.memory.noise) if cautious else 1.0)
 
     def energy(self, at):
         rest = mi.Float64(self.lengths_in(at.context.frame))
