@@ -241,7 +241,7 @@ def main(argv=None):
             raise InputError("--picture: all rows need the same drapes")
         cv2.imwrite(args.picture, np.vstack(strips)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])
     if films:
-        from polysft_mi.pictures.video import write_video
+        from polysft_mi.render.video import write_video
 
         write_video(args.video, films, FPS)
 

@@ -29,7 +29,7 @@ from polysft_mi.capture import iou
 from polysft_mi.capture.pictures import photo_on_frame
 from polysft_mi.capture.sheet import grid
 from polysft_mi.errors import InputError, cli
-from polysft_mi.pictures.video import write_video
+from polysft_mi.render.video import write_video
 from polysft_mi.results.evaluation import evaluate
 from polysft_mi.scene import kinect_paper
 from polysft_mi.scene.images import list_images, read_rgb

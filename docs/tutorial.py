@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from polysft_mi.capture import Sheet
-from polysft_mi.pictures.video import write_video
+from polysft_mi.render.video import write_video
 from polysft_mi.scene.images import list_images, read_rgb
 from polysft_mi.surface import meshio
 

@@ -146,8 +146,7 @@ def _render(drapes, folder, size, spp, advance):
     set_variant()
     import cv2
 
-    from polysft_mi.pictures import write_video
-    from polysft_mi.render import stage
+    from polysft_mi.render import stage, write_video
 
     body = drapes[0].body.numpy(), drapes[0].body_faces.numpy(), BODY_COLOUR
     meshes = [body, *_coloured(drapes)]

@@ -38,9 +38,7 @@ class Pose:
 
     def to_numpy(self) -> np.ndarray:
         """The frame, the rotations as vectors, and the translation, (1 + 3 J + 3,)."""
-        return np.concatenate(
-            [[self.frame], self.rotation.as_rotvec().ravel(), self.translation]
-        )
+        return np.concatenate([[self.frame], self.rotation.as_rotvec().ravel(), self.translation])
 
 
 @dataclass(frozen=True)
@@ -107,7 +105,7 @@ class Carrier:
     def pose(self, numbers: np.ndarray) -> Pose:
         """The reverse of :meth:`Pose.to_numpy`."""
         rotation = Rotation.from_rotvec(np.asarray(numbers[1:-3], float).reshape(-1, 3))
-        return Pose(int(round(float(numbers[0]))), rotation, np.asarray(numbers[-3:], float), self.free)
+        return Pose(round(float(numbers[0])), rotation, np.asarray(numbers[-3:], float), self.free)
 
     def correction(self, pose: Pose) -> np.ndarray:
         """What leads from the known pose of a frame to this one, (3 F + 3,): rotations [rad] in the
@@ -120,7 +118,7 @@ class Carrier:
     def maps(self, pose: Pose) -> Maps:
         """The :class:`Maps` of the vertices, the drape of the frame in them."""
         _, linear, shift, _ = self._joint_maps(pose)
-        linear = np.einsum("nj,jik->nik", self.weights, linear)
+        linear = (self.weights @ linear.reshape(-1, 9)).reshape(-1, 3, 3)
         shift = self.weights @ shift
         if self.draped is not None:
             shift = shift + np.einsum("nij,nj->ni", linear, self.draped[pose.frame])
@@ -135,21 +133,25 @@ class Carrier:
         return np.einsum("vij,vj->vi", maps[..., :3], vertices) + maps[..., 3]
 
     def columns(self, pose: Pose, points: np.ndarray) -> np.ndarray:
-        """Derivatives (N, 3, 3 F + 3) of the carried vertices, at ``points`` (N, 3) [m, rest] before
-        they are draped and carried, by a step of the pose (:meth:`Pose.after_step`).
+        """Derivatives (N, 3, 3 F + 3) of the carried vertices, at ``points`` (N, 3) [m, rest]
+        before they are draped and carried, by a step of the pose (:meth:`Pose.after_step`).
         """
         turns, linear, shift, places = self._joint_maps(pose)
         if self.draped is not None:
             points = points + self.draped[pose.frame]
-        each = np.einsum("jik,nk->nji", linear, points) + shift
-        arm = np.einsum("jk,nk,nki->nji", self._moves[self.free].astype(float), self.weights, each)
+        each = (points @ linear.reshape(-1, 3).T).reshape(len(points), -1, 3) + shift
+        # of what each joint moves of a vertex, the lever from the joint
+        arm = self._moves[self.free].astype(float) @ (self.weights[..., None] * each)
         arm -= self._moved[:, self.free, None] * places[self.free]
-        out = np.zeros((len(points), 3, len(self)))
+        out = np.empty((len(points), 3, len(self)))
         for k, j in enumerate(self.free):
-            p = self.parents[j]
-            axes = turns[p] if p >= 0 else np.eye(3)
-            for a in range(3):
-                out[:, :, 3 * k + a] = np.cross(axes[:, a], arm[:, k])
+            axes = turns[self.parents[j]] if self.parents[j] >= 0 else np.eye(3)
+            x, y, z = arm[:, k].T
+            across = np.zeros((len(points), 3, 3))  # a step a turns the lever to a x lever
+            across[:, 0, 1], across[:, 1, 0] = z, -z
+            across[:, 0, 2], across[:, 2, 0] = -y, y
+            across[:, 1, 2], across[:, 2, 1] = x, -x
+            out[:, :, 3 * k : 3 * k + 3] = across @ axes
         out[:, :, -3:] = np.eye(3)
         return out
 

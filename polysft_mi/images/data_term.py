@@ -141,8 +141,8 @@ class DataTerm:
         return self._brightness
 
     def on_template(self, texels):
-        """Points (K, 3) [m, world] of the template, as it stands first, at ``texels`` (K, 2) of the baked
-        texture; NaN beyond it.
+        """Points (K, 3) [m, world] of the template, as it stands first, at ``texels`` (K, 2) of the
+        baked texture; NaN beyond it.
         """
         from scipy.interpolate import LinearNDInterpolator  # a tenth of the start, seldom needed
 
@@ -179,7 +179,8 @@ class DataTerm:
         if self._before is None:
             return view
         x, y = (
-            mi.Int32(mi.Float(2 * k + 1) * (level.stride / 2)) for k in pixels.pixel_coordinates(view)
+            mi.Int32(mi.Float(2 * k + 1) * (level.stride / 2))
+            for k in pixels.pixel_coordinates(view)
         )
         pixel, known = self._before.at(x, y)
         before = dr.gather(mi.Float, self._before.texels, pixel, known)

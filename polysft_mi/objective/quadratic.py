@@ -99,7 +99,8 @@ class Linearisation:
 
     First in space, where one kernel sums it up: ``evaluation`` holds what the images say,
     ``images`` is that, and terms add what other cameras' say, each with its camera as
-    :class:`polysft_mi.images.gather.Gather` has it; they set ``edges`` and add to ``triangles``.
+    :class:`polysft_mi.images.gather.Gather` has it; they set ``edges`` and ``at_rest``, and add to
+    ``triangles``.
     Then in the unknowns: ``normal``, in whose local
     blocks ``diagonal`` (N,) are those of the vertices; ``edge_energy`` is that of the edges,
     ``energies`` those of the terms that act on triangles. ``d``: local unknowns of a vertex (3 with
@@ -117,6 +118,7 @@ class Linearisation:
     appearance: Appearance | None = None
     images: list = field(default_factory=list)
     triangles: TriangleForms | None = None
+    at_rest: RestForms | None = None
     edge_energy: float = 0.0
     energies: dict[str, float] = field(default_factory=dict)
     normal: NormalEquations = field(init=False)
@@ -142,6 +144,16 @@ class QuadraticModel:
     terms: dict[str, float]
     total: float
     appearance: Appearance | None = None
+
+
+@dataclass
+class RestForms:
+    """Quadratic models in the positions of N vertices before a body carries them: ``gradient`` (N,
+    3) [1/m], and the curvature ``weight`` (N,) [1/m^2], the same along all axes.
+    """
+
+    gradient: np.ndarray
+    weight: np.ndarray
 
 
 def _edges(tables, vertices, lengths, numbers):
@@ -198,7 +210,7 @@ def _vertex_sums_in_unknowns(
     index,
     size,
     triangles,
-    linear,
+    carried,
 ):
     """Normal equations of the images, the edges and the triangles, in the unknowns of an atlas.
 
@@ -207,8 +219,9 @@ def _vertex_sums_in_unknowns(
     ``numbers`` Float64: stiffness [1/m^2], give; ``offset_jacobian`` Float64 of 9N, ``up`` of 3K,
     ``motion_jacobian`` of 18 and ``basis`` of A an entry: of
     :class:`polysft_mi.surface.atlas.Surface`; ``index``: 0, 1, ... of A H, and ``size``: A,
-    UInt32; ``triangles``: Float64 of 9F and 81F, of :class:`TriangleForms`, or None; ``linear``:
-    Float64 of 9N, that of a carried surface, or None. Returns
+    UInt32; ``triangles``: Float64 of 9F and 81F, of :class:`TriangleForms`, or None; ``carried``:
+    of a surface that a body carries Float64 of 9N, its ``linear``, and of 3N and N, of
+    :class:`RestForms`, or None. Returns
     Float64: energies of the edges without their weight (E), gradient (3N) in space; by (Δu, Δv,
     Δw): gradient (3N), curvature (9U) of the pairs; of positions at rest and, over the halo, the
     motions (18H) and the coefficients (3 of A H each); and the curvature (9U) of the pairs in
@@ -258,12 +271,15 @@ def _vertex_sums_in_unknowns(
 
     # a body carries each vertex from where it is at rest
     at_rest, in_world = gradient, None
-    if linear is not None:
+    if carried is not None:
+        linear, pulls, weights = carried
         in_world = packed(space, pair)
         left, right = (rows_of(numbers_of(linear, k, 9), 3) for k in (tables.i, tables.j))
         space = flattened(congruence(left, rows_of(space, 3), right))
         own = rows_of(numbers_of(linear, vertex, 9), 3)
-        at_rest = [sum(own[k][a] * gradient[k] for k in range(3)) for a in range(3)]
+        pull, weight = numbers_of(pulls, vertex, 3), dr.gather(mi.Float64, weights, tables.i, same)
+        at_rest = [sum(own[k][a] * gradient[k] for k in range(3)) + pull[a] for a in range(3)]
+        space = [x + weight if k in (0, 4, 8) else x for k, x in enumerate(space)]
 
     # each vertex moves by its own (u, v) and height, and by the jets and the motions that hold it
     left, right = (rows_of(numbers_of(offset_jacobian, k, 9), 3) for k in (tables.i, tables.j))
@@ -357,10 +373,11 @@ class Assembly:
                 if len(kept):
                     self._meetings.append((other, k, part.start + kept, at[kept]))
 
-    def normal(self, surface, images, edges, triangles=None, wide=None, d=2):
+    def normal(self, surface, images, edges, triangles=None, at_rest=None, wide=None, d=2):
         """(:class:`NormalEquations`, the edges' energy) of what ``images`` (pairs of
         :class:`polysft_mi.images.gather.Images` and their camera), :class:`EdgeRows` and
-        :class:`TriangleForms` say at the vertices of a ``surface``.
+        :class:`TriangleForms` say at the vertices of a ``surface``, and :class:`RestForms` before a
+        body carries them.
 
         ``d``: local unknowns of a vertex; ``wide``: a pattern that holds this one, which the local
         block is to have.
@@ -369,12 +386,15 @@ class Assembly:
         size, patches = basis.shape[1], len(surface.up)
         forms = triangles and (flat(triangles.gradient), flat(triangles.curvature))
         of_edges = flat(edges.lengths), flat([edges.stiffness, edges.give])
+        pull, weight = np.zeros((count, 3)), np.zeros(count)
+        if at_rest is not None:
+            pull, weight = at_rest.gradient, at_rest.weight
         derivatives = surface.offset_jacobian, surface.up, surface.motion_jacobian, basis
         found = self._in_unknowns(
             *(self._tables, self._halo, images),
             *(flat(surface.vertices), *of_edges, *map(flat, derivatives)),
             *(dr.arange(mi.UInt32, size * self._index), dr.opaque(mi.UInt32, size), forms),
-            None if surface.linear is None else flat(surface.linear),
+            None if surface.linear is None else tuple(map(flat, (surface.linear, pull, weight))),
         )
         *found, in_world = found
         energy, gradient, along, local, moved, *lifted = (np.array(x) for x in found)
@@ -398,7 +418,7 @@ class Assembly:
             cross.reshape(count * d, -1),
             self._glob(surface, lifted, moved),
             np.ascontiguousarray(along.reshape(-1, 3)[:, :d]),
-            self._atlas.to_globals(surface, gradient),
+            self._atlas.to_globals(surface, gradient, None if at_rest is None else pull),
         )
         if surface.by_pose is not None:
             self._add_pose(normal, surface, np.array(in_world).reshape(-1, 3, 3), d)
@@ -418,13 +438,14 @@ class Assembly:
         flat_columns = columns.reshape(3 * count, size)
         pulled = upper @ flat_columns + upper.T @ flat_columns - own @ flat_columns
         pulled = pulled.reshape(count, 3, size)
-        at_rest = np.einsum("nka,nkp->nap", surface.linear, pulled)
-        cross = np.einsum("nka,nkp->nap", surface.offset_jacobian[:, :, :d], at_rest)
+        at_rest = surface.linear.transpose(0, 2, 1) @ pulled
+        cross = surface.offset_jacobian[:, :, :d].transpose(0, 2, 1) @ at_rest
         by_jets = []
         for k, part in enumerate(self._atlas.entries):
             of_patch = at_rest[self._atlas.entry_vertex[part]]
-            by_jets.append(surface.basis[part].T @ np.einsum("k,nkp->np", surface.up[k], of_patch))
-            by_jets.append(np.einsum("nkm,nkp->mp", surface.motion_jacobian[part], of_patch))
+            by_jets.append(surface.basis[part].T @ (surface.up[k] @ of_patch))
+            moving = surface.motion_jacobian[part].reshape(-1, 6)
+            by_jets.append(moving.T @ of_patch.reshape(len(moving), size))
         by_jets = np.concatenate(by_jets)
         own = flat_columns.T @ pulled.reshape(3 * count, size)
         normal.cross = np.concatenate([normal.cross, cross.reshape(count * d, size)], 1)

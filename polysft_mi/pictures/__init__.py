@@ -15,7 +15,6 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "exr": ["read_exr", "write_exr"],
         "moving": ["Source"],
         "report.page": ["write_report"],
-        "video": ["read_video", "write_video"],
         "viewer": ["Viewer"],
     },
 )

@@ -17,13 +17,12 @@ import numpy as np
 
 from polysft_mi.colours import srgb
 from polysft_mi.images import compared
-from polysft_mi.render import RasterIntegrator, SideView, Triangles
+from polysft_mi.render import RasterIntegrator, SideView, Triangles, write_video
 from polysft_mi.results import metrics
 
 from . import figures
 from .exr import write_exr
 from .panels import COLUMNS, PEAKS, Box, evenly_spaced, heat, heat_values
-from .video import write_video
 
 
 @dataclass(frozen=True)

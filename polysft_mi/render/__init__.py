@@ -7,7 +7,7 @@ import lazy_loader
 
 __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
-    submodules=["device", "pinhole", "silhouette", "stage", "topology", "view"],
+    submodules=["device", "pinhole", "silhouette", "stage", "topology", "video", "view"],
     submod_attrs={
         "device": ["frozen", "interruptible", "on_device", "threads"],
         "pinhole": ["MIN_DEPTH", "Pinhole"],
@@ -17,6 +17,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "silhouette": ["blend"],
         "stage": ["SideView", "Triangles"],
         "topology": ["Topology"],
+        "video": ["read_video", "write_video"],
         "view": ["Seen", "View", "point2"],
     },
 )

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from polysft_mi.colours import linear
 from polysft_mi.body import Carrier
+from polysft_mi.colours import linear
 from polysft_mi.errors import InputError
 
 from .evidence import DepthImages, Tracks
@@ -27,8 +27,8 @@ class Sequence:
     ``files``, ``mask_files``: paths (``mask_files`` is None without masks); ``indices``: for each
     selected frame its index in the sorted list of all images; ``size``: (width, height) [pixels];
     ``tracks``, ``depth``: what is known beside the images, or None; ``cameras``: others than the
-    scene's own (:class:`polysft_mi.scene.cameras.OtherCamera`); ``count``: of all images; ``carrier``: what carries the
-    template with a body (:class:`polysft_mi.body.carrier.Carrier`), or None.
+    scene's own (:class:`polysft_mi.scene.cameras.OtherCamera`); ``count``: of all images;
+    ``carrier``: what carries the template with a body (:class:`polysft_mi.body.carrier.Carrier`), or None.
     """
 
     tracks: Tracks | None = None

@@ -189,7 +189,9 @@ class Atlas:
         """
         if self.carrier is None:
             return state
-        corrected = None if like is None or like.pose is None else self.carrier.correction(like.pose)
+        corrected = (
+            None if like is None or like.pose is None else self.carrier.correction(like.pose)
+        )
         return replace(state, pose=self.carrier.at(frame, corrected))
 
     def state(self, arrays):
@@ -303,19 +305,6 @@ class Atlas:
             out[self.entry_vertex[part]] += values[part]
         return out
 
-    def rest_columns(self, surface):
-        """The derivatives (N, 3, K (A + 6)) of the vertices, before a body carries them, by all
-        jets and motions, patch by patch.
-        """
-        size = surface.basis.shape[1] + 6
-        out = np.zeros((len(surface.vertices), 3, size * len(self)))
-        for k, part in enumerate(self.entries):
-            at, first = self.entry_vertex[part], k * size
-            by_jet = surface.up[k][:, None] * surface.basis[part][:, None]
-            out[at, :, first : first + size - 6] = by_jet
-            out[at, :, first + size - 6 : first + size] = surface.motion_jacobian[part]
-        return out
-
     def global_columns(self, surface, rows):
         """The derivatives (N, G) of ``rows`` (N, 3) . vertices by all jets and motions, patch by
         patch, and by the body's pose.
@@ -332,12 +321,14 @@ class Atlas:
             return out
         return np.concatenate([out, np.einsum("nk,nkp->np", world, surface.by_pose)], 1)
 
-    def to_globals(self, surface, gradient):
+    def to_globals(self, surface, gradient, at_rest=None):
         """The gradient (G,) by the jets, the motions and the body's pose, of that in space (N,
-        3).
+        3), and of that ``at_rest`` (N, 3), where a body carries the surface from.
         """
         parts, world = [], gradient
         gradient = surface.to_rest(gradient)
+        if at_rest is not None:
+            gradient = gradient + at_rest
         for up, part in zip(surface.up, self.entries, strict=True):
             g = gradient[self.entry_vertex[part]]
             parts.append(surface.basis[part].T @ (g @ up))

@@ -72,7 +72,8 @@ class FrameTracker:
         s, path = self.settings, self.problem.experiment.path
         if s.body and (reason := self.objective.without_block):
             raise InputError(
-                f"{path}: setting body = {s.body} needs a quadratic model of each term, and {reason}"
+                f"{path}: setting body = {s.body} needs a quadratic model of each term, and"
+                f" {reason}"
             )
         if s.body and (s.window > 1 or self.solver.name != "gauss-newton"):
             raise InputError(

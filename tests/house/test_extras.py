@@ -46,7 +46,7 @@ Template.fit(np.stack([x, y, 0 * x], 1), np.array(faces), np.stack([x, y], 1), 2
 """
 _FIGURES = """
 import polysft_mi.pictures.figures, polysft_mi.results.metrics, polysft_mi.evaluate
-import polysft_mi.pictures.exr, polysft_mi.pictures.video, polysft_mi.surface.meshio
+import polysft_mi.pictures.exr, polysft_mi.render.video, polysft_mi.surface.meshio
 """
 _PUBLIC = "onefit.load, onefit.Garment, onefit.AnnyBody, onefit.Motion, onefit.SmplBody"
 LIGHT = {

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..quadratic import RestForms
 from .term import Term
 
 _ERROR = 0.02  # standard deviation of the drape [m] from the cloth, both at the body's rest
@@ -26,7 +27,7 @@ class Drape(Term):
 
     def __init__(self, inputs):
         super().__init__(inputs)
-        self._inputs, self._atlas = inputs, inputs.atlas
+        self._inputs = inputs
         count = len(inputs.template.vertices)
         self._unit = 1 / (_ERROR**2 * _ALIKE * count / 1000)
 
@@ -39,21 +40,14 @@ class Drape(Term):
         away = rest - mi.Point3d(*(mi.Float64(x) for x in self._inputs.template.vertices.T))
         return mi.Float(self._factor(at.context) / 2 * dr.sum(dr.squared_norm(away)))
 
+    def rows(self, at):
+        away = at.surface.at_rest - self._inputs.template.vertices
+        factor = self._factor(at.context)
+        at.at_rest = RestForms(factor * away, np.full(len(away), factor))
+        at.energies[self.name] = factor / 2 * float((away**2).sum())
+
     def add(self, at):
-        surface, normal, atlas = at.surface, at.normal, self._atlas
-        factor, d = self._factor(at.context), at.d
-        away = surface.at_rest - self._inputs.template.vertices
-        offset = surface.offset_jacobian[:, :, :d]
-        columns = atlas.rest_columns(surface)
-        flat = columns.reshape(-1, columns.shape[2])
-        jets = slice(0, columns.shape[2])
-        normal.gradient[jets] += factor * (away.ravel() @ flat)
-        normal.glob[jets, jets] += factor * (flat.T @ flat)
-        cross = np.einsum("nia,nig->nag", offset, columns).reshape(-1, columns.shape[2])
-        normal.cross[:, jets] += factor * cross
-        normal.local_gradient += factor * np.einsum("nia,ni->na", offset, away)
-        normal.local[at.diagonal] += factor * np.einsum("nia,nib->nab", offset, offset)
-        return factor / 2 * float((away**2).sum())
+        return at.energies[self.name]
 
     def _factor(self, context):
         """Weight of d^2 / 2 [1/m^2]."""

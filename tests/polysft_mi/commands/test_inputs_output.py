@@ -20,7 +20,7 @@ from refusals import QUICK, has, line_of, refused
 
 from polysft_mi import errors, run
 from polysft_mi.pictures import exr
-from polysft_mi.pictures.video import read_video
+from polysft_mi.render.video import read_video
 from polysft_mi.surface import meshio
 
 

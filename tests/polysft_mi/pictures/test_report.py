@@ -18,7 +18,6 @@ from scipy.spatial.transform import Rotation
 from polysft_mi import report
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError
-from polysft_mi.pictures import video
 from polysft_mi.pictures.panels import (
     PEAKS,
     Box,
@@ -29,6 +28,7 @@ from polysft_mi.pictures.panels import (
     heat_values,
 )
 from polysft_mi.pictures.report.page import write_report
+from polysft_mi.render import video
 from polysft_mi.results.run import Run
 
 

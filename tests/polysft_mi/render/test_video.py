@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from polysft_mi.errors import InputError
-from polysft_mi.pictures import video
+from polysft_mi.render import video
 
 needs_encoder = pytest.mark.skipif(
     not video.can_encode(), reason="PyAV was built without libx264 here"
