@@ -130,6 +130,14 @@ def _add_evidence(group):
         " a shift (default: metric)",
     )
 
+    group.add_argument(
+        "--body",
+        metavar="FILE",
+        help="a body's motion (.npz: poses (T, 24, 3), translation (T, 3)) that carries the"
+        " template, which is given on the body at rest; of a FOLDER whose camera.json has"
+        " world_to_camera (needs the extra learn for the run)",
+    )
+
 
 def _add_cameras(group):
     group.add_argument(
@@ -276,6 +284,8 @@ def _evidence(args):
     if args.depth:
         known |= {"depth": args.depth, "depth_unit": args.depth_unit}
         known["depth_known_to"] = args.depth_known_to
+    if args.body:
+        known["body"] = args.body
     return known
 
 
@@ -293,6 +303,10 @@ def _rig(args):
 def _from_video(args, command):
     from .capture import GivenEvidence, prepare_video
 
+    if args.body is not None:
+        raise InputError(
+            f"{args.folder}: --body is for a folder in a known form, whose template lies on a body"
+        )
     if args.texture is None:
         raise InputError(
             f"{args.folder}: a video needs --texture photo.jpg, a straight photo of the sheet (or"

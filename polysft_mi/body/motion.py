@@ -78,6 +78,8 @@ class BodyMotion:
                 )
             poses, places = poses[selected], places[selected]
         fps = float(arrays.get("fps", _USUAL_FPS))
+        if count != len(selected) and len(selected) > 1:
+            fps /= selected[1] - selected[0]
         if not 0 < fps < 10_000:
             raise InputError(f"{path}: fps = {fps:g}; a positive number is needed")
         shape = arrays.get("shape")

@@ -5,8 +5,9 @@ import os
 from dataclasses import replace
 
 from polyfit.files import aside
+from polysft_mi.body import BodyMotion
 from polysft_mi.errors import InputError
-from polysft_mi.scene import Sequence, checked_size, open_cameras
+from polysft_mi.scene import Sequence, checked_size, open_cameras, read_camera
 from polysft_mi.scene.kinect_paper import template as kinect_paper_template
 from polysft_mi.surface import meshio
 
@@ -31,7 +32,9 @@ def prepare_folder(
     Kinect-Paper also ``template.obj``, of that ``resolution``, in its pose of
     :func:`polysft_mi.scene.kinect_paper.template`.
 
-    ``evidence``: settings of tracks and depth, by their names, with paths as the caller has them;
+    ``evidence``: settings of tracks, depth and the body, by their names, with paths as the caller
+    has them; with a body, the template and the camera (``world_to_camera`` in its file) are in the
+    body's world;
     ``rig``: a :class:`polysft_mi.capture.rig.GivenRig`, whose cameras are written beside the scene
     (a folder of cameras of ours stays where it is).
     Everything that the scene names is read and checked first; ``warn`` is given a line about a
@@ -43,7 +46,10 @@ def prepare_folder(
     camera = layout.camera
     masks = os.path.join(folder, layout.masks) if layout.masks else ""
     said = []
-    known_to = evidence.pop("depth_known_to", "metric")
+    known_to, body = evidence.pop("depth_known_to", "metric"), evidence.pop("body", None)
+    if body:
+        _, pose = read_camera(os.path.join(folder, "camera.json"))
+        layout = replace(layout, world_to_camera=pose)
     depth = recognise_depth(evidence["depth"]) if evidence.get("depth") else None
     if depth:
         evidence["depth"] = depth.images
@@ -51,6 +57,9 @@ def prepare_folder(
     sequence = Sequence.open(
         os.path.join(folder, layout.frames), masks, size=(camera.width, camera.height), **evidence
     )
+    if body:
+        BodyMotion.read(body, len(sequence), sequence.indices)
+        evidence["body"] = body
     checked_size(os.path.join(folder, layout.texture))
     template, where = None, "template.obj"
     if layout.obj is None:
@@ -61,7 +70,8 @@ def prepare_folder(
         where = os.path.join(folder, layout.obj)
         vertices, faces, uv = meshio.read_textured_template(where)
     meshio.check_template(vertices, faces, uv, where)
-    _check_view(vertices * ((-1, -1, 1) if layout.flip else 1), camera, where)
+    if not body:
+        _check_view(vertices * ((-1, -1, 1) if layout.flip else 1), camera, where)
 
     here = out is None or os.path.realpath(out) == os.path.realpath(folder)
     target = folder if here else out
@@ -89,7 +99,7 @@ def prepare_folder(
     note = meshio.size_note(vertices, where)
     if note:
         warn(note)
-    for name in ("tracks", "depth", "cameras"):
+    for name in ("tracks", "depth", "cameras", "body"):
         if evidence.get(name):
             evidence[name] = _from_data(evidence[name], folder)
     if depth:
@@ -106,7 +116,7 @@ def prepare_folder(
         f"{folder}: a sequence in the form {layout.form}, {len(sequence)} frames of"
         f" {camera.width}x{camera.height}, {'with' if masks else 'without'} masks,"
         f"{' with tracks,' if sequence.tracks else ''}{' with depth,' if sequence.depth else ''}"
-        f"{' with further cameras,' if rig else ''}"
+        f"{' with further cameras,' if rig else ''}{' on a body,' if body else ''}"
         " template of"
         f" {len(vertices)} vertices ({layout.obj or f'subdivided to {resolution}x{resolution}'})"
     )

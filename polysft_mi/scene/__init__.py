@@ -11,7 +11,13 @@ import lazy_loader
 __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
-        "cameras": ["open_cameras", "read_cameras", "rigid_pose", "written"],
+        "cameras": [
+            "open_cameras",
+            "read_camera",
+            "read_cameras",
+            "rigid_pose",
+            "written",
+        ],
         "defaults": ["known_defaults", "located", "resolved_defaults"],
         "evidence": ["DepthImages", "Tracks"],
         "experiment": ["Experiment", "load"],

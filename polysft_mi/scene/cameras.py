@@ -76,7 +76,7 @@ def open_cameras(
     return [
         _open(
             os.path.join(folder, name),
-            known.get(name) or _read(os.path.join(folder, name, _CAMERA)),
+            known.get(name) or read_camera(os.path.join(folder, name, _CAMERA)),
             count,
             (first, last, stride),
         )
@@ -123,8 +123,10 @@ def _open(folder, camera, count, selected):
     return OtherCamera(os.path.basename(folder), intrinsics, pose, sequence)
 
 
-def _read(where):
-    """(:class:`Intrinsics`, world_to_camera (4, 4)) of a camera's file."""
+def read_camera(where: str) -> tuple[Intrinsics, np.ndarray]:
+    """Intrinsics and world_to_camera (4, 4) [m] of a camera's file, as :func:`written` makes it.
+    Raises InputError.
+    """
     try:
         with open(where, encoding="utf-8") as file:
             known = json.load(file)
@@ -134,7 +136,7 @@ def _read(where):
 
 
 def _camera(known, where):
-    """:func:`_read` of what the file holds."""
+    """:func:`read_camera` of what the file holds."""
     try:
         numbers = [float(known[name]) for name in ("fx", "fy", "cx", "cy")]
         size = [int(known[name]) for name in ("width", "height")]

@@ -28,7 +28,8 @@ class Sequence:
     selected frame its index in the sorted list of all images; ``size``: (width, height) [pixels];
     ``tracks``, ``depth``: what is known beside the images, or None; ``cameras``: others than the
     scene's own (:class:`polysft_mi.scene.cameras.OtherCamera`); ``count``: of all images;
-    ``carrier``: what carries the template with a body (:class:`polysft_mi.body.carrier.Carrier`), or None.
+    ``carrier``: what carries the template with a body
+    (:class:`polysft_mi.body.carrier.Carrier`), or None.
     """
 
     tracks: Tracks | None = None

@@ -15,8 +15,8 @@ _CHANGE = np.radians(0.6), 0.003
 
 class Pose(Term):
     """k_pose e / 2 times the sum over the numbers of a pose's correction c of c^2 / s^2 + (c -
-    c')^2 / t^2: s = 2.5 degrees and 1.5 cm, c' that of the frame before, t = 0.6 degrees and 3 mm, e what
-    one unit of log-likelihood costs (:meth:`polysft_mi.objective.terms.term.Inputs.nat`).
+    c')^2 / t^2: s = 2.5 degrees and 1.5 cm, c' that of the frame before, t = 0.6 degrees and 3 mm,
+    e what one unit of log-likelihood costs (:meth:`polysft_mi.objective.terms.term.Inputs.nat`).
 
     Pose estimators err slowly: what they have wrong in a frame, they have wrong in the next one.
     """
