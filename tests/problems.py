@@ -1,9 +1,12 @@
 """Problems of the tracker from folders that :mod:`synthetic` makes, templates of grids, and normal
 equations written out. Import only where a Mitsuba variant is set."""
 
+import dataclasses
+
 import numpy as np
 import synthetic
 from scipy.spatial.transform import Rotation
+from worn import arm
 
 from polysft_mi import prepare
 from polysft_mi.objective import Objective, Problem
@@ -31,6 +34,17 @@ def problem_of(folder, rules=None, **settings):
     prepare.main([str(folder), "--overwrite"])
     experiment = scene.load(str(folder / "scene.xml"), settings)
     return Problem(experiment, experiment.sequence(), rules)
+
+
+def on_an_arm(problem, rng):
+    """A problem of a sleeve, on an arm that bends, in drapes that are not the template."""
+    template, count = problem.template, len(problem.sequence)
+    draped = 3e-3 * rng.normal(size=(count, *template.vertices.shape))
+    bend, places = 0.2 * np.arange(count), 0.01 * rng.normal(size=(count, 3))
+    problem.sequence.carrier = arm(template.vertices, bend, places, draped, template.faces)
+    worn = Problem(problem.experiment, problem.sequence, problem.rules)
+    worn.settings = dataclasses.replace(worn.settings, body="known")
+    return worn
 
 
 def data_of(problem):

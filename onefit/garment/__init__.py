@@ -8,7 +8,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
         "alignment": ["aligned", "pose_of"],
-        "binding": ["standard_body", "standard_surface"],
+        "binding": ["cotangent_laplacian", "smoother", "standard_body", "standard_surface"],
         "charts": ["FRAMES", "Deformation", "PatchedGarment", "SparseMatrix"],
         "fitting": ["placed"],
         "garment": ["FOLDER", "Garment", "LOOSE", "TEMPLATES"],

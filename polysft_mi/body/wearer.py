@@ -16,18 +16,20 @@ if TYPE_CHECKING:
     from .motion import BodyMotion
 
 _NETWORK_FPS = 30.0
+_SMOOTHING = 0.05  # [m] over which a drape is smoothed, twice: its folds are not those of the cloth
 
 
 def put_on(vertices: np.ndarray, faces: np.ndarray, motion: BodyMotion) -> Carrier:
     """The :class:`Carrier` of a template of ``vertices`` (N, 3) [m] and ``faces`` (F, 3), which
     lies on the body at rest, in a ``motion``: the template's weights are those of OneFit, and what
-    it is carried in is OneFit's simulation on the same motion. Raises InputError where OneFit is
+    it is carried in is OneFit's simulation on the same motion, without its folds. Raises InputError where OneFit is
     not installed, and for a template that is no garment on this body.
     """
     require("torch", "anny")
     import torch
 
     import onefit
+    from onefit.garment import cotangent_laplacian, smoother
 
     draper = onefit.load()
     shape = None if motion.shape is None else torch.as_tensor(motion.shape).float()
@@ -67,5 +69,7 @@ def put_on(vertices: np.ndarray, faces: np.ndarray, motion: BodyMotion) -> Carri
     after, part = np.minimum(before + 1, len(worn) - 1), (at - before)[:, None, None]
     worn = worn[before] * (1 - part) + worn[after] * part
     at_rest = [carrier.maps(carrier.at(k)).back(x) for k, x in enumerate(worn)]
-    carrier.draped = np.stack(at_rest) - vertices
+    area, stiffness = cotangent_laplacian(vertices, faces)
+    smooth = smoother(area, stiffness, _SMOOTHING)
+    carrier.draped = np.stack([smooth(smooth(x - vertices)) for x in at_rest])
     return carrier

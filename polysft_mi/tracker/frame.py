@@ -60,6 +60,7 @@ class FrameTracker:
     def __init__(self, problem: Problem, solver: Solver | None = None) -> None:
         self.problem, self.settings = problem, problem.settings
         self.objective = Objective(problem)
+        self._check_body()
         self.solver = solver or solvers.create(self.objective)
         self._check_settings()
         # what frames are compared by, and how sure they are, needs the closed form
@@ -68,18 +69,22 @@ class FrameTracker:
         self._starts = Starts(problem, self._stages)
         self._atlas, self._is_prepared = problem.atlas, False
 
-    def _check_settings(self):
+    def _check_body(self):
+        """Raise InputError where the poses of a body cannot be corrected."""
         s, path = self.settings, self.problem.experiment.path
         if s.body and (reason := self.objective.without_block):
             raise InputError(
                 f"{path}: setting body = {s.body} needs a quadratic model of each term, and"
                 f" {reason}"
             )
-        if s.body and (s.window > 1 or self.solver.name != "gauss-newton"):
+        if s.body and (s.window > 1 or s.solver == "adam"):
             raise InputError(
                 f"{path}: setting body = {s.body}: its poses are corrected frame by frame; solver ="
                 " gauss-newton and window = 1 are needed"
             )
+
+    def _check_settings(self):
+        s, path = self.settings, self.problem.experiment.path
         for name in ("smooth", "sweeps"):
             value = getattr(s, name)
             if value > 0 and s.window > 1:
