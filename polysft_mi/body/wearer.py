@@ -22,8 +22,8 @@ _SMOOTHING = 0.05  # [m] over which a drape is smoothed, twice: its folds are no
 def put_on(vertices: np.ndarray, faces: np.ndarray, motion: BodyMotion) -> Carrier:
     """The :class:`Carrier` of a template of ``vertices`` (N, 3) [m] and ``faces`` (F, 3), which
     lies on the body at rest, in a ``motion``: the template's weights are those of OneFit, and what
-    it is carried in is OneFit's simulation on the same motion, without its folds. Raises InputError where OneFit is
-    not installed, and for a template that is no garment on this body.
+    it is carried in is OneFit's simulation on the same motion, without its folds. Raises InputError
+    where OneFit is not installed, and for a template that is no garment on this body.
     """
     require("torch", "anny")
     import torch

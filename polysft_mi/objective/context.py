@@ -41,15 +41,17 @@ def stages_of(settings: Settings, rules: Rules) -> tuple[Stage, tuple[Stage, ...
 
     Soft edges come first, so that the texture coordinates register to the image before lengths are
     enforced: in a stiff flat sheet that is compressed in the image, height has no first-order
-    effect, and the sheet would drift in depth instead of bending.
+    effect, and the sheet would drift in depth instead of bending. On a body, edges are stiff from
+    the beginning: it brings the garment near, and soft sleeves would slip by a stripe.
     """
     if settings.blur >= 0:
         only = Stage(Level(settings.blur), 1.0, sum(rules.iterations))
         return only, (only,)
-    numbers = zip(rules.blurs, rules.stiffness, rules.iterations, strict=True)
+    stiffness = (1.0,) * len(rules.stiffness) if settings.body else rules.stiffness
+    numbers = zip(rules.blurs, stiffness, rules.iterations, strict=True)
     last = len(rules.blurs) - 1
     usual = tuple(Stage(*three, relief=k > 0, last=k == last) for k, three in enumerate(numbers))
-    far = Stage(rules.far_blur, rules.stiffness[0], rules.iterations[0], False, False)
+    far = Stage(rules.far_blur, stiffness[0], rules.iterations[0], False, False)
     return far, usual
 
 

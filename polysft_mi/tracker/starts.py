@@ -50,9 +50,9 @@ class Starts:
         starts = [objective.atlas.posed(state, frame, start) for state in starts]
         if context.is_first and not objective.is_known(context):
             # a body's pose is far off, and no frame before says by how much
-            bodily = [replace(stage, bodily=True) for stage in (objective.far, objective.usual[0])]
-            far = *bodily, objective.far, *objective.usual
-            return stages.descend(start, context, far, rules.far_iterations)
+            all_of = objective.far, *objective.usual
+            bodily = [replace(stage, bodily=True) for stage in all_of[:3]]
+            return stages.descend(start, context, (*bodily, *all_of), rules.far_iterations)
         best = stages.descend(
             self.nearest(starts, frame, objective.usual[0]), context, objective.usual
         )
