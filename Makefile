@@ -1,5 +1,5 @@
-# make demo, demo-paper, demo-lit, demo-shirt, drape, gpu, test, docs, lint, dist: each installs into
-# .venv what it needs and is not there yet (seconds where nothing is missing), and runs.
+# make demo, demo-paper, demo-lit, demo-shirt, demo-dressed, drape, gpu, test, docs, lint, dist: each
+# installs into .venv what it needs and is not there yet (seconds where nothing is missing), and runs.
 # PYTHON=python3.12 takes another Python for a new .venv; TORCH=any takes torch with CUDA too.
 # LLVM comes with it on Linux on x86-64; elsewhere every command says what to install.
 
@@ -11,13 +11,14 @@ SHELL := /bin/bash
 # Extras of pyproject.toml; make demo needs none
 EXTRAS_demo :=
 EXTRAS_demo-paper := learn
+EXTRAS_demo-dressed := learn
 EXTRAS_drape := learn,usd
 EXTRAS_test := test
 EXTRAS_docs := docs
 EXTRAS_lint := lint
 EXTRAS_dist := dist
 
-.PHONY: demo demo-paper demo-lit demo-shirt drape gpu test docs lint dist clean
+.PHONY: demo demo-paper demo-lit demo-shirt demo-dressed drape gpu test docs lint dist clean
 .PRECIOUS: .venv/with-%
 .NOTPARALLEL:
 
@@ -34,6 +35,10 @@ demo-lit: .venv/with-demo
 
 demo-shirt: .venv/with-demo
 	$(PY) -m polysft_mi.run scenes/demo_shirt.xml -o out/demo-shirt --overwrite
+
+# A garment on a moving body, which OneFit knows; two or three minutes
+demo-dressed: .venv/with-demo-dressed
+	$(PY) -m polysft_mi.run scenes/demo_dressed.xml -o out/demo-dressed --overwrite
 
 drape: .venv/with-drape
 	$(PY) -m onefit.drape dress dance -o out/drape --seconds 2 --overwrite

@@ -6,6 +6,7 @@ import json
 import math
 import os
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -93,7 +94,7 @@ class Intrinsics:
                 f"{path}: {error} missing or not a number; fx, fy, cx, cy, width, height are needed"
             ) from None
 
-    def sensor_xml(self, indent: str = "    ", world_to_camera: np.ndarray | None = None) -> str:
+    def sensor_xml(self, indent: str = "    ", world_to_camera: Any = None) -> str:
         """The ``<sensor>`` element: Mitsuba's ``perspective`` where the pixels are square, else our
         ``pinhole``; it stands where ``world_to_camera`` (4, 4) says, or at the world's origin.
 
@@ -123,8 +124,8 @@ class Intrinsics:
             ]
         place = 'origin="0, 0, 0" target="0, 0, 1" up="0, -1, 0"'
         if world_to_camera is not None:
-            rotation = np.asarray(world_to_camera, dtype=np.float64)[:3, :3]
-            origin = -rotation.T @ np.asarray(world_to_camera, dtype=np.float64)[:3, 3]
+            pose = np.asarray(world_to_camera, dtype=np.float64)
+            rotation, origin = pose[:3, :3], -pose[:3, :3].T @ pose[:3, 3]
             points = {"origin": origin, "target": origin + rotation[2], "up": -rotation[1]}
             text = lambda x: ", ".join(f"{value:.12g}" for value in x + 0.0)
             place = " ".join(f'{name}="{text(x)}"' for name, x in points.items())

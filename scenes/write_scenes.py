@@ -36,6 +36,18 @@ def _lit(**settings):
     )
 
 
+def _dressed(**settings):
+    camera = Intrinsics(600, 600, 180, 240, 360, 480)
+    pose = (
+        (1.0, 0.0, 0.0, -0.004818422719836235),
+        (0.0, 0.0, -1.0, 0.4208582937717438),
+        (0.0, 1.0, 0.0, 2.084437608718872),
+        (0.0, 0.0, 0.0, 1.0),
+    )
+    named = "frames", "masks", "texture.jpg", "template.obj"
+    return Layout("cloth", camera, *named, settings=settings, world_to_camera=pose)
+
+
 # The paper's objective and solver, a frame at a time. Noise asks for l2, whose gradient has no
 # bias, and plain paper for edges that hold.
 LIT = dict(PRESETS["paper"], canonical_frame="pca", window=1, spp=4, period=150, rgb_norm="l2")
@@ -45,6 +57,7 @@ SCENES = {
     "demo": _demo(last=11),
     "demo_shirt": _demo(),
     "demo_lit": _lit(**LIT),
+    "demo_dressed": _dressed(body="$data/body.npz", fps=15.0),
     "flag": _cloth(),
     "bend": _cloth(),
     "paper": _cloth(),
@@ -80,6 +93,8 @@ DEMOS = {
     " scenes/demo_shirt.xml -o OUT",
     "demo_lit": "A sheet between a lamp and a bright floor, rendered with the light that falls on"
     " it, 6 frames: polysft run scenes/demo_lit.xml -o OUT",
+    "demo_dressed": "A pullover on a body that lifts its arms, 12 frames: polysft run"
+    " scenes/demo_dressed.xml -o OUT",
 }
 
 #: what stands in place of light from everywhere, and of the integrator, in the scenes named here

@@ -22,7 +22,7 @@ def arm(vertices, bend, translation, draped=None, faces=((0, 1, 2),)):
     poses[:, 1, 2] = bend
     skin = vertices, weights, np.asarray(faces)
     rest = np.zeros((2, 3))
-    return Carrier(joints, PARENTS, rest, weights, poses, translation, draped, skin)
+    return Carrier(joints, PARENTS, rest, weights, poses, translation, draped=draped, skin=skin)
 
 
 def some_pose(carrier, rng, frame=1, size=0.05):

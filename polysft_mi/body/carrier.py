@@ -66,17 +66,28 @@ class Carrier:
     ``weights`` (N, J), rows that sum to one; ``poses`` (T, J, 3) [rad], ``translation`` (T, 3) [m]:
     what is known of its motion. ``draped`` (T, N, 3) [m, rest], or None: by what the garment's
     drape differs from the template in each frame, before it is carried. ``skin``: the body itself:
-    vertices at rest (V, 3) [m], their weights (V, J), and faces (F, 3), or None. Maps, as
+    vertices at rest (V, 3) [m], their weights (V, J), and faces (F, 3), or None. ``fps``: frames a
+    second. Maps, as
     :mod:`onefit.body.skinning` has them, are from the rest pose to a frame.
     """
 
     def __init__(
-        self, joints, parents, rest_pose, weights, poses, translation, draped=None, skin=None
+        self,
+        joints,
+        parents,
+        rest_pose,
+        weights,
+        poses,
+        translation,
+        *,
+        draped=None,
+        skin=None,
+        fps=30.0,
     ):
         self.joints, self.weights = np.asarray(joints, float), np.asarray(weights, float)
         self.parents = tuple(parents)
         self.poses, self.translation = np.asarray(poses, float), np.asarray(translation, float)
-        self.draped, self.skin = draped, skin
+        self.draped, self.skin, self.fps = draped, skin, fps
         self._rest = self._chained(Rotation.from_rotvec(rest_pose).as_matrix())
         count = len(self.parents)
         #: (J, J): whether the first joint moves the second one

@@ -54,6 +54,7 @@ def put_on(vertices: np.ndarray, faces: np.ndarray, motion: BodyMotion) -> Carri
         weights / weights.sum(1, keepdims=True),
         motion.poses,
         motion.translation,
+        fps=motion.fps,
         skin=tuple(
             x.numpy().astype(kind)
             for x, kind in (

@@ -49,7 +49,7 @@ def prepare_folder(
     known_to, body = evidence.pop("depth_known_to", "metric"), evidence.pop("body", None)
     if body:
         _, pose = read_camera(os.path.join(folder, "camera.json"))
-        layout = replace(layout, world_to_camera=pose)
+        layout = replace(layout, world_to_camera=tuple(map(tuple, pose.tolist())))
     depth = recognise_depth(evidence["depth"]) if evidence.get("depth") else None
     if depth:
         evidence["depth"] = depth.images

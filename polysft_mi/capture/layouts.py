@@ -7,8 +7,6 @@ size are the folder's own.
 import os
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError
 from polysft_mi.scene import EXTENSIONS, kinect_paper
@@ -29,7 +27,7 @@ class Layout:
     ``texture``: an image; ``obj``: the template's file, None where the form has none; ``flip``:
     whether x and y of the template are negated to reach the camera frame; ``settings``: values of
     :class:`polysft_mi.scene.settings.Settings` that are not the defaults; ``world_to_camera``
-    (4, 4) [m]: where the camera stands, None at the world's origin.
+    [m], four rows: where the camera stands, None at the world's origin.
     """
 
     form: str
@@ -40,7 +38,7 @@ class Layout:
     obj: str | None = None
     flip: bool = False
     settings: dict = field(default_factory=dict)
-    world_to_camera: np.ndarray | None = None
+    world_to_camera: tuple | None = None
 
 
 def recognise(folder):

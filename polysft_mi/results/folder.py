@@ -15,6 +15,7 @@ FILES = (
     "log.jsonl",
     "surface.npz",
     "params.npz",
+    "body.npz",
     "metrics.json",
     "loss.png",
     "comparison.png",

@@ -95,7 +95,8 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
             frames=indices,
             **certainty,
         )
-    arrays = {name: np.stack([s[name] for s in track.states]) for name in Unknowns.NAMES}
+    names = [name for name in Unknowns.NAMES if name != "pose"]  # that is in body.npz
+    arrays = {name: np.stack([s[name] for s in track.states]) for name in names}
     with aside(os.path.join(out, "params.npz")) as temporary:
         np.savez_compressed(
             temporary,
@@ -106,6 +107,16 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
             axes=problem.camera.axes @ template.axes,
             **arrays,
         )
+    carrier = problem.atlas.carrier
+    if carrier is not None:
+        poses = [carrier.pose(state["pose"]) for state in track.states]
+        with aside(os.path.join(out, "body.npz")) as temporary:
+            np.savez_compressed(
+                temporary,
+                poses=np.stack([pose.rotation.as_rotvec() for pose in poses]),
+                translation=np.stack([pose.translation for pose in poses]),
+                fps=carrier.fps,
+            )
     say("meshes")
     os.makedirs(os.path.join(out, "meshes"), exist_ok=True)
     source, uv, faces = template.texcoords.split(template.faces)

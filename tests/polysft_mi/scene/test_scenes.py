@@ -47,9 +47,10 @@ def test_scenes_show_frame_0(name, shared_data):
 def test_demos(name):
     folder = ROOT / "scenes" / name
     assert sum(p.stat().st_size for p in folder.rglob("*") if p.is_file()) < 1_900_000
-    assert recognise(str(folder)) == dataclasses.replace(
-        write_scenes.SCENES[name], settings={}
-    )  # shorter than what prepare would write
+    layout = dataclasses.replace(write_scenes.SCENES[name], settings={}, world_to_camera=None)
+    assert recognise(str(folder)) == layout  # shorter than what prepare would write
+    if "body" in write_scenes.SCENES[name].settings:
+        return
     experiment = loaded(str(ROOT / "scenes" / f"{name}.xml"))
     right, *mirrored = difference(experiment, 64 if name in write_scenes.LIGHTS else 1)
     assert right < (0.05 if name == "demo_shirt" else 0.03) and min(mirrored) > 2 * right
