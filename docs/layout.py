@@ -17,6 +17,7 @@ WAY = {
     "polysft_mi": {
         "capture": "video and photo → a scene's folder",
         "poses": "image → rigid pose of a template",
+        "body": "motion → maps that carry a garment",
         "scene": "scene file → experiment",
         "surface": "mesh → template; unknowns → vertices",
         "render": "vertices → image, with gradients",
