@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from polyfit.errors import require
+from polyfit.mesh import edges_of
 
 from .carrier import Carrier
 
@@ -70,6 +71,8 @@ def put_on(vertices: np.ndarray, faces: np.ndarray, motion: BodyMotion) -> Carri
     after, part = np.minimum(before + 1, len(worn) - 1), (at - before)[:, None, None]
     worn = worn[before] * (1 - part) + worn[after] * part
     at_rest = [carrier.maps(carrier.at(k)).back(x) for k, x in enumerate(worn)]
+    a, b = edges_of(faces)[0].T
+    carrier.lengths = np.linalg.norm(worn[:, a] - worn[:, b], axis=2)
     area, stiffness = cotangent_laplacian(vertices, faces)
     smooth = smoother(area, stiffness, _SMOOTHING)
     carrier.draped = np.stack([smooth(smooth(x - vertices)) for x in at_rest])

@@ -28,14 +28,14 @@ class Inextensibility(Term):
         self._rules, template = inputs.rules, inputs.template
         self._gives = inputs.settings.mi_norm == "charbonnier"
         self._unit = template.scale**2
-        self._template_edges = edges = template.edges
+        edges = template.edges
         # of the surface as the device has it: what it rounds is no strain
         with dr.suspend_grad():
             rest = np.array(inputs.surface.vertices(inputs.surface.rest()), dtype=np.float64).T
         lengths = np.linalg.norm(rest[edges[:, 0]] - rest[edges[:, 1]], axis=1)
         #: (E,) [m]
         self.lengths = lengths.astype(np.float32).astype(np.float64)
-        self._atlas, self._of_drapes = inputs.atlas, {}
+        self._atlas = inputs.atlas
         self._edges = tuple(
             mi.UInt32(np.ascontiguousarray(edges[:, k], dtype=np.uint32)) for k in (0, 1)
         )
@@ -44,13 +44,9 @@ class Inextensibility(Term):
         """The edges' lengths (E,) [m] in a frame where nothing strains them: the template's, or, on
         a body, those of the drape, which its weight has stretched.
         """
-        if self._atlas.carrier is None:
-            return self.lengths
-        if frame not in self._of_drapes:
-            draped = self._atlas.surface(self._atlas.posed(self._atlas.start, frame)).vertices
-            a, b = (draped[k] for k in self._template_edges.T)
-            self._of_drapes = {frame: np.linalg.norm(a - b, axis=1)}
-        return self._of_drapes[frame]
+        carrier = self._atlas.carrier
+        known = carrier is not None and carrier.lengths is not None
+        return carrier.lengths[frame] if known else self.lengths
 
     def _give(self, context, stage):
         """The strain from which on stretched edges pull no harder: more where there is noise."""
