@@ -1,0 +1,188 @@
+"""Garments on moving bodies: what is found where a body's motion, tracks and depth are given.
+
+    python benchmarks/dressed.py --data FOLDER [--evidence FOLDER] [--only sleeves_up ...]
+    [--kinds body tracks depth ...] [--docs docs]
+
+FOLDER holds a folder for each sequence, with ``body.npz``, and ``world_to_camera`` in its
+``camera.json``; that of ``--evidence`` holds, for each, a folder with ``tracks.npz`` and ``depth``,
+and without it these kinds are left out. Each run is two commands, as a user would give them, on one
+core; ``drape`` is what OneFit makes of the motion as it is given, without a video. Each result goes
+into ``dressed.json`` in DOCS as soon as it is there, and the next call does what is missing (all of
+it with ``--again``); the table in ``evidence.md`` is made anew, and so is ``dressed.jpg``, of a run
+that was made.
+"""
+
+import argparse
+import json
+import os
+import re
+import resource
+import subprocess
+import sys
+import tempfile
+
+import numpy as np
+from sequences import ROOT
+
+from polysft_mi.errors import InputError, cli
+from polysft_mi.results.evaluation import score
+from polysft_mi.results.truth import load_npz
+
+KINDS = {"body": (), "tracks": ("tracks",), "depth": ("depth",)}
+_FILES = {"tracks": "tracks.npz", "depth": "depth"}
+_SEQUENCES = ("tshirt_box", "sleeves_up")
+_TABLE = re.compile(r"(<!-- dressed -->\n).*?(\n<!-- /dressed -->)", re.S)
+_SHOWN = "sleeves_up", "body", 18
+
+
+def figures(surface, truth):
+    """RMSE [mm], a mean over the frames, of a surface (arrays of a ``surface.npz``) against the
+    file ``truth``: of the vertices in view, of those that are not, and of all.
+    """
+    of_all = score(surface, truth)
+    known = load_npz(truth)
+    frames = np.asarray(surface["frames"])
+    away = np.linalg.norm(surface["vertices"] - known["vertices"][frames], axis=2)
+    hidden = [np.sqrt((a[~s] ** 2).mean()) for a, s in zip(away, known["seen"][frames])]
+    found = {name: of_all[name] for name in ("rmse_mm_seen", "rmse_mm", "en_deg_seen")}
+    return found | {"rmse_mm_hidden": 1e3 * float(np.mean(hidden))}
+
+
+def run(folder, kind, evidence, out, last):
+    """A result, a dict, of the sequence in a folder; the run goes to ``out``."""
+    given = [f"--{name}={os.path.join(evidence, _FILES[name])}" for name in KINDS[kind]]
+    scene = os.path.join(out, "scene")
+    module = [sys.executable, "-m"]
+    body = ["--body", os.path.join(folder, "body.npz")]
+    prepare = [*module, "polysft_mi.prepare", folder, "-o", scene, "-q", *body, *given]
+    track = [*module, "polysft_mi.run", os.path.join(scene, "scene.xml"), "-q", "--no-report"]
+    track += ["-o", os.path.join(out, "run"), "--exr", "0", "-D", f"last={last}"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    for command in (prepare, track):
+        done = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True)
+        if done.returncode:
+            raise InputError(f"{folder}, {kind}: {done.stderr.strip().splitlines()[-1]}")
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    spent = sum(getattr(after, k) - getattr(before, k) for k in ("ru_utime", "ru_stime"))
+    surface = load_npz(os.path.join(out, "run", "surface.npz"))
+    found = figures(surface, os.path.join(folder, "gt.npz"))
+    return found | {"cpu_seconds_a_frame": spent / len(surface["frames"])}
+
+
+def drape(folder, last):
+    """The figures of OneFit's drape on the motion as it is given."""
+    from polysft_mi.body import BodyMotion, put_on
+    from polysft_mi.scene import read_camera
+    from polysft_mi.surface import meshio
+
+    truth = os.path.join(folder, "gt.npz")
+    vertices, faces, _ = meshio.read_textured_template(os.path.join(folder, "template.obj"))
+    _, pose = read_camera(os.path.join(folder, "camera.json"))
+    count = len(load_npz(truth)["vertices"])
+    frames = np.arange(count if last < 0 else last + 1)
+    motion = BodyMotion.read(os.path.join(folder, "body.npz"), count, frames.tolist())
+    carrier = put_on(vertices, faces, motion)
+    world = np.stack([carrier.maps(carrier.at(k))(vertices) for k in frames])
+    surface = {"vertices": world @ pose[:3, :3].T + pose[:3, 3], "faces": faces, "frames": frames}
+    return figures(surface, truth)
+
+
+def table(results):
+    """The results as a Markdown table."""
+    lines = [
+        "| sequence | given | RMSE in view [mm] | not in view | normals in view [deg] |"
+        " s a frame |",
+        "|---|---|---|---|---|---|",
+    ]
+    names = {"drape": "the motion alone: its drape", "body": "video and body"}
+    order = ["drape", *KINDS]
+    for r in sorted(results, key=lambda r: (r["sequence"], order.index(r["kind"]))):
+        seconds = r.get("cpu_seconds_a_frame")
+        lines.append(
+            f"| {r['sequence']} | {names.get(r['kind'], 'and ' + r['kind'])} |"
+            f" {r['rmse_mm_seen']:.1f} | {r['rmse_mm_hidden']:.1f} | {r['en_deg_seen']:.1f} |"
+            f" {f'{seconds:.1f}' if seconds else '–'} |"
+        )
+    return "\n".join(lines)
+
+
+def picture(path, out, frame):
+    """Write a frame of a run in ``out``: the video; the drape on the body as its motion is given;
+    and what was found, over the faded video.
+    """
+    from polysft_mi.backend import set_variant
+
+    set_variant()
+    import cv2
+    import mitsuba as mi
+
+    from polysft_mi.colours import srgb
+    from polysft_mi.objective import Problem
+    from polysft_mi.scene import load
+
+    experiment = load(os.path.join(out, "scene", "scene.xml"))
+    problem = Problem(experiment, experiment.sequence())
+    atlas = problem.atlas
+    given = atlas.surface(atlas.posed(atlas.start, frame)).vertices
+    camera = problem.camera
+    found = load_npz(os.path.join(out, "run", "surface.npz"))["vertices"][frame] @ camera.axes
+    found = found.astype(float) + camera.origin
+    image = problem.sequence.frame(frame)
+    panels, faded = [image], 0.5 * image.mean(2, keepdims=True) + 0.25
+    for vertices in (given, found):
+        rgb, alpha = problem.placed.image(mi.Point3f(vertices.T.astype(np.float32)))
+        alpha = np.array(alpha).reshape(*image.shape[:2], 1)
+        panels.append(np.array(rgb) + (1 - alpha) * faded)
+    row = srgb(np.hstack(panels))
+    cv2.imwrite(path, row[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
+
+
+def main(argv=None):
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(
+        prog="python benchmarks/dressed.py", description=__doc__, formatter_class=raw
+    )
+    parser.add_argument("--data", metavar="FOLDER", required=True)
+    parser.add_argument("--evidence", metavar="FOLDER")
+    parser.add_argument("--only", nargs="+", default=list(_SEQUENCES))
+    parser.add_argument("--kinds", nargs="*", choices=["drape", *KINDS], default=["drape", *KINDS])
+    parser.add_argument("--last", type=int, default=-1, help="last frame (default: all)")
+    parser.add_argument("--docs", metavar="FOLDER", default=os.path.join(ROOT, "docs"))
+    parser.add_argument("--again", action="store_true", help="run what has a result, too")
+    args = parser.parse_args(argv)
+    where, results = os.path.join(args.docs, "dressed.json"), []
+    if os.path.exists(where):
+        with open(where, encoding="utf-8") as file:
+            results = json.load(file)
+    for sequence in args.only:
+        folder = os.path.abspath(os.path.join(args.data, sequence))
+        evidence = os.path.abspath(os.path.join(args.evidence or ".", sequence))
+        for kind in args.kinds:
+            done = [r for r in results if (r["sequence"], r["kind"]) == (sequence, kind)]
+            if (done and not args.again) or (KINDS.get(kind) and not args.evidence):
+                continue
+            print(f"{sequence}, {kind} ...", file=sys.stderr, flush=True)
+            with tempfile.TemporaryDirectory(prefix="dressed-") as out:
+                if kind == "drape":
+                    found = drape(folder, args.last)
+                else:
+                    found = run(folder, kind, evidence, out, args.last)
+                if (sequence, kind) == _SHOWN[:2] and args.last < 0:
+                    picture(os.path.join(args.docs, "dressed.jpg"), out, _SHOWN[2])
+            found = {"sequence": sequence, "kind": kind, **found}
+            results = [r for r in results if r not in done] + [found]
+            with open(where, "w", encoding="utf-8") as file:
+                json.dump(results, file, indent=1)
+                file.write("\n")
+    page = os.path.join(args.docs, "evidence.md")
+    if os.path.exists(page):
+        with open(page, encoding="utf-8") as file:
+            text = file.read()
+        with open(page, "w", encoding="utf-8") as file:
+            file.write(_TABLE.sub(lambda m: m[1] + table(results) + m[2], text))
+    print(table(results))
+
+
+if __name__ == "__main__":
+    cli(main)
