@@ -71,9 +71,12 @@ def put_on(vertices: np.ndarray, faces: np.ndarray, motion: BodyMotion) -> Carri
     after, part = np.minimum(before + 1, len(worn) - 1), (at - before)[:, None, None]
     worn = worn[before] * (1 - part) + worn[after] * part
     at_rest = [carrier.maps(carrier.at(k)).back(x) for k, x in enumerate(worn)]
-    a, b = edges_of(faces)[0].T
-    carrier.lengths = np.linalg.norm(worn[:, a] - worn[:, b], axis=2)
     area, stiffness = cotangent_laplacian(vertices, faces)
     smooth = smoother(area, stiffness, _SMOOTHING)
     carrier.draped = np.stack([smooth(smooth(x - vertices)) for x in at_rest])
+    # a surface follows about half of its folds
+    carried = np.stack([carrier.maps(carrier.at(k))(vertices) for k in range(len(worn))])
+    a, b = edges_of(faces)[0].T
+    each = [np.linalg.norm(x[:, a] - x[:, b], axis=2) for x in (worn, carried)]
+    carrier.lengths = (each[0] + each[1]) / 2
     return carrier

@@ -10,12 +10,12 @@ from .term import Term
 # standard deviations of what is known: of a joint [rad], of the root's place [m]; and of how much
 # the error changes from a frame to the next
 _KNOWN = np.radians(2.5), 0.015
-_CHANGE = np.radians(0.6), 0.003
+_CHANGE = np.radians(0.6), 0.005
 
 
 class Pose(Term):
     """k_pose e / 2 times the sum over the numbers of a pose's correction c of c^2 / s^2 + (c -
-    c')^2 / t^2: s = 2.5 degrees and 1.5 cm, c' that of the frame before, t = 0.6 degrees and 3 mm,
+    c')^2 / t^2: s = 2.5 degrees and 1.5 cm, c' that of the frame before, t = 0.6 degrees and 5 mm,
     e what one unit of log-likelihood costs (:meth:`polysft_mi.objective.terms.term.Inputs.nat`).
 
     Pose estimators err slowly: what they have wrong in a frame, they have wrong in the next one.

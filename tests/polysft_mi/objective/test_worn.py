@@ -98,6 +98,9 @@ def test_curvatures_by_the_pose_are_symmetric_and_promise_the_change(problem, rn
     objective = objective_of(problem, "inextensibility", **WEIGHTS, mi_norm="l2")
     context = worn_context(objective, rng)
     state = objective.atlas.posed(objective.atlas.start, 1)
+    a, b = objective.atlas.surface(state).vertices[problem.template.edges.T]
+    lengths = np.linalg.norm(a - b, axis=1)
+    objective.atlas.carrier.lengths = np.tile(lengths, (len(problem.sequence), 1))
     frozen = objective.frozen([context], objective.usual[-1], [state])
     (model,) = frozen.quadratic([state])  # no strain: Gauss-Newton's curvature is all there is
     normal = model.normal
