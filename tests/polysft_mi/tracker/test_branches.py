@@ -2,12 +2,15 @@
 
 import dataclasses
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 import synthetic
 from problems import problem_of, small_cloth
 
+from polysft_mi.pictures import Drawing, write_report
+from polysft_mi.results import Run, outputs
 from polysft_mi.scene.rules import Rules
 from polysft_mi.surface.patch import Unknowns
 from polysft_mi.tracker import CHECKPOINT, FrameTracker, Track, branches, track
@@ -86,23 +89,44 @@ def test_a_track_on_the_wrong_side_comes_back(tmp_path):
     assert error(problem, last.states[5], truth.vertices[5]) < 0.003
 
 
-def test_both_branches_outlive_an_interruption(tmp_path):
-    truth, problem = of_a_cloth(tmp_path)
-    # all is undecided
+@pytest.fixture(scope="module")
+def undecided(tmp_path_factory):
+    """A problem whose rules decide nothing, its track, and the track's folder."""
+    folder = tmp_path_factory.mktemp("undecided")
     rules = dataclasses.replace(Rules(), mirror_share=math.inf, mirror_apart=math.inf)
-    problem = problem_of(truth.folder, rules=rules)
-    whole, part = tmp_path / "whole", tmp_path / "part"
-    for folder in (whole, part):
-        folder.mkdir()
-    there = track(FrameTracker(problem), 6, whole)
-    assert there.other is not None and 0 < there.fork < 5
-    assert np.isfinite(branches.ahead(there)) and branches.ahead(there) <= 0
-    track(FrameTracker(problem), 4, part)
-    again = track(FrameTracker(problem), 6, part, resume=True)
+    problem = problem_of(small_cloth(folder, frames=5).folder, rules=rules)
+    out = folder / "out"
+    out.mkdir()
+    return problem, track(FrameTracker(problem), 5, out), out
+
+
+def test_both_branches_outlive_an_interruption(undecided, tmp_path):
+    problem, there, _ = undecided
+    assert there.other is not None and 0 < there.fork < 4
+    assert np.isfinite(branches.ahead(there)) and branches.ahead(there) <= 0  # the cheaper is shown
+    track(FrameTracker(problem), there.fork + 1, tmp_path)
+    again = track(FrameTracker(problem), 5, tmp_path, resume=True)
     for a, b in ((there, again), (there.other, again.other)):
         for x, y in zip(a.states, b.states, strict=True):
             assert all(np.array_equal(x[name], y[name]) for name in x)
     assert again.fork == there.fork
+
+
+def test_what_stays_undecided_is_shown(undecided):
+    problem, done, out = undecided
+    cameras = problem.camera, problem.sequence.cameras
+    text = outputs.resolved_scene(problem.experiment)
+    outputs.write_beginning(out, text, *cameras, "the command", 15)
+    with Drawing(problem, {}, out, exr_frames=0, about={}) as drawing:
+        summary, plotted = outputs.write(problem, done, out, drawing, fps=15, command="the command")
+        plotted()
+    run = Run.open(out)
+    assert summary["undecided"]["from"] == done.fork
+    apart = 1e3 * np.linalg.norm(run.other - run.vertices, axis=-1)
+    assert np.isclose(apart.max(), summary["undecided"]["apart_mm"])
+    assert not apart[: done.fork].any() and (apart[done.fork :].max(1) > 0).all()
+    page = Path(write_report(out)).read_text(encoding="utf-8")
+    assert f"Undecided: from frame {done.fork} on" in page and "second surface" in page
 
 
 def test_a_closed_surface_has_no_mirror_image(tmp_path):
