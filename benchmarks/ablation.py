@@ -91,6 +91,7 @@ SWITCHES = (
     Switch("other starts", {"suspect_margin": math.inf}),
     Switch("more iterations there", {"far_iterations": 6}),
     Switch("small step ends a stage", {"small_step": 0.0}),
+    Switch("mirror images", {"mirror_share": 0.0}),
     Switch("texture fit", settings={"texture_fit": "none"}),
     Switch("joints", settings={"k_coupling": 0.0}, rounded=True),
     Switch("unseen parts are held", {"unseen": 1.0}, rounded=True),

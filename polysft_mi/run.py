@@ -139,6 +139,14 @@ class Outcome:
             f"inside the surface: PSNR {s.get('psnr_mask', float('nan')):.2f} dB,"
             f" SSIM {s.get('ssim_mask', float('nan')):.3f}",
             f"surfaces: {os.path.join(self.out, 'surface.npz')}",
+            *(
+                [
+                    f"undecided: from frame {s['undecided']['from']} on"
+                    f" {os.path.join(self.out, 'other.npz')} explains the video about as well"
+                ]
+                if "undecided" in s
+                else []
+            ),
             f"meshes: {os.path.join(self.out, 'meshes')}",
             f"pictures: {os.path.join(self.out, 'comparison.png')}",
             f"video: {s['video']}",

@@ -6,6 +6,7 @@ import shutil
 
 from polysft_mi.errors import InputError
 
+OTHER = "other.npz"  # a second surface, in the form of the first one's file
 FILES = (
     "scene.xml",
     "camera.json",
@@ -14,6 +15,7 @@ FILES = (
     "checkpoint.npz",
     "log.jsonl",
     "surface.npz",
+    OTHER,
     "params.npz",
     "body.npz",
     "metrics.json",

@@ -20,6 +20,7 @@ from polysft_mi import __version__
 from polysft_mi.scene import located, written
 from polysft_mi.surface import Unknowns
 
+from .folder import OTHER
 from .truth import uv_arrays
 
 _PARAMS = ("alpha", "patch", "weight", "chart", "rest", "scale", "radius")
@@ -70,6 +71,12 @@ def resolved_scene(experiment):
     return ET.tostring(tree.getroot(), encoding="unicode") + "\n"
 
 
+def _vertices(problem, track):
+    """Of all frames (T, N, 3) [m]: in the world, and float32 in the camera frame."""
+    world = np.stack([problem.surface(Unknowns.from_numpy(s)) for s in track.states])
+    return world, problem.camera.to_camera(world).astype(np.float32)
+
+
 def write(problem, track, out, drawing, *, fps, command, say=None):
     """Write everything for the frames that ``track`` holds. Returns the summary that
     ``metrics.json`` begins with, and a function to call in the end: it waits for the plots.
@@ -81,20 +88,24 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
     sequence, template = problem.sequence, problem.template
     count = len(track.states)
     indices = np.asarray(sequence.indices[:count], dtype=np.int64)
-    world = np.stack([problem.surface(Unknowns.from_numpy(s)) for s in track.states])
-    vertices = problem.camera.to_camera(world).astype(np.float32)
+    world, vertices = _vertices(problem, track)
     drawn, bound, plotted = drawing.finish(world, vertices, fps)
 
+    mesh = {
+        "faces": template.faces.astype(np.int32),
+        **uv_arrays(template.texcoords, template.faces),
+        "frames": indices,
+    }
     certainty = dict(zip(("sigma", "score"), track.certainties(vertices.shape[1])))
     with aside(os.path.join(out, "surface.npz")) as temporary:
-        np.savez_compressed(
-            temporary,
-            vertices=vertices,
-            faces=template.faces.astype(np.int32),
-            **uv_arrays(template.texcoords, template.faces),
-            frames=indices,
-            **certainty,
-        )
+        np.savez_compressed(temporary, vertices=vertices, **mesh, **certainty)
+    undecided = {}
+    if track.other and len(track.other.states) == count:
+        others = _vertices(problem, track.other)[1]
+        with aside(os.path.join(out, OTHER)) as temporary:
+            np.savez_compressed(temporary, vertices=others, **mesh)
+        apart = np.linalg.norm(others - vertices, axis=-1).max()
+        undecided = {"from": int(indices[track.fork]), "apart_mm": 1e3 * float(apart)}
     names = [name for name in Unknowns.NAMES if name != "pose"]  # that is in body.npz
     arrays = {name: np.stack([s[name] for s in track.states]) for name in names}
     with aside(os.path.join(out, "params.npz")) as temporary:
@@ -129,6 +140,7 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
         "frames": count,
         "frames_wanted": len(sequence.indices),
         "lost": {str(int(indices[k])): reason for k, reason in track.lost.items() if k < count},
+        **({"undecided": undecided} if undecided else {}),
         **_means(per_frame),
         "seconds_per_frame": float(sum(track.seconds) / count),
         "iterations_per_window": float(np.mean(track.iterations)) if track.iterations else 0.0,

@@ -18,6 +18,7 @@ from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError
 from polysft_mi.scene import known_defaults, list_images, located, read_cameras
 
+from .folder import OTHER
 from .truth import load_npz, read_surface, texcoords_of
 
 
@@ -78,6 +79,14 @@ class Run:
     def fps(self) -> float:
         """Frames a second that the run was given."""
         return float(self.about.get("fps", 15))
+
+    @cached_property
+    def other(self) -> np.ndarray | None:
+        """Vertices (T, N, 3) [m, camera frame] of a second surface that explains the video about as
+        well, None where there is none.
+        """
+        path = self.path(OTHER)
+        return read_surface(path)["vertices"] if os.path.exists(path) else None
 
     @cached_property
     def camera(self) -> Intrinsics | None:

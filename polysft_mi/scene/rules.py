@@ -98,6 +98,16 @@ class Rules:
         "iterations a stage when a suspect frame is started anew",
         row="more iterations there",
     )
+    # mirror images
+    mirror_share: float = _rule(
+        0.05,
+        "share",
+        "of a frame's cost that the mirror image of a sheet may cost more, to be tracked too",
+        row="mirror images",
+    )
+    mirror_apart: float = _rule(
+        1.0, "frames", "whose cost one must have saved over the other, for this to be dropped"
+    )
     # the relief, and caution with noise
     relief_vertices: int = _rule(
         3000, "vertices", "of the template, above which there is no relief: it costs too much time"

@@ -337,6 +337,17 @@ class Atlas:
             parts.append(np.einsum("nk,nkp->p", world, surface.by_pose))
         return np.concatenate(parts)
 
+    def reaching(self, vertices, state, iterations=8):
+        """The ``state`` with its vertices displaced to ``vertices`` (N, 3) [m, world; where a body
+        carries them, at its rest], by Newton's method.
+        """
+        offset = state.offset
+        for _ in range(iterations):
+            now = self._surface(replace(state, offset=offset))
+            missing = (vertices - now.vertices)[..., None]
+            offset = offset + np.linalg.solve(now.offset_jacobian, missing)[..., 0]
+        return replace(state, offset=offset)
+
     def with_relief_in_jets(self, state, ridge=1e-6):
         """The state of the same surface with as much of the relief as the jets can hold in the
         coefficients instead; ``ridge`` holds those that the vertices do not determine.
@@ -354,11 +365,7 @@ class Atlas:
         offset[:, 2] -= columns @ part / lift
         found = replace(state, alpha=state.alpha + part.reshape(len(self), -1), offset=offset)
         if len(self) > 1:  # charts at an angle: what the heights leave is taken by all three
-            for _ in range(2):
-                now = self._surface(found)
-                missing = surface.vertices - now.vertices
-                change = np.linalg.solve(now.offset_jacobian, missing[..., None])[..., 0]
-                found.offset = found.offset + change
+            found = self.reaching(surface.vertices, found, 2)
             left = np.abs(self._surface(found).vertices - surface.vertices).max()
             less = (found.offset**2).sum() < (state.offset**2).sum()
             if not (less and left < _SAME * self.template.scale):

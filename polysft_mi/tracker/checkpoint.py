@@ -35,6 +35,9 @@ class Track:
     standard deviation of each vertex along its ray and its score, (2, N) [m], where they are known;
     ``swept``: frames gone over by the setting ``sweeps``, each as often as it was; ``finished``:
     whether the tracker has looked back over the whole; ``solver``: its name.
+
+    ``other``: a second track that explains the frames from ``fork`` on about as well, or None;
+    ``mirror_at``: the frame from which on one is looked for.
     """
 
     states: list = field(default_factory=list)
@@ -49,6 +52,9 @@ class Track:
     swept: int = 0
     finished: bool = False
     solver: str = ""
+    fork: int = 0
+    mirror_at: int = 1
+    other: Track | None = None
 
     def certainties(self, count: int) -> list[np.ndarray]:
         """``certainty`` of ``count`` vertices in all frames: sigma and score, (T, N) float32 [m],
@@ -62,18 +68,22 @@ class Track:
 
     def save(self, path: str | os.PathLike[str], stages: Sequence[Stage]) -> None:
         """Write it; ``stages``: those that memories have robust scales of."""
+        arrays = self._arrays(stages)
+        if self.other:
+            arrays |= {_OTHER + name: x for name, x in self.other._arrays(stages).items()}
+        with aside(path) as temporary:
+            np.savez(temporary, **arrays)
+
+    def _arrays(self, stages):
         arrays: dict[str, Any] = {
             name: np.stack([s[name] for s in self.states]) for name in Unknowns.NAMES
         }
-        meta = {k: getattr(self, k) for k in _META}
+        arrays["meta"] = json.dumps({k: getattr(self, k) for k in _META})
         known = sorted(self.certainty)
         if known:
             arrays["certain_frames"] = np.array(known, dtype=np.int64)
             arrays["certainty"] = np.stack([self.certainty[k] for k in known])
-        with aside(path) as temporary:
-            np.savez(
-                temporary, meta=json.dumps(meta), **arrays, **_memory_arrays(self.memories, stages)
-            )
+        return arrays | _memory_arrays(self.memories, stages)
 
     @classmethod
     def load(
@@ -84,30 +94,42 @@ class Track:
         """
         try:
             with np.load(path) as data:
-                meta = json.loads(str(data["meta"]))
-                arrays = {name: data[name] for name in Unknowns.NAMES}
-                memories = _memories(data, stages, rules or Rules())
-                certainty = (
-                    dict(zip(data["certain_frames"].tolist(), data["certainty"]))
-                    if "certainty" in data
-                    else {}
-                )
+                arrays = dict(data)
+                own = {name: x for name, x in arrays.items() if not name.startswith(_OTHER)}
+                track = cls._of(own, stages, rules)
+                if len(own) < len(arrays):
+                    others = {
+                        name.removeprefix(_OTHER): x
+                        for name, x in arrays.items()
+                        if name.startswith(_OTHER)
+                    }
+                    track.other = cls._of(others, stages, rules)
+                return track
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             raise InputError(
                 f"{path}: not a checkpoint of a run ({error}); start again with --overwrite"
             ) from None
+
+    @classmethod
+    def _of(cls, arrays, stages, rules):
+        meta = json.loads(str(arrays["meta"]))
         for name in ("lost", "unusable"):
             meta[name] = {int(k): v for k, v in meta[name].items()}
-        count = len(arrays["rotation"])
+        certain = arrays.get("certain_frames", np.empty(0, np.int64)).tolist()
         return cls(
-            states=[{name: arrays[name][k] for name in arrays} for k in range(count)],
-            certainty=certainty,
-            memories=memories,
+            states=[
+                {name: arrays[name][k] for name in Unknowns.NAMES}
+                for k in range(len(arrays["rotation"]))
+            ],
+            certainty=dict(zip(certain, arrays.get("certainty", ()))),
+            memories=_memories(arrays, stages, rules or Rules()),
             **meta,
         )
 
 
 _META = "next_window iterations seconds totals lost unusable swept finished solver".split()
+_META += ["fork", "mirror_at"]
+_OTHER = "other_"  # before the names of the other track's arrays
 
 
 def _memory_arrays(memories, stages):
@@ -131,7 +153,7 @@ def _memory_arrays(memories, stages):
 
 def _memories(data, stages, rules):
     found, prefix = [], "memory_noise_"
-    kinds = [name.removeprefix(prefix) for name in data.files if name.startswith(prefix)]
+    kinds = [name.removeprefix(prefix) for name in data if name.startswith(prefix)]
     for k, explained in enumerate(data["memory_explained"]):
         if math.isnan(explained):
             found.append(None)

@@ -17,6 +17,7 @@ from polysft_mi.objective import FrameContext, FrameMemory, Objective
 from polysft_mi.solvers import Report, Solver
 from polysft_mi.surface import State
 
+from .branches import mirrored
 from .sigma import along_rays, score
 from .stages import Found, Stages
 from .starts import Starts
@@ -170,6 +171,55 @@ class FrameTracker:
         if self._cost(new, context) >= self._cost(state, context):
             return None
         return self._solution([new], [found], self._same_noise(found, context, memory))
+
+    @property
+    def mirrors(self) -> bool:
+        """Whether :meth:`mirror` may find something: frames are solved one by one, surfaces are
+        compared, and are a sheet. A closed one has no mirror image, nor has one on a body.
+        """
+        s = self.settings
+        alone = s.window == 1 and s.starts == "auto"
+        wanted = self._learns and self.objective.rules.mirror_share > 0
+        sheet = len(self._atlas) == 1 and self._atlas.carrier is None
+        return wanted and alone and sheet
+
+    def mirror(
+        self,
+        frame: int,
+        state: State,
+        certainty: np.ndarray,
+        memory: FrameMemory | None,
+        past: Past,
+        report: Report | None = None,
+    ) -> tuple[Solution | None, float]:
+        """Solve a frame anew from the mirror image of its surface. Returns the solution, None where
+        it is the same surface, or explains the frame less well; and by what share of the cost of
+        the frame's own surface it costs more.
+
+        ``state``, ``certainty`` (2, N) [m], ``memory``: of the frame so far.
+        """
+        self._prepare(report)
+        self._expect(frame)
+        context = self._context(frame, past[-1][0], [memory for _, memory in past])
+        vertices = self._atlas.surface(state).vertices
+        image = self._atlas.reaching(mirrored(vertices, self.problem.camera.origin), state)
+        start = self._atlas.with_relief_in_jets(image)
+        coarse, *fine = self.objective.usual
+        (found,) = self._stages.minimise([context], coarse, [start])
+
+        def is_other(state):
+            apart = np.linalg.norm(self._atlas.surface(state).vertices - vertices, axis=1)
+            return np.median(apart / certainty[0]) > 1
+
+        if not is_other(found.state):  # most often where the sheet is flat
+            return None, 0.0
+        found = self._stages.descend(found.state, context, fine or [coarse])
+        new = self._atlas.with_relief_in_jets(found.state)
+        excess = self._cost(new, context) / self._cost(state, context) - 1
+        if excess > self.objective.rules.mirror_share or not is_other(new):
+            return None, excess
+        memory = self._same_noise(found, context, memory)
+        return self._solution([new], [found], memory), excess
 
     def _cost(self, state, context):
         """The cost of a state at the last stage."""

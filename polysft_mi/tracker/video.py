@@ -19,6 +19,7 @@ from polysft_mi.errors import BadFrame
 from polysft_mi.render import interruptible
 from polysft_mi.surface import Unknowns
 
+from . import branches
 from .checkpoint import CHECKPOINT, Track
 from .frame import FrameTracker
 
@@ -27,6 +28,7 @@ _MIN_VISIBLE_SHARE = (
     0.02  # share of the vertices inside the image below which the surface is said to have left it
 )
 _MAX_HISTORY = 20  # frames before that a frame is told of
+_LATEST = 20  # frames after which a mirror image is tried again
 _LOG_EVERY = 1  # iterations between records of the log
 
 
@@ -72,9 +74,12 @@ def track(
             for k in range(start + width - 1 if start else 0, start + width):
                 _observe(tracker, done, k)
             log.flush()
+            _follow(tracker, done, start, progress)
             done.save(checkpoint, stages)
             if solved:
                 solved(start, _vertices(tracker.problem, done.states[start]))
+        if done.other and len(done.totals) == frames:
+            branches.decide(done)  # which is shown; the other one is kept beside it
         for k, neighbour in _swept(frames, settings.sweeps)[done.swept :]:
             _retry(tracker, done, k, neighbour, progress)
             done.swept += 1
@@ -84,6 +89,34 @@ def track(
             done.finished = True
             done.save(checkpoint, stages)
     return done
+
+
+def _follow(tracker, done, k, progress):
+    """Go on with the other branch of the track in frame ``k``, and drop what has cost more. Where
+    there is none, begin one if the mirror image explains this frame as well; the worse it does,
+    the later it is tried again.
+    """
+    share, apart = tracker.objective.rules.mirror_share, tracker.objective.rules.mirror_apart
+    if done.other:
+        _advance(tracker, done.other, k, 1, None, progress)
+        done.seconds[k] = done.other.seconds[k] = done.seconds[k] + done.other.seconds[k]
+        if branches.decide(done, apart):
+            done.other, done.mirror_at = None, k + 1
+    elif tracker.mirrors and k >= done.mirror_at and k not in done.lost:
+        began = time.perf_counter()
+        past = _past(tracker, done, range(max(0, k - _MAX_HISTORY), k))
+        state = tracker.problem.atlas.state(done.states[k])
+        report = progress and functools.partial(progress, k, k)
+        known = done.certainty[k], done.memories[k]
+        try:
+            solution, excess = tracker.mirror(k, state, *known, past, report)
+        except BadFrame:
+            solution, excess = None, math.inf
+        if solution:
+            other = branches.split(done, k)
+            _replace(other, k, _rounded(tracker.problem, solution.states[0]), solution)
+        done.mirror_at = k + math.ceil(min(max(excess / share, 1), _LATEST))
+        done.seconds[k] += time.perf_counter() - began
 
 
 def _vertices(problem, arrays):
@@ -184,6 +217,8 @@ def _advance(tracker, done, start, width, log, progress):
     began, newest, latest = time.perf_counter(), members[-1], 0
 
     def record(iteration, total, terms, **more):
+        if log is None:
+            return
         frame = {"frame": problem.sequence.indices[newest], "iteration": iteration}
         numbers = _numbers({"loss": total, **terms})
         log.write(json.dumps({**frame, **numbers, **more}) + "\n")

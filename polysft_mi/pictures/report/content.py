@@ -156,6 +156,11 @@ def warning(run):
     texts = (
         [f"Interrupted: {len(run.frames)} of {wanted} frames."] if wanted > len(run.frames) else []
     )
+    if known := run.metrics.get("undecided"):
+        texts.append(
+            f"Undecided: from frame {known['from']} on a second surface, up to"
+            f" {known['apart_mm']:.1f} mm away, explains the video about as well (other.npz)."
+        )
     texts += [f"Frame {frame}: {reason}." for frame, reason in list(lost.items())[:5]]
     return " ".join(texts + ([f"And {len(lost) - 5} more lost frames."] if len(lost) > 5 else []))
 

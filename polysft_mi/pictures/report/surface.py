@@ -106,6 +106,10 @@ def scalars(run, shown, errors, distance):
         " first frame's camera, blue where it is hollow."
     )
     out.append(_scalar("curvature", meaning, "1/m", curvature, "RdBu_r", signed=True))
+    if run.other is not None:
+        apart = 1e3 * np.linalg.norm(run.other[shown] - run.vertices[shown], axis=-1)
+        meaning = "Distance of each vertex to the second surface, which explains the video as well."
+        out.append(_scalar("second surface", meaning, "mm", apart, "viridis"))
     for name, of, meaning in (
         ("sigma", run.sigma, "Standard deviation of each vertex along its ray, by the noise alone"),
         ("score", run.score, "How far off each vertex may be along its ray, fitted to errors"),

@@ -218,3 +218,13 @@ def test_hinges_measure_bending_and_no_plane_bends():
         for x in (across, [(f[k], f[k - 1]) for f in faces for k in range(3)])
     )
     assert not a & b
+
+
+@pytest.mark.parametrize("shape", TEMPLATES)
+def test_a_state_that_reaches_given_vertices(shape):
+    chart = Atlas(TEMPLATES[shape](order=4))
+    start, wanted = (some_state(chart, RNG, size) for size in (0.01, 0.02))
+    vertices = chart.surface(wanted).vertices
+    found = chart.reaching(vertices, start)
+    assert np.abs(chart.surface(found).vertices - vertices).max() < 1e-9
+    assert np.array_equal(found.alpha, start.alpha)  # by the displacements alone

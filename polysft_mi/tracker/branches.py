@@ -1,0 +1,68 @@
+"""Where a video does not tell which of two surfaces it shows, both are tracked until it does.
+
+Seen from afar a sheet and its mirror image, hollow where it bulges, look alike: shape from one view
+has these two answers at least. While the sheet is nearly flat rounding decides between them, and
+when it bends more, no small step leads from the wrong one to the right one. NumPy only.
+"""
+
+import dataclasses
+import math
+
+import numpy as np
+
+
+def mirrored(vertices, origin):
+    """Vertices (N, 3) [m] as far before their plane as ``vertices`` are behind it, and the other
+    way round, each along its ray from ``origin`` (3,) [m]. The plane is that of least squares.
+    """
+    from_origin = vertices - origin
+    middle = from_origin.mean(0)
+    normal = np.linalg.svd(from_origin - middle, full_matrices=False)[2][2]
+    on_plane = (middle @ normal) / (from_origin @ normal)
+    return origin + (2 * on_plane - 1)[:, None] * from_origin
+
+
+def split(track, frame):
+    """Let the ``track`` have another branch, which begins at the ``frame`` and is a copy of it so
+    far; returns that.
+    """
+    own = {f.name: getattr(track, f.name) for f in dataclasses.fields(track)}
+    copies = {name: x.copy() for name, x in own.items() if isinstance(x, (list, dict))}
+    track.other, track.fork = dataclasses.replace(track, **copies), frame
+    return track.other
+
+
+def ahead(track):
+    """How much more the track has cost than its other branch since they parted, over what a frame
+    costs; infinite where frames of one of them are lost.
+    """
+    since = range(track.fork, len(track.totals))
+    own, others = (np.array([_cost(t, k) for k in since]) for t in (track, track.other))
+    both = np.isfinite(own) & np.isfinite(others)
+    if not both.all():
+        return math.copysign(math.inf, np.isinf(own).sum() - np.isinf(others).sum())
+    return float((own - others).sum() / np.minimum(own, others).mean())
+
+
+def _cost(track, frame):
+    known = [x for x in track.totals[frame].values() if x is not None]
+    return math.inf if frame in track.lost else sum(known)
+
+
+def decide(track, apart=0.0):
+    """Keep the cheaper branch where they are ``apart`` by so many frames' costs. Returns whether it
+    was decided.
+    """
+    difference = ahead(track)
+    if difference > 0 and (apart == 0 or difference >= apart):
+        swap(track)
+    return abs(difference) >= apart
+
+
+def swap(track):
+    """Let the other branch be the track, and the track the other."""
+    other, fork = track.other, track.fork
+    kept = dataclasses.replace(track, other=None)
+    for f in dataclasses.fields(track):
+        setattr(track, f.name, getattr(other, f.name))
+    track.other, track.fork = kept, fork

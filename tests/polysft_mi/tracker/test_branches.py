@@ -1,0 +1,138 @@
+"""A sheet and its mirror image: both are tracked while the video does not tell."""
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import synthetic
+from problems import problem_of, small_cloth
+
+from polysft_mi.pictures import Drawing, write_report
+from polysft_mi.results import Run, outputs
+from polysft_mi.scene.rules import Rules
+from polysft_mi.surface.patch import Unknowns
+from polysft_mi.tracker import CHECKPOINT, FrameTracker, Track, branches, track
+
+ORIGIN = np.array([0.1, -0.2, 0.05])
+
+
+def test_the_mirror_image_lies_behind_the_plane_as_far_as_the_sheet_before_it():
+    flat = synthetic.sheet(0.0, 9, 12)
+    assert np.abs(branches.mirrored(flat, ORIGIN) - flat).max() < 1e-12
+    bent = synthetic.sheet(1.0, 9, 12)
+    image = branches.mirrored(bent, ORIGIN)
+    rays, others = bent - ORIGIN, image - ORIGIN
+    along = np.linalg.norm(np.cross(rays, others), axis=1)
+    assert along.max() < 1e-12  # each vertex stays on its ray
+    middle = bent.mean(0)
+    normal = np.linalg.svd(bent - middle, full_matrices=False)[2][2]
+    height, other = ((x - middle) @ normal for x in (bent, image))
+    assert np.abs(height).max() > 0.01
+    assert np.abs(height + other).max() < 1e-9
+
+
+def of_costs(*costs, lost=()):
+    """A track of frames that cost so much."""
+    states = [{"alpha": np.full(2, k)} for k in range(len(costs))]
+    return Track(states=states, totals=[{"rgb": c} for c in costs], lost=dict.fromkeys(lost, ""))
+
+
+def test_the_branch_that_saves_a_frames_cost_is_kept():
+    done = of_costs(1.0, 1.0)
+    other = branches.split(done, 1)
+    assert done.other is other and done.fork == 1
+    other.states[1] = {"alpha": np.ones(2)}
+    assert np.array_equal(done.states[1]["alpha"], [1, 1]) and done.states[0] is other.states[0]
+    for own, others in ((1.0, 0.8), (1.5, 1.0), (1.4, 1.0)):
+        assert not branches.decide(done, 1.0)
+        for t, cost in ((done, own), (other, others)):
+            t.states.append({"alpha": np.full(2, cost)})
+            t.totals.append({"rgb": cost, "uv": None})
+    assert branches.ahead(done) == pytest.approx(1.1 / 0.95)
+    assert branches.decide(done, 1.0)
+    assert done.totals[2]["rgb"] == 0.8 and done.other.totals[2]["rgb"] == 1.0
+
+
+def test_a_branch_that_is_lost_loses():
+    done = of_costs(1.0, 1.0, lost=[1])
+    other = branches.split(done, 0)
+    other.lost.clear()
+    other.totals = [{"rgb": 5.0}] * 2
+    assert branches.ahead(done) == math.inf
+    assert branches.decide(done, 1.0) and not done.lost
+
+
+def of_a_cloth(folder):
+    truth = small_cloth(folder, frames=6)
+    return truth, problem_of(truth.folder)
+
+
+def error(problem, state, vertices):
+    return np.linalg.norm(problem.surface(Unknowns.from_numpy(state)) - vertices, axis=1).mean()
+
+
+def test_a_track_on_the_wrong_side_comes_back(tmp_path):
+    truth, problem = of_a_cloth(tmp_path)
+    tracker = FrameTracker(problem)
+    done = track(tracker, 3, tmp_path)
+    atlas, origin = problem.atlas, problem.camera.origin
+    right = atlas.state(done.states[2])
+    image = branches.mirrored(atlas.surface(right).vertices, origin)
+    wrong = atlas.arrays(atlas.with_relief_in_jets(atlas.reaching(image, right)))
+    done.states[2] = Unknowns.from_numpy(wrong).to_numpy()
+    assert error(problem, done.states[2], truth.vertices[2]) > 0.003
+    done.other, done.mirror_at = None, 3
+    done.save(tmp_path / CHECKPOINT, tracker.objective.stages)
+    last = track(FrameTracker(problem), 6, tmp_path, resume=True)
+    assert error(problem, last.states[5], truth.vertices[5]) < 0.003
+
+
+@pytest.fixture(scope="module")
+def undecided(tmp_path_factory):
+    """A problem whose rules decide nothing, its track, and the track's folder."""
+    folder = tmp_path_factory.mktemp("undecided")
+    rules = dataclasses.replace(Rules(), mirror_share=math.inf, mirror_apart=math.inf)
+    problem = problem_of(small_cloth(folder, frames=5).folder, rules=rules)
+    out = folder / "out"
+    out.mkdir()
+    return problem, track(FrameTracker(problem), 5, out), out
+
+
+def test_both_branches_outlive_an_interruption(undecided, tmp_path):
+    problem, there, _ = undecided
+    assert there.other is not None and 0 < there.fork < 4
+    assert np.isfinite(branches.ahead(there)) and branches.ahead(there) <= 0  # the cheaper is shown
+    track(FrameTracker(problem), there.fork + 1, tmp_path)
+    again = track(FrameTracker(problem), 5, tmp_path, resume=True)
+    for a, b in ((there, again), (there.other, again.other)):
+        for x, y in zip(a.states, b.states, strict=True):
+            assert all(np.array_equal(x[name], y[name]) for name in x)
+    assert again.fork == there.fork
+
+
+def test_what_stays_undecided_is_shown(undecided):
+    problem, done, out = undecided
+    cameras = problem.camera, problem.sequence.cameras
+    text = outputs.resolved_scene(problem.experiment)
+    outputs.write_beginning(out, text, *cameras, "the command", 15)
+    with Drawing(problem, {}, out, exr_frames=0, about={}) as drawing:
+        summary, plotted = outputs.write(problem, done, out, drawing, fps=15, command="the command")
+        plotted()
+    run = Run.open(out)
+    assert summary["undecided"]["from"] == done.fork
+    apart = 1e3 * np.linalg.norm(run.other - run.vertices, axis=-1)
+    assert np.isclose(apart.max(), summary["undecided"]["apart_mm"])
+    assert not apart[: done.fork].any() and (apart[done.fork :].max(1) > 0).all()
+    page = Path(write_report(out)).read_text(encoding="utf-8")
+    assert f"Undecided: from frame {done.fork} on" in page and "second surface" in page
+
+
+def test_a_closed_surface_has_no_mirror_image(tmp_path):
+    truth = synthetic.cloth(
+        tmp_path / "tube", frames=2, size=(160, 120), rows=9, columns=18, shape=synthetic.tube
+    )
+    problem = problem_of(truth.folder)
+    assert not FrameTracker(problem).mirrors
+    assert FrameTracker(of_a_cloth(tmp_path)[1]).mirrors
