@@ -57,28 +57,20 @@ class Inextensibility(Term):
         cautious = r.strain_caution and self._atlas.carrier is None
         return r.give * (r.caution(context.memory.noise) if cautious else 1.0)
 
-    def _crush(self, context, stage):
-        """The strain from which on compressed edges pull no harder: a garment on a body has folds
-        that its jets do not follow, and pushed out of them it would go far from the camera.
-        """
-        return math.inf if self._atlas.carrier is None else self._give(context, stage)
-
     def energy(self, at):
         rest = mi.Float64(self.lengths_in(at.context.frame))
         excess = edge_lengths(at.vertices, self._edges) - rest
-        give, crush = self._give(at.context, at.stage), self._crush(at.context, at.stage)
+        give = self._give(at.context, at.stage)
         squared = dr.square(excess)
-        for yields, strain in ((excess > 0, give), (excess < 0, crush)):
-            if math.isfinite(strain):
-                over = dr.square(dr.select(yields, excess, 0) / (strain * rest))
-                squared *= 2 / (1 + dr.sqrt(1 + over))
+        if math.isfinite(give):
+            over = dr.square(dr.maximum(excess, 0) / (give * rest))
+            squared *= 2 / (1 + dr.sqrt(1 + over))
         return mi.Float(self.weight * at.stage.stiffness / self._unit * dr.sum(squared))
 
     def rows(self, at):
         stiffness = self.weight * at.stage.stiffness / self._unit
         lengths = self.lengths_in(at.context.frame)
-        strains = self._give(at.context, at.stage), self._crush(at.context, at.stage)
-        at.edges = EdgeRows(lengths, stiffness, *strains)
+        at.edges = EdgeRows(lengths, stiffness, self._give(at.context, at.stage))
 
     def add(self, at):
         return at.edge_energy
