@@ -13,10 +13,12 @@ import numpy as np
 import pytest
 import synthetic
 from loading import difference, loaded
+from scipy.spatial.transform import Rotation
 
 from polysft_mi import prepare
 from polysft_mi.capture import prepare_folder, recognise
 from polysft_mi.errors import InputError
+from polysft_mi.render import Pinhole
 from polysft_mi.scene.sequence import Sequence
 from polysft_mi.scene.settings import Settings
 
@@ -244,3 +246,34 @@ def test_command_line(tmp_path, capsys):
     assert f"python -m polysft_mi.run {tmp_path / 'out' / 'scene.xml'}" in said
     with pytest.raises(InputError, match="--overwrite"):
         prepare.main(words)
+
+
+def test_a_body_says_where_the_camera_stands(tmp_path):
+    """The scene's world is the body's, and the template is not looked for in the image."""
+    folder, frames = synthetic.cloth(tmp_path / "a", frames=3).folder, 3
+    body = {"poses": np.zeros((frames, 24, 3)), "translation": np.zeros((frames, 3))}
+    np.savez(tmp_path / "body.npz", **body)
+    words = [str(folder), "--body", str(tmp_path / "body.npz"), "-o", str(tmp_path / "out")]
+    with pytest.raises(InputError, match=r"camera.json: world_to_camera is missing"):
+        prepare.main(words)
+    assert not (tmp_path / "out").exists()
+    camera = json.loads((folder / "camera.json").read_text())
+    turn = Rotation.from_rotvec([0.3, -0.2, 0.1]).as_matrix()
+    pose = np.vstack([np.column_stack([turn, (0.1, 0.2, 3.0)]), (0, 0, 0, 1)])
+    (folder / "camera.json").write_text(json.dumps(camera | {"world_to_camera": pose.tolist()}))
+    prepare.main(words)
+    experiment = loaded(str(tmp_path / "out" / "scene.xml"))
+    assert experiment.settings.body == str(tmp_path / "body.npz")
+    seen = Pinhole(experiment.sensor)
+    np.testing.assert_allclose(seen.axes, turn, atol=1e-5)
+    np.testing.assert_allclose(seen.origin, -turn.T @ pose[:3, 3], atol=1e-5)
+    np.savez(tmp_path / "body.npz", poses=body["poses"][1:], translation=body["translation"][1:])
+    with pytest.raises(InputError, match="frames, the video's, are needed"):
+        prepare.main([*words, "--overwrite"])
+
+
+def test_a_body_is_for_a_folder(tmp_path):
+    video = tmp_path / "clip.mp4"
+    video.write_bytes(b"")
+    with pytest.raises(InputError, match="--body is for a folder in a known form"):
+        prepare.main([str(video), "--body", "body.npz", "-o", str(tmp_path / "out")])
