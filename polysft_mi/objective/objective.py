@@ -170,7 +170,7 @@ class Objective:
         for term in self.terms:
             term.rows(at)
         at.normal, at.edge_energy = self._assembly.normal(
-            surface, at.images, at.edges, at.triangles, at.at_rest, operators.patterns[d], d
+            surface, at.images, at.edges, at.triangles, operators.patterns[d], d, at.at_rest
         )
         terms = {term.name: term.add(at) for term in self.terms}
         total = sum(terms.values())

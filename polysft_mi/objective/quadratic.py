@@ -373,7 +373,7 @@ class Assembly:
                 if len(kept):
                     self._meetings.append((other, k, part.start + kept, at[kept]))
 
-    def normal(self, surface, images, edges, triangles=None, at_rest=None, wide=None, d=2):
+    def normal(self, surface, images, edges, triangles=None, wide=None, d=2, at_rest=None):
         """(:class:`NormalEquations`, the edges' energy) of what ``images`` (pairs of
         :class:`polysft_mi.images.gather.Images` and their camera), :class:`EdgeRows` and
         :class:`TriangleForms` say at the vertices of a ``surface``, and :class:`RestForms` before a

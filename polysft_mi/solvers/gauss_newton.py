@@ -122,8 +122,7 @@ def check_step(step, shape):
     (g, local), (patches, size) = step, shape
     jets, pose = np.split(g, [patches * (size + 6)])
     motion = jets.reshape(patches, -1)[:, -6:]
-    farthest = max(np.abs(x).max(initial=0) for x in (motion, local, pose))
-    if not farthest < _FARTHEST_STEP:
+    if not all(np.abs(x).max(initial=0) < _FARTHEST_STEP for x in (motion, local, pose)):
         raise LinAlgError("the step is not finite, or too long")
 
 

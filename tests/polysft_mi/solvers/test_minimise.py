@@ -144,9 +144,10 @@ def test_a_windows_step_is_that_of_the_dense_system(truth):
 
 def test_steps_that_lead_nowhere_are_refused():
     uv, g = np.zeros((5, 2)), np.zeros(10)
-    check_step((g, uv), 1)
+    shape = 1, 4  # patches, and coefficients of each
+    check_step((g, uv), shape)
     g[0] = 100.0  # of the coefficients: no bound
-    check_step((g, uv), 1)
+    check_step((g, uv), shape)
     for bad in ((g + np.eye(10)[9] * 3, uv), (g, uv - 3), (g * np.nan, uv)):
         with pytest.raises(LinAlgError):
-            check_step(bad, 1)
+            check_step(bad, shape)
