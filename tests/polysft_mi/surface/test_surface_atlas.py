@@ -80,9 +80,10 @@ def by_drjit(chart, state, step):
         "translation": g[:, -3:],
     }
     unknowns = unknowns_of(chart, state, in_double)
-    for name, value in unknowns.items():
+    for name, tangent in along.items():
+        value = getattr(unknowns, name)
         dr.enable_grad(value)
-        dr.set_grad(value, in_double(along[name].ravel()))
+        dr.set_grad(value, in_double(tangent.ravel()))
     found = Deformation(chart.template, in_double).vertices(unknowns)
     dr.forward_to(found)
     return np.stack([np.array(dr.grad(x)) for x in found], 1)
