@@ -7,7 +7,7 @@ path tracer.
         --methods gauss-newton -o RESULTS
 
 Newton is NVIDIA's simulator on Warp; it runs on the CPU too. OUT receives the folders flag, bend,
-paper, curtain, skirt, pillow, roll and pushed, about two minutes each on one core.
+paper, curtain, skirt, pillow, roll, pushed and tube, about two minutes each on one core.
 
 Each folder has the form that ``scenes/flag.xml`` and its sisters expect: ``template.obj`` (metres,
 camera frame), ``texture.png``, ``camera.json``, ``frames``, ``masks`` (480x360) and ``gt.npz``, the
@@ -22,6 +22,7 @@ light and texture.
     pillow   closed; its two ends are pushed together and turned against each other
     roll     a sheet that is rolled up by 250 degrees, held along one edge, in wind
     pushed   thinner than bend, its two ends pushed together by a fifth: it bulges either way
+    tube     a sleeve, open at both ends, which are turned as on an arm that bends
 """
 
 import argparse
@@ -68,6 +69,7 @@ KINDS = {
     "pillow": Kind(None, None, 3e-3, 0.3, 0.12, (0.0, 0.6), True),
     "roll": Kind(None, None, 5e-3, 0.6, 0.0, (0.6, 0.8), True),
     "pushed": Kind((0.31, 0.22), (36, 26), 1e-2, 0.3, 0.2, (0.0, 0.5)),
+    "tube": Kind(None, None, 2e-3, 0.6, 0.1, (0.0, 0.5), True),
 }
 
 
@@ -123,18 +125,23 @@ class Weather:
 
     def _turn(self, out, share, swing):
         """A skirt's waist and a roll's edge turn about an upright axis and sway; a pillow's ends
-        turn against each other.
+        turn against each other, and a tube's as those of a sleeve on an arm that bends.
         """
+        end = np.sign(self.start[:, 0])
         axis, angle = {
             "skirt": (1, 0.5 * self.side * share),
-            "pillow": (0, 0.35 * self.side * share * np.sign(self.start[:, 0])),
+            "pillow": (0, 0.35 * self.side * share * end),
             "roll": (1, 0.3 * swing),
+            "tube": (1, 0.45 * self.side * share * end),
         }[self.name]
         a, b = [k for k in range(3) if k != axis]
-        middle = out.mean(0)
-        x, y = out[:, a] - middle[a], out[:, b] - middle[b]
-        out[:, a] = middle[a] + np.cos(angle) * x - np.sin(angle) * y
-        out[:, b] = middle[b] + np.sin(angle) * x + np.cos(angle) * y
+        two_ends = self.name in ("pillow", "tube")
+        for part in (end < 0, end >= 0) if two_ends else (np.full(len(out), True),):
+            middle = out[part].mean(0)
+            x, y = out[part, a] - middle[a], out[part, b] - middle[b]
+            cos, sin = (np.broadcast_to(f(angle), len(out))[part] for f in (np.cos, np.sin))
+            out[part, a] = middle[a] + cos * x - sin * y
+            out[part, b] = middle[b] + sin * x + cos * y
         if self.name != "pillow":
             out[:, 0] += 0.03 * swing
 

@@ -90,4 +90,16 @@ def roll(cells=(40, 22), size=(0.32, 0.18), turn=4.4):
     return Shape(points.reshape(-1, 3), faces, uv, u.ravel() < 1.5 / cells[0], size[0] / size[1])
 
 
-ROUNDED = {"skirt": skirt, "pillow": pillow, "roll": roll}
+def tube(cells=(28, 36), radius=0.045, length=0.24):
+    """A sleeve, open at both ends, which are held; its axis lies across, its seam behind."""
+    u, v, faces = _grid(*cells)
+    angle = 2 * np.pi * (v - 0.5)  # v = 1/2 faces the camera
+    ring = radius * np.sin(angle), DEPTH - radius * np.cos(angle)
+    points = np.stack([(u - 0.5) * length, *ring], -1).reshape(-1, 3)
+    uv = np.stack([u, 1 - v], -1).reshape(-1, 2)
+    vertices, faces, coordinates = _sewn(points, faces, uv)
+    held = np.abs(vertices[:, 0]) > 0.5 * length - 1e-6
+    return Shape(vertices, faces, coordinates, held, length / (2 * np.pi * radius))
+
+
+ROUNDED = {"skirt": skirt, "pillow": pillow, "roll": roll, "tube": tube}

@@ -91,10 +91,9 @@ def test_rounded_shapes_are_sewn_and_their_hands_move_rigidly(name):
     edges, faces = edges_of(shape.faces)
     boundary = (np.bincount(faces.ravel(), minlength=len(edges)) == 1).sum()
     euler = len(shape.vertices) - len(edges) + len(shape.faces)
-    # an open tube, a closed surface, a disc
-    assert (euler, boundary > 0) == {"skirt": (0, True), "pillow": (2, False), "roll": (1, True)}[
-        name
-    ]
+    tube, closed, disc = (0, True), (2, False), (1, True)
+    wanted = {"skirt": tube, "pillow": closed, "roll": disc, "tube": tube}[name]
+    assert (euler, boundary > 0) == wanted
     normal = np.cross(
         *(shape.vertices[shape.faces[:, k]] - shape.vertices[shape.faces[:, 0]] for k in (1, 2))
     )
@@ -103,7 +102,7 @@ def test_rounded_shapes_are_sewn_and_their_hands_move_rigidly(name):
     weather = simulate.Weather(name, kind, shape.vertices, shape.held, np.random.default_rng(0))
     start, end = (weather.points(t) for t in (0.0, 0.4))
     assert np.allclose(start, shape.vertices[shape.held]) and np.abs(end - start).max() > 0.005
-    hands = [start[:, 0] < 0, start[:, 0] >= 0] if name == "pillow" else [slice(None)]
+    hands = [start[:, 0] < 0, start[:, 0] >= 0] if name in ("pillow", "tube") else [slice(None)]
     for hand in hands:
         apart = [np.linalg.norm(x[hand][:, None] - x[hand], axis=-1) for x in (start, end)]
         assert np.allclose(*apart, atol=1e-9)
