@@ -31,7 +31,7 @@ from polysft_mi.results.truth import load_npz
 KINDS = {"body": (), "tracks": ("tracks",), "depth": ("depth",)}
 _FILES = {"tracks": "tracks.npz", "depth": "depth"}
 _SEQUENCES = ("tshirt_box", "sleeves_up")
-_TABLE = re.compile(r"(<!-- dressed -->\n).*?(\n<!-- /dressed -->)", re.S)
+_TABLE = re.compile(r"(<!-- dressed -->\n).*?(<!-- /dressed -->)", re.S)
 _SHOWN = "sleeves_up", "body", 18
 
 
@@ -180,7 +180,7 @@ def main(argv=None):
         with open(page, encoding="utf-8") as file:
             text = file.read()
         with open(page, "w", encoding="utf-8") as file:
-            file.write(_TABLE.sub(lambda m: m[1] + table(results) + m[2], text))
+            file.write(_TABLE.sub(lambda m: m[1] + table(results) + "\n" + m[2], text))
     print(table(results))
 
 
