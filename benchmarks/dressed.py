@@ -32,7 +32,7 @@ KINDS = {"body": (), "tracks": ("tracks",), "depth": ("depth",)}
 _FILES = {"tracks": "tracks.npz", "depth": "depth"}
 _SEQUENCES = ("tshirt_box", "sleeves_up")
 _TABLE = re.compile(r"(<!-- dressed -->\n).*?(<!-- /dressed -->)", re.S)
-_SHOWN = "sleeves_up", "body", 18
+_SHOWN = "tshirt_box", "body", 28
 
 
 def figures(surface, truth):
@@ -134,7 +134,7 @@ def picture(path, out, frame):
         rgb, alpha = problem.placed.image(mi.Point3f(vertices.T.astype(np.float32)))
         alpha = np.array(alpha).reshape(*image.shape[:2], 1)
         panels.append(np.array(rgb) + (1 - alpha) * faded)
-    row = srgb(np.hstack(panels))
+    row = np.round(255 * srgb(np.hstack(panels))).astype(np.uint8)
     cv2.imwrite(path, row[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
 
 
