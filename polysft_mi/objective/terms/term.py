@@ -64,7 +64,9 @@ class Inputs:
         from polysft_mi.images import DataTerm
 
         normalise = self.settings.brightness == "local"
-        start = self.atlas.surface(self.atlas.start).vertices
+        start = self.template.vertices
+        if self.atlas.carrier is not None:
+            start = self.atlas.surface(self.atlas.start).vertices
         return DataTerm(self.placed, self.template, start, self.sequence, self.rules, normalise)
 
     def target(self, frame: int) -> Target:
