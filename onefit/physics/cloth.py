@@ -63,6 +63,7 @@ class Cloth:
         self.load, self.slip = np.zeros(keys), np.zeros(keys)  # [N], [m] in the last step
         self.iterations = 0  # of the last step
         self._forced = np.zeros_like(self.x)  # by what forces moved the cloth in the last step
+        self._dt = 0.0  # [s], of the last step
         N, E, F, H = len(sheet), sheet.edges, sheet.faces, sheet.hinges
         of_face, self._face_parts = _in_halves(F, N)
         of_hinge, self._hinge_parts = _in_halves(H, N)
@@ -161,6 +162,8 @@ class Cloth:
         """One step of ``dt`` [s]. Each vertex is pulled to ``target`` (N, 3) [m] by springs of
         stiffness ``pull`` (N,) [N/m].
         """
+        longer = dt / self._dt if self._dt else 1.0
+        self._forced, self.slip, self._dt = longer**2 * self._forced, longer * self.slip, dt
         y = self.flight(dt)
         pull = np.broadcast_to(pull, len(y))
         target = y if target is None else target

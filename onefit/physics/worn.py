@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from onefit.body import ClosestSurface
-from onefit.contact import SelfContact, SkinContact, ThreadContact
+from onefit.contact import SelfContact, SkinContact, ThreadContact, weighted
 
 from .cloth import Cloth
 from .settings import Settings
@@ -43,19 +43,41 @@ class WornCloth:
             self._threads.append(ThreadContact(*ends, lengths, self._firm, keys))
             keys += len(lengths)
         self.cloth = Cloth(sheet, x, settings, keys, patches)
+        self._target, self._stride, self._most_parts = self.cloth.x, settings.stride, settings.parts
         self._push_out()
+        self._target = self.cloth.x.copy()
 
     def step(
         self, dt: float, body: np.ndarray, target: np.ndarray, pull: np.ndarray | float
     ) -> None:
         """One step of ``dt`` [s], in which the body moves to ``body`` (V, 3) [m]; ``target`` and
-        ``pull`` as :meth:`onefit.physics.Cloth.step` takes them.
+        ``pull`` as :meth:`onefit.physics.Cloth.step` takes them. Where cloth flies towards cloth it
+        is done in parts, in which body and target go on evenly.
         """
-        cloth = self.cloth
-        contacts = [self._skin.follow(self._surface, body, self._firm)]
-        contacts.append(self._itself.find(cloth.x, dt * cloth.v))
-        contacts += [threads.find(cloth.x) for threads in self._threads]
-        cloth.step(dt, contacts, target, pull)
+        start = self._surface.vertices.copy(), self._target
+        pairs = self._itself.find(self.cloth.x, dt * self.cloth.v)
+        parts = self._parts(pairs, dt)
+        for k in range(1, parts):
+            at = (a + k / parts * (b - a) for a, b in zip(start, (body, target)))
+            self._part(dt / parts, *at, pull, pairs)
+            pairs = self._itself.find(self.cloth.x, dt / parts * self.cloth.v)
+        self._part(dt / parts, body, target, pull, pairs)
+
+    def _parts(self, pairs, dt):
+        """In how many parts a step is done. A pair stays on its side where that is in its step's
+        beginning; if layers fly far, other vertices and edges meet than were near.
+        """
+        vector = lambda x: weighted(x[pairs.corners], pairs.weights)
+        way = np.einsum("ci,ci->c", vector(dt * self.cloth.v), pairs.normal)
+        near = np.einsum("ci,ci->c", vector(self.cloth.x), pairs.normal) + way < pairs.offset
+        farthest = -way.min(initial=0.0, where=near)
+        return int(np.clip(np.ceil(farthest / self._stride), 1, self._most_parts))
+
+    def _part(self, dt, body, target, pull, pairs):
+        contacts = [self._skin.follow(self._surface, body, self._firm), pairs]
+        contacts += [threads.find(self.cloth.x) for threads in self._threads]
+        self.cloth.step(dt, contacts, target, pull)
+        self._target = target
         self._push_out()
 
     def _push_out(self):

@@ -88,14 +88,12 @@ def pairs_of(sheet, x, way):
     corners of what is nearest to it, or two sorted edges.
     """
     rest, F, found = sheet.cut, sheet.faces, {}
-    beside = np.zeros(len(x), bool)
-    reach = 2 * CONTACT.apart + np.linalg.norm(way - way.mean(0), axis=1)
-    reach = np.minimum(reach, CONTACT.reach)
+    beside, near = np.zeros(len(x), bool), 2 * CONTACT.apart
 
-    def is_layer(away, at_rest, reach):
+    def is_layer(away, at_rest, against):
         distance = np.linalg.norm(away)
-        far = max(2 * distance, 2 * CONTACT.apart)
-        return distance < reach and np.linalg.norm(at_rest) > far
+        comes_to = distance + min(against @ away / distance, 0)
+        return comes_to < near and np.linalg.norm(at_rest) > max(2 * distance, near)
 
     for i in range(len(x)):
         best, inner = (np.inf, None, None), False
@@ -103,8 +101,8 @@ def pairs_of(sheet, x, way):
             if i in corners:
                 continue
             on = closest(x[i], *x[corners])
-            away, at_rest = x[i] - on @ x[corners], rest[i] - on @ rest[corners]
-            if is_layer(away, at_rest, reach[i]):
+            away, at_rest, against = (y[i] - on @ y[corners] for y in (x, rest, way))
+            if is_layer(away, at_rest, against):
                 beside[i], key = True, (i, *sorted(corners[on > 1e-4]))
                 if on.min() > 1e-4:
                     found[key] = away
@@ -112,17 +110,20 @@ def pairs_of(sheet, x, way):
                     best, inner = (np.linalg.norm(away), key, away), on.min() > 1e-4
         if best[1] and not inner:
             found[best[1]] = best[2]
+    goes = np.linalg.norm(way - way.mean(0), axis=1)
+    is_long = lambda ends: np.linalg.norm(np.diff(rest[ends], axis=0)) > 2 * (
+        near + goes[ends].max()
+    )
     E = sheet.edges
     for e, (i, j) in enumerate(E):
         for m, n in E[:e]:
             A = np.stack([x[j] - x[i], x[m] - x[n]], 1)
             (s, t), *_ = np.linalg.lstsq(A, x[m] - x[i], rcond=None)
             weights = np.array([1 - s, s, t - 1, -t])
-            away, at_rest = (weights @ y[[i, j, m, n]] for y in (x, rest))
+            away, at_rest, against = (weights @ y[[i, j, m, n]] for y in (x, rest, way))
             between = min(s, t) > 0 and max(s, t) < 1 and not {i, j} & {m, n}
-            look = [ends for ends in ([i, j], [m, n]) if beside[ends].any()]
-            far = max((reach[ends].max() for ends in look), default=0)
-            if between and is_layer(away, at_rest, far):
+            looks = any(beside[ends].any() or is_long(ends) for ends in ([i, j], [m, n]))
+            if between and looks and is_layer(away, at_rest, against):
                 found[tuple(sorted([(i, j), (m, n)]))] = away
     return found
 
@@ -136,6 +137,7 @@ def test_pairs_are_those_that_a_search_of_all_against_all_finds(seed):
     x = V - [0, 0, 0.992] * (np.arange(len(V)) >= 49)[:, None]
     x += rng.normal(size=x.shape) * [0.002, 0.002, 0.002]
     way = rng.normal(size=x.shape) * 0.003 * rng.uniform(0, 3, (len(x), 1))
+    way[49:, 2] -= 0.004
     contacts = of(sheet).find(x, way)
     found = {}
     for corners, weights, normal in zip(contacts.corners, contacts.weights, contacts.normal):
@@ -149,9 +151,20 @@ def test_pairs_are_those_that_a_search_of_all_against_all_finds(seed):
         found[key] = vector
     expected = pairs_of(sheet, x, way)
     assert len(expected) > 50 and sum(isinstance(k[0], tuple) for k in expected) > 20
-    assert set(found) == set(expected)
-    for key, vector in expected.items():
-        assert np.allclose(np.abs(found[key]), np.abs(vector), atol=2e-6)
+    assert set(found) <= set(expected)
+    assert all(apart(key, x, way - way.mean(0)) for key in set(expected) - set(found))
+    for key, vector in found.items():
+        assert np.allclose(np.abs(expected[key]), np.abs(vector), atol=2e-6)
+
+
+def apart(key, x, way):
+    """Whether the boxes in which the two of a pair move are farther from each other than a search
+    looks: they come nearer, but past each other.
+    """
+    one, other = key if len(key) == 2 and isinstance(key[0], tuple) else (key[:1], key[1:])
+    places = [np.concatenate([x[list(k)], (x + way)[list(k)]]) for k in (one, other)]
+    low, high = (np.stack([f(p, axis=0) for p in places]) for f in (np.min, np.max))
+    return (low.max(0) - high.min(0)).max() > 2 * CONTACT.apart
 
 
 def test_what_has_slipped_through_is_drawn_back():
