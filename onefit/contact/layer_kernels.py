@@ -82,18 +82,15 @@ def _keep(found: Found, corners: wp.vec4i, weights: wp.vec4, normal: wp.vec3):
 
 
 @wp.func
-def _is_layer(
-    away: wp.vec3, way: wp.vec3, at_rest: wp.vec3, along: wp.vec4, neighbourhood: float
-):
+def _is_layer(away: wp.vec3, way: wp.vec3, at_rest: wp.vec3, along: wp.vec4, neighbourhood: float):
     """Whether two points that lie ``away`` from each other, and go a ``way`` against each other,
     are of two layers that meet: half as far from each other as at rest, or less. There they are as
     far from each other as ``at_rest`` says, or, as two thighs of trousers, farther along the sheet:
     at least by the difference of what they are ``along`` it from a third.
     """
-    distance = wp.length(away)
-    far = wp.max(2.0 * distance, neighbourhood)
-    apart = wp.max(wp.length(at_rest), wp.max(wp.max(along), -wp.min(along)))
-    if distance == 0.0 or apart <= far:
+    distance, apart = wp.length(away), wp.length(at_rest)
+    farther = wp.max(apart, wp.max(wp.max(along), -wp.min(along)))
+    if distance == 0.0 or apart <= neighbourhood or farther <= 2.0 * distance:
         return False
     return distance + wp.min(wp.dot(way, away) / distance, 0.0) < neighbourhood
 
@@ -125,7 +122,7 @@ def vertices_near(
     p, q, w = layers.x[i], layers.rest[i], layers.way[i]
     box = wp.vec3(neighbourhood, neighbourhood, neighbourhood)
     query = wp.bvh_query_aabb(layers.tree, wp.min(p, p + w) - box, wp.max(p, p + w) + box)
-    nearest = float(1.0e9)
+    nearest = wp.float32(1.0e9)
     corners, weights, normal = wp.vec4i(), wp.vec4(), wp.vec3()
     inner = int(0)  # noqa: RUF046, UP018 - a variable to Warp
     layered[i] = 0

@@ -19,7 +19,7 @@ from .planes import Contacts
 from .settings import ContactSettings
 
 _PARTS = 2  # in which pairs are looked for at once
-_STRAIGHT = 0.8  # of a way along edges, at least, is as long as the straight one in the sheet
+_STRAIGHT = 0.7  # of a way along the edges of a grid, at least, is as long as the straight one
 
 
 def _array(a, dtype):

@@ -58,8 +58,8 @@ class WornCloth:
         pairs = self._itself.find(self.cloth.x, dt * self.cloth.v)
         parts = self._parts(pairs, dt)
         for k in range(1, parts):
-            at = (a + k / parts * (b - a) for a, b in zip(start, (body, target)))
-            self._part(dt / parts, *at, pull, pairs)
+            now, to = (a + k / parts * (b - a) for a, b in zip(start, (body, target)))
+            self._part(dt / parts, now, to, pull, pairs)
             pairs = self._itself.find(self.cloth.x, dt / parts * self.cloth.v)
         self._part(dt / parts, body, target, pull, pairs)
 

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -5,7 +7,7 @@ from test_contact import COTTON, grid
 
 from onefit.contact import SelfContact
 from onefit.objective import crossings
-from onefit.physics import Settings
+from onefit.physics import Settings, WornCloth
 from onefit.physics.cloth import Cloth
 from onefit.physics.sheet import Sheet
 
@@ -76,6 +78,38 @@ def test_strips_whose_edges_alone_meet_do_not_pass_through_each_other(speed):
     assert (cloth.x - x)[falls, 2].mean() > -0.02  # it did not fall past
 
 
+def test_what_flies_farther_in_a_step_than_its_edges_are_long_does_not_pass_through():
+    V, F = grid(9, 9, 0.014)
+    two_sheets, faces = two((V, F), (V + [0.004, 0.003, 0.03], F))
+    upper = np.arange(len(two_sheets)) >= len(V)
+    cut = two_sheets + [0, 0, 1.0] * upper[:, None]  # they are not neighbours
+    sheet = Sheet(two_sheets, faces, COTTON, cut=cut)
+    far = np.array([[0.0, 0, -9], [1, 0, -9], [0, 1, -9], [0, 0, -10]])
+    body = far, np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]])
+
+    def after(settings):
+        worn = WornCloth(sheet, sheet.rest, *body, settings)
+        worn.cloth.v[:, 2] = np.where(upper, -2.0, 0.0)  # 33 mm in a step
+        for _ in range(4):
+            worn.step(1 / 60, body[0], sheet.rest, 1.0 * ~upper)
+        return crossings(worn.cloth.x, faces)
+
+    assert after(replace(SETTINGS, parts=1)) > 0
+    assert after(SETTINGS) == 0
+
+
+def test_what_is_near_at_rest_but_far_along_the_sheet_is_a_layer():
+    """Two legs, 8 mm from each other where they are made, as trousers between the thighs."""
+    V, F = grid(60, 6, 0.01)
+    s, x = V[:, 0], V.copy()
+    x[:, 0], x[:, 2] = np.abs(s), np.clip(s, -0.004, 0.004)
+    sheet = Sheet(x, F, COTTON)
+    assert len(of(sheet).find(1.25 * x).key) == 0  # 10 mm from each other
+    contacts = of(sheet).find(x * [1, 1, 0.625])  # 5 mm
+    far = np.flatnonzero((np.abs(s) > 0.03) & (np.abs(s) < 0.28))
+    assert np.isin(far, contacts.corners).all()
+
+
 def closest(p, *corners):
     """Barycentric coordinates of the point of a triangle nearest to p."""
     triangle = np.stack(corners)[None]
@@ -111,8 +145,8 @@ def pairs_of(sheet, x, way):
         if best[1] and not inner:
             found[best[1]] = best[2]
     goes = np.linalg.norm(way - way.mean(0), axis=1)
-    is_long = lambda ends: np.linalg.norm(np.diff(rest[ends], axis=0)) > 2 * (
-        near + goes[ends].max()
+    is_long = lambda ends: (
+        np.linalg.norm(np.diff(rest[ends], axis=0)) > 2 * (near + goes[ends].max())
     )
     E = sheet.edges
     for e, (i, j) in enumerate(E):
