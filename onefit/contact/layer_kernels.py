@@ -86,11 +86,14 @@ def _is_layer(away: wp.vec3, way: wp.vec3, at_rest: wp.vec3, along: wp.vec4, nei
     """Whether two points that lie ``away`` from each other, and go a ``way`` against each other,
     are of two layers that meet: half as far from each other as at rest, or less. There they are as
     far from each other as ``at_rest`` says, or, as two thighs of trousers, farther along the sheet:
-    at least by the difference of what they are ``along`` it from a third.
+    at least by the difference of what they are ``along`` it from a third. What is as near at rest
+    as layers are held (a hem turned in) stays as it is.
     """
     distance, apart = wp.length(away), wp.length(at_rest)
     farther = wp.max(apart, wp.max(wp.max(along), -wp.min(along)))
-    if distance == 0.0 or apart <= neighbourhood or farther <= 2.0 * distance:
+    if distance == 0.0 or apart <= 0.5 * neighbourhood:
+        return False
+    if farther <= wp.max(2.0 * distance, neighbourhood):
         return False
     return distance + wp.min(wp.dot(way, away) / distance, 0.0) < neighbourhood
 

@@ -238,7 +238,7 @@ def test_a_cut_in_folds_rests_on_its_folds():
     # the rest shape of what hangs in folds says nothing of who is whose neighbour; its cut does
     V, F = grid(24, 4, 0.01)
     hung = V.copy()
-    hung[:, 0], hung[:, 2] = np.abs(V[:, 0]), 0.0025 * np.sign(V[:, 0])
+    hung[:, 0], hung[:, 2] = np.abs(V[:, 0]), 0.0012 * np.sign(V[:, 0])
     folded = np.abs(V[:, 0]) > 0.05
     corners = V[F]
     sides = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
