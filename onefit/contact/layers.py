@@ -27,9 +27,9 @@ def _array(a, dtype):
 
 
 class SelfContact:
-    """Contacts of a sheet with itself, of ``stiffness`` [N/m]: of vertices with triangles, and of
-    edges with edges. ``cut`` (N, 3) [m]: where it has no folds; ``faces`` (F, 3). The keys start at
-    ``first``, one a vertex.
+    """Contacts of a sheet with itself: of vertices with triangles, and of edges with edges, each
+    with the lesser ``stiffness`` (N,) [N/m] of its two sides. ``cut`` (N, 3) [m]: where the sheet
+    has no folds; ``faces`` (F, 3). The keys start at ``first``, one a vertex.
     """
 
     def __init__(
@@ -37,7 +37,7 @@ class SelfContact:
         cut: np.ndarray,
         faces: np.ndarray,
         settings: ContactSettings,
-        stiffness: float,
+        stiffness: np.ndarray,
         first: int,
     ) -> None:
         self.settings, self.first, self.stiffness = settings, first, stiffness
@@ -93,9 +93,9 @@ class SelfContact:
         )
         self._keep_sides(corners, weights, normal)
         offset, still = np.full(len(corners), self.settings.apart), np.zeros((len(corners), 3))
-        key = self.first + corners[:, 0]
+        key, stiffness = self.first + corners[:, 0], self.stiffness[corners[:, [0, 3]]].min(1)
         return Contacts(
-            key, corners, weights.astype(float), normal.astype(float), offset, still, self.stiffness
+            key, corners, weights.astype(float), normal.astype(float), offset, still, stiffness
         )
 
     def _keep_sides(self, corners, weights, normal):

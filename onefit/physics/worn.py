@@ -29,18 +29,19 @@ class WornCloth:
         patches: np.ndarray | None = None,
         threads: tuple | None = None,
     ) -> None:
-        contact, stretch = settings.contact, sheet.material.stretch
+        contact, firmness = settings.contact, sheet.firmness
         limits = dict.fromkeys(("least", "point_near", "point_least"), contact.least)
         limits |= dict.fromkeys(("reach", "deepest"), contact.reach)
         self._skin = SkinContact(sheet.rest, sheet.faces, contact, **limits)
-        self._surface, self._firm = ClosestSurface(body, body_faces), contact.stiffness * stretch
-        between, keys = contact.layer_stiffness * stretch, len(self._skin)
+        self._surface, firm = ClosestSurface(body, body_faces), contact.stiffness * firmness
+        self._firm = firm[self._skin.corners[:, 0]]
+        between, keys = contact.layer_stiffness * firmness, len(self._skin)
         self._itself = SelfContact(sheet.cut, sheet.faces, contact, between, keys)
         keys, self._threads = keys + len(sheet), []
         if threads is not None:
             *ends, lengths = threads
             lengths = np.maximum(lengths, contact.apart)
-            self._threads.append(ThreadContact(*ends, lengths, self._firm, keys))
+            self._threads.append(ThreadContact(*ends, lengths, firm[ends[0]], keys))
             keys += len(lengths)
         self.cloth = Cloth(sheet, x, settings, keys, patches)
         self._target, self._stride, self._most_parts = self.cloth.x, settings.stride, settings.parts

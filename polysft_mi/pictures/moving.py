@@ -249,7 +249,7 @@ def _of_drapes(paths: list[str]) -> Moving:
                 " they are not of one outfit"
             )
         count += meshes[-1][0].shape[1]
-        colours.append(np.tile(np.uint8(colour), (meshes[-1][0].shape[1], 1)))
+        colours.append(np.tile(np.array(colour, np.uint8), (meshes[-1][0].shape[1], 1)))
     vertices, faces = (np.concatenate(parts, k) for parts, k in zip(zip(*meshes), (1, 0)))
     rgb = np.concatenate(colours)[None]
     return Moving(

@@ -17,7 +17,7 @@ CONTACT = SETTINGS.contact
 
 def of(sheet):
     """The contact of a sheet with itself."""
-    stiffness = CONTACT.layer_stiffness * sheet.material.stretch
+    stiffness = CONTACT.layer_stiffness * sheet.firmness
     return SelfContact(sheet.cut, sheet.faces, CONTACT, stiffness, 0)
 
 
