@@ -56,28 +56,42 @@ class WornCloth:
         is done in parts, in which body and target go on evenly.
         """
         start = self._surface.vertices.copy(), self._target
-        pairs = self._itself.find(self.cloth.x, dt * self.cloth.v)
-        parts = self._parts(pairs, dt)
+        skin, way, pairs = self._ahead(dt, body)
+        parts = self._parts(pairs, way)
+        if parts > 1:
+            self._surface.follow(start[0])
         for k in range(1, parts):
             now, to = (a + k / parts * (b - a) for a, b in zip(start, (body, target)))
-            self._part(dt / parts, now, to, pull, pairs)
-            pairs = self._itself.find(self.cloth.x, dt / parts * self.cloth.v)
-        self._part(dt / parts, body, target, pull, pairs)
+            skin, _, pairs = self._ahead(dt / parts, now)
+            self._part(dt / parts, skin, pairs, to, pull)
+        if parts > 1:
+            skin, _, pairs = self._ahead(dt / parts, body)
+        self._part(dt / parts, skin, pairs, target, pull)
 
-    def _parts(self, pairs, dt):
+    def _ahead(self, dt, body):
+        """The body moves to ``body`` (V, 3) [m]: contacts with it; where the cloth goes (N, 3) [m]
+        as it flies, and as the skin takes it along; and what meets there.
+        """
+        skin = self._skin.follow(self._surface, body, self._firm)
+        way = dt * self.cloth.v
+        own = skin.of(skin.key < len(way))
+        gap = np.einsum("ci,ci->c", self.cloth.x[own.key] + way[own.key], own.normal) - own.offset
+        way[own.key] -= np.minimum(gap, 0)[:, None] * own.normal
+        return skin, way, self._itself.find(self.cloth.x, way)
+
+    def _parts(self, pairs, way):
         """In how many parts a step is done. A pair stays on its side where that is in its step's
-        beginning; if layers fly far, other vertices and edges meet than were near.
+        beginning; if layers go far, other vertices and edges meet than were near.
         """
         vector = lambda x: weighted(x[pairs.corners], pairs.weights)
-        way = np.einsum("ci,ci->c", vector(dt * self.cloth.v), pairs.normal)
-        near = np.einsum("ci,ci->c", vector(self.cloth.x), pairs.normal) + way < pairs.offset
-        farthest = -way.min(initial=0.0, where=near)
+        goes = np.einsum("ci,ci->c", vector(way), pairs.normal)
+        near = np.einsum("ci,ci->c", vector(self.cloth.x), pairs.normal) + goes < pairs.offset
+        farthest = -goes.min(initial=0.0, where=near)
         return int(np.clip(np.ceil(farthest / self._stride), 1, self._most_parts))
 
-    def _part(self, dt, body, target, pull, pairs):
-        contacts = [self._skin.follow(self._surface, body, self._firm), pairs]
-        contacts += [threads.find(self.cloth.x) for threads in self._threads]
-        self.cloth.step(dt, contacts, target, pull)
+    def _part(self, dt, skin, pairs, target, pull):
+        threads = [threads.find(self.cloth.x) for threads in self._threads]
+        self.cloth.step(dt, [skin, pairs, *threads], target, pull)
         self._target = target
         self._push_out()
 
