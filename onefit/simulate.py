@@ -11,7 +11,6 @@ same files into OUT (its --help lists them).
 """
 
 from onefit.draping import command
-from onefit.draping.outfit import materials_of
 from onefit.physics import MATERIALS
 from polyfit.errors import InputError, cli
 
@@ -36,6 +35,8 @@ def parser():
 
 
 def main(argv=None):
+    from onefit.draping import materials_of
+
     args = parser().parse_args(argv)
     names = args.material.split(",")
     material = names if names[1:] else args.material
