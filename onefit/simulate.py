@@ -11,7 +11,7 @@ same files into OUT (its --help lists them).
 """
 
 from onefit.draping import command
-from onefit.physics import MATERIALS
+from onefit.physics import MATERIALS, Material
 from polyfit.errors import InputError, cli
 
 
@@ -35,12 +35,10 @@ def parser():
 
 
 def main(argv=None):
-    from onefit.draping import materials_of
-
     args = parser().parse_args(argv)
     names = args.material.split(",")
     material = names if names[1:] else args.material
-    materials_of(material, len(args.garment))
+    Material.of_each(material, len(args.garment))
     if args.steps < 1:
         raise InputError(f"--steps {args.steps}: steps a frame, 1 or more")
     command.run("simulate", args, material=material, steps=args.steps)

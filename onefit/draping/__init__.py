@@ -7,7 +7,6 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     submod_attrs={
         "draper": ["Drape", "Draper", "load"],
         "inputs": ["body_model", "motion_of", "shape_of"],
-        "outfit": ["materials_of"],
         "post": ["DRAG", "PULL"],
     },
 )

@@ -220,7 +220,7 @@ class Draper:
         if steps < 1:
             raise InputError(f"steps = {steps}; steps a frame, 1 or more")
         settings = settings or Settings()
-        materials = outfit.materials_of(material, len(outfit.several(garment)))
+        materials = Material.of_each(material, len(outfit.several(garment)))
         worn = self._worn(garment, motion, shape)
         body, moved = worn[0].body, worn[0].motion
         led = moved.led_in(body, settings.lead)

@@ -12,7 +12,6 @@ import torch
 from onefit.body import ClosestSurface
 from onefit.contact import SkinContact
 from onefit.garment import Stitches, untangled
-from onefit.physics import Material
 from polyfit import mesh
 from polyfit.errors import InputError
 
@@ -76,20 +75,6 @@ def several(garments: Any) -> list[Any]:
     if not 1 <= len(garments) <= _MOST:
         raise InputError(f"{len(garments)} garments; 1 to {_MOST} at once")
     return garments
-
-
-def materials_of(material: Any, count: int) -> list[Material]:
-    """The :class:`onefit.physics.Material` of each of so many garments (``count``): of a list of
-    them, or one for all. Raises InputError for one that there is not, or another number of them.
-    """
-    if not isinstance(material, list | tuple):
-        return [Material.named(material)] * count
-    if len(material) != count:
-        raise InputError(
-            f"{len(material)} materials for {count} garment{'s' * (count > 1)}; give one for each,"
-            " in their order, or one for all"
-        )
-    return [Material.named(one) for one in material]
 
 
 def let_out(garments: Sequence[Garment], rests: Sequence[torch.Tensor]) -> list[torch.Tensor]:
