@@ -4,6 +4,7 @@ drape, in tens of milliseconds a frame; writes the arrays, an animation and a re
     python -m onefit.simulate dress walk -o OUT
     python -m onefit.simulate shirt.obj motion.npz -o OUT --material denim
     python -m onefit.simulate trousers tshirt walk -o OUT      # one over the other, in this order
+    python -m onefit.simulate trousers tshirt walk -o OUT --material denim,cotton
 
 Where milliseconds count: python -m onefit.drape, which takes the same arguments and writes the
 same files into OUT (its --help lists them).
@@ -19,7 +20,8 @@ def parser():
     p.add_argument(
         "--material",
         default="cotton",
-        help=f"{', '.join(MATERIALS)} (default: cotton)",
+        help=f"{', '.join(MATERIALS)}; of several garments also one for each, as denim,cotton"
+        " (default: cotton)",
     )
     p.add_argument(
         "--steps",
@@ -34,10 +36,12 @@ def parser():
 
 def main(argv=None):
     args = parser().parse_args(argv)
-    Material.named(args.material)
+    names = args.material.split(",")
+    material = names if names[1:] else args.material
+    Material.of_each(material, len(args.garment))
     if args.steps < 1:
         raise InputError(f"--steps {args.steps}: steps a frame, 1 or more")
-    command.run("simulate", args, material=args.material, steps=args.steps)
+    command.run("simulate", args, material=material, steps=args.steps)
 
 
 if __name__ == "__main__":

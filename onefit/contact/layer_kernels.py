@@ -8,14 +8,19 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Layers:
-    """A sheet: its ``mesh`` as Warp knows it, of the vertices ``x`` (N,) [m]; where these are at
-    ``rest``; the ends of its ``edges`` (E, 2), the edges of each face ``edges_of`` (F, 3), and the
-    first face of each edge, its ``owner`` (E,).
+    """A sheet: its vertices at ``x`` (N,) [m], which go a ``way`` (N,) [m] in the step; the
+    hierarchy ``tree`` of the boxes in which its ``faces`` (F, 3) do so; where the vertices are at
+    ``rest``, and how far ``along`` (N,) [m] the sheet from four vertices far from each other; the
+    ends of its ``edges`` (E, 2), the edges of each face ``edges_of`` (F, 3), and the first face of
+    each edge, its ``owner`` (E,).
     """
 
-    mesh: wp.uint64
+    tree: wp.uint64
+    faces: wp.array2d(dtype=int)
     x: wp.array(dtype=wp.vec3)
+    way: wp.array(dtype=wp.vec3)
     rest: wp.array(dtype=wp.vec3)
+    along: wp.array(dtype=wp.vec4)
     edges: wp.array2d(dtype=int)
     edges_of: wp.array2d(dtype=int)
     owner: wp.array(dtype=int)
@@ -77,46 +82,67 @@ def _keep(found: Found, corners: wp.vec4i, weights: wp.vec4, normal: wp.vec3):
 
 
 @wp.func
-def _is_layer(distance: float, at_rest: float, neighbourhood: float, reach: float):
-    """Whether two points are of two layers: half as far from each other as at rest, or less."""
-    far = wp.max(2.0 * distance, neighbourhood)
-    return distance > 0.0 and distance < reach and at_rest > far
+def _is_layer(away: wp.vec3, way: wp.vec3, at_rest: wp.vec3, along: wp.vec4, neighbourhood: float):
+    """Whether two points that lie ``away`` from each other, and go a ``way`` against each other,
+    are of two layers that meet: half as far from each other as at rest, or less. There they are as
+    far from each other as ``at_rest`` says, or, as two thighs of trousers, farther along the sheet:
+    at least by the difference of what they are ``along`` it from a third. What is as near at rest
+    as layers are held (a hem turned in) stays as it is.
+    """
+    distance, apart = wp.length(away), wp.length(at_rest)
+    farther = wp.max(apart, wp.max(wp.max(along), -wp.min(along)))
+    if distance == 0.0 or apart <= 0.5 * neighbourhood:
+        return False
+    if farther <= wp.max(2.0 * distance, neighbourhood):
+        return False
+    return distance + wp.min(wp.dot(way, away) / distance, 0.0) < neighbourhood
+
+
+@wp.kernel
+def boxes(layers: Layers, lower: wp.array(dtype=wp.vec3), upper: wp.array(dtype=wp.vec3)):
+    """The corners of the boxes (F,) in which the faces are in the step."""
+    f = wp.tid()
+    a, b, c = layers.faces[f, 0], layers.faces[f, 1], layers.faces[f, 2]
+    x, w = layers.x, layers.way
+    low, high = wp.min(x[a], wp.min(x[b], x[c])), wp.max(x[a], wp.max(x[b], x[c]))
+    p, q, r = x[a] + w[a], x[b] + w[b], x[c] + w[c]
+    lower[f] = wp.min(low, wp.min(p, wp.min(q, r)))
+    upper[f] = wp.max(high, wp.max(p, wp.max(q, r)))
 
 
 @wp.kernel
 def vertices_near(
     first: int,
     layers: Layers,
-    neighbourhood: float,  # [m] at rest; what is nearer is no other layer
-    reaches: wp.array(dtype=float),  # [m] of the vertices
-    layered: wp.array(dtype=int),  # receives 1 where a layer is within reach
+    neighbourhood: float,  # [m]; what is nearer at rest is no other layer, what comes nearer meets
+    layered: wp.array(dtype=int),  # receives 1 where a layer meets the vertex
     found: Found,
 ):
-    """For each vertex from ``first`` on the triangles of other layers within its reach: those that
-    it stands above, and the nearest one.
+    """For each vertex from ``first`` on the triangles of other layers that meet it: those that it
+    stands above, and the nearest one.
     """
     i = first + wp.tid()
-    reach = reaches[i]
-    p, q = layers.x[i], layers.rest[i]
-    box = wp.vec3(reach, reach, reach)
-    query = wp.mesh_query_aabb(layers.mesh, p - box, p + box)
-    nearest = reach
+    p, q, w = layers.x[i], layers.rest[i], layers.way[i]
+    box = wp.vec3(neighbourhood, neighbourhood, neighbourhood)
+    query = wp.bvh_query_aabb(layers.tree, wp.min(p, p + w) - box, wp.max(p, p + w) + box)
+    nearest = wp.float32(1.0e9)
     corners, weights, normal = wp.vec4i(), wp.vec4(), wp.vec3()
     inner = int(0)  # noqa: RUF046, UP018 - a variable to Warp
     layered[i] = 0
     f = int(0)  # noqa: RUF046, UP018
-    while wp.mesh_query_aabb_next(query, f):
-        a = wp.mesh_get_index(layers.mesh, 3 * f)
-        b = wp.mesh_get_index(layers.mesh, 3 * f + 1)
-        c = wp.mesh_get_index(layers.mesh, 3 * f + 2)
+    while wp.bvh_query_next(query, f):
+        a, b, c = layers.faces[f, 0], layers.faces[f, 1], layers.faces[f, 2]
         if i != a and i != b and i != c:
             x = layers.x
             on = _closest_on_triangle(p, x[a], x[b], x[c])
             away = p - (on[0] * x[a] + on[1] * x[b] + on[2] * x[c])
             distance = wp.length(away)
-            r = layers.rest
-            at_rest = wp.length(q - (on[0] * r[a] + on[1] * r[b] + on[2] * r[c]))
-            if _is_layer(distance, at_rest, neighbourhood, reach):
+            r, s = layers.rest, layers.along
+            at_rest = q - (on[0] * r[a] + on[1] * r[b] + on[2] * r[c])
+            along = s[i] - (on[0] * s[a] + on[1] * s[b] + on[2] * s[c])
+            v = layers.way
+            against = w - (on[0] * v[a] + on[1] * v[b] + on[2] * v[c])
+            if _is_layer(away, against, at_rest, along, neighbourhood):
                 layered[i] = 1
                 is_inner = wp.min(on[0], wp.min(on[1], on[2])) > 0.0
                 if is_inner:
@@ -137,7 +163,7 @@ def vertices_near(
 
 
 @wp.func
-def _edge_pair(layers: Layers, e: int, g: int, neighbourhood: float, reach: float, found: Found):
+def _edge_pair(layers: Layers, e: int, g: int, neighbourhood: float, found: Found):
     """Keeps the edges e and g, the lower number first, if they are a pair (nearest points: Ericson
     2005, section 5.1.9).
     """
@@ -158,7 +184,10 @@ def _edge_pair(layers: Layers, e: int, g: int, neighbourhood: float, reach: floa
             away = between + s * along - t * other
             distance = wp.length(away)
             at_rest = (1.0 - s) * r[i] + s * r[j] - (1.0 - t) * r[m] - t * r[n]
-            if _is_layer(distance, wp.length(at_rest), neighbourhood, reach):
+            w, u = layers.way, layers.along
+            against = (1.0 - s) * w[i] + s * w[j] - (1.0 - t) * w[m] - t * w[n]
+            differ = (1.0 - s) * u[i] + s * u[j] - (1.0 - t) * u[m] - t * u[n]
+            if _is_layer(away, against, at_rest, differ, neighbourhood):
                 _keep(
                     found,
                     wp.vec4i(i, j, m, n),
@@ -168,20 +197,20 @@ def _edge_pair(layers: Layers, e: int, g: int, neighbourhood: float, reach: floa
 
 
 @wp.kernel
-def edge_reaches(
+def edges_that_look(
     layers: Layers,
-    reaches: wp.array(dtype=float),  # [m] of the vertices
+    neighbourhood: float,
     layered: wp.array(dtype=int),  # as :func:`vertices_near` leaves it
-    of_edges: wp.array(dtype=float),  # receives them
+    looks: wp.array(dtype=int),  # receives 1 for each edge that looks for others
 ):
-    """How far each edge looks for others [m]: as its ends do, if one of them is near a layer, or
-    the edge is so long that its middle may be; else 0.
+    """An edge looks for others if a layer meets one of its ends, or it is so long that one may
+    meet its middle alone.
     """
     e = wp.tid()
     i, j = layers.edges[e, 0], layers.edges[e, 1]
-    reach = wp.max(reaches[i], reaches[j])
-    is_long = wp.length(layers.rest[i] - layers.rest[j]) > 2.0 * reach
-    of_edges[e] = wp.where(is_long or layered[i] + layered[j] > 0, reach, 0.0)
+    goes = wp.max(wp.length(layers.way[i]), wp.length(layers.way[j]))
+    is_long = wp.length(layers.rest[i] - layers.rest[j]) > 2.0 * (neighbourhood + goes)
+    looks[e] = wp.where(is_long or layered[i] + layered[j] > 0, 1, 0)
 
 
 @wp.kernel
@@ -189,25 +218,25 @@ def edges_near(
     first: int,
     layers: Layers,
     neighbourhood: float,
-    reaches: wp.array(dtype=float),  # [m] of the edges
+    looks: wp.array(dtype=int),  # as :func:`edges_that_look` leaves it
     found: Found,
 ):
-    """For each edge from ``first`` on that looks for others the edges of layers within its reach,
-    where both are nearest to each other between their ends.
+    """For each edge from ``first`` on that looks for others the edges of layers that meet it, where
+    both are nearest to each other between their ends.
     """
     e = first + wp.tid()
-    reach = reaches[e]
-    if reach == 0.0:
+    if looks[e] == 0:
         return
     i, j = layers.edges[e, 0], layers.edges[e, 1]
-    x = layers.x
-    box = wp.vec3(reach, reach, reach)
-    query = wp.mesh_query_aabb(layers.mesh, wp.min(x[i], x[j]) - box, wp.max(x[i], x[j]) + box)
+    a, b = layers.x[i], layers.x[j]
+    p, q = a + layers.way[i], b + layers.way[j]
+    box = wp.vec3(neighbourhood, neighbourhood, neighbourhood)
+    low, high = wp.min(wp.min(a, b), wp.min(p, q)), wp.max(wp.max(a, b), wp.max(p, q))
+    query = wp.bvh_query_aabb(layers.tree, low - box, high + box)
     f = int(0)  # noqa: RUF046, UP018
-    while wp.mesh_query_aabb_next(query, f):
+    while wp.bvh_query_next(query, f):
         for k in range(3):
             g = layers.edges_of[f, k]
-            other = reaches[g]
-            # each pair once: that which looks farther finds it
-            if layers.owner[g] == f and (other < reach or (other == reach and g > e)):
-                _edge_pair(layers, e, g, neighbourhood, reach, found)
+            # each pair once
+            if layers.owner[g] == f and (looks[g] == 0 or g > e):
+                _edge_pair(layers, e, g, neighbourhood, found)

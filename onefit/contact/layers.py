@@ -5,8 +5,13 @@ neighbours.
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import dijkstra
+
+from polyfit.mesh import components
 
 from . import layer_kernels
 from .layer_kernels import wp
@@ -14,6 +19,7 @@ from .planes import Contacts
 from .settings import ContactSettings
 
 _PARTS = 2  # in which pairs are looked for at once
+_STRAIGHT = 0.7  # of a way along the edges of a grid, at least, is as long as the straight one
 
 
 def _array(a, dtype):
@@ -21,9 +27,9 @@ def _array(a, dtype):
 
 
 class SelfContact:
-    """Contacts of a sheet with itself, of ``stiffness`` [N/m]: of vertices with triangles, and of
-    edges with edges. ``cut`` (N, 3) [m]: where it has no folds; ``faces`` (F, 3). The keys start at
-    ``first``, one a vertex.
+    """Contacts of a sheet with itself: of vertices with triangles, and of edges with edges, each
+    with the lesser ``stiffness`` (N,) [N/m] of its two sides. ``cut`` (N, 3) [m]: where the sheet
+    has no folds; ``faces`` (F, 3). The keys start at ``first``, one a vertex.
     """
 
     def __init__(
@@ -31,7 +37,7 @@ class SelfContact:
         cut: np.ndarray,
         faces: np.ndarray,
         settings: ContactSettings,
-        stiffness: float,
+        stiffness: np.ndarray,
         first: int,
     ) -> None:
         self.settings, self.first, self.stiffness = settings, first, stiffness
@@ -42,15 +48,19 @@ class SelfContact:
         layers = layer_kernels.Layers()
         layers.x = _array(rest.copy(), wp.vec3)
         layers.rest = _array(rest, wp.vec3)
+        layers.along = _array(_along(cut, edges).astype(np.float32), wp.vec4)
         layers.edges = _array(edges.astype(np.int32), int)
         layers.edges_of = _array(number.reshape(-1, 3).astype(np.int32), int)
         layers.owner = _array((owner // 3).astype(np.int32), int)
-        self._mesh = wp.Mesh(layers.x, _array(faces.ravel().astype(np.int32), int))
-        layers.mesh = self._mesh.id
+        layers.faces = _array(faces.astype(np.int32), int)
+        layers.way = _array(np.zeros_like(rest), wp.vec3)
+        corners = rest[faces]
+        self._boxes = [_array(c, wp.vec3) for c in (corners.min(1), corners.max(1))]
+        self._tree = wp.Bvh(*self._boxes)
+        layers.tree = self._tree.id
         self._layers = layers
-        self._reaches = wp.zeros(len(rest), dtype=float, device="cpu")
         self._layered = wp.zeros(len(rest), dtype=int, device="cpu")
-        self._edge_reaches = wp.zeros(len(edges), dtype=float, device="cpu")
+        self._looks = wp.zeros(len(edges), dtype=int, device="cpu")
         self._found = [_room(len(rest)) for _ in range(_PARTS)]
         self._before = np.zeros(0, np.dtype((np.void, 20))), np.zeros((0, 3))  # keys and normals
         self._others = ThreadPoolExecutor(_PARTS - 1)
@@ -60,21 +70,19 @@ class SelfContact:
         was asked last. A vertex looks as far as its ``way`` (N, 3) [m] in the step leads it against
         the others, and a little farther.
         """
-        self._layers.x.numpy()[:] = x
-        self._mesh.refit()
-        way = np.broadcast_to(way, x.shape)
-        goes = np.linalg.norm(way - way.mean(0), axis=1)
-        self._reaches.numpy()[:] = np.minimum(self._neighbourhood + goes, self.settings.reach)
+        layers, launch = self._layers, partial(wp.launch, device="cpu")
+        layers.x.numpy()[:] = x
+        layers.way.numpy()[:] = way - np.broadcast_to(way, x.shape).mean(0)
+        launch(layer_kernels.boxes, len(layers.faces), [layers, *self._boxes])
+        self._tree.refit()
+        near = self._neighbourhood
         while True:
             for found in self._found:
                 found.count.numpy()[:] = 0
-            near = self._neighbourhood, self._reaches, self._layered
-            self._search(layer_kernels.vertices_near, len(x), *near)
-            edges = self._layers.edges.shape[0]
-            arguments = [self._layers, self._reaches, self._layered, self._edge_reaches]
-            wp.launch(layer_kernels.edge_reaches, edges, arguments, device="cpu")
-            of_edges = self._neighbourhood, self._edge_reaches
-            self._search(layer_kernels.edges_near, edges, *of_edges)
+            self._search(layer_kernels.vertices_near, len(x), near, self._layered)
+            looking = [layers, near, self._layered, self._looks]
+            launch(layer_kernels.edges_that_look, len(self._looks), looking)
+            self._search(layer_kernels.edges_near, len(self._looks), near, self._looks)
             counts = [int(found.count.numpy()[0]) for found in self._found]
             if all(count <= len(found.corners) for count, found in zip(counts, self._found)):
                 break
@@ -85,9 +93,9 @@ class SelfContact:
         )
         self._keep_sides(corners, weights, normal)
         offset, still = np.full(len(corners), self.settings.apart), np.zeros((len(corners), 3))
-        key = self.first + corners[:, 0]
+        key, stiffness = self.first + corners[:, 0], self.stiffness[corners[:, [0, 3]]].min(1)
         return Contacts(
-            key, corners, weights.astype(float), normal.astype(float), offset, still, self.stiffness
+            key, corners, weights.astype(float), normal.astype(float), offset, still, stiffness
         )
 
     def _keep_sides(self, corners, weights, normal):
@@ -118,6 +126,22 @@ class SelfContact:
         part(0)
         for other in others:
             other.result()
+
+
+def _along(cut, edges):
+    """How far the vertices (N, 3) [m] of a sheet with ``edges`` (E, 2) are from four of them along
+    the sheet, (N, 4) [m], or less; each is the farthest from those before it, in its own part.
+    """
+    count = len(cut)
+    long = np.linalg.norm(cut[edges[:, 0]] - cut[edges[:, 1]], axis=1)
+    graph = coo_matrix((long, edges.T), (count, count)).tocsr()
+    part = components(count, edges)
+    ends, found = np.unique(part, return_index=True)[1], []
+    for _ in range(5):
+        found.append(dijkstra(graph, directed=False, indices=ends, min_only=True))
+        order = np.lexsort([np.min(found, axis=0), part])
+        ends = order[np.flatnonzero(np.diff(part[order], append=-1))]
+    return _STRAIGHT * np.stack(found[1:], 1)  # the first lies anywhere
 
 
 def _room(size):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,7 +13,7 @@ class Contacts:
     ``weights`` (C, 4): the point sum_i w_i x_i, or, where the weights sum to zero, the vector from
     one point of the sheet to another; the plane's ``normal`` (C, 3) and ``offset`` (C,)
     [m], so that the gap is normal . point - offset; ``moved`` (C, 3) [m], by what the other side
-    moved in the step; ``stiffness`` [N/m] of each.
+    moved in the step; ``stiffness`` (C,) [N/m].
     """
 
     key: np.ndarray
@@ -22,12 +22,11 @@ class Contacts:
     normal: np.ndarray
     offset: np.ndarray
     moved: np.ndarray
-    stiffness: float
+    stiffness: np.ndarray
 
     def of(self, which: np.ndarray) -> Contacts:
         """Those of the contacts ``which`` (C,) says."""
-        arrays = {name: a[which] for name, a in vars(self).items() if name != "stiffness"}
-        return replace(self, **arrays)
+        return Contacts(*(a[which] for a in vars(self).values()))
 
 
 def weighted(x: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -38,10 +37,10 @@ def weighted(x: np.ndarray, weights: np.ndarray) -> np.ndarray:
 class ThreadContact:
     """Threads between two places of a sheet, from the vertex ``start`` (S,) to the point
     ``barycentric`` (S, 3) of a triangle with ``corners`` (S, 3): no longer than ``lengths`` (S,)
-    [m]. The keys start at ``first``, one a thread.
+    [m], with a ``stiffness`` (S,) [N/m]. The keys start at ``first``, one a thread.
     """
 
-    def __init__(self, start, corners, barycentric, lengths, stiffness: float, first: int) -> None:
+    def __init__(self, start, corners, barycentric, lengths, stiffness, first: int) -> None:
         self.corners = np.column_stack([start, corners])
         self.weights = np.column_stack([np.ones(len(start)), -barycentric])
         self.lengths, self.stiffness = lengths, stiffness

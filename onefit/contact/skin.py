@@ -130,10 +130,12 @@ class SkinContact:
         self._wp.launch(self._kernels.pushed_out, 1, arguments, device="cpu")
         return self._push.numpy()
 
-    def follow(self, surface: ClosestSurface, bodies: np.ndarray, stiffness: float) -> Contacts:
-        """The body moves to ``bodies`` (V, 3) [m], and its ``surface`` with it; the contacts, of
-        ``stiffness`` [N/m], of the step in which it does, after a :meth:`look`: each point that
-        touches is held in front of the plane of its triangle.
+    def follow(
+        self, surface: ClosestSurface, bodies: np.ndarray, stiffness: np.ndarray
+    ) -> Contacts:
+        """The body moves to ``bodies`` (V, 3) [m], and its ``surface`` with it; the contacts of the
+        step in which it does, after a :meth:`look`: each point that touches is held in front of the
+        plane of its triangle, with its ``stiffness`` (P,) [N/m].
         """
         before = self._array(surface.vertices, self._wp.vec3)
         surface.follow(bodies)
@@ -143,4 +145,4 @@ class SkinContact:
         near = np.flatnonzero(self.touched[0].numpy() >= 0)
         corners, weights = self.corners[near], self.weights[near]
         normal, offset, moved = (a.numpy()[near].astype(float) for a in self._planes)
-        return Contacts(near, corners, weights, normal, offset, moved, stiffness)
+        return Contacts(near, corners, weights, normal, offset, moved, stiffness[near])

@@ -200,7 +200,7 @@ class Draper:
         motion: _Moving,
         shape: torch.Tensor | None = None,
         *,
-        material: Material | str = "cotton",
+        material: Material | str | Sequence[Material | str] = "cotton",
         steps: int = 2,
         settings: Settings | None = None,
         advance: Callable[[], object] = lambda: None,
@@ -211,15 +211,16 @@ class Draper:
         ``advance`` as in :meth:`drape`. Garments of a list are one sheet, and feel each other.
 
         ``material``: one of :data:`onefit.physics.MATERIALS` by its name, or a
-        :class:`onefit.physics.Material`. ``steps`` a frame, two are enough, solved as
-        :class:`onefit.physics.Settings` say. Raises InputError, also for a material that there is
-        not.
+        :class:`onefit.physics.Material`; a list has one for each garment. ``steps`` a frame, two
+        are enough, solved as :class:`onefit.physics.Settings` say. Raises InputError, also for a
+        material that there is not, and for another number of materials than of garments.
         """
         from .simulation import simulated
 
         if steps < 1:
             raise InputError(f"steps = {steps}; steps a frame, 1 or more")
-        material, settings = Material.named(material), settings or Settings()
+        settings = settings or Settings()
+        materials = Material.of_each(material, len(outfit.several(garment)))
         worn = self._worn(garment, motion, shape)
         body, moved = worn[0].body, worn[0].motion
         led = moved.led_in(body, settings.lead)
@@ -242,12 +243,14 @@ class Draper:
             torch.cat(outfit.in_order(guides, faces), 1), torch.cat(rests),
             bodies=moving, body_faces=body.faces.cpu(),
             held=np.concatenate([self._held(one) for one in garments]),
-            material=material, steps=steps, fps=FPS, settings=settings, first=first,
+            material=materials, of=np.repeat(np.arange(len(faces)), [len(f) for f in faces]),
+            steps=steps, fps=FPS, settings=settings, first=first,
             patches=outfit.numbered(patches), **outfit.joined(garments, rests),
         )  # fmt: skip
         vertices = torch.stack([(frame, advance())[0] for frame in made])
         parts = vertices.split([len(rest) for rest in rests], 1)
-        drapes = [self._drape_of(w, x, moving[first:], material) for w, x in zip(worn, parts)]
+        each = zip(worn, parts, materials)
+        drapes = [self._drape_of(w, x, moving[first:], m) for w, x, m in each]
         return drapes if isinstance(garment, list | tuple) else drapes[0]
 
     def _worn(self, garment, motion, shape):

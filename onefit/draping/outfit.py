@@ -11,7 +11,7 @@ import torch
 
 from onefit.body import ClosestSurface
 from onefit.contact import SkinContact
-from onefit.garment import Stitches
+from onefit.garment import Stitches, untangled
 from polyfit import mesh
 from polyfit.errors import InputError
 
@@ -80,7 +80,8 @@ def several(garments: Any) -> list[Any]:
 def let_out(garments: Sequence[Garment], rests: Sequence[torch.Tensor]) -> list[torch.Tensor]:
     """The vertices of the garments at ``rests`` (N, 3) [m] each, graded once more, by what is worn
     under them: each is pushed out of those before it as the garment of a file is pushed out of the
-    body. Raises InputError where one does not go over another.
+    body, and smoothed where its folds come through each other then. Raises InputError where one
+    does not go over another.
     """
     made: list[torch.Tensor] = []
     under: list[Under] = []
@@ -88,10 +89,12 @@ def let_out(garments: Sequence[Garment], rests: Sequence[torch.Tensor]) -> list[
         x, faces = rest.detach().float().cpu().clone(), garment.faces.cpu().numpy()
         if under:
             skin = SkinContact(x.numpy(), faces, _AT_REST, **pushes(**_MADE))
+            for layer in under:
+                for _ in range(_LOOKS):
+                    skin.look(x, layer.surface)
+                    skin.push_out(x, layer.surface)
+            x = torch.as_tensor(untangled(x.double().numpy(), faces)).float()
         for other, layer in zip(garments, under):
-            for _ in range(_LOOKS):
-                skin.look(x, layer.surface)
-                skin.push_out(x, layer.surface)
             inside = 100 * float(np.mean(layer.surface(x.numpy()).distance < 0))
             if inside > _MOST_INSIDE:
                 raise InputError(

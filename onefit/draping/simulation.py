@@ -6,7 +6,7 @@ it is weakly drawn to; all else are the material, the air, the moving body and t
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import torch
@@ -25,7 +25,7 @@ def simulated(
     bodies: torch.Tensor,
     body_faces: torch.Tensor,
     *,
-    material: Material,
+    material: Material | Sequence[Material],
     steps: int,
     fps: float,
     settings: Settings | None = None,
@@ -34,12 +34,14 @@ def simulated(
     cut: np.ndarray | None = None,
     stitches: Stitches | None = None,
     patches: np.ndarray | None = None,
+    of: np.ndarray | None = None,
 ) -> Iterator[torch.Tensor]:
     """The garment's vertices (N, 3) [m] in one frame after the other, from the ``first`` on: those
     before lead to it, and are not given.
 
     ``guide`` (T, N, 3) [m]: the drape that leads the cloth; ``rest`` (N, 3) [m] and ``faces``
-    (F, 3) of the garment graded to the body; ``held`` (N,): how firmly each vertex is held, as
+    (F, 3) of the garment graded to the body, of a ``material``, or of several, of which ``of`` (F,)
+    says each face's; ``held`` (N,): how firmly each vertex is held, as
     :func:`onefit.garment.waistband.held` says; ``bodies`` (T, V, 3) [m], ``body_faces``; ``steps``
     in a frame, in which the body moves along straight lines; ``sides`` (F, 3) [m]: the lengths of
     the faces at rest, and ``cut`` (N, 3) [m], of a garment that was cut otherwise than it hangs;
@@ -49,7 +51,7 @@ def simulated(
     order = _order(faces.numpy(), len(rest))
     number = np.argsort(order)
     cut = None if cut is None else cut[order]
-    sheet = Sheet(rest.double().numpy()[order], number[faces.numpy()], material, sides, cut)
+    sheet = Sheet(rest.double().numpy()[order], number[faces.numpy()], material, sides, cut, of)
     start, moving = guide.double().numpy()[:, order], bodies.numpy()
     threads = None
     if stitches:
@@ -58,7 +60,7 @@ def simulated(
     of = None if patches is None else patches[order]
     worn = WornCloth(sheet, start[0], moving[0], body_faces.numpy(), settings, of, threads)
     cloth, dt = worn.cloth, 1 / fps / steps
-    pull = settings.draw * sheet.mass + material.stretch * np.asarray(held)[order]
+    pull = settings.draw * sheet.mass + sheet.firmness * np.asarray(held)[order]
 
     def step(now, target):
         worn.step(dt, now, target, pull)

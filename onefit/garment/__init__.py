@@ -10,7 +10,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "alignment": ["aligned", "pose_of"],
         "binding": ["cotangent_laplacian", "smoother", "standard_body", "standard_surface"],
         "charts": ["FRAMES", "Deformation", "PatchedGarment", "SparseMatrix"],
-        "fitting": ["placed"],
+        "fitting": ["placed", "untangled"],
         "garment": ["FOLDER", "Garment", "LOOSE", "TEMPLATES"],
         "reading": ["RenderMesh", "Stitches", "parts"],
     },

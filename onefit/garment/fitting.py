@@ -15,6 +15,7 @@ import torch
 
 from onefit.body import skeleton, skinning
 from onefit.contact import ContactSettings
+from onefit.objective import crossing_faces
 from polyfit import mesh
 from polyfit.errors import InputError
 
@@ -42,6 +43,7 @@ UNITS = {
 T_POSE = "T-pose"
 _GROUND_OFFSET = np.array([0.0, 0.0, -0.82])  # from a world in which the body stands at z = 0 [m]
 _TRIAL_VERTICES = 400  # vertices that places are tried on
+_SMOOTHINGS = 30  # of cloth that passes through itself, at most
 
 
 def placed(V, scale=1.0, up="z", turn=0.0, offset=(0.0, 0.0, 0.0)):
@@ -350,3 +352,20 @@ def standard_on(body):
         _correspondences[key] = body.faces.numpy()[found.face], found.barycentric.astype(np.float64)
     corners, barycentric = _correspondences[key]
     return np.einsum("nk,nkd->nd", barycentric, vertices[corners])
+
+
+def untangled(V, F):
+    """Vertices ``V`` (N, 3) [m] of cloth with faces ``F`` (F, 3) whose layers came through each
+    other, when it was brought to another body or over another garment: smoothed there, as long as
+    it takes.
+    """
+    mean = mesh.neighbour_mean(F, len(V), boundary_apart=True)
+    for _ in range(_SMOOTHINGS):
+        through = crossing_faces(V, F)
+        if not len(through):
+            break
+        near = np.zeros(len(V))
+        near[F[through]] = 1
+        share = np.minimum(1, near + mean @ near)[:, None] / 2
+        V = V + share * (mean @ V - V)
+    return V

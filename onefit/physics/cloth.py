@@ -27,7 +27,12 @@ class _Touch:
     def __init__(self, contacts: Contacts, drag: np.ndarray) -> None:
         c, self.contacts, self.drag, count = contacts, contacts, drag, len(contacts.key)
         self.arrays = [ints(c.corners), reals(c.weights), reals(c.normal, kernels.vec3)]
-        self.arrays += [reals(c.offset), reals(c.moved, kernels.vec3), c.stiffness, reals(drag)]
+        self.arrays += [
+            reals(c.offset),
+            reals(c.moved, kernels.vec3),
+            reals(c.stiffness),
+            reals(drag),
+        ]
         gap, slip = reals(np.zeros(count)), reals(np.zeros(count))
         self.found = [gap, slip, reals(np.zeros((count, 3, 3)), kernels.mat3)]
         self.gap, self.slip, self.block = (a.numpy() for a in self.found)
@@ -63,6 +68,7 @@ class Cloth:
         self.load, self.slip = np.zeros(keys), np.zeros(keys)  # [N], [m] in the last step
         self.iterations = 0  # of the last step
         self._forced = np.zeros_like(self.x)  # by what forces moved the cloth in the last step
+        self._dt = 0.0  # [s], of the last step
         N, E, F, H = len(sheet), sheet.edges, sheet.faces, sheet.hinges
         of_face, self._face_parts = _in_halves(F, N)
         of_hinge, self._hinge_parts = _in_halves(H, N)
@@ -77,7 +83,6 @@ class Cloth:
         of_faces = np.stack([at(F[:, a], F[:, b]) for a in range(3) for b in range(3)], 1)
         of_hinges = [at(H[:, i], H[:, i]) for i in range(4)]
         of_hinges += [at(H[:, p], H[:, q]) for p, q in beside]
-        material = sheet.material
         first = np.searchsorted(where // N, np.arange(N + 1))
         self._solver = Solver(first, where % N, patches)
         self._middle = ints(self._solver.middle)
@@ -85,16 +90,18 @@ class Cloth:
         angles, stiffness = sheet.angles[of_hinge], sheet.stiffness[of_hinge]
         self._hinges = ints(H), reals(angles), reals(stiffness)
         self._of_hinges = ints(np.stack(of_hinges, 1).reshape(-1, 14))
-        gradients, weight = sheet.gradients[of_face], material.stretch * sheet.area[of_face]
+        gradients, weight = sheet.gradients[of_face], (sheet.stretch * sheet.area)[of_face]
         self._stretch = reals(gradients, kernels.vec2), reals(weight)
+        self._drag = reals(sheet.drag[of_face] * AIR / 2)
         self._vectors = [reals(np.zeros((N, 3)), kernels.vec3) for _ in range(4)]
         self._springs = reals(np.zeros(N))
         self._other = ThreadPoolExecutor(1)  # a second thread
 
     def touches(self, contacts: Sequence[Contacts], dt: float) -> list[_Touch]:
         """The ``contacts`` of a step of ``dt`` [s], as :meth:`assemble` takes them."""
-        slow, friction = self.settings.contact.sticking * dt, self.sheet.material.friction
-        drag = lambda c: friction * self.load[c.key] / np.maximum(self.slip[c.key], slow)
+        slow = self.settings.contact.sticking * dt
+        friction = lambda c: self.sheet.friction[c.corners[:, [0, 3]]].mean(1)  # of the two sides
+        drag = lambda c: friction(c) * self.load[c.key] / np.maximum(self.slip[c.key], slow)
         return [_Touch(c, drag(c)) for c in contacts]
 
     def assemble(
@@ -115,7 +122,7 @@ class Cloth:
         into = [force, self._solver.block]
         launch = lambda kernel, size, arguments: wp.launch(kernel, size, arguments, device="cpu")
         launch(kernels.springs, len(y), [self._springs, self._middle, into[1]])
-        air = [self.sheet.material.drag * AIR / 2, dt, self._of_faces]
+        air = [self._drag, dt, self._of_faces]
         energies = [
             (kernels.bending, self._hinge_parts, [x, *self._hinges, self._of_hinges]),
             (kernels.stretching, self._face_parts, [x, self._faces, *self._stretch, air[2]]),
@@ -161,6 +168,8 @@ class Cloth:
         """One step of ``dt`` [s]. Each vertex is pulled to ``target`` (N, 3) [m] by springs of
         stiffness ``pull`` (N,) [N/m].
         """
+        longer = dt / self._dt if self._dt else 1.0
+        self._forced, self.slip, self._dt = longer**2 * self._forced, longer * self.slip, dt
         y = self.flight(dt)
         pull = np.broadcast_to(pull, len(y))
         target = y if target is None else target

@@ -148,7 +148,7 @@ def drag(
     before: wp.array(dtype=vec3),
     velocity: wp.array(dtype=vec3),  # at the start of the step [m/s]
     faces: wp.array2d(dtype=int),
-    coefficient: real,  # drag * density of the air / 2 [kg/m^3]
+    coefficient: wp.array(dtype=real),  # (F,): drag * density of the air / 2 [kg/m^3]
     dt: real,
     blocks: wp.array2d(dtype=int),
     force: wp.array(dtype=vec3),
@@ -164,7 +164,7 @@ def drag(
     n = normal / wp.max(double, real(1.0e-12))
     third = real(1.0) / real(3.0)
     speed = third * wp.abs(wp.dot(velocity[a] + velocity[b] + velocity[c], n))
-    k = coefficient * real(0.5) * double * speed * third / dt
+    k = coefficient[f] * real(0.5) * double * speed * third / dt
     moved = third * wp.dot(x[a] - before[a] + x[b] - before[b] + x[c] - before[c], n)
     nn = wp.outer(n, n)
     for i in range(3):
@@ -191,7 +191,7 @@ def contact(
     normal: wp.array(dtype=vec3),
     offset: wp.array(dtype=real),  # [m]; the gap is normal . sum_i weight_i x_i - offset
     moved: wp.array(dtype=vec3),  # [m]; by what the other side of the contact moved in the step
-    stiffness: real,  # [N/m]
+    stiffness: wp.array(dtype=real),  # (C,) [N/m]
     drag: wp.array(dtype=real),  # [N/m]; friction for a unit slip
     middle: wp.array(dtype=int),
     gap: wp.array(dtype=real),  # receives the gap [m]
@@ -219,7 +219,7 @@ def contact(
     slip[c] = wp.length(slid)
     k = real(0.0)
     if gap[c] < real(0.0):
-        k = stiffness
+        k = stiffness[c]
     if k + drag[c] > real(0.0):
         g = k * gap[c] * n + drag[c] * slid
         nn = wp.outer(n, n)

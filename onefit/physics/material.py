@@ -17,6 +17,7 @@ linearity LT (a curve F ~ strain^n has LT = 2 / (n + 1)) it is P / (EM (P / 490)
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from polyfit.errors import InputError
@@ -71,6 +72,22 @@ class Material:
         if str(name) not in MATERIALS:
             raise InputError(f"material '{name}': choose among {', '.join(MATERIALS)}")
         return MATERIALS[str(name)]
+
+    @classmethod
+    def of_each(
+        cls, material: str | Material | Sequence[str | Material], count: int
+    ) -> list[Material]:
+        """Those of so many garments (``count``): each :meth:`named` in a list, or one for all.
+        Raises InputError, also where a list has another number of them.
+        """
+        if isinstance(material, str | Material):
+            return [cls.named(material)] * count
+        if len(material) != count:
+            raise InputError(
+                f"{len(material)} materials for {count} garment{'s' * (count > 1)}; give one for"
+                " each, in their order, or one for all"
+            )
+        return [cls.named(one) for one in material]
 
 
 # EM %, LT; B gf cm^2/cm; bending length mm

@@ -18,6 +18,8 @@ class Settings:
     distance. ``lead`` [s]: how long the body takes, before the motion, from its rest, in which
     garments are made, to the first pose; ``settling`` [s]: how long that is held then, for the
     cloth to come to rest. In each step of both, velocities are multiplied by ``damping``.
+    ``stride`` [m]: by how much layers of cloth may fly towards each other in a step; where they
+    would by more it is cut into parts, at most ``parts``. It is about the length of an edge.
     """
 
     newton: int = 2
@@ -27,9 +29,15 @@ class Settings:
     lead: float = 0.6
     settling: float = 0.4
     damping: float = 0.9
+    stride: float = 0.015
+    parts: int = 4
     contact: ContactSettings = field(default_factory=ContactSettings)
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if name != "contact" and not 0 <= value < float("inf"):
                 raise InputError(f"{name} = {value}: a number, 0 or more")
+        if not self.stride or self.parts < 1:
+            raise InputError(
+                f"stride = {self.stride}, parts = {self.parts}: above 0, and 1 or more"
+            )

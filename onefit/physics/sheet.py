@@ -7,6 +7,8 @@ Points stand first and frames second, (N, T, 3), as in :mod:`onefit.objective`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 
@@ -18,13 +20,16 @@ _LEAST = 1e-12  # of the roots below, so that a degenerate triangle has a gradie
 
 
 class Sheet:
-    """``rest`` (N, 3) [m] and ``faces`` (F, 3), arrays, of ``material``. With ``sides`` (F, 3) [m],
+    """``rest`` (N, 3) [m] and ``faces`` (F, 3), arrays, of ``material``, or of several, of which
+    ``of`` (F,) says each face's. With ``sides`` (F, 3) [m],
     from each corner of a face to the next, the lengths at rest are these, not those of ``rest``,
     and the sheet rests flat: cloth that hangs in folds, as it was cut; NaN: of this face they are
     those of ``rest``, as its angles are. ``cut`` (N, 3) [m] is where it has no folds yet, so that
     only neighbours are near to each other.
 
-    ``area`` (F,) [m^2]; ``mass`` (N,) [kg]; ``gradients`` (F, 3, 2) [1/m], those of the three
+    ``stretch`` and ``drag`` (F,) are the materials' numbers, ``firmness`` [N/m] and ``friction``
+    (N,) those of stretch and friction at the vertices; ``area`` (F,) [m^2]; ``mass`` (N,) [kg];
+    ``gradients`` (F, 3, 2) [1/m], those of the three
     corners' hat functions in the plane of the triangle, so that F = sum_a x_a g_a^T is the
     deformation gradient; ``hinges`` (H, 4): the ends of an inner edge and the corners opposite to
     it, of the face that has the edge in this sense and of the other; ``angles`` (H,) [rad], those
@@ -35,11 +40,14 @@ class Sheet:
         self,
         rest: np.ndarray,
         faces: np.ndarray,
-        material: Material,
+        material: Material | Sequence[Material],
         sides: np.ndarray | None = None,
         cut: np.ndarray | None = None,
+        of: np.ndarray | None = None,
     ) -> None:
-        self.material = material
+        materials = [material] if isinstance(material, Material) else list(material)
+        made_of = np.zeros(len(faces), dtype=int) if of is None else np.asarray(of)
+        each = lambda name: np.array([float(getattr(m, name)) for m in materials])[made_of]
         self.rest = np.asarray(rest, dtype=np.float64)
         self.faces = np.asarray(faces, dtype=np.int64)
         self.cut = self.rest if cut is None else np.asarray(cut, dtype=np.float64)
@@ -50,15 +58,20 @@ class Sheet:
         inverse = np.linalg.inv(flat)
         self.gradients = np.concatenate([-inverse.sum(1, keepdims=True), inverse], 1)
         self.area = np.linalg.det(flat) / 2
-        share = np.repeat(material.density * self.area / 3, 3)
+        self.stretch, self.drag = each("stretch"), each("drag")
+        self.firmness, self.friction = np.zeros(len(self.rest)), np.zeros(len(self.rest))
+        self.firmness[self.faces] = self.stretch[:, None]
+        self.friction[self.faces] = each("friction")[:, None]
+        share = np.repeat(each("density") * self.area / 3, 3)
         self.mass = np.bincount(self.faces.ravel(), share, len(self.rest))
         self.edges = mesh.edges_of(self.faces)[0]
-        self.hinges, of = _hinges(self.faces)
-        squared = self.sides.ravel()[of[:, 0]] ** 2
-        self.stiffness = material.bending * squared / self.area[of // 3].sum(1)
+        self.hinges, side = _hinges(self.faces)
+        squared = self.sides.ravel()[side[:, 0]] ** 2
+        bending = each("bending")[side[:, 0] // 3]
+        self.stiffness = bending * squared / self.area[side // 3].sum(1)
         self.angles = _hinge_angles(torch.as_tensor(self.rest)[:, None], self.hinges)[:, 0].numpy()
         if sides is not None:
-            self.angles[~np.isnan(np.ravel(sides)[of[:, 0]])] = 0
+            self.angles[~np.isnan(np.ravel(sides)[side[:, 0]])] = 0
 
     def __len__(self) -> int:
         return len(self.rest)
@@ -108,8 +121,8 @@ def stretching(x, sheet):
     trace = C[..., 0, 0] + C[..., 1, 1]
     det = C[..., 0, 0] * C[..., 1, 1] - C[..., 0, 1].square()
     squared = trace - 2 * (trace + 2 * det.clamp(min=_LEAST).sqrt()).sqrt() + 2
-    area = torch.as_tensor(sheet.area).to(x)
-    return sheet.material.stretch / 2 * (area[:, None] * squared).sum(0)
+    weight = torch.as_tensor(sheet.stretch * sheet.area / 2).to(x)
+    return (weight[:, None] * squared).sum(0)
 
 
 def _hinge_angles(x, hinges):

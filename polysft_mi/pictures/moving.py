@@ -1,12 +1,14 @@
-"""What the viewer shows: a run, ended or still at work, or a drape, as one moving surface."""
+"""What the viewer shows: a run, ended or still at work, or drapes, as one moving surface."""
 
 from __future__ import annotations
 
+import glob
 import os
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import cycle
 
 import numpy as np
 
@@ -21,7 +23,7 @@ from polysft_mi.scene import located, open_cameras
 from .panels import residual_at_vertices
 
 _GREY = (176, 176, 176)
-_CLOTH = (106, 141, 182)
+_CLOTH = (106, 141, 182), (182, 112, 84), (104, 152, 112), (186, 164, 92)  # of the garments
 
 
 @dataclass(frozen=True)
@@ -78,8 +80,7 @@ class Source:
         self.folder = os.fspath(folder)
         self._problem = None  # of a run at work
         self._stamp: list[int | None] = []
-        drape = os.path.isfile(self._path("drape.npz"))
-        if not drape and not os.path.isfile(self._path("run.json")):
+        if not _drapes(self.folder) and not os.path.isfile(self._path("run.json")):
             what = "is not the folder of a run or of a drape (it holds no run.json, no drape.npz)"
             raise InputError(
                 f"{folder}: {what if os.path.isdir(self.folder) else 'no such folder'}"
@@ -90,9 +91,10 @@ class Source:
 
     def _stamps(self):
         found = []
-        for name in ("metrics.json", "checkpoint.npz", "drape.npz"):
+        own = (self._path(name) for name in ("metrics.json", "checkpoint.npz"))
+        for path in (*own, *_drapes(self.folder)):
             try:
-                found.append(os.stat(self._path(name)).st_mtime_ns)
+                found.append(os.stat(path).st_mtime_ns)
             except OSError:
                 found.append(None)
         return found
@@ -106,8 +108,8 @@ class Source:
         for until its end its folder holds nothing but unknowns.
         """
         stamp = self._stamps()
-        if os.path.isfile(self._path("drape.npz")):
-            found = _of_drape(self.folder)
+        if drapes := _drapes(self.folder):
+            found = _of_drapes(drapes)
         elif os.path.isfile(self._path("metrics.json")):  # which a run writes last
             found, self._problem = _of_run(Run.open(self.folder)), None
         else:
@@ -220,22 +222,43 @@ def _cameras(scene, intrinsics, images, further):
     return found
 
 
-def _of_drape(folder: str) -> Moving:
-    """What onefit.drape or onefit.simulate left in a folder: the cloth, and the body under it."""
-    path = os.path.join(folder, "drape.npz")
-    a = load_npz(path)
-    missing = [n for n in ("vertices", "faces", "body", "body_faces", "fps") if n not in a]
-    if missing:
-        raise InputError(f"{path}: holds no {', '.join(missing)}; it is not the file of a drape")
-    kind = "mesh_" if "mesh_vertices" in a else ""  # that of the garment's file
-    vertices, count = a[f"{kind}vertices"], len(a["vertices"])
+def _drapes(folder: str) -> list[str]:
+    """The drape.npz of a folder: its own, or those of an outfit's garments, each in a folder of its
+    own, in the order in which they are put on.
+    """
+    own = os.path.join(folder, "drape.npz")
+    garments = os.path.join(glob.escape(folder), "[1-9]_*", "drape.npz")
+    return [own] if os.path.isfile(own) else sorted(glob.glob(garments))
+
+
+def _of_drapes(paths: list[str]) -> Moving:
+    """What onefit.drape or onefit.simulate left in files: all cloth, and the body under it."""
+    meshes, colours, count = [], [], 0
+    for path, colour in zip(paths, cycle(_CLOTH)):
+        a = load_npz(path)
+        missing = [n for n in ("vertices", "faces", "body", "body_faces", "fps") if n not in a]
+        if missing:
+            raise InputError(
+                f"{path}: holds no {', '.join(missing)}; it is not the file of a drape"
+            )
+        kind = "mesh_" if "mesh_vertices" in a else ""  # that of the garment's file
+        meshes.append((a[f"{kind}vertices"], a[f"{kind}faces"] + count))
+        if len(meshes[-1][0]) != len(meshes[0][0]):
+            raise InputError(
+                f"{path}: {len(meshes[-1][0])} frames, where {paths[0]} has {len(meshes[0][0])};"
+                " they are not of one outfit"
+            )
+        count += meshes[-1][0].shape[1]
+        colours.append(np.tile(np.array(colour, np.uint8), (meshes[-1][0].shape[1], 1)))
+    vertices, faces = (np.concatenate(parts, k) for parts, k in zip(zip(*meshes), (1, 0)))
+    rgb = np.concatenate(colours)[None]
     return Moving(
         vertices,
-        a[f"{kind}faces"],
-        np.arange(count),
+        faces,
+        np.arange(len(vertices)),
         float(a["fps"]),
-        f"{count} frames",
-        colourings={"cloth": partial(_plain, vertices.shape[1], _CLOTH)},
+        f"{len(vertices)} frames" + (f", {len(paths)} garments" if paths[1:] else ""),
+        colourings={"cloth": lambda: Colouring(rgb, "")},
         body=(a["body"], a["body_faces"]),
     )
 

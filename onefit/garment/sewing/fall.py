@@ -23,7 +23,7 @@ def fallen(cut, seconds=SECONDS):
     sheet = Sheet(cut.start, cut.faces, Material.named(_MATERIAL), cut.sides, cut.vertices)
     surface, faces = body.vertices.numpy(), body.faces.numpy()
     worn = WornCloth(sheet, cut.start, surface, faces, SETTINGS)
-    pull = sheet.material.stretch * held(cut.start, cut.faces, body.joints.double().numpy())
+    pull = sheet.firmness * held(cut.start, cut.faces, body.joints.double().numpy())
     for _ in range(round(seconds / STEP)):
         worn.step(STEP, surface, cut.start, pull)
         worn.cloth.v *= _SLOWING

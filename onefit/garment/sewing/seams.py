@@ -18,11 +18,10 @@ import torch
 
 from onefit.body import AnnyBody, Body, skeleton, skinning
 from onefit.garment.binding import surface_of
-from onefit.garment.fitting import inward, misfit, pushed_out, to_standard
+from onefit.garment.fitting import inward, misfit, pushed_out, to_standard, untangled
 from onefit.garment.waistband import held
-from onefit.objective import crossing_faces, crossings
+from onefit.objective import crossings
 from onefit.physics import Material, Settings, Sheet, WornCloth
-from polyfit import mesh
 from polyfit.errors import InputError
 
 from . import specification
@@ -45,7 +44,6 @@ _SETTINGS = Settings(iterations=30, tolerance=1e-3, contact=CONTACT)
 # in the first and in the second half
 _CLOSING, _FIRST, _GROWING, _STEP = 50, 1e-3, 1.1, 1 / 120
 _STILL, _SLOWER = 0.0, 0.5
-_SMOOTHINGS = 30
 _FALL_STEP, _SLOWING = 1 / 60, 0.88  # [s]; the same, of the fall
 _STANDING, _FALL = 0.5, 1.5  # [s] in which the body comes to its stand; of the whole fall
 # The mean strain of cloth whose seams do not close, and how far from the body none hangs [m]
@@ -95,7 +93,7 @@ def sewn(path: str | os.PathLike[str], count: int | None = None, body: Body | No
     length = lambda x: np.linalg.norm(x[np.roll(cut.faces, -1, axis=1)] - x[cut.faces], axis=2)
     V = to_standard(worn, cut.faces, body, smooth=False)
     lengths = cut.sides * length(V) / length(worn)
-    V = _untangled(V, cut.faces)
+    V = untangled(V, cut.faces)
     V, pushed = pushed_out(V, cut.faces, where)
     return Sewn(pattern.name, V, cut, lengths, pushed)
 
@@ -141,22 +139,6 @@ def _fallen(cut, x, body):
         worn.step(_FALL_STEP, _standing(body, min(1.0, k * _FALL_STEP / _STANDING)), x, pull)
         worn.cloth.v *= _SLOWING
     return worn.cloth.x
-
-
-def _untangled(V, F):
-    """Vertices (N, 3) [m] where layers that touched came through each other, when they were brought
-    to another body: smoothed there, as long as it takes.
-    """
-    mean = mesh.neighbour_mean(F, len(V), boundary_apart=True)
-    for _ in range(_SMOOTHINGS):
-        through = crossing_faces(V, F)
-        if not len(through):
-            break
-        near = np.zeros(len(V))
-        near[F[through]] = 1
-        share = np.minimum(1, near + mean @ near)[:, None] / 2
-        V = V + share * (mean @ V - V)
-    return V
 
 
 def _check(x, cut, body, where):

@@ -98,7 +98,7 @@ def test_the_matrix_of_contacts_between_cloth_and_cloth_is_their_gradients_deriv
     between = weights @ np.ones(4)
     assert np.allclose(between, 0)
     offset, moved = np.array([1.0, 1.0, 1.0, -1.0]), rng.normal(size=(4, 3))  # the last is open
-    contacts = Contacts(np.arange(4), corners, weights, normal, offset, moved, 30.0)
+    contacts = Contacts(np.arange(4), corners, weights, normal, offset, moved, np.full(4, 30.0))
     touches, step, size = cloth.touches([contacts], 1 / 60), rng.normal(size=V.shape), 1e-6
     of = lambda y: cloth.assemble(y, 1 / 60, touches).copy() - cloth.assemble(y, 1 / 60)
     expected = (of(V + size * step) - of(V - size * step)) / (2 * size)

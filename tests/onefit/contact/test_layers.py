@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -5,7 +7,7 @@ from test_contact import COTTON, grid
 
 from onefit.contact import SelfContact
 from onefit.objective import crossings
-from onefit.physics import Settings
+from onefit.physics import Settings, WornCloth
 from onefit.physics.cloth import Cloth
 from onefit.physics.sheet import Sheet
 
@@ -15,7 +17,7 @@ CONTACT = SETTINGS.contact
 
 def of(sheet):
     """The contact of a sheet with itself."""
-    stiffness = CONTACT.layer_stiffness * sheet.material.stretch
+    stiffness = CONTACT.layer_stiffness * sheet.firmness
     return SelfContact(sheet.cut, sheet.faces, CONTACT, stiffness, 0)
 
 
@@ -76,6 +78,38 @@ def test_strips_whose_edges_alone_meet_do_not_pass_through_each_other(speed):
     assert (cloth.x - x)[falls, 2].mean() > -0.02  # it did not fall past
 
 
+def test_what_flies_farther_in_a_step_than_its_edges_are_long_does_not_pass_through():
+    V, F = grid(9, 9, 0.014)
+    two_sheets, faces = two((V, F), (V + [0.004, 0.003, 0.03], F))
+    upper = np.arange(len(two_sheets)) >= len(V)
+    cut = two_sheets + [0, 0, 1.0] * upper[:, None]  # they are not neighbours
+    sheet = Sheet(two_sheets, faces, COTTON, cut=cut)
+    far = np.array([[0.0, 0, -9], [1, 0, -9], [0, 1, -9], [0, 0, -10]])
+    body = far, np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]])
+
+    def after(settings):
+        worn = WornCloth(sheet, sheet.rest, *body, settings)
+        worn.cloth.v[:, 2] = np.where(upper, -2.0, 0.0)  # 33 mm in a step
+        for _ in range(4):
+            worn.step(1 / 60, body[0], sheet.rest, 1.0 * ~upper)
+        return crossings(worn.cloth.x, faces)
+
+    assert after(replace(SETTINGS, parts=1)) > 0
+    assert after(SETTINGS) == 0
+
+
+def test_what_is_near_at_rest_but_far_along_the_sheet_is_a_layer():
+    """Two legs, 8 mm from each other where they are made, as trousers between the thighs."""
+    V, F = grid(60, 6, 0.01)
+    s, x = V[:, 0], V.copy()
+    x[:, 0], x[:, 2] = np.abs(s), np.clip(s, -0.004, 0.004)
+    sheet = Sheet(x, F, COTTON)
+    assert len(of(sheet).find(1.25 * x).key) == 0  # 10 mm from each other
+    contacts = of(sheet).find(x * [1, 1, 0.625])  # 5 mm
+    far = np.flatnonzero((np.abs(s) > 0.03) & (np.abs(s) < 0.28))
+    assert np.isin(far, contacts.corners).all()
+
+
 def closest(p, *corners):
     """Barycentric coordinates of the point of a triangle nearest to p."""
     triangle = np.stack(corners)[None]
@@ -88,14 +122,12 @@ def pairs_of(sheet, x, way):
     corners of what is nearest to it, or two sorted edges.
     """
     rest, F, found = sheet.cut, sheet.faces, {}
-    beside = np.zeros(len(x), bool)
-    reach = 2 * CONTACT.apart + np.linalg.norm(way - way.mean(0), axis=1)
-    reach = np.minimum(reach, CONTACT.reach)
+    beside, near = np.zeros(len(x), bool), 2 * CONTACT.apart
 
-    def is_layer(away, at_rest, reach):
+    def is_layer(away, at_rest, against):
         distance = np.linalg.norm(away)
-        far = max(2 * distance, 2 * CONTACT.apart)
-        return distance < reach and np.linalg.norm(at_rest) > far
+        comes_to = distance + min(against @ away / distance, 0)
+        return comes_to < near and np.linalg.norm(at_rest) > max(2 * distance, near)
 
     for i in range(len(x)):
         best, inner = (np.inf, None, None), False
@@ -103,8 +135,8 @@ def pairs_of(sheet, x, way):
             if i in corners:
                 continue
             on = closest(x[i], *x[corners])
-            away, at_rest = x[i] - on @ x[corners], rest[i] - on @ rest[corners]
-            if is_layer(away, at_rest, reach[i]):
+            away, at_rest, against = (y[i] - on @ y[corners] for y in (x, rest, way))
+            if is_layer(away, at_rest, against):
                 beside[i], key = True, (i, *sorted(corners[on > 1e-4]))
                 if on.min() > 1e-4:
                     found[key] = away
@@ -112,17 +144,20 @@ def pairs_of(sheet, x, way):
                     best, inner = (np.linalg.norm(away), key, away), on.min() > 1e-4
         if best[1] and not inner:
             found[best[1]] = best[2]
+    goes = np.linalg.norm(way - way.mean(0), axis=1)
+    is_long = lambda ends: (
+        np.linalg.norm(np.diff(rest[ends], axis=0)) > 2 * (near + goes[ends].max())
+    )
     E = sheet.edges
     for e, (i, j) in enumerate(E):
         for m, n in E[:e]:
             A = np.stack([x[j] - x[i], x[m] - x[n]], 1)
             (s, t), *_ = np.linalg.lstsq(A, x[m] - x[i], rcond=None)
             weights = np.array([1 - s, s, t - 1, -t])
-            away, at_rest = (weights @ y[[i, j, m, n]] for y in (x, rest))
+            away, at_rest, against = (weights @ y[[i, j, m, n]] for y in (x, rest, way))
             between = min(s, t) > 0 and max(s, t) < 1 and not {i, j} & {m, n}
-            look = [ends for ends in ([i, j], [m, n]) if beside[ends].any()]
-            far = max((reach[ends].max() for ends in look), default=0)
-            if between and is_layer(away, at_rest, far):
+            looks = any(beside[ends].any() or is_long(ends) for ends in ([i, j], [m, n]))
+            if between and looks and is_layer(away, at_rest, against):
                 found[tuple(sorted([(i, j), (m, n)]))] = away
     return found
 
@@ -136,6 +171,7 @@ def test_pairs_are_those_that_a_search_of_all_against_all_finds(seed):
     x = V - [0, 0, 0.992] * (np.arange(len(V)) >= 49)[:, None]
     x += rng.normal(size=x.shape) * [0.002, 0.002, 0.002]
     way = rng.normal(size=x.shape) * 0.003 * rng.uniform(0, 3, (len(x), 1))
+    way[49:, 2] -= 0.004
     contacts = of(sheet).find(x, way)
     found = {}
     for corners, weights, normal in zip(contacts.corners, contacts.weights, contacts.normal):
@@ -149,9 +185,20 @@ def test_pairs_are_those_that_a_search_of_all_against_all_finds(seed):
         found[key] = vector
     expected = pairs_of(sheet, x, way)
     assert len(expected) > 50 and sum(isinstance(k[0], tuple) for k in expected) > 20
-    assert set(found) == set(expected)
-    for key, vector in expected.items():
-        assert np.allclose(np.abs(found[key]), np.abs(vector), atol=2e-6)
+    assert set(found) <= set(expected)
+    assert all(apart(key, x, way - way.mean(0)) for key in set(expected) - set(found))
+    for key, vector in found.items():
+        assert np.allclose(np.abs(expected[key]), np.abs(vector), atol=2e-6)
+
+
+def apart(key, x, way):
+    """Whether the boxes in which the two of a pair move are farther from each other than a search
+    looks: they come nearer, but past each other.
+    """
+    one, other = key if len(key) == 2 and isinstance(key[0], tuple) else (key[:1], key[1:])
+    places = [np.concatenate([x[list(k)], (x + way)[list(k)]]) for k in (one, other)]
+    low, high = (np.stack([f(p, axis=0) for p in places]) for f in (np.min, np.max))
+    return (low.max(0) - high.min(0)).max() > 2 * CONTACT.apart
 
 
 def test_what_has_slipped_through_is_drawn_back():
@@ -191,7 +238,7 @@ def test_a_cut_in_folds_rests_on_its_folds():
     # the rest shape of what hangs in folds says nothing of who is whose neighbour; its cut does
     V, F = grid(24, 4, 0.01)
     hung = V.copy()
-    hung[:, 0], hung[:, 2] = np.abs(V[:, 0]), 0.0025 * np.sign(V[:, 0])
+    hung[:, 0], hung[:, 2] = np.abs(V[:, 0]), 0.0012 * np.sign(V[:, 0])
     folded = np.abs(V[:, 0]) > 0.05
     corners = V[F]
     sides = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)

@@ -129,6 +129,7 @@ def test_refused_in_one_line(arguments, message, network, tmp_path):
     [
         (("--steps", "0"), "--steps 0: steps a frame, 1 or more"),
         (("--material", "wool"), "material 'wool': choose among cotton, silk"),
+        (("--material", "denim,silk"), "^2 materials for 1 garment; give one for each, in their"),
         (("--no-post",), "--no-post: python -m onefit.drape takes it"),
     ],
 )

@@ -111,6 +111,29 @@ def test_what_is_worn_under_is_closed_beyond_its_rims():
     assert (np.sign(moved(places + [0, 0, 1]).distance) == [1, -1, 1, -1]).all()
 
 
+def test_folds_that_are_let_out_do_not_pass_through_each_other(draper):
+    garments = [Garment.template(name) for name in ("shorts", "circle_skirt")]
+    rests = [garment.graded(draper.standard) for garment in garments]
+    _, skirt = let_out(garments, rests)
+    assert (skirt - rests[1]).norm(dim=-1).max() > 0.004
+    assert crossings(skirt.numpy(), garments[1].faces.numpy()) == 0
+
+
+def test_each_garment_has_its_material(draper, shorts):
+    tank, motion = Garment.template("tank").remeshed(500), MOTION[:4]
+    stiff, soft = (
+        draper.simulate([shorts, tank], motion, material=[of, "silk"]) for of in ("denim", "silk")
+    )
+    assert [d.material.name for d in stiff] == ["denim", "silk"]
+    lengths = lambda d, x: (x[..., d.faces.roll(1, 1), :] - x[..., d.faces, :]).norm(dim=-1)
+    strain = lambda d: (lengths(d, d.vertices) / lengths(d, d.rest) - 1).abs().mean()
+    assert strain(stiff[0]) < strain(soft[0])
+    for pair in (stiff, soft):
+        assert passed(pair) == 0
+    with pytest.raises(InputError, match="^1 materials for 2 garments; give one for each"):
+        draper.simulate([shorts, tank], motion, material=["denim"])
+
+
 def test_refused_in_one_line(draper, shorts):
     with pytest.raises(InputError, match="^0 garments; 1 to 4 at once$"):
         draper.drape([], MOTION)

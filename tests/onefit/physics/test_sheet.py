@@ -38,6 +38,30 @@ def test_a_stretched_strip_bears_the_materials_tension(sheet):
     assert float(energy[1]) == pytest.approx(COTTON.stretch / 2 * 0.02**2 * area, rel=1e-6)
 
 
+def test_of_two_materials_each_part_has_its_own():
+    (V, F), denim = lattice(9, 8), MATERIALS["denim"]
+    parts = [Sheet(V, F, material) for material in (COTTON, denim)]
+    both, faces = np.concatenate([V, V + [9, 0, 0]]), np.concatenate([F, F + len(V)])
+    of = np.repeat([0, 1], len(F))
+    sheet = Sheet(both, faces, [COTTON, denim], of=of)
+    for name in ("mass", "friction", "firmness", "drag", "stretch"):
+        alone = np.concatenate([getattr(part, name) for part in parts])
+        np.testing.assert_allclose(getattr(sheet, name), alone, rtol=1e-12, err_msg=name)
+    rng = np.random.default_rng(0)
+    bent = V * [1.01, 1, 1] + 2e-3 * rng.normal(size=V.shape)
+    x = torch.as_tensor(np.concatenate([bent, bent + [9, 0, 0]]))[:, None]
+    for energy in (stretching, bending):
+        expected = sum(energy(torch.as_tensor(bent)[:, None], part) for part in parts)
+        assert float(energy(x, sheet)) == pytest.approx(float(expected), rel=1e-9)
+    free = [np.concatenate([_pull(part, bent) for part in parts]), _pull(sheet, x[:, 0].numpy())]
+    assert np.abs(free[1] - free[0]).max() < 1e-9 * np.abs(free[0]).max()
+
+
+def _pull(sheet, x):
+    """The gradient of all energies of a cloth at ``x``."""
+    return Cloth(sheet, sheet.rest).assemble(x, 1 / 60).copy()
+
+
 def test_a_cylinder_costs_half_the_bending_stiffness_by_curvature_squared():
     sheet = Sheet(*lattice(40, 40, 0.005), COTTON)
     for turn in (0.0, 0.3, 0.5):

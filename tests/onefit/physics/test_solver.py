@@ -22,7 +22,13 @@ def system(patches, seed=0):
     normal = rng.normal(size=(30, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     tied = Contacts(
-        np.arange(30), corners, weights, normal, np.full(30, 1.0), np.zeros((30, 3)), 200.0
+        np.arange(30),
+        corners,
+        weights,
+        normal,
+        np.full(30, 1.0),
+        np.zeros((30, 3)),
+        np.full(30, 200.0),
     )
     cloth = Cloth(sheet, sheet.rest, Settings(), 30, patches)
     x = sheet.rest * 1.01 + 2e-4 * rng.normal(size=(N, 3))

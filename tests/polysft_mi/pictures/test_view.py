@@ -178,6 +178,23 @@ def test_shows_a_drape_and_its_body(opened, tmp_path):
         opened(tmp_path)
 
 
+def test_shows_all_garments_of_an_outfit(opened, tmp_path):
+    rng = np.random.default_rng(0)
+    body = dict(body=rng.normal(size=(3, 4, 3)), body_faces=np.array([[0, 1, 2]]), fps=30.0)
+    faces, drapes = np.array([[0, 1, 2], [2, 3, 4]]), rng.normal(size=(2, 3, 5, 3))
+    for name, vertices in zip(("1_trousers", "2_tshirt"), drapes):
+        (tmp_path / name).mkdir()
+        np.savez(tmp_path / name / "drape.npz", vertices=vertices, faces=faces, **body)
+    viewer = opened(tmp_path)
+    mesh = show(viewer, 2)
+    np.testing.assert_allclose(mesh.vertices, np.concatenate(drapes[:, 2]), atol=1e-6)
+    assert len(mesh.faces) == 4 and mesh.faces[2:].min() == 5
+    assert "2 garments" in viewer._about.content
+    np.savez(tmp_path / "2_tshirt/drape.npz", vertices=drapes[1, :2], faces=faces, **body)
+    with pytest.raises(InputError, match=r"2_tshirt.*2 frames, where .*1_trousers.* has 3"):
+        opened(tmp_path)
+
+
 def test_refusals(finished_run, tmp_path, monkeypatch):
     for arguments, words in [
         ([tmp_path], "not the folder of a run or of a drape"),
