@@ -9,7 +9,7 @@ nearby. Where the sheet casts shadows on itself both are wrong, hence a robust n
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -75,6 +75,18 @@ class Light:
     def numbers(self):
         """All of it as a list of numbers."""
         return [*self.matrix[_UPPER].tolist(), *self.right.tolist(), self.deviations, self.frames]
+
+    def mirrored(self, normal, distance):
+        """What the same frames would say, had they shown the mirror images of their surfaces at the
+        plane with this unit ``normal`` (3,), ``distance`` from the template's centre in the units
+        of :class:`Shade`'s ``centre``: a normal keeps its part along the plane's and turns the
+        rest, a centre the other way round.
+        """
+        across = np.outer(normal, normal)
+        turn = np.zeros((_SIZE, _SIZE))  # of a triangle's row (1, normal, centre)
+        turn[0, 0], turn[0, 4:] = 1, 2 * distance * normal
+        turn[1:4, 1:4], turn[4:, 4:] = 2 * across - np.eye(3), np.eye(3) - 2 * across
+        return replace(self, matrix=turn.T @ self.matrix @ turn, right=turn.T @ self.right)
 
     @property
     def scale(self):

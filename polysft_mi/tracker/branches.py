@@ -11,14 +11,19 @@ import math
 import numpy as np
 
 
+def plane_of(vertices):
+    """(middle, unit normal), (3,) each, of the plane of least squares of vertices (N, 3) [m]."""
+    middle = vertices.mean(0)
+    return middle, np.linalg.svd(vertices - middle, full_matrices=False)[2][2]
+
+
 def mirrored(vertices, origin):
-    """Vertices (N, 3) [m] as far before their plane as ``vertices`` are behind it, and the other
-    way round, each along its ray from ``origin`` (3,) [m]. The plane is that of least squares.
+    """Vertices (N, 3) [m] as far before their :func:`plane_of` as ``vertices`` are behind it, and
+    the other way round, each along its ray from ``origin`` (3,) [m].
     """
+    middle, normal = plane_of(vertices)
     from_origin = vertices - origin
-    middle = from_origin.mean(0)
-    normal = np.linalg.svd(from_origin - middle, full_matrices=False)[2][2]
-    on_plane = (middle @ normal) / (from_origin @ normal)
+    on_plane = ((middle - origin) @ normal) / (from_origin @ normal)
     return origin + (2 * on_plane - 1)[:, None] * from_origin
 
 

@@ -17,7 +17,7 @@ from polysft_mi.objective import FrameContext, FrameMemory, Objective
 from polysft_mi.solvers import Report, Solver
 from polysft_mi.surface import State
 
-from .branches import mirrored
+from .branches import mirrored, plane_of
 from .sigma import along_rays, score
 from .stages import Found, Stages
 from .starts import Starts
@@ -188,7 +188,6 @@ class FrameTracker:
         frame: int,
         state: State,
         certainty: np.ndarray,
-        memory: FrameMemory | None,
         past: Past,
         report: Report | None = None,
     ) -> tuple[Solution | None, float]:
@@ -196,12 +195,21 @@ class FrameTracker:
         it is the same surface, or explains the frame less well; and by what share of the cost of
         the frame's own surface it costs more.
 
-        ``state``, ``certainty`` (2, N) [m], ``memory``: of the frame so far.
+        ``state``, ``certainty`` (2, N) [m]: of the frame so far.
         """
         self._prepare(report)
         self._expect(frame)
-        context = self._context(frame, past[-1][0], [memory for _, memory in past])
+        known = [memory for _, memory in past]
+        context = self._context(frame, past[-1][0], known)
         vertices = self._atlas.surface(state).vertices
+        own_cost = self._cost(state, context)
+        light = context.light(self.objective.rules)
+        if light.frames:  # learned from surfaces that this one takes to be mirror images
+            middle, normal = plane_of(vertices)
+            brightness = self.objective.data.brightness
+            distance = (middle - brightness.centre) @ normal / brightness.unit
+            known[-1] = replace(context.memory, light=light.mirrored(normal, distance))
+            context = replace(context, memory=known[-1])
         image = self._atlas.reaching(mirrored(vertices, self.problem.camera.origin), state)
         start = self._atlas.with_relief_in_jets(image)
         coarse, *fine = self.objective.usual
@@ -215,11 +223,10 @@ class FrameTracker:
             return None, 0.0
         found = self._stages.descend(found.state, context, fine or [coarse])
         new = self._atlas.with_relief_in_jets(found.state)
-        excess = self._cost(new, context) / self._cost(state, context) - 1
+        excess = self._cost(new, context) / own_cost - 1
         if excess > self.objective.rules.mirror_share or not is_other(new):
             return None, excess
-        memory = self._same_noise(found, context, memory)
-        return self._solution([new], [found], memory), excess
+        return self._solution([new], [found], self._memory(found, context, known)), excess
 
     def _cost(self, state, context):
         """The cost of a state at the last stage."""

@@ -107,9 +107,8 @@ def _follow(tracker, done, k, progress):
         past = _past(tracker, done, range(max(0, k - _MAX_HISTORY), k))
         state = tracker.problem.atlas.state(done.states[k])
         report = progress and functools.partial(progress, k, k)
-        known = done.certainty[k], done.memories[k]
         try:
-            solution, excess = tracker.mirror(k, state, *known, past, report)
+            solution, excess = tracker.mirror(k, state, done.certainty[k], past, report)
         except BadFrame:
             solution, excess = None, math.inf
         if solution:

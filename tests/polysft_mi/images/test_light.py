@@ -240,6 +240,29 @@ def test_the_last_frames_say_most():
     )
 
 
+def test_the_light_of_mirror_images_is_the_mirror_image_of_the_light():
+    """What frames say of the light if their surfaces are reflected, from the surfaces alone."""
+    found, surfaces = brightness(), [wavy(seed) for seed in range(3)]
+    middle, normal = np.array([0.01, -0.02, 0.51]), np.array([0.1, -0.2, 1.0])
+    normal /= np.linalg.norm(normal)
+    images = [v - 2 * ((v - middle) @ normal)[:, None] * normal for v in surfaces]
+    lights = []
+    for vertices in (surfaces, images):
+        matrix, right = np.zeros((7, 7)), np.zeros(7)
+        for v, bright in zip(vertices, map(lit, surfaces), strict=True):
+            shade = shade_of(found, v, 0.5)
+            rows = np.column_stack([np.ones(len(FACES)), shade.normal, shade.centre])
+            matrix, right = matrix + rows.T @ rows, right + rows.T @ bright
+        lights.append(Light(matrix, right, 0.01, 3, Rules()))
+    distance = (middle - found.centre) @ normal / found.unit
+    mirrored = lights[0].mirrored(normal, distance)
+    assert np.allclose(mirrored.matrix, lights[1].matrix) and mirrored.frames == 3
+    assert np.allclose(mirrored.right, lights[1].right)
+    assert not np.allclose(lights[0].right, lights[1].right, rtol=0.1)
+    back = mirrored.mirrored(normal, distance)
+    assert np.allclose(back.matrix, lights[0].matrix)
+
+
 def test_a_flat_sheet_says_nothing_of_where_the_light_comes_from():
     found, light = brightness(masked=True), Light.unknown(Rules())
     for _ in range(20):
