@@ -100,7 +100,7 @@ class Rules:
     )
     # mirror images
     mirror_share: float = _rule(
-        0.05,
+        0.2,
         "share",
         "of a frame's cost that the mirror image of a sheet may cost more, to be tracked too",
         row="mirror images",
