@@ -63,7 +63,9 @@ class Unknowns:
 
     @classmethod
     def from_numpy(cls, arrays):
-        flat = {name: np.asarray(arrays[name], np.float32).ravel() for name in cls.NAMES}
+        """The reverse of :meth:`to_numpy`; without ``pose`` no body carries the surface."""
+        known = [name for name in cls.NAMES if name != "pose" or name in arrays]
+        flat = {name: np.asarray(arrays[name], np.float32).ravel() for name in known}
         return cls(**{name: mi.Float(x) for name, x in flat.items()})
 
 
