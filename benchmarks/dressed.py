@@ -12,15 +12,12 @@ it with ``--again``); the table in ``evidence.md`` is made anew, and so is ``dre
 that was made.
 """
 
-import argparse
-import json
 import os
-import re
-import resource
 import subprocess
 import sys
 import tempfile
 
+import given
 import numpy as np
 from sequences import ROOT
 
@@ -31,7 +28,6 @@ from polysft_mi.results.truth import load_npz
 KINDS = {"body": (), "tracks": ("tracks",), "depth": ("depth",)}
 _FILES = {"tracks": "tracks.npz", "depth": "depth"}
 _SEQUENCES = ("tshirt_box", "sleeves_up")
-_TABLE = re.compile(r"(<!-- dressed -->\n).*?(<!-- /dressed -->)", re.S)
 _SHOWN = "tshirt_box", "body", 28
 
 
@@ -48,26 +44,28 @@ def figures(surface, truth):
     return found | {"rmse_mm_hidden": 1e3 * float(np.mean(hidden))}
 
 
-def run(folder, kind, evidence, out, last):
-    """A result, a dict, of the sequence in a folder; the run goes to ``out``."""
-    given = [f"--{name}={os.path.join(evidence, _FILES[name])}" for name in KINDS[kind]]
+def run(folder, kind, where, out, last):
+    """A result, a dict, of the sequence in a folder, whose tracks and depth are in the folder
+    ``where``; the run goes to ``out``.
+    """
+    evidence = [f"--{name}={os.path.join(where, _FILES[name])}" for name in KINDS[kind]]
     scene = os.path.join(out, "scene")
     module = [sys.executable, "-m"]
     body = ["--body", os.path.join(folder, "body.npz")]
-    prepare = [*module, "polysft_mi.prepare", folder, "-o", scene, "-q", *body, *given]
+    prepare = [*module, "polysft_mi.prepare", folder, "-o", scene, "-q", *body, *evidence]
     track = [*module, "polysft_mi.run", os.path.join(scene, "scene.xml"), "-q", "--no-report"]
     track += ["-o", os.path.join(out, "run"), "--exr", "0", "-D", f"last={last}"]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    for command in (prepare, track):
-        done = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True)
-        if done.returncode:
-            raise InputError(f"{folder}, {kind}: {done.stderr.strip().splitlines()[-1]}")
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    spent = sum(getattr(after, k) - getattr(before, k) for k in ("ru_utime", "ru_stime"))
+    with given.processor_seconds() as spent:
+        for command in (prepare, track):
+            done = subprocess.run(
+                command, env=environment, cwd=ROOT, capture_output=True, text=True
+            )
+            if done.returncode:
+                raise InputError(f"{folder}, {kind}: {done.stderr.strip().splitlines()[-1]}")
     surface = load_npz(os.path.join(out, "run", "surface.npz"))
     found = figures(surface, os.path.join(folder, "gt.npz"))
-    return found | {"cpu_seconds_a_frame": spent / len(surface["frames"])}
+    return found | {"cpu_seconds_a_frame": spent[0] / len(surface["frames"])}
 
 
 def drape(folder, last):
@@ -139,49 +137,26 @@ def picture(path, out, frame):
 
 
 def main(argv=None):
-    raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(
-        prog="python benchmarks/dressed.py", description=__doc__, formatter_class=raw
-    )
+    parser = given.parser(__doc__, "dressed", _SEQUENCES, ["drape", *KINDS])
     parser.add_argument("--data", metavar="FOLDER", required=True)
     parser.add_argument("--evidence", metavar="FOLDER")
-    parser.add_argument("--only", nargs="+", default=list(_SEQUENCES))
-    parser.add_argument("--kinds", nargs="*", choices=["drape", *KINDS], default=["drape", *KINDS])
     parser.add_argument("--last", type=int, default=-1, help="last frame (default: all)")
-    parser.add_argument("--docs", metavar="FOLDER", default=os.path.join(ROOT, "docs"))
-    parser.add_argument("--again", action="store_true", help="run what has a result, too")
     args = parser.parse_args(argv)
-    where, results = os.path.join(args.docs, "dressed.json"), []
-    if os.path.exists(where):
-        with open(where, encoding="utf-8") as file:
-            results = json.load(file)
-    for sequence in args.only:
+
+    def result(sequence, kind):
+        if KINDS.get(kind) and not args.evidence:
+            return None
         folder = os.path.abspath(os.path.join(args.data, sequence))
-        evidence = os.path.abspath(os.path.join(args.evidence or ".", sequence))
-        for kind in args.kinds:
-            done = [r for r in results if (r["sequence"], r["kind"]) == (sequence, kind)]
-            if (done and not args.again) or (KINDS.get(kind) and not args.evidence):
-                continue
-            print(f"{sequence}, {kind} ...", file=sys.stderr, flush=True)
-            with tempfile.TemporaryDirectory(prefix="dressed-") as out:
-                if kind == "drape":
-                    found = drape(folder, args.last)
-                else:
-                    found = run(folder, kind, evidence, out, args.last)
-                if (sequence, kind) == _SHOWN[:2] and args.last < 0:
-                    picture(os.path.join(args.docs, "dressed.jpg"), out, _SHOWN[2])
-            found = {"sequence": sequence, "kind": kind, **found}
-            results = [r for r in results if r not in done] + [found]
-            with open(where, "w", encoding="utf-8") as file:
-                json.dump(results, file, indent=1)
-                file.write("\n")
-    page = os.path.join(args.docs, "evidence.md")
-    if os.path.exists(page):
-        with open(page, encoding="utf-8") as file:
-            text = file.read()
-        with open(page, "w", encoding="utf-8") as file:
-            file.write(_TABLE.sub(lambda m: m[1] + table(results) + "\n" + m[2], text))
-    print(table(results))
+        if kind == "drape":
+            return drape(folder, args.last)
+        where = os.path.abspath(os.path.join(args.evidence or ".", sequence))
+        with tempfile.TemporaryDirectory(prefix="dressed-") as out:
+            found = run(folder, kind, where, out, args.last)
+            if (sequence, kind) == _SHOWN[:2] and args.last < 0:
+                picture(os.path.join(args.docs, "dressed.jpg"), out, _SHOWN[2])
+        return found
+
+    given.show(args, "dressed", table(given.results(args, "dressed", result)))
 
 
 if __name__ == "__main__":

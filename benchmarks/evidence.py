@@ -12,17 +12,13 @@ missing (all of it with ``--again``); the table in ``evidence.md``, and the pict
 given, are made anew.
 """
 
-import argparse
-import json
 import os
-import re
-import resource
-import sys
 import tempfile
 
+import given
 import numpy as np
 import sft_runs
-from sequences import DATA, ROOT, folder_of
+from sequences import DATA, folder_of
 
 from polysft_mi.errors import InputError, cli
 
@@ -36,7 +32,6 @@ KINDS = {
 }
 _FILES = {"tracks": "tracks.npz", "depth": "depth", "cameras": "cameras"}
 _SEQUENCES = ("flag", "curtain", "corner", "tube")
-_TABLE = re.compile(r"(<!-- evidence -->\n).*?(\n<!-- /evidence -->)", re.S)
 
 
 def definitions(kind, folder):
@@ -50,19 +45,17 @@ def definitions(kind, folder):
 def run(sequence, kind, data, define):
     """A result, a dict: as of :func:`sft_runs.run`, with the processor's seconds."""
     setup = {"frames": None, "threads": 1, "define": define, "mode": "", "iterations": None}
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    with tempfile.TemporaryDirectory(prefix="evidence-") as out:
+    with (
+        tempfile.TemporaryDirectory(prefix="evidence-") as out,
+        given.processor_seconds() as spent,
+    ):
         result = sft_runs.run(sequence, "gauss-newton", data, os.path.join(out, "run"), setup)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    spent = sum(getattr(after, k) - getattr(before, k) for k in ("ru_utime", "ru_stime"))
     if "error" in result:
         raise InputError(f"{sequence}, {kind}: {result['error']}")
     return {
-        "sequence": sequence,
-        "kind": kind,
         "figures": {k: v for k, v in result["figures"].items() if isinstance(v, float)},
         "lost": result["lost"],
-        "cpu_seconds_a_frame": spent / result["frames"],
+        "cpu_seconds_a_frame": spent[0] / result["frames"],
         "machine": result["machine"],
     }
 
@@ -123,46 +116,26 @@ def picture(path, data, folder, frame=22):
 
 
 def main(argv=None):
-    raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(
-        prog="python benchmarks/evidence.py", description=__doc__, formatter_class=raw
-    )
+    parser = given.parser(__doc__, "evidence", _SEQUENCES, KINDS)
     parser.add_argument("--evidence", metavar="FOLDER", required=True)
     parser.add_argument("--data", nargs="+", metavar="FOLDER", default=[DATA])
-    parser.add_argument("--only", nargs="+", choices=_SEQUENCES, default=list(_SEQUENCES))
-    parser.add_argument("--kinds", nargs="*", choices=list(KINDS), default=list(KINDS))
-    parser.add_argument("--docs", metavar="FOLDER", default=os.path.join(ROOT, "docs"))
-    parser.add_argument("--again", action="store_true", help="run what has a result, too")
     args = parser.parse_args(argv)
-    where = os.path.join(args.docs, "evidence.json")
-    results = []
-    if os.path.exists(where):
-        with open(where, encoding="utf-8") as file:
-            results = json.load(file)
-    for sequence in args.only:
-        data = next(filter(None, (folder_of(place, sequence) for place in args.data)), None)
-        if data is None:
-            raise InputError(f"{sequence}: not in {', '.join(args.data)}")
-        for kind in args.kinds:
-            done = [r for r in results if (r["sequence"], r["kind"]) == (sequence, kind)]
-            define = definitions(kind, os.path.join(args.evidence, sequence))
-            if define is None or (done and not args.again):
-                continue
-            print(f"{sequence}, {kind} ...", file=sys.stderr, flush=True)
-            results = [r for r in results if r not in done] + [run(sequence, kind, data, define)]
-            with open(where, "w", encoding="utf-8") as file:
-                json.dump(results, file, indent=1)
-                file.write("\n")
+    data = {
+        sequence: next(filter(None, (folder_of(place, sequence) for place in args.data)), None)
+        for sequence in args.only
+    }
+    if missing := [sequence for sequence, folder in data.items() if folder is None]:
+        raise InputError(f"{missing[0]}: not in {', '.join(args.data)}")
+
+    def result(sequence, kind):
+        define = definitions(kind, os.path.join(args.evidence, sequence))
+        return None if define is None else run(sequence, kind, data[sequence], define)
+
+    results = given.results(args, "evidence", result)
     shown = os.path.join(args.evidence, "tube")
     if "tube" in args.only and definitions("tracks and depth", shown):
-        data = next(filter(None, (folder_of(place, "tube") for place in args.data)), None)
-        picture(os.path.join(args.docs, "evidence.jpg"), data, shown)
-    page = os.path.join(args.docs, "evidence.md")
-    with open(page, encoding="utf-8") as file:
-        text = file.read()
-    with open(page, "w", encoding="utf-8") as file:
-        file.write(_TABLE.sub(lambda m: m[1] + table(results) + m[2], text))
-    print(table(results))
+        picture(os.path.join(args.docs, "evidence.jpg"), data["tube"], shown)
+    given.show(args, "evidence", table(results))
 
 
 if __name__ == "__main__":

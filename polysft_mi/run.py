@@ -139,14 +139,6 @@ class Outcome:
             f"inside the surface: PSNR {s.get('psnr_mask', float('nan')):.2f} dB,"
             f" SSIM {s.get('ssim_mask', float('nan')):.3f}",
             f"surfaces: {os.path.join(self.out, 'surface.npz')}",
-            *(
-                [
-                    f"undecided: from frame {s['undecided']['from']} on"
-                    f" {os.path.join(self.out, 'other.npz')} explains the video about as well"
-                ]
-                if "undecided" in s
-                else []
-            ),
             f"meshes: {os.path.join(self.out, 'meshes')}",
             f"pictures: {os.path.join(self.out, 'comparison.png')}",
             f"video: {s['video']}",
@@ -154,6 +146,10 @@ class Outcome:
             if self.interrupted
             else f"next: open {self.report or s['video']}",
         ]
+        if known := s.get("undecided"):
+            first = f"undecided: from frame {known['from']} on"
+            other = os.path.join(self.out, folder.OTHER)
+            lines.insert(-1, f"{first} a second surface explains the video nearly as well: {other}")
         return "".join(line + "\n" for line in lines)
 
 

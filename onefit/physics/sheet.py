@@ -21,19 +21,18 @@ _LEAST = 1e-12  # of the roots below, so that a degenerate triangle has a gradie
 
 class Sheet:
     """``rest`` (N, 3) [m] and ``faces`` (F, 3), arrays, of ``material``, or of several, of which
-    ``of`` (F,) says each face's. With ``sides`` (F, 3) [m],
-    from each corner of a face to the next, the lengths at rest are these, not those of ``rest``,
-    and the sheet rests flat: cloth that hangs in folds, as it was cut; NaN: of this face they are
-    those of ``rest``, as its angles are. ``cut`` (N, 3) [m] is where it has no folds yet, so that
-    only neighbours are near to each other.
+    ``of`` (F,) says each face's. With ``sides`` (F, 3) [m], from each corner of a face to the next,
+    the lengths at rest are these, not those of ``rest``, and the sheet rests flat: cloth that hangs
+    in folds, as it was cut; NaN: of this face they are those of ``rest``, as its angles are.
+    ``cut`` (N, 3) [m] is where it has no folds yet, so that only neighbours are near to each other.
 
     ``stretch`` and ``drag`` (F,) are the materials' numbers, ``firmness`` [N/m] and ``friction``
     (N,) those of stretch and friction at the vertices; ``area`` (F,) [m^2]; ``mass`` (N,) [kg];
-    ``gradients`` (F, 3, 2) [1/m], those of the three
-    corners' hat functions in the plane of the triangle, so that F = sum_a x_a g_a^T is the
-    deformation gradient; ``hinges`` (H, 4): the ends of an inner edge and the corners opposite to
-    it, of the face that has the edge in this sense and of the other; ``angles`` (H,) [rad], those
-    of the hinges at rest; ``stiffness`` (H,) [J], of a hinge for a unit angle.
+    ``gradients`` (F, 3, 2) [1/m], those of the three corners' hat functions in the plane of the
+    triangle, so that F = sum_a x_a g_a^T is the deformation gradient; ``hinges`` (H, 4): the ends
+    of an inner edge and the corners opposite to it, of the face that has the edge in this sense and
+    of the other; ``angles`` (H,) [rad], those of the hinges at rest; ``stiffness`` (H,) [J], of a
+    hinge for a unit angle.
     """
 
     def __init__(

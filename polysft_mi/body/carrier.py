@@ -66,9 +66,8 @@ class Carrier:
     ``weights`` (N, J), rows that sum to one; ``poses`` (T, J, 3) [rad], ``translation`` (T, 3) [m]:
     what is known of its motion. ``draped`` (T, N, 3) [m, rest], or None: by what the garment's
     drape differs from the template in each frame, before it is carried; ``lengths`` (T, E) [m]: of
-    the template's edges in the drape, or None. ``skin``: the body itself:
-    vertices at rest (V, 3) [m], their weights (V, J), and faces (F, 3), or None. ``fps``: frames a
-    second. Maps, as
+    the template's edges in the drape, or None. ``skin``: the body itself: vertices at rest (V, 3)
+    [m], their weights (V, J), and faces (F, 3), or None. ``fps``: frames a second. Maps, as
     :mod:`onefit.body.skinning` has them, are from the rest pose to a frame.
     """
 

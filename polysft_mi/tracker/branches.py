@@ -55,13 +55,14 @@ def _cost(track, frame):
 
 
 def decide(track, apart=0.0):
-    """Keep the cheaper branch where they are ``apart`` by so many frames' costs. Returns whether it
-    was decided.
+    """Whether the branches are at least so many frames' costs ``apart``; then the cheaper one
+    becomes the track, and the other its other branch.
     """
     difference = ahead(track)
-    if difference > 0 and (apart == 0 or difference >= apart):
+    decided = abs(difference) >= apart
+    if decided and difference > 0:
         swap(track)
-    return abs(difference) >= apart
+    return decided
 
 
 def swap(track):

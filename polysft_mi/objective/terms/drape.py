@@ -10,7 +10,7 @@ from ..quadratic import RestForms
 from .term import Term
 
 _ERROR = 0.02  # standard deviation of the drape [m] from the cloth, both at the body's rest
-_ALIKE = 50.0  # vertices of a thousand that err alike, and count as one
+_ALIKE = 0.05  # share of the vertices that err alike, and count as one
 
 
 class Drape(Term):
@@ -29,7 +29,7 @@ class Drape(Term):
         super().__init__(inputs)
         self._inputs = inputs
         count = len(inputs.template.vertices)
-        self._unit = 1 / (_ERROR**2 * _ALIKE * count / 1000)
+        self._unit = 1 / (_ERROR**2 * _ALIKE * count)
 
     @classmethod
     def is_used(cls, settings):

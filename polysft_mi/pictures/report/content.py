@@ -159,7 +159,7 @@ def warning(run):
     if known := run.metrics.get("undecided"):
         texts.append(
             f"Undecided: from frame {known['from']} on a second surface, up to"
-            f" {known['apart_mm']:.1f} mm away, explains the video about as well (other.npz)."
+            f" {known['apart_mm']:.1f} mm away, explains the video nearly as well (other.npz)."
         )
     texts += [f"Frame {frame}: {reason}." for frame, reason in list(lost.items())[:5]]
     return " ".join(texts + ([f"And {len(lost) - 5} more lost frames."] if len(lost) > 5 else []))
