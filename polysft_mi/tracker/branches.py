@@ -39,13 +39,17 @@ def split(track, frame):
 
 def ahead(track):
     """How much more the track has cost than its other branch since they parted, over what a frame
-    costs; infinite where frames of one of them are lost.
+    costs; infinite where it lost more frames, or fewer. What both lost tells nothing.
     """
     since = range(track.fork, len(track.totals))
     own, others = (np.array([_cost(t, k) for k in since]) for t in (track, track.other))
+    more_lost = int(np.isinf(own).sum() - np.isinf(others).sum())
+    if more_lost:
+        return math.copysign(math.inf, more_lost)
     both = np.isfinite(own) & np.isfinite(others)
-    if not both.all():
-        return math.copysign(math.inf, np.isinf(own).sum() - np.isinf(others).sum())
+    if not both.any():
+        return 0.0
+    own, others = own[both], others[both]
     return float((own - others).sum() / np.minimum(own, others).mean())
 
 

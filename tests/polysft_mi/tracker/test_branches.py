@@ -64,6 +64,17 @@ def test_a_branch_that_is_lost_loses():
     assert branches.decide(done, 1.0) and not done.lost
 
 
+def test_a_frame_that_both_lose_tells_nothing():
+    done = of_costs(1.0, 1.0, 1.0, lost=[1])
+    other = branches.split(done, 0)
+    assert branches.ahead(done) == 0
+    other.totals[2] = {"rgb": 0.9}
+    assert branches.ahead(done) == pytest.approx(0.1 / 0.95)
+    done = of_costs(1.0, lost=[0])
+    branches.split(done, 0)
+    assert branches.ahead(done) == 0 and not branches.decide(done, 1.0)
+
+
 def of_a_cloth(folder):
     truth = small_cloth(folder, frames=6)
     return truth, problem_of(truth.folder)
