@@ -42,10 +42,10 @@ def simulated(
     ``guide`` (T, N, 3) [m]: the drape that leads the cloth; ``rest`` (N, 3) [m] and ``faces``
     (F, 3) of the garment graded to the body, of a ``material``, or of several, of which ``of`` (F,)
     says each face's; ``held`` (N,): how firmly each vertex is held, as
-    :func:`onefit.garment.waistband.held` says; ``bodies`` (T, V, 3) [m], ``body_faces``; ``steps``
-    in a frame, in which the body moves along straight lines; ``sides`` (F, 3) [m]: the lengths of
-    the faces at rest, and ``cut`` (N, 3) [m], of a garment that was cut otherwise than it hangs;
-    ``stitches``: what else holds it together; ``patches`` (N,): the patch of each vertex.
+    :func:`onefit.garment.waistband.held` says; ``bodies`` (T, V, 3) [m], ``body_faces`` (G, 3);
+    ``steps`` in a frame, in which the body moves along straight lines; ``sides`` (F, 3) [m]: the
+    lengths of the faces at rest, and ``cut`` (N, 3) [m], of a garment that was cut otherwise than
+    it hangs; ``stitches``: what else holds it together; ``patches`` (N,): the patch of each vertex.
     """
     settings = settings or Settings()
     order = _order(faces.numpy(), len(rest))

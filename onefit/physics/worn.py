@@ -58,15 +58,14 @@ class WornCloth:
         start = self._surface.vertices.copy(), self._target
         skin, way, pairs = self._ahead(dt, body)
         parts = self._parts(pairs, way)
-        if parts > 1:
-            self._surface.follow(start[0])
-        for k in range(1, parts):
+        if parts == 1:
+            self._part(dt, skin, pairs, target, pull)
+            return
+        self._surface.follow(start[0])
+        for k in range(1, parts + 1):
             now, to = (a + k / parts * (b - a) for a, b in zip(start, (body, target)))
             skin, _, pairs = self._ahead(dt / parts, now)
             self._part(dt / parts, skin, pairs, to, pull)
-        if parts > 1:
-            skin, _, pairs = self._ahead(dt / parts, body)
-        self._part(dt / parts, skin, pairs, target, pull)
 
     def _ahead(self, dt, body):
         """The body moves to ``body`` (V, 3) [m]: contacts with it; where the cloth goes (N, 3) [m]
