@@ -16,10 +16,17 @@ def crossing_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     corners = np.asarray(vertices, dtype=float)[faces]
     centre = corners.mean(1)
     radius = np.linalg.norm(corners - centre[:, None], axis=2).max(1)
-    one, two = cKDTree(centre).query_pairs(2 * radius.max(), output_type="ndarray").T
-    near = np.linalg.norm(centre[one] - centre[two], axis=1) < radius[one] + radius[two]
+    # the wider face of a pair reaches the other's centre within twice its radius
+    found = cKDTree(centre).query_ball_point(centre, 2 * radius, return_sorted=False)
+    one = np.repeat(np.arange(len(faces)), [len(x) for x in found])
+    two = np.concatenate(found).astype(np.int64) if len(faces) else one
+    first = (radius[one] > radius[two]) | ((radius[one] == radius[two]) & (one < two))
+    one, two = one[first], two[first]
+    low, high = corners.min(1), corners.max(1)
+    near = ((low[one] <= high[two]) & (low[two] <= high[one])).all(1)
+    one, two = one[near], two[near]
     apart = ~(faces[one][:, :, None] == faces[two][:, None]).any((1, 2))
-    one, two = one[near & apart], two[near & apart]
+    one, two = np.minimum(one, two)[apart], np.maximum(one, two)[apart]
     through = _pierces(corners[one], corners[two]) | _pierces(corners[two], corners[one])
     return np.column_stack([one, two])[through]
 

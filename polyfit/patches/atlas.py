@@ -136,7 +136,7 @@ def _few(vertices, faces, vectors):
         own = _few(halved, finer, mesh.face_vectors(halved, finer) / 2)[: len(points)]
         label[inside] = np.unique(own, return_inverse=True)[1]
         return label
-    for wanted in range(2, FINE):
+    for wanted in range(2, FINE if held(fine) else 0):  # what many do not hold, few do not
         for weight in NORMAL_WEIGHTS:
             own = clusters(fine, wanted, weight)
             if held(own):

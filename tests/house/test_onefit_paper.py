@@ -10,7 +10,7 @@ from scripts import load
 import onefit
 
 bench = load("benchmarks/onefit_paper.py")
-TINY = "--epochs 1 --epoch-steps 1 --batch 100 --seeds 1 --shapes 0".split()
+TINY = "--epochs 1 --batch 100 --seeds 1 --shapes 0".split()
 
 
 @pytest.fixture(scope="module")
@@ -37,10 +37,10 @@ def test_every_training_has_a_command(capsys):
 
 
 def test_tables_of_what_is_trained(runs, tmp_path):
-    bench.main([str(runs), "--train", "jumpsuit-tuned", "tank-no-col", "--short"])
+    bench.main([str(runs), "--train", "jumpsuit-tuned", "tank-no-col", "--short", "1"])
     assert sorted(p.name for p in runs.iterdir()) == ["jumpsuit-tuned", "six", "tank-no-col"]
     made = (runs / "six" / "weights.safetensors").stat().st_mtime_ns
-    bench.main([str(runs), "--train", "six", "--short"])  # is there already
+    bench.main([str(runs), "--train", "six", "--short", "1"])  # is there already
     assert (runs / "six" / "weights.safetensors").stat().st_mtime_ns == made
     (tmp_path / "onefit_paper.json").write_text('{"jumpsuit": {"six": 7.0}, "styles": {"old": 1}}')
     tables = ["trained", "losses", "styles", "poses", "resolutions"]

@@ -18,7 +18,7 @@ from onefit.body import ClosestSurface, skinning
 from polyfit.errors import InputError
 
 QUICK = Sampling(
-    seconds=1.0, taught=1, guided=3, shapes=8, guide=8, points=12, width=32, steps=300
+    seconds=0.5, taught=1, guided=2, shapes=8, guide=8, points=12, width=32, steps=300
 )  # fmt: skip
 
 

@@ -11,16 +11,16 @@ from clips import CAMERA, HEIGHT, WIDTH, photo, placed, rendered, write_png
 from polysft_mi import evaluate, prepare, run
 from polysft_mi.results.truth import load_npz
 
-ADAM = ["-q", "-D", "solver=adam", "-D", "window=3", "-D", "period=12", "-D", "patience=12"]
+PAPER = ["-q", "-D", "preset=paper", "-D", "period=12", "-D", "patience=12"]
 
 
 def test_a_synthetic_sequence_of_phi_sft(tmp_path, capsys):
     """S1 to S4: rgbs/, masks/, an OBJ file of quads, a texture, camera.json, and the truth."""
     folder, out = tmp_path / "S1", tmp_path / "out"
-    truth = synthetic.phi_sft(folder, frames=4, obj="0_S1_quad.obj", bend=0.3)
+    truth = synthetic.phi_sft(folder, frames=3, obj="0_S1_quad.obj", bend=0.3)
     np.savez(folder / "gt.npz", vertices=truth.vertices.astype(np.float32), faces=truth.faces)
     prepare.main([str(folder), "-o", str(tmp_path / "scene"), "-q"])
-    assert run.main([str(tmp_path / "scene" / "scene.xml"), "-o", str(out), *ADAM]) == 0
+    assert run.main([str(tmp_path / "scene" / "scene.xml"), "-o", str(out), *PAPER]) == 0
     capsys.readouterr()
     assert evaluate.main([str(out), str(folder), "--json"]) == 0
     figures = json.loads(capsys.readouterr().out)
@@ -43,7 +43,7 @@ def test_images_of_a_sheet_without_truth(tmp_path):
     words += ["--camera", str(tmp_path / "camera.json"), "--no-masks", "--corners", *corners]
     prepare.main([*words, "-o", str(tmp_path / "bend"), "-q"])
     out = tmp_path / "out"
-    assert run.main([str(tmp_path / "bend" / "scene.xml"), "-o", str(out), *ADAM]) == 0
+    assert run.main([str(tmp_path / "bend" / "scene.xml"), "-o", str(out), *PAPER]) == 0
     made = load_npz(out / "surface.npz")["vertices"]
     assert len(made) == 3
     # the sheet goes away to the side: its middle follows
