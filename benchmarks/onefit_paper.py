@@ -67,7 +67,7 @@ COUNTS = (1000, 4000, 16_000, 63_000)  # vertices
 
 
 def arguments(name, runs, short=None):
-    """Those of ``python -m onefit.train`` for the training ``name``, of ``short`` steps an epoch."""
+    """Those of ``python -m onefit.train`` for the training ``name``; ``short``: steps an epoch."""
     flags = [flag.replace("RUNS", str(runs)) for flag in TRAININGS[name]]
     fewer = [*SHORT, "--epoch-steps", str(short)] if short else []
     return [*flags, "-o", str(Path(runs) / name), "--preset", "paper", *fewer]

@@ -137,6 +137,18 @@ def _add_evidence(group):
         " template, which is given on the body at rest; of a FOLDER whose camera.json has"
         " world_to_camera (needs the extra learn for the run)",
     )
+    group.add_argument(
+        "--body-model",
+        metavar="FILE",
+        help="SMPL's, SMPL-H's or SMPL-X's file (.pkl, .npz), whose motion --body then is: poses or"
+        " global_orient and body_pose, trans, betas",
+    )
+    group.add_argument(
+        "--body-up",
+        choices=("z", "y", "-y"),
+        default="z",
+        help="axis of its world that points up; -y where that is a level camera's (default: z)",
+    )
 
 
 def _add_cameras(group):
@@ -285,7 +297,10 @@ def _evidence(args):
         known |= {"depth": args.depth, "depth_unit": args.depth_unit}
         known["depth_known_to"] = args.depth_known_to
     if args.body:
-        known["body"] = args.body
+        known |= {"body": args.body, "body_up": args.body_up}
+        known |= {"body_model": args.body_model} if args.body_model else {}
+    elif args.body_model:
+        raise InputError(f"--body-model {args.body_model}: of whose motion? --body names its file")
     return known
 
 

@@ -180,6 +180,20 @@ class SmplBody(BodyModel):
             self.kind,
         )
 
+    def shape_of(self, betas: np.ndarray | None) -> torch.Tensor:
+        """The shape (S,) of betas, of which there may be fewer or more; None is the mean shape."""
+        shape = self.standard_shape.clone()
+        known = np.asarray([] if betas is None else betas)[: len(shape)]
+        shape[: len(known)] = torch.as_tensor(known).float()
+        return shape
+
+    def root(self, shape: torch.Tensor | None = None) -> np.ndarray:
+        """The root joint (3,) [m, in SMPL's axes] of a shape in SMPL's zero pose: a translation of
+        SMPL's leads from there.
+        """
+        vertices = self._vertices + self._basis @ self._shape(shape).double().numpy()
+        return self._regressor[0] @ vertices
+
     def random_shape(self, rng: np.random.Generator) -> torch.Tensor:
         """Betas (S,) from the normal distribution that SMPL's are scaled to, cut off at ±2."""
         return torch.from_numpy(np.clip(rng.standard_normal(len(self.shape_names)), -2, 2)).float()

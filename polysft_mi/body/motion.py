@@ -7,33 +7,51 @@ import zipfile
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from polysft_mi.errors import InputError
 
 _JOINTS = 24
-_POSES, _PLACES = ("poses", "pose"), ("translation", "trans", "transl")
+_SMPL_JOINTS = (22, 24, 52, 55)
+_POSES = "poses", "pose", "pose_world"
+_PLACES = "translation", "trans", "transl", "trans_world"
+_RATES = "fps", "mocap_framerate", "mocap_frame_rate"
 _USUAL_FPS = 30.0
+_TO_Z = {"z": 0, "y": 90, "-y": -90}  # degrees about x that turn what is up to z
+_IDENTITY = Rotation.identity()
+_FROM_SMPL = Rotation.from_euler("x", 90, degrees=True)  # from SMPL's body axes to OneFit's
 
 
 @dataclass(frozen=True)
 class BodyMotion:
     """A body in T frames: ``poses`` (T, 24, 3) [rad] and ``translation`` (T, 3) [m] in the scene's
     world, as :class:`onefit.Motion` has them; ``fps`` frames a second; ``shape`` (S,) of Anny's
-    body, or None for the standard one. ``path``: where it was read.
+    body, or None for the standard one. ``up`` turns the scene's world to one whose z is up.
+    ``model``: the file of a body of SMPL's family, whose are the ``shape`` (betas) and the
+    ``translation``, which then leads from its root at rest; or empty. ``path``: where it was read.
     """
 
     poses: np.ndarray
     translation: np.ndarray
     fps: float
     shape: np.ndarray | None = None
+    up: Rotation = _IDENTITY
+    model: str = ""
     path: str = "body"
 
     @classmethod
     def read(
-        cls, path: str | os.PathLike[str], count: int | None, selected: list[int]
+        cls,
+        path: str | os.PathLike[str],
+        count: int | None,
+        selected: list[int],
+        model: str = "",
+        up: str = "z",
     ) -> BodyMotion:
         """The motion of an ``.npz`` file: ``poses`` (T, 24, 3) or (T, 72), ``translation`` (T, 3),
-        and, where it has them, ``fps`` and ``shape``.
+        and, where it has them, ``fps`` and ``shape``. With a ``model`` of SMPL's family, as
+        programs write its motions: ``poses``, of 22, 24, 52 or 55 joints, or ``global_orient`` and
+        ``body_pose``; ``trans``; ``betas``. ``up``: the scene's axis that is, z, y or -y.
 
         T is the number of all ``count`` images (None: of as many as the video has), or of those
         that are ``selected``. Raises InputError.
@@ -49,22 +67,28 @@ class BodyMotion:
                 f"{path}: not a file of a body's motion; .npz with poses (T, {_JOINTS}, 3) and"
                 " translation (T, 3) is needed"
             ) from None
-        poses, places = (
-            next((arrays[name] for name in names if name in arrays), None)
-            for names in (_POSES, _PLACES)
-        )
+        poses, places = _found(arrays, _POSES), _found(arrays, _PLACES)
+        orient, of_body = (arrays.get(name) for name in ("global_orient", "body_pose"))
+        if model and poses is None and orient is not None and of_body is not None:
+            poses = np.concatenate([x.reshape(len(places), -1) for x in (orient, of_body)], 1)
+        joints = _SMPL_JOINTS if model else (_JOINTS,)
+        needed = f"poses (T, {' or '.join(map(str, joints))}, 3) and translation (T, 3) are needed"
+        if "betas" in arrays and not model:
+            raise InputError(
+                f"{path}: has betas, so its poses are SMPL's; give its body's file too"
+                " (--body-model, or -D body_model=)"
+            )
         if poses is None or places is None:
             raise InputError(
-                f"{path}: no {'poses' if poses is None else 'translation'}; poses (T, {_JOINTS}, 3)"
-                f" and translation (T, 3) are needed, and the file has"
-                f" {', '.join(sorted(arrays)) or 'nothing'}"
+                f"{path}: no {'poses' if poses is None else 'translation'}; {needed}, and the file"
+                f" has {', '.join(sorted(arrays)) or 'nothing'}"
             )
-        if poses.ndim == 2 and poses.shape[1] == 3 * _JOINTS:
-            poses = poses.reshape(len(poses), _JOINTS, 3)
-        if poses.ndim != 3 or poses.shape[1:] != (_JOINTS, 3) or places.shape != (len(poses), 3):
+        if poses.ndim == 2 and poses.shape[1] in [3 * n for n in joints]:
+            poses = poses.reshape(len(poses), -1, 3)
+        fits = poses.ndim == 3 and poses.shape[1] in joints and poses.shape[2] == 3
+        if not fits or places.shape != (len(poses), 3):
             raise InputError(
-                f"{path}: poses {poses.shape} and translation {places.shape}; (T, {_JOINTS}, 3) and"
-                " (T, 3) are needed"
+                f"{path}: poses {poses.shape} and translation {places.shape}; {needed}"
             )
         numbers = poses.dtype.kind in "fiu" and places.dtype.kind in "fiu"
         if not numbers or not (np.isfinite(poses).all() and np.isfinite(places).all()):
@@ -77,10 +101,43 @@ class BodyMotion:
                     " the video's, are needed"
                 )
             poses, places = poses[selected], places[selected]
-        fps = float(arrays.get("fps", _USUAL_FPS))
+        rate = _found(arrays, _RATES)
+        fps = _USUAL_FPS if rate is None else float(np.ravel(rate)[0])
         if count != len(selected) and len(selected) > 1:
             fps /= selected[1] - selected[0]
         if not 0 < fps < 10_000:
             raise InputError(f"{path}: fps = {fps:g}; a positive number is needed")
+        poses, places, turn = poses.astype(float), places.astype(float), _upright(up)
         shape = arrays.get("shape")
-        return cls(poses.astype(float), places.astype(float), fps, shape, path)
+        if model:
+            poses, shape = _in_our_axes(poses), _betas(arrays.get("betas"), path)
+        return cls(poses, places, fps, shape, turn, model, path)
+
+
+def _found(arrays, names):
+    return next((arrays[name] for name in names if name in arrays), None)
+
+
+def _upright(up):
+    return Rotation.from_euler("x", _TO_Z[up], degrees=True)
+
+
+def _in_our_axes(poses):
+    """SMPL's rotations (T, J, 3) [rad], the root's first, as :class:`onefit.Motion` has them, (T,
+    24, 3): hands lie flat, and the root leads into the same world.
+    """
+    body = _JOINTS if poses.shape[1] == _JOINTS else 22
+    out = np.zeros((len(poses), _JOINTS, 3))
+    out[:, :body] = _FROM_SMPL.apply(poses[:, :body].reshape(-1, 3)).reshape(-1, body, 3)
+    out[:, 0] = (Rotation.from_rotvec(poses[:, 0]) * _FROM_SMPL.inv()).as_rotvec()
+    return out
+
+
+def _betas(betas, path):
+    """One shape (S,) for all frames: the mean of an estimate for each. None where there is none."""
+    if betas is None:
+        return None
+    betas = np.asarray(betas)
+    if betas.ndim not in (1, 2) or betas.dtype.kind not in "fiu" or not np.isfinite(betas).all():
+        raise InputError(f"{path}: betas {betas.shape}; finite numbers (S,) or (T, S) are needed")
+    return betas.reshape(-1, betas.shape[-1]).mean(0)

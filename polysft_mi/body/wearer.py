@@ -7,6 +7,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from polyfit.errors import require
 from polyfit.mesh import edges_of
@@ -32,21 +33,20 @@ def put_on(vertices: np.ndarray, faces: np.ndarray, motion: BodyMotion) -> Carri
     import onefit
     from onefit.garment import cotangent_laplacian, smoother
 
-    draper = onefit.load()
+    smpl = onefit.SmplBody(motion.model) if motion.model else None
+    draper = onefit.load(model=smpl)
     shape = None if motion.shape is None else torch.as_tensor(motion.shape).float()
+    translation = motion.translation
+    if smpl:
+        shape = smpl.shape_of(motion.shape)
+        translation = translation + smpl.root(shape) - smpl.body(shape).joints[0].double().numpy()
     body = draper.model.body(shape)
-    garment = onefit.Garment.of_mesh(
-        "template", vertices, faces, made_for=None if shape is None else body
-    )
+    given = smpl or shape is not None
+    garment = onefit.Garment.of_mesh("template", vertices, faces, made_for=body if given else None)
     seen = garment.render_mesh
     corners = garment.faces.numpy()[seen.face]
     weights = np.einsum(
         "nk,nkj->nj", seen.barycentric, garment.blend_weights.double().numpy()[corners]
-    )
-    as_onefit = onefit.Motion(
-        torch.as_tensor(motion.poses).float(),
-        torch.as_tensor(motion.translation).float(),
-        motion.fps,
     )
     carrier = Carrier(
         body.joints.double().numpy(),
@@ -54,7 +54,7 @@ def put_on(vertices: np.ndarray, faces: np.ndarray, motion: BodyMotion) -> Carri
         body.rest_pose.double().numpy(),
         weights / weights.sum(1, keepdims=True),
         motion.poses,
-        motion.translation,
+        translation,
         fps=motion.fps,
         skin=tuple(
             x.numpy().astype(kind)
@@ -65,7 +65,16 @@ def put_on(vertices: np.ndarray, faces: np.ndarray, motion: BodyMotion) -> Carri
             )
         ),
     )
+    upright, root = motion.up, carrier.joints[0]
+    poses = motion.poses.copy()
+    poses[:, 0] = (upright * Rotation.from_rotvec(poses[:, 0])).as_rotvec()
+    as_onefit = onefit.Motion(
+        torch.as_tensor(poses).float(),
+        torch.as_tensor(upright.apply(translation + root) - root).float(),
+        motion.fps,
+    )
     worn = draper.simulate(garment, as_onefit, shape).render_vertices().astype(float)
+    worn = upright.inv().apply(worn.reshape(-1, 3)).reshape(worn.shape)
     at = np.arange(len(motion.poses)) * (_NETWORK_FPS / motion.fps)
     before = np.minimum(at.astype(int), len(worn) - 1)
     after, part = np.minimum(before + 1, len(worn) - 1), (at - before)[:, None, None]

@@ -17,6 +17,8 @@ from .output import staged
 from .rig import CAMERAS
 from .scene_file import scene_xml
 
+_OF_BODY = "body", "body_model", "body_up"
+
 
 def prepare_folder(
     folder,
@@ -46,7 +48,9 @@ def prepare_folder(
     camera = layout.camera
     masks = os.path.join(folder, layout.masks) if layout.masks else ""
     said = []
-    known_to, body = evidence.pop("depth_known_to", "metric"), evidence.pop("body", None)
+    known_to = evidence.pop("depth_known_to", "metric")
+    of_body = {name: evidence.pop(name) for name in _OF_BODY if name in evidence}
+    body, model = (of_body.get(name, "") for name in ("body", "body_model"))
     if body:
         _, pose = read_camera(os.path.join(folder, "camera.json"))
         layout = replace(layout, world_to_camera=tuple(map(tuple, pose.tolist())))
@@ -58,8 +62,11 @@ def prepare_folder(
         os.path.join(folder, layout.frames), masks, size=(camera.width, camera.height), **evidence
     )
     if body:
-        BodyMotion.read(body, len(sequence), sequence.indices)
-        evidence["body"] = body
+        up = of_body.get("body_up", "z")
+        BodyMotion.read(body, len(sequence), sequence.indices, model, up)
+        if model and not os.path.isfile(model):
+            raise InputError(f"{model}: no such file of a body")
+        evidence |= of_body
     checked_size(os.path.join(folder, layout.texture))
     template, where = None, "template.obj"
     if layout.obj is None:
@@ -99,7 +106,7 @@ def prepare_folder(
     note = meshio.size_note(vertices, where)
     if note:
         warn(note)
-    for name in ("tracks", "depth", "cameras", "body"):
+    for name in ("tracks", "depth", "cameras", "body", "body_model"):
         if evidence.get(name):
             evidence[name] = _from_data(evidence[name], folder)
     if depth:

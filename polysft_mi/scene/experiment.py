@@ -67,9 +67,9 @@ class Experiment:
     def sequence(self) -> Sequence:
         """The :class:`Sequence` of the frames that the settings select. Raises InputError."""
         s = self.settings
-        tracks, depth, cameras, body = (
+        tracks, depth, cameras, body, model = (
             os.path.normpath(located(self.path, name)) if name else ""
-            for name in (s.tracks, s.depth, s.cameras, s.body)
+            for name in (s.tracks, s.depth, s.cameras, s.body, s.body_model)
         )
         sequence = Sequence.open(
             self.frames,
@@ -98,7 +98,7 @@ class Experiment:
             selected = s.first, s.last, s.stride
             sequence.cameras = open_cameras(cameras, len(sequence), *selected, self.sensors)
         if body:
-            motion = BodyMotion.read(body, sequence.count, sequence.indices)
+            motion = BodyMotion.read(body, sequence.count, sequence.indices, model, s.body_up)
             sequence.carrier = put_on(self.template.vertices, self.template.faces, motion)
         return sequence
 

@@ -80,6 +80,13 @@ class Settings:
         "file of a body's motion (.npz: poses, translation), in whose rest pose the template is"
         " given, and which carries it; empty: none",
     )
+    body_model: str = _setting(
+        "",
+        "file of a body of SMPL's family (.npz or .pkl), whose motion it then is; empty: Anny's",
+    )
+    body_up: str = _setting(
+        "z", "axis of the world that points up, where a body moves", choices=("z", "y", "-y")
+    )
     order: int = _setting(
         0,
         "order n of the jets; 0: 8, or 5 where the template has several patches, or less if the"

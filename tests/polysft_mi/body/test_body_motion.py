@@ -43,9 +43,10 @@ def test_of_the_frames_that_are_used(known, tmp_path):
     [
         ({"poses": None}, r"no poses; poses \(T, 24, 3\) and translation .* has translation"),
         ({"poses": np.zeros((FRAMES, 22, 3))}, r"poses \(6, 22, 3\) and translation \(6, 3\)"),
-        ({"translation": np.zeros((FRAMES, 2))}, r"\(6, 2\); \(T, 24, 3\) and \(T, 3\) are needed"),
+        ({"translation": np.zeros((FRAMES, 2))}, r"\(6, 2\); poses \(T, 24, 3\) and translation"),
         ({"translation": np.full((FRAMES, 3), np.nan)}, "must be finite numbers"),
         ({"fps": 0}, "fps = 0; a positive number is needed"),
+        ({"betas": np.zeros(10)}, "has betas, so its poses are SMPL's; give its body's file too"),
     ],
 )
 def test_what_cannot_be_used_is_refused(known, tmp_path, change, message):

@@ -272,6 +272,28 @@ def test_a_body_says_where_the_camera_stands(tmp_path):
         prepare.main([*words, "--overwrite"])
 
 
+def test_a_body_of_smpl_s_family(tmp_path):
+    """Its model and the axis that is up go into the scene; without the model its motion is none."""
+    folder, frames = synthetic.cloth(tmp_path / "a", frames=3).folder, 3
+    camera = json.loads((folder / "camera.json").read_text())
+    pose = np.diag([1.0, -1, -1, 1])
+    (folder / "camera.json").write_text(json.dumps(camera | {"world_to_camera": pose.tolist()}))
+    motion = {"poses": np.zeros((frames, 72)), "trans": np.zeros((frames, 3))}
+    np.savez(tmp_path / "smpl.npz", **motion, betas=np.zeros(10))
+    words = [str(folder), "--body", str(tmp_path / "smpl.npz"), "-o", str(tmp_path / "out")]
+    with pytest.raises(InputError, match="has betas, so its poses are SMPL's.*--body-model"):
+        prepare.main(words)
+    words += ["--body-model", str(tmp_path / "SMPL.pkl"), "--body-up", "y"]
+    with pytest.raises(InputError, match="SMPL.pkl: no such file of a body"):
+        prepare.main(words)
+    (tmp_path / "SMPL.pkl").write_bytes(b"")  # the run reads it
+    prepare.main(words)
+    settings = loaded(str(tmp_path / "out" / "scene.xml")).settings
+    assert settings.body_model == str(tmp_path / "SMPL.pkl") and settings.body_up == "y"
+    with pytest.raises(InputError, match="--body-model x.pkl: of whose motion"):
+        prepare.main([str(folder), "--body-model", "x.pkl", "-o", str(tmp_path / "other")])
+
+
 def test_a_body_is_for_a_folder(tmp_path):
     video = tmp_path / "clip.mp4"
     video.write_bytes(b"")

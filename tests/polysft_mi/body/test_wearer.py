@@ -1,0 +1,78 @@
+"""A garment is put on a body: SMPL's, whose motion is in SMPL's form and in a world with y up, as
+on the same body in OneFit's.
+"""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from standing import smpl_contents
+
+from polysft_mi.body import BodyMotion, put_on
+
+onefit = pytest.importorskip("onefit")
+C = Rotation.from_euler("x", 90, degrees=True)
+FRAMES = 3
+
+
+@pytest.fixture(scope="module")
+def garment():
+    return onefit.Garment.template("tank").remeshed(500)
+
+
+@pytest.fixture(scope="module")
+def motion():
+    made = onefit.Motion.generate("walk", seconds=FRAMES / 30, seed=2)
+    return made.poses.double().numpy(), made.translation.double().numpy()
+
+
+@pytest.fixture(scope="module")
+def smpl(tmp_path_factory):
+    path = tmp_path_factory.mktemp("smpl") / "model.npz"
+    np.savez(path, **smpl_contents(onefit.AnnyBody().body()))
+    return str(path)
+
+
+def as_smpl(motion, model):
+    """The motion in SMPL's form, y up."""
+    poses, translation = motion
+    root = onefit.AnnyBody().body().joints[0].double().numpy()
+    theirs = C.inv().apply(poses.reshape(-1, 3)).reshape(poses.shape)
+    theirs[:, 0] = (C.inv() * Rotation.from_rotvec(poses[:, 0]) * C).as_rotvec()
+    trans = C.inv().apply(translation + root) - onefit.SmplBody(model).root()
+    return theirs, trans
+
+
+def put(garment, path, *model, **arrays):
+    np.savez(path, **arrays)
+    motion = BodyMotion.read(path, FRAMES, list(range(FRAMES)), *model)
+    vertices, faces = garment.vertices.double().numpy(), garment.faces.numpy()
+    carrier = put_on(vertices, faces, motion)
+    return np.stack([carrier.maps(carrier.at(k))(vertices) for k in range(FRAMES)])
+
+
+def test_a_motion_in_smpl_s_form_is_the_same_motion(garment, motion, smpl, tmp_path):
+    ours = put(garment, tmp_path / "ours.npz", poses=motion[0], translation=motion[1])
+    poses, trans = as_smpl(motion, smpl)
+    given = dict(poses=poses.reshape(FRAMES, 72), trans=trans, betas=np.zeros((FRAMES, 10)))
+    theirs = put(garment, tmp_path / "theirs.npz", smpl, "y", **given)
+    away = np.linalg.norm(C.apply(theirs.reshape(-1, 3)).reshape(theirs.shape) - ours, axis=2)
+    # up to what skinning there and back makes of the body, and the cloth of that
+    assert np.median(away) < 4e-3 and away.max() < 0.03
+
+
+def test_smpl_s_forms_say_the_same(motion, smpl, tmp_path):
+    poses, trans = as_smpl(motion, smpl)
+    read = lambda name: BodyMotion.read(tmp_path / name, FRAMES, [0, 1, 2], smpl, "y")
+    np.savez(tmp_path / "a.npz", poses=poses, trans=trans, mocap_framerate=60.0)
+    parts = dict(global_orient=poses[:, 0], body_pose=poses[:, 1:22].reshape(FRAMES, -1))
+    np.savez(tmp_path / "b.npz", **parts, transl=trans, fps=60, betas=np.ones(4))
+    hands = np.zeros((FRAMES, 33, 3))
+    more = np.concatenate([poses[:, :22], hands], 1).reshape(FRAMES, 165)
+    np.savez(tmp_path / "c.npz", poses=more, trans=trans, mocap_framerate=60.0)
+    whole, in_parts, of_smplx = (read(name) for name in ("a.npz", "b.npz", "c.npz"))
+    assert whole.fps == in_parts.fps == 60 and whole.shape is None
+    assert in_parts.shape.tolist() == [1, 1, 1, 1] and whole.model == smpl
+    for other in (in_parts, of_smplx):
+        assert np.allclose(other.poses[:, :22], whole.poses[:, :22])
+        assert np.array_equal(other.translation, whole.translation)
+    assert whole.up.apply([0, 1, 0]) == pytest.approx([0, 0, 1])
