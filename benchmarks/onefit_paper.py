@@ -11,7 +11,8 @@ trained on (as by ``onefit_accuracy.py``), and is what the network alone makes: 
 post-processing. *ε_c*: % of the vertices inside the body; *ε_e*, *ε_a*: mean % by which edges and
 faces change.
 
-Writes ``onefit_paper.json``; tables whose networks RUNS lacks stay in it as they are.
+Writes ``onefit_paper.json``; tables whose networks RUNS lacks stay in it as they are. The poses are
+shown in ``paper_poses.jpg``, each in the frame that is farthest from the first.
 """
 
 import argparse
@@ -24,6 +25,7 @@ import onefit_accuracy as accuracy
 
 import onefit
 from onefit import train
+from onefit.draping.output import BODY_COLOUR, GARMENT_COLOURS
 from onefit.garment import Garment, standard_body
 from onefit.garment.fitting import pushed_out
 from onefit.garment.sewing.block import Block
@@ -64,6 +66,7 @@ STYLES = {  # of the tank top: measures of its pattern [m]
 }
 POSES = (("dress", "kick"), ("tank", "bend"), ("trousers", "lunge"), ("tshirt", "arms_up"))
 COUNTS = (1000, 4000, 16_000, 63_000)  # vertices
+PICTURE = (480, 320)  # of a pose: height and width [pixels]
 
 
 def arguments(name, runs, short=None):
@@ -88,8 +91,8 @@ def make(name, runs, short):
 class Bench:
     """The networks of a folder, and what they make of garments."""
 
-    def __init__(self, runs, seconds, shapes):
-        self.runs, self.seconds, self.shapes = Path(runs), seconds, shapes
+    def __init__(self, runs, seconds, shapes, docs):
+        self.runs, self.seconds, self.shapes, self.docs = Path(runs), seconds, shapes, Path(docs)
         self.drapers = {}
 
     def has(self, *names):
@@ -148,11 +151,13 @@ class Bench:
         """Each garment in a demanding motion, of a seed that no training uses."""
         if not self.has("six"):
             return {}
-        draper, found = self.draper("six"), {}
+        draper, found, drapes = self.draper("six"), {}, []
         for garment, kind in POSES:
             motion = onefit.Motion.generate(kind, seconds=self.seconds, seed=accuracy.SEED)
             drape = draper.drape(garment, motion, post=False, eased=False)
             found[f"{garment}, {kind}"] = drape.measures().collision
+            drapes.append(drape)
+        show(drapes, self.docs / "paper_poses.jpg")
         return found
 
     def resolutions(self):
@@ -181,6 +186,27 @@ class Bench:
                 )
             )
         return rows
+
+
+def show(drapes, path):
+    """A picture of each drape, side by side: the frame whose body is farthest from the first's."""
+    from polysft_mi.backend import set_variant
+
+    set_variant()
+    import cv2
+    import numpy as np
+
+    from polysft_mi.render import stage
+
+    row, colour = [], GARMENT_COLOURS[0]
+    for drape in drapes:
+        body = drape.body - drape.root[:, None]
+        k = int((body - body[0]).norm(dim=-1).mean(1).argmax())
+        shown = (drape.body, drape.body_faces, BODY_COLOUR), (drape.vertices, drape.faces, colour)
+        meshes = [(x[k : k + 1].numpy(), faces.numpy(), of) for x, faces, of in shown]
+        row += stage.render(meshes, size=PICTURE, spp=64)
+    quality = [cv2.IMWRITE_JPEG_QUALITY, 88]
+    cv2.imwrite(str(path), np.hstack(row)[..., ::-1], quality)
 
 
 TABLES = ("trained", "collisions", "jumpsuit", "losses", "styles", "poses", "resolutions")
@@ -212,8 +238,9 @@ def main(argv=None):
         for name in args.train:
             make(name, args.runs, args.short)
         return
-    bench, path = Bench(args.runs, args.seconds, args.shapes), Path(args.output)
+    path = Path(args.output)
     path.mkdir(parents=True, exist_ok=True)
+    bench = Bench(args.runs, args.seconds, args.shapes, path)
     path /= "onefit_paper.json"
     report = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     for name in args.tables:

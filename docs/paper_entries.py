@@ -216,12 +216,12 @@ SECTIONS = {
             "epochs, then 1e-4; 8 hours on four A100.",
             (
                 "python -m onefit.train --motions AMASS/a.npz -o RUNS/six --preset paper",
-                "python benchmarks/onefit_paper.py RUNS --short --train six",
+                "python benchmarks/onefit_paper.py RUNS --short 60 --train six",
                 "python benchmarks/onefit_paper.py RUNS --commands",
             ),
             figures.onefit_trainings,
             "The full trainings are not done: on two cores each takes ten hours. The short ones "
-            "(`--short`) have 120 steps of a tenth of the batch, on one core of a busy machine. "
+            "(`--short 60`) have 720 steps of a tenth of the batch, on one core of a busy machine. "
             "They show that the commands work, and what such networks do; not what the method "
             "reaches. All tables of OneFit here are by them.",
         ),
@@ -230,17 +230,17 @@ SECTIONS = {
             "Trained on a tank top, OneFit drapes tank tops of other styles.",
             (f"{ONEFIT} --tables styles",),
             figures.styles,
-            "Of 120 steps of training.",
+            "Of 720 steps of training.",
         ),
         Entry(
             "Table 4, and figure 6",
             "ε_c of six garments, trained on the dress, and on all six.",
             (
-                "python benchmarks/onefit_paper.py RUNS --short --train dress six",
+                "python benchmarks/onefit_paper.py RUNS --short 60 --train dress six",
                 f"{ONEFIT} --tables collisions",
             ),
             figures.collisions,
-            "Bodies, motions and garments are others, and 120 steps decide little: what is not in "
+            "Bodies, motions and garments are others, and 720 steps decide little: what is not in "
             "the training is hardly worse here. The package's weights, by more inputs, k_c = 4 and "
             "cuts, are in [onefit.md](onefit.md#figures).",
         ),
@@ -274,7 +274,7 @@ SECTIONS = {
                 "python -m onefit.train jumpsuit --from RUNS/six/weights.safetensors "
                 "-o RUNS/jumpsuit-tuned --preset paper --epochs 12",
                 "python -m onefit.train jumpsuit -o RUNS/jumpsuit --preset paper",
-                "python benchmarks/onefit_paper.py RUNS --short --train jumpsuit jumpsuit-tuned",
+                "python benchmarks/onefit_paper.py RUNS --short 60 --train jumpsuit jumpsuit-tuned",
                 f"{ONEFIT} --tables jumpsuit",
             ),
             figures.jumpsuit,
@@ -284,12 +284,12 @@ SECTIONS = {
             "Table 6",
             "Each loss left out, on the tank top.",
             (
-                "python benchmarks/onefit_paper.py RUNS --short --train tank tank-no-mesh-inext "
+                "python benchmarks/onefit_paper.py RUNS --short 60 --train tank tank-no-mesh-inext "
                 "tank-no-inext tank-no-col",
                 f"{ONEFIT} --tables losses",
             ),
             figures.losses,
-            "Trained for minutes, 120 steps each. What our inputs and patches bring is a row more, "
+            "Trained for minutes, 720 steps each. What our inputs and patches bring is a row more, "
             "`--train tank-ours`.",
         ),
         Entry(

@@ -218,7 +218,8 @@ def styles(data):
 def poses(data):
     found = data["onefit_paper"].get("poses", {})
     rows = [(name, f"{value:.2f}") for name, value in found.items()]
-    return table(("garment, motion", "ε_c %"), rows) if rows else ""
+    shown = "\n\n![The four poses, side by side](paper_poses.jpg)"
+    return table(("garment, motion", "ε_c %"), rows) + shown if rows else ""
 
 
 def resolutions(data):

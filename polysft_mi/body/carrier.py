@@ -66,7 +66,8 @@ class Carrier:
     ``weights`` (N, J), rows that sum to one; ``poses`` (T, J, 3) [rad], ``translation`` (T, 3) [m]:
     what is known of its motion. ``draped`` (T, N, 3) [m, rest], or None: by what the garment's
     drape differs from the template in each frame, before it is carried; ``lengths`` (T, E) [m]: of
-    the template's edges in the drape, or None. ``skin``: the body itself: vertices at rest (V, 3)
+    the template's edges in the drape, or None, and ``length_errors`` (T,) how well they are known
+    as a whole, shares. ``skin``: the body itself: vertices at rest (V, 3)
     [m], their weights (V, J), and faces (F, 3), or None. ``fps``: frames a second. Maps, as
     :mod:`onefit.body.skinning` has them, are from the rest pose to a frame.
     """
@@ -82,13 +83,15 @@ class Carrier:
         *,
         draped=None,
         lengths=None,
+        length_errors=None,
         skin=None,
         fps=30.0,
     ):
         self.joints, self.weights = np.asarray(joints, float), np.asarray(weights, float)
         self.parents = tuple(parents)
         self.poses, self.translation = np.asarray(poses, float), np.asarray(translation, float)
-        self.draped, self.lengths, self.skin, self.fps = draped, lengths, skin, fps
+        self.draped, self.skin, self.fps = draped, skin, fps
+        self.lengths, self.length_errors = lengths, length_errors
         self._rest = self._chained(Rotation.from_rotvec(rest_pose).as_matrix())
         count = len(self.parents)
         #: (J, J): whether the first joint moves the second one

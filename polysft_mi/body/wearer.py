@@ -88,4 +88,6 @@ def put_on(vertices: np.ndarray, faces: np.ndarray, motion: BodyMotion) -> Carri
     a, b = edges_of(faces)[0].T
     each = [np.linalg.norm(x[:, a] - x[:, b], axis=2) for x in (worn, carried)]
     carrier.lengths = (each[0] + each[1]) / 2
+    between = (each[0] - each[1]) / 2 / carrier.lengths  # none of its folds, and all of them
+    carrier.length_errors = np.abs(between.mean(1)) / np.sqrt(3)
     return carrier

@@ -1,7 +1,8 @@
 """How sure each vertex is.
 
 ``sigma`` is what the normal equations say: the curvature of the whole objective at a minimum, by
-the noise of the images. It knows nothing of a wrong model. Where the surface strains its edges to
+the noise of the images, and on a body how well the edges' lengths are known as a whole, for they
+tell depth. It knows nothing of a wrong model. Where the surface strains its edges to
 follow the images, it is at odds with them, and by how much says more of its error: the ``score``,
 which is fitted to errors.
 """
@@ -18,12 +19,13 @@ _ROUNDS = 4  # of the mean over neighbours
 def along_rays(objective, model, nat, origin):
     """Standard deviation (N,) [m, float32] of each vertex along its ray from ``origin`` (3,) [m]:
     the root of ``nat``, what one unit of log-likelihood costs, times the inverse of the curvature.
-    NaN where that is singular.
+    NaN where that is singular. On a body also the distance times what lengths may all be too long.
     """
     surface, local = model.surface, model.normal.local.shape[-1]
     atlas = objective.atlas
     ray = surface.vertices - origin
-    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    distance = np.linalg.norm(ray, axis=1, keepdims=True)
+    ray /= distance
     by_global = atlas.global_columns(surface, ray)
     by_local = surface.by_offset(ray)[:, :local]
     try:
@@ -32,7 +34,10 @@ def along_rays(objective, model, nat, origin):
         variance = reduced.variance(by_local, by_global)
     except (LinAlgError, np.linalg.LinAlgError):
         variance = np.full(len(ray), np.nan)
-    return np.sqrt(nat * variance).astype(np.float32)
+    carrier, known = atlas.carrier, 0.0
+    if carrier is not None and carrier.length_errors is not None:
+        known = carrier.length_errors[model.state.pose.frame] * distance[:, 0]
+    return np.sqrt(nat * variance + known**2).astype(np.float32)
 
 
 def score(objective, vertices, sigma):

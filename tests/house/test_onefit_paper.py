@@ -5,6 +5,7 @@ where it was, and measures the network alone.
 import json
 
 import pytest
+from PIL import Image
 from scripts import load
 
 import onefit
@@ -25,6 +26,7 @@ def tiny(monkeypatch):
     tuned = ["tank", "--from", "RUNS/six/weights.safetensors"]
     monkeypatch.setitem(bench.TRAININGS, "jumpsuit-tuned", tuned)
     monkeypatch.setattr(bench, "COUNTS", (600,))
+    monkeypatch.setattr(bench, "PICTURE", (48, 32))
     monkeypatch.setattr(bench, "POSES", (("tank", "bend"),))
     monkeypatch.setattr(bench, "STYLES", {"cropped": dict(hem=0.12, count=700)})
 
@@ -58,3 +60,5 @@ def test_tables_of_what_is_trained(runs, tmp_path):
     motion = onefit.Motion.generate("bend", seconds=0.1, seed=bench.accuracy.SEED)
     alone = draper.drape("tank", motion, post=False, eased=False).measures().collision
     assert report["poses"] == {"tank, bend": pytest.approx(alone)}
+    with Image.open(tmp_path / "paper_poses.jpg") as picture:
+        assert picture.size == (32, 48)

@@ -35,6 +35,7 @@ def worn(truth):
     carried = np.stack([carrier.maps(carrier.at(k))(vertices) for k in range(FRAMES)])
     a, b = problem.template.edges.T
     carrier.lengths = np.linalg.norm(carried[:, a] - carried[:, b], axis=2)  # as of a drape
+    carrier.length_errors = np.full(FRAMES, 0.01)
     problem = Problem(problem.experiment, problem.sequence, problem.rules)
     problem.settings = dataclasses.replace(problem.settings, body="known", k_mi=10.0)
     return problem
@@ -61,6 +62,13 @@ def test_the_image_corrects_where_the_body_is(bent, tracked):
     assert error.mean() < 0.75 * known.mean()
     for k, state in enumerate(done.states):
         assert carrier.pose(state["pose"]).frame == k
+
+
+def test_depth_is_no_surer_than_lengths(tracked):
+    problem, done = tracked
+    distance = np.linalg.norm(surfaces_of(problem, done) - problem.camera.origin, axis=2)
+    sigma = np.stack([done.certainty[k][0] for k in range(FRAMES)])
+    assert (sigma >= 0.00999 * distance).all() and (sigma < 0.05 * distance).any()
 
 
 def test_a_run_that_was_interrupted_ends_alike(bent, tracked, tmp_path):
