@@ -212,20 +212,21 @@ class FrameTracker:
             context = replace(context, memory=known[-1])
         image = self._atlas.reaching(mirrored(vertices, self.problem.camera.origin), state)
         start = self._atlas.with_relief_in_jets(image)
-        coarse, *fine = self.objective.usual
-        (found,) = self._stages.minimise([context], coarse, [start])
 
         def is_other(state):
             apart = np.linalg.norm(self._atlas.surface(state).vertices - vertices, axis=1)
             return np.median(apart / certainty[0]) > 1
 
-        if not is_other(found.state):  # most often where the sheet is flat
-            return None, 0.0
-        found = self._stages.descend(found.state, context, fine or [coarse])
-        new = self._atlas.with_relief_in_jets(found.state)
-        excess = self._cost(new, context) / own_cost - 1
-        if excess > self.objective.rules.mirror_share or not is_other(new):
+        excess, new = 0.0, start
+        for stage in self.objective.usual:
+            (found,) = self._stages.minimise([context], stage, [new])
+            new = found.state
+            if not is_other(new):  # most often where the sheet is flat
+                return None, excess
+            excess = self._cost(new, context) / own_cost - 1
+        if excess > self.objective.rules.mirror_share:
             return None, excess
+        new = self._atlas.with_relief_in_jets(new)
         return self._solution([new], [found], self._memory(found, context, known)), excess
 
     def _cost(self, state, context):
