@@ -222,8 +222,8 @@ SECTIONS = {
             figures.onefit_trainings,
             "The full trainings are not done: on two cores each takes ten hours. The short ones "
             "(`--short 60`) have 720 steps of a tenth of the batch, on one core of a busy machine. "
-            "They show that the commands work, and what such networks do; not what the method "
-            "reaches. All tables of OneFit here are by them.",
+            "They show what each loss and each garment of the training brings; not what the method "
+            "reaches in the end. All tables of OneFit here are by them.",
         ),
         Entry(
             "Figure 5",
@@ -240,9 +240,9 @@ SECTIONS = {
                 f"{ONEFIT} --tables collisions",
             ),
             figures.collisions,
-            "Bodies, motions and garments are others, and 720 steps decide little: what is not in "
-            "the training is hardly worse here. The package's weights, by more inputs, k_c = 4 and "
-            "cuts, are in [onefit.md](onefit.md#figures).",
+            "Bodies, motions and garments are others. What a dress alone has taught goes through "
+            "other garments' bodies here, too, and what six have taught does not. The package's "
+            "weights, by more inputs, k_c = 4 and cuts, are in [onefit.md](onefit.md#figures).",
         ),
         Entry(
             "Figures 7 and 8",
@@ -289,7 +289,9 @@ SECTIONS = {
                 f"{ONEFIT} --tables losses",
             ),
             figures.losses,
-            "Trained for minutes, 720 steps each. What our inputs and patches bring is a row more, "
+            "Trained for minutes, 720 steps each. Mesh inextensibility and collision do what they do "
+            "in the paper; without inextensibility edges change more, collisions do not. What our "
+            "inputs and patches bring is a row more, "
             "`--train tank-ours`.",
         ),
         Entry(
