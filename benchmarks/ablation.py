@@ -83,7 +83,6 @@ SWITCHES = (
     Switch("relief", settings={"k_relief": 0}),
     Switch("relief's bending", {"relief_bend": 0.0}),
     Switch("relief's caution", {"relief_caution": False}),
-    Switch("strain's caution", {"strain_caution": False}),
     Switch("edges give", {"give": math.inf}),
     Switch("robust scale", {"scale_bounds": (0.3, 0.3)}),
     Switch("fine passes", {"fine_passes": 0}),

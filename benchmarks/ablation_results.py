@@ -17,7 +17,6 @@ NEEDED = {  # rules that stay where they pay on one sequence alone, and why
     "other starts": "without it Kinect-Paper loses its sheet in fast motion",
     "more iterations there": "a part of the other starts",
     "texture fit": "without it the texture of φ-SfT R1 lies pixels off in every frame",
-    "strain's caution": "without it the demo, a noisy video, crumples",
     "joints": "it is what holds patches together",
     "small step ends a stage": "it is for time: a stage that has converged ends",
 }

@@ -251,11 +251,11 @@ class DataTerm:
             squared, weight = pixels.squares(*self._residual_arguments(view, frame, level))
             return np.array(squared)[np.array(weight) > 0]
 
-    def pixels_as_one(self, vertices, frame, blur, appearance=None):
-        """How many pixels of the video count as one observation of a surface, 1 or more: the sum of
-        the residuals' correlation with those around, as far as the window of local brightness
-        reaches. Blur makes it, and whatever else is wrong alike in neighbours. Other arguments as
-        of :meth:`evaluate`.
+    def numbers_as_one(self, vertices, frame, blur, appearance=None):
+        """How many of the video's numbers, three a pixel, count as one observation of a surface, 1
+        or more: the sum of the residuals' correlation with each other and with those around, as far
+        as the window of local brightness reaches. Blur makes it, and whatever else is wrong alike
+        in neighbours, and in all colours. Other arguments as of :meth:`evaluate`.
         """
         level = self.level(blur)
         with dr.suspend_grad():
@@ -269,11 +269,12 @@ class DataTerm:
         most = _ROBUST * float(np.median(size)) / _MEDIAN
         clipped = np.where(known, np.clip(residual[:3], -most, most), 0)
         shape, reach = view.size[::-1], round(level.window / level.stride)
-        images = np.dstack([x.reshape(shape) for x in (*clipped, known.astype(np.float32))])
+        images = (clipped.sum(0), known.astype(np.float32))
+        images = np.dstack([x.reshape(shape) for x in images])
         side = 2 * reach + 1, 2 * reach + 1
         around = cv2.boxFilter(images, -1, side, borderType=cv2.BORDER_CONSTANT)
-        inside, share = known.reshape(shape), around[..., 3]
-        alike = float((images[..., :3] * around[..., :3])[inside].sum(dtype=np.float64))
+        inside, share = known.reshape(shape), around[..., 1]
+        alike = float((images[..., 0] * around[..., 0])[inside].sum(dtype=np.float64))
         mean_share = float(share[inside].mean(dtype=np.float64))
         power = max(float(np.square(clipped).sum(dtype=np.float64)), 1e-30)
         return max(1.0, side[0] * side[1] * alike / (mean_share * power) * level.stride**2)

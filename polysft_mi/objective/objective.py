@@ -186,10 +186,10 @@ class Objective:
 
     def nat(self, context: FrameContext, model: QuadraticModel) -> float:
         """What one unit of log-likelihood of the images costs, by the residuals of a frame at the
-        last stage: their size, and how many pixels count as one.
+        last stage: their size, and how many numbers of theirs count as one.
         """
         vertices, blur = model.surface.vertices, self.usual[-1].blur
-        alike = self.data.pixels_as_one(vertices, context.frame, blur, model.appearance)
+        alike = self.data.numbers_as_one(vertices, context.frame, blur, model.appearance)
         return model.evaluation.noise * alike
 
     def frozen(

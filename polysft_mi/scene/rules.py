@@ -116,15 +116,12 @@ class Rules:
         3e-3, "share", "of the relief's weight, for its bending", row="relief's bending"
     )
     noise_misfit: float = _rule(
-        0.05, "misfit", "of noise, at which the relief's weight and `give` have doubled"
+        0.05, "misfit", "of noise, at which the relief's weight has doubled"
     )
-    noise_power: float = _rule(8.0, "", "with which they grow with the noise")
+    noise_power: float = _rule(8.0, "", "with which it grows with the noise")
     noise_most: float = _rule(1e3, "", "factor by which the relief's weight grows at most")
     relief_caution: bool = _rule(
         True, "", "whether the relief's weight grows with noise", row="relief's caution"
-    )
-    strain_caution: bool = _rule(
-        True, "", "whether `give` grows with noise", row="strain's caution"
     )
     give: float = _rule(
         0.002,

@@ -48,19 +48,14 @@ class Inextensibility(Term):
         known = carrier is not None and carrier.lengths is not None
         return carrier.lengths[frame] if known else self.lengths
 
-    def _give(self, context, stage):
-        """The strain from which on stretched edges pull no harder: more where there is noise."""
-        if not (self._gives and stage.gives):
-            return math.inf
-        r = self._rules
-        # a drape says how much cloth stretches, however noisy the images are
-        cautious = r.strain_caution and self._atlas.carrier is None
-        return r.give * (r.caution(context.memory.noise) if cautious else 1.0)
+    def _give(self, stage):
+        """The strain from which on stretched edges pull no harder."""
+        return self._rules.give if self._gives and stage.gives else math.inf
 
     def energy(self, at):
         rest = mi.Float64(self.lengths_in(at.context.frame))
         excess = edge_lengths(at.vertices, self._edges) - rest
-        give = self._give(at.context, at.stage)
+        give = self._give(at.stage)
         squared = dr.square(excess)
         if math.isfinite(give):
             over = dr.square(dr.maximum(excess, 0) / (give * rest))
@@ -70,7 +65,7 @@ class Inextensibility(Term):
     def rows(self, at):
         stiffness = self.weight * at.stage.stiffness / self._unit
         lengths = self.lengths_in(at.context.frame)
-        at.edges = EdgeRows(lengths, stiffness, self._give(at.context, at.stage))
+        at.edges = EdgeRows(lengths, stiffness, self._give(at.stage))
 
     def add(self, at):
         return at.edge_energy

@@ -59,11 +59,8 @@ def test_whole_gradient_against_finite_differences(problem, stage, rng):
     assert np.median(errors) < 0.03, errors
 
 
-@pytest.mark.parametrize("noise, more", [(math.nan, 1), (0.007, 1), (0.05, 1.5), (0.124, 20)])
-def test_stretch_is_held_harder_where_it_may_be_noise(truth, noise, more):
-    """Of a sheet that is stretched, edges give; less where there is noise, and not where the stage
-    says so.
-    """
+def test_stretched_edges_give(truth):
+    """Of a sheet that is stretched; not where the stage says so. Noise changes nothing in it."""
     objective = Objective(problem_of(truth.folder, order=4))
     rest, stage = (
         objective.atlas.state(objective.problem.patch.rest().to_numpy()),
@@ -73,10 +70,9 @@ def test_stretch_is_held_harder_where_it_may_be_noise(truth, noise, more):
     term = lambda stage, noise: quadratic(objective, stretched, stage, noise).terms[
         "inextensibility"
     ]
-    gives, firm = term(stage, math.nan), term(dataclasses.replace(stage, gives=False), noise)
+    gives, firm = term(stage, math.nan), term(dataclasses.replace(stage, gives=False), math.nan)
     assert firm > 20 * gives
-    found = term(stage, noise) / gives
-    assert found == pytest.approx(1, abs=1e-3) if more == 1 else more <= found <= firm / gives
+    assert term(stage, 0.124) == pytest.approx(gives)
 
 
 @pytest.mark.parametrize("outside", [True, False])
