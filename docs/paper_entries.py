@@ -289,10 +289,9 @@ SECTIONS = {
                 f"{ONEFIT} --tables losses",
             ),
             figures.losses,
-            "Trained for minutes, 720 steps each. Mesh inextensibility and collision do what they do "
-            "in the paper; without inextensibility edges change more, collisions do not. What our "
-            "inputs and patches bring is a row more, "
-            "`--train tank-ours`.",
+            "Trained for minutes, 720 steps each. Mesh inextensibility and collision do what they "
+            "do in the paper; without inextensibility edges change more, collisions do not. What "
+            "our inputs and patches bring is a row more, `--train tank-ours`.",
         ),
         Entry(
             "Table 7",
