@@ -48,7 +48,7 @@ gpu: .venv/with-test
 	$(PY) benchmarks/gpu.py
 
 test: .venv/with-test
-	$(PY) -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
+	$(PY) -m pytest -q -n 2 --dist loadfile
 
 # The pages of docs/ as HTML, in out/docs, with the API reference; a warning is an error
 docs: .venv/with-docs

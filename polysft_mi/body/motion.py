@@ -18,24 +18,22 @@ _PLACES = "translation", "trans", "transl", "trans_world"
 _RATES = "fps", "mocap_framerate", "mocap_frame_rate"
 _USUAL_FPS = 30.0
 _TO_Z = {"z": 0, "y": 90, "-y": -90}  # degrees about x that turn what is up to z
-_IDENTITY = Rotation.identity()
-_FROM_SMPL = Rotation.from_euler("x", 90, degrees=True)  # from SMPL's body axes to OneFit's
 
 
 @dataclass(frozen=True)
 class BodyMotion:
     """A body in T frames: ``poses`` (T, 24, 3) [rad] and ``translation`` (T, 3) [m] in the scene's
     world, as :class:`onefit.Motion` has them; ``fps`` frames a second; ``shape`` (S,) of Anny's
-    body, or None for the standard one. ``up`` turns the scene's world to one whose z is up.
-    ``model``: the file of a body of SMPL's family, whose are the ``shape`` (betas) and the
-    ``translation``, which then leads from its root at rest; or empty. ``path``: where it was read.
+    body, or None for the standard one. ``up``: the scene's axis that is: z, y or -y. ``model``: the
+    file of a body of SMPL's family, whose are the ``shape`` (betas) and the ``translation``, which
+    then leads from its root at rest; or empty. ``path``: where it was read.
     """
 
     poses: np.ndarray
     translation: np.ndarray
     fps: float
     shape: np.ndarray | None = None
-    up: Rotation = _IDENTITY
+    up: str = "z"
     model: str = ""
     path: str = "body"
 
@@ -107,19 +105,20 @@ class BodyMotion:
             fps /= selected[1] - selected[0]
         if not 0 < fps < 10_000:
             raise InputError(f"{path}: fps = {fps:g}; a positive number is needed")
-        poses, places, turn = poses.astype(float), places.astype(float), _upright(up)
+        poses, places = poses.astype(float), places.astype(float)
         shape = arrays.get("shape")
         if model:
             poses, shape = _in_our_axes(poses), _betas(arrays.get("betas"), path)
-        return cls(poses, places, fps, shape, turn, model, path)
+        return cls(poses, places, fps, shape, up, model, path)
+
+    @property
+    def upright(self) -> Rotation:
+        """Turns the scene's world to one whose z is up."""
+        return Rotation.from_euler("x", _TO_Z[self.up], degrees=True)
 
 
 def _found(arrays, names):
     return next((arrays[name] for name in names if name in arrays), None)
-
-
-def _upright(up):
-    return Rotation.from_euler("x", _TO_Z[up], degrees=True)
 
 
 def _in_our_axes(poses):
@@ -127,9 +126,10 @@ def _in_our_axes(poses):
     24, 3): hands lie flat, and the root leads into the same world.
     """
     body = _JOINTS if poses.shape[1] == _JOINTS else 22
+    turn = Rotation.from_euler("x", 90, degrees=True)  # from SMPL's body axes to OneFit's
     out = np.zeros((len(poses), _JOINTS, 3))
-    out[:, :body] = _FROM_SMPL.apply(poses[:, :body].reshape(-1, 3)).reshape(-1, body, 3)
-    out[:, 0] = (Rotation.from_rotvec(poses[:, 0]) * _FROM_SMPL.inv()).as_rotvec()
+    out[:, :body] = turn.apply(poses[:, :body].reshape(-1, 3)).reshape(-1, body, 3)
+    out[:, 0] = (Rotation.from_rotvec(poses[:, 0]) * turn.inv()).as_rotvec()
     return out
 
 

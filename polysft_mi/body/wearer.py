@@ -65,7 +65,7 @@ def put_on(vertices: np.ndarray, faces: np.ndarray, motion: BodyMotion) -> Carri
             )
         ),
     )
-    upright, root = motion.up, carrier.joints[0]
+    upright, root = motion.upright, carrier.joints[0]
     poses = motion.poses.copy()
     poses[:, 0] = (upright * Rotation.from_rotvec(poses[:, 0])).as_rotvec()
     as_onefit = onefit.Motion(

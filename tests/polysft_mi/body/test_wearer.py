@@ -75,4 +75,4 @@ def test_smpl_s_forms_say_the_same(motion, smpl, tmp_path):
     for other in (in_parts, of_smplx):
         assert np.allclose(other.poses[:, :22], whole.poses[:, :22])
         assert np.array_equal(other.translation, whole.translation)
-    assert whole.up.apply([0, 1, 0]) == pytest.approx([0, 0, 1])
+    assert whole.upright.apply([0, 1, 0]) == pytest.approx([0, 0, 1])

@@ -164,7 +164,7 @@ def test_unknown_setting_lists_the_known_ones_and_the_nearest(sheet):
     has(
         message,
         "-D ordre: ",
-        "did you mean order?; known: blur, body, brightness, cameras, canonical_frame,",
+        "did you mean order?; known: blur, body, body_model, body_up, brightness, cameras,",
         "k_mi",
         "window",
     )
