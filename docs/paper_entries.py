@@ -357,7 +357,7 @@ SECTIONS = {
             None,
             "They do not ([conventions.md](conventions.md#solver-and-window)). Twelve frames of "
             "the demo take 1 min 25 s on two cores and end 8.7 mm RMSE from the truth (`polysft "
-            "evaluate OUT scenes/demo`); by default 10 s and 1.1 mm.",
+            "evaluate OUT scenes/demo`); by default 36 s and 1.6 mm.",
         ),
         Entry(
             "Figure, Paper-Bend",
