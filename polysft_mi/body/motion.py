@@ -68,7 +68,12 @@ class BodyMotion:
         poses, places = _found(arrays, _POSES), _found(arrays, _PLACES)
         orient, of_body = (arrays.get(name) for name in ("global_orient", "body_pose"))
         if model and poses is None and orient is not None and of_body is not None:
-            poses = np.concatenate([x.reshape(len(places), -1) for x in (orient, of_body)], 1)
+            if orient.ndim < 2 or len(orient) != len(of_body):
+                raise InputError(
+                    f"{path}: global_orient {orient.shape} and body_pose {of_body.shape}; a row of"
+                    " each for each frame is needed"
+                )
+            poses = np.concatenate([x.reshape(len(x), -1) for x in (orient, of_body)], 1)
         joints = _SMPL_JOINTS if model else (_JOINTS,)
         needed = f"poses (T, {' or '.join(map(str, joints))}, 3) and translation (T, 3) are needed"
         if "betas" in arrays and not model:
@@ -123,7 +128,7 @@ def _found(arrays, names):
 
 def _in_our_axes(poses):
     """SMPL's rotations (T, J, 3) [rad], the root's first, as :class:`onefit.Motion` has them, (T,
-    24, 3): hands lie flat, and the root leads into the same world.
+    24, 3): fingers are left out, and the root leads into the same world.
     """
     body = _JOINTS if poses.shape[1] == _JOINTS else 22
     turn = Rotation.from_euler("x", 90, degrees=True)  # from SMPL's body axes to OneFit's

@@ -36,11 +36,11 @@ def put_on(vertices: np.ndarray, faces: np.ndarray, motion: BodyMotion) -> Carri
     smpl = onefit.SmplBody(motion.model) if motion.model else None
     draper = onefit.load(model=smpl)
     shape = None if motion.shape is None else torch.as_tensor(motion.shape).float()
-    translation = motion.translation
     if smpl:
         shape = smpl.shape_of(motion.shape)
-        translation = translation + smpl.root(shape) - smpl.body(shape).joints[0].double().numpy()
-    body = draper.model.body(shape)
+    body, translation = draper.model.body(shape), motion.translation
+    if smpl:  # theirs leads from where their own root is
+        translation = translation + smpl.root(shape) - body.joints[0].double().numpy()
     given = smpl or shape is not None
     garment = onefit.Garment.of_mesh("template", vertices, faces, made_for=body if given else None)
     seen = garment.render_mesh

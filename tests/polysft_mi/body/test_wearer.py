@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from standing import smpl_contents
 
 from polysft_mi.body import BodyMotion, put_on
+from polysft_mi.errors import InputError
 
 onefit = pytest.importorskip("onefit")
 C = Rotation.from_euler("x", 90, degrees=True)
@@ -76,3 +77,17 @@ def test_smpl_s_forms_say_the_same(motion, smpl, tmp_path):
         assert np.allclose(other.poses[:, :22], whole.poses[:, :22])
         assert np.array_equal(other.translation, whole.translation)
     assert whole.upright.apply([0, 1, 0]) == pytest.approx([0, 0, 1])
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"global_orient": np.zeros((3, 3)), "body_pose": np.zeros((3, 69))}, "no translation"),
+        ({"global_orient": np.zeros((2, 3)), "body_pose": np.zeros((3, 69))}, "a row of each"),
+        ({"poses": np.zeros((3, 72)), "trans": np.zeros((3, 3)), "betas": np.float64(1)}, "betas"),
+    ],
+)
+def test_what_is_no_motion_of_smpl_s_is_refused(arrays, message, tmp_path):
+    np.savez(tmp_path / "motion.npz", **arrays)
+    with pytest.raises(InputError, match=message):
+        BodyMotion.read(tmp_path / "motion.npz", FRAMES, [0, 1, 2], "SMPL.pkl", "y")
