@@ -22,7 +22,7 @@ PROBLEMS = {
     "paper": PAPER,
     "paper's images, our smoothness": {**PAPER, "k_bend": 1e-6, "k_uv": 1e-4},
 }
-FAST = {"period": 60, "lr_rigid": 3e-3, "lr_alpha": 1e-3}  # the paper's steps need hundreds
+FAST = {"period": 40, "lr_rigid": 3e-3, "lr_alpha": 1e-3}  # the paper's steps need hundreds
 
 
 def objective_of(folder, solver, **settings):
