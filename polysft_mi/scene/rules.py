@@ -119,7 +119,9 @@ class Rules:
         0.05, "misfit", "of noise, at which the relief's weight has doubled"
     )
     noise_power: float = _rule(8.0, "", "with which it grows with the noise")
-    noise_most: float = _rule(1e3, "", "factor by which the relief's weight grows at most")
+    noise_most: float = _rule(
+        300.0, "", "factor of the relief's weight from which on the relief does not move at all"
+    )
     relief_caution: bool = _rule(
         True, "", "whether the relief's weight grows with noise", row="relief's caution"
     )
@@ -177,6 +179,10 @@ class Rules:
         """The factor by which weights grow with the ``noise`` (a misfit; NaN: none is known)."""
         noise = 0.0 if math.isnan(noise) else noise
         return 1 + min((noise / self.noise_misfit) ** self.noise_power, self.noise_most)
+
+    def holds_relief(self, noise):
+        """Whether the ``noise`` (a misfit) is so much that the relief would hardly move."""
+        return self.relief_caution and self.caution(noise) > self.noise_most
 
 
 def table():

@@ -100,7 +100,9 @@ def _in_plane(objective):
     return np.column_stack([chart, np.zeros(len(chart))])
 
 
-@pytest.mark.parametrize("noise, moves", [(math.nan, [2, 2, 2]), (0.2, [2, 3, 3])])
+@pytest.mark.parametrize(
+    "noise, moves", [(math.nan, [2, 2, 2]), (0.05, [2, 3, 3]), (0.2, [2, 2, 2])]
+)
 def test_stages_in_which_the_relief_moves(problem, noise, moves):
     objective = Objective(problem)
     rest = objective.atlas.state(problem.patch.rest().to_numpy())

@@ -107,8 +107,8 @@ def test_large_templates_have_no_relief(truth, tmp_path):
 
 
 def test_relief_moves_only_where_it_may(truth, tracked, tmp_path):
-    """Not in the first frame, nor where its weight is zero; else the more it weighs, the less there
-    is of it.
+    """Not in the first frame, nor where its weight is zero, nor in noise; else the more it weighs,
+    the less there is of it.
     """
     found = {}
     for weight, frames in ((0.0, 2), (10.0, 4)):
@@ -121,6 +121,10 @@ def test_relief_moves_only_where_it_may(truth, tracked, tmp_path):
         np.abs(x.states[-1]["delta_w"]).mean() for x in (found[0.0], found[10.0], tracked)
     )
     assert none == 0 < little < 0.1 * usual
+    noisy = Rules(noise_misfit=1e-6)
+    done = track(FrameTracker(problem_of(truth.folder, rules=noisy)), 3, str(tmp_path))
+    assert not any(state["delta_w"].any() for state in done.states)
+    assert noisy.holds_relief(1e-3) and not noisy.holds_relief(math.nan)
 
 
 def test_noise_is_the_least_misfit_but_for_the_first_frame():
