@@ -252,10 +252,11 @@ class DataTerm:
             return np.array(squared)[np.array(weight) > 0]
 
     def numbers_as_one(self, vertices, frame, blur, appearance=None):
-        """How many of the video's numbers, three a pixel, count as one observation of a surface, 1
-        or more: the sum of the residuals' correlation with each other and with those around, as far
-        as the window of local brightness reaches. Blur makes it, and whatever else is wrong alike
-        in neighbours, and in all colours. Other arguments as of :meth:`evaluate`.
+        """How many numbers of the video count as one observation of a surface: of those of one
+        colour, and of a pixel's three colours, 1 or more each. The first is the sum of the
+        residuals' correlation with those around, as far as the window of local brightness reaches:
+        blur makes it, and whatever else is wrong alike in neighbours. Other arguments as of
+        :meth:`evaluate`.
         """
         level = self.level(blur)
         with dr.suspend_grad():
@@ -264,20 +265,21 @@ class DataTerm:
             residual, weight = (np.array(x, dtype=np.float32) for x in found[:2])
         known = weight > 0
         if not known.any():
-            return 1.0
+            return 1.0, 1.0
         size = np.abs(residual[:3, known])
         most = _ROBUST * float(np.median(size)) / _MEDIAN
         clipped = np.where(known, np.clip(residual[:3], -most, most), 0)
         shape, reach = view.size[::-1], round(level.window / level.stride)
-        images = (clipped.sum(0), known.astype(np.float32))
+        images = (*clipped, clipped.sum(0), known.astype(np.float32))
         images = np.dstack([x.reshape(shape) for x in images])
         side = 2 * reach + 1, 2 * reach + 1
         around = cv2.boxFilter(images, -1, side, borderType=cv2.BORDER_CONSTANT)
-        inside, share = known.reshape(shape), around[..., 1]
-        alike = float((images[..., 0] * around[..., 0])[inside].sum(dtype=np.float64))
-        mean_share = float(share[inside].mean(dtype=np.float64))
+        inside = known.reshape(shape)
+        *each, together = (images * around)[inside][:, :-1].sum(0, dtype=np.float64).tolist()
+        mean_share = float(around[inside, -1].mean(dtype=np.float64))
         power = max(float(np.square(clipped).sum(dtype=np.float64)), 1e-30)
-        return max(1.0, side[0] * side[1] * alike / (mean_share * power) * level.stride**2)
+        alike = side[0] * side[1] * sum(each) / (mean_share * power) * level.stride**2
+        return max(1.0, alike), min(max(together / max(sum(each), 1e-30), 1.0), 3.0)
 
     def evaluate(self, vertices, frame, blur, scale, appearance=None, k_rgb=1.0, k_silhouette=1.0):
         """The :class:`Evaluation` of a surface against a frame, under the robust ``scale`` [local

@@ -63,7 +63,8 @@ class FrameMemory:
     but for the first one, which the texture was taken from; ``explained``: the highest misfit that
     more iterations could not lower; ``light``: what is known of it, None where it is not learned;
     ``scales``: the robust scale by stage that fits the residuals; ``nat``: what one unit of
-    log-likelihood of the images costs; ``noises``: of the other kinds of evidence, what their
+    log-likelihood of the images costs, were the colours of a pixel independent, and ``colours``:
+    how many of them count as one; ``noises``: of the other kinds of evidence, what their
     residuals say of their noise, by name. NaN is what is not known.
     """
 
@@ -74,6 +75,7 @@ class FrameMemory:
     light: Light | None = None
     scales: dict[Stage, float] = field(default_factory=dict)
     nat: float = math.nan
+    colours: float = 1.0
     noises: dict[str, float] = field(default_factory=dict)
 
     @classmethod

@@ -185,13 +185,14 @@ class Objective:
         """
         return context.memory.scale(stage, self.settings.rgb_scale)
 
-    def nat(self, context: FrameContext, model: QuadraticModel) -> float:
+    def nat(self, context: FrameContext, model: QuadraticModel) -> tuple[float, float]:
         """What one unit of log-likelihood of the images costs, by the residuals of a frame at the
-        last stage: their size, and how many numbers of theirs count as one.
+        last stage: their size, and how many numbers of a colour count as one. And how many of a
+        pixel's colours do.
         """
         vertices, blur = model.surface.vertices, self.usual[-1].blur
-        alike = self.data.numbers_as_one(vertices, context.frame, blur, model.appearance)
-        return model.evaluation.noise * alike
+        alike, colours = self.data.numbers_as_one(vertices, context.frame, blur, model.appearance)
+        return model.evaluation.noise * alike, colours
 
     def frozen(
         self, contexts: Sequence[FrameContext], stage: Stage, start: Sequence[State]

@@ -20,7 +20,7 @@ from polysft_mi.scene import Rules
 from polysft_mi.surface import Unknowns
 
 CHECKPOINT = "checkpoint.npz"
-_NUMBERS = ("misfit", "outlier_share", "least_misfit", "explained", "nat")  # of a memory
+_NUMBERS = ("misfit", "outlier_share", "least_misfit", "explained", "nat", "colours")  # of a memory
 
 
 @dataclass

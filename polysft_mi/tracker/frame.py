@@ -281,6 +281,7 @@ class FrameTracker:
             vertices, seen = model.surface.vertices, model.evaluation.seen
             shade = self.objective.data.shade(vertices, context.frame, seen, model.appearance)
             light = light.updated(shade)
+        nat, colours = self.objective.nat(context, model)
         return FrameMemory(
             misfit=found.misfit,
             outlier_share=model.evaluation.outlier_share,
@@ -288,7 +289,8 @@ class FrameTracker:
             explained=found.misfit if found.more_is_vain else before.explained,
             light=light,
             scales=found.scales,
-            nat=self.objective.nat(context, model),
+            nat=nat,
+            colours=colours,
             noises=self.objective.noises(context, model.surface.vertices),
         )
 
@@ -329,5 +331,6 @@ class FrameTracker:
 
     def _certainty(self, model, memory):
         """(2, N) of :class:`Solution`."""
-        sigma = along_rays(self.objective, model, memory.nat, self.problem.camera.origin)
+        nat = memory.nat * memory.colours
+        sigma = along_rays(self.objective, model, nat, self.problem.camera.origin)
         return np.stack([sigma, score(self.objective, model.surface.vertices, sigma)])

@@ -204,15 +204,17 @@ def test_numbers_count_as_one_as_their_residuals_are_alike(problem):
     known = (weight > 0).reshape(height, width)
     most = 2.5 * np.median(np.abs(residual[:3, weight > 0])) / 0.6745
     residual = np.clip(residual[:3], -most, most).reshape(3, height, width) * known
-    grey = residual.sum(0)
-    reach, alike, pairs = round(level.window / level.stride), 0.0, 0
+    reach, alike, together, pairs = round(level.window / level.stride), 0.0, 0.0, 0
     for dy in range(-reach, reach + 1):  # the slow way: of each offset the mean product
         for dx in range(-reach, reach + 1):
             a = tuple(slice(max(0, -k), n - max(0, k)) for k, n in ((dy, height), (dx, width)))
             b = tuple(slice(max(0, k), n - max(0, -k)) for k, n in ((dy, height), (dx, width)))
-            alike += (grey[a] * grey[b]).sum()
+            alike += sum((x[a] * x[b]).sum() for x in residual)
+            together += (residual.sum(0)[a] * residual.sum(0)[b]).sum()
             pairs += (known[a] & known[b]).sum()
     power = (residual**2).sum() / known.sum()
     expected = (2 * reach + 1) ** 2 * alike / pairs / power * level.stride**2
     assert expected > 2 * np.pi * level.sigma**2  # blur alone makes 4 pi sigma^2
-    assert abs(data.numbers_as_one(vertices, 2, blur) / expected - 1) < 1e-3
+    found, colours = data.numbers_as_one(vertices, 2, blur)
+    assert abs(found / expected - 1) < 1e-3
+    assert 1 < colours < 3 and abs(colours / (together / alike) - 1) < 1e-3
