@@ -252,8 +252,8 @@ class DataTerm:
             return np.array(squared)[np.array(weight) > 0]
 
     def numbers_as_one(self, vertices, frame, blur, appearance=None):
-        """How many numbers of the video count as one observation of a surface: of those of one
-        colour, and of a pixel's three colours, 1 or more each. The first is the sum of the
+        """(pixels, colours), how many numbers of the video count as one observation of a surface:
+        of one colour's, 1 or more, and of the three of a pixel, 1 to 3. The first is the sum of the
         residuals' correlation with those around, as far as the window of local brightness reaches:
         blur makes it, and whatever else is wrong alike in neighbours. Other arguments as of
         :meth:`evaluate`.

@@ -185,10 +185,10 @@ class Objective:
         """
         return context.memory.scale(stage, self.settings.rgb_scale)
 
-    def nat(self, context: FrameContext, model: QuadraticModel) -> tuple[float, float]:
-        """What one unit of log-likelihood of the images costs, by the residuals of a frame at the
-        last stage: their size, and how many numbers of a colour count as one. And how many of a
-        pixel's colours do.
+    def nat_and_colours(self, context: FrameContext, model: QuadraticModel) -> tuple[float, float]:
+        """By the residuals of a frame at the last stage: what one unit of log-likelihood of the
+        images costs, were the colours of a pixel independent, from the residuals' size and how many
+        numbers of a colour count as one; and how many of a pixel's three colours do, 1 to 3.
         """
         vertices, blur = model.surface.vertices, self.usual[-1].blur
         alike, colours = self.data.numbers_as_one(vertices, context.frame, blur, model.appearance)

@@ -281,7 +281,7 @@ class FrameTracker:
             vertices, seen = model.surface.vertices, model.evaluation.seen
             shade = self.objective.data.shade(vertices, context.frame, seen, model.appearance)
             light = light.updated(shade)
-        nat, colours = self.objective.nat(context, model)
+        nat, colours = self.objective.nat_and_colours(context, model)
         return FrameMemory(
             misfit=found.misfit,
             outlier_share=model.evaluation.outlier_share,

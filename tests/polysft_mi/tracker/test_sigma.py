@@ -51,7 +51,7 @@ def test_strain_is_the_mean_over_the_edges_smoothed_over_neighbours(solved):
 
 def test_score_grows_with_strain_and_where_nothing_is_seen_and_is_sigma_at_least(solved):
     objective, model, origin = solved
-    nat = np.prod(objective.nat(FrameContext(0), model))
+    nat = np.prod(objective.nat_and_colours(FrameContext(0), model))
     x, template = model.surface.vertices, objective.problem.template
     sigma = along_rays(objective, model, nat, origin)
     found = score(objective, x, sigma)
