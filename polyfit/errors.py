@@ -63,7 +63,6 @@ EXTRAS = {
     "torch": "learn",
     "warp": "learn",
     "pxr": "usd",
-    "ray": "batch",
     "viser": "view",
 }
 

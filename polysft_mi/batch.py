@@ -6,8 +6,6 @@ import os
 import sys
 from pathlib import Path
 
-from polyfit.errors import require
-
 from . import batches, commands
 from .errors import InputError, cli
 
@@ -25,7 +23,7 @@ def parser():
     p = commands.parser(
         "batch",
         "Reconstruct many scenes, or drape many garments, each in a process of its own; called"
-        " again, it goes on where it was (by ray, of the optional extra 'batch').",
+        " again, it goes on where it was.",
         _EXAMPLES,
     )
     p.add_argument(
@@ -68,7 +66,6 @@ def main(arguments=None):
         raise InputError("--garments and --motions belong together, and take no -D")
     if options.workers < 1:
         raise InputError(f"--workers {options.workers}: at least 1 is needed")
-    require("ray")
     out = Path(options.output)
     common = [word for text in options.define for word in ("-D", text)] + extra
     if drapes:

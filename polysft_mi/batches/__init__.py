@@ -1,8 +1,8 @@
 """Many runs, each in a process of its own: scenes, or garments and motions, go in; their folders
 and one table come out.
 
-:mod:`jobs` says what there is to do and what was done before, :mod:`schedule` has ray do it,
-:mod:`table` writes the result.
+:mod:`jobs` says what there is to do and what was done before, :mod:`schedule` does it, :mod:`table`
+writes the result.
 """
 
 import lazy_loader

@@ -87,7 +87,6 @@ def test_polysft_imports_without_any_extra():
         ("onefit.drape dress walk -o OUT", "torch"),
         ("onefit.simulate dress walk -o OUT", "torch"),
         ("onefit.tailor -o OUT", "torch"),
-        ("polysft_mi.batch scenes/demo.xml -o OUT", "ray"),
     ],
 )
 def test_a_command_names_the_extra_that_it_misses(command, module, tmp_path):

@@ -17,8 +17,6 @@ from places import ROOT
 from polysft_mi import batch, batches, prepare
 from polysft_mi.errors import InputError
 
-pytest.importorskip("ray", reason="ray is not installed (the extra 'batch')")
-
 QUICK = ["--", "--exr", "0", "--no-report"]
 
 
@@ -136,7 +134,7 @@ def test_names_tell_scenes_apart(tmp_path):
     assert jobs[0].command()[3] == str(tmp_path / "b" / "flag one.xml")
 
 
-def test_refusals(tmp_path, monkeypatch):
+def test_refusals(tmp_path):
     scene, out = str(ROOT / "scenes" / "demo.xml"), ["-o", str(tmp_path / "out")]
     full = tmp_path / "full"
     full.mkdir()
@@ -153,7 +151,4 @@ def test_refusals(tmp_path, monkeypatch):
     ]:
         with pytest.raises(InputError, match=words):
             batch.main(arguments)
-    monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(InputError, match=r"ray is not installed.*\[batch\]"):
-        batch.main([scene, *out])
     assert not (tmp_path / "out").exists()
