@@ -13,6 +13,7 @@ import torch
 from polyfit.errors import InputError
 
 from . import skeleton
+from .anny_data import read_fast
 
 
 @dataclass(frozen=True)
@@ -111,7 +112,8 @@ class AnnyBody(BodyModel):
 
         # plain skinning: Anny's default compiles Warp kernels for seconds, and all skinning here is
         # onefit.body.skinning's
-        model = self._anny = anny.Anny(skinning_method="lbs")
+        with read_fast():
+            model = self._anny = anny.Anny(skinning_method="lbs")
         bones, joint_of_bone = model.bone_labels, self.joint_of_bone()
         faces = model.get_triangular_faces()
         kept = largest_component(len(model.template_vertices), faces)
