@@ -1,15 +1,15 @@
 """Garments on moving bodies: what is found where a body's motion, tracks and depth are given.
 
     python benchmarks/dressed.py --data FOLDER [--evidence FOLDER] [--only sleeves_up ...]
-    [--kinds body tracks depth ...] [--docs docs]
+    [--kinds body mesh tracks depth ...] [--docs docs]
 
 FOLDER holds a folder for each sequence, with ``body.npz``, and ``world_to_camera`` in its
 ``camera.json``; that of ``--evidence`` holds, for each, a folder with ``tracks.npz`` and ``depth``,
 and without it these kinds are left out. Each run is two commands, as a user would give them, on one
-core; ``drape`` is what OneFit makes of the motion as it is given, without a video. Each result goes
-into ``dressed.json`` in DOCS as soon as it is there, and the next call does what is missing (all of
-it with ``--again``); the table in ``evidence.md`` is made anew, and so is ``dressed.jpg``, of a run
-that was made.
+core; ``drape`` is what OneFit makes of the motion as it is given, without a video; ``mesh`` has the
+same body, given as a moving mesh. Each result goes into ``dressed.json`` in DOCS as soon as it is
+there, and the next call does what is missing (all of it with ``--again``); the table in
+``evidence.md`` is made anew, and so is ``dressed.jpg``, of a run that was made.
 """
 
 import os
@@ -19,13 +19,14 @@ import tempfile
 
 import given
 import numpy as np
+import torch
 from sequences import ROOT
 
 from polysft_mi.errors import InputError, cli
 from polysft_mi.results.evaluation import score
 from polysft_mi.results.truth import load_npz
 
-KINDS = {"body": (), "tracks": ("tracks",), "depth": ("depth",)}
+KINDS = {"body": (), "mesh": (), "tracks": ("tracks",), "depth": ("depth",)}
 _FILES = {"tracks": "tracks.npz", "depth": "depth"}
 _SEQUENCES = ("tshirt_box", "sleeves_up")
 _SHOWN = "tshirt_box", "body", 28
@@ -51,7 +52,10 @@ def run(folder, kind, where, out, last):
     evidence = [f"--{name}={os.path.join(where, _FILES[name])}" for name in KINDS[kind]]
     scene = os.path.join(out, "scene")
     module = [sys.executable, "-m"]
-    body = ["--body", os.path.join(folder, "body.npz")]
+    motion = os.path.join(folder, "body.npz")
+    if kind == "mesh":
+        motion = moving_mesh(motion, os.path.join(out, "mesh.npz"))
+    body = ["--body", motion]
     prepare = [*module, "polysft_mi.prepare", folder, "-o", scene, "-q", *body, *evidence]
     track = [*module, "polysft_mi.run", os.path.join(scene, "scene.xml"), "-q", "--no-report"]
     track += ["-o", os.path.join(out, "run"), "--exr", "0", "-D", f"last={last}"]
@@ -66,6 +70,20 @@ def run(folder, kind, where, out, last):
     surface = load_npz(os.path.join(out, "run", "surface.npz"))
     found = figures(surface, os.path.join(folder, "gt.npz"))
     return found | {"cpu_seconds_a_frame": spent[0] / len(surface["frames"])}
+
+
+def moving_mesh(path, to):
+    """The mesh of the body whose motion the file ``path`` has, written into the file ``to``."""
+    import onefit
+    from onefit.body import skinning
+
+    arrays, body = load_npz(path), onefit.AnnyBody().body()
+    poses, places = (torch.as_tensor(arrays[n]).float() for n in ("poses", "translation"))
+    maps = skinning.transforms(body, poses.reshape(len(poses), -1, 3), places)
+    vertices = skinning.skin(body.vertices, body.blend_weights, maps)
+    known = {"vertices": vertices, "rest": body.vertices, "faces": body.faces}
+    np.savez(to, fps=arrays["fps"], **{name: x.numpy() for name, x in known.items()})
+    return to
 
 
 def drape(folder, last):
@@ -93,7 +111,11 @@ def table(results):
         " s a frame |",
         "|---|---|---|---|---|---|",
     ]
-    names = {"drape": "the motion alone: its drape", "body": "video and body"}
+    names = {
+        "drape": "the motion alone: its drape",
+        "body": "video and body",
+        "mesh": "video and body, as a mesh",
+    }
     order = ["drape", *KINDS]
     for r in sorted(results, key=lambda r: (r["sequence"], order.index(r["kind"]))):
         seconds = r.get("cpu_seconds_a_frame")

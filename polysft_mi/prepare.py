@@ -133,9 +133,10 @@ def _add_evidence(group):
     group.add_argument(
         "--body",
         metavar="FILE",
-        help="a body's motion (.npz: poses (T, 24, 3), translation (T, 3)) that carries the"
-        " template, which is given on the body at rest; of a FOLDER whose camera.json has"
-        " world_to_camera (needs the extra learn for the run)",
+        help="a body's motion (.npz: poses (T, 24, 3), translation (T, 3); or vertices (T, V, 3),"
+        " faces (F, 3), rest (V, 3); or a folder of its meshes) that carries the template, which is"
+        " given on the body at rest; of a FOLDER whose camera.json has world_to_camera (needs the"
+        " extra learn for the run)",
     )
     group.add_argument(
         "--body-model",

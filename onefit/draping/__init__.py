@@ -8,5 +8,6 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "draper": ["Drape", "Draper", "load"],
         "inputs": ["body_model", "motion_of", "shape_of"],
         "post": ["DRAG", "PULL"],
+        "simulation": ["simulated"],
     },
 )

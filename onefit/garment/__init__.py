@@ -8,10 +8,17 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
         "alignment": ["aligned", "pose_of"],
-        "binding": ["cotangent_laplacian", "smoother", "standard_body", "standard_surface"],
+        "binding": [
+            "Binding",
+            "cotangent_laplacian",
+            "smoother",
+            "standard_body",
+            "standard_surface",
+        ],
         "charts": ["FRAMES", "Deformation", "PatchedGarment", "SparseMatrix"],
-        "fitting": ["placed", "untangled"],
+        "fitting": ["inward", "placed", "untangled"],
         "garment": ["FOLDER", "Garment", "LOOSE", "TEMPLATES"],
-        "reading": ["RenderMesh", "Stitches", "parts"],
+        "reading": ["RenderMesh", "Stitches", "mended", "parts"],
+        "waistband": ["held", "held_below"],
     },
 )

@@ -26,7 +26,14 @@ def _highest_rim(vertices, faces):
 
 def held(vertices, faces, joints):
     """How firmly each of the vertices (N, 3) [m] of a garment with ``faces`` (F, 3) is held, 0 to
-    1, (N,); ``joints`` (J, 3) [m] of the body.
+    1, (N,); ``joints`` (J, 3) [m] of the body. As :func:`held_below` its shoulders.
+    """
+    return held_below(vertices, faces, joints[_SHOULDERS, 2].mean())
+
+
+def held_below(vertices, faces, shoulders):
+    """How firmly each of the vertices (N, 3) [m] of a garment with ``faces`` (F, 3) is held, 0 to
+    1, (N,), on a body whose ``shoulders`` are at that height [m].
 
     A garment that reaches as high as the shoulder joints hangs from them, and nothing of it is
     held. Of any other one it is what lies along the highest loop of its boundary. Each part that is
@@ -37,14 +44,14 @@ def held(vertices, faces, joints):
     for k in np.unique(part[faces]):
         own = part == k
         number = np.cumsum(own) - 1
-        out[own] = _held(vertices[own], number[faces[own[faces[:, 0]]]], joints)
+        out[own] = _held(vertices[own], number[faces[own[faces[:, 0]]]], shoulders)
     return out
 
 
-def _held(vertices, faces, joints):
-    """As :func:`held`, of one part."""
+def _held(vertices, faces, shoulders):
+    """As :func:`held_below`, of one part."""
     out, rim = np.zeros(len(vertices)), _highest_rim(vertices, faces)
-    if rim is None or vertices[:, 2].max() > joints[_SHOULDERS, 2].mean():
+    if rim is None or vertices[:, 2].max() > shoulders:
         return out
     rim = vertices[rim]
     near = np.flatnonzero(

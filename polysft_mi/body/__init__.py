@@ -8,8 +8,9 @@ import lazy_loader
 __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
+        "bones": ["Bones"],
         "carrier": ["Carrier", "Maps", "Pose"],
-        "motion": ["BodyMotion"],
+        "motion": ["BodyMotion", "MeshMotion", "read_motion"],
         "wearer": ["put_on"],
     },
 )

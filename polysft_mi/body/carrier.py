@@ -68,8 +68,11 @@ class Carrier:
     drape differs from the template in each frame, before it is carried; ``lengths`` (T, E) [m]: of
     the template's edges in the drape, or None, and ``length_errors`` (T,) how well they are known
     as a whole, shares. ``skin``: the body itself: vertices at rest (V, 3)
-    [m], their weights (V, J), and faces (F, 3), or None. ``fps``: frames a second. Maps, as
-    :mod:`onefit.body.skinning` has them, are from the rest pose to a frame.
+    [m], or of each frame, brought back to rest (T, V, 3), their weights (V, J), and faces (F, 3),
+    or None. ``offsets`` (T, J, 3) [m]: of joints that do not keep their place on their parents,
+    from there, along its axes. ``corrected``: the joints whose rotations may be corrected; None:
+    all. ``fps``: frames a second. Maps, as :mod:`onefit.body.skinning` has them, are from the rest
+    pose to a frame.
     """
 
     def __init__(
@@ -85,6 +88,8 @@ class Carrier:
         lengths=None,
         length_errors=None,
         skin=None,
+        offsets=None,
+        corrected=None,
         fps=30.0,
     ):
         self.joints, self.weights = np.asarray(joints, float), np.asarray(weights, float)
@@ -92,6 +97,10 @@ class Carrier:
         self.poses, self.translation = np.asarray(poses, float), np.asarray(translation, float)
         self.draped, self.skin, self.fps = draped, skin, fps
         self.lengths, self.length_errors = lengths, length_errors
+        kept = self.joints - self.joints[np.maximum(parents, 0)]
+        self._offsets = np.broadcast_to(kept, (len(self.poses), *kept.shape))
+        if offsets is not None:
+            self._offsets = np.asarray(offsets, float)
         self._rest = self._chained(Rotation.from_rotvec(rest_pose).as_matrix())
         count = len(self.parents)
         #: (J, J): whether the first joint moves the second one
@@ -103,7 +112,8 @@ class Carrier:
                 j = self.parents[j]
         #: (N, J): how much of each vertex each joint moves
         self._moved = self.weights @ self._moves.T.astype(float)
-        self.free = np.flatnonzero(self._moved.max(0) > _FELT)
+        felt = self._moved.max(0) > _FELT
+        self.free = np.flatnonzero(felt if corrected is None else felt & corrected)
 
     def __len__(self):
         """How many unknowns a correction of the pose has."""
@@ -142,10 +152,24 @@ class Carrier:
     def body(self, pose: Pose) -> np.ndarray:
         """The body's vertices (V, 3) [m, world]."""
         vertices, weights, _ = self.skin
+        vertices = vertices[pose.frame] if vertices.ndim == 3 else vertices
         _, linear, shift, _ = self._joint_maps(pose)
         each = np.concatenate([linear, shift[..., None]], 2).reshape(len(linear), -1)
         maps = (weights @ each).reshape(-1, 3, 4)
         return np.einsum("vij,vj->vi", maps[..., :3], vertices) + maps[..., 3]
+
+    def motion(self, poses: list[Pose]) -> dict[str, np.ndarray | float]:
+        """The body in these poses, as a file of its motion has it: arrays by their names. One that
+        was known as a mesh, whose skin has another form in each frame, is a mesh again.
+        """
+        if self.skin is not None and self.skin[0].ndim == 3:
+            found = np.stack([self.body(pose) for pose in poses]).astype(np.float32)
+            return dict(vertices=found, faces=self.skin[2], fps=self.fps)
+        return dict(
+            poses=np.stack([pose.rotation.as_rotvec() for pose in poses]),
+            translation=np.stack([pose.translation for pose in poses]),
+            fps=self.fps,
+        )
 
     def columns(self, pose: Pose, points: np.ndarray) -> np.ndarray:
         """Derivatives (N, 3, 3 F + 3) of the carried vertices, at ``points`` (N, 3) [m, rest]
@@ -176,12 +200,12 @@ class Carrier:
         """
         turns = self._chained(pose.rotation.as_matrix())
         linear = turns @ self._rest.transpose(0, 2, 1)
-        places = np.empty_like(self.joints)
+        places, offsets = np.empty_like(self.joints), self._offsets[pose.frame]
         for j, p in enumerate(self.parents):
             if p < 0:
                 places[j] = self.joints[j] + pose.translation
             else:
-                places[j] = places[p] + linear[p] @ (self.joints[j] - self.joints[p])
+                places[j] = places[p] + linear[p] @ offsets[j]
         return turns, linear, places - np.einsum("jik,jk->ji", linear, self.joints), places
 
     def _chained(self, rotations):

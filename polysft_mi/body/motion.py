@@ -1,4 +1,4 @@
-"""A body's motion, as a pose estimator gives it. Needs no Mitsuba."""
+"""A body's motion, as a pose estimator or a 4D scanner gives it. Needs no Mitsuba."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from polyfit.mesh import read_mesh
 from polysft_mi.errors import InputError
 
 _JOINTS = 24
 _SMPL_JOINTS = (22, 24, 52, 55)
 _POSES = "poses", "pose", "pose_world"
 _PLACES = "translation", "trans", "transl", "trans_world"
+_MESHES = ".obj", ".ply", ".glb"
 _RATES = "fps", "mocap_framerate", "mocap_frame_rate"
 _USUAL_FPS = 30.0
 _TO_Z = {"z": 0, "y": 90, "-y": -90}  # degrees about x that turn what is up to z
@@ -55,16 +57,7 @@ class BodyMotion:
         that are ``selected``. Raises InputError.
         """
         path = os.fspath(path)
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                arrays = {name: file[name] for name in file.files}
-        except FileNotFoundError:
-            raise InputError(f"{path}: no such file of a body's motion") from None
-        except (OSError, ValueError, EOFError, zipfile.BadZipFile, AttributeError):
-            raise InputError(
-                f"{path}: not a file of a body's motion; .npz with poses (T, {_JOINTS}, 3) and"
-                " translation (T, 3) is needed"
-            ) from None
+        arrays = _read(path)
         poses, places = _found(arrays, _POSES), _found(arrays, _PLACES)
         orient, of_body = (arrays.get(name) for name in ("global_orient", "body_pose"))
         if model and poses is None and orient is not None and of_body is not None:
@@ -96,21 +89,9 @@ class BodyMotion:
         numbers = poses.dtype.kind in "fiu" and places.dtype.kind in "fiu"
         if not numbers or not (np.isfinite(poses).all() and np.isfinite(places).all()):
             raise InputError(f"{path}: poses and translation must be finite numbers")
-        if len(poses) != len(selected):
-            whole = len(poses) > selected[-1] if count is None else len(poses) == count
-            if not whole:
-                raise InputError(
-                    f"{path}: {len(poses)} poses; {count or f'more than {selected[-1]}'} frames,"
-                    " the video's, are needed"
-                )
-            poses, places = poses[selected], places[selected]
-        rate = _found(arrays, _RATES)
-        fps = _USUAL_FPS if rate is None else float(np.ravel(rate)[0])
-        if count != len(selected) and len(selected) > 1:
-            fps /= selected[1] - selected[0]
-        if not 0 < fps < 10_000:
-            raise InputError(f"{path}: fps = {fps:g}; a positive number is needed")
-        poses, places = poses.astype(float), places.astype(float)
+        frames = _of_video(path, len(poses), "poses", count, selected)
+        fps = _rate(path, arrays, count, selected)
+        poses, places = poses[frames].astype(float), places[frames].astype(float)
         shape = arrays.get("shape")
         if model:
             poses, shape = _in_our_axes(poses), _betas(arrays.get("betas"), path)
@@ -120,6 +101,141 @@ class BodyMotion:
     def upright(self) -> Rotation:
         """Turns the scene's world to one whose z is up."""
         return Rotation.from_euler("x", _TO_Z[self.up], degrees=True)
+
+
+@dataclass(frozen=True)
+class MeshMotion:
+    """A body that is known as a mesh alone: ``rest`` (V, 3) and ``frames`` (T, V, 3) [m] in the
+    scene's world, ``faces`` (F, 3); ``fps``, ``up`` and ``path`` as of :class:`BodyMotion`.
+    """
+
+    rest: np.ndarray
+    faces: np.ndarray
+    frames: np.ndarray
+    fps: float
+    up: str = "z"
+    path: str = "body"
+
+    @classmethod
+    def read(
+        cls, path: str | os.PathLike[str], count: int | None, selected: list[int], up: str = "z"
+    ) -> MeshMotion:
+        """The motion of an ``.npz`` file: ``vertices`` (T, V, 3), ``faces`` (F, 3), and, where it
+        has them, ``rest`` (V, 3) and ``fps``. Or of a folder of mesh files of the same vertices and
+        faces, in the order of their names, of which ``rest`` may be one. Without it the first frame
+        is the rest. T, ``count``, ``selected`` and ``up`` as :meth:`BodyMotion.read` has them.
+        Raises InputError.
+        """
+        path = os.fspath(path)
+        arrays = _read_folder(path) if os.path.isdir(path) else _read(path)
+        needed = "vertices (T, V, 3) and faces (F, 3) are needed"
+        if not ("vertices" in arrays and "faces" in arrays):
+            raise InputError(
+                f"{path}: {needed}, and the file has {', '.join(sorted(arrays)) or 'nothing'}"
+            )
+        vertices, faces = arrays["vertices"], arrays["faces"]
+        if vertices.ndim != 3 or vertices.shape[2] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
+            raise InputError(f"{path}: vertices {vertices.shape} and faces {faces.shape}; {needed}")
+        rest = arrays.get("rest", vertices[:1].reshape(-1, 3))
+        if rest.shape != vertices.shape[1:]:
+            raise InputError(
+                f"{path}: rest {rest.shape}; {vertices.shape[1:]}, as in each frame, is needed"
+            )
+        if not (np.isfinite(vertices).all() and np.isfinite(rest).all()):
+            raise InputError(f"{path}: vertices and rest must be finite numbers")
+        whole = faces.dtype.kind in "iu" and len(faces)
+        if not (whole and 0 <= faces.min() <= faces.max() < len(rest)):
+            raise InputError(
+                f"{path}: faces must be whole numbers from 0 to {len(rest) - 1}, its vertices"
+            )
+        frames = _of_video(path, len(vertices), "meshes", count, selected)
+        fps = _rate(path, arrays, count, selected)
+        frames = vertices[frames].astype(float)
+        return cls(rest.astype(float), faces.astype(np.int64), frames, fps, up, path)
+
+    @property
+    def upright(self) -> Rotation:
+        """Turns the scene's world to one whose z is up."""
+        return Rotation.from_euler("x", _TO_Z[self.up], degrees=True)
+
+
+def read_motion(
+    path: str | os.PathLike[str],
+    count: int | None,
+    selected: list[int],
+    model: str = "",
+    up: str = "z",
+) -> BodyMotion | MeshMotion:
+    """The motion of a file or a folder, whichever of both it has; arguments as
+    :meth:`BodyMotion.read` has them. Raises InputError.
+    """
+    folder = os.path.isdir(path)
+    if folder or "faces" in _read(os.fspath(path)):
+        if model:
+            raise InputError(f"{os.fspath(path)}: is of meshes; {model} is for poses alone")
+        return MeshMotion.read(path, count, selected, up)
+    return BodyMotion.read(path, count, selected, model, up)
+
+
+def _read(path):
+    """The arrays of a file, by their names."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file of a body's motion") from None
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, AttributeError):
+        raise InputError(
+            f"{path}: not a file of a body's motion; .npz with poses (T, {_JOINTS}, 3) and"
+            " translation (T, 3), or with vertices (T, V, 3) and faces (F, 3), is needed"
+        ) from None
+
+
+def _read_folder(path):
+    """The same of a folder of mesh files."""
+    names = sorted(n for n in os.listdir(path) if n.lower().endswith(_MESHES))
+    if not names:
+        raise InputError(f"{path}: no meshes ({', '.join(_MESHES)}) in this folder")
+    known, faces, rest = [], None, {}
+    for name in names:
+        vertices, own, _ = read_mesh(os.path.join(path, name))
+        faces = own if faces is None else faces
+        if not np.array_equal(own, faces) or (known and len(vertices) != len(known[0])):
+            raise InputError(
+                f"{os.path.join(path, name)}: other faces than {names[0]}; all meshes of a body"
+                " must have the same vertices and faces, in the same order"
+            )
+        if os.path.splitext(name)[0] == "rest":
+            rest = {"rest": vertices}
+        else:
+            known.append(vertices)
+    if not known:
+        raise InputError(f"{path}: only the body at rest; a mesh for each frame is needed")
+    return {"vertices": np.stack(known), "faces": faces, **rest}
+
+
+def _of_video(path, given, what, count, selected):
+    """Which of ``given`` poses or meshes are of the frames that are used: their indices."""
+    if given == len(selected):
+        return list(range(given))
+    whole = given > selected[-1] if count is None else given == count
+    if not whole:
+        raise InputError(
+            f"{path}: {given} {what}; {count or f'more than {selected[-1]}'} frames, the video's,"
+            " are needed"
+        )
+    return selected
+
+
+def _rate(path, arrays, count, selected):
+    """Frames a second, of those that are used."""
+    rate = _found(arrays, _RATES)
+    fps = _USUAL_FPS if rate is None else float(np.ravel(rate)[0])
+    if count != len(selected) and len(selected) > 1:
+        fps /= selected[1] - selected[0]
+    if not 0 < fps < 10_000:
+        raise InputError(f"{path}: fps = {fps:g}; a positive number is needed")
+    return fps
 
 
 def _found(arrays, names):

@@ -4,8 +4,6 @@ alone.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -13,25 +11,33 @@ from polyfit.errors import require
 from polyfit.mesh import edges_of
 
 from .carrier import Carrier
-
-if TYPE_CHECKING:
-    from .motion import BodyMotion
+from .motion import BodyMotion, MeshMotion
+from .on_mesh import on_mesh
 
 _NETWORK_FPS = 30.0
 _SMOOTHING = 0.05  # [m] over which a drape is smoothed, twice: its folds are not those of the cloth
 
 
-def put_on(vertices: np.ndarray, faces: np.ndarray, motion: BodyMotion) -> Carrier:
+def put_on(vertices: np.ndarray, faces: np.ndarray, motion: BodyMotion | MeshMotion) -> Carrier:
     """The :class:`Carrier` of a template of ``vertices`` (N, 3) [m] and ``faces`` (F, 3), which
     lies on the body at rest, in a ``motion``: the template's weights are those of OneFit, and what
     it is carried in is OneFit's simulation on the same motion, without its folds. Raises InputError
     where OneFit is not installed, and for a template that is no garment on this body.
     """
     require("torch", "anny")
+    if isinstance(motion, MeshMotion):
+        carrier, worn = on_mesh(vertices, faces, motion)
+    else:
+        carrier, worn = _on_joints(vertices, faces, motion)
+    _drape(carrier, vertices, faces, worn)
+    return carrier
+
+
+def _on_joints(vertices, faces, motion):
+    """(the :class:`Carrier`, the simulated template (T, N, 3) [m, world])."""
     import torch
 
     import onefit
-    from onefit.garment import cotangent_laplacian, smoother
 
     smpl = onefit.SmplBody(motion.model) if motion.model else None
     draper = onefit.load(model=smpl)
@@ -78,7 +84,13 @@ def put_on(vertices: np.ndarray, faces: np.ndarray, motion: BodyMotion) -> Carri
     at = np.arange(len(motion.poses)) * (_NETWORK_FPS / motion.fps)
     before = np.minimum(at.astype(int), len(worn) - 1)
     after, part = np.minimum(before + 1, len(worn) - 1), (at - before)[:, None, None]
-    worn = worn[before] * (1 - part) + worn[after] * part
+    return carrier, worn[before] * (1 - part) + worn[after] * part
+
+
+def _drape(carrier, vertices, faces, worn):
+    """A drape ``worn`` (T, N, 3) [m, world], without its folds, becomes part of what carries."""
+    from onefit.garment import cotangent_laplacian, smoother
+
     at_rest = [carrier.maps(carrier.at(k)).back(x) for k, x in enumerate(worn)]
     area, stiffness = cotangent_laplacian(vertices, faces)
     smooth = smoother(area, stiffness, _SMOOTHING)
@@ -90,4 +102,3 @@ def put_on(vertices: np.ndarray, faces: np.ndarray, motion: BodyMotion) -> Carri
     carrier.lengths = (each[0] + each[1]) / 2
     between = (each[0] - each[1]) / 2 / carrier.lengths  # none of its folds, and all of them
     carrier.length_errors = np.abs(between.mean(1)) / np.sqrt(3)
-    return carrier

@@ -5,7 +5,7 @@ import os
 from dataclasses import replace
 
 from polyfit.files import aside
-from polysft_mi.body import BodyMotion
+from polysft_mi.body import read_motion
 from polysft_mi.errors import InputError
 from polysft_mi.scene import Sequence, checked_size, open_cameras, read_camera
 from polysft_mi.scene.kinect_paper import template as kinect_paper_template
@@ -63,7 +63,7 @@ def prepare_folder(
     )
     if body:
         up = of_body.get("body_up", "z")
-        BodyMotion.read(body, len(sequence), sequence.indices, model, up)
+        read_motion(body, len(sequence), sequence.indices, model, up)
         if model and not os.path.isfile(model):
             raise InputError(f"{model}: no such file of a body")
         evidence |= of_body

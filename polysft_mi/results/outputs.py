@@ -122,12 +122,7 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
     if carrier is not None:
         poses = [carrier.pose(state["pose"]) for state in track.states]
         with aside(os.path.join(out, "body.npz")) as temporary:
-            np.savez_compressed(
-                temporary,
-                poses=np.stack([pose.rotation.as_rotvec() for pose in poses]),
-                translation=np.stack([pose.translation for pose in poses]),
-                fps=carrier.fps,
-            )
+            np.savez_compressed(temporary, **carrier.motion(poses))
     say("meshes")
     os.makedirs(os.path.join(out, "meshes"), exist_ok=True)
     source, uv, faces = template.texcoords.split(template.faces)

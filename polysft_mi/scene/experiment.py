@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from polyfit.errors import require
 from polyfit.jets import CanonicalFrame
 from polyfit.mesh import TexCoords, read_textured, write_ply
-from polysft_mi.body import BodyMotion, put_on
+from polysft_mi.body import put_on, read_motion
 from polysft_mi.errors import InputError
 from polysft_mi.render import Pinhole
 from polysft_mi.surface import Template, meshio
@@ -98,7 +98,7 @@ class Experiment:
             selected = s.first, s.last, s.stride
             sequence.cameras = open_cameras(cameras, len(sequence), *selected, self.sensors)
         if body:
-            motion = BodyMotion.read(body, sequence.count, sequence.indices, model, s.body_up)
+            motion = read_motion(body, sequence.count, sequence.indices, model, s.body_up)
             sequence.carrier = put_on(self.template.vertices, self.template.faces, motion)
         return sequence
 

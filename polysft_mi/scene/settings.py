@@ -77,8 +77,8 @@ class Settings:
     )
     body: str = _setting(
         "",
-        "file of a body's motion (.npz: poses, translation), in whose rest pose the template is"
-        " given, and which carries it; empty: none",
+        "file of a body's motion (.npz: poses, translation; or vertices, faces), or a folder of its"
+        " meshes, in whose rest the template is given, and which carries it; empty: none",
     )
     body_model: str = _setting(
         "",

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from polysft_mi.body import BodyMotion
+from polyfit.mesh import write_ply
+from polysft_mi.body import BodyMotion, MeshMotion, read_motion
 from polysft_mi.errors import InputError
 
 FRAMES = 6
@@ -66,3 +67,67 @@ def test_no_such_file(tmp_path):
     (tmp_path / "text.npz").write_text("poses")
     with pytest.raises(InputError, match="not a file of a body's motion"):
         BodyMotion.read(tmp_path / "text.npz", 2, [0, 1])
+
+
+@pytest.fixture
+def meshes():
+    rng = np.random.default_rng(1)
+    return {"vertices": rng.normal(size=(FRAMES, 5, 3)), "faces": np.array([[0, 1, 2], [2, 3, 4]])}
+
+
+def read_meshes(path, selected=range(FRAMES), count=FRAMES, **how):
+    return read_motion(path, count, list(selected), **how)
+
+
+def test_meshes_in_a_file_and_in_a_folder_say_the_same(meshes, tmp_path):
+    rest = meshes["vertices"][0] + 1
+    np.savez(tmp_path / "body.npz", **meshes, rest=rest, fps=24)
+    (tmp_path / "body").mkdir()
+    for name, mesh in [
+        ("rest", rest),
+        *((f"{k:03d}", x) for k, x in enumerate(meshes["vertices"])),
+    ]:
+        write_ply(tmp_path / "body" / f"{name}.ply", mesh, meshes["faces"])
+    of_file, of_folder = (read_meshes(tmp_path / name) for name in ("body.npz", "body"))
+    assert isinstance(of_file, MeshMotion) and (of_file.fps, of_folder.fps) == (24, 30)
+    for name in ("rest", "faces", "frames"):
+        assert np.allclose(getattr(of_file, name), getattr(of_folder, name), atol=1e-6)
+    some = read_meshes(tmp_path / "body.npz", [1, 3, 5], up="y")
+    assert np.array_equal(some.frames, of_file.frames[1::2]) and some.fps == 12
+    assert some.upright.apply([0, 1, 0]) == pytest.approx([0, 0, 1])
+    np.savez(tmp_path / "bare.npz", **meshes)
+    assert np.array_equal(read_meshes(tmp_path / "bare.npz").rest, meshes["vertices"][0])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            {"vertices": None},
+            r"vertices \(T, V, 3\) and faces \(F, 3\) are needed, and .* has faces",
+        ),
+        ({"vertices": np.zeros((FRAMES, 15))}, r"vertices \(6, 15\) and faces \(2, 3\)"),
+        ({"rest": np.zeros((4, 3))}, r"rest \(4, 3\); \(5, 3\), as in each frame, is needed"),
+        ({"rest": np.full((5, 3), np.nan)}, "must be finite numbers"),
+        ({"faces": np.array([[0, 1, 5]])}, "whole numbers from 0 to 4"),
+        ({"faces": np.zeros((0, 3), int)}, "whole numbers from 0 to 4"),
+        ({"fps": -1}, "fps = -1; a positive number is needed"),
+        ({"vertices": np.zeros((4, 5, 3))}, "4 meshes; 6 frames, the video's, are needed"),
+    ],
+)
+def test_meshes_that_cannot_be_used_are_refused(meshes, tmp_path, change, message):
+    arrays = {name: x for name, x in {**meshes, **change}.items() if x is not None}
+    np.savez(tmp_path / "body.npz", **arrays)
+    with pytest.raises(InputError, match=message):
+        read_meshes(tmp_path / "body.npz")
+
+
+def test_folders_that_cannot_be_used_are_refused(meshes, tmp_path):
+    with pytest.raises(InputError, match="no meshes"):
+        read_meshes(tmp_path)
+    for k, faces in enumerate([meshes["faces"], meshes["faces"][:1]]):
+        write_ply(tmp_path / f"{k}.ply", meshes["vertices"][k], faces)
+    with pytest.raises(InputError, match="1.ply: other faces than 0.ply"):
+        read_meshes(tmp_path)
+    with pytest.raises(InputError, match="is of meshes; SMPL.pkl is for poses alone"):
+        read_meshes(tmp_path, model="SMPL.pkl")

@@ -1,5 +1,5 @@
-"""A garment is put on a body: SMPL's, whose motion is in SMPL's form and in a world with y up, as
-on the same body in OneFit's.
+"""A garment is put on a body: SMPL's, whose motion is in SMPL's form and in a world with y up, and
+one that is known as a mesh alone, as on the same body in OneFit's.
 """
 
 import numpy as np
@@ -7,10 +7,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 from standing import smpl_contents
 
-from polysft_mi.body import BodyMotion, put_on
+from polysft_mi.body import BodyMotion, put_on, read_motion
 from polysft_mi.errors import InputError
 
 onefit = pytest.importorskip("onefit")
+torch = pytest.importorskip("torch")
+skinning = pytest.importorskip("onefit.body.skinning")
 C = Rotation.from_euler("x", 90, degrees=True)
 FRAMES = 3
 
@@ -45,7 +47,7 @@ def as_smpl(motion, model):
 
 def put(garment, path, *model, **arrays):
     np.savez(path, **arrays)
-    motion = BodyMotion.read(path, FRAMES, list(range(FRAMES)), *model)
+    motion = read_motion(path, FRAMES, list(range(FRAMES)), *model)
     vertices, faces = garment.vertices.double().numpy(), garment.faces.numpy()
     carrier = put_on(vertices, faces, motion)
     return np.stack([carrier.maps(carrier.at(k))(vertices) for k in range(FRAMES)])
@@ -59,6 +61,28 @@ def test_a_motion_in_smpl_s_form_is_the_same_motion(garment, motion, smpl, tmp_p
     away = np.linalg.norm(C.apply(theirs.reshape(-1, 3)).reshape(theirs.shape) - ours, axis=2)
     # up to what skinning there and back makes of the body, and the cloth of that
     assert np.median(away) < 4e-3 and away.max() < 0.03
+
+
+def test_on_the_moving_mesh_alone_it_lies_alike(garment, motion, tmp_path):
+    """In a world with y up. Without network, joints, and yielding flesh the cloth is another."""
+    ours = put(garment, tmp_path / "ours.npz", poses=motion[0], translation=motion[1])
+    body = onefit.AnnyBody().body()
+    known = [torch.as_tensor(x).float() for x in motion]
+    transforms = skinning.transforms(body, *known)
+    frames = skinning.skin(body.vertices, body.blend_weights, transforms).double().numpy()
+    turned = lambda x: C.inv().apply(x.reshape(-1, 3)).reshape(x.shape)
+    given = {"vertices": turned(frames), "rest": turned(body.vertices.double().numpy())}
+    np.savez(tmp_path / "mesh.npz", **given, faces=body.faces.numpy(), fps=30)
+    mesh = read_motion(tmp_path / "mesh.npz", FRAMES, list(range(FRAMES)), up="y")
+    vertices, faces = turned(garment.vertices.double().numpy()), garment.faces.numpy()
+    carrier = put_on(vertices, faces, mesh)
+    for k in range(FRAMES):
+        there = C.apply(carrier.maps(carrier.at(k))(vertices))
+        away = np.linalg.norm(there - ours[k], axis=1)
+        assert np.median(away) < 0.01 and away.max() < 0.05
+        assert np.abs(carrier.body(carrier.at(k)) - mesh.frames[k]).max() < 1e-6
+    with pytest.raises(InputError, match="from this body at rest in the mean"):
+        put_on(vertices + (0, 0, 1.0), faces, mesh)
 
 
 def test_smpl_s_forms_say_the_same(motion, smpl, tmp_path):
