@@ -1,5 +1,6 @@
-# make demo, demo-paper, demo-lit, demo-shirt, demo-dressed, drape, gpu, test, docs, lint, dist: each
-# installs into .venv what it needs and is not there yet (seconds where nothing is missing), and runs.
+# make demo, demo-paper, demo-lit, demo-shirt, demo-dressed, drape, gpu, test, test-all, docs, lint,
+# dist: each installs into .venv what it needs and is not there yet (seconds where nothing is
+# missing), and runs.
 # PYTHON=python3.12 takes another Python for a new .venv; TORCH=any takes torch with CUDA too.
 # LLVM comes with it on Linux on x86-64; elsewhere every command says what to install.
 
@@ -18,7 +19,7 @@ EXTRAS_docs := docs
 EXTRAS_lint := lint
 EXTRAS_dist := dist
 
-.PHONY: demo demo-paper demo-lit demo-shirt demo-dressed drape gpu test docs lint dist clean
+.PHONY: demo demo-paper demo-lit demo-shirt demo-dressed drape gpu test test-all docs lint dist clean
 .PRECIOUS: .venv/with-%
 .NOTPARALLEL:
 
@@ -47,7 +48,11 @@ drape: .venv/with-drape
 gpu: .venv/with-test
 	$(PY) benchmarks/gpu.py
 
+# All but those that are marked as slow; test-all has these, too
 test: .venv/with-test
+	$(PY) -m pytest -q -n 2 --dist loadfile -m 'not slow'
+
+test-all: .venv/with-test
 	$(PY) -m pytest -q -n 2 --dist loadfile
 
 # The pages of docs/ as HTML, in out/docs, with the API reference; a warning is an error

@@ -27,6 +27,7 @@ def registered():
     plugins.register()
 
 
+@pytest.mark.slow
 def test_contenders_show_the_same_sheet_on_half_of_the_image(tmp_path):
     result = raster.measure_times(
         (640, 480), POINTS, str(tmp_path), seconds=0
@@ -70,6 +71,7 @@ def test_the_page_has_the_table_of_its_figures():
 DEMO = (str(ROOT / "scenes" / "demo.xml"), {"last": "1", "period": "4"})
 
 
+@pytest.mark.slow
 def test_snapshots_are_what_shorter_runs_return(tmp_path):
     long = stability.run(*DEMO, [3, 40], str(tmp_path), say=str)
     (tmp_path / "log.jsonl").unlink()

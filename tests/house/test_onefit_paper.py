@@ -38,6 +38,7 @@ def test_every_training_has_a_command(capsys):
     assert all("--preset paper" in line and "-o RUNS/" in line for line in lines)
 
 
+@pytest.mark.slow
 def test_tables_of_what_is_trained(runs, tmp_path):
     bench.main([str(runs), "--train", "jumpsuit-tuned", "tank-no-col", "--short", "1"])
     assert sorted(p.name for p in runs.iterdir()) == ["jumpsuit-tuned", "six", "tank-no-col"]

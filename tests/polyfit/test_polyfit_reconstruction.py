@@ -42,6 +42,7 @@ def test_samples_are_even():
     )
 
 
+@pytest.mark.slow
 def test_tables_at_a_small_size(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(benchmark, "PATCHES", (10,))
     monkeypatch.setattr(benchmark, "POINTS", 1000)

@@ -231,6 +231,7 @@ def test_ctrl_c_leaves_a_checkpoint(tmp_path, monkeypatch):
     assert all(torch.equal(resumed[k], whole[k]) for k in whole)
 
 
+@pytest.mark.slow
 def test_two_processes_do_what_one_does(tmp_path):
     # a thread of the group that outlives it may abort the ending interpreter
     (tmp_path / "run.py").write_text(

@@ -1,6 +1,7 @@
 """Sewing patterns: read, sewn around the body, and draped."""
 
 import json
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -24,14 +25,19 @@ def path_of(name):
     return FOLDER / f"{name}_specification.json"
 
 
-@pytest.fixture(scope="module")
-def garments():
-    return {name: Garment.read(path_of(name), count=900) for name in LOOPS}
+@cache
+def sewn(name):
+    return Garment.read(path_of(name), count=900)
 
 
-@pytest.fixture(params=LOOPS)
-def garment(request, garments):
-    return garments[request.param]
+@pytest.fixture(
+    params=[
+        pytest.param(name, marks=[pytest.mark.slow] * (name in ("hoody_mean", "js_mean_all")))
+        for name in LOOPS
+    ]
+)
+def garment(request):
+    return sewn(request.param)
 
 
 def perimeter(points):
@@ -104,14 +110,14 @@ def _area(polygon):
     return abs((x * np.roll(y, -1) - np.roll(x, -1) * y).sum()) / 2
 
 
-def test_drapes_and_carries_its_panels_as_texture(garments, tmp_path):
+def test_drapes_and_carries_its_panels_as_texture(tmp_path):
     draper, motion = onefit.load(), onefit.Motion.generate("walk", seconds=0.3)
     for make in (draper.drape, draper.simulate):
-        made = make(garments["dress_pencil"], motion)
+        made = make(sewn("dress_pencil"), motion)
         assert torch.isfinite(made.vertices).all() and made.measures().collision < 0.5
     assert np.allclose(made.render_vertices(), made.vertices.numpy(), atol=1e-6)
     uv = made.render_mesh.texcoords.coordinates
-    assert uv.min() == 0 and uv.max() == 1 and len(uv) > len(garments["dress_pencil"])
+    assert uv.min() == 0 and uv.max() == 1 and len(uv) > len(sewn("dress_pencil"))
 
 
 def test_the_command_takes_a_pattern(tmp_path):

@@ -182,6 +182,7 @@ def one_thread():
     torch.set_num_threads(count)
 
 
+@pytest.mark.slow
 def test_a_resumed_training_ends_where_an_uninterrupted_one_does(small, tmp_path, one_thread):
     small = replace(small, epoch_steps=2)
     whole = loop.train(small, tmp_path / "whole", command="python -m onefit.train ...")
@@ -247,6 +248,7 @@ def test_a_training_of_the_paper_s_network_goes_on_from_its_checkpoint(motion, t
     assert onefit.load(tmp_path / "tuned" / "weights.safetensors").network.shape == network.shape
 
 
+@pytest.mark.slow
 def test_two_processes_have_the_curve_of_one(small, tmp_path):
     flags = "shorts --batch 600 --epochs 1 --epoch-steps 3 --shapes 1".split()
     flags += ["--motions", small.motions[0]]

@@ -93,6 +93,7 @@ def test_lessons_that_are_there_are_kept(folder):
     assert path.stat().st_mtime_ns == before
 
 
+@pytest.mark.slow
 def test_cuts_are_taught_by_their_names(tmp_path, monkeypatch):
     monkeypatch.setattr(cuts, "Block", partial(cuts.Block, spacing=0.024))  # thrice as coarse
     arguments = ["--cuts", "1", "--kinds", "idle", "walk", "--each", "1", "--seconds", "0.1"]
@@ -118,6 +119,7 @@ def test_windows_of_lessons_are_their_frames(learned):
             assert torch.equal(there, at[0].displacement[:, frame].float())
 
 
+@pytest.mark.slow
 def test_regression_comes_nearer_to_the_lessons(folder, learned):
     alone = Weights(k_c=0.0, k_m=0.0)
     settings = replace(SMALL, teacher=str(folder), weights=alone)

@@ -5,6 +5,7 @@ docs/paper.md take them.
 import json
 
 import numpy as np
+import pytest
 import synthetic
 from clips import CAMERA, HEIGHT, WIDTH, photo, placed, rendered, write_png
 
@@ -29,6 +30,7 @@ def test_a_synthetic_sequence_of_phi_sft(tmp_path, capsys):
     assert load_npz(out / "surface.npz")["vertices"].shape == truth.vertices.shape
 
 
+@pytest.mark.slow
 def test_images_of_a_sheet_without_truth(tmp_path):
     """Paper-Bend: images, a camera, and the sheet's corners in the first image."""
     print_ = photo()

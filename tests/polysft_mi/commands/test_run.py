@@ -135,7 +135,9 @@ def test_resolved_scene_runs_from_anywhere(result, tmp_path, monkeypatch):
     assert surface(tmp_path / "again")["vertices"].shape[0] == 2
 
 
-@pytest.mark.parametrize("solver, kept", [("adam", 3), ("gauss-newton", 1)])
+@pytest.mark.parametrize(
+    "solver, kept", [pytest.param("adam", 3, marks=pytest.mark.slow), ("gauss-newton", 1)]
+)
 def test_resume_ends_with_the_same_result(sequence, tmp_path, monkeypatch, solver, kept):
     arguments = [str(sequence.folder / "scene.xml"), "-q", "-D", "last=3", *SOLVERS[solver]]
     whole, parts = tmp_path / "whole", tmp_path / "parts"

@@ -34,7 +34,7 @@ def test_a_window_follows_the_sheet_and_couples_its_frames(truth, tracked, tmp_p
     assert moved[0] < 0.5 * moved[1]
 
 
-@pytest.mark.parametrize("solver", ["gauss-newton", "adam"])
+@pytest.mark.parametrize("solver", ["gauss-newton", pytest.param("adam", marks=pytest.mark.slow)])
 def test_windows_that_begin_at_the_frame_before_follow_the_sheet(truth, tmp_path, solver):
     """The paper's way through a video, by either solver: all frames together, no other starts."""
     adam = {"preset": "paper", "canonical_frame": "pca", "period": 150}
