@@ -171,7 +171,7 @@ class DataTerm:
         mask = self._frames.mask(frame)
         if mask is not None:
             nearest[mask > 0.5] = np.inf
-        nearest = mi.Float(np.ascontiguousarray(nearest).ravel())
+        nearest = on_device(nearest, mi.Float)
         self._before, self._last = pixels.Image.of(nearest, depth.shape), None
 
     def _hidden(self, view, level):
@@ -193,7 +193,7 @@ class DataTerm:
         """
         last = self._last
         if last is None or last[0] != level.stride or not np.array_equal(last[1], vertices):
-            self._placed.place(mi.Point3f(np.ascontiguousarray(vertices.T, dtype=np.float32)))
+            self._placed.place(on_device(vertices, mi.Point3f))
             position, before = self.camera.project(vertices)
             box = (*position.min(0), *position.max(0)) if before.all() else None
             view = self._raster.view(self._placed.scene, self._placed.sensor, 1 / level.stride, box)

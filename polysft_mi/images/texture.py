@@ -66,7 +66,7 @@ class Texture:
             for dy in (np.arange(fine) + 0.5) / fine - 0.5:
                 x, y = np.meshgrid(at[0] + dx * size[0] / shape[0], at[1] + dy * size[1] / shape[1])
                 si = dr.zeros(mi.SurfaceInteraction3f, x.size)
-                si.uv = mi.Point2f(x.ravel().astype(np.float32), y.ravel().astype(np.float32))
+                si.uv = mi.Point2f(*(on_device(k, mi.Float) for k in (x, y)))
                 si.wi = mi.Vector3f(0, 0, 1)
                 total = total + np.array(mesh.bsdf().eval_diffuse_reflectance(si)).T
         self.image = (total / fine**2).reshape(len(at[1]), len(at[0]), 3).astype(np.float32)

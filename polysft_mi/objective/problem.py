@@ -58,8 +58,8 @@ class Problem:
         """Raise InputError where the template, as the scene places it, cannot be seen in the first
         frame.
         """
-        start = Unknowns.from_numpy(self.atlas.arrays(self.atlas.start))
-        position, before = self.camera.project(self.atlas.surface(self.atlas.start).vertices)
+        vertices = self.atlas.surface(self.atlas.start).vertices
+        position, before = self.camera.project(vertices)
         where = f"{self.experiment.path}: the template"
         if not before.all():
             raise InputError(
@@ -67,7 +67,7 @@ class Problem:
                 " it must stand in its pose of the first frame"
             )
         low, high = position.min(0).round(), position.max(0).round()
-        if self.visible_share(self.surface(start)) == 0:
+        if self.visible_share(vertices) == 0:
             raise InputError(
                 f"{where} is out of view in the first frame: it projects to x"
                 f" {low[0]:g}..{high[0]:g}, y {low[1]:g}..{high[1]:g} of an image of"
@@ -75,8 +75,14 @@ class Problem:
             )
         mask = self.sequence.mask(0)
         if mask is not None:
-            alpha = np.array(self.placed.image(self.patch.vertices(start))[1])
-            if float((alpha.reshape(mask.shape) * mask).sum()) == 0:
+            import cv2
+
+            far = 10 * max(self.width, self.height)
+            corners = np.round(position.clip(-far, far)).astype(np.int32)[self.template.faces]
+            covered = np.zeros(mask.shape, np.uint8)
+            for triangle in corners:  # one by one: where two overlap, both together cut a hole
+                cv2.fillConvexPoly(covered, triangle, 1)
+            if not (mask[covered > 0] > 0).any():
                 raise InputError(
                     f"{where} does not meet the mask of the first frame: it projects to x"
                     f" {low[0]:g}..{high[0]:g}, y {low[1]:g}..{high[1]:g}"

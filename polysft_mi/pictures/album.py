@@ -17,7 +17,7 @@ import numpy as np
 
 from polysft_mi.colours import srgb
 from polysft_mi.images import compared
-from polysft_mi.render import RasterIntegrator, SideView, Triangles, write_video
+from polysft_mi.render import RasterIntegrator, SideView, Triangles, on_device, write_video
 from polysft_mi.results import metrics
 
 from . import figures
@@ -70,7 +70,7 @@ class Renderings:
         problem = self.problem
         with dr.suspend_grad():
             rgb, alpha = self.placed.image(
-                mi.Point3f(np.ascontiguousarray(vertices.T, dtype=np.float32)),
+                on_device(vertices, mi.Point3f),
                 spp=problem.settings.spp,
             )
             render = np.array(rgb)

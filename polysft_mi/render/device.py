@@ -66,8 +66,15 @@ def interruptible():
 
 
 def on_device(array, kind):
-    """A NumPy array, flat, as a Dr.Jit array of type ``kind``; a copy."""
+    """A NumPy array, flat, as a Dr.Jit array of type ``kind``, or points (N, 3) as a Point3f, or
+    another type of three; a copy.
+
+    Dr.Jit takes NumPy's memory as it is, and kernels say how that is aligned: by chance, so that
+    kernels in the cache would be others in each run.
+    """
     array = np.asarray(array)
+    if dr.depth_v(kind) > 1:
+        return kind(*(on_device(x, dr.value_t(kind)) for x in array.T))
     scalar = np.dtype(_NUMPY[dr.type_v(kind)])
     room = np.empty(array.size * scalar.itemsize + _ALIGNED, np.uint8)
     skipped = -room.ctypes.data % _ALIGNED

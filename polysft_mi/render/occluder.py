@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .device import on_device
 from .raster import RasterIntegrator
 
 
@@ -15,8 +16,8 @@ class Occluder:
     def __init__(self, faces: np.ndarray, count: int, sensor: mi.Sensor) -> None:
         mesh = mi.Mesh("occluder", count, len(faces))
         params = mi.traverse(mesh)
-        params["faces"] = mi.UInt32(np.ascontiguousarray(faces, dtype=np.uint32).ravel())
-        params["vertex_positions"] = mi.Float(np.zeros(3 * count, dtype=np.float32))
+        params["faces"] = on_device(faces, mi.UInt32)
+        params["vertex_positions"] = dr.zeros(mi.Float, 3 * count)
         params.update()
         self._sensor = sensor
         self._scene = mi.load_dict({"type": "scene", "occluder": mesh})
@@ -28,7 +29,7 @@ class Occluder:
         """Its depth (H, W) float32 [m] along the camera's axis, its vertices at (N, 3) [m, world];
         infinite where there is nothing.
         """
-        self._params[self._key] = mi.Float(np.ascontiguousarray(vertices, np.float32).ravel())
+        self._params[self._key] = on_device(vertices, mi.Float)
         self._params.update()
         with dr.suspend_grad():
             view = self._raster.view(self._scene, self._sensor)

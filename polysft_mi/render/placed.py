@@ -13,6 +13,7 @@ import numpy as np
 
 from polysft_mi.errors import InputError
 
+from .device import on_device
 from .pinhole import Pinhole
 from .raster import RasterIntegrator
 
@@ -47,7 +48,7 @@ class PlacedMesh:
         self.faces = corner[self.rendered_faces]
         #: (2V,): texture coordinates that replaced the mesh's own, or None
         self.texcoords: np.ndarray | None = None
-        self._corner = mi.UInt32(corner.astype(np.uint32))
+        self._corner = on_device(corner, mi.UInt32)
         self._is_identity = np.array_equal(corner, np.arange(len(corner)))
         # through the scene, not the mesh alone: only so does the scene rebuild what it traces rays
         # with

@@ -19,6 +19,8 @@ from scipy import sparse
 from polyfit import mesh
 from polysft_mi.colours import srgb
 
+from .device import on_device
+
 MARGIN = 1.12  # of the picture around what moves
 _FOV = 28.0  # degrees, of the picture's height
 FLOOR = np.array([0.36, 0.37, 0.39])  # linear RGB
@@ -74,8 +76,8 @@ class Triangles:
     def __init__(self, vertices, faces):
         shape = mi.Mesh("mesh", len(vertices), len(faces))
         params = mi.traverse(shape)
-        params["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
-        params["vertex_positions"] = mi.Float(np.float32(vertices).ravel())
+        params["faces"] = on_device(faces, mi.UInt32)
+        params["vertex_positions"] = on_device(vertices, mi.Float)
         params.update()
         self.scene = mi.load_dict({"type": "scene", "mesh": shape})
         self.params = mi.traverse(self.scene)
@@ -85,7 +87,7 @@ class Triangles:
 
     def move(self, vertices):
         """The vertices are at (N, 3) [m] from now on."""
-        self.params[self.key] = mi.Float(np.float32(vertices).ravel())
+        self.params[self.key] = on_device(vertices, mi.Float)
         self.params.update()
         self.vertices = vertices
 
@@ -99,7 +101,7 @@ class Triangles:
         x, y = _samples(camera.width, camera.height)
         x, y = (x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy
         hit = self._hit(mi.Point3f(0), mi.Vector3f(x, y, 1))
-        images = [hit.t, *(self._mixed(hit, mi.Float(np.float32(v))) for v in values)]
+        images = [hit.t, *(self._mixed(hit, on_device(v, mi.Float)) for v in values)]
         images = [np.array(dr.select(hit.is_valid(), x, dr.nan)) for x in images]
         return tuple(x.reshape(camera.height, camera.width) for x in images)
 
@@ -125,12 +127,12 @@ class Triangles:
         across = mesh.face_vectors(self.vertices, self.faces) @ view.rotation[2]
         away = dr.gather(mi.Bool, mi.Bool(across > 0), hit.prim_index, hit.is_valid())
         front, back = (
-            self._mixed(hit, mi.Float(np.float32(_light(n, look)))) for n in (normals, -normals)
+            self._mixed(hit, on_device(_light(n, look), mi.Float)) for n in (normals, -normals)
         )
         light = dr.clip(dr.select(away, back, front), 0, 2)
         for values in () if uv is None else np.moveaxis(np.asarray(uv, np.float64), 2, 0):
             cells = 10 * (values - values.min()) / max(np.ptp(values), 1e-12)
-            at = self._mixed(hit, mi.Float(np.float32(cells).ravel()), of_corners=True)
+            at = self._mixed(hit, on_device(cells, mi.Float), of_corners=True)
             light *= 1 - 0.17 * dr.clip(2 - dr.abs(at - dr.round(at)) / 0.03, 0, 1)
         colour = light * dr.select(away, mi.Color3f(*look.back), mi.Color3f(*look.front))
         colour = dr.select(hit.is_valid(), colour, mi.Color3f(look.background))
@@ -237,7 +239,7 @@ class Stage(Triangles):
         super().__init__(vertices, faces)
         self.floor = floor
         self.part = np.zeros(len(vertices), np.uint32) if part is None else part.astype(np.uint32)
-        self.part_of_face = mi.UInt32(self.part[faces[:, 0]])
+        self.part_of_face = on_device(self.part[faces[:, 0]], mi.UInt32)
         self.colour = mi.Color3f(colours.T.astype(np.float32))
         self.sky = _sphere(_SKY_RAYS)
         x, y, z = _TOWARDS_KEY / np.linalg.norm(_TOWARDS_KEY)
@@ -248,7 +250,7 @@ class Stage(Triangles):
     def move(self, vertices):
         super().move(vertices)
         self.normals = mesh.vertex_normals(np.float64(vertices), self.faces)
-        self.normal = mi.Vector3f(self.normals.T.astype(np.float32))
+        self.normal = on_device(self.normals, mi.Vector3f)
 
     def light(self, target, asked=None):
         """Light falls on the vertices, on those ``asked`` (N,) alone if given, and on the floor
@@ -256,9 +258,8 @@ class Stage(Triangles):
         """
         asked = np.ones(len(self.vertices), bool) if asked is None else asked
         light = self._uncovered(asked)
-        light = light.T.astype(np.float32)
-        self.front, self.back = mi.Color3f(light[:3]), mi.Color3f(light[3:6])
-        self.shadow = mi.Float(light[6])
+        self.front, self.back = (on_device(x, mi.Color3f) for x in (light[:, :3], light[:, 3:6]))
+        self.shadow = on_device(light[:, 6], mi.Float)
         self.centre = np.asarray(target, np.float64)[:2]
         x = np.linspace(-_REACH, _REACH, GRID)
         y, x = np.meshgrid(self.centre[1] + x, self.centre[0] + x, indexing="ij")
@@ -274,10 +275,10 @@ class Stage(Triangles):
         covers, skin below cloth or right along its rim, have what their uncovered neighbours have:
         so no darkness leaks out at a sleeve or a strap.
         """
-        p, normal = (mi.Point3f(x.T.astype(np.float32)) for x in (self.vertices, self.normals))
+        p, normal = (on_device(x, mi.Point3f) for x in (self.vertices, self.normals))
         axis, part, covered = (
             dr.normalize(mi.Vector3f(normal)),
-            mi.UInt32(self.part),
+            on_device(self.part, mi.UInt32),
             mi.Bool(False),
         )
         frame, around = mi.Frame3f(axis), np.arange(8) * np.pi / 4
@@ -309,12 +310,12 @@ class Stage(Triangles):
         hidden.
         """
         n = len(points)
-        p = mi.Point3f(points.T.astype(np.float32))
-        m = mi.Vector3f(normals.T.astype(np.float32))
+        p = on_device(points, mi.Point3f)
+        m = on_device(normals, mi.Vector3f)
         sums = dr.zeros(mi.Float, 6 * n)
         index = dr.arange(mi.UInt32, n * self.sky.shape[1])
         point, ray = index % n, index // n
-        d = dr.gather(mi.Vector3f, mi.Vector3f(self.sky.astype(np.float32)), ray)
+        d = dr.gather(mi.Vector3f, on_device(self.sky.T, mi.Vector3f), ray)
         at, normal = dr.gather(mi.Point3f, p, point), dr.gather(mi.Vector3f, m, point)
         cosine = dr.dot(d, normal)
         side = dr.select(cosine > 0, 1.0, -1.0)
@@ -329,7 +330,7 @@ class Stage(Triangles):
         rays = self.sun.shape[1]
         index = dr.arange(mi.UInt32, n * rays)
         point, ray = index % n, index // n
-        d = dr.gather(mi.Vector3f, mi.Vector3f(self.sun.astype(np.float32)), ray)
+        d = dr.gather(mi.Vector3f, on_device(self.sun.T, mi.Vector3f), ray)
         at, normal = dr.gather(mi.Point3f, p, point), dr.gather(mi.Vector3f, m, point)
         side = dr.select(dr.dot(d, normal) > 0, 1.0, -1.0)
         hidden = self.scene.ray_test(mi.Ray3f(at + side * _LIFT * normal, d))

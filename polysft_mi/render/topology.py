@@ -8,6 +8,8 @@ import numpy as np
 
 from polysft_mi.errors import InputError
 
+from .device import on_device
+
 
 class Topology:
     """Triangles of all meshes of a scene in one numbering, with their neighbours. Detached;
@@ -34,8 +36,8 @@ class Topology:
             face_offset.append(face_offset[-1] + len(f))
             vertex_offset.append(vertex_offset[-1] + len(v))
         self.face_count, self.vertex_count = face_offset[-1], vertex_offset[-1]
-        self.faces = mi.UInt32(np.concatenate(faces).ravel().astype(np.uint32))
-        self.neighbours = mi.Int32(np.concatenate(neighbours).ravel().astype(np.int32))
+        self.faces = on_device(np.concatenate(faces), mi.UInt32)
+        self.neighbours = on_device(np.concatenate(neighbours), mi.Int32)
         # from a shape's place in the registry to its first triangle
         self.face_offset = dr.zeros(
             mi.UInt32,

@@ -21,7 +21,7 @@ from polyfit.jets import CanonicalFrame
 from polyfit.mesh import TexCoords, read_textured, write_ply
 from polysft_mi.body import put_on, read_motion
 from polysft_mi.errors import InputError
-from polysft_mi.render import Pinhole
+from polysft_mi.render import Pinhole, on_device
 from polysft_mi.surface import Template, meshio
 
 from . import plugins
@@ -347,7 +347,7 @@ def _template(mesh, source, settings, template):
     if not kept.all():
         shown = shown[kept]
         of_mesh = mi.traverse(mesh)
-        of_mesh["faces"] = mi.UInt32(shown.astype(np.uint32).ravel())
+        of_mesh["faces"] = on_device(shown, mi.UInt32)
         of_mesh.update()
     if not np.isfinite(rendered).all():
         raise InputError(f"{where}: positions are not finite (NaN)")

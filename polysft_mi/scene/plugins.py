@@ -14,7 +14,7 @@ import numpy as np
 
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError
-from polysft_mi.render import RasterIntegrator
+from polysft_mi.render import RasterIntegrator, on_device
 
 from . import settings
 
@@ -192,10 +192,10 @@ def _varol_template(props):
     )
     mesh = mi.Mesh("template", len(vertices), len(faces), has_vertex_texcoords=True, props=props)
     params = mi.traverse(mesh)
-    params["vertex_positions"] = mi.Float(np.ascontiguousarray(vertices, dtype=np.float32).ravel())
-    params["faces"] = mi.UInt32(np.ascontiguousarray(faces, dtype=np.uint32).ravel())
+    params["vertex_positions"] = on_device(vertices, mi.Float)
+    params["faces"] = on_device(faces, mi.UInt32)
     flipped = np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1)  # Mitsuba's v runs down
-    params["vertex_texcoords"] = mi.Float(flipped.astype(np.float32).ravel())
+    params["vertex_texcoords"] = on_device(flipped, mi.Float)
     params.update()
     return mesh
 

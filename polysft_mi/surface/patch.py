@@ -10,6 +10,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from polysft_mi.render import on_device
+
 from .deformation import Deformation
 
 
@@ -66,7 +68,7 @@ class Unknowns:
         """The reverse of :meth:`to_numpy`; without ``pose`` no body carries the surface."""
         known = [name for name in cls.NAMES if name != "pose" or name in arrays]
         flat = {name: np.asarray(arrays[name], np.float32).ravel() for name in known}
-        return cls(**{name: mi.Float(x) for name, x in flat.items()})
+        return cls(**{name: on_device(x, mi.Float) for name, x in flat.items()})
 
 
 class JetAtlas(Deformation):
@@ -121,10 +123,6 @@ def _on_device(array):
     """An array (N,) of numbers or indices as a Float or UInt32. Opaque: the numbers of one template
     must not be baked into kernels that serve every template.
     """
-    made = (
-        mi.UInt32(array.astype(np.uint32))
-        if array.dtype.kind == "i"
-        else mi.Float(array.astype(np.float32))
-    )
+    made = on_device(array, mi.UInt32 if array.dtype.kind == "i" else mi.Float)
     dr.make_opaque(made)
     return made

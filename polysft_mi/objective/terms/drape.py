@@ -6,6 +6,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from polysft_mi.render import on_device
+
 from ..quadratic import RestForms
 from .term import Term
 
@@ -37,7 +39,9 @@ class Drape(Term):
 
     def energy(self, at):
         rest = mi.Point3d(self._inputs.surface.at_rest(at.unknowns))
-        away = rest - mi.Point3d(*(mi.Float64(x) for x in self._inputs.template.vertices.T))
+        away = rest - mi.Point3d(
+            *(on_device(x, mi.Float64) for x in self._inputs.template.vertices.T)
+        )
         return mi.Float(self._factor(at.context) / 2 * dr.sum(dr.squared_norm(away)))
 
     def rows(self, at):

@@ -8,6 +8,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from polysft_mi.render import on_device
+
 from ..quadratic import EdgeRows
 from .term import Term
 
@@ -36,9 +38,7 @@ class Inextensibility(Term):
         #: (E,) [m]
         self.lengths = lengths.astype(np.float32).astype(np.float64)
         self._atlas = inputs.atlas
-        self._edges = tuple(
-            mi.UInt32(np.ascontiguousarray(edges[:, k], dtype=np.uint32)) for k in (0, 1)
-        )
+        self._edges = tuple(on_device(edges[:, k], mi.UInt32) for k in (0, 1))
 
     def lengths_in(self, frame):
         """The edges' lengths (E,) [m] in a frame where nothing strains them: the template's, or, on

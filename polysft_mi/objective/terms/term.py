@@ -15,6 +15,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from polysft_mi.render import on_device
+
 if TYPE_CHECKING:
     from polysft_mi.images import Appearance, DataTerm
     from polysft_mi.render import PlacedMesh
@@ -75,8 +77,8 @@ class Inputs:
             image, mask, area = self.sequence.frame(frame), self.sequence.mask(frame), None
             if mask is not None:
                 image, area = image * mask[..., None], max(1.0, float(mask.sum()))
-                mask = mi.Float(np.ascontiguousarray(mask, dtype=np.float32).ravel())
-            found = Target(mi.TensorXf(np.ascontiguousarray(image, np.float32)), mask, area)
+                mask = on_device(mask, mi.Float)
+            found = Target(mi.TensorXf(on_device(image, mi.Float), image.shape), mask, area)
             dr.eval(found.image, found.mask)
             self._targets[frame] = found
             while len(self._targets) > _CACHED_FRAMES:

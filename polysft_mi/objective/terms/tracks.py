@@ -82,8 +82,8 @@ class Tracks(Term):
         inverse = mi.Matrix3d(self._camera.inverse)
         x = inverse @ (point - mi.Point3d(self._camera.origin))
         target = self._tracks.positions[frame, chosen]
-        squared = dr.square(x.x / x.z - mi.Float64(target[:, 0])) + dr.square(
-            x.y / x.z - mi.Float64(target[:, 1])
+        squared = dr.square(x.x / x.z - on_device(target[:, 0], mi.Float64)) + dr.square(
+            x.y / x.z - on_device(target[:, 1], mi.Float64)
         )
         factor, scale = self._factor(at.context), self._scale(at.context, at.stage)
         rho = float(2 * factor * scale**2) * (dr.sqrt(1 + squared / float(scale**2)) - 1)

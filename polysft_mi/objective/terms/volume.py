@@ -6,6 +6,7 @@ import numpy as np
 
 from polyfit.mesh import sheets, winding
 from polysft_mi.errors import InputError
+from polysft_mi.render import on_device
 
 from .term import Term
 
@@ -28,7 +29,7 @@ class Volume(Term):
         #: (F, 3): all wound alike
         self.faces = np.where(turned[:, None], faces[:, ::-1], faces)
         self.rest = self.of(template.vertices)  # [m^3]
-        self._corners = [mi.UInt32(k.astype(np.uint32)) for k in self.faces.T]
+        self._corners = [on_device(k, mi.UInt32) for k in self.faces.T]
 
     def of(self, vertices):
         """The volume [m^3], negative where faces are wound inwards."""
