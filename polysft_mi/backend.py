@@ -155,13 +155,13 @@ def set_variant(mode: str | None = None) -> str:
     mitsuba = sys.modules.get("mitsuba")
     current = mitsuba and mitsuba.variant()
     if current and (mode == current or mode is None) and current.endswith(_SUFFIX):
+        _refuse_llvm(current)
         _ensure_two_threads()
         return current
     if mode is None:
         mode = DEFAULT
-    version = None
     try:  # before the import, which already starts Dr.Jit and makes it look for an LLVM
-        os.environ[VARIABLE], version = find_libllvm()
+        os.environ[VARIABLE], _ = find_libllvm()
     except InputError:
         if mode.startswith("llvm"):
             raise
@@ -181,19 +181,24 @@ def set_variant(mode: str | None = None) -> str:
         raise InputError(
             f"mode {mode!r} cannot be used here: {' '.join(str(error).split())}"
         ) from None
-    if mode.startswith("llvm"):
-        import drjit as dr
-
-        running = dr.detail.llvm_version()
-        if (
-            running != version and running[0] not in PROVEN_LLVM
-        ):  # Mitsuba or Dr.Jit was imported before
-            raise InputError(
-                f"Dr.Jit already runs on LLVM {running[0]}: call polysft_mi.backend.set_variant"
-                f" before importing mitsuba or drjit, or set {VARIABLE}"
-            )
+    _refuse_llvm(mode)
     _ensure_two_threads()
     return mode
+
+
+def _refuse_llvm(mode: str) -> None:
+    """Where Mitsuba or Dr.Jit was imported before, it may run on another LLVM than it should, which
+    would end the process.
+    """
+    import drjit as dr
+
+    if not mode.startswith("llvm") or (running := dr.detail.llvm_version())[0] in PROVEN_LLVM:
+        return
+    if running != find_libllvm()[1]:
+        raise InputError(
+            f"Dr.Jit already runs on LLVM {running[0]}: call polysft_mi.backend.set_variant before"
+            f" importing mitsuba or drjit, or set {VARIABLE}"
+        )
 
 
 _process = None  # the one in which set_variant was last called

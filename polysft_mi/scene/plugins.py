@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from polysft_mi.backend import set_variant
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError
 from polysft_mi.render import RasterIntegrator, on_device
@@ -201,7 +202,10 @@ def _varol_template(props):
 
 
 def register() -> None:
-    """Register every plugin of ours with Mitsuba's current variant."""
+    """Register every plugin of ours with Mitsuba's current variant. Raises InputError where that,
+    or the LLVM that Dr.Jit runs on, does not fit.
+    """
+    set_variant(mi.variant())
     mi.register_integrator("raster", RasterIntegrator)
     mi.register_integrator("polysft", PolySfT)
     mi.register_sensor("pinhole", PinholeSensor)

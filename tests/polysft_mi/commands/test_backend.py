@@ -251,15 +251,23 @@ print(os.path.isfile(os.environ["DRJIT_LIBLLVM_PATH"]), (x + 1)[0])
 
 
 @pytest.mark.skipif(not OLD_LLVM, reason="needs an LLVM 15 to start Dr.Jit on")
-def test_dr_jit_already_on_an_old_llvm_is_told():
-    """As where the caller imported Mitsuba before and LLVM 15 was found first: nothing may be
-    computed then.
+@pytest.mark.parametrize("before", ["", 'mitsuba.set_variant("llvm_ad_rgb")'])
+@pytest.mark.parametrize(
+    "then", ["from polysft_mi import set_variant", "from polysft_mi.scene import register"]
+)
+def test_dr_jit_already_on_an_old_llvm_is_told(before, then):
+    """As where the caller imported Mitsuba before, or set its variant, too, and LLVM 15 was found
+    first: nothing may be computed then.
     """
-    code = """
+    if "register" in then and not before:
+        pytest.skip("without a variant there is nothing to register")
+    code = f"""
 import os, mitsuba
+{before}
 del os.environ["DRJIT_LIBLLVM_PATH"]
-from polysft_mi.backend import cli, set_variant
-cli(lambda: set_variant("llvm_ad_rgb") and 0)
+from polysft_mi.errors import cli
+{then} as begin
+cli(lambda: begin() and 0)
 """
     assert "already runs on LLVM 15" in one_line_and_status_2(
         python(code, DRJIT_LIBLLVM_PATH=OLD_LLVM[0])
