@@ -51,7 +51,8 @@ class Progress:
             return
         self._shown = now
         again = "again " if done >= self.windows else ""
-        state = f"{again}frame {frame + 1}/{self.frames} it {iteration} loss {total:.4g}"
+        at = f"it {iteration} " if iteration else ""  # where lines are rare, a frame has begun
+        state = f"{again}frame {frame + 1}/{self.frames} {at}loss {total:.4g}"
         detail = " ".join(f"{name[:3]} {value:.2g}" for name, value in terms.items() if value)
         if self.terminal:
             self._bar.update(
