@@ -17,11 +17,11 @@ import torch
 
 from onefit.body import AnnyBody, ClosestSurface, skinning
 from onefit.contact import Flesh
-from onefit.garment import Garment, PatchedGarment, standard_body, waistband
+from onefit.garment import Garment, PatchedGarment, standard_body, untangled, waistband
 from onefit.motion import Motion
 from onefit.network import DEFAULT, Trained
 from onefit.network.weights import load as load_weights
-from onefit.objective import posed
+from onefit.objective import crossings, posed
 from onefit.physics import Material, Settings
 from polyfit import mesh
 from polyfit.errors import InputError
@@ -259,11 +259,22 @@ class Draper:
         motion = motion if isinstance(motion, Motion) else Motion.read(motion)
         motion = motion.resampled(FPS).to(self.device)
         body = self.model.body(shape)
-        rests, body = [one.graded(body).to(self.device) for one in garments], body.to(self.device)
+        rests = [self._graded(one, body).to(self.device) for one in garments]
+        body = body.to(self.device)
         rests = outfit.let_out(garments, rests)
         motion = motion if shape is None else motion.fitted(body)
         transforms = skinning.transforms(body, motion.poses, motion.translation)
         return [_Worn(one, motion, body, rest, transforms) for one, rest in zip(garments, rests)]
+
+    def _graded(self, garment, body):
+        """The garment's vertices graded to a body, (N, 3) [m]; where layers came through each other
+        by that, they are apart again: else they stay so in all of a motion.
+        """
+        V, F, rest = garment.vertices.cpu(), garment.faces.cpu().numpy(), garment.graded(body)
+        clean = lambda: not crossings(V.double().numpy(), F)
+        if torch.equal(rest.cpu(), V) or not self._once(garment, "clean", clean):
+            return rest
+        return torch.as_tensor(untangled(rest.cpu().double().numpy(), F)).to(rest)
 
     def _draped(
         self,

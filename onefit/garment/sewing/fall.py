@@ -4,6 +4,7 @@ with slack. The physics is :mod:`onefit.physics`.
 
 from onefit.contact import ContactSettings
 from onefit.garment.binding import standard_body
+from onefit.garment.fitting import untangled
 from onefit.garment.waistband import held
 from onefit.physics import Material, Settings, Sheet, WornCloth
 
@@ -17,7 +18,8 @@ SETTINGS = Settings(iterations=150, tolerance=3e-4, contact=CONTACT)
 
 def fallen(cut, seconds=SECONDS):
     """Vertices (N, 3) [m] of a :class:`onefit.garment.sewing.loose.Cut` as it hangs on the standard
-    body, held at its waistband if it does not hang from the shoulders.
+    body, held at its waistband if it does not hang from the shoulders; it does not pass through
+    itself.
     """
     body = standard_body()
     sheet = Sheet(cut.start, cut.faces, Material.named(_MATERIAL), cut.sides, cut.vertices)
@@ -27,4 +29,4 @@ def fallen(cut, seconds=SECONDS):
     for _ in range(round(seconds / STEP)):
         worn.step(STEP, surface, cut.start, pull)
         worn.cloth.v *= _SLOWING
-    return worn.cloth.x
+    return untangled(worn.cloth.x, cut.faces)  # one crossing here grows to dozens in motion

@@ -8,11 +8,12 @@ from meshes import turned
 from surfaces import joined, sphere
 
 from onefit.body import ClosestSurface, skeleton, skinning
-from onefit.garment import TEMPLATES, Garment, standard_body, standard_surface
+from onefit.garment import LOOSE, TEMPLATES, Garment, standard_body, standard_surface
 from onefit.garment.binding import Binding, surface_of
 from onefit.garment.reading.mending import mended
 from onefit.garment.sewing.patterns import ramp, smooth_union
 from onefit.garment.sewing.sew import sewn
+from onefit.objective import crossings
 from polyfit import mesh
 from polyfit.errors import InputError
 from polyfit.mesh import loops, vertex_normals
@@ -44,6 +45,13 @@ AREA = {
 def edge_lengths(V, F):
     e = mesh.edges_of(F)[0]
     return np.linalg.norm(V[e[:, 0]] - V[e[:, 1]], axis=1)
+
+
+@pytest.mark.parametrize("name", [*TEMPLATES, *LOOSE])
+def test_no_template_passes_through_itself(name):
+    """One place where it does grows to dozens in motion."""
+    garment = Garment.template(name)
+    assert crossings(garment.vertices.numpy(), garment.faces.numpy()) == 0
 
 
 class TestTemplates:

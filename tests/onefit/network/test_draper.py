@@ -3,10 +3,12 @@
 import weakref
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 import onefit
 from onefit.garment import Garment
+from onefit.objective import crossings
 
 
 @pytest.fixture(scope="module")
@@ -58,3 +60,23 @@ def test_energies_are_of_the_material(draper, coarse):
     assert of(None).energy == pytest.approx(
         cotton.energy + (jersey.energy - cotton.energy) * 5 / 3, rel=1e-3
     )  # 0.2 kg/m^2
+
+
+def test_what_grading_pushes_through_itself_comes_apart(draper, monkeypatch):
+    """Where layers of the template come through each other on another body, as a vertex of the
+    front that lands behind the back here.
+    """
+    garment, graded = Garment.template("tank").remeshed(500), Garment.graded
+    front = int(garment.vertices[:, 1].argmin())
+
+    def poked(self, body):
+        rest = graded(self, body).clone()
+        rest[front, 1] = rest[:, 1].max() + 0.05
+        return rest
+
+    faces = garment.faces.numpy()
+    shape = draper.model.random_shape(np.random.default_rng(3))
+    monkeypatch.setattr(Garment, "graded", poked)
+    through = crossings(garment.graded(draper.model.body(shape)).numpy(), faces)
+    made = draper.drape(garment, onefit.Motion.generate("walk", seconds=0.1), shape)
+    assert through > 0 and crossings(made.rest.numpy(), faces) == 0
