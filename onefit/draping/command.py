@@ -160,7 +160,11 @@ def run(verb: str, args: argparse.Namespace, **how) -> None:
     for name, garment in zip(args.garment, garments):
         for repair in garment.repairs:
             print(f"{name}: {repair}", file=sys.stderr)
-        draper.ease(garment)  # cut and tried on once for all motions, so it does not count
+    # garments are cut and tried on, and kernels compiled, once for all motions: it does not count
+    for garment in garments:
+        draper.ease(garment)
+    if verb == "drape":
+        draper.drape(garments, motion[:2], shape, **how)
     outcome = output.drape_into(
         args.output,
         partial(getattr(draper, verb), garments, motion, shape, **how),
