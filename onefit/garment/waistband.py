@@ -26,7 +26,8 @@ def _highest_rim(vertices, faces):
 
 def held(vertices, faces, joints):
     """How firmly each of the vertices (N, 3) [m] of a garment with ``faces`` (F, 3) is held, 0 to
-    1, (N,); ``joints`` (J, 3) [m] of the body. As :func:`held_below` its shoulders.
+    1, (N,), by the height of the shoulders among the body's ``joints`` (J, 3) [m]: see
+    :func:`held_below`.
     """
     return held_below(vertices, faces, joints[_SHOULDERS, 2].mean())
 

@@ -22,8 +22,19 @@ _USUAL_FPS = 30.0
 _TO_Z = {"z": 0, "y": 90, "-y": -90}  # degrees about x that turn what is up to z
 
 
+class _World:
+    """Whose world has ``up`` for the axis that is: z, y or -y."""
+
+    up: str
+
+    @property
+    def upright(self) -> Rotation:
+        """Turns the scene's world to one whose z is up."""
+        return Rotation.from_euler("x", _TO_Z[self.up], degrees=True)
+
+
 @dataclass(frozen=True)
-class BodyMotion:
+class BodyMotion(_World):
     """A body in T frames: ``poses`` (T, 24, 3) [rad] and ``translation`` (T, 3) [m] in the scene's
     world, as :class:`onefit.Motion` has them; ``fps`` frames a second; ``shape`` (S,) of Anny's
     body, or None for the standard one. ``up``: the scene's axis that is: z, y or -y. ``model``: the
@@ -97,14 +108,9 @@ class BodyMotion:
             poses, shape = _in_our_axes(poses), _betas(arrays.get("betas"), path)
         return cls(poses, places, fps, shape, up, model, path)
 
-    @property
-    def upright(self) -> Rotation:
-        """Turns the scene's world to one whose z is up."""
-        return Rotation.from_euler("x", _TO_Z[self.up], degrees=True)
-
 
 @dataclass(frozen=True)
-class MeshMotion:
+class MeshMotion(_World):
     """A body that is known as a mesh alone: ``rest`` (V, 3) and ``frames`` (T, V, 3) [m] in the
     scene's world, ``faces`` (F, 3); ``fps``, ``up`` and ``path`` as of :class:`BodyMotion`.
     """
@@ -153,11 +159,6 @@ class MeshMotion:
         frames = vertices[frames].astype(float)
         return cls(rest.astype(float), faces.astype(np.int64), frames, fps, up, path)
 
-    @property
-    def upright(self) -> Rotation:
-        """Turns the scene's world to one whose z is up."""
-        return Rotation.from_euler("x", _TO_Z[self.up], degrees=True)
-
 
 def read_motion(
     path: str | os.PathLike[str],
@@ -169,12 +170,20 @@ def read_motion(
     """The motion of a file or a folder, whichever of both it has; arguments as
     :meth:`BodyMotion.read` has them. Raises InputError.
     """
-    folder = os.path.isdir(path)
-    if folder or "faces" in _read(os.fspath(path)):
+    if os.path.isdir(path) or _has_faces(path):
         if model:
             raise InputError(f"{os.fspath(path)}: is of meshes; {model} is for poses alone")
         return MeshMotion.read(path, count, selected, up)
     return BodyMotion.read(path, count, selected, model, up)
+
+
+def _has_faces(path):
+    """Whether a file is of meshes; what is no file at all is not."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return "faces" in file.files
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, AttributeError):
+        return False
 
 
 def _read(path):
