@@ -156,7 +156,7 @@ def set_variant(mode: str | None = None) -> str:
     current = mitsuba and mitsuba.variant()
     if current and (mode == current or mode is None) and current.endswith(_SUFFIX):
         _refuse_llvm(current)
-        _ensure_two_threads()
+        _fit_threads()
         return current
     if mode is None:
         mode = DEFAULT
@@ -182,7 +182,7 @@ def set_variant(mode: str | None = None) -> str:
             f"mode {mode!r} cannot be used here: {' '.join(str(error).split())}"
         ) from None
     _refuse_llvm(mode)
-    _ensure_two_threads()
+    _fit_threads()
     return mode
 
 
@@ -223,12 +223,22 @@ def _refuse_fork() -> None:
     _process = os.getpid()
 
 
-def _ensure_two_threads() -> None:
-    """With one, as on a machine of one core, Mitsuba would wait for ever for an EXR file."""
+def cores() -> int:
+    """How many processor cores this process may use, as ``taskset`` or a batch system leaves it."""
+    if hasattr(os, "sched_getaffinity"):  # not on macOS
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _fit_threads() -> None:
+    """A thread a core that may be used, where Dr.Jit has one for each that there is: threads that
+    wait for one another's core double the time. At least two: with one, Mitsuba would wait for
+    ever for an EXR file.
+    """
     import drjit as dr
 
-    if dr.thread_count() < 2:
-        dr.set_thread_count(2)
+    if dr.thread_count() in (1, os.cpu_count()):
+        dr.set_thread_count(max(2, cores()))
 
 
 @functools.cache

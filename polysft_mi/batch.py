@@ -2,11 +2,11 @@
 a time, with one table at the end.
 """
 
-import os
 import sys
 from pathlib import Path
 
 from . import batches, commands
+from .backend import cores
 from .errors import InputError, cli
 
 _EXAMPLES = [
@@ -44,7 +44,7 @@ def parser():
         "--workers",
         type=int,
         metavar="N",
-        default=max(1, (os.cpu_count() or 1) // 2),
+        default=max(1, cores() // 2),
         help="how many at a time (default: one for two processors)",
     )
     p.add_argument("-q", "--quiet", action="store_true", help="no line for each, only the result")

@@ -4,7 +4,6 @@ video.
 
 from __future__ import annotations
 
-import contextlib
 import gc
 import json
 import os
@@ -223,7 +222,7 @@ def reconstruct(
     gc.freeze()  # what is loaded by now stays: the collector need not go through it again and again
     about = {"scene": os.path.abspath(experiment.path), **outputs.versions()}
     with (
-        threads(0.5) if tracker.solver.name == "gauss-newton" else contextlib.nullcontext(),
+        threads(0.5 if tracker.solver.name == "gauss-newton" else 1.0),
         Progress(len(sequence.indices), s, quiet) as progress,
         Drawing(problem, overrides, out, exr_frames=exr_frames, about=about) as drawing,
     ):

@@ -27,10 +27,15 @@ def blur(image, sigma):
     """Gaussian blur of (H, W, C) by ``sigma`` [pixels], zeros beyond its border."""
     if sigma <= 0:
         return image
-    radius = max(1, int(np.ceil(2.5 * sigma)))
+    radius = reach(sigma)
     taps = np.exp(-0.5 * (np.arange(-radius, radius + 1) / sigma) ** 2)
     taps = (taps / taps.sum()).tolist()
     return dr.convolve(dr.convolve(image, taps, axis=0), taps, axis=1)
+
+
+def reach(sigma):
+    """How far [pixels] a :func:`blur` by ``sigma`` [pixels] reaches."""
+    return max(1, int(np.ceil(2.5 * sigma))) if sigma > 0 else 0
 
 
 def srgb(image):

@@ -9,6 +9,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submodules=["device", "pinhole", "silhouette", "stage", "topology", "video", "view"],
     submod_attrs={
+        "crop": ["Crop"],
         "device": ["frozen", "interruptible", "on_device", "threads"],
         "pinhole": ["MIN_DEPTH", "Pinhole"],
         "occluder": ["Occluder"],

@@ -5,10 +5,11 @@ is set.
 import contextlib
 import functools
 import gc
-import os
 
 import drjit as dr
 import numpy as np
+
+from polysft_mi.backend import cores
 
 _ALIGNED = 64  # bytes: what kernels take for granted of memory, or are recorded again for
 _NUMPY = {
@@ -85,13 +86,13 @@ def on_device(array, kind):
 
 @contextlib.contextmanager
 def threads(share):
-    """Let Dr.Jit use this share of the processors meanwhile.
+    """Let Dr.Jit use this share of the cores meanwhile.
 
     Short kernels, as those of the second-order solver, run as fast on half of them: with a thread a
     processor, threads mostly wait for each other, and none is left to draw.
     """
     before = dr.thread_count()
-    dr.set_thread_count(max(1, int(share * (os.cpu_count() or 1))))
+    dr.set_thread_count(max(1, int(share * cores())))
     try:
         yield
     finally:

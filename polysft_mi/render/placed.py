@@ -4,6 +4,7 @@ attached. Import only after a Mitsuba variant is set.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 
 from polysft_mi.errors import InputError
 
+from .crop import Crop
 from .device import on_device
 from .pinhole import Pinhole
 from .raster import RasterIntegrator
@@ -101,35 +103,37 @@ class PlacedMesh:
         self._params[self._key.removesuffix("positions") + "texcoords"] = texcoords
         self._params.update()
 
+    def crop(
+        self,
+        vertices: np.ndarray,
+        boxes: Sequence[tuple[float, float, float, float]] = (),
+        margin: int = 0,
+    ) -> Crop:
+        """What of the image the surface (N, 3) [m, world] and the ``boxes`` (x, y, x, y) [pixels]
+        cover, and a ``margin`` [pixels] around: beyond it is nothing. The whole image where the
+        scene may show something else.
+        """
+        position, before = self.camera.project(vertices)
+        if not (self.is_raster and len(self.scene.shapes()) == 1 and before.all()):
+            return Crop(0, 0, *self.size)
+        own = (*position.min(0), *position.max(0))
+        return Crop.around([own, *boxes], margin + 1, self.size)  # 1: antialiasing blends
+
     def image(
-        self, vertices: mi.Point3f, seed: int = 0, spp: int = 1
+        self, vertices: mi.Point3f, seed: int = 0, spp: int = 1, crop: Crop | None = None
     ) -> tuple[mi.TensorXf, mi.Float]:
         """Render the surface: (rgb (H, W, 3), linear, over black, and alpha, Float of H W),
-        attached to the vertices (Point3f of N [m, world]).
+        attached to the vertices (Point3f of N [m, world]); of the whole image, or of a ``crop``.
         """
         self.place(vertices)
-        width, height = self.size
-        count = width * height
+        crop = crop or Crop(0, 0, *self.size)
         if self.is_raster:
-            image = self.renderer.image(self.scene, self.sensor, seed, spp)
-            channels = image.shape[2]
-            alpha = _channel(image, 3, count, channels)
+            image = mask = self.renderer.image(self.scene, self.sensor, seed, spp)
         else:
             shown = partial(mi.render, self.scene, self._params, self.sensor)
             image = shown(self.renderer, spp=spp, seed=seed)
             mask = self._silhouette.image(self._alone, self.sensor, spp=1)
-            channels = image.shape[2]
-            alpha = _channel(mask, 3, count, mask.shape[2])
-        pixel = dr.arange(mi.UInt32, 3 * count)
-        rgb = dr.gather(
-            mi.Float, image.array, pixel // 3 * channels + pixel % 3, mode=dr.ReduceMode.Permute
-        )
-        return mi.TensorXf(rgb, (height, width, 3)), alpha
-
-
-def _channel(image, channel, count, channels):
-    at = dr.arange(mi.UInt32, count) * channels + channel
-    return dr.gather(mi.Float, image.array, at, mode=dr.ReduceMode.Permute)
+        return crop.cut(image, 0, 3), crop.cut(mask, 3, 4).array
 
 
 def _positions_key(params, mesh):

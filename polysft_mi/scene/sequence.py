@@ -5,13 +5,13 @@ the start and read one frame at a time.
 from __future__ import annotations
 
 import functools
-import os
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 
+from polysft_mi.backend import cores
 from polysft_mi.body import Carrier
 from polysft_mi.colours import linear
 from polysft_mi.errors import InputError
@@ -99,7 +99,7 @@ class Sequence:
             mask_files = [mask_paths[k] for k in indices]
 
         everything = files + (mask_files or [])
-        with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
+        with ThreadPoolExecutor(min(8, cores())) as pool:
             sizes = dict(zip(everything, pool.map(checked_size, everything)))
         wanted, why = (
             ((size[0], size[1]), "the camera's film has")

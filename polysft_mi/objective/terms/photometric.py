@@ -10,13 +10,16 @@ program: pixel values as they are stored, and a mean over the image. Import only
 variant is set.
 """
 
+import math
+
 import drjit as dr
 import mitsuba as mi
 
-from polysft_mi.images import Level, differentiable
+from polysft_mi.images import differentiable
 
 from .term import Term
 
+_SMALL = 1e-6  # residual below which ``l1`` is smooth
 _INTERIOR = 0.999  # alpha above which a pixel counts as filled by the surface
 
 
@@ -30,25 +33,22 @@ class Photometric(Term):
         s, self._inputs = inputs.settings, inputs
         self._norm, self._brightness, self._region = s.rgb_norm, s.brightness, s.rgb_region
         self._scale = s.rgb_scale
-        width, height = inputs.placed.size
-        self._shape, self._count = (height, width), width * height
+        self._count = math.prod(inputs.placed.size)
 
     def energy(self, at):
-        rgb, alpha = at.image
-        level = self._level(at.stage)
-        shown = self._inputs.target(at.context.frame)
-        frame, mask, area = shown.image, shown.mask, shown.area
-        inside = interior(alpha)
+        (rgb, cut), level = at.image, self._inputs.level(at.stage)
+        target, mask, area = at.target.image, at.target.mask, at.target.area
+        inside, weight, covered = interior(cut.array), 1, mask
         if mask is None:
             # both cut out alike, else a band inside the silhouette would compare with the
             # background
-            weight, area, cut = inside, dr.maximum(dr.sum(inside), 1), self._image_of(inside)
-            rgb, target, covered = _times(rgb, cut), _times(frame, cut), cut
-        else:
-            weight, target, covered = dr.ones(mi.Float, self._count), frame, self._image_of(mask)
-            cut = self._image_of(alpha)
+            weight, area = inside, dr.maximum(dr.sum(inside), 1)
+            cut = covered = mi.TensorXf(inside, cut.shape)
+            rgb, target = _times(rgb, cut), _times(target, cut)
         if self._region == "sheet":
-            weight = inside * (dr.select(mask > 0.5, mi.Float(1), 0) if mask is not None else 1)
+            weight = inside
+            if mask is not None:
+                weight = inside * dr.select(mask.array > 0.5, mi.Float(1), 0)
             a = differentiable.compared(rgb, cut, level, self._brightness == "local")
             b = differentiable.compared(target, covered, level, self._brightness == "local")
         else:
@@ -58,7 +58,7 @@ class Photometric(Term):
                 b = differentiable.normalised(b, covered, level.window, level.floor)
         if self._norm == "phi-sft":
             a, b, area = differentiable.srgb(a), differentiable.srgb(b), self._count
-        a, b = self._channels(a), self._channels(b)
+        a, b = _channels(a), _channels(b)
         if self._brightness == "gain":
             g = gain([dr.detach(x) for x in a], b, inside)
             a = [g * x for x in a]
@@ -84,18 +84,12 @@ class Photometric(Term):
                 return f"{name} = {value}; {' or '.join(known)} is needed"
         return None
 
-    def _level(self, stage):
-        return stage.blur if isinstance(stage.blur, Level) else self._inputs.data.level(stage.blur)
 
-    def _image_of(self, values):
-        return mi.TensorXf(values, (*self._shape, 1))
-
-    def _channels(self, tensor):
-        index = dr.arange(mi.UInt32, self._count) * 3
-        return [
-            dr.gather(mi.Float, tensor.array, index + c, mode=dr.ReduceMode.Permute)
-            for c in range(3)
-        ]
+def _channels(tensor):
+    index = dr.arange(mi.UInt32, dr.width(tensor.array) // 3) * 3
+    return [
+        dr.gather(mi.Float, tensor.array, index + c, mode=dr.ReduceMode.Permute) for c in range(3)
+    ]
 
 
 def robust(squared, norm, scale):
@@ -105,7 +99,7 @@ def robust(squared, norm, scale):
     if norm == "l2":
         return squared
     if norm == "l1":
-        return dr.sqrt(squared + 1e-12)
+        return dr.sqrt(squared + _SMALL**2) - _SMALL
     if norm == "charbonnier":
         return 2 * scale * scale * (dr.sqrt(1 + squared / (scale * scale)) - 1)
     return scale * scale * dr.log(1 + squared / (scale * scale))

@@ -2,6 +2,8 @@
 Losses). Frames without masks have none. Import only after a Mitsuba variant is set.
 """
 
+import math
+
 import drjit as dr
 import mitsuba as mi
 
@@ -19,17 +21,15 @@ class Silhouette(Term):
 
     def __init__(self, inputs):
         super().__init__(inputs)
-        s, self._inputs = inputs.settings, inputs
+        s = inputs.settings
         self._norm, self._blur = s.silhouette_norm, s.mask_blur
-        width, height = inputs.placed.size
-        self._shape, self._count = (height, width, 1), width * height
+        self._count = math.prod(inputs.placed.size)
 
     def energy(self, at):
-        target = self._inputs.target(at.context.frame)
+        target = at.target
         if target.mask is None:
             return mi.Float(0)
-        difference = mi.TensorXf(at.image[1] - target.mask, self._shape)
-        difference = differentiable.blur(difference, self._blur).array
+        difference = differentiable.blur(at.image[1] - target.mask, self._blur).array
         if self._norm == "phi-sft":
             return self.weight * dr.sum(dr.abs(difference)) / self._count
         return self.weight * dr.sum(dr.square(difference)) / target.area

@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 from collections import OrderedDict
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -15,11 +15,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from polysft_mi.images import Level, differentiable
 from polysft_mi.render import on_device
 
 if TYPE_CHECKING:
     from polysft_mi.images import Appearance, DataTerm
-    from polysft_mi.render import PlacedMesh
+    from polysft_mi.render import Crop, PlacedMesh
     from polysft_mi.scene import Rules, Sequence, Settings
     from polysft_mi.surface import Atlas, Template, Unknowns
 
@@ -34,12 +35,18 @@ _USUAL_NOISE = 0.1  # of a photometric residual, in local standard deviations
 @dataclass
 class Target:
     """A frame on the device: ``image`` (H, W, 3), linear, cut out by its mask where there is one;
-    ``mask`` Float of H W and ``area`` [pixels], or None.
+    ``mask`` (H, W, 1), its ``area`` [pixels] and ``box`` (x, y, x, y) [pixels], or None.
     """
 
     image: mi.TensorXf
-    mask: mi.Float | None
-    area: float | None
+    mask: mi.TensorXf | None = None
+    area: float | None = None
+    box: tuple[float, float, float, float] | None = None
+
+    def cut(self, crop: Crop) -> Target:
+        """Its part in a crop."""
+        mask = None if self.mask is None else crop.cut(self.mask)
+        return replace(self, image=crop.cut(self.image), mask=mask)
 
 
 @dataclass
@@ -74,11 +81,12 @@ class Inputs:
     def target(self, frame: int) -> Target:
         """The :class:`Target` of a frame; the last ones are kept."""
         if frame not in self._targets:
-            image, mask, area = self.sequence.frame(frame), self.sequence.mask(frame), None
-            if mask is not None:
-                image, area = image * mask[..., None], max(1.0, float(mask.sum()))
-                mask = on_device(mask, mi.Float)
-            found = Target(mi.TensorXf(on_device(image, mi.Float), image.shape), mask, area)
+            image, mask = self.sequence.frame(frame), self.sequence.mask(frame)
+            if mask is None:
+                found = Target(_tensor(image))
+            else:
+                area, mask = max(1.0, float(mask.sum())), mask[..., None]
+                found = Target(_tensor(image * mask), _tensor(mask), area, _box(mask[..., 0] > 0))
             dr.eval(found.image, found.mask)
             self._targets[frame] = found
             while len(self._targets) > _CACHED_FRAMES:
@@ -87,7 +95,11 @@ class Inputs:
 
     def blur(self, stage: Stage) -> float:
         """Standard deviation [pixels of the video] of the images' blur at a stage."""
-        return self.data.level(stage.blur).sigma
+        return self.level(stage).sigma
+
+    def level(self, stage: Stage) -> Level:
+        """How images are compared at a stage."""
+        return stage.blur if isinstance(stage.blur, Level) else self.data.level(stage.blur)
 
     def nat(self, context: FrameContext) -> float:
         """What one unit of log-likelihood costs in the objective: as the images of the frame before
@@ -112,9 +124,20 @@ class Inputs:
         return Operators(self.atlas, data.faces, data.pattern, self.rules.relief_bend)
 
 
+def _tensor(image):
+    return mi.TensorXf(on_device(image, mi.Float), image.shape)
+
+
+def _box(mask):
+    """(x, y, x, y) [pixels] of a mask (H, W) of bool; None where it is empty."""
+    rows, columns = (np.flatnonzero(mask.any(axis)) for axis in (1, 0))
+    return (columns[0], rows[0], columns[-1] + 1, rows[-1] + 1) if len(rows) else None
+
+
 class DeviceFrame:
-    """A frame's surface on the device, attached to its ``unknowns``: what energies are computed
-    of. It is rendered once, where a term asks for it; ``look`` tells its :attr:`appearance`.
+    """A frame's surface on the device, attached to its ``unknowns``, and what it is compared with:
+    what energies are computed of. It is rendered once, where a term asks for it; ``look`` tells its
+    :attr:`appearance`.
     """
 
     def __init__(
@@ -128,8 +151,7 @@ class DeviceFrame:
     ) -> None:
         self.unknowns, self.context, self.stage = unknowns, context, stage
         self.vertices = inputs.surface.vertices(unknowns)
-        self._placed, self.seed, self._spp = inputs.placed, seed, inputs.settings.spp
-        self._look = look
+        self.seed, self._inputs, self._look = seed, inputs, look
 
     @property
     def appearance(self) -> Appearance | None:
@@ -137,9 +159,26 @@ class DeviceFrame:
         return self._look()
 
     @cached_property
-    def image(self) -> tuple[mi.TensorXf, mi.Float]:
-        """(rgb (H, W, 3), linear, over black, and alpha, Float of H W)."""
-        return self._placed.image(self.vertices, self.seed, self._spp)
+    def crop(self) -> Crop:
+        """The part of the image that surface and mask lie in, as far as they are blurred to."""
+        inputs, box = self._inputs, self._inputs.target(self.context.frame).box
+        blur = max(inputs.blur(self.stage), inputs.settings.mask_blur)
+        vertices = np.array(dr.detach(self.vertices)).T
+        return inputs.placed.crop(vertices, [box] if box else [], differentiable.reach(blur))
+
+    @cached_property
+    def target(self) -> Target:
+        """The frame, in the :attr:`crop`."""
+        return self._inputs.target(self.context.frame).cut(self.crop)
+
+    @cached_property
+    def image(self) -> tuple[mi.TensorXf, mi.TensorXf]:
+        """The rendering in the :attr:`crop`: rgb (H, W, 3), linear, over black, and alpha
+        (H, W, 1).
+        """
+        spp = self._inputs.settings.spp
+        rgb, alpha = self._inputs.placed.image(self.vertices, self.seed, spp, self.crop)
+        return rgb, mi.TensorXf(alpha, (*rgb.shape[:2], 1))
 
 
 class Term:

@@ -346,3 +346,21 @@ print(mi.Bitmap({path!r}).size()[0])
 """
     done = python(code)
     assert done.stdout.split() == ["8"], done.stderr
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="needs a way to take cores away")
+def test_threads_are_those_of_the_cores_that_a_process_may_use():
+    code = """
+import os
+os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
+from polysft_mi.backend import cores, set_variant
+set_variant()
+import drjit as dr
+from polysft_mi.render import threads
+before = dr.thread_count()
+with threads(1.0):
+    print(cores(), before, dr.thread_count())
+print(dr.thread_count())
+"""
+    done = python(code)
+    assert done.stdout.split() == ["1", "2", "1", "2"], done.stderr
