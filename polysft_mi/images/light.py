@@ -86,7 +86,9 @@ class Light:
         turn = np.zeros((_SIZE, _SIZE))  # of a triangle's row (1, normal, centre)
         turn[0, 0], turn[0, 4:] = 1, 2 * distance * normal
         turn[1:4, 1:4], turn[4:, 4:] = 2 * across - np.eye(3), np.eye(3) - 2 * across
-        return replace(self, matrix=turn.T @ self.matrix @ turn, right=turn.T @ self.right)
+        matrix = turn.T @ self.matrix @ turn
+        # to the last bit, as numbers() has it: a run that is resumed is the same
+        return replace(self, matrix=(matrix + matrix.T) / 2, right=turn.T @ self.right)
 
     @property
     def scale(self):

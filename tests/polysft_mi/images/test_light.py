@@ -258,6 +258,8 @@ def test_the_light_of_mirror_images_is_the_mirror_image_of_the_light():
     mirrored = lights[0].mirrored(normal, distance)
     assert np.allclose(mirrored.matrix, lights[1].matrix) and mirrored.frames == 3
     assert np.allclose(mirrored.right, lights[1].right)
+    kept = Light.of(mirrored.numbers(), mirrored.rules)  # as a checkpoint does
+    assert np.array_equal(kept.matrix, mirrored.matrix)
     assert not np.allclose(lights[0].right, lights[1].right, rtol=0.1)
     back = mirrored.mirrored(normal, distance)
     assert np.allclose(back.matrix, lights[0].matrix)
