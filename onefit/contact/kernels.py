@@ -221,6 +221,13 @@ def pushed_out(
             x[queue[i]] = x[queue[i]] + push[queue[i]]
         for s in range(corners.shape[0]):  # what is moved comes nearer by no more than its way
             gap[s] = gap[s] - wp.length(weighted(push, corners, weights, s))
+    for i in range(last):  # between two skins, as in the crease of an armpit: to the middle
+        v = queue[i]
+        far = wp.length(push[v]) + clearance
+        p, d, face, b = pushed(body, x[v], far, 0.0, clearance)
+        if wp.length_sq(p) > 0.0:
+            push[v] = push[v] + 0.5 * p
+            x[v] = x[v] + 0.5 * p
 
 
 @wp.kernel

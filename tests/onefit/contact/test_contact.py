@@ -74,6 +74,23 @@ def test_a_fast_body_takes_cloth_along():
     assert (cloth.x[:, 2] - 1.0).min() > 0  # on the side on which it was
 
 
+@pytest.mark.parametrize("gap", [0.0003, 0.0015, 0.004])
+def test_cloth_in_a_crease_of_the_skin_lies_in_neither_side(gap):
+    """Wherever between the two it was pressed to, though both cannot have their clearance."""
+    box = trimesh.creation.box((0.2, 0.2, 0.1)).subdivide().subdivide()
+    high = 0.05 + gap / 2
+    body = np.concatenate([box.vertices + [0, 0, high], box.vertices - [0, 0, high]])
+    surface = ClosestSurface(body, np.concatenate([box.faces, box.faces + len(box.vertices)]))
+    V, F = grid(4, 4, 0.01)
+    limits = dict.fromkeys(("least", "point_near", "point_least"), 0.001)
+    skin = SkinContact(V, F, ContactSettings(), reach=0.03, deepest=0.03, **limits)
+    for share in (-2.0, -0.6, -0.4, 0.0, 0.3, 0.6, 3.0):
+        at = skin.vertices(V + [0, 0, share * gap])
+        skin.look(at, surface)
+        pushed = V + [0, 0, share * gap] + skin.push_out(at, surface)
+        assert surface(pushed, 1.0).distance.min() > 0
+
+
 def test_points_of_faces_lie_no_farther_apart_than_the_spacing():
     V, F = grid(3, 3, 0.1)
     sheet = Sheet(V, F, COTTON)
