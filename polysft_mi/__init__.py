@@ -13,11 +13,11 @@ imports neither Mitsuba nor Dr.Jit and sets no variant: :func:`set_variant` does
 ``docs/api.md`` lists the public names; other packages may change without notice.
 """
 
-import lazy_loader
+from . import lazy
 
 __version__ = "0.2.0"
 
-__getattr__, __dir__, __all__ = lazy_loader.attach(
+__getattr__, __dir__, __all__ = lazy.attach(
     __name__,
     submodules=["bridge", "solvers"],
     submod_attrs={

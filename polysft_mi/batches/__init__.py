@@ -5,9 +5,9 @@ and one table come out.
 writes the result.
 """
 
-import lazy_loader
+from polysft_mi import lazy
 
-__getattr__, __dir__, __all__ = lazy_loader.attach(
+__getattr__, __dir__, __all__ = lazy.attach(
     __name__,
     submod_attrs={
         "jobs": ["Job", "drapes", "runs"],

@@ -3,9 +3,9 @@ the template into each frame, with their derivatives by the body's pose; OneFit'
 surface. Needs OneFit, and with it torch, where a body is put on; importing it needs NumPy alone.
 """
 
-import lazy_loader
+from polysft_mi import lazy
 
-__getattr__, __dir__, __all__ = lazy_loader.attach(
+__getattr__, __dir__, __all__ = lazy.attach(
     __name__,
     submod_attrs={
         "bones": ["Bones"],

@@ -5,9 +5,9 @@ texture, camera and ``scene.xml``, which ``polysft run`` takes. Where the sheet 
 :mod:`polysft_mi.poses` tells.
 """
 
-import lazy_loader
+from polysft_mi import lazy
 
-__getattr__, __dir__, __all__ = lazy_loader.attach(
+__getattr__, __dir__, __all__ = lazy.attach(
     __name__,
     submod_attrs={
         "evidence": ["GivenEvidence"],

@@ -3,9 +3,9 @@ explains a frame, to second order at its vertices, out. The solver asks one obje
 :class:`polysft_mi.images.data_term.DataTerm`. Import only after a Mitsuba variant is set.
 """
 
-import lazy_loader
+from polysft_mi import lazy
 
-__getattr__, __dir__, __all__ = lazy_loader.attach(
+__getattr__, __dir__, __all__ = lazy.attach(
     __name__,
     submodules=["differentiable"],
     submod_attrs={

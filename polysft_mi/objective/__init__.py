@@ -3,9 +3,9 @@ gradients by automatic differentiation (any renderer), or a quadratic model in c
 only after a Mitsuba variant is set.
 """
 
-import lazy_loader
+from polysft_mi import lazy
 
-__getattr__, __dir__, __all__ = lazy_loader.attach(
+__getattr__, __dir__, __all__ = lazy.attach(
     __name__,
     submod_attrs={
         "context": ["FrameContext", "FrameMemory", "Stage", "stages_of"],

@@ -5,9 +5,9 @@ finished run, the viewer also one at work, or a drape. Meshes are drawn by
 :mod:`polysft_mi.render.stage`. matplotlib, plotly, viser and Mitsuba are loaded on use.
 """
 
-import lazy_loader
+from polysft_mi import lazy
 
-__getattr__, __dir__, __all__ = lazy_loader.attach(
+__getattr__, __dir__, __all__ = lazy.attach(
     __name__,
     submod_attrs={
         "comparison": ["write_comparison"],

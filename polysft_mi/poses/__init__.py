@@ -3,9 +3,9 @@ by features that two images share, or by the edges that its outline follows. Num
 only.
 """
 
-import lazy_loader
+from polysft_mi import lazy
 
-__getattr__, __dir__, __all__ = lazy_loader.attach(
+__getattr__, __dir__, __all__ = lazy.attach(
     __name__,
     submodules=["outline"],
     submod_attrs={

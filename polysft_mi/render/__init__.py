@@ -3,9 +3,9 @@ gradients come out. :mod:`stage` draws any mesh for pictures. Importing a name n
 variant.
 """
 
-import lazy_loader
+from polysft_mi import lazy
 
-__getattr__, __dir__, __all__ = lazy_loader.attach(
+__getattr__, __dir__, __all__ = lazy.attach(
     __name__,
     submodules=["device", "pinhole", "silhouette", "stage", "topology", "video", "view"],
     submod_attrs={

@@ -4,9 +4,9 @@ exports out.
 It needs no Mitsuba but to write a run's folder (:mod:`outputs`). :mod:`polysft_mi.pictures` draws.
 """
 
-import lazy_loader
+from polysft_mi import lazy
 
-__getattr__, __dir__, __all__ = lazy_loader.attach(
+__getattr__, __dir__, __all__ = lazy.attach(
     __name__,
     submod_attrs={
         "comparison": ["Comparison", "compare"],

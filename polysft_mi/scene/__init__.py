@@ -6,9 +6,9 @@ masks. :func:`load` and :func:`register` need a Mitsuba variant that is set; the
 Mitsuba.
 """
 
-import lazy_loader
+from polysft_mi import lazy
 
-__getattr__, __dir__, __all__ = lazy_loader.attach(
+__getattr__, __dir__, __all__ = lazy.attach(
     __name__,
     submod_attrs={
         "cameras": [

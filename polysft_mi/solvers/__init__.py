@@ -7,9 +7,9 @@ To add one, write a class with :meth:`polysft_mi.solvers.solver.Solver.minimise`
 into :func:`create` and the setting's choices.
 """
 
-import lazy_loader
+from polysft_mi import lazy
 
-__getattr__, __dir__, __all__ = lazy_loader.attach(
+__getattr__, __dir__, __all__ = lazy.attach(
     __name__,
     submod_attrs={
         "adam": ["Adam"],

@@ -5,9 +5,9 @@ vertices [m, camera frame] of a :class:`JetAtlas`, differentiable by Dr.Jit. Wha
 needs a Mitsuba variant that is set.
 """
 
-import lazy_loader
+from polysft_mi import lazy
 
-__getattr__, __dir__, __all__ = lazy_loader.attach(
+__getattr__, __dir__, __all__ = lazy.attach(
     __name__,
     submodules=["meshio"],
     submod_attrs={

@@ -4,9 +4,9 @@ In: a camera file, a field of view, a focal length on film, or views of a board.
 :class:`Lens`, and frames freed from its distortion (:class:`Undistortion`).
 """
 
-import lazy_loader
+from polysft_mi import lazy
 
-__getattr__, __dir__, __all__ = lazy_loader.attach(
+__getattr__, __dir__, __all__ = lazy.attach(
     __name__,
     submod_attrs={
         "calibration": ["calibrate"],

@@ -5,9 +5,9 @@ uint8, 0 or 255. GrabCut finds the border by colour (:class:`Masks`); where the 
 of the background, the photo tells where the sheet ends (:class:`Registration`).
 """
 
-import lazy_loader
+from polysft_mi import lazy
 
-__getattr__, __dir__, __all__ = lazy_loader.attach(
+__getattr__, __dir__, __all__ = lazy.attach(
     __name__,
     submod_attrs={
         "grabcut": ["MaskSettings", "Masks", "iou", "silhouette"],

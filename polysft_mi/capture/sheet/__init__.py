@@ -4,9 +4,9 @@ In: the lengths or the OBJ that a person gives, the photo, the first frame. Out:
 and its :class:`Pose`.
 """
 
-import lazy_loader
+from polysft_mi import lazy
 
-__getattr__, __dir__, __all__ = lazy_loader.attach(
+__getattr__, __dir__, __all__ = lazy.attach(
     __name__,
     submod_attrs={
         "placing": ["Placed", "place"],

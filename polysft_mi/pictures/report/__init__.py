@@ -4,8 +4,6 @@
 :mod:`surface` what it draws in 3D.
 """
 
-import lazy_loader
+from polysft_mi import lazy
 
-__getattr__, __dir__, __all__ = lazy_loader.attach(
-    __name__, submod_attrs={"page": ["write_report"]}
-)
+__getattr__, __dir__, __all__ = lazy.attach(__name__, submod_attrs={"page": ["write_report"]})

@@ -364,3 +364,12 @@ print(dr.thread_count())
 """
     done = python(code)
     assert done.stdout.split() == ["1", "2", "1", "2"], done.stderr
+
+
+@pytest.mark.parametrize("name", ["tracker.track", "render.PlacedMesh", "Problem"])
+def test_a_name_that_needs_a_variant_says_so(name):
+    package, _, name = f"polysft_mi.{name}".rpartition(".")
+    done = python(f"from {package} import {name}")
+    said = done.stderr.splitlines()[-1]
+    assert "InputError: polysft_mi." in said
+    assert said.endswith(" needs a Mitsuba variant: call polysft_mi.set_variant() first")

@@ -1,0 +1,129 @@
+"""Whether the paper's solver holds Kinect-Paper's sheet where it is fast, by how its losses are
+read: it begins where the default solver is.
+
+    python -m polysft_mi.run scenes/kinect_paper.xml -D data=DATA/kinect_paper -D order=4
+        -D patches=1 -D canonical_frame=stn -D k_relief=0 -o RUN
+    python benchmarks/stretch.py RUN [--first 113] [--last 121] [--masks FOLDER] [-o docs]
+
+RUN's surfaces are of the paper's kind, one jet of order 4. Its unknowns up to the frame before
+``--first`` are taken, and the windows from there on to ``--last`` are solved with ``preset`` =
+paper. What is measured is how far each surface ends from RUN's, RMS over the vertices; RUN is 4 mm
+from the truth in depth. Frames count from 0. The readings: the preset, which has no masks there;
+the preset, and φ-SfT's losses, with RUN's own silhouettes for masks, the best that masks can be;
+with ``--masks``, φ-SfT's losses with those of ``polysft prepare``. Writes ``stretch.json``.
+"""
+
+import argparse
+import os
+import tempfile
+
+import cv2
+import numpy as np
+
+from polysft_mi.backend import add_mode_argument, set_variant
+from polysft_mi.errors import InputError, cli
+
+PHI_SFT = {
+    "rgb_norm": "phi-sft",
+    "silhouette_norm": "phi-sft",
+    "mask_blur": 5.0,
+    "k_silhouette": 0.5,
+}
+
+
+def begun(run, tracker, first, folder):
+    """A checkpoint of a tracker in ``folder``, as if it had tracked the frames before the
+    ``first`` and ended where ``run`` did.
+    """
+    from polysft_mi.tracker import Track
+
+    states = Track.load(os.path.join(run.folder, "checkpoint.npz")).states[:first]
+    alpha = tracker.problem.template.alpha
+    if states[0]["delta_alpha"].shape != alpha.shape:
+        raise InputError(f"{run.folder}: its jets are others; make it as --help says")
+    done = first - tracker.settings.window + 1
+    terms = dict.fromkeys((term.name for term in tracker.objective.terms), 0.0)
+    track = Track(states, done, [0] * done, [0.0] * done, [terms] * done, [None] * done)
+    track.solver = tracker.solver.name
+    track.save(os.path.join(folder, "checkpoint.npz"), tracker.objective.stages)
+
+
+def tracked(run, settings, first, last):
+    """How far the frames ``first`` to ``last`` end from RUN's surfaces [m], RMS."""
+    from polysft_mi.objective import Problem
+    from polysft_mi.results import metrics
+    from polysft_mi.scene import load
+    from polysft_mi.surface import Unknowns
+    from polysft_mi.tracker import FrameTracker, track
+
+    overrides = {"preset": "paper", **settings, "last": last}
+    scene = load(os.path.join(run.folder, "scene.xml"), overrides)
+    problem = Problem(scene, scene.sequence())
+    with tempfile.TemporaryDirectory() as folder:
+        tracker = FrameTracker(problem)
+        begun(run, tracker, first, folder)
+        states = track(tracker, last + 1, folder, resume=True).states
+    surfaces = [problem.surface(Unknowns.from_numpy(state)) for state in states[first:]]
+    return [metrics.rmse(a, b) for a, b in zip(surfaces, run.vertices[first:])]
+
+
+def silhouettes(run, folder):
+    """Masks of RUN's surfaces, PNG files in ``folder``."""
+    import mitsuba as mi
+
+    from polysft_mi.objective import Problem
+    from polysft_mi.scene import load
+
+    scene = load(os.path.join(run.folder, "scene.xml"))
+    placed = Problem(scene, scene.sequence()).placed
+    width, height = placed.size
+    for k, vertices in enumerate(run.vertices):
+        points = mi.Point3f(np.ascontiguousarray(vertices.T, np.float32))
+        alpha = np.array(placed.image(points, spp=16)[1]).reshape(height, width)
+        cv2.imwrite(os.path.join(folder, f"{k:05d}.png"), np.round(255 * alpha).astype(np.uint8))
+
+
+def main(arguments=None):
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("run", metavar="RUN", help="folder of a finished run")
+    parser.add_argument("--first", type=int, default=113, help="frame (default: 113)")
+    parser.add_argument("--last", type=int, default=121, help="frame (default: 121)")
+    parser.add_argument("--masks", metavar="FOLDER", help="of polysft prepare")
+    parser.add_argument("-o", "--out", metavar="FOLDER", default="out/benchmarks")
+    add_mode_argument(parser)
+    options = parser.parse_args(arguments)
+    set_variant(options.mode)
+    from polysft_mi import Run
+    from polysft_mi.results import outputs
+
+    run = Run.open(options.run)
+    if not 3 <= options.first <= options.last < len(run.vertices):
+        raise InputError(
+            f"--first {options.first} --last {options.last}: frames of the {len(run.vertices)} of"
+            f" {options.run}, from 3 on, are needed"
+        )
+    with tempfile.TemporaryDirectory() as masks:
+        silhouettes(run, masks)
+        readings = {
+            "preset": {},
+            "preset, right masks": {"masks": masks},
+            "as in φ-SfT, right masks": {"masks": masks, **PHI_SFT},
+        }
+        if options.masks:
+            readings["as in φ-SfT, masks of prepare"] = {"masks": options.masks, **PHI_SFT}
+        found = {}
+        for name, settings in readings.items():
+            print(name, flush=True)
+            found[name] = tracked(run, settings, options.first, options.last)
+            print("  mm:", *(f"{1e3 * x:.1f}" for x in found[name]), flush=True)
+    os.makedirs(options.out, exist_ok=True)
+    frames = list(range(options.first, options.last + 1))
+    outputs.write_json(
+        os.path.join(options.out, "stretch.json"), {"frames": frames, "readings": found}
+    )
+
+
+if __name__ == "__main__":
+    cli(main)
