@@ -93,10 +93,10 @@ class Light:
     @property
     def scale(self):
         """The residual, over the texture's mean luminance, from which on one hardly counts."""
+        least, most = self.rules.light_scale_bounds
         if not self.frames:
-            return self.rules.light_first_scale
-        scale = self.rules.light_scale * self.deviations / self.frames
-        return float(np.clip(scale, *self.rules.light_scale_bounds))
+            return most
+        return float(np.clip(self.rules.light_scale * self.deviations / self.frames, least, most))
 
     def coefficients(self, triangles):
         """(l_0, l, g) (7,), of a sheet of so many triangles; the same from all sides where nothing

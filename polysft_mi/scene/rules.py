@@ -168,8 +168,11 @@ class Rules:
         0.8, "share", "of what earlier frames say of light, a frame later", row="light's memory"
     )
     light_scale: float = _rule(8.0, "deviations", "at which a triangle's residual is an outlier")
-    light_first_scale: float = _rule(0.05, "share", "of the mean luminance, before any is known")
-    light_scale_bounds: tuple = _rule((0.005, 0.05), "share", "bounds of that scale, likewise")
+    light_scale_bounds: tuple = _rule(
+        (0.005, 0.05),
+        "share",
+        "of the mean luminance, bounds of that scale; first it is the larger",
+    )
 
     def for_patches(self, count: int) -> "Rules":
         """The rules for a template of so many patches: a sheet is one."""
