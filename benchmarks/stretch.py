@@ -1,5 +1,5 @@
-"""Whether the paper's solver holds Kinect-Paper's sheet where it is fast, by how its losses are
-read: it begins where the default solver is.
+"""Whether the paper's solver holds Kinect-Paper's sheet, by how its losses are read: on a stretch
+of the video that begins where the default solver is.
 
     python -m polysft_mi.run scenes/kinect_paper.xml -D data=DATA/kinect_paper -D order=4
         -D patches=1 -D canonical_frame=stn -D k_relief=0 -o RUN
@@ -8,12 +8,15 @@ read: it begins where the default solver is.
 RUN's surfaces are of the paper's kind, one jet of order 4. Its unknowns up to the frame before
 ``--first`` are taken, and the windows from there on to ``--last`` are solved with ``preset`` =
 paper. What is measured is how far each surface ends from RUN's, RMS over the vertices; RUN is 4 mm
-from the truth in depth. Frames count from 0. The readings: the preset, which has no masks there;
-the preset, and φ-SfT's losses, with RUN's own silhouettes for masks, the best that masks can be;
-with ``--masks``, φ-SfT's losses with those of ``polysft prepare``. Writes ``stretch.json``.
+from the truth in depth. Frames count from 0; the sheet is fast from 114 on. The readings: the
+preset, which has no masks there; the preset with lengths in millimetres, as the sequence's files
+have them, not in the template's scale; the preset, and φ-SfT's losses, with RUN's own silhouettes
+for masks, the best that masks can be; with ``--masks``, φ-SfT's losses with those of ``polysft
+prepare``. Each goes into ``stretch.json`` as soon as it is there, beside those of other stretches.
 """
 
 import argparse
+import json
 import os
 import tempfile
 
@@ -22,6 +25,7 @@ import numpy as np
 
 from polysft_mi.backend import add_mode_argument, set_variant
 from polysft_mi.errors import InputError, cli
+from polysft_mi.scene.settings import PRESETS
 
 PHI_SFT = {
     "rgb_norm": "phi-sft",
@@ -51,6 +55,7 @@ def begun(run, tracker, first, folder):
 def tracked(run, settings, first, last):
     """How far the frames ``first`` to ``last`` end from RUN's surfaces [m], RMS."""
     from polysft_mi.objective import Problem
+    from polysft_mi.render import threads
     from polysft_mi.results import metrics
     from polysft_mi.scene import load
     from polysft_mi.surface import Unknowns
@@ -59,7 +64,7 @@ def tracked(run, settings, first, last):
     overrides = {"preset": "paper", **settings, "last": last}
     scene = load(os.path.join(run.folder, "scene.xml"), overrides)
     problem = Problem(scene, scene.sequence())
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, threads(1.0):
         tracker = FrameTracker(problem)
         begun(run, tracker, first, folder)
         states = track(tracker, last + 1, folder, resume=True).states
@@ -83,6 +88,21 @@ def silhouettes(run, folder):
         cv2.imwrite(os.path.join(folder, f"{k:05d}.png"), np.round(255 * alpha).astype(np.uint8))
 
 
+def scale(run):
+    """The template's scale [m], which lengths are measured in."""
+    from polysft_mi.scene import load
+
+    return load(os.path.join(run.folder, "scene.xml")).template.scale
+
+
+def read(path):
+    """Stretch to reading to distances [m], of each frame; none where there is no such file."""
+    if not os.path.exists(path):
+        return {}
+    with open(path, encoding="utf-8") as file:
+        return json.load(file)
+
+
 def main(arguments=None):
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -91,6 +111,7 @@ def main(arguments=None):
     parser.add_argument("--first", type=int, default=113, help="frame (default: 113)")
     parser.add_argument("--last", type=int, default=121, help="frame (default: 121)")
     parser.add_argument("--masks", metavar="FOLDER", help="of polysft prepare")
+    parser.add_argument("--only", nargs="+", metavar="READING", help="some of them")
     parser.add_argument("-o", "--out", metavar="FOLDER", default="out/benchmarks")
     add_mode_argument(parser)
     options = parser.parse_args(arguments)
@@ -104,25 +125,27 @@ def main(arguments=None):
             f"--first {options.first} --last {options.last}: frames of the {len(run.vertices)} of"
             f" {options.run}, from 3 on, are needed"
         )
+    path = os.path.join(options.out, "stretch.json")
+    stretch = f"{options.first} to {options.last}"
+    os.makedirs(options.out, exist_ok=True)
     with tempfile.TemporaryDirectory() as masks:
         silhouettes(run, masks)
         readings = {
             "preset": {},
+            "preset, lengths in mm": {"k_mi": PRESETS["paper"]["k_mi"] * (1e3 * scale(run)) ** 2},
             "preset, right masks": {"masks": masks},
             "as in φ-SfT, right masks": {"masks": masks, **PHI_SFT},
         }
         if options.masks:
             readings["as in φ-SfT, masks of prepare"] = {"masks": options.masks, **PHI_SFT}
-        found = {}
-        for name, settings in readings.items():
-            print(name, flush=True)
-            found[name] = tracked(run, settings, options.first, options.last)
-            print("  mm:", *(f"{1e3 * x:.1f}" for x in found[name]), flush=True)
-    os.makedirs(options.out, exist_ok=True)
-    frames = list(range(options.first, options.last + 1))
-    outputs.write_json(
-        os.path.join(options.out, "stretch.json"), {"frames": frames, "readings": found}
-    )
+        for name in options.only or readings:
+            if name not in readings:
+                raise InputError(f"--only {name}: known are {', '.join(readings)}")
+            found = tracked(run, readings[name], options.first, options.last)
+            print(name, "mm:", *(f"{1e3 * x:.1f}" for x in found), flush=True)
+            known = read(path)
+            known.setdefault(stretch, {})[name] = found
+            outputs.write_json(path, known)
 
 
 if __name__ == "__main__":

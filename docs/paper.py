@@ -35,7 +35,7 @@ what it says: the command is there, the hours were not.
 def read(folder=DOCS):
     """The JSON files of ``folder`` by their names; an empty dict where there is none."""
     names = ("sft", "stability", "polyfit_reconstruction", "polyfit_accuracy", "onefit_paper")
-    names += ("onefit_speed", "readings")
+    names += ("onefit_speed", "readings", "stretch")
     found = {}
     for name in names:
         path = Path(folder) / f"{name}.json"

@@ -126,7 +126,22 @@ def readings(data):
         return ""
     frames = next(iter(found.values()))
     rows = [(name, *(f"{row[k][1]:.2f}" for k in frames)) for name, row in found.items()]
-    return table(("loss left after 35 % of the way to frame", *frames), rows)
+    left = table(("loss left after 35 % of the way to frame", *frames), rows)
+    return f"{left}\n\n{stretch(data)}".rstrip()
+
+
+def stretch(data):
+    tables = []
+    for name, found in data["stretch"].items():
+        first, last = map(int, name.split(" to "))
+        frames = range(first, last + 1)[:: max(1, (last + 1 - first) // 8)]
+        rows = [
+            (reading, *(f"{1e3 * values[k - first]:.1f}" for k in frames))
+            for reading, values in found.items()
+        ]
+        head = ("mm from the default's surface in frame", *map(str, frames))
+        tables.append(table(head, rows))
+    return "\n\n".join(tables)
 
 
 def kinect_frames(data):
