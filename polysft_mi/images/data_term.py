@@ -23,7 +23,7 @@ from . import pixels
 from .frames import Frames
 from .gather import Gather, Images
 from .light import Brightness
-from .pyramid import FLOOR, POOL, Level, compared
+from .pyramid import POOL, Level, compared
 from .texture import Texture, packed_image
 
 _ROBUST, _MEDIAN = 2.5, 0.6745  # deviations that count; the median size of a normal variable
@@ -104,10 +104,6 @@ class DataTerm:
         self._frames = Frames(sequence, normalise)
         self._levels, self._last, self._brightness = {}, None, None
         self._before = None  # what hides the surface
-        self._floor = FLOOR
-        finest = self.level(self._rules.blurs[-1])
-        if normalise and self.texture.contrast(finest) < self._rules.plain:
-            self._floor, self._levels = self._rules.plain_floor, {}
 
     def level(self, blur):
         """The :class:`polysft_mi.images.pyramid.Level` that a ``blur`` names."""
@@ -116,7 +112,7 @@ class DataTerm:
         if blur not in self._levels:
             sigma = blur * self._unit
             window = max(self._rules.window * self._unit, 3 * sigma)
-            self._levels[blur] = Level(sigma, max(1, int(0.8 * sigma)), window, self._floor)
+            self._levels[blur] = Level(sigma, max(1, int(0.8 * sigma)), window)
         return self._levels[blur]
 
     # -- what is known before a frame is looked at ---------------------------
@@ -399,6 +395,6 @@ class DataTerm:
         inside = inside.astype(np.float32)
         padded = np.pad(colour, (*pads, (0, 0))), np.pad(inside, pads)
         scales = level.sigma / level.stride, level.window / level.stride
-        wide = compared(*padded, *scales, self.normalise, level.floor)
+        wide = compared(*padded, *scales, self.normalise)
         (top, _), (left, _) = pads
         return wide[top : top + inside.shape[0], left : left + inside.shape[1]], inside

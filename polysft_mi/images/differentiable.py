@@ -20,7 +20,7 @@ def compared(image, weight, level, normalise):
         inside = _per_channel(weight)
         share = dr.maximum(_per_channel(blur(weight, level.sigma)), _LEAST_SHARE)
         image = mi.TensorXf(blur(image, level.sigma).array / share * inside, image.shape)
-    return normalised(image, weight, level.window, level.floor) if normalise else image
+    return normalised(image, weight, level.window) if normalise else image
 
 
 def blur(image, sigma):
@@ -45,10 +45,10 @@ def srgb(image):
     return mi.TensorXf(dr.select(x <= 0.0031308, 12.92 * x, power), image.shape)
 
 
-def normalised(image, weight, window, floor=FLOOR):
+def normalised(image, weight, window):
     """(H, W, 3), premultiplied by its ``weight`` (H, W, 1), less its local mean, over its local
-    standard deviation (one for all channels) and the ``floor``, under a window of standard
-    deviation ``window`` [pixels]. Zero outside the weight.
+    standard deviation (one for all channels) and :data:`polysft_mi.images.pyramid.FLOOR`, under a
+    window of standard deviation ``window`` [pixels]. Zero outside the weight.
     """
     height, width, channels = image.shape
     pool = int(min(POOL, max(1, window // 2)))
@@ -66,7 +66,7 @@ def normalised(image, weight, window, floor=FLOOR):
         share, channels
     )
     variance = _mean_of_channels(power - dr.square(mean), channels)
-    scale = dr.rsqrt(dr.maximum(variance, 0) + floor * floor)
+    scale = dr.rsqrt(dr.maximum(variance, 0) + FLOOR * FLOOR)
     shifted = _enlarged(mi.TensorXf(mean * _repeated(scale, channels), (*small, channels)), image)
     scale = _enlarged(mi.TensorXf(scale, (*small, 1)), weight)
     out = image.array * _per_channel(scale) - shifted.array * inside

@@ -9,19 +9,19 @@ import numpy as np
 
 POOL = 4  # local statistics are taken on an image this many times smaller
 MAX_CONTOUR_DISTANCE = 30.0  # pixels of the grid beyond which a silhouette is pulled no harder
-FLOOR = 0.02  # added to the local deviation, as squares: no flat area is blown up to the rest
+#: linear, of 1; added to the local deviation, as squares: no flat area is blown up to the rest
+FLOOR = 0.02
 
 
 @dataclass(frozen=True)
 class Level:
     """How images are compared: blurred by ``sigma``, freed from lighting under a window of
     ``window`` (standard deviations, pixels of the video), on a grid of every ``stride``-th pixel;
-    what deviates from its surroundings by less than ``floor`` (linear, of 1) says little."""
+    what deviates from its surroundings by less than :data:`FLOOR` says little."""
 
     sigma: float
     stride: int = 1
     window: float = 8.0
-    floor: float = FLOOR
 
 
 @dataclass
@@ -43,7 +43,7 @@ def level_image(image, mask, level, normalise=True):
     """A frame (H, W, 3), linear, with its mask (H, W) or None, at a :class:`Level`."""
     (y, x), near = _slices_around(mask, level)
     image, mask = image[near], mask[near] if mask is not None else None
-    colour = compared(image, mask, level.sigma, level.window, normalise, level.floor)
+    colour = compared(image, mask, level.sigma, level.window, normalise)
     inside = (
         np.ones(image.shape[:2], np.float32) if mask is None else (mask > 0.5).astype(np.float32)
     )
@@ -76,12 +76,12 @@ def _slices_around(mask, level):
     return (at[0][0], at[1][0]), tuple(slice(*x) for x in at)
 
 
-def compared(image, weight, sigma, window, normalise, floor=FLOOR):
+def compared(image, weight, sigma, window, normalise):
     """The image as it is compared: blurred by ``sigma`` and, with ``normalise``, freed from
-    lighting under ``window`` [pixels] over the ``floor``; only what is inside ``weight`` (H, W)
+    lighting under ``window`` [pixels]; only what is inside ``weight`` (H, W)
     counts."""
     image = blur(image, sigma, weight)
-    return normalised(image, window, weight, floor) if normalise else image
+    return normalised(image, window, weight) if normalise else image
 
 
 def blur(image, sigma, weight=None):
@@ -99,28 +99,19 @@ def blur(image, sigma, weight=None):
     )
 
 
-def normalised(image, sigma, weight=None, floor=FLOOR):
+def normalised(image, sigma, weight=None):
     """(H, W, C) less its local mean, over its local standard deviation (one for all channels) and
-    the ``floor``, under a window of ``sigma`` [pixels].
+    :data:`FLOOR`, under a window of ``sigma`` [pixels].
     """
     height, width = image.shape[:2]
     mean, variance = _local(image, sigma, weight)
-    scale = 1 / np.sqrt(variance + floor**2)
+    scale = 1 / np.sqrt(variance + FLOOR**2)
     both = cv2.resize(
         np.concatenate([mean * scale[..., None], scale[..., None]], -1),
         (width, height),
         interpolation=cv2.INTER_LINEAR,
     )
     return image * both[..., 3:] - both[..., :3]
-
-
-def contrast(image, sigma, weight):
-    """The median of an image's local standard deviations under a window of ``sigma`` [pixels],
-    inside ``weight`` (H, W).
-    """
-    _, variance = _local(image, sigma, weight)
-    share = cv2.resize(weight, variance.shape[::-1], interpolation=cv2.INTER_AREA)
-    return float(np.sqrt(np.median(variance[share >= min(0.5, share.max())])))
 
 
 def _local(image, sigma, weight):

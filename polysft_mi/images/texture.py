@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from polysft_mi.render import on_device
 
 from . import pixels
-from .pyramid import blur, compared, contrast
+from .pyramid import blur, compared
 
 _PIXEL_BLUR = 0.29  # standard deviation of a pixel's own square [pixels]
 _MARGIN = 12  # texels around the box of the texture coordinates
@@ -112,7 +112,7 @@ class Texture:
         if level not in self._levels:
             sigma = self.density * np.sqrt(level.sigma**2 + (_PIXEL_BLUR * level.stride) ** 2)
             window = self.density * level.window
-            image = compared(self.image, self._weight, sigma, window, self._normalise, level.floor)
+            image = compared(self.image, self._weight, sigma, window, self._normalise)
             trusted = np.ones_like(self.inside)
             if not self._masked and self._normalise:
                 # near the border the background is in a frame's local statistics
@@ -120,11 +120,6 @@ class Texture:
                 trusted = (distance > min(window, 0.5 * distance.max())).astype(np.float32)
             self._levels[level] = pixels.Image.of(packed_image(image, trusted), trusted.shape)
         return self._levels[level]
-
-    def contrast(self, level):
-        """The median of its local standard deviations, under a level's window."""
-        image = blur(self.image, self.density * level.sigma, self.inside)
-        return contrast(image, self.density * level.window, self.inside)
 
     def footprint_texture(self, stride):
         """The texture that the footprints of pixels are averaged over, on a grid of ``stride``

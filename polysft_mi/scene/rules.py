@@ -38,14 +38,6 @@ class Rules:
     window: float = _rule(
         8.0, "pixels", "standard deviation of the window of local brightness, likewise"
     )
-    plain: float = _rule(
-        0.04,
-        "linear",
-        "median deviation from the local mean below which a texture is plain: light has more of it",
-    )
-    plain_floor: float = _rule(
-        0.1, "linear", "that is added to the local deviation then, as squares, in place of 0.02"
-    )
     # surfaces of several patches
     unseen: float = _rule(
         10.0,

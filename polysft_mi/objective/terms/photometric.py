@@ -54,8 +54,8 @@ class Photometric(Term):
         else:
             a, b = (differentiable.blur(x, level.sigma) for x in (rgb, target))
             if self._brightness == "local":
-                a = differentiable.normalised(a, cut, level.window, level.floor)
-                b = differentiable.normalised(b, covered, level.window, level.floor)
+                a = differentiable.normalised(a, cut, level.window)
+                b = differentiable.normalised(b, covered, level.window)
         if self._norm == "phi-sft":
             a, b, area = differentiable.srgb(a), differentiable.srgb(b), self._count
         a, b = _channels(a), _channels(b)
