@@ -3,7 +3,7 @@ of the video that begins where the default solver is.
 
     python -m polysft_mi.run scenes/kinect_paper.xml -D data=DATA/kinect_paper -D order=4
         -D patches=1 -D canonical_frame=stn -D k_relief=0 -o RUN
-    python benchmarks/stretch.py RUN [--first 113] [--last 121] [--masks FOLDER] [-o docs]
+    python benchmarks/stretch.py RUN [--first 113] [--last 120] [--masks FOLDER] [-o docs]
 
 RUN's surfaces are of the paper's kind, one jet of order 4. Its unknowns up to the frame before
 ``--first`` are taken, and the windows from there on to ``--last`` are solved with ``preset`` =
@@ -109,7 +109,7 @@ def main(arguments=None):
     )
     parser.add_argument("run", metavar="RUN", help="folder of a finished run")
     parser.add_argument("--first", type=int, default=113, help="frame (default: 113)")
-    parser.add_argument("--last", type=int, default=121, help="frame (default: 121)")
+    parser.add_argument("--last", type=int, default=120, help="frame (default: 120)")
     parser.add_argument("--masks", metavar="FOLDER", help="of polysft prepare")
     parser.add_argument("--only", nargs="+", metavar="READING", help="some of them")
     parser.add_argument("-o", "--out", metavar="FOLDER", default="out/benchmarks")
@@ -127,9 +127,7 @@ def main(arguments=None):
         )
     path = os.path.join(options.out, "stretch.json")
     stretch = f"{options.first} to {options.last}"
-    os.makedirs(options.out, exist_ok=True)
     with tempfile.TemporaryDirectory() as masks:
-        silhouettes(run, masks)
         readings = {
             "preset": {},
             "preset, lengths in mm": {"k_mi": PRESETS["paper"]["k_mi"] * (1e3 * scale(run)) ** 2},
@@ -138,9 +136,11 @@ def main(arguments=None):
         }
         if options.masks:
             readings["as in φ-SfT, masks of prepare"] = {"masks": options.masks, **PHI_SFT}
+        if unknown := set(options.only or ()) - set(readings):
+            raise InputError(f"--only {'; '.join(unknown)}: known are {'; '.join(readings)}")
+        silhouettes(run, masks)
+        os.makedirs(options.out, exist_ok=True)
         for name in options.only or readings:
-            if name not in readings:
-                raise InputError(f"--only {name}: known are {', '.join(readings)}")
             found = tracked(run, readings[name], options.first, options.last)
             print(name, "mm:", *(f"{1e3 * x:.1f}" for x in found), flush=True)
             known = read(path)

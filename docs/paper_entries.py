@@ -159,6 +159,8 @@ SECTIONS = {
                 "-D silhouette_norm=phi-sft -D mask_blur=5 -D k_silhouette=0.5 -o OUT/run",
                 "python -m polysft_mi.run scenes/kinect_paper.xml -D data=DATA/kinect_paper "
                 "-D order=4 -D patches=1 -D canonical_frame=stn -D k_relief=0 -o OUT/jet",
+                "python benchmarks/stretch.py OUT/jet --first 3 --last 43 "
+                "--only preset 'preset, lengths in mm' -o docs",
                 "python benchmarks/stretch.py OUT/jet --masks OUT/kinect/masks -o docs",
             ),
             figures.readings,

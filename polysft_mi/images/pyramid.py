@@ -78,8 +78,7 @@ def _slices_around(mask, level):
 
 def compared(image, weight, sigma, window, normalise):
     """The image as it is compared: blurred by ``sigma`` and, with ``normalise``, freed from
-    lighting under ``window`` [pixels]; only what is inside ``weight`` (H, W)
-    counts."""
+    lighting under ``window`` [pixels]; only what is inside ``weight`` (H, W) counts."""
     image = blur(image, sigma, weight)
     return normalised(image, window, weight) if normalise else image
 
