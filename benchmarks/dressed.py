@@ -152,8 +152,7 @@ def picture(path, out, frame):
     panels, faded = [image], 0.5 * image.mean(2, keepdims=True) + 0.25
     for vertices in (given, found):
         rgb, alpha = problem.placed.image(mi.Point3f(vertices.T.astype(np.float32)))
-        alpha = np.array(alpha).reshape(*image.shape[:2], 1)
-        panels.append(np.array(rgb) + (1 - alpha) * faded)
+        panels.append(np.array(rgb) + (1 - np.array(alpha)) * faded)
     row = np.round(255 * srgb(np.hstack(panels))).astype(np.uint8)
     cv2.imwrite(path, row[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
 

@@ -64,7 +64,7 @@ def measure(run, frames):
     def seen(vertices):
         points = mi.Point3f(np.ascontiguousarray(vertices.T, np.float32))
         image, alpha = (np.array(x) for x in placed.image(points))
-        return image, alpha.reshape(image.shape[:2])
+        return image, alpha[..., 0]
 
     out = {}
     for frame in frames:

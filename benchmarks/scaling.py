@@ -88,7 +88,7 @@ def make(folder, surface, size, frames):
         rgb, alpha = problem.placed.image(
             mi.Point3f(np.ascontiguousarray(vertices.T, dtype=np.float32))
         )
-        alpha = np.array(alpha).reshape(size[1], size[0])
+        alpha = np.array(alpha)[..., 0]
         linear = np.array(rgb) + 0.05 * (1 - alpha[..., None])
         write("frames", k, np.round(255 * srgb(linear)).astype(np.uint8))
         write("masks", k, np.round(255 * alpha).astype(np.uint8))

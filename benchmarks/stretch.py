@@ -81,10 +81,9 @@ def silhouettes(run, folder):
 
     scene = load(os.path.join(run.folder, "scene.xml"))
     placed = Problem(scene, scene.sequence()).placed
-    width, height = placed.size
     for k, vertices in enumerate(run.vertices):
         points = mi.Point3f(np.ascontiguousarray(vertices.T, np.float32))
-        alpha = np.array(placed.image(points, spp=16)[1]).reshape(height, width)
+        alpha = np.array(placed.image(points, spp=16)[1])[..., 0]
         cv2.imwrite(os.path.join(folder, f"{k:05d}.png"), np.round(255 * alpha).astype(np.uint8))
 
 

@@ -82,7 +82,7 @@ def rendering(
     @_in_drjit
     def render(vertices: mi.TensorXf) -> tuple[mi.TensorXf, mi.TensorXf]:
         rgb, alpha = problem.placed.image(_points(vertices.array), seed, problem.settings.spp)
-        return rgb, mi.TensorXf(alpha, (problem.height, problem.width))
+        return rgb, mi.TensorXf(alpha.array, (problem.height, problem.width))
 
     def of(vertices: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         rgb, alpha = render(_at_home(vertices))

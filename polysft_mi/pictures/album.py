@@ -75,7 +75,7 @@ class Renderings:
             )
             render = np.array(rgb)
             more = self._geometry() if geometry else {}
-        mask_render = np.array(alpha).reshape(render.shape[:2])
+        mask_render = np.array(alpha)[..., 0]
         image, mask = self.sequence.frame(frame), self.sequence.mask(frame)
         target = image * mask[..., None] if mask is not None else image
         inside = np.ones_like(mask_render) if mask is not None else mask_render > 0.999

@@ -11,7 +11,6 @@ import mitsuba as mi
 import numpy as np
 
 _STEP = 64  # pixels: sizes are multiples of it, for kernels are made for a size
-_GRID = 4  # pixels: it begins at a multiple, so that what is pooled is pooled alike
 
 
 @dataclass(frozen=True)
@@ -27,14 +26,18 @@ class Crop:
 
     @classmethod
     def around(
-        cls, boxes: Sequence[tuple[float, float, float, float]], margin: int, size: tuple[int, int]
+        cls,
+        boxes: Sequence[tuple[float, float, float, float]],
+        margin: int,
+        size: tuple[int, int],
+        grid: int = 1,
     ) -> Crop:
         """What holds all ``boxes`` (x, y, x, y) [pixels] and a ``margin`` around them, as far as
-        they lie in an image of ``size`` (width, height).
+        they lie in an image of ``size`` (width, height); it begins at a multiple of ``grid``.
         """
         low, high = np.min(boxes, axis=0)[:2] - margin, np.max(boxes, axis=0)[2:] + margin
-        x, width = _span(low[0], high[0], size[0])
-        y, height = _span(low[1], high[1], size[1])
+        x, width = _span(low[0], high[0], size[0], grid)
+        y, height = _span(low[1], high[1], size[1], grid)
         return cls(x, y, width, height)
 
     def cut(self, image: mi.TensorXf, first: int = 0, last: int | None = None) -> mi.TensorXf:
@@ -55,9 +58,9 @@ class Crop:
         return mi.TensorXf(values, (self.height, self.width, count))
 
 
-def _span(low, high, size):
+def _span(low, high, size, grid):
     """(begin, length) along an axis of the image, ``size`` pixels long."""
     low, high = max(low, 0), min(high, size)
-    begin = _GRID * math.floor(min(low, size) / _GRID)
+    begin = grid * math.floor(min(low, size) / grid)
     length = _STEP * max(1, math.ceil((high - begin) / _STEP))
     return (begin, length) if length < size else (0, size)

@@ -108,23 +108,22 @@ class PlacedMesh:
         vertices: np.ndarray,
         boxes: Sequence[tuple[float, float, float, float]] = (),
         margin: int = 0,
+        grid: int = 1,
     ) -> Crop:
         """What of the image the surface (N, 3) [m, world] and the ``boxes`` (x, y, x, y) [pixels]
-        cover, and a ``margin`` [pixels] around: beyond it is nothing. The whole image where the
-        scene may show something else.
+        cover, and a ``margin`` [pixels] around: beyond it is nothing. It begins at a multiple of
+        ``grid``. The whole image where the scene may show something else.
         """
         position, before = self.camera.project(vertices)
         if not (self.is_raster and len(self.scene.shapes()) == 1 and before.all()):
             return Crop(0, 0, *self.size)
         own = (*position.min(0), *position.max(0))
-        return Crop.around([own, *boxes], margin + 1, self.size)  # 1: antialiasing blends
+        return Crop.around([own, *boxes], margin + 1, self.size, grid)  # 1: antialiasing blends
 
     def image(
         self, vertices: mi.Point3f, seed: int = 0, spp: int = 1, crop: Crop | None = None
-    ) -> tuple[mi.TensorXf, mi.Float]:
-        """Render the surface: (rgb (H, W, 3), linear, over black, and alpha, Float of H W),
-        attached to the vertices (Point3f of N [m, world]); of the whole image, or of a ``crop``.
-        """
+    ) -> tuple[mi.TensorXf, mi.TensorXf]:
+        """Render the surface: (rgb (H, W, 3), linear, over black, and alpha (H, W, 1)), attached to the vertices (Point3f of N [m, world]); of the whole image, or of a ``crop``."""
         self.place(vertices)
         crop = crop or Crop(0, 0, *self.size)
         if self.is_raster:
@@ -133,7 +132,7 @@ class PlacedMesh:
             shown = partial(mi.render, self.scene, self._params, self.sensor)
             image = shown(self.renderer, spp=spp, seed=seed)
             mask = self._silhouette.image(self._alone, self.sensor, spp=1)
-        return crop.cut(image, 0, 3), crop.cut(mask, 3, 4).array
+        return crop.cut(image, 0, 3), crop.cut(mask, 3, 4)
 
 
 def _positions_key(params, mesh):

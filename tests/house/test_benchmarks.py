@@ -11,14 +11,16 @@ from clips import CAMERA, HEIGHT, WIDTH, photo, placed, rendered, write_png
 from places import ROOT
 from scripts import load
 
+from polyfit.errors import InputError
 from polyfit.patches.atlas import Cover
+from polysft_mi import run
 from polysft_mi.results.truth import load_npz
 from polysft_mi.scene import plugins
 
 SIZE, POINTS = (64, 48), 9
-iteration, lit, outline, raster, raster_figures, scaling, stability = (
+iteration, lit, outline, raster, raster_figures, scaling, stability, stretch = (
     load(f"benchmarks/{name}.py")
-    for name in "iteration lit outline raster raster_figures scaling stability".split()
+    for name in "iteration lit outline raster raster_figures scaling stability stretch".split()
 )
 
 
@@ -84,19 +86,36 @@ def test_snapshots_are_what_shorter_runs_return(tmp_path):
     assert 0 < watched.seconds[3] < watched.seconds[40]
 
 
+@pytest.mark.slow
+def test_a_stretch_begins_where_a_run_is(tmp_path):
+    out, words = str(tmp_path / "run"), "order=4 patches=1 canonical_frame=stn k_relief=0 last=4"
+    defines = [w for word in words.split() for w in ("-D", word)]
+    run.main([str(ROOT / "scenes" / "demo.xml"), *defines, "-o", out])
+    asked = [out, "--first", "3", "--last", "4", "-o", str(tmp_path / "docs"), "--only"]
+    with pytest.raises(InputError, match="--only no such one: known are preset; "):
+        stretch.main([*asked, "no such one"])
+    assert not (tmp_path / "docs").exists()
+    stretch.main([*asked, "preset"])
+    found = json.loads((tmp_path / "docs" / "stretch.json").read_text())
+    assert list(found) == ["3 to 4"] and list(found["3 to 4"]) == ["preset"]
+    near, next_one = found["3 to 4"]["preset"]
+    template = load_npz(ROOT / "scenes" / "demo" / "gt.npz")["vertices"][0]
+    assert 0 < near < 0.01 * np.ptp(template, axis=0).max() and 0 < next_one < 3 * near + 0.01
+
+
 def test_stability_writes_figures_and_picture(tmp_path, capsys):
     stability.main(
         [DEMO[0], "-D", "first=3", "-D", "last=3", "--counts", "2", "6", "-o", str(tmp_path)]
     )
-    report = json.loads((tmp_path / "stability.json").read_text())
+    report = json.loads((tmp_path / "stability_demo.json").read_text())
     assert report["frame"] == 3 and list(report["counts"]) == ["2", "6"]
     assert report["counts"]["6"]["change_rms_mm"] == 0 < report["counts"]["2"]["change_rms_mm"]
     truth = load_npz(ROOT / "scenes" / "demo" / "gt.npz")["vertices"][3]
     assert report["counts"]["2"]["rmse_mm"] == pytest.approx(
         1e3 * np.linalg.norm(truth) / np.sqrt(len(truth)) * report["counts"]["2"]["e3d"], rel=1e-5
     )
-    assert (tmp_path / "stability.png").read_bytes().startswith(b"\x89PNG")
-    assert "stability.json" in capsys.readouterr().out
+    assert (tmp_path / "stability_demo.png").read_bytes().startswith(b"\x89PNG")
+    assert "stability_demo.json" in capsys.readouterr().out
 
 
 def test_the_lit_sheet_keeps_its_lengths_and_is_the_truth():

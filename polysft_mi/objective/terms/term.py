@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from polysft_mi.images import Level, differentiable
+from polysft_mi.images import POOL, Level, differentiable
 from polysft_mi.render import on_device
 
 if TYPE_CHECKING:
@@ -164,7 +164,9 @@ class DeviceFrame:
         inputs, box = self._inputs, self._inputs.target(self.context.frame).box
         blur = max(inputs.blur(self.stage), inputs.settings.mask_blur)
         vertices = np.array(dr.detach(self.vertices)).T
-        return inputs.placed.crop(vertices, [box] if box else [], differentiable.reach(blur))
+        margin = differentiable.reach(blur)
+        # what is pooled is pooled as in the whole image
+        return inputs.placed.crop(vertices, [box] if box else [], margin, POOL)
 
     @cached_property
     def target(self) -> Target:
@@ -177,8 +179,7 @@ class DeviceFrame:
         (H, W, 1).
         """
         spp = self._inputs.settings.spp
-        rgb, alpha = self._inputs.placed.image(self.vertices, self.seed, spp, self.crop)
-        return rgb, mi.TensorXf(alpha, (*rgb.shape[:2], 1))
+        return self._inputs.placed.image(self.vertices, self.seed, spp, self.crop)
 
 
 class Term:

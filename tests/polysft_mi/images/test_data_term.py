@@ -53,13 +53,13 @@ def twin(truth, problem, tmp_path_factory):
 
 
 def attached(problem, vertices):
-    """(flat positions with gradients, image tensor (H, W, 3), alpha) of a surface through
-    ``raster``.
+    """(flat positions with gradients, image tensor (H, W, 3), alpha, Float of H W) of a surface
+    through ``raster``.
     """
     flat = mi.Float(vertices.astype(np.float32).ravel())
     dr.enable_grad(flat)
     rgb, alpha = problem.placed.image(dr.unravel(mi.Point3f, flat))
-    return flat, rgb, alpha
+    return flat, rgb, alpha.array
 
 
 @pytest.mark.parametrize("scale", [0.2, 1.0])

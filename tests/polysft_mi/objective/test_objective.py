@@ -243,7 +243,7 @@ def test_without_masks_the_background_does_not_matter(tmp_path):
     p, truth = problem(tmp_path, masks=False)
     rest = p.patch.rest()
     before = energy(p, rest, 0)[0]
-    alpha = np.array(p.placed.image(p.patch.vertices(rest))[1]).reshape(p.height, p.width)
+    alpha = np.array(p.placed.image(p.patch.vertices(rest))[1])[..., 0]
     path = sorted((truth.folder / "frames").iterdir())[0]
     image = cv2.imread(str(path))
     image[alpha == 0] = 255
@@ -299,7 +299,7 @@ def test_losses_of_phi_sft_are_means_over_the_image(tmp_path):
     mask = p.sequence.mask(3)
     stored = [srgb(x) for x in (rgb, p.sequence.frame(3) * mask[..., None])]
     assert terms["rgb"] == pytest.approx(np.abs(stored[0] - stored[1]).mean(), rel=1e-3)
-    difference = gaussian_filter(alpha.reshape(mask.shape) - mask, 2, mode="constant", truncate=2.5)
+    difference = gaussian_filter(alpha[..., 0] - mask, 2, mode="constant", truncate=2.5)
     assert terms["silhouette"] == pytest.approx(0.5 * np.abs(difference).mean(), rel=0.01)
     for name, value in {"silhouette_norm": "phi-sft", "mask_blur": 2}.items():
         with pytest.raises(InputError, match=f"silhouette has {name} = .* is needed"):

@@ -46,7 +46,9 @@ def test_a_crop_holds_what_it_is_asked_for():
     for _ in range(50):
         size = tuple(rng.integers(20, 700, 2).tolist())
         boxes = [np.sort(rng.uniform(-50, 750, (2, 2)), axis=0).ravel() for _ in range(2)]
-        crop = Crop.around(boxes, 3, size)
+        grid = int(rng.integers(1, 6))
+        crop = Crop.around(boxes, 3, size, grid)
+        assert crop.x % grid == crop.y % grid == 0
         for low, high, begin, length, end in (
             (0, 2, crop.x, crop.width, size[0]),
             (1, 3, crop.y, crop.height, size[1]),
