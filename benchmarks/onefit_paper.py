@@ -6,12 +6,13 @@
     python benchmarks/onefit_paper.py RUNS -o docs                     # the tables of what is there
 
 A training that was cut short goes on from its checkpoint. ``--short N`` has twelve epochs of N
-steps, of 2,000 patches each. Everything is measured on motions and bodies that no network was
+steps, of 2,000 patches each. ``package`` is the network ``paper`` of the package, ``--train six
+--short 600``; it needs no RUNS. Everything is measured on motions and bodies that no network was
 trained on (as by ``onefit_accuracy.py``), and is what the network alone makes: without ease and
 post-processing. *ε_c*: % of the vertices inside the body; *ε_e*, *ε_a*: mean % by which edges and
 faces change.
 
-Writes ``onefit_paper.json``; tables whose networks RUNS lacks stay in it as they are. The poses are
+Writes ``onefit_paper.json``; rows whose networks RUNS lacks stay in it as they are. The poses are
 shown in ``paper_poses.jpg``, each in the frame that is farthest from the first.
 """
 
@@ -30,7 +31,7 @@ from onefit.garment import Garment, standard_body
 from onefit.garment.fitting import pushed_out
 from onefit.garment.sewing.block import Block
 from onefit.garment.sewing.sew import sewn
-from onefit.network import EXTRAS
+from onefit.network import EXTRAS, weights
 from onefit.training import STANDARD
 from polyfit.errors import cli
 from polyfit.files import aside
@@ -48,6 +49,7 @@ TRAININGS = {
     "jumpsuit": ["jumpsuit"],
     "jumpsuit-tuned": ["jumpsuit", "--from", "RUNS/six/weights.safetensors", "--epochs", "12"],
 }
+PACKAGE = "package"  # the package's network by the preset
 SHORT = ["--epochs", "12", "--batch", "2000"]
 LOSSES = {
     "all losses": "tank",
@@ -95,12 +97,18 @@ class Bench:
         self.runs, self.seconds, self.shapes, self.docs = Path(runs), seconds, shapes, Path(docs)
         self.drapers = {}
 
-    def has(self, *names):
-        return all((self.runs / name / "weights.safetensors").exists() for name in names)
+    def path(self, name):
+        """The weights of the network ``name``, which may not be there."""
+        if name == PACKAGE:
+            return weights.FOLDER / "paper.safetensors"
+        return self.runs / name / "weights.safetensors"
+
+    def has(self, name):
+        return self.path(name).exists()
 
     def draper(self, name):
         if name not in self.drapers:
-            self.drapers[name] = onefit.load(self.runs / name / "weights.safetensors")
+            self.drapers[name] = onefit.load(self.path(name))
         return self.drapers[name]
 
     def figures(self, name, garment):
@@ -113,8 +121,8 @@ class Bench:
 
     def trained(self):
         made = {}
-        for name in filter(self.has, TRAININGS):
-            about = json.loads((self.runs / name / "weights.json").read_text(encoding="utf-8"))
+        for name in filter(self.has, (*TRAININGS, PACKAGE)):
+            about = json.loads(self.path(name).with_suffix(".json").read_text(encoding="utf-8"))
             kept = ("command", "steps", "batch", "minutes", "machine", "processes", "date")
             made[name] = {key: about[key] for key in kept}
             made[name]["command"] = about["command"].replace(str(self.runs), "RUNS")
@@ -124,12 +132,12 @@ class Bench:
         """Trained on a dress, and on six garments."""
         return {
             name: {garment: self.figures(name, garment)["collision"] for garment in STANDARD}
-            for name in ("dress", "six")
+            for name in ("dress", "six", PACKAGE)
             if self.has(name)
         }
 
     def jumpsuit(self):
-        names = filter(self.has, ("six", "jumpsuit-tuned", "jumpsuit"))
+        names = filter(self.has, ("six", PACKAGE, "jumpsuit-tuned", "jumpsuit"))
         return {name: self.figures(name, "jumpsuit")["collision"] for name in names}
 
     def losses(self):
@@ -149,9 +157,7 @@ class Bench:
 
     def poses(self):
         """Each garment in a demanding motion, of a seed that no training uses."""
-        if not self.has("six"):
-            return {}
-        draper, found, drapes = self.draper("six"), {}, []
+        draper, found, drapes = self.draper(PACKAGE), {}, []
         for garment, kind in POSES:
             motion = onefit.Motion.generate(kind, seconds=self.seconds, seed=accuracy.SEED)
             drape = draper.drape(garment, motion, post=False, eased=False)
@@ -164,9 +170,7 @@ class Bench:
         """The T-shirt at several resolutions: ε_c, seconds to cut it, and milliseconds a frame of
         the least of five drapes, vertices included.
         """
-        if not self.has("six"):
-            return []
-        draper, rows = self.draper("six"), []
+        draper, rows = self.draper(PACKAGE), []
         motion = onefit.Motion.generate("walk", seconds=self.seconds, seed=accuracy.SEED)
         for count in COUNTS:
             garment, start = draper.garment("tshirt").remeshed(count), time.perf_counter()
@@ -246,6 +250,8 @@ def main(argv=None):
     for name in args.tables:
         found = getattr(bench, name)()
         print(f"{name}: {json.dumps(found, indent=1)}" if found else f"{name}: no network for it")
+        if isinstance(found, dict):
+            found = report.get(name, {}) | found
         if found:
             report[name] = found
     with aside(path) as temporary, open(temporary, "w", encoding="utf-8") as file:

@@ -9,7 +9,7 @@ the counts is kept: the best unknowns so far. Beside it stands the solver's late
 how much it wanders. Figures are those of the window's newest frame; a shorter video (``-D
 last=20``) tests another.
 
-Writes ``stability.json`` and ``stability.png``.
+Writes ``stability_SCENE.json`` and ``stability_SCENE.png``, for ``demo.xml`` those of ``demo``.
 """
 
 import argparse
@@ -277,7 +277,7 @@ def parser():
         "--out",
         metavar="FOLDER",
         default="out/benchmarks",
-        help="for stability.json and stability.png (default: out/benchmarks)",
+        help="for stability_SCENE.json and .png (default: out/benchmarks)",
     )
     add_mode_argument(p)
     return p
@@ -299,9 +299,11 @@ def main(arguments=None):
             options.scene, overrides, [*counts, usual], folder
         )
     truth = truth_of(problem, frame, options.truth)
+    scene = os.path.basename(options.scene)
+    result = os.path.join(options.out, f"stability_{os.path.splitext(scene)[0]}")
     rows = figures_of(surfaces, wandering, watched, usual, truth)
     picture(
-        os.path.join(options.out, "stability.png"),
+        f"{result}.png",
         problem,
         frame,
         surfaces,
@@ -311,19 +313,19 @@ def main(arguments=None):
         truth,
     )
     report = {
-        "scene": os.path.basename(options.scene),
+        "scene": scene,
         "overrides": overrides,
         "frame": int(problem.sequence.indices[frame]),
         "versions": outputs.versions(),
         "counts": {str(n): rows[n] for n in counts},
         "curve": {str(n): rows[n] for n in sorted(rows)},
     }
-    outputs.write_json(os.path.join(options.out, "stability.json"), report)
+    outputs.write_json(f"{result}.json", report)
     names = list(rows[counts[0]])
     print("iterations" + "".join(f"{name:>18s}" for name in names))
     for n in counts:
         print(f"{n:10d}" + "".join(f"{rows[n][name]:18.5g}" for name in names))
-    print(f"frame {report['frame']}; in {options.out}: stability.json, stability.png")
+    print(f"frame {report['frame']}; written: {result}.json, {result}.png")
 
 
 if __name__ == "__main__":

@@ -34,8 +34,8 @@ what it says: the command is there, the hours were not.
 
 def read(folder=DOCS):
     """The JSON files of ``folder`` by their names; an empty dict where there is none."""
-    names = ("sft", "stability", "polyfit_reconstruction", "polyfit_accuracy", "onefit_paper")
-    names += ("onefit_speed", "readings", "stretch")
+    names = ("sft", "stability_demo", "stability_kinect_paper", "readings", "stretch")
+    names += ("polyfit_reconstruction", "polyfit_accuracy", "onefit_paper", "onefit_speed")
     found = {}
     for name in names:
         path = Path(folder) / f"{name}.json"

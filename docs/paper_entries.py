@@ -164,21 +164,20 @@ SECTIONS = {
                 "python benchmarks/stretch.py OUT/jet --masks OUT/kinect/masks -o docs",
             ),
             figures.readings,
-            "φ-SfT's program takes the mean absolute difference of each channel of the pixel "
-            "values as they are stored, over the whole image, and half the weight of the same of "
-            "blurred masks; the preset a root mean square over the channels of linear colours, "
-            "and squares of sharp masks, over the sheet's area. The first table says that this is "
-            "not what decides: where the sheet moves by 6 to 14 pixels a frame, 35 at most, no "
-            "photometric loss falls by more than a tenth in the first third of the way, and a "
-            "silhouette by a third. The stretches, each begun where the default solver was, say "
-            "the same of whole descents: in frames 114 and 115 every reading loses the sheet, "
-            "with the right masks, too. The sequence has none; those of `prepare` run along the "
-            "print's border, 2 % too large, and the sheet comes as much nearer. Without masks the "
-            "preset drifts before that: the sheet is stretched over the white paper around the "
-            "print, which costs little with lengths in the template's scale. The authors' earlier "
-            "program (github.com/dvttran/nsft) has them in the files' unit, here millimetres; read "
-            "so, k_mi = 0.1 is 3,849 of ours, the sheet keeps its lengths, and drifts half as far. "
-            "Where files are in metres, 0.1 would be 0.004, and hold nothing.",
+            "How the losses are read is not what decides. φ-SfT's program takes absolute "
+            "differences of stored pixel values over the whole image, and blurred masks; the "
+            "preset the root mean square over the channels of linear colours, and squares of sharp "
+            "masks, over the sheet. No photometric "
+            "reading falls by more than a tenth in the first third of the way from frame to frame "
+            "(first table). The sheet is lost in two ways. It drifts, from frame 20 on (second "
+            "table): the paper around the print is white, there is no mask, and k_mi = 0.1 with "
+            "lengths in the template's scale lets the sheet stretch. With lengths in millimetres, "
+            "as the authors' earlier program (github.com/dvttran/nsft) has them here, 0.1 is 3,849 "
+            "of ours, and the sheet drifts half as far; in metres it would be 0.004, and hold "
+            "nothing. And it falls behind where the sheet is fast, 6 to 35 pixels a frame, in "
+            "frames 114 and 115: by every reading, even from the right surface and with the right "
+            "masks (third table). Masks of `prepare` run along the print's border, 2 % too large, "
+            "so the sheet comes nearer.",
         ),
         Entry(
             "Table 3",
@@ -227,13 +226,16 @@ SECTIONS = {
             (
                 "python -m onefit.train --motions AMASS/a.npz -o RUNS/six --preset paper",
                 "python benchmarks/onefit_paper.py RUNS --short 60 --train six",
+                "python benchmarks/onefit_paper.py RUNS-LONGER --short 600 --train six",
                 "python benchmarks/onefit_paper.py RUNS --commands",
             ),
             figures.onefit_trainings,
-            "The full trainings are not done: on two cores each takes ten hours. The short ones "
-            "(`--short 60`) have 720 steps of a tenth of the batch, on one core of a busy machine. "
-            "They show what each loss and each garment of the training brings; not what the method "
-            "reaches in the end. All tables of OneFit here are by them.",
+            "The full trainings are not done: on two cores each takes five to ten hours. The short "
+            "ones (`--short 60`) have 720 steps of a tenth of the batch, on one core of a busy "
+            "machine; they show what each loss and each garment of the training brings. *package* "
+            "has ten times as many: it is the network `paper` of the package, which `python -m "
+            "onefit.drape --preset paper` takes. A whole one has as many steps of ten times the "
+            "batch.",
         ),
         Entry(
             "Figure 5",
@@ -252,14 +254,14 @@ SECTIONS = {
             figures.collisions,
             "Bodies, motions and garments are others. What a dress alone has taught goes through "
             "other garments' bodies here, too, and what six have taught does not. The package's "
-            "weights, by more inputs, k_c = 4 and cuts, are in [onefit.md](onefit.md#figures).",
+            "other weights, by more inputs, k_c = 4 and cuts, are in "
+            "[onefit.md](onefit.md#figures).",
         ),
         Entry(
             "Figures 7 and 8",
             "Loose and tight garments, beside other methods.",
             (
-                "python -m onefit.drape dress dance -o OUT --preset paper "
-                "--weights RUNS/six/weights.safetensors",
+                "python -m onefit.drape dress dance -o OUT --preset paper",
                 "python -m onefit.drape dress dance -o OUT --preset paper --post",
             ),
             None,
@@ -270,12 +272,12 @@ SECTIONS = {
             "Figure 9",
             "Extreme poses: a high kick in a dress, a cobra in a tank top.",
             (
-                "python -m onefit.drape dress kick -o OUT --preset paper "
-                "--weights RUNS/six/weights.safetensors",
+                "python -m onefit.drape dress kick -o OUT --preset paper",
                 f"{ONEFIT} --tables poses",
             ),
             figures.poses,
-            "ε_c in motions of our own that are as extreme, of seeds that no training uses.",
+            "ε_c in motions of our own that are as extreme, of seeds that no training uses; by the "
+            "package's network.",
         ),
         Entry(
             "Table 5",

@@ -172,16 +172,18 @@ def seconds(data):
 
 
 def stability(data):
-    found = data["stability"].get("counts")
-    if not found:
-        return ""
-    names = ("change_rms_mm", "rmse_mm", "seconds")
-    rows = [
-        (count, *(f"{row[k]:.1f}" if k in row else "" for k in names))
-        for count, row in found.items()
-    ]
+    names, shown = ("change_rms_mm", "rmse_mm", "seconds"), []
     head = ("iterations", "from the surface at 300, mm", "error, mm", "processor's time, s")
-    return f"{table(head, rows)}\n\n![Surfaces by iterations](stability.png)"
+    for scene in ("demo", "kinect_paper"):
+        found = data[f"stability_{scene}"].get("counts", {})
+        rows = [
+            (count, *(f"{row[k]:.1f}" if k in row else "" for k in names))
+            for count, row in found.items()
+        ]
+        if rows:
+            picture = f"![Surfaces by iterations, {scene}](stability_{scene}.png)"
+            shown += [table((f"{scene}: {head[0]}", *head[1:]), rows), picture]
+    return "\n\n".join(shown)
 
 
 def onefit_trainings(data):
@@ -195,8 +197,9 @@ def onefit_trainings(data):
 
 def collisions(data):
     found, rows = data["onefit_paper"].get("collisions", {}), []
-    for name, values in COLLISIONS.items():
-        rows.append((name, "paper", *(f"{v:.2f}" for v in values)))
+    for name in dict.fromkeys([*COLLISIONS, *found]):
+        if name in COLLISIONS:
+            rows.append((name, "paper", *(f"{v:.2f}" for v in COLLISIONS[name])))
         if name in found:
             own = [found[name]["trousers" if g == "pants" else g] for g in SIX]
             rows.append((name, "ours", *(f"{v:.2f}" for v in own)))
@@ -205,10 +208,11 @@ def collisions(data):
 
 def jumpsuit(data):
     found = data["onefit_paper"].get("jumpsuit", {})
-    told = lambda name: f"{found[name]:.2f}" if name in found else "not measured yet"
-    return table(
-        ("ε_c %", "paper", "ours"), [(k, f"{v:.2f}", told(k)) for k, v in JUMPSUIT.items()]
-    )
+    rows = []
+    for name in dict.fromkeys([*JUMPSUIT, *found]):
+        paper = f"{JUMPSUIT[name]:.2f}" if name in JUMPSUIT else ""
+        rows.append((name, paper, f"{found[name]:.2f}" if name in found else "not measured yet"))
+    return table(("ε_c %", "paper", "ours"), rows)
 
 
 def losses(data):

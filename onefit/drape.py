@@ -27,8 +27,8 @@ import argparse
 from onefit.draping import command
 from polyfit.errors import cli
 
-# The paper: what the network alone makes; --post beside it pushes cloth out of the body
-PRESETS = {"paper": dict(post=False, ease=False)}
+# The paper: what its network alone makes; --post beside it pushes cloth out of the body
+PRESETS = {"paper": dict(weights="paper", post=False, ease=False)}
 
 
 def parser():

@@ -123,7 +123,9 @@ class PlacedMesh:
     def image(
         self, vertices: mi.Point3f, seed: int = 0, spp: int = 1, crop: Crop | None = None
     ) -> tuple[mi.TensorXf, mi.TensorXf]:
-        """Render the surface: (rgb (H, W, 3), linear, over black, and alpha (H, W, 1)), attached to the vertices (Point3f of N [m, world]); of the whole image, or of a ``crop``."""
+        """Render the surface: (rgb (H, W, 3), linear, over black, and alpha (H, W, 1)), attached
+        to the vertices (Point3f of N [m, world]); of the whole image, or of a ``crop``.
+        """
         self.place(vertices)
         crop = crop or Crop(0, 0, *self.size)
         if self.is_raster:

@@ -45,18 +45,18 @@ def test_tables_of_what_is_trained(runs, tmp_path):
     made = (runs / "six" / "weights.safetensors").stat().st_mtime_ns
     bench.main([str(runs), "--train", "six", "--short", "1"])  # is there already
     assert (runs / "six" / "weights.safetensors").stat().st_mtime_ns == made
-    (tmp_path / "onefit_paper.json").write_text('{"jumpsuit": {"six": 7.0}, "styles": {"old": 1}}')
+    (tmp_path / "onefit_paper.json").write_text('{"jumpsuit": {"six": 7.0}, "losses": {"old": 1}}')
     tables = ["trained", "losses", "styles", "poses", "resolutions"]
     words = ["--tables", *tables, "--seconds", "0.1", "--shapes", "0", "-o", str(tmp_path)]
     bench.main([str(runs), *words])
     report = json.loads((tmp_path / "onefit_paper.json").read_text())
-    assert report["jumpsuit"] == {"six": 7.0} and report["styles"] == {"old": 1}  # no new ones
-    assert set(report["trained"]) == {"six", "jumpsuit-tuned", "tank-no-col"}
+    assert report["jumpsuit"] == {"six": 7.0}  # not asked for
+    assert set(report["trained"]) == {"six", "jumpsuit-tuned", "tank-no-col", "package"}
     assert report["trained"]["tank-no-col"]["steps"] == 1
-    assert list(report["losses"]) == ["no collision"]
+    assert list(report["losses"]) == ["old", "no collision"]  # what RUNS lacks stays
     (row,) = report["resolutions"]
     assert 400 < row["vertices"] < 900 and row["ms"] > 0
-    draper = onefit.load(runs / "six" / "weights.safetensors")
+    draper = onefit.load("paper")
     assert draper.network.shape["extras"] == []
     motion = onefit.Motion.generate("bend", seconds=0.1, seed=bench.accuracy.SEED)
     alone = draper.drape("tank", motion, post=False, eased=False).measures().collision
