@@ -314,7 +314,7 @@ def main(arguments=None):
     )
     report = {
         "scene": scene,
-        "overrides": overrides,
+        "overrides": {name: x for name, x in overrides.items() if name != "data"},
         "frame": int(problem.sequence.indices[frame]),
         "versions": outputs.versions(),
         "counts": {str(n): rows[n] for n in counts},

@@ -219,7 +219,7 @@ class Brightness:
         centre = corner.sum(1) / 3
         normal *= -np.sign(np.einsum("fk,fk->f", normal, centre - origin))[:, None]
         value = light[0] + normal @ light[1:4] + (centre - self.centre) @ light[4:] / self.unit
-        value = np.maximum(value, self.rules.light_dimmest * abs(light[0]))
+        value = np.maximum(value, 0.0)  # no light is less than none
         total, count = (
             sum(np.bincount(k, w, len(vertices)) for k in self.faces.T)
             for w in (value, np.ones(len(value)))

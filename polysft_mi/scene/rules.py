@@ -154,7 +154,6 @@ class Rules:
     light_ridge: float = _rule(
         3e-3, "observations", "a triangle, that hold the light to be the same from all sides"
     )
-    light_dimmest: float = _rule(0.1, "share", "of the ambient light that a triangle has at least")
     light_refits: int = _rule(3, "", "of a frame's robust regression")
     light_kept: float = _rule(
         0.8, "share", "of what earlier frames say of light, a frame later", row="light's memory"
