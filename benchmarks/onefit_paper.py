@@ -44,6 +44,7 @@ TRAININGS = {
     "tank-no-mesh-inext": ["tank", "--k-mi", "0"],
     "tank-no-inext": ["tank", "--k-i", "0"],
     "tank-no-col": ["tank", "--k-c", "0"],
+    "tank-pca": ["tank", "--frames", "pca"],
     "tank-no-boundary": ["tank", "--k-b", "0", "--k-bn", "0"],
     "tank-ours": ["tank", "--extras", *EXTRAS, "--frames", "pca", "--no-acvd"],
     "jumpsuit": ["jumpsuit"],
@@ -57,6 +58,7 @@ LOSSES = {
     "no inextensibility": "tank-no-inext",
     "no collision": "tank-no-col",
     "no boundary": "tank-no-boundary",
+    "frames by PCA alone": "tank-pca",
     "with our inputs and patches": "tank-ours",
 }
 STYLES = {  # of the tank top: measures of its pattern [m]

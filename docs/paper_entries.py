@@ -45,7 +45,9 @@ SECTIONS = {
             ("python -m polyfit garment.obj -o surface.ply --frames stn",),
             figures.turned,
             "With our cut PCA is right already, so the transformer is off by default; with plain "
-            "ACVD it brings more (the table above).",
+            "ACVD it brings more (the table above). OneFit's tank top comes out alike by both "
+            "(table 6), and so do most tracked sheets "
+            "([tracker.md](tracker.md#the-frame-of-a-sheets-jet)); both presets take it.",
         ),
         Entry(
             "Section 3, jets",
@@ -309,7 +311,8 @@ SECTIONS = {
             figures.losses,
             "Trained for minutes, 720 steps each. Mesh inextensibility and collision do what they "
             "do in the paper; without inextensibility edges change more, collisions do not. What "
-            "our inputs and patches bring is a row more, `--train tank-ours`.",
+            "our inputs and patches bring is a row more, `--train tank-ours`; what the transformer "
+            "does, another, `--train tank-pca`.",
         ),
         Entry(
             "Table 7",
@@ -375,7 +378,7 @@ SECTIONS = {
             None,
             "They do not ([conventions.md](conventions.md#solver-and-window)). Twelve frames of "
             "the demo take 1 min 25 s on two cores and end 8.7 mm RMSE from the truth (`polysft "
-            "evaluate OUT scenes/demo`); by default 36 s and 1.6 mm.",
+            "evaluate OUT scenes/demo`); by default 36 s and 1.9 mm.",
         ),
         Entry(
             "Figure, Paper-Bend",
