@@ -410,9 +410,9 @@ SECTIONS = {
             "Meshes of any resolution take about the same time.",
             (f"{ONEFIT} --tables resolutions",),
             figures.resolutions,
-            "The network's time is the same; the vertices, which someone wants to see, are not. The "
-            "cut into patches is another at each resolution, and with it what lies inside. By the "
-            "package's network, the T-shirt walking.",
+            "The network's time is the same; the vertices, which someone wants to see, are not. "
+            "The cut into patches is another at each resolution, and with it what lies inside. By "
+            "the package's network, the T-shirt walking.",
         ),
     ),
 }
