@@ -187,12 +187,16 @@ def stability(data):
 
 
 def onefit_trainings(data):
+    def asked(row):
+        own = row["command"].removeprefix("python -m onefit.train").partition("-o ")[0].strip()
+        return f"`{own}`" if own else ""
+
     found = data["onefit_paper"].get("trained", {})
     rows = [
-        (name, f"`{row['command']}`", row["steps"], row["batch"], f"{row['minutes']:.0f}")
+        (name, asked(row), row["steps"], row["batch"], f"{row['minutes']:.0f}")
         for name, row in found.items()
     ]
-    return table(("network", "command", "steps", "batch", "minutes"), rows) if rows else ""
+    return table(("network", "asked for", "steps", "batch", "minutes"), rows) if rows else ""
 
 
 def collisions(data):
