@@ -241,11 +241,11 @@ SECTIONS = {
             "Each is `python -m onefit.train`, what it asks for, and `-o RUNS/NETWORK --preset "
             "paper --epochs 12 --batch 2000 --epoch-steps` a twelfth of its steps; the lines are "
             "in `docs/onefit_paper.json`. The full trainings are not done: on two cores each takes "
-            "five to ten hours. The short ones (`--short 60`) have 720 steps of a tenth of the batch, on one core of a busy "
-            "machine; they show what each loss and each garment of the training brings. *package* "
-            "has ten times as many: it is the network `paper` of the package, which `python -m "
-            "onefit.drape --preset paper` takes. A whole one has as many steps of ten times the "
-            "batch.",
+            "five to ten hours. The short ones (`--short 60`) have 720 steps of a tenth of the "
+            "batch, on one core of a busy machine; they show what each loss and each garment of "
+            "the training brings. *package* has ten times as many: it is the network `paper` of "
+            "the package, which `python -m onefit.drape --preset paper` takes. A whole one has as "
+            "many steps of ten times the batch.",
         ),
         Entry(
             "Figure 5",
