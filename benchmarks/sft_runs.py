@@ -18,11 +18,7 @@ from polysft_mi.results.evaluation import evaluate, score
 from polysft_mi.results.truth import find_truth, load_npz
 from polysft_mi.surface import meshio
 
-# of the paper's solver everything but one patch and a trained frame, so that any template is taken
-_METHODS = {
-    "gauss-newton": ["solver=gauss-newton"],
-    "adam": ["preset=paper", "patches=0", "canonical_frame=pca"],
-}
+_METHODS = {"gauss-newton": ["solver=gauss-newton"], "adam": ["preset=paper"]}
 
 
 def command(sequence, method, folder, out, setup):

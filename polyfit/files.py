@@ -5,11 +5,16 @@ encoding programs write. And image files that are read without a word of the dec
 import codecs
 import contextlib
 import errno
+import json
+import math
 import os
 import shutil
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from .errors import InputError
 
@@ -38,6 +43,22 @@ def text_encoding(path: str | os.PathLike[str]) -> str:
     if len(head) > 1 and not any(head[1::2]):
         return "utf-16-le"
     return "utf-16-be" if len(head) > 1 and not any(head[::2]) else "utf-8"
+
+
+def json_text(value: Any, **options: Any) -> str:
+    """A value as JSON, which has no NaN and no infinity: they become null. Arrays' numbers are
+    numbers; ``options``: of :func:`json.dumps`.
+    """
+    return json.dumps(_plain(value), allow_nan=False, **options)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _plain(x) for name, x in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(x) for x in value]
+    value = value.item() if isinstance(value, np.generic) else value
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 @contextlib.contextmanager

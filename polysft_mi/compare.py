@@ -2,9 +2,10 @@
 figures, and pictures of where they differ.
 """
 
-import json
 import math
 import os
+
+from polyfit.files import json_text
 
 from . import commands
 from .errors import InputError, cli
@@ -80,7 +81,7 @@ def main(arguments=None):
 
         write_comparison(comparison, options.output, count=options.frames, scale=options.scale)
     if options.json:
-        print(json.dumps(figures))
+        print(json_text(figures))
     elif not options.quiet:
         rows = {"frames": figures["frames"], **figures["difference"]}
         commands.print_table(rows, LABELS, title=f"{options.a} against {options.b}")

@@ -2,7 +2,7 @@
 table or as JSON.
 """
 
-import json
+from polyfit.files import json_text
 
 from . import commands
 from .errors import cli
@@ -30,7 +30,7 @@ def main(arguments=None):
     options = parser().parse_args(arguments)
     figures = evaluate(options.out, options.truth)
     if options.json:
-        print(json.dumps(figures))
+        print(json_text(figures))
     else:
         commands.print_table(figures, LABELS, title=options.out)
     return 0

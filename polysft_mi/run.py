@@ -5,7 +5,6 @@ video.
 from __future__ import annotations
 
 import gc
-import json
 import os
 import shlex
 import sys
@@ -13,10 +12,13 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from polyfit.files import json_text
+
 from . import commands
 from .errors import InputError, cli
 from .results import Progress, folder
 
+_DOUBTS = 5  # lines of them
 _EXAMPLES = [
     ("scenes/demo.xml -o out/demo", "the demo; then open out/demo/report.html"),
     (
@@ -78,15 +80,11 @@ def execute(name, scene, options):
     ``name``, and print the result. Returns the exit status.
     """
     overrides = commands.definitions(options.define)
-    try:
-        exr_frames = sys.maxsize if options.exr == "all" else int(options.exr)
-        if exr_frames < 0 or not (options.fps is None or 0 < options.fps <= 1000):
-            raise ValueError
-    except ValueError:
-        raise InputError(
-            f"--exr {options.exr} --fps {options.fps}: a number of frames or 'all', and a rate"
-            " above 0, at most 1000, are needed"
-        ) from None
+    if options.exr != "all" and not options.exr.isdecimal():
+        raise InputError(f"--exr {options.exr}: a number of frames or 'all' is needed")
+    if options.fps is not None and not 0 < options.fps <= 1000:
+        raise InputError(f"--fps {options.fps:g}: a rate above 0, at most 1000, is needed")
+    exr_frames = sys.maxsize if options.exr == "all" else int(options.exr)
     outcome = reconstruct(
         scene,
         options.output,
@@ -101,7 +99,7 @@ def execute(name, scene, options):
         command=shlex.join(["python", "-m", f"polysft_mi.{name}", *sys.argv[1:]]),
     )
     if options.json and outcome.summary:
-        print(json.dumps(outcome.as_json(), default=float))
+        print(json_text(outcome.as_json()))
     else:
         print(outcome.as_text(), end="")
     return 130 if outcome.interrupted else 0
@@ -136,7 +134,9 @@ class Outcome:
             f"speed: {s['seconds_per_frame']:.2f} s a frame,"
             f" {s['iterations_per_window']:.0f} iterations a window",
             f"inside the surface: PSNR {s.get('psnr_mask', float('nan')):.2f} dB,"
-            f" SSIM {s.get('ssim_mask', float('nan')):.3f}",
+            f" SSIM {s.get('ssim_mask', float('nan')):.3f}"
+            + (f", silhouettes: IoU {s['iou']:.3f}" if "iou" in s else ""),
+            *_doubts(s.get("doubtful", {})),
             f"surfaces: {os.path.join(self.out, 'surface.npz')}",
             f"meshes: {os.path.join(self.out, 'meshes')}",
             f"pictures: {os.path.join(self.out, 'comparison.png')}",
@@ -150,6 +150,22 @@ class Outcome:
             other = os.path.join(self.out, folder.OTHER)
             lines.insert(-1, f"{first} a second surface explains the video nearly as well: {other}")
         return "".join(line + "\n" for line in lines)
+
+
+def _doubts(doubtful):
+    """A line for each row of frames that their surfaces do not explain."""
+    frames = [int(frame) for frame in doubtful]
+    rows: list[list[int]] = []
+    for frame in frames:
+        if rows and frame == rows[-1][-1] + 1:
+            rows[-1].append(frame)
+        else:
+            rows.append([frame])
+    for row in rows[:_DOUBTS]:
+        which = f"frames {row[0]} to {row[-1]}" if len(row) > 1 else f"frame {row[0]}"
+        yield f"doubtful: {which}: {doubtful[str(row[0])]}"
+    if len(rows) > _DOUBTS:
+        yield f"doubtful: and {sum(map(len, rows[_DOUBTS:]))} more frames, in metrics.json"
 
 
 def reconstruct(

@@ -100,6 +100,12 @@ class BodyMotion(_World):
         numbers = poses.dtype.kind in "fiu" and places.dtype.kind in "fiu"
         if not numbers or not (np.isfinite(poses).all() and np.isfinite(places).all()):
             raise InputError(f"{path}: poses and translation must be finite numbers")
+        longest = np.linalg.norm(poses, axis=2).max()
+        if longest > 1.001 * 2 * np.pi:
+            raise InputError(
+                f"{path}: a rotation vector of length {longest:.3g}; radians below 2π are needed:"
+                " in degrees? then multiply poses by π/180"
+            )
         frames = _of_video(path, len(poses), "poses", count, selected)
         fps = _rate(path, arrays, count, selected)
         poses, places = poses[frames].astype(float), places[frames].astype(float)

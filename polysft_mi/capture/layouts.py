@@ -46,7 +46,9 @@ def recognise(folder):
     file of a known form is missing.
     """
     if not os.path.isdir(folder):
-        raise InputError(f"{folder}: no such folder; the folder of a sequence is needed")
+        raise InputError(
+            f"{folder}: no such file or folder; a video, or the folder of a sequence is needed"
+        )
     has = lambda name: os.path.exists(os.path.join(folder, name))
     if any(map(has, kinect_paper.FILES)):
         return _kinect_paper(folder)

@@ -73,17 +73,66 @@ class Problem:
                 f" {low[0]:g}..{high[0]:g}, y {low[1]:g}..{high[1]:g} of an image of"
                 f" {self.width}x{self.height} pixels"
             )
+        import cv2
+
+        far = 10 * max(self.width, self.height)
+        corners = np.round(position.clip(-far, far)).astype(np.int32)[self.template.faces]
+        covered = np.zeros((self.height, self.width), np.uint8)
+        for triangle in corners:  # one by one: where two overlap, both together cut a hole
+            cv2.fillConvexPoly(covered, triangle, 1)
         mask = self.sequence.mask(0)
         if mask is not None:
-            import cv2
-
-            far = 10 * max(self.width, self.height)
-            corners = np.round(position.clip(-far, far)).astype(np.int32)[self.template.faces]
-            covered = np.zeros(mask.shape, np.uint8)
-            for triangle in corners:  # one by one: where two overlap, both together cut a hole
-                cv2.fillConvexPoly(covered, triangle, 1)
-            if not (mask[covered > 0] > 0).any():
+            sheet, masked = covered > 0, mask > 0.5
+            both = int((sheet & masked).sum())
+            # what passes before the sheet may hide most of it, but not be in the mask
+            if 2 * both < min(sheet.sum(), masked.sum()):
+                inverted = (sheet & ~masked).sum() > both and masked[~sheet].mean() > 0.5
+                hint = "; is it inverted? White is the sheet" if inverted else ""
                 raise InputError(
-                    f"{where} does not meet the mask of the first frame: it projects to x"
+                    f"{where} does not meet the mask of the first frame, {both} of whose"
+                    f" {int(masked.sum())} pixels it covers{hint}: it projects to x"
                     f" {low[0]:g}..{high[0]:g}, y {low[1]:g}..{high[1]:g}"
+                )
+        self._check_tracks(covered > 0)
+        self._check_depth(covered > 0, vertices)
+
+    def _check_tracks(self, covered):
+        """Raise InputError where tracks begin in the first frame, but none of them on the template,
+        ``covered`` (H, W).
+        """
+        tracks = self.sequence.tracks
+        if tracks is None or not (tracks.query == 0).any():
+            return
+        x, y = np.floor(tracks.positions[0, tracks.query == 0]).astype(int).T
+        inside = (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
+        if not covered[y[inside], x[inside]].any():
+            raise InputError(
+                f"{self.experiment.path}: tracks: none of the {len(x)} that begin in the first"
+                f" frame begins on the template; pixels of {self.width}x{self.height} are needed"
+            )
+
+    def _check_depth(self, covered, vertices):
+        """Raise InputError where the first depth image is of another shape than the frames, or of
+        another unit than the template.
+        """
+        images = self.sequence.depth
+        if images is None:
+            return
+        depth, path = images.read(0), images.files[0]
+        h, w = depth.shape
+        if abs(w * self.height - h * self.width) > 0.02 * w * self.height:
+            raise InputError(
+                f"{path}: {w}x{h} pixels are not of the shape of the frames,"
+                f" {self.width}x{self.height}; depth as the camera of the frames sees it is needed"
+            )
+        rows = ((np.arange(self.height) + 0.5) * h / self.height).astype(int)
+        columns = ((np.arange(self.width) + 0.5) * w / self.width).astype(int)
+        known = depth[rows[:, None], columns][covered]
+        known = known[known > 0]
+        if self.settings.depth_known_to == "metric" and len(known):
+            told, own = np.median(known), np.median(self.camera.to_camera(vertices)[:, 2])
+            if not 0.5 < told / own < 2:
+                raise InputError(
+                    f"{path}: {told:.3g} m where the template lies, whose distance is {own:.3g} m;"
+                    f" depth_unit = {images.unit:g} m must be wrong"
                 )

@@ -2,13 +2,12 @@
 EXR layers.
 """
 
-import json
 import os
 import re
 
 import numpy as np
 
-from polyfit.files import folder_aside
+from polyfit.files import folder_aside, json_text
 from polysft_mi.backend import set_variant
 from polysft_mi.errors import InputError
 from polysft_mi.results.comparison import LABELS
@@ -53,8 +52,8 @@ def write_comparison(comparison, out, *, count=20, scale=None):
         columns = {n: v for n, v in comparison.figures["per_frame"].items() if n != "shared"}
         figures.frame_plot(os.path.join(folder, "figures.png"), columns, LABELS)
         with open(os.path.join(folder, "compare.json"), "w", encoding="utf-8") as file:
-            json.dump({**comparison.figures, "false_colour_mm": scale}, file, indent=1)
-            file.write("\n")
+            known = {**comparison.figures, "false_colour_mm": scale}
+            file.write(json_text(known, indent=1) + "\n")
     return len(shown)
 
 

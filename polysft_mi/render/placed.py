@@ -121,11 +121,13 @@ class PlacedMesh:
         return Crop.around([own, *boxes], margin + 1, self.size, grid)  # 1: antialiasing blends
 
     def image(
-        self, vertices: mi.Point3f, seed: int = 0, spp: int = 1, crop: Crop | None = None
+        self, vertices: mi.Point3f, seed: int = 0, spp: int = 0, crop: Crop | None = None
     ) -> tuple[mi.TensorXf, mi.TensorXf]:
         """Render the surface: (rgb (H, W, 3), linear, over black, and alpha (H, W, 1)), attached
-        to the vertices (Point3f of N [m, world]); of the whole image, or of a ``crop``.
+        to the vertices (Point3f of N [m, world]); of the whole image, or of a ``crop``. ``spp``:
+        samples a pixel; 0: 1 by raster, 4 by path replay, which has noise.
         """
+        spp = spp or (1 if self.is_raster else 4)
         self.place(vertices)
         crop = crop or Crop(0, 0, *self.size)
         if self.is_raster:

@@ -45,7 +45,7 @@ def check_output(out, *, resume=False, overwrite=False):
         raise InputError(f"{out}: holds no run to resume; leave out --resume to start one")
     if holds_run and not (overwrite or resume):
         raise InputError(
-            f"{out}: holds another run; give --overwrite to replace it or --resume to continue it"
+            f"{out}: holds a run; give --overwrite to replace it or --resume to continue it"
         )
     if os.path.isdir(out) and os.listdir(out) and not holds_run:
         raise InputError(f"{out}: is not empty and holds no run; give an empty or new folder")

@@ -4,7 +4,7 @@ Import only after a Mitsuba variant is set.
 """
 
 import dataclasses
-import json
+import math
 import os
 import platform
 import time
@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from polyfit.files import aside
+from polyfit.files import aside, json_text
 from polyfit.mesh import write_ply
 from polysft_mi import __version__
 from polysft_mi.scene import located, written
@@ -23,6 +23,8 @@ from polysft_mi.surface import Unknowns
 from .folder import OTHER
 from .truth import uv_arrays
 
+# below these a frame's surface explains its image hardly better than any would
+_LEAST_IOU, _LEAST_SSIM = 0.8, 0.4
 _PARAMS = ("alpha", "patch", "weight", "chart", "rest", "scale", "radius")
 
 
@@ -41,8 +43,7 @@ def versions():
 
 def write_json(path, value):
     with aside(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
-        json.dump(value, file, indent=1, default=float)
-        file.write("\n")
+        file.write(json_text(value, indent=1) + "\n")
 
 
 def resolved_scene(experiment):
@@ -135,6 +136,7 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
         "frames": count,
         "frames_wanted": len(sequence.indices),
         "lost": {str(int(indices[k])): reason for k, reason in track.lost.items() if k < count},
+        "doubtful": _doubtful(indices, per_frame),
         **({"undecided": undecided} if undecided else {}),
         **_means(per_frame),
         "seconds_per_frame": float(sum(track.seconds) / count),
@@ -166,6 +168,21 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
         },
     )
     return {**summary, "video": video}, plotted
+
+
+def _doubtful(indices, per_frame):
+    """Of each frame that its surface does not explain, why: its number, as text, to a reason."""
+    found = {}
+    for index, figures in zip(indices, per_frame):
+        iou, ssim = (figures.get(name, math.nan) for name in ("iou", "ssim_mask"))
+        reasons = []
+        if iou < _LEAST_IOU:
+            reasons.append(f"its silhouette does not meet the mask (IoU {iou:.2f})")
+        if ssim < _LEAST_SSIM:
+            reasons.append(f"it does not look like the image (SSIM {ssim:.2f})")
+        if reasons:
+            found[str(int(index))] = " and ".join(reasons)
+    return found
 
 
 def _means(per_frame):

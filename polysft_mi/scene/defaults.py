@@ -16,7 +16,9 @@ def known_defaults(path):
     missing or not XML.
     """
     if not os.path.isfile(path):
-        raise InputError(f"{path}: no such scene file")
+        inside = os.path.join(path, "scene.xml")
+        hint = f"; {inside} is one" if os.path.isfile(inside) else ""
+        raise InputError(f"{path}: no such scene file{hint}")
     try:
         root = ET.parse(path).getroot()
     except (ET.ParseError, ValueError, LookupError) as error:  # the latter two: encodings

@@ -41,7 +41,9 @@ def list_images(pattern, what="images", endings=EXTENSIONS):
         and os.path.isfile(p)
     ]
     if not images:
-        kind = "folder" if os.path.isdir(pattern) else "pattern"
+        kind = "pattern" if "*" in pattern else "folder"
+        if kind == "folder" and not os.path.isdir(pattern):
+            raise InputError(f"{what}: {pattern}: no such folder")
         raise InputError(
             f"{what}: {pattern}: no images in this {kind}; PNG, JPEG, TIFF, EXR and the like are"
             " read"

@@ -19,6 +19,8 @@ from polysft_mi.errors import InputError
 from .evidence import DepthImages, Tracks
 from .images import checked_size, finite, list_images, read_pixels
 
+_LEAST_AREA = 0.01  # of the first mask's area; what is smaller is no mask
+
 
 class Sequence:
     """The selected frames of a video; ``frame(i)`` and ``mask(i)`` count from 0 in the selection,
@@ -29,7 +31,8 @@ class Sequence:
     ``tracks``, ``depth``: what is known beside the images, or None; ``cameras``: others than the
     scene's own (:class:`polysft_mi.scene.cameras.OtherCamera`); ``count``: of all images;
     ``carrier``: what carries the template with a body
-    (:class:`polysft_mi.body.carrier.Carrier`), or None.
+    (:class:`polysft_mi.body.carrier.Carrier`), or None; ``unmasked``: frames whose mask is empty,
+    or nearly.
     """
 
     tracks: Tracks | None = None
@@ -37,6 +40,7 @@ class Sequence:
     cameras: Iterable[Any] = ()
     carrier: Carrier | None = None
     count: int = 0
+    unmasked: frozenset[int] = frozenset()
 
     def __init__(
         self,
@@ -118,12 +122,20 @@ class Sequence:
             sequence.tracks = Tracks.read(tracks, len(paths), indices, track_centre)
         if depth:
             sequence.depth = DepthImages.open(depth, len(paths), indices, depth_unit)
-        first_mask = sequence.mask(0)
-        if mask_files and first_mask is not None and not first_mask.any():
-            raise InputError(
-                f"{mask_files[0]}: the mask is empty; the template must be seen in the first frame"
-            )
+        if mask_files:
+            with ThreadPoolExecutor(min(8, cores())) as pool:
+                areas = list(pool.map(sequence._mask_area, range(len(files))))
+            if not areas[0]:
+                raise InputError(
+                    f"{mask_files[0]}: the mask is empty; the template must be seen in the first"
+                    " frame"
+                )
+            least = _LEAST_AREA * areas[0]
+            sequence.unmasked = frozenset(k for k, area in enumerate(areas) if area < least)
         return sequence
+
+    def _mask_area(self, i):
+        return float(self.mask(i).sum())
 
     def __len__(self) -> int:
         return len(self.files)

@@ -235,7 +235,11 @@ class Settings:
         choices=("auto", "previous"),
     )
     spp: int = _setting(
-        1, "samples a pixel; raster takes square numbers (1, 4, 9, ...)", low=1, solver="adam"
+        0,
+        "samples a pixel; raster takes square numbers (1, 4, 9, ...); 0: 1 by raster, 4 by path"
+        " replay",
+        low=0,
+        solver="adam",
     )
     sppi: int = _setting(
         0,
@@ -355,6 +359,8 @@ PRESETS: dict[str, dict[str, object]] = {
         **dict.fromkeys(("k_shading", "k_volume", "k_bend", "k_coupling", "k_uv", "k_relief"), 0.0),
         "rgb_norm": "l1",
         "rgb_region": "image",
+        "silhouette_norm": "l2",
+        "mask_blur": 0.0,
         "brightness": "none",
         "mi_norm": "l2",
         "tc_basis": "monomial",
@@ -366,7 +372,8 @@ PRESETS: dict[str, dict[str, object]] = {
         "texture_fit": "none",
         "blur": 0.0,
         "starts": "previous",
-        "spp": 1,
+        "spp": 0,
+        "sppi": 0,
         "smooth": 0.0,
         "sweeps": 0,
     },

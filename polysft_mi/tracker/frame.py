@@ -282,6 +282,8 @@ class FrameTracker:
             shade = self.objective.data.shade(vertices, context.frame, seen, model.appearance)
             light = light.updated(shade)
         nat, colours = self.objective.nat_and_colours(context, model)
+        if not nat:  # nothing was compared
+            nat, colours = math.nan, 1.0
         return FrameMemory(
             misfit=found.misfit,
             outlier_share=model.evaluation.outlier_share,

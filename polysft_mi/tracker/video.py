@@ -213,6 +213,8 @@ def _advance(tracker, done, start, width, log, progress):
         done.states.append(
             dict(done.states[-1]) if done.states else problem.patch.rest().to_numpy()
         )
+    for k in problem.sequence.unmasked.intersection(members):
+        done.unusable[k] = "its mask is empty, or nearly"
     began, newest, latest = time.perf_counter(), members[-1], 0
 
     def record(iteration, total, terms, **more):

@@ -108,6 +108,9 @@ class Masks:
         x, y, w, h = cv2.boundingRect(outer)
         window = np.s_[max(0, y - 4 * r) : y + h + 4 * r, max(0, x - 4 * r) : x + w + 4 * r]
         part = np.ascontiguousarray(trimap[window])
+        sides = {cv2.GC_FGD, cv2.GC_PR_FGD}, {cv2.GC_BGD, cv2.GC_PR_BGD}
+        if any(side.isdisjoint(np.unique(part)) for side in sides):  # it fills the picture
+            return expected
         cv2.setRNGSeed(0)
         cv2.grabCut(
             np.ascontiguousarray(image[window]),

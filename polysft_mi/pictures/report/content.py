@@ -161,6 +161,10 @@ def warning(run):
             f"Undecided: from frame {known['from']} on a second surface, up to"
             f" {known['apart_mm']:.1f} mm away, explains the video nearly as well (other.npz)."
         )
+    if doubtful := {k: v for k, v in run.metrics.get("doubtful", {}).items() if k not in lost}:
+        frame, reason = next(iter(doubtful.items()))
+        more = f" So are {len(doubtful) - 1} more frames." if len(doubtful) > 1 else ""
+        texts.append(f"Frame {frame} is doubtful: {reason}.{more}")
     texts += [f"Frame {frame}: {reason}." for frame, reason in list(lost.items())[:5]]
     return " ".join(texts + ([f"And {len(lost) - 5} more lost frames."] if len(lost) > 5 else []))
 

@@ -1,12 +1,9 @@
 """One page, in one file, that shows a run in any browser and without a network."""
 
-import json
 import os
 from importlib import resources
 
-import numpy as np
-
-from polyfit.files import aside
+from polyfit.files import aside, json_text
 from polysft_mi.errors import InputError
 from polysft_mi.results import Run
 
@@ -65,9 +62,7 @@ def write_report(out, path=None, *, truth=None, frames=200, positions=450_000):
 
     page = resources.files("polysft_mi").joinpath("data/report.html").read_text(encoding="utf-8")
     text = (
-        json.dumps(_finite(data), separators=(",", ":"), allow_nan=False)
-        .replace("</", "<\\/")
-        .replace("<!--", "<\\u0021--")
+        json_text(data, separators=(",", ":")).replace("</", "<\\/").replace("<!--", "<\\u0021--")
     )
     title = data["title"].replace("&", "&amp;").replace("<", "&lt;")
     for name, value in (("title", title), ("plotly", get_plotlyjs()), ("data", text)):
@@ -87,14 +82,3 @@ def _shows(run):
         f"The pictures are cropped to the sheet: x {box.left} to {box.right}, y {box.top} to"
         f" {box.bottom} of {camera.width}×{camera.height} pixels."
     )
-
-
-def _finite(value):
-    """The same for JSON: numbers that are not finite become null."""
-    if isinstance(value, dict):
-        return {k: _finite(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite(v) for v in value]
-    if isinstance(value, (float, np.floating)):
-        return float(value) if np.isfinite(value) else None
-    return value.item() if isinstance(value, np.generic) else value

@@ -105,3 +105,11 @@ def test_the_map_follows_a_bent_sheet():
     for k in (0.25, 0.5, 0.75, 1.0):
         shown = registration.next(warp(frame, k))
     assert iou(shown, warp(cover.astype(np.float32), 1.0)) > 0.97
+
+
+@pytest.mark.parametrize("border", [0, 2])
+def test_a_sheet_that_fills_the_picture_is_its_own_mask(border):
+    shown = np.pad(np.full((240 - 2 * border, 320 - 2 * border), 255, np.uint8), border)
+    masks, frame = Masks((320, 240)), cv2.resize(photo(), (320, 240))
+    assert (masks.first(frame, shown) > 0).mean() > 0.95
+    assert (masks.next(frame) > 0).mean() > 0.95

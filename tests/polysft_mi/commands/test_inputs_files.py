@@ -6,10 +6,11 @@ untouched.
 
 import shutil
 
+import cv2
 import numpy as np
 import pytest
 import synthetic
-from refusals import edited, has, refused
+from refusals import QUICK, SIZE, edited, has, refused
 
 from polyfit import write_ply
 from polysft_mi import run
@@ -33,7 +34,7 @@ def test_files_are_missing(sheet, name):
     has(
         refused(sheet / "scene.xml"),
         str(sheet / name) if name == "texture.png" else name,
-        "no such file" if name == "texture.png" else "no images",
+        "no such file" if name == "texture.png" else "no such folder",
     )
 
 
@@ -59,7 +60,7 @@ BAD_TEMPLATES = {
     ),
     "off the mask": (
         lambda t: moved(t, (0.15, 0.1, 0.5), 0.05),
-        ["does not meet the mask of the first frame: it projects to x"],
+        ["does not meet the mask of the first frame, 0 of whose", ": it projects to x"],
     ),
 }
 
@@ -69,6 +70,41 @@ def test_bad_template(good, sheet, kind):
     make, words = BAD_TEMPLATES[kind]
     synthetic.write_obj(sheet / "template.obj", *make(good))
     has(refused(sheet / "scene.xml"), *words)
+
+
+def test_masks_that_are_inverted(sheet):
+    for path in (sheet / "masks").iterdir():
+        cv2.imwrite(str(path), 255 - cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
+    message = refused(sheet / "scene.xml")
+    has(message, "does not meet the mask of the first frame", "is it inverted? White is the sheet")
+
+
+def test_tracks_that_are_no_pixels(good, sheet):
+    centre = np.array(SIZE) / 2
+    tracks = np.tile(centre, (3, 5, 1)) + np.arange(5)[:, None]
+    np.savez(sheet / "tracks.npz", tracks=tracks / SIZE)
+    options = "-D", f"tracks={sheet / 'tracks.npz'}"
+    has(refused(sheet / "scene.xml", *options), "tracks: none of the 5", "pixels of 48x36")
+    np.savez(sheet / "tracks.npz", tracks=tracks)
+    assert run.main([str(sheet / "scene.xml"), "-o", str(sheet / "out"), *QUICK[:3], *options]) == 0
+
+
+def test_depth_of_another_unit_or_shape(good, sheet):
+    (sheet / "depth").mkdir()
+
+    def given(metres, shape):
+        for k in range(3):
+            image = np.full(shape, round(1000 * metres), np.uint16)
+            cv2.imwrite(str(sheet / "depth" / f"{k:03d}.png"), image)
+        return "-D", f"depth={sheet / 'depth'}"
+
+    away = good.vertices[0][:, 2].mean()
+    message = refused(sheet / "scene.xml", *given(away / 10, SIZE[::-1]))
+    has(message, "000.png:", "m where the template lies", "depth_unit = 0.001 m must be wrong")
+    message = refused(sheet / "scene.xml", *given(away, (36, 36)))
+    has(message, "000.png: 36x36 pixels are not of the shape of the frames, 48x36")
+    options = given(away, SIZE[::-1])
+    assert run.main([str(sheet / "scene.xml"), "-o", str(sheet / "out"), *QUICK[:3], *options]) == 0
 
 
 @pytest.mark.parametrize("kind", ["obj", "ply"])

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 
+import cv2
 import numpy as np
 import pytest
 import synthetic
@@ -220,6 +221,34 @@ def test_a_frame_that_breaks_the_loss_is_reported_and_passed_over(
     assert (
         np.abs(s["vertices"][4] - s["vertices"][2]).max() > 1e-3
     )  # the frames after it are tracked on
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_a_frame_without_a_mask_is_reported_and_passed_over(sequence, tmp_path, capsys, solver):
+    folder = shutil.copytree(sequence.folder, tmp_path / "sheet")
+    mask = sorted((folder / "masks").iterdir())[2]
+    cv2.imwrite(str(mask), np.zeros((72, 96), np.uint8))
+    out = ran(folder, tmp_path / "out", "-D", "last=3", *SOLVERS[solver])
+    said = "frame 2: its mask is empty, or nearly; it keeps the state of the frame before"
+    assert said in capsys.readouterr().err
+    s, figures = surface(out), json.loads((out / "metrics.json").read_text())
+    assert np.array_equal(s["vertices"][2], s["vertices"][1]) and list(figures["lost"]) == ["2"]
+    if solver == "gauss-newton":
+        assert np.isnan(s["sigma"][2]).all()  # nothing is known of it
+        off = np.linalg.norm(s["vertices"][3] - sequence.vertices[3], axis=1)
+        assert np.median(off) < 0.01 * np.ptp(sequence.vertices[3], axis=0).max()
+
+
+def test_frames_that_the_surface_does_not_explain_are_called_doubtful(sequence, tmp_path, capsys):
+    folder = shutil.copytree(sequence.folder, tmp_path / "sheet")
+    frames, random = sorted((folder / "frames").iterdir()), np.random.default_rng(0)
+    for path in frames[2:4]:
+        cv2.imwrite(str(path), random.integers(0, 255, (72, 96, 3), np.uint8))
+    out = ran(folder, tmp_path / "out", "-D", "last=3", *SOLVERS["gauss-newton"])
+    assert list(json.loads((out / "metrics.json").read_text())["doubtful"]) == ["2", "3"]
+    assert (
+        "doubtful: frames 2 to 3: it does not look like the image (SSIM " in capsys.readouterr().out
+    )
 
 
 def test_a_surface_that_leaves_the_image_is_reported_and_held(

@@ -1,5 +1,7 @@
 """The paper's values in one word: over a scene's own, under those of -D."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import synthetic
@@ -35,6 +37,14 @@ def test_a_preset_wins_over_the_scene_and_a_value_that_is_given_over_both(sheet)
     assert chosen.k_tc == 0.05 and chosen.stride == 2  # the paper says nothing of the latter
     with pytest.raises(InputError, match="preset = 'papers'; known values: none, paper"):
         scene.load(sheet, {"preset": "papers"})
+
+
+def test_a_preset_says_all_but_what_the_input_is_and_how_it_is_read():
+    # weights of what it has not, too, and a scale of norms that it has not
+    data = "first last stride fps track_centre depth_unit depth_known_to body_model body_up seed"
+    unused = "k_cameras k_tracks k_depth k_drape k_pose rgb_scale"
+    names = {f.name for f in dataclasses.fields(Settings)}
+    assert names - set(PRESETS["paper"]) == {"preset", *data.split(), *unused.split()}
 
 
 def test_the_papers_objective_has_its_terms_alone_and_its_solver(sheet):
