@@ -2,7 +2,8 @@
 spatial transformer, against networks that regress jets; and what AtlasNet's autoencoder makes of
 garments that it has not seen.
 
-    python benchmarks/polyfit_accuracy.py DATA [--runs out/polyfit] [--train] [-o out/benchmarks]
+    python benchmarks/polyfit_accuracy.py DATA [--runs out/polyfit] [--train] [--only atlasnet]
+    [-o out/benchmarks]
 
 DATA holds ``garments_snug``, ``garments_makehuman`` and ``cloth``. The networks are read from RUNS,
 where ``--train`` makes those that are missing, each by the command that ``TRAININGS`` gives;
@@ -188,12 +189,17 @@ def measure(data, runs):
         rows,
     )
 
+    return report | atlasnet(data, runs)
+
+
+def atlasnet(data, runs):
+    """AtlasNet's table as a dictionary, printed."""
     clouds = {path: cloud(Path(data) / path) for path in HELD_OUT[: len(PAPER_ATLASNET[5])]}
-    report["atlasnet"], rows = {}, []
+    report, rows = {}, []
     for charts, paper in PAPER_ATLASNET.items():
         path = Path(runs) / f"atlasnet{charts}" / "weights.safetensors"
         if path.exists():
-            found = report["atlasnet"][charts] = {
+            found = report[charts] = {
                 name: autoencoded(AtlasNet.load(path), points) for name, points in clouds.items()
             }
             rows.append(
@@ -207,7 +213,7 @@ def measure(data, runs):
         ("", *(Path(p).stem for p in clouds)),
         rows,
     )
-    return report
+    return {"atlasnet": report}
 
 
 @torch.no_grad()
@@ -233,14 +239,17 @@ def main(argv=None):
         help="where the trained networks are (default: out/polyfit)",
     )
     p.add_argument("--train", action="store_true", help="train those that are missing")
+    p.add_argument("--only", choices=["atlasnet"], help="its table alone; the others stay")
     p.add_argument("-o", "--output", default="out/benchmarks")
     args = p.parse_args(argv)
+    path = Path(args.output, "polyfit_accuracy.json")
+    report = json.loads(path.read_text(encoding="utf-8")) if args.only and path.exists() else {}
     if args.train:
-        train_missing(args.data, args.runs)
-    report = measure(args.data, args.runs)
+        train_missing(args.data, args.runs, args.only or "")
+    report |= (atlasnet if args.only else measure)(args.data, args.runs)
     os.makedirs(args.output, exist_ok=True)
     with (
-        aside(os.path.join(args.output, "polyfit_accuracy.json")) as temporary,
+        aside(path) as temporary,
         open(temporary, "w", encoding="utf-8") as file,
     ):
         json.dump(report, file, indent=1)

@@ -105,9 +105,10 @@ def making(runs):
     return found
 
 
-def train_missing(data, runs, say=print):
+def train_missing(data, runs, only="", say=print):
+    """Train the networks that RUNS lacks, those whose names begin with ``only``."""
     for name, (options, on_garments) in TRAININGS.items():
-        if not (Path(runs) / name / "weights.safetensors").exists():
+        if name.startswith(only) and not (Path(runs) / name / "weights.safetensors").exists():
             meshes = [str(Path(data) / m) for m in TRAINED_ON] if on_garments else []
             say(f"training {name}")
             subprocess.run(

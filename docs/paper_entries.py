@@ -42,12 +42,17 @@ SECTIONS = {
             "Section 3, orientation",
             "PCA, then a rigid spatial transformer of unit quaternions, so that a patch is a "
             "height graph (figure 2a, and figure 1 of the supplement).",
-            ("python -m polyfit garment.obj -o surface.ply --frames stn",),
+            (
+                "python -m polyfit garment.obj -o surface.ply --frames stn",
+                f"{RECONSTRUCTION} --tables ways",
+            ),
             figures.turned,
             "With our cut PCA is right already, so the transformer is off by default; with plain "
             "ACVD it brings more (the table above). OneFit's tank top comes out alike by both "
-            "(table 6), and so do most tracked sheets "
-            "([tracker.md](tracker.md#the-frame-of-a-sheets-jet)); both presets take it.",
+            "(table 6), and so do most tracked sheets; the demo is better with it "
+            "([tracker.md](tracker.md#the-frame-of-a-sheets-jet)). PCA is the default there, for a "
+            "plain install has no torch. The presets take it: the tracker's and PolyFit's the one "
+            "of the paper's training, OneFit's the package's own, of five quaternions.",
         ),
         Entry(
             "Section 3, jets",
@@ -167,10 +172,10 @@ SECTIONS = {
             ),
             figures.readings,
             "How the losses are read is not what decides. φ-SfT's program takes absolute "
-            "differences of stored pixel values over the whole image, and blurred masks; the "
-            "preset the root mean square over the channels of linear colours, and squares of sharp "
-            "masks, over the sheet. No photometric "
-            "reading falls by more than a tenth in the first third of the way from frame to frame "
+            "differences of stored pixel values, and blurred masks; the preset the root mean "
+            "square over the channels of linear colours, and squares of sharp masks; both over the "
+            "whole image. No photometric reading falls by more than a tenth in the first third of "
+            "the way from frame to frame "
             "(first table). The sheet is lost in two ways. It drifts, from frame 20 on (second "
             "table): the paper around the print is white, there is no mask, and k_mi = 0.1 with "
             "lengths in the template's scale lets the sheet stretch. With lengths in millimetres, "
