@@ -33,6 +33,9 @@ PHI_SFT = {
     "mask_blur": 5.0,
     "k_silhouette": 0.5,
 }
+# nsft, by the paper's authors, weighs residuals by their size, and compares images' derivatives;
+# here: a robust norm, of images without their local mean and contrast
+CONTRAST = {"rgb_norm": "cauchy", "brightness": "local", "rgb_region": "sheet"}
 
 
 def begun(run, tracker, first, folder):
@@ -126,12 +129,16 @@ def main(arguments=None):
         )
     path = os.path.join(options.out, "stretch.json")
     stretch = f"{options.first} to {options.last}"
+    stiff = PRESETS["paper"]["k_mi"] * (1e3 * scale(run)) ** 2
     with tempfile.TemporaryDirectory() as masks:
         readings = {
             "preset": {},
-            "preset, lengths in mm": {"k_mi": PRESETS["paper"]["k_mi"] * (1e3 * scale(run)) ** 2},
+            "preset, lengths in mm": {"k_mi": stiff},
             "preset, right masks": {"masks": masks},
             "as in φ-SfT, right masks": {"masks": masks, **PHI_SFT},
+            "weights and contrast": CONTRAST,
+            "weights and contrast, right masks": {"masks": masks, **CONTRAST},
+            "weights and contrast, lengths in mm": {"k_mi": stiff, **CONTRAST},
         }
         if options.masks:
             readings["as in φ-SfT, masks of prepare"] = {"masks": options.masks, **PHI_SFT}
