@@ -129,7 +129,7 @@ SECTIONS = {
             (f"{RECONSTRUCTION} --tables paper", ACCURACY),
             figures.chamfer,
             "PolyFit is at the floor of the measure, two samplings of the same garment, here and "
-            "in the paper. Our AtlasNet, where it was trained, is no rival: minutes on six "
+            "in the paper. Our AtlasNet is no rival: minutes of training on six "
             "garments, against 5,000 in the paper ([polyfit.md](polyfit.md#training)). The dress "
             "is not among the templates that SNUG publishes.",
         ),
