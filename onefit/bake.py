@@ -12,11 +12,13 @@ It drapes the garment in some minutes of generated motion, and takes minutes its
 """
 
 import argparse
+from functools import partial
 from pathlib import Path
+from re import fullmatch
 
 from onefit.network import DEFAULT
-from polyfit.errors import InputError, Parser, cli, require
-from polyfit.files import folder_aside
+from polyfit.errors import Parser, cli, require
+from polyfit.files import check_aside, folder_aside
 
 
 def _parser():
@@ -56,11 +58,8 @@ def main(argv=None):
     from onefit.garment import Garment
 
     folder = Path(args.output)
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        if not args.overwrite:
-            raise InputError(f"{folder}: not empty; give another -o, or --overwrite")
-        if not (folder / "baked.npz").exists():
-            raise InputError(f"{folder}: holds no baked drape; --overwrite replaces nothing else")
+    ours = partial(_is_ours, folder)
+    check_aside(folder, ours, "baked.npz", "baked drape", args.overwrite)
     model = body_model("anny")
     shape = shape_of(model, args.shape) if args.shape else None
     motions = [motion_of(name, seconds=args.seconds, seed=args.seed) for name in args.motions]
@@ -70,13 +69,20 @@ def main(argv=None):
         baked = bake(draper, garment, shape, advance=advance)
     body = model.body(shape)
     folder.parent.mkdir(parents=True, exist_ok=True)
-    with folder_aside(folder, lambda name: True) as temporary:
+    with folder_aside(folder, ours) as temporary:
         baked.save(Path(temporary) / "baked.npz")
         for motion in motions:
             write_glb(Path(temporary) / f"{motion.name}.glb", baked, body, motion)
         write_page(Path(temporary) / "baked.html", baked, body, motions)
     print(folder)
     print(f"next: open {folder / 'baked.html'} in a browser")
+
+
+def _is_ours(folder, path):
+    """Whether the file ``path`` in ``folder`` is one that baking wrote."""
+    return path in ("baked.npz", "baked.html") or (
+        fullmatch(r"[^/]+\.glb", path) and b'"polyfit"' in (folder / path).read_bytes()
+    )
 
 
 def _progress():

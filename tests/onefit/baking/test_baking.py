@@ -208,3 +208,23 @@ def test_what_lies_there_is_kept(tmp_path):
         with pytest.raises(InputError, match=re.escape(str(tmp_path))):
             command.main(["skirt", "-o", str(tmp_path), *more])
     assert (tmp_path / "notes.txt").read_text() == "mine"
+
+
+def test_overwriting_replaces_what_was_baked_and_nothing_else(
+    baked, draper, motion, tmp_path, monkeypatch
+):
+    out, words = tmp_path / "out", ["skirt", "--motions", "walk", "--seconds", "0.2", "--overwrite"]
+    monkeypatch.setattr("onefit.baking.bake", lambda *_, **__: baked)
+    command.main([*words, "-o", str(out)])
+    write_glb(out / "older.glb", baked, draper.model.body(), motion)
+    command.main([*words, "-o", str(out)])
+    assert {p.name for p in out.iterdir()} == {"baked.npz", "baked.html", "walk-1000000.glb"}
+    for name in ("mine.glb", "notes.txt", "photos/1.png"):
+        (out / name).parent.mkdir(exist_ok=True)
+        (out / name).write_text("mine")
+        with pytest.raises(InputError, match=f"holds {name}, which is not of a baked drape"):
+            command.main([*words, "-o", str(out)])
+        assert (out / name).read_text() == "mine"
+        (out / name).unlink()
+    with pytest.raises(InputError, match="-o '/proc/x': /proc is not a folder"):
+        command.main(["no garment", "-o", "/proc/x"])

@@ -96,6 +96,41 @@ def test_what_is_there_is_not_lost(out, network):
         )
 
 
+def test_overwriting_replaces_a_drape_s_files_and_nothing_else(network, tmp_path):
+    out = tmp_path / "out"
+    quick = ["--weights", network, "--seconds", "0.1", "--skip", "usd", "render", "-o", str(out)]
+    drape.main(["shorts", "tank", "walk", "--meshes", "obj", *quick])
+    drape.main(["shorts", "walk", "--meshes", "ply", *quick, "--overwrite"])
+    assert {p.name for p in out.iterdir()} == {"drape.npz", "figures.json", "meshes"}
+    for name in (
+        "notes.txt",
+        "photos/1.png",
+        "meshes/mine.ply",
+        "2_tank/cut.obj",
+        "kept/drape.npz",
+    ):
+        (out / name).parent.mkdir(exist_ok=True)
+        (out / name).write_text("mine")
+        with pytest.raises(InputError, match=f"holds {name}, which is not of a drape"):
+            drape.main(["shorts", "walk", *quick, "--overwrite"])
+        assert (out / name).read_text() == "mine" and (out / "drape.npz").exists()
+        (out / name).unlink()
+        if not any((out / name).parent.iterdir()):
+            (out / name).parent.rmdir()
+
+
+def test_a_folder_that_cannot_be_written_is_told_before_the_work(tmp_path):
+    (tmp_path / "file.obj").write_text("")
+    for out, message in (
+        (tmp_path / "file.obj" / "sub", "file.obj is not a folder that can be written to"),
+        (tmp_path / "file.obj", "file.obj: is a file"),
+        ("/proc/x", "-o '/proc/x': /proc is not a folder"),
+    ):
+        with pytest.raises(InputError, match=message):
+            drape.main(["no garment", "no motion", "-o", str(out)])
+    assert [p.name for p in tmp_path.iterdir()] == ["file.obj"]
+
+
 @pytest.mark.parametrize(
     "arguments, message",
     [
