@@ -194,12 +194,41 @@ def test_a_browser_computes_the_same_vertices(baked, draper, motion, tmp_path):
         (["skirt", "--motions", "moonwalk"], "moonwalk"),
         (["scarf"], "scarf"),
         (["skirt", "--shape", "girth=1"], "girth"),
+        (["skirt", "--vertices", "3"], "--vertices 3: at least 100 are needed"),
+        (["skirt", "--up", "y"], "--up: for a garment's file; skirt is a template"),
+        (["skirt", "--fps", "60"], "--fps: for a motion file; dance is generated"),
+        (["skirt", "--motions", "walk", "dance", "walk"], "walk: another .* walk-1000000.glb, too"),
     ],
 )
 def test_what_cannot_be_baked_is_refused_at_once(arguments, message, tmp_path):
     with pytest.raises(InputError, match=message):
         command.main([*arguments, "-o", str(tmp_path / "out")])
     assert not (tmp_path / "out").exists()
+
+
+def test_what_files_do_not_say_is_said_by_the_flags_of_a_drape(
+    baked, garment, tmp_path, monkeypatch
+):
+    from polyfit.mesh import write_ply
+
+    seen = []
+    monkeypatch.setattr("onefit.baking.bake", lambda _, garment, *__, **___: seen.append(garment))
+    monkeypatch.setattr("onefit.bake.folder_aside", lambda *_: 1 / 0)
+    x, y, z = 100 * garment.vertices.double().numpy().T
+    write_ply(tmp_path / "skirt.ply", np.stack([x, z, -y], 1), garment.faces.numpy())
+    np.savez(tmp_path / "still.npz", poses=np.zeros((9, 72)), trans=np.zeros((9, 3)))
+    words = [str(tmp_path / "skirt.ply"), "-o", str(tmp_path / "out"), "--motions"]
+    words += ["walk", str(tmp_path / "still.npz")]
+    for more, message in (
+        ([], "give it: fps=30, or --fps 30"),
+        (["--fps", "60"], "give up='y', or --motion-up y"),
+        (["--fps", "60", "--motion-up", "y"], "it looks like .*y up"),
+    ):
+        with pytest.raises(InputError, match=message):
+            command.main([*words, *more])
+    with pytest.raises(ZeroDivisionError):  # where files are written
+        command.main([*words, *"--fps 60 --motion-up y --scale 0.01 --up y".split()])
+    assert (seen[0].vertices - garment.vertices).abs().max() < 1e-3
 
 
 def test_what_lies_there_is_kept(tmp_path):

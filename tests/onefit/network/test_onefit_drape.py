@@ -149,6 +149,13 @@ def test_a_folder_that_cannot_be_written_is_told_before_the_work(tmp_path):
         (("shorts", "walk", "--shape", "girth=3"), "--shape girth=3: choose among gender, age"),
         (("shorts", "walk", "--shape", "weight=heavy"), "--shape weight=heavy: a number is needed"),
         (("shorts", "walk", "--shape", "weight=2"), "weight = 2; phenotypes go from 0 to 1"),
+        (("shorts", "tank", "walk", "--scale", "0.01"), "--scale: for a garment's file; shorts is"),
+        (("shorts", "walk", "--made-for", "T-pose"), "--made-for: for a garment's file"),
+        (("shorts", "walk", "--turn", "90"), "--turn: for a garment's file"),
+        (("skirt", "walk", "--loose"), "--loose: for a garment's file"),
+        (("shorts", "walk", "--fps", "60"), "--fps: for a motion file; walk is generated"),
+        (("shorts", "walk", "--motion-up", "y"), "--motion-up: for a motion file"),
+        ((str(ROOT / "tests"), "walk"), "tests: is a folder; a garment is an .obj"),
         (("shorts", "walk", "--body", "nobody.npz"), "--body nobody.npz: no such file"),
     ],
 )
@@ -225,6 +232,23 @@ def test_what_a_motion_file_does_not_say_is_said_by_flags(network, tmp_path):
     drape.main([*arguments, "--fps", "60", "--motion-up", "y"])
     with np.load(tmp_path / "out" / "drape.npz") as file:
         assert len(file["vertices"]) == 5 and file["fps"] == 30  # 8 / 60 s
+
+
+def test_a_motion_file_is_cut_and_resampled_which_is_told(network, tmp_path, capsys):
+    path = str(tmp_path / "still.npz")
+    np.savez(path, poses=np.zeros((90, 72)), trans=np.zeros((90, 3)), fps=60)
+    words = ["shorts", path, "--weights", network, "--skip", "usd", "render"]
+    drape.main([*words, "--seconds", "0.2", "-o", str(tmp_path / "out")])
+    with np.load(tmp_path / "out" / "drape.npz") as file:
+        assert len(file["vertices"]) == 6 and file["fps"] == 30
+    assert f"{path}: 60 frames a second, resampled to 30\n" in capsys.readouterr().err
+    for flags, message in (
+        (["--seed", "1"], "--seed: for a generated motion; .*still.npz is a file"),
+        (["--seconds", "0"], "--seconds 0: more than 0 are needed"),
+        (["--seconds", "nan"], "--seconds nan: more than 0 are needed"),
+    ):
+        with pytest.raises(InputError, match=message):
+            drape.main([*words, *flags, "-o", str(tmp_path / "none")])
 
 
 def test_a_mesh_in_centimetres_with_y_up(network, tmp_path):
