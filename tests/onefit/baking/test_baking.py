@@ -66,6 +66,36 @@ def test_stream_is_the_batch(baked, motion):
         assert np.abs(stream(pose, place) - expected).max() < 1e-5
 
 
+@pytest.mark.parametrize("fps", [-1, 0, float("nan")])
+def test_no_frames_a_second_are_refused(baked, motion, fps):
+    for call in (lambda: baked.vertices(*arrays(motion), fps=fps), lambda: baked.stream(fps)):
+        with pytest.raises(InputError, match=f"^{fps} frames a second; a positive number"):
+            call()
+
+
+def test_what_is_no_motion_is_refused(baked, motion):
+    poses, places = arrays(motion)
+    bad = poses.copy()
+    bad[3, 7, 1] = np.nan
+    for arguments, message in (
+        ((poses[:, :22], places), r"^poses of shape \(30, 22, 3\) .*; \(T, 24, 3\) and \(T, 3\)"),
+        ((poses, places[:4]), r"a translation of shape \(4, 3\)"),
+        ((poses[0], places[0]), r"^poses of shape \(24, 3\)"),
+        ((poses[:0], places[:0]), r"^poses of shape \(0, 24, 3\)"),
+        ((bad, places), "all numbers must be finite"),
+        (("walk", places), "arrays of numbers are needed"),
+    ):
+        with pytest.raises(InputError, match=message):
+            baked.vertices(*arguments)
+    stream = baked.stream()
+    with pytest.raises(InputError, match=r"; \(24, 3\) and \(3,\) are needed"):
+        stream(poses, places)
+    with pytest.raises(InputError, match="all numbers must be finite"):
+        stream(bad[3], places[3])
+    expected = baked.vertices(poses[:1], places[:1])[0]  # what is refused leaves no trace
+    assert np.abs(stream(poses[0].tolist(), places[0].tolist()) - expected).max() < 1e-5
+
+
 def test_it_does_not_know_where_the_body_is_nor_faces(baked, motion):
     poses, translation = arrays(motion)
     turn = Rotation.from_rotvec([0, 0, 1.1])
