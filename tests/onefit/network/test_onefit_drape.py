@@ -170,6 +170,20 @@ def test_refused_in_one_line(arguments, message, network, tmp_path):
 
 
 @pytest.mark.parametrize(
+    "words, hint",
+    [
+        ("--shape weight=0.7 dress walk", "required: GARMENT, MOTION; --shape takes all words up"),
+        ("dress --shape weight=0.7 walk", "required: MOTION; --shape takes all words up"),
+        ("--skip render usd dress walk", "'dress' .*; --skip takes all words up to the next flag"),
+        ("dress", "required: MOTION; python -m onefit.drape --help lists the options$"),
+    ],
+)
+def test_words_that_a_list_swallowed_are_hinted_at(words, hint, tmp_path):
+    with pytest.raises(InputError, match=hint):
+        drape.main([*words.split(), "-o", str(tmp_path / "out")])
+
+
+@pytest.mark.parametrize(
     "arguments, message",
     [
         (("--steps", "0"), "--steps 0: steps a frame, 1 or more"),
