@@ -91,9 +91,9 @@ class _LeastSquares(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor, _: Any) -> tuple[Tensor, Tensor | None, None]:
         points, weights = ctx.saved_tensors[:2]
         with torch.no_grad():
-            found = _LeastSquares._gradients(ctx, grad)
-        once = lambda x: x if x is None else _Once.apply(x, points, weights, grad)
-        return once(found[0]), once(found[1]), None
+            to_points, to_weights = _LeastSquares._gradients(ctx, grad)
+        once = lambda x: _Once.apply(x, points, weights, grad)
+        return once(to_points), None if to_weights is None else once(to_weights), None
 
     @staticmethod
     def _gradients(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor | None]:
