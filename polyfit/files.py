@@ -7,6 +7,7 @@ import contextlib
 import errno
 import os
 import shutil
+import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -120,17 +121,16 @@ def folder_aside(path: str | os.PathLike[str], ours: Callable[[str], bool]) -> I
     )
     try:
         os.mkdir(temporary)
-        yield temporary
-        if os.path.isdir(path):
-            shutil.rmtree(path)
-        os.rename(temporary, path)
-    except BaseException as error:
-        shutil.rmtree(temporary, ignore_errors=True)
-        if (
-            isinstance(error, OSError)
-            and error.errno is not None
-            and str(error.filename).startswith(temporary)
-        ):
+        try:
+            yield temporary
+            if os.path.isdir(path):
+                shutil.rmtree(path)
+            os.rename(temporary, path)
+        except BaseException:
+            shutil.rmtree(temporary, ignore_errors=True)
+            raise
+    except OSError as error:
+        if error.errno is not None and str(error.filename).startswith(temporary):
             error.filename = path + str(error.filename)[len(temporary) :]
         raise
 
@@ -171,12 +171,11 @@ def check_aside(
     while not os.path.lexists(existing):
         existing = existing.parent
     try:
-        (existing / f".{os.getpid()}.partial").mkdir()
+        os.rmdir(tempfile.mkdtemp(dir=existing))
     except OSError:
         raise InputError(
             f"-o '{path}': {existing} is not a folder that can be written to; another one is needed"
         ) from None
-    (existing / f".{os.getpid()}.partial").rmdir()
 
 
 class _SilentDecoders:
