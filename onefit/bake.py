@@ -12,11 +12,16 @@ It drapes the garment in some minutes of generated motion, and takes minutes its
 """
 
 import argparse
+from functools import partial
 from pathlib import Path
+from re import fullmatch
 
+from onefit.draping import command
 from onefit.network import DEFAULT
 from polyfit.errors import InputError, Parser, cli, require
-from polyfit.files import folder_aside
+from polyfit.files import check_aside, folder_aside
+
+SECONDS, SEED = 6.0, 1_000_000  # of a generated motion
 
 
 def _parser():
@@ -31,14 +36,11 @@ def _parser():
         nargs="+",
         default=["dance", "walk", "jumping_jack"],
         metavar="MOTION",
-        help="what glTF and the page show: files, or generated kinds (default: dance walk"
-        " jumping_jack)",
+        help="what glTF and the page show, at 30 frames a second: files, or generated kinds"
+        " (default: dance walk jumping_jack)",
     )
-    p.add_argument("--seconds", type=float, default=6.0, help="of a generated motion (default: 6)")
-    p.add_argument("--seed", type=int, default=1_000_000, help="of one (default: 1000000)")
-    p.add_argument(
-        "--vertices", type=int, metavar="N", help="about so many of the garment (default: its own)"
-    )
+    command.add_mesh_arguments(p)
+    command.add_motion_arguments(p, SECONDS, SEED)
     p.add_argument(
         "--shape", nargs="*", default=[], metavar="NAME=VALUE", help="of the body: weight=0.7"
     )
@@ -52,31 +54,38 @@ def main(argv=None):
     require("torch", "anny", "pygltflib")
 
     from onefit.baking import bake, write_glb, write_page
-    from onefit.draping import body_model, load, motion_of, shape_of
-    from onefit.garment import Garment
+    from onefit.draping import body_model, load, shape_of
 
     folder = Path(args.output)
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        if not args.overwrite:
-            raise InputError(f"{folder}: not empty; give another -o, or --overwrite")
-        if not (folder / "baked.npz").exists():
-            raise InputError(f"{folder}: holds no baked drape; --overwrite replaces nothing else")
+    ours = partial(_is_ours, folder)
+    check_aside(folder, ours, "baked.npz", "baked drape", args.overwrite)
     model = body_model("anny")
     shape = shape_of(model, args.shape) if args.shape else None
-    motions = [motion_of(name, seconds=args.seconds, seed=args.seed) for name in args.motions]
-    garment = Garment.named(args.garment, count=args.vertices)
+    motions = command.motions_of(args.motions, args, SECONDS, SEED)
+    names = [motion.name for motion in motions]
+    for name, motion in zip(args.motions, names):
+        if names.count(motion) > 1:
+            raise InputError(f"--motions {name}: another one would be {motion}.glb, too")
+    (garment,) = command.garments_of([args.garment], args)
     with _progress() as advance:
         draper = load(args.weights, model=model)
         baked = bake(draper, garment, shape, advance=advance)
     body = model.body(shape)
     folder.parent.mkdir(parents=True, exist_ok=True)
-    with folder_aside(folder, lambda name: True) as temporary:
+    with folder_aside(folder, ours) as temporary:
         baked.save(Path(temporary) / "baked.npz")
         for motion in motions:
             write_glb(Path(temporary) / f"{motion.name}.glb", baked, body, motion)
         write_page(Path(temporary) / "baked.html", baked, body, motions)
     print(folder)
     print(f"next: open {folder / 'baked.html'} in a browser")
+
+
+def _is_ours(folder, path):
+    """Whether the file ``path`` in ``folder`` is one that baking wrote."""
+    return path in ("baked.npz", "baked.html") or (
+        fullmatch(r"[^/]+\.glb", path) and b'"polyfit"' in (folder / path).read_bytes()
+    )
 
 
 def _progress():

@@ -32,8 +32,22 @@ class Parser(argparse.ArgumentParser):
 
     _presets: dict[str, dict[str, Any]] | None = None
 
+    _given: Sequence[str] = ()
+
     def error(self, message: str) -> NoReturn:
-        raise InputError(f"{message}; {self.prog} --help lists the options")
+        raise InputError(
+            f"{message}; {self._swallowed(message)}{self.prog} --help lists the options"
+        )
+
+    def _swallowed(self, message: str) -> str:
+        """A hint where words may be missing, or too many, because a list's flag took them."""
+        missing = message.startswith("the following arguments are required")
+        for action in self._actions:
+            for flag in action.option_strings:
+                wrong = message.startswith(f"argument {flag}: invalid choice")
+                if action.nargs in ("*", "+") and flag in self._given and (missing or wrong):
+                    return f"{flag} takes all words up to the next flag, give others before it; "
+        return ""
 
     def add_presets(self, presets: dict[str, dict[str, Any]]) -> None:
         """Add ``--preset NAME``: other defaults, by the names of the parsed arguments."""
@@ -44,6 +58,7 @@ class Parser(argparse.ArgumentParser):
     def parse_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: Any = None
     ) -> argparse.Namespace:
+        self._given = list(sys.argv[1:] if args is None else args)
         found = super().parse_args(args, namespace)
         preset = getattr(found, "preset", None)
         if preset and self._presets:

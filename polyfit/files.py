@@ -9,6 +9,7 @@ import json
 import math
 import os
 import shutil
+import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -127,11 +128,11 @@ def folder_aside(path: str | os.PathLike[str], ours: Callable[[str], bool]) -> I
     """``with folder_aside(path, ours) as temporary:`` fill the folder ``temporary``; it becomes
     ``path`` at the end of the block, or is removed on any exception.
 
-    What stands at ``path`` is replaced where it is a folder in which ``ours(name)`` is true of
-    every name, and else refused by an InputError.
+    What stands at ``path`` is replaced where it is a folder that :func:`others` finds nothing in,
+    and else refused by an InputError. An OSError of the write names ``path``.
     """
-    path = os.path.abspath(path)
-    if os.path.lexists(path) and not (os.path.isdir(path) and all(map(ours, os.listdir(path)))):
+    path = os.path.realpath(path)
+    if os.path.lexists(path) and (not os.path.isdir(path) or others(path, ours)):
         raise InputError(
             f"{path}: {'holds other files' if os.path.isdir(path) else 'is a file'}; a new or empty"
             " folder is needed"
@@ -139,15 +140,63 @@ def folder_aside(path: str | os.PathLike[str], ours: Callable[[str], bool]) -> I
     temporary = os.path.join(
         os.path.dirname(path), f".{os.getpid()}.partial.{os.path.basename(path)}"
     )
-    os.mkdir(temporary)
     try:
-        yield temporary
-        if os.path.isdir(path):
-            shutil.rmtree(path)
-        os.rename(temporary, path)
-    except BaseException:
-        shutil.rmtree(temporary, ignore_errors=True)
+        os.mkdir(temporary)
+        try:
+            yield temporary
+            if os.path.isdir(path):
+                shutil.rmtree(path)
+            os.rename(temporary, path)
+        except BaseException:
+            shutil.rmtree(temporary, ignore_errors=True)
+            raise
+    except OSError as error:
+        if error.errno is not None and str(error.filename).startswith(temporary):
+            error.filename = path + str(error.filename)[len(temporary) :]
         raise
+
+
+def others(folder: str | os.PathLike[str], ours: Callable[[str], bool]) -> list[str]:
+    """What of a folder is not ``ours``: its files, and its folders that are empty, by their paths
+    in it, with slashes, of which ``ours(path)`` is not true. Links are not followed.
+    """
+    return [
+        name
+        for path in sorted(Path(folder).rglob("*"))
+        if path.is_symlink() or not path.is_dir() or not any(path.iterdir())
+        if not ours(name := path.relative_to(folder).as_posix())
+    ]
+
+
+def check_aside(
+    path: str | os.PathLike[str], ours: Callable[[str], bool], sign: str, what: str, overwrite: bool
+) -> None:
+    """Raises InputError where :func:`folder_aside` could not make the folder ``path``, before
+    anything is computed: it cannot be written, is not empty without ``overwrite``, or holds no
+    ``what`` (a file that matches the pattern ``sign``) or something else beside it.
+    """
+    place = Path(os.path.realpath(path))
+    if place.exists() and not place.is_dir():
+        raise InputError(f"{path}: is a file; OUT must be a folder")
+    if place.is_dir() and any(place.iterdir()):
+        if not overwrite:
+            raise InputError(f"{path}: not empty; give another -o, or --overwrite")
+        only = "--overwrite replaces nothing else"
+        if not any(place.glob(sign)):
+            raise InputError(f"{path}: holds no {what}; {only}")
+        if found := others(place, ours):
+            raise InputError(f"{path}: holds {found[0]}, which is not of a {what}; {only}")
+    if os.path.ismount(place):
+        raise InputError(f"{path}: is where a disk is mounted; a folder in it is needed")
+    existing = place.parent
+    while not os.path.lexists(existing):
+        existing = existing.parent
+    try:
+        os.rmdir(tempfile.mkdtemp(dir=existing))
+    except OSError:
+        raise InputError(
+            f"-o '{path}': {existing} is not a folder that can be written to; another one is needed"
+        ) from None
 
 
 class _SilentDecoders:

@@ -91,7 +91,8 @@ class Baked:
 
     def vertices(self, poses: Any, translation: Any, fps: float | None = None) -> np.ndarray:
         """Vertices (T, N, 3) float32 [m] in the world of a motion: ``poses`` (T, 24, 3) [rad] and
-        ``translation`` (T, 3) [m] as :class:`onefit.Motion` has them, ``fps`` a second.
+        ``translation`` (T, 3) [m] as :class:`onefit.Motion` has them, ``fps`` a second. Raises
+        InputError where they are not so.
         """
         weights, maps = self._played(poses, translation, fps)
         out, skinned = np.empty((len(maps), 3, len(self.mean)), np.float32), self._skinning()
@@ -105,11 +106,35 @@ class Baked:
 
     def _played(self, poses, translation, fps):
         """Weights (T, R) and maps (T, K, 12) of a motion."""
-        poses, translation = (np.asarray(x, np.float32) for x in (poses, translation))
+        poses, translation = self._checked(poses, translation, many=True)
+        fps = self._rate(fps)
         features, placed = self.features(poses, translation, fps)
         maps, guide, swung = self.maps(placed), self.guide(features), self.swings(fps)
         swings = [swung(m, g) for m, g in zip(maps, guide)]
         return self.answered(guide, np.stack(swings)), maps
+
+    def _checked(self, poses, translation, many=False):
+        """A pose and a translation, or ``many`` frames of them, as float32 arrays."""
+        try:
+            poses, translation = (np.asarray(x, np.float32) for x in (poses, translation))
+        except (TypeError, ValueError):
+            raise InputError("poses and translation: arrays of numbers are needed") from None
+        count, lead = len(self.parents), poses.shape[:1] if many else ()
+        if poses.shape != (*lead, count, 3) or translation.shape != (*lead, 3) or 0 in lead:
+            frames = "T, " if many else ""
+            raise InputError(
+                f"poses of shape {poses.shape} and a translation of shape {translation.shape};"
+                f" ({frames}{count}, 3) and ({frames}3{'' if many else ','}) are needed"
+            )
+        if not (np.isfinite(poses).all() and np.isfinite(translation).all()):
+            raise InputError("poses and translation: all numbers must be finite")
+        return poses, translation
+
+    def _rate(self, fps):
+        """``fps``, or what the drape was baked at."""
+        if fps is not None and not 0 < fps < 10_000:
+            raise InputError(f"{fps} frames a second; a positive number is needed")
+        return self.fps if fps is None else fps
 
     def size(self) -> int:
         """Bytes of all its arrays."""
@@ -118,7 +143,9 @@ class Baked:
         return sum(x.nbytes for x in arrays if isinstance(x, np.ndarray))
 
     def stream(self, fps: float | None = None) -> Stream:
-        """A :class:`Stream`, which takes poses one at a time, ``fps`` of them a second."""
+        """A :class:`Stream`, which takes poses one at a time, ``fps`` of them a second. Raises
+        InputError for an ``fps`` that is not positive.
+        """
         return Stream(self, fps)
 
     def features(
@@ -133,7 +160,7 @@ class Baked:
         """
         rotations, placed = self.placed(poses, translation)
         before = np.concatenate([placed[:1], placed[:-1]])
-        return _features(rotations, placed, before, fps or self.fps), placed
+        return _features(rotations, placed, before, self._rate(fps)), placed
 
     def guide(self, features: np.ndarray) -> np.ndarray:
         """The guide (..., G), from :meth:`features` (..., C): where cloth without mass would be."""
@@ -151,7 +178,7 @@ class Baked:
         down by the air, and is pulled to where the guide has its vertex, by one step of the
         implicit Euler method. It begins there, and moves with it.
         """
-        dt = 1 / (fps or self.fps)
+        dt = 1 / (self._rate(fps))
         share = (1 / (1 + self.pull * dt * dt)).astype(np.float32)
         shapes = self.point_shapes.swapaxes(1, 2).reshape(len(self.point_shapes), -1)
         points = np.ascontiguousarray(self.points.T).ravel()
@@ -278,15 +305,16 @@ class Stream:
     """
 
     def __init__(self, baked: Baked, fps: float | None = None) -> None:
-        self._baked, self._fps = baked, fps or baked.fps
+        self._baked, self._fps = baked, baked._rate(fps)
         self._swings, self._skinned = baked.swings(self._fps), baked._skinning()
         self._before: np.ndarray | None = None
 
-    def __call__(self, pose: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    def __call__(self, pose: Any, translation: Any) -> np.ndarray:
         """Vertices (N, 3) float32 [m] in the world, for the next ``pose`` (24, 3) [rad] and
-        ``translation`` (3,) [m], float32.
+        ``translation`` (3,) [m]. Raises InputError where they are not so.
         """
         baked = self._baked
+        pose, translation = baked._checked(pose, translation)
         rotations, placed = baked.placed(pose, translation)
         before = placed if self._before is None else self._before
         self._before, maps = placed, baked.maps(placed)

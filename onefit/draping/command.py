@@ -1,12 +1,22 @@
 """The commands onefit.drape and onefit.simulate: their arguments, and the way to their files."""
 
+from __future__ import annotations
+
 import argparse
 import sys
+from collections.abc import Sequence
 from functools import partial
+from typing import TYPE_CHECKING
 
 from onefit.motion import add_file_arguments
 from onefit.network import DEFAULT
 from polyfit.errors import InputError, Parser, require
+
+if TYPE_CHECKING:
+    from onefit.garment import Garment
+    from onefit.motion import Motion
+
+SECONDS, SEED = 3.0, 0  # of a generated motion
 
 
 def parser(name: str, text: str) -> Parser:
@@ -27,7 +37,8 @@ def parser(name: str, text: str) -> Parser:
     p.add_argument(
         "motion",
         metavar="MOTION",
-        help="a file (AMASS or NCS .npz, .bvh), or a generated kind: walk, run, dance, ...",
+        help="a file (AMASS or NCS .npz, .bvh), or a generated kind: walk, run, dance, ...; of a"
+        " file at any rate 30 frames a second are made",
     )
     p.add_argument(
         "-o",
@@ -53,6 +64,28 @@ def parser(name: str, text: str) -> Parser:
         metavar="NAME=VALUE",
         help="the body's shape, e.g. weight=0.7; the rest is standard",
     )
+    add_mesh_arguments(p)
+    add_motion_arguments(p, SECONDS, SEED)
+    p.add_argument(
+        "--skip", nargs="*", default=[], choices=("usd", "render"), help="results to leave out"
+    )
+    p.add_argument("--meshes", choices=("obj", "ply"), help="also one mesh a frame")
+    p.add_argument(
+        "--size",
+        nargs=2,
+        type=int,
+        default=(480, 360),
+        metavar=("HEIGHT", "WIDTH"),
+        help="size of the rendering [pixels] (default: 480 360)",
+    )
+    p.add_argument("--spp", type=int, default=16, help="samples a pixel (default: 16)")
+    p.add_argument("--device", default="cpu", help="cpu or cuda, for the network (default: cpu)")
+    p.add_argument("--overwrite", action="store_true", help="replace an earlier drape in OUT")
+    return p
+
+
+def add_mesh_arguments(p: Parser) -> None:
+    """What :func:`garments_of` needs."""
     group = p.add_argument_group("a garment's mesh that is not in metres around the standard body")
     group.add_argument(
         "--scale",
@@ -83,32 +116,87 @@ def parser(name: str, text: str) -> Parser:
         "--vertices",
         type=int,
         metavar="N",
-        help="drape about N vertices of cloth, which carry the file's mesh (default: its own)",
+        help="about N vertices of cloth, which carry the file's mesh (default: its own)",
     )
     group.add_argument(
         "--loose", action="store_true", help="a skirt or dress: the legs' pose is not followed"
     )
+
+
+def add_motion_arguments(p: Parser, seconds: float, seed: int) -> None:
+    """What :func:`motions_of` needs, which is to be given the same ``seconds`` and ``seed``."""
     add_file_arguments(p)
     p.add_argument(
-        "--seconds", type=float, default=3.0, help="length of a generated motion (default: 3)"
+        "--seconds",
+        type=float,
+        help=f"length of a generated motion (default: {seconds:g}); a file is cut to its first ones"
+        " (default: all)",
     )
-    p.add_argument("--seed", type=int, default=0, help="seed of a generated motion (default: 0)")
-    p.add_argument(
-        "--skip", nargs="*", default=[], choices=("usd", "render"), help="results to leave out"
+    p.add_argument("--seed", type=int, help=f"seed of a generated motion (default: {seed})")
+
+
+def garments_of(names: Sequence[str], args: argparse.Namespace) -> list[Garment]:
+    """The garments called ``names``, by the flags of :func:`add_mesh_arguments`. Raises InputError,
+    also where none of them is a file, which such a flag speaks of.
+    """
+    from onefit.garment import LOOSE, TEMPLATES, Garment
+
+    if args.vertices is not None and args.vertices < 100:
+        raise InputError(f"--vertices {args.vertices}: at least 100 are needed")
+    placed = dict(
+        made_for=args.made_for,
+        loose=args.loose,
+        scale=args.scale,
+        up=args.up,
+        turn=args.turn,
+        offset=tuple(args.offset),
     )
-    p.add_argument("--meshes", choices=("obj", "ply"), help="also one mesh a frame")
-    p.add_argument(
-        "--size",
-        nargs=2,
-        type=int,
-        default=(480, 360),
-        metavar=("HEIGHT", "WIDTH"),
-        help="size of the rendering [pixels] (default: 480 360)",
-    )
-    p.add_argument("--spp", type=int, default=16, help="samples a pixel (default: 16)")
-    p.add_argument("--device", default="cpu", help="cpu or cuda, for the network (default: cpu)")
-    p.add_argument("--overwrite", action="store_true", help="replace an earlier drape in OUT")
-    return p
+    if all(name in TEMPLATES + LOOSE for name in names):
+        plain = (None, False, 1.0, "z", 0.0, (0.0, 0.0, 0.0))
+        for (flag, value), default in zip(placed.items(), plain):
+            if value != default:
+                raise InputError(
+                    f"--{flag.replace('_', '-')}: for a garment's file; {names[0]} is a template,"
+                    " which lies on the body"
+                )
+    return [Garment.named(name, **placed, count=args.vertices) for name in names]
+
+
+def motions_of(
+    names: Sequence[str], args: argparse.Namespace, seconds: float, seed: int
+) -> list[Motion]:
+    """The motions called ``names``, by the flags of :func:`add_motion_arguments`. Raises
+    InputError, also for flags that speak of none of them. What will be resampled is said on stderr.
+    """
+    from onefit.motion import KINDS
+
+    from .draper import FPS
+    from .inputs import motion_of
+
+    files = [name for name in names if name not in KINDS]
+    for flag, value in (("--fps", args.fps), ("--motion-up", args.motion_up)):
+        if value is not None and not files:
+            raise InputError(f"{flag}: for a motion file; {names[0]} is generated")
+    if args.seed is not None and len(files) == len(names):
+        raise InputError(f"--seed: for a generated motion; {names[0]} is a file")
+    if files and args.seconds is not None and not args.seconds > 0:
+        raise InputError(f"--seconds {args.seconds:g}: more than 0 are needed")
+    made = []
+    for name in names:
+        motion = motion_of(
+            name,
+            seconds=seconds if args.seconds is None else args.seconds,
+            seed=seed if args.seed is None else args.seed,
+            fps=args.fps,
+            up=args.motion_up,
+        )
+        if name in files and args.seconds is not None:
+            motion = motion[: max(1, round(min(args.seconds * motion.fps, len(motion))))]
+        if motion.fps != FPS:
+            note = f"{name}: {motion.fps:g} frames a second, resampled to {FPS:g}"
+            print(note, file=sys.stderr)
+        made.append(motion)
+    return made
 
 
 def refuse(p: Parser, flag: str, why: str) -> None:
@@ -131,31 +219,16 @@ def run(verb: str, args: argparse.Namespace, **how) -> None:
         )
     require("torch", "anny", *(["pxr"] if "usd" not in args.skip else []))
 
-    from onefit.garment import Garment
     from polyfit.training import device_of
 
     from . import inputs, load, outfit, output
     from .draper import FPS
 
     output.check_folder(args.output, args.overwrite)
-    if args.vertices is not None and args.vertices < 100:
-        raise InputError(f"--vertices {args.vertices}: at least 100 are needed")
     model = inputs.body_model(args.body)
     draper = load(args.weights, model=model, device=device_of(args.device))
-    read = partial(
-        Garment.named,
-        made_for=args.made_for,
-        loose=args.loose,
-        scale=args.scale,
-        up=args.up,
-        turn=args.turn,
-        offset=tuple(args.offset),
-        count=args.vertices,
-    )
-    garments = [read(name) for name in outfit.several(args.garment)]
-    motion = inputs.motion_of(
-        args.motion, seconds=args.seconds, seed=args.seed, fps=args.fps, up=args.motion_up
-    )
+    garments = garments_of(outfit.several(args.garment), args)
+    (motion,) = motions_of([args.motion], args, SECONDS, SEED)
     shape = inputs.shape_of(model, args.shape)
     for name, garment in zip(args.garment, garments):
         for repair in garment.repairs:

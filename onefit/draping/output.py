@@ -1,6 +1,7 @@
 """The files of a drape: arrays, animations, meshes, pictures, a video."""
 
 import json
+import re
 import time
 from dataclasses import dataclass
 from itertools import cycle
@@ -12,8 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from onefit.garment import parts
 from polyfit.animation import write_frames, write_usd
-from polyfit.errors import InputError
-from polyfit.files import aside, folder_aside
+from polyfit.files import aside, check_aside, folder_aside
 
 BODY_COLOUR = (0.5, 0.48, 0.46)  # linear RGB
 GARMENT_COLOURS = (0.08, 0.19, 0.42), (0.42, 0.12, 0.06), (0.10, 0.28, 0.13), (0.42, 0.30, 0.06)
@@ -53,14 +53,23 @@ class Outcome:
         return blender if usd.exists() else f"read {arrays} by numpy.load"
 
 
+# What a drape writes into its folder, and each garment of several into its own
+_OURS = re.compile(
+    r"figures\.json|drape\.mp4|frames/\d+\.png"
+    r"|(\d+_[^/]+/)?(drape\.npz|(garment|body)\.usd|meshes/(\d+\.(obj|ply)|surface\.mtl))"
+)
+
+
+def _is_ours(path):
+    return bool(_OURS.fullmatch(path))
+
+
 def check_folder(folder, overwrite):
-    """Raises InputError where ``folder`` holds something that a drape must not replace."""
-    folder = Path(folder)
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        if not overwrite:
-            raise InputError(f"{folder}: not empty; give another -o, or --overwrite")
-        if not _arrays(folder):
-            raise InputError(f"{folder}: holds no drape; --overwrite replaces nothing else")
+    """Raises InputError where a drape cannot be written to ``folder``, or something is there that
+    it must not replace.
+    """
+    sign = "drape.npz" if (Path(folder) / "drape.npz").exists() else "*/drape.npz"
+    check_aside(folder, _is_ours, sign, "drape", overwrite)
 
 
 def _arrays(folder):
@@ -113,7 +122,7 @@ def drape_into(folder, make, verb, frames, *, names, about, **files):
     folder.parent.mkdir(parents=True, exist_ok=True)
     with (
         Progress(*columns, console=Console(stderr=True)) as progress,
-        folder_aside(folder, lambda name: True) as temporary,
+        folder_aside(folder, _is_ours) as temporary,
     ):
         visible = "render" not in files.get("skip", ())
         task = progress.add_task("rendering", total=T, visible=visible)

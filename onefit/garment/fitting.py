@@ -6,9 +6,11 @@ on it; where it does not, other units, axes, places and the T-pose are tried on 
 vertices, and the error names the one with which it would.
 """
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import product
+from typing import Any
 
 import numpy as np
 import torch
@@ -90,27 +92,49 @@ def misfit(surface, V):
     return np.abs(d).mean() + 5 * np.maximum(-d, 0).mean()
 
 
-def check_place(V, surface, where, tell_pose=True):
+@dataclass(frozen=True)
+class Stand:
+    """Another stand in which a garment may have been made: the body's ``surface`` there, what a
+    garment is that was made for it, ``looks``, and what to ``give`` then.
+    """
+
+    surface: Callable[..., Any]
+    looks: str
+    give: str
+
+
+def t_stand():
+    """The :class:`Stand` of the standard body in the T-pose."""
+    return Stand(_t_surface(), "made for the T-pose", f"made_for='{T_POSE}'")
+
+
+def lowered_stand(surface=None, give="made_for=None (no --made-for)"):
+    """The :class:`Stand` with lowered arms, in which bodies rest: of a body's ``surface`` there, by
+    default the standard one's.
+    """
+    looks = "made for the stand with lowered arms"
+    return Stand(surface or standard_surface(), looks, give)
+
+
+def check_place(V, surface, where, other=None):
     """Raises InputError, with a suggestion, where vertices (N, 3) [m] do not lie on the body of
     ``surface``.
 
     They do if they are 15 cm from it on average at most, at most 2 % of them more than 3 cm inside,
     and no other place or stand would fit much better: half the misfit where it is above 4 cm, 0.87
-    times of it for the T-pose (with ``tell_pose``).
+    times of it for the ``other`` :class:`Stand`, if any.
     """
     seen = V[np.linspace(0, len(V) - 1, min(_TRIAL_VERTICES, len(V))).astype(int)]
     d, own = surface(V, 1e9).distance, misfit(surface, seen)
     lies = np.abs(d).mean() < 0.15 and (d < -_PUSHED_DEPTH).mean() <= 0.02
-    if lies and tell_pose:
-        other = misfit(_t_surface(), seen)
-        if other < 0.87 * own and own - other > 0.005:
-            fits = f"{_mm(other)} from it, {_mm(own)} from the stand with lowered arms"
-            raise InputError(
-                f"{where}: looks made for the T-pose ({fits}): give made_for='{T_POSE}'"
-            )
-    if lies and own < 0.04:
+    there = misfit(other.surface, seen) if lies and other else np.inf
+    stands = not (there < 0.87 * own and own - there > 0.005)
+    if lies and stands and own < 0.04:
         return
-    best = _best_place(seen, surface, [1.0] if lies else list(UNITS), tell_pose)
+    best = _best_place(seen, surface, [1.0] if lies else list(UNITS), other)
+    if not stands and (there < 0.04 or not (best and best[0] < 0.5 * there)):
+        fits = f"{_mm(there)} from the body there, {_mm(own)} from it in the stand it is read in"
+        raise InputError(f"{where}: looks {other.looks} ({fits}): give {other.give}")
     if lies and not (best and best[0] < 0.5 * own):
         return
     size = " x ".join(f"{s:.3g}" for s in np.ptp(V, axis=0))
@@ -137,11 +161,11 @@ def _mm(distance):
     )
 
 
-def _best_place(seen, surface, scales, tell_pose):
+def _best_place(seen, surface, scales, other):
     """``(misfit [m], what it looks like, what to give)`` of the plainest place in which the
     vertices lie on a body, or None.
     """
-    bodies = [(surface, None)] + ([(_t_surface(), T_POSE)] if tell_pose else [])
+    bodies = [(surface, None)] + ([(other.surface, other)] if other else [])
     found = []
     for scale, up, turn in product(scales, ("z", "y"), (0, 180)):
         V = placed(seen, scale, up, turn)
@@ -177,8 +201,8 @@ def _best_place(seen, surface, scales, tell_pose):
         looks.append("facing backwards")
         give.append(f"turn={turn}")
     if pose:
-        looks.append("made for the T-pose")
-        give.append(f"made_for='{pose}'")
+        looks.append(pose.looks)
+        give.append(pose.give)
     if offset.any():
         looks.append(
             "on a body that stands on the ground"

@@ -162,18 +162,16 @@ class Garment:
         """The garment of any triangle mesh (N, 3) [m], (F, 3) in OneFit's axes, with its texture
         coordinates or None; otherwise as :meth:`read`.
         """
-        made_for = (
-            fitting.t_posed()
-            if isinstance(made_for, str) and made_for == fitting.T_POSE
-            else made_for
-        )
+        other = fitting.t_stand() if made_for is None else None
+        if isinstance(made_for, str) and made_for == fitting.T_POSE:
+            made_for, other = fitting.t_posed(), fitting.lowered_stand()
         if made_for is not None and not isinstance(made_for, Body):
             raise InputError(
                 f"{where}: made_for={made_for!r}; a Body or '{fitting.T_POSE}' is needed"
             )
         surface = standard_surface() if made_for is None else fitting.surface_of(made_for)
         check(vertices, faces, where)
-        fitting.check_place(vertices[np.unique(faces)], surface, where, tell_pose=made_for is None)
+        fitting.check_place(vertices[np.unique(faces)], surface, where, other)
         V, F, told = mended(vertices, faces, where, surface)
         turned = fitting.inward(V, F, surface)
         if turned.any():

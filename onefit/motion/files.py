@@ -60,17 +60,17 @@ def _read_npz(path, fps, up):
             raise InputError(
                 f"{path}: misses {key}; a motion file has poses, trans and a frame rate"
             )
-    poses, trans = (
-        np.asarray(data["poses"], dtype=np.float64),
-        np.asarray(data["trans"], dtype=np.float64),
-    )
+    poses, trans = (_numbers(path, key, data[key]) for key in ("poses", "trans"))
     rate = next((key for key in _RATES if key in data), None)
     if fps is None:
         if rate is None:
             raise InputError(
                 f"{path}: no frame rate ({', '.join(_RATES)}); give it: fps=30, or --fps 30"
             )
-        fps = float(np.asarray(data[rate]).ravel()[0])
+        try:
+            fps = float(data[rate].ravel()[0])
+        except (ValueError, TypeError, IndexError):
+            raise InputError(f"{path}: {rate} is no number; give it: fps=30, or --fps 30") from None
     likely.check_rate(path, fps)
     if up is None:  # AMASS names its rate after its motion capture
         up = "z" if rate is None or rate.startswith("mocap") else "y"
@@ -96,3 +96,10 @@ def _read_npz(path, fps, up):
     local[:, 0] = root.as_rotvec()
     other = ("z", world.apply([0.0, 0, 1])) if up == "y" else ("y", np.array([0.0, 1, 0]))
     return local, world.apply(trans), fps, other
+
+
+def _numbers(path, key, array):
+    """An array of a file as float64. Raises InputError where it holds no numbers."""
+    if array.dtype.kind not in "fiu":
+        raise InputError(f"{path}: {key} of type {array.dtype}; numbers are needed")
+    return array.astype(np.float64)

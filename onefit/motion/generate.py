@@ -23,7 +23,8 @@ def generate(name, seconds=10.0, seed=0, fps=30.0):
     gives the same motion, at any rate and for any length. :meth:`onefit.Motion.generate` makes a
     motion of them.
 
-    Raises InputError for a kind that does not exist, or a length that has no two frames.
+    Raises InputError for a kind that does not exist, a length that has no frame, or a negative
+    seed.
     """
     if name not in KINDS:
         raise InputError(f"no kind of motion {name!r}; there are {', '.join(KINDS)}")
@@ -32,6 +33,8 @@ def generate(name, seconds=10.0, seed=0, fps=30.0):
             f"a motion of {seconds} s at {fps} frames a second; at least one frame, at most a"
             " million are needed"
         )
+    if seed < 0:
+        raise InputError(f"seed = {seed}; 0 or more is needed")
     rng = np.random.default_rng([zlib.crc32(name.encode()), seed])
     flipped = rng.random() < 0.5
     t = np.arange(round(seconds * fps)) / fps

@@ -19,7 +19,8 @@ from . import files, generate
 class Motion:
     """A sequence of poses of the 24 joints, in OneFit's world (metres, z up, facing -y).
 
-    ``poses`` (T, 24, 3) axis-angle vectors [rad], each joint relative to its parent and counted
+    Both arrays are given as anything like one, and held as float32 tensors. ``poses`` (T, 24, 3)
+    axis-angle vectors [rad], each joint relative to its parent and counted
     from the T-pose; ``translation`` (T, 3) [m], added to the rest position of the root joint;
     ``fps`` frames a second; ``name``. Raises InputError where shapes do not fit or a number is not
     finite.
@@ -31,7 +32,9 @@ class Motion:
     name: str = "motion"
 
     def __post_init__(self):
-        T = len(self.poses)
+        for what in ("poses", "translation"):
+            object.__setattr__(self, what, self._tensor(what))
+        T = len(self.poses) if self.poses.ndim else 0
         if (
             self.poses.ndim != 3
             or self.poses.shape[2] != 3
@@ -62,6 +65,16 @@ class Motion:
             raise InputError(
                 f"motion {self.name}: {self.fps} frames a second; a positive number is needed"
             )
+
+    def _tensor(self, what):
+        """The attribute ``what`` as a float32 tensor."""
+        values = getattr(self, what)
+        try:
+            if not isinstance(values, torch.Tensor):  # of lists of arrays NumPy makes one
+                values = np.asarray(values, dtype=np.float32)
+            return torch.as_tensor(values, dtype=torch.float32)
+        except (TypeError, ValueError, RuntimeError):
+            raise InputError(f"motion {self.name}: {what} are no array of numbers") from None
 
     def __len__(self):
         return len(self.poses)

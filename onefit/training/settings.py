@@ -64,7 +64,7 @@ class Settings:
         for name in ("batch", "epochs", "seeds"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} = {getattr(self, name)}; at least 1 is needed")
-        for name in ("epoch_steps", "lr_epochs", "shapes", "cuts"):
+        for name in ("epoch_steps", "lr_epochs", "shapes", "cuts", "seed"):
             if getattr(self, name) < 0:
                 raise InputError(f"{name} = {getattr(self, name)}; at least 0 is needed")
         if self.objective and self.objective not in OBJECTIVES:

@@ -7,7 +7,7 @@ whatever dtype the points have.
 """
 
 from functools import lru_cache, reduce
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import torch
@@ -88,8 +88,15 @@ class _LeastSquares(torch.autograd.Function):
         return alpha.to(points.dtype), fitted
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad: Tensor, _: Any) -> tuple[Tensor, Tensor | None, None]:
+        points, weights = ctx.saved_tensors[:2]
+        with torch.no_grad():
+            to_points, to_weights = _LeastSquares._gradients(ctx, grad)
+        once = lambda x: _Once.apply(x, points, weights, grad)
+        return once(to_points), None if to_weights is None else once(to_weights), None
+
+    @staticmethod
+    def _gradients(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor | None]:
         # At the minimum sum w (z - c.b) b = 0 holds for the points' basis values b. Differentiated:
         # dc = G^-1 d(sum w (z - c.b) b) at fixed c, and the gradient contracts it with y = G^-1
         # grad, a jet like c itself.
@@ -108,7 +115,22 @@ class _LeastSquares(torch.autograd.Function):
             [w * (residual * yu - cu * y), w * (residual * yv - cv * y), w * y], -1
         )
         to_weights = residual * y / total.to(dtype) if ctx.needs_input_grad[1] else None
-        return to_points, to_weights, None
+        return to_points, to_weights
+
+
+class _Once(torch.autograd.Function):
+    """A gradient, and what it depends on: it is refused where that is asked for. Torch's
+    once_differentiable refuses it only where the gradient that came in has one of its own, which
+    that of a loss linear in alpha has not.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, gradient: Tensor, *of: Tensor) -> Tensor:
+        return gradient.view_as(gradient)
+
+    @staticmethod
+    def backward(ctx: Any, *_: Tensor) -> NoReturn:
+        raise RuntimeError("polyfit.jets.fit is differentiable once, not twice")
 
 
 def _normalised(weights: Tensor, points: Tensor) -> tuple[Tensor | None, Tensor]:

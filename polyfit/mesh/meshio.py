@@ -73,6 +73,8 @@ def read_textured(path: str | os.PathLike[str], what: str = "mesh") -> _Textured
     """
     path = os.fspath(path)
     extension = os.path.splitext(path)[1].lower()
+    if os.path.isdir(path):
+        raise InputError(f"{path}: is a folder; a {what} is an .obj, .ply or .glb file")
     if extension not in (".obj", ".ply", ".glb", ".gltf"):
         raise InputError(f"{path}: {what} of type '{extension}'; .obj, .ply or .glb is needed")
     if not os.path.isfile(path):

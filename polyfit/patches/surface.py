@@ -98,15 +98,19 @@ class PatchedSurface:
         rounds: int = 5,
         acvd: bool = False,
         where: str = "mesh",
-        **options: Any,
+        polyfit: Callable[..., Any] | None = None,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str | None = None,
     ) -> "PatchedSurface":
         """Cut the mesh (N, 3) [m], (F, 3) into patches (:meth:`polyfit.patches.Patches.cut`),
-        :meth:`fit` them with ``options``, and let the boundaries move to where the jets fit best,
-        ``rounds`` times (:func:`polyfit.patches.refine.refined`). ``acvd``: by plain ACVD, whose
-        boundaries stay, as in the paper. Raises InputError for a mesh that lies too far from the
-        origin for single precision (:func:`polyfit.mesh.centred`).
+        :meth:`fit` them with ``polyfit``, ``dtype`` and ``device``, and let the boundaries move to
+        where the jets fit best, ``rounds`` times (:func:`polyfit.patches.refine.refined`).
+        ``acvd``: by plain ACVD, whose boundaries stay, as in the paper. Raises InputError for a
+        mesh that lies too far from the origin for single precision
+        (:func:`polyfit.mesh.centred`).
         """
         patches = Patches.cut(vertices, faces, count, acvd=acvd, where=where)
+        options: dict[str, Any] = dict(polyfit=polyfit, dtype=dtype, device=device)
         if mesh.centred(patches.vertices)[1] is not None:
             raise InputError(
                 f"{where}: it lies more than 1000 times its extent from the origin, too far for"
@@ -223,7 +227,10 @@ class PatchedSurface:
         ``(vertices (N', 3) [m], faces (parts^2 F, 3) int64)``.
 
         The given mesh's vertices come first. ``smoothing``: how often :meth:`smoothed` is applied.
+        Raises InputError for ``parts`` below 1.
         """
+        if parts < 1:
+            raise InputError(f"parts = {parts}; 1 or more is needed")
         faces, face, barycentric = mesh.refined(self.patches.given, parts)
         vertices = self.at(face, barycentric)
         seam = self.patches.on_boundary[self.patches.locate(face, barycentric)[0]]

@@ -3,6 +3,7 @@ common: flags of the run, and its end.
 """
 
 import os
+import re
 from importlib import import_module
 
 import torch
@@ -17,7 +18,7 @@ class Processes:
         self.count, self.rank = int(os.environ.get("WORLD_SIZE", 1)), int(os.environ.get("RANK", 0))
         self.device = torch.device(
             f"cuda:{os.environ.get('LOCAL_RANK', 0)}"
-            if device == "cuda" and self.count > 1
+            if device != "cpu" and self.count > 1
             else device
         )
         if self.count > 1:
@@ -25,7 +26,7 @@ class Processes:
             # imports them: after the line below they would keep the group, whose threads then
             # outlive destroy_process_group and now and then abort the ending interpreter.
             import_module("torch.distributed.nn.functional")
-            torch.distributed.init_process_group("nccl" if device == "cuda" else "gloo")
+            torch.distributed.init_process_group("nccl" if device != "cpu" else "gloo")
 
     def wait(self):
         if self.count > 1:
@@ -56,9 +57,13 @@ class Processes:
 
 
 def device_of(name):
-    """``name``, checked. Raises InputError for a CUDA device that torch does not see."""
-    if name == "cuda" and not torch.cuda.is_available():
-        raise InputError("--device cuda: this torch sees no CUDA device")
+    """``name``, checked: "cpu", "cuda", or one of several as "cuda:1". Raises InputError for
+    others, and for a CUDA device that torch does not see.
+    """
+    if not re.fullmatch(r"cpu|cuda(:\d+)?", name):
+        raise InputError(f"--device {name}: cpu or cuda is needed, or one of several as cuda:1")
+    if name != "cpu" and int(name[5:] or 0) >= torch.cuda.device_count():
+        raise InputError(f"--device {name}: this torch sees no such CUDA device")
     return name
 
 

@@ -82,6 +82,8 @@ class Settings:
         for name in ("patches", "points", "reads", "steps", "batch", "charts", "turns"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} = {getattr(self, name)}; at least 1 is needed")
+        if self.seed < 0:
+            raise InputError(f"seed = {self.seed}; at least 0 is needed")
         if not 1 <= self.order <= 10:
             raise InputError(f"order = {self.order}; the order of a jet is 1 to 10")
         if not self.lr > 0:

@@ -144,13 +144,14 @@ def test_gradient_in_single_precision_at_order_8():
     assert (gradients[0][~mask] == 0).all()
 
 
-def test_a_second_derivative_is_refused_rather_than_wrong():
-    points = patches(3)[0].requires_grad_()
-    (gradient,) = torch.autograd.grad(
-        jets.fit(points, 3).alpha.square().sum(), points, create_graph=True
-    )
-    with pytest.raises(RuntimeError, match="once_differentiable"):
-        gradient.sum().backward()
+@pytest.mark.parametrize("loss", [torch.Tensor.sum, lambda alpha: alpha.square().sum()])
+def test_a_second_derivative_is_refused_rather_than_wrong(loss):
+    points, _, mask = patches(3)
+    points, weights = points.requires_grad_(), torch.ones(mask.shape).double().requires_grad_()
+    alpha = jets.fit(points, 3, weights=weights).alpha
+    for gradient in torch.autograd.grad(loss(alpha), (points, weights), create_graph=True):
+        with pytest.raises(RuntimeError, match="differentiable once"):
+            (gradient.sum() + points.sum()).backward(retain_graph=True)
 
 
 def test_what_cannot_be_fitted_is_named():

@@ -341,3 +341,7 @@ def test_bad_input_is_named():
         PatchedSurface.from_mesh(V, F, 2, order=0)
     with pytest.raises(InputError, match="mesh: no faces"):
         PatchedSurface.from_mesh(V, F[:0])
+    with pytest.raises(TypeError, match="unexpected keyword argument 'patches'"):
+        PatchedSurface.from_mesh(V, F, patches=2)
+    with pytest.raises(InputError, match="parts = 0; 1 or more is needed"):
+        PatchedSurface.from_mesh(V, F, 2).resampled(0)

@@ -284,6 +284,7 @@ class TestRefused:
             (dict(families=("sine",)), "families sine: choose among jet"),
             (dict(order=0), "order = 0"),
             (dict(steps=0), "steps = 0; at least 1 is needed"),
+            (dict(seed=-1), "seed = -1; at least 0 is needed"),
             (dict(lr=0.0), "lr = 0.0; more than 0 is needed"),
             (dict(reads=300), "reads = 300"),
             (dict(families=()), "nothing to train on"),

@@ -66,6 +66,36 @@ def test_stream_is_the_batch(baked, motion):
         assert np.abs(stream(pose, place) - expected).max() < 1e-5
 
 
+@pytest.mark.parametrize("fps", [-1, 0, float("nan")])
+def test_no_frames_a_second_are_refused(baked, motion, fps):
+    for call in (lambda: baked.vertices(*arrays(motion), fps=fps), lambda: baked.stream(fps)):
+        with pytest.raises(InputError, match=f"^{fps} frames a second; a positive number"):
+            call()
+
+
+def test_what_is_no_motion_is_refused(baked, motion):
+    poses, places = arrays(motion)
+    bad = poses.copy()
+    bad[3, 7, 1] = np.nan
+    for arguments, message in (
+        ((poses[:, :22], places), r"^poses of shape \(30, 22, 3\) .*; \(T, 24, 3\) and \(T, 3\)"),
+        ((poses, places[:4]), r"a translation of shape \(4, 3\)"),
+        ((poses[0], places[0]), r"^poses of shape \(24, 3\)"),
+        ((poses[:0], places[:0]), r"^poses of shape \(0, 24, 3\)"),
+        ((bad, places), "all numbers must be finite"),
+        (("walk", places), "arrays of numbers are needed"),
+    ):
+        with pytest.raises(InputError, match=message):
+            baked.vertices(*arguments)
+    stream = baked.stream()
+    with pytest.raises(InputError, match=r"; \(24, 3\) and \(3,\) are needed"):
+        stream(poses, places)
+    with pytest.raises(InputError, match="all numbers must be finite"):
+        stream(bad[3], places[3])
+    expected = baked.vertices(poses[:1], places[:1])[0]  # what is refused leaves no trace
+    assert np.abs(stream(poses[0].tolist(), places[0].tolist()) - expected).max() < 1e-5
+
+
 def test_it_does_not_know_where_the_body_is_nor_faces(baked, motion):
     poses, translation = arrays(motion)
     turn = Rotation.from_rotvec([0, 0, 1.1])
@@ -194,6 +224,10 @@ def test_a_browser_computes_the_same_vertices(baked, draper, motion, tmp_path):
         (["skirt", "--motions", "moonwalk"], "moonwalk"),
         (["scarf"], "scarf"),
         (["skirt", "--shape", "girth=1"], "girth"),
+        (["skirt", "--vertices", "3"], "--vertices 3: at least 100 are needed"),
+        (["skirt", "--up", "y"], "--up: for a garment's file; skirt is a template"),
+        (["skirt", "--fps", "60"], "--fps: for a motion file; dance is generated"),
+        (["skirt", "--motions", "walk", "dance", "walk"], "walk: another .* walk-1000000.glb, too"),
     ],
 )
 def test_what_cannot_be_baked_is_refused_at_once(arguments, message, tmp_path):
@@ -202,9 +236,54 @@ def test_what_cannot_be_baked_is_refused_at_once(arguments, message, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+def test_what_files_do_not_say_is_said_by_the_flags_of_a_drape(
+    baked, garment, tmp_path, monkeypatch
+):
+    from polyfit.mesh import write_ply
+
+    seen = []
+    monkeypatch.setattr("onefit.baking.bake", lambda _, garment, *__, **___: seen.append(garment))
+    monkeypatch.setattr("onefit.bake.folder_aside", lambda *_: 1 / 0)
+    x, y, z = 100 * garment.vertices.double().numpy().T
+    write_ply(tmp_path / "skirt.ply", np.stack([x, z, -y], 1), garment.faces.numpy())
+    np.savez(tmp_path / "still.npz", poses=np.zeros((9, 72)), trans=np.zeros((9, 3)))
+    words = [str(tmp_path / "skirt.ply"), "-o", str(tmp_path / "out"), "--motions"]
+    words += ["walk", str(tmp_path / "still.npz")]
+    for more, message in (
+        ([], "give it: fps=30, or --fps 30"),
+        (["--fps", "60"], "give up='y', or --motion-up y"),
+        (["--fps", "60", "--motion-up", "y"], "it looks like .*y up"),
+    ):
+        with pytest.raises(InputError, match=message):
+            command.main([*words, *more])
+    with pytest.raises(ZeroDivisionError):  # where files are written
+        command.main([*words, *"--fps 60 --motion-up y --scale 0.01 --up y".split()])
+    assert (seen[0].vertices - garment.vertices).abs().max() < 1e-3
+
+
 def test_what_lies_there_is_kept(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     for more in ([], ["--overwrite"]):
         with pytest.raises(InputError, match=re.escape(str(tmp_path))):
             command.main(["skirt", "-o", str(tmp_path), *more])
     assert (tmp_path / "notes.txt").read_text() == "mine"
+
+
+def test_overwriting_replaces_what_was_baked_and_nothing_else(
+    baked, draper, motion, tmp_path, monkeypatch
+):
+    out, words = tmp_path / "out", ["skirt", "--motions", "walk", "--seconds", "0.2", "--overwrite"]
+    monkeypatch.setattr("onefit.baking.bake", lambda *_, **__: baked)
+    command.main([*words, "-o", str(out)])
+    write_glb(out / "older.glb", baked, draper.model.body(), motion)
+    command.main([*words, "-o", str(out)])
+    assert {p.name for p in out.iterdir()} == {"baked.npz", "baked.html", "walk-1000000.glb"}
+    for name in ("mine.glb", "notes.txt", "photos/1.png"):
+        (out / name).parent.mkdir(exist_ok=True)
+        (out / name).write_text("mine")
+        with pytest.raises(InputError, match=f"holds {name}, which is not of a baked drape"):
+            command.main([*words, "-o", str(out)])
+        assert (out / name).read_text() == "mine"
+        (out / name).unlink()
+    with pytest.raises(InputError, match="-o '/proc/x': /proc is not a folder"):
+        command.main(["no garment", "-o", "/proc/x"])

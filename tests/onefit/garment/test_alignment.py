@@ -1,5 +1,7 @@
 """``python -m onefit.align``: garments of CLOTH3D on the standard body."""
 
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -53,3 +55,26 @@ def test_alignment_refuses_what_is_not_on_the_body(tank, tmp_path):
     with pytest.raises(InputError, match="pose 'sitting': choose cloth3d or T-pose"):
         alignment.pose_of("sitting")
     assert not (tmp_path / "out.ply").exists()
+
+
+@pytest.mark.parametrize(
+    "name", ["tshirt", "long_sleeve_top", "shirt", "trousers", "jumpsuit", "boxy_tshirt"]
+)
+def test_a_garment_is_refused_in_a_stand_that_is_not_its_own(name, tmp_path):
+    """In the standard stand it is not read as one in the T-pose, nor aligned; in that one it is."""
+    g = Garment.template(name)
+    V, F = g.vertices.double().numpy(), g.faces.numpy()
+    looks = "^garment: looks made for the stand with lowered arms .*: "
+    with pytest.raises(InputError, match=looks + re.escape("give made_for=None (no --made-for)")):
+        Garment.of_mesh(name, V, F, made_for="T-pose")
+    write_ply(tmp_path / "made.ply", V, F)
+    with pytest.raises(
+        InputError, match="lowered arms .*: give the garment itself to onefit.drape"
+    ):
+        align.main([str(tmp_path / "made.ply"), "-o", str(tmp_path / "out.ply")])
+    assert not (tmp_path / "out.ply").exists()
+    body, t_pose = standard_body(), torch.zeros(1, 24, 3)
+    maps = skinning.transforms(body, t_pose, torch.zeros(1, 3))
+    posed = skinning.skin(g.vertices, g.blend_weights, maps)[0].double().numpy()
+    back = Garment.of_mesh(name, posed, F, made_for="T-pose")
+    assert (back.vertices - g.vertices).norm(dim=1).mean() < 0.01

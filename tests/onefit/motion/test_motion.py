@@ -34,6 +34,46 @@ def test_motions_that_cannot_be():
         assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize("as_given", [np.asarray, np.ndarray.tolist, list, torch.tensor])
+def test_a_motion_is_made_of_anything_like_an_array(as_given):
+    poses, places = np.full((5, 24, 3), 0.25), np.ones((5, 3))
+    motion = Motion(as_given(poses), as_given(places), 30)
+    assert motion.poses.dtype == motion.translation.dtype == torch.float32
+    assert torch.equal(motion.poses, torch.full((5, 24, 3), 0.25))
+    assert len(motion.resampled(60)) == 9
+
+
+@pytest.mark.parametrize(
+    "poses, message",
+    [
+        ("walk", "motion x: poses are no array of numbers"),
+        ([[1, 2], [3]], "motion x: poses are no array of numbers"),
+        (0.0, r"motion x: poses of shape \(\); \(frames, 24, 3\) is needed"),
+    ],
+)
+def test_a_motion_is_not_made_of_anything_else(poses, message):
+    with pytest.raises(InputError, match=message):
+        Motion(poses, np.zeros((5, 3)), 30, "x")
+
+
+@pytest.mark.parametrize(
+    "changed, message",
+    [
+        (dict(poses=np.full((5, 72), "still")), "m.npz: poses of type <U5; numbers are needed"),
+        (dict(trans=np.full((5, 3), "here")), "m.npz: trans of type <U4; numbers are needed"),
+        (dict(fps="thirty"), "m.npz: fps is no number; give it: fps=30, or --fps 30"),
+        (dict(fps=[]), "m.npz: fps is no number"),
+    ],
+)
+def test_a_file_without_numbers(changed, message, tmp_path):
+    np.savez(
+        tmp_path / "m.npz",
+        **dict(poses=np.zeros((5, 72)), trans=np.zeros((5, 3)), fps=30) | changed,
+    )
+    with pytest.raises(InputError, match=message):
+        Motion.read(tmp_path / "m.npz")
+
+
 def test_resampling_keeps_frames_and_turns_evenly():
     axis = np.array([0.3, -0.5, 0.8]) / np.linalg.norm([0.3, -0.5, 0.8])
     turn = np.linspace(

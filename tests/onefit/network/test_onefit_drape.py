@@ -96,6 +96,41 @@ def test_what_is_there_is_not_lost(out, network):
         )
 
 
+def test_overwriting_replaces_a_drape_s_files_and_nothing_else(network, tmp_path):
+    out = tmp_path / "out"
+    quick = ["--weights", network, "--seconds", "0.1", "--skip", "usd", "render", "-o", str(out)]
+    drape.main(["shorts", "tank", "walk", "--meshes", "obj", *quick])
+    drape.main(["shorts", "walk", "--meshes", "ply", *quick, "--overwrite"])
+    assert {p.name for p in out.iterdir()} == {"drape.npz", "figures.json", "meshes"}
+    for name in (
+        "notes.txt",
+        "photos/1.png",
+        "meshes/mine.ply",
+        "2_tank/cut.obj",
+        "kept/drape.npz",
+    ):
+        (out / name).parent.mkdir(exist_ok=True)
+        (out / name).write_text("mine")
+        with pytest.raises(InputError, match=f"holds {name}, which is not of a drape"):
+            drape.main(["shorts", "walk", *quick, "--overwrite"])
+        assert (out / name).read_text() == "mine" and (out / "drape.npz").exists()
+        (out / name).unlink()
+        if not any((out / name).parent.iterdir()):
+            (out / name).parent.rmdir()
+
+
+def test_a_folder_that_cannot_be_written_is_told_before_the_work(tmp_path):
+    (tmp_path / "file.obj").write_text("")
+    for out, message in (
+        (tmp_path / "file.obj" / "sub", "file.obj is not a folder that can be written to"),
+        (tmp_path / "file.obj", "file.obj: is a file"),
+        ("/proc/x", "-o '/proc/x': /proc is not a folder"),
+    ):
+        with pytest.raises(InputError, match=message):
+            drape.main(["no garment", "no motion", "-o", str(out)])
+    assert [p.name for p in tmp_path.iterdir()] == ["file.obj"]
+
+
 @pytest.mark.parametrize(
     "arguments, message",
     [
@@ -114,6 +149,16 @@ def test_what_is_there_is_not_lost(out, network):
         (("shorts", "walk", "--shape", "girth=3"), "--shape girth=3: choose among gender, age"),
         (("shorts", "walk", "--shape", "weight=heavy"), "--shape weight=heavy: a number is needed"),
         (("shorts", "walk", "--shape", "weight=2"), "weight = 2; phenotypes go from 0 to 1"),
+        (("shorts", "tank", "walk", "--scale", "0.01"), "--scale: for a garment's file; shorts is"),
+        (("shorts", "walk", "--made-for", "T-pose"), "--made-for: for a garment's file"),
+        (("shorts", "walk", "--turn", "90"), "--turn: for a garment's file"),
+        (("skirt", "walk", "--loose"), "--loose: for a garment's file"),
+        (("shorts", "walk", "--fps", "60"), "--fps: for a motion file; walk is generated"),
+        (("shorts", "walk", "--motion-up", "y"), "--motion-up: for a motion file"),
+        ((str(ROOT / "tests"), "walk"), "tests: is a folder; a garment is an .obj"),
+        (("shorts", "walk", "--seed", "-1"), "seed = -1; 0 or more is needed"),
+        (("shorts", "walk", "--device", "foo"), "--device foo: cpu or cuda is needed"),
+        (("shorts", "walk", "--device", "cuda:99"), "--device cuda:99: this torch sees no such"),
         (("shorts", "walk", "--body", "nobody.npz"), "--body nobody.npz: no such file"),
     ],
 )
@@ -122,6 +167,20 @@ def test_refused_in_one_line(arguments, message, network, tmp_path):
         drape.main([*arguments, "-o", str(tmp_path / "out"), "--weights", network])
     assert message in str(caught.value)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    "words, hint",
+    [
+        ("--shape weight=0.7 dress walk", "required: GARMENT, MOTION; --shape takes all words up"),
+        ("dress --shape weight=0.7 walk", "required: MOTION; --shape takes all words up"),
+        ("--skip render usd dress walk", "'dress' .*; --skip takes all words up to the next flag"),
+        ("dress", "required: MOTION; python -m onefit.drape --help lists the options$"),
+    ],
+)
+def test_words_that_a_list_swallowed_are_hinted_at(words, hint, tmp_path):
+    with pytest.raises(InputError, match=hint):
+        drape.main([*words.split(), "-o", str(tmp_path / "out")])
 
 
 @pytest.mark.parametrize(
@@ -190,6 +249,23 @@ def test_what_a_motion_file_does_not_say_is_said_by_flags(network, tmp_path):
     drape.main([*arguments, "--fps", "60", "--motion-up", "y"])
     with np.load(tmp_path / "out" / "drape.npz") as file:
         assert len(file["vertices"]) == 5 and file["fps"] == 30  # 8 / 60 s
+
+
+def test_a_motion_file_is_cut_and_resampled_which_is_told(network, tmp_path, capsys):
+    path = str(tmp_path / "still.npz")
+    np.savez(path, poses=np.zeros((90, 72)), trans=np.zeros((90, 3)), fps=60)
+    words = ["shorts", path, "--weights", network, "--skip", "usd", "render"]
+    drape.main([*words, "--seconds", "0.2", "-o", str(tmp_path / "out")])
+    with np.load(tmp_path / "out" / "drape.npz") as file:
+        assert len(file["vertices"]) == 6 and file["fps"] == 30
+    assert f"{path}: 60 frames a second, resampled to 30\n" in capsys.readouterr().err
+    for flags, message in (
+        (["--seed", "1"], "--seed: for a generated motion; .*still.npz is a file"),
+        (["--seconds", "0"], "--seconds 0: more than 0 are needed"),
+        (["--seconds", "nan"], "--seconds nan: more than 0 are needed"),
+    ):
+        with pytest.raises(InputError, match=message):
+            drape.main([*words, *flags, "-o", str(tmp_path / "none")])
 
 
 def test_a_mesh_in_centimetres_with_y_up(network, tmp_path):

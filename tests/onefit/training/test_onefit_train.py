@@ -292,6 +292,7 @@ class _Nothing:
         (dict(order=1), "order = 1"),
         (dict(lr=0.0), "lr = 0.0; more than 0 is needed"),
         (dict(epoch_steps=-1), "epoch_steps = -1"),
+        (dict(seed=-1), "seed = -1; at least 0 is needed"),
         (dict(objective="beauty"), "objective 'beauty': choose material or paper"),
         (dict(extras=("wings",)), "extras wings: choose among drift"),
         (dict(frames="lda"), "frames 'lda': choose pca or stn"),
