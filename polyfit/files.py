@@ -23,6 +23,7 @@ from .errors import InputError
 DISK_FULL_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
+_LITTER = ".DS_Store", "Thumbs.db", "desktop.ini"
 _MARKS = (
     (codecs.BOM_UTF8, "utf-8-sig"),
     (codecs.BOM_UTF32_LE, "utf-32"),  # before UTF-16, whose mark it begins with
@@ -158,13 +159,14 @@ def folder_aside(path: str | os.PathLike[str], ours: Callable[[str], bool]) -> I
 
 def others(folder: str | os.PathLike[str], ours: Callable[[str], bool]) -> list[str]:
     """What of a folder is not ``ours``: its files, and its folders that are empty, by their paths
-    in it, with slashes, of which ``ours(path)`` is not true. Links are not followed.
+    in it, with slashes, of which ``ours(path)`` is not true. Links are not followed; what file
+    managers leave does not count.
     """
     return [
         name
         for path in sorted(Path(folder).rglob("*"))
         if path.is_symlink() or not path.is_dir() or not any(path.iterdir())
-        if not ours(name := path.relative_to(folder).as_posix())
+        if path.name not in _LITTER and not ours(name := path.relative_to(folder).as_posix())
     ]
 
 
