@@ -100,7 +100,7 @@ def test_trainings_that_are_missing_are_made_once(tmp_path, monkeypatch):
     monkeypatch.setattr(polyfit_networks, "TRAININGS", {"families": (small, False)})
     said = []
     for _ in range(2):
-        polyfit_networks.train_missing(tmp_path, tmp_path / "runs", said.append)
+        polyfit_networks.train_missing(tmp_path, tmp_path / "runs", say=said.append)
     assert said == ["training families"]
     assert polyfit_networks.trained(tmp_path / "runs", "families", PolyFit.load).order == 4
 

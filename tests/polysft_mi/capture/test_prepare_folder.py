@@ -140,7 +140,7 @@ def test_unknown_folders(tmp_path):
     (tmp_path / "empty").mkdir()
     message = refused(str(tmp_path / "empty"))
     assert all(name in message for name in ("frames/", "rgbs/", "mesh.pts", "camera.json"))
-    assert "nowhere: no such folder" in refused(str(tmp_path / "nowhere"))
+    assert "nowhere: no such file or folder" in refused(str(tmp_path / "nowhere"))
     assert "folder" in refused(__file__)
 
 

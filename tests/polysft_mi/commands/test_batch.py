@@ -44,7 +44,7 @@ def test_a_broken_scene_costs_its_own_line(scenes, tmp_path, capsys):
     assert {n: r["status"] for n, r in found.items()} == {
         "flat": "done", "bent": "done", "gone": "failed",
     }  # fmt: skip
-    assert "gone/frames: no images" in found["gone"]["error"]
+    assert "gone/frames: no such folder" in found["gone"]["error"]
     for name in ("flat", "bent"):
         metrics = json.loads((out / name / "metrics.json").read_text())
         row = found[name]

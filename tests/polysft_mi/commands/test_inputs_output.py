@@ -50,7 +50,7 @@ def test_out_that_holds_something(good, finished, tmp_path):
     scene = good.folder / "scene.xml"
     has(
         refused(scene, out=finished),
-        f"{finished}: holds another run; give --overwrite to replace it or --resume",
+        f"{finished}: holds a run; give --overwrite to replace it or --resume",
     )
     (tmp_path / "notes.txt").write_text("mine")
     for flag in ([], ["--overwrite"]):

@@ -198,8 +198,8 @@ def test_malformed_setting(sheet, text):
         ("first=3", "first = 3; "),
         ("last=3", "last = 3; it must lie in [0, 2]"),
         ("data=/nowhere", "data = /nowhere: no such folder"),
-        ("frames=nothing", "nothing: no images"),
-        ("masks=nothing", "nothing: no images"),
+        ("frames=nothing", "nothing: no such folder"),
+        ("masks=nothing", "nothing: no such folder"),
     ],
 )
 def test_bad_value(sheet, setting, words):
@@ -243,4 +243,4 @@ def test_order_too_high_for_the_vertices(tmp_path):
     "options", [["--fps", "0"], ["--fps", "nan"], ["--exr", "-1"], ["--exr", "some"]]
 )
 def test_bad_numbers_of_flags(sheet, options):
-    has(refused(sheet / "scene.xml", *options), " ".join(options), "are needed")
+    has(refused(sheet / "scene.xml", *options), " ".join(options), "is needed")

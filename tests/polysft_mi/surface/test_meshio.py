@@ -217,9 +217,11 @@ def test_a_template_without_texture_on_some_faces_is_refused(tmp_path):
 
 def test_missing_file_and_folder(tmp_path):
     (tmp_path / "folder.obj").mkdir()
-    for name in ("missing.obj", "missing.ply", "folder.obj"):
+    for name in ("missing.obj", "missing.ply"):
         with pytest.raises(InputError, match=f"{name}: no such file"):
             read_template(tmp_path / name)
+    with pytest.raises(InputError, match="folder.obj: is a folder; a template is an .obj"):
+        read_template(tmp_path / "folder.obj")
 
 
 def test_a_ply_of_points_is_refused(tmp_path):
