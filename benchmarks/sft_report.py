@@ -124,7 +124,11 @@ def page(results, picture):
         ),
         *(f"- {machine}" for machine in machines or ["no machine yet"]),
         "The methods and figures:",
-        "- `gauss-newton` is the default. `adam` is the paper's way (`preset` = `paper`).",
+        (
+            "- `gauss-newton` is the default. `adam` is the paper's way (`preset` = `paper`). Its"
+            " rows of `curtain`, `corner` and the two real videos are of an earlier state, on a"
+            " slower machine, and with the frame by PCA, which changed nothing in the other three."
+        ),
         (
             "- `per-vertex` is what a Mitsuba user would write without jets"
             " (`benchmarks/per_vertex.py`): the same renderer and objective, with the template's"

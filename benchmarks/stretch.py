@@ -11,7 +11,9 @@ paper. What is measured is how far each surface ends from RUN's, RMS over the ve
 from the truth in depth. Frames count from 0; the sheet is fast from 114 on. The readings: the
 preset, which has no masks there; the preset with lengths in millimetres, as the sequence's files
 have them, not in the template's scale; the preset, and φ-SfT's losses, with RUN's own silhouettes
-for masks, the best that masks can be; with ``--masks``, φ-SfT's losses with those of ``polysft
+for masks, the best that masks can be; with these also a robust norm of the images' local contrast,
+near to what nsft, by the paper's authors, does: it weighs residuals by their size, and compares
+images' derivatives; with ``--masks``, φ-SfT's losses with those of ``polysft
 prepare``. Each goes into ``stretch.json`` as soon as it is there, beside those of other stretches.
 """
 
@@ -33,8 +35,6 @@ PHI_SFT = {
     "mask_blur": 5.0,
     "k_silhouette": 0.5,
 }
-# nsft, by the paper's authors, weighs residuals by their size, and compares images' derivatives;
-# here: a robust norm, of images without their local mean and contrast
 CONTRAST = {"rgb_norm": "cauchy", "brightness": "local", "rgb_region": "sheet"}
 
 
@@ -136,9 +136,7 @@ def main(arguments=None):
             "preset, lengths in mm": {"k_mi": stiff},
             "preset, right masks": {"masks": masks},
             "as in φ-SfT, right masks": {"masks": masks, **PHI_SFT},
-            "weights and contrast": CONTRAST,
             "weights and contrast, right masks": {"masks": masks, **CONTRAST},
-            "weights and contrast, lengths in mm": {"k_mi": stiff, **CONTRAST},
         }
         if options.masks:
             readings["as in φ-SfT, masks of prepare"] = {"masks": options.masks, **PHI_SFT}

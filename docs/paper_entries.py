@@ -169,6 +169,8 @@ SECTIONS = {
                 "python benchmarks/stretch.py OUT/jet --first 3 --last 43 "
                 "--only preset 'preset, lengths in mm' -o docs",
                 "python benchmarks/stretch.py OUT/jet --masks OUT/kinect/masks -o docs",
+                "python benchmarks/stretch.py OUT/jet --last 115 --only 'weights and contrast, "
+                "right masks' -o docs",
             ),
             figures.readings,
             "How the losses are read is not what decides. φ-SfT's program takes absolute "
@@ -183,7 +185,9 @@ SECTIONS = {
             "of ours, and the sheet drifts half as far; in metres it would be 0.004, and hold "
             "nothing. And it falls behind where the sheet is fast, 6 to 35 pixels a frame, in "
             "frames 114 and 115: by every reading, even from the right surface and with the right "
-            "masks (third table). Masks of `prepare` run along the print's border, 2 % too large, "
+            "masks (third table), nor does it help to weigh residuals by their size and to compare "
+            "local contrast, near to what that program does with images' derivatives (last "
+            "table). Masks of `prepare` run along the print's border, 2 % too large, "
             "so the sheet comes nearer.",
         ),
         Entry(
