@@ -41,9 +41,9 @@ def list_images(pattern, what="images", endings=EXTENSIONS):
         and os.path.isfile(p)
     ]
     if not images:
-        kind = "pattern" if "*" in pattern else "folder"
-        if kind == "folder" and not os.path.isdir(pattern):
+        if not (glob.has_magic(pattern) or os.path.exists(pattern)):
             raise InputError(f"{what}: {pattern}: no such folder")
+        kind = "folder" if os.path.isdir(pattern) else "pattern"
         raise InputError(
             f"{what}: {pattern}: no images in this {kind}; PNG, JPEG, TIFF, EXR and the like are"
             " read"
