@@ -62,7 +62,8 @@ def main(argv=None):
     for name, least in (("resolution", 1), ("smoothing", 0)):
         if getattr(args, name) < least:
             raise InputError(f"--{name} {getattr(args, name)}; at least {least} is needed")
-    if args.weights and args.frames != "stn" and args.preset != "paper":
+    typed = args.weights != PRESETS.get(args.preset, {}).get("weights")
+    if args.weights and typed and args.frames != "stn":
         raise InputError(f"--weights {args.weights}: of the transformer, for --frames stn")
     import numpy as np
 

@@ -178,7 +178,7 @@ class Baked:
         down by the air, and is pulled to where the guide has its vertex, by one step of the
         implicit Euler method. It begins there, and moves with it.
         """
-        dt = 1 / (self._rate(fps))
+        dt = 1 / self._rate(fps)
         share = (1 / (1 + self.pull * dt * dt)).astype(np.float32)
         shapes = self.point_shapes.swapaxes(1, 2).reshape(len(self.point_shapes), -1)
         points = np.ascontiguousarray(self.points.T).ravel()

@@ -6,7 +6,6 @@ import os
 
 import numpy as np
 
-from polysft_mi.errors import InputError
 from polysft_mi.scene import DepthImages, Tracks
 
 from .camera import Lens
@@ -78,7 +77,7 @@ class GivenEvidence:
             def converted(k):
                 if source.camera is not None:
                     return source.seen_by(images.read(k), straight.camera)
-                return straight.numbers(self._sized(images, k, straight))
+                return straight.numbers(images.like_frames(k, straight.size))
 
             settings |= {
                 "depth": DEPTH,
@@ -94,17 +93,3 @@ class GivenEvidence:
             lines += self.rig.write(where, indices, straight.camera, scale)
             settings["cameras"] = CAMERAS
         return settings, lines
-
-    @staticmethod
-    def _sized(images, k, straight):
-        """A depth image with as many pixels as the frames: the nearest of each."""
-        depth, (width, height) = images.read(k), straight.size
-        h, w = depth.shape
-        if abs(w * height - h * width) > 0.02 * w * height:
-            raise InputError(
-                f"{images.files[k]}: {w}x{h} pixels are not of the shape of the frames,"
-                f" {width}x{height}; depth as the camera of the frames sees it is needed"
-            )
-        rows = ((np.arange(height) + 0.5) * h / height).astype(int)
-        columns = ((np.arange(width) + 0.5) * w / width).astype(int)
-        return depth[rows[:, None], columns]

@@ -118,21 +118,12 @@ class Problem:
         images = self.sequence.depth
         if images is None:
             return
-        depth, path = images.read(0), images.files[0]
-        h, w = depth.shape
-        if abs(w * self.height - h * self.width) > 0.02 * w * self.height:
-            raise InputError(
-                f"{path}: {w}x{h} pixels are not of the shape of the frames,"
-                f" {self.width}x{self.height}; depth as the camera of the frames sees it is needed"
-            )
-        rows = ((np.arange(self.height) + 0.5) * h / self.height).astype(int)
-        columns = ((np.arange(self.width) + 0.5) * w / self.width).astype(int)
-        known = depth[rows[:, None], columns][covered]
+        known = images.like_frames(0, (self.width, self.height))[covered]
         known = known[known > 0]
         if self.settings.depth_known_to == "metric" and len(known):
             told, own = np.median(known), np.median(self.camera.to_camera(vertices)[:, 2])
             if not 0.5 < told / own < 2:
                 raise InputError(
-                    f"{path}: {told:.3g} m where the template lies, whose distance is {own:.3g} m;"
-                    f" depth_unit = {images.unit:g} m must be wrong"
+                    f"{images.files[0]}: {told:.3g} m where the template lies, whose"
+                    f" distance is {own:.3g} m; depth_unit = {images.unit:g} m must be wrong"
                 )

@@ -126,6 +126,21 @@ class DepthImages:
             depth = finite(image, path).astype(np.float32) * np.float32(self.unit)
         return np.maximum(depth, 0)
 
+    def like_frames(self, i: int, size: tuple[int, int]) -> np.ndarray:
+        """Depth i, (H, W) float32 [m], with as many pixels as frames of ``size`` (W, H): the
+        nearest of each. Raises InputError where it is of another shape.
+        """
+        depth, (width, height) = self.read(i), size
+        h, w = depth.shape
+        if abs(w * height - h * width) > 0.02 * w * height:
+            raise InputError(
+                f"{self.files[i]}: {w}x{h} pixels are not of the shape of the frames,"
+                f" {width}x{height}; depth as the camera of the frames sees it is needed"
+            )
+        rows = ((np.arange(height) + 0.5) * h / height).astype(int)
+        columns = ((np.arange(width) + 0.5) * w / width).astype(int)
+        return depth[rows[:, None], columns]
+
 
 def _table(path):
     """Numbers (H, W) float32, a line a row, with commas between."""
