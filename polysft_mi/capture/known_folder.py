@@ -4,20 +4,28 @@ import contextlib
 import os
 from dataclasses import replace
 
+import numpy as np
+
 from polyfit.files import aside
+from polyfit.mesh import TexCoords
+from polysft_mi.backend import set_variant
 from polysft_mi.body import read_motion
+from polysft_mi.colours import srgb
 from polysft_mi.errors import InputError
-from polysft_mi.scene import Sequence, checked_size, open_cameras, read_camera
+from polysft_mi.scene import Sequence, checked_size, open_cameras, read_camera, read_rgb
 from polysft_mi.scene.kinect_paper import template as kinect_paper_template
 from polysft_mi.surface import meshio
 
+from . import pictures
 from .depth import DEPTH, recognise_depth, write_depth
 from .layouts import recognise
-from .output import staged
+from .output import REPORT, staged, write_png
 from .rig import CAMERAS
 from .scene_file import scene_xml
+from .sheet import Sheet
 
 _OF_BODY = "body", "body_model", "body_up"
+_POSE = f"{REPORT}/pose.png"
 
 
 def prepare_folder(
@@ -32,7 +40,8 @@ def prepare_folder(
 ):
     """Write ``scene.xml`` for a sequence into ``out`` (default: the folder itself); for
     Kinect-Paper also ``template.obj``, of that ``resolution``, in its pose of
-    :func:`polysft_mi.scene.kinect_paper.template`.
+    :func:`polysft_mi.scene.kinect_paper.template`. ``prepare/pose.png`` shows how all of it lies in
+    the first frame; not of a garment on a body, which is draped first.
 
     ``evidence``: settings of tracks, depth and the body, by their names, with paths as the caller
     has them; with a body, the template and the camera (``world_to_camera`` in its file) are in the
@@ -67,7 +76,8 @@ def prepare_folder(
         if model and not os.path.isfile(model):
             raise InputError(f"{model}: no such file of a body")
         evidence |= of_body
-    checked_size(os.path.join(folder, layout.texture))
+    texture = os.path.join(folder, layout.texture)
+    checked_size(texture)
     template, where = None, "template.obj"
     if layout.obj is None:
         vertices, faces, uv = template = kinect_paper_template(
@@ -77,12 +87,14 @@ def prepare_folder(
         where = os.path.join(folder, layout.obj)
         vertices, faces, uv = meshio.read_textured_template(where)
     meshio.check_template(vertices, faces, uv, where)
+    placed = vertices * ((-1, -1, 1) if layout.flip else 1)
     if not body:
-        _check_view(vertices * ((-1, -1, 1) if layout.flip else 1), camera, where)
+        _check_view(placed, camera, where)
 
     here = out is None or os.path.realpath(out) == os.path.realpath(folder)
     target = folder if here else out
-    for name in ["scene.xml"] + (["template.obj"] if template else []):
+    names = ["scene.xml"] + (["template.obj"] if template else []) + ([] if body else [_POSE])
+    for name in names:
         if os.path.exists(os.path.join(target, name)) and not overwrite:
             raise InputError(
                 f"{os.path.join(target, name)}: is there already; give --overwrite to replace it,"
@@ -118,7 +130,11 @@ def prepare_folder(
         "template.obj" if template else None,
     )
     hint = "; give a folder that can be written by -o DIR" if here else ""
-    _write(target, text, template, hint, folders)
+    picture = None
+    if not body:
+        told = depth if known_to == "metric" else None
+        picture = _pose(sequence, texture, (placed, faces, uv), camera, told)
+    _write(target, text, template, picture, hint, folders)
     recognised = (
         f"{folder}: a sequence in the form {layout.form}, {len(sequence)} frames of"
         f" {camera.width}x{camera.height}, {'with' if masks else 'without'} masks,"
@@ -127,7 +143,30 @@ def prepare_folder(
         " template of"
         f" {len(vertices)} vertices ({layout.obj or f'subdivided to {resolution}x{resolution}'})"
     )
+    if not body:
+        said.append(f"{os.path.join(target, _POSE)} shows the template in the first frame")
     return os.path.join(target, "scene.xml"), "\n".join([recognised, *said])
+
+
+def _pose(sequence, texture, template, camera, depth):
+    """The picture of how the template, its vertices in the camera frame, the mask, the tracks and
+    ``depth``, a :class:`DepthFolder` in metres or None, lie in the first frame.
+    """
+    set_variant()  # the picture needs rays
+    vertices, faces, texcoords = template
+    if isinstance(texcoords, np.ndarray):  # of each vertex
+        texcoords = TexCoords(texcoords, faces)
+    source, uv, split = texcoords.split(faces)
+    sheet = Sheet(vertices[source], split, uv, "template", source)
+    frame = np.round(255 * srgb(sequence.frame(0))).astype(np.uint8)
+    tracks = sequence.tracks and sequence.tracks.positions[0, sequence.tracks.visible[0]]
+    metres = None
+    if depth and depth.is_seen_by(camera):
+        metres = sequence.depth.like_frames(0, sequence.size)
+    elif depth:
+        metres = depth.seen_by(sequence.depth.read(0), camera)
+    known = pictures.Known(sequence.mask(0), tracks, metres)
+    return pictures.pose(frame, read_rgb(texture), sheet, sheet.vertices, camera, known)
 
 
 def _from_data(path, folder):
@@ -153,9 +192,9 @@ def _check_folder(folder, source, overwrite, known):
         raise InputError(f"{folder}: is there already; {hint} another folder by -o")
 
 
-def _write(target, text, template, hint, folders):
-    """Write what ``folders`` maps names of folders to (functions of a path), the template where
-    there is one, and the scene, ``text()``, into a folder: all or none.
+def _write(target, text, template, picture, hint, folders):
+    """Write what ``folders`` maps names of folders to (functions of a path), the template and the
+    picture of its pose where there is one, and the scene, ``text()``, into a folder: all or none.
     """
     made = not os.path.isdir(target)
     try:
@@ -166,10 +205,15 @@ def _write(target, text, template, hint, folders):
             if template:
                 obj = stack.enter_context(aside(os.path.join(target, "template.obj")))
                 meshio.write_obj(obj, *template)
+            if picture is not None:
+                os.makedirs(os.path.join(target, REPORT), exist_ok=True)
+                write_png(stack.enter_context(aside(os.path.join(target, _POSE))), picture)
             scene = stack.enter_context(aside(os.path.join(target, "scene.xml")))
             with open(scene, "w", encoding="utf-8") as file:
                 file.write(text())
     except (OSError, InputError) as error:
+        with contextlib.suppress(OSError):
+            os.rmdir(os.path.join(target, REPORT))
         if made:
             with contextlib.suppress(OSError):
                 os.rmdir(target)

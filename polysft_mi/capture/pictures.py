@@ -2,12 +2,14 @@
 images.
 """
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 
 from polyfit.mesh import loops
 
-GREEN, _RED, _YELLOW = (60, 220, 90), (235, 70, 60), (255, 210, 40)
+GREEN, _RED, _YELLOW, _BLUE = (60, 220, 90), (235, 70, 60), (255, 210, 40), (60, 120, 250)
 
 
 def shrunk(image, side):
@@ -97,9 +99,10 @@ def matches(photo, frame, found, most=60):
     return canvas
 
 
-def pose(frame, photo, sheet, placed, camera):
-    """Two pictures of the first frame: the template's mesh and border drawn on it; and the photo
-    laid on it where the template is.
+def pose(frame, photo, sheet, placed, camera, known=None):
+    """Pictures of the first frame, side by side: the template's mesh and border drawn on it; the
+    photo laid on it where the template is; and what is :class:`Known` beside the image, on the
+    first one, with a third one for depth.
     """
     wired, scale = _canvas(frame)
     vertices, faces, _ = sheet.mesh(placed)  # a seam is no border
@@ -118,10 +121,63 @@ def pose(frame, photo, sheet, placed, camera):
     wired = cv2.addWeighted(plain, 0.7, wired, 0.3, 0)  # what is printed shows through
     for loop in loops(faces):
         draw(np.stack([loop, np.roll(loop, -1)], axis=1), _YELLOW, 2)
-    label(wired, "the template in the first frame")
+    said = "the template in the first frame"
+    if known is not None:
+        said += known.draw(wired, scale)
+    label(wired, said)
     beside, _ = _canvas(photo_on_frame(frame, photo, sheet, placed, camera))
     label(beside, "the photo, placed on the template")
-    return np.hstack([wired, np.full((wired.shape[0], 4, 3), 255, np.uint8), beside])
+    shown = [wired, beside]
+    if known is not None and known.depth is not None:
+        shown.append(_canvas(known.depth_beside(sheet, placed, camera))[0])
+        label(shown[-1], f"the depth image less the template: 0 grey, {known.PEAK} mm behind red")
+    gap = np.full((wired.shape[0], 4, 3), 255, np.uint8)
+    return np.hstack([shown[0], *(part for image in shown[1:] for part in (gap, image))])
+
+
+@dataclass(frozen=True)
+class Known:
+    """What is known of the first frame beside its image: the ``mask`` (H, W) in [0, 1], places of
+    ``tracks`` (P, 2) [pixels] and ``depth`` (H, W) [m], 0 for unknown; or None.
+    """
+
+    mask: np.ndarray | None = None
+    tracks: np.ndarray | None = None
+    depth: np.ndarray | None = None
+
+    PEAK = 30  # [mm] that is the strongest colour of a difference in depth
+
+    def draw(self, image, scale):
+        """Draw the mask's border and the tracks into a picture that is ``scale`` times as large;
+        returns what is to be said of them.
+        """
+        said = ""
+        if self.mask is not None:
+            inside = cv2.resize(self.mask, image.shape[1::-1], interpolation=cv2.INTER_LINEAR) > 0.5
+            found = cv2.findContours(inside.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[
+                0
+            ]
+            cv2.drawContours(image, found, -1, _RED, 1, cv2.LINE_AA)
+            said += ", the mask's border (red)"
+        if self.tracks is not None:
+            for place in self.tracks * scale:
+                cv2.circle(image, tuple(round(v) for v in place), 3, _BLUE, -1, cv2.LINE_AA)
+            said += ", tracks (blue)"
+        return said
+
+    def depth_beside(self, sheet, placed, camera):
+        """How far the depth image lies behind the template (red) or before it (blue), which the
+        ``camera`` sees of the ``sheet`` with vertices ``placed`` (N, 3) [m, camera frame]; black
+        where one of them is unknown.
+        """
+        from polysft_mi.render import Triangles
+
+        (own,) = Triangles(placed, sheet.faces).seen(camera)
+        known = (self.depth > 0) & np.isfinite(own)
+        share = np.clip((self.depth - np.where(known, own, 0)) / (1e-3 * self.PEAK), -1, 1)
+        grey, end = np.array((190.0,) * 3), np.where(share[..., None] > 0, _RED, _BLUE)
+        shown = grey + np.abs(share[..., None]) * (end - grey)
+        return np.where(known[..., None], np.round(shown), 0).astype(np.uint8)
 
 
 def photo_on_frame(frame, photo, sheet, placed, camera):
@@ -131,6 +187,8 @@ def photo_on_frame(frame, photo, sheet, placed, camera):
     from polysft_mi.render import Triangles
 
     _, u, v = Triangles(placed, sheet.faces).seen(camera, sheet.uv.T)
+    if sheet.uv.min() < -1e-3 or sheet.uv.max() > 1.001:  # tiles of a photo that repeats
+        u, v = u % 1, v % 1
     rows, columns = np.nonzero(np.isfinite(u))
     extent = max(np.ptp(rows), np.ptp(columns)) if len(rows) else 1
     side = max(1.0, max(photo.shape[:2]) / max(extent, 1))

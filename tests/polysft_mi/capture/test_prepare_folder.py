@@ -110,6 +110,31 @@ def test_tracks_and_depth_are_checked_and_named(tmp_path, capsys):
     assert (folder / "scene.xml").read_bytes() == before
 
 
+def test_a_picture_shows_how_all_of_it_lies_in_the_first_frame(tmp_path):
+    truth = synthetic.cloth(tmp_path / "a", frames=2)
+    np.savez(tmp_path / "tracks.npz", tracks=np.full((2, 1, 2), (10.0, 60.0)))
+    (tmp_path / "depth").mkdir()
+    near = np.full((72, 96), 500, np.uint16)  # [mm]: the sheet is flat, and faces the camera
+    near[:, 48:] += 30
+    for k in range(2):
+        cv2.imwrite(str(tmp_path / "depth" / f"{k}.png"), near)
+    given = dict(tracks=str(tmp_path / "tracks.npz"), depth=str(tmp_path / "depth"))
+    _, said = prepare_folder(str(truth.folder), str(tmp_path / "out"), **given)
+    path = tmp_path / "out" / "prepare" / "pose.png"
+    assert f"{path} shows" in said
+    picture = cv2.imread(str(path))[..., ::-1]
+    assert picture.shape == (480, 3 * 640 + 2 * 4, 3)
+    known, depth = (picture[:, k : k + 640].astype(int) for k in (0, 2 * 644))
+    scale = 480 / 72
+    assert np.ptp(depth[240, round(44 * scale)]) < 20 and np.ptp(depth[240, round(52 * scale)]) > 99
+    assert known[round(60 * scale), round(10 * scale)].argmax() == 2  # the track
+    red = np.abs(known - (235, 70, 60)).max(-1) < 25
+    mask = cv2.imread(str(min((truth.folder / "masks").iterdir())), 0)
+    border = cv2.morphologyEx(mask, cv2.MORPH_GRADIENT, np.ones((3, 3)))
+    border = cv2.resize(border, (640, 480), interpolation=cv2.INTER_NEAREST) > 0
+    assert red.sum() > 200 and (red & border).sum() > 0.9 * red.sum()
+
+
 def test_other_names_and_no_masks(tmp_path):
     truth = synthetic.phi_sft(tmp_path / "data", frames=2, masks=False, obj="cloth 7.obj")
     (truth.folder / "texture.png").rename(truth.folder / "print.png")
