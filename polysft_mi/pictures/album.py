@@ -285,11 +285,12 @@ class Album:
     def _draw(self, frame, layers, exr):
         found = {n: self._others[n].draw(frame, layers[n]) for n in self._others}
         found[None] = self._own.draw(frame, layers[None])
-        if exr:
-            os.makedirs(os.path.join(self.out, "comparison"), exist_ok=True)
+        for name in layers if exr else ():
+            folder = os.path.join(self.out, "comparison", name or "")
+            os.makedirs(folder, exist_ok=True)
             index = found[None]["frame"]
-            path = os.path.join(self.out, "comparison", f"{index:03d}.exr")
-            write_exr(path, layers[None], {"frame": index, **self.about})
+            about = {"frame": index, **({"camera": name} if name else {}), **self.about}
+            write_exr(os.path.join(folder, f"{index:03d}.exr"), layers[name], about)
         return found
 
     def _shaded(self, surface):

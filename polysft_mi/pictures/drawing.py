@@ -13,6 +13,7 @@ import tempfile
 import threading
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 
@@ -175,11 +176,11 @@ class Drawing:
 
     def _remove_other_exrs(self):
         """Of frames that were chosen when more, or fewer, were to come."""
-        folder, indices = os.path.join(self.out, "comparison"), self.problem.sequence.indices
+        indices = self.problem.sequence.indices
         kept = {f"{indices[k]:03d}.exr" for k in self._exr}
-        for name in os.listdir(folder) if os.path.isdir(folder) else ():
-            if name.endswith(".exr") and name not in kept:
-                os.remove(os.path.join(folder, name))
+        for path in Path(self.out, "comparison").glob("**/*.exr"):
+            if path.name not in kept:
+                path.unlink()
 
     def __enter__(self):
         return self

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from polysft_mi import prepare, run
 from polysft_mi.camera import Intrinsics
 from polysft_mi.objective import Problem
+from polysft_mi.pictures import read_exr
 from polysft_mi.pictures.album import Album
 from polysft_mi.results import Run
 from polysft_mi.results import folder as folders
@@ -92,7 +93,7 @@ def test_each_camera_is_measured_by_itself(sheet, tmp_path):
 
 def test_a_run_tells_of_them(sheet, tmp_path):
     out = tmp_path / "out"
-    words = [str(sheet.folder / "scene.xml"), "-o", str(out), "-q", "-D", "order=3"]
+    words = [str(sheet.folder / "scene.xml"), "-o", str(out), "-q", "-D", "order=3", "--exr", "2"]
     assert run.main(words) == 0
     metrics = json.loads((out / "metrics.json").read_text())
     side = metrics["cameras"]["side"]
@@ -112,5 +113,11 @@ def test_a_run_tells_of_them(sheet, tmp_path):
         assert np.abs(shown.astype(int) - drawn).mean() < 6
     assert data["columns"]["iou, side"] == [row["iou"] for row in side["per_frame"]]
     assert data["labels"]["iou, side"] == "side: silhouettes, IoU"
+    exrs = sorted(str(p.relative_to(out / "comparison")) for p in out.glob("comparison/**/*.exr"))
+    assert exrs == ["000.exr", "002.exr", "side/000.exr", "side/002.exr"]
+    layers, header = read_exr(str(out / "comparison" / "side" / "002.exr"))
+    frame = open_cameras(str(sheet.folder / "cameras"), 3)[0].sequence.frame(2)
+    assert np.allclose(layers["target"], frame, atol=1e-3)
+    assert {"render", "error", "mask_target"} < set(layers) and header["camera"] == "side"
     folders.clear(str(out))
     assert [p.name for p in Path(out).iterdir()] == []
