@@ -247,7 +247,7 @@ def run(verb: str, args: argparse.Namespace, **how) -> None:
             garment=args.garment[0] if len(garments) == 1 else args.garment,
             motion=motion.name,
             weights=args.weights,
-            shape=shape.tolist(),
+            shape=(model.standard_shape if shape is None else shape).tolist(),
             **how,
         ),
         names=args.garment,

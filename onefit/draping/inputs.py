@@ -11,9 +11,11 @@ from polyfit.errors import InputError
 
 
 def shape_of(model, pairs):
-    """The shape (S,) of a body ``model`` from pairs as "weight=0.6". What is not named is
-    standard.
+    """The shape (S,) of a body ``model`` from pairs as "weight=0.6"; None without any. What is not
+    named is standard.
     """
+    if not pairs:
+        return None
     shape = model.standard_shape.clone()
     for pair in pairs:
         name, _, value = pair.partition("=")

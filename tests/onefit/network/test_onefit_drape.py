@@ -226,6 +226,20 @@ def test_the_summary_is_in_lines_that_fit_a_terminal(network, tmp_path, capsys, 
     assert max(map(len, lines)) < 80
 
 
+@pytest.mark.parametrize("verb", ["drape", "simulate"])
+def test_a_command_makes_what_python_makes(verb, tmp_path):
+    words = ["tshirt", "walk", "--seconds", "0.2", "--skip", "usd", "render"]
+    garment = onefit.Garment.template("tshirt")
+    if verb == "simulate":
+        words, garment = [*words, "--vertices", "300"], garment.remeshed(300)
+    {"drape": drape, "simulate": simulate}[verb].main([*words, "-o", str(tmp_path / "out")])
+    motion = onefit.Motion.generate("walk", seconds=0.2)
+    made = getattr(onefit.load(), verb)(garment, motion)
+    with np.load(tmp_path / "out" / "drape.npz") as file:
+        for name in ("vertices", "body", "root"):
+            assert np.abs(file[name] - getattr(made, name).numpy()).max() < 1e-6
+
+
 def test_what_a_motion_file_does_not_say_is_said_by_flags(network, tmp_path):
     # the advice of the messages is taken word for word
     np.savez(tmp_path / "still.npz", poses=np.zeros((9, 72)), trans=np.zeros((9, 3)))
