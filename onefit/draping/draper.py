@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -17,7 +18,15 @@ import torch
 
 from onefit.body import AnnyBody, ClosestSurface, skinning
 from onefit.contact import Flesh
-from onefit.garment import Garment, PatchedGarment, standard_body, untangled, waistband
+from onefit.garment import (
+    LOOSE,
+    TEMPLATES,
+    Garment,
+    PatchedGarment,
+    standard_body,
+    untangled,
+    waistband,
+)
 from onefit.motion import Motion
 from onefit.network import DEFAULT, Trained
 from onefit.network.weights import load as load_weights
@@ -103,7 +112,8 @@ _Moving: TypeAlias = Motion | str | os.PathLike[str]
 
 
 class Draper:
-    """A trained network and a body model, ready to drape any garment. Made by :func:`onefit.load`.
+    """A trained network and a body model, ready to drape any garment, in any number of threads.
+    Made by :func:`onefit.load`.
 
     Garments are cut into patches once and kept; frames go through in batches. ``device``: where it
     runs. On a body model of another kind than the network was trained on, garments are graded to
@@ -116,10 +126,11 @@ class Draper:
         self.trained, self.device = trained, torch.device(device)
         self.network = trained.network.to(self.device).eval()
         self.model = model or AnnyBody()
-        self._garments: dict = {}
+        self._garments: dict[str, tuple[Any, Garment]] = {}
         # what was made of each garment, by name, as long as that lives
         self._made: WeakKeyDictionary[Garment, dict[str, Any]] = WeakKeyDictionary()
-        self._surfaces: tuple = ()
+        self._lock = threading.RLock()  # of both
+        self._surfaces = threading.local()  # of the body, two for each thread
 
     @cached_property
     def standard(self) -> Body:
@@ -127,14 +138,19 @@ class Draper:
         return standard_body()
 
     def garment(self, garment: Garment | str | os.PathLike[str]) -> Garment:
-        """A :class:`Garment` of one, of a template's name, or of a mesh file; names and files are
-        read once.
+        """A :class:`Garment` of one, of a template's name, or of a mesh file; names are read once,
+        and files where they have changed.
         """
         if isinstance(garment, Garment):
             return garment
-        if str(garment) not in self._garments:
-            self._garments[str(garment)] = Garment.named(garment)
-        return self._garments[str(garment)]
+        name, state = str(garment), None
+        if name not in TEMPLATES + LOOSE and os.path.exists(name):
+            name, now = os.path.realpath(name), os.stat(name)
+            state = now.st_mtime_ns, now.st_size
+        with self._lock:
+            if name not in self._garments or self._garments[name][0] != state:
+                self._garments[name] = state, Garment.named(garment)
+            return self._garments[name][1]
 
     def patched(self, garment: Garment) -> PatchedGarment:
         """The :class:`onefit.PatchedGarment` of a garment, cut once."""
@@ -143,10 +159,11 @@ class Draper:
 
     def _once(self, garment, name, make):
         """What ``make()`` makes of a garment, its ``name``; it must not hold the garment."""
-        made = self._made.setdefault(garment, {})
-        if name not in made:
-            made[name] = make()
-        return made[name]
+        with self._lock:
+            made = self._made.setdefault(garment, {})
+            if name not in made:
+                made[name] = make()
+            return made[name]
 
     @overload
     def drape(self, garment: _Named, motion: _Moving, *args: Any, **how: Any) -> Drape: ...
@@ -336,9 +353,9 @@ class Draper:
         vertices at ``rest`` (N, 3) [m]; ``under``: the surfaces of what it is worn over, besides,
         in one frame after the other.
         """
-        if not self._surfaces:  # made once for a body model
+        if not hasattr(self._surfaces, "two"):
             at, faces = body.vertices.cpu(), body.faces.cpu()
-            self._surfaces = ClosestSurface(at, faces), ClosestSurface(at, faces)
+            self._surfaces.two = ClosestSurface(at, faces), ClosestSurface(at, faces)
         edges = mesh.edges_of(garment.faces.cpu().numpy())[0]
         lengths = garment.rest_lengths(torch.as_tensor(edges), rest.cpu())
         if garment.stitches:
@@ -346,7 +363,7 @@ class Draper:
             edges = np.concatenate([edges, threads])
             lengths = torch.cat([lengths, torch.as_tensor(long).to(lengths)])
         pulls = self.pull(garment)
-        return PostProcessing(rest, garment.faces, edges, lengths, pulls, self._surfaces, under)
+        return PostProcessing(rest, garment.faces, edges, lengths, pulls, self._surfaces.two, under)
 
     def pull(self, garment: Garment) -> np.ndarray:
         """How firmly post-processing draws each vertex of a garment to the network's drape, (N,)

@@ -1,14 +1,17 @@
 """What a draper keeps of garments, what it tells while it drapes, and what a drape measures."""
 
 import weakref
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 import onefit
 from onefit.garment import Garment
 from onefit.objective import crossings
+from polyfit.mesh import write_ply
 
 
 @pytest.fixture(scope="module")
@@ -80,3 +83,25 @@ def test_what_grading_pushes_through_itself_comes_apart(draper, monkeypatch):
     through = crossings(garment.graded(draper.model.body(shape)).numpy(), faces)
     made = draper.drape(garment, onefit.Motion.generate("walk", seconds=0.1), shape)
     assert through > 0 and crossings(made.rest.numpy(), faces) == 0
+
+
+def test_two_threads_drape_as_one_does(draper, coarse):
+    motions = [onefit.Motion.generate(kind, seconds=0.5) for kind in ("walk", "dance")] * 2
+    expected = [draper.drape(coarse, motion, eased=False).vertices for motion in motions]
+    other = onefit.Draper(draper.trained, draper.model)
+    with ThreadPoolExecutor(2) as threads:
+        one, two = threads.map(other.patched, [coarse] * 2)
+        drapes = threads.map(lambda motion: other.drape(coarse, motion, eased=False), motions)
+        assert all(torch.equal(d.vertices, x) for d, x in zip(drapes, expected))
+    assert one is two  # made once
+
+
+def test_a_file_that_changes_is_read_again(draper, coarse, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path, faces = tmp_path / "shorts.ply", coarse.faces.numpy()
+    write_ply(path, coarse.vertices.numpy(), faces)
+    first = draper.garment("shorts.ply")
+    assert draper.garment(path) is first and draper.garment("tank") is draper.garment("tank")
+    write_ply(path, coarse.vertices.numpy() + [0, 0, 0.01], faces)
+    again = draper.garment("shorts.ply")
+    assert (again.vertices - first.vertices)[:, 2].mean() == pytest.approx(0.01, abs=1e-3)
