@@ -131,6 +131,8 @@ class Draper:
         self._made: WeakKeyDictionary[Garment, dict[str, Any]] = WeakKeyDictionary()
         self._lock = threading.RLock()  # of both
         self._surfaces = threading.local()  # of the body, two for each thread
+        # of the last outfit: its garments, the shape, and the vertices at rest that these gave
+        self._outfit: tuple = ([], None, [])
 
     @cached_property
     def standard(self) -> Body:
@@ -189,11 +191,14 @@ class Draper:
         ``post``: post-processing (:class:`onefit.draping.post.PostProcessing`): the cloth keeps its
         motion, edges come back towards their lengths at rest, and vertices are pushed out of the
         body. ``eased``: with the garment's :meth:`ease`, which costs seconds once, and nothing a
-        frame; without it and ``post`` a drape is what the network alone makes. ``skinning_only``:
+        frame; without it and ``post``, which a list needs, a drape is what the network alone makes.
+        ``skinning_only``:
         plain skinning of the template, what OneFit is held against, without any of these.
         ``advance`` is called once for each frame that is done. Raises InputError for a garment,
         motion or shape that cannot be used, and for a garment that does not go over another.
         """
+        if not post and len(outfit.several(garment)) > 1:
+            raise InputError("post=False: of several garments only post-processing keeps the order")
         worn, drapes = self._worn(garment, motion, shape), list[Drape]()
         for one in worn:
             post_processed = lambda vertices, *_: vertices
@@ -276,12 +281,24 @@ class Draper:
         motion = motion if isinstance(motion, Motion) else Motion.read(motion)
         motion = motion.resampled(FPS).to(self.device)
         body = self.model.body(shape)
-        rests = [self._graded(one, body).to(self.device) for one in garments]
+        rests = self._rests(garments, body)
         body = body.to(self.device)
-        rests = outfit.let_out(garments, rests)
         motion = motion if shape is None else motion.fitted(body)
         transforms = skinning.transforms(body, motion.poses, motion.translation)
         return [_Worn(one, motion, body, rest, transforms) for one, rest in zip(garments, rests)]
+
+    def _rests(self, garments, body):
+        """Vertices at rest (N, 3) [m] of each of the garments, graded to a body, and let out over
+        those before it; those of the last outfit are kept, for its other motions.
+        """
+        graded = lambda: [self._graded(one, body).to(self.device) for one in garments]
+        if len(garments) == 1:
+            return graded()
+        of, shape, rests = self._outfit
+        if garments != of or not torch.equal(body.shape, shape):
+            rests = outfit.let_out(garments, graded())
+            self._outfit = garments, body.shape, rests
+        return [rest.clone() for rest in rests]
 
     def _graded(self, garment, body):
         """The garment's vertices graded to a body, (N, 3) [m]; where layers came through each other

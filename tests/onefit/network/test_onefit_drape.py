@@ -311,6 +311,15 @@ def test_a_mesh_in_centimetres_with_y_up(network, tmp_path):
     assert sorted(p.name for p in (tmp_path / "right").iterdir()) == ["drape.npz", "figures.json"]
 
 
+def test_what_two_frames_do_not_tell_is_null(network, tmp_path):
+    words = ["shorts", "walk", "--seconds", "0.05", "--vertices", "300", "--weights", network]
+    drape.main([*words, "--skip", "usd", "render", "-o", str(tmp_path / "out")])
+    refuse = lambda word: pytest.fail(f"{word} is no JSON")
+    text = (tmp_path / "out" / "figures.json").read_text()
+    figures = json.loads(text, parse_constant=refuse)
+    assert figures["frames"] == 2 and figures["jitter"] is None and figures["edge"] > 0
+
+
 def test_the_paper_s_preset_is_the_paper_s_network_alone(tmp_path):
     words = "tank walk --seconds 0.2 --preset paper --skip usd render -o".split()
     drape.main([*words, str(tmp_path / "out")])
