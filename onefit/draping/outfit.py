@@ -10,21 +10,21 @@ import numpy as np
 import torch
 
 from onefit.body import ClosestSurface
-from onefit.contact import SkinContact
+from onefit.contact import MADE, SkinContact
 from onefit.garment import Stitches, untangled
 from onefit.objective import crossing_faces
 from polyfit import mesh
 from polyfit.errors import InputError
 
-from .post import CONTACT, pushes
+from .post import CONTACT, DEEPEST, pushes
 
 if TYPE_CHECKING:
     from onefit.garment import Garment
 
 _MOST = 4  # garments
 _AT_REST = replace(CONTACT, spacing=0.006)  # [m] between points of faces: it is done once
-_FAR = dict(reach=CONTACT.deepest)  # what lies in a garment as a whole is found, too
-_MADE = _FAR | dict.fromkeys(("least", "point_near", "point_least"), CONTACT.made)
+_FAR = dict(reach=DEEPEST)  # what lies in a garment as a whole is found, too
+_MADE = _FAR | dict.fromkeys(("least", "point_near", "point_least"), MADE)
 _LOOKS = 3  # at rest
 _MOST_INSIDE = 1.0  # [%] of a garment's vertices in one under it, or it does not go over that
 # Pairs of faces of the two that pass through each other then, of 1,000 faces, at most: sensible

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from onefit.body import skeleton, skinning
-from onefit.contact import ContactSettings
+from onefit.contact import MADE
 from onefit.objective import crossing_faces
 from polyfit import mesh
 from polyfit.errors import InputError
@@ -32,7 +32,6 @@ from .binding import (
 from .reading import parts
 
 _PUSHED_DEPTH = 0.03  # vertices inside the body by less than this are pushed out [m]
-_MADE = ContactSettings().made
 _PUSH_RADIUS = 0.02  # how far a vertex pushed out takes its neighbours with it [m]
 UNITS = {
     1.0: "metres",
@@ -333,13 +332,13 @@ def pushed_out(V, F, where="garment"):
     for _ in range(8):
         found, middle = surface(out), surface(out[F].mean(axis=1))
         move = np.where(
-            found.distance[:, None] < 0, (_MADE - found.distance)[:, None] * found.normal, 0
+            found.distance[:, None] < 0, (MADE - found.distance)[:, None] * found.normal, 0
         )
         poked = np.flatnonzero(middle.distance < 0)
         if not move.any() and not len(poked):
             break
         move[F[poked].ravel()] += (
-            np.repeat((_MADE - middle.distance[poked])[:, None] * middle.normal[poked], 3, axis=0)
+            np.repeat((MADE - middle.distance[poked])[:, None] * middle.normal[poked], 3, axis=0)
             / 2
         )
         out = out + smoother(area * np.where(move.any(axis=1), 1.0, 0.1), stiffness, _PUSH_RADIUS)(
@@ -347,9 +346,7 @@ def pushed_out(V, F, where="garment"):
         )
     for _ in range(8):
         found = surface(out)
-        out = np.where(
-            (found.distance < _MADE / 4)[:, None], found.point + _MADE * found.normal, out
-        )
+        out = np.where((found.distance < MADE / 4)[:, None], found.point + MADE * found.normal, out)
     return out, (
         f"pushed {(d < 0).sum()} vertices out of the body, by up to {-1000 * d.min():.1f} mm",
     )
