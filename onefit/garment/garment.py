@@ -114,13 +114,19 @@ class Garment:
         takes ``made_for``, a Body in the standard stand, by default one of GarmentCode's mean size.
         Raises InputError, in one line, for a mesh that is no garment or does not lie on the body.
         """
-        if Path(path).suffix == ".json":
+        extension = Path(path).suffix.lower()
+        if extension == ".json":
             if (loose, scale, up, turn, *offset) != (False, 1.0, "z", 0.0, 0.0, 0.0, 0.0):
                 raise InputError(
                     f"{path}: scale, up, turn, offset and loose are for meshes; a sewing pattern"
                     " says its unit and place itself"
                 )
             return cls._sewn(path, name, made_for, count)
+        if extension not in (".obj", ".ply", ".glb", ".gltf") and not Path(path).is_dir():
+            raise InputError(
+                f"{path}: garment of type '{extension}'; a mesh (.obj, .ply or .glb) or a sewing"
+                " pattern (.json) is needed"
+            )
         V, F, texcoords = read_textured(path, "garment")
         garment = cls.of_mesh(
             name or Path(path).stem,
