@@ -220,14 +220,12 @@ def run(verb: str, args: argparse.Namespace, **how) -> None:
         )
     require("torch", "anny", *(["pxr"] if "usd" not in args.skip else []))
 
-    from polyfit.training import device_of
-
     from . import inputs, load, outfit, output
     from .draper import FPS
 
     output.check_folder(args.output, args.overwrite)
     model = inputs.body_model(args.body)
-    draper = load(args.weights, model=model, device=device_of(args.device))
+    draper = load(args.weights, model=model, device=args.device)
     garments = garments_of(outfit.several(args.garment), args)
     (motion,) = motions_of([args.motion], args, SECONDS, SEED)
     shape = inputs.shape_of(model, args.shape)

@@ -34,6 +34,7 @@ from onefit.objective import crossings, posed
 from onefit.physics import Material, Settings
 from polyfit import mesh
 from polyfit.errors import InputError
+from polyfit.training import device_of
 
 from . import ease, outfit
 from .post import PostProcessing, pull
@@ -239,8 +240,8 @@ class Draper:
         """
         from .simulation import simulated
 
-        if steps < 1:
-            raise InputError(f"steps = {steps}; steps a frame, 1 or more")
+        if not isinstance(steps, int) or steps < 1:
+            raise InputError(f"steps = {steps}; steps a frame, a whole number, 1 or more")
         settings = settings or Settings()
         materials = Material.of_each(material, len(outfit.several(garment)))
         worn = self._worn(garment, motion, shape)
@@ -466,5 +467,7 @@ def load(
     """The :class:`Draper` of a network: ``name`` of one that comes with the package
     (:func:`onefit.pretrained`), or a file of weights.
 
-    ``model``: a body model, by default :class:`onefit.AnnyBody`. Raises InputError."""
-    return Draper(load_weights(name), model, device)
+    ``model``: a body model, by default :class:`onefit.AnnyBody`; ``device``: "cpu" or "cuda", or
+    one of several as "cuda:1". Raises InputError.
+    """
+    return Draper(load_weights(name), model, device_of(str(device)))

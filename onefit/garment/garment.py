@@ -78,7 +78,7 @@ class Garment:
         """
         if name in TEMPLATES + LOOSE:
             garment, count = cls.template(str(name)), options.get("count")
-            return garment.remeshed(count) if count else garment
+            return garment if count is None else garment.remeshed(count)
         if not Path(name).suffix and not Path(name).exists():
             raise InputError(
                 f"garment '{name}': no such template; there are {', '.join(TEMPLATES + LOOSE)}; or"
@@ -137,12 +137,13 @@ class Garment:
             loose=loose,
             where=str(path),
         )
-        return garment.remeshed(count) if count else garment
+        return garment if count is None else garment.remeshed(count)
 
     @classmethod
     def _sewn(cls, path, name, made_for, count):
         from .sewing.seams import sewn
 
+        _check_count(count)
         if made_for is not None and not isinstance(made_for, Body):
             raise InputError(f"{path}: made_for={made_for!r}; of a sewing pattern a Body is needed")
         made = sewn(path, count, made_for)
@@ -284,6 +285,7 @@ class Garment:
         are made anew (ACVD). Raises InputError for one that was sewn of panels: :meth:`read` takes
         the ``count`` there.
         """
+        _check_count(count)
         if self.lengths is not None:
             raise InputError(
                 f"{self.name}: sewn of panels: Garment.read(..., count={count}) sews it anew"
@@ -307,3 +309,9 @@ class Garment:
             self.vertices.cpu().numpy(), self.faces.cpu().numpy(), V, F
         )
         return Garment.bound(self.name, V, F, self.repairs + pushed, cut, render_mesh)
+
+
+def _check_count(count):
+    """Raises InputError for a number of vertices that no garment can have; None says none."""
+    if count is not None and not count >= 100:
+        raise InputError(f"count = {count}: at least 100 vertices are needed")

@@ -11,6 +11,8 @@ import torch
 import onefit
 from onefit.garment import Garment
 from onefit.objective import crossings
+from onefit.physics import Settings
+from polyfit.errors import InputError
 from polyfit.mesh import write_ply
 
 
@@ -44,6 +46,32 @@ def test_a_garment_gets_no_patches_of_one_that_is_gone(draper, coarse):
     assert len(draper.patched(other).vertex_patch) == len(other)
     assert len(draper.codes(other)) == len(draper.patched(other))
     assert draper.patched(other) is draper.patched(other)
+
+
+def test_arguments_of_a_wrong_kind_are_refused_in_one_line(draper, coarse):
+    walk = onefit.Motion.generate("walk", seconds=0.1)
+    for how, message in (
+        (dict(material=None), "^material 'None': choose among cotton"),
+        (dict(material=7), "^material '7': choose among cotton"),
+        (dict(steps=1.5), "^steps = 1.5; steps a frame, a whole number, 1 or more$"),
+    ):
+        with pytest.raises(InputError, match=message):
+            draper.simulate(coarse, walk, **how)
+    for how, message in (
+        (dict(newton=0), "^newton = 0: a whole number, 1 or more$"),
+        (dict(iterations=2.5), "^iterations = 2.5: a whole number, 1 or more$"),
+        (dict(parts=0), "^parts = 0: a whole number, 1 or more$"),
+        (dict(stride=0), "^stride = 0: a number above 0$"),
+        (dict(contact=None), "^contact = None: ContactSettings are needed$"),
+    ):
+        with pytest.raises(InputError, match=message):
+            Settings(**how)
+    for device, message in (("foo", "cpu or cuda is needed"), ("cuda:99", "no such CUDA device")):
+        with pytest.raises(InputError, match=f"^device {device}: .*{message}"):
+            onefit.load(device=device)
+    for count in (0, 3):
+        with pytest.raises(InputError, match=f"^count = {count}: at least 100 vertices"):
+            coarse.remeshed(count)
 
 
 def test_each_frame_is_told(draper, coarse):
