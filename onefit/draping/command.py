@@ -94,7 +94,9 @@ def add_mesh_arguments(p: Parser) -> None:
         help="factor to metres: 0.01 for centimetres (default: 1)",
     )
     group.add_argument(
-        "--up", default="z", choices=("z", "y"), help="the axis that points up (default: z)"
+        "--up",
+        choices=("z", "y"),
+        help="the axis that points up (default: of .glb y, as glTF has it, or z)",
     )
     group.add_argument(
         "--turn", type=float, default=0.0, help="rotation about the vertical [degrees] (default: 0)"
@@ -153,7 +155,7 @@ def garments_of(names: Sequence[str], args: argparse.Namespace) -> list[Garment]
         offset=tuple(args.offset),
     )
     if all(name in TEMPLATES + LOOSE for name in names):
-        plain = (None, False, 1.0, "z", 0.0, (0.0, 0.0, 0.0))
+        plain = (None, False, 1.0, None, 0.0, (0.0, 0.0, 0.0))
         for (flag, value), default in zip(placed.items(), plain):
             if value != default:
                 raise InputError(

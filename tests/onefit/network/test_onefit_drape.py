@@ -148,6 +148,8 @@ def test_a_folder_that_cannot_be_written_is_told_before_the_work(tmp_path):
         (("shorts", "walk", "--steps", "2"), "--steps: python -m onefit.simulate takes it"),
         (("shorts", "walk", "--shape", "girth=3"), "--shape girth=3: choose among gender, age"),
         (("shorts", "walk", "--shape", "weight=heavy"), "--shape weight=heavy: a number is needed"),
+        (("shorts", "walk", "--shape", "weight=0.5", "weight=0.9"), "weight is there twice"),
+        (("shorts", "walk", "--up", "z"), "--up: for a garment's file; shorts is a template"),
         (("shorts", "walk", "--shape", "weight=2"), "weight = 2; phenotypes go from 0 to 1"),
         (("shorts", "tank", "walk", "--scale", "0.01"), "--scale: for a garment's file; shorts is"),
         (("shorts", "walk", "--made-for", "T-pose"), "--made-for: for a garment's file"),
@@ -190,6 +192,9 @@ def test_words_that_a_list_swallowed_are_hinted_at(words, hint, tmp_path):
         (("--material", "wool"), "material 'wool': choose among cotton, silk"),
         (("--material", "denim,silk"), "^2 materials for 1 garment; give one for each, in their"),
         (("--no-post",), "--no-post: python -m onefit.drape takes it"),
+        (("--post",), "--post: python -m onefit.drape takes it"),
+        (("--no-ease",), "--no-ease: python -m onefit.drape takes it"),
+        (("--preset", "paper"), "--preset: python -m onefit.drape takes it"),
     ],
 )
 def test_a_simulation_refuses_what_it_has_not(arguments, message, network, tmp_path):
