@@ -22,37 +22,21 @@ import numpy as np
 from onefit_accuracy import SEED
 
 import onefit
-from onefit.body import ClosestSurface
 from onefit.network import DEFAULT
-from onefit.objective import crossings
+from onefit.objective import crossings, depths_beneath
 from polyfit.errors import cli
-from polyfit.mesh import boundary_edges
 
 OUTFITS = "trousers+tshirt", "tshirt+shirt", "trousers+waisted_dress"
 MOTIONS = "walk", "dance", "jumping_jack"  # the last two are held out
-FRAME_STEP, REACH = 5, 0.05  # one frame in so many is looked at; [m]
-
-
-def beneath(inner, outer):
-    """How far each of the vertices of a drape lies beneath another garment's [m], 0 for those that
-    do not, of each frame that is looked at.
-    """
-    faces = inner.faces.numpy()
-    surface = ClosestSurface(inner.vertices[0], faces)
-    on_rim = np.zeros(inner.vertices.shape[1], dtype=bool)
-    on_rim[boundary_edges(faces)] = True
-    for x, y in zip(inner.vertices[::FRAME_STEP], outer.vertices[::FRAME_STEP].numpy()):
-        surface.follow(x)
-        found = surface(y, REACH)
-        corners = faces[found.face]
-        rim = (on_rim[corners] | (found.barycentric < 1e-4)).all(1)
-        yield np.where((found.face >= 0) & ~rim, np.maximum(-found.distance, 0), 0.0)
+FRAME_STEP = 5  # one frame in so many is looked at
 
 
 def figures(drapes):
     """The figures of an outfit's drapes, but for the times."""
     pairs = [(a, b) for k, b in enumerate(drapes) for a in drapes[:k]]
-    deep = np.concatenate([x for a, b in pairs for x in beneath(a, b)])
+    seen = lambda drape: drape.vertices[::FRAME_STEP]
+    depths = [depths_beneath(seen(b), seen(a), a.faces) for a, b in pairs]
+    deep = np.concatenate([x.ravel() for x in depths])
     faces = [d.faces.numpy() for d in drapes]
     first = np.cumsum([0, *(d.vertices.shape[1] for d in drapes)])
     joined = np.concatenate([f + n for f, n in zip(faces, first)])

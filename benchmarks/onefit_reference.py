@@ -206,7 +206,7 @@ def main(argv=None):
     settings = cloth_simulation.Settings()
     drapers = {name: onefit.load(name) for name in args.weights}
     first = next(iter(drapers.values()))
-    shape = inputs.shape_of(first.model, args.shape) if args.shape else None
+    shape = inputs.shape_of(first.model, args.shape)
     body, lines, strips, films = first.model.body(shape), [HEAD], [], []
     with Progress() as progress:
         for garment in map(first.garment, args.garments):

@@ -30,7 +30,11 @@ def parser():
     p.add_argument("--pose", choices=("cloth3d", "T-pose"), default="cloth3d", help="of that body")
     p.add_argument("--loose", action="store_true", help="a dress or skirt: by the shape alone")
     p.add_argument("--scale", type=float, default=1.0, help="factor to metres (default: 1)")
-    p.add_argument("--up", default="z", choices=("z", "y"), help="the axis that points up")
+    p.add_argument(
+        "--up",
+        choices=("z", "y"),
+        help="the axis that points up (default: of .glb y, as glTF has it, or z)",
+    )
     p.add_argument("--turn", type=float, default=0.0, help="about the vertical [degrees]")
     p.add_argument(
         "--offset", nargs=3, type=float, default=(0.0, 0.0, 0.0), metavar=("X", "Y", "Z"),
@@ -49,12 +53,13 @@ def main(argv=None):
     from polyfit.mesh import read_mesh, write_ply
 
     from .draping import inputs
-    from .garment import aligned, placed, pose_of
+    from .garment import aligned, placed, pose_of, up_of
 
     vertices, faces, _ = read_mesh(args.garment)
     model = inputs.body_model(args.body)
     body = model.body(inputs.shape_of(model, args.shape))
-    vertices = placed(vertices, args.scale, args.up, args.turn, tuple(args.offset))
+    up = up_of(args.garment, args.up)
+    vertices = placed(vertices, args.scale, up, args.turn, tuple(args.offset))
     made = aligned(vertices, faces, body, pose_of(args.pose), loose=args.loose, where=args.garment)
     write_ply(args.output, made, faces)
     print(f"written: {args.output}, around the standard body in the T-pose")

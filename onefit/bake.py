@@ -1,5 +1,5 @@
 """Bakes a garment's drape into bones, corrective shapes and a small network, which games and
-browsers evaluate in microseconds.
+browsers evaluate in two tenths of a millisecond.
 
     python -m onefit.bake skirt -o OUT
     python -m onefit.bake shirt.obj -o OUT --vertices 4000 --motions dance walk motion.npz
@@ -60,7 +60,7 @@ def main(argv=None):
     ours = partial(_is_ours, folder)
     check_aside(folder, ours, "baked.npz", "baked drape", args.overwrite)
     model = body_model("anny")
-    shape = shape_of(model, args.shape) if args.shape else None
+    shape = shape_of(model, args.shape)
     motions = command.motions_of(args.motions, args, SECONDS, SEED)
     names = [motion.name for motion in motions]
     for name, motion in zip(args.motions, names):

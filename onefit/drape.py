@@ -25,7 +25,7 @@ frames and the video are of all.
 import argparse
 
 from onefit.draping import command
-from polyfit.errors import cli
+from polyfit.errors import InputError, cli
 
 # The paper: what its network alone makes; --post beside it pushes cloth out of the body
 PRESETS = {"paper": dict(weights="paper", post=False, ease=False)}
@@ -53,6 +53,11 @@ def parser():
 
 def main(argv=None):
     args = parser().parse_args(argv)
+    if not args.post and len(args.garment) > 1:
+        raise InputError(
+            "--no-post, --preset paper: for one garment; of several, only post-processing keeps the"
+            " order: --post"
+        )
     command.run("drape", args, post=args.post, eased=args.ease)
 
 

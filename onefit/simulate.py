@@ -30,7 +30,9 @@ def parser():
         metavar="N",
         help="implicit steps of cloth a frame (default: 2)",
     )
-    command.refuse(p, "--no-post", "python -m onefit.drape takes it, a simulation has no such step")
+    for flag in ("--post", "--no-post", "--ease", "--no-ease"):
+        command.refuse(p, flag, "python -m onefit.drape takes it, a simulation has no such step")
+    command.refuse(p, "--preset", "python -m onefit.drape takes it, a simulation has none")
     return p
 
 

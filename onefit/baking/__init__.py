@@ -1,5 +1,5 @@
-"""A garment and its drapes go in; what a game or a browser plays in microseconds comes out: joints,
-corrective shapes, and how to find their weights from poses.
+"""A garment and its drapes go in; what a game or a browser plays in two tenths of a millisecond
+comes out: joints, corrective shapes, and how to find their weights from poses.
 
 ``making`` samples drapes and fits; ``evaluation`` needs NumPy alone.
 """

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -75,6 +77,7 @@ class Baked:
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Baked:
         """A baked drape that :meth:`save` wrote. Raises InputError for another file."""
+        needed = "a baked.npz that onefit.bake wrote is needed"
         try:
             with np.load(path) as file:
                 layered = lambda name: tuple(file[f"{name}{k}"] for k in range(_LAYERS))
@@ -82,11 +85,11 @@ class Baked:
                     f.name: layered(f.name) if f.name in ("layers", "biases") else file[f.name]
                     for f in fields(cls)
                 }
-        except FileNotFoundError:
-            raise InputError(f"{path}: no such file; onefit.bake writes one") from None
-        except (ValueError, KeyError, EOFError) as error:
-            raise InputError(f"{path}: not a baked drape ({error})") from None
-        scalars: dict[str, Any] = {k: float(values[k]) for k in ("fps", "pace", "drag")}
+            scalars: dict[str, Any] = {k: float(values[k]) for k in ("fps", "pace", "drag")}
+        except OSError as error:
+            raise InputError(f"{path}: {error.strerror or error}; {needed}") from None
+        except (ValueError, TypeError, AttributeError, KeyError, EOFError, BadZipFile, zlib.error):
+            raise InputError(f"{path}: not a baked drape, or cut off; {needed}") from None
         return cls(**(values | scalars | {"name": str(values["name"])}))
 
     def vertices(self, poses: Any, translation: Any, fps: float | None = None) -> np.ndarray:
@@ -305,8 +308,12 @@ class Stream:
     """
 
     def __init__(self, baked: Baked, fps: float | None = None) -> None:
-        self._baked, self._fps = baked, baked._rate(fps)
-        self._swings, self._skinned = baked.swings(self._fps), baked._skinning()
+        self._baked, self._fps, self._skinned = baked, baked._rate(fps), baked._skinning()
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the poses so far: with the next one a motion begins, as with the first."""
+        self._swings = self._baked.swings(self._fps)
         self._before: np.ndarray | None = None
 
     def __call__(self, pose: Any, translation: Any) -> np.ndarray:

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import base64
 import html
-import json
 import os
 from collections.abc import Sequence
 from importlib import resources
@@ -17,7 +16,7 @@ import numpy as np
 from onefit.body import Body, skeleton
 from onefit.motion import Motion
 from polyfit.animation import Skeleton, SkinnedMesh, write_skinned_glb
-from polyfit.files import aside
+from polyfit.files import aside, json_text
 
 from .evaluation import Baked
 
@@ -77,7 +76,7 @@ def write_page(
     )  # fmt: skip
     page = (resources.files("onefit") / "data" / "baked.html").read_text(encoding="utf-8")
     page = page.replace("{{title}}", html.escape(f"{baked.name}, baked"))
-    page = page.replace("{{data}}", json.dumps(data).replace("<", "\\u003c"))
+    page = page.replace("{{data}}", json_text(data).replace("<", "\\u003c"))
     with aside(path) as temporary:
         Path(temporary).write_text(page, encoding="utf-8")
 

@@ -11,7 +11,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "kernels": ["neighbour_mean"],
         "layers": ["SelfContact"],
         "planes": ["Contacts", "ThreadContact", "weighted"],
-        "settings": ["ContactSettings"],
+        "settings": ["MADE", "ContactSettings"],
         "skin": ["SkinContact"],
     },
 )

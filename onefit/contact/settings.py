@@ -4,36 +4,29 @@ from dataclasses import dataclass
 
 from polyfit.errors import InputError
 
+#: [m] that a garment gets where it lies in the body, or in another one: more than the clearance,
+#: for smoothing takes some
+MADE = 0.004
+
 
 @dataclass(frozen=True)
 class ContactSettings:
-    """How near cloth and skin come to each other. Raises InputError for a number below 0."""
+    """How near cloth and skin come to each other in a simulation; what drapes and grading share
+    with it has these defaults there. Raises InputError for a number below 0.
+    """
 
-    #: [m] that cloth keeps from the skin, in drapes, simulations and grading: what a chord of 2 cm
-    #: misses of a limb
+    #: [m] that cloth keeps from the skin, also in drapes and grading: what a chord of 2 cm misses
+    #: of a limb
     clearance: float = 0.003
-    #: [m] that a garment's file gets where it lies in the body: more, for smoothing takes some
-    made: float = 0.004
-    #: [m] that a garment that is tried on gets, if it was made with as much: more, for what comes
-    #: nearer in some poses
-    eased: float = 0.007
     #: [m] to which cloth is pushed at the end of a simulation's step that brought it nearer: less,
     #: for a push is sudden where the contact's force is not
     least: float = 0.001
-    #: [m] between the points of large faces that are kept out, too: a limb shows through there
+    #: [m] between the points of large faces that are kept out, also in drapes: a limb shows through
+    #: there
     spacing: float = 0.02
-    #: [m]: in drapes such a point is pushed where it is nearer than the first, to the second: less
-    #: than a vertex, for skin bulges between these
-    point_near: float = 0.0015
-    point_clearance: float = 0.002
-    #: [m]: cloth that is so near touches the skin: twice the clearance
-    touching: float = 0.006
-    #: [m]: what comes nearer in a step is seen, and cloth that went so far is free: 2 m/s at 60 Hz
+    #: [m]: what comes nearer in a step is seen, and cloth that went so far is free, also in drapes:
+    #: 2 m/s at 60 Hz
     reach: float = 0.03
-    #: [m] in the body that cloth is looked for: deeper, the nearest skin is another side's
-    deepest: float = 0.08
-    #: [m] of limbs: cloth that moves by less has not passed through one
-    thinnest: float = 0.02
     #: [m] between folds: cloth's thickness and hairs, and what a step's errors take
     apart: float = 0.003
     #: [m] between skin and skin, to which flesh yields (:class:`onefit.contact.Flesh`): two layers

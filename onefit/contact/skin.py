@@ -19,6 +19,8 @@ from .planes import Contacts
 from .points import samples
 from .settings import ContactSettings
 
+_THINNEST = 0.02  # [m] of limbs: cloth that moves by less has not passed through one
+
 
 class SkinContact:
     """Contact of a garment with ``faces`` (F, 3), at ``rest`` (N, 3) [m], arrays, with skin.
@@ -104,7 +106,7 @@ class SkinContact:
 
         def part(half):
             (first, last), (start, end) = ([n * k // 2 for k in (half, half + 1)] for n in counts)
-            limits = first, self.settings.thinnest, self._least, self._reach
+            limits = first, _THINNEST, self._least, self._reach
             found = goal, x, self._push, self._known, *self.touched
             launch(self._kernels.first_look, last - first, *limits, *found)
             points = x, *self._of_faces, *self._found, *self.touched

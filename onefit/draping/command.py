@@ -94,7 +94,9 @@ def add_mesh_arguments(p: Parser) -> None:
         help="factor to metres: 0.01 for centimetres (default: 1)",
     )
     group.add_argument(
-        "--up", default="z", choices=("z", "y"), help="the axis that points up (default: z)"
+        "--up",
+        choices=("z", "y"),
+        help="the axis that points up (default: of .glb y, as glTF has it, or z)",
     )
     group.add_argument(
         "--turn", type=float, default=0.0, help="rotation about the vertical [degrees] (default: 0)"
@@ -116,7 +118,8 @@ def add_mesh_arguments(p: Parser) -> None:
         "--vertices",
         type=int,
         metavar="N",
-        help="about N vertices of cloth, which carry the file's mesh (default: its own)",
+        help="about N vertices of cloth, which carry the file's mesh (default: its own; of a sewing"
+        " pattern 4000)",
     )
     group.add_argument(
         "--loose", action="store_true", help="a skirt or dress: the legs' pose is not followed"
@@ -152,7 +155,7 @@ def garments_of(names: Sequence[str], args: argparse.Namespace) -> list[Garment]
         offset=tuple(args.offset),
     )
     if all(name in TEMPLATES + LOOSE for name in names):
-        plain = (None, False, 1.0, "z", 0.0, (0.0, 0.0, 0.0))
+        plain = (None, False, 1.0, None, 0.0, (0.0, 0.0, 0.0))
         for (flag, value), default in zip(placed.items(), plain):
             if value != default:
                 raise InputError(
@@ -219,14 +222,12 @@ def run(verb: str, args: argparse.Namespace, **how) -> None:
         )
     require("torch", "anny", *(["pxr"] if "usd" not in args.skip else []))
 
-    from polyfit.training import device_of
-
     from . import inputs, load, outfit, output
     from .draper import FPS
 
     output.check_folder(args.output, args.overwrite)
     model = inputs.body_model(args.body)
-    draper = load(args.weights, model=model, device=device_of(args.device))
+    draper = load(args.weights, model=model, device=args.device)
     garments = garments_of(outfit.several(args.garment), args)
     (motion,) = motions_of([args.motion], args, SECONDS, SEED)
     shape = inputs.shape_of(model, args.shape)
@@ -247,7 +248,7 @@ def run(verb: str, args: argparse.Namespace, **how) -> None:
             garment=args.garment[0] if len(garments) == 1 else args.garment,
             motion=motion.name,
             weights=args.weights,
-            shape=shape.tolist(),
+            shape=(model.standard_shape if shape is None else shape).tolist(),
             **how,
         ),
         names=args.garment,

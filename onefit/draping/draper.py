@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -17,7 +18,15 @@ import torch
 
 from onefit.body import AnnyBody, ClosestSurface, skinning
 from onefit.contact import Flesh
-from onefit.garment import Garment, PatchedGarment, standard_body, untangled, waistband
+from onefit.garment import (
+    LOOSE,
+    TEMPLATES,
+    Garment,
+    PatchedGarment,
+    standard_body,
+    untangled,
+    waistband,
+)
 from onefit.motion import Motion
 from onefit.network import DEFAULT, Trained
 from onefit.network.weights import load as load_weights
@@ -25,6 +34,7 @@ from onefit.objective import crossings, posed
 from onefit.physics import Material, Settings
 from polyfit import mesh
 from polyfit.errors import InputError
+from polyfit.training import device_of
 
 from . import ease, outfit
 from .post import PostProcessing, pull
@@ -103,7 +113,8 @@ _Moving: TypeAlias = Motion | str | os.PathLike[str]
 
 
 class Draper:
-    """A trained network and a body model, ready to drape any garment. Made by :func:`onefit.load`.
+    """A trained network and a body model, ready to drape any garment, in any number of threads.
+    Made by :func:`onefit.load`.
 
     Garments are cut into patches once and kept; frames go through in batches. ``device``: where it
     runs. On a body model of another kind than the network was trained on, garments are graded to
@@ -116,10 +127,13 @@ class Draper:
         self.trained, self.device = trained, torch.device(device)
         self.network = trained.network.to(self.device).eval()
         self.model = model or AnnyBody()
-        self._garments: dict = {}
+        self._garments: dict[str, tuple[Any, Garment]] = {}
         # what was made of each garment, by name, as long as that lives
         self._made: WeakKeyDictionary[Garment, dict[str, Any]] = WeakKeyDictionary()
-        self._surfaces: tuple = ()
+        self._lock = threading.RLock()  # of both
+        self._surfaces = threading.local()  # of the body, two for each thread
+        # of the last outfit: its garments, the shape, and the vertices at rest that these gave
+        self._outfit: tuple = ([], None, [])
 
     @cached_property
     def standard(self) -> Body:
@@ -127,14 +141,19 @@ class Draper:
         return standard_body()
 
     def garment(self, garment: Garment | str | os.PathLike[str]) -> Garment:
-        """A :class:`Garment` of one, of a template's name, or of a mesh file; names and files are
-        read once.
+        """A :class:`Garment` of one, of a template's name, or of a mesh file; names are read once,
+        and files where they have changed.
         """
         if isinstance(garment, Garment):
             return garment
-        if str(garment) not in self._garments:
-            self._garments[str(garment)] = Garment.named(garment)
-        return self._garments[str(garment)]
+        name, state = str(garment), None
+        if name not in TEMPLATES + LOOSE and os.path.exists(name):
+            name, now = os.path.realpath(name), os.stat(name)
+            state = now.st_mtime_ns, now.st_size
+        with self._lock:
+            if name not in self._garments or self._garments[name][0] != state:
+                self._garments[name] = state, Garment.named(garment)
+            return self._garments[name][1]
 
     def patched(self, garment: Garment) -> PatchedGarment:
         """The :class:`onefit.PatchedGarment` of a garment, cut once."""
@@ -143,10 +162,11 @@ class Draper:
 
     def _once(self, garment, name, make):
         """What ``make()`` makes of a garment, its ``name``; it must not hold the garment."""
-        made = self._made.setdefault(garment, {})
-        if name not in made:
-            made[name] = make()
-        return made[name]
+        with self._lock:
+            made = self._made.setdefault(garment, {})
+            if name not in made:
+                made[name] = make()
+            return made[name]
 
     @overload
     def drape(self, garment: _Named, motion: _Moving, *args: Any, **how: Any) -> Drape: ...
@@ -172,11 +192,14 @@ class Draper:
         ``post``: post-processing (:class:`onefit.draping.post.PostProcessing`): the cloth keeps its
         motion, edges come back towards their lengths at rest, and vertices are pushed out of the
         body. ``eased``: with the garment's :meth:`ease`, which costs seconds once, and nothing a
-        frame; without it and ``post`` a drape is what the network alone makes. ``skinning_only``:
+        frame; without it and ``post``, which a list needs, a drape is what the network alone makes.
+        ``skinning_only``:
         plain skinning of the template, what OneFit is held against, without any of these.
         ``advance`` is called once for each frame that is done. Raises InputError for a garment,
         motion or shape that cannot be used, and for a garment that does not go over another.
         """
+        if not post and len(outfit.several(garment)) > 1:
+            raise InputError("post=False: of several garments only post-processing keeps the order")
         worn, drapes = self._worn(garment, motion, shape), list[Drape]()
         for one in worn:
             post_processed = lambda vertices, *_: vertices
@@ -217,8 +240,8 @@ class Draper:
         """
         from .simulation import simulated
 
-        if steps < 1:
-            raise InputError(f"steps = {steps}; steps a frame, 1 or more")
+        if not isinstance(steps, int) or steps < 1:
+            raise InputError(f"steps = {steps}; steps a frame, a whole number, 1 or more")
         settings = settings or Settings()
         materials = Material.of_each(material, len(outfit.several(garment)))
         worn = self._worn(garment, motion, shape)
@@ -259,12 +282,24 @@ class Draper:
         motion = motion if isinstance(motion, Motion) else Motion.read(motion)
         motion = motion.resampled(FPS).to(self.device)
         body = self.model.body(shape)
-        rests = [self._graded(one, body).to(self.device) for one in garments]
+        rests = self._rests(garments, body)
         body = body.to(self.device)
-        rests = outfit.let_out(garments, rests)
         motion = motion if shape is None else motion.fitted(body)
         transforms = skinning.transforms(body, motion.poses, motion.translation)
         return [_Worn(one, motion, body, rest, transforms) for one, rest in zip(garments, rests)]
+
+    def _rests(self, garments, body):
+        """Vertices at rest (N, 3) [m] of each of the garments, graded to a body, and let out over
+        those before it; those of the last outfit are kept, for its other motions.
+        """
+        graded = lambda: [self._graded(one, body).to(self.device) for one in garments]
+        if len(garments) == 1:
+            return graded()
+        of, shape, rests = self._outfit
+        if garments != of or not torch.equal(body.shape, shape):
+            rests = outfit.let_out(garments, graded())
+            self._outfit = garments, body.shape, rests
+        return [rest.clone() for rest in rests]
 
     def _graded(self, garment, body):
         """The garment's vertices graded to a body, (N, 3) [m]; where layers came through each other
@@ -336,9 +371,9 @@ class Draper:
         vertices at ``rest`` (N, 3) [m]; ``under``: the surfaces of what it is worn over, besides,
         in one frame after the other.
         """
-        if not self._surfaces:  # made once for a body model
+        if not hasattr(self._surfaces, "two"):
             at, faces = body.vertices.cpu(), body.faces.cpu()
-            self._surfaces = ClosestSurface(at, faces), ClosestSurface(at, faces)
+            self._surfaces.two = ClosestSurface(at, faces), ClosestSurface(at, faces)
         edges = mesh.edges_of(garment.faces.cpu().numpy())[0]
         lengths = garment.rest_lengths(torch.as_tensor(edges), rest.cpu())
         if garment.stitches:
@@ -346,7 +381,7 @@ class Draper:
             edges = np.concatenate([edges, threads])
             lengths = torch.cat([lengths, torch.as_tensor(long).to(lengths)])
         pulls = self.pull(garment)
-        return PostProcessing(rest, garment.faces, edges, lengths, pulls, self._surfaces, under)
+        return PostProcessing(rest, garment.faces, edges, lengths, pulls, self._surfaces.two, under)
 
     def pull(self, garment: Garment) -> np.ndarray:
         """How firmly post-processing draws each vertex of a garment to the network's drape, (N,)
@@ -432,5 +467,7 @@ def load(
     """The :class:`Draper` of a network: ``name`` of one that comes with the package
     (:func:`onefit.pretrained`), or a file of weights.
 
-    ``model``: a body model, by default :class:`onefit.AnnyBody`. Raises InputError."""
-    return Draper(load_weights(name), model, device)
+    ``model``: a body model, by default :class:`onefit.AnnyBody`; ``device``: "cpu" or "cuda", or
+    one of several as "cuda:1". Raises InputError.
+    """
+    return Draper(load_weights(name), model, device_of(str(device)))

@@ -16,7 +16,7 @@ from onefit.body import ClosestSurface
 from onefit.contact import spread
 from polyfit.mesh import neighbour_mean
 
-from .post import CONTACT
+from .post import DEEPEST
 
 MOTIONS = (
     "idle",
@@ -29,6 +29,9 @@ MOTIONS = (
     "arms_crossed",
 )  # of the kinds that networks are trained on
 SECONDS = 1.0  # [s] of each motion
+# [m] from the skin that a garment gets, if it was made with as much: more than it keeps in a drape,
+# for what comes nearer in some poses
+EASED = 0.007
 FRAME_STEP = 6  # one frame in so many is looked at
 _CLEAR_SHARE = 0.95  # of those frames in which a vertex is to lie far enough out
 SMOOTHING = 4  # times
@@ -43,7 +46,7 @@ def ease(rest, faces, body, frames):
 
     ``frames``: for each frame, the vertices as the network drapes them and as plain skinning does
     (N, 3), and the body's (V, 3) [m]. A vertex should lie as far out of the body as in the rest
-    pose and under plain skinning, whichever is less, or the contact's ``eased`` where both are
+    pose and under plain skinning, whichever is less, or EASED where both are
     more. It is moved along the body's normal at rest, so far that this holds in _CLEAR_SHARE of the
     frames, and its neighbours go along. What the centre of a triangle with a side above _LONG_SIDE
     misses, all its vertices are moved by.
@@ -53,13 +56,13 @@ def ease(rest, faces, body, frames):
     corners = rest[faces]
     coarse = faces[(corners - corners.roll(1, 1)).norm(dim=-1).amax(1) > _LONG_SIDE]
     places = lambda x: torch.cat([x, x[coarse].mean(1)])
-    at_rest = surface(places(rest), CONTACT.deepest)
+    at_rest = surface(places(rest), DEEPEST)
     missing = []
     for draped, skinned, vertices in frames:
         surface.follow(vertices)
-        of_skinning = surface(places(skinned), CONTACT.deepest).distance
-        wanted = torch.minimum(at_rest.distance, of_skinning).clamp(max=CONTACT.eased)
-        missing.append((wanted - surface(places(draped), CONTACT.deepest).distance).clamp(min=0))
+        of_skinning = surface(places(skinned), DEEPEST).distance
+        wanted = torch.minimum(at_rest.distance, of_skinning).clamp(max=EASED)
+        missing.append((wanted - surface(places(draped), DEEPEST).distance).clamp(min=0))
     missing = torch.as_tensor(
         np.quantile(torch.stack(missing).cpu().numpy(), _CLEAR_SHARE, axis=0)
     ).to(rest)  # torch's has a largest size

@@ -11,12 +11,19 @@ from polyfit.errors import InputError
 
 
 def shape_of(model, pairs):
-    """The shape (S,) of a body ``model`` from pairs as "weight=0.6". What is not named is
-    standard.
+    """The shape (S,) of a body ``model`` from pairs as "weight=0.6"; None without any. What is not
+    named is standard.
     """
-    shape = model.standard_shape.clone()
+    if not pairs:
+        return None
+    if not model.shape_names:
+        raise InputError(f"--shape {pairs[0]}: this body has one shape only; leave --shape out")
+    shape, given = model.standard_shape.clone(), set()
     for pair in pairs:
         name, _, value = pair.partition("=")
+        if name in given:
+            raise InputError(f"--shape {pair}: {name} is there twice; give it once")
+        given.add(name)
         if name not in model.shape_names:
             raise InputError(
                 f"--shape {pair}: choose among {', '.join(model.shape_names)}, as in weight=0.6"

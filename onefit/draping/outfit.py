@@ -10,22 +10,26 @@ import numpy as np
 import torch
 
 from onefit.body import ClosestSurface
-from onefit.contact import SkinContact
+from onefit.contact import MADE, SkinContact
 from onefit.garment import Stitches, untangled
+from onefit.objective import crossing_faces
 from polyfit import mesh
 from polyfit.errors import InputError
 
-from .post import CONTACT, pushes
+from .post import CONTACT, DEEPEST, pushes
 
 if TYPE_CHECKING:
     from onefit.garment import Garment
 
 _MOST = 4  # garments
 _AT_REST = replace(CONTACT, spacing=0.006)  # [m] between points of faces: it is done once
-_FAR = dict(reach=CONTACT.deepest)  # what lies in a garment as a whole is found, too
-_MADE = _FAR | dict.fromkeys(("least", "point_near", "point_least"), CONTACT.made)
+_FAR = dict(reach=DEEPEST)  # what lies in a garment as a whole is found, too
+_MADE = _FAR | dict.fromkeys(("least", "point_near", "point_least"), MADE)
 _LOOKS = 3  # at rest
 _MOST_INSIDE = 1.0  # [%] of a garment's vertices in one under it, or it does not go over that
+# Pairs of faces of the two that pass through each other then, of 1,000 faces, at most: sensible
+# orders of the templates have 0 to 5, a tight garment over a wide one has 8 to 140
+_MOST_THROUGH = 6.0
 _APART = 10.0  # [m] between the garments where they are cut: what lies in two is never neighbours
 
 
@@ -81,7 +85,7 @@ def let_out(garments: Sequence[Garment], rests: Sequence[torch.Tensor]) -> list[
     """The vertices of the garments at ``rests`` (N, 3) [m] each, graded once more, by what is worn
     under them: each is pushed out of those before it as the garment of a file is pushed out of the
     body, and smoothed where its folds come through each other then. Raises InputError where one
-    does not go over another.
+    does not go over another: it stays inside, or both pass through each other.
     """
     made: list[torch.Tensor] = []
     under: list[Under] = []
@@ -94,17 +98,30 @@ def let_out(garments: Sequence[Garment], rests: Sequence[torch.Tensor]) -> list[
                     skin.look(x, layer.surface)
                     skin.push_out(x, layer.surface)
             x = torch.as_tensor(untangled(x.double().numpy(), faces)).float()
-        for other, layer in zip(garments, under):
+        for other, at, layer in zip(garments, made, under):
             inside = 100 * float(np.mean(layer.surface(x.numpy()).distance < 0))
-            if inside > _MOST_INSIDE:
+            wrong = f"{inside:.0f} % of it stays inside" if inside > _MOST_INSIDE else ""
+            below = at.cpu().numpy(), other.faces.cpu().numpy()
+            if not wrong and (through := _through(below, (x.numpy(), faces))) > _MOST_THROUGH:
+                wrong = f"{through:.0f} of 1,000 faces still pass through each other"
+            if wrong:
                 raise InputError(
-                    f"{garment.name} does not go over {other.name}: {inside:.0f} % of it stays"
-                    " inside; garments are given in the order in which they are put on"
+                    f"{garment.name} does not go over {other.name}: {wrong}; garments are given in"
+                    " the order in which they are put on"
                 )
         made.append(x.to(rest))
         if len(made) < len(rests):
             under.append(Under(x.numpy(), faces))
     return made
+
+
+def _through(one, two):
+    """Pairs of faces of two surfaces, ``(vertices (N, 3) [m], faces (F, 3))`` each, that pass
+    through each other, for 1,000 faces of both.
+    """
+    (x, F), (y, G) = one, two
+    pairs = crossing_faces(np.concatenate([x, y]), np.concatenate([F, G + len(x)]))
+    return 1000 * ((pairs < len(F)).sum(1) == 1).sum() / (len(F) + len(G))
 
 
 def numbered(parts: Sequence[np.ndarray]) -> np.ndarray:

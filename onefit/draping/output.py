@@ -1,6 +1,5 @@
 """The files of a drape: arrays, animations, meshes, pictures, a video."""
 
-import json
 import re
 import time
 from dataclasses import dataclass
@@ -12,8 +11,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from onefit.garment import parts
+from onefit.objective import depths_beneath
 from polyfit.animation import write_frames, write_usd
-from polyfit.files import aside, check_aside, folder_aside
+from polyfit.files import aside, check_aside, folder_aside, json_text
 
 BODY_COLOUR = (0.5, 0.48, 0.46)  # linear RGB
 GARMENT_COLOURS = (0.08, 0.19, 0.42), (0.42, 0.12, 0.06), (0.10, 0.28, 0.13), (0.42, 0.30, 0.06)
@@ -41,6 +41,10 @@ class Outcome:
             f"frames: {self.frames}, of {self.vertices} vertices\n"
             f"speed: {speed:.1f} ms a frame{settled}\n"
             f"inside the body: {self.figures['collision']:.2f} % of the vertices\n"
+        ) + "".join(
+            f"{name} beneath those under it: {found['beneath']:.2f} % of the vertices\n"
+            for name, found in self.figures.get("garments", {}).items()
+            if "beneath" in found
         )
 
     def next_step(self):
@@ -112,13 +116,15 @@ def drape_into(folder, make, verb, frames, *, names, about, **files):
     settling = ends[1] - ends[0] if verb == "simulate" else 0.0
     T, counts = len(drapes[0].vertices), [drape.vertices.shape[1] for drape in drapes]
     found, N = [drape.measures().as_dict() for drape in drapes], sum(counts)
-    inside = [figures["collision"] for figures in found]
-    figures = dict(collision=float(np.average(inside, weights=counts))) if drapes[1:] else found[0]
-    outcome = Outcome(folder, T, N, seconds, settling, figures)
-    about = dict(verb=verb, **about, vertices=N, frames=T, **outcome.figures)
+    figures = found[0]
     if len(drapes) > 1:
-        each = (dict(vertices=n, **f) for n, f in zip(counts, found))
-        about["garments"] = dict(zip(_folders(names), each))
+        inside = float(np.average([f["collision"] for f in found], weights=counts))
+        each = [dict(vertices=n, **f) for n, f in zip(counts, found)]
+        for k in range(1, len(drapes)):
+            each[k]["beneath"] = _beneath(drapes[k], drapes[:k])
+        figures = dict(collision=inside, garments=dict(zip(_folders(names), each)))
+    outcome = Outcome(folder, T, N, seconds, settling, figures)
+    about = dict(verb=verb, **about, vertices=N, frames=T, **figures)
     folder.parent.mkdir(parents=True, exist_ok=True)
     with (
         Progress(*columns, console=Console(stderr=True)) as progress,
@@ -128,9 +134,15 @@ def drape_into(folder, make, verb, frames, *, names, about, **files):
         task = progress.add_task("rendering", total=T, visible=visible)
         write(drapes, names, temporary, advance=lambda: progress.advance(task), **files)
         (Path(temporary) / "figures.json").write_text(
-            json.dumps(about, indent=2) + "\n", encoding="utf-8"
+            json_text(about, indent=2) + "\n", encoding="utf-8"
         )
     return outcome
+
+
+def _beneath(outer, inner):
+    """% of the vertices of a drape, in all its frames, that lie beneath any ``inner`` one."""
+    depths = [depths_beneath(outer.vertices, one.vertices, one.faces) for one in inner]
+    return 100 * float((np.stack(depths) > 0).any(0).mean())
 
 
 def _coloured(drapes):

@@ -10,13 +10,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
 from onefit.body import skeleton, skinning
-from onefit.contact import ContactSettings
+from onefit.contact import MADE
 from onefit.objective import crossing_faces
 from polyfit import mesh
 from polyfit.errors import InputError
@@ -32,7 +33,6 @@ from .binding import (
 from .reading import parts
 
 _PUSHED_DEPTH = 0.03  # vertices inside the body by less than this are pushed out [m]
-_MADE = ContactSettings().made
 _PUSH_RADIUS = 0.02  # how far a vertex pushed out takes its neighbours with it [m]
 UNITS = {
     1.0: "metres",
@@ -46,6 +46,11 @@ T_POSE = "T-pose"
 _GROUND_OFFSET = np.array([0.0, 0.0, -0.82])  # from a world in which the body stands at z = 0 [m]
 _TRIAL_VERTICES = 400  # vertices that places are tried on
 _SMOOTHINGS = 30  # of cloth that passes through itself, at most
+
+
+def up_of(path, up=None):
+    """The axis that points up in the mesh of a file, if ``up`` does not say it: y in glTF, or z."""
+    return up or ("y" if Path(path).suffix.lower() in (".glb", ".gltf") else "z")
 
 
 def placed(V, scale=1.0, up="z", turn=0.0, offset=(0.0, 0.0, 0.0)):
@@ -95,17 +100,20 @@ def misfit(surface, V):
 @dataclass(frozen=True)
 class Stand:
     """Another stand in which a garment may have been made: the body's ``surface`` there, what a
-    garment is that was made for it, ``looks``, and what to ``give`` then.
+    garment is that was made for it, ``looks``, and what to ``give`` then, in Python or by
+    ``flags``.
     """
 
     surface: Callable[..., Any]
     looks: str
     give: str
+    flags: tuple[str, ...] = ()
 
 
 def t_stand():
     """The :class:`Stand` of the standard body in the T-pose."""
-    return Stand(_t_surface(), "made for the T-pose", f"made_for='{T_POSE}'")
+    flags = (f"--made-for {T_POSE}",)
+    return Stand(_t_surface(), "made for the T-pose", f"made_for='{T_POSE}'", flags)
 
 
 def lowered_stand(surface=None, give="made_for=None (no --made-for)"):
@@ -134,7 +142,8 @@ def check_place(V, surface, where, other=None):
     best = _best_place(seen, surface, [1.0] if lies else list(UNITS), other)
     if not stands and (there < 0.04 or not (best and best[0] < 0.5 * there)):
         fits = f"{_mm(there)} from the body there, {_mm(own)} from it in the stand it is read in"
-        raise InputError(f"{where}: looks {other.looks} ({fits}): give {other.give}")
+        give = _advice([other.give], other.flags)
+        raise InputError(f"{where}: looks {other.looks} ({fits}): give {give}")
     if lies and not (best and best[0] < 0.5 * own):
         return
     size = " x ".join(f"{s:.3g}" for s in np.ptp(V, axis=0))
@@ -190,19 +199,23 @@ def _best_place(seen, surface, scales, other):
     _, value, scale, up, turn, pose, offset = min(found, key=lambda f: f[0])
     if value > 0.12:
         return None
-    looks, give = [], []
+    looks, give, flags = [], [], []
     if scale != 1:
         looks.append(UNITS[scale])
         give.append(f"scale={scale:g}")
+        flags.append(f"--scale {scale:g}")
     if up != "z":
         looks.append("y up")
         give.append(f"up='{up}'")
+        flags.append(f"--up {up}")
     if turn:
         looks.append("facing backwards")
         give.append(f"turn={turn}")
+        flags.append(f"--turn {turn}")
     if pose:
         looks.append(pose.looks)
         give.append(pose.give)
+        flags.extend(pose.flags)
     if offset.any():
         looks.append(
             "on a body that stands on the ground"
@@ -210,7 +223,13 @@ def _best_place(seen, surface, scales, other):
             else "in another place"
         )
         give.append(f"offset=({', '.join(f'{o:g}' for o in offset)})")
-    return (value, ", ".join(looks), ", ".join(give)) if give else None
+        flags.append(f"--offset {' '.join(f'{o:g}' for o in offset)}")
+    return (value, ", ".join(looks), _advice(give, flags)) if give else None
+
+
+def _advice(give, flags):
+    """What to ``give`` in Python, or by ``flags``, where there are some."""
+    return ", ".join(give) + (f", or {' '.join(flags)}" if flags else "")
 
 
 def _offset(V, surface):
@@ -333,13 +352,13 @@ def pushed_out(V, F, where="garment"):
     for _ in range(8):
         found, middle = surface(out), surface(out[F].mean(axis=1))
         move = np.where(
-            found.distance[:, None] < 0, (_MADE - found.distance)[:, None] * found.normal, 0
+            found.distance[:, None] < 0, (MADE - found.distance)[:, None] * found.normal, 0
         )
         poked = np.flatnonzero(middle.distance < 0)
         if not move.any() and not len(poked):
             break
         move[F[poked].ravel()] += (
-            np.repeat((_MADE - middle.distance[poked])[:, None] * middle.normal[poked], 3, axis=0)
+            np.repeat((MADE - middle.distance[poked])[:, None] * middle.normal[poked], 3, axis=0)
             / 2
         )
         out = out + smoother(area * np.where(move.any(axis=1), 1.0, 0.1), stiffness, _PUSH_RADIUS)(
@@ -347,9 +366,7 @@ def pushed_out(V, F, where="garment"):
         )
     for _ in range(8):
         found = surface(out)
-        out = np.where(
-            (found.distance < _MADE / 4)[:, None], found.point + _MADE * found.normal, out
-        )
+        out = np.where((found.distance < MADE / 4)[:, None], found.point + MADE * found.normal, out)
     return out, (
         f"pushed {(d < 0).sum()} vertices out of the body, by up to {-1000 * d.min():.1f} mm",
     )

@@ -78,7 +78,7 @@ class Garment:
         """
         if name in TEMPLATES + LOOSE:
             garment, count = cls.template(str(name)), options.get("count")
-            return garment.remeshed(count) if count else garment
+            return garment if count is None else garment.remeshed(count)
         if not Path(name).suffix and not Path(name).exists():
             raise InputError(
                 f"garment '{name}': no such template; there are {', '.join(TEMPLATES + LOOSE)}; or"
@@ -95,7 +95,7 @@ class Garment:
         made_for: Body | str | None = None,
         loose: bool = False,
         scale: float = 1.0,
-        up: str = "z",
+        up: str | None = None,
         turn: float = 0.0,
         offset: Any = (0.0, 0.0, 0.0),
         count: int | None = None,
@@ -107,38 +107,52 @@ class Garment:
 
         ``scale``, ``up``, ``turn`` [degrees], ``offset`` [m]: as in
         :func:`onefit.garment.fitting.placed`, from the file's units and axes to metres and
-        OneFit's. ``made_for``: the :class:`~onefit.Body` on which it lies, if that is not the
-        standard body, or "T-pose" for the standard body in the T-pose; the garment is brought to
-        the standard body as :func:`onefit.garment.fitting.to_standard` says, and ``loose`` (skirts,
-        dresses) leaves the legs' pose out. A pattern says itself where it lies: of all these it
-        takes ``made_for``, a Body in the standard stand, by default one of GarmentCode's mean size.
-        Raises InputError, in one line, for a mesh that is no garment or does not lie on the body.
+        OneFit's; without ``up``, y is up in glTF and z in others. ``made_for``: the
+        :class:`~onefit.Body` on which it lies, if that is not the standard body, or "T-pose" for
+        the standard body in the T-pose; the garment is brought to the standard body as
+        :func:`onefit.garment.fitting.to_standard` says, and ``loose`` (skirts, dresses) leaves the
+        legs' pose out. A pattern says itself where it lies: of all these it takes ``made_for``, a
+        Body in the standard stand, by default one of GarmentCode's mean size. Raises InputError, in
+        one line, for a mesh that is no garment or does not lie on the body.
         """
-        if Path(path).suffix == ".json":
-            if (loose, scale, up, turn, *offset) != (False, 1.0, "z", 0.0, 0.0, 0.0, 0.0):
+        extension = Path(path).suffix.lower()
+        if extension == ".json":
+            if (loose, scale, up, turn, *offset) != (False, 1.0, None, 0.0, 0.0, 0.0, 0.0):
                 raise InputError(
                     f"{path}: scale, up, turn, offset and loose are for meshes; a sewing pattern"
                     " says its unit and place itself"
                 )
             return cls._sewn(path, name, made_for, count)
+        if extension not in (".obj", ".ply", ".glb", ".gltf") and not Path(path).is_dir():
+            raise InputError(
+                f"{path}: garment of type '{extension}'; a mesh (.obj, .ply or .glb) or a sewing"
+                " pattern (.json) is needed"
+            )
         V, F, texcoords = read_textured(path, "garment")
+        axis, where = fitting.up_of(path, up), str(path)
+        if axis != (up or "z"):
+            where += " (read with y up, as glTF has it; else up='z', or --up z)"
         garment = cls.of_mesh(
             name or Path(path).stem,
-            fitting.placed(V, scale, up, turn, offset),
+            fitting.placed(V, scale, axis, turn, offset),
             F,
             texcoords,
             made_for=made_for,
             loose=loose,
-            where=str(path),
+            where=where,
         )
-        return garment.remeshed(count) if count else garment
+        return garment if count is None else garment.remeshed(count)
 
     @classmethod
     def _sewn(cls, path, name, made_for, count):
         from .sewing.seams import sewn
 
+        _check_count(count)
         if made_for is not None and not isinstance(made_for, Body):
-            raise InputError(f"{path}: made_for={made_for!r}; of a sewing pattern a Body is needed")
+            raise InputError(
+                f"{path}: made_for={made_for!r}; of a sewing pattern a Body is needed, or no"
+                " --made-for"
+            )
         made = sewn(path, count, made_for)
         V, F, flat = made.vertices, made.cut.faces, made.cut.panels
         places, of = np.unique(flat.reshape(-1, 2), axis=0, return_inverse=True)
@@ -278,6 +292,7 @@ class Garment:
         are made anew (ACVD). Raises InputError for one that was sewn of panels: :meth:`read` takes
         the ``count`` there.
         """
+        _check_count(count)
         if self.lengths is not None:
             raise InputError(
                 f"{self.name}: sewn of panels: Garment.read(..., count={count}) sews it anew"
@@ -301,3 +316,9 @@ class Garment:
             self.vertices.cpu().numpy(), self.faces.cpu().numpy(), V, F
         )
         return Garment.bound(self.name, V, F, self.repairs + pushed, cut, render_mesh)
+
+
+def _check_count(count):
+    """Raises InputError for a number of vertices that no garment can have; None says none."""
+    if count is not None and not count >= 100:
+        raise InputError(f"count = {count}: at least 100 vertices are needed")

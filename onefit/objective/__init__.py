@@ -8,7 +8,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
         "losses": ["Weights"],
-        "measures": ["Measures", "measure"],
+        "measures": ["Measures", "depths_beneath", "measure"],
         "objective": ["posed"],
         "piercing": ["crossing_faces", "crossings"],
     },

@@ -4,11 +4,15 @@ section "Experiments", OneFit).
 
 from dataclasses import asdict, dataclass
 
+import numpy as np
 import torch
 
+from onefit.body import ClosestSurface
 from polyfit import mesh
 
 from . import losses
+
+_BENEATH_REACH = 0.05  # [m]
 
 
 @dataclass(frozen=True)
@@ -81,3 +85,20 @@ def measure(vertices, faces, rest, body_vertices, collider, root, fps, density=l
         float(energy),
         1e3 * float(second),
     )
+
+
+def depths_beneath(vertices, inner, faces):
+    """How far vertices (T, N, 3) [m] of an outer garment lie beneath an ``inner`` one (T, M, 3) [m]
+    with ``faces`` (F, 3), an array (T, N) [m]: 0 for those that do not. One does where the point of
+    the inner one nearest to it, within 5 cm, is not on its rim, and it is on the inner side there.
+    """
+    faces, surface = np.asarray(faces), ClosestSurface(inner[0], faces)
+    on_rim = np.zeros(inner.shape[1], dtype=bool)
+    on_rim[mesh.boundary_edges(faces)] = True
+    depths = []
+    for x, at in zip(vertices.numpy(), inner):
+        surface.follow(at)
+        found = surface(x, _BENEATH_REACH)
+        rim = (on_rim[faces[found.face]] | (found.barycentric < 1e-4)).all(1)
+        depths.append(np.where((found.face >= 0) & ~rim, np.maximum(-found.distance, 0), 0.0))
+    return np.stack(depths)

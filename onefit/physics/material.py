@@ -80,7 +80,7 @@ class Material:
         """Those of so many garments (``count``): each :meth:`named` in a list, or one for all.
         Raises InputError, also where a list has another number of them.
         """
-        if isinstance(material, str | Material):
+        if isinstance(material, str) or not isinstance(material, Sequence):
             return [cls.named(material)] * count
         if len(material) != count:
             raise InputError(

@@ -35,9 +35,12 @@ class Settings:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if name != "contact" and not 0 <= value < float("inf"):
+            if name in ("newton", "iterations", "parts"):
+                if not isinstance(value, int) or value < 1:
+                    raise InputError(f"{name} = {value}: a whole number, 1 or more")
+            elif name != "contact" and not 0 <= value < float("inf"):
                 raise InputError(f"{name} = {value}: a number, 0 or more")
-        if not self.stride or self.parts < 1:
-            raise InputError(
-                f"stride = {self.stride}, parts = {self.parts}: above 0, and 1 or more"
-            )
+        if not self.stride:
+            raise InputError(f"stride = {self.stride}: a number above 0")
+        if not isinstance(self.contact, ContactSettings):
+            raise InputError(f"contact = {self.contact}: ContactSettings are needed")

@@ -61,9 +61,9 @@ def device_of(name):
     others, and for a CUDA device that torch does not see.
     """
     if not re.fullmatch(r"cpu|cuda(:\d+)?", name):
-        raise InputError(f"--device {name}: cpu or cuda is needed, or one of several as cuda:1")
+        raise InputError(f"device {name}: cpu or cuda is needed, or one of several as cuda:1")
     if name != "cpu" and int(name[5:] or 0) >= torch.cuda.device_count():
-        raise InputError(f"--device {name}: this torch sees no such CUDA device")
+        raise InputError(f"device {name}: this torch sees no such CUDA device")
     return name
 
 

@@ -76,16 +76,21 @@ def _pattern(name, found, where):
     try:
         panels, stitches = found["pattern"]["panels"], found["pattern"]["stitches"]
         properties = found.get("properties", {})
-        scale = 1 / float(properties.get("units_in_meter", 100))
+        units = properties.get("units_in_meter", 100)
         relative = properties.get("curvature_coords", "relative") == "relative"
         items, pairs = list(panels.items()), list(stitches)
-    except (KeyError, TypeError, AttributeError, ValueError, ZeroDivisionError):
+    except (KeyError, TypeError, AttributeError):
         raise InputError(
             f"{where}: no sewing pattern; GarmentCode's *_specification.json is needed, with"
             " 'pattern' of 'panels' and 'stitches'"
         ) from None
-    if not items or not 0 < scale < float("inf"):
-        raise InputError(f"{where}: no panels, or units_in_meter is not above 0")
+    if not items:
+        raise InputError(f"{where}: no panels")
+    if not isinstance(units, int | float) or not 0 < units < float("inf"):
+        raise InputError(
+            f"{where}: units_in_meter is {units!r}; a number above 0 is needed, 100 for centimetres"
+        )
+    scale = 1 / units
     made = tuple(_panel(n, panel, scale, relative, f"{where}: panel {n}") for n, panel in items)
     number = {n: k for k, (n, _) in enumerate(items)}
     return Pattern(name, made, tuple(_stitches(pairs, made, number, where)))
@@ -96,18 +101,20 @@ def _panel(name, panel, scale, relative, where):
         corners = np.array(panel["vertices"], dtype=float).reshape(-1, 2)
         angles = np.array(panel["rotation"], dtype=float).reshape(3)
         place = np.array(panel["translation"], dtype=float).reshape(3)
-        edges = [(tuple(edge["endpoints"]), edge.get("curvature")) for edge in panel["edges"]]
-        ends = np.array([e for e, _ in edges], dtype=int).reshape(-1, 2)
+        edges = [([_whole(e) for e in edge["endpoints"]], edge) for edge in panel["edges"]]
+        ends = np.array([e for e, _ in edges]).reshape(-1, 2)
         if ends.min() < 0:
             raise IndexError
-        curves = [_curve(*corners[e], bend, relative, where) for e, (_, bend) in zip(ends, edges)]
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
-        if isinstance(error, InputError):
-            raise
+        sides, bends = corners[ends], [edge.get("curvature") for _, edge in edges]
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError):
         raise InputError(
-            f"{where}: needs 'vertices' (x, y), 'edges' with 'endpoints' among them, 'translation'"
-            " and 'rotation'"
+            f"{where}: needs 'vertices' (x, y), 'edges' with two whole numbers of vertices as their"
+            " 'endpoints', 'translation' and 'rotation'"
         ) from None
+    curves = [
+        _curve(*side, bend, relative, f"{where}: edge {k}")
+        for k, (side, bend) in enumerate(zip(sides, bends))
+    ]
     if not all(np.isfinite(x).all() for x in (corners, angles, place, *curves)):
         raise InputError(f"{where}: has numbers that are not finite")
     if len(ends) < 2 or (ends[:, 1] != np.roll(ends[:, 0], -1)).any():
@@ -123,19 +130,30 @@ def _curve(start, end, bend, relative, where):
     """Points (n, 2) from ``start`` to ``end`` (2,)."""
     if bend is None:
         return np.stack([start, end])
-    kind = "quadratic" if isinstance(bend, list) else bend["type"]
-    values = [bend] if isinstance(bend, list) else bend["params"]
     along = end - start
-    if kind == "circle":
-        radius, large, right = (float(v) for v in values)
-        return _arc(start, end, radius, bool(large), bool(right))
-    if kind not in ("quadratic", "cubic") or len(values) != 1 + (kind == "cubic"):
-        raise InputError(f"{where}: curvature {kind!r}: quadratic, cubic or circle is needed")
-    controls = np.array(values, dtype=float).reshape(-1, 2)
+    try:
+        kind = "quadratic" if isinstance(bend, list) else bend["type"]
+        values = [bend] if isinstance(bend, list) else bend["params"]
+        if kind == "circle":
+            radius, large, right = (float(v) for v in values)
+            return _arc(start, end, radius, bool(large), bool(right))
+        controls = np.array(values, dtype=float).reshape({"quadratic": 1, "cubic": 2}[kind], 2)
+    except (KeyError, TypeError, ValueError):
+        raise InputError(
+            f"{where}: curvature {bend!r}; one of 'type' quadratic (1 point), cubic (2 points) or"
+            " circle (radius, large arc, right) is needed, with 'params'"
+        ) from None
     if relative:
         across = np.array([-along[1], along[0]])
         controls = start + controls[:, :1] * along + controls[:, 1:] * across
     return _bezier(np.stack([start, *controls, end]))
+
+
+def _whole(value):
+    """A whole number of the file. Raises ValueError for anything else."""
+    if not isinstance(value, int | float) or not float(value).is_integer():
+        raise ValueError
+    return int(value)
 
 
 def _bezier(controls):
@@ -170,13 +188,18 @@ def _stitches(pairs, panels, number, where):
     seen: set = set()
     for k, pair in enumerate(pairs):
         try:
-            sides = [(number[s["panel"]], int(s["edge"])) for s in pair[:2]]
-            (one, two), rest = sides, list(pair[2:])
+            words = [s for s in pair if isinstance(s, str)]
+            sides = [(number[s["panel"]], _whole(s["edge"])) for s in pair if s not in words]
+            one, two = sides
         except (KeyError, TypeError, ValueError):
             raise InputError(
                 f"{where}: stitch {k}: needs two sides, each with the 'panel' and 'edge' of one"
                 " that there is"
             ) from None
+        if wrong := [word for word in words if word != "right_wrong"]:
+            raise InputError(
+                f"{where}: stitch {k}: {wrong[0]!r} beside its sides; only 'right_wrong' is known"
+            )
         for panel, edge in sides:
             if not 0 <= edge < len(panels[panel].edges):
                 raise InputError(
@@ -188,4 +211,4 @@ def _stitches(pairs, panels, number, where):
                     f"{where}: stitch {k}: edge {edge} of panel {panels[panel].name} is sewn twice"
                 )
             seen.add((panel, edge))
-        yield Stitch(one, two, "right_wrong" in rest)
+        yield Stitch(one, two, "right_wrong" in words)

@@ -66,6 +66,15 @@ def test_stream_is_the_batch(baked, motion):
         assert np.abs(stream(pose, place) - expected).max() < 1e-5
 
 
+def test_a_stream_that_is_reset_begins_anew(baked, motion):
+    stream = baked.stream()
+    poses, places = arrays(motion)
+    first = [stream(pose, place) for pose, place in zip(poses[:3], places)]
+    stream.reset()
+    again = [stream(pose, place) for pose, place in zip(poses[:3], places)]
+    np.testing.assert_array_equal(first, again)
+
+
 @pytest.mark.parametrize("fps", [-1, 0, float("nan")])
 def test_no_frames_a_second_are_refused(baked, motion, fps):
     for call in (lambda: baked.vertices(*arrays(motion), fps=fps), lambda: baked.stream(fps)):
@@ -136,8 +145,16 @@ def test_arrays_come_back_from_a_file(baked, motion, tmp_path):
     np.testing.assert_array_equal(again.vertices(*arrays(motion)), baked.vertices(*arrays(motion)))
     np.savez(tmp_path / "other.npz", mean=baked.mean)
     (tmp_path / "text.npz").write_text("no zip file")
-    for name in ("other.npz", "text.npz", "none.npz"):
-        with pytest.raises(InputError, match=name):
+    whole = (tmp_path / "baked.npz").read_bytes()
+    for share in (0.3, 0.999):
+        (tmp_path / f"{share}.npz").write_bytes(whole[: int(share * len(whole))])
+    (tmp_path / "page.npz").write_text("<html>not found</html>")
+    np.save(tmp_path / "array.npy", baked.mean)
+    for name in ("other.npz", "text.npz", "0.3.npz", "0.999.npz", "page.npz", "array.npy"):
+        with pytest.raises(InputError, match=f"{name}: not a baked drape, or cut off; [^()]*$"):
+            Baked.load(tmp_path / name)
+    for name, why in (("none.npz", "No such file"), ("", "Is a directory")):
+        with pytest.raises(InputError, match=f"{why}.*; a baked.npz that onefit.bake wrote is"):
             Baked.load(tmp_path / name)
 
 

@@ -10,6 +10,7 @@ import torch
 from standing import random_poses, smpl_contents
 
 from onefit.body import PlainBody, SmplBody, skeleton, skinning
+from onefit.draping import shape_of
 from polyfit.errors import InputError
 
 # --- bodies from files ----------------------------------------------------------------------------
@@ -170,6 +171,12 @@ def test_plain_body_comes_out_as_it_went_in(standard, tmp_path):
         body.faces, standard.faces
     )
     assert torch.allclose(body.joints, standard.joints, atol=5e-5) and body.shape.shape == (0,)
+
+
+def test_a_plain_body_has_no_shapes(standard, tmp_path):
+    np.savez(tmp_path / "body.npz", **plain(standard))
+    with pytest.raises(InputError, match="^--shape x=1: this body has one shape only"):
+        shape_of(PlainBody(tmp_path / "body.npz"), ["x=1"])
 
 
 def test_plain_body_with_y_up_in_the_t_pose(standard, smpl, tmp_path):

@@ -8,10 +8,12 @@ import torch
 from meshes import turned
 from surfaces import joined, moebius, sphere, tube
 
+from onefit import drape
 from onefit.body import skeleton, skinning
 from onefit.garment import Garment, fitting, standard_body, standard_surface
 from onefit.garment.reading.mending import mended
 from polyfit import mesh, write_ply
+from polyfit.animation import write_glb
 from polyfit.errors import InputError
 from polyfit.mesh import loops, vertex_normals
 
@@ -265,15 +267,29 @@ class TestRefusals:
             Garment.read(path)
         found = re.fullmatch(
             rf"{re.escape(str(path))}: does not lie on the body: .*; it looks like {what}: give"
-            r" (.*)",
+            r" (.*), or (--.*)",
             str(error.value),
         )
         assert found, error.value
         given = eval(f"dict({found[1]})")
         assert given == expected
+        flags = drape.parser().parse_args([str(path), "walk", "-o", "OUT", *found[2].split()])
+        assert {name: getattr(flags, name) for name in given} == {
+            name: list(value) if name == "offset" else value for name, value in expected.items()
+        }
         assert (
             np.abs(Garment.read(path, **given).vertices.numpy() - g.vertices.numpy()).max() < 1e-4
         )
+
+    def test_y_is_up_in_gltf(self, templates, tmp_path):
+        g = templates["tank"]
+        x, y, z = g.vertices.double().numpy().T
+        for name, up, V in (("a.glb", None, [x, z, -y]), ("b.glb", "z", [x, y, z])):
+            write_glb(tmp_path / name, np.stack(V, 1)[None], g.faces.numpy())
+            read = Garment.read(tmp_path / name, up=up)
+            assert np.abs(read.vertices.numpy() - g.vertices.numpy()).max() < 1e-4
+        with pytest.raises(InputError, match="b.glb .read with y up, as glTF has it; else up='z'"):
+            Garment.read(tmp_path / "b.glb")
 
     def test_nothing_fits(self):
         V, F = tube(0.5, 0.4)
@@ -283,7 +299,11 @@ class TestRefusals:
         g, body = templates["long_sleeve_top"], standard_body()
         maps = skinning.transforms(body, torch.zeros(1, 24, 3), torch.zeros(1, 3))
         V = skinning.skin(g.vertices, g.blend_weights, maps)[0].double().numpy()
-        self.refused(V, g.faces.numpy(), "looks made for the T-pose .*give made_for='T-pose'")
+        self.refused(
+            V,
+            g.faces.numpy(),
+            "looks made for the T-pose .*give made_for='T-pose', or --made-for T-pose$",
+        )
         back = Garment.of_mesh("top", V, g.faces.numpy(), made_for="T-pose")
         error = (back.vertices - g.vertices).norm(dim=1)
         assert error.mean() < 0.003 and error.max() < 0.02
@@ -351,6 +371,6 @@ def test_garments_in_another_pose_and_axes(shared_data):
             match="does not lie on the body: .* it looks like y up, .*give up='y'.*offset=",
         ) as error:
             Garment.read(path)
-        given = eval(f"dict({str(error.value).partition('give ')[2]})")
+        given = eval(f"dict({str(error.value).partition('give ')[2].partition(', or ')[0]})")
         g = Garment.read(path, **{"made_for": "T-pose", **given})
         assert standard_surface()(g.vertices.numpy()).distance.min() > 0

@@ -178,22 +178,37 @@ def _stitch(k, **values):
     return lambda p: p["pattern"]["stitches"][k][0].update(values)
 
 
+def _more(value):
+    return lambda p: p["pattern"]["stitches"][0].append(value)
+
+
 @pytest.mark.parametrize(
     "change, message",
     [
         (lambda p: p.pop("pattern"), "no sewing pattern"),
-        (lambda p: p["properties"].update(units_in_meter=0), "no sewing pattern"),
+        (lambda p: p["properties"].update(units_in_meter=0), "units_in_meter is 0; a number above"),
+        (lambda p: p["properties"].update(units_in_meter=None), "units_in_meter is None; a number"),
+        (lambda p: p["properties"].update(units_in_meter="cm"), "units_in_meter is 'cm'; a number"),
         (lambda p: p["properties"].update(units_in_meter=1e9), "shorter than 0.1 mm"),
         (lambda p: p["pattern"]["panels"].clear(), "no panels"),
         (_without("vertices"), "panel front: needs 'vertices'"),
         (_without("rotation"), "panel front: needs"),
         (_edge(1, endpoints=[1, 3]), "panel front: its edges are no loop"),
         (_edge(1, endpoints=[1, 7]), "panel front: needs"),
-        (_edge(1, curvature={"type": "spline", "params": []}), "curvature 'spline'"),
-        (_edge(1, curvature={"type": "cubic", "params": [[0.5, 0.2]]}), "curvature 'cubic'"),
+        (_edge(1, endpoints=[1.4, 2.4]), "panel front: needs .* two whole numbers"),
+        (_edge(1, curvature={"type": "spline", "params": []}), "edge 1: curvature .*'spline'"),
+        (
+            _edge(1, curvature={"type": "cubic", "params": [[0.5, 0.2]]}),
+            "edge 1: curvature .*cubic",
+        ),
+        (_edge(1, curvature={"type": "circle", "params": [20]}), "edge 1: curvature .*circle"),
+        (_edge(1, curvature=0.2), "front: edge 1: curvature 0.2; one of 'type' quadratic"),
         (_edge(1, curvature=[0.5, float("nan")]), "not finite"),
         (_edge(1, curvature=[0.5, -3.0]), "its edges cross each other"),
         (_stitch(0, panel="hood"), "stitch 0: needs two sides"),
+        (_stitch(0, edge=1.7), "stitch 0: needs two sides"),
+        (_more({"panel": "front", "edge": 1}), "stitch 0: needs two sides"),
+        (_more("wrong_right"), "stitch 0: 'wrong_right' beside its sides; only 'right_wrong'"),
         (_stitch(0, edge=9), "panel front has no edge 9; it has 4"),
         (_stitch(1, edge=0), "edge 0 of panel front is sewn twice"),
         (lambda p: p["properties"].update(units_in_meter=300), "does not fit the body"),
@@ -206,6 +221,17 @@ def test_a_bad_pattern_is_refused_in_one_line(change, message, tmp_path):
     with pytest.raises(InputError, match=message) as error:
         Garment.read(path, count=400)
     assert str(error.value).startswith(str(path)) and "\n" not in str(error.value)
+
+
+def test_a_pattern_s_name_may_end_in_capitals(tmp_path):
+    path = tmp_path / "TUBE.JSON"
+    with pytest.raises(InputError, match="TUBE.JSON: cannot be read"):
+        Garment.read(path)
+    with pytest.raises(InputError, match="of type '.txt'; a mesh .* or a sewing pattern"):
+        Garment.read(tmp_path / "tube.txt")
+    path.write_text("{}")
+    with pytest.raises(InputError, match="no sewing pattern"):
+        Garment.read(path)
 
 
 def test_what_is_no_pattern_or_is_for_meshes_is_refused(tmp_path):

@@ -1,14 +1,19 @@
 """What a draper keeps of garments, what it tells while it drapes, and what a drape measures."""
 
 import weakref
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 import onefit
 from onefit.garment import Garment
 from onefit.objective import crossings
+from onefit.physics import Settings
+from polyfit.errors import InputError
+from polyfit.mesh import write_ply
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +46,32 @@ def test_a_garment_gets_no_patches_of_one_that_is_gone(draper, coarse):
     assert len(draper.patched(other).vertex_patch) == len(other)
     assert len(draper.codes(other)) == len(draper.patched(other))
     assert draper.patched(other) is draper.patched(other)
+
+
+def test_arguments_of_a_wrong_kind_are_refused_in_one_line(draper, coarse):
+    walk = onefit.Motion.generate("walk", seconds=0.1)
+    for how, message in (
+        (dict(material=None), "^material 'None': choose among cotton"),
+        (dict(material=7), "^material '7': choose among cotton"),
+        (dict(steps=1.5), "^steps = 1.5; steps a frame, a whole number, 1 or more$"),
+    ):
+        with pytest.raises(InputError, match=message):
+            draper.simulate(coarse, walk, **how)
+    for how, message in (
+        (dict(newton=0), "^newton = 0: a whole number, 1 or more$"),
+        (dict(iterations=2.5), "^iterations = 2.5: a whole number, 1 or more$"),
+        (dict(parts=0), "^parts = 0: a whole number, 1 or more$"),
+        (dict(stride=0), "^stride = 0: a number above 0$"),
+        (dict(contact=None), "^contact = None: ContactSettings are needed$"),
+    ):
+        with pytest.raises(InputError, match=message):
+            Settings(**how)
+    for device, message in (("foo", "cpu or cuda is needed"), ("cuda:99", "no such CUDA device")):
+        with pytest.raises(InputError, match=f"^device {device}: .*{message}"):
+            onefit.load(device=device)
+    for count in (0, 3):
+        with pytest.raises(InputError, match=f"^count = {count}: at least 100 vertices"):
+            coarse.remeshed(count)
 
 
 def test_each_frame_is_told(draper, coarse):
@@ -80,3 +111,25 @@ def test_what_grading_pushes_through_itself_comes_apart(draper, monkeypatch):
     through = crossings(garment.graded(draper.model.body(shape)).numpy(), faces)
     made = draper.drape(garment, onefit.Motion.generate("walk", seconds=0.1), shape)
     assert through > 0 and crossings(made.rest.numpy(), faces) == 0
+
+
+def test_two_threads_drape_as_one_does(draper, coarse):
+    motions = [onefit.Motion.generate(kind, seconds=0.5) for kind in ("walk", "dance")] * 2
+    expected = [draper.drape(coarse, motion, eased=False).vertices for motion in motions]
+    other = onefit.Draper(draper.trained, draper.model)
+    with ThreadPoolExecutor(2) as threads:
+        one, two = threads.map(other.patched, [coarse] * 2)
+        drapes = threads.map(lambda motion: other.drape(coarse, motion, eased=False), motions)
+        assert all(torch.equal(d.vertices, x) for d, x in zip(drapes, expected))
+    assert one is two  # made once
+
+
+def test_a_file_that_changes_is_read_again(draper, coarse, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path, faces = tmp_path / "shorts.ply", coarse.faces.numpy()
+    write_ply(path, coarse.vertices.numpy(), faces)
+    first = draper.garment("shorts.ply")
+    assert draper.garment(path) is first and draper.garment("tank") is draper.garment("tank")
+    write_ply(path, coarse.vertices.numpy() + [0, 0, 0.01], faces)
+    again = draper.garment("shorts.ply")
+    assert (again.vertices - first.vertices)[:, 2].mean() == pytest.approx(0.01, abs=1e-3)

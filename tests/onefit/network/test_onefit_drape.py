@@ -148,6 +148,8 @@ def test_a_folder_that_cannot_be_written_is_told_before_the_work(tmp_path):
         (("shorts", "walk", "--steps", "2"), "--steps: python -m onefit.simulate takes it"),
         (("shorts", "walk", "--shape", "girth=3"), "--shape girth=3: choose among gender, age"),
         (("shorts", "walk", "--shape", "weight=heavy"), "--shape weight=heavy: a number is needed"),
+        (("shorts", "walk", "--shape", "weight=0.5", "weight=0.9"), "weight is there twice"),
+        (("shorts", "walk", "--up", "z"), "--up: for a garment's file; shorts is a template"),
         (("shorts", "walk", "--shape", "weight=2"), "weight = 2; phenotypes go from 0 to 1"),
         (("shorts", "tank", "walk", "--scale", "0.01"), "--scale: for a garment's file; shorts is"),
         (("shorts", "walk", "--made-for", "T-pose"), "--made-for: for a garment's file"),
@@ -157,8 +159,8 @@ def test_a_folder_that_cannot_be_written_is_told_before_the_work(tmp_path):
         (("shorts", "walk", "--motion-up", "y"), "--motion-up: for a motion file"),
         ((str(ROOT / "tests"), "walk"), "tests: is a folder; a garment is an .obj"),
         (("shorts", "walk", "--seed", "-1"), "seed = -1; 0 or more is needed"),
-        (("shorts", "walk", "--device", "foo"), "--device foo: cpu or cuda is needed"),
-        (("shorts", "walk", "--device", "cuda:99"), "--device cuda:99: this torch sees no such"),
+        (("shorts", "walk", "--device", "foo"), "device foo: cpu or cuda is needed"),
+        (("shorts", "walk", "--device", "cuda:99"), "device cuda:99: this torch sees no such"),
         (("shorts", "walk", "--body", "nobody.npz"), "--body nobody.npz: no such file"),
     ],
 )
@@ -190,6 +192,9 @@ def test_words_that_a_list_swallowed_are_hinted_at(words, hint, tmp_path):
         (("--material", "wool"), "material 'wool': choose among cotton, silk"),
         (("--material", "denim,silk"), "^2 materials for 1 garment; give one for each, in their"),
         (("--no-post",), "--no-post: python -m onefit.drape takes it"),
+        (("--post",), "--post: python -m onefit.drape takes it"),
+        (("--no-ease",), "--no-ease: python -m onefit.drape takes it"),
+        (("--preset", "paper"), "--preset: python -m onefit.drape takes it"),
     ],
 )
 def test_a_simulation_refuses_what_it_has_not(arguments, message, network, tmp_path):
@@ -224,6 +229,20 @@ def test_the_summary_is_in_lines_that_fit_a_terminal(network, tmp_path, capsys, 
     lines = [line for line in said.err.splitlines() if line.strip()]
     assert [line.partition(":")[0] for line in lines] == ["frames", "speed", "inside the body"]
     assert max(map(len, lines)) < 80
+
+
+@pytest.mark.parametrize("verb", ["drape", "simulate"])
+def test_a_command_makes_what_python_makes(verb, tmp_path):
+    words = ["tshirt", "walk", "--seconds", "0.2", "--skip", "usd", "render"]
+    garment = onefit.Garment.template("tshirt")
+    if verb == "simulate":
+        words, garment = [*words, "--vertices", "300"], garment.remeshed(300)
+    {"drape": drape, "simulate": simulate}[verb].main([*words, "-o", str(tmp_path / "out")])
+    motion = onefit.Motion.generate("walk", seconds=0.2)
+    made = getattr(onefit.load(), verb)(garment, motion)
+    with np.load(tmp_path / "out" / "drape.npz") as file:
+        for name in ("vertices", "body", "root"):
+            assert np.abs(file[name] - getattr(made, name).numpy()).max() < 1e-6
 
 
 def test_what_a_motion_file_does_not_say_is_said_by_flags(network, tmp_path):
@@ -295,6 +314,15 @@ def test_a_mesh_in_centimetres_with_y_up(network, tmp_path):
         apart = np.linalg.norm(file["mesh_vertices"] - file["vertices"], axis=2)
         assert apart.max() < 1e-3 and (file["mesh_faces"] == file["faces"]).all()
     assert sorted(p.name for p in (tmp_path / "right").iterdir()) == ["drape.npz", "figures.json"]
+
+
+def test_what_two_frames_do_not_tell_is_null(network, tmp_path):
+    words = ["shorts", "walk", "--seconds", "0.05", "--vertices", "300", "--weights", network]
+    drape.main([*words, "--skip", "usd", "render", "-o", str(tmp_path / "out")])
+    refuse = lambda word: pytest.fail(f"{word} is no JSON")
+    text = (tmp_path / "out" / "figures.json").read_text()
+    figures = json.loads(text, parse_constant=refuse)
+    assert figures["frames"] == 2 and figures["jitter"] is None and figures["edge"] > 0
 
 
 def test_the_paper_s_preset_is_the_paper_s_network_alone(tmp_path):

@@ -9,13 +9,11 @@ import torch
 
 import onefit
 from onefit import drape
-from onefit.body import ClosestSurface
 from onefit.draping.outfit import Under, joined, let_out
 from onefit.garment import Garment
-from onefit.objective import crossings
+from onefit.objective import crossings, depths_beneath
 from onefit.physics import MATERIALS, Settings
 from polyfit.errors import InputError
-from polyfit.mesh import boundary_edges
 
 
 @pytest.fixture(scope="module")
@@ -38,18 +36,8 @@ MOTION = onefit.Motion.generate("dance", seconds=0.3, seed=1_000_003)
 
 
 def beneath(inner, outer):
-    """The share of the vertices of a drape that lie on the inner side of another, beside its
-    rim.
-    """
-    faces, wrong = inner.faces.numpy(), []
-    surface = ClosestSurface(inner.vertices[0], faces)
-    rim = np.unique(boundary_edges(faces))
-    for x, y in zip(inner.vertices, outer.vertices.numpy()):
-        surface.follow(x)
-        found = surface(y, 0.05)
-        beside = (np.isin(faces[found.face], rim) | (found.barycentric < 1e-4)).all(1)
-        wrong.append((found.face >= 0) & ~beside & (found.distance < 0))
-    return np.mean(wrong)
+    """The share of the vertices of a drape that lie beneath another."""
+    return (depths_beneath(outer.vertices, inner.vertices, inner.faces) > 0).mean()
 
 
 def passed(drapes):
@@ -142,12 +130,55 @@ def test_refused_in_one_line(draper, shorts):
         draper.drape([], MOTION)
     with pytest.raises(InputError, match="^5 garments; 1 to 4 at once$"):
         draper.simulate([shorts] * 5, MOTION)
+    with pytest.raises(InputError, match="^post=False: of several garments"):
+        draper.drape([shorts] * 2, MOTION, post=False)
     dress = Garment.template("dress").remeshed(800)
     with pytest.raises(InputError, match="shorts does not go over dress: .* in which they are put"):
         draper.drape([dress, shorts], MOTION)
 
 
-def test_the_command_takes_several_garments(tmp_path):
+@pytest.mark.parametrize(
+    "order", ["shirt tshirt", "shirt tank", "boxy_tshirt tank", "waisted_dress tank"]
+)
+def test_a_wrong_order_is_refused(order):
+    names = order.split()
+    garments = [Garment.template(name) for name in names]
+    rests = [garment.vertices for garment in garments]
+    with pytest.raises(
+        InputError, match=f"^{names[1]} does not go over {names[0]}: .* pass through"
+    ):
+        let_out(garments, rests)
+    let_out(garments[::-1], rests[::-1])
+
+
+@pytest.mark.parametrize(
+    "order", ["trousers tshirt", "tank tshirt shirt", "trousers dress", "trousers waisted_dress"]
+)
+def test_a_right_order_is_not_refused(order):
+    garments = [Garment.template(name) for name in order.split()]
+    let_out(garments, [garment.vertices for garment in garments])
+
+
+def test_an_outfit_is_let_out_once_for_all_its_motions(draper, shorts, monkeypatch):
+    told, outfit = [], [shorts, Garment.template("tank").remeshed(300)]
+    monkeypatch.setattr(
+        "onefit.draping.outfit.let_out", lambda *given: (told.append(1), let_out(*given))[1]
+    )
+    shapes = [None, None, draper.model.random_shape(np.random.default_rng(0))]
+    [first, again, other] = [draper.drape(outfit, MOTION[:2], shape)[1] for shape in shapes]
+    assert len(told) == 2
+    assert torch.equal(first.vertices, again.vertices) and not torch.equal(first.rest, other.rest)
+
+
+@pytest.mark.parametrize("flag", ["--no-post", "--preset=paper"])
+def test_the_network_alone_takes_one_garment(flag, tmp_path):
+    with pytest.raises(
+        InputError, match="^--no-post, --preset paper: for one garment; .*: --post$"
+    ):
+        drape.main(["shorts", "tank", "walk", flag, "-o", str(tmp_path / "out")])
+
+
+def test_the_command_takes_several_garments(tmp_path, capsys):
     words = ["shorts", "tank", "walk", "--seconds", "0.1", "--vertices", "300"]
     words += ["--skip", "usd", "render", "-o", str(tmp_path / "out")]
     drape.main(words)
@@ -161,5 +192,8 @@ def test_the_command_takes_several_garments(tmp_path):
     assert figures["garment"] == ["shorts", "tank"]
     assert {name: found["vertices"] for name, found in figures["garments"].items()} == sizes
     assert figures["vertices"] == sum(sizes.values())
+    assert "beneath" not in figures["garments"]["1_shorts"]
+    said = f"2_tank beneath those under it: {figures['garments']['2_tank']['beneath']:.2f} % of the"
+    assert said in capsys.readouterr().err
     with pytest.raises(InputError, match="not empty; give another -o, or --overwrite"):
         drape.main(words)

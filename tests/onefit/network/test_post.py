@@ -10,7 +10,7 @@ from surfaces import ball
 from onefit.body import ClosestSurface
 from onefit.contact.points import samples
 from onefit.draping import post
-from onefit.draping.post import CONTACT, DRAG, NEAR, PULL, RADIUS, PostProcessing
+from onefit.draping.post import CONTACT, DRAG, NEAR, PULL, RADIUS, TOUCHING, PostProcessing
 from polyfit.mesh import edges_of
 
 
@@ -47,7 +47,7 @@ def test_lengths_come_back_as_in_a_slow_reference(radius):
     given = x + torch.as_tensor(rng.normal(size=x.shape) * 2e-3).float()
     surface, process, found = ClosestSurface(body, body_faces), processing(x, faces), given.clone()
     process.skin.look(found, surface, found.clone())
-    touched = surface(given, CONTACT.touching).face
+    touched = surface(given, TOUCHING).face
     assert (touched >= 0).any() == (radius > 0.05)
     first, second, third = body[body_faces[touched]].double().unbind(1)
     normal = torch.linalg.cross(second - first, third - first)

@@ -1,13 +1,22 @@
+from dataclasses import fields, replace
+
 import pytest
+import torch
 
 import onefit
+from onefit.contact import ContactSettings
 from onefit.objective import crossings
 from onefit.physics import Settings
 
 
 @pytest.fixture(scope="module")
-def draped():
-    draper, motion = onefit.load(), onefit.Motion.generate("dance", seconds=0.1, seed=1_000_003)
+def draper():
+    return onefit.load()
+
+
+@pytest.fixture(scope="module")
+def draped(draper):
+    motion = onefit.Motion.generate("dance", seconds=0.1, seed=1_000_003)
     make = lambda **how: draper.simulate("shorts", motion, settings=Settings(settling=0.1, **how))
     return {
         "network": draper.drape("shorts", motion),
@@ -34,3 +43,19 @@ def test_what_leads_to_the_first_frame_is_not_given(draped):
         far = (drape.vertices - network.vertices).norm(dim=-1)
         assert 1e-3 < far.mean() < 0.03
         assert drape.measures().collision == 0
+
+
+def test_a_simulation_reads_every_number_of_contact(draper):
+    motion = onefit.Motion.generate("squat", seconds=0.1)
+    worn = [onefit.Garment.template("trousers").remeshed(300)] * 2
+    settings = Settings(settling=0, lead=0)
+
+    def simulated(contact):
+        drapes = draper.simulate(worn, motion, settings=replace(settings, contact=contact))
+        return torch.cat([drape.vertices for drape in drapes], 1)
+
+    standard = ContactSettings()
+    plain = simulated(standard)
+    for field in fields(standard):
+        changed = replace(standard, **{field.name: 0.5 * getattr(standard, field.name)})
+        assert not torch.equal(simulated(changed), plain), field.name
