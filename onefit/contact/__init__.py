@@ -11,7 +11,15 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "kernels": ["neighbour_mean"],
         "layers": ["SelfContact"],
         "planes": ["Contacts", "ThreadContact", "weighted"],
-        "settings": ["MADE", "ContactSettings"],
+        "settings": [
+            "DEEPEST",
+            "EASED",
+            "MADE",
+            "POINT_CLEARANCE",
+            "POINT_NEAR",
+            "TOUCHING",
+            "ContactSettings",
+        ],
         "skin": ["SkinContact"],
     },
 )

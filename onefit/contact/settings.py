@@ -4,9 +4,22 @@ from dataclasses import dataclass
 
 from polyfit.errors import InputError
 
-#: [m] that a garment gets where it lies in the body, or in another one: more than the clearance,
-#: for smoothing takes some
+# What a simulation does not read, all in metres:
+#: that a garment gets where it lies in the body, or in another one: more than the clearance, for
+#: smoothing takes some
 MADE = 0.004
+#: that a garment that is tried on gets, if it was made with as much: more, for what comes nearer in
+#: some poses
+EASED = 0.007
+#: cloth of a drape that is so near touches the skin: twice the clearance
+TOUCHING = 0.006
+#: in the body that cloth of a drape is looked for: deeper, the nearest skin is another side's
+DEEPEST = 0.08
+#: points of a drape's large faces that are nearer than the first are pushed to the second: less
+#: than a vertex, for skin bulges between these
+POINT_NEAR, POINT_CLEARANCE = 0.0015, 0.002
+#: of limbs: cloth of a drape that moves by less has not passed through one
+THINNEST = 0.02
 
 
 @dataclass(frozen=True)

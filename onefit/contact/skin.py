@@ -17,9 +17,7 @@ from polyfit.mesh import edges_of
 
 from .planes import Contacts
 from .points import samples
-from .settings import ContactSettings
-
-_THINNEST = 0.02  # [m] of limbs: cloth that moves by less has not passed through one
+from .settings import THINNEST, ContactSettings
 
 
 class SkinContact:
@@ -106,7 +104,7 @@ class SkinContact:
 
         def part(half):
             (first, last), (start, end) = ([n * k // 2 for k in (half, half + 1)] for n in counts)
-            limits = first, _THINNEST, self._least, self._reach
+            limits = first, THINNEST, self._least, self._reach
             found = goal, x, self._push, self._known, *self.touched
             launch(self._kernels.first_look, last - first, *limits, *found)
             points = x, *self._of_faces, *self._found, *self.touched

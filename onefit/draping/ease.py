@@ -13,10 +13,8 @@ import numpy as np
 import torch
 
 from onefit.body import ClosestSurface
-from onefit.contact import spread
+from onefit.contact import DEEPEST, EASED, spread
 from polyfit.mesh import neighbour_mean
-
-from .post import DEEPEST
 
 MOTIONS = (
     "idle",
@@ -29,9 +27,6 @@ MOTIONS = (
     "arms_crossed",
 )  # of the kinds that networks are trained on
 SECONDS = 1.0  # [s] of each motion
-# [m] from the skin that a garment gets, if it was made with as much: more than it keeps in a drape,
-# for what comes nearer in some poses
-EASED = 0.007
 FRAME_STEP = 6  # one frame in so many is looked at
 _CLEAR_SHARE = 0.95  # of those frames in which a vertex is to lie far enough out
 SMOOTHING = 4  # times

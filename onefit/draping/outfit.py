@@ -10,13 +10,13 @@ import numpy as np
 import torch
 
 from onefit.body import ClosestSurface
-from onefit.contact import MADE, SkinContact
+from onefit.contact import DEEPEST, MADE, SkinContact
 from onefit.garment import Stitches, untangled
 from onefit.objective import crossing_faces
 from polyfit import mesh
 from polyfit.errors import InputError
 
-from .post import CONTACT, DEEPEST, pushes
+from .post import CONTACT, pushes
 
 if TYPE_CHECKING:
     from onefit.garment import Garment

@@ -12,7 +12,14 @@ import numpy as np
 import torch
 
 from onefit.body import ClosestSurface
-from onefit.contact import ContactSettings, SkinContact
+from onefit.contact import (
+    DEEPEST,
+    POINT_CLEARANCE,
+    POINT_NEAR,
+    TOUCHING,
+    ContactSettings,
+    SkinContact,
+)
 
 PULL = 50.0  # [1/s^2]: acceleration towards the drape, for a unit distance: a pendulum of 20 cm
 NEAR = 0.06  # [m] from the body at rest, where skin doubles the pull
@@ -21,13 +28,6 @@ _SWING_SMOOTHING = 2  # times in a frame
 _ROUNDS = 24  # of the lengths
 RADIUS = 0.985  # spectral radius of a round, as the acceleration takes it to be
 _PUSHES, _SMOOTHING = 5, 6  # rounds; times, of the pushes of the first
-TOUCHING = 0.006  # [m]: cloth that is so near touches the skin: twice the clearance
-DEEPEST = (
-    0.08  # [m] in the body that cloth is looked for: deeper, the nearest skin is another side's
-)
-# [m]: points of large faces are pushed where they are nearer than the first, to the second: less
-# than a vertex, for skin bulges between these
-_POINT_NEAR, _POINT_CLEARANCE = 0.0015, 0.002
 CONTACT = ContactSettings()
 _OVER_CLOTH = replace(CONTACT, spacing=0.01)  # [m]: folds are narrower than limbs
 
@@ -48,7 +48,7 @@ def pushes(**near):
     for cloth in motion.
     """
     of_motion = dict(reach=TOUCHING, least=CONTACT.clearance)
-    of_motion |= dict(point_near=_POINT_NEAR, point_least=_POINT_CLEARANCE)
+    of_motion |= dict(point_near=POINT_NEAR, point_least=POINT_CLEARANCE)
     how = dict(deepest=DEEPEST, rounds=_PUSHES, smoothing=_SMOOTHING, once=True)
     return of_motion | how | near
 
