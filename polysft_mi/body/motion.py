@@ -54,7 +54,7 @@ class BodyMotion(_World):
     def read(
         cls,
         path: str | os.PathLike[str],
-        count: int | None,
+        count: int,
         selected: list[int],
         model: str = "",
         up: str = "z",
@@ -64,8 +64,8 @@ class BodyMotion(_World):
         programs write its motions: ``poses``, of 22, 24, 52 or 55 joints, or ``global_orient`` and
         ``body_pose``; ``trans``; ``betas``. ``up``: the scene's axis that is, z, y or -y.
 
-        T is the number of all ``count`` images (None: of as many as the video has), or of those
-        that are ``selected``. Raises InputError.
+        T is the number of all ``count`` images, or of those that are ``selected``. Raises
+        InputError.
         """
         path = os.fspath(path)
         arrays = _read(path)
@@ -130,7 +130,7 @@ class MeshMotion(_World):
 
     @classmethod
     def read(
-        cls, path: str | os.PathLike[str], count: int | None, selected: list[int], up: str = "z"
+        cls, path: str | os.PathLike[str], count: int, selected: list[int], up: str = "z"
     ) -> MeshMotion:
         """The motion of an ``.npz`` file: ``vertices`` (T, V, 3), ``faces`` (F, 3), and, where it
         has them, ``rest`` (V, 3) and ``fps``. Or of a folder of mesh files of the same vertices and
@@ -168,7 +168,7 @@ class MeshMotion(_World):
 
 def read_motion(
     path: str | os.PathLike[str],
-    count: int | None,
+    count: int,
     selected: list[int],
     model: str = "",
     up: str = "z",
@@ -233,12 +233,8 @@ def _of_video(path, given, what, count, selected):
     """Which of ``given`` poses or meshes are of the frames that are used: their indices."""
     if given == len(selected):
         return list(range(given))
-    whole = given > selected[-1] if count is None else given == count
-    if not whole:
-        raise InputError(
-            f"{path}: {given} {what}; {count or f'more than {selected[-1]}'} frames, the video's,"
-            " are needed"
-        )
+    if given != count:
+        raise InputError(f"{path}: {given} {what}; {count} frames, the video's, are needed")
     return selected
 
 

@@ -92,6 +92,8 @@ def prepare_video(
     film = Film()
     stream = read_frames(video, first, last, stride, film)
     index, frame = next(stream)
+    if evidence:
+        evidence.open(video, first, last, stride)
     taken = frame.shape[1::-1]
     lens, board_picture = _lens(video, texture, camera, fov, calibrate, board, taken, evidence)
     straight = Undistortion(lens, scale)

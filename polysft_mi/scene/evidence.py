@@ -20,7 +20,10 @@ _POSITIONS = ("tracks", "pred_tracks", "trajs", "trajs_e", "points", "coords")
 _VISIBLE = ("visible", "visibility", "pred_visibility", "visibles", "vis", "visibs", "visconfs_e")
 _HIDDEN = ("occluded", "occlusion", "pred_occluded", "occlusions")
 _QUERIES = ("queries", "query_points")
-_SURE = 0.5  # of a visibility that is no yes or no
+_POINTS_FIRST = ("occluded", "visibles")  # as TAPIR calls them, whose arrays have points first
+# of a visibility that is no yes or no; of one beyond 0 to 1 by more than so much, the logarithm of
+# its odds
+_SURE, _LOGIT, _BEYOND = 0.5, 0.0, 0.01
 # tracks whose motion foretells that of one amid them, rounds of their robust fit, and how many
 # times the usual distance from there (at least so many pixels) is not the surface's motion
 _AROUND, _ROUNDS, _LEAST, _STRANGE = 8, 3, 0.3, 8.0
@@ -43,19 +46,20 @@ class Tracks:
     def read(
         cls,
         path: str | os.PathLike[str],
-        count: int | None,
+        count: int,
         selected: list[int],
         centre: float = 0.5,
     ) -> Tracks:
         """The tracks of an ``.npz`` or ``.npy`` file.
 
-        Positions (T, P, 2), (P, T, 2) or (1, T, P, 2), of all ``count`` images (None: of as many as
-        the video has) or of those that are ``selected``; visibilities likewise, true or above 0.5
-        (or occlusions, the reverse); queries (P, 3), or (1, P, 3): the frame, and the place in it.
-        Without visibilities a finite position is one that is seen; without queries a track begins
-        where it is first seen. ``centre``: the coordinate that the file gives the centre of the
-        first pixel. From where a track moves otherwise than its neighbours it is not visible.
-        Raises InputError.
+        Positions (T, P, 2), (P, T, 2) or (1, T, P, 2), of all ``count`` images or of those that are
+        ``selected``; visibilities likewise, true or above 0.5, or above 0 where they are logits (or
+        occlusions, the reverse); queries (P, 3), or (1, P, 3): the frame, and the place in it.
+        Where T and P are alike, the queries say which is which, or names that TAPIR gives; else
+        frames come first. Without visibilities a finite position is one that is seen; without
+        queries a track begins where it is first seen. ``centre``: the coordinate that the file
+        gives the centre of the first pixel. From where a track moves otherwise than its neighbours
+        it is not visible. Raises InputError.
         """
         arrays = _arrays(path)
         name, positions = _first(arrays, _POSITIONS)
@@ -64,19 +68,18 @@ class Tracks:
                 f"{path}: no tracks; an array 'tracks' (T, P, 2) of pixels is needed, and the file"
                 f" has {', '.join(sorted(arrays)) or 'nothing'}"
             )
-        frames = _Frames(count, selected)
-        positions = _by_frame(path, name, positions, frames, 3)
-        if positions.shape[-1] != 2 or not positions.shape[1]:
+        positions, points_first = _by_frame(path, name, arrays, _Frames(count, selected))
+        visible = _visibility(path, arrays, positions, points_first)
+        if not visible.any():
             raise InputError(
-                f"{path}: {name} is {positions.shape}; x and y of at least one point are needed"
+                f"{path}: no point is seen in any frame; a position that is NaN, or that the"
+                " visibility denies, is not seen"
             )
-        visible = _visibility(path, arrays, frames, positions)
         query = _queries(path, arrays, positions.shape)
         if len(positions) != len(selected) or count == len(selected):
             # a query in a frame that is left out counts from the next one that is used
             positions, visible = positions[selected], visible[selected]
             query = np.searchsorted(selected, query)
-        visible = visible & np.isfinite(positions).all(-1)
         visible &= ~_left_their_neighbours(positions, visible)
         used = (np.arange(len(selected))[:, None] >= query) & visible
         first = np.where(used.any(0), used.argmax(0), len(selected))
@@ -92,10 +95,10 @@ class DepthImages:
     unit: float
 
     @classmethod
-    def open(cls, folder: str, count: int | None, selected: list[int], unit: float) -> DepthImages:
+    def open(cls, folder: str, count: int, selected: list[int], unit: float) -> DepthImages:
         """Those in a folder, or of a pattern, sorted like frames: one for each of the ``count``
-        images (None: of as many as the video has), or of those that are ``selected``. ``unit`` [m]:
-        of whole numbers; those with a fraction (EXR, TIFF, CSV) are metres. Raises InputError.
+        images, or of those that are ``selected``. ``unit`` [m]: of whole numbers; those with a
+        fraction (EXR, TIFF, CSV) are metres. Raises InputError.
         """
         paths = list_images(folder, "depth images", (*EXTENSIONS, ".csv"))
         frames = _Frames(count, selected)
@@ -206,54 +209,75 @@ def _arrays(path):
 class _Frames:
     """How many frames a file may be of: those of the whole video, or those that are used."""
 
-    count: int | None
+    count: int
     selected: list[int]
 
     def __contains__(self, size):
-        if size == len(self.selected):
-            return True
-        return size > self.selected[-1] if self.count is None else size == self.count
+        return size in (self.count, len(self.selected))
 
     def __str__(self):
-        all_of = f"more than {self.selected[-1]}" if self.count is None else f"{self.count}"
         used = len(self.selected)
-        return all_of if used == self.count else f"{all_of} or {used}"
+        return f"{self.count}" if used == self.count else f"{self.count} or {used}"
 
 
 def _first(arrays, names):
     return next(((name, arrays[name]) for name in names if name in arrays), (None, None))
 
 
-def _by_frame(path, name, array, frames, dimensions):
-    """An array with its frames first, without the axis of a batch of one."""
-    if array.ndim == dimensions + 1 and len(array) == 1:
-        array = array[0]
-    if array.ndim == dimensions and array.dtype.kind in "fiub":
-        if array.shape[0] in frames:
-            return array.astype(np.float64)
-        if array.shape[1] in frames:
-            return array.swapaxes(0, 1).astype(np.float64)
-    raise InputError(
-        f"{path}: {name} is {array.shape}; {frames} frames, the video's, by points are needed"
-    )
+def _by_frame(path, name, arrays, frames):
+    """Positions (T, P, 2) float64, and whether the file has points first."""
+    positions = _one_batch(arrays[name], 3)
+    if positions.ndim != 3 or positions.dtype.kind not in "fiu":
+        fits = []
+    else:
+        fits = [axis for axis in (0, 1) if positions.shape[axis] in frames]
+    if not fits:
+        raise InputError(
+            f"{path}: {name} is {positions.shape}; {frames} frames, the video's, by points are"
+            " needed"
+        )
+    if positions.shape[-1] != 2 or not positions.size:
+        raise InputError(
+            f"{path}: {name} is {positions.shape}; x and y of at least one point are needed"
+        )
+    points_first = fits == [1]
+    if len(fits) == 2:
+        queries = _one_batch(_first(arrays, _QUERIES)[1], 2)
+        if queries is not None and positions.shape[0] != positions.shape[1]:
+            points_first = len(queries) == positions.shape[0]
+        else:
+            points_first = any(name in arrays for name in _POINTS_FIRST)
+    positions = positions.swapaxes(0, 1) if points_first else positions
+    return positions.astype(np.float64), points_first
 
 
-def _visibility(path, arrays, frames, positions):
+def _one_batch(array, dimensions):
+    """An array without the axis of a batch of one."""
+    is_batch = array is not None and array.ndim == dimensions + 1 and len(array) == 1
+    return array[0] if is_batch else array
+
+
+def _visibility(path, arrays, positions, points_first):
     """Which positions are seen, (T, P)."""
+    known = np.isfinite(positions).all(-1)
     name, seen = _first(arrays, _VISIBLE)
     hidden_name, hidden = _first(arrays, _HIDDEN)
     if seen is None and hidden is None:
-        return np.isfinite(positions).all(-1)
+        return known
     name, found = (name, seen) if seen is not None else (hidden_name, hidden)
-    if found.ndim >= 3 and found.shape[-1] in (1, 2) and found.ndim > positions.ndim - 1:
-        found = found[..., 0]  # of two, the second is how sure it is
-    found = _by_frame(path, name, found, frames, 2)
-    if found.shape != positions.shape[:2]:
+    forms = [found, *([found[0]] if found.ndim > 2 and len(found) == 1 else [])]
+    # of two, the second is how sure it is
+    forms += [x[..., 0] for x in forms if x.ndim > 2 and x.shape[-1] in (1, 2)]
+    forms = [x.T if points_first else x for x in forms if x.ndim == 2]
+    turned = [y for x in forms for y in (x, x.T) if y.shape == positions.shape[:2]]
+    if not turned or found.dtype.kind not in "fiub":
         raise InputError(
-            f"{path}: {name} is of {found.shape} frames and points, the tracks are of"
-            f" {positions.shape[:2]}"
+            f"{path}: {name} is {found.shape}; it must be of the frames and points of the tracks,"
+            f" {positions.shape[:2]}, in numbers, or yes and no"
         )
-    return found > _SURE if seen is not None else found < _SURE
+    found = turned[0].astype(np.float64)
+    likely = _LOGIT if (np.abs(found - 0.5) > 0.5 + _BEYOND).any() else _SURE
+    return known & ((found > likely) if seen is not None else (found < likely))
 
 
 def _queries(path, arrays, shape):

@@ -49,6 +49,9 @@ def written(folder, depth, count=2, lens=None, unit=1e-3):
     """What is written of the depth images, read back; and the lines."""
     straight = Undistortion(lens or Lens(COLOUR))
     evidence = GivenEvidence(depth=str(depth), depth_unit=unit)
+    for k in range(count):
+        write_png(folder / "frames" / f"{k}.png", np.zeros((COLOUR.height, COLOUR.width), np.uint8))
+    evidence.open(str(folder / "frames"))
     settings, lines = evidence.write(str(folder), list(range(count)), straight)
     images = DepthImages.open(str(folder / settings["depth"]), count, list(range(count)), 1e-4)
     return np.stack([images.read(k) for k in range(count)]), lines

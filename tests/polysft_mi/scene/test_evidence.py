@@ -56,6 +56,35 @@ def test_files_of_trackers_say_the_same(known, tmp_path):
     assert same(Tracks.read(tmp_path / "tracks.npy", FRAMES, list(range(FRAMES))), plain)
 
 
+def test_points_and_frames_that_are_as_many_are_told_apart(tmp_path):
+    """By the queries, or by TAPIR's names; else frames come first."""
+    rng, path = np.random.default_rng(1), tmp_path / "t.npz"
+    whole, some = rng.uniform(0, 90, (FRAMES, 3, 2)), rng.random((FRAMES, 3)) < 0.7
+    some[0] = True  # so that each of them begins in the first frame
+    used, queries = [0, 2, 4], np.zeros((3, 3))
+    plain = read(path, selected=used, tracks=whole, visible=some)
+    turned = {"tracks": whole.swapaxes(0, 1), "visible": some.T}
+    assert same(read(path, selected=used, queries=queries, **turned), plain)
+    tapir = {"tracks": turned["tracks"], "visibles": some.T}
+    assert same(read(path, selected=used, **tapir), plain)
+    square, seen = rng.uniform(0, 90, (FRAMES, FRAMES, 2)), rng.random((FRAMES, FRAMES)) < 0.7
+    plain = read(path, tracks=square, visible=seen)
+    assert np.array_equal(plain.positions[plain.visible], square[seen])
+    assert same(read(path, tracks=square.swapaxes(0, 1), occluded=~seen.T), plain)
+
+
+def test_visibilities_may_be_logits(known, tmp_path):
+    positions, visible = known
+    plain = read(tmp_path / "t.npz", tracks=positions, visible=visible)
+    for low, high in ((-4.0, 0.3), (0, 255), (-1e-4, 1.001)):
+        given = {"tracks": positions, "visibility": np.where(visible, high, low)}
+        assert same(read(tmp_path / "t.npz", **given), plain), (low, high)
+    given = {"tracks": positions, "occlusion": np.where(visible, -0.3, 4.0)}
+    assert same(read(tmp_path / "t.npz", **given), plain)
+    one = {"tracks": positions[:, :1], "visibility": visible[None, :, :1]}
+    assert same(read(tmp_path / "t.npz", **one), read(tmp_path / "t.npz", tracks=positions[:, :1]))
+
+
 def test_a_pixels_centre_may_be_at_zero(known, tmp_path):
     positions, visible = known
     found = read(tmp_path / "t.npz", 0.0, tracks=positions, visible=visible)
@@ -86,7 +115,9 @@ def _saved(folder, **arrays):
         ({"tracks": np.zeros((4, 3, 2))}, "tracks is .4, 3, 2.; 5 frames"),
         ({"tracks": np.zeros((5, 3, 3))}, "x and y"),
         ({"tracks": np.zeros((5, 0, 2))}, "at least one point"),
-        ({"tracks": np.zeros((5, 3, 2)), "visible": np.ones((5, 4))}, "visible is of"),
+        ({"tracks": np.zeros((5, 3, 2)), "visible": np.ones((5, 4))}, "visible is .5, 4."),
+        ({"tracks": np.full((5, 3, 2), np.nan)}, "no point is seen in any frame"),
+        ({"tracks": np.zeros((5, 3, 2)), "visible": np.zeros((5, 3))}, "no point is seen"),
         ({"tracks": np.zeros((5, 3, 2)), "queries": np.zeros((2, 3))}, "queries is .2, 3."),
         (
             {"tracks": np.zeros((5, 3, 2)), "queries": np.full((3, 3), 7.0)},
