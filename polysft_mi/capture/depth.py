@@ -22,6 +22,8 @@ DEPTH = "depth"  # in the scene's folder
 _NAME = "{:05d}.png"
 _UNIT = 1e-4  # metres of a whole number of the depth images that are written
 _MOST = 65535  # what they hold; farther off there is no sheet
+_FEW = 0.01  # share of an image that tells nothing of a sheet
+_UNITS = (1e-3, 1e-4, 1e-2, 1e-5, 1.0)  # of depth cameras, the likely ones first [m]
 _APART = 0.5  # pixels up to which two cameras see alike
 _STRAIGHT = 1e-3  # how far a pose may be from another's
 
@@ -92,20 +94,42 @@ def recognise_depth(path):
     return _realsense(path) or DepthFolder(path)
 
 
-def write_depth(folder, images, converted, known_to):
+def check_range(images):
+    """Raise InputError where :func:`write_depth` would keep hardly anything of the first of
+    ``images`` (:class:`polysft_mi.scene.evidence.DepthImages`) that has depth.
+    """
+    if images.known_to != "metric":
+        return
+    each = ((k, images.read(k)) for k in range(len(images.files)))
+    k, depth = next((k, depth) for k, depth in each if (depth > 0).any())
+    known = depth[depth > 0]
+    whole = np.round(known / _UNIT)
+    if ((whole > 0) & (whole <= _MOST)).mean() > _FEW:
+        return
+    told, is_whole = np.median(known), images.numbers(k).dtype.kind != "f"
+    number = told / images.unit if is_whole else told
+    likely = [unit for unit in _UNITS if 0.05 < number * unit < _UNIT * _MOST]
+    hint = f", and {number:.4g} is likely in units of {likely[0]:g} m" if likely else ""
+    needed = "--depth-unit says the unit" if is_whole else "EXR, TIFF and CSV are read in metres"
+    raise InputError(
+        f"{images.files[k]}: {told:.3g} m in the median is no distance of a sheet{hint}; {needed}"
+    )
+
+
+def write_depth(folder, images, converted):
     """Write depth images into ``folder``: of each of ``images``
     (:class:`polysft_mi.scene.evidence.DepthImages`) what ``converted(k)`` gives (H, W) [m].
-    Returns the settings that say what they are, ``known_to`` as the setting of that name.
+    Returns the settings that say what they are.
     """
     os.makedirs(folder, exist_ok=True)
     for k in range(len(images.files)):
         depth = converted(k)
         # what is fitted to each frame anyway is known to no scale
-        unit = _UNIT if known_to == "metric" else depth.max() / _MOST
+        unit = _UNIT if images.known_to == "metric" else depth.max() / _MOST
         whole = np.round(depth / max(unit, 1e-12))
         whole = np.where(whole <= _MOST, whole, 0).astype(np.uint16)
         write_png(os.path.join(folder, _NAME.format(k)), whole)
-    return {"depth_unit": _UNIT, "depth_known_to": known_to}
+    return {"depth_unit": _UNIT, "depth_known_to": images.known_to}
 
 
 def _record3d(folder):

@@ -9,7 +9,7 @@ import numpy as np
 from polysft_mi.scene import DepthImages, Tracks
 
 from .camera import Lens
-from .depth import DEPTH, recognise_depth, write_depth
+from .depth import DEPTH, check_range, recognise_depth, write_depth
 from .frames import count_frames
 from .rig import CAMERAS
 
@@ -51,10 +51,10 @@ class GivenEvidence:
         rig = self.rig.path if self.rig else None
         return [path for path in (self._tracks, self._depth, rig) if path]
 
-    def open(self, video, first=0, last=-1, stride=1):
+    def open(self, video, size, first=0, last=-1, stride=1):
         """Read and check what there is of the frames ``first`` to ``last`` in steps of ``stride``
-        of a ``video``, as :func:`polysft_mi.capture.frames.read_frames` takes them. Raises
-        InputError.
+        of a ``video``, as :func:`polysft_mi.capture.frames.read_frames` takes them, of a ``size``
+        (width, height). Raises InputError.
         """
         if not (self._tracks or self._depth):
             return
@@ -64,7 +64,12 @@ class GivenEvidence:
             self._known = Tracks.read(self._tracks, count, indices, self._centre)
         if self._depth:
             self._source = recognise_depth(self._depth)
-            self._images = DepthImages.open(self._source.images, count, indices, self._unit)
+            self._images = DepthImages.open(
+                self._source.images, count, indices, self._unit, self._known_to
+            )
+            check_range(self._images)
+            if self._source.camera is None:
+                self._images.like_frames(0, size)
 
     def write(self, folder, indices, straight):
         """Write what was opened, of the frames ``indices``, into the folder, undistorted and scaled
@@ -96,7 +101,7 @@ class GivenEvidence:
 
             settings |= {
                 "depth": DEPTH,
-                **write_depth(where, images, converted, self._known_to),
+                **write_depth(where, images, converted),
             }
             form = f", as of {source.form}" if source.form else ""
             moved = ", as the frames' camera sees it" if source.camera is not None else ""

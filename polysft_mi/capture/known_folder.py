@@ -17,7 +17,7 @@ from polysft_mi.scene.kinect_paper import template as kinect_paper_template
 from polysft_mi.surface import meshio
 
 from . import pictures
-from .depth import DEPTH, recognise_depth, write_depth
+from .depth import DEPTH, check_range, recognise_depth, write_depth
 from .layouts import recognise
 from .output import REPORT, staged, write_png
 from .rig import CAMERAS
@@ -57,7 +57,7 @@ def prepare_folder(
     camera = layout.camera
     masks = os.path.join(folder, layout.masks) if layout.masks else ""
     said = []
-    known_to = evidence.pop("depth_known_to", "metric")
+    known_to = evidence.get("depth_known_to", "metric")
     of_body = {name: evidence.pop(name) for name in _OF_BODY if name in evidence}
     body, model = (of_body.get(name, "") for name in ("body", "body_model"))
     if body:
@@ -70,6 +70,8 @@ def prepare_folder(
     sequence = Sequence.open(
         os.path.join(folder, layout.frames), masks, size=(camera.width, camera.height), **evidence
     )
+    if depth and depth.is_seen_by(camera):
+        sequence.depth.like_frames(0, sequence.size)
     if body:
         up = of_body.get("body_up", "z")
         read_motion(body, len(sequence), sequence.indices, model, up)
@@ -111,18 +113,17 @@ def prepare_folder(
             rig.write(to, sequence.indices, camera, whole=True)
         )
     if depth and not depth.is_seen_by(camera):
+        check_range(sequence.depth)
         known = lambda path: path.endswith(".png")
         _check_folder(os.path.join(target, DEPTH), depth.images, overwrite, known)
         seen = lambda k: depth.seen_by(sequence.depth.read(k), camera)
-        folders[DEPTH] = lambda to: evidence.update(write_depth(to, sequence.depth, seen, known_to))
+        folders[DEPTH] = lambda to: evidence.update(write_depth(to, sequence.depth, seen))
     note = meshio.size_note(vertices, where)
     if note:
         warn(note)
     for name in ("tracks", "depth", "cameras", "body", "body_model"):
         if evidence.get(name):
             evidence[name] = _from_data(evidence[name], folder)
-    if depth:
-        evidence["depth_known_to"] = known_to
     evidence |= {name: name for name in folders}
     text = lambda: scene_xml(
         replace(layout, settings=layout.settings | evidence),

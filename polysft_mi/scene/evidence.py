@@ -6,14 +6,16 @@ from __future__ import annotations
 
 import os
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from polysft_mi.backend import cores
 from polysft_mi.errors import InputError
 
-from .images import EXTENSIONS, finite, list_images, read_pixels
+from .images import EXTENSIONS, checked_size, list_images, read_pixels
 
 #: names of the arrays in files of tracks, as CoTracker, TAPIR and AllTracker are used to write them
 _POSITIONS = ("tracks", "pred_tracks", "trajs", "trajs_e", "points", "coords")
@@ -89,16 +91,21 @@ class Tracks:
 
 @dataclass(frozen=True)
 class DepthImages:
-    """Depth images, one a frame: ``files``, and the metres that one of their units is."""
+    """Depth images, one a frame: ``files``, and the metres that one of their units is;
+    ``known_to``: metric, affine or disparity, as the setting ``depth_known_to``.
+    """
 
     files: list[str]
     unit: float
+    known_to: str = "metric"
 
     @classmethod
-    def open(cls, folder: str, count: int, selected: list[int], unit: float) -> DepthImages:
+    def open(
+        cls, folder: str, count: int, selected: list[int], unit: float, known_to: str = "metric"
+    ) -> DepthImages:
         """Those in a folder, or of a pattern, sorted like frames: one for each of the ``count``
-        images, or of those that are ``selected``. ``unit`` [m]: of whole numbers; those with a
-        fraction (EXR, TIFF, CSV) are metres. Raises InputError.
+        images, or of those that are ``selected``, which are read here once. ``unit`` [m]: of whole
+        numbers; those with a fraction (EXR, TIFF, CSV) are metres. Raises InputError.
         """
         paths = list_images(folder, "depth images", (*EXTENSIONS, ".csv"))
         frames = _Frames(count, selected)
@@ -108,26 +115,54 @@ class DepthImages:
             )
         if len(paths) != len(selected):
             paths = [paths[k] for k in selected]
-        images = cls(paths, unit)
-        if not (images.read(0) > 0).any():
-            raise InputError(f"{paths[0]}: no depth in it; every pixel is 0 (nothing known)")
+        images = cls(paths, unit, known_to)
+        with ThreadPoolExecutor(min(8, cores())) as pool:
+            found = list(pool.map(images._checked, range(len(paths))))
+        for path, (shape, _) in zip(paths, found, strict=True):
+            if shape != found[0][0]:
+                (h, w), (height, width) = shape, found[0][0]
+                raise InputError(
+                    f"{path}: {w}x{h} pixels; {paths[0]} has {width}x{height}, and all depth images"
+                    " must be of one size"
+                )
+        if not any(has_depth for _, has_depth in found):
+            raise InputError(
+                f"{folder}: no depth in its images; every pixel is 0, or none (nothing known)"
+            )
         return images
 
-    def read(self, i: int) -> np.ndarray:
-        """Depth i along the camera's axis, (H, W) float32 [m], 0 where nothing is known."""
+    def _checked(self, i):
+        """((H, W), whether anything is known) of image i, which must be whole."""
+        if not self.files[i].lower().endswith(".csv"):
+            checked_size(self.files[i])
+        depth = self.read(i)
+        return depth.shape, bool((depth > 0).any())
+
+    def numbers(self, i: int) -> np.ndarray:
+        """The numbers of image i as its file has them, (H, W), uint16 or float32."""
         path = self.files[i]
         image = _table(path) if path.lower().endswith(".csv") else read_pixels(path)
-        if image.ndim == 3:
-            image = image[..., 0]
-        if image.dtype.kind == "f":
-            depth = np.where(np.isfinite(image), image, 0).astype(np.float32)
-        elif image.dtype == np.uint8:
-            raise InputError(
-                f"{path}: 8 bits; depth is needed as 16 bit PNG in millimetres, or as EXR in metres"
+        if image.dtype == np.uint8:
+            needed = (
+                "depth is needed as 16 bit PNG in millimetres, or as EXR in metres"
+                if self.known_to == "metric"
+                else "they are too coarse: a network's numbers are needed as 16 bit PNG, or EXR"
             )
-        else:
-            depth = finite(image, path).astype(np.float32) * np.float32(self.unit)
-        return np.maximum(depth, 0)
+            raise InputError(f"{path}: 8 bits; {needed}")
+        return image[..., 0] if image.ndim == 3 else image
+
+    def read(self, i: int) -> np.ndarray:
+        """Depth i along the camera's axis, (H, W) float32 [m], 0 where nothing is known. Numbers
+        with a fraction that are known up to a shift are shifted to be above 0.
+        """
+        image = self.numbers(i)
+        if image.dtype.kind != "f":
+            return image.astype(np.float32) * np.float32(self.unit)
+        known = np.isfinite(image)
+        if self.known_to != "metric" and known.any():
+            low, high = image[known].min(), image[known].max()
+            image = image - low + np.float32(1e-3 * (high - low) or 1)
+        return np.maximum(np.where(known, image, 0), 0).astype(np.float32)
 
     def like_frames(self, i: int, size: tuple[int, int]) -> np.ndarray:
         """Depth i, (H, W) float32 [m], with as many pixels as frames of ``size`` (W, H): the

@@ -39,8 +39,7 @@ class Depth(Term):
     def __init__(self, inputs):
         super().__init__(inputs)
         self._inputs = inputs
-        known_to = inputs.settings.depth_known_to
-        self._images = DepthData(inputs.data, inputs.sequence, known_to)
+        self._images = DepthData(inputs.data, inputs.sequence)
         self._focal = inputs.placed.camera.focal
 
     @classmethod

@@ -152,6 +152,29 @@ def test_depth_is_read_in_metres(tmp_path):
     assert np.allclose(found, [[0.7, 0], [0, 0]])
 
 
+def test_every_depth_image_is_read(tmp_path):
+    """So that a bad one is known before the work starts; of those that are used."""
+    good = np.full((6, 8), 500, np.uint16)
+    for k in range(3):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), good)
+    call = lambda: DepthImages.open(str(tmp_path), 3, [0, 2], 1e-3)
+    assert len(call().files) == 2
+    for pixels, said in (
+        (np.zeros((6, 6), np.uint16), "2.png: 6x6 pixels; .*0.png has 8x6"),
+        (good.astype(np.uint8), "2.png: 8 bits"),
+    ):
+        cv2.imwrite(str(tmp_path / "2.png"), pixels)
+        with pytest.raises(InputError, match=said):
+            call()
+    cv2.imwrite(str(tmp_path / "2.png"), good)
+    (tmp_path / "2.png").write_bytes((tmp_path / "2.png").read_bytes()[:60])
+    with pytest.raises(InputError, match="2.png: not a readable image"):
+        call()
+    cv2.imwrite(str(tmp_path / "2.png"), good)
+    cv2.imwrite(str(tmp_path / "0.png"), 0 * good)  # a sensor that starts dark
+    assert not call().read(0).any()
+
+
 def test_depth_that_says_nothing_is_told(tmp_path):
     for name, pixels, said in (
         ("empty", np.zeros((2, 2), np.uint16), "every pixel is 0"),
@@ -162,5 +185,7 @@ def test_depth_that_says_nothing_is_told(tmp_path):
         cv2.imwrite(str(folder / "0.png"), pixels)
         with pytest.raises(InputError, match=said):
             DepthImages.open(str(folder), 1, [0], 1e-3)
+    with pytest.raises(InputError, match="0.png: 8 bits; they are too coarse"):
+        DepthImages.open(str(tmp_path / "bytes"), 1, [0], 1e-3, "disparity")
     with pytest.raises(InputError, match="1 depth images for 3 or 2 frames"):
         DepthImages.open(str(tmp_path / "empty"), 3, [0, 1], 1e-3)
