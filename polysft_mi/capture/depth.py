@@ -106,7 +106,7 @@ def check_range(images):
     whole = np.round(known / _UNIT)
     if ((whole > 0) & (whole <= _MOST)).mean() > _FEW:
         return
-    told, is_whole = np.median(known), images.numbers(k).dtype.kind != "f"
+    told, is_whole = np.median(known), images.is_whole(k)
     number = told / images.unit if is_whole else told
     likely = [unit for unit in _UNITS if 0.05 < number * unit < _UNIT * _MOST]
     hint = f", and {number:.4g} is likely in units of {likely[0]:g} m" if likely else ""

@@ -151,6 +151,10 @@ class DepthImages:
             raise InputError(f"{path}: 8 bits; {needed}")
         return image[..., 0] if image.ndim == 3 else image
 
+    def is_whole(self, i: int) -> bool:
+        """Whether the numbers of image i are whole, so that the unit is theirs."""
+        return self.numbers(i).dtype.kind != "f"
+
     def read(self, i: int) -> np.ndarray:
         """Depth i along the camera's axis, (H, W) float32 [m], 0 where nothing is known. Numbers
         with a fraction that are known up to a shift are shifted to be above 0.
