@@ -14,12 +14,13 @@ import numpy as np
 
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError
-from polysft_mi.scene import image_size, list_images, read_pixels
+from polysft_mi.scene import EXTENSIONS, image_size, list_images, read_pixels
 
 from .output import write_png
 
 DEPTH = "depth"  # in the scene's folder
 _NAME = "{:05d}.png"
+_IMAGES = (*EXTENSIONS, ".csv")
 _UNIT = 1e-4  # metres of a whole number of the depth images that are written
 _MOST = 65535  # what they hold; farther off there is no sheet
 _FEW = 0.01  # share of an image that tells nothing of a sheet
@@ -81,6 +82,9 @@ def recognise_depth(path):
     record = f"{path}: depth in it is compressed as by Apple (LZFSE); export EXR + RGB in Record3D"
     if path.lower().endswith(".r3d"):
         raise InputError(record)
+    if os.path.isfile(path) and not path.lower().endswith(_IMAGES):
+        hint = ", as ScanNet's SensReader exports it" if path.lower().endswith(".sens") else ""
+        raise InputError(f"{path}: a folder of depth images, one a frame, is needed{hint}")
     if not os.path.isdir(path):
         return DepthFolder(path)
     if glob.glob(os.path.join(glob.escape(path), "rgbd", "*.depth")):
@@ -91,7 +95,14 @@ def recognise_depth(path):
             found = _scannet(folder) or _record3d(folder)
             if found:
                 return found
-    return _realsense(path) or DepthFolder(path)
+    found = _realsense(path) or DepthFolder(path)
+    within = os.path.join(path, "depth")
+    if os.path.isdir(within) and not any(n.lower().endswith(_IMAGES) for n in os.listdir(path)):
+        raise InputError(
+            f"{path}: depth of no known program: metadata.json with K, w and h (Record3D), or"
+            f" intrinsic/intrinsic_depth.txt (ScanNet), is needed; {within} names the images alone"
+        )
+    return found
 
 
 def check_range(images):

@@ -234,7 +234,7 @@ def _arrays(path):
         if isinstance(found, np.ndarray):
             return {"tracks": found}
         with found:
-            return {name: found[name] for name in found.files}
+            arrays = {name: found[name] for name in found.files}
     except FileNotFoundError:
         raise InputError(f"{path}: no such file of tracks") from None
     except (OSError, ValueError, EOFError, zipfile.BadZipFile):
@@ -242,6 +242,12 @@ def _arrays(path):
             f"{path}: not a file of tracks; .npz with 'tracks' (T, P, 2) and 'visible' (T, P) is"
             " needed"
         ) from None
+    if any(name.endswith("data.pkl") for name in arrays):
+        raise InputError(
+            f"{path}: a file of torch; save it as .npz, by numpy.savez(file, tracks=...,"
+            " visible=...)"
+        )
+    return arrays
 
 
 @dataclass(frozen=True)

@@ -176,7 +176,16 @@ def test_record3d(tmp_path):
     (tmp_path / "metadata.json").write_text(json.dumps({"title": "mine"}))
     assert recognise_depth(str(tmp_path / "depth")).form == ""
     assert GivenEvidence(depth=str(tmp_path / "depth")).lens(48, 36) is None
+    for broken in ({"title": "mine"}, {"K": K[:3], "w": 96, "h": 72}):
+        (tmp_path / "metadata.json").write_text(json.dumps(broken))
+        said = refused(recognise_depth, str(tmp_path))
+        assert (
+            "metadata.json with K, w and h (Record3D)" in said and f"{tmp_path / 'depth'}" in said
+        )
     assert "EXR + RGB" in refused(recognise_depth, str(tmp_path / "a.r3d"))
+    (tmp_path / "a.sens").write_bytes(b"")
+    said = refused(recognise_depth, str(tmp_path / "a.sens"))
+    assert "a folder of depth images, one a frame, is needed, as ScanNet's SensReader" in said
     write_png(tmp_path / "raw" / "rgbd" / "0.png", np.zeros((4, 4), np.uint8))
     (tmp_path / "raw" / "rgbd" / "0.depth").write_bytes(b"bvx2")
     assert "EXR + RGB" in refused(recognise_depth, str(tmp_path / "raw"))

@@ -315,7 +315,7 @@ def test_a_body_of_smpl_s_family(tmp_path):
     prepare.main(words)
     settings = loaded(str(tmp_path / "out" / "scene.xml")).settings
     assert settings.body_model == str(tmp_path / "SMPL.pkl") and settings.body_up == "y"
-    with pytest.raises(InputError, match="--body-model x.pkl: of whose motion"):
+    with pytest.raises(InputError, match="--body-model: is of a body; --body names"):
         prepare.main([str(folder), "--body-model", "x.pkl", "-o", str(tmp_path / "other")])
 
 

@@ -1,6 +1,7 @@
 """Files of tracks and depth images, in the forms that other programs write."""
 
 import dataclasses
+import zipfile
 
 import cv2
 import numpy as np
@@ -133,6 +134,11 @@ def test_what_is_no_file_of_tracks_is_told(arrays, said, tmp_path):
 def test_a_file_that_is_none_is_told(tmp_path):
     with pytest.raises(InputError, match="no such file of tracks"):
         Tracks.read(tmp_path / "none.npz", 1, [0])
+    with zipfile.ZipFile(tmp_path / "tracks.pt", "w") as file:  # as torch.save writes it
+        file.writestr("tracks/data.pkl", b"")
+        file.writestr("tracks/data/0", b"")
+    with pytest.raises(InputError, match=r"tracks.pt: a file of torch; save it as \.npz"):
+        Tracks.read(tmp_path / "tracks.pt", 1, [0])
     (tmp_path / "text.npz").write_text("tracks")
     with pytest.raises(InputError, match="not a file of tracks"):
         Tracks.read(tmp_path / "text.npz", 1, [0])
