@@ -19,6 +19,10 @@ _PLACES = "translation", "trans", "transl", "trans_world"
 _MESHES = ".obj", ".ply", ".glb"
 _RATES = "fps", "mocap_framerate", "mocap_frame_rate"
 _USUAL_FPS = 30.0
+_SHAPE = "gender, age, muscle, weight, height, proportions"  # of Anny's body, from 0 to 1
+_BETAS = 10  # of SMPL's, that a body has
+_ROOT = 0.0, 0.0, 0.9  # [m] about where a body of ours at rest has its root
+_SIZES = 0.4, 3.0  # [m] of a body's longest side
 _TO_Z = {"z": 0, "y": 90, "-y": -90}  # degrees about x that turn what is up to z
 
 
@@ -110,9 +114,26 @@ class BodyMotion(_World):
         fps = _rate(path, arrays, count, selected)
         poses, places = poses[frames].astype(float), places[frames].astype(float)
         shape = arrays.get("shape")
+        if shape is not None and not model:
+            fits = shape.shape == (_SHAPE.count(",") + 1,) and shape.dtype.kind in "fiu"
+            if not (fits and ((shape >= 0) & (shape <= 1)).all()):
+                said = shape.tolist() if fits else shape.shape
+                raise InputError(f"{path}: shape {said}; {_SHAPE} are needed, each from 0 to 1")
         if model:
             poses, shape = _in_our_axes(poses), _betas(arrays.get("betas"), path)
         return cls(poses, places, fps, shape, up, model, path)
+
+    @property
+    def place(self) -> np.ndarray:
+        """About where its middle is in the first frame (3,) [m, world]."""
+        return self.translation[0] + (0 if self.model else np.array(_ROOT))
+
+    @property
+    def note(self) -> str:
+        """A line about what is not used of it, or ""."""
+        if not self.model or self.shape is None or not np.any(self.shape[_BETAS:]):
+            return ""
+        return f"note: {self.path}: {len(self.shape)} betas; the first {_BETAS} of them count"
 
 
 @dataclass(frozen=True)
@@ -162,8 +183,20 @@ class MeshMotion(_World):
             )
         frames = _of_video(path, len(vertices), "meshes", count, selected)
         fps = _rate(path, arrays, count, selected)
+        size, (low, high) = np.ptp(rest, axis=0).max(), _SIZES
+        if not low < size < high:
+            units = [u for u, per in (("cm", 100), ("mm", 1000)) if low < size / per < high]
+            hint = f", not {units[0]}" if units else ""
+            raise InputError(f"{path}: a body of {size:.4g} m; metres are needed{hint}")
         frames = vertices[frames].astype(float)
         return cls(rest.astype(float), faces.astype(np.int64), frames, fps, up, path)
+
+    @property
+    def place(self) -> np.ndarray:
+        """Where its middle is in the first frame (3,) [m, world]."""
+        return self.frames[0].mean(0)
+
+    note = ""
 
 
 def read_motion(

@@ -9,7 +9,7 @@ import numpy as np
 from polyfit.files import aside
 from polyfit.mesh import TexCoords
 from polysft_mi.backend import set_variant
-from polysft_mi.body import read_motion
+from polysft_mi.body import check_model, read_motion
 from polysft_mi.colours import srgb
 from polysft_mi.errors import InputError
 from polysft_mi.scene import Sequence, checked_size, open_cameras, read_camera, read_rgb
@@ -26,6 +26,7 @@ from .sheet import Sheet
 
 _OF_BODY = "body", "body_model", "body_up"
 _POSE = f"{REPORT}/pose.png"
+_BODY, _FARTHEST = 1.2, 30.0  # [m] that a body reaches from its middle; that it may be away
 
 
 def prepare_folder(
@@ -74,9 +75,11 @@ def prepare_folder(
         sequence.depth.like_frames(0, sequence.size)
     if body:
         up = of_body.get("body_up", "z")
-        read_motion(body, len(sequence), sequence.indices, model, up)
-        if model and not os.path.isfile(model):
-            raise InputError(f"{model}: no such file of a body")
+        motion = read_motion(body, len(sequence), sequence.indices, model, up)
+        _check_body(motion, pose, camera)
+        if model:
+            check_model(model)
+        said += [motion.note] if motion.note else []
         evidence |= of_body
     texture = os.path.join(folder, layout.texture)
     checked_size(texture)
@@ -221,6 +224,29 @@ def _write(target, text, template, picture, hint, folders):
         if isinstance(error, InputError):
             raise
         raise InputError(f"{target}: {error.strerror or error}{hint}") from None
+
+
+def _check_body(motion, pose, camera):
+    """Raise InputError where a body stands out of the view of a camera with ``pose`` (4, 4) in the
+    first frame, or so far away that its motion is in another unit.
+    """
+    x, y, z = place = pose[:3, :3] @ motion.place + pose[:3, 3]
+    beyond = z + _BODY  # where the farthest of it is
+    sides = (x, camera.fx, camera.cx, camera.width), (y, camera.fy, camera.cy, camera.height)
+    if beyond <= 0 or any(
+        (at - _BODY) / beyond * f + c > side or (at + _BODY) / beyond * f + c < 0
+        for at, f, c, side in sides
+    ):
+        why = "out of the camera's view"
+    elif z > _FARTHEST:
+        why = "too far away"
+    else:
+        return
+    raise InputError(
+        f"{motion.path}: in the first frame the body is {why}, at {np.round(place, 2).tolist()} m"
+        " from it (right, down, forward); its translation, in metres, and world_to_camera in"
+        " camera.json must be of one world"
+    )
 
 
 def _check_view(vertices, camera, where):
