@@ -105,7 +105,6 @@ def _add_evidence(group):
     group.add_argument(
         "--track-centre",
         type=float,
-        default=0.5,
         metavar="C",
         help="coordinate that they give the centre of the first pixel: 0.5 (default) or 0",
     )
@@ -118,14 +117,12 @@ def _add_evidence(group):
     group.add_argument(
         "--depth-unit",
         type=float,
-        default=1e-3,
         metavar="M",
         help="metres that a whole number of them stands for (default: 0.001)",
     )
     group.add_argument(
         "--depth-known-to",
         choices=("metric", "affine", "disparity"),
-        default="metric",
         help="affine, disparity: depth, or its inverse, as a network guesses it, up to a scale and"
         " a shift (default: metric)",
     )
@@ -147,7 +144,6 @@ def _add_evidence(group):
     group.add_argument(
         "--body-up",
         choices=("z", "y", "-y"),
-        default="z",
         help="axis of its world that points up; -y where that is a level camera's (default: z)",
     )
 
@@ -165,7 +161,6 @@ def _add_cameras(group):
     group.add_argument(
         "--rig-scale",
         type=float,
-        default=1.0,
         metavar="M",
         help="metres of the rig's unit (default: 1)",
     )
@@ -291,29 +286,33 @@ def main(argv=None):
 
 def _evidence(args):
     """Settings of what is given beside the images, by their names."""
-    known = {}
-    if args.tracks:
-        known |= {"tracks": args.tracks, "track_centre": args.track_centre}
-    if args.depth:
-        known |= {"depth": args.depth, "depth_unit": args.depth_unit}
-        known["depth_known_to"] = args.depth_known_to
-    if args.body:
-        known |= {"body": args.body, "body_up": args.body_up}
-        known |= {"body_model": args.body_model} if args.body_model else {}
-    elif args.body_model:
-        raise InputError(f"--body-model {args.body_model}: of whose motion? --body names its file")
+    known = _told(args, "tracks", "track_centre", of="tracks")
+    known |= _told(args, "depth", "depth_unit", "depth_known_to", of="depth images")
+    known |= _told(args, "body", "body_model", "body_up", of="a body")
+    unit = known.get("depth_unit", 1)
+    if not (np.isfinite(unit) and unit > 0):
+        raise InputError(f"--depth-unit {unit:g}: metres a number; above 0 is needed")
     return known
 
 
 def _rig(args):
     from .capture import GivenRig
 
-    if args.cameras is None:
-        for name in ("camera_name", "rig_images"):
-            if getattr(args, name) is not None:
-                raise InputError(f"--{name.replace('_', '-')}: is of a rig; --cameras names it")
-        return None
-    return GivenRig(args.cameras, args.camera_name, args.rig_scale, args.rig_images)
+    known = _told(args, "cameras", "camera_name", "rig_scale", "rig_images", of="a rig")
+    names = {"camera_name": "own", "rig_scale": "scale", "rig_images": "images"}
+    path = known.pop("cameras", None)
+    return GivenRig(path, **{names[name]: x for name, x in known.items()}) if path else None
+
+
+def _told(args, name, *about, of):
+    """The options ``name`` and ``about`` it that are given. Raises InputError where it is not, but
+    something about it is.
+    """
+    given = {n: getattr(args, n) for n in (name, *about) if getattr(args, n) is not None}
+    if given and not given.get(name):
+        option = next(iter(given)).replace("_", "-")
+        raise InputError(f"--{option}: is of {of}; --{name} names its file or folder")
+    return given
 
 
 def _from_video(args, command):

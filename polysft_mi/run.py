@@ -5,6 +5,7 @@ video.
 from __future__ import annotations
 
 import gc
+import math
 import os
 import shlex
 import sys
@@ -19,6 +20,7 @@ from .errors import InputError, cli
 from .results import Progress, folder
 
 _DOUBTS = 5  # lines of them
+_DOUBTED = 5.0  # [pixels] from the surface above which tracks are of another video
 _EXAMPLES = [
     ("scenes/demo.xml -o out/demo", "the demo; then open out/demo/report.html"),
     (
@@ -136,6 +138,7 @@ class Outcome:
             f"inside the surface: PSNR {s.get('psnr_mask', float('nan')):.2f} dB,"
             f" SSIM {s.get('ssim_mask', float('nan')):.3f}"
             + (f", silhouettes: IoU {s['iou']:.3f}" if "iou" in s else ""),
+            *_fits(s),
             *_doubts(s.get("doubtful", {})),
             f"surfaces: {os.path.join(self.out, 'surface.npz')}",
             f"meshes: {os.path.join(self.out, 'meshes')}",
@@ -150,6 +153,22 @@ class Outcome:
             other = os.path.join(self.out, folder.OTHER)
             lines.insert(-1, f"{first} a second surface explains the video nearly as well: {other}")
         return "".join(line + "\n" for line in lines)
+
+
+def _fits(summary):
+    """A line for each kind of evidence beside the images: how much of it was used, and how far from
+    the surface it is.
+    """
+    for name, of, unit, least in (("tracks", "", "px", _DOUBTED), ("depth", " images", "mm", None)):
+        if not (known := summary.get(name)):
+            continue
+        line = f"{name}: {known['used']} of {known['given']}{of} used"
+        noise = known[f"noise_{unit}"]
+        if math.isfinite(noise):
+            line += f", noise {noise:.2g} {unit}"
+        if least and noise > least:
+            line += ": are they of this video?"
+        yield line
 
 
 def _doubts(doubtful):
@@ -247,7 +266,14 @@ def reconstruct(
         if not done.states:
             return Outcome(out, interrupted=interrupted)
         summary, plotted = outputs.write(
-            problem, done, out, drawing, fps=fps, command=command, say=progress.stage
+            problem,
+            done,
+            out,
+            drawing,
+            fps=fps,
+            command=command,
+            say=progress.stage,
+            fits=tracker.objective.fits,
         )
         if sequence.cameras:
             plotted()  # the page shows their pictures

@@ -11,6 +11,6 @@ __getattr__, __dir__, __all__ = lazy.attach(
         "bones": ["Bones"],
         "carrier": ["Carrier", "Maps", "Pose"],
         "motion": ["BodyMotion", "MeshMotion", "read_motion"],
-        "wearer": ["put_on"],
+        "wearer": ["check_model", "put_on"],
     },
 )

@@ -19,6 +19,10 @@ _PLACES = "translation", "trans", "transl", "trans_world"
 _MESHES = ".obj", ".ply", ".glb"
 _RATES = "fps", "mocap_framerate", "mocap_frame_rate"
 _USUAL_FPS = 30.0
+_SHAPE = "gender, age, muscle, weight, height, proportions"  # of Anny's body, from 0 to 1
+_BETAS = 10  # of SMPL's, that a body has
+_ROOT = 0.0, 0.0, 0.9  # [m] about where a body of ours at rest has its root
+_SIZES = 0.4, 3.0  # [m] of a body's longest side
 _TO_Z = {"z": 0, "y": 90, "-y": -90}  # degrees about x that turn what is up to z
 
 
@@ -54,7 +58,7 @@ class BodyMotion(_World):
     def read(
         cls,
         path: str | os.PathLike[str],
-        count: int | None,
+        count: int,
         selected: list[int],
         model: str = "",
         up: str = "z",
@@ -64,8 +68,8 @@ class BodyMotion(_World):
         programs write its motions: ``poses``, of 22, 24, 52 or 55 joints, or ``global_orient`` and
         ``body_pose``; ``trans``; ``betas``. ``up``: the scene's axis that is, z, y or -y.
 
-        T is the number of all ``count`` images (None: of as many as the video has), or of those
-        that are ``selected``. Raises InputError.
+        T is the number of all ``count`` images, or of those that are ``selected``. Raises
+        InputError.
         """
         path = os.fspath(path)
         arrays = _read(path)
@@ -110,9 +114,26 @@ class BodyMotion(_World):
         fps = _rate(path, arrays, count, selected)
         poses, places = poses[frames].astype(float), places[frames].astype(float)
         shape = arrays.get("shape")
+        if shape is not None and not model:
+            fits = shape.shape == (_SHAPE.count(",") + 1,) and shape.dtype.kind in "fiu"
+            if not (fits and ((shape >= 0) & (shape <= 1)).all()):
+                said = shape.tolist() if fits else shape.shape
+                raise InputError(f"{path}: shape {said}; {_SHAPE} are needed, each from 0 to 1")
         if model:
             poses, shape = _in_our_axes(poses), _betas(arrays.get("betas"), path)
         return cls(poses, places, fps, shape, up, model, path)
+
+    @property
+    def place(self) -> np.ndarray:
+        """About where its middle is in the first frame (3,) [m, world]."""
+        return self.translation[0] + (0 if self.model else np.array(_ROOT))
+
+    @property
+    def note(self) -> str:
+        """A line about what is not used of it, or ""."""
+        if not self.model or self.shape is None or not np.any(self.shape[_BETAS:]):
+            return ""
+        return f"note: {self.path}: {len(self.shape)} betas; the first {_BETAS} of them count"
 
 
 @dataclass(frozen=True)
@@ -130,7 +151,7 @@ class MeshMotion(_World):
 
     @classmethod
     def read(
-        cls, path: str | os.PathLike[str], count: int | None, selected: list[int], up: str = "z"
+        cls, path: str | os.PathLike[str], count: int, selected: list[int], up: str = "z"
     ) -> MeshMotion:
         """The motion of an ``.npz`` file: ``vertices`` (T, V, 3), ``faces`` (F, 3), and, where it
         has them, ``rest`` (V, 3) and ``fps``. Or of a folder of mesh files of the same vertices and
@@ -162,13 +183,25 @@ class MeshMotion(_World):
             )
         frames = _of_video(path, len(vertices), "meshes", count, selected)
         fps = _rate(path, arrays, count, selected)
+        size, (low, high) = np.ptp(rest, axis=0).max(), _SIZES
+        if not low < size < high:
+            units = [u for u, per in (("cm", 100), ("mm", 1000)) if low < size / per < high]
+            hint = f", not {units[0]}" if units else ""
+            raise InputError(f"{path}: a body of {size:.4g} m; metres are needed{hint}")
         frames = vertices[frames].astype(float)
         return cls(rest.astype(float), faces.astype(np.int64), frames, fps, up, path)
+
+    @property
+    def place(self) -> np.ndarray:
+        """Where its middle is in the first frame (3,) [m, world]."""
+        return self.frames[0].mean(0)
+
+    note = ""
 
 
 def read_motion(
     path: str | os.PathLike[str],
-    count: int | None,
+    count: int,
     selected: list[int],
     model: str = "",
     up: str = "z",
@@ -233,12 +266,8 @@ def _of_video(path, given, what, count, selected):
     """Which of ``given`` poses or meshes are of the frames that are used: their indices."""
     if given == len(selected):
         return list(range(given))
-    whole = given > selected[-1] if count is None else given == count
-    if not whole:
-        raise InputError(
-            f"{path}: {given} {what}; {count or f'more than {selected[-1]}'} frames, the video's,"
-            " are needed"
-        )
+    if given != count:
+        raise InputError(f"{path}: {given} {what}; {count} frames, the video's, are needed")
     return selected
 
 

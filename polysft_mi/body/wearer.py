@@ -4,11 +4,15 @@ alone.
 
 from __future__ import annotations
 
+import os
+from importlib.util import find_spec
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from polyfit.errors import require
 from polyfit.mesh import edges_of
+from polysft_mi.errors import InputError
 
 from .carrier import Carrier
 from .motion import BodyMotion, MeshMotion
@@ -33,6 +37,18 @@ def put_on(vertices: np.ndarray, faces: np.ndarray, motion: BodyMotion | MeshMot
     return carrier
 
 
+def check_model(path: str) -> None:
+    """Raise InputError where a file is none of a body of SMPL's family; where torch is not
+    installed, where there is none.
+    """
+    if not os.path.isfile(path):
+        raise InputError(f"{path}: no such file of a body")
+    if find_spec("torch"):
+        import onefit
+
+        onefit.SmplBody(path)
+
+
 def _on_joints(vertices, faces, motion):
     """(the :class:`Carrier`, the simulated template (T, N, 3) [m, world])."""
     import torch
@@ -48,7 +64,17 @@ def _on_joints(vertices, faces, motion):
     if smpl:  # theirs leads from where their own root is
         translation = translation + smpl.root(shape) - body.joints[0].double().numpy()
     given = smpl or shape is not None
-    garment = onefit.Garment.of_mesh("template", vertices, faces, made_for=body if given else None)
+    try:
+        made_for = body if given else None
+        garment = onefit.Garment.of_mesh("template", vertices, faces, made_for=made_for)
+    except InputError as error:
+        if (away := "does not lie on the body") not in str(error):
+            raise
+        why = str(error).partition(away)[2].partition(";")[0]
+        raise InputError(
+            f"{motion.path}: the template {away} at rest{why}; it is needed as it lies there, z up,"
+            " facing -y (onefit.align brings a garment there)"
+        ) from None
     seen = garment.render_mesh
     corners = garment.faces.numpy()[seen.face]
     weights = np.einsum(

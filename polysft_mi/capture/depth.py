@@ -14,14 +14,17 @@ import numpy as np
 
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError
-from polysft_mi.scene import image_size, list_images, read_pixels
+from polysft_mi.scene import EXTENSIONS, image_size, list_images, read_pixels
 
 from .output import write_png
 
 DEPTH = "depth"  # in the scene's folder
 _NAME = "{:05d}.png"
+_IMAGES = (*EXTENSIONS, ".csv")
 _UNIT = 1e-4  # metres of a whole number of the depth images that are written
 _MOST = 65535  # what they hold; farther off there is no sheet
+_FEW = 0.01  # share of an image that tells nothing of a sheet
+_UNITS = (1e-3, 1e-4, 1e-2, 1e-5, 1.0)  # of depth cameras, the likely ones first [m]
 _APART = 0.5  # pixels up to which two cameras see alike
 _STRAIGHT = 1e-3  # how far a pose may be from another's
 
@@ -79,6 +82,9 @@ def recognise_depth(path):
     record = f"{path}: depth in it is compressed as by Apple (LZFSE); export EXR + RGB in Record3D"
     if path.lower().endswith(".r3d"):
         raise InputError(record)
+    if os.path.isfile(path) and not path.lower().endswith(_IMAGES):
+        hint = ", as ScanNet's SensReader exports it" if path.lower().endswith(".sens") else ""
+        raise InputError(f"{path}: a folder of depth images, one a frame, is needed{hint}")
     if not os.path.isdir(path):
         return DepthFolder(path)
     if glob.glob(os.path.join(glob.escape(path), "rgbd", "*.depth")):
@@ -89,23 +95,52 @@ def recognise_depth(path):
             found = _scannet(folder) or _record3d(folder)
             if found:
                 return found
-    return _realsense(path) or DepthFolder(path)
+    found = _realsense(path) or DepthFolder(path)
+    within = os.path.join(path, "depth")
+    if os.path.isdir(within) and not any(n.lower().endswith(_IMAGES) for n in os.listdir(path)):
+        raise InputError(
+            f"{path}: depth of no known program: metadata.json with K, w and h (Record3D), or"
+            f" intrinsic/intrinsic_depth.txt (ScanNet), is needed; {within} names the images alone"
+        )
+    return found
 
 
-def write_depth(folder, images, converted, known_to):
+def check_range(images):
+    """Raise InputError where :func:`write_depth` would keep hardly anything of the first of
+    ``images`` (:class:`polysft_mi.scene.evidence.DepthImages`) that has depth.
+    """
+    if images.known_to != "metric":
+        return
+    each = ((k, images.read(k)) for k in range(len(images.files)))
+    k, depth = next((k, depth) for k, depth in each if (depth > 0).any())
+    known = depth[depth > 0]
+    whole = np.round(known / _UNIT)
+    if ((whole > 0) & (whole <= _MOST)).mean() > _FEW:
+        return
+    told, is_whole = np.median(known), images.is_whole(k)
+    number = told / images.unit if is_whole else told
+    likely = [unit for unit in _UNITS if 0.05 < number * unit < _UNIT * _MOST]
+    hint = f", and {number:.4g} is likely in units of {likely[0]:g} m" if likely else ""
+    needed = "--depth-unit says the unit" if is_whole else "EXR, TIFF and CSV are read in metres"
+    raise InputError(
+        f"{images.files[k]}: {told:.3g} m in the median is no distance of a sheet{hint}; {needed}"
+    )
+
+
+def write_depth(folder, images, converted):
     """Write depth images into ``folder``: of each of ``images``
     (:class:`polysft_mi.scene.evidence.DepthImages`) what ``converted(k)`` gives (H, W) [m].
-    Returns the settings that say what they are, ``known_to`` as the setting of that name.
+    Returns the settings that say what they are.
     """
     os.makedirs(folder, exist_ok=True)
     for k in range(len(images.files)):
         depth = converted(k)
         # what is fitted to each frame anyway is known to no scale
-        unit = _UNIT if known_to == "metric" else depth.max() / _MOST
+        unit = _UNIT if images.known_to == "metric" else depth.max() / _MOST
         whole = np.round(depth / max(unit, 1e-12))
         whole = np.where(whole <= _MOST, whole, 0).astype(np.uint16)
         write_png(os.path.join(folder, _NAME.format(k)), whole)
-    return {"depth_unit": _UNIT, "depth_known_to": known_to}
+    return {"depth_unit": _UNIT, "depth_known_to": images.known_to}
 
 
 def _record3d(folder):

@@ -9,7 +9,8 @@ import numpy as np
 from polysft_mi.scene import DepthImages, Tracks
 
 from .camera import Lens
-from .depth import DEPTH, recognise_depth, write_depth
+from .depth import DEPTH, check_range, recognise_depth, write_depth
+from .frames import count_frames
 from .rig import CAMERAS
 
 _TRACKS = "tracks.npz"
@@ -50,14 +51,34 @@ class GivenEvidence:
         rig = self.rig.path if self.rig else None
         return [path for path in (self._tracks, self._depth, rig) if path]
 
+    def open(self, video, size, first=0, last=-1, stride=1):
+        """Read and check what there is of the frames ``first`` to ``last`` in steps of ``stride``
+        of a ``video``, as :func:`polysft_mi.capture.frames.read_frames` takes them, of a ``size``
+        (width, height). Raises InputError.
+        """
+        if not (self._tracks or self._depth):
+            return
+        count = count_frames(video)
+        indices = list(range(count))[first : None if last == -1 else last + 1 : stride]
+        if self._tracks:
+            self._known = Tracks.read(self._tracks, count, indices, self._centre)
+        if self._depth:
+            self._source = recognise_depth(self._depth)
+            self._images = DepthImages.open(
+                self._source.images, count, indices, self._unit, self._known_to
+            )
+            check_range(self._images)
+            if self._source.camera is None:
+                self._images.like_frames(0, size)
+
     def write(self, folder, indices, straight):
-        """Write those of the frames ``indices`` into the folder, undistorted and scaled by
-        ``straight`` (:class:`polysft_mi.capture.camera.Undistortion`), further cameras scaled
+        """Write what was opened, of the frames ``indices``, into the folder, undistorted and scaled
+        by ``straight`` (:class:`polysft_mi.capture.camera.Undistortion`), further cameras scaled
         likewise. Returns the settings that name them, and lines for a person. Raises InputError.
         """
         settings, lines = {}, []
         if self._tracks:
-            known = Tracks.read(self._tracks, None, indices, self._centre)
+            known = self._known
             positions = straight.points(known.positions).reshape(known.positions.shape)
             queries = np.zeros((len(known.query), 3))
             queries[:, 0] = np.minimum(known.query, len(indices) - 1)
@@ -71,8 +92,7 @@ class GivenEvidence:
             seen = 100 * known.visible.mean()
             lines.append(f"tracks: {len(known.query)} of {self._tracks}, {seen:.0f} % visible")
         if self._depth:
-            source, where = recognise_depth(self._depth), os.path.join(folder, DEPTH)
-            images = DepthImages.open(source.images, None, indices, self._unit)
+            source, images, where = self._source, self._images, os.path.join(folder, DEPTH)
 
             def converted(k):
                 if source.camera is not None:
@@ -81,7 +101,7 @@ class GivenEvidence:
 
             settings |= {
                 "depth": DEPTH,
-                **write_depth(where, images, converted, self._known_to),
+                **write_depth(where, images, converted),
             }
             form = f", as of {source.form}" if source.form else ""
             moved = ", as the frames' camera sees it" if source.camera is not None else ""

@@ -54,6 +54,20 @@ def read_frames(path, first=0, last=-1, stride=1, film=None):
         )
 
 
+def count_frames(path):
+    """How many frames a video, a folder or a pattern of images holds; of a video that breaks off,
+    those before. Raises InputError where there are none to read.
+    """
+    count = 0
+    try:
+        for _ in _sources(path, Film()):
+            count += 1
+    except InputError:
+        if not count:
+            raise
+    return count
+
+
 def is_video(path):
     """Whether ``path`` is a file, other than a folder or pattern of images."""
     return os.path.isfile(path)

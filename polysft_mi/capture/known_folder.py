@@ -9,7 +9,7 @@ import numpy as np
 from polyfit.files import aside
 from polyfit.mesh import TexCoords
 from polysft_mi.backend import set_variant
-from polysft_mi.body import read_motion
+from polysft_mi.body import check_model, read_motion
 from polysft_mi.colours import srgb
 from polysft_mi.errors import InputError
 from polysft_mi.scene import Sequence, checked_size, open_cameras, read_camera, read_rgb
@@ -17,7 +17,7 @@ from polysft_mi.scene.kinect_paper import template as kinect_paper_template
 from polysft_mi.surface import meshio
 
 from . import pictures
-from .depth import DEPTH, recognise_depth, write_depth
+from .depth import DEPTH, check_range, recognise_depth, write_depth
 from .layouts import recognise
 from .output import REPORT, staged, write_png
 from .rig import CAMERAS
@@ -26,6 +26,7 @@ from .sheet import Sheet
 
 _OF_BODY = "body", "body_model", "body_up"
 _POSE = f"{REPORT}/pose.png"
+_BODY, _FARTHEST = 1.2, 30.0  # [m] that a body reaches from its middle; that it may be away
 
 
 def prepare_folder(
@@ -57,7 +58,7 @@ def prepare_folder(
     camera = layout.camera
     masks = os.path.join(folder, layout.masks) if layout.masks else ""
     said = []
-    known_to = evidence.pop("depth_known_to", "metric")
+    known_to = evidence.get("depth_known_to", "metric")
     of_body = {name: evidence.pop(name) for name in _OF_BODY if name in evidence}
     body, model = (of_body.get(name, "") for name in ("body", "body_model"))
     if body:
@@ -70,11 +71,15 @@ def prepare_folder(
     sequence = Sequence.open(
         os.path.join(folder, layout.frames), masks, size=(camera.width, camera.height), **evidence
     )
+    if depth and depth.is_seen_by(camera):
+        sequence.depth.like_frames(0, sequence.size)
     if body:
         up = of_body.get("body_up", "z")
-        read_motion(body, len(sequence), sequence.indices, model, up)
-        if model and not os.path.isfile(model):
-            raise InputError(f"{model}: no such file of a body")
+        motion = read_motion(body, len(sequence), sequence.indices, model, up)
+        _check_body(motion, pose, camera)
+        if model:
+            check_model(model)
+        said += [motion.note] if motion.note else []
         evidence |= of_body
     texture = os.path.join(folder, layout.texture)
     checked_size(texture)
@@ -111,18 +116,17 @@ def prepare_folder(
             rig.write(to, sequence.indices, camera, whole=True)
         )
     if depth and not depth.is_seen_by(camera):
+        check_range(sequence.depth)
         known = lambda path: path.endswith(".png")
         _check_folder(os.path.join(target, DEPTH), depth.images, overwrite, known)
         seen = lambda k: depth.seen_by(sequence.depth.read(k), camera)
-        folders[DEPTH] = lambda to: evidence.update(write_depth(to, sequence.depth, seen, known_to))
+        folders[DEPTH] = lambda to: evidence.update(write_depth(to, sequence.depth, seen))
     note = meshio.size_note(vertices, where)
     if note:
         warn(note)
     for name in ("tracks", "depth", "cameras", "body", "body_model"):
         if evidence.get(name):
             evidence[name] = _from_data(evidence[name], folder)
-    if depth:
-        evidence["depth_known_to"] = known_to
     evidence |= {name: name for name in folders}
     text = lambda: scene_xml(
         replace(layout, settings=layout.settings | evidence),
@@ -220,6 +224,29 @@ def _write(target, text, template, picture, hint, folders):
         if isinstance(error, InputError):
             raise
         raise InputError(f"{target}: {error.strerror or error}{hint}") from None
+
+
+def _check_body(motion, pose, camera):
+    """Raise InputError where a body stands out of the view of a camera with ``pose`` (4, 4) in the
+    first frame, or so far away that its motion is in another unit.
+    """
+    x, y, z = place = pose[:3, :3] @ motion.place + pose[:3, 3]
+    beyond = z + _BODY  # where the farthest of it is
+    sides = (x, camera.fx, camera.cx, camera.width), (y, camera.fy, camera.cy, camera.height)
+    if beyond <= 0 or any(
+        (at - _BODY) / beyond * f + c > side or (at + _BODY) / beyond * f + c < 0
+        for at, f, c, side in sides
+    ):
+        why = "out of the camera's view"
+    elif z > _FARTHEST:
+        why = "too far away"
+    else:
+        return
+    raise InputError(
+        f"{motion.path}: in the first frame the body is {why}, at {np.round(place, 2).tolist()} m"
+        " from it (right, down, forward); its translation, in metres, and world_to_camera in"
+        " camera.json must be of one world"
+    )
 
 
 def _check_view(vertices, camera, where):

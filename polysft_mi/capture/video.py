@@ -93,6 +93,8 @@ def prepare_video(
     stream = read_frames(video, first, last, stride, film)
     index, frame = next(stream)
     taken = frame.shape[1::-1]
+    if evidence:
+        evidence.open(video, taken, first, last, stride)
     lens, board_picture = _lens(video, texture, camera, fov, calibrate, board, taken, evidence)
     straight = Undistortion(lens, scale)
     view, frame = straight.camera, straight.image(frame)

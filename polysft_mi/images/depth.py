@@ -46,12 +46,12 @@ class DepthData:
     """The depth images of a ``sequence`` (:class:`polysft_mi.scene.sequence.Sequence`) against
     surfaces that ``data`` (:class:`polysft_mi.images.data_term.DataTerm`) finds in the image.
 
-    ``known_to``: metric, affine or disparity, as the setting ``depth_known_to``. Vertices are (N,
-    3) [m, world]; a ``level`` (:class:`polysft_mi.images.pyramid.Level`) has the grid.
+    Vertices are (N, 3) [m, world]; a ``level`` (:class:`polysft_mi.images.pyramid.Level`) has the
+    grid.
     """
 
-    def __init__(self, data, sequence, known_to="metric"):
-        self._data, self._sequence, self.known_to = data, sequence, known_to
+    def __init__(self, data, sequence):
+        self._data, self._sequence, self.known_to = data, sequence, sequence.depth.known_to
         self._sums = frozen(_sums)
         self._grids: OrderedDict = OrderedDict()
 
@@ -181,7 +181,8 @@ class DepthData:
                 (np.arange(-(-size // level.stride)) + 0.5) * level.stride
                 for size in (width, height)
             )
-            grid = _nearest(self._sequence.depth.read(frame), x / width, y / height)
+            depth = self._sequence.depth.like_frames(frame, (width, height))
+            grid = _nearest(depth, x / width, y / height)
             mask = self._sequence.mask(frame)
             if mask is not None:
                 grid = np.where(_nearest(mask, x / width, y / height) > 0.5, grid, 0)

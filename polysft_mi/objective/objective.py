@@ -220,6 +220,13 @@ class Objective:
             found |= term.noise(context, vertices, self.usual[-1])
         return found
 
+    def fits(self, surfaces: np.ndarray) -> dict[str, dict[str, float]]:
+        """How each kind of evidence beside the images fits the surfaces (T, N, 3) [m, world] that
+        were found, by the names of the terms.
+        """
+        found = {term.name: term.fit(surfaces, self.usual[-1]) for term in self.terms}
+        return {name: figures for name, figures in found.items() if figures}
+
     def check_gradient(self) -> None:
         """Raise RuntimeError where the renderer cannot be differentiated; Mitsuba tells only when
         it is.

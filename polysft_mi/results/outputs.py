@@ -78,12 +78,13 @@ def _vertices(problem, track):
     return world, problem.camera.to_camera(world).astype(np.float32)
 
 
-def write(problem, track, out, drawing, *, fps, command, say=None):
+def write(problem, track, out, drawing, *, fps, command, say=None, fits=None):
     """Write everything for the frames that ``track`` holds. Returns the summary that
     ``metrics.json`` begins with, and a function to call in the end: it waits for the plots.
 
     ``drawing``: the :class:`polysft_mi.pictures.drawing.Drawing` of the run; ``fps``: of the video;
-    ``say(text)``: told what is being written.
+    ``say(text)``: told what is being written; ``fits(surfaces)``: how evidence fits them, as
+    :meth:`polysft_mi.objective.Objective.fits` says it.
     """
     say = say or (lambda text: None)
     sequence, template = problem.sequence, problem.template
@@ -138,6 +139,7 @@ def write(problem, track, out, drawing, *, fps, command, say=None):
         "lost": {str(int(indices[k])): reason for k, reason in track.lost.items() if k < count},
         "doubtful": _doubtful(indices, per_frame),
         **({"undecided": undecided} if undecided else {}),
+        **(fits(world) if fits else {}),
         **_means(per_frame),
         "seconds_per_frame": float(sum(track.seconds) / count),
         "iterations_per_window": float(np.mean(track.iterations)) if track.iterations else 0.0,

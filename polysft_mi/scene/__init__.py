@@ -12,6 +12,7 @@ __getattr__, __dir__, __all__ = lazy.attach(
     __name__,
     submod_attrs={
         "cameras": [
+            "camera_names",
             "open_cameras",
             "read_camera",
             "read_cameras",

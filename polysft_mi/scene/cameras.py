@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -67,7 +67,7 @@ def open_cameras(
     known = known or {}
     if not os.path.isdir(folder):
         raise InputError(f"cameras: {folder}: no such folder{_HINT}")
-    names = sorted({*known, *(name for name in os.listdir(folder) if has_camera(folder, name))})
+    names = sorted({*known, *camera_names(folder, known)})
     if not names:
         raise InputError(
             f"{folder}: no cameras in it; a folder for each, with {_CAMERA} and frames, is"
@@ -82,6 +82,25 @@ def open_cameras(
         )
         for name in names
     ]
+
+
+def camera_names(folder: str, known: Iterable[str] = ()) -> list[str]:
+    """The names of the cameras in a folder, which are those of its folders but the ``known`` ones.
+    Raises InputError where one of them has no ``camera.json``.
+    """
+    names = sorted(
+        name
+        for name in os.listdir(folder)
+        if os.path.isdir(os.path.join(folder, name)) and not name.startswith(".")
+    )
+    names = [name for name in names if name not in known]
+    for name in names:
+        if not has_camera(folder, name):
+            raise InputError(
+                f"{os.path.join(folder, name)}: no {_CAMERA} in it; each folder in {folder} is a"
+                f" camera's{_HINT}"
+            )
+    return names
 
 
 def has_camera(folder: str, name: str) -> bool:
@@ -153,7 +172,11 @@ def _camera(known, where):
             f"{where}: distortion; frames without are needed, as polysft prepare VIDEO --cameras"
             " makes them"
         )
-    return Intrinsics(*numbers, *size), rigid_pose(pose, f"{where}: world_to_camera")
+    try:
+        intrinsics = Intrinsics(*numbers, *size)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+    return intrinsics, rigid_pose(pose, f"{where}: world_to_camera")
 
 
 def rigid_pose(values: Any, where: str) -> np.ndarray:
@@ -171,6 +194,8 @@ def rigid_pose(values: Any, where: str) -> np.ndarray:
         pose = np.vstack([pose, (0, 0, 0, 1)])
     if pose.shape != (4, 4):
         raise InputError(f"{where} is {pose.shape}; 3 x 4 or 4 x 4 is needed")
+    if np.abs(pose[3] - (0, 0, 0, 1)).max() > 1e-6:
+        raise InputError(f"{where}: its last row is {pose[3].tolist()}; 0, 0, 0, 1 is needed")
     turn = pose[:3, :3]
     if np.abs(turn @ turn.T - np.eye(3)).max() > _STRAIGHT or np.linalg.det(turn) < 0:
         raise InputError(f"{where} is no rotation and translation")

@@ -82,6 +82,7 @@ class Experiment:
             track_centre=s.track_centre,
             depth=depth,
             depth_unit=s.depth_unit,
+            depth_known_to=s.depth_known_to,
         )
         if cameras:
             for name in self.sensors:

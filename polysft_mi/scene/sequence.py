@@ -67,6 +67,7 @@ class Sequence:
         track_centre: float = 0.5,
         depth: str = "",
         depth_unit: float = 1e-3,
+        depth_known_to: str = "metric",
     ) -> Sequence:
         """Find, select and check the images.
 
@@ -121,7 +122,9 @@ class Sequence:
         if tracks:
             sequence.tracks = Tracks.read(tracks, len(paths), indices, track_centre)
         if depth:
-            sequence.depth = DepthImages.open(depth, len(paths), indices, depth_unit)
+            sequence.depth = DepthImages.open(
+                depth, len(paths), indices, depth_unit, depth_known_to
+            )
         if mask_files:
             with ThreadPoolExecutor(min(8, cores())) as pool:
                 areas = list(pool.map(sequence._mask_area, range(len(files))))

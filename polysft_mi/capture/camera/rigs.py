@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from polysft_mi.errors import InputError
-from polysft_mi.scene import rigid_pose
+from polysft_mi.scene import camera_names, rigid_pose
 
 from .files import colmap_camera, nerfstudio_camera, own_camera
 from .lens import Lens
@@ -82,12 +82,9 @@ def read_rig(path):
             files = [os.path.join(model, name + ending) for name in ("cameras", "images")]
             if all(map(os.path.isfile, files)):
                 return _colmap(model, *read(*files))
-    names = sorted(
-        name for name in os.listdir(path) if os.path.isfile(os.path.join(path, name, "camera.json"))
-    )
-    if not names:
+    if not any(os.path.isfile(os.path.join(path, n, "camera.json")) for n in os.listdir(path)):
         raise InputError(f"{path}: not a rig in a known form; the known forms are: {_FORMS}")
-    return Rig([_own(path, name) for name in names], [path], ours=True)
+    return Rig([_own(path, name) for name in camera_names(path)], [path], ours=True)
 
 
 def _own(folder, name):

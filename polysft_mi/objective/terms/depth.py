@@ -1,5 +1,7 @@
 """Depth images, of a sensor or guessed by a network. Import only after a Mitsuba variant is set."""
 
+import math
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -39,8 +41,7 @@ class Depth(Term):
     def __init__(self, inputs):
         super().__init__(inputs)
         self._inputs = inputs
-        known_to = inputs.settings.depth_known_to
-        self._images = DepthData(inputs.data, inputs.sequence, known_to)
+        self._images = DepthData(inputs.data, inputs.sequence)
         self._focal = inputs.placed.camera.focal
 
     @classmethod
@@ -68,6 +69,22 @@ class Depth(Term):
             self.name: float(np.clip(sigma, *_BOUNDS)),
             self._patch: float(np.clip(patch, *_PATCHES)),
         }
+
+    def fit(self, surfaces, stage):
+        """``used`` of ``given`` images, those that know the surface's depth; ``noise_mm``, their
+        standard deviation, by the median.
+        """
+        level, found = self._level(stage), []
+        for frame, vertices in enumerate(surfaces):
+            fit = self._images.fitted(vertices, frame, level)
+            if fit is None:
+                continue
+            residual, _ = self._images.residuals(vertices, frame, level, fit)
+            residual = residual[np.isfinite(residual)]
+            if len(residual) >= _FEWEST:
+                found.append(1e3 * float(np.median(np.abs(residual))) / _MEDIAN)
+        noise = float(np.median(found)) if found else math.nan
+        return {"used": len(found), "given": len(surfaces), "noise_mm": noise}
 
     def energy(self, at):
         context, level = at.context, self._level(at.stage)

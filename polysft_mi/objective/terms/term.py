@@ -224,6 +224,12 @@ class Term:
         """
         return {}
 
+    def fit(self, surfaces: np.ndarray, stage: Stage) -> dict[str, float]:
+        """How evidence beside the images fits the surfaces (T, N, 3) [m, world] that were found, by
+        names of metrics.json; empty for other terms.
+        """
+        return {}
+
     @property
     def without_block(self) -> str | None:
         """Why there is no :meth:`add` under these settings, in words; None where there is one."""

@@ -68,6 +68,19 @@ class Tracks(Term):
             found = float(np.median(np.linalg.norm(residual, axis=1)) / _MEDIAN)
         return {self.name: float(np.clip(found, *_BOUNDS))}
 
+    def fit(self, surfaces, stage):
+        """``used`` of ``given`` tracks, those that begin on the surface; ``noise_px``, the standard
+        deviation of either coordinate after that, by the median.
+        """
+        apart = [np.zeros(0)]
+        for frame, vertices in enumerate(surfaces):
+            residual, _, chosen = self._residuals(frame, vertices)
+            apart.append(np.linalg.norm(residual[self._tracks.query[chosen] < frame], axis=1))
+        apart = np.concatenate(apart)
+        noise = float(np.median(apart)) / _MEDIAN if len(apart) else math.nan
+        used = int((self.face >= 0).sum())
+        return {"used": used, "given": len(self.face), "noise_px": noise}
+
     def energy(self, at):
         frame = at.context.frame
         chosen = self._chosen(frame)

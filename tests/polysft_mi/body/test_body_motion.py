@@ -48,6 +48,8 @@ def test_of_the_frames_that_are_used(known, tmp_path):
         ({"translation": np.full((FRAMES, 3), np.nan)}, "must be finite numbers"),
         ({"fps": 0}, "fps = 0; a positive number is needed"),
         ({"betas": np.zeros(10)}, "has betas, so its poses are SMPL's; give its body's file too"),
+        ({"shape": np.zeros(10)}, r"shape \(10,\); gender, age, .* are needed, each from 0 to 1"),
+        ({"shape": np.full(6, np.nan)}, r"body.npz: shape \[nan, .* each from 0 to 1"),
     ],
 )
 def test_what_cannot_be_used_is_refused(known, tmp_path, change, message):
@@ -112,6 +114,7 @@ def test_meshes_in_a_file_and_in_a_folder_say_the_same(meshes, tmp_path):
         ({"faces": np.array([[0, 1, 5]])}, "whole numbers from 0 to 4"),
         ({"faces": np.zeros((0, 3), int)}, "whole numbers from 0 to 4"),
         ({"fps": -1}, "fps = -1; a positive number is needed"),
+        ({"rest": 100 * np.eye(5, 3)}, "body.npz: a body of 100 m; metres are needed, not cm"),
         ({"vertices": np.zeros((4, 5, 3))}, "4 meshes; 6 frames, the video's, are needed"),
     ],
 )

@@ -85,6 +85,17 @@ def test_on_the_moving_mesh_alone_it_lies_alike(garment, motion, tmp_path):
         put_on(vertices + (0, 0, 1.0), faces, mesh)
 
 
+def test_a_template_that_is_not_on_the_body_is_told(garment, motion, tmp_path):
+    """In words for who runs a scene."""
+    np.savez(tmp_path / "body.npz", poses=motion[0], translation=motion[1])
+    away = garment.vertices.double().numpy() - (0, 0, 1.2)
+    known = read_motion(tmp_path / "body.npz", FRAMES, list(range(FRAMES)))
+    with pytest.raises(InputError, match="body.npz: the template does not lie on the body") as told:
+        put_on(away, garment.faces.numpy(), known)
+    assert "onefit.align" in str(told.value)
+    assert not any(word in str(told.value) for word in ("made_for", "offset"))
+
+
 def test_smpl_s_forms_say_the_same(motion, smpl, tmp_path):
     poses, trans = as_smpl(motion, smpl)
     read = lambda name: BodyMotion.read(tmp_path / name, FRAMES, [0, 1, 2], smpl, "y")
@@ -97,6 +108,11 @@ def test_smpl_s_forms_say_the_same(motion, smpl, tmp_path):
     whole, in_parts, of_smplx = (read(name) for name in ("a.npz", "b.npz", "c.npz"))
     assert whole.fps == in_parts.fps == 60 and whole.shape is None
     assert in_parts.shape.tolist() == [1, 1, 1, 1] and whole.model == smpl
+    assert in_parts.note == ""
+    np.savez(tmp_path / "d.npz", poses=poses, trans=trans, betas=np.zeros(16))
+    assert read("d.npz").note == ""
+    np.savez(tmp_path / "e.npz", poses=poses, trans=trans, betas=np.ones((FRAMES, 16)))
+    assert "e.npz: 16 betas; the first 10 of them count" in read("e.npz").note
     for other in (in_parts, of_smplx):
         assert np.allclose(other.poses[:, :22], whole.poses[:, :22])
         assert np.array_equal(other.translation, whole.translation)

@@ -49,6 +49,9 @@ def written(folder, depth, count=2, lens=None, unit=1e-3):
     """What is written of the depth images, read back; and the lines."""
     straight = Undistortion(lens or Lens(COLOUR))
     evidence = GivenEvidence(depth=str(depth), depth_unit=unit)
+    for k in range(count):
+        write_png(folder / "frames" / f"{k}.png", np.zeros((COLOUR.height, COLOUR.width), np.uint8))
+    evidence.open(str(folder / "frames"), (COLOUR.width, COLOUR.height))
     settings, lines = evidence.write(str(folder), list(range(count)), straight)
     images = DepthImages.open(str(folder / settings["depth"]), count, list(range(count)), 1e-4)
     return np.stack([images.read(k) for k in range(count)]), lines
@@ -112,17 +115,55 @@ def test_a_scene_is_prepared_with_it(tmp_path, capsys):
     assert "4 x 4 is needed" in refused(prepare.main, [*words, "--overwrite"])
 
 
+def exr(path, depth):
+    path.parent.mkdir(exist_ok=True)
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, {"R": depth.astype(np.float32)}).write(str(path))
+
+
+def test_depth_of_which_nothing_would_be_left_is_refused(tmp_path):
+    """The likely unit is named."""
+    for k in range(2):
+        exr(tmp_path / "mm" / f"{k}.exr", 1000 * plane(COLOUR, k))
+        write_png(tmp_path / "png" / f"{k}.png", np.full((72, 96), 800, np.uint16))
+    (tmp_path / "out").mkdir()
+    said = refused(written, tmp_path / "out", tmp_path / "mm")
+    assert (
+        "0.exr: 8" in said and "in units of 0.001 m; EXR, TIFF and CSV are read in metres" in said
+    )
+    for unit in (1.0, 1e-8):
+        said = refused(written, tmp_path / "out", tmp_path / "png", unit=unit)
+        assert "800 is likely in units of 0.001 m; --depth-unit says the unit" in said
+    assert not (tmp_path / "out" / "depth").exists()
+    assert written(tmp_path / "out", tmp_path / "png")[0].max() == pytest.approx(0.8)
+    folder = synthetic.cloth(tmp_path / "data", frames=2).folder
+    words = [str(folder), "--depth", str(scannet(tmp_path / "scan")), "--depth-unit", "1"]
+    assert "in units of 0.001 m" in refused(prepare.main, words)
+    assert not (folder / "depth").exists() and not (folder / "scene.xml").exists()
+
+
+def test_depth_of_another_shape_is_refused_before_the_work(tmp_path):
+    """Of a folder and of a video."""
+    for k in range(2):
+        write_png(tmp_path / "square" / f"{k}.png", np.full((72, 72), 600, np.uint16))
+    (tmp_path / "out").mkdir()
+    said = "0.png: 72x72 pixels are not of the shape of the frames, 96x72"
+    assert said in refused(written, tmp_path / "out", tmp_path / "square")
+    folder = synthetic.cloth(tmp_path / "data", frames=2).folder
+    words = [str(folder), "--depth", str(tmp_path / "square"), "--depth-known-to", "affine"]
+    assert said in refused(prepare.main, words)
+    assert not (folder / "scene.xml").exists()
+
+
 def test_record3d(tmp_path):
     """Its depth has fewer pixels; its K, column by column, is that of the colour images."""
     c = COLOUR
     K = [c.fx, 0, 0, 0, c.fy, 0, c.cx, c.cy, 1]
-    (tmp_path / "depth").mkdir()
     small = Intrinsics(*(x / 4 for x in (c.fx, c.fy, c.cx, c.cy)), 24, 18)
     for k in range(2):
         depth = plane(small, k).astype(np.float32)
         depth[0, 0] = np.nan
-        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-        OpenEXR.File(header, {"R": depth}).write(str(tmp_path / "depth" / f"{k}.exr"))
+        exr(tmp_path / "depth" / f"{k}.exr", depth)
     (tmp_path / "metadata.json").write_text(json.dumps({"K": K, "w": 96, "h": 72, "fps": 60}))
     (tmp_path / "out").mkdir()
     found, lines = written(tmp_path / "out", tmp_path)
@@ -135,7 +176,16 @@ def test_record3d(tmp_path):
     (tmp_path / "metadata.json").write_text(json.dumps({"title": "mine"}))
     assert recognise_depth(str(tmp_path / "depth")).form == ""
     assert GivenEvidence(depth=str(tmp_path / "depth")).lens(48, 36) is None
+    for broken in ({"title": "mine"}, {"K": K[:3], "w": 96, "h": 72}):
+        (tmp_path / "metadata.json").write_text(json.dumps(broken))
+        said = refused(recognise_depth, str(tmp_path))
+        assert (
+            "metadata.json with K, w and h (Record3D)" in said and f"{tmp_path / 'depth'}" in said
+        )
     assert "EXR + RGB" in refused(recognise_depth, str(tmp_path / "a.r3d"))
+    (tmp_path / "a.sens").write_bytes(b"")
+    said = refused(recognise_depth, str(tmp_path / "a.sens"))
+    assert "a folder of depth images, one a frame, is needed, as ScanNet's SensReader" in said
     write_png(tmp_path / "raw" / "rgbd" / "0.png", np.zeros((4, 4), np.uint8))
     (tmp_path / "raw" / "rgbd" / "0.depth").write_bytes(b"bvx2")
     assert "EXR + RGB" in refused(recognise_depth, str(tmp_path / "raw"))

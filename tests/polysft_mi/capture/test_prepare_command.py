@@ -164,5 +164,23 @@ def test_words_of_the_command_line(words, said, clip):
     assert said in refused(prepare.main, [clip[0], *words.split()])
 
 
+@pytest.mark.parametrize(
+    "words, said",
+    [
+        ("--track-centre 0.5", "--track-centre: is of tracks; --tracks names"),
+        ("--depth-unit 0.001", "--depth-unit: is of depth images; --depth names"),
+        ("--depth-known-to affine", "--depth-known-to: is of depth images; --depth names"),
+        ("--body-up y", "--body-up: is of a body; --body names"),
+        ("--rig-scale 1", "--rig-scale: is of a rig; --cameras names"),
+        ("--camera-name left", "--camera-name: is of a rig; --cameras names"),
+        ("--depth deep --depth-unit 0", "--depth-unit 0: metres a number; above 0 is needed"),
+        ("--depth deep --depth-unit -1", "--depth-unit -1: metres a number; above 0 is needed"),
+    ],
+)
+def test_options_that_speak_of_nothing_are_refused(words, said, tmp_path):
+    assert said in refused(prepare.main, [str(DEMO), "-o", str(tmp_path / "out"), *words.split()])
+    assert not (tmp_path / "out").exists()
+
+
 def test_options_for_videos_are_refused_for_folders(tmp_path):
     assert "--fov" in refused(prepare.main, [str(DEMO), "--fov", "60"])

@@ -5,6 +5,7 @@ in one line.
 import dataclasses
 import json
 import os
+import pickle
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -292,6 +293,11 @@ def test_a_body_says_where_the_camera_stands(tmp_path):
     seen = Pinhole(experiment.sensor)
     np.testing.assert_allclose(seen.axes, turn, atol=1e-5)
     np.testing.assert_allclose(seen.origin, -turn.T @ pose[:3, 3], atol=1e-5)
+    for place, why in (((50, 0, 0), "out of the camera's view"), ((0, 0, 90), "too far away")):
+        away = body["translation"] + turn.T @ place
+        np.savez(tmp_path / "body.npz", poses=body["poses"], translation=away)
+        with pytest.raises(InputError, match=f"body.npz: in the first frame the body is {why}"):
+            prepare.main([*words, "--overwrite"])
     np.savez(tmp_path / "body.npz", poses=body["poses"][1:], translation=body["translation"][1:])
     with pytest.raises(InputError, match="frames, the video's, are needed"):
         prepare.main([*words, "--overwrite"])
@@ -302,6 +308,7 @@ def test_a_body_of_smpl_s_family(tmp_path):
     folder, frames = synthetic.cloth(tmp_path / "a", frames=3).folder, 3
     camera = json.loads((folder / "camera.json").read_text())
     pose = np.diag([1.0, -1, -1, 1])
+    pose[2, 3] = 3
     (folder / "camera.json").write_text(json.dumps(camera | {"world_to_camera": pose.tolist()}))
     motion = {"poses": np.zeros((frames, 72)), "trans": np.zeros((frames, 3))}
     np.savez(tmp_path / "smpl.npz", **motion, betas=np.zeros(10))
@@ -311,11 +318,17 @@ def test_a_body_of_smpl_s_family(tmp_path):
     words += ["--body-model", str(tmp_path / "SMPL.pkl"), "--body-up", "y"]
     with pytest.raises(InputError, match="SMPL.pkl: no such file of a body"):
         prepare.main(words)
-    (tmp_path / "SMPL.pkl").write_bytes(b"")  # the run reads it
+    (tmp_path / "SMPL.pkl").write_bytes(b"")
+    pytest.importorskip("torch")
+    with pytest.raises(InputError, match="SMPL.pkl: cannot be read as a body"):
+        prepare.main(words)
+    onefit, standing = pytest.importorskip("onefit"), pytest.importorskip("standing")
+    contents = standing.smpl_contents(onefit.AnnyBody().body())
+    (tmp_path / "SMPL.pkl").write_bytes(pickle.dumps(contents))
     prepare.main(words)
     settings = loaded(str(tmp_path / "out" / "scene.xml")).settings
     assert settings.body_model == str(tmp_path / "SMPL.pkl") and settings.body_up == "y"
-    with pytest.raises(InputError, match="--body-model x.pkl: of whose motion"):
+    with pytest.raises(InputError, match="--body-model: is of a body; --body names"):
         prepare.main([str(folder), "--body-model", "x.pkl", "-o", str(tmp_path / "other")])
 
 

@@ -314,8 +314,34 @@ def test_given_tracks_and_depth(clip, tmp_path):
     short = GivenEvidence(depth=str(tmp_path / "few"))
     write_png(tmp_path / "few" / "0.png", np.full((CAMERA.height, CAMERA.width), 500, np.uint16))
     said = refused(prepare_video, clip[0], str(tmp_path / "b"), evidence=short, **given(clip))
-    assert "1 depth images for more than 11 or 12 frames" in said
+    assert "1 depth images for 12 frames" in said
     assert not (tmp_path / "b").exists()
+
+
+@pytest.mark.parametrize("last", [-1, 8])
+def test_tracks_of_a_video_may_have_points_first(last, clip, tmp_path):
+    """As many frames as the video has say which axis is theirs, also where not all are used; what
+    is of another length is refused before the work.
+    """
+    positions = np.random.default_rng(0).uniform(20, 80, (12, 20, 2))
+    lines, path = [], tmp_path / "tracks.npz"
+    call = dict(last=last, say=lines.append, masks=False, **given(clip))
+    np.savez(path, tracks=positions.swapaxes(0, 1))
+    scene, found = prepare_video(
+        clip[0], str(tmp_path / "out"), evidence=GivenEvidence(str(path)), **call
+    )
+    tracks = loaded(scene).sequence().tracks
+    assert np.allclose(tracks.positions, positions[found["indices"]], atol=1e-3)
+    assert any(line.startswith("tracks: 20 of") for line in lines)
+    for wrong in (positions[:11], np.concatenate([positions, positions])):
+        np.savez(path, tracks=wrong)
+        lines.clear()
+        said = refused(
+            prepare_video, clip[0], str(tmp_path / "b"), evidence=GivenEvidence(str(path)), **call
+        )
+        used = "" if last == -1 else " or 9"
+        assert f"tracks is {wrong.shape}; 12{used} frames, the video's" in said
+        assert lines == [] and not (tmp_path / "b").exists()
 
 
 def test_masks_that_cannot_be_believed_are_not_used(clip, tmp_path):

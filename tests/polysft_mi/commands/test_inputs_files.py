@@ -4,6 +4,7 @@ One line names the file, property or value and says what is accepted; the exit s
 untouched.
 """
 
+import json
 import shutil
 
 import cv2
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 import synthetic
 from refusals import QUICK, SIZE, edited, has, refused
+from scipy.spatial.transform import Rotation
 
 from polyfit import write_ply
 from polysft_mi import run
@@ -84,9 +86,43 @@ def test_tracks_that_are_no_pixels(good, sheet):
     tracks = np.tile(centre, (3, 5, 1)) + np.arange(5)[:, None]
     np.savez(sheet / "tracks.npz", tracks=tracks / SIZE)
     options = "-D", f"tracks={sheet / 'tracks.npz'}"
-    has(refused(sheet / "scene.xml", *options), "tracks: none of the 5", "pixels of 48x36")
+    has(refused(sheet / "scene.xml", *options), "tracks.npz: 0 of the 5", "pixels of 48x36")
+    late = np.arange(3)[:, None] >= [1] * 5
+    np.savez(sheet / "tracks.npz", tracks=10 * tracks, visible=late)
+    message = refused(sheet / "scene.xml", *options)
+    has(message, "tracks.npz: all of them lie outside the image", "pixels of 48x36")
+    few = np.tile([(1.0, 1.0)], (3, 60, 1))  # a corner, where the sheet is not
+    few[:, :2] = tracks[:, :2]
+    np.savez(sheet / "tracks.npz", tracks=few)
+    message = refused(sheet / "scene.xml", *options)
+    has(message, "2 of the 60 that begin in the first frame begin on the template")
     np.savez(sheet / "tracks.npz", tracks=tracks)
     assert run.main([str(sheet / "scene.xml"), "-o", str(sheet / "out"), *QUICK[:3], *options]) == 0
+
+
+def test_further_cameras_that_do_not_see_the_template(good, sheet):
+    """As the scene's own camera must, by a pose that is right."""
+    side = sheet / "cameras" / "side"
+    for name in ("frames", "masks"):
+        shutil.copytree(sheet / name, side / name)
+    known = json.loads((sheet / "camera.json").read_text())
+
+    def given(*place, turn=0.0):
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_rotvec([0, turn, 0]).as_matrix()
+        pose[:3, 3] = place
+        (side / "camera.json").write_text(json.dumps(known | {"world_to_camera": pose.tolist()}))
+        return "-D", f"cameras={sheet / 'cameras'}"
+
+    for place, turn, said in (
+        ((0, 0, 0), np.pi, "99 of 99 vertices behind the camera"),
+        ((50, 0, 0), 0.0, "is out of view in the first frame"),
+        ((0.3, 0.2, 0.3), 0.0, "does not meet the mask of the first frame"),
+    ):
+        message = refused(sheet / "scene.xml", *given(*place, turn=turn))
+        has(message, "camera side: the template", said, "world_to_camera")
+    options = given(0, 0, 0)
+    assert run.main([str(sheet / "scene.xml"), "-o", str(sheet / "out"), *QUICK, *options]) == 0
 
 
 def test_depth_of_another_unit_or_shape(good, sheet):
@@ -101,10 +137,18 @@ def test_depth_of_another_unit_or_shape(good, sheet):
     away = good.vertices[0][:, 2].mean()
     message = refused(sheet / "scene.xml", *given(away / 10, SIZE[::-1]))
     has(message, "000.png:", "m where the template lies", "depth_unit = 0.001 m must be wrong")
+    has(message, "(0.01 would fit)", "depth_known_to = affine")
+    for factor in (1.4, 0.7):
+        message = refused(sheet / "scene.xml", *given(factor * away, SIZE[::-1]))
+        has(message, "m where the template lies", "depth_known_to = affine")
     message = refused(sheet / "scene.xml", *given(away, (36, 36)))
     has(message, "000.png: 36x36 pixels are not of the shape of the frames, 48x36")
-    options = given(away, SIZE[::-1])
-    assert run.main([str(sheet / "scene.xml"), "-o", str(sheet / "out"), *QUICK[:3], *options]) == 0
+    options = given(1.1 * away, SIZE[::-1])
+    dark = np.zeros(SIZE[::-1], np.uint16)
+    words = [str(sheet / "scene.xml"), "-o", str(sheet / "out"), *QUICK[:3], *options]
+    assert run.main(words) == 0
+    cv2.imwrite(str(sheet / "depth" / "000.png"), dark)  # a sensor that starts dark
+    assert run.main([*words, "--overwrite"]) == 0
 
 
 @pytest.mark.parametrize("kind", ["obj", "ply"])

@@ -251,6 +251,33 @@ def test_frames_that_the_surface_does_not_explain_are_called_doubtful(sequence, 
     )
 
 
+def test_how_tracks_and_depth_fit_is_told(sequence, tmp_path, capsys):
+    """How much of them was used, their noise, and tracks that are of another video."""
+    rng, (count, points) = np.random.default_rng(0), sequence.vertices.shape[:2]
+    x = sequence.vertices @ sequence.K.T
+    tracks = x[..., :2] / x[..., 2:]
+    noisy = tracks + (np.arange(count) > 0)[:, None, None] * rng.normal(0, 0.5, tracks.shape)
+    noisy[:, :20] = 2.0  # beside the sheet
+    (tmp_path / "depth").mkdir()
+    for k, vertices in enumerate(sequence.vertices):
+        deep = np.full((72, 96), 1e4 * vertices[:, 2].mean()) + rng.normal(0, 30, (72, 96))
+        cv2.imwrite(str(tmp_path / "depth" / f"{k}.png"), np.round(deep).astype(np.uint16))
+    np.savez(tmp_path / "tracks.npz", tracks=noisy)
+    given = ["-D", f"tracks={tmp_path / 'tracks.npz'}", "-D", "last=2"]
+    deep = ["-D", f"depth={tmp_path / 'depth'}", "-D", "depth_unit=0.0001"]
+    out = ran(sequence.folder, tmp_path / "out", *GAUSS_NEWTON, *given, *deep)
+    said, figures = capsys.readouterr().out, json.loads((out / "metrics.json").read_text())
+    found = figures["tracks"]
+    assert found["given"] == points and points - 45 < found["used"] <= points - 20
+    assert f"tracks: {found['used']} of {points} used, noise {found['noise_px']:.2g} px\n" in said
+    assert 0.25 < found["noise_px"] < 1
+    assert "depth: 3 of 3 images used, noise " in said and 2 < figures["depth"]["noise_mm"] < 30
+    noisy[1:] += 10
+    np.savez(tmp_path / "tracks.npz", tracks=noisy)
+    out = ran(sequence.folder, tmp_path / "out", *GAUSS_NEWTON, *given, "--overwrite")
+    assert " px: are they of this video?\n" in capsys.readouterr().out
+
+
 def test_a_surface_that_leaves_the_image_is_reported_and_held(
     sequence, tmp_path, capsys, monkeypatch
 ):

@@ -30,14 +30,19 @@ def scene(truth):
 
 
 def depth_of(problem, folder, numbers, unit, known_to="metric"):
-    """:class:`DepthData` of one image of numbers, written in whole ``unit``."""
-    whole = np.round(numbers / unit)
-    assert whole.min() >= 0 and whole.max() < 65536
-    count = len(problem.sequence)
+    """:class:`DepthData` of one image of numbers, written in whole ``unit``; as they are without
+    one.
+    """
+    whole, count = numbers.astype(np.float32), len(problem.sequence)
+    if unit:
+        whole = np.round(numbers / unit)
+        assert whole.min() >= 0 and whole.max() < 65536
+        whole = whole.astype(np.uint16)
     for k in range(count):
-        assert cv2.imwrite(str(folder / f"{k}.png"), whole.astype(np.uint16))
-    problem.sequence.depth = DepthImages.open(str(folder), count, list(range(count)), unit)
-    return DepthData(data_of(problem), problem.sequence, known_to)
+        assert cv2.imwrite(str(folder / f"{k}.{'png' if unit else 'tiff'}"), whole)
+    given = str(folder), count, list(range(count)), unit, known_to
+    problem.sequence.depth = DepthImages.open(*given)
+    return DepthData(data_of(problem), problem.sequence)
 
 
 def test_a_surface_is_compared_with_what_the_image_knows_of_it(scene, tmp_path):
@@ -77,6 +82,21 @@ def test_a_scale_and_a_shift_are_fitted_though_some_pixels_are_wrong(scene, know
     other = known.fitted(vertices + (0, 0, 0.01), FRAME, LEVEL)
     again, _, _ = known.sums(vertices + (0, 0, 0.01), FRAME, LEVEL, NOISE, other)
     assert again < pushed
+
+
+@pytest.mark.parametrize("known_to", ["affine", "disparity"])
+def test_a_network_s_numbers_may_be_0_and_below(scene, known_to, tmp_path):
+    problem, vertices, depth = scene
+    value = depth if known_to == "affine" else 1 / np.maximum(depth, 1e-3)
+    middle = np.median(value[depth > 0])  # so that half of them are below 0
+    numbers = np.where(depth > 0, (value - middle) / 0.5, np.nan)
+    known = depth_of(problem, tmp_path, numbers, 0, known_to)
+    fit = known.fitted(vertices, FRAME, LEVEL)
+    assert fit[0] == pytest.approx(0.5, rel=0.01)
+    residual, _ = known.residuals(vertices, FRAME, LEVEL, fit)
+    inside = problem.sequence.mask(FRAME) > 0.5
+    assert np.isfinite(residual).sum() == (inside & (depth > 0)).sum()
+    assert np.nanmax(np.abs(residual)) < 1e-3
 
 
 def test_metric_depth_is_taken_as_it_is(scene, tmp_path):

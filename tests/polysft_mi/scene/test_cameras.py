@@ -11,6 +11,7 @@ from loading import loaded
 from scipy.spatial.transform import Rotation
 
 from polysft_mi.capture import prepare_folder
+from polysft_mi.capture.camera.rigs import read_rig
 from polysft_mi.errors import InputError
 from polysft_mi.render.pinhole import Pinhole
 from polysft_mi.scene import read_cameras, register, written
@@ -65,6 +66,8 @@ def test_the_selected_frames_are_used(folder):
         ({"world_to_camera": [[1, 0], [0, 1]]}, "is (2, 2); 3 x 4 or 4 x 4"),
         ({"world_to_camera": np.diag([2.0, 2, 2, 1]).tolist()}, "no rotation and translation"),
         ({"world_to_camera": np.diag([1.0, 1, -1, 1]).tolist()}, "no rotation and translation"),
+        ({"world_to_camera": np.diag([1.0, 1, 1, 2]).tolist()}, "camera: its last row is [0.0, 0"),
+        ({"fx": -100.0}, "side/camera.json: camera: (fx, fy, cx, cy) = (-100.0,"),
     ],
 )
 def test_a_bad_file_is_told(other, said, folder):
@@ -148,9 +151,25 @@ def test_bad_further_sensors_are_told(scene):
         loaded(make(id=""))
     with pytest.raises(InputError, match="'thinlens' is not a pinhole"):
         loaded(make(kind="thinlens"))
-    (Path(make()).parent / "cameras" / "right").mkdir(parents=True)
+    cameras = Path(make()).parent / "cameras"
+    (cameras / "right").mkdir(parents=True)
     with pytest.raises(InputError, match=r"sensor 'left': .*cameras.left: no such folder"):
         loaded(make(), cameras="cameras").sequence()
+    synthetic.cloth(cameras / "left", frames=2)
+    (cameras / "left" / "camera.json").unlink()
+    with pytest.raises(InputError, match=r"cameras.right: no camera\.json in it"):
+        loaded(make(), cameras="cameras").sequence()
+
+
+def test_a_camera_s_folder_without_its_file_is_told(folder):
+    """A hidden folder, and a file, is none."""
+    (folder / ".cache").mkdir()
+    (folder / "notes.txt").write_text("")
+    assert len(open_cameras(str(folder), 3)) == len(read_rig(str(folder)).views) == 1
+    (folder / "back").mkdir()
+    for read in (lambda: open_cameras(str(folder), 3), lambda: read_rig(str(folder))):
+        with pytest.raises(InputError, match=r"back: no camera\.json in it"):
+            read()
 
 
 def test_a_folder_without_cameras_is_told(tmp_path):

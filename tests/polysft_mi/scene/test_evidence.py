@@ -1,6 +1,7 @@
 """Files of tracks and depth images, in the forms that other programs write."""
 
 import dataclasses
+import zipfile
 
 import cv2
 import numpy as np
@@ -56,6 +57,35 @@ def test_files_of_trackers_say_the_same(known, tmp_path):
     assert same(Tracks.read(tmp_path / "tracks.npy", FRAMES, list(range(FRAMES))), plain)
 
 
+def test_points_and_frames_that_are_as_many_are_told_apart(tmp_path):
+    """By the queries, or by TAPIR's names; else frames come first."""
+    rng, path = np.random.default_rng(1), tmp_path / "t.npz"
+    whole, some = rng.uniform(0, 90, (FRAMES, 3, 2)), rng.random((FRAMES, 3)) < 0.7
+    some[0] = True  # so that each of them begins in the first frame
+    used, queries = [0, 2, 4], np.zeros((3, 3))
+    plain = read(path, selected=used, tracks=whole, visible=some)
+    turned = {"tracks": whole.swapaxes(0, 1), "visible": some.T}
+    assert same(read(path, selected=used, queries=queries, **turned), plain)
+    tapir = {"tracks": turned["tracks"], "visibles": some.T}
+    assert same(read(path, selected=used, **tapir), plain)
+    square, seen = rng.uniform(0, 90, (FRAMES, FRAMES, 2)), rng.random((FRAMES, FRAMES)) < 0.7
+    plain = read(path, tracks=square, visible=seen)
+    assert np.array_equal(plain.positions[plain.visible], square[seen])
+    assert same(read(path, tracks=square.swapaxes(0, 1), occluded=~seen.T), plain)
+
+
+def test_visibilities_may_be_logits(known, tmp_path):
+    positions, visible = known
+    plain = read(tmp_path / "t.npz", tracks=positions, visible=visible)
+    for low, high in ((-4.0, 0.3), (0, 255), (-1e-4, 1.001)):
+        given = {"tracks": positions, "visibility": np.where(visible, high, low)}
+        assert same(read(tmp_path / "t.npz", **given), plain), (low, high)
+    given = {"tracks": positions, "occlusion": np.where(visible, -0.3, 4.0)}
+    assert same(read(tmp_path / "t.npz", **given), plain)
+    one = {"tracks": positions[:, :1], "visibility": visible[None, :, :1]}
+    assert same(read(tmp_path / "t.npz", **one), read(tmp_path / "t.npz", tracks=positions[:, :1]))
+
+
 def test_a_pixels_centre_may_be_at_zero(known, tmp_path):
     positions, visible = known
     found = read(tmp_path / "t.npz", 0.0, tracks=positions, visible=visible)
@@ -86,7 +116,9 @@ def _saved(folder, **arrays):
         ({"tracks": np.zeros((4, 3, 2))}, "tracks is .4, 3, 2.; 5 frames"),
         ({"tracks": np.zeros((5, 3, 3))}, "x and y"),
         ({"tracks": np.zeros((5, 0, 2))}, "at least one point"),
-        ({"tracks": np.zeros((5, 3, 2)), "visible": np.ones((5, 4))}, "visible is of"),
+        ({"tracks": np.zeros((5, 3, 2)), "visible": np.ones((5, 4))}, "visible is .5, 4."),
+        ({"tracks": np.full((5, 3, 2), np.nan)}, "no point is seen in any frame"),
+        ({"tracks": np.zeros((5, 3, 2)), "visible": np.zeros((5, 3))}, "no point is seen"),
         ({"tracks": np.zeros((5, 3, 2)), "queries": np.zeros((2, 3))}, "queries is .2, 3."),
         (
             {"tracks": np.zeros((5, 3, 2)), "queries": np.full((3, 3), 7.0)},
@@ -102,6 +134,11 @@ def test_what_is_no_file_of_tracks_is_told(arrays, said, tmp_path):
 def test_a_file_that_is_none_is_told(tmp_path):
     with pytest.raises(InputError, match="no such file of tracks"):
         Tracks.read(tmp_path / "none.npz", 1, [0])
+    with zipfile.ZipFile(tmp_path / "tracks.pt", "w") as file:  # as torch.save writes it
+        file.writestr("tracks/data.pkl", b"")
+        file.writestr("tracks/data/0", b"")
+    with pytest.raises(InputError, match=r"tracks.pt: a file of torch; save it as \.npz"):
+        Tracks.read(tmp_path / "tracks.pt", 1, [0])
     (tmp_path / "text.npz").write_text("tracks")
     with pytest.raises(InputError, match="not a file of tracks"):
         Tracks.read(tmp_path / "text.npz", 1, [0])
@@ -121,6 +158,29 @@ def test_depth_is_read_in_metres(tmp_path):
     assert np.allclose(found, [[0.7, 0], [0, 0]])
 
 
+def test_every_depth_image_is_read(tmp_path):
+    """So that a bad one is known before the work starts; of those that are used."""
+    good = np.full((6, 8), 500, np.uint16)
+    for k in range(3):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), good)
+    call = lambda: DepthImages.open(str(tmp_path), 3, [0, 2], 1e-3)
+    assert len(call().files) == 2
+    for pixels, said in (
+        (np.zeros((6, 6), np.uint16), "2.png: 6x6 pixels; .*0.png has 8x6"),
+        (good.astype(np.uint8), "2.png: 8 bits"),
+    ):
+        cv2.imwrite(str(tmp_path / "2.png"), pixels)
+        with pytest.raises(InputError, match=said):
+            call()
+    cv2.imwrite(str(tmp_path / "2.png"), good)
+    (tmp_path / "2.png").write_bytes((tmp_path / "2.png").read_bytes()[:60])
+    with pytest.raises(InputError, match="2.png: not a readable image"):
+        call()
+    cv2.imwrite(str(tmp_path / "2.png"), good)
+    cv2.imwrite(str(tmp_path / "0.png"), 0 * good)  # a sensor that starts dark
+    assert not call().read(0).any()
+
+
 def test_depth_that_says_nothing_is_told(tmp_path):
     for name, pixels, said in (
         ("empty", np.zeros((2, 2), np.uint16), "every pixel is 0"),
@@ -131,5 +191,7 @@ def test_depth_that_says_nothing_is_told(tmp_path):
         cv2.imwrite(str(folder / "0.png"), pixels)
         with pytest.raises(InputError, match=said):
             DepthImages.open(str(folder), 1, [0], 1e-3)
+    with pytest.raises(InputError, match="0.png: 8 bits; they are too coarse"):
+        DepthImages.open(str(tmp_path / "bytes"), 1, [0], 1e-3, "disparity")
     with pytest.raises(InputError, match="1 depth images for 3 or 2 frames"):
         DepthImages.open(str(tmp_path / "empty"), 3, [0, 1], 1e-3)
