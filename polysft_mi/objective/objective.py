@@ -309,7 +309,11 @@ class FrozenObjective:
         inputs, context = self.objective.inputs, self.contexts[k]
         look = lambda: self.appearances[k]
         frame = DeviceFrame(inputs, unknowns, context, self.stage, look, seed)
-        return {term.name: term.energy(frame) for term in self.objective.terms}
+        found = {term.name: term.energy(frame) for term in self.objective.terms}
+        if not inputs.placed.is_raster:
+            # path replay traces the scene once more for its gradient, and a term may have moved it
+            inputs.placed.place(frame.vertices)
+        return found
 
     @staticmethod
     def _finish(terms, backward, sums, frame):
