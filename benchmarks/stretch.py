@@ -9,12 +9,13 @@ RUN's surfaces are of the paper's kind, one jet of order 4. Its unknowns up to t
 ``--first`` are taken, and the windows from there on to ``--last`` are solved with ``preset`` =
 paper. What is measured is how far each surface ends from RUN's, RMS over the vertices; RUN is 4 mm
 from the truth in depth. Frames count from 0; the sheet is fast from 114 on. The readings: the
-preset, which has no masks there; the preset with lengths in millimetres, as the sequence's files
-have them, not in the template's scale; the preset, and φ-SfT's losses, with RUN's own silhouettes
-for masks, the best that masks can be; with these also a robust norm of the images' local contrast,
-near to what nsft, by the paper's authors, does: it weighs residuals by their size, and compares
-images' derivatives; with ``--masks``, φ-SfT's losses with those of ``polysft
-prepare``. Each goes into ``stretch.json`` as soon as it is there, beside those of other stretches.
+preset, for which the sequence has no masks; the preset with lengths in millimetres, as the
+sequence's files have them, not in the template's scale; linear colours and sharp masks, in means
+over the sheet; with RUN's own silhouettes for masks, the best that masks can be, the preset, these
+means, and a robust norm of the images' local contrast, near to what nsft, by the paper's authors,
+does: it weighs residuals by their size, and compares images' derivatives. With ``--masks``, the
+preset with those of ``polysft prepare``. Each goes into ``stretch.json`` as soon as it is there,
+beside those of other stretches.
 """
 
 import argparse
@@ -24,18 +25,13 @@ import tempfile
 
 import cv2
 import numpy as np
+from per_vertex import OVER_SHEET
 
 from polysft_mi.backend import add_mode_argument, set_variant
 from polysft_mi.errors import InputError, cli
 from polysft_mi.scene.settings import PRESETS
 
-PHI_SFT = {
-    "rgb_norm": "phi-sft",
-    "silhouette_norm": "phi-sft",
-    "mask_blur": 5.0,
-    "k_silhouette": 0.5,
-}
-CONTRAST = {"rgb_norm": "cauchy", "brightness": "local", "rgb_region": "sheet"}
+CONTRAST = {**OVER_SHEET, "rgb_norm": "cauchy", "brightness": "local", "rgb_region": "sheet"}
 
 
 def begun(run, tracker, first, folder):
@@ -135,11 +131,12 @@ def main(arguments=None):
             "preset": {},
             "preset, lengths in mm": {"k_mi": stiff},
             "preset, right masks": {"masks": masks},
-            "as in φ-SfT, right masks": {"masks": masks, **PHI_SFT},
+            "means over the sheet": OVER_SHEET,
+            "means over the sheet, right masks": {"masks": masks, **OVER_SHEET},
             "weights and contrast, right masks": {"masks": masks, **CONTRAST},
         }
         if options.masks:
-            readings["as in φ-SfT, masks of prepare"] = {"masks": options.masks, **PHI_SFT}
+            readings["preset, masks of prepare"] = {"masks": options.masks}
         if unknown := set(options.only or ()) - set(readings):
             raise InputError(f"--only {'; '.join(unknown)}: known are {'; '.join(readings)}")
         silhouettes(run, masks)

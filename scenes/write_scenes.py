@@ -48,10 +48,10 @@ def _dressed(**settings):
     return Layout("cloth", camera, *named, settings=settings, world_to_camera=pose)
 
 
-# The paper's objective and solver, a frame at a time. Noise asks for l2, whose gradient has no
-# bias, and plain paper for edges that hold.
-LIT = dict(PRESETS["paper"], canonical_frame="pca", window=1, spp=4, period=150, rgb_norm="l2")
-LIT |= dict(k_mi=10.0, order=6)
+# The paper's solver and what it couples, a frame at a time. Noise asks for squares, whose gradient
+# has no bias, and plain paper for edges that hold.
+LIT = dict(PRESETS["paper"], canonical_frame="pca", window=1, spp=4, period=150, order=6, k_mi=10.0)
+LIT |= dict(k_silhouette=1.0, rgb_norm="l2", silhouette_norm="l2", mask_blur=0.0)
 
 SCENES = {
     "demo": _demo(last=11),

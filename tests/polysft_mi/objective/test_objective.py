@@ -27,7 +27,9 @@ from polysft_mi.tracker import FrameTracker
 
 RNG = np.random.default_rng(1)
 PAPER = {"preset": "paper", "canonical_frame": "pca", "patches": 0}
-PHI_SFT = {"rgb_norm": "phi-sft", "silhouette_norm": "phi-sft"}
+PHI_SFT = {"rgb_norm": "phi-sft", "silhouette_norm": "phi-sft"}  # the preset's own
+# the paper's with both image losses over the sheet, one sharp and one of squares
+SHEET = {"rgb_norm": "l1", "silhouette_norm": "l2", "mask_blur": 0.0, "k_silhouette": 1.0}
 
 
 def floats(x):
@@ -129,7 +131,7 @@ def problem(folder, masks=True, **overrides):
     layout = capture.recognise(str(truth.folder))
     path = folder / "scene.xml"
     path.write_text(capture.scene_xml(layout, str(truth.folder)))
-    experiment = scene.load(path, {**PAPER, **overrides})
+    experiment = scene.load(path, {**PAPER, **SHEET, **overrides})
     return Problem(experiment, experiment.sequence()), truth
 
 
@@ -283,7 +285,7 @@ def test_padding_does_not_change_the_loss(tmp_path):
             )
         path = tmp_path / f"{name}.xml"
         path.write_text(capture.scene_xml(capture.recognise(str(truth.folder)), str(truth.folder)))
-        experiment = scene.load(path, PAPER)
+        experiment = scene.load(path, {**PAPER, **SHEET})
         p = Problem(experiment, experiment.sequence())
         totals.append(energy(p, p.patch.rest(), 4)[0])
     assert totals[1] == pytest.approx(totals[0], rel=1e-3)
@@ -303,9 +305,21 @@ def test_losses_of_phi_sft_are_means_over_the_image(tmp_path):
     assert terms["silhouette"] == pytest.approx(0.5 * np.abs(difference).mean(), rel=0.01)
     for name, value in {"silhouette_norm": "phi-sft", "mask_blur": 2}.items():
         with pytest.raises(InputError, match=f"silhouette has {name} = .* is needed"):
-            FrameTracker(
-                problem(tmp_path / name, preset="none", solver="gauss-newton", **{name: value})[0]
-            )
+            usual = {"preset": "none", "solver": "gauss-newton", "rgb_norm": "cauchy"}
+            FrameTracker(problem(tmp_path / name, **{**usual, name: value})[0])
+
+
+def test_the_preset_compares_images_as_phi_sft_does(tmp_path):
+    truth = synthetic.cloth(tmp_path / "a", frames=2)
+    (tmp_path / "scene.xml").write_text(
+        capture.scene_xml(capture.recognise(str(truth.folder)), str(truth.folder))
+    )
+    totals = []
+    for settings in ({}, {**PHI_SFT, "k_silhouette": 0.5, "mask_blur": 5}, SHEET):
+        experiment = scene.load(tmp_path / "scene.xml", {**PAPER, **settings})
+        p = Problem(experiment, experiment.sequence())
+        totals.append(energy(p, p.patch.rest(), 1)[0])
+    assert totals[0] == totals[1] and abs(totals[2] / totals[0] - 1) > 0.1
 
 
 def test_path_replay_gives_the_gradient_of_raster(tmp_path):
@@ -333,6 +347,23 @@ def test_path_replay_gives_the_gradient_of_raster(tmp_path):
         assert np.linalg.norm(a - b) < 0.25 * np.linalg.norm(a), (name, a, b)
 
 
+def test_path_replay_has_a_gradient_beside_depth(tmp_path):
+    """The depth term looks for what rays meet, in the scene that path replay goes through again."""
+    (tmp_path / "depth").mkdir()
+    for k in range(5):
+        cv2.imwrite(str(tmp_path / "depth" / f"{k}.png"), np.full((72, 96), 510, np.uint16))
+    gradients = []
+    for depth in ("", str(tmp_path / "depth")):
+        (folder := tmp_path / f"with{depth[-5:]}").mkdir()
+        p, _ = problem(folder, integrator="prb_projective", k_mi=0, depth=depth, k_depth=1e-9)
+        unknowns = p.patch.rest()
+        dr.enable_grad(unknowns.translation)
+        energy(p, unknowns, 2, backward=True)
+        gradients.append(np.array(dr.grad(unknowns.translation)))
+    assert np.linalg.norm(gradients[0]) > 0
+    np.testing.assert_allclose(gradients[1], gradients[0], rtol=1e-3, atol=1e-6)
+
+
 @pytest.mark.parametrize("integrator", ["raster", "prb_projective"])
 def test_gradients_of_several_patches(tmp_path, integrator):
     """Of a tube, whose texture has a seam: by the jets and the motions of its patches, against
@@ -342,7 +373,7 @@ def test_gradients_of_several_patches(tmp_path, integrator):
     prepare.main([str(truth.folder), "-q"])
 
     def of(integrator, spp):
-        settings = {**PAPER, "k_mi": 0, "order": 3, "integrator": integrator, "spp": spp}
+        settings = {**PAPER, **SHEET, "k_mi": 0, "order": 3, "integrator": integrator, "spp": spp}
         experiment = scene.load(truth.folder / "scene.xml", settings)
         return Problem(experiment, experiment.sequence())
 
