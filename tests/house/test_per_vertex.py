@@ -10,6 +10,7 @@ from scripts import load
 from polysft_mi import prepare
 from polysft_mi.errors import InputError
 from polysft_mi.results import evaluation, metrics, truth
+from polysft_mi.scene import PRESETS
 
 per_vertex = load("benchmarks/per_vertex.py")
 
@@ -27,7 +28,8 @@ def test_objective_of_the_baseline_is_adams(large_steps, tmp_path):
     # through
     sheet = synthetic.cloth(tmp_path / "flag", frames=2, rows=10, bend=1.5, shift=0.005)
     prepare.main([str(sheet.folder)])
-    baseline = per_vertex.load(str(sheet.folder / "scene.xml"), {})
+    losses = {name: PRESETS["paper"][name] for name in per_vertex.OVER_SHEET}
+    baseline = per_vertex.load(str(sheet.folder / "scene.xml"), losses)
     paper = {"preset": "paper", "canonical_frame": "pca", "k_tc": "0"}
     experiment = scene.load(str(sheet.folder / "scene.xml"), paper)
     problem = Problem(experiment, experiment.sequence())
