@@ -2,11 +2,13 @@
 alone.
 
     python benchmarks/evidence.py --evidence FOLDER [--data FOLDER ...] [--only tube ...]
-    [--kinds video tracks depth cameras ...] [--docs docs]
+    [--kinds video tracks depth cameras ...] [--repeats 3] [--docs docs]
 
 FOLDER holds, for each sequence, a folder with ``tracks.npz``, ``depth`` and ``cameras``; what is
 missing is left out. Further cameras are made by ``further_cameras.py``. Each run is a command, as a
-user would give it, on one core; its figures are those of ``python -m polysft_mi.evaluate``. Each
+user would give it, on one core; its figures are those of ``python -m polysft_mi.evaluate``. Runs
+are repeated with ``rgb_scale`` changed in its sixth digit, which shows what chance does; the table
+has the medians, and the least and the most of e3d. Each
 result goes into ``evidence.json`` in DOCS as soon as it is there, and the next call does what is
 missing (all of it with ``--again``); the table in ``evidence.md``, and the picture of what is
 given, are made anew.
@@ -21,6 +23,7 @@ import sft_runs
 from sequences import DATA, folder_of
 
 from polysft_mi.errors import InputError, cli
+from polysft_mi.scene import Settings
 
 #: kind of evidence: names of what is given, in the sequence's folder of evidence
 KINDS = {
@@ -42,8 +45,19 @@ def definitions(kind, folder):
     return [f"{name}={os.path.abspath(path)}" for name, path in paths.items()]
 
 
+def result(sequence, kind, data, define, repeats):
+    """A result, a dict: the ``runs``, and the medians of their figures and times."""
+    scale = Settings().rgb_scale
+    changed = [[f"rgb_scale={scale * (1 + 1e-5 * k):.8g}"] if k else [] for k in range(repeats)]
+    runs = [run(sequence, kind, data, define + more) for more in changed]
+    names = set.intersection(*(set(r["figures"]) for r in runs))
+    middle = {n: float(np.median([r["figures"][n] for r in runs])) for n in sorted(names)}
+    seconds = float(np.median([r["cpu_seconds_a_frame"] for r in runs]))
+    return {"figures": middle, "cpu_seconds_a_frame": seconds, "runs": runs}
+
+
 def run(sequence, kind, data, define):
-    """A result, a dict: as of :func:`sft_runs.run`, with the processor's seconds."""
+    """One run of a result, a dict: figures, frames lost, the processor's seconds."""
     setup = {"frames": None, "threads": 1, "define": define, "mode": "", "iterations": None}
     with (
         tempfile.TemporaryDirectory(prefix="evidence-") as out,
@@ -63,17 +77,21 @@ def run(sequence, kind, data, define):
 def table(results):
     """The results as a Markdown table."""
     lines = [
-        "| sequence | given | e3d, in view | normals [deg] | RMSE [mm] | e3d, all | s a frame |",
-        "|---|---|---|---|---|---|---|",
+        "| sequence | given | e3d, in view | least, most | normals [deg] | RMSE [mm] | e3d, all |"
+        " within 2 sigma | s a frame |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     for r in sorted(
         results, key=lambda r: (_SEQUENCES.index(r["sequence"]), list(KINDS).index(r["kind"]))
     ):
         f = r["figures"]
         seen = lambda name, f=f: f.get(f"{name}_seen", f[name])
+        each = [seen("e3d_proc", one["figures"]) for one in r["runs"]]
         lines.append(
-            f"| {r['sequence']} | {r['kind']} | {seen('e3d_proc'):.5f} | {seen('en_deg'):.2f} |"
-            f" {seen('rmse_mm'):.2f} | {f['e3d_proc']:.5f} | {r['cpu_seconds_a_frame']:.2f} |"
+            f"| {r['sequence']} | {r['kind']} | {seen('e3d_proc'):.5f} |"
+            f" {min(each):.5f}, {max(each):.5f} | {seen('en_deg'):.2f} |"
+            f" {seen('rmse_mm'):.2f} | {f['e3d_proc']:.5f} | {100 * f['sigma_two']:.0f} % |"
+            f" {r['cpu_seconds_a_frame']:.2f} |"
         )
     return "\n".join(lines)
 
@@ -119,7 +137,10 @@ def main(argv=None):
     parser = given.parser(__doc__, "evidence", _SEQUENCES, KINDS)
     parser.add_argument("--evidence", metavar="FOLDER", required=True)
     parser.add_argument("--data", nargs="+", metavar="FOLDER", default=[DATA])
+    parser.add_argument("--repeats", type=int, default=3, help="runs of each (default: 3)")
     args = parser.parse_args(argv)
+    if args.repeats < 1:
+        raise InputError(f"--repeats {args.repeats}: at least one run is needed")
     data = {
         sequence: next(filter(None, (folder_of(place, sequence) for place in args.data)), None)
         for sequence in args.only
@@ -127,11 +148,13 @@ def main(argv=None):
     if missing := [sequence for sequence, folder in data.items() if folder is None]:
         raise InputError(f"{missing[0]}: not in {', '.join(args.data)}")
 
-    def result(sequence, kind):
+    def of(sequence, kind):
         define = definitions(kind, os.path.join(args.evidence, sequence))
-        return None if define is None else run(sequence, kind, data[sequence], define)
+        if define is None:
+            return None
+        return result(sequence, kind, data[sequence], define, args.repeats)
 
-    results = given.results(args, "evidence", result)
+    results = given.results(args, "evidence", of)
     shown = os.path.join(args.evidence, "tube")
     if "tube" in args.only and definitions("tracks and depth", shown):
         picture(os.path.join(args.docs, "evidence.jpg"), data["tube"], shown)
