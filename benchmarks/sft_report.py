@@ -126,9 +126,9 @@ def page(results, picture):
         "The methods and figures:",
         (
             "- `gauss-newton` is the default. `adam` is the paper's way (`preset` = `paper`). Its"
-            " rows of `curtain`, `corner` and the two real videos are of an earlier state, on a"
-            " slower machine, with the frame by PCA, and with image losses that are means over the"
-            " sheet, not over the image; by these the other three were 0.0057, 0.0204 and 0.0244."
+            " rows of `curtain`, `corner` and `phi_sft_R1` are of an earlier state, on a slower"
+            " machine, with the frame by PCA, and with image losses that are means over the sheet,"
+            " not over the image; by these flag, bend and paper were 0.0057, 0.0204 and 0.0244."
             " These three were run beside much other work: their time is twice what it is alone."
         ),
         (

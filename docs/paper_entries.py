@@ -150,7 +150,8 @@ SECTIONS = {
             figures.kinect_paper,
             "The paper does not say over what its RMSE is taken. Over all 640×480 pixels, those "
             "beyond the sheet count as zero; over the surface alone the same run has about twice "
-            "that. Compare either with itself only. Adam loses the sheet, as told next.",
+            "that. Compare either with itself only. The preset follows the sheet until it is fast, "
+            "in frame 114, and falls behind, as told next.",
         ),
         Entry(
             "RGB and silhouette loss",
@@ -174,9 +175,11 @@ SECTIONS = {
             figures.readings,
             "The preset takes both losses as φ-SfT's program does: absolute differences of stored "
             "pixel values, and of blurred masks, means over the image. This sequence has no masks; "
-            "then colours are compared within the rendered sheet. So it keeps the sheet, both "
-            "where the print's white border lets it drift (second table) and where it is fast, 6 "
-            "to 35 pixels a frame, in frames 114 and 115 (third table). No photometric reading "
+            "then colours are compared within the rendered sheet. So it keeps the sheet where the "
+            "print's white border lets it drift (second table), and where it is fast, 6 to 35 "
+            "pixels a frame, in frames 114 and 115, if it comes there from the right surface "
+            "(third table). The whole run comes there 9 mm off, and falls behind. No photometric "
+            "reading "
             "falls by more than a tenth in the first third of the way from frame to frame (first "
             "table); what decides is how much they weigh beside the lengths. Means over the sheet "
             "weigh five times as much, and the sheet stretches and is lost. With lengths in "
@@ -214,7 +217,8 @@ SECTIONS = {
             "Where the errors of Kinect-Paper are.",
             ("python -m polysft_mi.compare OUT/run DATA/kinect_paper -o OUT/errors",),
             figures.kinect_frames,
-            "The command draws the errors in false colours; the figures are the default's.",
+            "The command draws the errors in false colours. The twelve frames are those that have "
+            "a truth.",
         ),
         Entry(
             "Stability, and figure of the supplement",

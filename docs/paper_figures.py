@@ -111,7 +111,7 @@ def _sft(data, sequence, method):
 
 def kinect_paper(data):
     rows = [("paper", "2.59", "", "", "")]
-    for method, name in (("paper", "preset"), ("adam", "adam"), ("gauss-newton", "default")):
+    for method, name in (("adam", "preset"), ("gauss-newton", "default")):
         if r := _sft(data, "kinect_paper", method):
             f = r["figures"]
             values = (f"{f[k]:.2f}" for k in ("depth_rmse_allpix_mm", "depth_rmse_mm"))
@@ -145,12 +145,16 @@ def stretch(data):
 
 
 def kinect_frames(data):
-    found = _sft(data, "kinect_paper", "gauss-newton")
-    each = found["figures"].get("per_frame_mm", {}) if found else {}
-    if not each:
+    rows = {}
+    for method, name in (("adam", "preset"), ("gauss-newton", "default")):
+        found = _sft(data, "kinect_paper", method)
+        if each := found["figures"].get("per_frame_mm") if found else None:
+            rows[name] = each
+    if not rows:
         return ""
-    head = ("frame", *each)
-    return table(head, [("depth RMSE on the surface, mm", *(f"{v:.1f}" for v in each.values()))])
+    head = ("depth RMSE on the surface, mm, in frame", *next(iter(rows.values())))
+    cells = lambda each: (f"{each[k]:.1f}" if k in each else "" for k in head[1:])
+    return table(head, [(name, *cells(each)) for name, each in rows.items()])
 
 
 def simulated(data):
