@@ -389,8 +389,8 @@ SECTIONS = {
             ("python -m polysft_mi.run scenes/demo.xml -D preset=paper -o OUT",),
             None,
             "They do not ([conventions.md](conventions.md#solver-and-window)). Twelve frames of "
-            "the demo take 1 min 25 s on two cores and end 7.6 mm RMSE from the truth (`polysft "
-            "evaluate OUT scenes/demo`); by default 36 s and 1.9 mm.",
+            "the demo take 1 min 41 s on two cores and end 7.6 mm RMSE from the truth (`polysft "
+            "evaluate OUT scenes/demo`); by default 10 s and 1.9 mm.",
         ),
         Entry(
             "Figure, Paper-Bend",
