@@ -8,10 +8,9 @@ FOLDER holds, for each sequence, a folder with ``tracks.npz``, ``depth`` and ``c
 missing is left out. Further cameras are made by ``further_cameras.py``. Each run is a command, as a
 user would give it, on one core; its figures are those of ``python -m polysft_mi.evaluate``. Runs
 are repeated with ``rgb_scale`` changed in its sixth digit, which shows what chance does; the table
-has the medians, and the least and the most of e3d. Each
-result goes into ``evidence.json`` in DOCS as soon as it is there, and the next call does what is
-missing (all of it with ``--again``); the table in ``evidence.md``, and the picture of what is
-given, are made anew.
+has the medians, and the least and the most of e3d. Each result goes into ``evidence.json`` in DOCS
+as soon as it is there, and the next call does what is missing (all of it with ``--again``); the
+table in ``evidence.md``, and the picture of what is given, are made anew.
 """
 
 import os

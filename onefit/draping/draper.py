@@ -193,10 +193,10 @@ class Draper:
         motion, edges come back towards their lengths at rest, and vertices are pushed out of the
         body. ``eased``: with the garment's :meth:`ease`, which costs seconds once, and nothing a
         frame; without it and ``post``, which a list needs, a drape is what the network alone makes.
-        ``skinning_only``:
-        plain skinning of the template, what OneFit is held against, without any of these.
-        ``advance`` is called once for each frame that is done. Raises InputError for a garment,
-        motion or shape that cannot be used, and for a garment that does not go over another.
+        ``skinning_only``: plain skinning of the template, what OneFit is held against, without any
+        of these. ``advance`` is called once for each frame that is done. Raises InputError for a
+        garment, motion or shape that cannot be used, and for a garment that does not go over
+        another.
         """
         if not post and len(outfit.several(garment)) > 1:
             raise InputError("post=False: of several garments only post-processing keeps the order")

@@ -154,10 +154,9 @@ class Known:
         said = ""
         if self.mask is not None:
             inside = cv2.resize(self.mask, image.shape[1::-1], interpolation=cv2.INTER_LINEAR) > 0.5
-            found = cv2.findContours(inside.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[
-                0
-            ]
-            cv2.drawContours(image, found, -1, _RED, 1, cv2.LINE_AA)
+            how = cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE
+            border, _ = cv2.findContours(inside.astype(np.uint8), *how)
+            cv2.drawContours(image, border, -1, _RED, 1, cv2.LINE_AA)
             said += ", the mask's border (red)"
         if self.tracks is not None:
             for place in self.tracks * scale:

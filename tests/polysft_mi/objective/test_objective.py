@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import synthetic
+from per_vertex import OVER_SHEET
 from scipy.ndimage import gaussian_filter
 
 from polysft_mi import capture, prepare
@@ -28,8 +29,6 @@ from polysft_mi.tracker import FrameTracker
 RNG = np.random.default_rng(1)
 PAPER = {"preset": "paper", "canonical_frame": "pca", "patches": 0}
 PHI_SFT = {"rgb_norm": "phi-sft", "silhouette_norm": "phi-sft"}  # the preset's own
-# the paper's with both image losses over the sheet, one sharp and one of squares
-SHEET = {"rgb_norm": "l1", "silhouette_norm": "l2", "mask_blur": 0.0, "k_silhouette": 1.0}
 
 
 def floats(x):
@@ -131,7 +130,7 @@ def problem(folder, masks=True, **overrides):
     layout = capture.recognise(str(truth.folder))
     path = folder / "scene.xml"
     path.write_text(capture.scene_xml(layout, str(truth.folder)))
-    experiment = scene.load(path, {**PAPER, **SHEET, **overrides})
+    experiment = scene.load(path, {**PAPER, **OVER_SHEET, **overrides})
     return Problem(experiment, experiment.sequence()), truth
 
 
@@ -285,7 +284,7 @@ def test_padding_does_not_change_the_loss(tmp_path):
             )
         path = tmp_path / f"{name}.xml"
         path.write_text(capture.scene_xml(capture.recognise(str(truth.folder)), str(truth.folder)))
-        experiment = scene.load(path, {**PAPER, **SHEET})
+        experiment = scene.load(path, {**PAPER, **OVER_SHEET})
         p = Problem(experiment, experiment.sequence())
         totals.append(energy(p, p.patch.rest(), 4)[0])
     assert totals[1] == pytest.approx(totals[0], rel=1e-3)
@@ -315,7 +314,7 @@ def test_the_preset_compares_images_as_phi_sft_does(tmp_path):
         capture.scene_xml(capture.recognise(str(truth.folder)), str(truth.folder))
     )
     totals = []
-    for settings in ({}, {**PHI_SFT, "k_silhouette": 0.5, "mask_blur": 5}, SHEET):
+    for settings in ({}, {**PHI_SFT, "k_silhouette": 0.5, "mask_blur": 5}, OVER_SHEET):
         experiment = scene.load(tmp_path / "scene.xml", {**PAPER, **settings})
         p = Problem(experiment, experiment.sequence())
         totals.append(energy(p, p.patch.rest(), 1)[0])
@@ -373,7 +372,14 @@ def test_gradients_of_several_patches(tmp_path, integrator):
     prepare.main([str(truth.folder), "-q"])
 
     def of(integrator, spp):
-        settings = {**PAPER, **SHEET, "k_mi": 0, "order": 3, "integrator": integrator, "spp": spp}
+        settings = {
+            **PAPER,
+            **OVER_SHEET,
+            "k_mi": 0,
+            "order": 3,
+            "integrator": integrator,
+            "spp": spp,
+        }
         experiment = scene.load(truth.folder / "scene.xml", settings)
         return Problem(experiment, experiment.sequence())
 

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from per_vertex import OVER_SHEET
 from problems import dense, problem_of, some_state
 from scipy.linalg import LinAlgError, block_diag
 
@@ -16,13 +17,12 @@ from polysft_mi.surface import Unknowns
 
 PAPER = {**PRESETS["paper"], "canonical_frame": "pca", "patches": 0}
 del PAPER["solver"]
-SQUARES = {"rgb_norm": "l1", "silhouette_norm": "l2", "mask_blur": 0.0, "k_silhouette": 1.0}
 PROBLEMS = {
     "default": {},
     "colours as they are": {"brightness": "none"},
     "paper": PAPER,
-    "paper, losses over the sheet": {**PAPER, **SQUARES},
-    "these, and our smoothness": {**PAPER, **SQUARES, "k_bend": 1e-6, "k_uv": 1e-4},
+    "paper, losses over the sheet": {**PAPER, **OVER_SHEET},
+    "these, and our smoothness": {**PAPER, **OVER_SHEET, "k_bend": 1e-6, "k_uv": 1e-4},
 }
 FAST = {"period": 40, "lr_rigid": 3e-3, "lr_alpha": 1e-3}  # the paper's steps need hundreds
 
