@@ -35,17 +35,17 @@ def best_jets(template, truth):
 def _laid_over(atlas, V):
     """The state whose patches, each moved as a whole, lie closest to the vertices V (N, 3)."""
     t = atlas.template
-    zeros = {name: np.zeros(len(V)) for name in ("delta_u", "delta_v", "delta_w")}
     turns, shifts = [], []
     for k, part in enumerate(atlas.entries):
         at = atlas.entry_vertex[part]
         start, end = t.vertices[at].mean(0), V[at].mean(0)
         turn = Rotation.align_vectors(V[at] - end, t.vertices[at] - start)[0]
-        rotation, translation = atlas.rigid(turn, end - turn.apply(start))
-        turns.append(rotation[k].as_quat())
-        shifts.append(translation[k])
-    moved = {"rotation": np.array(turns), "translation": np.array(shifts)}
-    return atlas.state({"delta_alpha": np.zeros_like(t.alpha), **zeros, **moved})
+        moved = atlas.moved(atlas.start, turn, end - turn.apply(start))
+        turns.append(moved.rotation[k])
+        shifts.append(moved.translation[k])
+    return dataclasses.replace(
+        atlas.start, rotation=Rotation.concatenate(turns), translation=np.array(shifts)
+    )
 
 
 def _refined(atlas, state, V):

@@ -211,6 +211,14 @@ class Objective:
         for term in self.terms:
             term.observe(frame, vertices)
 
+    def matches(self, frame: int, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Points (P, 3) [m] of a surface (N, 3) [m, world], and where evidence has them in a frame,
+        (P, 2) [pixels].
+        """
+        known = [term.matches(frame, vertices) for term in self.terms]
+        points, pixels = zip((np.zeros((0, 3)), np.zeros((0, 2))), *known, strict=True)
+        return np.concatenate(points), np.concatenate(pixels)
+
     def noises(self, context: FrameContext, vertices: np.ndarray) -> dict[str, float]:
         """What the surface (N, 3) [m, world] that was found of a frame says of the noise of each
         kind of evidence beside the images.

@@ -205,14 +205,18 @@ class Atlas:
             self.carrier.pose(a["pose"]) if len(a.get("pose", ())) else None,
         )
 
-    def rigid(self, rotation, translation):
-        """(R_k, T_k) that move the template by p -> R p + t in the world (Rotation, (3,) [m])."""
+    def moved(self, state, rotation, translation):
+        """The state whose surface is that of ``state``, moved by p -> R p + t in the world
+        (Rotation, (3,) [m]).
+        """
         t = self.template
         turn = t.rotation.transpose(0, 2, 1) @ rotation.as_matrix() @ t.rotation
         moved = rotation.apply(t.origin) + translation - t.origin
-        return (
-            Rotation.from_matrix(turn),
-            np.einsum("kji,kj->ki", t.rotation, moved) / t.scale,
+        shift = np.einsum("kji,kj->ki", t.rotation, moved) / t.scale
+        return replace(
+            state,
+            rotation=Rotation.from_matrix(turn) * state.rotation,
+            translation=np.einsum("kij,kj->ki", turn, state.translation) + shift,
         )
 
     def arrays(self, state):

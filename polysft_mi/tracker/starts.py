@@ -1,5 +1,5 @@
 """Where a frame begins: at the frame before, where its motion leads, or, where that does not
-explain the image, farther away or at the pose that features tell.
+explain the image, farther away or at the pose that features and tracks tell.
 """
 
 import math
@@ -7,9 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from polysft_mi.surface import State
-
-from .relocate import Relocator
+from .relocate import TemplateFeatures, rigid_motion
 
 
 def motion_starts(start, history):
@@ -26,7 +24,7 @@ class Starts:
 
     def __init__(self, problem, stages):
         self._problem, self._stages, self._rules = problem, stages, stages.rules
-        self._relocator = None
+        self._features = None
 
     def nearest(self, starts, frame, stage):
         """The start that explains the frame best at a stage."""
@@ -87,16 +85,17 @@ class Starts:
         return noise + above + rules.suspect_margin
 
     def _rigid(self, frame):
-        """The undeformed template in the pose that its features have in the frame; None where too
-        few are found.
+        """The undeformed template in the pose that its features and tracks have in the frame; None
+        where too few are found.
         """
         objective = self._stages.objective
         if objective.atlas.carrier is not None:  # nothing on a body is rigid
             return None
-        if self._relocator is None:
-            self._relocator = Relocator(objective.data)
-        motion = self._relocator.pose(self._problem.sequence.frame(frame))
-        if motion is None:
-            return None
-        rest = objective.atlas.state(self._problem.patch.rest().to_numpy())
-        return State(rest.alpha, rest.offset, *objective.atlas.rigid(*motion))
+        if self._features is None:
+            self._features = TemplateFeatures(objective.data)
+        start = objective.atlas.start
+        found = self._features.matches(self._problem.sequence.frame(frame))
+        known = objective.matches(frame, objective.atlas.surface(start).vertices)
+        points, pixels = map(np.concatenate, zip(found, known, strict=True))
+        motion = rigid_motion(objective.data.camera, points, pixels)
+        return None if motion is None else objective.atlas.moved(start, *motion)

@@ -218,6 +218,12 @@ class Term:
         order.
         """
 
+    def matches(self, frame: int, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Points (P, 3) [m] of a surface (N, 3) [m, world] whose place in a frame is known, and
+        where, (P, 2) [pixels]; none for most terms.
+        """
+        return np.zeros((0, 3)), np.zeros((0, 2))
+
     def noise(self, context: FrameContext, vertices: np.ndarray, stage: Stage) -> dict[str, float]:
         """What the residuals say of their noise at the surface (N, 3) [m, world] that was found of
         a frame: numbers by name, for :attr:`polysft_mi.objective.context.FrameMemory.noises`.

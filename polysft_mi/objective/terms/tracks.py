@@ -61,6 +61,10 @@ class Tracks(Term):
         hit = found >= 0
         self.face[at[hit]], self.weights[at[hit]] = found[hit], weights[hit]
 
+    def matches(self, frame, vertices):
+        chosen = self._chosen(frame)
+        return self._points(vertices, chosen), self._tracks.positions[frame, chosen]
+
     def noise(self, context, vertices, stage):
         residual, _, _ = self._residuals(context.frame, vertices)
         found = self._noise(context)
@@ -133,13 +137,17 @@ class Tracks(Term):
         tracks (P,)) of those that say something in a frame.
         """
         chosen = self._chosen(frame)
-        corners = vertices[self._faces[self.face[chosen]]]
-        point = np.einsum("pa,pak->pk", self.weights[chosen], corners)
+        point = self._points(vertices, chosen)
         inverse = self._camera.inverse
         x = (point - self._camera.origin) @ inverse.T
         projected = x[:, :2] / x[:, 2:]
         by_point = (inverse[:2] - projected[:, :, None] * inverse[2]) / x[:, 2, None, None]
         return projected - self._tracks.positions[frame, chosen], by_point, chosen
+
+    def _points(self, vertices, chosen):
+        """Where the points of the ``chosen`` tracks are on a surface (N, 3) [m], (P, 3) [m]."""
+        corners = vertices[self._faces[self.face[chosen]]]
+        return np.einsum("pa,pak->pk", self.weights[chosen], corners)
 
     def _noise(self, context):
         return context.memory.noises.get(self.name, _FIRST)

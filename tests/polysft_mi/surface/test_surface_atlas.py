@@ -13,7 +13,7 @@ import torch
 from problems import at_rest, grid_template, some_state, tube_template
 from scipy.spatial.transform import Rotation
 
-from polysft_mi.surface.atlas import Atlas, State
+from polysft_mi.surface.atlas import Atlas
 from polysft_mi.surface.bending import hinges, slides
 from polysft_mi.surface.deformation import Deformation
 from polysft_mi.surface.patch import JetAtlas, Unknowns
@@ -144,14 +144,12 @@ def test_towards_goes_on_with_the_motion(template):
 
 
 @pytest.mark.parametrize("template", [grid_template, tube_template])
-def test_rigid_motion_moves_the_template(template):
+def test_rigid_motion_moves_a_surface(template):
     chart = Atlas(template())
-    rest = at_rest(chart)
     turn, shift = Rotation.from_rotvec([0.2, -0.1, 0.3]), np.array([0.02, -0.01, 0.05])
-    state = State(rest.alpha, rest.offset, *chart.rigid(turn, shift))
-    assert np.allclose(
-        chart.surface(state).vertices, turn.apply(chart.surface(rest).vertices) + shift
-    )
+    for state in (at_rest(chart), some_state(chart, RNG)):
+        moved = chart.surface(chart.moved(state, turn, shift)).vertices
+        assert np.allclose(moved, turn.apply(chart.surface(state).vertices) + shift)
 
 
 def test_absorbed_leaves_the_surface_and_as_little_relief_as_the_jet_can():

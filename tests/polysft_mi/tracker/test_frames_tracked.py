@@ -11,11 +11,11 @@ import pytest
 import synthetic
 from problems import data_of, problem_of
 
-from polysft_mi.objective import FrameContext, FrameMemory
+from polysft_mi.objective import FrameContext, FrameMemory, Objective
 from polysft_mi.scene.rules import Rules
 from polysft_mi.surface.patch import Unknowns
 from polysft_mi.tracker import CHECKPOINT, FrameTracker, Track, track
-from polysft_mi.tracker.relocate import Relocator
+from polysft_mi.tracker.relocate import TemplateFeatures, rigid_motion
 
 PCA = {"canonical_frame": "pca", "patches": 0}
 
@@ -67,15 +67,40 @@ def test_a_sheet_that_jumps_is_found_again(tmp_path, monkeypatch):
         tmp_path / "cloth", frames=2, size=(320, 240), bend=0.3, turn=0.4, shift=0.04
     )
     problem = problem_of(truth.folder)
-    found = Relocator(data_of(problem))
-    turn, shift = found.pose(problem.sequence.frame(1))
+    found = TemplateFeatures(data_of(problem))
+    motion_in = lambda image: rigid_motion(problem.camera, *found.matches(image))
+    turn, shift = motion_in(problem.sequence.frame(1))
     there = turn.apply(truth.vertices[0]) + shift
     assert (
         np.linalg.norm(there - truth.vertices[1], axis=1).mean()
         < 0.006
         < 0.1 * np.linalg.norm(truth.vertices[1] - truth.vertices[0], axis=1).max()
     )
-    assert found.pose(np.zeros((240, 320, 3), np.float32)) is None
+    assert motion_in(np.zeros((240, 320, 3), np.float32)) is None
+
+
+def test_tracks_tell_where_a_sheet_jumped_to(tmp_path):
+    """Those whose points are known and that are seen there; where there are too few, none do."""
+    truth = synthetic.cloth(
+        tmp_path / "cloth", frames=2, size=(320, 240), bend=0.3, turn=0.4, shift=0.04
+    )
+    camera = problem_of(truth.folder).camera
+    places = np.stack([camera.project(v)[0] for v in truth.vertices])
+    visible = np.ones(places.shape[:2], bool)
+    visible[1, ::3] = False
+    places[1, ::3] += 100
+    np.savez(tmp_path / "tracks.npz", tracks=places, visible=visible)
+    objective = Objective(problem_of(truth.folder, tracks=str(tmp_path / "tracks.npz")))
+    objective.observe(0, truth.vertices[0])
+    points, pixels = objective.matches(1, truth.vertices[0])
+    turn, shift = rigid_motion(camera, points, pixels)
+    there = turn.apply(truth.vertices[0]) + shift
+    assert (
+        np.linalg.norm(there - truth.vertices[1], axis=1).mean()
+        < 0.006
+        < 0.1 * np.linalg.norm(truth.vertices[1] - truth.vertices[0], axis=1).max()
+    )
+    assert rigid_motion(camera, points[:5], pixels[:5]) is None
 
 
 def test_a_sheet_that_matches_nothing_stays_in_view(truth, tmp_path):
