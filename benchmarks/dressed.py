@@ -34,7 +34,8 @@ _SHOWN = "tshirt_box", "body", 28
 
 def figures(surface, truth):
     """RMSE [mm], a mean over the frames, of a surface (arrays of a ``surface.npz``) against the
-    file ``truth``: of the vertices in view, of those that are not, and of all.
+    file ``truth``: of the vertices in view, of those that are not, and of all; and the share of the
+    errors that lie within two sigma, of a surface that has it.
     """
     of_all = score(surface, truth)
     known = load_npz(truth)
@@ -42,6 +43,7 @@ def figures(surface, truth):
     away = np.linalg.norm(surface["vertices"] - known["vertices"][frames], axis=2)
     hidden = [np.sqrt((a[~s] ** 2).mean()) for a, s in zip(away, known["seen"][frames])]
     found = {name: of_all[name] for name in ("rmse_mm_seen", "rmse_mm", "en_deg_seen")}
+    found |= {name: of_all[name] for name in ("sigma_two",) if name in of_all}
     return found | {"rmse_mm_hidden": 1e3 * float(np.mean(hidden))}
 
 
@@ -108,8 +110,8 @@ def table(results):
     """The results as a Markdown table."""
     lines = [
         "| sequence | given | RMSE in view [mm] | not in view | normals in view [deg] |"
-        " s a frame |",
-        "|---|---|---|---|---|---|",
+        " within 2 sigma | s a frame |",
+        "|---|---|---|---|---|---|---|",
     ]
     names = {
         "drape": "the motion alone: its drape",
@@ -118,10 +120,11 @@ def table(results):
     }
     order = ["drape", *KINDS]
     for r in sorted(results, key=lambda r: (r["sequence"], order.index(r["kind"]))):
-        seconds = r.get("cpu_seconds_a_frame")
+        seconds, sigma = r.get("cpu_seconds_a_frame"), r.get("sigma_two")
         lines.append(
             f"| {r['sequence']} | {names.get(r['kind'], 'and ' + r['kind'])} |"
             f" {r['rmse_mm_seen']:.1f} | {r['rmse_mm_hidden']:.1f} | {r['en_deg_seen']:.1f} |"
+            f" {'–' if sigma is None else f'{100 * sigma:.0f} %'} |"
             f" {f'{seconds:.1f}' if seconds else '–'} |"
         )
     return "\n".join(lines)

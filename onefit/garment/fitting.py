@@ -124,6 +124,14 @@ def lowered_stand(surface=None, give="made_for=None (no --made-for)"):
     return Stand(surface or standard_surface(), looks, give)
 
 
+class OffBody(InputError):
+    """A garment does not lie on the body; ``why``: how it lies, in words."""
+
+    def __init__(self, message, why=""):
+        super().__init__(message)
+        self.why = why
+
+
 def check_place(V, surface, where, other=None):
     """Raises InputError, with a suggestion, where vertices (N, 3) [m] do not lie on the body of
     ``surface``.
@@ -148,16 +156,11 @@ def check_place(V, surface, where, other=None):
         return
     size = " x ".join(f"{s:.3g}" for s in np.ptp(V, axis=0))
     deep = 100 * (d < -_PUSHED_DEPTH).mean()
-    found = (
-        f"{where}: does not lie on the body: {_mm(np.abs(d).mean())} from it on average, {deep:.0f}"
-        " % of the vertices deep inside"
-    )
-    if best is None:
-        raise InputError(
-            f"{found}; it spans {size} m; the body is 1.63 m tall (z from -0.82 to 0.81), z up, and"
-            " faces -y"
-        )
-    raise InputError(f"{found}; it looks like {best[1]}: give {best[2]}")
+    why = f"{_mm(np.abs(d).mean())} from it on average, {deep:.0f} % of the vertices deep inside"
+    advice = f"it spans {size} m; the body is 1.63 m tall (z from -0.82 to 0.81), z up, faces -y"
+    if best:
+        advice = f"it looks like {best[1]}: give {best[2]}"
+    raise OffBody(f"{where}: does not lie on the body: {why}; {advice}", why)
 
 
 def _mm(distance):

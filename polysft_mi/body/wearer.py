@@ -54,6 +54,7 @@ def _on_joints(vertices, faces, motion):
     import torch
 
     import onefit
+    from onefit.garment import OffBody
 
     smpl = onefit.SmplBody(motion.model) if motion.model else None
     draper = onefit.load(model=smpl)
@@ -67,13 +68,10 @@ def _on_joints(vertices, faces, motion):
     try:
         made_for = body if given else None
         garment = onefit.Garment.of_mesh("template", vertices, faces, made_for=made_for)
-    except InputError as error:
-        if (away := "does not lie on the body") not in str(error):
-            raise
-        why = str(error).partition(away)[2].partition(";")[0]
+    except OffBody as error:
         raise InputError(
-            f"{motion.path}: the template {away} at rest{why}; it is needed as it lies there, z up,"
-            " facing -y (onefit.align brings a garment there)"
+            f"{motion.path}: the template does not lie on the body at rest: {error.why}; it is"
+            " needed as it lies there, z up, facing -y (onefit.align brings a garment there)"
         ) from None
     seen = garment.render_mesh
     corners = garment.faces.numpy()[seen.face]
