@@ -125,12 +125,11 @@ class Rules:
     )
     # the texture
     texels: float = _rule(1.5, "texels", "of the baked texture to a pixel of the first frame")
-    texture_misfit: float = _rule(
-        0.15, "misfit", "of the first frame, above which the texture is fitted to it"
-    )
-    texture_gain: float = _rule(0.6, "share", "of that misfit that may be left, for it to be taken")
-    texture_farthest: float = _rule(
-        0.08, "chart units", "farthest that the texture may move, for it to be taken"
+    texture_gain: float = _rule(
+        0.6,
+        "share",
+        "of the first frame's misfit that may be left, for a texture that was fitted to it to be"
+        " taken",
     )
     appearance: bool = _rule(
         True,
