@@ -11,11 +11,13 @@ paper. What is measured is how far each surface ends from RUN's, RMS over the ve
 from the truth in depth. Frames count from 0; the sheet is fast from 114 on. The readings: the
 preset, for which the sequence has no masks; the preset with lengths in millimetres, as the
 sequence's files have them, not in the template's scale; linear colours and sharp masks, in means
-over the sheet; with RUN's own silhouettes for masks, the best that masks can be, the preset, these
-means, and a robust norm of the images' local contrast, near to what nsft, by the paper's authors,
-does: it weighs residuals by their size, and compares images' derivatives. With ``--masks``, the
-preset with those of ``polysft prepare``. Each goes into ``stretch.json`` as soon as it is there,
-beside those of other stretches.
+over the sheet; other weights: of lengths ten times as much, of what ties frames together a
+thousandth, as if it were a mean over the vertices; with these weights, rigid steps ten times as
+long; with RUN's own silhouettes for masks, the best that masks can be, the preset, these means over
+the sheet, and a robust norm of the images' local contrast, near to what nsft, by the paper's
+authors, does: it weighs residuals by their size, and compares images' derivatives. With
+``--masks``, the preset with those of ``polysft prepare``. Each goes into ``stretch.json`` as soon
+as it is there, beside those of other stretches.
 """
 
 import argparse
@@ -31,6 +33,7 @@ from polysft_mi.backend import add_mode_argument, set_variant
 from polysft_mi.errors import InputError, cli
 from polysft_mi.scene.settings import PRESETS
 
+WEIGHTS = {"k_mi": 1.0, "k_tc": 5e-5}
 CONTRAST = {**OVER_SHEET, "rgb_norm": "cauchy", "brightness": "local", "rgb_region": "sheet"}
 
 
@@ -132,6 +135,8 @@ def main(arguments=None):
             "preset, lengths in mm": {"k_mi": stiff},
             "preset, right masks": {"masks": masks},
             "means over the sheet": OVER_SHEET,
+            "other weights": WEIGHTS,
+            "other weights, longer rigid steps": {**WEIGHTS, "lr_rigid": 1e-3},
             "means over the sheet, right masks": {"masks": masks, **OVER_SHEET},
             "weights and contrast, right masks": {"masks": masks, **CONTRAST},
         }

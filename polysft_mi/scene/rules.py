@@ -71,7 +71,6 @@ class Rules:
         row="fine passes",
     )
     fine_gain: float = _rule(0.01, "share", "of its cost that a pass must gain for another one")
-    explained: float = _rule(0.02, "misfit", "below this misfit a frame counts as explained")
     # starts
     motion_starts: bool = _rule(
         True,
@@ -79,11 +78,18 @@ class Rules:
         "whether a frame may start where the motion of the two before leads",
         row="motion starts",
     )
-    suspect_factor: float = _rule(
-        1.25, "", "a frame is suspect whose misfit exceeds the noise by so many times the usual"
+    margin: float = _rule(
+        0.03,
+        "misfit",
+        "that tells: below it a frame counts as explained; one that exceeds the usual by it is"
+        " suspect",
     )
-    suspect_margin: float = _rule(0.03, "misfit", "and by this much more", row="other starts")
-    suspect_memory: int = _rule(5, "frames", "over which the usual misfit is a median")
+    usual_frames: int = _rule(
+        5,
+        "frames",
+        "over which the usual misfit is a median; of less than three there is none",
+        row="other starts",
+    )
     far_iterations: int = _rule(
         18,
         "",
@@ -108,14 +114,14 @@ class Rules:
         3e-3, "share", "of the relief's weight, for its bending", row="relief's bending"
     )
     noise_misfit: float = _rule(
-        0.05, "misfit", "of noise, at which the relief's weight has doubled"
+        0.05,
+        "misfit",
+        "of noise, at which the relief's weight has doubled",
+        row="relief's caution",
     )
     noise_power: float = _rule(8.0, "", "with which it grows with the noise")
     noise_most: float = _rule(
         300.0, "", "factor of the relief's weight from which on the relief does not move at all"
-    )
-    relief_caution: bool = _rule(
-        True, "", "whether the relief's weight grows with noise", row="relief's caution"
     )
     give: float = _rule(
         0.002,
@@ -125,11 +131,11 @@ class Rules:
     )
     # the texture
     texels: float = _rule(1.5, "texels", "of the baked texture to a pixel of the first frame")
-    texture_gain: float = _rule(
-        0.6,
-        "share",
-        "of the first frame's misfit that may be left, for a texture that was fitted to it to be"
-        " taken",
+    texture_misfit: float = _rule(
+        0.15,
+        "misfit",
+        "of the first frame, above which the texture is fitted to it, and below which it must be"
+        " then",
     )
     appearance: bool = _rule(
         True,
@@ -175,7 +181,7 @@ class Rules:
 
     def holds_relief(self, noise):
         """Whether the ``noise`` (a misfit) is so much that the relief would hardly move."""
-        return self.relief_caution and self.caution(noise) > self.noise_most
+        return self.caution(noise) > self.noise_most
 
 
 def table():

@@ -83,7 +83,7 @@ class Stages:
         rules, fine = self.rules, self.objective.usual[1:]
         best = self._through(start, context, stages, iterations)
         for count in range(rules.fine_passes if fine else 0):
-            explained = max(rules.explained, context.memory.explained)
+            explained = max(rules.margin, context.memory.explained)
             if self.objective.is_known(context) or not best.misfit > explained:
                 break
             found = self._through(best.state, context, fine, iterations)

@@ -54,7 +54,7 @@ class Starts:
         best = stages.descend(
             self.nearest(starts, frame, objective.usual[0]), context, objective.usual
         )
-        limit = self._suspect_above(usual_misfits, context.memory.noise)
+        limit = self._suspect_above(usual_misfits)
         far = objective.far, *objective.usual
         if best.misfit > limit:
             objective.data.prefetch([frame], [objective.far.blur], self._has_shading)
@@ -72,17 +72,12 @@ class Starts:
     def _has_shading(self):
         return self._problem.settings.k_shading > 0
 
-    def _suspect_above(self, usual, noise):
+    def _suspect_above(self, usual):
         """The misfit above which a frame is suspect: infinite while those of the frames before are
         too few to tell.
         """
-        rules = self._rules
-        usual = usual[-rules.suspect_memory :]
-        if len(usual) < 3:
-            return math.inf
-        noise = min(noise, *usual)
-        above = rules.suspect_factor * (np.median(usual) - noise)
-        return noise + above + rules.suspect_margin
+        usual = usual[-self._rules.usual_frames :]
+        return np.median(usual) + self._rules.margin if len(usual) > 2 else math.inf
 
     def _rigid(self, frame):
         """The undeformed template in the pose that its features and tracks have in the frame; None

@@ -78,7 +78,7 @@ class Relief(Term):
 
     def _weight(self, context):
         r = self._rules
-        return self.weight * (r.caution(context.memory.noise) if r.relief_caution else 1.0)
+        return self.weight * r.caution(context.memory.noise)
 
 
 def _visibility(inputs, context):
