@@ -132,11 +132,9 @@ class Rules:
     # the texture
     texels: float = _rule(1.5, "texels", "of the baked texture to a pixel of the first frame")
     texture_misfit: float = _rule(
-        0.15,
-        "misfit",
-        "of the first frame, above which the texture is fitted to it, and below which it must be"
-        " then",
+        0.15, "misfit", "of the first frame, above which the texture is fitted to it"
     )
+    texture_gain: float = _rule(0.6, "share", "of that misfit that may be left, for it to be taken")
     appearance: bool = _rule(
         True,
         "",

@@ -17,7 +17,7 @@ _ITERATIONS, _STIFFNESS, _DAMPING = 6, 1e-3, 1e-3  # a stage's; a share of k_mi:
 
 def fit_texture(problem, objective, context):
     """Slide the vertices of the undeformed template over it until its texture fits the first frame,
-    and move the texture so, where it did not fit before and does then.
+    and move the texture so, where that explains the frame much better.
 
     ``context``: a :class:`polysft_mi.objective.context.FrameContext` of the first frame.
     """
@@ -26,7 +26,7 @@ def fit_texture(problem, objective, context):
     if len(atlas) > 1:  # texture coordinates with seams are no function of a chart
         return
     misfit = lambda state: data.misfit(atlas.surface(state).vertices, 0, finest.blur)
-    if misfit(state) < rules.texture_misfit:
+    if (before := misfit(state)) < rules.texture_misfit:
         return
     for stage in objective.usual[:2]:
         loose = replace(stage, stiffness=_STIFFNESS, gives=False)
@@ -38,7 +38,7 @@ def fit_texture(problem, objective, context):
             except (BadFrame, LinAlgError):
                 return
             state = state.after_step((np.zeros(len(model.normal.gradient)), slide))
-    if misfit(state) < rules.texture_misfit:
+    if misfit(state) < rules.texture_gain * before:
         template = problem.template
         flat, unit = template.chart[:, 0], template.scale / template.radius[0]
         objective.move_texture(flat, flat + unit * state.offset[:, :2])
