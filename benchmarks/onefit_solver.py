@@ -1,7 +1,8 @@
 """How fast the linear systems of a simulation are solved: by conjugate gradients, with the
-garment's patches and without, and by sparse direct factorisations.
+garment's patches and without, vertex by vertex, and by sparse direct factorisations; and what
+barriers would cost beside.
 
-    pip install qdldl cholespy                          # for this benchmark only, each if wanted
+    pip install pyamg qdldl cholespy ipctk              # for this benchmark only, each if wanted
     python benchmarks/onefit_solver.py                  # skirt in a jumping jack, T-shirt boxing
     python benchmarks/onefit_solver.py --garments shirt.obj --motions dance
 
@@ -9,11 +10,18 @@ Every so many systems of a simulation are kept, and solved again from the same s
 *residual*, its norm relative to the right-hand side's, and *error*, the energy norm of what is
 left, relative to that of the solution, geometric means; *ms* of the processor for a solution, the
 median. A factorisation's has its ordering, for each step has other contacts. SuperLU comes with
-SciPy; CHOLMOD is that of the package cholespy.
+SciPy; CHOLMOD is that of the package cholespy. *Vertex by vertex* is what vertex block descent
+(VBD) does with a quadratic energy: each vertex's own 3x3 system, one after the other, by pyamg.
+
+The second table is of the same frames, garment and body as one mesh, by ipctk: *ms* of the
+processor to look for what is nearer than 3 mm, for the barriers' gradient and Hessian, and for the
+longest step without a collision to the next frame: once each, an iteration of Newton, beside a
+factorisation. *Crossed* says whether the mesh passes through itself, where no barrier can begin.
 """
 
 import argparse
 import importlib.util
+import itertools
 import time
 
 import numpy as np
@@ -28,6 +36,9 @@ from polyfit.errors import cli
 
 EVERY = 23  # one system in so many is kept
 ITERATIONS = (5, 10, 20, 40, 60)
+SWEEPS = (10, 40, 160)
+NEAR = 0.003  # [m]: where barriers begin, as far as a simulation holds cloth from skin
+BARRIER_HEAD = "| garment | motion | near | barriers | step | crossed |"
 HEAD = "| garment | motion | solver | residual | error | ms |"
 
 
@@ -106,6 +117,44 @@ DIRECT = {"SuperLU": superlu, "qdldl": by_qdldl, "CHOLMOD": cholmod}
 PACKAGES = {"qdldl": "qdldl", "CHOLMOD": "cholespy"}
 
 
+def vertex_by_vertex(system, A, sweeps):
+    """The solution after so many sweeps of block Gauss-Seidel, forwards and backwards in turns."""
+    from pyamg.relaxation.relaxation import block_gauss_seidel
+
+    b, x = system[3].ravel(), system[4].ravel().copy()
+    blocks = A.tobsr(blocksize=(3, 3))
+    began = time.process_time()
+    block_gauss_seidel(blocks, x, b, iterations=sweeps // 2, sweep="symmetric", blocksize=3)
+    return x.reshape(-1, 3), time.process_time() - began
+
+
+def barriers(drape):
+    """Seconds of the parts of a Newton iteration with barriers, (3,) medians over the frames of a
+    drape, and the share of the frames in which something passes through something.
+    """
+    import ipctk
+
+    count = drape.vertices.shape[1]
+    faces = np.concatenate([drape.faces, drape.body_faces + count]).astype(np.int32)
+    frames = np.concatenate([drape.vertices, drape.body], 1).astype(np.float64)
+    mesh = ipctk.CollisionMesh(frames[0], ipctk.edges(faces), faces)
+    mesh.can_collide = ipctk.make_static_obstacle_filter(count)  # skin meets no skin
+    potential, seconds, crossed = ipctk.BarrierPotential(NEAR, 1.0), [], 0
+    for now, then in itertools.pairwise(frames):
+        crossed += ipctk.has_intersections(mesh, now)
+        at = [time.process_time()]
+        near = ipctk.NormalCollisions()
+        near.build(mesh, now, NEAR)
+        at.append(time.process_time())
+        potential.gradient(near, mesh, now)
+        potential.hessian(near, mesh, now, ipctk.PSDProjectionMethod.CLAMP)
+        at.append(time.process_time())
+        ipctk.compute_collision_free_stepsize(mesh, now, then)
+        at.append(time.process_time())
+        seconds.append(np.diff(at))
+    return np.median(seconds, axis=0), crossed / len(seconds)
+
+
 def rows(garment, motion):
     """A row for each way to solve."""
     exact, found = [], {}
@@ -129,6 +178,10 @@ def rows(garment, motion):
             for system, of in zip(_Keeping.systems, exact):
                 x, seconds, _ = solved(system, iterations, patches)
                 note(name, x, seconds, of)
+    for sweeps in SWEEPS if importlib.util.find_spec("pyamg") else ():
+        for system, of in zip(_Keeping.systems, exact):
+            x, seconds = vertex_by_vertex(system, of[1], sweeps)
+            note(f"vertex by vertex, {sweeps} sweeps", x, seconds, of)
     for name, solve in DIRECT.items():
         if importlib.util.find_spec(PACKAGES.get(name, "scipy")) is None:
             continue
@@ -148,13 +201,19 @@ def main(argv=None):
     parser.add_argument("--motions", nargs="+", default=["jumping_jack", "box"], metavar="KIND")
     parser.add_argument("--seconds", type=float, default=0.7, help="of a motion (default: 0.7)")
     args = parser.parse_args(argv)
-    draper, cloth.Solver = onefit.load(), _Keeping
+    draper, cloth.Solver, drapes = onefit.load(), _Keeping, {}
     print(HEAD, "|---" * (HEAD.count("|") - 1) + "|", sep="\n")
     for garment, kind in zip(args.garments, args.motions):
         _Keeping.systems.clear()
         motion = onefit.Motion.generate(kind, seconds=args.seconds, seed=SEED)
-        draper.simulate(garment, motion)
+        drapes[garment, kind] = draper.simulate(garment, motion)
         rows(garment, kind)
+    if importlib.util.find_spec("ipctk"):
+        print("", BARRIER_HEAD, "|---" * (BARRIER_HEAD.count("|") - 1) + "|", sep="\n")
+        for names, drape in drapes.items():
+            seconds, crossed = barriers(drape)
+            times = [f"{1e3 * x:.0f}" for x in seconds]
+            print("|", " | ".join([*names, *times, f"{100 * crossed:.0f} %"]), "|", flush=True)
 
 
 if __name__ == "__main__":
