@@ -224,6 +224,12 @@ def _add_video(group):
         help="use these masks, one a frame",
     )
     masks.add_argument("--no-masks", action="store_true", help="use no masks")
+    group.add_argument(
+        "--inset",
+        type=float,
+        metavar="PIXELS",
+        help="draw the masks' borders in by so many pixels, or out if negative (default: 0)",
+    )
 
 
 def _add_camera(group):
@@ -259,7 +265,7 @@ def main(argv=None):
     if args.texture is not None or os.path.isfile(args.folder):
         scene, found = _from_video(args, shlex.join(["python", "-m", "polysft_mi.prepare", *words]))
     else:
-        for name in ("size", "template", "corners", "fov", "camera"):
+        for name in ("size", "template", "corners", "fov", "camera", "inset"):
             if getattr(args, name) is not None:
                 raise InputError(
                     f"{args.folder}: --{name} is for a video or a folder of images; these also need"
@@ -327,6 +333,10 @@ def _from_video(args, command):
             f"{args.folder}: a video needs --texture photo.jpg, a straight photo of the sheet (or"
             " --texture first-frame, with --corners), and --size"
         )
+    if args.inset is not None and args.no_masks:
+        raise InputError("--inset draws masks in; with --no-masks there are none")
+    if args.inset is not None and not np.isfinite(args.inset):
+        raise InputError(f"--inset {args.inset:g}: a number of pixels is needed")
     corners, texture_corners = args.corners, args.texture_corners
     if corners == ["frame"]:
         corners = "frame"
@@ -346,6 +356,7 @@ def _from_video(args, command):
             corners=corners,
             texture_corners=texture_corners,
             masks=args.masks or not args.no_masks,
+            inset=args.inset or 0.0,
             evidence=GivenEvidence(rig=_rig(args), **_evidence(args)),
             say=(lambda line: None) if quiet else print,
             progress=progress,

@@ -11,7 +11,7 @@ from polysft_mi.errors import InputError
 from polysft_mi.scene import list_images, read_rgb
 
 from . import pictures
-from .masks import Masks, iou
+from .masks import Masks, beyond, drawn_in, iou
 from .output import FRAME, MASK, REPORT, write_png
 
 
@@ -40,19 +40,20 @@ class Written:
     lines: list
 
 
-def write_frames(folder, frames, masks, expected, straight, progress, registration=None):
+def write_frames(folder, frames, masks, expected, straight, progress, registration=None, inset=0.0):
     """Write ``frames``, an iterable of (index in the video, image (H, W, 3) uint8 RGB), and masks.
 
     ``masks``: True to find them, from ``expected`` (H, W), the template's silhouette in the first
     frame; False for none; or :class:`GivenMasks`, which ``straight``, the
     :class:`polysft_mi.capture.camera.Undistortion` of the frames, makes fit to them. ``progress``
     is given the number of frames done; ``registration`` as for
-    :class:`polysft_mi.capture.masks.Masks`. Returns :class:`Written`. Raises InputError.
+    :class:`polysft_mi.capture.masks.Masks`; ``inset`` [pixels]: masks are drawn in by it, or out.
+    Returns :class:`Written`. Raises InputError.
     """
     tracked = Masks(expected.shape[::-1], registration) if masks is True else None
     if masks:
         os.makedirs(os.path.join(folder, "masks"))
-    indices, areas, strange, overlap = [], [], [], None
+    indices, areas, strange, overlap, passes = [], [], [], None, 0.0
     # small matrices: several threads of BLAS would only wait for each other
     with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(2) as pool:
         pending = []
@@ -66,8 +67,10 @@ def write_frames(folder, frames, masks, expected, straight, progress, registrati
             write(FRAME.format(k), frame)
             if tracked:
                 mask = tracked.next(frame) if k else tracked.first(frame, expected)
-                overlap = iou(mask, expected) if k == 0 else overlap
-                areas.append(int((mask > 0).sum()))
+                mask = drawn_in(mask, inset)
+                if k == 0:
+                    overlap, passes = iou(mask, expected), beyond(mask, expected)
+                areas.append(int((mask > 127).sum()))
                 strange.append(tracked.strangeness)
                 write(MASK.format(k), mask)
             indices.append(index)
@@ -76,15 +79,21 @@ def write_frames(folder, frames, masks, expected, straight, progress, registrati
             job.result()
     result = Written(indices, bool(masks), None, [])
     if isinstance(masks, GivenMasks):
-        masks.write(folder, indices, straight)
+        masks.write(folder, indices, straight, inset)
         result.lines.append(f"masks: those of {masks.pattern}")
     elif tracked:
         why = _why_not_used(overlap, areas, strange, indices)
         result.masked = why is None
-        result.figures = {"first_iou": overlap, "strangeness": max(strange), "used": why is None}
+        result.figures = {
+            "first_iou": overlap,
+            "beyond_px": passes,
+            "strangeness": max(strange),
+            "used": why is None,
+        }
         if why is None:
             result.lines.append(
-                f"masks: by GrabCut; the first and the template overlap by {100 * overlap:.0f} %"
+                f"masks: by GrabCut; the first and the template overlap by {100 * overlap:.0f} %,"
+                f" its border passes the template's by {passes:.1f} pixels"
             )
         else:
             result.figures["why"] = why
@@ -142,8 +151,10 @@ class GivenMasks:
         self.pattern = pattern
         self._paths = list_images(pattern, "masks")
 
-    def write(self, folder, indices, straight):
-        """Write those of the frames ``indices`` into the folder, undistorted and scaled."""
+    def write(self, folder, indices, straight, inset=0.0):
+        """Write those of the frames ``indices`` into the folder, undistorted, scaled, and drawn in
+        by ``inset`` [pixels].
+        """
         paths, size = self._paths, straight.size
         if len(paths) != len(indices):
             if len(paths) <= indices[-1]:
@@ -164,4 +175,4 @@ class GivenMasks:
                 raise InputError(
                     f"{path}: the mask of the first frame is empty; the sheet must be seen in it"
                 )
-            write_png(os.path.join(folder, MASK.format(k)), mask)
+            write_png(os.path.join(folder, MASK.format(k)), drawn_in(mask, inset))

@@ -44,6 +44,7 @@ def prepare_video(
     texture_corners=None,
     pose_fit="auto",
     masks=True,
+    inset=0.0,
     evidence=None,
     first=0,
     last=-1,
@@ -66,7 +67,8 @@ def prepare_video(
     - ``corners`` (4, 2): pixels of the sheet's corners in the frame ``first`` as it was taken, or
       "frame" for the picture's own; ``pose_fit``: "auto" to move the sheet from there to the edges
       in that frame, where they are clear, or "none".
-    - ``masks``: True to find them, a folder of them, or False for none; ``evidence``: a
+    - ``masks``: True to find them, a folder of them, or False for none; their borders are drawn in
+      by ``inset`` [pixels], or out; ``evidence``: a
       :class:`polysft_mi.capture.evidence.GivenEvidence` where there is more than images.
     - ``first`` to ``last`` in steps of ``stride``: the frames; ``scale``: what they are scaled by.
     - ``say`` is given one line for each step, ``progress`` the number of frames done.
@@ -156,7 +158,9 @@ def prepare_video(
         for name, image in shown.items():
             write_png(os.path.join(partial, REPORT, name), image)
         expected = silhouette(view.project(placed), mesh.faces, frame.shape[1::-1])
-        written = write_frames(partial, frames(), masks, expected, straight, progress, registration)
+        written = write_frames(
+            partial, frames(), masks, expected, straight, progress, registration, inset
+        )
         found |= {"frames": len(written.indices), "indices": written.indices}
         found["fps"], uneven = film.rate(stride)
         for line in [*film.notes[told:], *filter(None, [uneven])]:

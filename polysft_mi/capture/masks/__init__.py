@@ -10,7 +10,7 @@ from polysft_mi import lazy
 __getattr__, __dir__, __all__ = lazy.attach(
     __name__,
     submod_attrs={
-        "grabcut": ["MaskSettings", "Masks", "iou", "silhouette"],
+        "grabcut": ["MaskSettings", "Masks", "beyond", "drawn_in", "iou", "silhouette"],
         "registration": ["Registration"],
     },
 )

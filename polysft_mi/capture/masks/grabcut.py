@@ -176,3 +176,30 @@ def iou(a, b):
     a, b = (np.asarray(m) > 0.5 * max(np.max(m), 1e-9) for m in (a, b))
     union = (a | b).sum()
     return float((a & b).sum() / union) if union else 1.0
+
+
+def beyond(mask, silhouette):
+    """How far a mask passes a silhouette [pixels], the median along its border; negative where it
+    does not reach it, 0 where one of them is empty.
+    """
+    inside = (silhouette > 127).astype(np.uint8)
+    border = inside - cv2.erode(inside, _disc(1), borderValue=1)
+    if not border.any() or not (mask > 127).any():
+        return 0.0
+    return float(np.median(_depths(mask)[border > 0])) - 0.5
+
+
+def drawn_in(mask, pixels):
+    """A mask (H, W) uint8 whose border is drawn in by so many pixels, or out where they are
+    negative; it is soft there, 0 to 255.
+    """
+    if not pixels or not (mask > 127).any():
+        return mask
+    return np.round(255 * np.clip(_depths(mask) - pixels + 0.5, 0, 1)).astype(np.uint8)
+
+
+def _depths(mask):
+    """How far each pixel's centre lies within a mask's border [pixels]; negative outside."""
+    inside = (mask > 127).astype(np.uint8)
+    to_border = lambda x: cv2.distanceTransform(x, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return np.maximum(to_border(inside) - 0.5, 0) - np.maximum(to_border(1 - inside) - 0.5, 0)

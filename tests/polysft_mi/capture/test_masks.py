@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from clips import CAMERA, HEIGHT, WIDTH, photo, placed, rendered
 
-from polysft_mi.capture.masks import Masks, Registration, iou, silhouette
+from polysft_mi.capture.masks import Masks, Registration, beyond, drawn_in, iou, silhouette
 from polysft_mi.capture.sheet import grid
 
 GREY = np.full((240, 320, 3), 40, np.uint8)
@@ -59,6 +59,19 @@ def corner_misses(masks):
         corner = CAMERA.project(corners @ R.T + t)
         missed.append(np.linalg.norm(corner[:, None] - inside, axis=2).min(1).max())
     return np.array(missed)
+
+
+@pytest.mark.parametrize("radius", [37, 39, 40, 41.5, 44])
+def test_masks_are_drawn_in_by_what_they_pass_a_silhouette(radius):
+    y, x = np.mgrid[:120, :160] + 0.5
+    disc = lambda r: np.where(np.hypot(x - 80, y - 60) < r, 255, 0).astype(np.uint8)
+    passes = beyond(disc(radius), disc(40))
+    assert passes == pytest.approx(radius - 40, abs=0.5)
+    area = drawn_in(disc(radius), passes).sum() / 255
+    assert np.sqrt(area / np.pi) == pytest.approx(40, abs=0.3)
+    assert (drawn_in(disc(radius), 0.0) == disc(radius)).all()
+    empty = np.zeros_like(disc(1))
+    assert beyond(empty, disc(40)) == 0 and not drawn_in(empty, -3.0).any()
 
 
 def test_dark_corners_are_kept():

@@ -4,6 +4,7 @@ import json
 import os
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from clips import (
@@ -55,6 +56,21 @@ def test_replacing_a_folder(clip, tmp_path, capsys):
         "not replaced" in refused(prepare.main, [*words, "--overwrite"])
         and (tmp_path / "out" / "scene.xml").exists()
     )
+
+
+def test_masks_are_drawn_in(clip, tmp_path):
+    area = {}
+    for inset in (0, 3):
+        out = tmp_path / str(inset)
+        prepare.main([*arguments(clip, out, "--last", "0", "--inset", str(inset)), "-q"])
+        area[inset] = (cv2.imread(str(out / "masks" / "00000.png"), 0) > 127).sum()
+        found = json.loads((out / "prepare" / "prepare.json").read_text())["masks"]
+        assert found["beyond_px"] == pytest.approx(-inset, abs=0.6)
+    assert area[3] < area[0]
+    for words in (["--no-masks"], ["--inset", "nan"]):
+        assert "--inset" in refused(
+            prepare.main, arguments(clip, tmp_path / "no", "--inset", "1", *words)
+        )
 
 
 def test_photo_that_is_not_in_the_video(clip, tmp_path):
