@@ -5,11 +5,12 @@
 
 Each method is a command, run as a user would and timed as a whole, start-up and everything it
 writes included: ``python -m polysft_mi.run`` with the solver ``gauss-newton`` or ``adam``, and
-``per_vertex.py``. The figures are those of ``python -m polysft_mi.evaluate``. Each result goes into
-``sft.json`` as soon as it is there; the next call does what is missing (all of it with
-``--again``), and draws the tables and the plot from everything that was run in the same way. Where
-the truth is a mesh, they also say what the best jets of the order used make of it: those fitted to
-the true vertices of each frame.
+``per_vertex.py``; if it is asked for, ``adam-reweighted``: the paper's solver and losses by other
+weights, on Kinect-Paper with the ``--masks`` that ``polysft prepare`` makes. The figures are those
+of ``python -m polysft_mi.evaluate``. Each result goes into ``sft.json`` as soon as it is there; the
+next call does what is missing (all of it with ``--again``), and draws the tables and the plot from
+everything that was run in the same way. Where the truth is a mesh, they also say what the best jets
+of the order used make of it: those fitted to the true vertices of each frame.
 
 To see what a change does, run the code before and after it with ``--threads 1 --docs FOLDER`` of
 its own, and the second time with ``--against`` the first one's sft.json; ``--only flag bend paper
@@ -55,10 +56,12 @@ def parser():
         default=list(SEQUENCES),
         help=f"of {', '.join(SEQUENCES)}",
     )
-    known = f"of {', '.join(METHODS)}; none for the report alone"
+    usual = [name for name in METHODS if name != "adam-reweighted"]
+    known = f"of {', '.join(METHODS)}; none for the report alone (default: {' '.join(usual)})"
     p.add_argument(
-        "--methods", nargs="*", metavar="METHOD", choices=METHODS, default=list(METHODS), help=known
+        "--methods", nargs="*", metavar="METHOD", choices=METHODS, default=usual, help=known
     )
+    p.add_argument("--masks", metavar="FOLDER", help="of Kinect-Paper, for adam-reweighted")
     p.add_argument("--frames", type=int, metavar="N", help="only the first N frames of each")
     p.add_argument("--threads", type=int, metavar="N", help="cores for each command (default: all)")
     p.add_argument(
@@ -128,6 +131,7 @@ def main(arguments=None):
                 folder,
                 os.path.join(options.out, "sft", f"{sequence}-{method}{shortened}"),
                 setup,
+                options.masks,
             )
             sft_results.add(path, result)
             told = (

@@ -15,7 +15,7 @@ SEQUENCES = (
     *("ball", "shirt", "tube", *SIMULATED),  # no sheets
     *("kinect_paper", "phi_sft_R1"),
 )
-METHODS = ("gauss-newton", "adam", "per-vertex")
+METHODS = ("gauss-newton", "adam", "adam-reweighted", "per-vertex")
 JET = "best jet"  # the method of a result that no command made: the jet nearest to the truth
 
 

@@ -18,11 +18,17 @@ from polysft_mi.results.evaluation import evaluate, score
 from polysft_mi.results.truth import find_truth, load_npz
 from polysft_mi.surface import meshio
 
-_METHODS = {"gauss-newton": ["solver=gauss-newton"], "adam": ["preset=paper"]}
+_METHODS = {
+    "gauss-newton": ["solver=gauss-newton"],
+    "adam": ["preset=paper"],
+    "adam-reweighted": ["preset=paper", "k_mi=1", "k_tc=5e-5", "k_silhouette=0.05"],
+}
 
 
-def command(sequence, method, folder, out, setup):
-    """The command line of one result, a list; ``setup`` as :func:`setup_of` makes it."""
+def command(sequence, method, folder, out, setup, masks=None):
+    """The command line of one result, a list; ``setup`` as :func:`setup_of` makes it; ``masks``: a
+    folder of them, for adam-reweighted where the sequence has none.
+    """
     define = [f"data={os.path.abspath(folder)}", *setup["define"]]
     if setup["frames"]:
         define.append(f"last={setup['frames'] - 1}")
@@ -31,6 +37,8 @@ def command(sequence, method, folder, out, setup):
     else:
         line = [sys.executable, "-m", "polysft_mi.run"]
         define += _METHODS[method]
+        if masks and method == "adam-reweighted" and sequence == "kinect_paper":
+            define.append(f"masks={os.path.abspath(masks)}")
     line += [scene_of(sequence), "-o", out, "--overwrite", "-q"]
     if setup["mode"]:
         line += ["-m", setup["mode"]]
@@ -54,11 +62,11 @@ def is_whole(setup):
     return not (setup["frames"] or setup["threads"] or setup["define"] or setup["iterations"])
 
 
-def run(sequence, method, folder, out, setup):
-    """Run one command and read its accuracy: a result, a dict. A command that fails gives one with
-    ``error``, its last line.
+def run(sequence, method, folder, out, setup, masks=None):
+    """Run one command (:func:`command`) and read its accuracy: a result, a dict. A command that
+    fails gives one with ``error``, its last line.
     """
-    line = command(sequence, method, folder, out, setup)
+    line = command(sequence, method, folder, out, setup, masks)
     environment = {
         **os.environ,
         "PYTHONPATH": os.pathsep.join(filter(None, [ROOT, os.environ.get("PYTHONPATH")])),
@@ -81,6 +89,7 @@ def run(sequence, method, folder, out, setup):
         .replace(folder, sequence)
         .replace(ROOT + os.sep, "")
         .replace(out, os.path.join("OUT", os.path.basename(out)))
+        .replace(os.path.abspath(masks or out), "MASKS")
     )
     result = {
         "sequence": sequence,

@@ -109,9 +109,16 @@ def _sft(data, sequence, method):
     return found[0] if found else None
 
 
+KINECT = {  # method to its name in tables
+    "adam": "preset",
+    "adam-reweighted": "its losses by other weights, with masks",
+    "gauss-newton": "default",
+}
+
+
 def kinect_paper(data):
     rows = [("paper", "2.59", "", "", "")]
-    for method, name in (("adam", "preset"), ("gauss-newton", "default")):
+    for method, name in KINECT.items():
         if r := _sft(data, "kinect_paper", method):
             f = r["figures"]
             values = (f"{f[k]:.2f}" for k in ("depth_rmse_allpix_mm", "depth_rmse_mm"))
@@ -146,7 +153,7 @@ def stretch(data):
 
 def kinect_frames(data):
     rows = {}
-    for method, name in (("adam", "preset"), ("gauss-newton", "default")):
+    for method, name in KINECT.items():
         found = _sft(data, "kinect_paper", method)
         if each := found["figures"].get("per_frame_mm") if found else None:
             rows[name] = each
