@@ -13,7 +13,7 @@ COPY constraints.txt /tmp/
 # The first start of Python as root finishes the installation of LLVM, whose links it makes
 RUN --mount=type=bind,from=build,source=/wheels,target=/wheels \
     pip install --no-cache-dir -c /tmp/constraints.txt /wheels/*.whl \
-    && python -m polysft_mi.backend
+    && python -m polyfit.backend
 # For the caches of whatever user runs it
 ENV HOME=/tmp
 WORKDIR /work

@@ -33,8 +33,8 @@ import numpy as np
 from ablation_results import BASELINE, CHANCES, FIGURES, ROUNDED, decided, page, read, write
 from sequences import DATA, ROOT, SCENES, folder_of, scene_of
 
+from polyfit.backend import add_mode_argument, set_variant
 from polyfit.files import aside
-from polysft_mi.backend import add_mode_argument, set_variant
 from polysft_mi.errors import InputError, cli
 from polysft_mi.scene.rules import Rules
 

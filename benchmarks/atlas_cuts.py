@@ -29,10 +29,10 @@ from ablation import Switch, run
 from best_jets import best_jets
 from sequences import DATA, folder_of, scene_of
 
+from polyfit.backend import add_mode_argument, set_variant
 from polyfit.files import aside
 from polyfit.mesh import edges_of
 from polyfit.patches import Cover, partition
-from polysft_mi.backend import add_mode_argument, set_variant
 from polysft_mi.errors import InputError, cli
 from polysft_mi.results import metrics
 from polysft_mi.results.truth import Truth

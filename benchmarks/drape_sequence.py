@@ -22,8 +22,8 @@ from simulate_shapes import Shape
 import onefit
 from onefit.draping.draper import FPS
 from onefit.motion import generate
+from polyfit.backend import set_variant
 from polyfit.mesh import TexCoords, face_vectors
-from polysft_mi.backend import set_variant
 from polysft_mi.errors import InputError, cli
 
 FRAMES, VERTICES = 45, 1200  # of a sequence; a finer garment is remeshed to so many

@@ -134,13 +134,13 @@ def picture(path, out, frame):
     """Write a frame of a run in ``out``: the video; the drape on the body as its motion is given;
     and what was found, over the faded video.
     """
-    from polysft_mi.backend import set_variant
+    from polyfit.backend import set_variant
 
     set_variant()
     import cv2
     import mitsuba as mi
 
-    from polysft_mi.colours import srgb
+    from polyfit.colours import srgb
     from polysft_mi.objective import Problem
     from polysft_mi.scene import load
 

@@ -14,7 +14,7 @@ import os
 import numpy as np
 from simulate_pictures import add_cameras
 
-from polysft_mi.backend import set_variant
+from polyfit.backend import set_variant
 from polysft_mi.errors import InputError, cli
 
 

@@ -93,9 +93,10 @@ def arrays(on, scratch):
         np.add.at(wanted, place, whole)
         said.append(near(np.array(mi.Int64(total)), wanted, 0))
     with check("a recorded function with loops and scatters, launched again") as said:
+        from polyfit.device import on_device
         from polysft_mi.images.gather import add
         from polysft_mi.images.pixels import packed
-        from polysft_mi.render import frozen, on_device
+        from polysft_mi.render import frozen
 
         def sums(start, index, values):
             value = lambda k: [dr.gather(mi.Float64, values, 2 * k + c) for c in range(2)]
@@ -152,7 +153,7 @@ def forms(on, scratch):
 
 def _forms(on, kept):
     with check("the variant") as said:
-        from polysft_mi.backend import set_variant
+        from polyfit.backend import set_variant
 
         said.append(set_variant(on))
     import drjit as dr
@@ -228,7 +229,7 @@ def _forms(on, kept):
         said.append(f"mean colour {np.array(shown)[..., :3].mean():.4f}")
     _closed_forms(problem, kept)
     with check("the stage of OneFit's videos"):
-        from polysft_mi.render import stage
+        from polyfit.pictures import stage
 
         mesh = rest[None] - rest.mean(0), problem.template.faces, (0.5, 0.3, 0.2)
         if len(rest) != len(problem.template.vertices):
@@ -327,6 +328,8 @@ def classified(stack):
         return "linear algebra of the host", place
     if own[0].endswith("render/device.py"):
         return "recorded functions", place
+    if own[0].endswith("polyfit/device.py"):
+        return "copies, and waiting for the device", place
     if own[0] != stack[0][0] and any(x in stack[0][0] for x in ("/drjit/", "/mitsuba/")):
         return "tracing", place
     if "scipy" not in stack[0][0] and any(x in line for x in _WAITS):
@@ -340,7 +343,7 @@ def classified(stack):
 
 def track(on, scratch, scene, define, frames, history=""):
     """Track a sequence, without pictures; with ``history`` each kernel is timed by Dr.Jit."""
-    from polysft_mi.backend import set_variant
+    from polyfit.backend import set_variant
 
     began = time.perf_counter()
     set_variant(on)

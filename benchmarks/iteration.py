@@ -26,7 +26,7 @@ def main(arguments=None):
     p.add_argument("--turns", type=int, default=30)
     options = p.parse_args(arguments)
 
-    from polysft_mi.backend import set_variant
+    from polyfit.backend import set_variant
 
     set_variant()
     rows = measured(options.scene, definitions(options.define), options.turns)

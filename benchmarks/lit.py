@@ -18,8 +18,8 @@ import time
 import numpy as np
 from sequences import ROOT
 
+from polyfit.backend import add_mode_argument, set_variant
 from polyfit.files import aside
-from polysft_mi.backend import add_mode_argument, set_variant
 from polysft_mi.errors import cli
 
 SCENE, DATA = (os.path.join(ROOT, "scenes", name) for name in ("demo_lit.xml", "demo_lit"))
@@ -162,7 +162,7 @@ def picture(path, found, figures, truth):
     import mitsuba as mi
     from matplotlib.figure import Figure
 
-    from polysft_mi.colours import srgb
+    from polyfit.colours import srgb
     from polysft_mi.scene import load
 
     last = len(found[LIT][0].vertices) - 1

@@ -196,13 +196,13 @@ class Bench:
 
 def show(drapes, path):
     """A picture of each drape, side by side: the frame whose body is farthest from the first's."""
-    from polysft_mi.backend import set_variant
+    from polyfit.backend import set_variant
 
     set_variant()
     import cv2
     import numpy as np
 
-    from polysft_mi.render import stage
+    from polyfit.pictures import stage
 
     row, colour = [], GARMENT_COLOURS[0]
     for drape in drapes:

@@ -155,11 +155,11 @@ FRAME_STEP = 3  # one frame in so many is looked at for crossings
 
 def pictures(drapes, skinned, frames, size, spp):
     """Images (H, W, 3) uint8, one a frame of ``frames``: the drapes side by side."""
-    from polysft_mi.backend import set_variant
+    from polyfit.backend import set_variant
 
     set_variant()
     from onefit.draping.output import BODY_COLOUR, GARMENT_COLOURS
-    from polysft_mi.render import stage
+    from polyfit.pictures import stage
 
     body = (skinned.body[frames].numpy(), skinned.body_faces.numpy(), BODY_COLOUR)
     rows = [
@@ -241,7 +241,7 @@ def main(argv=None):
             raise InputError("--picture: all rows need the same drapes")
         cv2.imwrite(args.picture, np.vstack(strips)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])
     if films:
-        from polysft_mi.render.video import write_video
+        from polyfit.pictures import write_video
 
         write_video(args.video, films, FPS)
 

@@ -28,8 +28,8 @@ import time
 
 import numpy as np
 
+from polyfit.backend import add_mode_argument, set_variant
 from polyfit.files import aside
-from polysft_mi.backend import add_mode_argument, set_variant
 from polysft_mi.commands import add_define_argument, definitions
 from polysft_mi.errors import InputError, cli
 

@@ -33,7 +33,7 @@ from pathlib import Path
 
 import pytest
 
-from polysft_mi.backend import VARIABLE, find_libllvm, set_variant
+from polyfit.backend import VARIABLE, find_libllvm, set_variant
 from polysft_mi.errors import InputError, cli
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -24,12 +24,12 @@ import cv2
 import numpy as np
 from sequences import DATA, ROOT
 
+from polyfit.pictures import write_video
 from polysft_mi.camera import Intrinsics
 from polysft_mi.capture import iou
 from polysft_mi.capture.pictures import photo_on_frame
 from polysft_mi.capture.sheet import grid
 from polysft_mi.errors import InputError, cli
-from polysft_mi.render.video import write_video
 from polysft_mi.results.evaluation import evaluate
 from polysft_mi.scene import kinect_paper
 from polysft_mi.scene.images import list_images, read_rgb

@@ -56,7 +56,7 @@ from raster_figures import (
 )
 from sequences import ROOT
 
-from polysft_mi.backend import add_mode_argument, set_variant
+from polyfit.backend import add_mode_argument, set_variant
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError, cli
 

@@ -17,7 +17,7 @@ import os
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from polysft_mi.backend import add_mode_argument, set_variant
+from polyfit.backend import add_mode_argument, set_variant
 from polysft_mi.errors import cli
 
 WAY = (0.0, 0.1, 0.35, 0.65, 1.0)
@@ -28,7 +28,7 @@ def readings(image, alpha, frame, mask):
     """Each reading's loss of an image (H, W, 3), linear, with its alpha (H, W), against a frame
     and its mask; a mean over what the surface fills.
     """
-    from polysft_mi.colours import srgb
+    from polyfit.colours import srgb
 
     inside = alpha > 0.999
     difference = image - frame

@@ -31,8 +31,8 @@ from cases import add_case_arguments, parse_size
 from scaling_surfaces import Surface, camera
 from sequences import ROOT
 
+from polyfit.backend import add_mode_argument, set_variant
 from polyfit.files import aside
-from polysft_mi.backend import add_mode_argument, set_variant
 from polysft_mi.errors import InputError, cli
 
 GRIDS, SIZES, FRAMES = (33, 50, 71, 100), ("640x480", "1280x720", "1920x1080"), 8
@@ -50,8 +50,8 @@ def make(folder, surface, size, frames):
     import cv2
     import mitsuba as mi
 
+    from polyfit.colours import srgb
     from polysft_mi import prepare
-    from polysft_mi.colours import srgb
     from polysft_mi.objective.problem import Problem
     from polysft_mi.scene import experiment as scene
 

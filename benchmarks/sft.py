@@ -32,7 +32,7 @@ from sequences import DATA, ROOT, folder_of
 from sft_report import against, report
 from sft_results import JET, METHODS, SEQUENCES
 
-from polysft_mi.backend import add_mode_argument
+from polyfit.backend import add_mode_argument
 from polysft_mi.commands import add_define_argument, definitions
 from polysft_mi.errors import InputError, cli
 

@@ -33,8 +33,8 @@ import numpy as np
 from simulate_pictures import add_cameras, render
 from simulate_shapes import DEPTH, ROUNDED, Shape
 
+from polyfit.backend import set_variant
 from polyfit.mesh import edges_of
-from polysft_mi.backend import set_variant
 from polysft_mi.errors import InputError, cli
 
 FRAMES, FPS = 45, 60.0

@@ -22,8 +22,8 @@ import time
 import numpy as np
 from sequences import ROOT
 
+from polyfit.backend import add_mode_argument, set_variant
 from polyfit.files import aside
-from polysft_mi.backend import add_mode_argument, set_variant
 from polysft_mi.commands import add_define_argument, definitions
 from polysft_mi.errors import InputError, cli
 
@@ -168,9 +168,9 @@ def picture(path, problem, frame, surfaces, counts, rows, usual, truth):
     """
     from matplotlib.figure import Figure
 
+    from polyfit.colours import srgb
     from polyfit.mesh import boundary_edges
-    from polysft_mi.colours import srgb
-    from polysft_mi.render import SideView, Triangles
+    from polyfit.pictures import SideView, Triangles
 
     template, image = problem.template, srgb(problem.sequence.frame(frame))
     shown = [(f"{n} iterations", surfaces[n]) for n in counts] + (

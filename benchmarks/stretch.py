@@ -29,7 +29,7 @@ import cv2
 import numpy as np
 from per_vertex import OVER_SHEET
 
-from polysft_mi.backend import add_mode_argument, set_variant
+from polyfit.backend import add_mode_argument, set_variant
 from polysft_mi.errors import InputError, cli
 from polysft_mi.scene.settings import PRESETS
 

@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 
 from polyfit import mesh
-from polysft_mi.backend import set_variant
+from polyfit.backend import set_variant
+from polyfit.colours import patch_colours
 from polysft_mi.camera import Intrinsics
-from polysft_mi.colours import patch_colours
 from polysft_mi.surface.meshio import read_textured_template
 from polysft_mi.surface.template import Template
 
@@ -30,7 +30,7 @@ CAMERA = Intrinsics(5.2 * PIXELS, 5.2 * PIXELS, PIXELS / 2, PIXELS / 2, PIXELS, 
 def picture(vertices, faces, colours, turn):
     """(SIDE, SIDE, 3) uint8: the mesh with colours (N, 3) uint8 of its vertices, turned by ``turn``
     [degrees] about its upright axis."""
-    from polysft_mi.render import Triangles
+    from polyfit.pictures import Triangles
 
     angle = np.radians(turn)
     c, s = np.cos(angle), np.sin(angle)

@@ -10,12 +10,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from polysft_mi.backend import set_variant
+from polyfit.backend import set_variant
 
 set_variant()
 import onefit  # noqa: E402
 from onefit.network import DEFAULT  # noqa: E402
-from polysft_mi.render import stage  # noqa: E402
+from polyfit.pictures import stage  # noqa: E402
 
 ROWS = [  # garments, motion, shape, colours
     (["dress"], "dance", None, [(0.35, 0.03, 0.06)]),

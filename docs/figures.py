@@ -7,7 +7,7 @@
 
 import os
 
-from polysft_mi.backend import set_variant
+from polyfit.backend import set_variant
 
 set_variant()
 

@@ -13,13 +13,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from polyfit.colours import srgb
 from polysft_mi import Run, set_variant
-from polysft_mi.colours import srgb
 
 set_variant()
 import mitsuba as mi  # noqa: E402
 
-from polysft_mi.render import Triangles  # noqa: E402
+from polyfit.pictures import Triangles  # noqa: E402
 
 ROOT = Path(__file__).parents[1]
 DEMO = ROOT / "scenes" / "demo"

@@ -37,6 +37,7 @@ WAY = {
         "baselines": "others' networks, to compare with",
         "training": "surfaces → weights",
         "animation": "moving mesh → USD, glTF, OBJ, PLY",
+        "pictures": "meshes → pictures and videos",
     },
     "onefit": {
         "body": "shape and pose → skinned body",

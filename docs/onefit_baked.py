@@ -9,12 +9,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from polysft_mi.backend import set_variant
+from polyfit.backend import set_variant
 
 set_variant()
 import onefit  # noqa: E402
 from onefit.baking import Baked  # noqa: E402
-from polysft_mi.render import stage  # noqa: E402
+from polyfit.pictures import stage  # noqa: E402
 
 MOTIONS, AT, SIZE = ("dance", "jumping_jack"), (0.45, 0.9), (400, 330)
 BODY, COLOURS = (0.5, 0.48, 0.46), ((0.06, 0.16, 0.35), (0.35, 0.03, 0.06), (0.24, 0.12, 0.02))

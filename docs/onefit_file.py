@@ -11,11 +11,11 @@ import cv2
 import numpy as np
 import trimesh
 
-from polysft_mi.backend import set_variant
+from polyfit.backend import set_variant
 
 set_variant()
 import onefit  # noqa: E402
-from polysft_mi.render import stage  # noqa: E402
+from polyfit.pictures import stage  # noqa: E402
 
 BUTTONS, FRAMES, SIZE = 7, (8, 20, 29), (420, 330)
 CLOTH, BUTTON, BODY = (0.06, 0.16, 0.35), (0.75, 0.73, 0.68), (0.5, 0.48, 0.46)

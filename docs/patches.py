@@ -10,7 +10,7 @@ The picture in the documentation is that of a CC0 shirt of the MakeHuman communi
 import argparse
 import os
 
-from polysft_mi.backend import set_variant
+from polyfit.backend import set_variant
 
 set_variant()
 

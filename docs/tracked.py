@@ -13,10 +13,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from polyfit.backend import set_variant
+from polyfit.colours import srgb
 from polyfit.mesh import edges_of
 from polysft_mi import Run
-from polysft_mi.backend import set_variant
-from polysft_mi.colours import srgb
 
 SIDE, ZOOM = 360, 2  # pixels of a picture; how much larger lines are drawn
 LINE = (255, 214, 64)  # RGB
@@ -34,7 +34,7 @@ def frame_of(run, k):
 
 def with_lines(image, run, vertices):
     """The image, enlarged, with the edges of the mesh that the camera sees."""
-    from polysft_mi.render import Triangles
+    from polyfit.pictures import Triangles
 
     camera = run.camera
     (depth,) = Triangles(vertices, run.faces.astype(np.int64)).seen(camera)
@@ -52,7 +52,7 @@ def with_lines(image, run, vertices):
 
 def row_of(folder, k):
     """The pictures of a run's frame, (SIDE, 4 SIDE, 3) uint8."""
-    from polysft_mi.render import SideView, Triangles
+    from polyfit.pictures import SideView, Triangles
 
     run = Run.open(folder)
     vertices = run.vertices[list(run.frames).index(k)].astype(np.float64)

@@ -13,8 +13,8 @@ import sys
 import cv2
 import numpy as np
 
+from polyfit.pictures import write_video
 from polysft_mi.capture import Sheet
-from polysft_mi.render.video import write_video
 from polysft_mi.scene.images import list_images, read_rgb
 from polysft_mi.surface import meshio
 

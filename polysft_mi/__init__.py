@@ -21,7 +21,6 @@ __getattr__, __dir__, __all__ = lazy.attach(
     __name__,
     submodules=["bridge", "solvers"],
     submod_attrs={
-        "backend": ["set_variant"],
         "camera": ["Intrinsics"],
         "errors": ["InputError"],
         "objective.problem": ["Problem"],
@@ -35,4 +34,5 @@ __getattr__, __dir__, __all__ = lazy.attach(
         "scene.settings": ["Settings"],
         "tracker": ["Track", "track"],
     },
+    handed_on={"polyfit.backend": ["set_variant"]},
 )

@@ -4,8 +4,9 @@ import difflib
 import importlib
 import sys
 
+from polyfit.backend import llvm_line
+
 from . import __version__
-from .backend import llvm_line
 from .commands import COMMANDS
 from .errors import InputError, cli
 

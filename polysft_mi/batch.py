@@ -5,8 +5,9 @@ a time, with one table at the end.
 import sys
 from pathlib import Path
 
+from polyfit.backend import cores
+
 from . import batches, commands
-from .backend import cores
 from .errors import InputError, cli
 
 _EXAMPLES = [

@@ -1,5 +1,7 @@
 """Packages whose names are imported when they are asked for."""
 
+import importlib
+
 import lazy_loader
 
 from .errors import InputError
@@ -7,13 +9,18 @@ from .errors import InputError
 _WITHOUT_VARIANT = "before setting a variant"  # as Mitsuba says it
 
 
-def attach(package, **names):
+def attach(package, handed_on=None, **names):
     """:func:`lazy_loader.attach`, where a name that needs a Mitsuba variant says so. Its own error,
-    an AttributeError, would tell that there is no such name.
+    an AttributeError, would tell that there is no such name. ``handed_on``: names of modules of
+    other packages, which are names of this one, too.
     """
-    get, names_of, everything = lazy_loader.attach(package, **names)
+    get, _, own = lazy_loader.attach(package, **names)
+    home = {name: module for module, others in (handed_on or {}).items() for name in others}
+    everything = sorted([*own, *home])
 
     def __getattr__(name):
+        if name in home:
+            return getattr(importlib.import_module(home[name]), name)
         try:
             return get(name)
         except AttributeError as error:
@@ -23,4 +30,4 @@ def attach(package, **names):
             f"{package}.{name} needs a Mitsuba variant: call polysft_mi.set_variant() first"
         )
 
-    return __getattr__, names_of, everything
+    return __getattr__, everything.copy, everything

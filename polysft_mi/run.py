@@ -48,7 +48,7 @@ def parser():
 
 def add_options(p):
     """Add the options of a run to the parser ``p``, all but the scene and ``--output``."""
-    from .backend import add_mode_argument
+    from polyfit.backend import add_mode_argument
 
     commands.add_define_argument(p)
     add_mode_argument(p)
@@ -205,7 +205,7 @@ def reconstruct(
 
     ``scene``: the path of the scene; ``out``: the folder for the results; ``overrides``: name to
     value of the scene's defaults; ``variant``: Mitsuba's, as
-    :func:`polysft_mi.backend.set_variant` takes it. ``resume`` goes on with the run that ``out``
+    :func:`polysft_mi.set_variant` takes it. ``resume`` goes on with the run that ``out``
     holds, ``overwrite`` replaces it. ``exr_frames``: comparison EXRs at most; ``fps``: frames a
     second of the result, by default the scene's; ``report``: whether report.html is written;
     ``quiet``: no progress on stderr; ``command``: what run.json and the report say made the result.
@@ -214,7 +214,8 @@ def reconstruct(
     Raises InputError.
     """
     scene, out = os.fspath(scene), os.fspath(out)
-    from .backend import set_variant
+    from polyfit.backend import set_variant
+
     from .scene import resolved_defaults
 
     began = time.perf_counter()

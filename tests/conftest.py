@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from places import ROOT
 
-from polysft_mi.backend import set_variant
+from polyfit.backend import set_variant
 from polysft_mi.errors import InputError
 
 

@@ -13,7 +13,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from onefit.garment import parts
 from onefit.objective import depths_beneath
 from polyfit.animation import write_frames, write_usd
+from polyfit.backend import set_variant
 from polyfit.files import aside, check_aside, folder_aside, json_text
+from polyfit.pictures import write_video
 
 BODY_COLOUR = (0.5, 0.48, 0.46)  # linear RGB
 GARMENT_COLOURS = (0.08, 0.19, 0.42), (0.42, 0.12, 0.06), (0.10, 0.28, 0.13), (0.42, 0.30, 0.06)
@@ -162,12 +164,10 @@ def _coloured(drapes):
 
 def _render(drapes, folder, size, spp, advance):
     """PNG frames and a video; Mitsuba is loaded here alone."""
-    from polysft_mi.backend import set_variant
-
     set_variant()
     import cv2
 
-    from polysft_mi.render import stage, write_video
+    from polyfit.pictures import stage
 
     body = drapes[0].body.numpy(), drapes[0].body_faces.numpy(), BODY_COLOUR
     meshes = [body, *_coloured(drapes)]

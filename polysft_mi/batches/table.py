@@ -188,7 +188,7 @@ _PAGES = ("report.html", "drape.mp4")
 
 def _of_run(folder):
     """The middle one of the pictures in a run's comparison video."""
-    from polysft_mi.render import read_video
+    from polyfit.pictures import read_video
 
     path = folder / "comparison.mp4"
     if path.exists():

@@ -6,7 +6,7 @@ Light is counted in shares of the white of a sheet of paper, 203 cd/m2 (ITU-R BT
 
 import numpy as np
 
-from polysft_mi.colours import srgb
+from polyfit.colours import srgb
 
 _CURVES = {16: "PQ", 18: "HLG"}  # FFmpeg's numbers of transfer characteristics
 _BT2020 = 9  # and of primaries

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from polyfit.backend import set_variant
+from polyfit.colours import srgb
 from polyfit.files import aside
 from polyfit.mesh import TexCoords
-from polysft_mi.backend import set_variant
 from polysft_mi.body import check_model, read_motion
-from polysft_mi.colours import srgb
 from polysft_mi.errors import InputError
 from polysft_mi.scene import Sequence, checked_size, open_cameras, read_camera, read_rgb
 from polysft_mi.scene.kinect_paper import template as kinect_paper_template

@@ -169,7 +169,7 @@ class Known:
         ``camera`` sees of the ``sheet`` with vertices ``placed`` (N, 3) [m, camera frame]; black
         where one of them is unknown.
         """
-        from polysft_mi.render import Triangles
+        from polyfit.pictures import Triangles
 
         (own,) = Triangles(placed, sheet.faces).seen(camera)
         known = (self.depth > 0) & np.isfinite(own)
@@ -183,7 +183,7 @@ def photo_on_frame(frame, photo, sheet, placed, camera):
     """The frame (H, W, 3), and on it the photo where the camera sees it on the sheet, whose
     vertices are ``placed`` (N, 3) [m, camera frame].
     """
-    from polysft_mi.render import Triangles
+    from polyfit.pictures import Triangles
 
     _, u, v = Triangles(placed, sheet.faces).seen(camera, sheet.uv.T)
     if sheet.uv.min() < -1e-3 or sheet.uv.max() > 1.001:  # tiles of a photo that repeats

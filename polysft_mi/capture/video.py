@@ -9,7 +9,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from polysft_mi.backend import set_variant
+from polyfit.backend import set_variant
 from polysft_mi.errors import InputError
 from polysft_mi.scene import focal_35mm, read_rgb
 from polysft_mi.surface import meshio

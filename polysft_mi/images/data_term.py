@@ -15,8 +15,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from polyfit.device import on_device
 from polyfit.mesh import signed_areas
-from polysft_mi.render import frozen, on_device
+from polysft_mi.render import frozen
 from polysft_mi.surface import Pattern
 
 from . import pixels

@@ -12,8 +12,8 @@ from functools import lru_cache
 import mitsuba as mi
 import numpy as np
 
+from polyfit.device import on_device
 from polysft_mi.errors import BadFrame
-from polysft_mi.render import on_device
 
 from . import pixels
 from .pyramid import level_image

@@ -12,7 +12,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from polysft_mi.render import frozen, on_device
+from polyfit.device import on_device
+from polysft_mi.render import frozen
 
 from .pixels import CORNERS, CURVATURES, FIGURES, SLOPES, packed
 

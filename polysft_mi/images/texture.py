@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial import cKDTree
 
-from polysft_mi.render import on_device
+from polyfit.device import on_device
 
 from . import pixels
 from .pyramid import blur, compared

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from polysft_mi.render import on_device
+from polyfit.device import on_device
 from polysft_mi.surface import Pattern, hinges, slides
 
 from .visibility import VisibilityWeights

@@ -19,6 +19,7 @@ import mitsuba as mi
 import numpy as np
 import scipy.sparse as sp
 
+from polyfit.device import on_device
 from polysft_mi.images import packed
 from polysft_mi.images.gather import (
     add,
@@ -29,7 +30,7 @@ from polysft_mi.images.gather import (
     projection,
     rows_of,
 )
-from polysft_mi.render import frozen, on_device
+from polysft_mi.render import frozen
 
 if TYPE_CHECKING:
     from polysft_mi.images import Appearance, Evaluation

@@ -2,7 +2,7 @@
 
 The album of a run is drawn while it tracks (:class:`Drawing`); its report and comparisons read a
 finished run, the viewer also one at work, or a drape. Meshes are drawn by
-:mod:`polysft_mi.render.stage`. matplotlib, plotly, viser and Mitsuba are loaded on use.
+:mod:`polyfit.pictures.stage`. matplotlib, plotly, viser and Mitsuba are loaded on use.
 """
 
 from polysft_mi import lazy

@@ -15,9 +15,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from polysft_mi.colours import srgb
+from polyfit.colours import srgb
+from polyfit.device import on_device
+from polyfit.pictures import SideView, Triangles, write_video
 from polysft_mi.images import compared
-from polysft_mi.render import RasterIntegrator, SideView, Triangles, on_device, write_video
+from polysft_mi.render import RasterIntegrator
 from polysft_mi.results import metrics
 
 from . import figures

@@ -7,8 +7,8 @@ import re
 
 import numpy as np
 
+from polyfit.backend import set_variant
 from polyfit.files import folder_aside, json_text
-from polysft_mi.backend import set_variant
 from polysft_mi.errors import InputError
 from polysft_mi.results.comparison import LABELS
 
@@ -61,7 +61,7 @@ def difference_maps(comparison, frame):
     """Images (H, W) [m] of a frame, as A's camera sees it, NaN where a value is not known:
     ``depth_a``, and as far as B allows ``depth_b``, ``depth_difference`` and ``distance``.
     """
-    from polysft_mi.render import Triangles
+    from polyfit.pictures import Triangles
 
     run, truth = comparison.run, comparison.truth
     V, G = comparison.vertices(frame), truth.at(frame)

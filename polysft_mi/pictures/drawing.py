@@ -33,7 +33,7 @@ def _draw_in_background(variant, scene, overrides, template, sequence, album, ca
         threading.Thread(target=_end_with_parent, args=[album[-1]], daemon=True).start()
         if hasattr(os, "nice"):
             os.nice(5)  # below the tracker in rank
-        from polysft_mi.backend import set_variant
+        from polyfit.backend import set_variant
 
         set_variant(variant)
         import drjit as dr

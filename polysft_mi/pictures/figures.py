@@ -12,9 +12,9 @@ import warnings
 
 import numpy as np
 
+from polyfit.colours import linear
 from polyfit.errors import Notice
 from polyfit.files import DISK_FULL_ERRORS, aside
-from polysft_mi.colours import linear
 
 from .panels import PEAKS
 

@@ -13,9 +13,9 @@ from itertools import cycle
 import numpy as np
 
 from polyfit.animation import AXES_FROM_CAMERA, from_camera
+from polyfit.colours import patch_colours, range_of
 from polyfit.mesh import TexCoords
 from polysft_mi.camera import Intrinsics
-from polysft_mi.colours import patch_colours, range_of
 from polysft_mi.errors import InputError
 from polysft_mi.results import Run, load_npz
 from polysft_mi.scene import located, open_cameras
@@ -118,7 +118,7 @@ class Source:
         return found
 
     def _at_work(self):
-        from polysft_mi.backend import set_variant
+        from polyfit.backend import set_variant
 
         set_variant()
         from polysft_mi.objective import Problem

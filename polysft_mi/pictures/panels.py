@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from polyfit.pictures import read_video
 from polysft_mi.errors import InputError
-from polysft_mi.render import read_video
 
 COLUMNS = ("target", "render", "error", "residual", "surface")
 # the value that is white in the pictures of a run: error in linear colour, residual in local

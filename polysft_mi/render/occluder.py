@@ -6,7 +6,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .device import on_device
+from polyfit.device import on_device
+
 from .raster import RasterIntegrator
 
 

@@ -12,10 +12,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from polyfit.device import on_device
 from polysft_mi.errors import InputError
 
 from .crop import Crop
-from .device import on_device
 from .pinhole import Pinhole
 from .raster import RasterIntegrator
 

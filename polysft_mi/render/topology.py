@@ -6,9 +6,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from polyfit.device import on_device
 from polysft_mi.errors import InputError
-
-from .device import on_device
 
 
 class Topology:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from polysft_mi.backend import cores
+from polyfit.backend import cores
 from polysft_mi.errors import InputError
 
 from .images import EXTENSIONS, checked_size, list_images, read_pixels

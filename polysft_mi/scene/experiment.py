@@ -16,12 +16,13 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial import cKDTree
 
+from polyfit.device import on_device
 from polyfit.errors import require
 from polyfit.jets import CanonicalFrame
 from polyfit.mesh import TexCoords, read_textured, write_ply
 from polysft_mi.body import put_on, read_motion
 from polysft_mi.errors import InputError
-from polysft_mi.render import Pinhole, on_device
+from polysft_mi.render import Pinhole
 from polysft_mi.surface import Template, meshio
 
 from . import plugins

@@ -8,8 +8,8 @@ import re
 
 import numpy as np
 
+from polyfit.colours import srgb
 from polyfit.files import silent_decoders
-from polysft_mi.colours import srgb
 from polysft_mi.errors import InputError
 
 EXTENSIONS = tuple(".png .jpg .jpeg .jpe .bmp .tif .tiff .webp .ppm .pgm .pnm .exr .hdr".split())

@@ -12,10 +12,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from polysft_mi.backend import set_variant
+from polyfit.backend import set_variant
+from polyfit.device import on_device
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError
-from polysft_mi.render import RasterIntegrator, on_device
+from polysft_mi.render import RasterIntegrator
 
 from . import settings
 

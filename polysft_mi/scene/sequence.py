@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from polysft_mi.backend import cores
+from polyfit.backend import cores
+from polyfit.colours import linear
 from polysft_mi.body import Carrier
-from polysft_mi.colours import linear
 from polysft_mi.errors import InputError
 
 from .evidence import DepthImages, Tracks

@@ -18,7 +18,7 @@ runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
 """
 _ALL = """
 import importlib, pkgutil
-from polysft_mi.backend import set_variant
+from polyfit.backend import set_variant
 set_variant("llvm_ad_rgb")
 import polyfit, onefit, polysft_mi
 for module in pkgutil.walk_packages(polysft_mi.__path__, "polysft_mi."):
@@ -35,7 +35,7 @@ x = CanonicalFrame.from_points(x).to_chart(x)
 jets.principal_curvatures(jets.fit_points(x, 3).alpha, jets.point(np.ones(6), x[:, :2])[:, :2])
 """
 _RUN = """
-from polysft_mi import backend; backend.set_variant("llvm_ad_rgb")
+from polyfit import backend; backend.set_variant("llvm_ad_rgb")
 import polysft_mi.run, polysft_mi.scene.experiment, polysft_mi.solvers, polysft_mi.report
 import numpy as np
 from polysft_mi.surface.template import Template
@@ -46,14 +46,16 @@ Template.fit(np.stack([x, y, 0 * x], 1), np.array(faces), np.stack([x, y], 1), 2
 """
 _FIGURES = """
 import polysft_mi.pictures.figures, polysft_mi.results.metrics, polysft_mi.evaluate
-import polysft_mi.pictures.exr, polysft_mi.render.video, polysft_mi.surface.meshio
+import polysft_mi.pictures.exr, polyfit.pictures.video, polysft_mi.surface.meshio
 """
 _PUBLIC = "onefit.load, onefit.Garment, onefit.AnnyBody, onefit.Motion, onefit.SmplBody"
 LIGHT = {
     "import polyfit; dir(polyfit)": "torch mitsuba drjit pyvista numpy",
     "import polyfit; polyfit.PatchedSurface, polyfit.PolyFit": "mitsuba drjit polysft_mi onefit",
-    "import onefit": "torch numpy mitsuba drjit warp anny",
-    f"import onefit; {_PUBLIC}": "mitsuba",
+    "from polyfit.pictures import write_video": "torch mitsuba drjit av cv2",
+    "import onefit": "torch numpy mitsuba drjit warp anny polysft_mi",
+    "import polysft_mi": "torch numpy mitsuba drjit onefit",
+    f"import onefit; {_PUBLIC}": "mitsuba polysft_mi",
     "from onefit.body import AnnyBody; AnnyBody().body()": "warp mitsuba",
     "import polysft_mi.__main__ as m; m.main(['--help'])": "numpy torch mitsuba plotly pxr",
     _FIGURES: "matplotlib OpenEXR trimesh skimage scipy rich mitsuba torch cv2",

@@ -48,7 +48,7 @@ class Sheet:
         """
         if self.one_sided:
             return self.faces
-        from polysft_mi.render import Triangles
+        from polyfit.pictures import Triangles
 
         (depth,) = Triangles(placed, self.faces).seen(camera)
         middle = placed[self.faces].mean(1)

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from polysft_mi.render import on_device
+from polyfit.device import on_device
 
 from ..quadratic import RestForms
 from .term import Term

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from polysft_mi.render import on_device
+from polyfit.device import on_device
 
 from ..quadratic import EdgeRows
 from .term import Term

@@ -6,8 +6,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from polyfit.device import on_device
 from polysft_mi.images.light import residuals
-from polysft_mi.render import on_device
 
 from ..quadratic import TriangleForms
 from .term import Term

@@ -15,8 +15,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from polyfit.device import on_device
 from polysft_mi.images import POOL, Level, differentiable
-from polysft_mi.render import on_device
 
 if TYPE_CHECKING:
     from polysft_mi.images import Appearance, DataTerm

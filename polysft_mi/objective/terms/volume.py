@@ -4,9 +4,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from polyfit.device import on_device
 from polyfit.mesh import sheets, winding
 from polysft_mi.errors import InputError
-from polysft_mi.render import on_device
 
 from .term import Term
 

@@ -5,7 +5,7 @@ import os
 
 import numpy as np
 
-from polysft_mi.colours import patch_colours, range_of
+from polyfit.colours import patch_colours, range_of
 
 
 def mesh(run, shown, triangles=24_000):

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from surfaces import joined, sphere
+from synthetic import write_obj
 
 from onefit.garment import Garment, RenderMesh
 from polyfit.mesh import TexCoords
-from polysft_mi.surface.meshio import write_obj
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +98,7 @@ def test_a_drape_hands_the_file_back(garment, file_mesh, tmp_path):
     from polyfit.mesh import read_textured
 
     V, F = file_mesh
-    write_obj(tmp_path / "top.obj", V, F, TexCoords(V[:, ::2], F))
+    write_obj(tmp_path / "top.obj", V, TexCoords(V[:, ::2], F), F)
     drape = onefit.load().drape(tmp_path / "top.obj", onefit.Motion.generate("walk", seconds=0.1))
     assert drape.render_vertices().shape == (3, *V.shape)
     output.write([drape], ["top"], tmp_path, skip=("usd", "render"), meshes="obj")

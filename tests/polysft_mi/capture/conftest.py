@@ -5,7 +5,7 @@ import json
 import pytest
 from clips import CAMERA, photo, rendered, write_png
 
-from polysft_mi.render.video import write_video
+from polyfit.pictures import write_video
 
 
 @pytest.fixture(scope="module")

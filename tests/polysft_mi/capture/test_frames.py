@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from clips import given, photo, refused, rendered, write_png
 
+from polyfit.pictures import write_video
 from polysft_mi.capture import prepare_video
 from polysft_mi.capture.frames import read_frames
-from polysft_mi.render.video import write_video
 from polysft_mi.scene.images import read_rgb
 
 

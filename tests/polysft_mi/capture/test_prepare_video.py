@@ -25,11 +25,11 @@ from clips import (
 from loading import difference, loaded
 from scripts import load
 
+from polyfit.pictures import write_video
 from polysft_mi import prepare
 from polysft_mi.camera import Intrinsics
 from polysft_mi.capture import GivenEvidence, iou, prepare_video
 from polysft_mi.capture.camera import Undistortion, read_lens
-from polysft_mi.render.video import write_video
 from polysft_mi.scene.images import read_rgb
 from polysft_mi.surface import meshio
 

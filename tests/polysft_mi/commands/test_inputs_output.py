@@ -18,9 +18,9 @@ import pytest
 from processes import python, refusal
 from refusals import QUICK, has, line_of, refused
 
+from polyfit.pictures import read_video
 from polysft_mi import errors, run
 from polysft_mi.pictures import exr
-from polysft_mi.render.video import read_video
 from polysft_mi.surface import meshio
 
 

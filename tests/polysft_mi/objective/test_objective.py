@@ -14,8 +14,8 @@ import synthetic
 from per_vertex import OVER_SHEET
 from scipy.ndimage import gaussian_filter
 
+from polyfit.colours import srgb
 from polysft_mi import capture, prepare
-from polysft_mi.colours import srgb
 from polysft_mi.errors import InputError
 from polysft_mi.images import differentiable, pyramid
 from polysft_mi.images.pyramid import Level

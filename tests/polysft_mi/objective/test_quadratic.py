@@ -10,10 +10,10 @@ import pytest
 from problems import dense, grid_template, some_state, tube_template
 from scipy.spatial.transform import Rotation
 
+from polyfit.device import on_device
 from polysft_mi.images import pixels
 from polysft_mi.images.gather import Gather
 from polysft_mi.objective.quadratic import Assembly, EdgeRows, TriangleForms
-from polysft_mi.render.device import on_device
 from polysft_mi.surface.atlas import Atlas
 from polysft_mi.surface.bending import hinges
 from polysft_mi.surface.pattern import Pattern

@@ -14,13 +14,13 @@ import pytest
 import synthetic
 from places import ROOT
 
+from polyfit.pictures import video
 from polysft_mi import prepare
 from polysft_mi.objective.problem import Problem
 from polysft_mi.pictures import exr
 from polysft_mi.pictures.album import Album, AlbumSettings, Renderings, residual
 from polysft_mi.pictures.drawing import Drawing
 from polysft_mi.pictures.panels import COLUMNS, Box, evenly_spaced
-from polysft_mi.render import video
 from polysft_mi.scene import experiment as scene
 
 

@@ -15,6 +15,7 @@ from browser import BROWSER, needs_browser
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from polyfit.pictures import video
 from polysft_mi import report
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError
@@ -28,7 +29,6 @@ from polysft_mi.pictures.panels import (
     heat_values,
 )
 from polysft_mi.pictures.report.page import write_report
-from polysft_mi.render import video
 from polysft_mi.results.run import Run
 
 

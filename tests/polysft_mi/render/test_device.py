@@ -1,4 +1,4 @@
-"""Arrays on the device, recorded functions, and Ctrl-C in the middle of them."""
+"""Recorded functions, Ctrl-C in the middle of them, and their threads."""
 
 import gc
 from types import SimpleNamespace
@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from problems import problem_of, small_cloth
 
-from polysft_mi.render.device import frozen, interruptible, on_device
+from polyfit.backend import cores
+from polysft_mi.render.device import frozen, interruptible, threads
 from polysft_mi.render.raster import RasterIntegrator
 from polysft_mi.tracker import FrameTracker, Track, track
 
@@ -17,17 +18,6 @@ from polysft_mi.tracker import FrameTracker, Track, track
 @pytest.fixture(scope="module")
 def problem(tmp_path_factory):
     return problem_of(small_cloth(tmp_path_factory.mktemp("data"), frames=3).folder)
-
-
-@pytest.mark.parametrize("kind", ["Float", "Float64", "UInt32", "Int32"])
-def test_arrays_reach_the_device_as_copies(kind):
-    for start in range(5):  # at any place in memory
-        values = np.arange(40)[start:].reshape(-1, 1) * 3
-        found = on_device(values[:, 0], getattr(mi, kind))
-        values[:] = -1
-        assert np.array_equal(np.array(found), np.arange(40)[start:] * 3) and isinstance(
-            found, getattr(mi, kind)
-        )
 
 
 @pytest.mark.parametrize("where", ["loop", "record"])
@@ -82,3 +72,12 @@ def test_nothing_is_collected_while_a_function_is_recorded():
 
     frozen(work)(mi.Float([1.0, 2.0]))
     assert state.collecting is False and gc.isenabled()
+
+
+def test_a_share_of_the_cores():
+    before = dr.thread_count()
+    with threads(1.0):
+        assert dr.thread_count() == cores()
+        with threads(1e-3):
+            assert dr.thread_count() == 1
+    assert dr.thread_count() == before

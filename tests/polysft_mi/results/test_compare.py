@@ -8,13 +8,13 @@ import numpy as np
 import OpenEXR
 import pytest
 
+from polyfit.pictures import Triangles
 from polysft_mi import compare
 from polysft_mi.camera import Intrinsics
 from polysft_mi.errors import InputError
 from polysft_mi.pictures import comparison as drawn
 from polysft_mi.pictures import figures
 from polysft_mi.pictures.exr import read_exr
-from polysft_mi.render import Triangles
 from polysft_mi.results import comparison
 from polysft_mi.results.evaluation import evaluate
 from polysft_mi.results.metrics import ray_depth

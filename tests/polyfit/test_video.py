@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from polysft_mi.errors import InputError
-from polysft_mi.render import video
+from polyfit.errors import InputError
+from polyfit.pictures import video
 
 needs_encoder = pytest.mark.skipif(
     not video.can_encode(), reason="PyAV was built without libx264 here"

@@ -6,7 +6,7 @@ past any ``try`` (x86-64: "Cannot select: fminimum"); so the library is chosen h
 starts: the one that the user names, else that of the Python package ``karellen-llvm-core``, which
 is the same on every machine and comes with this package where it exists, else the system's.
 Command lines, tests and library users all call :func:`set_variant`. Importing this module has no
-side effect and needs the standard library alone; ``python -m polysft_mi.backend`` and
+side effect and needs the standard library alone; ``python -m polyfit.backend`` and
 ``polysft --version`` print the library that would be used.
 """
 
@@ -196,7 +196,7 @@ def _refuse_llvm(mode: str) -> None:
         return
     if running != find_libllvm()[1]:
         raise InputError(
-            f"Dr.Jit already runs on LLVM {running[0]}: call polysft_mi.backend.set_variant before"
+            f"Dr.Jit already runs on LLVM {running[0]}: call polysft_mi.set_variant before"
             f" importing mitsuba or drjit, or set {VARIABLE}"
         )
 

@@ -8,8 +8,8 @@ from processes import python
 
 _FORK = """
 import multiprocessing, os, sys
-from polysft_mi import backend
-from polysft_mi.errors import InputError
+from polyfit import backend
+from polyfit.errors import InputError
 
 def child():
     try:

@@ -17,9 +17,8 @@ import numpy as np
 from scipy import sparse
 
 from polyfit import mesh
-from polysft_mi.colours import srgb
-
-from .device import on_device
+from polyfit.colours import srgb
+from polyfit.device import on_device
 
 MARGIN = 1.12  # of the picture around what moves
 _FOV = 28.0  # degrees, of the picture's height
@@ -95,8 +94,9 @@ class Triangles:
         """What a camera sees: depth (H, W) [m], NaN beyond the mesh, and an image (H, W) of each of
         ``values`` (N,), given at the vertices.
 
-        The vertices are in the camera's frame; ``camera``: :class:`polysft_mi.camera.Intrinsics`.
-        Interpolation is perspective, at the pixels' centres, in single precision.
+        The vertices are in the camera's frame; ``camera`` says ``fx``, ``fy``, ``cx``, ``cy``,
+        ``width`` and ``height`` [pixels]. Interpolation is perspective, at the pixels' centres, in
+        single precision.
         """
         x, y = _samples(camera.width, camera.height)
         x, y = (x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import surfaces
 
-from polysft_mi.render import SideView, Triangles, stage
+from polyfit.pictures import SideView, Triangles, stage
 
 
 def ball(radius=0.5, height=0.7, n=48):

@@ -10,8 +10,8 @@ from fractions import Fraction
 
 import numpy as np
 
+from polyfit.errors import InputError
 from polyfit.files import aside
-from polysft_mi.errors import InputError
 
 
 @functools.cache
