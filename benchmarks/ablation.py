@@ -89,7 +89,7 @@ SWITCHES = (
     Switch("motion starts", {"motion_starts": False}),
     Switch("other starts", {"usual_frames": 2}),
     Switch("more iterations there", {"far_iterations": 6}),
-    Switch("small step ends a stage", {"small_step": 0.0}),
+    Switch("small step ends a stage", {"gain": 0.0}),
     Switch("mirror images", {"mirror_share": 0.0}),
     Switch("texture fit", settings={"texture_fit": "none"}),
     Switch("joints", settings={"k_coupling": 0.0}, rounded=True),

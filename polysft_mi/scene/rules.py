@@ -51,10 +51,10 @@ class Rules:
     )
     score_unseen: float = _rule(3.3, "", "factor of the score where no pixel sees the vertex")
     # the step
-    small_step: float = _rule(
-        2e-3,
+    gain: float = _rule(
+        0.01,
         "share",
-        "of the objective that a step must promise for another one to follow",
+        "of the objective that a step must promise, or a pass must gain, for another one to follow",
         row="small step ends a stage",
     )
     damping: tuple = _rule(
@@ -70,7 +70,6 @@ class Rules:
         "further passes of the fine stages for a frame that is not explained",
         row="fine passes",
     )
-    fine_gain: float = _rule(0.01, "share", "of its cost that a pass must gain for another one")
     # starts
     motion_starts: bool = _rule(
         True,

@@ -90,7 +90,7 @@ class Stages:
             gain = 1 - self.cost(found) / self.cost(best)
             if gain > 0:
                 best = found
-            if gain < rules.fine_gain:
+            if gain < rules.gain:
                 return replace(best, more_is_vain=count == 0)
         return best
 

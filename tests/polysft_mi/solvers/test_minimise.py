@@ -137,7 +137,7 @@ def test_a_windows_step_is_that_of_the_dense_system(truth):
         whole[np.ix_(i, j)] -= frozen.coupling
         whole[np.ix_(j, i)] -= frozen.coupling
     expected = np.split(-np.linalg.solve(whole, np.concatenate(right)), start[1:-1])
-    solver = GaussNewton(dataclasses.replace(objective.rules, small_step=1e9))  # taken unseen
+    solver = GaussNewton(dataclasses.replace(objective.rules, gain=1e9))  # taken unseen
     result = solver.minimise(frozen, states, iterations=1)
     for state, found, x in zip(states, result.states, expected, strict=True):
         step = state.after_step((x[n:], x[:n].reshape(-1, 2)))

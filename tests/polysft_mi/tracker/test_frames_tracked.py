@@ -176,8 +176,8 @@ def test_the_least_misfit_goes_from_frame_to_frame(truth, tracked):
         data.misfit(problem.surface(Unknowns.from_numpy(s)), k, finest)
         for k, s in enumerate(tracked.states)
     ]
-    # of the texture as the template has it
-    assert least[1] == pytest.approx(bare[1], rel=0.02)
+    # of the texture as the template has it, one small step before
+    assert least[1] == pytest.approx(bare[1], rel=0.1)
     assert least[-1] == pytest.approx(min(bare[1:]), rel=0.1)
     assert misfit[1] < 0.9 * least[1]  # the sheet's own image explains the frame better
 
