@@ -93,7 +93,7 @@ def write_frames(folder, frames, masks, expected, straight, progress, registrati
         if why is None:
             result.lines.append(
                 f"masks: by GrabCut; the first and the template overlap by {100 * overlap:.0f} %,"
-                f" its border passes the template's by {passes:.1f} pixels"
+                f" and it passes the template by {passes:.1f} pixels"
             )
         else:
             result.figures["why"] = why
