@@ -165,8 +165,8 @@ SECTIONS = {
             "makes, drawn in by the 1.3 pixels by which they pass its template in the first frame. "
             "These weights were chosen on frames 70 to 76, 113 to 118 and 125 to 131, with the "
             "default's surface in view, and the whole video was run once. From frame 170 on it is "
-            "10 to 30 mm off. On `flag`, which nothing was chosen by, these weights are no better than "
-            "the preset's (e3d 0.0073 for 0.0063).",
+            "10 to 30 mm off. On `flag`, which nothing was chosen by, these weights are no better "
+            "than the preset's (e3d 0.0073 for 0.0063).",
         ),
         Entry(
             "RGB and silhouette loss",
