@@ -61,7 +61,7 @@ def parser():
     p.add_argument(
         "--methods", nargs="*", metavar="METHOD", choices=METHODS, default=usual, help=known
     )
-    p.add_argument("--masks", metavar="FOLDER", help="of Kinect-Paper, for adam-reweighted")
+    p.add_argument("--masks", metavar="FOLDER", help="for adam-reweighted, of a sequence without")
     p.add_argument("--frames", type=int, metavar="N", help="only the first N frames of each")
     p.add_argument("--threads", type=int, metavar="N", help="cores for each command (default: all)")
     p.add_argument(

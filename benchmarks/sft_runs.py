@@ -2,6 +2,8 @@
 best that a jet can hold of the sequence's truth.
 """
 
+import functools
+import glob
 import json
 import os
 import subprocess
@@ -37,7 +39,7 @@ def command(sequence, method, folder, out, setup, masks=None):
     else:
         line = [sys.executable, "-m", "polysft_mi.run"]
         define += _METHODS[method]
-        if masks and method == "adam-reweighted" and sequence == "kinect_paper":
+        if masks and method == "adam-reweighted" and not glob.glob(os.path.join(folder, "mask*")):
             define.append(f"masks={os.path.abspath(masks)}")
     line += [scene_of(sequence), "-o", out, "--overwrite", "-q"]
     if setup["mode"]:
@@ -84,13 +86,11 @@ def run(sequence, method, folder, out, setup, masks=None):
             (lambda: os.sched_setaffinity(0, chosen)) if hasattr(os, "sched_setaffinity") else None
         )
     # the results are for other machines too: paths begin with the sequence's name there
-    plain = lambda text: (
-        text.replace(os.path.abspath(folder), sequence)
-        .replace(folder, sequence)
-        .replace(ROOT + os.sep, "")
-        .replace(out, os.path.join("OUT", os.path.basename(out)))
-        .replace(os.path.abspath(masks or out), "MASKS")
-    )
+    known = {os.path.abspath(folder): sequence, folder: sequence, ROOT + os.sep: ""}
+    known |= {out: os.path.join("OUT", os.path.basename(out))}
+    if masks:
+        known = {os.path.abspath(masks): "MASKS", **known}
+    plain = lambda text: functools.reduce(lambda t, pair: t.replace(*pair), known.items(), text)
     result = {
         "sequence": sequence,
         "method": method,
