@@ -2,7 +2,7 @@
 spatial transformer, against networks that regress jets; and what AtlasNet's autoencoder makes of
 garments that it has not seen.
 
-    python benchmarks/polyfit_accuracy.py DATA [--runs out/polyfit] [--train] [--only atlasnet]
+    python benchmarks/polyfit_accuracy.py DATA [--runs out/polyfit] [--train] [--only sources]
     [-o out/benchmarks]
 
 DATA holds ``garments_snug``, ``garments_makehuman`` and ``cloth``. The networks are read from RUNS,
@@ -30,7 +30,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from polyfit_held_out import CLOUD_POINTS, HELD_OUT, POINTS, cloud, kinds
-from polyfit_networks import ORDER, BestAxis, Tilted, making, train_missing, trained
+from polyfit_networks import ORDER, TRAININGS, BestAxis, Tilted, making, train_missing, trained
 from scipy.spatial import cKDTree
 
 from polyfit.baselines import DGCNN, AtlasNet, PointNet
@@ -74,6 +74,15 @@ def milliseconds(model, seconds=3.0):
     return 1e3 * float(np.median(times)) / len(points)
 
 
+def on_all(model, patches):
+    return {kind: figures(model, p) for kind, p in patches.items()}
+
+
+def both(figures):
+    """Height and normals, for a table."""
+    return f"{figures['height']:.4f} / {figures['angle']:.2f}"
+
+
 def table(title, head, rows):
     print(f"\n{title}\n\n| {' | '.join(head)} |\n|{'---|' * len(head)}")
     for row in rows:
@@ -87,12 +96,6 @@ def measure(data, runs):
     every = {kind: str(len(p)) for kind, p in patches.items()}
     report = {"patches": {kind: len(p) for kind, p in patches.items()}, "trained": making(runs)}
 
-    def on_all(model):
-        return {kind: figures(model, p) for kind, p in patches.items()}
-
-    def both(f):
-        return f"{f['height']:.4f} / {f['angle']:.2f}"
-
     frames = {
         "PCA": PolyFit(ORDER),
         "five fixed tilts": PolyFit(ORDER, Tilted()),
@@ -101,7 +104,7 @@ def measure(data, runs):
     }
     if by_preset := trained(runs, "paper", PolyFit.load):
         frames["one quaternion, by the preset"] = by_preset
-    report["frames"] = {name: on_all(m) for name, m in frames.items()}
+    report["frames"] = {name: on_all(m, patches) for name, m in frames.items()}
     rows = []
     for kind in patches:
         least = report["frames"]["PCA"][kind]["height"]
@@ -147,7 +150,9 @@ def measure(data, runs):
     for name, kind in (("pointnet", PointNet), ("dgcnn", DGCNN)):
         if model := trained(runs, name, kind.load):
             models[kind.__name__] = model
-    report["networks"] = {name: on_all(m) | {"ms": milliseconds(m)} for name, m in models.items()}
+    report["networks"] = {
+        name: on_all(m, patches) | {"ms": milliseconds(m)} for name, m in models.items()
+    }
     report["threads"] = torch.get_num_threads()
     rows = [
         (name, *(both(f[kind]) for kind in patches), f"{f['ms']:.4f}")
@@ -168,28 +173,35 @@ def measure(data, runs):
         rows,
     )
 
-    sources = {
-        "Gaussians only": ("gaussian", "0.0248 / 5.49"),
-        "4 families": ("families", "0.0239 / 5.42"),
-    }
-    sources["4 families + garment patches"] = ("garments", "0.0201 / 5.32")
+    return report | sources(patches, runs) | atlasnet(data, runs)
+
+
+SOURCES = {  # what a network was trained on: its folder in RUNS, and the paper's figures of it
+    "Gaussians only": ("gaussian", "0.0248 / 5.49"),
+    "4 families": ("families", "0.0239 / 5.42"),
+    "4 families, fine-tuned on garment patches": ("tuned", ""),
+    "4 families + garment patches": ("garments", "0.0201 / 5.32"),
+}
+
+
+def sources(patches, runs):
+    """The table of training sets as a dictionary, printed."""
     found = {
         title: (m, paper)
-        for title, (run, paper) in sources.items()
+        for title, (run, paper) in SOURCES.items()
         if (m := trained(runs, run, PolyFit.load))
     }
-    report["sources"] = {title: on_all(m) for title, (m, _) in found.items()}
+    report = {title: on_all(m, patches) for title, (m, _) in found.items()}
     rows = [
         (title, *(both(f[kind]) for kind in patches), found[title][1])
-        for title, f in report["sources"].items()
+        for title, f in report.items()
     ]
     table(
-        "What it was trained on, 800 steps each: height RMSE / normals °",
+        "What it was trained on, 800 steps each, 200 of fine-tuning: height RMSE / normals °",
         ("trained on", *patches, "paper, CLOTH3D"),
         rows,
     )
-
-    return report | atlasnet(data, runs)
+    return {"sources": report}
 
 
 def atlasnet(data, runs):
@@ -230,6 +242,13 @@ def autoencoded(model, points):
     )
 
 
+# the networks of a table that can be made alone
+TABLES = {
+    "sources": [run for run, _ in SOURCES.values()],
+    "atlasnet": [f"atlasnet{charts}" for charts in PAPER_ATLASNET],
+}
+
+
 def main(argv=None):
     p = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     p.add_argument("data", metavar="DATA")
@@ -239,14 +258,18 @@ def main(argv=None):
         help="where the trained networks are (default: out/polyfit)",
     )
     p.add_argument("--train", action="store_true", help="train those that are missing")
-    p.add_argument("--only", choices=["atlasnet"], help="its table alone; the others stay")
+    p.add_argument("--only", choices=TABLES, help="its table alone; the others stay")
     p.add_argument("-o", "--output", default="out/benchmarks")
     args = p.parse_args(argv)
     path = Path(args.output, "polyfit_accuracy.json")
     report = json.loads(path.read_text(encoding="utf-8")) if args.only and path.exists() else {}
     if args.train:
-        train_missing(args.data, args.runs, args.only or "")
-    report |= (atlasnet if args.only else measure)(args.data, args.runs)
+        train_missing(args.data, args.runs, TABLES.get(args.only, TRAININGS))
+    if args.only == "sources":
+        report |= {"trained": report.get("trained", {}) | making(args.runs)}
+        report |= sources(kinds(args.data), args.runs)
+    else:
+        report |= (atlasnet if args.only else measure)(args.data, args.runs)
     os.makedirs(args.output, exist_ok=True)
     with (
         aside(path) as temporary,

@@ -34,6 +34,10 @@ TRAININGS = {  # folder in RUNS: options of python -m polyfit.train, whether on 
     "gaussian": (["--families", "gaussian", *SHORT], False),
     "families": (SHORT, False),
     "garments": (SHORT, True),
+    "tuned": (
+        ["--from", "RUNS/families/weights.safetensors", "--steps", "200", "--patches", "2000"],
+        True,
+    ),  # after families
     **{
         f"atlasnet{charts}": ([*ATLASNET, "--charts", str(charts)], True) for charts in (5, 25, 125)
     },
@@ -105,11 +109,12 @@ def making(runs):
     return found
 
 
-def train_missing(data, runs, only="", say=print):
-    """Train the networks that RUNS lacks, those whose names begin with ``only``."""
+def train_missing(data, runs, only=tuple(TRAININGS), say=print):
+    """Train those of the networks ``only`` that RUNS lacks."""
     for name, (options, on_garments) in TRAININGS.items():
-        if name.startswith(only) and not (Path(runs) / name / "weights.safetensors").exists():
+        if name in only and not (Path(runs) / name / "weights.safetensors").exists():
             meshes = [str(Path(data) / m) for m in TRAINED_ON] if on_garments else []
+            options = [option.replace("RUNS", str(runs)) for option in options]
             say(f"training {name}")
             subprocess.run(
                 [

@@ -45,11 +45,6 @@ class Rules:
         "factor of the weights of smoothness where no pixel sees such a surface",
         row="unseen parts are held",
     )
-    # how sure a vertex is
-    score_strain: float = _rule(
-        6.0, "", "factor of the score, the geometric mean of sigma and the strain around a vertex"
-    )
-    score_unseen: float = _rule(3.3, "", "factor of the score where no pixel sees the vertex")
     # the step
     gain: float = _rule(
         0.01,

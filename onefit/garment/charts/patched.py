@@ -63,15 +63,15 @@ class PatchedGarment:
         """Cut ``garment`` into ``patches`` (by default as many as the paper has for its area);
         ``body``: the standard one.
 
-        ``frames``: "pca", or "stn", refined by PolyFit's spatial transformer; ``acvd``: cut by
-        plain ACVD; ``waistband``: garments that do not reach the shoulders are held along a rim.
-        Raises InputError for other ``frames``.
+        ``frames``: "pca", or "stn", refined by the spatial transformer of the paper's training;
+        ``acvd``: cut by plain ACVD; ``waistband``: garments that do not reach the shoulders are
+        held along a rim. Raises InputError for other ``frames``.
         """
         if frames not in FRAMES:
             raise InputError(f"frames '{frames}': choose {' or '.join(FRAMES)}")
         self.garment = garment
         vertices, faces = garment.vertices.double().numpy(), garment.faces.numpy()
-        stn = PolyFit.pretrained(order).requires_grad_(False) if frames == "stn" else None
+        stn = PolyFit.pretrained(order, "paper").requires_grad_(False) if frames == "stn" else None
         surface = PatchedSurface.from_mesh(
             vertices, faces, patches, order, acvd=acvd, polyfit=stn, dtype=torch.float64,
             where=garment.name,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from polysft_mi.objective import FrameContext, FrameMemory, Objective
-from polysft_mi.tracker.sigma import _strain, along_rays, score
+from polysft_mi.tracker.sigma import SCORE, SCORE_UNSEEN, _strain, along_rays, score
 
 
 @pytest.fixture(scope="module")
@@ -58,8 +58,8 @@ def test_score_grows_with_strain_and_where_nothing_is_seen_and_is_sigma_at_least
     assert found.dtype == np.float32 and (found >= sigma).all()
     seen = objective.data.seen_vertices(x, objective.usual[-1].blur)
     assert 0.2 < seen.mean() < 0.8
-    expected = objective.rules.score_strain * np.sqrt(sigma * _strain(template, x) * template.scale)
-    expected *= np.where(seen, 1, objective.rules.score_unseen)
+    expected = SCORE * np.sqrt(sigma * _strain(template, x) * template.scale)
+    expected *= np.where(seen, 1, SCORE_UNSEEN)
     more = expected > sigma
     assert more.any() and np.allclose(found[more], expected[more], rtol=1e-5)
 
