@@ -192,28 +192,17 @@ SECTIONS = {
             ),
             figures.readings,
             "The preset takes both losses as φ-SfT's program does: absolute differences of stored "
-            "pixel values, and of blurred masks, means over the image. This sequence has no masks; "
-            "then colours are compared within the rendered sheet. So it keeps the sheet where the "
-            "print's white border lets it drift (second table), and where it is fast, 6 to 35 "
-            "pixels a frame, in frames 114 and 115, if it comes there from the right surface "
-            "(third table). The whole run comes there 9 mm off, and falls behind. No photometric "
-            "reading "
-            "falls by more than a tenth in the first third of the way from frame to frame (first "
-            "table); what decides is how much they weigh beside the lengths. Means over the sheet "
-            "weigh five times as much, and the sheet stretches and is lost. With lengths in "
-            "millimetres, as the authors' earlier program (github.com/dvttran/nsft) has them here, "
-            "k_mi = 0.1 is 3,849 of ours, too stiff to follow; in metres it would be 0.004, and "
-            "hold nothing. With masks, even the right ones, it falls behind where it is fast, nor "
-            "does it help there to weigh residuals by their size and to compare local contrast, "
-            "near to what that program does with images' derivatives (fourth table). Masks of "
-            "`prepare` run along the print's border, 2 % too large, so the sheet comes nearer. "
-            "Where the preset falls behind, from frame 70 on (fifth table), the right surface has "
-            "the lower loss: the descent ends before it. The ties between frames are to blame in "
-            "part: a sum over the vertices holds Δu and Δv, so the sheet must move by T_c, whose "
-            "500 steps of 1e-4 reach 10 mm where it moves by 16 mm a frame. With the *other "
-            "weights* of Table 2, but without masks, the fastest frames are within 1.1 mm, by the "
-            "paper's steps, and the sheet is lost later, in frame 131 (last table); a whole run by "
-            "them and longer rigid steps was given up there. With masks it is held.",
+            "pixel values, and of blurred masks, means over the image; colours within the rendered "
+            "sheet where there are no masks, as here. The tables say what was tried to hold this "
+            "sheet. Norm, colour space, blur (first): no reading falls by more than a tenth in a "
+            "third of the way to the next frame. Means over the sheet weigh five times as much; it "
+            "stretches and is lost. Lengths in millimetres, as in github.com/dvttran/nsft, are too "
+            "stiff. Masks, even the right ones, and residuals weighed and compared nearly as that "
+            "program does, do not hold it where it is fast (third, fourth). The descent ends too "
+            "early: from frame 70 on the right surface has the lower loss (fifth), and 500 steps "
+            "of 1e-4 carry T_c 10 mm where the sheet goes 16. Other weights (Table 2) hold the "
+            "fastest frames to 1.1 mm without masks, lose it in frame 131 (last), and hold it with "
+            "them.",
         ),
         Entry(
             "Table 3",
@@ -377,7 +366,12 @@ SECTIONS = {
         Entry(
             "Fine-tuning (section 1)",
             "A small number of samples of an object's kind improves accuracy.",
-            ("python -m polyfit.train MESH ... -o OUT --from polyfit",),
+            (
+                "python -m polyfit.train MESH ... -o OUT --from polyfit",
+                "python benchmarks/polyfit_accuracy.py DATA --runs RUNS --train --only sources "
+                "-o docs",
+            ),
+            figures.tuned,
         ),
         Entry(
             "Figure, orders 1 to 8",

@@ -308,6 +308,20 @@ def families(data):
     return _by_kind(data["polyfit_accuracy"].get("sources", {}), FAMILIES, "trained on")
 
 
+def tuned(data):
+    found = data["polyfit_accuracy"].get("sources", {})
+    about = data["polyfit_accuracy"].get("trained", {}).get("tuned")
+    names = "4 families", "4 families, fine-tuned on garment patches"
+    if not about or not all(name in found for name in names):
+        return ""
+    before, after = (both(found[name]["folded"]) for name in names)
+    return (
+        f"Of the four families alone, then {about['steps']} steps with {about['patches']:,}"
+        f" patches of six garments, {60 * about['minutes']:.0f} s: height / normals on folded"
+        f" patches of other garments go from {before} to {after}."
+    )
+
+
 def _by_kind(found, paper, first, ms=False):
     """A row for each of ``found``: height / normals by the kind of patches, and the paper's."""
     if not found:
