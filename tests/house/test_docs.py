@@ -29,6 +29,14 @@ SCENE = (ROOT / "docs" / "scene.md").read_text(encoding="utf-8")
 FOLDERS = "polysft_mi|polyfit|onefit|scenes|tests|docs|benchmarks|blender"
 
 
+WRITTEN = "\n".join(
+    path.read_text(encoding="utf-8")
+    for folder in (*FOLDERS.split("|"), "examples")
+    for kind in ("py", "xml", "ipynb")
+    for path in (ROOT / folder).rglob(f"*.{kind}")
+)
+
+
 def _resolves(name):
     """Whether ``name`` is a module, or an attribute of one."""
     with contextlib.suppress(ImportError):
@@ -51,6 +59,10 @@ class TestPage:
         assert [m for m in sorted(commands) if importlib.util.find_spec(m) is None] == []
         for name in re.findall(r"`((?:polysft_mi|polyfit|onefit)\.[\w.]+)", text):
             assert _resolves(name), name
+
+    def test_words_of_the_code_that_it_names_are_in_the_code(self, page):
+        named = re.findall(r"`([A-Za-z]\w*_\w+)`", page.read_text(encoding="utf-8"))
+        assert [w for w in sorted(set(named)) if not re.search(rf"\b{w}\b", WRITTEN)] == []
 
     def test_links_lead_somewhere(self, page):
         for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8")):
