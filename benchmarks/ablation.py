@@ -91,7 +91,7 @@ SWITCHES = (
     Switch("more iterations there", {"far_iterations": 6}),
     Switch("small step ends a stage", {"gain": 0.0}),
     Switch("mirror images", {"mirror_share": 0.0}),
-    Switch("texture fit", settings={"texture_fit": "none"}),
+    Switch("texture fit", {"texture_gain": 0.0}),
     Switch("joints", settings={"k_coupling": 0.0}, rounded=True),
     Switch("unseen parts are held", {"unseen": 1.0}, rounded=True),
     Switch("softer lengths", settings={"k_mi": 100.0}, rounded=True),

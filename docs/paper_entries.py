@@ -51,8 +51,7 @@ SECTIONS = {
             "ACVD it brings more (the table above). OneFit's tank top comes out alike by both "
             "(table 6), and so do most tracked sheets; the demo is better with it "
             "([tracker.md](tracker.md#the-frame-of-a-sheets-jet)). PCA is the default there, for a "
-            "plain install has no torch. The presets take it: the tracker's and PolyFit's the one "
-            "of the paper's training, OneFit's the package's own, of five quaternions.",
+            "plain install has no torch. All presets take it, the one of the paper's training.",
         ),
         Entry(
             "Section 3, jets",
@@ -331,14 +330,14 @@ SECTIONS = {
             "Each loss left out, on the tank top.",
             (
                 "python benchmarks/onefit_paper.py RUNS --short 60 --train tank tank-no-mesh-inext "
-                "tank-no-inext tank-no-col",
+                "tank-no-inext tank-no-col tank-no-boundary tank-pca tank-ours",
                 f"{ONEFIT} --tables losses",
             ),
             figures.losses,
-            "Trained for minutes, 720 steps each. Mesh inextensibility and collision do what they "
-            "do in the paper; without inextensibility edges change more, collisions do not. What "
-            "our inputs and patches bring is a row more, `--train tank-ours`; what the transformer "
-            "does, another, `--train tank-pca`.",
+            "Trained for minutes, 720 steps each. Mesh inextensibility does what it does in the "
+            "paper, collision far more; without inextensibility edges change more, collisions do "
+            "not. The last rows are not the paper's: the boundary loss left out, our inputs and "
+            "patches, and frames by PCA alone.",
         ),
         Entry(
             "Table 7",

@@ -24,6 +24,7 @@ _SIZE = 7  # of the unknowns (l_0, l, g)
 _UPPER = np.triu_indices(_SIZE)
 # standard deviation of a normal distribution over the median of its absolute values
 _NORMAL_DEVIATION = 1.4826
+_LEAST_SCALE = 1e-4  # where a light explains all, as in a rendering
 
 
 @dataclass
@@ -93,10 +94,11 @@ class Light:
     @property
     def scale(self):
         """The residual, over the texture's mean luminance, from which on one hardly counts."""
-        least, most = self.rules.light_scale_bounds
+        most = self.rules.light_most
         if not self.frames:
             return most
-        return float(np.clip(self.rules.light_scale * self.deviations / self.frames, least, most))
+        found = self.rules.light_scale * self.deviations / self.frames
+        return min(max(found, _LEAST_SCALE), most)
 
     def coefficients(self, triangles):
         """(l_0, l, g) (7,), of a sheet of so many triangles; the same from all sides where nothing
@@ -187,7 +189,7 @@ class Brightness:
         covered = cv2.GaussianBlur(inside, (0, 0), sigma)
         luminance = blur(texture.image @ _LUMINANCE, sigma, inside if masked else None)
         found = _sampled(luminance, centroids)
-        self.trusted = _sampled(covered, centroids) > rules.shading_inside[not masked]
+        self.trusted = _sampled(covered, centroids) > (0.0 if masked else rules.shading_inside)
         self.mean = max(float(found[self.trusted].mean()) if self.trusted.any() else 0.0, 1e-6)
         self.texture = found / self.mean
         self.trusted &= self.texture > 0

@@ -90,8 +90,8 @@ class Objective:
 
     def d(self, context: FrameContext, stage: Stage) -> int:
         """Local unknowns of a vertex: 3 where its relief moves, or 2."""
-        held = self.rules.holds_relief(context.memory.noise) or self.is_known(context)
-        return 3 if self.has_relief and stage.relief and not held else 2
+        moves = self.has_relief and stage.relief and not self.is_known(context)
+        return 3 if moves else 2
 
     def is_known(self, context: FrameContext) -> bool:
         """Whether the surface has the template's shape in a frame: the first, but on a body."""

@@ -114,9 +114,6 @@ class Rules:
         row="relief's caution",
     )
     noise_power: float = _rule(8.0, "", "with which it grows with the noise")
-    noise_most: float = _rule(
-        300.0, "", "factor of the relief's weight from which on the relief does not move at all"
-    )
     give: float = _rule(
         0.002,
         "strain",
@@ -125,10 +122,12 @@ class Rules:
     )
     # the texture
     texels: float = _rule(1.5, "texels", "of the baked texture to a pixel of the first frame")
-    texture_misfit: float = _rule(
-        0.15, "misfit", "of the first frame, above which the texture is fitted to it"
+    texture_gain: float = _rule(
+        0.6,
+        "share",
+        "of the first frame's misfit that may be left, for the texture to be fitted to it",
+        row="texture fit",
     )
-    texture_gain: float = _rule(0.6, "share", "of that misfit that may be left, for it to be taken")
     appearance: bool = _rule(
         True,
         "",
@@ -140,10 +139,10 @@ class Rules:
     )
     # shading
     shading_blur: float = _rule(0.45, "triangles", "blur of texture and frames, in triangle sides")
-    shading_inside: tuple = _rule(
-        (0.3, 0.97),
+    shading_inside: float = _rule(
+        0.97,
         "share",
-        "of a triangle's surroundings that must be texture, with and without masks",
+        "of a triangle's surroundings that must be texture, where images have no masks",
     )
     exposure: bool = _rule(
         True, "", "whether a frame's overall brightness is its own", row="exposure"
@@ -156,10 +155,8 @@ class Rules:
         0.8, "share", "of what earlier frames say of light, a frame later", row="light's memory"
     )
     light_scale: float = _rule(8.0, "deviations", "at which a triangle's residual is an outlier")
-    light_scale_bounds: tuple = _rule(
-        (0.005, 0.05),
-        "share",
-        "of the mean luminance, bounds of that scale; first it is the larger",
+    light_most: float = _rule(
+        0.05, "share", "of the mean luminance, the most that this may be, and what it is at first"
     )
 
     def for_patches(self, count: int) -> "Rules":
@@ -169,11 +166,7 @@ class Rules:
     def caution(self, noise):
         """The factor by which weights grow with the ``noise`` (a misfit; NaN: none is known)."""
         noise = 0.0 if math.isnan(noise) else noise
-        return 1 + min((noise / self.noise_misfit) ** self.noise_power, self.noise_most)
-
-    def holds_relief(self, noise):
-        """Whether the ``noise`` (a misfit) is so much that the relief would hardly move."""
-        return self.caution(noise) > self.noise_most
+        return 1 + (noise / self.noise_misfit) ** self.noise_power
 
 
 def table():

@@ -26,7 +26,7 @@ def fit_texture(problem, objective, context):
     if len(atlas) > 1:  # texture coordinates with seams are no function of a chart
         return
     misfit = lambda state: data.misfit(atlas.surface(state).vertices, 0, finest.blur)
-    if (before := misfit(state)) < rules.texture_misfit:
+    if (before := misfit(state)) < rules.margin:
         return
     for stage in objective.usual[:2]:
         loose = replace(stage, stiffness=_STIFFNESS, gives=False)

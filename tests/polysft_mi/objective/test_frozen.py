@@ -100,9 +100,7 @@ def _in_plane(objective):
     return np.column_stack([chart, np.zeros(len(chart))])
 
 
-@pytest.mark.parametrize(
-    "noise, moves", [(math.nan, [2, 2, 2]), (0.05, [2, 3, 3]), (0.2, [2, 2, 2])]
-)
+@pytest.mark.parametrize("noise, moves", [(math.nan, [2, 2, 2]), (0.05, [2, 3, 3])])
 def test_stages_in_which_the_relief_moves(problem, noise, moves):
     objective = Objective(problem)
     rest = objective.atlas.state(problem.patch.rest().to_numpy())
@@ -122,7 +120,6 @@ def test_rules_are_immutable_and_each_is_told():
         rules.give = 1.0
     assert all(f.metadata["doc"] for f in dataclasses.fields(rules))
     assert rules.caution(math.nan) == 1.0 and rules.caution(rules.noise_misfit) == 2.0
-    assert rules.caution(1e3) == 1 + rules.noise_most
 
 
 def test_weights_that_are_left_to_the_template():

@@ -30,7 +30,7 @@ def test_texture_is_fitted_to_the_first_frame(truth, tmp_path):
     )
     misfit = []
     for fit in ("none", "auto"):
-        problem = problem_of(moved, rules=Rules(texture_misfit=0.0), last=0, texture_fit=fit)
+        problem = problem_of(moved, rules=Rules(margin=0.0), last=0, texture_fit=fit)
         tracker = FrameTracker(problem)
         tracker.solve([problem.atlas.state(problem.patch.rest().to_numpy())], [0])
         objective = tracker.objective
@@ -148,8 +148,7 @@ def test_relief_moves_only_where_it_may(truth, tracked, tmp_path):
     assert none == 0 < little < 0.1 * usual
     noisy = Rules(noise_misfit=1e-6)
     done = track(FrameTracker(problem_of(truth.folder, rules=noisy)), 3, str(tmp_path))
-    assert not any(state["delta_w"].any() for state in done.states)
-    assert noisy.holds_relief(1e-3) and not noisy.holds_relief(math.nan)
+    assert all(np.abs(state["delta_w"]).max() < 1e-6 * usual for state in done.states)
 
 
 def test_noise_is_the_least_misfit_but_for_the_first_frame():
