@@ -55,14 +55,14 @@ class Rules:
     damping: tuple = _rule(
         (1e-4, 3e-3), "", "Levenberg-Marquardt damping at a stage's start, without and with relief"
     )
-    scale_bounds: tuple = _rule(
-        (0.2, 1.0), "deviations", "bounds of the robust scale", row="robust scale"
+    scale_least: float = _rule(
+        0.2, "deviations", "that the robust scale is at least", row="robust scale"
     )
     # frames that the stages do not explain
-    fine_passes: int = _rule(
-        8,
+    fine_passes: bool = _rule(
+        True,
         "",
-        "further passes of the fine stages for a frame that is not explained",
+        "whether a frame that is not explained goes through the fine stages again while they gain",
         row="fine passes",
     )
     # starts
@@ -84,10 +84,10 @@ class Rules:
         "over which the usual misfit is a median; of less than three there is none",
         row="other starts",
     )
-    far_iterations: int = _rule(
-        18,
+    far_converges: bool = _rule(
+        True,
         "",
-        "iterations a stage when a suspect frame is started anew",
+        "whether a suspect frame that is started anew takes steps until its stages converge",
         row="more iterations there",
     )
     # mirror images

@@ -6,8 +6,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-
 from polysft_mi.objective import FrameContext, Objective, QuadraticModel, Stage
 from polysft_mi.solvers import Report, Result, Solver
 from polysft_mi.surface import State
@@ -82,16 +80,17 @@ class Stages:
         """
         rules, fine = self.rules, self.objective.usual[1:]
         best = self._through(start, context, stages, iterations)
-        for count in range(rules.fine_passes if fine else 0):
-            explained = max(rules.margin, context.memory.explained)
-            if self.objective.is_known(context) or not best.misfit > explained:
-                break
+        if not fine or not rules.fine_passes or self.objective.is_known(context):
+            return best
+        is_first = True
+        while best.misfit > max(rules.margin, context.memory.explained):
             found = self._through(best.state, context, fine, iterations)
             gain = 1 - self.cost(found) / self.cost(best)
             if gain > 0:
                 best = found
-            if gain < rules.gain:
-                return replace(best, more_is_vain=count == 0)
+            if not gain >= rules.gain:
+                return replace(best, more_is_vain=is_first)
+            is_first = False
         return best
 
     @staticmethod
@@ -117,4 +116,4 @@ class Stages:
             return {}
         m = min(max(model.evaluation.outlier_share, 0.02), 0.98)
         stretched = self.objective.scale(context, stage) * math.sqrt(m / (1 - m) / 0.44)
-        return {stage: float(np.clip(stretched, *self.rules.scale_bounds))}
+        return {stage: max(stretched, self.rules.scale_least)}

@@ -9,6 +9,8 @@ import numpy as np
 
 from .relocate import TemplateFeatures, rigid_motion
 
+_MOST = 60  # steps of a stage, which ends before, where one promises little
+
 
 def motion_starts(start, history):
     """``start``, and where the motion from the last but one to the last state of ``history`` leads:
@@ -50,7 +52,7 @@ class Starts:
             # a body's pose is far off, and no frame before says by how much
             all_of = objective.far, *objective.usual
             bodily = [replace(stage, bodily=True) for stage in all_of[:3]]
-            return stages.descend(start, context, (*bodily, *all_of), rules.far_iterations)
+            return stages.descend(start, context, (*bodily, *all_of), self._many)
         best = stages.descend(
             self.nearest(starts, frame, objective.usual[0]), context, objective.usual
         )
@@ -63,10 +65,15 @@ class Starts:
                 break
             if (other := other()) is None:
                 continue
-            found = stages.descend(other, context, far, rules.far_iterations)
+            found = stages.descend(other, context, far, self._many)
             if stages.cost(found) < stages.cost(best):
                 best = found
         return best
+
+    @property
+    def _many(self):
+        """Steps of a stage from a start that may be far off; None: as usual."""
+        return _MOST if self._rules.far_converges else None
 
     @property
     def _has_shading(self):
