@@ -75,6 +75,7 @@ def milliseconds(model, seconds=3.0):
 
 
 def on_all(model, patches):
+    """The :func:`figures` of each kind of patches, by its name."""
     return {kind: figures(model, p) for kind, p in patches.items()}
 
 
@@ -94,7 +95,7 @@ def measure(data, runs):
     patches = kinds(data)
     main = trained(runs, "main", PolyFit.load) or PolyFit.pretrained(ORDER)
     every = {kind: str(len(p)) for kind, p in patches.items()}
-    report = {"patches": {kind: len(p) for kind, p in patches.items()}, "trained": making(runs)}
+    report = {"patches": {kind: len(p) for kind, p in patches.items()}}
 
     frames = {
         "PCA": PolyFit(ORDER),
@@ -173,7 +174,7 @@ def measure(data, runs):
         rows,
     )
 
-    return report | sources(patches, runs) | atlasnet(data, runs)
+    return report | sources(data, runs, patches) | atlasnet(data, runs)
 
 
 SOURCES = {  # what a network was trained on: its folder in RUNS, and the paper's figures of it
@@ -184,8 +185,9 @@ SOURCES = {  # what a network was trained on: its folder in RUNS, and the paper'
 }
 
 
-def sources(patches, runs):
-    """The table of training sets as a dictionary, printed."""
+def sources(data, runs, patches=None):
+    """The table of training sets as a dictionary, printed; ``patches``: the kinds of DATA."""
+    patches = patches or kinds(data)
     found = {
         title: (m, paper)
         for title, (run, paper) in SOURCES.items()
@@ -242,10 +244,9 @@ def autoencoded(model, points):
     )
 
 
-# the networks of a table that can be made alone
-TABLES = {
-    "sources": [run for run, _ in SOURCES.values()],
-    "atlasnet": [f"atlasnet{charts}" for charts in PAPER_ATLASNET],
+TABLES = {  # those that can be made alone, and their networks
+    "sources": (sources, [run for run, _ in SOURCES.values()]),
+    "atlasnet": (atlasnet, [f"atlasnet{charts}" for charts in PAPER_ATLASNET]),
 }
 
 
@@ -262,14 +263,12 @@ def main(argv=None):
     p.add_argument("-o", "--output", default="out/benchmarks")
     args = p.parse_args(argv)
     path = Path(args.output, "polyfit_accuracy.json")
+    make, networks = TABLES.get(args.only, (measure, TRAININGS))
     report = json.loads(path.read_text(encoding="utf-8")) if args.only and path.exists() else {}
     if args.train:
-        train_missing(args.data, args.runs, TABLES.get(args.only, TRAININGS))
-    if args.only == "sources":
-        report |= {"trained": report.get("trained", {}) | making(args.runs)}
-        report |= sources(kinds(args.data), args.runs)
-    else:
-        report |= (atlasnet if args.only else measure)(args.data, args.runs)
+        train_missing(args.data, args.runs, networks)
+    report["trained"] = report.get("trained", {}) | making(args.runs)
+    report |= make(args.data, args.runs)
     os.makedirs(args.output, exist_ok=True)
     with (
         aside(path) as temporary,

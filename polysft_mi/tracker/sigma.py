@@ -46,9 +46,9 @@ def score(objective, vertices, sigma):
     """How far off each of the ``vertices`` (N, 3) [m] may be along its ray, (N,) [m, float32], from
     its ``sigma`` (N,) [m].
 
-    With s the root of the mean squared strain around, and r the template's scale, it is
-    6 (sigma s r)^1/2, times 3.3 where no pixel sees the vertex, and sigma at least: a regression
-    of errors.
+    With s the root of the mean squared strain around, and r the template's scale, it is ``SCORE``
+    (sigma s r)^1/2, times ``SCORE_UNSEEN`` where no pixel sees the vertex, and sigma at least: a
+    regression of errors.
     """
     template = objective.problem.template
     found = SCORE * np.sqrt(sigma * _strain(template, vertices) * template.scale)

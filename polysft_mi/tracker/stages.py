@@ -88,7 +88,7 @@ class Stages:
             gain = 1 - self.cost(found) / self.cost(best)
             if gain > 0:
                 best = found
-            if not gain >= rules.gain:
+            if not gain > rules.gain:
                 return replace(best, more_is_vain=is_first)
             is_first = False
         return best

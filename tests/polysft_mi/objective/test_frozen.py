@@ -120,6 +120,7 @@ def test_rules_are_immutable_and_each_is_told():
         rules.give = 1.0
     assert all(f.metadata["doc"] for f in dataclasses.fields(rules))
     assert rules.caution(math.nan) == 1.0 and rules.caution(rules.noise_misfit) == 2.0
+    assert rules.caution(3 * rules.noise_misfit) == pytest.approx(1 + 3**rules.noise_power)
 
 
 def test_weights_that_are_left_to_the_template():
