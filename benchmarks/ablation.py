@@ -78,6 +78,7 @@ SWITCHES = (
     *(Switch(rule, chance=share) for rule, share in CHANCES.items()),
     Switch("appearance", {"appearance": False}),
     Switch("shading", settings={"k_shading": 0}),
+    Switch("chromaticity", settings={"k_chroma": 0}),
     Switch("exposure", {"exposure": False}),
     Switch("light's memory", {"light_kept": 1.0}),
     Switch("relief", settings={"k_relief": 0}),

@@ -9,8 +9,10 @@ __getattr__, __dir__, __all__ = lazy.attach(
     __name__,
     submodules=["differentiable"],
     submod_attrs={
+        "chroma": ["cast"],
         "data_term": ["Appearance", "DataTerm", "Evaluation"],
         "depth": ["DepthData", "DepthNoise"],
+        "gather": ["Images"],
         "light": ["Light"],
         "pixels": ["packed"],
         "pyramid": ["Level", "POOL", "compared"],

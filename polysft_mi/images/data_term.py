@@ -21,11 +21,13 @@ from polysft_mi.render import frozen
 from polysft_mi.surface import Pattern
 
 from . import pixels
+from .chroma import Chroma
 from .frames import Frames
 from .gather import Gather, Images
 from .light import Brightness
 from .pyramid import POOL, Level, compared
 from .texture import Texture, packed_image
+from .triangles import TriangleColours
 
 _ROBUST, _MEDIAN = 2.5, 0.6745  # deviations that count; the median size of a normal variable
 _BEHIND = 0.03  # [m] that a surface is behind what hides it
@@ -60,13 +62,13 @@ class Appearance:
 
     ``excess``: colours of the texture less those of the sheet's image, a
     :class:`polysft_mi.images.pixels.Image` on a part of the level's grid; ``misfit``: what it alone
-    would be as a misfit; ``luminance`` (F,): of the triangles' texture as the image shows it, over
-    its mean, or None; ``others``: of the same sheet, in other cameras.
+    would be as a misfit; ``colours`` (F, 3): of the triangles'
+    texture as the image shows it, or None; ``others``: of the same sheet, in other cameras.
     """
 
     excess: pixels.Image
     misfit: float
-    luminance: np.ndarray | None = None
+    colours: np.ndarray | None = None
     others: tuple = ()
 
 
@@ -103,7 +105,7 @@ class DataTerm:
         self.area = max(signed[signed > 0].sum(), -signed[signed < 0].sum())
         self._unit = max(1.0, math.sqrt(self.area) / _SHEET)
         self._frames = Frames(sequence, normalise)
-        self._levels, self._last, self._brightness = {}, None, None
+        self._levels, self._last, self._colours = {}, None, None
         self._before = None  # what hides the surface
 
     def level(self, blur):
@@ -118,24 +120,30 @@ class DataTerm:
 
     # -- what is known before a frame is looked at ---------------------------
 
-    def prefetch(self, frames, blurs, shading):
+    def prefetch(self, frames, blurs, coloured):
         """Read ``frames`` ahead in a second thread, for what follows at ``blurs``, and with
-        ``shading`` for :meth:`shade`; those beyond the video are left out.
+        ``coloured`` for :meth:`shade` and :meth:`chroma`; those beyond the video are left out.
         """
         # made here, because the thread must not touch the device
-        brightness = self.brightness if shading else None
-        self._frames.prefetch(frames, [self.level(blur) for blur in blurs], brightness)
+        colours = self.colours if coloured else None
+        self._frames.prefetch(frames, [self.level(blur) for blur in blurs], colours)
+
+    @property
+    def colours(self):
+        """The :class:`polysft_mi.images.triangles.TriangleColours` of the template and the video;
+        others once the texture has moved.
+        """
+        if self._colours is None:
+            position, _ = self.camera.project(self._start)
+            self._colours = TriangleColours(
+                self.faces, position, self.texture, self._masked, self._rules
+            )
+        return self._colours
 
     @property
     def brightness(self):
         """The :class:`polysft_mi.images.light.Brightness` of the template and the video."""
-        if self._brightness is None:
-            vertices, texture = self._start, self.texture
-            position, _ = self.camera.project(vertices)
-            self._brightness = Brightness(
-                self.faces, vertices, position, texture, self._masked, self._rules
-            )
-        return self._brightness
+        return Brightness(self.colours, self._start)
 
     def on_template(self, texels):
         """Points (K, 3) [m, world] of the template, as it stands first, at ``texels`` (K, 2) of the
@@ -152,7 +160,7 @@ class DataTerm:
         """
         if not self.texture.move(self._corner, chart, displaced):
             return False
-        self._brightness = None
+        self._colours = None
         self._placed.set_texcoords(self.texture.coordinates)
         return True
 
@@ -320,10 +328,25 @@ class DataTerm:
         """The triangles' :class:`polysft_mi.images.light.Shade` in a frame; ``seen`` as in
         :class:`Evaluation`. The texture's luminance is that of the ``appearance`` where it has one.
         """
-        luminance = self._frames.luminance(frame, self.brightness)
+        prepared = self._frames.colours(frame, self.colours)
         position, _ = self.camera.project(vertices)
-        known = appearance.luminance if appearance else None
-        return self.brightness.of(luminance, vertices, self.camera.origin, position, seen, known)
+        known = appearance.colours if appearance else None
+        return self.brightness.of(prepared, vertices, self.camera.origin, position, seen, known)
+
+    def shown(self, vertices, frame):
+        """The colours (F, 3) that a frame shows of a surface's triangles, wherever they are."""
+        position, _ = self.camera.project(vertices)
+        centres = position[self.faces].sum(1) / 3
+        return self.colours.shown(self._frames.colours(frame, self.colours), centres)
+
+    def chroma(self, vertices, frame, seen, cast, appearance=None):
+        """The triangles' :class:`polysft_mi.images.chroma.Chroma` in a frame; ``seen`` as in
+        :class:`Evaluation`, ``cast`` (F, 3): :func:`polysft_mi.images.chroma.cast`.
+        """
+        prepared = self._frames.colours(frame, self.colours)
+        known = appearance.colours if appearance else None
+        scale = self._rules.chroma_scale
+        return Chroma.of(self.colours, prepared, vertices, self.camera, seen, cast, scale, known)
 
     def appearance(self, vertices, blur, light=None, shaded=False):
         """The :class:`Appearance` of a sheet.
@@ -331,7 +354,7 @@ class DataTerm:
         A frame is blurred, and freed from lighting, in the image; the texture on the template, once
         for all. Where the sheet is seen at a slant, or hides a part of itself, these differ. So the
         sheet is rendered, under the ``light`` (7,) of :class:`polysft_mi.images.light.Light` where
-        it is known, and then treated like a frame. ``shaded``: with the triangles' luminance.
+        it is known, and then treated like a frame. ``shaded``: with the triangles' colours.
         """
         level = self.level(blur)
         lit = np.ones(len(self.faces))
@@ -365,12 +388,12 @@ class DataTerm:
             squared = (excess**2).sum(-1) / 3
             misfit = float((squared / (squared + pixels.MISFIT**2)).sum() / max(inside.sum(), 1.0))
             excess = pixels.Image.of(packed_image(excess, np.zeros_like(inside)), (h, w), corner)
-        luminance = None
+        colours = None
         if shaded:
             position, _ = self.camera.project(vertices)
             at = position / level.stride - corner
-            luminance = self.brightness.texture_luminance(found[..., :3], inside, level.stride, at)
-        return Appearance(excess, misfit, luminance)
+            colours = self.colours.of_rendering(found[..., :3], inside, level.stride, at)
+        return Appearance(excess, misfit, colours)
 
     # -- parts ----------------------------------------------------------------
 

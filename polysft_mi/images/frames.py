@@ -62,13 +62,13 @@ class Frames:
         # all levels are made of one decoding
         self._decoded = lru_cache(2)(lambda frame: (sequence.frame(frame), sequence.mask(frame)))
 
-    def prefetch(self, frames, levels, brightness=None):
-        """Read ``frames`` ahead at ``levels`` and, with a
-        :class:`polysft_mi.images.light.Brightness`, their luminance.
+    def prefetch(self, frames, levels, triangles=None):
+        """Read ``frames`` ahead at ``levels`` and, with
+        :class:`polysft_mi.images.triangles.TriangleColours`, as these want them.
         """
         jobs = [(level, self._level_image, (level,)) for level in levels]
-        if brightness is not None:
-            jobs.append(("luminance", self._luminance, (brightness,)))
+        if triangles is not None:
+            jobs.append(("colours", self._colours, (triangles,)))
         for frame in frames:
             for key, read, arguments in jobs:
                 if frame < self._count and (frame, key) not in self._kept:
@@ -83,14 +83,14 @@ class Frames:
     def _level_image(self, frame, level):
         return level_image(*self._decoded(frame), level, self._normalise)
 
-    def _luminance(self, frame, brightness):
-        return brightness.frame_luminance(*self._decoded(frame))
+    def _colours(self, frame, triangles):
+        return triangles.of_frame(*self._decoded(frame))
 
-    def luminance(self, frame, brightness):
-        """What :meth:`polysft_mi.images.light.Brightness.frame_luminance` makes of a frame."""
-        if (frame, "luminance") not in self._kept:
-            self.prefetch([frame], [], brightness)
-        return self._kept[frame, "luminance"].result()
+    def colours(self, frame, triangles):
+        """What :meth:`polysft_mi.images.triangles.TriangleColours.of_frame` makes of a frame."""
+        if (frame, "colours") not in self._kept:
+            self.prefetch([frame], [], triangles)
+        return self._kept[frame, "colours"].result()
 
     def level(self, frame, level):
         """A :class:`Frame` at a level. Raises BadFrame where it is not finite."""

@@ -96,6 +96,9 @@ class Images:
     gradient: mi.Float64
     second: mi.Float64
 
+    def __add__(self, other):
+        return Images(self.gradient + other.gradient, self.second + other.second)
+
 
 def add(start, index, value, count):
     """Sums of value(entry), a list of ``count`` Float64, over the entries of each list."""

@@ -8,18 +8,14 @@ Reflectance and Linear Subspaces", PAMI 2003); that in the position, what of it 
 nearby. Where the sheet casts shadows on itself both are wrong, hence a robust norm.
 """
 
-import math
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 
-from polyfit.mesh import signed_areas
 from polysft_mi.scene import Rules
 
-from .pyramid import blur, shrink
+from .triangles import cross, luminance
 
-_LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # of linear RGB
 _SIZE = 7  # of the unknowns (l_0, l, g)
 _UPPER = np.triu_indices(_SIZE)
 # standard deviation of a normal distribution over the median of its absolute values
@@ -171,52 +167,21 @@ class Shade:
 
 
 class Brightness:
-    """Luminance of the template's texture and of frames, at the size of the triangles ``faces`` (F,
-    3).
+    """Luminance of the template's texture and of frames, at the size of the triangles.
 
-    ``vertices`` (N, 3) [m], ``position`` (N, 2) [pixels]: of the template, and in the image;
-    ``texture``: :class:`polysft_mi.images.texture.Texture`; ``masked``: whether the frames have
-    masks. Without them, what lies close to the border is left out, for the background is in it.
+    ``colours``: theirs, :class:`polysft_mi.images.triangles.TriangleColours`; ``vertices`` (N, 3)
+    [m]: of the template.
     """
 
-    def __init__(self, faces, vertices, position, texture, masked, rules):
-        self.faces, self.centre, self.rules = faces, vertices.mean(0), rules
+    def __init__(self, colours, vertices):
+        self.colours, self.faces, self.centre = colours, colours.faces, vertices.mean(0)
         self.unit = float(np.abs(vertices - self.centre).max())
-        self.sigma = rules.shading_blur * math.sqrt(
-            max(np.abs(signed_areas(position, faces)).mean(), 1.0)
-        )
-        sigma, inside, centroids = texture.density * self.sigma, texture.inside, texture.centroids()
-        covered = cv2.GaussianBlur(inside, (0, 0), sigma)
-        luminance = blur(texture.image @ _LUMINANCE, sigma, inside if masked else None)
-        found = _sampled(luminance, centroids)
-        self.trusted = _sampled(covered, centroids) > (0.0 if masked else rules.shading_inside)
-        self.mean = max(float(found[self.trusted].mean()) if self.trusted.any() else 0.0, 1e-6)
-        self.texture = found / self.mean
-        self.trusted &= self.texture > 0
-
-    def frame_luminance(self, colour, mask):
-        """A frame ``colour`` (H, W, 3) [linear RGB] with its ``mask`` (H, W) or None, as :meth:`of`
-        wants it: luminances over the texture's mean, blurred, on a grid of blocks of ``pool`` x
-        ``pool`` pixels, and ``pool``."""
-        image = colour @ _LUMINANCE
-        pool = max(1, int(self.sigma / 2))
-        if pool > 1:
-            image, mask = shrink(image, pool), None if mask is None else shrink(mask, pool)
-        return blur(image, self.sigma / pool, mask) / self.mean, pool
-
-    def texture_luminance(self, colour, inside, stride, position):
-        """Luminance (F,) of the triangles' texture over its mean, where a sheet's image without
-        light is ``colour`` (h, w, 3), covered by it where ``inside`` (h, w) is 1, of blocks of
-        ``stride`` x ``stride`` pixels, and its vertices lie at ``position`` (N, 2) [blocks] there.
-        """
-        image = blur(colour @ _LUMINANCE, self.sigma / stride, inside)
-        return _sampled(image, position[self.faces].sum(1) / 3 - 0.5) / self.mean
 
     def irradiance(self, vertices, origin, light):
         """How bright the ``light`` (7,) makes the triangles (F,) of a surface with ``vertices`` (N,
         3) [m], seen from ``origin`` (3,): averages over their neighbours."""
         corner = vertices[self.faces]
-        normal = _cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        normal = cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
         normal /= np.maximum(np.sqrt(np.einsum("fk,fk->f", normal, normal)), 1e-15)[:, None]
         centre = corner.sum(1) / 3
         normal *= -np.sign(np.einsum("fk,fk->f", normal, centre - origin))[:, None]
@@ -231,24 +196,21 @@ class Brightness:
     def of(self, prepared, vertices, origin, position, pixels, texture=None):
         """The :class:`Shade` of the surface with ``vertices`` (N, 3) [m], which lie at ``position``
         (N, 2) [pixels] in the image and of whose triangles ``pixels`` (F,) are seen; ``origin``
-        (3,): the camera's; ``texture`` (F,): the luminance of the texture, as :meth:`shown`.
+        (3,): the camera's; ``texture`` (F, 3): colours of the texture as an image shows it.
         """
-        image, pool = prepared
         corner = vertices[self.faces]
         a, b = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
         ray = corner.sum(1) / 3 - origin
-        cross = _cross(a, b)
-        double = np.maximum(np.sqrt(np.einsum("fk,fk->f", cross, cross)), 1e-15)
-        towards = -np.einsum("fk,fk->f", cross, ray)
+        across = cross(a, b)
+        double = np.maximum(np.sqrt(np.einsum("fk,fk->f", across, across)), 1e-15)
+        towards = -np.einsum("fk,fk->f", across, ray)
         facing = np.sign(towards)
-        normal = cross * (facing / double)[:, None]
-        luminance = _sampled(image, (position[self.faces].sum(1) / 3) / pool - 0.5)
-        texture = self.texture if texture is None else np.where(texture > 0, texture, self.texture)
-        seen = self.trusted & (pixels > 0)
+        normal = across * (facing / double)[:, None]
+        shown = luminance(self.colours.shown(prepared, position[self.faces].sum(1) / 3))
+        texture = luminance(self.colours.known(texture))
+        seen = self.colours.trusted & (pixels > 0)
         centre = (corner.sum(1) / 3 - self.centre) / self.unit
-        return Shade(
-            normal, centre, self.unit, texture, luminance, seen, (a, b), double / 2, facing
-        )
+        return Shade(normal, centre, self.unit, texture, shown, seen, (a, b), double / 2, facing)
 
 
 def residuals(shade, light, weight):
@@ -271,7 +233,7 @@ def residuals(shade, light, weight):
     across = (slope - shade.normal * (shade.normal @ slope)[:, None]) * (
         -shade.texture * shade.facing / (2 * shade.area)
     )[:, None]
-    second, third = _cross(b, across), _cross(across, a)
+    second, third = cross(b, across), cross(across, a)
     by_corner = (
         np.stack([-second - third, second, third], 1)
         - (shade.texture / (3 * shade.unit))[:, None, None] * gradient
@@ -285,18 +247,3 @@ def _exposure(value, lit):
     """
     known = (value > 0) & (lit > 0)
     return float(np.median(value[known] / lit[known])) if known.any() else 1.0
-
-
-def _cross(a, b):
-    """a x b of (F, 3) each; several times faster than numpy.cross."""
-    return np.stack([a[:, i] * b[:, j] - a[:, j] * b[:, i] for i, j in ((1, 2), (2, 0), (0, 1))], 1)
-
-
-def _sampled(image, points):
-    """The image at points (K, 2) [pixels, whole at their centres], (K,) float64, bilinear; the
-    border's values beyond it.
-    """
-    x, y = (np.ascontiguousarray(points[None, :, k], np.float32) for k in (0, 1))
-    return cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0].astype(
-        np.float64
-    )

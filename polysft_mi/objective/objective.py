@@ -141,7 +141,7 @@ class Objective:
         # colours as they are say that there is no light
         lit = self.data.normalise and light.frames
         coefficients = light.coefficients(len(self.data.faces)) if lit else None
-        shaded = self.settings.k_shading > 0 and stage.last
+        shaded = self.settings.compares_triangles and stage.last
         vertices = self.atlas.surface(state).vertices
         found = self.data.appearance(vertices, stage.blur, coefficients, shaded)
         if self.cameras:

@@ -33,7 +33,7 @@ from polysft_mi.images.gather import (
 from polysft_mi.render import frozen
 
 if TYPE_CHECKING:
-    from polysft_mi.images import Appearance, Evaluation
+    from polysft_mi.images import Appearance, Evaluation, Images
     from polysft_mi.surface import State, Surface
 
     from .context import FrameContext, Stage
@@ -104,7 +104,8 @@ class Linearisation:
     ``triangles``.
     Then in the unknowns: ``normal``, in whose local
     blocks ``diagonal`` (N,) are those of the vertices; ``edge_energy`` is that of the edges,
-    ``energies`` those of the terms that act on triangles. ``d``: local unknowns of a vertex (3 with
+    ``energies`` those of the terms that act on triangles or
+    images. ``d``: local unknowns of a vertex (3 with
     its relief, or 2).
     """
 
@@ -123,6 +124,12 @@ class Linearisation:
     edge_energy: float = 0.0
     energies: dict[str, float] = field(default_factory=dict)
     normal: NormalEquations = field(init=False)
+
+    def add_to_images(self, name: str, energy: float, images: Images) -> None:
+        """Add what the term ``name``, whose energy is ``energy``, says in the scene's camera."""
+        self.energies[name] = energy
+        (first, camera), *others = self.images
+        self.images = [(first + images, camera), *others]
 
     def add_to_triangles(self, name: str, energy: float, forms: TriangleForms) -> None:
         """Add the quadratic models of the term ``name``, whose energy is ``energy``."""

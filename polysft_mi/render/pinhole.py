@@ -68,6 +68,20 @@ class Pinhole:
         before = x[:, 2] > MIN_DEPTH
         return x[:, :2] / np.where(before, x[:, 2], 1)[:, None], before
 
+    def attached(self, points):
+        """:meth:`project` of a Point3d before the camera, in the same precision, attached: a
+        Vector2d.
+        """
+        x = mi.Matrix3d(self.inverse) @ (points - mi.Point3d(self.origin))
+        return mi.Vector2d(x.x / x.z, x.y / x.z)
+
+    def derivatives(self, points):
+        """Those of :meth:`project` by the points (N, 3) before the camera, (N, 2, 3) [pixels/m]."""
+        x = (np.asarray(points, dtype=np.float64) - self.origin) @ self.inverse.T
+        depth = np.maximum(x[:, 2], MIN_DEPTH)
+        at = x[:, :2] / depth[:, None]
+        return (self.inverse[:2] - at[:, :, None] * self.inverse[2]) / depth[:, None, None]
+
     def intrinsics(self):
         """The same camera as :class:`polysft_mi.camera.Intrinsics`, for points in the OpenCV camera
         frame.

@@ -137,7 +137,10 @@ class Rules:
     border: float = _rule(
         2.0, "windows", "from the sheet's border where images without masks are not corrected so"
     )
-    # shading
+    # colours of triangles
+    chroma_scale: float = _rule(
+        0.04, "share", "of the mean luminance, beyond which a triangle's chromaticity is an outlier"
+    )
     shading_blur: float = _rule(0.45, "triangles", "blur of texture and frames, in triangle sides")
     shading_inside: float = _rule(
         0.97,

@@ -122,6 +122,12 @@ class Settings:
         " video; 0: off",
         low=0,
     )
+    k_chroma: float = _setting(
+        9.0,
+        "weight of chromaticity: the triangles' colours but for their brightness, which light does"
+        " not change; 0: off",
+        low=0,
+    )
     k_cameras: float = _setting(1.0, "weight of the further cameras; 1: as the scene's own", low=0)
     k_tracks: float = _setting(
         1.0, "weight of the tracks; 1: as their noise, and the images', says", low=0
@@ -292,6 +298,11 @@ class Settings:
         """Frames a second of the images that are used."""
         return self.fps / self.stride if self.fps else 15.0
 
+    @property
+    def compares_triangles(self) -> bool:
+        """Whether triangles are compared by their colours."""
+        return self.k_shading > 0 or self.k_chroma > 0
+
     def jet_order(self, patches: int) -> int:
         """The order of the jets of so many patches, where the template's vertices determine it."""
         return self.order or (8 if patches == 1 else 5)
@@ -356,7 +367,9 @@ PRESETS: dict[str, dict[str, object]] = {
         "k_silhouette": 0.5,
         "k_mi": 0.1,
         "k_tc": 0.05,
-        **dict.fromkeys(("k_shading", "k_volume", "k_bend", "k_coupling", "k_uv", "k_relief"), 0.0),
+        **dict.fromkeys(
+            ("k_shading", "k_chroma", "k_volume", "k_bend", "k_coupling", "k_uv", "k_relief"), 0.0
+        ),
         "rgb_norm": "phi-sft",
         "rgb_region": "image",
         "silhouette_norm": "phi-sft",

@@ -40,6 +40,18 @@ class Pattern:
             ),
             shape=(len(edges), count),
         )
+        a, b = np.repeat(np.arange(3), 3), np.tile(np.arange(3), 3)
+        first, second = faces[:, a], faces[:, b]
+        triangle, pair = np.nonzero(first <= second)
+        half = self.find_half(first[triangle, pair], second[triangle, pair])
+        #: (N, F), (U, F): sums over the triangles at a vertex, and at a pair of corners
+        self.corners, self.shares = (
+            sp.csr_matrix((np.ones(len(k)), (k, f)), shape=(n, len(faces)))
+            for k, f, n in (
+                (faces.ravel(), np.repeat(np.arange(len(faces)), 3), count),
+                (half, triangle, len(self.upper)),
+            )
+        )
         self.to_ends = self.difference.T.tocsr()  # sums over the edges at a vertex, with signs
         graph = sp.csr_matrix(
             (np.ones(len(self._keys)), (self.row, self.column)), shape=(count, count)

@@ -262,7 +262,7 @@ class FrameTracker:
         if self._learns:
             frames = [k for k in (frame, frame + 1) if k < len(self.problem.sequence)]
             blurs = [stage.blur for stage in self.objective.usual]
-            self.objective.data.prefetch(frames, blurs, self.settings.k_shading > 0)
+            self.objective.data.prefetch(frames, blurs, self.settings.compares_triangles)
 
     def _context(self, frame, anchor, known):
         """The :class:`FrameContext` of a frame after those whose memory is ``known``."""

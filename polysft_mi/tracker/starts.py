@@ -59,7 +59,7 @@ class Starts:
         limit = self._suspect_above(usual_misfits)
         far = objective.far, *objective.usual
         if best.misfit > limit:
-            objective.data.prefetch([frame], [objective.far.blur], self._has_shading)
+            objective.data.prefetch([frame], [objective.far.blur], self._by_colour)
         for other in (lambda: self.nearest(starts, frame, far[0]), lambda: self._rigid(frame)):
             if not best.misfit > limit:
                 break
@@ -76,8 +76,8 @@ class Starts:
         return _MOST if self._rules.far_converges else None
 
     @property
-    def _has_shading(self):
-        return self._problem.settings.k_shading > 0
+    def _by_colour(self):
+        return self._problem.settings.compares_triangles
 
     def _suspect_above(self, usual):
         """The misfit above which a frame is suspect: infinite while those of the frames before are

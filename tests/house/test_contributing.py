@@ -19,7 +19,7 @@ def objective(tmp_path):
     text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
     names = {}
     exec(re.search(r"```python\n(.*?)```", text, re.S)[1], names)
-    weights = dict(k_rgb=0.0, k_silhouette=0.0, k_shading=0.0, k_tc=0.0)
+    weights = dict(k_rgb=0.0, k_silhouette=0.0, k_shading=0.0, k_chroma=0.0, k_tc=0.0)
     found = Objective(problem_of(small_cloth(tmp_path, frames=1).folder, order=3, **weights))
     inputs = dataclasses.replace(found.inputs, settings=_Weighted(found.settings))
     found.terms.append(names["Plane"](inputs))

@@ -7,6 +7,7 @@ variant is set.
 
 from .bending import Bending
 from .cameras import Cameras
+from .chroma import Chroma
 from .coupling import PatchCoupling
 from .depth import Depth
 from .drape import Drape
@@ -26,6 +27,7 @@ TERMS: tuple[type[Term], ...] = (
     Photometric,
     Silhouette,
     Shading,
+    Chroma,
     Cameras,
     Tracks,
     Depth,

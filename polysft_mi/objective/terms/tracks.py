@@ -96,12 +96,8 @@ class Tracks(Term):
             index = on_device(self._faces[self.face[chosen], corner], mi.UInt32)
             weight = on_device(self.weights[chosen, corner], mi.Float64)
             point += weight * dr.gather(mi.Point3d, flat, index)
-        inverse = mi.Matrix3d(self._camera.inverse)
-        x = inverse @ (point - mi.Point3d(self._camera.origin))
-        target = self._tracks.positions[frame, chosen]
-        squared = dr.square(x.x / x.z - on_device(target[:, 0], mi.Float64)) + dr.square(
-            x.y / x.z - on_device(target[:, 1], mi.Float64)
-        )
+        target = mi.Vector2d(self._tracks.positions[frame, chosen].T)
+        squared = dr.squared_norm(self._camera.attached(point) - target)
         factor, scale = self._factor(at.context), self._scale(at.context, at.stage)
         rho = float(2 * factor * scale**2) * (dr.sqrt(1 + squared / float(scale**2)) - 1)
         return mi.Float(dr.sum(rho))
@@ -138,11 +134,9 @@ class Tracks(Term):
         """
         chosen = self._chosen(frame)
         point = self._points(vertices, chosen)
-        inverse = self._camera.inverse
-        x = (point - self._camera.origin) @ inverse.T
-        projected = x[:, :2] / x[:, 2:]
-        by_point = (inverse[:2] - projected[:, :, None] * inverse[2]) / x[:, 2, None, None]
-        return projected - self._tracks.positions[frame, chosen], by_point, chosen
+        projected, _ = self._camera.project(point)
+        away = projected - self._tracks.positions[frame, chosen]
+        return away, self._camera.derivatives(point), chosen
 
     def _points(self, vertices, chosen):
         """Where the points of the ``chosen`` tracks are on a surface (N, 3) [m], (P, 3) [m]."""

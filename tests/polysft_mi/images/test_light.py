@@ -11,6 +11,7 @@ import synthetic
 from problems import data_of, problem_of
 
 from polysft_mi.images.light import Brightness, Light, residuals
+from polysft_mi.images.triangles import TriangleColours, luminance
 from polysft_mi.objective import FrameContext, FrameMemory, Objective
 from polysft_mi.scene.rules import Rules
 from polysft_mi.solvers.linear import Reduced
@@ -40,13 +41,13 @@ def brightness(luminance=0.5, masked=False):
     texels = np.stack([u, v], -1).reshape(-1, 2)[FACES].mean(1)
     flat = synthetic.sheet(0, ROWS, COLUMNS)
     baked = SimpleNamespace(image=texture, inside=inside, density=1.5, centroids=lambda: texels)
-    return Brightness(FACES, flat, project(flat), baked, masked, Rules())
+    return Brightness(TriangleColours(FACES, project(flat), baked, masked, Rules()), flat)
 
 
 def shade_of(found, vertices, image, seen=1e9, mask=None):
     colour = np.broadcast_to(np.asarray(image, np.float32)[..., None], (120, 160, 3))
     return found.of(
-        found.frame_luminance(colour, mask),
+        found.colours.of_frame(colour, mask),
         vertices,
         np.zeros(3),
         project(vertices),
@@ -171,12 +172,12 @@ def test_what_a_frame_shows_of_each_triangle():
     y, x = np.mgrid[:64, :64] / 63
     texture = 0.4 + 0.2 * x + 0.1 * y
     found, vertices = brightness(texture), synthetic.sheet(0, ROWS, COLUMNS)
-    shade = shade_of(found, vertices, 0.7 * found.mean)
+    shade = shade_of(found, vertices, 0.7 * found.colours.mean)
     assert shade.luminance == pytest.approx(0.7, rel=1e-5)
     assert shade.texture[shade.seen].mean() == pytest.approx(1, rel=1e-5)
     u, v = ((vertices[FACES].mean(1) / (0.12, 0.09, 1))[:, :2].T + 1) / 2
     np.testing.assert_allclose(
-        shade.texture[shade.seen] * found.mean,
+        shade.texture[shade.seen] * found.colours.mean,
         (0.4 + 0.2 * u + 0.1 * (1 - v))[shade.seen],
         atol=0.01,
     )
@@ -190,20 +191,20 @@ def test_only_triangles_that_are_seen_count():
     assert shade_of(found, flat, 0.4, seen=1.0).seen.all()
     assert not shade_of(found, flat, 0.4, seen=0.0).seen.any()
     assert (
-        not brightness().trusted.all()
+        not brightness().colours.trusted.all()
     )  # without masks the background is in what lies at the border
     assert not brightness(
         np.zeros((64, 64)), masked=True
-    ).trusted.any()  # a black texture says nothing
+    ).colours.trusted.any()  # a black texture says nothing
 
 
 def test_a_frame_larger_than_its_triangles_need_is_shrunk():
-    found = brightness(masked=True)
+    found = brightness(masked=True).colours
     found.sigma = 6.0
-    image, pool = found.frame_luminance(
+    image, pool = found.of_frame(
         np.full((120, 160, 3), 0.4, np.float32), np.ones((120, 160), np.float32)
     )
-    assert pool == 3 and image.shape == (40, 53) and image == pytest.approx(0.8, rel=1e-5)
+    assert pool == 3 and image.shape == (40, 53, 3) and image == pytest.approx(0.8, rel=1e-5)
 
 
 def test_the_light_is_learned_from_surfaces_that_bend():
@@ -333,12 +334,12 @@ def test_what_is_known_of_the_light_survives_an_interruption(truth, tracked, tmp
     )
 
 
-def test_a_texture_that_moves_takes_its_brightness_along(truth):
+def test_a_texture_that_moves_takes_its_colours_along(truth):
     problem = problem_of(truth.folder)
     images = data_of(problem)
-    before, chart = images.brightness.texture, problem.template.chart[:, 0]
+    before, chart = images.colours.colour, problem.template.chart[:, 0]
     assert images.move_texture(chart, chart + 0.1)
-    assert np.abs(images.brightness.texture - before).max() > 0.05
+    assert np.abs(images.colours.colour - before).max() > 0.05
 
 
 @pytest.mark.parametrize("stage", [0, 1, 2])
@@ -375,23 +376,25 @@ def test_what_a_light_makes_of_each_triangle():
     assert min(one.min(), other.min()) == 0 < max(one.max(), other.max())  # no light is less
 
 
-def test_a_textures_luminance_as_an_image_shows_it():
+def test_a_textures_colours_as_an_image_shows_them():
     found, vertices = brightness(), synthetic.sheet(0, ROWS, COLUMNS)
     image = np.broadcast_to(
         np.linspace(0.2, 0.8, 80, dtype=np.float32)[None, :, None], (60, 80, 3)
     )  # on a grid of two pixels
-    value = found.texture_luminance(image, np.ones((60, 80), np.float32), 2, project(vertices) / 2)
+    value = found.colours.of_rendering(
+        image, np.ones((60, 80), np.float32), 2, project(vertices) / 2
+    )
     x = project(vertices)[FACES].mean(1)[:, 0] / 2 - 0.5
-    assert np.allclose(value * found.mean, 0.2 + 0.6 * x / 79, atol=1e-3)
+    assert np.allclose(value * found.colours.mean, (0.2 + 0.6 * x / 79)[:, None], atol=1e-3)
     assert np.array_equal(
-        shade_of(found, vertices, np.full((120, 160), 0.5)).texture, found.texture
+        shade_of(found, vertices, np.full((120, 160), 0.5)).texture, luminance(found.colours.colour)
     )
     known = found.of(
-        found.frame_luminance(np.full((120, 160, 3), 0.5, np.float32), None),
+        found.colours.of_frame(np.full((120, 160, 3), 0.5, np.float32), None),
         vertices,
         np.zeros(3),
         project(vertices),
         np.full(len(FACES), 1e9),
         value,
     )
-    assert np.array_equal(known.texture, value)
+    assert np.array_equal(known.texture, luminance(value))

@@ -21,7 +21,9 @@ from polysft_mi.scene import DepthImages, Tracks
 from polysft_mi.scene.cameras import OtherCamera
 from polysft_mi.surface.patch import Unknowns
 
-GEOMETRY = "shading tracks depth inextensibility temporal bending coupling sliding relief".split()
+GEOMETRY = (
+    "shading chroma tracks depth inextensibility temporal bending coupling sliding relief".split()
+)
 WEIGHTS = dict(
     k_rgb=0.0,
     k_silhouette=0.0,
@@ -30,6 +32,7 @@ WEIGHTS = dict(
     k_uv=0.2,
     k_relief=0.4,
     k_shading=9.0,
+    k_chroma=9.0,
     tracks="known",  # by observe
     depth="known",
 )
@@ -153,8 +156,9 @@ def test_closed_forms_are_those_of_automatic_differentiation(problem, name, rng)
     assert max(np.abs(by_globals).max(), np.abs(by_offset).max()) > 1e-6
 
 
-# what an image shows of a triangle is detached where it is shaded, and pixels change hands at rims
-@pytest.mark.parametrize("name", [n for n in GEOMETRY if n not in ("shading", "depth")])
+# what an image shows of a triangle is detached, or its slope a difference; pixels change hands at
+# rims
+@pytest.mark.parametrize("name", [n for n in GEOMETRY if n not in ("shading", "chroma", "depth")])
 def test_curvatures_promise_the_change(problem, name, rng):
     """Where a term is a sum of squares, what its quadratic model promises of a small step is the
     change of its energy; where its norm is robust, or it takes Gauss-Newton's part, no more.

@@ -15,7 +15,9 @@ from polysft_mi.objective import FrameContext, Objective
 from polysft_mi.tracker import FrameTracker
 
 TERMS = "drape pose inextensibility temporal bending coupling sliding relief".split()
-WEIGHTS = dict(k_rgb=0.0, k_silhouette=0.0, k_shading=0.0, k_tc=0.3, k_bend=1e-2, k_uv=0.2)
+WEIGHTS = dict(
+    k_rgb=0.0, k_silhouette=0.0, k_shading=0.0, k_chroma=0.0, k_tc=0.3, k_bend=1e-2, k_uv=0.2
+)
 WEIGHTS |= dict(k_relief=0.4, k_drape=5.0, k_pose=3.0)
 
 

@@ -103,7 +103,7 @@ def test_a_windows_step_is_that_of_the_dense_system(truth):
     of all frames together.
     """
     rng = np.random.default_rng(4)
-    weights = dict(k_rgb=0.0, k_silhouette=0.0, k_tc=0.5, k_bend=1e-2, k_shading=0.0)
+    weights = dict(k_rgb=0.0, k_silhouette=0.0, k_tc=0.5, k_bend=1e-2, k_shading=0.0, k_chroma=0.0)
     objective = Objective(problem_of(truth.folder, **weights))
     before, *states = [some_state(objective.atlas, rng, 0.01) for _ in range(4)]
     contexts = [FrameContext(k, before if k == 0 else None) for k in range(3)]
