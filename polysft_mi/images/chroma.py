@@ -42,8 +42,9 @@ class Chroma:
         position, _ = camera.project(vertices)
         centres = position[colours.faces].sum(1) / 3
         shown, expected = colours.shown(prepared, centres), colours.known(texture) * cast
-        counts = colours.trusted & (pixels > 0) & (expected > _LEAST).all(1)
-        unit = expected / np.maximum(np.linalg.norm(expected, axis=1), _LEAST)[:, None]
+        length = np.linalg.norm(expected, axis=1)
+        counts = colours.trusted & (pixels > 0) & (length > _LEAST)
+        unit = expected / np.maximum(length, _LEAST)[:, None]
         one = cross(unit, np.eye(3)[np.abs(unit).argmin(1)])
         one /= np.maximum(np.linalg.norm(one, axis=1), _LEAST)[:, None]
         across = np.stack([one, cross(unit, one)], 1)

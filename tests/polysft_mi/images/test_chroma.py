@@ -123,6 +123,7 @@ def test_what_counts(colours):
     found = chroma(colours, hues(X, Y), seen=seen)
     assert ((found.area > 0) == (seen > 0)).all()
     assert found.area[seen > 0].mean() == pytest.approx(1)
+    assert chroma(colours, hues(X, Y), cast=np.array([1.0, 0, 0])).area.all()  # a pure colour
     black = chroma(colours, hues(X, Y), cast=0.0)
     assert not black.area.any() and np.isfinite(black.residual).all()
 
