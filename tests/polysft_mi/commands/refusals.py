@@ -27,7 +27,7 @@ def refused(scene, *options, out=None):
         "\n" not in message
         and "Traceback" not in message
         and ".cpp" not in message
-        and len(message) < 700
+        and len(message) < 800
     )
     return message
 
