@@ -9,7 +9,7 @@ __getattr__, __dir__, __all__ = lazy.attach(
     __name__,
     submodules=["differentiable"],
     submod_attrs={
-        "chroma": ["cast"],
+        "chroma": ["colour_cast"],
         "data_term": ["Appearance", "DataTerm", "Evaluation"],
         "depth": ["DepthData", "DepthNoise"],
         "gather": ["Images"],

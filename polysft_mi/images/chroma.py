@@ -33,7 +33,7 @@ class Chroma:
         """Of the surface with ``vertices`` (N, 3) [m] in the frame ``prepared`` by the ``colours``,
         :class:`polysft_mi.images.triangles.TriangleColours`. ``pixels`` (F,) of its triangles are
         seen; ``texture`` (F, 3): colours of the texture as an image shows it; ``cast`` (F, 3): what
-        those of the template are multiplied by, as another frame shows it (:func:`cast`).
+        those of the template are multiplied by, as another frame shows it (:func:`colour_cast`).
 
         A frame's white balance is its own: the channels' gains, whose mean is 1, are those of the
         least sum of ``scale`` ^2 log(1 + r^2 / ``scale`` ^2). At its least, that has no slope along
@@ -76,7 +76,7 @@ class Chroma:
         return np.einsum("np,npk->nk", at_corners, self.by_vertex), second.reshape(-1, 2, 2)
 
 
-def cast(colours, shown, pixels):
+def colour_cast(colours, shown, pixels):
     """(F, 3): by what a frame that shows the triangles as ``shown`` (F, 3) multiplies the colours
     of their texture, over the usual: a camera's curve, the light's colour. Between 1/2 and 2; the
     usual where none of the ``pixels`` (F,) is a triangle's.

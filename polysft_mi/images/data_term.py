@@ -62,8 +62,9 @@ class Appearance:
 
     ``excess``: colours of the texture less those of the sheet's image, a
     :class:`polysft_mi.images.pixels.Image` on a part of the level's grid; ``misfit``: what it alone
-    would be as a misfit; ``colours`` (F, 3): of the triangles'
-    texture as the image shows it, or None; ``others``: of the same sheet, in other cameras.
+    would be as a misfit; ``colours`` (F, 3): of the triangles' texture as the image shows it,
+    linear RGB over the mean of its luminance, or None; ``others``: of the same sheet, in other
+    cameras.
     """
 
     excess: pixels.Image
@@ -334,14 +335,16 @@ class DataTerm:
         return self.brightness.of(prepared, vertices, self.camera.origin, position, seen, known)
 
     def shown(self, vertices, frame):
-        """The colours (F, 3) that a frame shows of a surface's triangles, wherever they are."""
+        """The colours (F, 3) that a frame shows where the triangles of a surface are, seen or not,
+        as :class:`polysft_mi.images.triangles.TriangleColours` has them.
+        """
         position, _ = self.camera.project(vertices)
         centres = position[self.faces].sum(1) / 3
         return self.colours.shown(self._frames.colours(frame, self.colours), centres)
 
     def chroma(self, vertices, frame, seen, cast, appearance=None):
         """The triangles' :class:`polysft_mi.images.chroma.Chroma` in a frame; ``seen`` as in
-        :class:`Evaluation`, ``cast`` (F, 3): :func:`polysft_mi.images.chroma.cast`.
+        :class:`Evaluation`, ``cast`` (F, 3): :func:`polysft_mi.images.chroma.colour_cast`.
         """
         prepared = self._frames.colours(frame, self.colours)
         known = appearance.colours if appearance else None

@@ -104,8 +104,8 @@ class Linearisation:
     ``triangles``.
     Then in the unknowns: ``normal``, in whose local
     blocks ``diagonal`` (N,) are those of the vertices; ``edge_energy`` is that of the edges,
-    ``energies`` those of the terms that act on triangles or
-    images. ``d``: local unknowns of a vertex (3 with
+    ``energies`` those of the terms that act on triangles or images. ``d``: local unknowns of a
+    vertex (3 with
     its relief, or 2).
     """
 

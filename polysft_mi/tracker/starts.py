@@ -59,7 +59,9 @@ class Starts:
         limit = self._suspect_above(usual_misfits)
         far = objective.far, *objective.usual
         if best.misfit > limit:
-            objective.data.prefetch([frame], [objective.far.blur], self._by_colour)
+            objective.data.prefetch(
+                [frame], [objective.far.blur], self._problem.settings.compares_triangles
+            )
         for other in (lambda: self.nearest(starts, frame, far[0]), lambda: self._rigid(frame)):
             if not best.misfit > limit:
                 break
@@ -74,10 +76,6 @@ class Starts:
     def _many(self):
         """Steps of a stage from a start that may be far off; None: as usual."""
         return _MOST if self._rules.far_converges else None
-
-    @property
-    def _by_colour(self):
-        return self._problem.settings.compares_triangles
 
     def _suspect_above(self, usual):
         """The misfit above which a frame is suspect: infinite while those of the frames before are

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from polyfit.device import on_device
-from polysft_mi.images import Images, cast
+from polysft_mi.images import Images, colour_cast
 from polysft_mi.images.gather import flat
 
 from .term import Term
@@ -29,7 +29,7 @@ class Chroma(Term):
 
     def __init__(self, inputs):
         super().__init__(inputs)
-        self._inputs = inputs
+        self._inputs, self._squared_scale = inputs, inputs.rules.chroma_scale**2
         self._first = None  # (frame, vertices) that was solved first
         self._cast = None  # (colours, what that frame makes of them)
 
@@ -38,10 +38,10 @@ class Chroma(Term):
             self._first = frame, vertices
 
     def energy(self, at):
-        vertices = np.array(dr.detach(at.vertices), dtype=np.float64).T
         if not self._counts(at.context):
             return mi.Float(0)
         data = self._inputs.data
+        vertices = np.array(dr.detach(at.vertices), dtype=np.float64).T
         seen = self._seen(vertices, at.context.frame, at.stage.blur)
         found = self._compared(vertices, at.context.frame, seen, at.appearance)
         where = mi.Float64(dr.ravel(at.vertices))
@@ -54,8 +54,7 @@ class Chroma(Term):
         for k in range(2):
             slope = mi.Vector2d(found.slope[:, k].T)
             squared += dr.square(mi.Float64(found.residual[:, k]) + dr.dot(slope, moved))
-        c2 = self._inputs.rules.chroma_scale**2
-        rho = c2 * dr.log(1 + squared / c2)
+        rho = self._squared_scale * dr.log(1 + squared / self._squared_scale)
         total = dr.sum(mi.Float64(found.area) * rho)
         return mi.Float(self._factor(found) * total)
 
@@ -64,9 +63,9 @@ class Chroma(Term):
             return
         data, frame = self._inputs.data, at.context.frame
         found = self._compared(at.surface.vertices, frame, at.evaluation.seen, at.appearance)
-        over = (found.residual**2).sum(1) / self._inputs.rules.chroma_scale**2
-        factor, c2 = self._factor(found), self._inputs.rules.chroma_scale**2
-        energy = factor * c2 * float((found.area * np.log1p(over)).sum())
+        over = (found.residual**2).sum(1) / self._squared_scale
+        factor = self._factor(found)
+        energy = factor * self._squared_scale * float((found.area * np.log1p(over)).sum())
         each = 2 * factor * found.area / (1 + over)
         gradient, second = found.at_vertices(each, data.pattern)
         at.add_to_images(self.name, energy, Images(flat(gradient), flat(second)))
@@ -78,6 +77,7 @@ class Chroma(Term):
         return self._first is not None and context.frame != self._first[0]
 
     def _seen(self, vertices, frame, blur):
+        """Pixels (F,) of the triangles, as the images' evaluation counts them."""
         return self._inputs.data.evaluate(vertices, frame, blur, 1.0, k_silhouette=0.0).seen
 
     def _factor(self, found):
@@ -88,5 +88,6 @@ class Chroma(Term):
         if self._cast is None or self._cast[0] is not data.colours:  # the texture may have moved
             first, there = self._first
             seen_first = self._seen(there, first, self._inputs.rules.blurs[-1])
-            self._cast = data.colours, cast(data.colours, data.shown(there, first), seen_first)
+            shown = data.shown(there, first)
+            self._cast = data.colours, colour_cast(data.colours, shown, seen_first)
         return data.chroma(vertices, frame, seen, self._cast[1], appearance)

@@ -9,7 +9,7 @@ import pytest
 import synthetic
 
 from polyfit.mesh import edges_of
-from polysft_mi.images.chroma import Chroma, cast
+from polysft_mi.images.chroma import Chroma, colour_cast
 from polysft_mi.images.triangles import TriangleColours, luminance
 from polysft_mi.scene.rules import Rules
 from polysft_mi.surface.pattern import Pattern
@@ -134,19 +134,19 @@ def test_a_cast_that_the_first_frame_shows_is_the_textures(colours):
     place, _ = Camera().project(FLAT)
     prepared = colours.of_frame(curved, np.ones((120, 160), np.float32))
     shown = colours.shown(prepared, place[FACES].mean(1))
-    known = cast(colours, shown, SEEN)
+    known = colour_cast(colours, shown, SEEN)
     assert np.median(known) == pytest.approx(1)
     assert 5 * np.median(size(chroma(colours, curved, cast=known))) < np.median(
         size(chroma(colours, curved))
     )
-    dark = cast(colours, np.zeros((len(FACES), 3)), SEEN)
+    dark = colour_cast(colours, np.zeros((len(FACES), 3)), SEEN)
     assert dark.min() >= 0.5 and dark.max() <= 2
     # what another layer hides has the usual one
     shown[:5] = (1, 0, 0)
-    hidden = cast(colours, shown, np.where(np.arange(len(FACES)) < 5, 0, 9))
+    hidden = colour_cast(colours, shown, np.where(np.arange(len(FACES)) < 5, 0, 9))
     assert np.allclose(hidden[:5], np.median(known[5:], axis=0), rtol=0.02)
     assert np.allclose(hidden[5:], known[5:], rtol=0.02)
-    assert (cast(colours, shown, 0 * SEEN) == 1).all()
+    assert (colour_cast(colours, shown, 0 * SEEN) == 1).all()
 
 
 def test_colours_of_the_texture_where_an_image_shows_none(colours):
