@@ -1,5 +1,5 @@
-"""How fast ``raster`` is beside Mitsuba's path replay and DEODR: a picture, and one forward and
-backward pass, gradient to all vertex positions.
+"""How fast ``raster`` is beside Mitsuba's path replay, DEODR, nvdiffrast and DRTK: a picture, and
+one forward and backward pass, gradient to all vertex positions.
 
     python benchmarks/raster.py [--sizes 160x120 640x480 ...] [--grids 33 72 225] [-o
     out/benchmarks] [-m llvm_ad_rgb]
@@ -12,6 +12,8 @@ The contenders:
     raster, mi      the same through ``mi.render``, which renders once more for the backward pass
     prb_projective  through ``mi.render``, 1 sample a pixel, depth 2, ``sppi = 0``: RGB alone
     deodr           where it is installed (``pip install deodr``): RGB and alpha, one thread
+    nvdiffrast      where it is installed, with ``-m cuda_ad_rgb``: RGB and alpha, antialiased
+    drtk            likewise: RGB and alpha
 
 Depth 2 is one bounce, the emitter's light off the sheet, which is the texture's own colour wherever
 the sheet does not shadow itself: what raster shows (depth 1 would be black). ``sppi = 0`` leaves
@@ -29,6 +31,10 @@ on one core, where times are those of the processor:
     taskset -c 0 python benchmarks/raster.py --grids 33 -o docs \\
         --sizes 256x256 512x512 1024x1024 2048x2048
 
+On a GPU (``-m cuda_ad_rgb``) times are those of the clock, after Dr.Jit and torch have ended what
+they do, and memory is also the peak of what Dr.Jit or torch allocated on the device: without what
+nvdiffrast allocates past torch. A contender that fails is left out, with a line that says why.
+
 Writes ``raster.json`` and ``raster.png``, anew after every case, so that an interrupted run leaves
 the cases that it reached.
 """
@@ -41,15 +47,20 @@ import subprocess
 import sys
 import tempfile
 import time
+from concurrent.futures import ThreadPoolExecutor, wait
 
 import numpy as np
 from cases import add_case_arguments, parse_size
+from raster_cuda import AVAILABLE as AVAILABLE_ON_CUDA
+from raster_cuda import CONTENDERS as CUDA_CONTENDERS
 from raster_deodr import AVAILABLE, DeodrContender
 from raster_figures import (
     CONTENDERS,
     TARGET,
     judge_long_run,
+    page_table,
     print_end,
+    print_likeness,
     print_table,
     summarise,
     write,
@@ -64,9 +75,10 @@ SIZES = ("160x120", "320x240", "640x480", "1280x720", "1920x1080")
 GRIDS = (33, 72, 225)  # vertices a side: 1,089 vertices, 10,082 and 100,352 triangles
 WARM_UP, LEAST_TURNS, MOST_TURNS = 2, 3, 60  # few where a turn takes seconds
 MEMORY_PASSES = 2
+AT_ONCE = 8  # processes that measure memory on a GPU
 # On one core, seconds of that core: what others do on it meanwhile does not count
 _CLOCK = time.process_time if len(os.sched_getaffinity(0)) == 1 else time.perf_counter
-NAMES = [name for name in CONTENDERS if name != "deodr" or AVAILABLE]
+NAMES = [name for name in CONTENDERS if {"deodr": AVAILABLE, **AVAILABLE_ON_CUDA}.get(name, True)]
 
 _SCENE = """<scene version="3.0.0">
 {sensor}
@@ -183,9 +195,18 @@ class Contender:
         return image
 
 
+def on_gpu(mode):
+    return mode is not None and mode.startswith("cuda")
+
+
+def names_for(mode):
+    """Names of the contenders that there are here."""
+    return [name for name in NAMES if on_gpu(mode) or name not in CUDA_CONTENDERS]
+
+
 def contender(name, size, points, folder):
     """The contender of this name, with its sheet."""
-    if name != "deodr":
+    if name != "deodr" and name not in CUDA_CONTENDERS:
         return Contender(name, size, points, folder)
     import mitsuba as mi
 
@@ -194,19 +215,35 @@ def contender(name, size, points, folder):
     linear = bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False)
     bend = np.zeros_like(vertices)
     bend[:, 2] = vertices[:, 0] ** 2
-    return DeodrContender(vertices, faces, uv, camera(size), np.array(linear), bend)
+    make = CUDA_CONTENDERS.get(name, DeodrContender)
+    return make(vertices, faces, uv, camera(size), np.array(linear), bend)
+
+
+def now():
+    """Seconds; on a GPU those of the clock, when all that was asked of it is done."""
+    import mitsuba as mi
+
+    if not on_gpu(mi.variant()):
+        return _CLOCK()
+    import drjit as dr
+
+    dr.sync_thread()
+    torch = sys.modules.get("torch")
+    if torch and torch.cuda.is_initialized():
+        torch.cuda.synchronize()
+    return time.perf_counter()
 
 
 def turn(contender, k):
     """Move the sheet, take a picture and a gradient: seconds of each."""
-    times = [_CLOCK()]
+    times = [now()]
     for do in (
         lambda: contender.place(amount(k)),
         lambda: contender.forward(k),
         lambda: contender.forward_backward(k),
     ):
         do()
-        times.append(_CLOCK())
+        times.append(now())
     return np.diff(times).tolist()
 
 
@@ -227,57 +264,101 @@ def peak_resident():
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
 
 
-def measure_times(size, points, folder, seconds):
+def measure_times(size, points, folder, seconds, names=None):
     """Milliseconds of every turn, contender to list: ``passes``, ``pictures`` and ``moves``; and
-    how far the pictures differ.
+    how far the pictures differ. ``names``: of the contenders, all by default.
     """
-    contenders = [contender(name, size, points, folder) for name in NAMES]
-    passes, pictures, moves = ({name: [] for name in NAMES} for _ in range(3))
+    import mitsuba as mi
+
+    names = names_for(mi.variant()) if names is None else names
+    contenders = {}
+    for name in names:
+        try:
+            contenders[name] = contender(name, size, points, folder)
+        except Exception as error:
+            leave_out(contenders, name, error)
+    passes, pictures, moves = ({name: [] for name in contenders} for _ in range(3))
     began = None
     for k in range(WARM_UP + MOST_TURNS):
         if k == WARM_UP:
             began = time.perf_counter()
         if k >= WARM_UP + LEAST_TURNS and time.perf_counter() - began > seconds:
             break
-        for one in contenders if k % 2 else contenders[::-1]:
-            move, picture, one_pass = turn(one, k)
+        for name in list(contenders) if k % 2 else list(contenders)[::-1]:
+            try:
+                move, picture, one_pass = turn(contenders[name], k)
+            except Exception as error:
+                leave_out(contenders, name, error)
+                continue
             if k >= WARM_UP:
-                moves[one.name].append(1e3 * move)
-                pictures[one.name].append(1e3 * picture)
-                passes[one.name].append(1e3 * one_pass)
-    by_name = {one.name: one for one in contenders}
+                moves[name].append(1e3 * move)
+                pictures[name].append(1e3 * picture)
+                passes[name].append(1e3 * one_pass)
+    likeness = compare_pictures(contenders)
+    kept = lambda times: {name: times[name] for name in contenders}
     return {
-        "passes": passes,
-        "pictures": pictures,
-        "moves": moves,
-        **compare_pictures(
-            **{name.split(",")[0]: by_name[name] for name in NAMES if "," not in name}
-        ),
+        "passes": kept(passes),
+        "pictures": kept(pictures),
+        "moves": kept(moves),
+        **likeness,
     }
 
 
-def compare_pictures(raster, prb_projective, deodr=None):
-    """That all show the same: share of the image that the sheet covers, mean colour on it, and
-    mean difference of raster from path replay (16 samples), and from deodr where there is one.
+def leave_out(contenders, name, error):
+    """Take the contender that failed out of ``contenders``, and say so; raster must not fail."""
+    if name == "raster":
+        raise error
+    contenders.pop(name, None)
+    say_left_out(name, f"{type(error).__name__}: {error}")
+
+
+def say_left_out(name, why):
+    print(f"{name} is left out: {' '.join(why.split())[:300]}", file=sys.stderr, flush=True)
+
+
+def as_array(values):
+    """A NumPy array of a tensor of torch, or an array of Dr.Jit or NumPy."""
+    if hasattr(values, "detach") and hasattr(values, "cpu"):
+        values = values.detach().cpu()
+    return np.array(values, dtype=np.float64)
+
+
+def compare_pictures(contenders):
+    """That all show the same: share of the image that the sheet covers, mean colour on it, and mean
+    difference of raster from path replay (16 samples); how far the others' pictures are from
+    raster's, and the cosine of each gradient with raster's.
     """
     import mitsuba as mi
 
-    found = {}
-    for one in filter(None, (raster, prb_projective, deodr)):
+    raster = contenders["raster"]
+    for one in contenders.values():
         one.place(0)
     image = np.array(raster.render(0))
-    other = np.array(mi.render(prb_projective.scene, integrator=prb_projective.integrator, spp=16))
+    gradient = as_array(raster.forward_backward(0))
     inside = image[..., 3] > 0.999
-    if deodr is not None:
-        apart = np.abs(image[inside] - deodr.forward(0)[inside])
-        found["mean_absolute_difference_of_deodr"] = float(apart.mean())
-    return {
-        **found,
+    found = {
         "coverage": float(image[..., 3].mean()),
         "mean_colour": float(image[inside, :3].mean()),
-        "mean_difference": float((image[inside, :3] - other[inside]).mean()),
-        "mean_absolute_difference": float(np.abs(image[inside, :3] - other[inside]).mean()),
     }
+    for name, one in list(contenders.items()):
+        if name.split(",")[0] == "raster":
+            continue
+        try:
+            if name == "prb_projective":
+                other = np.array(mi.render(one.scene, integrator=one.integrator, spp=16))
+                apart = image[inside, :3] - other[inside]
+                found["mean_difference"] = float(apart.mean())
+                found["mean_absolute_difference"] = float(np.abs(apart).mean())
+            else:
+                apart = np.abs(image[inside] - as_array(one.forward(0))[inside])
+                found[f"mean_absolute_difference_of_{name}"] = float(apart.mean())
+            other = as_array(one.forward_backward(0))
+        except Exception as error:
+            leave_out(contenders, name, error)
+            continue
+        lengths = np.linalg.norm(gradient) * np.linalg.norm(other)
+        found[f"gradient_cosine_of_{name}"] = float(gradient @ other / lengths)
+    return found
 
 
 def measure_memory(size, points, folder, name):
@@ -291,12 +372,20 @@ def measure_memory(size, points, folder, name):
     one = contender(name, size, points, folder)
     for k in range(MEMORY_PASSES):
         turn(one, k)
-    backend = dr.JitBackend.CUDA if mi.variant().startswith("cuda") else dr.JitBackend.LLVM
-    return {
+    gpu = on_gpu(mi.variant())
+    backend = dr.JitBackend.CUDA if gpu else dr.JitBackend.LLVM
+    memory = {
         "started_mb": started,
         "peak_mb": peak_resident(),
         "drjit_peak_mb": dr.detail.malloc_watermark(backend) / 1e6,
     }
+    if gpu:
+        memory["device_peak_mb"] = memory["drjit_peak_mb"]
+        if name in CUDA_CONTENDERS:
+            import torch
+
+            memory["device_peak_mb"] = torch.cuda.max_memory_allocated() / 1e6
+    return memory
 
 
 def measure_growth(size, points, folder, iterations):
@@ -355,18 +444,48 @@ def worker(job):
 
 
 def in_process(measure, size, grid, mode, **options):
+    """What the measurement returns that a process of its own makes."""
     job = {"measure": measure, "size": size, "grid": grid, "mode": mode, "options": options}
     done = subprocess.run(
         [sys.executable, os.path.abspath(__file__), "--worker", json.dumps(job)],
         stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE if measure == "memory" else None,
         text=True,
     )
     if done.returncode:
+        words = (done.stderr or "").strip().splitlines()[-1:]
         raise InputError(
             f"{measure} at {size}, {grid}x{grid} vertices: the measuring process ended with status"
-            f" {done.returncode}"
+            f" {done.returncode}{''.join(': ' + word for word in words)}"
         )
     return json.loads(done.stdout.splitlines()[-1])
+
+
+def memory_or_why(size, grid, mode, name):
+    """Peak memory of a contender, or in words why it failed: of raster, raises InputError."""
+    try:
+        return in_process("memory", size, grid, mode, name=name)
+    except InputError as error:
+        if name == "raster":
+            raise
+        return str(error)
+
+
+def time_case(size, grid, options, names):
+    """The times of a case; a second time without the contenders in torch where they end the
+    process.
+    """
+    measure = lambda names: in_process(
+        "times", size, grid, options.mode, seconds=options.seconds, names=names
+    )
+    try:
+        return measure(names)
+    except InputError as error:
+        left = [name for name in names if name not in CUDA_CONTENDERS]
+        if left == names:
+            raise
+        say_left_out(", ".join(name for name in names if name not in left), str(error))
+        return measure(left)
 
 
 def parser():
@@ -425,23 +544,38 @@ def main(arguments=None):
         "long_run": {"size": size, "vertices": grid**2, **judge_long_run(growth, kernels)},
         "cases": cases,
     }
+    at_once = ThreadPoolExecutor(AT_ONCE if on_gpu(options.mode) else 1)
+    measure_of_memory = lambda size, grid: {
+        name: at_once.submit(memory_or_why, size, grid, options.mode, name)
+        for name in names_for(options.mode)
+    }
+    asked = {}
+    if on_gpu(options.mode):  # before any time is measured
+        asked = {(s, g): measure_of_memory(s, g) for g in options.grids for s in options.sizes}
+        for one in asked.values():
+            wait(one.values())
     for grid in options.grids:
         for size in options.sizes:
-            times = in_process("times", size, grid, options.mode, seconds=options.seconds)
-            memory = {
-                name: in_process("memory", size, grid, options.mode, name=name) for name in NAMES
-            }
+            found = asked.get((size, grid)) or measure_of_memory(size, grid)
+            memory = {name: one.result() for name, one in found.items()}
+            for name in [name for name, one in memory.items() if isinstance(one, str)]:
+                say_left_out(name, memory.pop(name))
+            times = time_case(size, grid, options, list(memory))
             cases.append(summarise(size, grid, times, memory))
             report["load"].append(os.getloadavg()[0])
             report["seconds"] = time.perf_counter() - began
             write(report, options.out)
-            ratio = cases[-1]["contenders"]["prb_projective"]["ratio"]
+            print_likeness(cases[-1])
+            path_replay = cases[-1]["contenders"].get("prb_projective")
+            times_raster = f"{path_replay['ratio']:.1f} times" if path_replay else "no path replay"
             print(
-                f"{report['seconds']:4.0f} s  {size}, {grid}x{grid} vertices: {ratio:.1f} times",
+                f"{report['seconds']:4.0f} s  {size}, {grid}x{grid} vertices: {times_raster}",
                 file=sys.stderr,
             )
     print_table(cases)
     print_end(report, options.out)
+    if on_gpu(options.mode):
+        print(page_table(report))
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from cases import parse_size
 
 from polyfit.files import aside
 
-CONTENDERS = ("raster", "raster, mi", "prb_projective", "deodr")
+CONTENDERS = ("raster", "raster, mi", "prb_projective", "deodr", "nvdiffrast", "drtk")
 _BEGIN, _END = "<!-- speed -->\n", "\n<!-- /speed -->"
 TARGET = ("640x480", 33, 3.0)  # a case, and how many times faster raster is to be there
 
@@ -41,7 +41,7 @@ def summarise(size, grid, times, memory):
         }
     return {
         **case,
-        **{k: v for k, v in times.items() if k == "coverage" or k.startswith("mean_")},
+        **{k: v for k, v in times.items() if k.startswith(("coverage", "mean_", "gradient_"))},
     }
 
 
@@ -64,6 +64,24 @@ def judge_long_run(growth, kernels):
     }
 
 
+def names_in(cases):
+    """Names of the contenders that any of the cases has."""
+    return [name for name in CONTENDERS if any(name in case["contenders"] for case in cases)]
+
+
+def print_likeness(case):
+    """How far the other contenders' pictures and gradients are from raster's."""
+    for name in case["contenders"]:
+        key = "mean_absolute_difference" + ("" if name == "prb_projective" else f"_of_{name}")
+        if key in case:
+            print(
+                f"{case['size']}, {case['vertices']:,} vertices: {name}'s picture is"
+                f" {case[key]:.4f} from raster's, mean absolute difference on the sheet; cosine of"
+                f" the gradients {case[f'gradient_cosine_of_{name}']:.3f}",
+                file=sys.stderr,
+            )
+
+
 def print_table(cases):
     from rich.console import Console
     from rich.table import Table
@@ -72,21 +90,25 @@ def print_table(cases):
     table = Table(
         title=(
             "One forward + backward pass in ms, how many times that of raster; peak memory of the"
-            " process in MB (of Dr.Jit)"
+            " process in MB (of Dr.Jit; on a GPU, on the device)"
         )
     )
     table.add_column("image")
     table.add_column("triangles", justify="right")
-    names = list(cases[0]["contenders"])
+    names = names_in(cases)
     for name in names:
         table.add_column(name, justify="right")
     table.add_column("move, ms", justify="right")
     for case in cases:
         cells = []
         for name in names:
-            c = case["contenders"][name]
+            c = case["contenders"].get(name)
+            if c is None:
+                cells.append("")
+                continue
             ratio = "" if name == "raster" else f"  [bold]{c['ratio']:.1f}x[/bold]"
-            cells.append(f"{c['ms']:.1f}{ratio}\n{c['peak_mb']:.0f} ({c['drjit_peak_mb']:.0f})")
+            own = c.get("device_peak_mb", c["drjit_peak_mb"])
+            cells.append(f"{c['ms']:.1f}{ratio}\n{c['peak_mb']:.0f} ({own:.0f})")
         table.add_row(
             case["size"],
             f"{case['triangles']:,}",
@@ -102,17 +124,19 @@ def plot(path, cases):
     triangles = sorted({case["triangles"] for case in cases})
     figure = Figure(figsize=(4.2 * len(triangles) + 0.6, 4), dpi=110, layout="constrained")
     rows = figure.subplots(1, len(triangles), sharey=True, squeeze=False)[0]
-    colours = ("#c4572e", "#e0a58c", "#3b6ea5", "#6a994e")
+    colours = ("#c4572e", "#e0a58c", "#3b6ea5", "#6a994e", "#7d5ba6", "#b08900")
+    names = names_in(cases)
     for axes, count in zip(rows, triangles):
         chosen = [case for case in cases if case["triangles"] == count]
         at = [np.prod(parse_size(case["size"])) for case in chosen]
-        for name, colour in zip(chosen[0]["contenders"], colours):
-            ms = [case["contenders"][name]["ms"] for case in chosen]
+        for name, colour in zip(names, colours):
+            have = [case["contenders"].get(name, {}) for case in chosen]
+            ms = [c.get("ms", np.nan) for c in have]
             axes.plot(at, ms, color=colour, marker="o", markersize=4, label=name)
             if name == "prb_projective":
-                for x, y, case in zip(at, ms, chosen):
+                for x, y, c in zip(at, ms, have):
                     axes.annotate(
-                        f"{case['contenders'][name]['ratio']:.1f}×",
+                        f"{c['ratio']:.1f}×" if c else "",
                         (x, y),
                         (0, 7),
                         textcoords="offset points",
@@ -137,8 +161,8 @@ def plot(path, cases):
 def print_end(report, out):
     size, grid, wanted = TARGET
     for case in report["cases"]:
-        if (case["size"], case["vertices"]) == (size, grid * grid):
-            c = case["contenders"]["prb_projective"]
+        c = case["contenders"].get("prb_projective")
+        if c and (case["size"], case["vertices"]) == (size, grid * grid):
             low, high = c["ratio_quartiles"]
             print(
                 f"{size}, {grid * grid:,} vertices: raster, RGB and alpha, is {c['ratio']:.2f}"
@@ -162,7 +186,7 @@ def print_end(report, out):
 
 def page_table(report):
     """The table of docs/raster.md, as text."""
-    names = list(report["cases"][0]["contenders"])
+    names = names_in(report["cases"])
     lines = [
         f"| image | {' | '.join(names)} |",
         "|---" * (1 + len(names)) + "|",
@@ -170,9 +194,13 @@ def page_table(report):
     for case in report["cases"]:
         cells = []
         for name in names:
-            c = case["contenders"][name]
-            memory = c["peak_mb"] - c["started_mb"]
-            cells.append(f"{c['picture_ms']:.0f} / {c['ms']:.0f} ms, {memory:.0f} MB")
+            c = case["contenders"].get(name)
+            if c is None:
+                cells.append("")
+                continue
+            memory = c.get("device_peak_mb", c["peak_mb"] - c["started_mb"])
+            digits = 1 if "device_peak_mb" in c else 0  # a GPU takes few milliseconds
+            cells.append(f"{c['picture_ms']:.{digits}f} / {c['ms']:.{digits}f} ms, {memory:.0f} MB")
         lines.append(f"| {case['size'].replace('x', '×')} | {' | '.join(cells)} |")
     return "\n".join(lines)
 

@@ -14,13 +14,16 @@ from scripts import load
 from polyfit.errors import InputError
 from polyfit.patches.atlas import Cover
 from polysft_mi import run
+from polysft_mi.camera import Intrinsics
 from polysft_mi.results.truth import load_npz
 from polysft_mi.scene import plugins
 
 SIZE, POINTS = (64, 48), 9
-iteration, lit, outline, raster, raster_figures, scaling, stability, stretch = (
+iteration, lit, outline, raster, raster_cuda, raster_figures, scaling, stability, stretch = (
     load(f"benchmarks/{name}.py")
-    for name in "iteration lit outline raster raster_figures scaling stability stretch".split()
+    for name in (
+        "iteration lit outline raster raster_cuda raster_figures scaling stability stretch".split()
+    )
 )
 
 
@@ -61,6 +64,43 @@ def test_deodr_takes_about_the_same_gradient(tmp_path):
         contender.place(-2.0)
         gradients.append(np.array(contender.forward_backward(0), dtype=np.float64))
     assert np.corrcoef(gradients)[0, 1] > 0.9
+
+
+def test_rasterisers_on_the_gpu_see_each_vertex_at_its_pixel():
+    """As nvdiffrast counts pixels (the centre of column x at 2 (x + 0.5) / width - 1) and as DRTK
+    does (at x).
+    """
+    pytest.importorskip("torch", reason="torch is not installed")
+    camera = Intrinsics(700.0, 650.0, 300.3, 260.1, 640, 480)
+    vertices, faces, uv = raster.sheet(POINTS, (640, 480))
+    wanted = camera.project(vertices) - 0.5
+
+    matrix, offset = raster_cuda.clip_from_camera(camera)
+    clip = vertices @ matrix + offset
+    seen = clip[:, :3] / clip[:, 3:]
+    assert (seen[:, :2] + 1) / 2 * (640, 480) - 0.5 == pytest.approx(wanted, abs=1e-9)
+    assert np.abs(seen[:, 2]).max() < 1
+    assert np.diff(seen[np.argsort(vertices[:, 2]), 2]).min() > -1e-12
+
+    class Placed(raster_cuda.DrtkContender):
+        def forward(self, seed):
+            """No picture, which would need DRTK."""
+
+    placed = Placed(
+        vertices, faces, uv, camera, np.ones((2, 2, 3)), np.zeros_like(vertices), device="cpu"
+    )
+    pixels = placed.pixels()[0].detach().numpy()
+    assert pixels == pytest.approx(np.column_stack([wanted, vertices[:, 2]]), abs=1e-3)
+
+
+def test_a_contender_that_fails_is_left_out(tmp_path, capsys, monkeypatch):
+    def fail(*arguments):
+        raise RuntimeError("not\nhere")
+
+    monkeypatch.setitem(raster.CUDA_CONTENDERS, "drtk", fail)
+    result = raster.measure_times(SIZE, POINTS, str(tmp_path), 0, ["raster", "drtk"])
+    assert list(result["passes"]) == ["raster"]
+    assert capsys.readouterr().err == "drtk is left out: RuntimeError: not here\n"
 
 
 def test_the_page_has_the_table_of_its_figures():
