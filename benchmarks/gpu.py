@@ -88,7 +88,7 @@ def parts_of(options, scratch):
         *more,
         name=title or name,
     )
-    both = [device] + [HOST] * (device != HOST)
+    both = [device] + [HOST] * (device != HOST and not options.device_only)
     parts = [worker("arrays", on, 60) for on in both]
     parts += [worker("forms", on, 120) for on in both]
     parts += [track("demo", on, 120, 12) for on in both]
@@ -104,7 +104,7 @@ def parts_of(options, scratch):
     out = os.path.join(scratch, "run")
     parts.append(Part("polysft run, demo", device, [*command, "-o", out], 120))
     parts += [track("shirt", on, 90, options.frames) for on in both if "shirt" in sequences]
-    for on in dict.fromkeys((torch_device, "cpu")):
+    for on in dict.fromkeys((torch_device, torch_device if options.device_only else "cpu")):
         parts.append(worker("drape", on, 60))
         parts.append(worker("train", on, 60))
     return parts
@@ -328,6 +328,9 @@ def parser():
     p.add_argument("--frames", type=int, default=15, help="of flag and shirt (default: 15)")
     p.add_argument(
         "--workers", type=int, default=min(6, os.cpu_count() or 1), help="processes of the tests"
+    )
+    p.add_argument(
+        "--device-only", action="store_true", help="nothing on the CPU, as where LLVM is not found"
     )
     p.add_argument("--only", nargs="+", metavar="PART", help="parts whose names begin so")
     p.add_argument("--skip", nargs="+", default=[], metavar="PART", help="parts to leave out")

@@ -35,8 +35,8 @@ On a GPU (``-m cuda_ad_rgb``) times are those of the clock, after Dr.Jit and tor
 they do, and memory is also the peak of what Dr.Jit or torch allocated on the device: without what
 nvdiffrast allocates past torch. A contender that fails is left out, with a line that says why.
 
-Writes ``raster.json`` and ``raster.png``, anew after every case, so that an interrupted run leaves
-the cases that it reached.
+Writes ``raster.json`` and ``raster.png`` (of a GPU ``raster_cuda``), anew after every case, so that
+an interrupted run leaves the cases that it reached.
 """
 
 import argparse

@@ -12,7 +12,8 @@ from cases import parse_size
 from polyfit.files import aside
 
 CONTENDERS = ("raster", "raster, mi", "prb_projective", "deodr", "nvdiffrast", "drtk")
-_BEGIN, _END = "<!-- speed -->\n", "\n<!-- /speed -->"
+#: of a variant's figures: the name of its file, and of its table's marks in docs/raster.md
+ON_CPU, ON_GPU = ("raster", "speed"), ("raster_cuda", "speed, cuda")
 TARGET = ("640x480", 33, 3.0)  # a case, and how many times faster raster is to be there
 
 
@@ -177,16 +178,17 @@ def print_end(report, out):
         f" {r['kernels_an_iteration']:.0f} kernels an iteration, {r['new_kernels_later']} new after"
         " the second"
     )
-    load = report["load"]
+    load, name = report["load"], _names(report)[0]
     print(
         f"{report['versions']['variant']}, {report['versions']['machine']}, load {min(load):.1f} to"
-        f" {max(load):.1f}; in {out}: raster.json, raster.png"
+        f" {max(load):.1f}; in {out}: {name}.json, {name}.png"
     )
 
 
 def page_table(report):
     """The table of docs/raster.md, as text."""
     names = names_in(report["cases"])
+    several = len({case["triangles"] for case in report["cases"]}) > 1
     lines = [
         f"| image | {' | '.join(names)} |",
         "|---" * (1 + len(names)) + "|",
@@ -201,27 +203,40 @@ def page_table(report):
             memory = c.get("device_peak_mb", c["peak_mb"] - c["started_mb"])
             digits = 1 if "device_peak_mb" in c else 0  # a GPU takes few milliseconds
             cells.append(f"{c['picture_ms']:.{digits}f} / {c['ms']:.{digits}f} ms, {memory:.0f} MB")
-        lines.append(f"| {case['size'].replace('x', '×')} | {' | '.join(cells)} |")
+        image = case["size"].replace("x", "×")
+        if several:
+            image += f", {case['triangles']:,} triangles"
+        lines.append(f"| {image} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
+def marked(report):
+    """The table of docs/raster.md between its marks, and the marks."""
+    word = _names(report)[1]
+    begin, end = f"<!-- {word} -->\n", f"\n<!-- /{word} -->"
+    return f"{begin}{page_table(report)}{end}", begin, end
+
+
+def _names(report):
+    return ON_GPU if report["versions"]["variant"].startswith("cuda") else ON_CPU
+
+
 def write(report, out):
-    """``raster.json`` and ``raster.png`` in the folder ``out``; where it has a page raster.md, as
-    docs/ has, its table too.
+    """``raster.json`` and ``raster.png`` (of a GPU ``raster_cuda``) in the folder ``out``; where it
+    has a page raster.md, as docs/ has, its table too.
     """
-    with (
-        aside(os.path.join(out, "raster.json")) as temporary,
-        open(temporary, "w", encoding="utf-8") as file,
-    ):
+    name = os.path.join(out, _names(report)[0])
+    with aside(f"{name}.json") as temporary, open(temporary, "w", encoding="utf-8") as file:
         json.dump(report, file, indent=1)
         file.write("\n")
     page = os.path.join(out, "raster.md")
     if not os.path.exists(page):
-        plot(os.path.join(out, "raster.png"), report["cases"])
+        plot(f"{name}.png", report["cases"])
         return
     with open(page, encoding="utf-8") as file:
         text = file.read()
-    before, rest = text.split(_BEGIN)
-    after = rest.split(_END)[1]
+    table, begin, end = marked(report)
+    before, rest = text.split(begin)
+    after = rest.split(end)[1]
     with aside(page) as temporary, open(temporary, "w", encoding="utf-8") as file:
-        file.write(f"{before}{_BEGIN}{page_table(report)}{_END}{after}")
+        file.write(f"{before}{table}{after}")

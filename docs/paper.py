@@ -35,7 +35,7 @@ what it says: the command is there, the hours were not.
 def read(folder=DOCS):
     """The JSON files of ``folder`` by their names; an empty dict where there is none."""
     names = ("sft", "stability_demo", "stability_kinect_paper", "readings", "stretch")
-    names += ("polyfit_reconstruction", "polyfit_accuracy", "onefit_paper", "onefit_speed")
+    names += ("polyfit_reconstruction", "polyfit_accuracy", "onefit_paper", "onefit_speed", "gpu")
     found = {}
     for name in names:
         path = Path(folder) / f"{name}.json"

@@ -344,7 +344,8 @@ SECTIONS = {
             "0.48 ms a frame, 3 to 4 ms with the optional pushes.",
             ("python benchmarks/onefit_speed.py -o docs",),
             figures.speed,
-            "A CPU of two cores, no GPU. *Network alone* has the vertices, and no ease.",
+            "A CPU of two cores; the last row by `python benchmarks/gpu.py --only drape`."
+            " *Network alone* has the vertices, and no ease.",
         ),
     ),
     "Supplement": (

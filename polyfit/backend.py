@@ -145,7 +145,7 @@ def set_variant(mode: str | None = None) -> str:
     ``import mitsuba``, which makes Dr.Jit choose an LLVM.
 
     ``mode``: a variant that ends in ``_ad_rgb``. None takes one that is already set and fits, else
-    ``llvm_ad_rgb``. ``cuda_ad_rgb`` is taken only where it is asked for: no test has run on it.
+    ``llvm_ad_rgb``. ``cuda_ad_rgb`` is taken only where it is asked for: it hardly gains.
 
     Returns the variant's name. Raises :class:`InputError` where the mode is unknown or does not
     fit, a GPU is asked for and none works, LLVM is missing, or this process was forked from one
@@ -170,10 +170,10 @@ def set_variant(mode: str | None = None) -> str:
     known = [name for name in mi.variants() if name.endswith(_SUFFIX)]
     if mode not in known:
         raise InputError(f"mode {mode!r}: one of {', '.join(known)} is needed")
-    if mode.startswith("cuda") and not gpu_works():
+    if mode.startswith("cuda") and (reason := _gpu_fails()):
         raise InputError(
-            f"mode {mode!r}: no working GPU (NVIDIA, with its driver and OptiX) was found; leave"
-            " the mode out, or give llvm_ad_rgb"
+            f"mode {mode!r}: no working GPU (NVIDIA, its driver, OptiX) was found: {reason};"
+            " leave the mode out, or give llvm_ad_rgb"
         )
     try:
         mi.set_variant(mode)
@@ -241,12 +241,19 @@ def _fit_threads() -> None:
         dr.set_thread_count(max(2, cores()))
 
 
-@functools.cache
 def gpu_works() -> bool:
     """Whether ``cuda_ad_rgb`` computes and traces rays here; costs nothing on a machine without an
     NVIDIA driver.
     """
-    return _driver_sees_device() and variant_works("cuda_ad_rgb")
+    return not _gpu_fails()
+
+
+@functools.cache
+def _gpu_fails() -> str:
+    """Why there is no GPU that works, in words; empty where one does."""
+    if not _driver_sees_device():
+        return "the driver (libcuda.so.1) is missing or sees none"
+    return _variant_fails("cuda_ad_rgb")
 
 
 def variant_works(mode: str, library: str | None = None, timeout: float = 120.0) -> bool:
@@ -256,6 +263,11 @@ def variant_works(mode: str, library: str | None = None, timeout: float = 120.0)
     ``library``: the libLLVM to do it with (default: what Dr.Jit takes). ``timeout``: seconds after
     which it counts as not working.
     """
+    return not _variant_fails(mode, library, timeout)
+
+
+def _variant_fails(mode, library=None, timeout=120.0):
+    """Why a variant does not work, in words; empty where it does."""
     with tempfile.TemporaryDirectory() as empty:
         # Dr.Jit's cache on the disk would answer with kernels that another LLVM compiled
         environment = (
@@ -271,9 +283,16 @@ def variant_works(mode: str, library: str | None = None, timeout: float = 120.0)
                 timeout=timeout,
                 stdin=subprocess.DEVNULL,
             )
-        except (OSError, subprocess.TimeoutExpired):
-            return False
-    return tried.returncode == 0 and tried.stdout.split()[-1:] == ["True"]
+        except OSError as error:
+            return str(error)
+        except subprocess.TimeoutExpired:
+            return f"no answer in {timeout:g} seconds"
+    if tried.returncode == 0 and tried.stdout.split()[-1:] == ["True"]:
+        return ""
+    if tried.returncode == 0:
+        return "it computes what is wrong"
+    said = tried.stderr.split("\n")
+    return next((line for line in reversed(said) if line.strip()), f"status {tried.returncode}")
 
 
 def add_mode_argument(parser: ArgumentParser) -> None:

@@ -173,9 +173,9 @@ class TrainingData:
     def _sheet(self, garment, shape):
         if (garment, shape) not in self._sheets:
             patched, rest, _ = self.garments[garment]
-            cloth, rest = patched.garment, rest[:, shape].cpu()
-            sides = None if cloth.cut is None else cloth.sides(rest).double().numpy()
+            cloth, rest = patched.garment, rest[:, shape]
+            sides = None if cloth.cut is None else cloth.sides(rest).double().cpu().numpy()
             self._sheets[garment, shape] = Sheet(
-                rest.double().numpy(), cloth.faces.cpu().numpy(), self.material, sides
+                rest.double().cpu().numpy(), cloth.faces.cpu().numpy(), self.material, sides
             )
         return self._sheets[garment, shape]

@@ -103,11 +103,12 @@ def test_a_contender_that_fails_is_left_out(tmp_path, capsys, monkeypatch):
     assert capsys.readouterr().err == "drtk is left out: RuntimeError: not here\n"
 
 
-def test_the_page_has_the_table_of_its_figures():
+@pytest.mark.parametrize(("name", "cores"), [("raster", 1), ("raster_cuda", 16)])
+def test_the_page_has_the_table_of_its_figures(name, cores):
     page = (ROOT / "docs" / "raster.md").read_text(encoding="utf-8")
-    report = json.loads((ROOT / "docs" / "raster.json").read_text(encoding="utf-8"))
-    assert report["cores"] == 1
-    assert f"<!-- speed -->\n{raster_figures.page_table(report)}\n<!-- /speed -->" in page
+    report = json.loads((ROOT / "docs" / f"{name}.json").read_text(encoding="utf-8"))
+    assert report["cores"] == cores
+    assert raster_figures.marked(report)[0] in page
 
 
 DEMO = (str(ROOT / "scenes" / "demo.xml"), {"last": "1", "period": "4"})
