@@ -266,7 +266,7 @@ def variant_works(mode: str, library: str | None = None, timeout: float = 120.0)
     return not _variant_fails(mode, library, timeout)
 
 
-def _variant_fails(mode, library=None, timeout=120.0):
+def _variant_fails(mode: str, library: str | None = None, timeout: float = 120.0) -> str:
     """Why a variant does not work, in words; empty where it does."""
     with tempfile.TemporaryDirectory() as empty:
         # Dr.Jit's cache on the disk would answer with kernels that another LLVM compiled
