@@ -177,7 +177,9 @@ class Objective:
         total = sum(terms.values())
         if not math.isfinite(total):
             raise BadFrame(context.frame, total)
-        return QuadraticModel(state, surface, evaluation, at.normal, terms, total, appearance)
+        measure = sum(terms[term.name] for term in self.terms if not term.is_noise)
+        equations = at.normal, terms, total, measure
+        return QuadraticModel(state, surface, evaluation, *equations, appearance)
 
     def scale(self, context: FrameContext, stage: Stage) -> float:
         """The robust scale of a frame's residuals: the one that fitted the frame before, or the

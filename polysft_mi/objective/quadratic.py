@@ -141,7 +141,8 @@ class Linearisation:
 class QuadraticModel:
     """An objective around a ``state`` whose vertices are of ``surface``.
 
-    ``terms``: name to energy; ``total``: their sum; ``evaluation``: of the images; ``normal``: the
+    ``terms``: name to energy; ``total``: their sum; ``measure``: the sum of those that are not
+    mostly noise, what a gain is a share of; ``evaluation``: of the images; ``normal``: the
     equations of a step; ``appearance``: the sheet's that was used.
     """
 
@@ -151,6 +152,7 @@ class QuadraticModel:
     normal: NormalEquations
     terms: dict[str, float]
     total: float
+    measure: float
     appearance: Appearance | None = None
 
 

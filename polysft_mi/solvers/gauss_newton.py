@@ -64,7 +64,7 @@ class GaussNewton:
                 damping = max(10 * damping, _RAISED_DAMPING)
                 continue
             trial = [state.after_step(step) for state, step in zip(states, steps, strict=True)]
-            if promised < self.rules.gain * total:
+            if promised < self.rules.gain * sum(m.measure for m in models):
                 states = trial
                 break
             found, now = evaluate(trial)

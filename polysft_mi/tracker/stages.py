@@ -85,10 +85,10 @@ class Stages:
         is_first = True
         while best.misfit > max(rules.margin, context.memory.explained):
             found = self._through(best.state, context, fine, iterations)
-            gain = 1 - self.cost(found) / self.cost(best)
+            gain, least = self.cost(best) - self.cost(found), rules.gain * best.model.measure
             if gain > 0:
                 best = found
-            if not gain > rules.gain:
+            if not gain > least:
                 return replace(best, more_is_vain=is_first)
             is_first = False
         return best

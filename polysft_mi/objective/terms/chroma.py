@@ -25,7 +25,7 @@ class Chroma(Term):
     its own.
     """
 
-    name, setting = "chroma", "k_chroma"
+    name, setting, is_noise = "chroma", "k_chroma", True
 
     def __init__(self, inputs):
         super().__init__(inputs)

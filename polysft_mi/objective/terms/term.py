@@ -188,11 +188,13 @@ class Term:
     ``name``: of its figure in logs and reports; ``setting``: its weight's, where 0 leaves the term
     out. A term has its :meth:`energy` on Dr.Jit arrays, for any solver that takes gradients. Where
     it is also known in closed form to second order, it has :meth:`add`, and :meth:`rows` for what
-    acts on vertices; the tests hold both forms together.
+    acts on vertices; the tests hold both forms together. ``is_noise``: most of its energy is noise
+    that no step lowers, and no measure of what one gains.
     """
 
     name: ClassVar[str]
     setting: ClassVar[str]
+    is_noise: ClassVar[bool] = False
 
     def __init__(self, inputs: Inputs) -> None:
         self.weight = getattr(inputs.settings, self.setting)
