@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable
 
 import numpy as np
+from scipy.linalg import LinAlgError
 from threadpoolctl import ThreadpoolController
 
 from polyfit.files import aside, naming
@@ -109,7 +110,7 @@ def _follow(tracker, done, k, progress):
         report = progress and functools.partial(progress, k, k)
         try:
             solution, excess = tracker.mirror(k, state, done.certainty[k], past, report)
-        except BadFrame:
+        except (BadFrame, LinAlgError):
             solution, excess = None, math.inf
         if solution:
             other = branches.split(done, k)

@@ -12,7 +12,8 @@ from .term import DeviceFrame, Term
 
 class Cameras(Term):
     """The photometric and the silhouette term of each camera but the scene's own, with its weights,
-    summed up, times k_cameras.
+    summed up, times k_cameras. A camera says nothing of a frame in which its mask is empty, or
+    nearly: it does not see the surface.
     """
 
     name, setting = "cameras", "k_cameras"
@@ -45,15 +46,15 @@ class Cameras(Term):
 
     def energy(self, at):
         total = mi.Float(0)
-        for k, (view, terms) in enumerate(zip(self.views, self._terms, strict=True)):
+        for k, view in self._seeing(at.context.frame):
             look = lambda k=k: at.appearance and at.appearance.others[k]
             frame = DeviceFrame(view, at.unknowns, at.context, at.stage, look, at.seed + k + 1)
-            total += sum(term.energy(frame) for term in terms)
+            total += sum(term.energy(frame) for term in self._terms[k])
         return self.weight * total
 
     def rows(self, at):
         s, energy = self._settings, 0.0
-        for k, view in enumerate(self.views):
+        for k, view in self._seeing(at.context.frame):
             found = view.data.evaluate(
                 at.surface.vertices,
                 at.context.frame,
@@ -69,3 +70,7 @@ class Cameras(Term):
 
     def add(self, at):
         return at.energies[self.name]
+
+    def _seeing(self, frame):
+        """The numbers and the views of the cameras that see the surface in a frame."""
+        return [(k, v) for k, v in enumerate(self.views) if frame not in v.sequence.unmasked]

@@ -2,6 +2,7 @@
 each curvature against the change of the gradient.
 """
 
+import copy
 import dataclasses
 
 import cv2
@@ -231,6 +232,20 @@ def test_another_camera_says_what_the_first_says_from_its_place(problem, rng):
     for name in ("gradient", "glob", "cross", "local"):  # with the objective's own images
         once, twice = (getattr(model.normal, name) for model in (a, b))
         assert np.abs(twice - 2 * once).max() < 1e-3 * np.abs(once).max(), name
+
+
+def test_a_camera_says_nothing_of_a_frame_in_which_its_mask_is_empty(truth, rng):
+    problem = problem_of(truth.folder, order=4)
+    blind, camera = copy.copy(problem.sequence), problem.camera.intrinsics()
+    blind.unmasked = frozenset({1})
+    problem.sequence.cameras = [OtherCamera("other", camera, np.eye(4), blind)]
+    objective = objective_of(problem, "cameras", cameras="known")
+    state = objective.atlas.state(problem.patch.rest().to_numpy())
+    for frame in (1, 2):
+        context = context_of(objective, rng, frame)
+        frozen = objective.frozen([context], objective.usual[-1], [state])
+        energies = by_autodiff(frozen, state)[0], frozen.quadratic([state])[0].terms["cameras"]
+        assert energies == (0, 0) if frame == 1 else min(energies) > 0
 
 
 def test_a_closed_surface_keeps_its_volume(tmp_path, rng):
