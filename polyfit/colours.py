@@ -16,6 +16,18 @@ def linear(srgb):
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear RGB (ITU-R BT.709)
+
+
+def grey(colour, weights=LUMINANCE, is_coded=False):
+    """Linear RGB (..., 3) without its colours: its channels by ``weights`` (3,), three times.
+    ``is_coded``: it is sRGB's that are summed, as programs do that take colours from a video.
+    """
+    shown = srgb(colour) if is_coded else colour
+    mixed = np.repeat((shown @ weights.astype(shown.dtype))[..., None], 3, axis=-1)
+    return linear(mixed) if is_coded else mixed
+
+
 def patch_colours(patch, weight):
     """Colours (N, 3) uint8 of vertices by the patches that hold them, ``patch`` (N, M), in the
     shares ``weight`` (N, M): a hue for each patch, blended where they overlap.

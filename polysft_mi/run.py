@@ -244,6 +244,9 @@ def reconstruct(
     sequence = experiment.sequence()
     problem = Problem(experiment, sequence)
     problem.check_start()
+    if problem.bleached:
+        note = "the frames are grey, and so the texture is taken without its colours"
+        print(f"note: {scene}: {note}", file=sys.stderr)
     tracker = FrameTracker(problem)
     text = outputs.resolved_scene(experiment)
     if resume:

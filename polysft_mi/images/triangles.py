@@ -5,16 +5,15 @@ import math
 import cv2
 import numpy as np
 
+from polyfit.colours import LUMINANCE
 from polyfit.mesh import signed_areas
 
 from .pyramid import blur, shrink
 
-_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear RGB
-
 
 def luminance(colour):
     """Of linear RGB (..., 3)."""
-    return colour @ _LUMINANCE
+    return colour @ LUMINANCE
 
 
 class TriangleColours:

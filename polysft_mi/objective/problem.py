@@ -7,8 +7,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
+from scipy.optimize import nnls
 
+from polyfit.colours import LUMINANCE, srgb
 from polysft_mi.errors import InputError
 from polysft_mi.render import Pinhole, PlacedMesh
 from polysft_mi.scene import Rules
@@ -18,6 +21,8 @@ if TYPE_CHECKING:
     from polysft_mi.scene import Experiment, Sequence
 
 
+_INSIDE = 0.99  # alpha, and mask, of a pixel that the template fills
+_FEW_PIXELS = 100  # that say nothing of a camera
 _FEW_TRACKS = 0.1  # share of them on the template by which they are not of it
 # range of the depth images' numbers by the template's depth where it stands in its true place, and
 # where a body with an estimated pose carries it
@@ -29,7 +34,8 @@ class Problem:
 
     ``template``; ``patch``: its jets on the device, ``atlas``: on the host; ``placed``: its mesh in
     the scene; ``camera``; ``sequence``: the frames; ``settings``, with what they leave open decided
-    for this template; ``rules``. Raises InputError where the sensor does not suit.
+    for this template; ``rules``; ``bleached``: whether the template's colours were taken away,
+    since a camera has none. Raises InputError where the sensor does not suit.
     """
 
     def __init__(
@@ -46,6 +52,36 @@ class Problem:
         self.placed = PlacedMesh(*rendered, self.settings.sppi, e.path)
         self.camera = self.placed.camera
         self.width, self.height = experiment.size
+        videos, self.bleached = [sequence, *(c.sequence for c in sequence.cameras)], False
+        if any(video.grey for video in videos):
+            for video in videos:
+                video.grey = True
+            self.bleached = self.placed.make_grey(*self._response())
+
+    def _response(self):
+        """``(weights, is_coded)`` of :func:`polyfit.colours.grey`, as the first frame says what a
+        grey camera makes of the texture's colours; where it says nothing, the luminance.
+        """
+        import cv2
+
+        vertices = self.atlas.surface(self.atlas.start).vertices
+        with dr.suspend_grad():
+            image = self.placed.image(mi.Point3f(vertices.T.astype(np.float32)))
+        colour, alpha = (np.array(x) for x in image)
+        inside, mask = alpha[..., 0] > _INSIDE, self.sequence.mask(0)
+        inside &= True if mask is None else mask > _INSIDE
+        if inside.sum() < _FEW_PIXELS:
+            return LUMINANCE, False
+        frame, found = self.sequence.frame(0)[..., 0], []
+        for is_coded in (False, True):
+            known, wanted = (srgb(x) if is_coded else x for x in (colour, frame))
+            smooth = lambda x: cv2.GaussianBlur(np.ascontiguousarray(x), (0, 0), 1)[inside]
+            rows = [smooth(known[..., k]) for k in range(3)]
+            rows, wanted = np.stack([*rows, np.ones_like(rows[0])], 1), smooth(wanted)  # haze, too
+            weights, left = nnls(rows, wanted)
+            found.append((left / max(wanted.std(), 1e-9), weights[:3], is_coded))
+        _, weights, is_coded = min(found, key=lambda x: x[0])
+        return (weights / weights.sum(), is_coded) if weights.sum() > 0 else (LUMINANCE, False)
 
     def surface(self, unknowns: Unknowns) -> np.ndarray:
         """Vertices (N, 3) [m, world] as float32 NumPy."""

@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from polyfit.colours import grey, linear, srgb
 from polyfit.device import on_device
 from polysft_mi.errors import InputError
 
@@ -102,6 +103,30 @@ class PlacedMesh:
         self.texcoords = np.array(texcoords)
         self._params[self._key.removesuffix("positions") + "texcoords"] = texcoords
         self._params.update()
+
+    def make_grey(self, weights: np.ndarray, is_coded: bool) -> bool:
+        """Take the colours of the mesh's reflectance away, as :func:`polyfit.colours.grey` does;
+        returns whether it had some.
+        """
+        params, had = mi.traverse(self.mesh.bsdf()), False
+        for key in [key for key in params.keys() if "reflectance" in key or "base_color" in key]:
+            old = np.array(params[key])
+            if key.endswith(".data") and old.ndim == 3 and old.shape[2] >= 3:  # (H, W, 3 or 4)
+                colour, is_byte = old[..., :3].astype(np.float32), old.dtype == np.uint8
+                now = grey(linear(colour / 255) if is_byte else colour, weights, is_coded)
+                if is_byte:
+                    now = np.round(255 * srgb(now))
+                new = np.concatenate([now, old[..., 3:]], 2).astype(old.dtype)
+            elif key.endswith(".value") and old.shape[0] == 3:
+                colour = old.reshape(3).astype(np.float32)
+                new = grey(colour, weights, is_coded).reshape(old.shape)
+            else:
+                continue
+            params[key] = type(params[key])(new)
+            had |= not np.allclose(old, new, atol=0.01 * max(float(old.max()), 1e-9))
+        if had:
+            params.update()
+        return had
 
     def crop(
         self,

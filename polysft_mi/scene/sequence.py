@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from polyfit.backend import cores
-from polyfit.colours import linear
+from polyfit.colours import grey, linear
 from polysft_mi.body import Carrier
 from polysft_mi.errors import InputError
 
@@ -20,6 +20,9 @@ from .evidence import DepthImages, Tracks
 from .images import checked_size, finite, list_images, read_pixels
 
 _LEAST_AREA = 0.01  # of the first mask's area; what is smaller is no mask
+# of the largest value: the most that a grey image's channels differ by, in 99 % of its pixels, as
+# coding leaves it
+_LEAST_COLOUR = 0.01
 
 
 class Sequence:
@@ -32,7 +35,8 @@ class Sequence:
     scene's own (:class:`polysft_mi.scene.cameras.OtherCamera`); ``count``: of all images;
     ``carrier``: what carries the template with a body
     (:class:`polysft_mi.body.carrier.Carrier`), or None; ``unmasked``: frames whose mask is empty,
-    or nearly.
+    or nearly; ``grey``: whether frames are taken without their colours, which is so where the first
+    one has none.
     """
 
     tracks: Tracks | None = None
@@ -41,6 +45,7 @@ class Sequence:
     carrier: Carrier | None = None
     count: int = 0
     unmasked: frozenset[int] = frozenset()
+    grey: bool = False
 
     def __init__(
         self,
@@ -118,7 +123,7 @@ class Sequence:
                     " must be of that size"
                 )
         sequence = cls(files, mask_files, indices, wanted, drop_stray)
-        sequence.count = len(paths)
+        sequence.count, sequence.grey = len(paths), _is_grey(read_pixels(files[0]))
         if tracks:
             sequence.tracks = Tracks.read(tracks, len(paths), indices, track_centre)
         if depth:
@@ -144,7 +149,8 @@ class Sequence:
         return len(self.files)
 
     def frame(self, i: int) -> np.ndarray:
-        """Image i, (H, W, 3) float32, linear RGB in [0, 1].
+        """Image i, (H, W, 3) float32, linear RGB in [0, 1]; without its colours where the sequence
+        is ``grey``.
 
         8 and 16 bit images are taken as sRGB and decoded; float images (EXR, HDR, TIFF) as linear.
         Grey becomes RGB, alpha is ignored.
@@ -155,7 +161,8 @@ class Sequence:
         image = np.ascontiguousarray(
             image[..., 2::-1] if image.shape[2] >= 3 else np.repeat(image[..., :1], 3, axis=2)
         )  # OpenCV's order is BGR
-        return _linear(image, self.files[i])
+        image = _linear(image, self.files[i])
+        return grey(image) if self.grey else image
 
     def mask(self, i: int) -> np.ndarray | None:
         """Silhouette i, (H, W) float32 in [0, 1]; None without masks.
@@ -189,6 +196,14 @@ def drop_stray_components(mask, share=0.1):
     area = stats[:, cv2.CC_STAT_AREA].copy()
     area[0] = 0
     return mask * (area >= share * area.max())[labels]
+
+
+def _is_grey(image):
+    if image.ndim == 2 or image.shape[2] < 3:
+        return True
+    largest, least = image[..., :3].max(2), image[..., :3].min(2)
+    apart = np.quantile(largest.astype(float) - least, 0.99)
+    return bool(apart <= _LEAST_COLOUR * max(largest.max(), 1e-9))
 
 
 def _linear(image, path):

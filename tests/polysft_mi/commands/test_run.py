@@ -19,6 +19,7 @@ import synthetic
 import trimesh
 from places import ROOT
 
+from polyfit.colours import linear, srgb
 from polysft_mi import demo, prepare, run
 from polysft_mi.pictures import exr
 from polysft_mi.results.evaluation import evaluate, score
@@ -249,6 +250,26 @@ def test_frames_that_the_surface_does_not_explain_are_called_doubtful(sequence, 
     assert (
         "doubtful: frames 2 to 3: it does not look like the image (SSIM " in capsys.readouterr().out
     )
+
+
+def linear_grey(image):
+    """What a sensor without colours makes of an image (H, W, 3) uint8 BGR, coded as sRGB."""
+    return np.round(255 * srgb(linear(image / 255) @ [0.5, 0.3, 0.2])).astype(np.uint8)
+
+
+def test_a_grey_video_of_a_coloured_sheet_is_tracked(sequence, result, tmp_path, capsys):
+    """A sensor's own, and what a program made of a video in colour."""
+    own = evaluate(str(result), str(sequence.folder))
+    for kind in (linear_grey, lambda image: cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)):
+        folder = shutil.copytree(sequence.folder, tmp_path / "sheet", dirs_exist_ok=True)
+        for path in (folder / "frames").iterdir():
+            image = cv2.imread(str(sequence.folder / "frames" / path.name))
+            assert cv2.imwrite(str(path), kind(image))
+        out = ran(folder, tmp_path / "out", "--overwrite", *GAUSS_NEWTON)
+        figures = evaluate(str(out), str(folder))
+        assert "the frames are grey" in capsys.readouterr().err
+        assert figures["rmse_mm"] < 2 * own["rmse_mm"] + 1
+        assert figures["psnr_mask"] > 30
 
 
 def test_how_tracks_and_depth_fit_is_told(sequence, tmp_path, capsys):

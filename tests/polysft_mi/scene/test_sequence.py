@@ -89,6 +89,21 @@ def test_grey_alpha_and_exr(tmp_path):
     np.testing.assert_allclose(s.frame(0), np.broadcast_to([0.25, 0.5, 1], (3, 4, 3)))
 
 
+def test_frames_without_colours_are_known(tmp_path):
+    """One channel, or three that differ no more than coding makes them."""
+    random = np.random.default_rng(0)
+    grey = random.integers(0, 250, (12, 16, 1), np.uint8)
+    near = grey + random.integers(0, 3, (12, 16, 3), np.uint8)
+    colour = grey + random.integers(0, 6, (12, 16, 3), np.uint8)
+    for name, image, expected in (("a", grey, True), ("b", near, True), ("c", colour, False)):
+        (tmp_path / name).mkdir()
+        assert cv2.imwrite(str(tmp_path / name / "0.png"), image)
+        sequence = Sequence.open(str(tmp_path / name))
+        assert sequence.grey is expected, name
+        if expected:
+            assert np.ptp(sequence.frame(0), axis=2).max() == 0
+
+
 @pytest.mark.parametrize(
     "dtype, high", [(np.uint8, 255), (np.uint8, 1), (np.uint16, 65535), (np.uint16, 1)]
 )
