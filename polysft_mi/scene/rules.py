@@ -49,8 +49,8 @@ class Rules:
     gain: float = _rule(
         0.01,
         "share",
-        "of the objective, chromaticity aside, that a step must promise, or a pass must gain, for"
-        " another one to follow",
+        "of the objective, chromaticity, tracks and depth aside, that a step must promise, or a"
+        " pass must gain, for another one to follow",
         row="small step ends a stage",
     )
     damping: tuple = _rule(

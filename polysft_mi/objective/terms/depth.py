@@ -35,7 +35,7 @@ class Depth(Term):
     surface at every step; where it does not go along with the surface at all, it says nothing.
     """
 
-    name, setting = "depth", "k_depth"
+    name, setting, is_noise = "depth", "k_depth", True
     _patch = "depth_patch"  # the name of m among the noises
 
     def __init__(self, inputs):

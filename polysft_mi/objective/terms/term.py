@@ -189,7 +189,7 @@ class Term:
     out. A term has its :meth:`energy` on Dr.Jit arrays, for any solver that takes gradients. Where
     it is also known in closed form to second order, it has :meth:`add`, and :meth:`rows` for what
     acts on vertices; the tests hold both forms together. ``is_noise``: most of its energy is noise
-    that no step lowers, and no measure of what one gains.
+    that no step lowers, so what a step gains is no share of it.
     """
 
     name: ClassVar[str]

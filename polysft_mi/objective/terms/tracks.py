@@ -32,7 +32,7 @@ class Tracks(Term):
     surface that slipped comes back.
     """
 
-    name, setting = "tracks", "k_tracks"
+    name, setting, is_noise = "tracks", "k_tracks", True
 
     def __init__(self, inputs):
         super().__init__(inputs)
