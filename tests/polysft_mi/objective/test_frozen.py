@@ -132,12 +132,3 @@ def test_weights_that_are_left_to_the_template():
     assert Settings(order=6).jet_order(3) == 6
     with pytest.raises(InputError, match=r"k_mi = -2.0; a finite number, at least 0, or -1"):
         Settings(k_mi=-2.0)
-
-
-def test_what_is_mostly_noise_is_no_measure_of_a_gain(truth):
-    objective = Objective(problem_of(truth.folder))
-    state = objective.atlas.state(objective.inputs.surface.rest().to_numpy())
-    objective.observe(0, objective.atlas.surface(state).vertices)
-    model = quadratic(objective, state, objective.usual[-1], 0.05)
-    noise = model.terms["chroma"]
-    assert noise > 0 and model.measure == pytest.approx(model.total - noise)

@@ -209,6 +209,16 @@ def test_images_in_closed_form_go_where_automatic_differentiation_goes(problem, 
     assert np.linalg.norm(a - b) < near * np.linalg.norm(b)
 
 
+def test_what_is_mostly_noise_is_no_measure_of_a_gain(problem, rng):
+    weights = {**WEIGHTS, "k_rgb": 1.0}
+    objective = objective_of(problem, "rgb", "chroma", "tracks", "depth", **weights)
+    state = objective.atlas.state(problem.patch.rest().to_numpy())
+    context = context_of(objective, rng)
+    (model,) = objective.frozen([context], objective.usual[-1], [state]).quadratic([state])
+    assert min(model.terms.values()) > 0
+    assert model.measure == pytest.approx(model.terms["rgb"])
+
+
 def test_another_camera_says_what_the_first_says_from_its_place(problem, rng):
     """At the place of the scene's own camera, it has the same energy, gradient and curvature."""
     weights = {"k_rgb": 2.0, "k_silhouette": 0.5}
