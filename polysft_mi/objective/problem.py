@@ -34,8 +34,8 @@ class Problem:
 
     ``template``; ``patch``: its jets on the device, ``atlas``: on the host; ``placed``: its mesh in
     the scene; ``camera``; ``sequence``: the frames; ``settings``, with what they leave open decided
-    for this template; ``rules``; ``bleached``: whether the template's colours were taken away,
-    since a camera has none. Raises InputError where the sensor does not suit.
+    for this template; ``rules``; ``bleached``: whether the texture's colours were taken away, for
+    the frames have none. Raises InputError where the sensor does not suit.
     """
 
     def __init__(
@@ -52,11 +52,7 @@ class Problem:
         self.placed = PlacedMesh(*rendered, self.settings.sppi, e.path)
         self.camera = self.placed.camera
         self.width, self.height = experiment.size
-        videos, self.bleached = [sequence, *(c.sequence for c in sequence.cameras)], False
-        if any(video.grey for video in videos):
-            for video in videos:
-                video.grey = True
-            self.bleached = self.placed.make_grey(*self._response())
+        self.bleached = sequence.grey and self.placed.make_grey(*self._response())
 
     def _response(self):
         """``(weights, is_coded)`` of :func:`polyfit.colours.grey`, as the first frame says what a

@@ -99,6 +99,10 @@ class Experiment:
                     )
             selected = s.first, s.last, s.stride
             sequence.cameras = open_cameras(cameras, len(sequence), *selected, self.sensors)
+            videos = [sequence, *(camera.sequence for camera in sequence.cameras)]
+            is_grey = any(video.grey for video in videos)  # all are compared with one texture
+            for video in videos:
+                video.grey = is_grey
         if body:
             motion = read_motion(body, sequence.count, sequence.indices, model, s.body_up)
             sequence.carrier = put_on(self.template.vertices, self.template.faces, motion)

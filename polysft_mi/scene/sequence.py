@@ -36,7 +36,7 @@ class Sequence:
     ``carrier``: what carries the template with a body
     (:class:`polysft_mi.body.carrier.Carrier`), or None; ``unmasked``: frames whose mask is empty,
     or nearly; ``grey``: whether frames are taken without their colours, which is so where the first
-    one has none.
+    one, or that of another camera, has none.
     """
 
     tracks: Tracks | None = None

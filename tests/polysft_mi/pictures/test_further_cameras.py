@@ -4,6 +4,7 @@ import base64
 import io
 import json
 import re
+import shutil
 from pathlib import Path
 
 import cv2
@@ -56,6 +57,18 @@ def sheet(tmp_path_factory):
     film(truth, folder / "cameras" / "side")
     prepare.main([str(folder), "--cameras", str(folder / "cameras")])
     return truth
+
+
+def test_one_grey_camera_makes_all_grey(sheet, tmp_path):
+    """All are compared with one texture."""
+    folder = shutil.copytree(sheet.folder, tmp_path / "sheet")
+    for path in (folder / "cameras" / "side" / "frames").iterdir():
+        assert cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
+    experiment = scene.load(str(folder / "scene.xml"))
+    sequence = experiment.sequence()
+    for video in (sequence, sequence.cameras[0].sequence):
+        assert np.ptp(video.frame(1), axis=2).max() == 0
+    assert Problem(experiment, sequence).bleached
 
 
 def test_each_camera_is_measured_by_itself(sheet, tmp_path):
