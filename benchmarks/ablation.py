@@ -1,11 +1,20 @@
 """What each rule of the tracker is worth: it is switched off alone, on every sequence.
 
-    python benchmarks/ablation.py [--data FOLDER] [--simulated FOLDER] [--only flag ...]
+    python benchmarks/ablation.py --simulated FOLDER [--data FOLDER] [--only "flag 91" ...]
     [--rules relief ...] [--until-decided] [--threads N] [--docs docs]
 
 A rule is a field of ``polysft_mi.scene.rules.Rules``, or a setting, that decides when or whether
-something happens. Each is switched off by the values in ``SWITCHES``, and everything else stays as
-it is. Measured are the error of the surface and the seconds of CPU a frame, tracking alone.
+something happens, or how much it counts. Each is switched off by the values in ``SWITCHES``, or,
+where a number has no off, moved far; everything else stays as it is. Measured are the error of the
+surface and the seconds of CPU a frame, tracking alone.
+
+The simulated sequences were made after the rules had their values. FOLDER holds a folder a seed:
+
+    python benchmarks/simulate.py FOLDER/91 --seed 91 --only flag
+    python benchmarks/simulate.py FOLDER/96 --seed 96 --plain --only flag
+
+and so on: SIMULATED below says which kinds of surface of which seed are used. Those of seeds 96 to
+99 are plain, with textures of few details.
 
 Where folds come and go, the smallest change grows from frame to frame. So the tracker runs several
 times with a setting changed by some hundred-thousandths; a rule's error is compared with the median
@@ -14,9 +23,7 @@ so by 5 % without it on at least two sequences. Rules stay, too, without which a
 
 Each result goes into ``ablation.json`` as soon as it is there, and the next call does what is
 missing. All of it takes many hours. With ``--until-decided`` a rule is measured until two sequences
-need it, and only a rule that may go on all. The simulated sequences are made by
-``benchmarks/simulate.py OUT --seed N``, one folder a seed below FOLDER. Writes ``ablation.json``
-and ``ablation.md`` into DOCS.
+need it, and only a rule that may go on all. Writes ``ablation.json`` and ``ablation.md`` into DOCS.
 """
 
 import argparse
@@ -31,31 +38,24 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from ablation_results import BASELINE, CHANCES, FIGURES, ROUNDED, decided, page, read, write
-from sequences import DATA, ROOT, SCENES, folder_of, scene_of
+from sequences import DATA, ROOT, folder_of, scene_of
 
 from polyfit.backend import add_mode_argument, set_variant
 from polyfit.files import aside
 from polysft_mi.errors import InputError, cli
 from polysft_mi.scene.rules import Rules
 
-SEQUENCES = tuple(
-    "demo flag bend paper curtain corner hand poster".split()
-    + "kinect_paper phi_sft_R1 tube shirt ball".split()
-)
-SIMULATED = (
-    ("flag", 5),
-    ("flag", 10),
-    ("curtain", 6),
-    ("bend", 10),
-    ("bend", 5),
-    ("bend", 11),
-    ("paper", 5),
-    ("curtain", 5),
-    ("skirt", 1),
-    ("pillow", 1),
-    ("roll", 1),
-)
-ORDER = (*SEQUENCES, *(f"{name} {seed}" for name, seed in SIMULATED))  # of the table's columns
+SEQUENCES = ("kinect_paper", "phi_sft_R1", "tube", "shirt", "ball")
+SIMULATED = {  # name in the table: (kind of surface, seed)
+    f"{kind} {seed}": (kind, seed)
+    for kind, seed in (
+        *(("flag", 91), ("bend", 92), ("paper", 93), ("curtain", 94), ("pushed", 95)),
+        *(("flag", 96), ("bend", 97), ("pushed", 99)),  # with --plain
+        *(("skirt", 1), ("pillow", 1), ("roll", 1)),
+    )
+}
+UNMASKED = {f"{name}, no masks": SIMULATED[name] for name in ("flag 91", "bend 92")}
+ORDER = (*SIMULATED, *UNMASKED, *SEQUENCES)  # of the table's columns
 
 
 @dataclass(frozen=True)
@@ -76,23 +76,36 @@ SWITCHES = (
     Switch(BASELINE),
     # changes that mean nothing: how far results move by themselves
     *(Switch(rule, chance=share) for rule, share in CHANCES.items()),
-    Switch("appearance", {"appearance": False}),
-    Switch("shading", settings={"k_shading": 0}),
-    Switch("chromaticity", settings={"k_chroma": 0}),
-    Switch("exposure", {"exposure": False}),
-    Switch("light's memory", {"light_kept": 1.0}),
-    Switch("relief", settings={"k_relief": 0}),
-    Switch("relief's bending", {"relief_bend": 0.0}),
-    Switch("relief's caution", {"noise_misfit": math.inf}),
-    Switch("edges give", {"give": math.inf}),
+    Switch("three stages", {"blurs": (1.0, 1.0, 1.0)}),
+    Switch("a wider blur where it moved far", {"far_blur": 3.0}),
+    Switch("soft edges first", {"stiffness": (1.0, 1.0, 1.0)}),
+    Switch("more steps at first", {"iterations": (3, 3, 3)}),
+    Switch("window of local brightness", {"window": 16.0}),
+    Switch("small step ends a stage", {"gain": 1e-4}),
+    Switch("damping", {"damping": (1e-8, 1e-8)}),
     Switch("robust scale", {"scale_least": 0.3}),  # what it is in the first frame
     Switch("fine passes", {"fine_passes": False}),
     Switch("motion starts", {"motion_starts": False}),
+    Switch("a frame may be explained", {"margin": 0.0}),
     Switch("other starts", {"usual_frames": 2}),
-    Switch("more iterations there", {"far_converges": False}),
-    Switch("small step ends a stage", {"gain": 1e-4}),
     Switch("mirror images", {"mirror_share": 0.0}),
+    Switch("relief", {"relief_vertices": 0}),
+    Switch("relief's bending", {"relief_bend": 0.0}),
+    Switch("relief's caution", {"noise_misfit": math.inf}),
+    Switch("its steepness", {"noise_power": 2.0}),
+    Switch("edges give", {"give": math.inf}),
     Switch("texture fit", {"texture_gain": 0.0}),
+    Switch("appearance", {"appearance": False}),
+    Switch("borders", {"border": 0.0}),
+    Switch("shading", settings={"k_shading": 0}),
+    Switch("chromaticity", settings={"k_chroma": 0}),
+    Switch("triangles' outliers", {"triangle_scale": 1.0}),
+    Switch("triangles' blur", {"shading_blur": 0.0}),
+    Switch("triangles inside", {"shading_inside": 0.0}),
+    Switch("exposure", {"exposure": False}),
+    Switch("light's prior", {"light_ridge": 0.0}),
+    Switch("light's memory", {"light_kept": 1.0}),
+    Switch("shading's outliers", {"light_scale": math.inf}),
     Switch("joints", settings={"k_coupling": 0.0}, rounded=True),
     Switch("unseen parts are held", {"unseen": 1.0}, rounded=True),
     Switch("softer lengths", settings={"k_mi": 100.0}, rounded=True),
@@ -105,21 +118,23 @@ SWITCHES = (
 
 
 def sequences(data, simulated):
-    """Name in the table to (scene file, folder of the data and the truth); those that are there."""
-    found = {name: (name, folder_of(data, name)) for name in SEQUENCES}
-    found["demo"] = "demo", os.path.join(SCENES, "demo")
-    for name, seed in SIMULATED if simulated else ():
-        found[f"{name} {seed}"] = name, os.path.join(simulated, str(seed), name)
+    """Name in the table to (scene file, folder of the data and the truth, settings); those that are
+    there.
+    """
+    found = {name: (name, folder_of(data, name), {}) for name in SEQUENCES}
+    for name, (kind, seed) in (SIMULATED | UNMASKED).items() if simulated else ():
+        settings = {"masks": ""} if name in UNMASKED else {}
+        found[name] = kind, os.path.join(simulated, str(seed), kind), settings
     return {
-        name: (scene_of(kind), folder)
-        for name, (kind, folder) in found.items()
+        name: (scene_of(kind), folder, settings)
+        for name, (kind, folder, settings) in found.items()
         if folder and os.path.isdir(folder)
     }
 
 
-def run(switch, scene_file, data, template=None):
+def run(switch, scene_file, data, settings=None, template=None):
     """One sequence with one rule off: its figures, ``lost`` frames and ``cpu`` seconds a frame;
-    with a :class:`Template`, where one is given, instead of the scene's.
+    under ``settings``, and with a :class:`Template`, where one is given, instead of the scene's.
     """
     from polysft_mi import tracker
     from polysft_mi.objective.problem import Problem
@@ -128,7 +143,9 @@ def run(switch, scene_file, data, template=None):
     from polysft_mi.scene import experiment as scene
     from polysft_mi.surface.patch import Unknowns
 
-    experiment = scene.load(scene_file, {"data": data, **switch.settings}, template)
+    experiment = scene.load(
+        scene_file, {"data": data, **(settings or {}), **switch.settings}, template
+    )
     sequence = experiment.sequence()
     rules = dataclasses.replace(Rules(), **switch.fields)
     problem = Problem(experiment, sequence, rules)
@@ -181,8 +198,8 @@ def main(arguments=None):
     os.makedirs(options.docs, exist_ok=True)
     path = os.path.join(options.docs, "ablation.json")
     found = sequences(options.data, options.simulated)
-    if set(found) == {"demo"}:
-        raise InputError(f"--data {options.data}: none of the sequences is there")
+    if not found:
+        raise InputError(f"none of the sequences is in --data {options.data}, or in --simulated")
     if unknown := set(options.only or ()) - set(found):
         raise InputError(f"--only {', '.join(sorted(unknown))}: known are {', '.join(found)}")
     set_variant(options.mode)
@@ -192,7 +209,7 @@ def main(arguments=None):
     for switch in SWITCHES:
         if options.rules is not None and switch.rule not in options.rules:
             continue
-        for name in options.only or found:
+        for name in options.only or [n for n in ORDER if n in found]:
             known = read(path)
             if options.until_decided and decided(known, switch.rule):
                 break

@@ -87,7 +87,7 @@ def tracked(template, name, folder, chance, sheet):
     one = Settings().for_patches(1)
     weights = {name: getattr(one, name) for name in ("k_mi", "k_silhouette", "k_relief")}
     switch = Switch("", {"unseen": 1.0} if sheet else {}, weights if sheet else {}, chance)
-    result = run(switch, scene_of(name), folder, template)
+    result = run(switch, scene_of(name), folder, template=template)
     figures = result["figures"]
     return figures.get("e3d_proc_seen", figures["e3d_proc"]), result["cpu"]
 

@@ -5,7 +5,7 @@ import os
 ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 SCENES = os.path.join(ROOT, "scenes")
 # Simulated surfaces that are no sheet (benchmarks/simulate.py) have no scene of their own
-_SCENE_OF = {"skirt": "tube", "pillow": "tube", "roll": "tube"}
+_SCENE_OF = {"skirt": "tube", "pillow": "tube", "roll": "tube", "pushed": "bend"}
 DATA = os.environ.get("POLYSFT_DATA") or os.path.join(os.path.dirname(ROOT), "shared", "data")
 
 

@@ -29,14 +29,28 @@ class Rules:
         (2.5, 1.5, 1.0),
         "pixels",
         "blur of the images at the three stages, on a sheet of 225 pixels; it grows with the sheet",
+        row="three stages",
     )
-    far_blur: float = _rule(6.0, "pixels", "blur of the stage for a sheet that moved far, likewise")
+    far_blur: float = _rule(
+        6.0,
+        "pixels",
+        "blur of the stage for a sheet that moved far, likewise",
+        row="a wider blur where it moved far",
+    )
     stiffness: tuple = _rule(
-        (0.1, 0.3, 1.0), "share", "of `k_mi` at the three stages: soft edges register first"
+        (0.1, 0.3, 1.0),
+        "share",
+        "of `k_mi` at the three stages: soft edges register first",
+        row="soft edges first",
     )
-    iterations: tuple = _rule((6, 4, 3), "", "iterations of the three stages")
+    iterations: tuple = _rule(
+        (6, 4, 3), "", "iterations of the three stages", row="more steps at first"
+    )
     window: float = _rule(
-        8.0, "pixels", "standard deviation of the window of local brightness, likewise"
+        8.0,
+        "pixels",
+        "standard deviation of the window of local brightness, likewise",
+        row="window of local brightness",
     )
     # surfaces of several patches
     unseen: float = _rule(
@@ -54,7 +68,10 @@ class Rules:
         row="small step ends a stage",
     )
     damping: tuple = _rule(
-        (1e-4, 3e-3), "", "Levenberg-Marquardt damping at a stage's start, without and with relief"
+        (1e-4, 3e-3),
+        "",
+        "Levenberg-Marquardt damping at a stage's start, without and with relief",
+        row="damping",
     )
     scale_least: float = _rule(
         0.2, "deviations", "that the robust scale is at least", row="robust scale"
@@ -78,18 +95,13 @@ class Rules:
         "misfit",
         "that tells: below it a frame counts as explained; one that exceeds the usual by it is"
         " suspect",
+        row="a frame may be explained",
     )
     usual_frames: int = _rule(
         5,
         "frames",
         "over which the usual misfit is a median; of less than three there is none",
         row="other starts",
-    )
-    far_converges: bool = _rule(
-        True,
-        "",
-        "whether a suspect frame that is started anew takes steps until its stages converge",
-        row="more iterations there",
     )
     # mirror images
     mirror_share: float = _rule(
@@ -98,12 +110,12 @@ class Rules:
         "of a frame's cost that the mirror image of a sheet may cost more, to be tracked too",
         row="mirror images",
     )
-    mirror_apart: float = _rule(
-        1.0, "frames", "whose cost one must have saved over the other, for this to be dropped"
-    )
     # the relief, and caution with noise
     relief_vertices: int = _rule(
-        3000, "vertices", "of the template, above which there is no relief: it costs too much time"
+        3000,
+        "vertices",
+        "of the template, above which there is no relief: it costs too much time",
+        row="relief",
     )
     relief_bend: float = _rule(
         3e-3, "share", "of the relief's weight, for its bending", row="relief's bending"
@@ -114,7 +126,7 @@ class Rules:
         "of noise, at which the relief's weight has doubled",
         row="relief's caution",
     )
-    noise_power: float = _rule(8.0, "", "with which it grows with the noise")
+    noise_power: float = _rule(8.0, "", "with which it grows with the noise", row="its steepness")
     give: float = _rule(
         0.002,
         "strain",
@@ -122,7 +134,6 @@ class Rules:
         row="edges give",
     )
     # the texture
-    texels: float = _rule(1.5, "texels", "of the baked texture to a pixel of the first frame")
     texture_gain: float = _rule(
         0.6,
         "share",
@@ -136,31 +147,44 @@ class Rules:
         row="appearance",
     )
     border: float = _rule(
-        2.0, "windows", "from the sheet's border where images without masks are not corrected so"
+        2.0,
+        "windows",
+        "from the sheet's border where images without masks are not corrected so",
+        row="borders",
     )
     # colours of triangles
-    chroma_scale: float = _rule(
-        0.04, "share", "of the mean luminance, beyond which a triangle's chromaticity is an outlier"
+    triangle_scale: float = _rule(
+        0.05,
+        "share",
+        "of the mean luminance, beyond which a triangle's colour, or its brightness, is an outlier",
+        row="triangles' outliers",
     )
-    shading_blur: float = _rule(0.45, "triangles", "blur of texture and frames, in triangle sides")
+    shading_blur: float = _rule(
+        0.45, "triangles", "blur of texture and frames, in triangle sides", row="triangles' blur"
+    )
     shading_inside: float = _rule(
         0.97,
         "share",
         "of a triangle's surroundings that must be texture, where images have no masks",
+        row="triangles inside",
     )
     exposure: bool = _rule(
         True, "", "whether a frame's overall brightness is its own", row="exposure"
     )
     light_ridge: float = _rule(
-        3e-3, "observations", "a triangle, that hold the light to be the same from all sides"
+        3e-3,
+        "observations",
+        "a triangle, that hold the light to be the same from all sides",
+        row="light's prior",
     )
-    light_refits: int = _rule(3, "", "of a frame's robust regression")
     light_kept: float = _rule(
         0.8, "share", "of what earlier frames say of light, a frame later", row="light's memory"
     )
-    light_scale: float = _rule(8.0, "deviations", "at which a triangle's residual is an outlier")
-    light_most: float = _rule(
-        0.05, "share", "of the mean luminance, the most that this may be, and what it is at first"
+    light_scale: float = _rule(
+        8.0,
+        "deviations",
+        "at which its brightness is one, where that is less",
+        row="shading's outliers",
     )
 
     def for_patches(self, count: int) -> "Rules":

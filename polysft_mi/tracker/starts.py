@@ -9,7 +9,7 @@ import numpy as np
 
 from .relocate import TemplateFeatures, rigid_motion
 
-_MOST = 60  # steps of a stage, which ends before, where one promises little
+_MOST = 60  # steps of a stage from a start that may be far off; it ends where one promises little
 
 
 def motion_starts(start, history):
@@ -52,7 +52,7 @@ class Starts:
             # a body's pose is far off, and no frame before says by how much
             all_of = objective.far, *objective.usual
             bodily = [replace(stage, bodily=True) for stage in all_of[:3]]
-            return stages.descend(start, context, (*bodily, *all_of), self._many)
+            return stages.descend(start, context, (*bodily, *all_of), _MOST)
         best = stages.descend(
             self.nearest(starts, frame, objective.usual[0]), context, objective.usual
         )
@@ -67,15 +67,10 @@ class Starts:
                 break
             if (other := other()) is None:
                 continue
-            found = stages.descend(other, context, far, self._many)
+            found = stages.descend(other, context, far, _MOST)
             if stages.cost(found) < stages.cost(best):
                 best = found
         return best
-
-    @property
-    def _many(self):
-        """Steps of a stage from a start that may be far off; None: as usual."""
-        return _MOST if self._rules.far_converges else None
 
     def _suspect_above(self, usual):
         """The misfit above which a frame is suspect: infinite while those of the frames before are

@@ -97,11 +97,11 @@ def _follow(tracker, done, k, progress):
     there is none, begin one if the mirror image explains this frame as well; the worse it does,
     the later it is tried again.
     """
-    share, apart = tracker.objective.rules.mirror_share, tracker.objective.rules.mirror_apart
+    share = tracker.objective.rules.mirror_share
     if done.other:
         _advance(tracker, done.other, k, 1, None, progress)
         done.seconds[k] = done.other.seconds[k] = done.seconds[k] + done.other.seconds[k]
-        if branches.decide(done, apart):
+        if branches.decide(done, share):
             done.other, done.mirror_at = None, k + 1
     elif tracker.mirrors and k >= done.mirror_at and k not in done.lost:
         began = time.perf_counter()

@@ -116,7 +116,7 @@ def test_the_light_follows_the_surface_and_the_energy_has_no_slope_along_it():
         np.diag([5.0, 1, 1, 1, 2, 2, 2]) @ LIGHT,
         0.01,
         1,
-        Rules(light_refits=60),
+        Rules(),
     )
     shade = shade_of(found, vertices, 0.4)
     fit = light.fit(shade)
