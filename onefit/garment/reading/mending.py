@@ -14,7 +14,8 @@ as a part of the garment's :class:`onefit.garment.RenderMesh`:
 4. Of separate parts, those below 5 % of the area (buttons, labels, pockets) are no cloth; the
    others stay, each for itself. Refused if less than 80 % of the area would be left.
 5. Faces wound against the others of their part are turned. A part with a single side is refused (a
-   Moebius strip).
+   Moebius strip). Faces whose corners lie in a line are flipped with the next one, or dropped at
+   the boundary (:mod:`onefit.garment.reading.flat`).
 6. Of cloth with a thickness the outer side is taken (:mod:`onefit.garment.reading.thickness`); a
    solid is refused.
 7. Holes of less than 10 cm around are filled.
@@ -28,6 +29,7 @@ from polyfit import mesh
 from polyfit.errors import InputError
 from polyfit.mesh import loops
 
+from .flat import without_flat
 from .thickness import outer_side
 from .zip import zipped
 
@@ -66,6 +68,10 @@ def _one_layer(V, F, merged, cuts, body, where, told):
     V, F = _cut_apart(V, F, told)
     V, F = _large_parts(V, F, where, told)
     F = _wound_alike(V, F, where, told)
+    F, flat = without_flat(V, F)
+    if flat:
+        told.append(f"flipped or dropped {flat} faces whose corners lie in a line")
+        V, F = _without_slivers(V, F, where, told)
     V, F = _outer_sides(V, F, body, where, told)
     if (count := parts(F).max() + 1) > 1:
         told.append(f"has {count} separate parts, which move each for itself")

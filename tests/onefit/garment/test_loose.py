@@ -42,7 +42,9 @@ def lowest_loops(garment, count=1):
 def test_is_one_clean_sheet_whose_seams_are_closed(garment):
     V, F = garment.vertices.double().numpy(), garment.faces.numpy()
     _W, G, told = mended(V, F)
-    assert told == () and np.array_equal(G, F)
+    flat = garment.name == "waisted_dress"  # one face at its rim, 0.03 mm high
+    assert told == ("flipped or dropped 1 faces whose corners lie in a line",) * flat
+    assert len(F) - len(G) == flat and np.isin(G, F).all() and (flat or np.array_equal(G, F))
     found = loops(F)
     assert len(found) == LOOPS[garment.name]
     assert len(V) - len(mesh.edges_of(F)[0]) + len(F) == 2 - len(found)

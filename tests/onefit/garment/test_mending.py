@@ -1,5 +1,6 @@
 """Meshes that are repaired or refused, and garments of other makes."""
 
+import itertools
 import re
 
 import numpy as np
@@ -53,6 +54,31 @@ def flipped(F, rows):
     return G
 
 
+def with_flat_faces(V, F, count, rows=3):
+    """With ``count`` faces whose corners lie in a line, ``rows`` of them one beside the other in
+    the place of one edge; the first ones lie at the boundary.
+    """
+    side = mesh.edges_of(F)[1]
+    uses = np.bincount(side.ravel())
+    V, F, used = list(V), F.tolist(), set()
+    for e in np.argsort(uses, kind="stable")[[*range(0, 99), *range(-99, 0)]]:
+        sides = np.argwhere(side == e)
+        if used & set(sides[:, 0]):
+            continue
+        used |= set(sides[:, 0])
+        f, k = sides[0]
+        p, q, c = np.roll(F[f], -k)
+        inner = [len(V) + i for i in range(rows)]
+        V += [V[p] + (i + 1) / (rows + 1) * (V[q] - V[p]) for i in range(rows)]
+        line = list(itertools.pairwise([p, *inner, q]))
+        F[f] = [p, inner[0], c]
+        F += [[a, b, c] for a, b in line[1:]] + [[a, q, b] for a, b in line[:-1]]
+        count -= rows
+        if count <= 0:
+            break
+    return np.array(V), np.array(F)
+
+
 class TestRepairs:
     """Each case is made from the tank top; what reading says of it, and that the tank top comes
     out.
@@ -91,6 +117,15 @@ class TestRepairs:
             "1 faces without area",
             "2 faces that repeat others",
         )
+
+    def test_faces_whose_corners_lie_in_a_line(self, tank):
+        V, F = tank
+        W, G = with_flat_faces(V, F, 300)
+        assert (mesh.areas(W, G) < 1e-12).sum() == 300
+        g = self.check(W, G, "flipped or dropped 300 faces")
+        X, H = g.vertices.double().numpy(), g.faces.numpy()
+        assert len(g) == len(W) and mesh.areas(X, H).min() > 1e-7
+        assert mesh.areas(X, H).sum() == pytest.approx(mesh.areas(V, F).sum(), rel=1e-4)
 
     def test_seams_and_soups_are_sewn(self, tank):
         V, F = tank
