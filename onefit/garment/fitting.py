@@ -33,6 +33,7 @@ from .binding import (
 from .reading import parts
 
 _PUSHED_DEPTH = 0.03  # vertices inside the body by less than this are pushed out [m]
+_FARTHEST = 5.0  # of cloth from the body: beyond that nothing tells what it hangs on [m]
 _PUSH_RADIUS = 0.02  # how far a vertex pushed out takes its neighbours with it [m]
 UNITS = {
     1.0: "metres",
@@ -161,6 +162,19 @@ def check_place(V, surface, where, other=None):
     if best:
         advice = f"it looks like {best[1]}: give {best[2]}"
     raise OffBody(f"{where}: does not lie on the body: {why}; {advice}", why)
+
+
+def check_reach(V, surface, where):
+    """Raises InputError where any of the cloth's vertices (N, 3) [m] lies far from the body of
+    ``surface``.
+    """
+    far = np.abs(surface(V, 1e9).distance) > _FARTHEST
+    if far.any():
+        at = ", ".join(f"{x:.3g}" for x in V[far.argmax()])
+        raise InputError(
+            f"{where}: {far.sum()} of {len(V)} vertices of the cloth lie more than"
+            f" {_FARTHEST:g} m from the body, the first at ({at}) m; delete them, or put them back"
+        )
 
 
 def _mm(distance):

@@ -187,6 +187,7 @@ class Garment:
         check(vertices, faces, where)
         fitting.check_place(vertices[np.unique(faces)], surface, where, other)
         V, F, told = mended(vertices, faces, where, surface)
+        fitting.check_reach(V, surface, where)
         turned = fitting.inward(V, F, surface)
         if turned.any():
             F = np.where(turned[:, None], F[:, ::-1], F)

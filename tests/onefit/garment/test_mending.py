@@ -264,6 +264,9 @@ class TestRefusals:
         W[17, 1] = np.nan
         self.refused(W, F, "1 vertices have coordinates that are not finite .*vertex 17")
         self.refused(np.zeros_like(V), F, "no area")
+        W = V.copy()
+        W[17] = 30, 0, 0
+        self.refused(W, F, r"1 of 3000 vertices of the cloth .* 5 m .* at \(30, 0, 0\) m")
         loose, G = soup(V, F)
         self.refused(
             0.7 * loose + 0.3 * np.repeat(V[F].mean(axis=1), 3, axis=0),
