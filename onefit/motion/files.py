@@ -9,7 +9,9 @@ W t. AMASS's world has z up (W = 1), Neural Cloth Simulation's y up (W = C).
 """
 
 import os
+import tokenize
 import zipfile
+import zlib
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -22,6 +24,7 @@ from .placing import placed, require_finite
 
 _C = Rotation.from_euler("x", 90, degrees=True)  # from SMPL's body axes, or any world with y up
 _RATES = ("mocap_framerate", "mocap_frame_rate", "fps", "frame_rate", "framerate")
+_DAMAGED = zipfile.BadZipFile, zlib.error, tokenize.TokenError  # of NumPy, in a damaged file
 _COUNTS = {22: 22, 24: 24, 52: 22, 55: 22}  # joints in a file, and how many of them are the body's
 
 
@@ -47,11 +50,14 @@ def read(path, fps=None, up=None):
 def _read_npz(path, fps, up):
     """(poses (T, 24, 3) [rad], translation (T, 3) [m], fps, what may be up instead)."""
     try:
-        with np.load(path, allow_pickle=False) as file:
+        file = np.load(path, allow_pickle=False)
+        if isinstance(file, np.ndarray):
+            raise ValueError("it holds one array, as .npy; poses and trans are needed")
+        with file:
             data = {key: file[key] for key in ("poses", "trans", *_RATES) if key in file.files}
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
-    except (ValueError, EOFError, OSError, zipfile.BadZipFile) as error:
+    except (ValueError, EOFError, OSError, *_DAMAGED) as error:
         raise InputError(
             f"{path}: cannot be read as .npz ({' '.join(str(error).split())[:200]})"
         ) from None
@@ -68,7 +74,7 @@ def _read_npz(path, fps, up):
                 f"{path}: no frame rate ({', '.join(_RATES)}); give it: fps=30, or --fps 30"
             )
         try:
-            fps = float(data[rate].ravel()[0])
+            fps = float(np.ravel(data[rate])[0])
         except (ValueError, TypeError, IndexError):
             raise InputError(f"{path}: {rate} is no number; give it: fps=30, or --fps 30") from None
     likely.check_rate(path, fps)
@@ -100,6 +106,7 @@ def _read_npz(path, fps, up):
 
 def _numbers(path, key, array):
     """An array of a file as float64. Raises InputError where it holds no numbers."""
+    array = np.asarray(array)  # bytes, where it is no array
     if array.dtype.kind not in "fiu":
         raise InputError(f"{path}: {key} of type {array.dtype}; numbers are needed")
     return array.astype(np.float64)

@@ -1,6 +1,8 @@
 """Motions: files of AMASS, Neural Cloth Simulation and BVH, retargeting, resampling, and the
 generator's kinds."""
 
+import zipfile
+
 import numpy as np
 import pytest
 import torch
@@ -258,9 +260,24 @@ def test_motion_files_that_cannot_be_used(tmp_path):
     np.savez(tmp_path / "m.npz", poses=good["poses"], trans=trans)
     assert Motion.read(tmp_path / "m.npz", fps=25, up="z").fps == 25
     (tmp_path / "bad.npz").write_text("no archive")
+    with open(tmp_path / "one.npz", "wb") as file:
+        np.save(file, good["poses"])
+    with zipfile.ZipFile(tmp_path / "text.npz", "w") as archive:
+        archive.writestr("poses.npy", "text")
+        archive.writestr("trans.npy", "text")
+    noise = np.random.default_rng(0).normal(size=good["poses"].shape)
+    np.savez_compressed(tmp_path / "whole.npz", **good | {"poses": noise})
+    whole = (tmp_path / "whole.npz").read_bytes()
+    for start in (70, 2000):  # in the array's header, and behind it
+        damaged = whole[:start] + bytes(250) + whole[start + 250 :]
+        (tmp_path / f"damaged{start}.npz").write_bytes(damaged)
     for name, message in (
         ("none.npz", "no such file"),
         ("bad.npz", "cannot be read as .npz"),
+        ("one.npz", "cannot be read as .npz .it holds one array, as .npy; poses and trans are"),
+        ("text.npz", r"poses of type \|S4; numbers are needed"),
+        ("damaged70.npz", "cannot be read as .npz"),
+        ("damaged2000.npz", "cannot be read as .npz"),
         ("walk.fbx", "read from .npz"),
     ):
         with pytest.raises(InputError, match=message):
