@@ -290,8 +290,8 @@ class Garment:
     def remeshed(self, count: int) -> Garment:
         """The same garment with about ``count`` vertices: every face is cut in four as often as is
         needed for 0.7 times as many; where there are more than 1.4 times as many, even triangles
-        are made anew (ACVD). Raises InputError for one that was sewn of panels: :meth:`read` takes
-        the ``count`` there.
+        are made anew (ACVD). Raises InputError for so few that a sleeve or a leg closes, and for a
+        garment that was sewn of panels: :meth:`read` takes the ``count`` there.
         """
         _check_count(count)
         if self.lengths is not None:
@@ -312,6 +312,7 @@ class Garment:
                 cut, F = remesh.remeshed(W, G, count)
                 at = ClosestSurface(W, G)(cut)
                 V = np.einsum("nk,nkd->nd", at.barycentric, V[G[at.face]])
+            remesh.check(V if cut is None else cut, F, self.name, count)
         V, pushed = fitting.pushed_out(V, F, self.name)
         render_mesh = self.render_mesh and self.render_mesh.rebound(
             self.vertices.cpu().numpy(), self.faces.cpu().numpy(), V, F

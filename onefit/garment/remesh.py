@@ -8,6 +8,9 @@ import numpy as np
 
 from onefit.body import ClosestSurface
 from polyfit import mesh
+from polyfit.errors import InputError
+
+_SHORTEST = 0.01  # an edge over the median one: below, its ends have become one
 
 
 def nearest_on_segments(points, a, b):
@@ -89,3 +92,15 @@ def remeshed(V, F, count, steps=40):
         if len(own):
             x[own] = nearest_on_segments(0.5 * (x + y)[own], V[rim[:, 0]], V[rim[:, 1]])
     return x, _delaunay(x, f)
+
+
+def check(V, F, name, count):
+    """Raises InputError where faces of a garment called ``name``, that :func:`remeshed` made with
+    ``count`` vertices, have no area, as where a sleeve has too few vertices to stay open.
+    """
+    side = np.linalg.norm(V[np.roll(F, -1, axis=1)] - V[F], axis=2)
+    if side.min() < _SHORTEST * np.median(side):
+        raise InputError(
+            f"{name}: count = {count} vertices are too few, a sleeve or a leg closes; twice as many"
+            " may do"
+        )

@@ -158,6 +158,17 @@ def test_at_another_resolution_is_the_same_garment(templates, name, times):
     assert share(other, area, F) == pytest.approx(share(garment, area_was, G), abs=0.005)
 
 
+@pytest.mark.parametrize("name, count", [("tshirt", 100), ("shirt", 200)])
+def test_too_few_vertices_for_a_sleeve(templates, name, count):
+    garment = templates[name] if name in templates else Garment.template(name)
+    with pytest.raises(
+        InputError, match=f"^{name}: count = {count} vertices are too few, a sleeve"
+    ):
+        garment.remeshed(count)
+    other = garment.remeshed(2 * count)
+    assert mesh.areas(other.vertices.numpy(), other.faces.numpy()).min() > 1e-6
+
+
 def test_grading_to_a_body_of_other_topology(templates, anny):
     body = anny.body(anny.random_shape(np.random.default_rng(8)))
     faces, edges = mesh.subdivided(body.faces.numpy())
