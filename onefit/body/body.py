@@ -69,13 +69,14 @@ class BodyModel:
         """``shape`` checked, float32 (S,), on the CPU."""
         if shape is None:
             return self.standard_shape
-        shape = torch.as_tensor(shape, dtype=torch.float32)
+        names = f"({len(self.shape_names)},) is needed: {', '.join(self.shape_names)}"
+        try:
+            shape = torch.as_tensor(shape, dtype=torch.float32)
+        except (TypeError, ValueError, RuntimeError):
+            kind = type(shape).__name__
+            raise InputError(f"body {self.kind}: a shape of type {kind}; {names}") from None
         if shape.shape != self.standard_shape.shape:
-            names = ", ".join(self.shape_names)
-            given = f"a shape of size {tuple(shape.shape)}"
-            raise InputError(
-                f"body {self.kind}: {given}; ({len(self.shape_names)},) is needed: {names}"
-            )
+            raise InputError(f"body {self.kind}: a shape of size {tuple(shape.shape)}; {names}")
         if not torch.isfinite(shape).all():
             raise InputError(f"body {self.kind}: a shape parameter is not finite")
         return shape

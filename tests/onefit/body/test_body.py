@@ -182,6 +182,9 @@ def test_shapes(model):
         model.body((0.5, 0.5, 0.5, 1.4, 0.5, 0.5))
     with pytest.raises(InputError, match=r"\(6,\) is needed: gender"):
         model.body((0.5, 0.5))
+    for wrong in ({"weight": 0.7}, "tall", [0.5, "tall"]):
+        with pytest.raises(InputError, match=r"a shape of type .*; \(6,\) is needed: gender"):
+            model.body(wrong)
     with pytest.raises(InputError, match="not finite"):
         model.body((0.5, 0.5, float("nan"), 0.4, 0.5, 0.5))
 
