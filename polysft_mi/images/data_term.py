@@ -98,7 +98,7 @@ class DataTerm:
         self.normalise, self._masked = normalise, sequence.mask_files is not None
         position, _ = self.camera.project(start)
         shown = placed.mesh, placed.rendered_faces, position[self._corner]
-        how = self._masked, self.normalise, len(template) > 1
+        how = self._rules.texels, self._masked, self.normalise, len(template) > 1
         self.texture = Texture(*shown, *how)
         # of the side that is turned to the camera: the larger one, for a sheet has any winding
         signed = signed_areas(position, self.faces)
@@ -348,7 +348,7 @@ class DataTerm:
         """
         prepared = self._frames.colours(frame, self.colours)
         known = appearance.colours if appearance else None
-        scale = self._rules.triangle_scale
+        scale = self._rules.chroma_scale
         return Chroma.of(self.colours, prepared, vertices, self.camera, seen, cast, scale, known)
 
     def appearance(self, vertices, blur, light=None, shaded=False):

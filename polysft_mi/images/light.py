@@ -21,9 +21,6 @@ _UPPER = np.triu_indices(_SIZE)
 # standard deviation of a normal distribution over the median of its absolute values
 _NORMAL_DEVIATION = 1.4826
 _LEAST_SCALE = 1e-4  # where a light explains all, as in a rendering
-# a frame's robust regression ends where no coefficient changes by more than this share of the
-# largest, or after so many refits
-_CONVERGED, _MOST_REFITS = 1e-6, 60
 
 
 @dataclass
@@ -93,7 +90,7 @@ class Light:
     @property
     def scale(self):
         """The residual, over the texture's mean luminance, from which on one hardly counts."""
-        most = self.rules.triangle_scale
+        most = self.rules.light_most
         if not self.frames:
             return most
         found = self.rules.light_scale * self.deviations / self.frames
@@ -126,15 +123,12 @@ class Light:
         value = shade.luminance
         if self.rules.exposure:
             value = value / _exposure(value[shade.seen], (rows @ before)[shade.seen])
-        found, tolerance = before, _CONVERGED * float(np.abs(before).max())
-        for _ in range(_MOST_REFITS):
-            last = found
+        found = before
+        for _ in range(self.rules.light_refits):
             weighted = (area / (1 + ((value - rows @ found) / self.scale) ** 2))[:, None] * rows
             matrix, right = weighted.T @ rows, weighted.T @ value
             matrix = np.triu(matrix) + np.triu(matrix, 1).T  # as a checkpoint has it
             found = np.linalg.solve(held + matrix, held @ before + right)
-            if np.abs(found - last).max() < tolerance:
-                break
         change = found - before
         return Fit(found, value - rows @ found, area, float(change @ held @ change), matrix, right)
 

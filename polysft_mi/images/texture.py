@@ -27,20 +27,17 @@ class Texture:
     """The reflectance of a rendered mesh over the box of its texture coordinates.
 
     ``image`` (H, W, 3) float32, linear; ``inside`` (H, W): 1 where a triangle may have it;
-    ``density``: texels a pixel of the first frame, two as for any signal that is sampled;
-    ``coordinates``: Float of 2V, of the rendered vertices; ``scale``, ``shift``: take coordinates
-    to texels (whole at their centres).
+    ``density``: texels a pixel of the first frame; ``coordinates``: Float of 2V, of the rendered
+    vertices; ``scale``, ``shift``: take coordinates to texels (whole at their centres).
     """
 
-    density = 2.0
-
-    def __init__(self, mesh, faces, position, masked, normalise, islands=False):
+    def __init__(self, mesh, faces, position, density, masked, normalise, islands=False):
         """``faces`` (F, 3): of the rendered vertices; ``position`` (V, 2) [pixels]: of these in the
         first frame; ``masked``: whether frames have masks; ``normalise``: whether images are freed
         from lighting; ``islands``: whether the texture is that of the triangles alone. A sheet's is
         that of their whole box, for it may be moved on the sheet.
         """
-        self._masked, self._normalise = masked, normalise
+        self.density, self._masked, self._normalise = density, masked, normalise
         self._faces, self._levels = faces, {}
         self.coordinates = on_device(mesh.vertex_texcoords_buffer(), mi.Float)
         self._bake(mesh, position, islands)

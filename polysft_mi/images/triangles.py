@@ -21,8 +21,7 @@ class TriangleColours:
     ``faces`` (F, 3), linear, over the mean of the texture's luminance.
 
     ``position`` (N, 2) [pixels]: of the template in the image; ``texture``:
-    :class:`polysft_mi.images.texture.Texture`; ``masked``: whether the frames have masks. Without
-    them, what lies close to the border is left out, for the background is in it.
+    :class:`polysft_mi.images.texture.Texture`; ``masked``: whether the frames have masks.
 
     ``colour`` (F, 3): of the texture; ``trusted`` (F,): which say something.
     """
@@ -35,7 +34,7 @@ class TriangleColours:
         sigma, inside, centroids = texture.density * self.sigma, texture.inside, texture.centroids()
         covered = cv2.GaussianBlur(inside, (0, 0), sigma)
         found = sampled(blur(texture.image, sigma, inside if masked else None), centroids)
-        self.trusted = sampled(covered, centroids) > (0.0 if masked else rules.shading_inside)
+        self.trusted = sampled(covered, centroids) > 0
         usual = luminance(found[self.trusted]).mean() if self.trusted.any() else 0.0
         self.mean = max(float(usual), 1e-6)
         self.colour = found / self.mean

@@ -134,6 +134,9 @@ class Rules:
         row="edges give",
     )
     # the texture
+    texels: float = _rule(
+        1.5, "texels", "of the baked texture to a pixel of the first frame", row="fine texture"
+    )
     texture_gain: float = _rule(
         0.6,
         "share",
@@ -153,20 +156,14 @@ class Rules:
         row="borders",
     )
     # colours of triangles
-    triangle_scale: float = _rule(
-        0.05,
+    chroma_scale: float = _rule(
+        0.04,
         "share",
-        "of the mean luminance, beyond which a triangle's colour, or its brightness, is an outlier",
-        row="triangles' outliers",
+        "of the mean luminance, beyond which a triangle's chromaticity is an outlier",
+        row="its outliers",
     )
     shading_blur: float = _rule(
         0.45, "triangles", "blur of texture and frames, in triangle sides", row="triangles' blur"
-    )
-    shading_inside: float = _rule(
-        0.97,
-        "share",
-        "of a triangle's surroundings that must be texture, where images have no masks",
-        row="triangles inside",
     )
     exposure: bool = _rule(
         True, "", "whether a frame's overall brightness is its own", row="exposure"
@@ -177,14 +174,20 @@ class Rules:
         "a triangle, that hold the light to be the same from all sides",
         row="light's prior",
     )
+    light_refits: int = _rule(
+        3, "", "of a frame's robust regression, which ends before it converges", row="few refits"
+    )
     light_kept: float = _rule(
         0.8, "share", "of what earlier frames say of light, a frame later", row="light's memory"
     )
     light_scale: float = _rule(
-        8.0,
-        "deviations",
-        "at which its brightness is one, where that is less",
-        row="shading's outliers",
+        8.0, "deviations", "at which a triangle's residual is an outlier", row="shading's outliers"
+    )
+    light_most: float = _rule(
+        0.05,
+        "share",
+        "of the mean luminance, the most that this may be, and what it is at first",
+        row="shading's least trust",
     )
 
     def for_patches(self, count: int) -> "Rules":

@@ -29,7 +29,7 @@ class Chroma(Term):
 
     def __init__(self, inputs):
         super().__init__(inputs)
-        self._inputs, self._squared_scale = inputs, inputs.rules.triangle_scale**2
+        self._inputs, self._squared_scale = inputs, inputs.rules.chroma_scale**2
         self._first = None  # (frame, vertices) that was solved first
         self._cast = None  # (colours, what that frame makes of them)
 
