@@ -13,6 +13,7 @@ CHANCES = {f"nothing (k_mi changed by {share:+g})": share for share in (1e-5, -1
 PAYS = 0.05  # share by which the error must grow without a rule
 FIGURES = {"e3d_proc": "e3d aligned", "depth_rmse_mm": "depth RMSE [mm]", "chamfer_1e4": "Chamfer"}
 ROUNDED = ("tube", "shirt", "ball", "skirt 1", "pillow 1", "roll 1")  # surfaces of several patches
+BEFORE = ", before"  # ends the names of sequences that were measured before there was chromaticity
 NEEDED = {  # rules that stay where they pay on one sequence alone, and why
     "other starts": "without it Kinect-Paper loses its sheet in fast motion",
     "texture fit": "without it the texture of φ-SfT R1 lies pixels off in every frame",
@@ -159,6 +160,7 @@ def page(results, all_switches, order):
     """The text of ``ablation.md``: the rules of ``all_switches``, sequences in ``order``."""
     done = [n for n in order if (BASELINE, n) in results]
     sheets, rounded = ([n for n in done if (n in ROUNDED) == part] for part in (False, True))
+    before = [n for rule, n in results if rule == BASELINE and n.endswith(BEFORE)]
     switches = [s for s in all_switches if s.rule not in (BASELINE, *CHANCES)]
     measured = lambda rule, names: any((rule, n) in results for n in names)
     rules = [s.rule for s in switches if not s.rounded and measured(s.rule, sheets)]
@@ -186,6 +188,16 @@ With all rules on, also those that are gone since (CPU time on one thread, besid
 compare it within this page only):
 
 {baseline_table(results, sheets)}
+"""
+    rules = [rule for rule in unknown if measured(rule, before)]
+    if rules:
+        text += f"""
+## Before
+
+Rules that are not measured above, on sequences that were in view when rules got their values, two
+real videos among them; before there was chromaticity.
+
+{table(results, rules, before)}
 """
     rules = [s.rule for s in switches if measured(s.rule, rounded)]
     gone = [rule for rule in gone if measured(rule, rounded)]

@@ -82,3 +82,20 @@ def test_page_is_made_from_the_file(tmp_path):
     assert "| relief | +100 | +0 | pays on 1 of 1; goes |" in text
     unknown = text[text.index("Not measured") : text.index("With all rules on")]
     assert "appearance" in unknown and "relief's bending" in unknown and "relief," not in unknown
+
+
+def test_what_was_measured_before_has_a_table_of_its_own():
+    there = "flag" + results_of.BEFORE
+    found = {
+        (rule, name): {"figures": {"e3d_proc": error}, "lost": 0, "cpu": 1.0}
+        for rule, name, error in (
+            *((results_of.BASELINE, name, 0.001) for name in ("flag 91", there)),
+            *(("relief", name, 0.002) for name in ("flag 91", there)),
+            ("edges give", there, 0.003),
+        )
+    }
+    text = results_of.page(found, ablation.SWITCHES, ablation.ORDER)
+    now, before = text.split("## Before")
+    assert "| relief | +100 |" in now and "| edges give |" not in now
+    assert "| edges give | +200 |" in before
+    assert "| relief |" not in before
