@@ -35,14 +35,19 @@ PARTS = {  # columns of the table: the terms that they sum up
 
 
 def probed(experiment, truth, every):
-    """Rows of every so many frames: the frame, and of ``track`` and ``truth`` the ``terms`` and
-    what is ``left`` [mm] of the way to the true surface.
+    """Rows of every so many frames: the frame, and of ``track`` and ``truth`` the ``terms`` (name
+    to energy) and what is ``left`` [mm] of the way to the true surface.
+
+    ``experiment``: of a scene, :class:`polysft_mi.scene.experiment.Experiment`; ``truth``: of its
+    template's vertices (N, 3) [m, camera frame]. Raises InputError where it is of others.
     """
     from polysft_mi import tracker
     from polysft_mi.objective.problem import Problem
 
     problem = Problem(experiment, experiment.sequence())
-    camera, rows = problem.camera, []
+    camera, rows, count = problem.camera, [], len(experiment.template.vertices)
+    if truth.kind != "mesh" or len(truth.at(min(truth.places))) != count:
+        raise InputError(f"{truth.path}: the template's {count} vertices in each frame are needed")
 
     class Probe(tracker.FrameTracker):
         def _newest(self, start, frame, history, known):
@@ -134,10 +139,6 @@ def main(arguments=None):
             results = json.load(file)
     for name, folder in folders.items():
         loaded, truth = experiment.load(scene_of(name), {"data": folder}), Truth.open(folder)
-        if truth.kind != "mesh":
-            raise InputError(
-                f"{truth.path}: holds {truth.kind}; vertices of the template's are needed"
-            )
         results[name] = probed(loaded, truth, options.every)
         with aside(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
             json.dump(results, file, indent=1)

@@ -126,7 +126,9 @@ class Rules:
         "of noise, at which the relief's weight has doubled",
         row="relief's caution",
     )
-    noise_power: float = _rule(8.0, "", "with which it grows with the noise", row="its steepness")
+    noise_power: float = _rule(
+        8.0, "", "with which it grows with the noise", row="caution's steepness"
+    )
     give: float = _rule(
         0.002,
         "strain",
@@ -160,7 +162,7 @@ class Rules:
         0.04,
         "share",
         "of the mean luminance, beyond which a triangle's chromaticity is an outlier",
-        row="its outliers",
+        row="chromaticity's outliers",
     )
     shading_blur: float = _rule(
         0.45, "triangles", "blur of texture and frames, in triangle sides", row="triangles' blur"

@@ -1,10 +1,12 @@
 """What is compared with a track: the same frames, solved from the true surface."""
 
+import numpy as np
 import pytest
 import synthetic
 from scripts import load
 
 from polysft_mi import prepare
+from polysft_mi.errors import InputError
 from polysft_mi.results.truth import Truth
 from polysft_mi.scene import experiment
 
@@ -29,6 +31,15 @@ def test_both_are_costs_of_one_objective(rows):
         # an easy sheet: both ways lead to about the same surface
         assert sum(truth.values()) == pytest.approx(sum(track.values()), rel=0.3)
         assert row["track"]["left"] == pytest.approx(row["truth"]["left"], abs=1.0)
+
+
+def test_a_truth_of_other_vertices_is_refused(tmp_path):
+    truth = synthetic.cloth(tmp_path / "flag", frames=2)
+    prepare.main([str(truth.folder)])
+    loaded = experiment.load(str(truth.folder / "scene.xml"), {"data": str(truth.folder)})
+    points = Truth(str(tmp_path), "points", {0: np.zeros((3, 3))})
+    with pytest.raises(InputError, match="the template's [0-9]+ vertices"):
+        from_truth.probed(loaded, points, 1)
 
 
 def test_the_page_has_both(rows):
