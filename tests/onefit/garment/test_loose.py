@@ -44,7 +44,8 @@ def test_is_one_clean_sheet_whose_seams_are_closed(garment):
     _W, G, told = mended(V, F)
     flat = garment.name == "waisted_dress"  # one face at its rim, 0.03 mm high
     assert told == ("flipped or dropped 1 faces whose corners lie in a line",) * flat
-    assert len(F) - len(G) == flat and np.isin(G, F).all() and (flat or np.array_equal(G, F))
+    kept = set(map(tuple, G.tolist()))
+    assert len(F) - len(G) == flat and kept <= set(map(tuple, F.tolist()))
     found = loops(F)
     assert len(found) == LOOPS[garment.name]
     assert len(V) - len(mesh.edges_of(F)[0]) + len(F) == 2 - len(found)
