@@ -29,6 +29,7 @@ _NAMES = {
     "wrist": ("hand", "wrist"),
 }
 _OPTIONAL = ("foot", "collar", "wrist")
+_CHANNELS = tuple(f"{axis}{what}" for what in ("position", "rotation") for axis in "xyz")
 
 
 def read_bvh(path, fps=None, up=None):
@@ -102,8 +103,8 @@ def _parse(path):
         raise InputError(f"{path}: no BVH file (HIERARCHY and MOTION are needed)")
     names, parents, offsets, channels, open_bones = [], [], [], [], []
     try:
-        words = iter(head.split("HIERARCHY", 1)[1].split("\n"))
-        for line in words:
+        bones = re.sub("([{}])", r"\n\1\n", head.split("HIERARCHY", 1)[1])  # a line for each brace
+        for line in bones.split("\n"):
             word = line.split()
             if not word:
                 continue
@@ -112,17 +113,16 @@ def _parse(path):
                 parents.append(open_bones[-1] if open_bones else -1)
                 offsets.append(np.zeros(3))
                 channels.append([])
-                if "{" in word:
-                    names[-1] = names[-1] and names[-1].replace("{", "").strip()
-                    open_bones.append(len(names) - 1)
             elif word[0] == "{":
                 open_bones.append(len(names) - 1)
             elif word[0] == "}":
                 open_bones.pop()
             elif word[0] == "OFFSET":
+                if len(word) < 4:
+                    raise ValueError(f"{line.strip()[:60]!r}: three numbers are needed")
                 offsets[open_bones[-1]] = np.array(word[1:4], dtype=float)
             elif word[0] == "CHANNELS":
-                channels[open_bones[-1]] = word[2 : 2 + int(word[1])]
+                channels[open_bones[-1]] = _channels(word[1:])
             else:
                 raise ValueError(f"{word[0]!r} in the hierarchy")
         found = re.match(r"\s*Frames:\s*(\d+)\s*Frame Time:\s*(\S+)(.*)", tail, re.S)
@@ -140,6 +140,17 @@ def _parse(path):
         return names, parents, np.array(offsets), channels, frames, float(found[2])
     except (ValueError, IndexError) as error:
         raise InputError(f"{path}: no BVH file that can be read ({error})") from None
+
+
+def _channels(words):
+    """The channels that a line ``CHANNELS`` names, in lower case, after their number."""
+    found = [word.lower() for word in words[1:]]
+    if len(found) != int(words[0]) or not len(found) == len(set(found) & set(_CHANNELS)):
+        raise ValueError(
+            f"CHANNELS {' '.join(words)[:80]}: a number is needed, and as many names, each once, of"
+            " Xposition, Yposition, Zposition, Xrotation, Yrotation, Zrotation"
+        )
+    return found
 
 
 def _joints(path, names, parents, offsets):

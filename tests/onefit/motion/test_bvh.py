@@ -1,5 +1,7 @@
 """Motions from BVH files."""
 
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -148,6 +150,14 @@ def test_bvh_without_collars_toes_and_with_a_short_spine(tmp_path):
     assert np.abs(a - b).max() < 1e-4
 
 
+def test_bvh_whose_braces_share_their_lines(tmp_path):
+    write_bvh(tmp_path / "m.bvh", body_only(some_motion()), "mixamo")
+    text = (tmp_path / "m.bvh").read_text()
+    (tmp_path / "n.bvh").write_text(re.sub(r"\s*([{}])\s*(?!MOTION)", r" \1 ", text))
+    a, b = Motion.read(tmp_path / "m.bvh"), Motion.read(tmp_path / "n.bvh")
+    assert (a.poses == b.poses).all() and (a.translation == b.translation).all()
+
+
 def test_bvh_files_that_cannot_be_used(tmp_path):
     motion = body_only(some_motion(frames=3))
     write_bvh(tmp_path / "m.bvh", motion, "mixamo")
@@ -168,6 +178,11 @@ def test_bvh_files_that_cannot_be_used(tmp_path):
             "Frame Time: 0.0333333", "Frame Time: 0"
         ),
         "its zero pose is not an upright stance": (tmp_path / "sat.bvh").read_text(),
+        "CHANNELS 6 .* Wrotation .*as many names, each once": good.replace("Zrot", "Wrot", 1),
+        "CHANNELS 6 .* Wposition .*as many names, each once": good.replace("Zpos", "Wpos", 1),
+        "CHANNELS 6 .* Xrotation Xrotation .*each once": good.replace("Zrot", "Xrot", 1),
+        "CHANNELS 2 Zrotation Xrotation Yrotation: a": good.replace("ELS 3 Z", "ELS 2 Z", 1),
+        "'OFFSET 0.0 0.0': three numbers are needed": re.sub("OFFSET.*", "OFFSET 0.0 0.0", good),
     }
     for message, text in cases.items():
         (tmp_path / "bad.bvh").write_text(text)
