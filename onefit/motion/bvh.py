@@ -60,9 +60,8 @@ def read_bvh(path, fps=None, up=None):
         fps = round(fps) if abs(fps - round(fps)) < 0.01 else fps
     check_rate(path, fps)
 
-    world, root = _posed(
-        path, parents, channels, frames
-    )  # rotations of bones (bones, T) and places (T, 3), in the file's axes
+    world, places = _posed(path, parents, offsets, channels, frames)  # in the file's axes
+    root = places[joint_of["pelvis"]]
     given = np.eye(3)[2] if up is None else turn @ np.eye(3)["xyz".index(up)]
     if given[2] == 0:  # the motion's up is not that of the zero pose
         over = Rotation.from_matrix(turn.T @ to_z(given).as_matrix() @ turn)
@@ -267,29 +266,28 @@ def _standing(path, rest, joint_of):
     return joints
 
 
-def _posed(path, parents, channels, frames):
-    """Rotations of the bones in the file's world, a list of Rotation (T,), and the root's places
-    (T, 3).
+def _posed(path, parents, offsets, channels, frames):
+    """Rotations of the bones in the file's world, a list of Rotation (T,), and their places, a list
+    of (T, 3): a bone's positions take the place of its offset.
     """
     require_finite(path, frames=frames)
-    world, column, root = [], 0, np.zeros((len(frames), 3))
+    world, places, column = [], [], 0
     for bone, names in enumerate(channels):
         values = frames[:, column : column + len(names)]
         column += len(names)
-        axes = [
-            (name[0].upper(), values[:, k])
-            for k, name in enumerate(names)
-            if name.lower().endswith("rotation")
-        ]
-        order = "".join(axis for axis, _ in axes)
-        local = (
-            Rotation.from_euler(order, np.stack([v for _, v in axes], -1), degrees=True)
-            if axes
+        order, angles, place = "", [], np.tile(offsets[bone], (len(frames), 1))
+        for name, value in zip(names, values.T):
+            if name.endswith("rotation"):
+                order += name[0].upper()
+                angles.append(value)
+            else:
+                place[:, "xyz".index(name[0])] = value
+        turn = (
+            Rotation.from_euler(order, np.stack(angles, -1), degrees=True)
+            if angles
             else Rotation.identity(len(frames))
         )
-        world.append(local if parents[bone] < 0 else world[parents[bone]] * local)
-        if parents[bone] < 0:
-            for k, name in enumerate(names):
-                if name.lower().endswith("position"):
-                    root[:, "xyz".index(name[0].lower())] = values[:, k]
-    return world, root
+        above = parents[bone]
+        world.append(turn if above < 0 else world[above] * turn)
+        places.append(place if above < 0 else places[above] + world[above].apply(place))
+    return world, places

@@ -158,6 +158,35 @@ def test_bvh_whose_braces_share_their_lines(tmp_path):
     assert (a.poses == b.poses).all() and (a.translation == b.translation).all()
 
 
+def test_bvh_whose_hips_hang_on_another_root(tmp_path):
+    """The way is the hips', whether they move, or the bone that they hang on."""
+    motion = body_only(some_motion(size=0.3))
+    write_bvh(tmp_path / "m.bvh", motion, "mixamo")
+    bones, frames = (tmp_path / "m.bvh").read_text().split("MOTION")
+    bones = bones.replace("ROOT", "ROOT Reference\n{\nOFFSET 0 0 0\nCHANNELS 0\nJOINT") + "}\n"
+    (tmp_path / "hips.bvh").write_text(f"{bones}MOTION{frames}")
+    hips = "CHANNELS 6 Xposition Yposition Zposition Zrotation"
+    bones = bones.replace(hips, "CHANNELS 3 Zrotation")
+    root = "CHANNELS 6 Yrotation Zposition Xposition Yposition Xrotation Zrotation"
+    bones = bones.replace("CHANNELS 0", root).replace("OFFSET 0", "OFFSET 9", 1)
+    bones = bones.replace("OFFSET 0.00000000 0.00000000 0.00000000", "OFFSET 0 40 30")
+    head, rate, *rows = frames.strip().split("\n")
+    turn = Rotation.from_euler("y", 50, degrees=True)
+    moved = []
+    for row in rows:
+        x, y, z, *rest = row.split()
+        way = np.array([x, y, z], float) - turn.apply([0, 40, 30])
+        turned = turn.inv() * Rotation.from_euler("ZXY", np.array(rest[:3], float), degrees=True)
+        first = [50, way[2], way[0], way[1], 0, 0, *turned.as_euler("ZXY", degrees=True)]
+        moved.append(" ".join(map(str, [*first, *rest[3:]])))
+    (tmp_path / "root.bvh").write_text("\n".join([f"{bones}MOTION", head, rate, *moved]))
+    expected = Motion.read(tmp_path / "m.bvh")
+    for name in ("hips.bvh", "root.bvh"):
+        read = Motion.read(tmp_path / name)
+        np.testing.assert_allclose(read.poses, expected.poses, atol=1e-4)
+        np.testing.assert_allclose(read.translation, expected.translation, atol=1e-4)
+
+
 def test_bvh_files_that_cannot_be_used(tmp_path):
     motion = body_only(some_motion(frames=3))
     write_bvh(tmp_path / "m.bvh", motion, "mixamo")
