@@ -17,16 +17,16 @@ from .placing import require_finite
 
 # Names of bones, without case, separators, prefixes as in "mixamorig:", and sides, for each joint:
 # the first that a file has counts. Mixamo, CMU and MotionBuilder; Blender's Rigify; Poser and Daz;
-# Unreal; others. The spine, the neck and what lies between are found by their place.
+# Unreal; SMPL; others. The spine, the neck and what lies between are found by their place.
 _NAMES = {
     "hip": ("upleg", "thigh", "upperleg", "hip", "femur"),
     "knee": ("leg", "shin", "calf", "lowerleg", "lowleg", "knee", "tibia"),
-    "ankle": ("foot", "ankle"),
-    "foot": ("toebase", "toe", "toes", "ball"),
+    "foot": ("toebase", "toe", "toes", "ball", "foot"),
+    "ankle": ("ankle", "foot"),
     "collar": ("collar", "clavicle", "shoulder"),
     "shoulder": ("arm", "upperarm", "uparm", "shldr", "shoulder", "humerus"),
     "elbow": ("forearm", "lowerarm", "lowarm", "elbow", "radius"),
-    "wrist": ("hand", "wrist"),
+    "wrist": ("wrist", "hand"),
 }
 _OPTIONAL = ("foot", "collar", "wrist")
 _CHANNELS = tuple(f"{axis}{what}" for what in ("position", "rotation") for axis in "xyz")
@@ -164,7 +164,7 @@ def _joints(path, names, parents, offsets):
         taken = set()
         for joint, bases in reversed(
             _NAMES.items()
-        ):  # from the hand inwards: a shoulder is an arm only where no arm is
+        ):  # from the hand inwards: a shoulder is an arm only where no arm is, a foot an ankle
             bone = next((bones[b] for b in bases if b in bones and bones[b] not in taken), None)
             if bone is None and joint not in _OPTIONAL:
                 raise InputError(

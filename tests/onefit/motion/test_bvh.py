@@ -22,12 +22,14 @@ _LEGS = "{S}UpLeg {S}Leg {S}Foot {S}ToeBase {S}Shoulder {S}Arm {S}ForeArm {S}Han
 _THIGHS = "thigh.{s} shin.{s} foot.{s} toe.{s} shoulder.{s} upper_arm.{s} forearm.{s} hand.{s}"
 _POSER = "{l}Thigh {l}Shin {l}Foot {l}Toe {l}Collar {l}Shldr {l}ForeArm {l}Hand"
 _PLAIN = "{S}Hip {S}Knee {S}Ankle {S}Toe {S}Collar {S}Shoulder {S}Elbow {S}Wrist"
+_SMPL = "{s}_Hip {s}_Knee {s}_Ankle {s}_Foot {s}_Collar {s}_Shoulder {s}_Elbow {s}_Wrist"
 _UNREAL = "thigh calf foot ball clavicle upperarm lowerarm hand"
 # names of pelvis, spine, neck and head, and of a side's bones; Euler order; axes; units a metre
 STYLES = {
     "mixamo": ("Hips Spine Spine1 Spine2 Neck Head", _LEGS, "mixamorig:", "ZXY", "y", 100.0),
     "cmu": ("Hips LowerBack Spine Spine1 Neck Head", _LEGS, "", "ZYX", "y", 17.7),
     "rigify": ("spine spine.001 spine.002 spine.003 spine.004 head", _THIGHS, "", "XYZ", "z", 1.0),
+    "smpl": ("Pelvis Spine1 Spine2 Spine3 Neck Head", _SMPL, "", "ZYX", "y", 100.0),
     "poser": ("hip abdomen chest chest2 neck head", _POSER, "", "YZX", "y", 40.0),
     "mocap": ("Hips Chest Chest2 Chest3 Neck Head", _PLAIN, "", "ZXY", "y", 100.0),
     "unreal": (
