@@ -189,7 +189,11 @@ def _joints(path, names, parents, offsets):
         if spine:
             found[joint] = spine[max(0, round((k + 1) * len(spine) / 3) - 1)]
     head = next(
-        (b for b, n in enumerate(names) if n and re.fullmatch(r"(.*[^a-z])?head\d*", n.lower())),
+        (
+            b
+            for b, n in enumerate(names)
+            if n and re.fullmatch(r"(.*[^a-z])?head\d*", _without_prefix(n).lower())
+        ),
         None,
     )
     if head is not None and chest in above(head):
@@ -200,11 +204,18 @@ def _joints(path, names, parents, offsets):
     return found
 
 
+def _without_prefix(name):
+    """A bone's name without ``mixamorig:``, of which some programs leave the colon out, or the
+    like.
+    """
+    return re.sub(r"(?i)^mixamorig\d*[._\- ]*", "", name.rpartition(":")[2])
+
+
 def _side(name):
     """('left', 'right' or None, the rest of a bone's name without case, prefix and separators)."""
     if not name:
         return None, ""
-    base = name.rpartition(":")[2]
+    base = _without_prefix(name)
     for side, letter in (("left", "l"), ("right", "r")):
         for pattern in (
             rf"(?i){side}",

@@ -27,6 +27,8 @@ _UNREAL = "thigh calf foot ball clavicle upperarm lowerarm hand"
 # names of pelvis, spine, neck and head, and of a side's bones; Euler order; axes; units a metre
 STYLES = {
     "mixamo": ("Hips Spine Spine1 Spine2 Neck Head", _LEGS, "mixamorig:", "ZXY", "y", 100.0),
+    "mixamo_": ("Hips Spine Spine1 Spine2 Neck Head", _LEGS, "mixamorig_", "ZXY", "y", 1.0),
+    "mixamo1": ("Hips Spine Spine1 Spine2 Neck Head", _LEGS, "mixamorig1", "XYZ", "y", 1.0),
     "cmu": ("Hips LowerBack Spine Spine1 Neck Head", _LEGS, "", "ZYX", "y", 17.7),
     "rigify": ("spine spine.001 spine.002 spine.003 spine.004 head", _THIGHS, "", "XYZ", "z", 1.0),
     "smpl": ("Pelvis Spine1 Spine2 Spine3 Neck Head", _SMPL, "", "ZYX", "y", 100.0),
