@@ -26,6 +26,7 @@ _SHOULDER, _ASIDE = np.array([0.18, 0.0, 1.37]), 0.25  # [m] of the left one; be
 _DRAWN_OUT = 0.0, 0.03, 0.06, 0.09, 0.12, 0.15  # [m], along the arms
 _FINER = 5  # times that edges that are near to each other are cut, in ever more parts
 _BETWEEN = 0.05  # [m] of panels that are laid out flat
+_NARROW = 1e-3  # [m] that the mean width of no panel is below
 
 
 def joined(pattern: Pattern, count: int, where: str) -> Iterator[Cut]:
@@ -55,8 +56,14 @@ def _drawn_out(pattern, far):
 
 
 def _joined(pattern, count, where):
-    area = sum(_area(np.concatenate([e[:-1] for e in p.edges])) for p in pattern.panels)
-    spacing = np.sqrt(2 / np.sqrt(3) * area / count)
+    areas = [_area(np.concatenate([e[:-1] for e in p.edges])) for p in pattern.panels]
+    for panel, area in zip(pattern.panels, areas):
+        if 2 * area < _NARROW * sum(_length(edge) for edge in panel.edges):
+            raise InputError(
+                f"{where}: panel {panel.name}: its edges lie on each other, or cross; it is"
+                f" narrower than {1000 * _NARROW:g} mm"
+            )
+    spacing = np.sqrt(2 / np.sqrt(3) * sum(areas) / count)
     parts = _parts(pattern, spacing)
     partner = {one: two for s in pattern.stitches for one, two in ((s.one, s.two), (s.two, s.one))}
     for _ in range(_FINER):
@@ -89,8 +96,7 @@ def _joined(pattern, count, where):
 
 def _parts(pattern, spacing):
     """Of each panel the number of parts of each edge; the same on both sides of a stitch."""
-    length = lambda edge: np.linalg.norm(np.diff(edge, axis=0), axis=1).sum()
-    parts = [[max(1, round(length(e) / spacing)) for e in p.edges] for p in pattern.panels]
+    parts = [[max(1, round(_length(e) / spacing)) for e in p.edges] for p in pattern.panels]
     for stitch in pattern.stitches:
         (p, e), (q, f) = stitch.one, stitch.two
         # a dart's legs meet in its tip: with one part each, they would be one edge
@@ -103,6 +109,10 @@ def _evenly(curve, count):
     along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
     at = np.linspace(0, along[-1], count + 1)
     return np.stack([np.interp(at, along, x) for x in curve.T], axis=1)
+
+
+def _length(curve):
+    return np.linalg.norm(np.diff(curve, axis=0), axis=1).sum()
 
 
 def _area(polygon):

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from polyfit.errors import InputError
 
 _FINE = 200  # parts of a curve, by which its length is measured
+_LONGEST = 20.0  # [m] that an edge spans
 _SUFFIX = "_specification"
 
 
@@ -119,8 +120,14 @@ def _panel(name, panel, scale, relative, where):
         raise InputError(f"{where}: has numbers that are not finite")
     if len(ends) < 2 or (ends[:, 1] != np.roll(ends[:, 0], -1)).any():
         raise InputError(f"{where}: its edges are no loop: each begins where the last one ends")
-    if min(np.ptp(curve, axis=0).max() for curve in curves) * scale < 1e-4:
+    spans = [np.ptp(curve, axis=0).max() * scale for curve in curves]
+    if min(spans) < 1e-4:
         raise InputError(f"{where}: an edge is shorter than 0.1 mm; units_in_meter may be wrong")
+    if max(spans) > _LONGEST:
+        raise InputError(
+            f"{where}: edge {np.argmax(spans)} spans {max(spans):.3g} m, more than {_LONGEST:g};"
+            " units_in_meter may be wrong, or its curvature"
+        )
     up = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # y up, z forward, to z up, -y forward
     rotation = up @ Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
     return Panel(name, tuple(scale * curve for curve in curves), rotation, scale * up @ place)

@@ -178,6 +178,14 @@ def _stitch(k, **values):
     return lambda p: p["pattern"]["stitches"][k][0].update(values)
 
 
+_FLAT = dict(
+    vertices=[[0, 0], [10, 0], [20, 0]],
+    edges=[{"endpoints": ends} for ends in ([0, 1], [1, 2], [2, 0])],
+    translation=[0, 100, 20],
+    rotation=[0, 0, 0],
+)
+
+
 def _more(value):
     return lambda p: p["pattern"]["stitches"][0].append(value)
 
@@ -190,6 +198,9 @@ def _more(value):
         (lambda p: p["properties"].update(units_in_meter=None), "units_in_meter is None; a number"),
         (lambda p: p["properties"].update(units_in_meter="cm"), "units_in_meter is 'cm'; a number"),
         (lambda p: p["properties"].update(units_in_meter=1e9), "shorter than 0.1 mm"),
+        (lambda p: p["properties"].update(units_in_meter=1), "edge 1 spans 50 m, more than 20"),
+        (_edge(1, curvature=[0.5, 1e6]), "edge 1 spans .* m, more than 20; .*its curvature"),
+        (lambda p: p["pattern"]["panels"].update(flat=_FLAT), "panel flat: .* on each other"),
         (lambda p: p["pattern"]["panels"].clear(), "no panels"),
         (_without("vertices"), "panel front: needs 'vertices'"),
         (_without("rotation"), "panel front: needs"),
