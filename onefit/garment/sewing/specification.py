@@ -17,6 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from polyfit.errors import InputError
+from polyfit.files import text_encoding
 
 _FINE = 200  # parts of a curve, by which its length is measured
 _LONGEST = 20.0  # [m] that an edge spans
@@ -63,11 +64,11 @@ class Pattern:
 def read(path: str | os.PathLike[str]) -> Pattern:
     """The pattern of a file. Raises InputError, in one line that starts with its name."""
     try:
-        with open(path, encoding="utf-8") as file:
+        with open(path, encoding=text_encoding(path)) as file:
             found = json.load(file)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: no JSON: {error}") from None
     name = os.path.splitext(os.path.basename(path))[0].removesuffix(_SUFFIX)
     return _pattern(name, found, str(path))

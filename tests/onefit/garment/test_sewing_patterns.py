@@ -245,9 +245,19 @@ def test_a_pattern_s_name_may_end_in_capitals(tmp_path):
         Garment.read(path)
 
 
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_a_pattern_s_file_may_begin_with_a_byte_order_mark(encoding, tmp_path):
+    path = tmp_path / "tube_specification.json"
+    path.write_bytes(json.dumps(tube()).encode(encoding))
+    assert [panel.name for panel in specification.read(path).panels] == ["front", "back"]
+
+
 def test_what_is_no_pattern_or_is_for_meshes_is_refused(tmp_path):
     path = tmp_path / "broken.json"
     path.write_text("{")
+    with pytest.raises(InputError, match="no JSON"):
+        Garment.read(path)
+    path.write_text("[" * 100_000)
     with pytest.raises(InputError, match="no JSON"):
         Garment.read(path)
     with pytest.raises(InputError, match="cannot be read"):
