@@ -241,10 +241,11 @@ class _Document:
         accessor = self.json["accessors"][index]
         size, count = _LENGTHS[accessor["type"]], accessor["count"]
         component = accessor["componentType"]
-        values = np.zeros((count, size))
         if "bufferView" in accessor:
             offset = accessor.get("byteOffset", 0)
             values = self._array(accessor["bufferView"], offset, component, count, size)
+        else:
+            values = np.zeros((count, size))
         if "sparse" in accessor:
             sparse, values = accessor["sparse"], values.copy()
             where, new = sparse["indices"], sparse["values"]

@@ -79,6 +79,6 @@ def _corner(word: str, vertices: int, coordinates: int) -> tuple[int, int]:
 
 def _from_zero(index: int, count: int) -> int:
     """An OBJ file's index, counted from 1 or backwards from the ``count``-th, counted from 0."""
-    if index == 0 or index < -count:
+    if index == 0 or not -count <= index < 2**31:
         raise ValueError(f"index {index}")
     return index - 1 if index > 0 else count + index

@@ -80,6 +80,13 @@ def test_ply_in_any_encoding(tmp_path, encoding, end):
     read_as_it_is(tmp_path / "a.ply")
 
 
+@pytest.mark.parametrize("index", [0, -5, 2**31, 10**30])
+def test_obj_with_an_index_that_none_can_be(index, tmp_path):
+    (tmp_path / "a.obj").write_text(OBJ.replace("f 1/", f"f {index}/"))
+    with pytest.raises(InputError, match=f"a.obj: line 9: .* is not OBJ .index {index}"):
+        read_textured(tmp_path / "a.obj")
+
+
 @pytest.mark.parametrize("names", ["s t", "u v", "texture_u texture_v"])
 def test_ply_that_names_a_texture_is_quiet(tmp_path, names, capfd, caplog):
     properties = "".join(f"property float {name}\n" for name in names.split())
@@ -275,6 +282,13 @@ class File:
             + struct.pack("<I4s", len(body), b"BIN\0") + body
         )  # fmt: skip
         return path
+
+
+def test_gltf_that_counts_more_than_it_has(tmp_path):
+    file = File()
+    file.json["accessors"][0]["count"] = 10**12
+    with pytest.raises(InputError, match="an accessor reaches beyond its buffer"):
+        read_mesh(file.write(tmp_path / "a.glb"))
 
 
 @pytest.mark.parametrize("name", ["a.glb", "a.gltf"])
