@@ -60,13 +60,14 @@ def placed(V, scale=1.0, up="z", turn=0.0, offset=(0.0, 0.0, 0.0)):
     """
     if up not in ("y", "z"):
         raise InputError(f"up={up!r}; 'z' or 'y' is needed")
+    moved = np.asarray(offset, dtype=np.float64)
+    if moved.shape != (3,):
+        raise InputError(f"offset={offset!r}; three numbers (x, y, z) are needed")
     x, y, z = scale * np.asarray(V, dtype=np.float64).T
     if up == "y":
         y, z = -z, y
     c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
-    return np.stack([c * x - s * y, s * x + c * y, z], axis=1) + np.asarray(
-        offset, dtype=np.float64
-    )
+    return np.stack([c * x - s * y, s * x + c * y, z], axis=1) + moved
 
 
 def in_pose(body, pose):

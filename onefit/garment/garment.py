@@ -173,8 +173,8 @@ class Garment:
         loose: bool = False,
         where: str = "garment",
     ) -> Garment:
-        """The garment of any triangle mesh (N, 3) [m], (F, 3) in OneFit's axes, with its texture
-        coordinates or None; otherwise as :meth:`read`.
+        """The garment of any triangle mesh (N, 3) [m], (F, 3) in OneFit's axes, anything like
+        arrays, with its texture coordinates or None; otherwise as :meth:`read`.
         """
         other = fitting.t_stand() if made_for is None else None
         if isinstance(made_for, str) and made_for == fitting.T_POSE:
@@ -184,6 +184,7 @@ class Garment:
                 f"{where}: made_for={made_for!r}; a Body or '{fitting.T_POSE}' is needed"
             )
         surface = standard_surface() if made_for is None else fitting.surface_of(made_for)
+        vertices, faces = mesh.as_arrays(vertices, faces, where)
         check(vertices, faces, where)
         fitting.check_place(vertices[np.unique(faces)], surface, where, other)
         V, F, told = mended(vertices, faces, where, surface)

@@ -97,6 +97,8 @@ def _parse(path):
             text = file.read()
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}") from None
     head, motion, tail = text.partition("MOTION")
     if not motion or "HIERARCHY" not in head:
         raise InputError(f"{path}: no BVH file (HIERARCHY and MOTION are needed)")

@@ -12,6 +12,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "texcoords": ["TexCoords"],
         "triangles": [
             "areas",
+            "as_arrays",
             "boundary_edges",
             "centred",
             "checked",

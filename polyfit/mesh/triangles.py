@@ -14,6 +14,28 @@ from scipy.sparse.csgraph import connected_components
 from polyfit.errors import InputError
 
 
+def as_arrays(
+    vertices: ArrayLike, faces: ArrayLike, where: str = "mesh"
+) -> tuple[np.ndarray, np.ndarray]:
+    """``(vertices (N, 3) float64, faces (F, 3) int64)`` of anything like arrays. Raises InputError,
+    in one line that starts with ``where``, for other shapes, and for faces whose vertices are not
+    there.
+    """
+    V, F = np.asarray(vertices, dtype=np.float64), np.asarray(faces)
+    if V.ndim != 2 or V.shape[1] != 3:
+        raise InputError(f"{where}: vertices of shape {V.shape}; (N, 3) is needed")
+    if F.size == 0:
+        return V, np.empty((0, 3), np.int64)
+    if F.ndim != 2 or F.shape[1] != 3:
+        raise InputError(f"{where}: faces of shape {F.shape}; (F, 3) is needed")
+    F = F.astype(np.int64)
+    if F.min() < 0 or F.max() >= len(V):
+        raise InputError(
+            f"{where}: faces name vertices {F.min()} to {F.max()}; 0 to {len(V) - 1} exist"
+        )
+    return V, F
+
+
 def checked(
     vertices: ArrayLike, faces: ArrayLike, where: str = "mesh", drop_loose: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -22,18 +44,9 @@ def checked(
     face, too: the others keep their order. Raises InputError, in one line that starts with
     ``where``, for anything else that is wrong.
     """
-    V, F = np.asarray(vertices, dtype=np.float64), np.asarray(faces)
-    if V.ndim != 2 or V.shape[1] != 3 or len(V) == 0:
-        raise InputError(f"{where}: vertices of shape {V.shape}; (N, 3) is needed")
-    if F.size == 0:
+    V, F = as_arrays(vertices, faces, where)
+    if len(F) == 0:
         raise InputError(f"{where}: no faces; a triangle mesh is needed")
-    if F.ndim != 2 or F.shape[1] != 3:
-        raise InputError(f"{where}: faces of shape {F.shape}; (F, 3) is needed")
-    F = F.astype(np.int64)
-    if F.min() < 0 or F.max() >= len(V):
-        raise InputError(
-            f"{where}: faces name vertices {F.min()} to {F.max()}; 0 to {len(V) - 1} exist"
-        )
     if drop_loose:
         V, F = in_use(V, F)
     _refuse(~np.isfinite(V).all(axis=1), where, "vertices have coordinates that are not finite")

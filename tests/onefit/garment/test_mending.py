@@ -260,6 +260,10 @@ class TestRefusals:
         V, F = tank
         self.refused(V, F[:0], "no faces")
         self.refused(V[:0], F[:0], "no faces")
+        self.refused(V[:, :2], F, r"vertices of shape \(3000, 2\); \(N, 3\) is needed")
+        self.refused(V, F[:, [0, 1, 2, 2]], r"faces of shape .* \(F, 3\) is needed")
+        self.refused(V, F + 1, "faces name vertices 1 to 3000; 0 to 2999 exist")
+        self.refused(V, F - 1, "faces name vertices -1 to 2998; 0 to 2999 exist")
         W = V.copy()
         W[17, 1] = np.nan
         self.refused(W, F, "1 vertices have coordinates that are not finite .*vertex 17")
@@ -357,6 +361,8 @@ class TestRefusals:
     def test_wrong_up(self):
         with pytest.raises(InputError, match="'z' or 'y'"):
             fitting.placed(np.zeros((1, 3)), up="x")
+        with pytest.raises(InputError, match=r"offset=\(0, 1\); three numbers"):
+            fitting.placed(np.zeros((1, 3)), offset=(0, 1))
 
 
 @pytest.mark.parametrize("name, loose", [("tshirt", False), ("trousers", False), ("dress", True)])

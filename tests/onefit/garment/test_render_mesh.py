@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 from scipy.spatial.transform import Rotation
 from surfaces import joined, sphere
 from synthetic import write_obj
@@ -40,6 +41,13 @@ def test_at_rest_it_is_the_file(garment, file_mesh, tank):
     used = np.unique(F)
     assert np.abs(mesh.carried(*arrays(garment)) - V)[used].max() < 1e-6
     assert np.array_equal(mesh.faces, F) and np.array_equal(mesh.texcoords.faces, F)
+
+
+@pytest.mark.parametrize("kind", [torch.as_tensor, np.ndarray.tolist])
+def test_a_mesh_may_be_anything_like_arrays(tank, kind):
+    garment = Garment.of_mesh("top", kind(tank[0]), kind(tank[1]))
+    assert np.array_equal(garment.faces, tank[1])
+    assert np.abs(garment.render_mesh.carried(*arrays(garment)) - tank[0]).max() < 1e-6
 
 
 def test_a_garment_wound_inwards_carries_its_file(tank):

@@ -222,5 +222,8 @@ def test_bvh_files_that_cannot_be_used(tmp_path):
         with pytest.raises(InputError, match=message) as error:
             Motion.read(tmp_path / "bad.bvh")
         assert "\n" not in str(error.value) and "bad.bvh" in str(error.value)
+    (tmp_path / "folder.bvh").mkdir()
+    with pytest.raises(InputError, match="folder.bvh: Is a directory"):
+        Motion.read(tmp_path / "folder.bvh")
     (tmp_path / "bad.bvh").write_text(cases["a frame time of 0.0; give the rate"])
     assert Motion.read(tmp_path / "bad.bvh", fps=25).fps == 25
