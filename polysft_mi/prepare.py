@@ -295,6 +295,9 @@ def _evidence(args):
     known = _told(args, "tracks", "track_centre", of="tracks")
     known |= _told(args, "depth", "depth_unit", "depth_known_to", of="depth images")
     known |= _told(args, "body", "body_model", "body_up", of="a body")
+    centre = known.get("track_centre", 0.5)
+    if not 0 <= centre <= 1:
+        raise InputError(f"--track-centre {centre:g}: 0.5 or 0, at most 1, is needed")
     unit = known.get("depth_unit", 1)
     if not (np.isfinite(unit) and unit > 0):
         raise InputError(f"--depth-unit {unit:g}: metres a number; above 0 is needed")

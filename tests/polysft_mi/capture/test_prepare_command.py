@@ -189,6 +189,8 @@ def test_words_of_the_command_line(words, said, clip):
         ("--body-up y", "--body-up: is of a body; --body names"),
         ("--rig-scale 1", "--rig-scale: is of a rig; --cameras names"),
         ("--camera-name left", "--camera-name: is of a rig; --cameras names"),
+        ("--tracks t.npz --track-centre nan", "--track-centre nan: 0.5 or 0, at most 1, is needed"),
+        ("--tracks t.npz --track-centre -3", "--track-centre -3: 0.5 or 0, at most 1, is needed"),
         ("--depth deep --depth-unit 0", "--depth-unit 0: metres a number; above 0 is needed"),
         ("--depth deep --depth-unit -1", "--depth-unit -1: metres a number; above 0 is needed"),
     ],
