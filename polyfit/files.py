@@ -11,6 +11,9 @@ import os
 import shutil
 import tempfile
 import threading
+import tokenize
+import zipfile
+import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -21,6 +24,13 @@ from .errors import InputError
 
 # Numbers of the OSErrors that say that no more can be written
 DISK_FULL_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+# What reading arrays from an .npz raises where it is damaged, or none: NumPy, zipfile and zlib each
+# have their own, and an .npy is no archive
+NOT_NPZ = (
+    OSError, ValueError, EOFError, AttributeError, TypeError, NotImplementedError,
+    zipfile.BadZipFile, zlib.error, tokenize.TokenError,
+)  # fmt: skip
 
 
 _LITTER = ".DS_Store", "Thumbs.db", "desktop.ini"

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import os
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 
 from polyfit.errors import InputError
-from polyfit.files import aside
+from polyfit.files import NOT_NPZ, aside
 
 _BATCH = 4  # frames at once: what they need stays in a core's cache
 _LAYERS = 3  # of the network
@@ -88,7 +86,7 @@ class Baked:
             scalars: dict[str, Any] = {k: float(values[k]) for k in ("fps", "pace", "drag")}
         except OSError as error:
             raise InputError(f"{path}: {error.strerror or error}; {needed}") from None
-        except (ValueError, TypeError, AttributeError, KeyError, EOFError, BadZipFile, zlib.error):
+        except (*NOT_NPZ, KeyError):
             raise InputError(f"{path}: not a baked drape, or cut off; {needed}") from None
         return cls(**(values | scalars | {"name": str(values["name"])}))
 

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import os
 import pickle
-import zipfile
 
 import numpy as np
 import torch
 
 from polyfit.errors import InputError
+from polyfit.files import NOT_NPZ
 from polyfit.mesh import checked
 
 from . import skeleton, skinning
@@ -279,7 +279,7 @@ def _read(path, keys):
         raise InputError(f"{path}: no such file") from None
     except InputError:
         raise
-    except (ValueError, EOFError, OSError, zipfile.BadZipFile, *_UNPICKLING) as error:
+    except (*NOT_NPZ, *_UNPICKLING) as error:
         raise InputError(
             f"{path}: cannot be read as a body ({' '.join(str(error).split())[:200]})"
         ) from None

@@ -9,14 +9,12 @@ W t. AMASS's world has z up (W = 1), Neural Cloth Simulation's y up (W = C).
 """
 
 import os
-import tokenize
-import zipfile
-import zlib
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from polyfit.errors import InputError
+from polyfit.files import NOT_NPZ
 
 from . import likely
 from .bvh import read_bvh
@@ -24,7 +22,6 @@ from .placing import placed, require_finite
 
 _C = Rotation.from_euler("x", 90, degrees=True)  # from SMPL's body axes, or any world with y up
 _RATES = ("mocap_framerate", "mocap_frame_rate", "fps", "frame_rate", "framerate")
-_DAMAGED = zipfile.BadZipFile, zlib.error, tokenize.TokenError  # of NumPy, in a damaged file
 _COUNTS = {22: 22, 24: 24, 52: 22, 55: 22}  # joints in a file, and how many of them are the body's
 
 
@@ -57,7 +54,7 @@ def _read_npz(path, fps, up):
             data = {key: file[key] for key in ("poses", "trans", *_RATES) if key in file.files}
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
-    except (ValueError, EOFError, OSError, *_DAMAGED) as error:
+    except NOT_NPZ as error:
         raise InputError(
             f"{path}: cannot be read as .npz ({' '.join(str(error).split())[:200]})"
         ) from None

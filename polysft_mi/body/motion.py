@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-import zipfile
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from polyfit.files import NOT_NPZ
 from polyfit.mesh import read_mesh
 from polysft_mi.errors import InputError
 
@@ -221,7 +221,7 @@ def _has_faces(path):
     try:
         with np.load(path, allow_pickle=False) as file:
             return "faces" in file.files
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, AttributeError):
+    except NOT_NPZ:
         return False
 
 
@@ -232,7 +232,7 @@ def _read(path):
             return {name: file[name] for name in file.files}
     except FileNotFoundError:
         raise InputError(f"{path}: no such file of a body's motion") from None
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, AttributeError):
+    except NOT_NPZ:
         raise InputError(
             f"{path}: not a file of a body's motion; .npz with poses (T, {_JOINTS}, 3) and"
             " translation (T, 3), or with vertices (T, V, 3) and faces (F, 3), is needed"
@@ -274,7 +274,10 @@ def _of_video(path, given, what, count, selected):
 def _rate(path, arrays, count, selected):
     """Frames a second, of those that are used."""
     rate = _found(arrays, _RATES)
-    fps = _USUAL_FPS if rate is None else float(np.ravel(rate)[0])
+    try:
+        fps = _USUAL_FPS if rate is None else float(np.ravel(rate)[0])
+    except (ValueError, TypeError, IndexError):
+        raise InputError(f"{path}: fps = {rate}; a positive number is needed") from None
     if count != len(selected) and len(selected) > 1:
         fps /= selected[1] - selected[0]
     if not 0 < fps < 10_000:

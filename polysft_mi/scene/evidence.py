@@ -5,7 +5,6 @@ checked once at the start. Needs no Mitsuba.
 from __future__ import annotations
 
 import os
-import zipfile
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -13,6 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from polyfit.backend import cores
+from polyfit.files import NOT_NPZ
 from polysft_mi.errors import InputError
 
 from .images import EXTENSIONS, checked_size, list_images, read_pixels
@@ -237,7 +237,7 @@ def _arrays(path):
             arrays = {name: found[name] for name in found.files}
     except FileNotFoundError:
         raise InputError(f"{path}: no such file of tracks") from None
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile):
+    except NOT_NPZ:
         raise InputError(
             f"{path}: not a file of tracks; .npz with 'tracks' (T, P, 2) and 'visible' (T, P) is"
             " needed"

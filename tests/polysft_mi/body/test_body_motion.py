@@ -47,6 +47,8 @@ def test_of_the_frames_that_are_used(known, tmp_path):
         ({"translation": np.zeros((FRAMES, 2))}, r"\(6, 2\); poses \(T, 24, 3\) and translation"),
         ({"translation": np.full((FRAMES, 3), np.nan)}, "must be finite numbers"),
         ({"fps": 0}, "fps = 0; a positive number is needed"),
+        ({"fps": "thirty"}, "fps = thirty; a positive number is needed"),
+        ({"fps": np.zeros(0)}, r"fps = \[\]; a positive number is needed"),
         ({"betas": np.zeros(10)}, "has betas, so its poses are SMPL's; give its body's file too"),
         ({"shape": np.zeros(10)}, r"shape \(10,\); gender, age, .* are needed, each from 0 to 1"),
         ({"shape": np.full(6, np.nan)}, r"body.npz: shape \[nan, .* each from 0 to 1"),
@@ -69,6 +71,17 @@ def test_no_such_file(tmp_path):
     (tmp_path / "text.npz").write_text("poses")
     with pytest.raises(InputError, match="not a file of a body's motion"):
         BodyMotion.read(tmp_path / "text.npz", 2, [0, 1])
+
+
+def test_a_damaged_file_and_an_array_alone_are_refused(known, tmp_path):
+    np.savez_compressed(tmp_path / "deflated.npz", **known)
+    whole = (tmp_path / "deflated.npz").read_bytes()
+    (tmp_path / "deflated.npz").write_bytes(whole[:70] + b"\xff" * 250 + whole[320:])
+    with open(tmp_path / "one.npz", "wb") as file:
+        np.save(file, known["poses"])
+    for name in ("deflated.npz", "one.npz"):
+        with pytest.raises(InputError, match=f"{name}: not a file of a body's motion"):
+            read_motion(tmp_path / name, FRAMES, list(range(FRAMES)))
 
 
 @pytest.fixture

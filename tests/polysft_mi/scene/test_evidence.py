@@ -139,6 +139,12 @@ def test_a_file_that_is_none_is_told(tmp_path):
         file.writestr("tracks/data/0", b"")
     with pytest.raises(InputError, match=r"tracks.pt: a file of torch; save it as \.npz"):
         Tracks.read(tmp_path / "tracks.pt", 1, [0])
+    rows = np.random.default_rng(0).normal(size=(9, 40, 2))
+    np.savez_compressed(tmp_path / "damaged.npz", tracks=rows)
+    whole = (tmp_path / "damaged.npz").read_bytes()
+    (tmp_path / "damaged.npz").write_bytes(whole[:70] + b"\xff" * 250 + whole[320:])
+    with pytest.raises(InputError, match="damaged.npz: not a file of tracks"):
+        Tracks.read(tmp_path / "damaged.npz", 9, list(range(9)))
     (tmp_path / "text.npz").write_text("tracks")
     with pytest.raises(InputError, match="not a file of tracks"):
         Tracks.read(tmp_path / "text.npz", 1, [0])
