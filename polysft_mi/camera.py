@@ -76,7 +76,7 @@ class Intrinsics:
     def from_json(cls, path: str | os.PathLike[str]) -> Intrinsics:
         """From a JSON file with the keys fx, fy, cx, cy, width, height."""
         try:
-            with open(path, encoding="utf-8") as file:
+            with open(path, encoding="utf-8-sig") as file:
                 data = json.load(file)
         except FileNotFoundError:
             raise InputError(

@@ -147,7 +147,7 @@ def _record3d(folder):
     """Depth has fewer pixels than the colour images, and shows what they do."""
     for name in ("metadata.json", "metadata"):
         try:
-            with open(os.path.join(folder, name), encoding="utf-8") as file:
+            with open(os.path.join(folder, name), encoding="utf-8-sig") as file:
                 known = json.load(file)
             K = np.array(known["K"], dtype=np.float64).reshape(3, 3).T  # column by column
             size = int(known["w"]), int(known["h"])

@@ -113,7 +113,7 @@ def read_cameras(path: str) -> dict[str, tuple[Intrinsics, np.ndarray]]:
     of. Raises InputError.
     """
     try:
-        with open(path, encoding="utf-8") as file:
+        with open(path, encoding="utf-8-sig") as file:
             cameras = json.load(file)
         return {name: _camera(values, f"{path}: {name}") for name, values in cameras.items()}
     except (OSError, ValueError, AttributeError) as error:
@@ -147,7 +147,7 @@ def read_camera(where: str) -> tuple[Intrinsics, np.ndarray]:
     Raises InputError.
     """
     try:
-        with open(where, encoding="utf-8") as file:
+        with open(where, encoding="utf-8-sig") as file:
             known = json.load(file)
     except (OSError, ValueError) as error:
         raise InputError(f"{where}: not a camera as JSON ({error})") from None

@@ -19,9 +19,9 @@ from .sew import sewn
 
 def write(names, folder):
     """Sew the named templates into ``folder``; those with slack fall once, and keep their cut."""
+    os.makedirs(folder, exist_ok=True)
     body = standard_body()
     block = Block(body.vertices.numpy(), body.faces.numpy())
-    os.makedirs(folder, exist_ok=True)
     for name in names:
         if name in LOOSE_PATTERNS:
             flat = cut(block, name)

@@ -10,6 +10,7 @@ import synthetic
 from loading import loaded
 from scipy.spatial.transform import Rotation
 
+from polysft_mi.camera import Intrinsics
 from polysft_mi.capture import prepare_folder
 from polysft_mi.capture.camera.rigs import read_rig
 from polysft_mi.errors import InputError
@@ -49,6 +50,13 @@ def test_its_sensor_sees_as_the_file_says(folder):
     pixels, before = Pinhole(camera.sensor()).project(points)
     assert before.all()
     assert np.abs(pixels - camera.intrinsics.project(inside)).max() < 1e-2
+
+
+def test_a_byte_order_mark_does_not_matter(folder):
+    where = folder / "side" / "camera.json"
+    where.write_text(where.read_text(), encoding="utf-8-sig")
+    (camera,) = open_cameras(str(folder), 3, 0, -1, 1)
+    assert camera.intrinsics == Intrinsics.from_json(where)
 
 
 def test_the_selected_frames_are_used(folder):
