@@ -3,10 +3,12 @@ resolution.
 """
 
 import os
+import sys
 
 from .errors import InputError, Parser, cli
 
 _SAME_AXIS = 0.99999  # cosine of two z axes: 0.3 degrees
+_MOST_FACES = 100_000_000  # of the surface that is written: some 10 GB of memory
 # The paper: plain ACVD, the frame of PCA and the spatial transformer, jets of order 4
 PRESETS = {"paper": dict(patches=None, order=4, cuts="acvd", frames="stn", weights="paper")}
 
@@ -59,6 +61,10 @@ def main(argv=None):
         raise InputError(f"{args.output}: a .ply file is needed")
     if os.path.dirname(args.output) and not os.path.isdir(os.path.dirname(args.output)):
         raise InputError(f"{os.path.dirname(args.output)}: no such folder")
+    if os.path.isdir(args.output):
+        raise InputError(f"{args.output}: is a folder; a .ply file is needed")
+    if os.path.exists(args.output) and os.path.realpath(args.output) == os.path.realpath(args.mesh):
+        raise InputError(f"{args.output}: is the mesh itself; -o needs another name")
     for name, least in (("resolution", 1), ("smoothing", 0)):
         if getattr(args, name) < least:
             raise InputError(f"--{name} {getattr(args, name)}; at least {least} is needed")
@@ -68,10 +74,20 @@ def main(argv=None):
     import numpy as np
 
     from . import PatchedSurface, PolyFit, read_mesh, write_ply
-    from .mesh import centred
+    from .mesh import centred, checked, seam_note, size_note
     from .network import PRETRAINED
 
     vertices, faces, _ = read_mesh(args.mesh)
+    vertices, faces = checked(vertices, faces, args.mesh, drop_loose=True)
+    made = len(faces) * args.resolution**2
+    if made > _MOST_FACES:
+        raise InputError(
+            f"--resolution {args.resolution}: {made:.3g} faces of the {len(faces)} of {args.mesh};"
+            f" at most {_MOST_FACES:.3g} can be made"
+        )
+    for note in size_note(vertices, args.mesh), seam_note(vertices, faces, args.mesh):
+        if note:
+            print(note, file=sys.stderr)
     vertices, moved = centred(vertices)
     if moved is not None:
         by = ", ".join(f"{x:.9g}" for x in moved)

@@ -215,6 +215,7 @@ def reconstruct(
     """
     scene, out = os.fspath(scene), os.fspath(out)
     from polyfit.backend import set_variant
+    from polyfit.mesh import seam_note, size_note
 
     from .scene import resolved_defaults
 
@@ -229,12 +230,15 @@ def reconstruct(
     from .render import threads
     from .results import outputs
     from .scene import experiment as experiments
-    from .surface.meshio import seam_note, size_note, uv_note
+    from .surface.meshio import uv_note
     from .tracker import FrameTracker
 
     experiment = experiments.load(scene, overrides)
     mesh = experiment.template
-    notes = size_note(mesh.vertices, scene), seam_note(mesh.vertices, mesh.faces, scene)
+    notes = (
+        size_note(mesh.vertices, scene, "template"),
+        seam_note(mesh.vertices, mesh.faces, scene),
+    )
     far = uv_note(mesh.texcoords, scene)
     for note in (*experiment.notes, *notes, far and f"note: {far}"):
         if note:

@@ -8,6 +8,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
         "meshio": ["read_mesh", "read_textured", "write_ply"],
+        "notes": ["seam_note", "size_note"],
         "subdivision": ["child", "refined", "subdivided", "subdivided_loop"],
         "texcoords": ["TexCoords"],
         "triangles": [

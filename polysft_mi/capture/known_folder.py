@@ -9,7 +9,7 @@ import numpy as np
 from polyfit.backend import set_variant
 from polyfit.colours import srgb
 from polyfit.files import aside
-from polyfit.mesh import TexCoords
+from polyfit.mesh import TexCoords, size_note
 from polysft_mi.body import check_model, read_motion
 from polysft_mi.errors import InputError
 from polysft_mi.scene import Sequence, checked_size, open_cameras, read_camera, read_rgb
@@ -121,7 +121,7 @@ def prepare_folder(
         _check_folder(os.path.join(target, DEPTH), depth.images, overwrite, known)
         seen = lambda k: depth.seen_by(sequence.depth.read(k), camera)
         folders[DEPTH] = lambda to: evidence.update(write_depth(to, sequence.depth, seen))
-    note = meshio.size_note(vertices, where)
+    note = size_note(vertices, where, "template")
     if note:
         warn(note)
     for name in ("tracks", "depth", "cameras", "body", "body_model"):

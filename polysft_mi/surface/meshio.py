@@ -59,42 +59,6 @@ def write_obj(path, vertices, faces, uv):
         file.writelines("f {}/{} {}/{} {}/{}\n".format(*f) for f in corners)
 
 
-def size_note(vertices, where="template"):
-    """A line about a template whose size in metres is unlikely, with the factor that would make it
-    likely; None for one that lies between a grain of rice and a house. ``vertices`` (N, 3) [m].
-    """
-    extent, rice, house = float(np.ptp(vertices, axis=0).max()), 0.005, 30.0
-    if rice <= extent <= house:
-        return None
-    # in the order in which people use them
-    units = [("millimetres", 1e-3), ("centimetres", 1e-2), ("micrometres", 1e-6)]
-    units = units if extent > house else [("kilometres", 1e3)]
-    likely = [(unit, factor) for unit, factor in units if 0.02 <= factor * extent <= house]
-    unit, factor = likely[0] if likely else ("another unit", 1 / extent)
-    return (
-        f"note: {where}: the template is {extent:.4g} m large, since lengths are read as metres; if"
-        f" it is in {unit}, scale it by {factor:g}, to {factor * extent:.3g} m"
-    )
-
-
-def seam_note(vertices, faces, where="template"):
-    """A line about boundary vertices (N, 3) [m] that lie on one another, so that the surface comes
-    apart there; None without any.
-    """
-    from scipy.spatial import cKDTree
-
-    edges, side = mesh.edges_of(faces)
-    rim = np.unique(edges[np.bincount(side.ravel(), minlength=len(edges)) == 1])
-    near = 1e-7 * np.ptp(vertices, axis=0).max()
-    pairs = cKDTree(vertices[rim]).query_pairs(near) if len(rim) else ()
-    if not pairs:
-        return None
-    return (
-        f"note: {where}: the surface is open where {len(pairs)} vertices lie on others; if that is"
-        " a seam of the texture, an OBJ keeps it closed (f v/vt)"
-    )
-
-
 def uv_note(texcoords, where="template"):
     """A line about texture coordinates far outside the image, :class:`polyfit.mesh.TexCoords`; None
     where they lie within 0 to 1, but for a margin.

@@ -53,6 +53,7 @@ def test_bad_input_ends_in_one_line_and_writes_nothing(tmp_path):
     write_ply(tmp_path / "sheet.ply", V, F)
     write_ply(tmp_path / "points.ply", V, F[:0])
     (tmp_path / "broken.obj").write_text("v 0 0 0\nv 1 0 zero\n")
+    (tmp_path / "folder.ply").mkdir()
     before = sorted(tmp_path.iterdir())
     for message, args in {
         "broken.obj: line 2": ["broken.obj"],
@@ -61,13 +62,32 @@ def test_bad_input_ends_in_one_line_and_writes_nothing(tmp_path):
         "26 patches; 1 to 25, the number of its vertices": ["sheet.ply", "--patches", "26"],
         "order = 11; the order of a jet is 1 to 10": ["sheet.ply", "--order", "11"],
         "--resolution 0; at least 1 is needed": ["sheet.ply", "--resolution", "0"],
+        "3.2e+13 faces of the 32 of": ["sheet.ply", "--resolution", "1000000"],
     }.items():
         with pytest.raises(InputError) as error:
             main([str(tmp_path / args[0]), *args[1:], "-o", str(tmp_path / "out.ply")])
         assert message in str(error.value) and "\n" not in str(error.value)
+    for output, message in ("sheet.ply", "is the mesh itself"), ("folder.ply", "is a folder"):
+        with pytest.raises(InputError, match=f"{output}: {message}"):
+            main([str(tmp_path / "sheet.ply"), "-o", str(tmp_path / output)])
     with pytest.raises(InputError, match="nowhere: no such folder"):
         main([str(tmp_path / "sheet.ply"), "-o", str(tmp_path / "nowhere" / "out.ply")])
     assert sorted(tmp_path.iterdir()) == before
+
+
+def test_a_mesh_that_may_not_be_what_was_meant_is_told(tmp_path, capsys):
+    V, F = surfaces.sheet(n=4)
+    flags = ["--resolution", "1", "-o", str(tmp_path / "out.ply")]
+    for vertices, faces, said in [
+        (V, F, ""),
+        (1000 * V, F, "the mesh is "),
+        (V[F].reshape(-1, 3), np.arange(F.size).reshape(-1, 3), "the surface is open where "),
+    ]:
+        write_ply(tmp_path / "mesh.ply", vertices, faces)
+        main([str(tmp_path / "mesh.ply"), *flags])
+        told = capsys.readouterr().err
+        assert told.startswith(f"note: {tmp_path / 'mesh.ply'}: {said}" if said else "")
+        assert told.count("\n") == bool(said)
 
 
 def test_a_process_ends_in_status_2(tmp_path):

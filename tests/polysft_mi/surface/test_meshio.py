@@ -12,7 +12,7 @@ from places import ROOT
 
 from polyfit import animation
 from polyfit.files import aside
-from polyfit.mesh import TexCoords, in_use, read_textured, write_ply
+from polyfit.mesh import TexCoords, in_use, read_textured, seam_note, write_ply
 from polysft_mi.errors import InputError
 from polysft_mi.surface.atlas import Atlas
 from polysft_mi.surface.meshio import (
@@ -20,7 +20,6 @@ from polysft_mi.surface.meshio import (
     cleaned,
     read_template,
     read_textured_template,
-    seam_note,
     uv_note,
 )
 from polysft_mi.surface.template import Template
@@ -196,7 +195,7 @@ def test_a_surface_cut_along_a_seam_is_told():
     cut = np.where(left[:, None], F, F + len(V))
     W, G = in_use(np.concatenate([V, V]), cut)
     both = len(np.intersect1d(F[left], F[~left]))
-    assert f"the surface is open where {both} vertices lie on others" in seam_note(W, G)
+    assert f"the surface is open where {2 * both} vertices lie on others" in seam_note(W, G)
 
 
 def test_coordinates_beyond_the_image_are_told():

@@ -4,14 +4,16 @@ import numpy as np
 import pytest
 import synthetic
 
+from polyfit.mesh import size_note
 from polysft_mi import prepare, run
-from polysft_mi.surface.meshio import read_template, size_note
+from polysft_mi.surface.meshio import read_template
 
 
 @pytest.mark.parametrize(
     "extent, said",
     [
         (297.0, "if it is in millimetres, scale it by 0.001, to 0.297 m"),
+        (70.0, "scale it by 0.001, to 0.07 m; if it is in centimetres, scale it by 0.01, to 0.7 m"),
         (1800.0, "if it is in millimetres, scale it by 0.001, to 1.8 m"),
         (297e3, "if it is in micrometres, scale it by 1e-06, to 0.297 m"),
         (0.0003, "if it is in kilometres, scale it by 1000, to 0.3 m"),
@@ -23,7 +25,7 @@ from polysft_mi.surface.meshio import read_template, size_note
 )
 def test_size_note(extent, said):
     vertices = np.array([[0, 0, 1], [extent, 0, 1], [0, 0.7 * extent, 1]])
-    note = size_note(vertices, "a.obj")
+    note = size_note(vertices, "a.obj", "template")
     assert (note is None) == (said is None)
     if note:
         assert note.startswith("note: a.obj: the template is ") and said in note
