@@ -67,7 +67,7 @@ def write_frames(folder, frames, masks, expected, straight, progress, registrati
             write(FRAME.format(k), frame)
             if tracked:
                 mask = tracked.next(frame) if k else tracked.first(frame, expected)
-                mask = drawn_in(mask, inset)
+                mask = _drawn_in(mask, inset, k == 0)
                 if k == 0:
                     overlap, passes = iou(mask, expected), beyond(mask, expected)
                 areas.append(int((mask > 127).sum()))
@@ -79,8 +79,9 @@ def write_frames(folder, frames, masks, expected, straight, progress, registrati
             job.result()
     result = Written(indices, bool(masks), None, [])
     if isinstance(masks, GivenMasks):
-        masks.write(folder, indices, straight, inset)
-        result.lines.append(f"masks: those of {masks.pattern}")
+        first = masks.write(folder, indices, straight, inset)
+        met = _how_met(iou(first, expected), beyond(first, expected))
+        result.lines.append(f"masks: those of {masks.pattern}; {met}")
     elif tracked:
         why = _why_not_used(overlap, areas, strange, indices)
         result.masked = why is None
@@ -91,10 +92,7 @@ def write_frames(folder, frames, masks, expected, straight, progress, registrati
             "used": why is None,
         }
         if why is None:
-            result.lines.append(
-                f"masks: by GrabCut; the first and the template overlap by {100 * overlap:.0f} %,"
-                f" and it passes the template by {passes:.1f} pixels"
-            )
+            result.lines.append(f"masks: by GrabCut; {_how_met(overlap, passes)}")
         else:
             result.figures["why"] = why
             result.lines.append(f"masks: not used: {why}; prepare/masks.png shows them")
@@ -102,6 +100,27 @@ def write_frames(folder, frames, masks, expected, straight, progress, registrati
     if masks and not result.masked:
         shutil.rmtree(os.path.join(folder, "masks"))
     return result
+
+
+def _drawn_in(mask, inset, first):
+    """A mask drawn in by ``inset`` [pixels]. Raises InputError where that leaves nothing of the
+    ``first`` one.
+    """
+    drawn = drawn_in(mask, inset)
+    if first and (mask > 127).any() and not (drawn > 127).any():
+        raise InputError(
+            f"--inset {inset:g}: nothing is left of the first frame's mask; a few pixels, by which"
+            " the masks pass the sheet, can be drawn in"
+        )
+    return drawn
+
+
+def _how_met(overlap, passes):
+    """How the first mask meets the template, in words."""
+    return (
+        f"the first and the template overlap by {100 * overlap:.0f} %, and it passes the template"
+        f" by {passes:.1f} pixels"
+    )
 
 
 def _write_contact_sheets(folder, indices, masked):
@@ -153,7 +172,7 @@ class GivenMasks:
 
     def write(self, folder, indices, straight, inset=0.0):
         """Write those of the frames ``indices`` into the folder, undistorted, scaled, and drawn in
-        by ``inset`` [pixels].
+        by ``inset`` [pixels]; returns the first of them.
         """
         paths, size = self._paths, straight.size
         if len(paths) != len(indices):
@@ -175,4 +194,8 @@ class GivenMasks:
                 raise InputError(
                     f"{path}: the mask of the first frame is empty; the sheet must be seen in it"
                 )
-            write_png(os.path.join(folder, MASK.format(k)), drawn_in(mask, inset))
+            mask = _drawn_in(mask, inset, k == 0)
+            if k == 0:
+                first = mask
+            write_png(os.path.join(folder, MASK.format(k)), mask)
+        return first

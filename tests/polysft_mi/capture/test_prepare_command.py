@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 from pathlib import Path
 
 import cv2
@@ -71,6 +72,25 @@ def test_masks_are_drawn_in(clip, tmp_path):
         assert "--inset" in refused(
             prepare.main, arguments(clip, tmp_path / "no", "--inset", "1", *words)
         )
+
+
+def test_given_masks_are_told_and_not_drawn_in_to_nothing(clip, tmp_path, capsys):
+    out = tmp_path / "found"
+    prepare.main([*arguments(clip, out, "--last", "0"), "-q"])
+    mask = cv2.imread(str(out / "masks" / "00000.png"), 0)
+    (tmp_path / "inverted").mkdir()
+    cv2.imwrite(str(tmp_path / "inverted" / "0.png"), 255 - mask)
+    for folder, least, most in (out / "masks", 85, 100), (tmp_path / "inverted", 0, 20):
+        words = arguments(clip, tmp_path / str(most), "--last", "0", "--masks", str(folder))
+        prepare.main(words)
+        said = re.search(
+            rf"masks: those of {folder}; .* overlap by (\d+) %", capsys.readouterr().out
+        )
+        assert least <= int(said[1]) <= most
+    no = arguments(clip, tmp_path / "no", "--last", "0", "--inset", "500")
+    for words in (no, [*no, "--masks", str(out / "masks")]):
+        assert "--inset 500: nothing is left" in refused(prepare.main, words)
+    assert not (tmp_path / "no").exists()
 
 
 def test_photo_that_is_not_in_the_video(clip, tmp_path):
