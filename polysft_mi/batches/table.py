@@ -68,14 +68,15 @@ class Table:
     @classmethod
     def opened(cls, jobs: Sequence[Job], out: Path, options: Sequence[str]) -> Table:
         """The table, its folder made where it is new. Raises InputError where ``out`` holds
-        anything but a batch with the same options.
+        anything but a batch, or what a batch with other options made.
         """
         if out.exists() and not out.is_dir():
             raise InputError(f"{out}: is a file; OUT must be a folder")
         before = read_json(out / "batch.json")
         if not before and out.exists() and any(out.iterdir()):
             raise InputError(f"{out}: is not empty and holds no batch; give an empty or new folder")
-        if before and before.get("options") != list(options):
+        left = any((out / row["name"]).exists() for row in before.get("jobs", []))
+        if left and before.get("options") != list(options):
             made = shlex.join(before.get("options", [])) or "none"
             raise InputError(
                 f"{out}: was made with other options ({made}); go on with those, or give another"

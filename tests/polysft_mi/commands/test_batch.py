@@ -71,6 +71,14 @@ def test_a_broken_scene_costs_its_own_line(scenes, tmp_path, capsys):
         batch.main([str(scenes), "-o", str(out), "-D", "order=5"])
 
 
+def test_options_may_change_while_nothing_came_out(scenes, tmp_path):
+    words = [str(scenes / "gone"), "-o", str(tmp_path / "out"), "-q"]
+    for wrong in "ordr=4", "order=4":
+        assert batch.main([*words, "-D", wrong, *QUICK]) == 1
+        about = json.loads((tmp_path / "out" / "batch.json").read_text())
+        assert about["options"][:2] == ["-D", wrong]
+
+
 def test_ctrl_c_keeps_what_is_done_and_the_next_call_goes_on(tmp_path):
     """However late the signal comes: of two runs, one after the other, the last has not begun."""
     truth = synthetic.cloth(tmp_path / "data", frames=6, bend=2.5, turn=0.1)
