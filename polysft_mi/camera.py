@@ -84,15 +84,27 @@ class Intrinsics:
             ) from None
         except (json.JSONDecodeError, UnicodeDecodeError) as error:
             raise InputError(f"{path}: not JSON ({error})") from None
+        if not isinstance(data, dict):
+            raise InputError(f"{path}: not a JSON object; fx, fy, cx, cy, width, height are needed")
+
+        def number(name: str, whole: bool = False) -> float:
+            if name not in data:
+                raise InputError(f"{path}: no {name}; fx, fy, cx, cy, width, height are needed")
+            try:
+                value = float(data[name])
+            except (TypeError, ValueError):
+                value = math.nan
+            if not (value.is_integer() if whole else math.isfinite(value)):
+                kind = "a whole number" if whole else "a number"
+                raise InputError(f"{path}: {name} = {data[name]!r}; {kind} is needed")
+            return value
+
+        lens = number("fx"), number("fy"), number("cx"), number("cy")
+        size = int(number("width", whole=True)), int(number("height", whole=True))
         try:
-            fx, fy, cx, cy = (float(data[k]) for k in ("fx", "fy", "cx", "cy"))
-            return cls(fx, fy, cx, cy, int(data["width"]), int(data["height"]))
-        except (KeyError, TypeError, ValueError) as error:
-            if isinstance(error, InputError):
-                raise InputError(f"{path}: {error}") from None
-            raise InputError(
-                f"{path}: {error} missing or not a number; fx, fy, cx, cy, width, height are needed"
-            ) from None
+            return cls(*lens, *size)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
 
     def sensor_xml(self, indent: str = "    ", world_to_camera: Any = None) -> str:
         """The ``<sensor>`` element: Mitsuba's ``perspective`` where the pixels are square, else our

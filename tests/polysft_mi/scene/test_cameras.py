@@ -84,6 +84,24 @@ def test_a_bad_file_is_told(other, said, folder):
         open_cameras(str(folder), 3, 0, -1, 1)
 
 
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda known: [known], "not a JSON object; fx, fy"),
+        (lambda known: known.pop("cx") and known, "no cx; fx, fy"),
+        (lambda known: known | {"fx": None}, "fx = None; a number is needed"),
+        (lambda known: known | {"height": 1e999}, "height = inf; a whole number is needed"),
+        (lambda known: known | {"width": 3.7}, "width = 3.7; a whole number is needed"),
+        (lambda known: known | {"width": 0}, "both must be positive"),
+    ],
+)
+def test_a_bad_camera_of_a_run_is_told(change, said, folder):
+    where = folder / "side" / "camera.json"
+    where.write_text(json.dumps(change(json.loads(where.read_text()))))
+    with pytest.raises(InputError, match=re.escape(f"{where}: ") + ".*" + re.escape(said)):
+        Intrinsics.from_json(where)
+
+
 def test_distortion_is_told(folder):
     write(folder, distortion=[-0.1, 0, 0, 0])
     with pytest.raises(InputError, match="distortion"):
