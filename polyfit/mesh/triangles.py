@@ -28,6 +28,8 @@ def as_arrays(
         return V, np.empty((0, 3), np.int64)
     if F.ndim != 2 or F.shape[1] != 3:
         raise InputError(f"{where}: faces of shape {F.shape}; (F, 3) is needed")
+    if F.dtype.kind == "f" and not (F % 1 == 0).all():
+        raise InputError(f"{where}: faces are not whole numbers, which name vertices")
     F = F.astype(np.int64)
     if F.min() < 0 or F.max() >= len(V):
         raise InputError(

@@ -86,6 +86,8 @@ class Patches:
         area = mesh.areas(V, given)
         if count is None:
             count = max(parts, min(len(V), patch_count(area.sum())))
+        if count != int(count):
+            raise InputError(f"{where}: {count} patches; a whole number is needed")
         if not 1 <= count <= len(V):
             raise InputError(
                 f"{where}: {count} patches; 1 to {len(V)}, the number of its vertices, are possible"

@@ -339,6 +339,11 @@ def test_bad_input_is_named():
     V, F = surfaces.sheet(n=4)
     with pytest.raises(InputError, match="order = 0; the order of a jet is 1 to 10"):
         PatchedSurface.from_mesh(V, F, 2, order=0)
+    with pytest.raises(InputError, match="mesh: 2.5 patches; a whole number is needed"):
+        PatchedSurface.from_mesh(V, F, 2.5)
+    for wrong in F + 0.5, np.nan * F:
+        with pytest.raises(InputError, match="mesh: faces are not whole numbers"):
+            PatchedSurface.from_mesh(V, wrong)
     with pytest.raises(InputError, match="mesh: no faces"):
         PatchedSurface.from_mesh(V, F[:0])
     with pytest.raises(TypeError, match="unexpected keyword argument 'patches'"):
