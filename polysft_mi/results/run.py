@@ -169,9 +169,12 @@ class Run:
             return []
         with open(path, encoding="utf-8") as file:
             try:
-                return [json.loads(line) for line in file if line.strip()]
+                records = [json.loads(line) for line in file if line.strip()]
             except ValueError as error:
                 raise InputError(f"{path}: not JSON lines ({error})") from None
+        if not all(isinstance(record, dict) for record in records):
+            raise InputError(f"{path}: a line is no JSON object")
+        return records
 
     def mean_curvature(self) -> np.ndarray:
         """Mean curvature (T, N) [1/m] of the jets, without relief, at the vertices, each in its own

@@ -62,6 +62,12 @@ def test_a_plane_is_held_exactly():
     assert surface.parameters == 5 * 22
 
 
+@pytest.mark.parametrize("face", [-1, 10**6])
+def test_a_face_that_is_not_there_is_told(ball, face):
+    with pytest.raises(InputError, match=f"faces {face} to {face}; 0 to"):
+        ball.at([face], [[1.0, 0, 0]])
+
+
 def test_vertices_come_back(ball, sleeve):
     for surface, bound in ((ball, 1e-3), (sleeve, 3e-3)):
         V = torch.as_tensor(surface.patches.vertices)
