@@ -67,6 +67,14 @@ def test_what_the_camera_sees_agrees_with_rays(finished_run):
     np.testing.assert_allclose(nearer[inside], 0.9 * depth[inside], rtol=1e-5)
 
 
+@pytest.mark.parametrize(("line", "said"), [("3", "a line is no JSON"), ("{", "not JSON lines")])
+def test_a_log_that_is_no_log_is_told(finished_run, tmp_path, line, said):
+    out = shutil.copytree(finished_run[1], tmp_path / "out")
+    (out / "log.jsonl").write_text(line + "\n")
+    with pytest.raises(InputError, match=said):
+        Run.open(out).log()
+
+
 def test_a_run_against_the_truth_has_the_figures_of_evaluate(finished_run):
     truth, out = finished_run
     ours, theirs = (
