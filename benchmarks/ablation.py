@@ -101,7 +101,7 @@ SWITCHES = (
     Switch("shading", settings={"k_shading": 0}),
     Switch("chromaticity", settings={"k_chroma": 0}),
     Switch("chromaticity's outliers", {"chroma_scale": 1.0}),
-    Switch("triangles' blur", {"shading_blur": 0.05}),
+    Switch("triangles' blur", {"shading_blur": 0.05}),  # OpenCV has no blur of 0
     Switch("exposure", {"exposure": False}),
     Switch("light's prior", {"light_ridge": 0.0}),
     Switch("shading's outliers", {"light_scale": math.inf}),

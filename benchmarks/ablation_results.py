@@ -195,8 +195,8 @@ compare it within this page only):
 
 {baseline_table(results, sheets)}
 """
-    open_ = [rule for rule in unknown + rules if outcome(results, rule, sheets)[0] < 2]
-    rules = [rule for rule in open_ if measured(rule, before)]
+    undecided = [rule for rule in unknown + rules if outcome(results, rule, sheets)[0] < 2]
+    rules = [rule for rule in undecided if measured(rule, before)]
     if rules:
         text += f"""
 ## Before
