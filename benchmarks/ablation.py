@@ -89,6 +89,7 @@ SWITCHES = (
     Switch("a frame may be explained", {"margin": 0.0}),
     Switch("other starts", {"usual_frames": 2}),
     Switch("mirror images", {"mirror_share": 0.0}),
+    Switch("rims", {"rim": 0.0}),
     Switch("relief", {"relief_vertices": 0}),
     Switch("relief's bending", {"relief_bend": 0.0}),
     Switch("relief's caution", {"noise_misfit": math.inf}),

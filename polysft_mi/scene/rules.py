@@ -110,6 +110,13 @@ class Rules:
         "of a frame's cost that the mirror image of a sheet may cost more, to be tracked too",
         row="mirror images",
     )
+    rim: float = _rule(
+        0.1,
+        "share",
+        "of a surface's size, the root of its area: what is nearer to its border is tried anew, as"
+        " it would go on from the inside",
+        row="rims",
+    )
     # the relief, and caution with noise
     relief_vertices: int = _rule(
         3000,

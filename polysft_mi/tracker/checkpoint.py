@@ -37,7 +37,8 @@ class Track:
     whether the tracker has looked back over the whole; ``solver``: its name.
 
     ``other``: a second track that explains the frames from ``fork`` on about as well, or None;
-    ``mirror_at``: the frame from which on one is looked for.
+    ``mirror_at``: the frame from which on one is looked for; ``rim_at``: the one from which on the
+    rim is tried again.
     """
 
     states: list = field(default_factory=list)
@@ -54,6 +55,7 @@ class Track:
     solver: str = ""
     fork: int = 0
     mirror_at: int = 1
+    rim_at: int = 1
     other: Track | None = None
 
     def certainties(self, count: int) -> list[np.ndarray]:
@@ -128,7 +130,7 @@ class Track:
 
 
 _META = "next_window iterations seconds totals lost unusable swept finished solver".split()
-_META += ["fork", "mirror_at"]
+_META += ["fork", "mirror_at", "rim_at"]
 _OTHER = "other_"  # before the names of the other track's arrays
 
 

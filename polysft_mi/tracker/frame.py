@@ -4,6 +4,7 @@ tells the frames after it.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,6 +19,7 @@ from polysft_mi.solvers import Report, Solver
 from polysft_mi.surface import State
 
 from .branches import mirrored, plane_of
+from .rims import Rim
 from .sigma import along_rays, score
 from .stages import Found, Stages
 from .starts import Starts
@@ -173,15 +175,19 @@ class FrameTracker:
         return self._solution([new], [found], self._same_noise(found, context, memory))
 
     @property
-    def mirrors(self) -> bool:
-        """Whether :meth:`mirror` may find something: frames are solved one by one, surfaces are
-        compared, and are a sheet. A closed one has no mirror image, nor has one on a body.
+    def _tries(self):
+        """Whether other surfaces are tried where a frame is solved: frames are solved one by one,
+        and surfaces are compared. On a body nothing is: its drape leads.
         """
         s = self.settings
         alone = s.window == 1 and s.starts == "auto"
-        wanted = self._learns and self.objective.rules.mirror_share > 0
-        sheet = len(self._atlas) == 1 and self._atlas.carrier is None
-        return wanted and alone and sheet
+        return self._learns and alone and self._atlas.carrier is None
+
+    @property
+    def mirrors(self) -> bool:
+        """Whether :meth:`mirror` may find something: a closed surface has no mirror image."""
+        wanted = self.objective.rules.mirror_share > 0
+        return self._tries and wanted and len(self._atlas) == 1
 
     def mirror(
         self,
@@ -210,28 +216,86 @@ class FrameTracker:
             distance = (middle - brightness.centre) @ normal / brightness.unit
             known[-1] = replace(context.memory, light=light.mirrored(normal, distance))
             context = replace(context, memory=known[-1])
-        image = self._atlas.reaching(mirrored(vertices, self.problem.camera.origin), state)
-        start = self._atlas.with_relief_in_jets(image)
+        image = mirrored(vertices, self.problem.camera.origin)
+        found, _ = self._other(
+            image, state, context, lambda apart: np.median(apart / certainty[0]) > 1
+        )
+        if not found:  # most often where the sheet is flat
+            return None, 0.0
+        excess = self._cost(found.state, context) / own_cost - 1
+        if excess > self.objective.rules.mirror_share:
+            return None, excess
+        new = self._atlas.with_relief_in_jets(found.state)
+        return self._solution([new], [found], self._memory(found, context, known)), excess
 
-        def is_other(state):
-            apart = np.linalg.norm(self._atlas.surface(state).vertices - vertices, axis=1)
-            return np.median(apart / certainty[0]) > 1
+    @functools.cached_property
+    def rim(self) -> Rim | None:
+        """The rim that :meth:`unfold` continues; None where there is none, or none is asked for."""
+        share = self.objective.rules.rim if self._tries else 0.0
+        return Rim(self.problem.template, self.objective.inputs.operators.bends, share) or None
 
-        excess, new = 0.0, start
+    def unfold(
+        self,
+        frame: int,
+        state: State,
+        certainty: np.ndarray,
+        memory: FrameMemory | None,
+        past: Past,
+        report: Report | None = None,
+    ) -> tuple[Solution | None, float]:
+        """Solve a frame anew from its surface with the rim continued from the inside. Returns the
+        solution, None where it is the same surface, or gains less than another pass must; and by
+        what share of the cost of the frame's own surface it costs more.
+
+        ``state``, ``certainty`` (2, N) [m], ``memory``: of the frame so far.
+        """
+        assert self.rim is not None
+        self._prepare(report)
+        self._expect(frame)
+        context = self._context(frame, past[-1][0], [memory for _, memory in past])
+        vertices = self._atlas.surface(state).vertices
+        continued, rays = self.rim.continued(vertices), vertices - self.problem.camera.origin
+        along = np.einsum("ij,ij->i", continued - vertices, rays) / np.linalg.norm(rays, axis=1)
+        before, behind = (sign * along > certainty[0] for sign in (-1, 1))
+        parts = [*self.rim.parts(before), *self.rim.parts(behind)]
+        found, excess = None, 0.0
+        if parts:
+            found, excess = self._other(
+                continued,
+                state,
+                context,
+                lambda apart: any(np.median((apart / certainty[0])[part]) > 1 for part in parts),
+                self.objective.rules.mirror_share,
+            )
+        if not found:
+            return None, excess
+        new = self._atlas.with_relief_in_jets(found.state)
+        excess = self._cost(new, context) / self._cost(state, context) - 1
+        if excess > -self.objective.rules.gain:
+            return None, excess
+        return self._solution([new], [found], self._same_noise(found, context, memory)), excess
+
+    def _other(self, vertices, state, context, is_other, most=math.inf):
+        """(found, excess): the :class:`Found` that ``vertices`` (N, 3) [m, world] lead to, stage by
+        stage. None from the first stage on that is not ``is_other`` by how far (N,) [m] it is from
+        ``state``, or costs more there by a share, the excess, above ``most``.
+        """
+        own, found = self._atlas.surface(state).vertices, None
+        new = self._atlas.with_relief_in_jets(self._atlas.reaching(vertices, state))
         for stage in self.objective.usual:
             (found,) = self._stages.minimise([context], stage, [new])
             new = found.state
-            if not is_other(new):  # most often where the sheet is flat
-                return None, excess
-            excess = self._cost(new, context) / own_cost - 1
-        if excess > self.objective.rules.mirror_share:
-            return None, excess
-        new = self._atlas.with_relief_in_jets(new)
-        return self._solution([new], [found], self._memory(found, context, known)), excess
+            if not is_other(np.linalg.norm(self._atlas.surface(new).vertices - own, axis=1)):
+                return None, 0.0
+            if most < math.inf:
+                excess = self._stages.cost(found) / self._cost(state, context, stage) - 1
+                if excess > most:
+                    return None, excess
+        return found, 0.0
 
-    def _cost(self, state, context):
-        """The cost of a state at the last stage."""
-        frozen = self.objective.frozen([context], self.objective.usual[-1], [state])
+    def _cost(self, state, context, stage=None):
+        """The cost of a state at a stage, the last one by default."""
+        frozen = self.objective.frozen([context], stage or self.objective.usual[-1], [state])
         (model,) = frozen.quadratic([state])
         return self._stages.cost(Found(state, None, model))
 

@@ -29,7 +29,8 @@ _MIN_VISIBLE_SHARE = (
     0.02  # share of the vertices inside the image below which the surface is said to have left it
 )
 _MAX_HISTORY = 20  # frames before that a frame is told of
-_LATEST = 20  # frames after which a mirror image is tried again
+_LATEST = 20  # frames after which a mirror image, or a rim, is tried again
+_RIM_EVERY = 5  # frames, at least, from one try of a rim to the next
 _LOG_EVERY = 1  # iterations between records of the log
 
 
@@ -76,6 +77,8 @@ def track(
                 _observe(tracker, done, k)
             log.flush()
             _follow(tracker, done, start, progress)
+            for branch in filter(None, (done, done.other)):
+                _unfold(tracker, branch, start, progress)
             done.save(checkpoint, stages)
             if solved:
                 solved(start, _vertices(tracker.problem, done.states[start]))
@@ -117,6 +120,29 @@ def _follow(tracker, done, k, progress):
             _replace(other, k, _rounded(tracker.problem, solution.states[0]), solution)
         done.mirror_at = k + math.ceil(min(max(excess / share, 1), _LATEST))
         done.seconds[k] += time.perf_counter() - began
+
+
+def _unfold(tracker, done, k, progress):
+    """Keep what frame ``k`` becomes with its rim continued from the inside, where that costs less;
+    the more it costs, the later it is tried again.
+    """
+    if not tracker.rim or k < done.rim_at or k in done.lost:
+        return
+    began, share = time.perf_counter(), tracker.objective.rules.mirror_share
+    past = _past(tracker, done, range(max(0, k - _MAX_HISTORY), k))
+    state = tracker.problem.atlas.state(done.states[k])
+    report = progress and functools.partial(progress, k, k)
+    try:
+        solution, excess = tracker.unfold(
+            k, state, done.certainty[k], done.memories[k], past, report
+        )
+    except (BadFrame, LinAlgError):
+        solution, excess = None, math.inf
+    if solution:
+        _replace(done, k, _rounded(tracker.problem, solution.states[0]), solution)
+    wait = excess / share if share > 0 else math.inf
+    done.rim_at = k + math.ceil(min(_RIM_EVERY * max(wait, 1), _LATEST))
+    done.seconds[k] += time.perf_counter() - began
 
 
 def _vertices(problem, arrays):
