@@ -30,7 +30,7 @@ _MIN_VISIBLE_SHARE = (
 )
 _MAX_HISTORY = 20  # frames before that a frame is told of
 _LATEST = 20  # frames after which a mirror image, or a rim, is tried again
-_RIM_EVERY = 5  # frames, at least, from one try of a rim to the next
+_RIM_EVERY = 3  # frames, at least, from one try of a rim to the next
 _LOG_EVERY = 1  # iterations between records of the log
 
 
