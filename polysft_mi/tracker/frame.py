@@ -216,13 +216,11 @@ class FrameTracker:
             distance = (middle - brightness.centre) @ normal / brightness.unit
             known[-1] = replace(context.memory, light=light.mirrored(normal, distance))
             context = replace(context, memory=known[-1])
-        image = mirrored(vertices, self.problem.camera.origin)
-        found, _ = self._other(
-            image, state, context, lambda apart: np.median(apart / certainty[0]) > 1
-        )
-        if not found:  # most often where the sheet is flat
-            return None, 0.0
-        excess = self._cost(found.state, context) / own_cost - 1
+        image, excess = mirrored(vertices, self.problem.camera.origin), 0.0
+        for _, found, apart in self._from(image, state, context):
+            if not np.median(apart / certainty[0]) > 1:  # most often where the sheet is flat
+                return None, excess
+            excess = self._cost(found.state, context) / own_cost - 1
         if excess > self.objective.rules.mirror_share:
             return None, excess
         new = self._atlas.with_relief_in_jets(found.state)
@@ -258,40 +256,31 @@ class FrameTracker:
         along = np.einsum("ij,ij->i", continued - vertices, rays) / np.linalg.norm(rays, axis=1)
         before, behind = (sign * along > certainty[0] for sign in (-1, 1))
         parts = [*self.rim.parts(before), *self.rim.parts(behind)]
-        found, excess = None, 0.0
-        if parts:
-            found, excess = self._other(
-                continued,
-                state,
-                context,
-                lambda apart: any(np.median((apart / certainty[0])[part]) > 1 for part in parts),
-                self.objective.rules.mirror_share,
-            )
-        if not found:
-            return None, excess
+        if not parts:
+            return None, 0.0
+        for stage, found, apart in self._from(continued, state, context):
+            apart /= certainty[0]
+            if not any(np.median(apart[part]) > 1 for part in parts):
+                return None, 0.0
+            excess = self._stages.cost(found) / self._cost(state, context, stage) - 1
+            if excess > self.objective.rules.mirror_share:
+                return None, excess
         new = self._atlas.with_relief_in_jets(found.state)
         excess = self._cost(new, context) / self._cost(state, context) - 1
         if excess > -self.objective.rules.gain:
             return None, excess
         return self._solution([new], [found], self._same_noise(found, context, memory)), excess
 
-    def _other(self, vertices, state, context, is_other, most=math.inf):
-        """(found, excess): the :class:`Found` that ``vertices`` (N, 3) [m, world] lead to, stage by
-        stage. None from the first stage on that is not ``is_other`` by how far (N,) [m] it is from
-        ``state``, or costs more there by a share, the excess, above ``most``.
+    def _from(self, vertices, state, context):
+        """Yields each stage, what ``vertices`` (N, 3) [m, world] lead to there, :class:`Found`, and
+        how far (N,) [m] that is from the ``state``.
         """
-        own, found = self._atlas.surface(state).vertices, None
+        own = self._atlas.surface(state).vertices
         new = self._atlas.with_relief_in_jets(self._atlas.reaching(vertices, state))
         for stage in self.objective.usual:
             (found,) = self._stages.minimise([context], stage, [new])
             new = found.state
-            if not is_other(np.linalg.norm(self._atlas.surface(new).vertices - own, axis=1)):
-                return None, 0.0
-            if most < math.inf:
-                excess = self._stages.cost(found) / self._cost(state, context, stage) - 1
-                if excess > most:
-                    return None, excess
-        return found, 0.0
+            yield stage, found, np.linalg.norm(self._atlas.surface(new).vertices - own, axis=1)
 
     def _cost(self, state, context, stage=None):
         """The cost of a state at a stage, the last one by default."""

@@ -101,6 +101,12 @@ def test_a_track_on_the_wrong_side_comes_back(tmp_path):
     assert error(problem, last.states[5], true) < 0.5 * error(problem, last.states[5], other)
 
 
+def test_an_image_that_costs_much_more_is_not_tried_again_soon(tmp_path):
+    truth = synthetic.cloth(tmp_path / "cloth", size=(240, 180), bend=6.0)
+    done = track(FrameTracker(problem_of(truth.folder)), 5, tmp_path)
+    assert done.other is None and done.mirror_at > 5
+
+
 @pytest.fixture(scope="module")
 def undecided(tmp_path_factory):
     """A problem whose rules decide nothing, its track, and the track's folder: of a sheet far away
