@@ -20,8 +20,8 @@ class Rim:
     """The ``vertices`` (N,) bool of a ``template`` within a distance of its border: a ``share`` of
     its size, the root of its area.
 
-    ``bends`` (H, N): the matrix of :func:`polysft_mi.surface.hinges`. False where no vertex, or
-    every one, is in the rim.
+    ``bends`` (H, N): the matrix of :func:`polysft_mi.surface.hinges`. False where no vertex is in
+    the rim: also where those inside of it would lie in a line, and not say how it goes on.
     """
 
     def __init__(self, template, bends, share):
@@ -33,6 +33,8 @@ class Rim:
         if len(border := np.unique(boundary_edges(faces))) and share > 0:
             away = dijkstra(self._links, directed=False, indices=border, min_only=True)
             self.vertices = away <= share * np.sqrt(areas(points, faces).sum())
+            if not _spread(points[~self.vertices]):
+                self.vertices[:] = False
         if self:
             rim, energy = self.vertices, (bends.T @ bends).tocsr()
             ridge = _RIDGE * sp.identity(rim.sum())
@@ -40,7 +42,7 @@ class Rim:
             self._known = energy[rim][:, ~rim]
 
     def __bool__(self):
-        return bool(self.vertices.any() and not self.vertices.all())
+        return bool(self.vertices.any())
 
     def continued(self, surface):
         """``surface`` (N, 3) with the vertices of the rim where it bends least from the template,
@@ -60,3 +62,11 @@ class Rim:
         at = np.flatnonzero(chosen & self.vertices)
         count, part = connected_components(self._links[at][:, at], directed=False)
         return [at[part == k] for k in range(count)]
+
+
+def _spread(points):
+    """Whether ``points`` (N, 3) lie in no line."""
+    if len(points) < 3:
+        return False
+    sizes = np.linalg.svd(points - points.mean(0), compute_uv=False)
+    return bool(sizes[1] > 1e-3 * sizes[0])

@@ -57,6 +57,10 @@ def test_a_rim_is_what_is_near_the_border(flat):
     inner = (np.abs(points[:, :2]) < [[0.12, 0.09]] - 0.15 * size - np.array([1e-9, 1e-9])).all(1)
     assert rim and np.array_equal(rim.vertices, ~inner)
     assert not rim_of(points, faces, share=0.0) and not rim_of(points, faces, share=1.0)
+    for rows, columns in ((2, 9), (3, 3), (3, 9)):  # what is inside lies in a line, at most
+        assert not rim_of(
+            synthetic.sheet(0.0, rows, columns), synthetic.grid_faces(rows, columns), share=0.01
+        )
     ball = trimesh.creation.icosphere(2)
     assert not rim_of(np.asarray(ball.vertices), np.asarray(ball.faces))
 
