@@ -22,6 +22,7 @@ NEEDED = {  # rules that stay where they pay on one sequence alone, and why
     "a wider blur where it moved far": "it is for fast motion, which Kinect-Paper has",
     "caution's steepness": "it is for a real camera's noise, as on Kinect-Paper",
     "mirror images": "they are for plain textures (tracker.md has those that gain)",
+    "rims": "they are for plain textures (tracker.md has those that gain)",
     "exposure": "it is for cameras whose exposure changes; that of the simulated ones does not",
     "shading's outliers": "without it flag loses its corner",
     "few refits": "more take longer, and flag loses its corner",
