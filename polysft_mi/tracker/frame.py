@@ -217,7 +217,7 @@ class FrameTracker:
             known[-1] = replace(context.memory, light=light.mirrored(normal, distance))
             context = replace(context, memory=known[-1])
         image, excess = mirrored(vertices, self.problem.camera.origin), 0.0
-        for _, found, apart in self._from(image, state, context):
+        for _, found, apart in self._stage_by_stage(image, state, context):
             if not np.median(apart / certainty[0]) > 1:  # most often where the sheet is flat
                 return None, excess
             excess = self._cost(found.state, context) / own_cost - 1
@@ -235,9 +235,9 @@ class FrameTracker:
     def unfold(
         self,
         frame: int,
+        memory: FrameMemory | None,
         state: State,
         certainty: np.ndarray,
-        memory: FrameMemory | None,
         past: Past,
         report: Report | None = None,
     ) -> tuple[Solution | None, float]:
@@ -245,7 +245,7 @@ class FrameTracker:
         solution, None where it is the same surface, or gains less than another pass must; and by
         what share of the cost of the frame's own surface it costs more.
 
-        ``state``, ``certainty`` (2, N) [m], ``memory``: of the frame so far.
+        ``memory``, ``state``, ``certainty`` (2, N) [m]: of the frame so far.
         """
         assert self.rim is not None
         self._prepare(report)
@@ -258,7 +258,7 @@ class FrameTracker:
         parts = [*self.rim.parts(before), *self.rim.parts(behind)]
         if not parts:
             return None, 0.0
-        for stage, found, apart in self._from(continued, state, context):
+        for stage, found, apart in self._stage_by_stage(continued, state, context):
             apart /= certainty[0]
             if not any(np.median(apart[part]) > 1 for part in parts):
                 return None, 0.0
@@ -271,7 +271,7 @@ class FrameTracker:
             return None, excess
         return self._solution([new], [found], self._same_noise(found, context, memory)), excess
 
-    def _from(self, vertices, state, context):
+    def _stage_by_stage(self, vertices, state, context):
         """Yields each stage, what ``vertices`` (N, 3) [m, world] lead to there, :class:`Found`, and
         how far (N,) [m] that is from the ``state``.
         """

@@ -108,17 +108,11 @@ def _follow(tracker, done, k, progress):
             done.other, done.mirror_at = None, k + 1
     elif tracker.mirrors and k >= done.mirror_at and k not in done.lost:
         began = time.perf_counter()
-        past = _past(tracker, done, range(max(0, k - _MAX_HISTORY), k))
-        state = tracker.problem.atlas.state(done.states[k])
-        report = progress and functools.partial(progress, k, k)
-        try:
-            solution, excess = tracker.mirror(k, state, done.certainty[k], past, report)
-        except (BadFrame, LinAlgError):
-            solution, excess = None, math.inf
+        solution, excess = _tried(tracker, done, k, progress, functools.partial(tracker.mirror, k))
         if solution:
             other = branches.split(done, k)
             _replace(other, k, _rounded(tracker.problem, solution.states[0]), solution)
-        done.mirror_at = k + math.ceil(min(max(excess / share, 1), _LATEST))
+        done.mirror_at = _again_at(k, excess, share, 1)
         done.seconds[k] += time.perf_counter() - began
 
 
@@ -129,20 +123,33 @@ def _unfold(tracker, done, k, progress):
     if not tracker.rim or k < done.rim_at or k in done.lost:
         return
     began, share = time.perf_counter(), tracker.objective.rules.mirror_share
+    unfold = functools.partial(tracker.unfold, k, done.memories[k])
+    solution, excess = _tried(tracker, done, k, progress, unfold)
+    if solution:
+        _replace(done, k, _rounded(tracker.problem, solution.states[0]), solution)
+    done.rim_at = _again_at(k, excess, share, _RIM_EVERY)
+    done.seconds[k] += time.perf_counter() - began
+
+
+def _tried(tracker, done, k, progress, solve):
+    """(solution, excess) of another surface that ``solve`` tries for frame ``k`` from what the
+    track has there; None and infinity where that breaks off.
+    """
     past = _past(tracker, done, range(max(0, k - _MAX_HISTORY), k))
     state = tracker.problem.atlas.state(done.states[k])
     report = progress and functools.partial(progress, k, k)
     try:
-        solution, excess = tracker.unfold(
-            k, state, done.certainty[k], done.memories[k], past, report
-        )
+        return solve(state, done.certainty[k], past, report)
     except (BadFrame, LinAlgError):
-        solution, excess = None, math.inf
-    if solution:
-        _replace(done, k, _rounded(tracker.problem, solution.states[0]), solution)
+        return None, math.inf
+
+
+def _again_at(k, excess, share, least):
+    """The frame at which to try again what cost more by a share, the ``excess``, in frame ``k``:
+    ``least`` frames later, more where it is above ``share``.
+    """
     wait = excess / share if share > 0 else math.inf
-    done.rim_at = k + math.ceil(min(_RIM_EVERY * max(wait, 1), _LATEST))
-    done.seconds[k] += time.perf_counter() - began
+    return k + math.ceil(min(least * max(wait, 1), _LATEST))
 
 
 def _vertices(problem, arrays):
