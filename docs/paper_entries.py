@@ -409,7 +409,7 @@ SECTIONS = {
             None,
             "They do not ([conventions.md](conventions.md#solver-and-window)). Twelve frames of "
             "the demo take 1 min 41 s on two cores and end 7.6 mm RMSE from the truth (`polysft "
-            "evaluate OUT scenes/demo`); by default 10 s and 1.9 mm.",
+            "evaluate OUT scenes/demo`); by default 17 s and 1.1 mm.",
         ),
         Entry(
             "Figure, Paper-Bend",
