@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 _FARTHEST_STEP = 2.0  # rotation [rad], translation and displacements [of the template's scale]
 _LEAST_DAMPING, _RAISED_DAMPING = 1e-7, 1e-4
+_BODILY_GAIN = 1e-6  # share that a step of the pose alone must promise: what it leaves, cloth takes
 
 
 class GaussNewton:
@@ -56,6 +57,7 @@ class GaussNewton:
             return models, sum(m.total for m in models)
 
         models, total = evaluate(states)
+        least = _BODILY_GAIN if objective.stage.bodily else self.rules.gain
         damping = self.rules.damping[objective.d - 2]
         for _ in range(iterations or objective.stage.iterations):
             try:
@@ -64,7 +66,7 @@ class GaussNewton:
                 damping = max(10 * damping, _RAISED_DAMPING)
                 continue
             trial = [state.after_step(step) for state, step in zip(states, steps, strict=True)]
-            if promised < self.rules.gain * sum(m.measure for m in models):
+            if promised < least * sum(m.measure for m in models):
                 states = trial
                 break
             found, now = evaluate(trial)

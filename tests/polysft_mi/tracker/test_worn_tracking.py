@@ -9,7 +9,8 @@ import synthetic
 from problems import problem_of
 from worn import arm
 
-from polysft_mi.objective import Problem
+from polysft_mi.objective import FrameContext, FrameMemory, Objective, Problem
+from polysft_mi.solvers import create
 from polysft_mi.surface import Unknowns
 from polysft_mi.tracker import FrameTracker, Track, track
 
@@ -62,6 +63,22 @@ def test_the_image_corrects_where_the_body_is(bent, tracked):
     assert error.mean() < 0.75 * known.mean()
     for k, state in enumerate(done.states):
         assert carrier.pose(state["pose"]).frame == k
+
+
+def test_a_pose_alone_goes_on_to_its_minimum(bent):
+    """However little a step gains of a cost that the pose cannot lower: of what the pose leaves,
+    the cloth would make folds.
+    """
+    problem = worn(bent)
+    problem.rules = dataclasses.replace(problem.rules, gain=1.0)
+    objective = Objective(problem)
+    stage = dataclasses.replace(objective.usual[0], bodily=True)
+    start = objective.atlas.posed(objective.atlas.start, 1)
+    frozen = objective.frozen([FrameContext(1, start, FrameMemory(0.05))], stage, [start])
+    found = create(objective).minimise(frozen, [start], iterations=60)
+    again = create(objective).minimise(frozen, found.states, iterations=60)
+    assert found.total < 0.95 * frozen.quadratic([start])[0].total
+    assert again.total > 0.999 * found.total
 
 
 def test_depth_is_no_surer_than_lengths(tracked):
