@@ -12,6 +12,8 @@ import numpy as np
 
 from .errors import InputError
 
+LARGEST = 1e9  # [pixels, m]: a number beyond it is a mistake, and overflows where it is squared
+
 
 @dataclass(frozen=True)
 class Intrinsics:
@@ -31,14 +33,15 @@ class Intrinsics:
 
     def __post_init__(self) -> None:
         values = (self.fx, self.fy, self.cx, self.cy)
-        if not all(math.isfinite(v) for v in values) or min(self.fx, self.fy) <= 0:
+        if not all(abs(v) <= LARGEST for v in values) or min(self.fx, self.fy) <= 0:
             raise InputError(
                 f"camera: (fx, fy, cx, cy) = {values} is not a pinhole; finite values and positive"
-                " focal lengths are needed"
+                f" focal lengths are needed, none beyond {LARGEST:g}"
             )
-        if self.width < 1 or self.height < 1:
+        if not (1 <= self.width <= LARGEST and 1 <= self.height <= LARGEST):
             raise InputError(
-                f"camera: image size {self.width}x{self.height}; both must be positive"
+                f"camera: image size {self.width:g}x{self.height:g}; both must be positive, and at"
+                f" most {LARGEST:g}"
             )
 
     def matrix(self) -> np.ndarray:
@@ -92,11 +95,11 @@ class Intrinsics:
                 raise InputError(f"{path}: no {name}; fx, fy, cx, cy, width, height are needed")
             try:
                 value = float(data[name])
-            except (TypeError, ValueError):
+            except (TypeError, ValueError, OverflowError):
                 value = math.nan
             if not (value.is_integer() if whole else math.isfinite(value)):
                 kind = "a whole number" if whole else "a number"
-                raise InputError(f"{path}: {name} = {data[name]!r}; {kind} is needed")
+                raise InputError(f"{path}: {name} = {data[name]!r:.40}; {kind} is needed")
             return value
 
         lens = number("fx"), number("fy"), number("cx"), number("cy")

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from polysft_mi.camera import Intrinsics
+from polysft_mi.camera import LARGEST, Intrinsics
 from polysft_mi.errors import InputError
 
 from .sequence import Sequence
@@ -165,7 +165,7 @@ def _camera(known, where):
             f"{where}: {error.args[0]} is missing; fx, fy, cx, cy, width, height and"
             " world_to_camera are needed"
         ) from None
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, OverflowError) as error:
         raise InputError(f"{where}: not a camera as JSON ({error})") from None
     if np.any(known.get("distortion")):
         raise InputError(
@@ -185,11 +185,13 @@ def rigid_pose(values: Any, where: str) -> np.ndarray:
     """
     try:
         pose = np.array(values, dtype=np.float64)
-        finite = pose.ndim > 0 and np.isfinite(pose).all()
-    except (TypeError, ValueError):
-        finite = False
-    if not finite:
-        raise InputError(f"{where} is no matrix of 4 x 4, or 3 x 4, finite numbers")
+        usable = pose.ndim > 0 and (np.abs(pose) <= LARGEST).all()
+    except (TypeError, ValueError, OverflowError):
+        usable = False
+    if not usable:
+        raise InputError(
+            f"{where} is no matrix of 4 x 4, or 3 x 4, finite numbers, none beyond {LARGEST:g}"
+        )
     if pose.shape == (3, 4):
         pose = np.vstack([pose, (0, 0, 0, 1)])
     if pose.shape != (4, 4):

@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 
 from polyfit.backend import cores
 from polyfit.files import NOT_NPZ
+from polysft_mi.camera import LARGEST
 from polysft_mi.errors import InputError
 
 from .images import EXTENSIONS, checked_size, list_images, read_pixels
@@ -59,9 +60,9 @@ class Tracks:
         occlusions, the reverse); queries (P, 3), or (1, P, 3): the frame, and the place in it.
         Where T and P are alike, the queries say which is which, or names that TAPIR gives; else
         frames come first. Without visibilities a finite position is one that is seen; without
-        queries a track begins where it is first seen. ``centre``: the coordinate that the file
-        gives the centre of the first pixel. From where a track moves otherwise than its neighbours
-        it is not visible. Raises InputError.
+        queries a track begins where it is first seen. One that is not finite, or over 1e9, never
+        is. ``centre``: the coordinate that the file gives the centre of the first pixel. From where
+        a track moves otherwise than its neighbours it is not visible. Raises InputError.
         """
         arrays = _arrays(path)
         name, positions = _first(arrays, _POSITIONS)
@@ -74,8 +75,8 @@ class Tracks:
         visible = _visibility(path, arrays, positions, points_first)
         if not visible.any():
             raise InputError(
-                f"{path}: no point is seen in any frame; a position that is NaN, or that the"
-                " visibility denies, is not seen"
+                f"{path}: no point is seen in any frame; a position that is NaN, or over"
+                f" {LARGEST:g} pixels away, or that the visibility denies, is not seen"
             )
         query = _queries(path, arrays, positions.shape)
         if len(positions) != len(selected) or count == len(selected):
@@ -304,7 +305,7 @@ def _one_batch(array, dimensions):
 
 def _visibility(path, arrays, positions, points_first):
     """Which positions are seen, (T, P)."""
-    known = np.isfinite(positions).all(-1)
+    known = (np.abs(positions) <= LARGEST).all(-1)
     name, seen = _first(arrays, _VISIBLE)
     hidden_name, hidden = _first(arrays, _HIDDEN)
     if seen is None and hidden is None:

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from polyfit.files import silent_decoders
-from polysft_mi.camera import Intrinsics
+from polysft_mi.camera import LARGEST, Intrinsics
 from polysft_mi.errors import InputError
 
 from .lens import Lens
@@ -77,8 +77,9 @@ def _numbers(values, names, default=None):
         value = values.get(name, default)
         if value is None:
             raise InputError(f"{name} is missing; {', '.join(names)} are needed")
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise InputError(f"{name} = {value!r}; a number is needed")
+        known = isinstance(value, (int, float)) and not isinstance(value, bool)
+        if not (known and abs(value) <= LARGEST):
+            raise InputError(f"{name} = {value!r:.40}; a number, at most {LARGEST:g}, is needed")
         found.append(float(value))
     return found
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from polysft_mi.camera import Intrinsics
+from polysft_mi.camera import LARGEST, Intrinsics
 from polysft_mi.errors import InputError
 
 
@@ -27,11 +27,11 @@ class Lens:
     def __post_init__(self):
         if (
             len(self.distortion) not in (0, 4, 5, 8, 12, 14)
-            or not np.isfinite(self.distortion).all()
+            or not (np.abs(self.distortion) <= LARGEST).all()
         ):
             raise InputError(
                 f"{self.source}: {len(self.distortion)} distortion coefficients; 4, 5, 8, 12 or 14"
-                " finite numbers, in OpenCV's order, are needed"
+                f" finite numbers, none beyond {LARGEST:g}, in OpenCV's order, are needed"
             )
 
     @classmethod

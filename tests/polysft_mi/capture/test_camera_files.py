@@ -123,6 +123,12 @@ def test_our_own_form(tmp_path):
         ("{}", "fx is missing"),
         ('{"fx": "a", "fy": 1, "cx": 1, "cy": 1, "width": 2, "height": 2}', "fx = 'a'"),
         ('{"fx": 0, "fy": 1, "cx": 1, "cy": 1, "width": 640, "height": 480}', "not a pinhole"),
+        ('{"fx": 1e300, "fy": 1, "cx": 1, "cy": 1, "width": 2, "height": 2}', "at most 1e+09"),
+        (
+            '{"fx": 9, "fy": 9, "cx": 1, "cy": 1, "width": 9, "height": 9,'
+            ' "distortion": [1e300, 0, 0, 0]}',
+            "4 distortion coefficients",
+        ),
         ("%YAML:1.0\n---\ncamera_matrix: [", "OpenCV"),
         ("%YAML:1.0\n---\nK: 1\n", "no matrix camera_matrix"),
         ("<?xml version='1.0'?>\n<opencv_storage>\n<camera_matrix>", "OpenCV"),

@@ -50,6 +50,7 @@ def test_files_of_trackers_say_the_same(known, tmp_path):
         {"tracks": positions.swapaxes(0, 1), "occluded": ~visible.T},
         {"trajs": positions, "visibility": np.where(visible, 0.9, 0.2)},
         {"tracks": np.where(visible[..., None], positions, np.nan)},
+        {"tracks": np.where(visible[..., None], positions, 1e300)},
     )
     for arrays in others:
         assert same(read(path, **arrays), plain), list(arrays)
@@ -118,6 +119,7 @@ def _saved(folder, **arrays):
         ({"tracks": np.zeros((5, 0, 2))}, "at least one point"),
         ({"tracks": np.zeros((5, 3, 2)), "visible": np.ones((5, 4))}, "visible is .5, 4."),
         ({"tracks": np.full((5, 3, 2), np.nan)}, "no point is seen in any frame"),
+        ({"tracks": np.full((5, 3, 2), 1e300)}, "no point is seen in any frame"),
         ({"tracks": np.zeros((5, 3, 2)), "visible": np.zeros((5, 3))}, "no point is seen"),
         ({"tracks": np.zeros((5, 3, 2)), "queries": np.zeros((2, 3))}, "queries is .2, 3."),
         (
