@@ -18,10 +18,11 @@ def as_arrays(
     vertices: ArrayLike, faces: ArrayLike, where: str = "mesh"
 ) -> tuple[np.ndarray, np.ndarray]:
     """``(vertices (N, 3) float64, faces (F, 3) int64)`` of anything like arrays. Raises InputError,
-    in one line that starts with ``where``, for other shapes, and for faces whose vertices are not
-    there.
+    in one line that starts with ``where``, for other shapes, for what is no array of numbers, and
+    for faces whose vertices are not there.
     """
-    V, F = np.asarray(vertices, dtype=np.float64), np.asarray(faces)
+    V = _numbers(vertices, f"{where}: vertices", "(N, 3)").astype(np.float64)
+    F = _numbers(faces, f"{where}: faces", "(F, 3)")
     if V.ndim != 2 or V.shape[1] != 3:
         raise InputError(f"{where}: vertices of shape {V.shape}; (N, 3) is needed")
     if F.size == 0:
@@ -36,6 +37,16 @@ def as_arrays(
             f"{where}: faces name vertices {F.min()} to {F.max()}; 0 to {len(V) - 1} exist"
         )
     return V, F
+
+
+def _numbers(given: ArrayLike, what: str, needed: str) -> np.ndarray:
+    try:
+        found = np.asarray(given)
+    except ValueError:  # rows of several lengths
+        found = np.array(None)
+    if found.dtype.kind not in "fiu":
+        raise InputError(f"{what} are no array of numbers; {needed} is needed")
+    return found
 
 
 def checked(

@@ -252,6 +252,8 @@ def test_bad_meshes_and_counts_are_named():
         "faces name vertices 0 to 24; 0 to 23 exist": (V[:24], F),
         "faces of shape (8, 4)": (V, np.zeros((8, 4), dtype=int)),
         "vertices of shape (25, 2)": (V[:, :2], F),
+        "vertices are no array of numbers": ([["x", "y", "z"]] * 25, F),
+        "faces are no array of numbers": (V, [[0, 1, 2], [1, 2]]),
         "its faces have no area": (V * (1, 0, 0), F),
         "26 patches; 1 to 25, the number of its vertices, are possible": (V, F, 26),
         "0 patches; 1 to 25": (V, F, 0),

@@ -261,6 +261,8 @@ class TestRefusals:
         self.refused(V, F[:0], "no faces")
         self.refused(V[:0], F[:0], "no faces")
         self.refused(V[:, :2], F, r"vertices of shape \(3000, 2\); \(N, 3\) is needed")
+        self.refused([*V.tolist(), [0, 1]], F, r"vertices are no array of numbers; \(N, 3\) is")
+        self.refused(V, F.astype(str), r"faces are no array of numbers; \(F, 3\) is needed")
         self.refused(V, F[:, [0, 1, 2, 2]], r"faces of shape .* \(F, 3\) is needed")
         self.refused(V, F + 1, "faces name vertices 1 to 3000; 0 to 2999 exist")
         self.refused(V, F - 1, "faces name vertices -1 to 2998; 0 to 2999 exist")
