@@ -26,14 +26,18 @@ def write_ply(
     """Write a triangle mesh as binary PLY: vertices (N, 3) as float32, faces (F, 3), uv (N, 2) as
     the properties ``s``, ``t``.
 
-    Blender, MeshLab and Mitsuba read uv under these names. Raises OSError where the file
-    cannot be written.
+    Blender, MeshLab and Mitsuba read uv under these names. Raises InputError for what is no mesh,
+    and OSError where the file cannot be written.
     """
-    columns = np.asarray(vertices, dtype="<f4")
-    names = ["x", "y", "z"]
+    from .triangles import as_arrays  # SciPy is slow to load
+
+    V, F = as_arrays(vertices, faces, os.fspath(path))
+    columns, names = V.astype("<f4"), ["x", "y", "z"]
     if uv is not None:
-        columns, names = np.hstack([columns, np.asarray(uv, dtype="<f4")]), names + ["s", "t"]
-    F = np.asarray(faces)
+        of_vertices = np.asarray(uv, dtype="<f4")
+        if of_vertices.shape != (len(V), 2):
+            raise InputError(f"{path}: uv of shape {of_vertices.shape}; ({len(V)}, 2) is needed")
+        columns, names = np.hstack([columns, of_vertices]), names + ["s", "t"]
     corners = np.empty(len(F), dtype=[("count", "u1"), ("vertices", "<i4", 3)])
     corners["count"], corners["vertices"] = 3, F
     header = ["ply", "format binary_little_endian 1.0"]

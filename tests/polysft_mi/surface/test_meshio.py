@@ -3,6 +3,7 @@ one.
 """
 
 import os
+import re
 
 import mitsuba as mi
 import numpy as np
@@ -58,6 +59,20 @@ def test_ply_without_uv(tmp_path):
     v, f, uv = read_template(tmp_path / "a.ply")
     assert uv is None and len(v) == len(V)
     np.testing.assert_array_equal(f, F)
+
+
+def test_ply_of_what_is_no_mesh_is_not_written(tmp_path):
+    V, F, uv = sheet()
+    for said, mesh in {
+        "a.ply: faces name vertices 1 to 12; 0 to 11 exist": (V, F + 1),
+        "a.ply: faces are not whole numbers": (V, F + 0.5),
+        "a.ply: vertices of shape (12, 2); (N, 3) is needed": (V[:, :2], F),
+        "a.ply: uv of shape (12, 3); (12, 2) is needed": (V, F, V),
+        "a.ply: uv of shape (11, 2); (12, 2) is needed": (V, F, uv[1:]),
+    }.items():
+        with pytest.raises(InputError, match=re.escape(said)):
+            write_ply(tmp_path / "a.ply", *mesh)
+    assert os.listdir(tmp_path) == []
 
 
 def test_ply_is_what_mitsuba_reads(tmp_path):
