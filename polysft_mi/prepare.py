@@ -40,6 +40,10 @@ _EXAMPLES = [
         "a part of a video, at half its size, and without masks",
     ),
 ]
+_OF_VIDEO = (
+    "size template corners texture_corners first last stride scale masks no_masks inset board fov"
+    " camera calibrate"
+)
 
 
 def parser():
@@ -67,7 +71,6 @@ def parser():
     p.add_argument(
         "--resolution",
         type=int,
-        default=33,
         metavar="N",
         help="vertices along the longer side of a flat template; of Kinect-Paper's, along both"
         " (default: 33)",
@@ -259,17 +262,18 @@ def _add_camera(group):
 
 
 def main(argv=None):
-    args = parser().parse_args(argv)
+    p = parser()
+    args = p.parse_args(argv)
     words = sys.argv[1:] if argv is None else argv
     lines = []
     if args.texture is not None or os.path.isfile(args.folder):
         scene, found = _from_video(args, shlex.join(["python", "-m", "polysft_mi.prepare", *words]))
     else:
-        for name in ("size", "template", "corners", "fov", "camera", "inset"):
-            if getattr(args, name) is not None:
+        for name in _OF_VIDEO.split():
+            if getattr(args, name) != p.get_default(name):
                 raise InputError(
-                    f"{args.folder}: --{name} is for a video or a folder of images; these also need"
-                    " --texture"
+                    f"{args.folder}: --{name.replace('_', '-')} is for a video or a folder of"
+                    " images; these also need --texture"
                 )
         from .capture import prepare_folder
 

@@ -32,7 +32,7 @@ _BODY, _FARTHEST = 1.2, 30.0  # [m] that a body reaches from its middle; that it
 def prepare_folder(
     folder,
     out=None,
-    resolution=33,
+    resolution=None,
     overwrite=False,
     pose_fit="auto",
     warn=lambda line: None,
@@ -40,7 +40,7 @@ def prepare_folder(
     **evidence,
 ):
     """Write ``scene.xml`` for a sequence into ``out`` (default: the folder itself); for
-    Kinect-Paper also ``template.obj``, of that ``resolution``, in its pose of
+    Kinect-Paper also ``template.obj``, of that ``resolution`` (33), in its pose of
     :func:`polysft_mi.scene.kinect_paper.template`. ``prepare/pose.png`` shows how all of it lies in
     the first frame; not of a garment on a body, which is draped first.
 
@@ -55,6 +55,12 @@ def prepare_folder(
     """
     folder = os.path.normpath(folder)
     layout = recognise(folder)
+    if layout.obj is not None and resolution is not None:
+        raise InputError(
+            f"--resolution {resolution}: is for Kinect-Paper; {os.path.join(folder, layout.obj)}"
+            " has its own vertices"
+        )
+    resolution = 33 if resolution is None else resolution
     camera = layout.camera
     masks = os.path.join(folder, layout.masks) if layout.masks else ""
     said = []

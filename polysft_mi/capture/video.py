@@ -35,7 +35,7 @@ def prepare_video(
     texture,
     size=None,
     template=None,
-    resolution=33,
+    resolution=None,
     camera=None,
     fov=None,
     calibrate=None,
@@ -61,7 +61,7 @@ def prepare_video(
     - ``texture``: the photo, or "first-frame"; ``texture_corners`` (4, 2): pixels of the sheet's
       corners in the photo, whose rest is cut off.
     - ``size``: words as :func:`polysft_mi.capture.sheet.parse_size` takes them, for a flat template
-      with ``resolution`` vertices along its longer side; or ``template``, an OBJ.
+      with ``resolution`` vertices along its longer side (33); or ``template``, an OBJ.
     - The camera, by one of ``camera`` (a file), ``fov`` [degrees] and ``calibrate`` (a video of a
       ``board``); else by what ``evidence`` says, or the video or the photo says.
     - ``corners`` (4, 2): pixels of the sheet's corners in the frame ``first`` as it was taken, or
@@ -81,6 +81,10 @@ def prepare_video(
         raise InputError("--camera, --fov and --calibrate: give only one of them")
     if (size is None) == (template is None):
         raise InputError("give either --size WIDTH HEIGHT, of a flat sheet, or --template mesh.obj")
+    if template is not None and resolution is not None:
+        raise InputError(
+            f"--resolution {resolution}: of a flat sheet; {template} has its own vertices"
+        )
     inputs = [
         x
         for x in (video, texture, template, camera, calibrate, masks)
@@ -254,7 +258,7 @@ def _sheet(size, template, resolution, photo, texture, say):
                 f" {width / height:.3g} times; does it show the sheet from edge to edge"
                 " (--texture-corners)?"
             )
-    return sheet.grid(width, height, resolution)
+    return sheet.grid(width, height, 33 if resolution is None else resolution)
 
 
 def _seen(placed, view, where):

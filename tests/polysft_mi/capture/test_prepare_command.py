@@ -156,6 +156,8 @@ def test_what_does_not_go_together(clip, tmp_path):
     assert "--size 0.297 0.21?" in call(size=["210mm", "297mm"])
     assert "16" in call(scale=0.01)
     assert "400" in call(resolution=1)
+    own = dict(size=None, template=str(DEMO / "template.obj"), resolution=9)
+    assert "--resolution 9: of a flat sheet; " in call(**own)
     camera = tmp_path / "camera.json"
     camera.write_text(json.dumps({"fx": 1, "fy": 1, "cx": 1, "cy": 1, "width": 100, "height": 100}))
     assert "320x240" in call(camera=str(camera))
@@ -220,5 +222,11 @@ def test_options_that_speak_of_nothing_are_refused(words, said, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_options_for_videos_are_refused_for_folders(tmp_path):
-    assert "--fov" in refused(prepare.main, [str(DEMO), "--fov", "60"])
+@pytest.mark.parametrize(
+    "words",
+    ["--fov 60", "--first 3", "--no-masks", "--texture-corners 0,0 9,0 9,9 0,9", "--resolution 9"],
+)
+def test_options_for_videos_are_refused_for_folders(words, tmp_path):
+    call = [str(DEMO), "-o", str(tmp_path / "out"), *words.split()]
+    assert words.split()[0] in refused(prepare.main, call)
+    assert not (tmp_path / "out").exists()
