@@ -17,7 +17,8 @@ EXTENSIONS = tuple(".png .jpg .jpeg .jpe .bmp .tif .tiff .webp .ppm .pgm .pnm .e
 
 def list_images(pattern, what="images", endings=EXTENSIONS):
     """The image files of a folder or a glob pattern, by their ``endings``, sorted by name, numbers
-    in names by value. Raises InputError where there are none.
+    in names by value. Raises InputError where there are none, or two that differ by their ending
+    alone.
     """
     pattern = os.fspath(pattern)
     if os.path.isdir(pattern):
@@ -48,7 +49,17 @@ def list_images(pattern, what="images", endings=EXTENSIONS):
             f"{what}: {pattern}: no images in this {kind}; PNG, JPEG, TIFF, EXR and the like are"
             " read"
         )
-    return sorted(images, key=_natural_key)
+    images.sort(key=_natural_key)
+    named = {}
+    for path in images:
+        stem, ending = os.path.splitext(path)
+        other = named.setdefault(stem, path)
+        if other != path:
+            raise InputError(
+                f"{what}: {other} and {os.path.basename(path)} differ by their ending alone; one of"
+                f" both is needed, or a pattern such as '*{ending}'"
+            )
+    return images
 
 
 def _natural_key(name):

@@ -32,6 +32,14 @@ def test_numbers_in_names_sort_by_value(tmp_path):
     assert names == ["Frame_1.png", "frame_2.png", "frame_02b.png", "frame_10.png"]
 
 
+def test_two_images_of_one_name_are_told(video):
+    frames = video.folder / "frames"
+    write(frames / "003.jpg", cv2.imread(str(frames / "003.png")))
+    with pytest.raises(InputError, match=r"frames: .*frames/003\.jpg and 003\.png differ"):
+        Sequence.open(frames)
+    assert len(Sequence.open(frames / "*.png")) == 5
+
+
 def test_selection(video):
     s = Sequence.open(video.folder / "frames", first=1, last=4, stride=2)
     assert len(s) == 2 and s.indices == [1, 3] and s.size == (48, 36)
