@@ -139,6 +139,10 @@ def read_surface(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
         )
     if not np.isfinite(V).all():
         raise InputError(f"{path}: vertices hold values that are not finite")
+    numbers, count = np.unique(frames, return_counts=True)
+    if len(numbers) < len(frames):
+        twice = numbers[count > 1][0]
+        raise InputError(f"{path}: frames holds {twice} more than once; each is needed once")
     return surface
 
 
