@@ -4,6 +4,7 @@ What a part finds goes, line by line, into the file that ``GPU_PART_TELLS`` name
 which ends its process has told what came before.
 """
 
+import argparse
 import contextlib
 import json
 import linecache
@@ -464,4 +465,8 @@ def train(on, scratch):
 PARTS = {f.__name__: f for f in (arrays, forms, track, drape, train)}
 
 if __name__ == "__main__":
-    PARTS[sys.argv[1]](*sys.argv[2:])
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("part", choices=PARTS)
+    parser.add_argument("arguments", nargs=argparse.REMAINDER)
+    options = parser.parse_args()
+    PARTS[options.part](*options.arguments)

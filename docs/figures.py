@@ -5,6 +5,7 @@
 ``raster_continuity.png``: a pixel's colour while an edge passes it.
 """
 
+import argparse
 import os
 
 from polyfit.backend import set_variant
@@ -170,6 +171,7 @@ def continuity(path):
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args()
     plugins.register()
     print(gradient(os.path.join(HERE, "raster_gradient.png")))
     print(continuity(os.path.join(HERE, "raster_continuity.png")))

@@ -3,6 +3,7 @@
 python docs/layout.py
 """
 
+import argparse
 import ast
 from pathlib import Path
 
@@ -142,6 +143,7 @@ def draw(path):
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args()
     draw(ROOT / "docs" / "layout.png")
     for first, second in sorted(imports()):
         print(".".join(first), "imports", ".".join(second))

@@ -3,7 +3,7 @@
 python docs/onefit_baked.py OUT/skirt/baked.npz OUT/tshirt/baked.npz ...      (a minute)
 """
 
-import sys
+import argparse
 from pathlib import Path
 
 import cv2
@@ -38,4 +38,6 @@ def main(paths):
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("baked", nargs="+", help="baked.npz of a garment")
+    main(parser.parse_args().baked)

@@ -4,6 +4,7 @@ to right.
 python docs/onefit_motions.py        (a minute)
 """
 
+import argparse
 import os
 
 import numpy as np
@@ -76,4 +77,5 @@ def main():
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args()
     main()

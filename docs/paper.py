@@ -6,6 +6,7 @@ Figures are read from the JSON files of docs/, which the benchmarks write (``-o 
 not measured yet says so. tests/house/test_paper.py parses every command.
 """
 
+import argparse
 import json
 from pathlib import Path
 
@@ -98,4 +99,5 @@ def main():
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args()
     main()

@@ -4,6 +4,7 @@ The demo's frames become a video, which is prepared and run by the tutorial's ow
 ``out/tutorial``; the pictures go into ``docs``. With ``--inputs``: the video and the photo alone.
 """
 
+import argparse
 import os
 import re
 import shlex
@@ -75,9 +76,12 @@ def errors():
 
 
 def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--inputs", action="store_true", help="the video and the photo alone")
+    options = parser.parse_args()
     os.chdir(ROOT)
     write_inputs(OUT)
-    if "--inputs" in sys.argv:
+    if options.inputs:
         return
     for words in commands():
         print(shlex.join(words), flush=True)

@@ -7,6 +7,7 @@ include those of the silhouette.
 Look at the last line: curvature and distance beside the true ones.
 """
 
+import argparse
 from pathlib import Path
 
 import polysft_mi
@@ -55,4 +56,5 @@ def main(steps=60, width=96):
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args()
     print(", ".join(f"{name}: {x:.3f}, true {TRUE[name]:.3f}" for name, x in main().items()))

@@ -5,6 +5,7 @@
 data=FOLDER``. ``demo.xml`` and ``demo/`` are links to the data of the package ``polysft_mi``.
 """
 
+import argparse
 import os
 import re
 
@@ -150,6 +151,7 @@ def text(name):
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args()
     for name in SCENES:
         with open(os.path.join(HERE, f"{name}.xml"), "w", encoding="utf-8") as file:
             file.write(text(name))
