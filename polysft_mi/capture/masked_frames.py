@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from threadpoolctl import threadpool_limits
 
 from polysft_mi.errors import InputError
-from polysft_mi.scene import list_images, read_rgb
+from polysft_mi.scene import inverted, list_images, read_rgb
 
 from . import pictures
 from .masks import Masks, beyond, drawn_in, iou
@@ -80,6 +80,11 @@ def write_frames(folder, frames, masks, expected, straight, progress, registrati
     result = Written(indices, bool(masks), None, [])
     if isinstance(masks, GivenMasks):
         first = masks.write(folder, indices, straight, inset)
+        if inverted(first > 127, expected > 127):
+            raise InputError(
+                f"{masks.pattern}: the first frame's mask is of all but the template; is it"
+                " inverted? White is the sheet"
+            )
         met = _how_met(iou(first, expected), beyond(first, expected))
         result.lines.append(f"masks: those of {masks.pattern}; {met}")
     elif tracked:

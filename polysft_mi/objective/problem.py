@@ -14,7 +14,7 @@ from scipy.optimize import nnls
 from polyfit.colours import LUMINANCE, srgb
 from polysft_mi.errors import InputError
 from polysft_mi.render import Pinhole, PlacedMesh
-from polysft_mi.scene import Rules
+from polysft_mi.scene import Rules, inverted
 from polysft_mi.surface import Atlas, JetAtlas, Unknowns
 
 if TYPE_CHECKING:
@@ -142,8 +142,7 @@ class Problem:
             both = int((sheet & masked).sum())
             # what passes before the sheet may hide most of it, but not be in the mask
             if 2 * both < min(sheet.sum(), masked.sum()):
-                inverted = (sheet & ~masked).sum() > both and masked[~sheet].mean() > 0.5
-                hint = "; is it inverted? White is the sheet" if inverted else hint
+                hint = "; is it inverted? White is the sheet" if inverted(masked, sheet) else hint
                 raise InputError(
                     f"{where} does not meet the mask of the first frame, {both} of whose"
                     f" {int(masked.sum())} pixels it covers: {place}{hint}"

@@ -33,7 +33,7 @@ __getattr__, __dir__, __all__ = lazy.attach(
         ],
         "plugins": ["register"],
         "rules": ["Rules"],
-        "sequence": ["Sequence", "drop_stray_components"],
+        "sequence": ["Sequence", "drop_stray_components", "inverted"],
         "settings": ["PRESETS", "Settings", "defaults_xml", "properties_xml"],
     },
 )

@@ -182,6 +182,13 @@ class Sequence:
         return drop_stray_components(mask) if self._drop_stray else mask
 
 
+def inverted(mask, sheet):
+    """Whether a mask (H, W) bool is of the background rather than of the ``sheet`` (H, W) bool, as
+    the template has it.
+    """
+    return 2 * (mask & sheet).sum() < sheet.sum() and 2 * (mask & ~sheet).sum() > (~sheet).sum()
+
+
 def drop_stray_components(mask, share=0.1):
     """The mask (H, W) without its 8-connected components of less than ``share`` of the largest
     one's area. (Something before the sheet may split it into parts of some size.)

@@ -74,19 +74,24 @@ def test_masks_are_drawn_in(clip, tmp_path):
         )
 
 
-def test_given_masks_are_told_and_not_drawn_in_to_nothing(clip, tmp_path, capsys):
+def test_given_masks_are_told_and_not_inverted_nor_drawn_in_to_nothing(clip, tmp_path, capsys):
     out = tmp_path / "found"
     prepare.main([*arguments(clip, out, "--last", "0"), "-q"])
     mask = cv2.imread(str(out / "masks" / "00000.png"), 0)
-    (tmp_path / "inverted").mkdir()
-    cv2.imwrite(str(tmp_path / "inverted" / "0.png"), 255 - mask)
-    for folder, least, most in (out / "masks", 85, 100), (tmp_path / "inverted", 0, 20):
-        words = arguments(clip, tmp_path / str(most), "--last", "0", "--masks", str(folder))
-        prepare.main(words)
+    made = {"inverted": 255 - mask, "part": mask.copy()}
+    made["part"][:, : mask.shape[1] // 2] = 0  # as a hand hides the rest
+    for name, image in made.items():
+        (tmp_path / name).mkdir()
+        cv2.imwrite(str(tmp_path / name / "0.png"), image)
+    given = lambda folder, out: arguments(clip, out, "--last", "0", "--masks", str(folder))
+    for folder, least, most in (out / "masks", 85, 100), (tmp_path / "part", 20, 80):
+        prepare.main(given(folder, tmp_path / str(most)))
         said = re.search(
             rf"masks: those of {folder}; .* overlap by (\d+) %", capsys.readouterr().out
         )
         assert least <= int(said[1]) <= most
+    words = given(tmp_path / "inverted", tmp_path / "no")
+    assert "is it inverted? White is the sheet" in refused(prepare.main, words)
     no = arguments(clip, tmp_path / "no", "--last", "0", "--inset", "500")
     for words in (no, [*no, "--masks", str(out / "masks")]):
         assert "--inset 500: nothing is left" in refused(prepare.main, words)
