@@ -234,11 +234,9 @@ def run(verb: str, args: argparse.Namespace, **how) -> None:
     for name, garment in zip(args.garment, garments):
         for repair in garment.repairs:
             print(f"{name}: {repair}", file=sys.stderr)
-    # garments are cut and tried on, and kernels compiled, once for all motions: it does not count
-    for garment in garments:
-        draper.ease(garment)
-    if verb == "drape":
-        draper.drape(garments, motion[:2], shape, **how)
+    # garments are put on, cut and tried, and kernels compiled, once for all motions: that does not
+    # count
+    draper.drape(garments, motion[:2], shape, **(how if verb == "drape" else {}))
     outcome = output.drape_into(
         args.output,
         partial(getattr(draper, verb), garments, motion, shape, **how),

@@ -97,22 +97,27 @@ def let_out(garments: Sequence[Garment], rests: Sequence[torch.Tensor]) -> list[
                 for _ in range(_LOOKS):
                     skin.look(x, layer.surface)
                     skin.push_out(x, layer.surface)
+            for other, layer in zip(garments, under):  # what smoothing does not mend
+                inside = 100 * float(np.mean(layer.surface(x.numpy()).distance < 0))
+                if inside > _MOST_INSIDE:
+                    raise _not_over(garment, other, f"{inside:.0f} % of it stays inside")
             x = torch.as_tensor(untangled(x.double().numpy(), faces)).float()
-        for other, at, layer in zip(garments, made, under):
-            inside = 100 * float(np.mean(layer.surface(x.numpy()).distance < 0))
-            wrong = f"{inside:.0f} % of it stays inside" if inside > _MOST_INSIDE else ""
+        for other, at in zip(garments, made):
             below = at.cpu().numpy(), other.faces.cpu().numpy()
-            if not wrong and (through := _through(below, (x.numpy(), faces))) > _MOST_THROUGH:
-                wrong = f"{through:.0f} of 1,000 faces still pass through each other"
-            if wrong:
-                raise InputError(
-                    f"{garment.name} does not go over {other.name}: {wrong}; garments are given in"
-                    " the order in which they are put on"
-                )
+            if (through := _through(below, (x.numpy(), faces))) > _MOST_THROUGH:
+                why = f"{through:.0f} of 1,000 faces still pass through each other"
+                raise _not_over(garment, other, why)
         made.append(x.to(rest))
         if len(made) < len(rests):
             under.append(Under(x.numpy(), faces))
     return made
+
+
+def _not_over(garment, other, why):
+    return InputError(
+        f"{garment.name} does not go over {other.name}: {why}; garments are given in the order in"
+        " which they are put on"
+    )
 
 
 def _through(one, two):

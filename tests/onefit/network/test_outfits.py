@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import onefit
-from onefit import drape
+from onefit import drape, simulate
 from onefit.draping.outfit import Under, joined, let_out
 from onefit.garment import Garment
 from onefit.objective import crossings, depths_beneath
@@ -149,6 +149,16 @@ def test_a_wrong_order_is_refused(order):
     ):
         let_out(garments, rests)
     let_out(garments[::-1], rests[::-1])
+
+
+@pytest.mark.parametrize("command", [drape, simulate])
+def test_a_wrong_order_is_refused_before_the_long_work(command, tmp_path, monkeypatch):
+    monkeypatch.setattr(onefit.Draper, "ease", None)  # which tries a garment on, for seconds
+    monkeypatch.setattr("onefit.draping.outfit.untangled", None)  # which smooths it, for seconds
+    words = ["dress", "trousers", "walk", "--skip", "usd", "render", "-o", str(tmp_path / "out")]
+    with pytest.raises(InputError, match="^trousers does not go over dress: 11 % of it stays in"):
+        command.main(words)
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
