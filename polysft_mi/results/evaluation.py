@@ -24,7 +24,7 @@ from .metrics import (
     rmse,
     sample_surface,
 )
-from .truth import Truth, read_surface
+from .truth import Truth, check_surface, read_surface
 
 LABELS = {
     "frames": "frames compared",
@@ -111,10 +111,9 @@ def per_frame(surface, truth):
     """The figures of each frame that both have: a dict of equally long lists, ``frame`` and the
     figures of :func:`score`, which says what the arguments are.
     """
+    check_surface(surface, "surface")
     meshes = np.asarray(surface["vertices"], dtype=np.float64)
     faces = np.asarray(surface["faces"], dtype=np.int64)
-    if not np.isfinite(meshes).all():
-        raise InputError("surface: vertices hold values that are not finite")
     at = {int(k): V for k, V in zip(surface["frames"], meshes)}
     rng = np.random.default_rng(0)  # one stream through all frames, so that figures repeat
     rows = [{"frame": k, **_figures(at[k], faces, truth, k, rng)} for k in truth.places if k in at]

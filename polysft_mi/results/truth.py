@@ -9,9 +9,11 @@ from __future__ import annotations
 import glob
 import os
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from polyfit.mesh import TexCoords
 from polysft_mi.errors import InputError
@@ -109,13 +111,21 @@ def read_surface(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
             )
         path = os.path.join(path, "surface.npz")
     surface = load_npz(path)
+    check_surface(surface, str(path))
+    return surface
+
+
+def check_surface(surface: Mapping[str, ArrayLike], where: str) -> None:
+    """Raise InputError, which begins with ``where``, where arrays are not those of a
+    ``surface.npz``.
+    """
     missing = [name for name in ("vertices", "faces", "frames") if name not in surface]
     if missing:
         raise InputError(
-            f"{path}: holds no {', '.join(missing)}; vertices (T,N,3), faces (F,3) and frames (T,)"
+            f"{where}: holds no {', '.join(missing)}; vertices (T,N,3), faces (F,3) and frames (T,)"
             " are needed"
         )
-    V, F, frames = (surface[name] for name in ("vertices", "faces", "frames"))
+    V, F, frames = (np.asarray(surface[name]) for name in ("vertices", "faces", "frames"))
     if (
         V.ndim != 3
         or V.shape[2] != 3
@@ -125,25 +135,24 @@ def read_surface(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
         or not len(frames)
     ):
         raise InputError(
-            f"{path}: vertices {V.shape}, faces {F.shape}, frames {frames.shape}; (T,N,3), (F,3)"
+            f"{where}: vertices {V.shape}, faces {F.shape}, frames {frames.shape}; (T,N,3), (F,3)"
             " and (T,) with T > 0 are needed"
         )
     if V.dtype.kind not in "fiu" or F.dtype.kind not in "iu" or frames.dtype.kind not in "iu":
         raise InputError(
-            f"{path}: types {V.dtype}, {F.dtype}, {frames.dtype} of vertices, faces, frames; a"
+            f"{where}: types {V.dtype}, {F.dtype}, {frames.dtype} of vertices, faces, frames; a"
             " float and two integers are needed"
         )
     if F.size and not 0 <= F.min() <= F.max() < V.shape[1]:
         raise InputError(
-            f"{path}: faces name vertices {F.min()} to {F.max()}; 0 to {V.shape[1] - 1} exist"
+            f"{where}: faces name vertices {F.min()} to {F.max()}; 0 to {V.shape[1] - 1} exist"
         )
     if not np.isfinite(V).all():
-        raise InputError(f"{path}: vertices hold values that are not finite")
+        raise InputError(f"{where}: vertices hold values that are not finite")
     numbers, count = np.unique(frames, return_counts=True)
     if len(numbers) < len(frames):
         twice = numbers[count > 1][0]
-        raise InputError(f"{path}: frames holds {twice} more than once; each is needed once")
-    return surface
+        raise InputError(f"{where}: frames holds {twice} more than once; each is needed once")
 
 
 def uv_arrays(texcoords: TexCoords, faces: np.ndarray) -> dict[str, np.ndarray]:

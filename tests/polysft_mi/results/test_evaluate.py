@@ -15,7 +15,7 @@ from processes import python
 from polysft_mi import evaluate
 from polysft_mi.errors import InputError
 from polysft_mi.results import evaluation
-from polysft_mi.results.truth import find_truth, read_surface
+from polysft_mi.results.truth import Truth, find_truth, read_surface
 
 SHARED = os.path.join(os.path.dirname(ROOT), "shared")
 SCORER = os.path.join(SHARED, "tools", "score_sft.py")
@@ -188,6 +188,9 @@ def test_refuses_a_surface_of_another_form(tmp_path, change, words):
     np.savez(tmp_path / "surface.npz", **arrays)
     with pytest.raises(InputError, match=words):
         read_surface(str(tmp_path))
+    truth = Truth("gt.npz", "mesh", dict(enumerate(GOOD["vertices"])), GOOD["faces"])
+    with pytest.raises(InputError, match=f"^surface: .*{words.removeprefix('surface.npz: ')}"):
+        evaluation.score(arrays, truth)
 
 
 def test_bad_input_is_told(run_folder):
