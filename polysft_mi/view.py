@@ -2,6 +2,10 @@
 a run may still be at work.
 """
 
+import errno
+import os
+import socket
+
 from . import commands
 from .errors import InputError, cli
 from .pictures import Source, Viewer
@@ -43,7 +47,28 @@ def open_viewer(arguments=None):
     options = parser().parse_args(arguments)
     if not 0 <= options.port < 65536:
         raise InputError(f"--port {options.port}: a port from 0 to 65535 is needed")
-    return Viewer(Source(options.out), host=options.host, port=options.port, frame=options.frame)
+    source, port = Source(options.out), _free_port(options.host, options.port)
+    return Viewer(source, host=options.host, port=port, frame=options.frame)
+
+
+def _free_port(host, first):
+    """The first port from ``first`` on that can be listened at. Raises InputError where none can:
+    viser would wait for one for ever.
+    """
+    for port in range(first, min(first + 1000, 65536)):
+        try:
+            family = socket.getaddrinfo(host or None, port, type=socket.SOCK_STREAM)[0][0]
+            socket.create_server((host, port), family=family).close()
+            return port
+        except OSError as error:
+            unknown = isinstance(error, socket.gaierror)
+            problem = error.strerror if unknown else os.strerror(error.errno)
+            if unknown or error.errno == errno.EADDRNOTAVAIL:
+                break
+    raise InputError(
+        f"--host {host} --port {first}: {problem}; an address of this machine, such as 127.0.0.1 or"
+        " 0.0.0.0, and a free port are needed"
+    )
 
 
 def main(arguments=None):

@@ -78,13 +78,14 @@ class Source:
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         self.folder = os.fspath(folder)
-        self._problem = None  # of a run at work
+        self._problem = self._loaded = None  # of a run at work, and when its scene was written
         self._stamp: list[int | None] = []
         if not _drapes(self.folder) and not os.path.isfile(self._path("run.json")):
             what = "is not the folder of a run or of a drape (it holds no run.json, no drape.npz)"
-            raise InputError(
-                f"{folder}: {what if os.path.isdir(self.folder) else 'no such folder'}"
-            )
+            if not os.path.isdir(self.folder):
+                is_file = os.path.exists(self.folder)
+                what = f"{'is a file' if is_file else 'no such folder'}; a run's folder is needed"
+            raise InputError(f"{folder}: {what}")
 
     def _path(self, name):
         return os.path.join(self.folder, name)
@@ -126,9 +127,10 @@ class Source:
         from polysft_mi.surface import Unknowns
         from polysft_mi.tracker import CHECKPOINT, Track
 
-        if self._problem is None:
+        written = os.stat(self._path("scene.xml")).st_mtime_ns
+        if self._problem is None or self._loaded != written:  # another run took its place
             experiment = scenes.load(self._path("scene.xml"))
-            self._problem = Problem(experiment, experiment.sequence())
+            self._problem, self._loaded = Problem(experiment, experiment.sequence()), written
         problem = self._problem
         path, track = self._path(CHECKPOINT), Track()
         if os.path.isfile(path):

@@ -66,7 +66,8 @@ class Viewer:
     @property
     def address(self):
         """Where a browser finds it."""
-        return f"http://{self.server.get_host()}:{self.server.get_port()}"
+        host = self.server.get_host()
+        return f"http://{f'[{host}]' if ':' in host else host}:{self.server.get_port()}"
 
     def close(self):
         """Stop the server."""
@@ -107,7 +108,7 @@ class Viewer:
         is being replaced, is read later.
         """
         if self.source.changed():
-            with contextlib.suppress(InputError):
+            with contextlib.suppress(InputError, OSError):
                 self._take(self.source.read())
 
     def _take(self, moving):

@@ -119,7 +119,7 @@ class Run:
     @staticmethod
     def texture_of(path: str) -> str | None:
         """:attr:`texture` of the scene file ``path``."""
-        root, defaults = ET.parse(path).getroot(), known_defaults(path)
+        defaults, root = known_defaults(path), ET.parse(path).getroot()
         shapes = root.findall("shape[@id='template']") or root.findall("shape")
         ids = {ref.get("id") for shape in shapes for ref in shape.iter("ref")}
         places = shapes + [e for e in root if e.get("id") in ids]
@@ -134,9 +134,9 @@ class Run:
         """The paths of the frames' images (T,), as the scene names them; none where they are
         gone.
         """
-        path = self.path("scene.xml")
+        path, settings = self.path("scene.xml"), self.settings
         name = ET.parse(path).getroot().find("integrator/string[@name='frames']")
-        text = _filled(name.get("value", ""), self.settings) if name is not None else ""
+        text = _filled(name.get("value", ""), settings) if name is not None else ""
         try:
             found = list_images(located(path, text))
         except InputError:

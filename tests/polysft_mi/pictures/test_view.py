@@ -1,8 +1,11 @@
 """The viewer in the browser: what its scene holds, how it follows a run, and what it refuses."""
 
+import contextlib
 import io
 import json
+import os
 import shutil
+import socket
 import subprocess
 import sys
 import time
@@ -140,6 +143,33 @@ def test_follows_a_run_that_is_at_work(finished_run, opened, tmp_path):
     assert "residual" in viewer.colour.options and not viewer.follow.visible
 
 
+def test_follows_another_run_in_the_same_folder(finished_run, finished_tube, opened, tmp_path):
+    out = tmp_path / "out"
+    shutil.copytree(finished_tube[1], out)
+    (out / "metrics.json").unlink()
+    viewer = opened(out)
+    shutil.rmtree(out)
+    viewer.refresh()  # between the two there is nothing
+    shutil.copytree(finished_run[1], out)
+    (out / "metrics.json").unlink()
+    os.utime(out / CHECKPOINT)
+    os.utime(out / "scene.xml")
+    viewer.refresh()
+    wanted = from_camera(Run.open(finished_run[1]).vertices[-1], "z")
+    np.testing.assert_allclose(show(viewer, colour="plain").vertices, wanted, atol=1e-6)
+
+
+def test_waits_at_a_free_port_and_names_it(finished_run, opened):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        viewer = opened(finished_run[1], "--port", str(port))
+        assert viewer.server.get_port() > port
+    with pytest.raises(InputError, match="a free port"), contextlib.ExitStack() as stack:
+        with contextlib.suppress(OSError):  # taken by whomever
+            stack.enter_context(socket.create_server(("127.0.0.1", 65535)))
+        view.main([str(finished_run[1]), "--port", "65535"])
+
+
 def test_further_cameras_stand_where_their_files_say(finished_run, opened, tmp_path):
     run, out = Run.open(finished_run[1]), tmp_path / "out"
     shutil.copytree(finished_run[1], out)
@@ -199,8 +229,10 @@ def test_refusals(finished_run, tmp_path, monkeypatch):
     for arguments, words in [
         ([tmp_path], "not the folder of a run or of a drape"),
         ([tmp_path / "nowhere"], "no such folder"),
+        ([finished_run[1] / "surface.npz"], "is a file"),
         ([finished_run[1], "--frame", "9"], "frames 0 to 3"),
         ([finished_run[1], "--port", "70000"], "a port from 0"),
+        ([finished_run[1], "--host", "192.0.2.1"], "an address of this machine"),  # documentation's
     ]:
         with pytest.raises(InputError, match=words):
             view.main([str(a) for a in arguments])
