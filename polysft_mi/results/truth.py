@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from polyfit.files import NOT_NPZ
 from polyfit.mesh import TexCoords
 from polysft_mi.errors import InputError
 
@@ -51,10 +52,26 @@ class Truth:
             return cls(path, "clouds", clouds)
         arrays = load_npz(path)
         if "points" in arrays and "frames" in arrays:
-            places = {int(k): points for k, points in zip(arrays["frames"], arrays["points"])}
+            points, frames, K = arrays["points"], arrays["frames"], arrays.get("K", np.eye(3))
+            if (
+                points.ndim != 3
+                or points.shape[2] != 3
+                or not points.size
+                or frames.shape != points.shape[:1]
+                or K.shape != (3, 3)
+            ):
+                raise InputError(
+                    f"{path}: points {points.shape}, frames {frames.shape}, K {K.shape}; (T,P,3),"
+                    " (T,) and (3,3) with T > 0 and P > 0 are needed"
+                )
+            places = {int(k): P for k, P in zip(frames, points)}
             return cls(path, "points", places, K=arrays.get("K"))
         if "vertices" in arrays and "faces" in arrays:
-            places = dict(enumerate(arrays["vertices"]))
+            counted = {"frames": np.arange(len(np.atleast_1d(arrays["vertices"])))}
+            surface = counted | arrays
+            check_surface(surface, str(path))
+            numbers = [int(k) for k in surface["frames"]]
+            places = dict(zip(numbers, surface["vertices"]))
             visible, seen = arrays.get("seen"), None
             if visible is not None:
                 if visible.shape != arrays["vertices"].shape[:2] or not visible.any(1).all():
@@ -62,7 +79,7 @@ class Truth:
                         f"{path}: seen {visible.shape}; {arrays['vertices'].shape[:2]}, with a"
                         " vertex that is seen in every frame, is needed"
                     )
-                seen = dict(enumerate(visible.astype(bool)))
+                seen = dict(zip(numbers, visible.astype(bool)))
             return cls(path, "mesh", places, arrays["faces"].astype(np.int64), seen=seen)
         raise InputError(
             f"{path}: holds {', '.join(arrays)}; vertices and faces, or points and frames, are"
@@ -198,7 +215,5 @@ def load_npz(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
             return {name: file[name] for name in file.files}
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; an .npz file is needed") from None
-    except Exception as error:  # zipfile, zlib and numpy each have their own for a damaged file
-        raise InputError(
-            f"{path}: not a readable .npz file ({type(error).__name__}: {error})"
-        ) from None
+    except NOT_NPZ:
+        raise InputError(f"{path}: not a readable .npz file, or a damaged one") from None

@@ -193,6 +193,31 @@ def test_refuses_a_surface_of_another_form(tmp_path, change, words):
         evaluation.score(arrays, truth)
 
 
+@pytest.mark.parametrize(
+    "arrays, words",
+    [
+        (dict(vertices=np.ones((3, 3)), faces=GOOD["faces"]), r"vertices \(3, 3\)"),
+        (dict(vertices=np.full((2, 3, 3), np.nan), faces=GOOD["faces"]), "not finite"),
+        (dict(GOOD, frames=np.arange(3)), r"frames \(3,\)"),
+        (dict(points=np.ones((2, 4, 2)), frames=np.arange(2)), r"points \(2, 4, 2\)"),
+        (dict(points=np.ones((2, 4, 3)), frames=np.arange(2), K=np.eye(2)), r"K \(2, 2\)"),
+    ],
+)
+def test_refuses_a_truth_of_another_form(run_folder, arrays, words):
+    np.savez(run_folder / "truth.npz", **arrays)
+    with pytest.raises(InputError, match=words):
+        evaluate.main([str(run_folder / "out"), str(run_folder / "truth.npz")])
+
+
+def test_a_truth_may_name_its_frames(run_folder):
+    """As the surface.npz of another run does, which began later."""
+    V, F = np.load(run_folder / "seq" / "gt.npz")["vertices"], GOOD["faces"]
+    later = np.stack([V[1] + np.float32([0, 0, 0.03]), V[1]])
+    np.savez(run_folder / "later.npz", vertices=later, faces=F, frames=np.arange(1, 3))
+    figures = evaluation.evaluate(run_folder / "out", run_folder / "later.npz")
+    assert figures["frames"] == 1 and figures["rmse_mm"] == pytest.approx(20, rel=1e-4)
+
+
 def test_bad_input_is_told(run_folder):
     for out, truth in [("nowhere", "seq"), ("seq", "seq"), ("out", "nowhere"), ("out", "out")]:
         with pytest.raises(InputError) as caught:
