@@ -17,6 +17,7 @@ from polyfit.errors import InputError
 
 from . import jet
 from .chebyshev import DETERMINED_RMS, Box, determined_order, values
+from .frames import check_points
 from .least_squares import JetFit
 from .monomials import exponents, size_of
 
@@ -33,10 +34,11 @@ def fit(
     Differentiable once in points and weights, at the cost of evaluating two jets. Raises InputError
     where a patch has no points or weight, or where numbers are not finite.
     """
-    if not 1 <= order <= 10:
+    if order not in range(1, 11):
         raise InputError(f"order = {order}; the order of a jet is 1 to 10")
-    if points.ndim < 2 or points.shape[-1] != 3:
-        raise InputError(f"points of shape {tuple(points.shape)}; (..., points, 3) is needed")
+    check_points(points)
+    if not isinstance(points, Tensor):
+        raise InputError(f"points are {type(points)}; a tensor of torch is needed")
     shape = points.shape[:-1]
     if shape[-1] == 0:
         raise InputError("patch 0 has no points")

@@ -37,6 +37,7 @@ class CanonicalFrame:
         a choice of coordinates. Raises InputError where a patch has no points, or points that are
         not finite or all the same.
         """
+        check_points(points)
         xp = namespace(points)
         m, where = xp.module, xp.module.where
         with xp.no_grad():
@@ -142,6 +143,13 @@ def _pointed(x: Any, axis: Any, w: Any, level: float) -> Any:
     first = m.where(far & (far.cumsum(-1) == 1), along, 0).sum(-1)
     side = m.where(abs(skew) > level, skew, first)
     return m.where((side < 0)[..., None], -axis, axis)
+
+
+def check_points(points: Any) -> None:
+    """Raises InputError where ``points`` are no array of NumPy or torch (..., P, 3) of floats."""
+    shape, kind = tuple(getattr(points, "shape", ())), getattr(points, "dtype", type(points))
+    if len(shape) < 2 or shape[-1] != 3 or "float" not in str(kind):
+        raise InputError(f"points of shape {shape}, {kind}; (..., points, 3) of floats is needed")
 
 
 def _check(points: Any, mask: Any, s: Any) -> None:

@@ -14,6 +14,8 @@ import math
 from functools import lru_cache
 from typing import Any
 
+from polyfit.errors import InputError
+
 from .backends import namespace
 from .monomials import exponents, order_of
 
@@ -62,6 +64,8 @@ def derivatives(alpha: Any, uv: Any, *which: tuple[int, int]) -> tuple[Any, ...]
     """For each (du, dv) in ``which`` the derivative d^(du+dv) z / du^du dv^dv at uv, (..., P)."""
     xp, m = namespace(uv), matrix(alpha)
     order = order_of(xp.size(alpha))
+    if xp.size(uv) != 2:
+        raise InputError(f"uv of {xp.size(uv)} coordinates; (..., points, 2) is needed")
     u, v = xp.parts(uv)
     along_v = {du: xp.times(powers(u, order, du), m) for du in {du for du, _ in which}}
     of_v = {dv: powers(v, order, dv) for dv in {dv for _, dv in which}}

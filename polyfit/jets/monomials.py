@@ -4,6 +4,8 @@ from functools import lru_cache
 
 import numpy as np
 
+from polyfit.errors import InputError
+
 
 @lru_cache
 def exponents(order: int) -> np.ndarray:
@@ -19,8 +21,8 @@ def size_of(order: int) -> int:
 
 
 def order_of(size: int) -> int:
-    """Order n of a jet with ``size`` coefficients. Raises ValueError where there is none."""
+    """Order n of a jet with ``size`` coefficients. Raises InputError where there is none."""
     order = int((np.sqrt(8 * size + 1) - 3) / 2 + 0.5)
     if size_of(order) != size:
-        raise ValueError(f"{size} is not the number of coefficients of a jet")
+        raise InputError(f"{size} is not the number of coefficients of a jet")
     return order

@@ -29,7 +29,7 @@ def as_arrays(
         return V, np.empty((0, 3), np.int64)
     if F.ndim != 2 or F.shape[1] != 3:
         raise InputError(f"{where}: faces of shape {F.shape}; (F, 3) is needed")
-    if F.dtype.kind == "f" and not (F % 1 == 0).all():
+    if F.dtype.kind not in "iuf" or (F.dtype.kind == "f" and not (F % 1 == 0).all()):
         raise InputError(f"{where}: faces are not whole numbers, which name vertices")
     F = F.astype(np.int64)
     if F.min() < 0 or F.max() >= len(V):
@@ -42,7 +42,7 @@ def as_arrays(
 def _numbers(given: ArrayLike, what: str, needed: str) -> np.ndarray:
     try:
         found = np.asarray(given)
-    except ValueError:  # rows of several lengths
+    except (ValueError, TypeError, RuntimeError):  # rows of several lengths; gradients, of torch
         found = np.array(None)
     if found.dtype.kind not in "fiu":
         raise InputError(f"{what} are no array of numbers; {needed} is needed")

@@ -207,8 +207,12 @@ class Patches:
 
     def locate(self, face: np.ndarray, barycentric: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Points on the given mesh, by face (P,) and barycentric coordinates (P, 3), as points on
-        ``faces``. Raises InputError for a face that is not there.
+        ``faces``. Raises InputError for a face that is not there, and for other shapes.
         """
+        if barycentric.shape != (*face.shape, 3):
+            raise InputError(
+                f"faces {face.shape}, barycentric {barycentric.shape}; (P,) and (P, 3) are needed"
+            )
         if len(face) and not 0 <= face.min() <= face.max() < len(self.given):
             raise InputError(
                 f"faces {face.min()} to {face.max()}; 0 to {len(self.given) - 1} exist"

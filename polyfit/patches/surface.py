@@ -229,8 +229,8 @@ class PatchedSurface:
         The given mesh's vertices come first. ``smoothing``: how often :meth:`smoothed` is applied.
         Raises InputError for ``parts`` below 1.
         """
-        if parts < 1:
-            raise InputError(f"parts = {parts}; 1 or more is needed")
+        if parts < 1 or parts != int(parts):
+            raise InputError(f"parts = {parts}; a whole number, 1 or more, is needed")
         faces, face, barycentric = mesh.refined(self.patches.given, parts)
         vertices = self.at(face, barycentric)
         seam = self.patches.on_boundary[self.patches.locate(face, barycentric)[0]]
@@ -238,7 +238,9 @@ class PatchedSurface:
         return smoothed(vertices, faces, self._index(seam), smoothing), faces
 
     def _blended(self, face: np.ndarray, barycentric: np.ndarray, what: str) -> Tensor:
-        value = {"points": self.points, "normals": self.normals}[what]
+        if what not in ("points", "normals"):
+            raise InputError(f"what = {what!r}; points or normals is needed")
+        value = self.points if what == "points" else self.normals
         on_boundary = self.patches.on_boundary[face]
         entries, patch = self.patches.face_entries[face], self.patches.corner_patch[face]
         b = torch.as_tensor(barycentric, dtype=self.uv.dtype, device=self.uv.device)

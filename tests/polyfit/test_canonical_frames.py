@@ -131,3 +131,6 @@ def test_what_has_no_frame_is_named():
             CanonicalFrame.from_points(*change(points, mask))
     with pytest.raises(InputError, match="the patch: its 4 points coincide"):
         CanonicalFrame.from_points(torch.ones(4, 3))
+    for wrong in torch.arange(12).reshape(4, 3), torch.rand(4, 2), [[0.0, 1.0, 2.0]] * 4:
+        with pytest.raises(InputError, match=r"\(..., points, 3\) of floats is needed"):
+            CanonicalFrame.from_points(wrong)

@@ -167,7 +167,10 @@ def test_what_cannot_be_fitted_is_named():
             points, 2, weights=torch.tensor([[-1.0], [1.0]]).expand(2, 20)
         ),
         "order = 11; the order of a jet is 1 to 10": lambda: jets.fit(points, 11),
-        "(..., points, 3) is needed": lambda: jets.fit(points[..., :2], 2),
+        "(..., points, 3) of floats is needed": lambda: jets.fit(points[..., :2], 2),
+        "torch.int32; (..., points, 3) of floats": lambda: jets.fit(points.int(), 2),
+        "a tensor of torch is needed": lambda: jets.fit(points.numpy(), 2),
+        "order = 2.5; the order of a jet is 1 to 10": lambda: jets.fit(points, 2.5),
     }.items():
         with pytest.raises(InputError) as error:
             call()

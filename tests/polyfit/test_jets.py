@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from polyfit import jets
+from polyfit.errors import InputError
 
 RNG = np.random.default_rng(7)
 
@@ -173,3 +174,10 @@ def test_numpy_and_torch_have_the_same_frames_and_feet():
     assert np.abs(jets.nearest(alpha, points / 5) - found).max() < 1e-8  # both have converged
     over = jets.turned_over(torch.tensor(alpha)).numpy()
     assert np.array_equal(jets.turned_over(alpha), over)
+
+
+def test_other_shapes_are_named():
+    with pytest.raises(InputError, match="14 is not the number of coefficients of a jet"):
+        jets.height(np.zeros(14), np.zeros((2, 2)))
+    with pytest.raises(InputError, match=r"uv of 3 coordinates; \(..., points, 2\) is needed"):
+        jets.point(torch.zeros(15), torch.zeros(2, 3))

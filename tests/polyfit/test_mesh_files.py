@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import surfaces
 
-from polyfit import PatchedSurface
+from polyfit import PatchedSurface, write_ply
 from polyfit.errors import InputError
 from polyfit.mesh import areas, centred, face_vectors, read_mesh, read_textured
 from polyfit.mesh.polygons import triangulated
@@ -490,3 +490,11 @@ def test_coordinates_of_a_map_are_moved_before_they_are_rounded():
         PatchedSurface.from_mesh(far, faces, 1)
     near, there = (PatchedSurface.from_mesh(p, faces, 1) for p in (points, moved))
     np.testing.assert_allclose(there.residual, near.residual, atol=1e-6)
+
+
+def test_a_ply_of_other_shapes_is_not_written(tmp_path):
+    V, F = np.eye(3), np.array([[0, 1, 2]])
+    for wrong in (V[:, :2], F), (V, F + 1), (V, F, V[:2, :2]):
+        with pytest.raises(InputError, match="a.ply: "):
+            write_ply(tmp_path / "a.ply", *wrong)
+    assert not list(tmp_path.iterdir())

@@ -354,5 +354,14 @@ def test_bad_input_is_named():
         PatchedSurface.from_mesh(V, F[:0])
     with pytest.raises(TypeError, match="unexpected keyword argument 'patches'"):
         PatchedSurface.from_mesh(V, F, patches=2)
-    with pytest.raises(InputError, match="parts = 0; 1 or more is needed"):
-        PatchedSurface.from_mesh(V, F, 2).resampled(0)
+    for wrong in ("sheet.obj", F), (torch.tensor(V, requires_grad=True), F):
+        with pytest.raises(InputError, match="mesh: vertices and faces must be arrays of numbers"):
+            PatchedSurface.from_mesh(*wrong)
+    surface = PatchedSurface.from_mesh(V, F, 2)
+    for parts in 0, 2.5:
+        with pytest.raises(InputError, match=f"parts = {parts}; a whole number, 1 or more"):
+            surface.resampled(parts)
+    with pytest.raises(InputError, match=r"barycentric \(1, 2\); \(P,\) and \(P, 3\) are needed"):
+        surface.at([0], [[0.5, 0.5]])
+    with pytest.raises(InputError, match="what = 'colours'; points or normals is needed"):
+        surface.sample(1, what=("colours",))
