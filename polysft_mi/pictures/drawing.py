@@ -5,10 +5,12 @@ surfaces. So a process of its own opens the scene once more and draws each frame
 solved (:class:`polysft_mi.pictures.album.Album`).
 """
 
+import contextlib
 import multiprocessing
 import os
 import shutil
 import signal
+import sys
 import tempfile
 import threading
 from concurrent.futures import ProcessPoolExecutor
@@ -59,6 +61,21 @@ def _end_with_parent(folder):
     os._exit(1)
 
 
+@contextlib.contextmanager
+def _without_main():
+    """A process that starts inside does not run the caller's script again, which would call for
+    another run where it is not under ``if __name__ == "__main__"``.
+    """
+    main = sys.modules["__main__"]
+    kept = {name: vars(main)[name] for name in ("__spec__", "__file__") if name in vars(main)}
+    main.__spec__ = None
+    vars(main).pop("__file__", None)
+    try:
+        yield
+    finally:
+        vars(main).update(kept)
+
+
 class Drawing:
     """The pictures of ``problem``'s run in the folder ``out``: hand over each frame when it is
     solved, and :meth:`finish`.
@@ -90,7 +107,8 @@ class Drawing:
             self._pool = ProcessPoolExecutor(
                 1, multiprocessing.get_context("spawn"), initializer=silence_others
             )
-            self._submit()  # starts the process
+            with _without_main():
+                self._submit()  # starts the process
 
     def _chosen(self, count):
         return set(evenly_spaced(count, self.exr_frames))

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import synthetic
 from places import ROOT
+from processes import python
 
 from polyfit.pictures import video
 from polysft_mi import prepare
@@ -266,6 +267,19 @@ def test_the_process_ends_with_a_run_that_is_killed(sheet, tmp_path):
     finally:
         if members(run.pid):
             os.killpg(run.pid, signal.SIGKILL)
+
+
+def test_a_script_without_a_guard_runs_once(sheet, tmp_path):
+    """As the README's, which does not stand under ``if __name__ == "__main__"``."""
+    script, out = tmp_path / "script.py", tmp_path / "out"
+    script.write_text(f"""
+print("begins")
+import polysft_mi
+outcome = polysft_mi.reconstruct({str(sheet.folder / "scene.xml")!r}, {str(out)!r}, report=False)
+print(outcome.summary["frames"], __file__)
+""")
+    done = python(script)
+    assert done.stderr == "" and done.stdout.split() == ["begins", "9", str(script)]
 
 
 def members(session):
