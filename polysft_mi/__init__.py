@@ -32,7 +32,11 @@ __getattr__, __dir__, __all__ = lazy.attach(
         "scene.plugins": ["register"],
         "scene.sequence": ["Sequence"],
         "scene.settings": ["Settings"],
-        "tracker": ["Track", "track"],
+        "tracker": ["FrameTracker", "Track", "track"],
     },
+    with_variant=[
+        *("Experiment", "FrameTracker", "Problem", "Track"),
+        *("bridge", "load", "register", "solvers", "track"),
+    ],
     handed_on={"polyfit.backend": ["set_variant"]},
 )

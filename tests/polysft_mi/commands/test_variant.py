@@ -47,3 +47,18 @@ def test_a_name_that_needs_a_variant_says_so(name):
     said = done.stderr.splitlines()[-1]
     assert "InputError: polysft_mi." in said
     assert said.endswith(" needs a Mitsuba variant: call polysft_mi.set_variant() first")
+
+
+def test_no_public_name_starts_dr_jit_before_a_variant_is_set():
+    """It would take an LLVM, and the variant that is then asked for be refused."""
+    code = """
+import sys, polysft_mi
+refused = []
+for name in polysft_mi.__all__:
+    try:
+        getattr(polysft_mi, name)
+    except polysft_mi.InputError:
+        refused.append(name)
+print("drjit" in sys.modules, "Problem" in refused, "Run" in refused)
+"""
+    assert python("-c", code).stdout.split() == ["False", "True", "False"]
