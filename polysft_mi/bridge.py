@@ -23,7 +23,8 @@ import numpy as np
 import torch
 
 from polyfit import jets
-from polyfit.mesh import TexCoords
+from polyfit.errors import InputError
+from polyfit.mesh import TexCoords, as_arrays
 
 from .surface import Template, Unknowns
 
@@ -45,14 +46,18 @@ def template(
     of ``polyfit`` (:class:`polyfit.PolyFit`).
 
     ``vertices`` (N, 3) [m], ``faces`` (F, 3), ``uv`` (N, 2) or :class:`polyfit.mesh.TexCoords`;
-    ``options`` and errors are those of ``Template.fit``.
+    ``options`` are those of ``Template.fit``. Raises InputError as that does, and for arrays of
+    other shapes.
     """
+    vertices, faces = as_arrays(vertices, faces, "template")
+    if not isinstance(uv, TexCoords) and np.shape(uv) != (len(vertices), 2):
+        raise InputError(f"template: uv of shape {np.shape(uv)}; ({len(vertices)}, 2) is needed")
     frame = polyfit.frame_of(vertices)
     return Template.fit(vertices, faces, uv, polyfit.order, frame=frame, **options)
 
 
 def surface(polyfit: PolyFit, points: torch.Tensor) -> torch.Tensor:
-    """The points (..., P, 3) [m] of patches, put onto the patches' jets along the frames' z;
+    """The points (K, P, 3) [m] of patches, put onto the patches' jets along the frames' z;
     differentiable to the weights of ``polyfit``."""
     found = polyfit(points)
     chart = found.frame.to_chart(points)
@@ -77,7 +82,9 @@ def rendering(
     problem: Problem, seed: int = 0
 ) -> Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor]]:
     """The rendering of a :class:`polysft_mi.objective.problem.Problem` as a torch function:
-    vertices (N, 3) [m, camera frame] -> (rgb (H, W, 3) linear, alpha (H, W))."""
+    vertices (N, 3) [m, camera frame] -> (rgb (H, W, 3) linear, alpha (H, W)). It raises InputError
+    for anything else."""
+    count = len(problem.template.vertices)
 
     @_in_drjit
     def render(vertices: mi.TensorXf) -> tuple[mi.TensorXf, mi.TensorXf]:
@@ -85,7 +92,7 @@ def rendering(
         return rgb, mi.TensorXf(alpha.array, (problem.height, problem.width))
 
     def of(vertices: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        rgb, alpha = render(_at_home(vertices))
+        rgb, alpha = render(_at_home("vertices", vertices, count, 3))
         return rgb.to(vertices.device), alpha.to(vertices.device)
 
     return of
@@ -94,18 +101,31 @@ def rendering(
 def deformed(patch: JetAtlas) -> Callable[..., torch.Tensor]:
     """The surface of a :class:`polysft_mi.surface.patch.JetAtlas` as a torch function of the
     unknowns: delta_alpha (A,), delta_u, delta_v, delta_w (N,), rotation (4,), translation (3,) ->
-    vertices (N, 3) [m, camera frame]."""
+    vertices (N, 3) [m, camera frame]; of K patches K times as many of all but delta_u, delta_v and
+    delta_w, patch by patch. It raises InputError for anything else."""
+    sizes = {name: dr.width(x) for name, x in patch.rest().items() if name != "pose"}
 
     @_in_drjit
     def vertices(*unknowns: mi.TensorXf) -> mi.TensorXf:
         points = patch.vertices(Unknowns(*(x.array for x in unknowns)))
         return mi.TensorXf(dr.ravel(points), (dr.width(points), 3))  # type: ignore[call-overload]
 
-    return lambda *unknowns: vertices(*map(_at_home, unknowns)).to(unknowns[0].device)
+    def of(*unknowns: torch.Tensor) -> torch.Tensor:
+        if len(unknowns) != len(sizes):
+            raise InputError(f"{len(unknowns)} unknowns; {', '.join(sizes)} are needed")
+        there = [_at_home(name, x, size) for (name, size), x in zip(sizes.items(), unknowns)]
+        return vertices(*there).to(unknowns[0].device)
+
+    return of
 
 
-def _at_home(tensor: torch.Tensor) -> torch.Tensor:
-    """A tensor in single precision where the variant in force computes."""
+def _at_home(name: str, tensor: torch.Tensor, *shape: int) -> torch.Tensor:
+    """A tensor of this ``shape`` in single precision where the variant in force computes. Raises
+    InputError for anything else; Mitsuba would read past the end of what is too short.
+    """
+    if not isinstance(tensor, torch.Tensor) or tensor.shape != shape:
+        given = f"{type(tensor).__name__} of shape {tuple(np.shape(tensor))}"
+        raise InputError(f"{name}: {given}; a tensor of torch of shape {shape} is needed")
     device = "cuda" if str(mi.variant()).startswith("cuda") else "cpu"
     return tensor.to(device, torch.float32).contiguous()
 

@@ -165,8 +165,11 @@ class PolyFit(torch.nn.Module):
         counts; ``weights`` (B, P) for mean and spread.
 
         Differentiable with respect to the network's weights, through the turn that was kept. Raises
-        InputError as :meth:`CanonicalFrame.from_points` does.
+        InputError as :meth:`CanonicalFrame.from_points` does, and for points of other shapes.
         """
+        if not isinstance(points, Tensor) or points.ndim != 3:
+            given = f"{type(points).__name__} of shape {tuple(np.shape(points))}"
+            raise InputError(f"points: {given}; a tensor of torch (patches, points, 3) is needed")
         frame = CanonicalFrame.from_points(points, mask, weights=weights)
         if self.stn is None:
             return frame

@@ -13,6 +13,7 @@ import polyfit
 from polyfit import jets
 from polyfit.network import PolyFit, SpatialTransformer
 from polysft_mi import bridge, capture
+from polysft_mi.errors import InputError
 from polysft_mi.objective.problem import Problem
 from polysft_mi.scene import experiment as scene
 from polysft_mi.surface.patch import JetAtlas
@@ -188,3 +189,26 @@ def test_gradient_of_the_deformed_patch_in_torch(bent, network):
         assert float(x.grad @ direction) == pytest.approx(
             (ends[0] - ends[1]) / (2 * h), rel=0.02, abs=2e-3
         ), k
+
+
+def test_other_shapes_are_named(bent, network):
+    """Mitsuba reads a transposed array as it comes, and past the end of a short one."""
+    problem, points = bent
+    N, t = len(points), problem.template
+    render, deformed = bridge.rendering(problem), bridge.deformed(problem.patch)
+    for wrong in points[:-1], points.T, points[None], points.flatten(), points.numpy():
+        with pytest.raises(InputError, match=rf"vertices: .*of shape \({N}, 3\) is needed"):
+            render(wrong)
+    rest = [torch.as_tensor(np.array(x)) for name, x in problem.patch.rest().items()][:6]
+    assert deformed(*rest).shape == (N, 3)
+    with pytest.raises(InputError, match="5 unknowns; delta_alpha, .*, translation are needed"):
+        deformed(*rest[:5])
+    with pytest.raises(InputError, match=r"rotation: .*\(3,\); a tensor of torch of shape \(4,\)"):
+        deformed(*rest[:4], rest[5], rest[5])
+    for wrong in points, points.numpy()[None]:
+        with pytest.raises(InputError, match=r"a tensor of torch \(patches, points, 3\) is needed"):
+            bridge.surface(network, wrong)
+    with pytest.raises(InputError, match=rf"uv of shape \(5, 2\); \({N}, 2\) is needed"):
+        bridge.template(network, points.numpy(), t.faces, np.zeros((5, 2)))
+    with pytest.raises(InputError, match="template: faces name vertices 1 to"):
+        bridge.template(network, points.numpy(), t.faces + 1, t.texcoords)
