@@ -84,8 +84,6 @@ def execute(name, scene, options):
     overrides = commands.definitions(options.define)
     if options.exr != "all" and not options.exr.isdecimal():
         raise InputError(f"--exr {options.exr}: a number of frames or 'all' is needed")
-    if options.fps is not None and not 0 < options.fps <= 1000:
-        raise InputError(f"--fps {options.fps:g}: a rate above 0, at most 1000, is needed")
     exr_frames = sys.maxsize if options.exr == "all" else int(options.exr)
     outcome = reconstruct(
         scene,
@@ -219,6 +217,8 @@ def reconstruct(
 
     from .scene import resolved_defaults
 
+    if fps is not None and not 0 < fps <= 1000:
+        raise InputError(f"--fps {fps:g}: a rate above 0, at most 1000, is needed")
     began = time.perf_counter()
     overrides = {name: str(value) for name, value in (overrides or {}).items()}
     folder.check_output(out, resume=resume, overwrite=overwrite)

@@ -16,7 +16,7 @@ from scipy.linalg import LinAlgError
 from threadpoolctl import ThreadpoolController
 
 from polyfit.files import aside, naming
-from polysft_mi.errors import BadFrame
+from polysft_mi.errors import BadFrame, InputError
 from polysft_mi.render import interruptible
 from polysft_mi.surface import Unknowns
 
@@ -53,7 +53,11 @@ def track(
     If the objective stops being finite, or the surface leaves the image, the new frame keeps the
     state of the one before, and the run goes on. KeyboardInterrupt passes through; the checkpoint
     on disk is then that of the last complete window, or of the last frame that a sweep went over.
+    Raises InputError where the video has fewer frames.
     """
+    count = len(tracker.problem.sequence)
+    if not 1 <= frames <= count:
+        raise InputError(f"frames = {frames}; 1 to {count}, as many as the video has, are needed")
     settings, checkpoint = tracker.settings, os.path.join(out, CHECKPOINT)
     width, log_path = min(settings.window, frames), os.path.join(out, _LOG)
     stages, rules = tracker.objective.stages, tracker.objective.rules

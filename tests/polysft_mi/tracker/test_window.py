@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from problems import problem_of
 
+from polysft_mi.errors import InputError
 from polysft_mi.surface.atlas import Atlas
 from polysft_mi.surface.patch import Unknowns
 from polysft_mi.tracker import CHECKPOINT, FrameTracker, Track, track
@@ -135,3 +136,11 @@ def test_a_sweep_cures_a_frame_on_a_wrong_branch_and_can_be_interrupted(truth, t
     assert gone_over == [(7, 2), (8, 3)] and whole.swept == parts.swept == 5
     for a, b in zip(whole.states, parts.states, strict=True):
         assert all(np.array_equal(a[name], b[name]) for name in a)
+
+
+def test_more_frames_than_the_video_has_are_named(truth, tmp_path):
+    problem = problem_of(truth.folder)
+    count = len(problem.sequence)
+    for frames in 0, count + 1:
+        with pytest.raises(InputError, match=f"frames = {frames}; 1 to {count}"):
+            track(FrameTracker(problem), frames, tmp_path)
