@@ -128,13 +128,14 @@ class DepthImages:
                 )
         if not any(has_depth for _, has_depth in found):
             raise InputError(
-                f"{folder}: no depth in its images; every pixel is 0, or none (nothing known)"
+                f"{folder}: no depth in its images; every pixel is 0 or below, or none, of which"
+                " nothing is known"
             )
         return images
 
     def _checked(self, i):
         """((H, W), whether anything is known) of image i, which must be whole."""
-        if not self.files[i].lower().endswith(".csv"):
+        if not self.files[i].lower().endswith((".csv", ".exr")):
             checked_size(self.files[i])
         depth = self.read(i)
         return depth.shape, bool((depth > 0).any())
@@ -142,7 +143,7 @@ class DepthImages:
     def numbers(self, i: int) -> np.ndarray:
         """The numbers of image i as its file has them, (H, W), uint16 or float32."""
         path = self.files[i]
-        image = _table(path) if path.lower().endswith(".csv") else read_pixels(path)
+        image = _table(path) if path.lower().endswith(".csv") else read_pixels(path, depth=True)
         if image.dtype == np.uint8:
             needed = (
                 "depth is needed as 16 bit PNG in millimetres, or as EXR in metres"
@@ -150,7 +151,14 @@ class DepthImages:
                 else "they are too coarse: a network's numbers are needed as 16 bit PNG, or EXR"
             )
             raise InputError(f"{path}: 8 bits; {needed}")
-        return image[..., 0] if image.ndim == 3 else image
+        if image.ndim == 2:
+            return image
+        if any(not np.array_equal(x, image[..., 0], True) for x in np.moveaxis(image, 2, 0)[1:3]):
+            raise InputError(
+                f"{path}: its channels differ, as colours do; depth in one channel is needed, which"
+                " an EXR calls Z or depth"
+            )
+        return image[..., 0]
 
     def is_whole(self, i: int) -> bool:
         """Whether the numbers of image i are whole, so that the unit is theirs."""

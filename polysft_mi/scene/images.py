@@ -102,14 +102,14 @@ def checked_size(path, decode=True):
             ) from None
 
 
-def read_pixels(path):
+def read_pixels(path, depth=False):
     """Pixels as the file has them: (H, W) or (H, W, C) in OpenCV's channel order, uint8, uint16 or
-    float32.
+    float32. ``depth``: of an EXR that has a channel of depth, that one.
     """
     import cv2
 
     if path.lower().endswith(".exr"):
-        return _read_exr(path)
+        return _read_exr(path, depth)
     try:
         image = cv2.imread(path, cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
@@ -127,9 +127,10 @@ def read_pixels(path):
     return image
 
 
-def _read_exr(path):
-    """Plain R, G, B (in OpenCV's order), or Y, or the only channel. Not by OpenCV, whose wheels
-    come without EXR.
+def _read_exr(path, depth):
+    """Plain R, G, B (in OpenCV's order), or Y, or the only channel; where ``depth`` is looked for,
+    before them Z, or one with "depth" in its name, as renderers write it beside colours. Not by
+    OpenCV, whose wheels come without EXR.
     """
     import OpenEXR
 
@@ -141,15 +142,13 @@ def _read_exr(path):
             }
     except (RuntimeError, ValueError) as error:
         raise InputError(f"{path}: not a readable image ({error})") from None
-    names = (
-        "BGR"
-        if {"R", "G", "B"} <= set(planes)
-        else [n for n in planes if n == "Y" or len(planes) == 1]
-    )
+    names = [n for n in sorted(planes) if depth and (n == "Z" or "depth" in n.lower())][:1]
+    if not names and {"R", "G", "B"} <= set(planes):
+        names = "BGR"
+    names = names or [n for n in planes if n == "Y" or len(planes) == 1]
     if not names:
-        raise InputError(
-            f"{path}: has the channels {', '.join(sorted(planes))}; R, G and B, or Y, are needed"
-        )
+        needed = "Z, or one called depth, is needed" if depth else "R, G and B, or Y, are needed"
+        raise InputError(f"{path}: has the channels {', '.join(sorted(planes))}; {needed}")
     return np.stack([planes[name] for name in names], axis=-1)
 
 

@@ -5,6 +5,7 @@ import zipfile
 
 import cv2
 import numpy as np
+import OpenEXR
 import pytest
 
 from polysft_mi.errors import InputError
@@ -164,6 +165,32 @@ def test_depth_is_read_in_metres(tmp_path):
     cv2.imwrite(str(floats / "0.tiff"), np.array([[0.7, np.nan], [-1, np.inf]], np.float32))
     found = DepthImages.open(str(floats), 1, [0], 1e-3).read(0)
     assert np.allclose(found, [[0.7, 0], [0, 0]])
+
+
+def test_depth_beside_colours_is_found(tmp_path):
+    """As renderers write it; their colours were taken for it."""
+    depth, colours = np.float32([[0.5, 0.6]]), dict(zip("RGB", np.float32([[[0.1, 1]]] * 3)))
+    colours["G"] = 2 * colours["R"]
+    layers = {f"ViewLayer.Combined.{name}": plane for name, plane in colours.items()}
+    call = lambda: DepthImages.open(str(tmp_path), 1, [0], 1e-3)
+
+    def write(planes):
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        with OpenEXR.File(header, planes) as file:
+            file.write(str(tmp_path / "0.exr"))
+
+    for planes in (
+        {"Z": depth, "ZBack": 2 * depth, **colours},
+        {"ViewLayer.Depth.Z": depth, "ViewLayer.Normal.Z": 0 * depth, **layers},
+        {"depth": depth.astype(np.float16)},
+        dict.fromkeys("RGB", depth),
+    ):
+        write(planes)
+        assert np.allclose(call().read(0), depth, atol=1e-3)
+    for planes, said in (colours, "its channels differ"), (layers, "Z, or one called depth"):
+        write(planes)
+        with pytest.raises(InputError, match=said):
+            call()
 
 
 def test_every_depth_image_is_read(tmp_path):
