@@ -162,8 +162,9 @@ def folder_aside(path: str | os.PathLike[str], ours: Callable[[str], bool]) -> I
             shutil.rmtree(temporary, ignore_errors=True)
             raise
     except OSError as error:
-        if error.errno is not None and str(error.filename).startswith(temporary):
-            error.filename = path + str(error.filename)[len(temporary) :]
+        at = str(error.filename or temporary)  # a full disk names none where a file is flushed
+        if error.errno is not None and at.startswith(temporary):
+            error.filename = path + at[len(temporary) :]
         raise
 
 

@@ -1,12 +1,14 @@
 """A moving mesh as a USD scene."""
 
+import contextlib
 import os
+import shutil
 import tempfile
 
 import numpy as np
 
 from polyfit.errors import InputError
-from polyfit.files import aside
+from polyfit.files import aside, naming
 
 from .moving import checked, encoded, normals
 
@@ -26,32 +28,28 @@ def write_usd(path, vertices, faces, uv=None, texture=None, *, fps=24.0, up="y",
     if extension.lower() not in (".usd", ".usda", ".usdc", ".usdz"):
         raise InputError(f"{path}: .usdz, .usdc, .usda or .usd is needed")
     data, kind = encoded(texture) if texture is not None and uv is not None else (None, None)
-    if extension.lower() == ".usdz":
-        _write_usdz(path, vertices, faces, uv, data, kind, fps, up, name)
-        return
-    image = f"{os.path.basename(stem)}_texture.{kind}" if data else None
-    stage = _stage(vertices, faces, uv, image and f"./{image}", fps, up, name)
-    if data:
-        with (
-            aside(os.path.join(os.path.dirname(stem), image)) as temporary,
-            open(temporary, "wb") as file,
-        ):
-            file.write(data)
-    with aside(path) as temporary:
-        stage.GetRootLayer().Export(temporary)
-
-
-def _write_usdz(path, vertices, faces, uv, data, kind, fps, up, name):
-    from pxr import Sdf, UsdUtils
-
-    with aside(path) as temporary, tempfile.TemporaryDirectory() as folder:
+    is_packed = extension.lower() == ".usdz"
+    image = (f"{os.path.basename(stem)}_" if not is_packed else "") + f"texture.{kind}"
+    stage = _stage(vertices, faces, uv, f"./{image}" if data else None, fps, up, name)
+    # written elsewhere and copied: where USD cannot write, it ends in a page of its own errors
+    with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
+        made = os.path.join(folder, f"surface{'.usdc' if is_packed else extension.lower()}")
+        files = {made: path}
         if data:
-            with open(os.path.join(folder, f"texture.{kind}"), "wb") as file:
+            beside = os.path.join(folder, image)
+            files[beside] = os.path.join(os.path.dirname(stem), image)
+            with naming(beside), open(beside, "wb") as file:
                 file.write(data)
-        inner = os.path.join(folder, "surface.usdc")
-        stage = _stage(vertices, faces, uv, f"./texture.{kind}" if data else None, fps, up, name)
-        stage.GetRootLayer().Export(inner)  # the stage must live on: layers are held weakly
-        UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(inner), temporary)
+        stage.GetRootLayer().Export(made)
+        if is_packed:
+            from pxr import Sdf, UsdUtils
+
+            files = {os.path.join(folder, "surface.usdz"): path}
+            UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(made), *files)
+        for source, target in files.items():
+            temporary = stack.enter_context(aside(target))
+            with open(source, "rb") as read, open(temporary, "wb") as written:
+                shutil.copyfileobj(read, written)
 
 
 def _stage(vertices, faces, uv, image, fps, up, name):

@@ -4,6 +4,7 @@ by frame.
 
 import io
 import json
+import resource
 import shutil
 import struct
 from pathlib import Path
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
-from processes import python
+from processes import python, refusal
 
 from polyfit import animation
 from polysft_mi import export
@@ -296,6 +297,24 @@ class TestRefusals:
         with pytest.raises(InputError, match="holds other files"):
             command(run, "--format", "obj", "-o", target)
         assert (target / "notes.txt").exists() and list(tmp_path.iterdir()) == [target]
+
+    @pytest.mark.parametrize("extension", ["usdz", "usdc", "usda", "usd"])
+    def test_to_write_where_nothing_can_be_written(self, run, tmp_path, capfd, extension):
+        """USD itself ends in a page of its own errors there."""
+        pytest.importorskip("pxr")
+        path = tmp_path / "gone" / f"a.{extension}"
+        with pytest.raises(FileNotFoundError) as caught:
+            animation.write_usd(path, run.vertices, run.faces, run.uv, run.texture)
+        assert caught.value.filename == str(path) and capfd.readouterr().err == ""
+        assert list(tmp_path.iterdir()) == []
+
+    def test_to_go_on_where_files_may_not_grow(self, run, tmp_path):
+        """As on a full disk: the error of a write names no file."""
+        limit = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
+        words = "polysft_mi.export", run.folder, "--format", "obj", "-o", tmp_path / "meshes"
+        said = refusal(python("-m", *words, preexec_fn=limit))
+        assert said == f"error: {tmp_path / 'meshes'}: File too large\n"
+        assert list(tmp_path.iterdir()) == []
 
     def test_of_arrays(self, tmp_path):
         V, F = np.zeros((2, 3, 3)), [[0, 1, 2]]
