@@ -83,7 +83,7 @@ class Drawing:
     ``overrides``: of the scene's defaults; ``exr_frames``: how many comparison EXRs at most;
     ``about``: for their headers; ``worth``: frames from which on another process is worth its
     start. Shorter runs are drawn here, at the end, as is everything where the drawing process
-    fails.
+    fails, or may not be started.
     """
 
     def __init__(self, problem, overrides, out, *, exr_frames, about, worth=8):
@@ -93,7 +93,9 @@ class Drawing:
         self._given, self._jobs, self._pool = {}, [], None
         self._here = None  # the album, where it must be drawn in this process
         self._exr = self._chosen(len(problem.sequence.indices))
-        if len(problem.sequence.indices) >= worth:
+        # those of a multiprocessing.Pool may start none of their own
+        is_pooled = multiprocessing.current_process().daemon
+        if len(problem.sequence.indices) >= worth and not is_pooled:
             import mitsuba as mi
 
             self._first = (

@@ -282,6 +282,25 @@ print(outcome.summary["frames"], __file__)
     assert done.stderr == "" and done.stdout.split() == ["begins", "9", str(script)]
 
 
+def test_a_pool_may_reconstruct(sheet, tmp_path):
+    """Whose processes may start none."""
+    script, out = tmp_path / "script.py", tmp_path / "out"
+    script.write_text(f"""
+import multiprocessing, polysft_mi
+
+def frames(scene):
+    outcome = polysft_mi.reconstruct(scene, {str(out)!r}, report=False)
+    return outcome.summary["frames"]
+
+if __name__ == "__main__":
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        print(pool.map(frames, [{str(sheet.folder / "scene.xml")!r}]))
+""")
+    done = python(script)
+    assert done.stdout == "[9]\n" and done.stderr == ""
+    assert (out / "comparison.png").exists()
+
+
 def members(session):
     """Processes of a session, zombies aside."""
     found = []
