@@ -4,6 +4,7 @@ import os
 
 import numpy as np
 
+from polyfit.errors import InputError
 from polyfit.files import folder_aside
 from polyfit.mesh import write_ply
 
@@ -18,6 +19,11 @@ def write_frames(folder, kind, vertices, faces, uv=None, texture=None, *, labels
     holds nothing but such files is replaced.
     """
     vertices, faces, uv = checked(vertices, faces, uv, 1)
+    labels = [int(k) for k in (range(len(vertices)) if labels is None else labels)]
+    if kind not in ("obj", "ply"):
+        raise InputError(f"animation: kind = {kind!r}; obj or ply is needed")
+    if not len(labels) == len(set(labels)) == len(vertices):
+        raise InputError(f"animation: {len(vertices)} labels, each another number, are needed")
     ours = lambda name: (
         name in ("surface.mtl", "texture.png", "texture.jpg")
         or (name.endswith(f".{kind}") and name[: -len(kind) - 1].isdigit())
@@ -41,8 +47,8 @@ def write_frames(folder, kind, vertices, faces, uv=None, texture=None, *, labels
                     "newmtl surface\nKd 1 1 1\nKs 0 0 0\nillum 1\n"
                     + (f"map_Kd texture.{image}\n" if data else "")
                 )
-        for label, V in zip(range(len(vertices)) if labels is None else labels, vertices):
-            name = os.path.join(place, f"{int(label):03d}.{kind}")
+        for label, V in zip(labels, vertices):
+            name = os.path.join(place, f"{label:03d}.{kind}")
             if kind == "ply":
                 write_ply(name, V[source], faces, uv)
             else:

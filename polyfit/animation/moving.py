@@ -9,7 +9,7 @@ import numpy as np
 
 from polyfit.errors import InputError
 from polyfit.files import silent_decoders
-from polyfit.mesh import TexCoords, vertex_normals
+from polyfit.mesh import TexCoords, as_arrays, vertex_normals
 
 # Rotations from OpenCV's camera axes to axes with y or z up
 AXES_FROM_CAMERA = {
@@ -25,7 +25,14 @@ def from_camera(points, up="y"):
     Both are rotations about x: nothing is mirrored. The camera stays at the origin; with y up it
     looks along -z, as the cameras of glTF and USD do.
     """
+    check_up(up)
     return np.asarray(points) @ AXES_FROM_CAMERA[up].T.astype(np.asarray(points).dtype)
+
+
+def check_up(up):
+    """Raises InputError where ``up`` is neither "y" nor "z"."""
+    if up not in AXES_FROM_CAMERA:
+        raise InputError(f"animation: up = {up!r}; y or z is needed")
 
 
 def normals(vertices, faces):
@@ -40,23 +47,15 @@ def checked(vertices, faces, uv, fps):
     """(V, F, :class:`polyfit.mesh.TexCoords` or None): the arguments of a writer, in their types.
     Raises InputError.
     """
-    V, F = np.asarray(vertices, np.float32), np.asarray(faces, np.int64)
-    if (
-        V.ndim != 3
-        or V.shape[2] != 3
-        or not V.size
-        or F.ndim != 2
-        or F.shape[1:] != (3,)
-        or not F.size
-    ):
+    V = np.asarray(vertices, np.float32)
+    if V.ndim != 3 or V.shape[2] != 3 or not V.size or not np.size(faces):
         raise InputError(
-            f"animation: vertices {V.shape}, faces {F.shape}; (T, N, 3) and (F, 3), neither empty,"
-            " are needed"
+            f"animation: vertices {V.shape}, faces {np.shape(faces)}; (T, N, 3) and (F, 3), neither"
+            " empty, are needed"
         )
-    if not np.isfinite(V).all() or not 0 <= F.min() <= F.max() < V.shape[1]:
-        raise InputError(
-            f"animation: positions that are not finite, or faces beyond the {V.shape[1]} vertices"
-        )
+    _, F = as_arrays(V[0], faces, "animation")
+    if not np.isfinite(V).all():
+        raise InputError("animation: positions that are not finite")
     if not (np.isfinite(fps) and fps > 0):
         raise InputError(f"animation: {fps} frames a second; a positive number is needed")
     if uv is not None:

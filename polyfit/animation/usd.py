@@ -10,7 +10,7 @@ import numpy as np
 from polyfit.errors import InputError
 from polyfit.files import aside, naming
 
-from .moving import checked, encoded, normals
+from .moving import check_up, checked, encoded, normals
 
 
 def write_usd(path, vertices, faces, uv=None, texture=None, *, fps=24.0, up="y", name="surface"):
@@ -24,6 +24,7 @@ def write_usd(path, vertices, faces, uv=None, texture=None, *, fps=24.0, up="y",
     usd-core.
     """
     vertices, faces, uv = checked(vertices, faces, uv, fps)
+    check_up(up)
     stem, extension = os.path.splitext(os.fspath(path))
     if extension.lower() not in (".usd", ".usda", ".usdc", ".usdz"):
         raise InputError(f"{path}: .usdz, .usdc, .usda or .usd is needed")

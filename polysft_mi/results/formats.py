@@ -5,7 +5,7 @@ import os
 import numpy as np
 
 from polyfit.errors import require
-from polyfit.files import aside
+from polyfit.files import aside, folder_for
 from polysft_mi.errors import InputError
 
 from .truth import uv_arrays
@@ -43,26 +43,26 @@ def export(run, kind, path=None, *, up="y", fps=None, texture=None):
     path = _place(run, kind, path)
     vertices = run.vertices if up == "camera" else animation.from_camera(run.vertices, up)
     image = _texture(run, texture) if kind in ("usd", "glb", "obj") else None
-    os.makedirs(os.path.dirname(path) or ".", exist_ok=True)
-    if kind == "usd":
-        animation.write_usd(path, vertices, run.faces, run.texcoords, image, fps=fps, up=up)
-    elif kind == "glb":
-        animation.write_glb(path, vertices, run.faces, run.texcoords, image, fps=fps)
-    elif kind == "npz":
-        arrays = {
-            "vertices": vertices,
-            "faces": run.faces,
-            **uv_arrays(run.texcoords, run.faces),
-            "frames": run.frames,
-            "fps": np.float64(fps),
-            "up": up,
-        }
-        with aside(path) as temporary:
-            np.savez_compressed(temporary, **arrays)
-    else:
-        animation.write_frames(
-            path, kind, vertices, run.faces, run.texcoords, image, labels=run.frames, up=up
-        )
+    with folder_for(os.path.dirname(path) or "."):
+        if kind == "usd":
+            animation.write_usd(path, vertices, run.faces, run.texcoords, image, fps=fps, up=up)
+        elif kind == "glb":
+            animation.write_glb(path, vertices, run.faces, run.texcoords, image, fps=fps)
+        elif kind == "npz":
+            arrays = {
+                "vertices": vertices,
+                "faces": run.faces,
+                **uv_arrays(run.texcoords, run.faces),
+                "frames": run.frames,
+                "fps": np.float64(fps),
+                "up": up,
+            }
+            with aside(path) as temporary:
+                np.savez_compressed(temporary, **arrays)
+        else:
+            animation.write_frames(
+                path, kind, vertices, run.faces, run.texcoords, image, labels=run.frames, up=up
+            )
     return path
 
 

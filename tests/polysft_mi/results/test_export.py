@@ -256,12 +256,11 @@ class TestRefusals:
     )
     def test_in_what_is_asked(self, run, tmp_path, monkeypatch, arguments, words):
         monkeypatch.chdir(tmp_path)
-        before = sorted(shutil.os.listdir(run.folder))
+        shutil.copytree(run.folder, tmp_path / "run")
+        before = sorted(tmp_path.rglob("*"))
         with pytest.raises(InputError, match=words):
-            export.main([run.folder, *arguments])
-        assert list(tmp_path.iterdir()) == [] and sorted(
-            set(shutil.os.listdir(run.folder)) - {"export"}
-        ) == sorted(set(before) - {"export"})
+            export.main(["run", *arguments])
+        assert sorted(tmp_path.rglob("*")) == before
 
     def test_in_an_image_of_which_its_decoder_complains_too(self, run, tmp_path, capfd):
         broken = tmp_path / "broken.tif"
@@ -321,6 +320,16 @@ class TestRefusals:
         for wrong in [(V[0], F), (V, [[0, 1, 3]]), (V * np.nan, F), (V, F, np.zeros((2, 2)))]:
             with pytest.raises(InputError, match="animation"):
                 animation.write_glb(tmp_path / "a.glb", *wrong)
+        for wrong in (V, np.add(F, 0.5)), (V, [[0, 1, 2, 2]]), (V[:, :, :2], F), (V, []):
+            with pytest.raises(InputError, match="animation"):
+                animation.write_frames(tmp_path / "a", "obj", *wrong)
+        for kind, labels, said in ("stl", None, "obj or ply"), ("obj", [1, 1], "2 labels, each"):
+            with pytest.raises(InputError, match=said):
+                animation.write_frames(tmp_path / "a", kind, V, F, labels=labels)
+        with pytest.raises(InputError, match="up = 'x'; y or z is needed"):
+            animation.from_camera(V, "x")
+        with pytest.raises(InputError, match="up = 'x'; y or z is needed"):
+            animation.write_usd(tmp_path / "a.usda", V, F, up="x")
         with pytest.raises(InputError, match="-1 frames a second"):
             animation.write_usd(tmp_path / "a.usda", V, F, fps=-1)
         assert list(tmp_path.iterdir()) == []
