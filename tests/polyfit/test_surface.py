@@ -355,7 +355,7 @@ def test_bad_input_is_named():
     with pytest.raises(TypeError, match="unexpected keyword argument 'patches'"):
         PatchedSurface.from_mesh(V, F, patches=2)
     for wrong in ("sheet.obj", F), (torch.tensor(V, requires_grad=True), F):
-        with pytest.raises(InputError, match="mesh: vertices and faces must be arrays of numbers"):
+        with pytest.raises(InputError, match="mesh: vertices are no array of numbers"):
             PatchedSurface.from_mesh(*wrong)
     surface = PatchedSurface.from_mesh(V, F, 2)
     for parts in 0, 2.5:
