@@ -1,5 +1,6 @@
 """The scripts beside the packages say what they are for."""
 
+import pytest
 from places import ROOT
 from processes import python
 
@@ -19,6 +20,7 @@ for path in sys.argv[1:]:
 """
 
 
+@pytest.mark.slow  # what the scripts import takes seconds
 def test_help_is_all_that_a_script_does_where_it_is_asked_for():
     """In one process, for what they import takes seconds."""
     folders = ("docs", "benchmarks", "examples", "scenes")

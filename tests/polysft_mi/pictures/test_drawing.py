@@ -282,6 +282,7 @@ print(outcome.summary["frames"], __file__)
     assert done.stderr == "" and done.stdout.split() == ["begins", "9", str(script)]
 
 
+@pytest.mark.slow  # most of it is what the test above does
 def test_a_pool_may_reconstruct(sheet, tmp_path):
     """Whose processes may start none."""
     script, out = tmp_path / "script.py", tmp_path / "out"
