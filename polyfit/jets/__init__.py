@@ -30,6 +30,6 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
             "turned_over",
         ],
         "least_squares": ["JetFit", "fit_points"],
-        "monomials": ["exponents", "order_of", "size_of"],
+        "monomials": ["check_order", "exponents", "order_of", "size_of"],
     },
 )

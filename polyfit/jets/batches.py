@@ -19,7 +19,7 @@ from . import jet
 from .chebyshev import DETERMINED_RMS, Box, determined_order, values
 from .frames import check_points
 from .least_squares import JetFit
-from .monomials import exponents, size_of
+from .monomials import check_order, exponents, size_of
 
 
 def fit(
@@ -34,8 +34,7 @@ def fit(
     Differentiable once in points and weights, at the cost of evaluating two jets. Raises InputError
     where a patch has no points or weight, or where numbers are not finite.
     """
-    if order not in range(1, 11):
-        raise InputError(f"order = {order}; the order of a jet is 1 to 10")
+    check_order(order)
     check_points(points)
     if not isinstance(points, Tensor):
         raise InputError(f"points are {type(points)}; a tensor of torch is needed")

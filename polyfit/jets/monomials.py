@@ -20,6 +20,12 @@ def size_of(order: int) -> int:
     return (order + 1) * (order + 2) // 2
 
 
+def check_order(order: int) -> None:
+    """Raises InputError where no jet of this ``order`` is fitted: 1 to 10 are."""
+    if order not in range(1, 11):
+        raise InputError(f"order = {order}; the order of a jet is 1 to 10")
+
+
 def order_of(size: int) -> int:
     """Order n of a jet with ``size`` coefficients. Raises InputError where there is none."""
     order = int((np.sqrt(8 * size + 1) - 3) / 2 + 0.5)

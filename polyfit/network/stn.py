@@ -153,8 +153,7 @@ class PolyFit(torch.nn.Module):
 
     def __init__(self, order: int = 4, stn: SpatialTransformer | None = None) -> None:
         super().__init__()
-        if order not in range(1, 11):
-            raise InputError(f"order = {order}; the order of a jet is 1 to 10")
+        jets.check_order(order)
         self.order = order
         self.stn = stn
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from polyfit.baselines import DGCNN, AtlasNet, PointNet
 from polyfit.errors import InputError
+from polyfit.jets import check_order
 from polyfit.network import PRETRAINED, PolyFit, SpatialTransformer
 
 from . import families
@@ -84,8 +85,7 @@ class Settings:
                 raise InputError(f"{name} = {getattr(self, name)}; at least 1 is needed")
         if self.seed < 0:
             raise InputError(f"seed = {self.seed}; at least 0 is needed")
-        if not 1 <= self.order <= 10:
-            raise InputError(f"order = {self.order}; the order of a jet is 1 to 10")
+        check_order(self.order)
         if not self.lr > 0:
             raise InputError(f"lr = {self.lr}; more than 0 is needed")
         if self.points > POINTS_PER_PATCH or self.reads > self.points:

@@ -13,6 +13,7 @@ from polyfit.mesh import TexCoords, size_note
 from polysft_mi.body import check_model, read_motion
 from polysft_mi.errors import InputError
 from polysft_mi.scene import Sequence, checked_size, open_cameras, read_camera, read_rgb
+from polysft_mi.scene.kinect_paper import RESOLUTION
 from polysft_mi.scene.kinect_paper import template as kinect_paper_template
 from polysft_mi.surface import meshio
 
@@ -60,7 +61,7 @@ def prepare_folder(
             f"--resolution {resolution}: is for Kinect-Paper; {os.path.join(folder, layout.obj)}"
             " has its own vertices"
         )
-    resolution = 33 if resolution is None else resolution
+    resolution = RESOLUTION if resolution is None else resolution
     camera = layout.camera
     masks = os.path.join(folder, layout.masks) if layout.masks else ""
     said = []

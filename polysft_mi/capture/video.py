@@ -258,7 +258,7 @@ def _sheet(size, template, resolution, photo, texture, say):
                 f" {width / height:.3g} times; does it show the sheet from edge to edge"
                 " (--texture-corners)?"
             )
-    return sheet.grid(width, height, 33 if resolution is None else resolution)
+    return sheet.grid(width, height, resolution)
 
 
 def _seen(placed, view, where):

@@ -13,6 +13,7 @@ from polysft_mi.errors import InputError
 from .images import image_size, list_images
 
 FILES = ("cam.intr", "cam.ext", "mesh.pts", "mesh.tri")
+RESOLUTION = 33  # vertices a side of the template: so the given grid's own points are kept
 
 
 def images(folder):
@@ -43,7 +44,7 @@ def camera(folder):
     )
 
 
-def template(folder, resolution=33, pose_fit="auto", say=lambda line: None):
+def template(folder, resolution=RESOLUTION, pose_fit="auto", say=lambda line: None):
     """The flat template of a folder in the form of Kinect-Paper (Varol et al. 2012), in the camera
     frame of the first image.
 

@@ -185,12 +185,12 @@ def _varol_template(props):
     The sequence's flat template as a mesh in the camera frame, its texture coordinates the
     projection into the first image.
     """
-    from .kinect_paper import template
+    from .kinect_paper import RESOLUTION, template
 
     folder = str(mi.file_resolver().resolve(str(props["folder"])))
     log = lambda line: mi.Log(mi.LogLevel.Info, line)
     vertices, faces, uv = template(
-        folder, int(props.get("resolution", 33)), str(props.get("pose_fit", "auto")), log
+        folder, int(props.get("resolution", RESOLUTION)), str(props.get("pose_fit", "auto")), log
     )
     mesh = mi.Mesh("template", len(vertices), len(faces), has_vertex_texcoords=True, props=props)
     params = mi.traverse(mesh)

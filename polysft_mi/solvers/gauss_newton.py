@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 _FARTHEST_STEP = 2.0  # rotation [rad], translation and displacements [of the template's scale]
 _LEAST_DAMPING, _RAISED_DAMPING = 1e-7, 1e-4
-_BODILY_GAIN = 1e-6  # share that a step of the pose alone must promise: what it leaves, cloth takes
+_BODILY_GAIN = 1e-6  # share that a step of a pose alone must promise, in place of ``gain``
 
 
 class GaussNewton:
@@ -44,7 +44,8 @@ class GaussNewton:
 
     def minimise(self, objective, start, *, iterations=None, report=None):
         """As :meth:`polysft_mi.solvers.Solver.minimise` says. A step is kept where it lowers the
-        objective; one that promises little is taken unseen, and ends it.
+        objective; one that promises little, of a pose alone next to nothing, is taken unseen, and
+        ends it.
         """
         states, count = list(start), 0
 

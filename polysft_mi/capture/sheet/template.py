@@ -10,6 +10,8 @@ from polysft_mi.surface import meshio
 
 from .size import LARGEST, SMALLEST
 
+_RESOLUTION = 33  # vertices along the longer side, where nothing is said
+
 
 @dataclass(frozen=True)
 class Sheet:
@@ -93,9 +95,10 @@ class Sheet:
         ]
 
 
-def grid(width, height, resolution=33):
+def grid(width, height, resolution=None):
     """The :class:`Sheet` of a flat rectangle of ``width`` x ``height`` [m], ``resolution`` vertices
-    along its longer side, its cells about square."""
+    along its longer side (33), its cells about square."""
+    resolution = _RESOLUTION if resolution is None else resolution
     if not 2 <= resolution <= 400:
         raise InputError(
             f"--resolution {resolution}: 2 to 400 vertices along the longer side can be used"
