@@ -282,13 +282,14 @@ SECTIONS = {
             "ε_c of six garments, trained on the dress, and on all six.",
             (
                 "python benchmarks/onefit_paper.py RUNS --short 60 --train dress six",
+                "python benchmarks/onefit_paper.py RUNS --short 600 --train dress-longer",
                 f"{ONEFIT} --tables collisions",
             ),
             figures.collisions,
             "Bodies, motions and garments are others. What a dress alone has taught goes through "
-            "other garments' bodies here, too, and what six have taught does not. The package's "
-            "other weights, by more inputs, k_c = 4 and cuts, are in "
-            "[onefit.md](onefit.md#figures).",
+            "other garments' bodies here, too, the more the longer it has learned; what six have "
+            "taught does not. The package's other weights, by more inputs, k_c = 4 and cuts, are "
+            "in [onefit.md](onefit.md#figures).",
         ),
         Entry(
             "Figures 7 and 8",
