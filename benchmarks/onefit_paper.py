@@ -6,7 +6,7 @@
     python benchmarks/onefit_paper.py RUNS -o docs                     # the tables of what is there
 
 A training that was cut short goes on from its checkpoint. ``--short N`` has twelve epochs of N
-steps, of 2,000 patches each; 60, but 600 for ``dress-longer``, in the figures of ``docs``.
+steps, of 2,000 patches each. Those of ``docs`` are by 60, and by 600 for ``dress-longer``.
 ``package`` is the network ``paper`` of the package, ``--train six --short 600``; it needs no RUNS.
 Everything is measured on motions and bodies that no network was trained on (as by
 ``onefit_accuracy.py``), and is what the network alone makes: without ease and post-processing.
