@@ -65,7 +65,8 @@ class FrameMemory:
     ``scales``: the robust scale by stage that fits the residuals; ``nat``: what one unit of
     log-likelihood of the images costs, were the colours of a pixel independent, and ``colours``:
     how many of them count as one; ``noises``: of the other kinds of evidence, what their
-    residuals say of their noise, by name. NaN is what is not known.
+    residuals say of their noise, by name. NaN is what is not known. ``bold``: whether what the
+    misfit has above the noise is taken for folds, as in a second pass.
     """
 
     misfit: float = math.nan
@@ -77,6 +78,7 @@ class FrameMemory:
     nat: float = math.nan
     colours: float = 1.0
     noises: dict[str, float] = field(default_factory=dict)
+    bold: bool = False
 
     @classmethod
     def of(cls, past: list[FrameMemory | None]) -> FrameMemory:
@@ -95,6 +97,14 @@ class FrameMemory:
     def noise(self) -> float:
         """The misfit that is noise; NaN where nothing is known, as in the first frame."""
         return self.misfit if math.isnan(self.least_misfit) else self.least_misfit
+
+    @property
+    def distrust(self) -> float:
+        """The noise that caution goes by: all of it, or, where the misfit has grown and that is
+        taken for folds, the less the more it has. NaN where nothing is known.
+        """
+        noise = self.noise
+        return noise * noise / self.misfit if self.bold and self.misfit > noise else noise
 
 
 @dataclass(frozen=True)

@@ -139,6 +139,7 @@ def write(problem, track, out, drawing, *, fps, command, say=None, fits=None):
         "lost": {str(int(indices[k])): reason for k, reason in track.lost.items() if k < count},
         "doubtful": _doubtful(indices, per_frame),
         **({"undecided": undecided} if undecided else {}),
+        **({"second_pass": track.second} if track.second else {}),
         **(fits(world) if fits else {}),
         **_means(per_frame),
         "seconds_per_frame": float(sum(track.seconds) / count),

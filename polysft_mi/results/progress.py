@@ -45,6 +45,10 @@ class Progress:
         now = time.perf_counter()
         if self._start is None:
             self._start, self._began = done, now
+        if done >= self.total:  # a second pass, which a noisy video gets
+            self.total += self.windows
+            if self.terminal:
+                self._bar.update(self._task, total=self.total)
         if done != self._done:
             self._done = done
         elif now - self._shown < (0.2 if self.terminal else 10):

@@ -136,6 +136,13 @@ class Rules:
     noise_power: float = _rule(
         8.0, "", "with which it grows with the noise", row="caution's steepness"
     )
+    second_pass: bool = _rule(
+        True,
+        "",
+        "whether a video is tracked twice where caution costs a share: what a misfit has above the"
+        " noise may be noise, or folds",
+        row="second pass",
+    )
     give: float = _rule(
         0.002,
         "strain",

@@ -37,12 +37,44 @@ def split(track, frame):
     return track.other
 
 
-def ahead(track):
-    """How much more the track has cost than its other branch since they parted, over what a frame
-    costs; infinite where it lost more frames, or fewer. What both lost tells nothing.
+def _first_solved(track):
+    return next(k for k, memory in enumerate(track.memories) if memory)
+
+
+def second_pass(track):
+    """A track that is a copy of the ``track`` up to the first frame that was solved, and tells the
+    frames after it to be bold.
     """
-    since = range(track.fork, len(track.totals))
-    own, others = (np.array([_cost(t, k) for k in since]) for t in (track, track.other))
+    first = _first_solved(track)
+    memory = dataclasses.replace(track.memories[first], bold=True)
+    again = type(track)(solver=track.solver, fork=first + 1, next_window=first + 1)
+    for name in ("states", "iterations", "seconds", "totals", "memories"):
+        setattr(again, name, getattr(track, name)[: first + 1])
+    again.memories[first] = memory
+    for name in ("lost", "unusable", "certainty"):
+        setattr(again, name, {k: x for k, x in getattr(track, name).items() if k <= first})
+    return again
+
+
+def settle(track, gain):
+    """Let the track be its second pass where a frame of that costs less by the share ``gain``; the
+    one that is not kept is dropped.
+    """
+    again, since = track.again, _first_solved(track) + 1
+    seconds = [a + b for a, b in zip(track.seconds[since:], again.seconds[since:], strict=True)]
+    is_better = ahead(track, again, since) > gain * (len(track.totals) - since)
+    if is_better:
+        become(track, again)
+    track.seconds[since:], track.again = seconds, None
+    track.second = "kept" if is_better else "dropped"
+
+
+def ahead(track, other, since):
+    """How much more the track has cost than the other one from the frame ``since`` on, over what a
+    frame costs; infinite where it lost more frames, or fewer. What both lost tells nothing.
+    """
+    frames = range(since, len(track.totals))
+    own, others = (np.array([_cost(t, k) for k in frames]) for t in (track, other))
     more_lost = int(np.isinf(own).sum() - np.isinf(others).sum())
     if more_lost:
         return math.copysign(math.inf, more_lost)
@@ -62,7 +94,7 @@ def decide(track, apart=0.0):
     """Whether the branches are at least so many frames' costs ``apart``; then the cheaper one
     becomes the track, and the other its other branch.
     """
-    difference = ahead(track)
+    difference = ahead(track, track.other, track.fork)
     decided = abs(difference) >= apart
     if decided and difference > 0:
         swap(track)
@@ -73,6 +105,11 @@ def swap(track):
     """Let the other branch be the track, and the track the other."""
     other, fork = track.other, track.fork
     kept = dataclasses.replace(track, other=None)
+    become(track, other)
+    track.other, track.fork = kept, fork
+
+
+def become(track, other):
+    """Let the track be a copy of the other one."""
     for f in dataclasses.fields(track):
         setattr(track, f.name, getattr(other, f.name))
-    track.other, track.fork = kept, fork

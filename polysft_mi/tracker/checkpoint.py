@@ -20,7 +20,9 @@ from polysft_mi.scene import Rules
 from polysft_mi.surface import Unknowns
 
 CHECKPOINT = "checkpoint.npz"
-_NUMBERS = ("misfit", "outlier_share", "least_misfit", "explained", "nat", "colours")  # of a memory
+# of a memory
+_NUMBERS = ("misfit", "outlier_share", "least_misfit", "explained", "nat", "colours", "bold")
+_BRANCHES = ("other", "again")  # tracks of a track
 
 
 @dataclass
@@ -39,6 +41,9 @@ class Track:
     ``other``: a second track that explains the frames from ``fork`` on about as well, or None;
     ``mirror_at``: the frame from which on one is looked for; ``rim_at``: the one from which on the
     rim is tried again.
+
+    ``again``: a second pass over the video that is under way, or None; ``second``: what became of
+    it, "kept" or "dropped"; empty where there was none.
     """
 
     states: list = field(default_factory=list)
@@ -57,6 +62,8 @@ class Track:
     mirror_at: int = 1
     rim_at: int = 1
     other: Track | None = None
+    again: Track | None = None
+    second: str = ""
 
     def certainties(self, count: int) -> list[np.ndarray]:
         """``certainty`` of ``count`` vertices in all frames: sigma and score, (T, N) float32 [m],
@@ -70,11 +77,8 @@ class Track:
 
     def save(self, path: str | os.PathLike[str], stages: Sequence[Stage]) -> None:
         """Write it; ``stages``: those that memories have robust scales of."""
-        arrays = self._arrays(stages)
-        if self.other:
-            arrays |= {_OTHER + name: x for name, x in self.other._arrays(stages).items()}
         with aside(path) as temporary:
-            np.savez(temporary, **arrays)
+            np.savez(temporary, **self._arrays(stages))
 
     def _arrays(self, stages):
         arrays: dict[str, Any] = {
@@ -85,6 +89,9 @@ class Track:
         if known:
             arrays["certain_frames"] = np.array(known, dtype=np.int64)
             arrays["certainty"] = np.stack([self.certainty[k] for k in known])
+        for branch in _BRANCHES:
+            if track := getattr(self, branch):
+                arrays |= {f"{branch}_{name}": x for name, x in track._arrays(stages).items()}
         return arrays | _memory_arrays(self.memories, stages)
 
     @classmethod
@@ -96,17 +103,7 @@ class Track:
         """
         try:
             with np.load(path) as data:
-                arrays = dict(data)
-                own = {name: x for name, x in arrays.items() if not name.startswith(_OTHER)}
-                track = cls._of(own, stages, rules)
-                if len(own) < len(arrays):
-                    others = {
-                        name.removeprefix(_OTHER): x
-                        for name, x in arrays.items()
-                        if name.startswith(_OTHER)
-                    }
-                    track.other = cls._of(others, stages, rules)
-                return track
+                return cls._of(dict(data), stages, rules)
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             raise InputError(
                 f"{path}: not a checkpoint of a run ({error}); start again with --overwrite"
@@ -114,7 +111,12 @@ class Track:
 
     @classmethod
     def _of(cls, arrays, stages, rules):
-        meta = json.loads(str(arrays["meta"]))
+        meta, branches = json.loads(str(arrays["meta"])), {}
+        for branch in _BRANCHES:
+            first = f"{branch}_"
+            branches[branch] = {
+                name.removeprefix(first): x for name, x in arrays.items() if name.startswith(first)
+            }
         for name in ("lost", "unusable"):
             meta[name] = {int(k): v for k, v in meta[name].items()}
         certain = arrays.get("certain_frames", np.empty(0, np.int64)).tolist()
@@ -125,13 +127,13 @@ class Track:
             ],
             certainty=dict(zip(certain, arrays.get("certainty", ()))),
             memories=_memories(arrays, stages, rules or Rules()),
+            **{name: cls._of(found, stages, rules) for name, found in branches.items() if found},
             **meta,
         )
 
 
 _META = "next_window iterations seconds totals lost unusable swept finished solver".split()
-_META += ["fork", "mirror_at", "rim_at"]
-_OTHER = "other_"  # before the names of the other track's arrays
+_META += ["fork", "mirror_at", "rim_at", "second"]
 
 
 def _memory_arrays(memories, stages):
@@ -161,6 +163,7 @@ def _memories(data, stages, rules):
             found.append(None)
             continue
         numbers = {name: float(data[f"memory_{name}"][k]) for name in _NUMBERS}
+        numbers["bold"] = bool(numbers["bold"])
         noises = {kind: float(data[f"memory_noise_{kind}"][k]) for kind in kinds}
         light, scales = data["memory_light"][k].tolist(), data["memory_scales"][k].tolist()
         found.append(

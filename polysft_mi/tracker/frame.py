@@ -226,6 +226,23 @@ class FrameTracker:
         new = self._atlas.with_relief_in_jets(found.state)
         return self._solution([new], [found], self._memory(found, context, known)), excess
 
+    def doubts(
+        self, totals: Sequence[dict[str, float]], memories: Sequence[FrameMemory | None]
+    ) -> bool:
+        """Whether the same surfaces would have cost less by what another pass must gain, had the
+        frames been bold. ``totals``: of each frame of a video, its terms; ``memories``: of each.
+        """
+        rules, saved, whole = self.objective.rules, 0.0, 0.0
+        if not (self._tries and rules.second_pass):
+            return False
+        for k, terms in enumerate(totals):
+            before = FrameMemory.of(list(memories[:k]))
+            bold = replace(before, bold=True)
+            less = 1 - rules.caution(bold.distrust) / rules.caution(before.distrust)
+            saved += less * (terms.get("relief") or 0.0)
+            whole += sum(x for x in terms.values() if x is not None)
+        return saved > rules.gain * whole
+
     @functools.cached_property
     def rim(self) -> Rim | None:
         """The rim that :meth:`unfold` continues; None where there is none, or none is asked for."""
@@ -347,6 +364,7 @@ class FrameTracker:
             nat=nat,
             colours=colours,
             noises=self.objective.noises(context, model.surface.vertices),
+            bold=before.bold,
         )
 
     def _same_noise(self, found, context, memory):

@@ -31,7 +31,6 @@ _MIN_VISIBLE_SHARE = (
 _MAX_HISTORY = 20  # frames before that a frame is told of
 _LATEST = 20  # frames after which a mirror image, or a rim, is tried again
 _RIM_EVERY = 3  # frames, at least, from one try of a rim to the next
-_LOG_EVERY = 1  # iterations between records of the log
 
 
 def track(
@@ -49,7 +48,8 @@ def track(
     ``frames``: number of frames. ``progress(done, frame, iteration, total, terms)`` is called after
     each evaluation; ``done``: windows, and frames gone over again, before this one.
     ``solved(frame, vertices)`` is called with the surface (N, 3) [m, world] of each frame as soon
-    as no later window moves it; only the settings ``sweeps`` and ``smooth`` may still change it.
+    as no later window moves it; only a second pass over a noisy video, and the settings ``sweeps``
+    and ``smooth``, may still change it.
     If the objective stops being finite, or the surface leaves the image, the new frame keeps the
     state of the one before, and the run goes on. KeyboardInterrupt passes through; the checkpoint
     on disk is then that of the last complete window, or of the last frame that a sweep went over.
@@ -80,14 +80,14 @@ def track(
             for k in range(start + width - 1 if start else 0, start + width):
                 _observe(tracker, done, k)
             log.flush()
-            _follow(tracker, done, start, progress)
-            for branch in filter(None, (done, done.other)):
-                _unfold(tracker, branch, start, progress)
+            _look_around(tracker, done, start, progress)
             done.save(checkpoint, stages)
             if solved:
                 solved(start, _vertices(tracker.problem, done.states[start]))
         if done.other and len(done.totals) == frames:
             branches.decide(done)  # which is shown; the other one is kept beside it
+        if not done.second and tracker.doubts(done.totals, done.memories):
+            _second_pass(tracker, done, frames, checkpoint, progress)
         for k, neighbour in _swept(frames, settings.sweeps)[done.swept :]:
             _retry(tracker, done, k, neighbour, progress)
             done.swept += 1
@@ -97,6 +97,35 @@ def track(
             done.finished = True
             done.save(checkpoint, stages)
     return done
+
+
+def _second_pass(tracker, done, frames, checkpoint, progress):
+    """Track a video that was done once more, boldly, and keep that where it costs less by what
+    another pass must gain.
+    """
+    stages = tracker.objective.stages
+    report = progress and (lambda n, *told: progress(len(done.totals) + n, *told))
+    if not done.again:
+        done.again = branches.second_pass(done)
+    again = done.again
+    for k in range(again.next_window):
+        _observe(tracker, again, k)
+    for k in range(again.next_window, frames):
+        _advance(tracker, again, k, 1, None, report)
+        _observe(tracker, again, k)
+        _look_around(tracker, again, k, report)
+        done.save(checkpoint, stages)
+    if again.other:
+        branches.decide(again)
+    branches.settle(done, tracker.objective.rules.gain)
+    done.save(checkpoint, stages)
+
+
+def _look_around(tracker, done, k, progress):
+    """What else may explain frame ``k``, that was solved: its mirror image, another rim."""
+    _follow(tracker, done, k, progress)
+    for branch in filter(None, (done, done.other)):
+        _unfold(tracker, branch, k, progress)
 
 
 def _follow(tracker, done, k, progress):
@@ -265,8 +294,7 @@ def _advance(tracker, done, start, width, log, progress):
     def report(iteration, total, terms):
         nonlocal latest
         latest = iteration + 1
-        if iteration % _LOG_EVERY == 0:
-            record(iteration, total, terms)
+        record(iteration, total, terms)
         if progress:
             progress(start, newest, iteration, total, terms)
 

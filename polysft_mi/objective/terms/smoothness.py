@@ -43,7 +43,7 @@ class Sliding(Term):
 class Relief(Term):
     """k_relief times the sum over edges of the squared difference of the ends' heights over the
     jets, more where no pixel sees them, and ``relief_bend`` times that of the bends at the inner
-    edges; the weight grows with noise.
+    edges; the weight grows with what of a misfit counts as noise.
     """
 
     name, setting = "relief", "k_relief"
@@ -77,8 +77,7 @@ class Relief(Term):
         return weight * float(visibility.edges @ steps**2) + bending * float(bent @ bent)
 
     def _weight(self, context):
-        r = self._rules
-        return self.weight * r.caution(context.memory.noise)
+        return self.weight * self._rules.caution(context.memory.distrust)
 
 
 def _visibility(inputs, context):

@@ -181,6 +181,8 @@ def about(run):
         if name in metric
     ]
     rows += [["texture", run.texture or "none"]]
+    if second := metric.get("second_pass"):
+        rows.append(["second pass", second])
     if run.camera:
         c = run.camera
         rows.append(

@@ -18,3 +18,12 @@ def test_frames_that_are_gone_over_again_count(capsys):
         4 * [None] + 5 * ["again "]
     )
     assert [int(line.split("/")[0][-1]) - 1 for line in lines] == order
+
+
+def test_a_second_pass_counts_as_soon_as_it_begins(capsys):
+    with Progress(3, Settings(), quiet=False) as progress:
+        for done, frame in enumerate((0, 1, 2, 1, 2)):
+            progress(done, frame, 0, 0.5, {})
+    lines = capsys.readouterr().err.splitlines()
+    assert progress.total == 6 and all("-" not in line for line in lines)
+    assert lines[3].startswith("again frame 2/3")

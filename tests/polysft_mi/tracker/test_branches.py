@@ -1,4 +1,4 @@
-"""A sheet and its mirror image: both are tracked while the video does not tell."""
+"""A sheet and its mirror image, noise and folds: both are tracked while the video does not tell."""
 
 import dataclasses
 import math
@@ -9,6 +9,7 @@ import pytest
 import synthetic
 from problems import problem_of, small_cloth
 
+from polysft_mi.objective import FrameMemory
 from polysft_mi.pictures import Drawing, write_report
 from polysft_mi.results import Run, outputs
 from polysft_mi.scene.rules import Rules
@@ -33,6 +34,10 @@ def test_the_mirror_image_lies_behind_the_plane_as_far_as_the_sheet_before_it():
     assert np.abs(height + other).max() < 1e-9
 
 
+def ahead(done):
+    return branches.ahead(done, done.other, done.fork)
+
+
 def of_costs(*costs, lost=()):
     """A track of frames that cost so much."""
     states = [{"alpha": np.full(2, k)} for k in range(len(costs))]
@@ -50,7 +55,7 @@ def test_the_branch_that_saves_a_frames_cost_is_kept():
         for t, cost in ((done, own), (other, others)):
             t.states.append({"alpha": np.full(2, cost)})
             t.totals.append({"rgb": cost, "uv": None})
-    assert branches.ahead(done) == pytest.approx(1.1 / 0.95)
+    assert ahead(done) == pytest.approx(1.1 / 0.95)
     assert branches.decide(done, 1.0)
     assert done.totals[2]["rgb"] == 0.8 and done.other.totals[2]["rgb"] == 1.0
 
@@ -60,19 +65,19 @@ def test_a_branch_that_is_lost_loses():
     other = branches.split(done, 0)
     other.lost.clear()
     other.totals = [{"rgb": 5.0}] * 2
-    assert branches.ahead(done) == math.inf
+    assert ahead(done) == math.inf
     assert branches.decide(done, 1.0) and not done.lost
 
 
 def test_a_frame_that_both_lose_tells_nothing():
     done = of_costs(1.0, 1.0, 1.0, lost=[1])
     other = branches.split(done, 0)
-    assert branches.ahead(done) == 0
+    assert ahead(done) == 0
     other.totals[2] = {"rgb": 0.9}
-    assert branches.ahead(done) == pytest.approx(0.1 / 0.95)
+    assert ahead(done) == pytest.approx(0.1 / 0.95)
     done = of_costs(1.0, lost=[0])
     branches.split(done, 0)
-    assert branches.ahead(done) == 0 and not branches.decide(done, 1.0)
+    assert ahead(done) == 0 and not branches.decide(done, 1.0)
 
 
 def of_a_cloth(folder):
@@ -124,7 +129,7 @@ def undecided(tmp_path_factory):
 def test_both_branches_outlive_an_interruption(undecided, tmp_path):
     problem, there, _ = undecided
     assert there.other is not None and 0 < there.fork < 4
-    assert np.isfinite(branches.ahead(there)) and branches.ahead(there) <= 0  # the cheaper is shown
+    assert np.isfinite(ahead(there)) and ahead(there) <= 0  # the cheaper is shown
     track(FrameTracker(problem), there.fork + 1, tmp_path)
     again = track(FrameTracker(problem), 5, tmp_path, resume=True)
     for a, b in ((there, again), (there.other, again.other)):
@@ -157,3 +162,86 @@ def test_a_closed_surface_has_no_mirror_image(tmp_path):
     problem = problem_of(truth.folder)
     assert not FrameTracker(problem).mirrors
     assert FrameTracker(of_a_cloth(tmp_path)[1]).mirrors
+
+
+def test_bold_frames_take_a_misfit_that_grew_for_folds():
+    quiet = FrameMemory(misfit=0.06, least_misfit=0.06, bold=True)
+    grown = dataclasses.replace(quiet, misfit=0.12)
+    assert quiet.distrust == pytest.approx(0.06) and grown.distrust == pytest.approx(0.03)
+    assert dataclasses.replace(grown, bold=False).distrust == 0.06
+    assert math.isnan(FrameMemory(bold=True).distrust)
+
+
+def test_a_second_pass_begins_after_the_first_frame_that_was_solved():
+    done = of_costs(1.0, 2.0, 3.0, lost=[0])
+    done.memories = [None, FrameMemory(misfit=0.1), FrameMemory(misfit=0.2)]
+    again = branches.second_pass(done)
+    assert len(again.states) == len(again.totals) == again.next_window == 2
+    assert again.memories[1] == FrameMemory(misfit=0.1, bold=True) and not done.memories[1].bold
+    assert again.lost == {0: ""}
+
+
+def rippled(t, rows, columns):
+    """A sheet whose ripples, finer than its jet, grow with the time t."""
+    points = synthetic.sheet(t, rows, columns, bend=1.0)
+    points[:, 2] += 0.015 * t * np.sin(2 * np.pi * points[:, 0] / 0.06)
+    return points
+
+
+@pytest.mark.parametrize("cost, verdict", [(0.9, "kept"), (0.995, "dropped"), (1.1, "dropped")])
+def test_a_second_pass_is_kept_where_it_costs_less(cost, verdict):
+    done = of_costs(1.0, 1.0, 1.0)
+    done.memories = [FrameMemory(misfit=0.1)] * 3
+    done.seconds = [1.0] * 3
+    done.again = branches.second_pass(done)
+    for k in (1, 2):
+        done.again.states.append({"alpha": np.full(2, -k)})
+        done.again.totals.append({"rgb": cost})
+        done.again.memories.append(FrameMemory(misfit=0.1, bold=True))
+        done.again.seconds.append(0.5)
+    branches.settle(done, 0.01)
+    assert done.second == verdict and done.again is None
+    assert done.states[2]["alpha"][0] == (-2 if verdict == "kept" else 2)
+    assert done.seconds == [1.0, 1.5, 1.5]
+
+
+@pytest.fixture(scope="module")
+def rippling(tmp_path_factory):
+    """A rippling cloth, its problem under rules for which its images are noisy, and its track."""
+    folder = tmp_path_factory.mktemp("rippling")
+    rules = dataclasses.replace(Rules(), noise_misfit=3e-3, noise_power=4.0, rim=0.0)
+    truth = synthetic.cloth(
+        folder / "cloth", frames=6, size=(320, 240), rows=13, columns=25, shape=rippled
+    )
+    problem = problem_of(truth.folder, rules=rules)
+    return truth, problem, track(FrameTracker(problem), 6, folder)
+
+
+def test_a_noisy_video_is_tracked_twice(rippling, tmp_path):
+    truth, problem, twice = rippling
+    rules = dataclasses.replace(problem.rules, second_pass=False)
+    once = track(FrameTracker(problem_of(truth.folder, rules=rules)), 6, tmp_path)
+    assert not once.second and twice.second and twice.again is None
+    less = branches.ahead(once, twice, 1)
+    assert less > 5 * rules.gain if twice.second == "kept" else less == 0
+
+
+def test_a_second_pass_outlives_an_interruption(rippling, tmp_path):
+    _, problem, there = rippling
+
+    def stop(done, *_):
+        if done == 6 + 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        track(FrameTracker(problem), 6, tmp_path, progress=stop)
+    assert Track.load(tmp_path / CHECKPOINT).again.next_window == 3
+    again = track(FrameTracker(problem), 6, tmp_path, resume=True)
+    assert again.second == there.second and again.again is None
+    for x, y in zip(there.states, again.states, strict=True):
+        assert all(np.array_equal(x[name], y[name]) for name in x)
+
+
+def test_a_clear_video_is_tracked_once(tmp_path):
+    _, problem = of_a_cloth(tmp_path)
+    assert not track(FrameTracker(problem), 3, tmp_path).second
