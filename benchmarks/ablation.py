@@ -14,7 +14,7 @@ The simulated sequences were made after the rules had their values. FOLDER holds
     python benchmarks/simulate.py FOLDER/96 --seed 96 --plain --only flag
 
 and so on: SIMULATED below says which kinds of surface of which seed are used. Those of seeds 96 to
-103 are plain, with textures of few details.
+124 are plain, with textures of few details.
 
 Where folds come and go, the smallest change grows from frame to frame. So the tracker runs several
 times with a setting changed by some hundred-thousandths; a rule's error is compared with the median
@@ -51,6 +51,7 @@ SIMULATED = {  # name in the table: (kind of surface, seed)
     for kind, seed in (
         *(("flag", 91), ("bend", 92), ("paper", 93), ("curtain", 94), ("pushed", 95)),
         *(("flag", 96), ("bend", 97), ("pushed", 99), ("pushed", 103)),  # with --plain
+        *(("flag", 121), ("pushed", 124)),  # likewise
         *(("skirt", 1), ("pillow", 1), ("roll", 1)),
     )
 }

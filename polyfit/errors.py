@@ -119,11 +119,13 @@ def cli(main: Callable[[], int | None]) -> NoReturn:
     """Run ``main()`` as a process: its return value is the exit status.
 
     An :class:`InputError`, a missing extra (``EXTRAS``) or an ``OSError`` that names a file ends in
-    one line on stderr and exit status 2, Ctrl-C in 130. Other packages are silenced.
+    one line on stderr and exit status 2, Ctrl-C in 130, a reader of stdout that has left in 141,
+    without a word. Other packages are silenced.
     """
     silence_others()
     try:
         status = main()
+        sys.stdout.flush()
     except InputError as error:
         status = _fail(str(error))
     except ModuleNotFoundError as error:
@@ -133,6 +135,9 @@ def cli(main: Callable[[], int | None]) -> NoReturn:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         status = 130
+    except BrokenPipeError:  # whoever read the output has read enough, as head does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        status = 141
     except OSError as error:
         if error.filename is None and error.strerror is None:
             raise

@@ -142,7 +142,7 @@ class Outcome:
             f"meshes: {os.path.join(self.out, 'meshes')}",
             f"pictures: {os.path.join(self.out, 'comparison.png')}",
             f"video: {s['video']}",
-            "next: the same command with --resume, for the frames that are missing"
+            "next: the same command with --resume, for what is missing"
             if self.interrupted
             else f"next: open {self.report or s['video']}",
         ]

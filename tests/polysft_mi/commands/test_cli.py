@@ -177,3 +177,15 @@ def test_ctrl_c_when_all_is_done_prints_nothing():
         time.sleep(0.5)
         process.send_signal(signal.SIGINT)
         assert process.stderr.read() == b"" and process.wait(10) == -signal.SIGINT
+
+
+@pytest.mark.parametrize("letters", [10, 10**6], ids=["before", "after the buffer is full"])
+def test_a_reader_that_leaves_early_is_not_told_off(letters):
+    code = f"from polyfit.errors import cli\ncli(lambda: print('x' * {letters}))"
+    command = [sys.executable, "-c", code]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=ROOT
+    ) as process:
+        process.stdout.close()
+        assert process.stderr.read() == b""
+    assert process.returncode == 141
