@@ -3,6 +3,7 @@
 Import only after a Mitsuba variant is set.
 """
 
+import contextlib
 import dataclasses
 import math
 import os
@@ -108,6 +109,9 @@ def write(problem, track, out, drawing, *, fps, command, say=None, fits=None):
             np.savez_compressed(temporary, vertices=others, **mesh)
         apart = np.linalg.norm(others - vertices, axis=-1).max()
         undecided = {"from": int(indices[track.fork]), "apart_mm": 1e3 * float(apart)}
+    else:  # what a run that was interrupted here did not know yet
+        with contextlib.suppress(FileNotFoundError):
+            os.remove(os.path.join(out, OTHER))
     names = [name for name in Unknowns.NAMES if name != "pose"]  # that is in body.npz
     arrays = {name: np.stack([s[name] for s in track.states]) for name in names}
     with aside(os.path.join(out, "params.npz")) as temporary:

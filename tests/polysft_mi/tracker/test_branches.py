@@ -153,6 +153,11 @@ def test_what_stays_undecided_is_shown(undecided):
     assert not apart[: done.fork].any() and (apart[done.fork :].max(1) > 0).all()
     page = Path(write_report(out)).read_text(encoding="utf-8")
     assert f"Undecided: from frame {done.fork} on" in page and "second surface" in page
+    decided = dataclasses.replace(done, other=None)
+    with Drawing(problem, {}, out, exr_frames=0, about={}) as drawing:
+        _, plotted = outputs.write(problem, decided, out, drawing, fps=15, command="the command")
+        plotted()
+    assert Run.open(out).other is None
 
 
 def test_a_closed_surface_has_no_mirror_image(tmp_path):
