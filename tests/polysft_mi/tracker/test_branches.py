@@ -247,6 +247,18 @@ def test_a_second_pass_outlives_an_interruption(rippling, tmp_path):
         assert all(np.array_equal(x[name], y[name]) for name in x)
 
 
+def test_a_video_is_doubtful_where_caution_costs(tmp_path):
+    folder = Path(of_a_cloth(tmp_path)[1].experiment.path).parent
+    memories = [FrameMemory(misfit=m, least_misfit=0.07) for m in (0.07, 0.07, 0.14, 0.14, 0.14)]
+    totals = [{"rgb": 1.0, "uv": None, "relief": cost} for cost in (0.0, 0.05, 0.05, 0.05, 0.05)]
+    assert not FrameTracker(problem_of(folder, window=2)).doubts(totals, memories)
+    tracker = FrameTracker(problem_of(folder))
+    assert tracker.doubts(totals, memories)
+    assert not tracker.doubts([{**x, "rgb": 100.0} for x in totals], memories)
+    assert not tracker.doubts(totals, [dataclasses.replace(m, misfit=0.07) for m in memories])
+    assert not tracker.doubts(totals, [dataclasses.replace(m, least_misfit=0.01) for m in memories])
+
+
 def test_a_clear_video_is_tracked_once(tmp_path):
     _, problem = of_a_cloth(tmp_path)
     assert not track(FrameTracker(problem), 3, tmp_path).second
