@@ -95,7 +95,7 @@ SWITCHES = (
     Switch("relief's bending", {"relief_bend": 0.0}),
     Switch("relief's caution", {"noise_misfit": math.inf}),
     Switch("caution's steepness", {"noise_power": 2.0}),
-    Switch("second pass", {"second_pass": False}),
+    Switch("second pass", {"second_pass": 1.0}),
     Switch("edges give", {"give": math.inf}),
     Switch("fine texture", {"texels": 0.75}),
     Switch("texture fit", {"texture_gain": 0.0}),

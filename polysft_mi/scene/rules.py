@@ -136,11 +136,11 @@ class Rules:
     noise_power: float = _rule(
         8.0, "", "with which it grows with the noise", row="caution's steepness"
     )
-    second_pass: bool = _rule(
-        True,
-        "",
-        "whether a video is tracked twice where caution costs a share: what a misfit has above the"
-        " noise may be noise, or folds",
+    second_pass: float = _rule(
+        0.05,
+        "share",
+        "that outline, shading, colours and evidence must cost less where what a misfit has above"
+        " the noise is taken for folds, for such a second pass to be kept; 1: none is made",
         row="second pass",
     )
     give: float = _rule(

@@ -10,6 +10,8 @@ import math
 
 import numpy as np
 
+_WITNESSES = ("silhouette", "shading", "chroma", "tracks", "depth", "cameras")
+
 
 def plane_of(vertices):
     """(middle, unit normal), (3,) each, of the plane of least squares of vertices (N, 3) [m]."""
@@ -56,13 +58,19 @@ def second_pass(track):
     return again
 
 
-def settle(track, gain):
-    """Let the track be its second pass where a frame of that costs less by the share ``gain``; the
-    one that is not kept is dropped.
+def settle(track, share):
+    """Let the track be its second pass where the witnesses, terms that a relief which follows noise
+    does not lower, cost less by the ``share``; the one that is not kept is dropped. Frames that
+    either lost do not count.
     """
     again, since = track.again, _first_solved(track) + 1
     seconds = [a + b for a, b in zip(track.seconds[since:], again.seconds[since:], strict=True)]
-    is_better = ahead(track, again, since) > gain * (len(track.totals) - since)
+    both = [k for k in range(since, len(track.totals)) if k not in {*track.lost, *again.lost}]
+    own, others = (
+        sum(t.totals[k].get(name) or 0.0 for k in both for name in _WITNESSES)
+        for t in (track, again)
+    )
+    is_better = others < (1 - share) * own and len(again.lost) <= len(track.lost)
     if is_better:
         become(track, again)
     track.seconds[since:], track.again = seconds, None

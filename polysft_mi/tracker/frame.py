@@ -233,7 +233,7 @@ class FrameTracker:
         frames been bold. ``totals``: of each frame of a video, its terms; ``memories``: of each.
         """
         rules, saved, whole = self.objective.rules, 0.0, 0.0
-        if not (self._tries and rules.second_pass):
+        if not (self._tries and rules.second_pass < 1):
             return False
         for k, terms in enumerate(totals):
             before = FrameMemory.of(list(memories[:k]))

@@ -100,8 +100,8 @@ def track(
 
 
 def _second_pass(tracker, done, frames, checkpoint, progress):
-    """Track a video that was done once more, boldly, and keep that where it costs less by what
-    another pass must gain.
+    """Track a video that was done once more, boldly, and keep that where other terms than the one
+    whose misfit is doubted say so.
     """
     stages = tracker.objective.stages
     report = progress and (lambda n, *told: progress(len(done.totals) + n, *told))
@@ -117,7 +117,7 @@ def _second_pass(tracker, done, frames, checkpoint, progress):
         done.save(checkpoint, stages)
     if again.other:
         branches.decide(again)
-    branches.settle(done, tracker.objective.rules.gain)
+    branches.settle(done, tracker.objective.rules.second_pass)
     done.save(checkpoint, stages)
 
 
