@@ -10,6 +10,7 @@ import math
 
 import numpy as np
 
+# terms that fall where a relief follows folds, and not where it follows noise
 _WITNESSES = ("silhouette", "shading", "chroma", "tracks", "depth", "cameras")
 
 
@@ -59,9 +60,8 @@ def second_pass(track):
 
 
 def settle(track, share):
-    """Let the track be its second pass where the witnesses, terms that a relief which follows noise
-    does not lower, cost less by the ``share``; the one that is not kept is dropped. Frames that
-    either lost do not count.
+    """Let the track be its second pass where the witnesses cost less by the ``share``; the one that
+    is not kept is dropped. Frames that either lost do not count.
     """
     again, since = track.again, _first_solved(track) + 1
     seconds = [a + b for a, b in zip(track.seconds[since:], again.seconds[since:], strict=True)]
@@ -77,12 +77,12 @@ def settle(track, share):
     track.second = "kept" if is_better else "dropped"
 
 
-def ahead(track, other, since):
-    """How much more the track has cost than the other one from the frame ``since`` on, over what a
-    frame costs; infinite where it lost more frames, or fewer. What both lost tells nothing.
+def ahead(track):
+    """How much more the track has cost than its other branch since they parted, over what a frame
+    costs; infinite where it lost more frames, or fewer. What both lost tells nothing.
     """
-    frames = range(since, len(track.totals))
-    own, others = (np.array([_cost(t, k) for k in frames]) for t in (track, other))
+    since = range(track.fork, len(track.totals))
+    own, others = (np.array([_cost(t, k) for k in since]) for t in (track, track.other))
     more_lost = int(np.isinf(own).sum() - np.isinf(others).sum())
     if more_lost:
         return math.copysign(math.inf, more_lost)
@@ -102,7 +102,7 @@ def decide(track, apart=0.0):
     """Whether the branches are at least so many frames' costs ``apart``; then the cheaper one
     becomes the track, and the other its other branch.
     """
-    difference = ahead(track, track.other, track.fork)
+    difference = ahead(track)
     decided = abs(difference) >= apart
     if decided and difference > 0:
         swap(track)

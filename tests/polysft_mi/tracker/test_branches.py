@@ -34,10 +34,6 @@ def test_the_mirror_image_lies_behind_the_plane_as_far_as_the_sheet_before_it():
     assert np.abs(height + other).max() < 1e-9
 
 
-def ahead(done):
-    return branches.ahead(done, done.other, done.fork)
-
-
 def of_costs(*costs, lost=()):
     """A track of frames that cost so much."""
     states = [{"alpha": np.full(2, k)} for k in range(len(costs))]
@@ -55,7 +51,7 @@ def test_the_branch_that_saves_a_frames_cost_is_kept():
         for t, cost in ((done, own), (other, others)):
             t.states.append({"alpha": np.full(2, cost)})
             t.totals.append({"rgb": cost, "uv": None})
-    assert ahead(done) == pytest.approx(1.1 / 0.95)
+    assert branches.ahead(done) == pytest.approx(1.1 / 0.95)
     assert branches.decide(done, 1.0)
     assert done.totals[2]["rgb"] == 0.8 and done.other.totals[2]["rgb"] == 1.0
 
@@ -65,19 +61,19 @@ def test_a_branch_that_is_lost_loses():
     other = branches.split(done, 0)
     other.lost.clear()
     other.totals = [{"rgb": 5.0}] * 2
-    assert ahead(done) == math.inf
+    assert branches.ahead(done) == math.inf
     assert branches.decide(done, 1.0) and not done.lost
 
 
 def test_a_frame_that_both_lose_tells_nothing():
     done = of_costs(1.0, 1.0, 1.0, lost=[1])
     other = branches.split(done, 0)
-    assert ahead(done) == 0
+    assert branches.ahead(done) == 0
     other.totals[2] = {"rgb": 0.9}
-    assert ahead(done) == pytest.approx(0.1 / 0.95)
+    assert branches.ahead(done) == pytest.approx(0.1 / 0.95)
     done = of_costs(1.0, lost=[0])
     branches.split(done, 0)
-    assert ahead(done) == 0 and not branches.decide(done, 1.0)
+    assert branches.ahead(done) == 0 and not branches.decide(done, 1.0)
 
 
 def of_a_cloth(folder):
@@ -129,7 +125,7 @@ def undecided(tmp_path_factory):
 def test_both_branches_outlive_an_interruption(undecided, tmp_path):
     problem, there, _ = undecided
     assert there.other is not None and 0 < there.fork < 4
-    assert np.isfinite(ahead(there)) and ahead(there) <= 0  # the cheaper is shown
+    assert np.isfinite(branches.ahead(there)) and branches.ahead(there) <= 0  # the cheaper is shown
     track(FrameTracker(problem), there.fork + 1, tmp_path)
     again = track(FrameTracker(problem), 5, tmp_path, resume=True)
     for a, b in ((there, again), (there.other, again.other)):
