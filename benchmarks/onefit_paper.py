@@ -6,7 +6,8 @@
     python benchmarks/onefit_paper.py RUNS -o docs                     # the tables of what is there
 
 A training that was cut short goes on from its checkpoint. ``--short N`` has twelve epochs of N
-steps, of 2,000 patches each. Those of ``docs`` are by 60, and by 600 for ``dress-longer``.
+steps, of 2,000 patches each. Those of ``docs`` are by 60; by 240 for ``tank-longer`` and the other
+tanks of that name; and by 600 for ``dress-longer``.
 ``package`` is the network ``paper`` of the package, ``--train six --short 600``; it needs no RUNS.
 Everything is measured on motions and bodies that no network was trained on (as by
 ``onefit_accuracy.py``), and is what the network alone makes: without ease and post-processing.
@@ -40,7 +41,6 @@ from polyfit.files import aside
 TRAININGS = {
     "six": [],
     "dress": ["dress"],
-    "dress-longer": ["dress"],
     "tank": ["tank"],
     "tank-no-mesh-inext": ["tank", "--k-mi", "0"],
     "tank-no-inext": ["tank", "--k-i", "0"],
@@ -51,6 +51,9 @@ TRAININGS = {
     "jumpsuit": ["jumpsuit"],
     "jumpsuit-tuned": ["jumpsuit", "--from", "RUNS/six/weights.safetensors", "--epochs", "12"],
 }
+LONGER = "-longer"  # the same training of more steps
+for _name in ("dress", "tank", "tank-no-mesh-inext", "tank-no-inext", "tank-no-col"):
+    TRAININGS[_name + LONGER] = TRAININGS[_name]
 PACKAGE = "package"  # the package's network by the preset
 SHORT = ["--epochs", "12", "--batch", "2000"]
 LOSSES = {
@@ -135,7 +138,7 @@ class Bench:
         """Trained on a dress, and on six garments."""
         return {
             name: {garment: self.figures(name, garment)["collision"] for garment in STANDARD}
-            for name in ("dress", "dress-longer", "six", PACKAGE)
+            for name in ("dress", "dress" + LONGER, "six", PACKAGE)
             if self.has(name)
         }
 
@@ -143,19 +146,24 @@ class Bench:
         names = filter(self.has, ("six", PACKAGE, "jumpsuit-tuned", "jumpsuit"))
         return {name: self.figures(name, "jumpsuit")["collision"] for name in names}
 
-    def losses(self):
-        return {row: self.figures(name, "tank") for row, name in LOSSES.items() if self.has(name)}
+    def losses(self, ending=""):
+        of = {row: name + ending for row, name in LOSSES.items()}
+        return {row: self.figures(name, "tank") for row, name in of.items() if self.has(name)}
+
+    def losses_longer(self):
+        return self.losses(LONGER)
 
     def styles(self):
         """The tank top's network on tank tops of other cuts."""
-        if not self.has("tank"):
+        tank = "tank" + LONGER
+        if not self.has(tank):
             return {}
         body = standard_body()
         block, found = Block(body.vertices.numpy(), body.faces.numpy()), {}
         for style, measures in STYLES.items():
             V, F = sewn(block, "tank", **measures)[:2]
             garment = Garment.bound(f"tank, {style}", *pushed_out(V, F)[:1], F)
-            found[style] = self.figures("tank", garment)
+            found[style] = self.figures(tank, garment)
         return found
 
     def poses(self):
@@ -216,7 +224,16 @@ def show(drapes, path):
     cv2.imwrite(str(path), np.hstack(row)[..., ::-1], quality)
 
 
-TABLES = ("trained", "collisions", "jumpsuit", "losses", "styles", "poses", "resolutions")
+TABLES = (
+    "trained",
+    "collisions",
+    "jumpsuit",
+    "losses",
+    "losses_longer",
+    "styles",
+    "poses",
+    "resolutions",
+)
 
 
 def main(argv=None):

@@ -231,13 +231,17 @@ def jumpsuit(data):
 
 
 def losses(data):
-    found = data["onefit_paper"].get("losses", {})
-    rows = []
-    for name in dict.fromkeys([*LOSSES, *found]):
-        paper = " / ".join(f"{v:.2f}" for v in LOSSES[name]) if name in LOSSES else ""
-        own = [found[name][k] for k in ("edge", "area", "collision")] if name in found else []
-        rows.append((name, paper, " / ".join(f"{v:.2f}" for v in own) or "not measured yet"))
-    return table(("ε_e / ε_a / ε_c %", "paper", "ours"), rows)
+    ours = [data["onefit_paper"].get(name, {}) for name in ("losses", "losses_longer")]
+    shown = lambda x: " / ".join(f"{v:.2f}" for v in x)
+    rows = [
+        (name, shown(LOSSES.get(name, ())))
+        + tuple(
+            shown(x[name][k] for k in ("edge", "area", "collision")) if name in x else "–"
+            for x in ours
+        )
+        for name in dict.fromkeys([*LOSSES, *ours[0]])
+    ]
+    return table(("ε_e / ε_a / ε_c %", "paper", "ours, 720 steps", "2,880 steps"), rows)
 
 
 def styles(data):
