@@ -119,10 +119,8 @@ def _drape(carrier, vertices, faces, worn):
     area, stiffness = cotangent_laplacian(vertices, faces)
     smooth = smoother(area, stiffness, _SMOOTHING)
     carrier.draped = np.stack([smooth(smooth(x - vertices)) for x in at_rest])
-    # a surface follows about half of its folds
     carried = np.stack([carrier.maps(carrier.at(k))(vertices) for k in range(len(worn))])
     a, b = edges_of(faces)[0].T
-    each = [np.linalg.norm(x[:, a] - x[:, b], axis=2) for x in (worn, carried)]
-    carrier.lengths = (each[0] + each[1]) / 2
-    between = (each[0] - each[1]) / 2 / carrier.lengths  # none of its folds, and all of them
-    carrier.length_errors = np.abs(between.mean(1)) / np.sqrt(3)
+    carrier.lengths, smooth = (np.linalg.norm(x[:, a] - x[:, b], axis=2) for x in (worn, carried))
+    in_folds = 1 - smooth / carrier.lengths  # a surface follows none of them, or all
+    carrier.length_errors = np.abs(in_folds.mean(1)) / np.sqrt(12)

@@ -58,12 +58,14 @@ class NormalEquations:
 class EdgeRows:
     """Residuals of the edges: squared differences to ``lengths`` (E,) [m], times ``stiffness``
     [1/m^2]. From the strain ``give`` on, a stretched edge hardly pulls harder: an excess e > 0 over
-    the length L costs 2 c^2 ((1 + e^2 / c^2)^1/2 - 1), c = give L (Charbonnier).
+    the length L costs 2 c^2 ((1 + e^2 / c^2)^1/2 - 1), c = give L (Charbonnier). What is missing of
+    a compressed one does so from the strain ``shrink`` on.
     """
 
     lengths: np.ndarray
     stiffness: float = 0.0
     give: float = math.inf
+    shrink: float = math.inf
 
 
 @dataclass
@@ -169,12 +171,12 @@ class RestForms:
 def _edges(tables, vertices, lengths, numbers):
     """What lengths cost: energy of each edge without its weight, and packed, a row an edge: the
     pull on its first end (3), and the curvature, 6 of a symmetric 3 x 3, of either end."""
-    stiffness, give = (dr.gather(mi.Float64, numbers, k) for k in range(2))
+    stiffness, give, shrink = (dr.gather(mi.Float64, numbers, k) for k in range(3))
     a, b = (dr.gather(mi.Vector3d, vertices, k) for k in (tables.a, tables.b))
     edge = a - b
     length = dr.maximum(dr.norm(edge), 1e-9)
     direction, excess = edge / length, length - lengths
-    over = dr.square(dr.maximum(excess, 0) / (give * lengths))
+    over = dr.square(excess / (dr.select(excess > 0, give, shrink) * lengths))
     heavy = 2 * stiffness / dr.sqrt(1 + over)
     x, y, z = direction
     columns = [heavy * excess * d for d in direction] + [
@@ -225,8 +227,8 @@ def _vertex_sums_in_unknowns(
     """Normal equations of the images, the edges and the triangles, in the unknowns of an atlas.
 
     ``halo``: :class:`Halo`; ``images``: pairs of :class:`polysft_mi.images.gather.Images` and their
-    camera; ``vertices`` Float64 of 3N [m]; ``lengths`` Float64 of E [m],
-    ``numbers`` Float64: stiffness [1/m^2], give; ``offset_jacobian`` Float64 of 9N, ``up`` of 3K,
+    camera; ``vertices`` Float64 of 3N [m]; ``lengths`` Float64 of E [m], ``numbers`` Float64:
+    stiffness [1/m^2], give, shrink; ``offset_jacobian`` Float64 of 9N, ``up`` of 3K,
     ``motion_jacobian`` of 18 and ``basis`` of A an entry: of
     :class:`polysft_mi.surface.atlas.Surface`; ``index``: 0, 1, ... of A H, and ``size``: A,
     UInt32; ``triangles``: Float64 of 9F and 81F, of :class:`TriangleForms`, or None; ``carried``:
@@ -395,7 +397,7 @@ class Assembly:
         pattern, count, basis = self.pattern, self.pattern.count, surface.basis
         size, patches = basis.shape[1], len(surface.up)
         forms = triangles and (flat(triangles.gradient), flat(triangles.curvature))
-        of_edges = flat(edges.lengths), flat([edges.stiffness, edges.give])
+        of_edges = flat(edges.lengths), flat([edges.stiffness, edges.give, edges.shrink])
         pull, weight = np.zeros((count, 3)), np.zeros(count)
         if at_rest is not None:
             pull, weight = at_rest.gradient, at_rest.weight

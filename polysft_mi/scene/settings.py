@@ -111,8 +111,7 @@ class Settings:
     k_silhouette: float = _setting(
         AUTO,
         "weight of the silhouette loss (needs masks); -1: 0.1, for masks are ragged, or 1 where the"
-        " template has several patches, or is on a body: an outline shows a bend that no texture"
-        " shows",
+        " template has several patches: an outline shows a bend that no texture shows",
         low=0,
         auto=True,
     )
@@ -144,8 +143,7 @@ class Settings:
     k_mi: float = _setting(
         AUTO,
         "weight of mesh inextensibility; -1: 100, or 30 where the template has several patches: a"
-        " sheet bends and keeps its lengths, a closed surface cannot; or 10 on a body, whose drape"
-        " knows lengths to a percent or two",
+        " sheet bends and keeps its lengths, a closed surface cannot",
         low=0,
         auto=True,
     )
@@ -166,8 +164,8 @@ class Settings:
         AUTO,
         "weight of the slopes of the relief, the vertices' heights over the jet; its bending has a"
         " few thousandths of this weight (templates of at most 3,000 vertices); 0: no relief; -1:"
-        " 0.001, or 0.0001 where the template has several patches and is on no body, whose jets"
-        " leave it more of a bend",
+        " 0.001, or 0.0001 where the template has several patches, whose jets leave it more of a"
+        " bend",
         low=0,
         auto=True,
     )
@@ -208,7 +206,8 @@ class Settings:
     )
     mi_norm: str = _setting(
         "charbonnier",
-        "norm of an edge's stretch: charbonnier lets cloth give where it hangs from a point",
+        "norm of an edge's stretch: charbonnier lets cloth give where it hangs from a point, and on"
+        " a body where it folds",
         choices=("charbonnier", "l2"),
     )
     tc_basis: str = _setting(
@@ -309,14 +308,11 @@ class Settings:
 
     def for_patches(self, patches: int) -> Settings:
         """The same, with what is left to the template's number of patches decided."""
-        kind = 2 if self.body else int(patches > 1)
-        values = {
-            "k_silhouette": (0.1, 1.0, 1.0),
-            "k_mi": (100.0, 30.0, 10.0),
-            "k_relief": (1e-3, 1e-4, 1e-3),
-        }
+        values = {"k_silhouette": (0.1, 1.0), "k_mi": (100.0, 30.0), "k_relief": (1e-3, 1e-4)}
         decided: dict[str, Any] = {
-            name: value[kind] for name, value in values.items() if getattr(self, name) == AUTO
+            name: value[patches > 1]
+            for name, value in values.items()
+            if getattr(self, name) == AUTO
         }
         return dataclasses.replace(self, **decided)
 

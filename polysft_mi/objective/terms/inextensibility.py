@@ -20,15 +20,19 @@ class Inextensibility(Term):
     With ``mi_norm`` = charbonnier, an edge that is stretched by more than the strain ``give``
     hardly pulls harder (:class:`polysft_mi.objective.quadratic.EdgeRows`): cloth that hangs from a
     point is stretched there by a tenth, and by squares that would turn the whole sheet. What is
-    compressed buckles; its costs are squares.
+    compressed buckles; its costs are squares. On a body the same strain is where a compressed edge
+    stops to pull harder, too: depth hangs on the lengths there, and a norm of one side makes all of
+    them too long.
     """
 
     name, setting = "inextensibility", "k_mi"
 
     def __init__(self, inputs):
         super().__init__(inputs)
-        self._rules, template = inputs.rules, inputs.template
-        self._gives = inputs.settings.mi_norm == "charbonnier"
+        template = inputs.template
+        gives = inputs.settings.mi_norm == "charbonnier"
+        self._give = inputs.rules.give if gives else math.inf
+        self._shrink = self._give if inputs.settings.body else math.inf
         self._unit = template.scale**2
         edges = template.edges
         # of the surface as the device has it: what it rounds is no strain
@@ -48,24 +52,22 @@ class Inextensibility(Term):
         known = carrier is not None and carrier.lengths is not None
         return carrier.lengths[frame] if known else self.lengths
 
-    def _give(self, stage):
-        """The strain from which on stretched edges pull no harder."""
-        return self._rules.give if self._gives and stage.gives else math.inf
+    def _strains(self, stage):
+        """(give, shrink), as :class:`polysft_mi.objective.quadratic.EdgeRows` has them."""
+        return (self._give, self._shrink) if stage.gives else (math.inf, math.inf)
 
     def energy(self, at):
         rest = mi.Float64(self.lengths_in(at.context.frame))
         excess = edge_lengths(at.vertices, self._edges) - rest
-        give = self._give(at.stage)
-        squared = dr.square(excess)
-        if math.isfinite(give):
-            over = dr.square(dr.maximum(excess, 0) / (give * rest))
-            squared *= 2 / (1 + dr.sqrt(1 + over))
+        give, shrink = self._strains(at.stage)
+        over = dr.square(excess / (dr.select(excess > 0, give, shrink) * rest))
+        squared = dr.square(excess) * 2 / (1 + dr.sqrt(1 + over))
         return mi.Float(self.weight * at.stage.stiffness / self._unit * dr.sum(squared))
 
     def rows(self, at):
         stiffness = self.weight * at.stage.stiffness / self._unit
         lengths = self.lengths_in(at.context.frame)
-        at.edges = EdgeRows(lengths, stiffness, self._give(at.stage))
+        at.edges = EdgeRows(lengths, stiffness, *self._strains(at.stage))
 
     def add(self, at):
         return at.edge_energy

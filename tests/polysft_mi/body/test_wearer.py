@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from standing import smpl_contents
 
+from polyfit.mesh import edges_of
 from polysft_mi.body import BodyMotion, put_on, read_motion
 from polysft_mi.errors import InputError
 
@@ -45,11 +46,15 @@ def as_smpl(motion, model):
     return theirs, trans
 
 
-def put(garment, path, *model, **arrays):
+def carrier_of(garment, path, *model, **arrays):
     np.savez(path, **arrays)
     motion = read_motion(path, FRAMES, list(range(FRAMES)), *model)
-    vertices, faces = garment.vertices.double().numpy(), garment.faces.numpy()
-    carrier = put_on(vertices, faces, motion)
+    return put_on(garment.vertices.double().numpy(), garment.faces.numpy(), motion)
+
+
+def put(garment, path, *model, **arrays):
+    carrier = carrier_of(garment, path, *model, **arrays)
+    vertices = garment.vertices.double().numpy()
     return np.stack([carrier.maps(carrier.at(k))(vertices) for k in range(FRAMES)])
 
 
@@ -61,6 +66,18 @@ def test_a_motion_in_smpl_s_form_is_the_same_motion(garment, motion, smpl, tmp_p
     away = np.linalg.norm(C.apply(theirs.reshape(-1, 3)).reshape(theirs.shape) - ours, axis=2)
     # up to what skinning there and back makes of the body, and the cloth of that
     assert np.median(away) < 4e-3 and away.max() < 0.03
+
+
+def test_lengths_are_those_of_cloth_whatever_skinning_does(garment, motion, tmp_path):
+    """Its weight stretches it by little; what carries it smooths its folds away."""
+    poses, translation = motion
+    carrier = carrier_of(garment, tmp_path / "motion.npz", poses=poses, translation=translation)
+    vertices, (a, b) = garment.vertices.double().numpy(), edges_of(garment.faces.numpy())[0].T
+    strain = carrier.lengths / np.linalg.norm(vertices[a] - vertices[b], axis=1) - 1
+    assert carrier.lengths.shape == (FRAMES, len(a))
+    assert np.abs(np.median(strain, axis=1)).max() < 0.001
+    assert np.abs(strain).mean() < 0.005
+    assert (carrier.length_errors >= 0).all() and carrier.length_errors.max() < 0.05
 
 
 def test_on_the_moving_mesh_alone_it_lies_alike(garment, motion, tmp_path):

@@ -180,3 +180,32 @@ def test_all_terms_are_those_of_their_dense_jacobians(make):
         assert found == pytest.approx(energy, rel=1e-9), case
         assert np.abs(matrix - expected).max() < 1e-6 * np.abs(expected).max(), case
         assert np.abs(gradient - by.T @ slope.ravel()).max() < 1e-6 * np.abs(gradient).max(), case
+
+
+def test_from_a_strain_on_edges_hardly_pull_harder():
+    """Of stretched and of compressed ones, by the formula; the slope by finite differences."""
+    template, rng = grid_template(), np.random.default_rng(0)
+    chart, faces, count = Atlas(template), template.faces, len(template.vertices)
+    camera, pattern = pinhole(rng, template.vertices), Pattern(faces, template.edges, count)
+    gather, state = Gather(pattern, camera), some_state(chart, rng)
+    assembly = Assembly(pattern, gather, chart)
+    images = Sums(template, camera, rng, None, False).images(gather, chart.surface(state).vertices)
+    a, b = chart.surface(state).vertices[template.edges.T]
+    lengths = np.linalg.norm(a - b, axis=1) / rng.uniform(0.9, 1.1, len(a))
+
+    def at(state, stiffness=3.0):
+        edges = EdgeRows(lengths, stiffness, 0.01, 0.03)
+        seen = [(images, gather.camera)]
+        return assembly.normal(chart.surface(state), seen, edges, None, pattern, 2)
+
+    (normal, found), (without, _) = at(state), at(state, 0.0)
+    excess = np.linalg.norm(a - b, axis=1) - lengths
+    c = np.where(excess > 0, 0.01, 0.03) * lengths
+    each = 2 * c**2 * (np.sqrt(1 + (excess / c) ** 2) - 1)
+    assert (excess > 3 * c).any() and (excess < -2 * c).any()
+    assert found == pytest.approx(3.0 * each.sum(), rel=1e-9)
+    step = rng.normal(size=len(normal.gradient)), rng.normal(size=normal.local_gradient.shape)
+    ends = [at(state.after_step(step, h))[1] for h in (1e-6, -1e-6)]
+    along = (normal.gradient - without.gradient) @ step[0]
+    along += ((normal.local_gradient - without.local_gradient) * step[1]).sum()
+    assert along == pytest.approx((ends[0] - ends[1]) / 2e-6, rel=1e-5)

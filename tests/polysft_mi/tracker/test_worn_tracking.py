@@ -38,7 +38,7 @@ def worn(truth):
     carrier.lengths = np.linalg.norm(carried[:, a] - carried[:, b], axis=2)  # as of a drape
     carrier.length_errors = np.full(FRAMES, 0.01)
     problem = Problem(problem.experiment, problem.sequence, problem.rules)
-    problem.settings = dataclasses.replace(problem.settings, body="known", k_mi=10.0)
+    problem.settings = dataclasses.replace(problem.settings, body="known")
     return problem
 
 
