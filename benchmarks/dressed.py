@@ -2,6 +2,7 @@
 
     python benchmarks/dressed.py --data FOLDER [--evidence FOLDER] [--only sleeves_up ...]
     [--kinds body mesh tracks depth ...] [--docs docs]
+    python benchmarks/dressed.py --data OUT --only dress_twist_12 --docs OUT     # simulate_dressed.py's
 
 FOLDER holds a folder for each sequence, with ``body.npz``, and ``world_to_camera`` in its
 ``camera.json``; that of ``--evidence`` holds, for each, a folder with ``tracks.npz`` and ``depth``,
@@ -166,6 +167,9 @@ def main(argv=None):
     parser.add_argument("--evidence", metavar="FOLDER")
     parser.add_argument("--last", type=int, default=-1, help="last frame (default: all)")
     args = parser.parse_args(argv)
+    for sequence in args.only:
+        if not os.path.isdir(folder := os.path.join(args.data, sequence)):
+            raise InputError(f"{folder}: no such folder; --only takes names of folders in --data")
 
     def result(sequence, kind):
         if KINDS.get(kind) and not args.evidence:

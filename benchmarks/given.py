@@ -20,7 +20,7 @@ def parser(doc, program, sequences, kinds):
         description=doc,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    p.add_argument("--only", nargs="+", choices=sequences, default=list(sequences))
+    p.add_argument("--only", nargs="+", metavar="SEQUENCE", default=list(sequences))
     p.add_argument("--kinds", nargs="*", choices=list(kinds), default=list(kinds))
     p.add_argument("--docs", metavar="FOLDER", default=os.path.join(ROOT, "docs"))
     p.add_argument("--again", action="store_true", help="run what has a result, too")
