@@ -2,7 +2,7 @@
 
     python benchmarks/dressed.py --data FOLDER [--evidence FOLDER] [--only sleeves_up ...]
     [--kinds body mesh tracks depth ...] [--docs docs]
-    python benchmarks/dressed.py --data OUT --only dress_twist_12 --docs OUT     # simulate_dressed.py's
+    python benchmarks/dressed.py --data OUT --only tshirt_dance_3 --docs OUT
 
 FOLDER holds a folder for each sequence, with ``body.npz``, and ``world_to_camera`` in its
 ``camera.json``; that of ``--evidence`` holds, for each, a folder with ``tracks.npz`` and ``depth``,

@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scripts import load
 
+from polysft_mi.errors import InputError
 from polysft_mi.surface.meshio import write_obj
 
 onefit = pytest.importorskip("onefit")
@@ -76,3 +77,14 @@ def test_masks_show_the_cloth_and_the_body_hides_it(garment, tmp_path, monkeypat
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         "frames", "masks", "template.obj", "texture.png"
     ]  # fmt: skip
+
+
+def test_a_limb_that_went_through_the_cloth_is_told(garment):
+    body = onefit.AnnyBody().body()
+    skin, faces = body.vertices.double().numpy()[None], body.faces.numpy()
+    rest = garment[0][None]
+    dressed.check_outside(rest, skin, faces)
+    with pytest.raises(InputError, match="in frame 1 the body has gone through the cloth"):
+        dressed.check_outside(
+            np.concatenate([rest, rest + (0, 0.05, 0)]), np.repeat(skin, 2, 0), faces
+        )
