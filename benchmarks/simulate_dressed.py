@@ -21,9 +21,8 @@ import cloth_simulation
 import cv2
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
-from simulate_pictures import texture
+from simulate_pictures import placer, texture
 
 from polyfit.backend import set_variant
 from polyfit.errors import InputError, cli
@@ -140,7 +139,7 @@ def film(folder, rest, cloth, body, body_faces, world_to_camera, rng):
             "bsdf": {"type": "twosided", "bsdf": diffuse(bitmap("texture.png"))},
         },
     })  # fmt: skip
-    places = [_placer(scene, "cloth", rest), _placer(scene, "body", body[0])]
+    places = [placer(scene, rest), placer(scene, body[0], "body")]
     y, x = np.mgrid[:height, :width] + 0.5
     pixels = np.stack([x - width / 2, y - height / 2, np.full(x.shape, FOCAL)], -1)
     pixels = pixels.reshape(-1, 3) @ world_to_camera[:3, :3]
@@ -162,24 +161,6 @@ def film(folder, rest, cloth, body, body_faces, world_to_camera, rng):
     for name in ("body.obj", "wall.png"):
         os.remove(at(name))
     return np.array(seen)
-
-
-def _placer(scene, name, rest):
-    """A function that puts vertices (N, 3) [m] into the scene's mesh ``name``, which was loaded
-    with those of ``rest``.
-    """
-    import mitsuba as mi
-
-    parameters = mi.traverse(scene)
-    key = f"{name}.vertex_positions"
-    start = np.array(parameters[key]).reshape(-1, 3)
-    corner = cKDTree(rest).query(start)[1]  # Mitsuba orders an OBJ's vertices itself
-
-    def place(x):
-        parameters[key] = x[corner].astype(np.float32).ravel()
-        parameters.update()
-
-    return place
 
 
 def _met(scene, eye, ways):

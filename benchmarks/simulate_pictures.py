@@ -5,6 +5,7 @@ import os
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 from polysft_mi.surface.meshio import write_obj
 
@@ -98,7 +99,7 @@ def render(folder, vertices, shape, rng, plain=False):
     film(folder, folder, vertices, np.eye(4), rng)
     cloth = {"type": "obj", "filename": at("template.obj")}
     scene = mi.load_dict({"type": "scene", "cloth": cloth})
-    place = _placer(scene, vertices[0])
+    place = placer(scene, vertices[0])
     return np.array([visible(place(x), x) for x in vertices])
 
 
@@ -175,7 +176,7 @@ def film(folder, out, vertices, world_to_camera, rng):
         },
     })  # fmt: skip
     depth = mi.load_dict({"type": "aov", "aovs": "z:depth"})
-    place, gain = _placer(scene, vertices[0]), None
+    place, gain = placer(scene, vertices[0]), None
     for t, x in enumerate(vertices):
         place(x)
         nearest = (x @ forward + world_to_camera[2, 3]).min()
@@ -193,19 +194,18 @@ def film(folder, out, vertices, world_to_camera, rng):
         cv2.imwrite(os.path.join(out, "masks", f"{t:03d}.png"), 255 * mask.astype(np.uint8))
 
 
-def _placer(scene, rest):
-    """A function that puts vertices (N, 3) [m] into a scene whose cloth is loaded with those of
-    ``rest``, and returns the scene.
+def placer(scene, rest, name="cloth"):
+    """A function that puts vertices (N, 3) [m] into a scene whose mesh ``name`` is loaded with
+    those of ``rest``, and returns the scene.
     """
     import mitsuba as mi
 
     parameters = mi.traverse(scene)
     key = next(
-        k for k in parameters.keys() if k.startswith("cloth") and k.endswith("vertex_positions")
+        k for k in parameters.keys() if k.startswith(name) and k.endswith("vertex_positions")
     )
     start = np.array(parameters[key]).reshape(-1, 3)
-    # Mitsuba orders an OBJ's vertices itself
-    corner = np.linalg.norm(start[:, None] - rest, axis=-1).argmin(1)
+    corner = cKDTree(rest).query(start)[1]  # Mitsuba orders an OBJ's vertices itself
 
     def place(x):
         parameters[key] = x[corner].astype(np.float32).ravel()
