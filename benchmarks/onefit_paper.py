@@ -52,8 +52,10 @@ TRAININGS = {
     "jumpsuit-tuned": ["jumpsuit", "--from", "RUNS/six/weights.safetensors", "--epochs", "12"],
 }
 LONGER = "-longer"  # the same training of more steps
-for _name in ("dress", "tank", "tank-no-mesh-inext", "tank-no-inext", "tank-no-col"):
-    TRAININGS[_name + LONGER] = TRAININGS[_name]
+TRAININGS |= {
+    name + LONGER: TRAININGS[name]
+    for name in ("dress", "tank", "tank-no-mesh-inext", "tank-no-inext", "tank-no-col")
+}
 PACKAGE = "package"  # the package's network by the preset
 SHORT = ["--epochs", "12", "--batch", "2000"]
 LOSSES = {

@@ -3,7 +3,7 @@ OneFit, filmed by Mitsuba's path tracer in a room.
 
     pip install newton
     python benchmarks/simulate_dressed.py OUT --garment tshirt --motion dance --seed 3
-    python benchmarks/dressed.py --data OUT --only tshirt_dance_3 --kinds body
+    python benchmarks/dressed.py --data OUT --only tshirt_dance_3 --kinds body --docs OUT
 
 OUT receives the folder GARMENT_MOTION_SEED, in some four minutes on one core, as
 ``polysft prepare --body`` takes it: ``template.obj`` on the body's rest (z up, facing -y),
@@ -32,15 +32,15 @@ from polysft_mi.surface.meshio import write_obj
 FRAMES, FPS = 45, 30.0
 SIZE, FOCAL, AWAY = (360, 480), 600.0, 1.9  # of the images [pixels]; of the camera [m]
 SAMPLES, NOISE = 48, 1.5  # paths a pixel; standard deviation of the noise [levels of 255]
-SKIN = (0.55, 0.38, 0.3)
+SKIN = (0.55, 0.38, 0.3)  # reflectance, linear RGB
 NEAR = 4e-3  # [m]: what a ray meets within so far of a vertex is the vertex
-DEEPEST = 0.01  # [m]
-JOINT_ERROR, ROOT_ERROR = np.radians(2.5), 0.015  # root mean squares
+DEEPEST = 0.01  # [m] that cloth may lie in the body
+JOINT_ERROR, ROOT_ERROR = np.radians(2.5), 0.015  # root mean squares [rad], [m]
 
 
 def split_in_two(vertices, faces):
-    """Texture coordinates of a garment, front and back beside each other, and the aspect of its
-    texture.
+    """:class:`polyfit.mesh.TexCoords` of a garment's vertices (N, 3) [m], which faces -y, and faces
+    (F, 3), front and back beside each other; and width over height of its texture.
     """
     a, b, c = vertices[faces].transpose(1, 0, 2)
     normal = np.cross(b - a, c - a)
@@ -57,7 +57,7 @@ def split_in_two(vertices, faces):
 
 
 def as_estimated(poses, translation, rng):
-    """Poses (T, J, 3) [rad] and places (T, 3) [m] with errors that change slowly."""
+    """Poses (T, J, 3) [rad] and the root's places (T, 3) [m], with errors that change slowly."""
     time = np.arange(len(poses)) / FPS
 
     def slow(size, rms):
@@ -89,8 +89,9 @@ def check_outside(cloth, body, body_faces):
 
 def film(folder, rest, cloth, body, body_faces, world_to_camera, rng):
     """Write frames and masks of the template in ``folder``, whose vertices ``rest`` (N, 3) are at
-    ``cloth`` (T, N, 3), on ``body`` (T, V, 3) [m, world]. Returns which vertices the camera sees,
-    (T, N) bool.
+    ``cloth`` (T, N, 3), on ``body`` (T, V, 3) [m, world], from a camera at ``world_to_camera`` (4,
+    4) that looks along y; ``rng`` draws wall, light and noise. Returns which vertices it sees, (T,
+    N) bool.
     """
     import mitsuba as mi
 
@@ -164,7 +165,7 @@ def film(folder, rest, cloth, body, body_faces, world_to_camera, rng):
 
 
 def _met(scene, eye, ways):
-    """What the rays from ``eye`` along ``ways`` (R, 3) meet first."""
+    """What the rays from ``eye`` (3,) [m, world] along ``ways`` (R, 3) meet first."""
     import mitsuba as mi
 
     ways = ways / np.linalg.norm(ways, axis=1, keepdims=True)

@@ -58,8 +58,8 @@ class NormalEquations:
 class EdgeRows:
     """Residuals of the edges: squared differences to ``lengths`` (E,) [m], times ``stiffness``
     [1/m^2]. From the strain ``give`` on, a stretched edge hardly pulls harder: an excess e > 0 over
-    the length L costs 2 c^2 ((1 + e^2 / c^2)^1/2 - 1), c = give L (Charbonnier). What is missing of
-    a compressed one does so from the strain ``shrink`` on.
+    the length L costs 2 c^2 ((1 + e^2 / c^2)^1/2 - 1), c = give L (Charbonnier). A compressed
+    edge costs the same, with ``shrink`` for ``give``.
     """
 
     lengths: np.ndarray

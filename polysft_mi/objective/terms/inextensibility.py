@@ -20,9 +20,8 @@ class Inextensibility(Term):
     With ``mi_norm`` = charbonnier, an edge that is stretched by more than the strain ``give``
     hardly pulls harder (:class:`polysft_mi.objective.quadratic.EdgeRows`): cloth that hangs from a
     point is stretched there by a tenth, and by squares that would turn the whole sheet. What is
-    compressed buckles; its costs are squares. On a body the same strain is where a compressed edge
-    stops to pull harder, too: depth hangs on the lengths there, and a norm of one side makes all of
-    them too long.
+    compressed buckles; its costs are squares. On a body a compressed edge yields from ``give`` on,
+    too: depth hangs on the lengths there, and a norm that yields on one side makes all too long.
     """
 
     name, setting = "inextensibility", "k_mi"
