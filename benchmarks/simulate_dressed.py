@@ -5,7 +5,7 @@ OneFit, filmed by Mitsuba's path tracer in a room.
     python benchmarks/simulate_dressed.py OUT --garment tshirt --motion dance --seed 3
     python benchmarks/dressed.py --data OUT --only tshirt_dance_3 --kinds body --docs OUT
 
-OUT receives the folder GARMENT_MOTION_SEED, in some four minutes on one core, as
+OUT receives the folder GARMENT_MOTION_SEED, in some six minutes on one core, as
 ``polysft prepare --body`` takes it: ``template.obj`` on the body's rest (z up, facing -y),
 ``texture.png``, ``camera.json`` with ``world_to_camera``, ``frames``, ``masks`` of the cloth that
 is seen, ``body.npz``; and ``gt.npz``, the true vertices (T, N, 3) [m, camera frame], with those
