@@ -22,6 +22,7 @@ from polyfit.errors import InputError, Parser, cli, require
 from polyfit.files import check_aside, folder_aside
 
 SECONDS, SEED = 6.0, 1_000_000  # of a generated motion
+_SIGN = "baked.npz"  # of a folder that this command wrote
 
 
 def _parser():
@@ -58,7 +59,7 @@ def main(argv=None):
 
     folder = Path(args.output)
     ours = partial(_is_ours, folder)
-    check_aside(folder, ours, "baked.npz", "baked drape", args.overwrite)
+    check_aside(folder, ours, _SIGN, "baked drape", args.overwrite)
     model = body_model("anny")
     shape = shape_of(model, args.shape)
     motions = command.motions_of(args.motions, args, SECONDS, SEED)
@@ -72,7 +73,7 @@ def main(argv=None):
         baked = bake(draper, garment, shape, advance=advance)
     body = model.body(shape)
     folder.parent.mkdir(parents=True, exist_ok=True)
-    with folder_aside(folder, ours) as temporary:
+    with folder_aside(folder, ours, _SIGN) as temporary:
         baked.save(Path(temporary) / "baked.npz")
         for motion in motions:
             write_glb(Path(temporary) / f"{motion.name}.glb", baked, body, motion)

@@ -135,15 +135,20 @@ def folder_for(path: str | os.PathLike[str]) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def folder_aside(path: str | os.PathLike[str], ours: Callable[[str], bool]) -> Iterator[str]:
-    """``with folder_aside(path, ours) as temporary:`` fill the folder ``temporary``; it becomes
-    ``path`` at the end of the block, or is removed on any exception.
+def folder_aside(
+    path: str | os.PathLike[str], ours: Callable[[str], bool], sign: str
+) -> Iterator[str]:
+    """``with folder_aside(path, ours, sign) as temporary:`` fill the folder ``temporary``; it
+    becomes ``path`` at the end of the block, or is removed on any exception.
 
-    What stands at ``path`` is replaced where it is a folder that :func:`others` finds nothing in,
-    and else refused by an InputError. An OSError of the write names ``path``.
+    What stands at ``path`` is replaced where it is an empty folder, or one that has a file that
+    matches the pattern ``sign``, and that :func:`others` finds nothing in; else it is refused by an
+    InputError. An OSError of the write names ``path``.
     """
     path = os.path.realpath(path)
-    if os.path.lexists(path) and (not os.path.isdir(path) or others(path, ours)):
+    signed = any(Path(path).glob(sign))  # names alone may be those of anybody's files
+    known = ours if signed else lambda name: False
+    if os.path.lexists(path) and (not os.path.isdir(path) or others(path, known)):
         raise InputError(
             f"{path}: {'holds other files' if os.path.isdir(path) else 'is a file'}; a new or empty"
             " folder is needed"

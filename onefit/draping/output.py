@@ -62,7 +62,7 @@ class Outcome:
 # What a drape writes into its folder, and each garment of several into its own
 _OURS = re.compile(
     r"figures\.json|drape\.mp4|frames/\d+\.png"
-    r"|(\d+_[^/]+/)?(drape\.npz|(garment|body)\.usd|meshes/(\d+\.(obj|ply)|surface\.mtl))"
+    r"|(\d+_[^/]+/)?(drape\.npz|(garment|body)\.usd|meshes/(\d+\.(obj|ply)|surface\.mtl|frames\.json))"
 )
 
 
@@ -74,8 +74,12 @@ def check_folder(folder, overwrite):
     """Raises InputError where a drape cannot be written to ``folder``, or something is there that
     it must not replace.
     """
-    sign = "drape.npz" if (Path(folder) / "drape.npz").exists() else "*/drape.npz"
-    check_aside(folder, _is_ours, sign, "drape", overwrite)
+    check_aside(folder, _is_ours, _sign(folder), "drape", overwrite)
+
+
+def _sign(folder):
+    """A pattern of the file that tells a drape's ``folder``, or one of several garments."""
+    return "drape.npz" if (Path(folder) / "drape.npz").exists() else "*/drape.npz"
 
 
 def _arrays(folder):
@@ -130,7 +134,7 @@ def drape_into(folder, make, verb, frames, *, names, about, **files):
     folder.parent.mkdir(parents=True, exist_ok=True)
     with (
         Progress(*columns, console=Console(stderr=True)) as progress,
-        folder_aside(folder, _is_ours) as temporary,
+        folder_aside(folder, _is_ours, _sign(folder)) as temporary,
     ):
         visible = "render" not in files.get("skip", ())
         task = progress.add_task("rendering", total=T, visible=visible)

@@ -1,5 +1,6 @@
 """A moving mesh as a folder with one OBJ or PLY file a frame."""
 
+import json
 import os
 
 import numpy as np
@@ -10,13 +11,16 @@ from polyfit.mesh import write_ply
 
 from .moving import checked, encoded
 
+_ABOUT = "frames.json"
+
 
 def write_frames(folder, kind, vertices, faces, uv=None, texture=None, *, labels=None, up="y"):
     """Write one mesh a frame into a new or empty ``folder``: ``kind`` "obj", with a material file
-    and the texture, or "ply", with uv as ``s``, ``t``, its vertices split along seams.
+    and the texture, or "ply", with uv as ``s``, ``t``, its vertices split along seams; and
+    frames.json, which says what they are.
 
     ``labels`` (T,): the frames' numbers in the file names, by default 0 to T - 1. A folder that
-    holds nothing but such files is replaced.
+    this function wrote is replaced, if nothing was added to it.
     """
     vertices, faces, uv = checked(vertices, faces, uv, 1)
     labels = [int(k) for k in (range(len(vertices)) if labels is None else labels)]
@@ -25,7 +29,7 @@ def write_frames(folder, kind, vertices, faces, uv=None, texture=None, *, labels
     if not len(labels) == len(set(labels)) == len(vertices):
         raise InputError(f"animation: {len(vertices)} labels, each another number, are needed")
     ours = lambda name: (
-        name in ("surface.mtl", "texture.png", "texture.jpg")
+        name in (_ABOUT, "surface.mtl", "texture.png", "texture.jpg")
         or (name.endswith(f".{kind}") and name[: -len(kind) - 1].isdigit())
     )
     data, image = (
@@ -37,7 +41,9 @@ def write_frames(folder, kind, vertices, faces, uv=None, texture=None, *, labels
     if kind == "ply" and uv is not None:
         source, uv, faces = uv.split(faces)
         uv = np.nan_to_num(uv)
-    with folder_aside(folder, ours) as place:
+    with folder_aside(folder, ours, _ABOUT) as place:
+        with open(os.path.join(place, _ABOUT), "w", encoding="ascii") as file:
+            json.dump({"up": up, "unit": "metre", "frames": labels}, file)
         if data:
             with open(os.path.join(place, f"texture.{image}"), "wb") as file:
                 file.write(data)

@@ -35,7 +35,7 @@ def write_comparison(comparison, out, *, count=20, scale=None):
     drawn, boxes = [_panels_of(r, set(shown)) for r in runs], [box_of(r) for r in runs]
     sides = [(side, comparison.figures[side.lower()]) for side in "AB"]
     title = "   ".join(f"{s}: {'/'.join(os.path.normpath(p).split(os.sep)[-2:])}" for s, p in sides)
-    with folder_aside(out, _is_ours) as folder:
+    with folder_aside(out, _is_ours, "compare.json") as folder:
         for k in shown:
             images = [("frame", drawn[0][k]["target"], boxes[0])]
             for side, own, box in zip("AB", drawn, boxes, strict=False):

@@ -79,6 +79,13 @@ def _place(run, kind, path):
         raise InputError(f"-o {path}: is a folder; a file is written for --format {kind}")
     if not os.path.isdir(folder):
         raise InputError(f"-o {path}: {folder}: no such folder")
+    place, own = (os.path.realpath(x) for x in (path, run.folder))
+    inside = os.path.relpath(place, own).split(os.sep)
+    if inside[0] not in (os.pardir, "export"):
+        raise InputError(
+            f"-o {path}: lies in the run's own folder; another one is needed, or no -o, for"
+            f" {run.path('export')}"
+        )
     return path
 
 

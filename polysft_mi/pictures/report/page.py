@@ -27,6 +27,8 @@ def write_report(out, path=None, *, truth=None, frames=200, positions=450_000):
     path = run.path("report.html") if path is None else path
     if os.path.isdir(path) or not os.path.isdir(os.path.dirname(os.path.abspath(path))):
         raise InputError(f"{path}: is not a file in a folder that exists")
+    if not os.fspath(path).lower().endswith((".html", ".htm")):
+        raise InputError(f"{path}: a name that ends in .html is needed")
     count, vertices = run.vertices.shape[:2]
     shown = evenly_spaced(count, min(frames, max(1, positions // vertices)))
     columns, cards, distance = figures(run, truth)

@@ -250,6 +250,8 @@ def test_refusals_leave_nothing(finished_run, tmp_path):
         write_report(out, truth=tmp_path)
     with pytest.raises(InputError, match="not a file in a folder"):
         write_report(out, tmp_path / "nowhere" / "a.html")
+    with pytest.raises(InputError, match="ends in .html"):
+        write_report(out, out / "params.npz")
     with pytest.raises(InputError, match="--frames 0"):
         report.main([str(out), "--frames", "0"])
     assert (

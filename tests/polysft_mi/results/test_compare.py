@@ -192,7 +192,7 @@ def test_refusals_leave_nothing(finished_run, moved, tmp_path):
     with pytest.raises(InputError, match="no frame in common"):
         compare.main([str(b), str(out)])
     (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "notes.txt").write_text("mine")
+    (tmp_path / "mine" / "000.png").write_text("mine")
     for arguments, words in [
         ([str(out), str(tmp_path / "mine")], "holds no ground truth"),
         ([str(truth.folder), str(out)], "not the folder of a run"),
@@ -205,5 +205,5 @@ def test_refusals_leave_nothing(finished_run, moved, tmp_path):
             compare.main(arguments)
     assert (
         sorted(p.name for p in tmp_path.iterdir()) == ["mine", "moved"]
-        and (tmp_path / "mine" / "notes.txt").exists()
+        and (tmp_path / "mine" / "000.png").exists()
     )

@@ -297,6 +297,23 @@ class TestRefusals:
             command(run, "--format", "obj", "-o", target)
         assert (target / "notes.txt").exists() and list(tmp_path.iterdir()) == [target]
 
+    def test_to_replace_meshes_of_others(self, run, tmp_path):
+        """Names with numbers are anybody's."""
+        (tmp_path / "mine").mkdir()
+        (tmp_path / "mine" / "999.ply").write_text("mine")
+        with pytest.raises(InputError, match="holds other files"):
+            command(run, "--format", "ply", "-o", tmp_path / "mine")
+        assert (tmp_path / "mine" / "999.ply").read_text() == "mine"
+
+    @pytest.mark.parametrize("kind, name", [("npz", "surface.npz"), ("ply", "meshes")])
+    def test_to_replace_the_runs_own(self, run, kind, name, tmp_path):
+        folder = tmp_path / "run"
+        shutil.copytree(run.folder, folder)
+        with pytest.raises(InputError, match="the run's own folder"):
+            export.main([str(folder), "--format", kind, "-o", str(folder / name)])
+        (folder / "export").mkdir()
+        command(Run.open(folder), "--format", kind, "-o", folder / "export" / f"a.{kind}")
+
     @pytest.mark.parametrize("extension", ["usdz", "usdc", "usda", "usd"])
     def test_to_write_where_nothing_can_be_written(self, run, tmp_path, capfd, extension):
         """USD itself ends in a page of its own errors there."""
