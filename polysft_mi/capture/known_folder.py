@@ -12,7 +12,16 @@ from polyfit.files import aside
 from polyfit.mesh import TexCoords, size_note
 from polysft_mi.body import check_model, read_motion
 from polysft_mi.errors import InputError
-from polysft_mi.scene import Sequence, checked_size, open_cameras, read_camera, read_rgb
+from polysft_mi.scene import (
+    Sequence,
+    check_depth,
+    check_seen,
+    check_tracks,
+    checked_size,
+    open_cameras,
+    read_camera,
+    read_rgb,
+)
 from polysft_mi.scene.kinect_paper import RESOLUTION
 from polysft_mi.scene.kinect_paper import template as kinect_paper_template
 from polysft_mi.surface import meshio
@@ -101,7 +110,8 @@ def prepare_folder(
     meshio.check_template(vertices, faces, uv, where)
     placed = vertices * ((-1, -1, 1) if layout.flip else 1)
     if not body:
-        _check_view(placed, camera, where)
+        tracks = f"{folder}: tracks = {evidence.get('tracks')}"
+        _check_start(placed, faces, camera, sequence, f"{where or folder}: ", tracks, depth)
 
     here = out is None or os.path.realpath(out) == os.path.realpath(folder)
     target = folder if here else out
@@ -233,6 +243,19 @@ def _write(target, text, template, picture, hint, folders):
         raise InputError(f"{target}: {error.strerror or error}{hint}") from None
 
 
+def _check_start(vertices, faces, camera, sequence, where, of_tracks, depth):
+    """Raise InputError where the first frame cannot show the template, its ``vertices`` (N, 3) [m,
+    camera frame], as a run would; ``where`` and ``of_tracks`` begin the line. Depth that another
+    camera sees is not compared.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        position = camera.project(vertices)
+    nearest = check_seen(where, position, vertices[:, 2], np.asarray(faces), sequence)
+    check_tracks(of_tracks, sequence.tracks, nearest > 0)
+    if depth and depth.is_seen_by(camera):
+        check_depth(sequence, nearest)
+
+
 def _check_body(motion, pose, camera):
     """Raise InputError where a body stands out of the view of a camera with ``pose`` (4, 4) in the
     first frame, or so far away that its motion is in another unit.
@@ -254,17 +277,3 @@ def _check_body(motion, pose, camera):
         " from it (right, down, forward); its translation, in metres, and world_to_camera in"
         " camera.json must be of one world"
     )
-
-
-def _check_view(vertices, camera, where):
-    if vertices[:, 2].min() <= 0:
-        raise InputError(
-            f"{where}: the template lies behind the camera (z down to {vertices[:, 2].min():.3g}"
-            " m); z must be positive in the camera frame"
-        )
-    x = camera.project(vertices)
-    if not ((x > 0) & (x < (camera.width, camera.height))).all(axis=1).any():
-        raise InputError(
-            f"{where}: the template is out of view: no vertex lies in the"
-            f" {camera.width}x{camera.height} image"
-        )

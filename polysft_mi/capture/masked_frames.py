@@ -5,10 +5,12 @@ import shutil
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
+import numpy as np
 from threadpoolctl import threadpool_limits
 
+from polyfit.files import silent_decoders
 from polysft_mi.errors import InputError
-from polysft_mi.scene import inverted, list_images, read_rgb
+from polysft_mi.scene import checked_size, inverted, list_images, read_mask, read_rgb
 
 from . import pictures
 from .masks import Masks, beyond, drawn_in, iou
@@ -85,10 +87,13 @@ def write_frames(folder, frames, masks, expected, straight, progress, registrati
                 f"{masks.pattern}: the first frame's mask is of all but the template; is it"
                 " inverted? White is the sheet"
             )
-        met = _how_met(iou(first, expected), beyond(first, expected))
+        overlap = iou(first, expected)
+        met = _how_met(overlap, beyond(first, expected))
+        if overlap < MaskChecks().overlap:
+            met += ": they should be of the template, and of all of it that is seen"
         result.lines.append(f"masks: those of {masks.pattern}; {met}")
     elif tracked:
-        why = _why_not_used(overlap, areas, strange, indices)
+        why = _why_not_used(overlap, areas, strange, indices, inset)
         result.masked = why is None
         result.figures = {
             "first_iou": overlap,
@@ -122,9 +127,10 @@ def _drawn_in(mask, inset, first):
 
 def _how_met(overlap, passes):
     """How the first mask meets the template, in words."""
+    how = "passes" if passes > -0.05 else "ends within"
     return (
-        f"the first and the template overlap by {100 * overlap:.0f} %, and it passes the template"
-        f" by {passes:.1f} pixels"
+        f"the first and the template overlap by {100 * overlap:.0f} %, and it {how} the template"
+        f" by {abs(passes):.1f} pixels"
     )
 
 
@@ -147,13 +153,16 @@ def _write_contact_sheets(folder, indices, masked):
         write_png(os.path.join(folder, REPORT, "masks.png"), pictures.contact_sheet(cells))
 
 
-def _why_not_used(overlap, areas, strange, indices, checks=None):
-    """Why masks that were found cannot be used, in words; None where they can."""
-    checks = checks or MaskChecks()
+def _why_not_used(overlap, areas, strange, indices, inset=0.0):
+    """Why masks that were found cannot be used, in words; None where they can. They were drawn in
+    by ``inset`` [pixels].
+    """
+    checks = MaskChecks()
     if overlap < checks.overlap:
+        cause = f"they are drawn in by --inset {inset:g}, or " if inset else ""
         return (
-            f"in the first frame mask and template overlap by only {100 * overlap:.0f} %, the sheet"
-            " does not stand out from its background"
+            f"in the first frame mask and template overlap by only {100 * overlap:.0f} %,"
+            f" {cause}the sheet does not stand out from its background"
         )
     for before, after, index in zip(areas, areas[1:], indices[1:]):
         if after == 0 or max(before / after, after / before) > checks.area_ratio:
@@ -188,13 +197,15 @@ class GivenMasks:
                 )
             paths = [paths[k] for k in indices]
         for k, path in enumerate(paths):
-            mask = read_rgb(path).max(axis=2)
+            checked_size(path)
+            with silent_decoders():
+                mask = np.round(255 * read_mask(path)).astype(np.uint8)
             if mask.shape[::-1] != size:
                 raise InputError(
                     f"{path}: {mask.shape[1]}x{mask.shape[0]} pixels; the frames have"
                     f" {size[0]}x{size[1]}"
                 )
-            mask = straight.image(255 * mask if 0 < mask.max() <= 1 else mask)
+            mask = straight.image(mask)
             if k == 0 and not (mask > 127).any():
                 raise InputError(
                     f"{path}: the mask of the first frame is empty; the sheet must be seen in it"

@@ -23,6 +23,10 @@ def list_images(pattern, what="images", endings=EXTENSIONS):
     pattern = os.fspath(pattern)
     if os.path.isdir(pattern):
         found = [os.path.join(pattern, name) for name in os.listdir(pattern)]
+    elif not pattern:
+        raise InputError(
+            f"{what}: nothing is given; a folder of images or a glob pattern is needed"
+        )
     else:
         folder, name = os.path.split(pattern)
         if os.path.isdir(
@@ -157,6 +161,24 @@ def finite(image, path):
     if image.dtype.kind == "f" and not np.isfinite(image).all():
         raise InputError(f"{path}: holds pixels that are not finite")
     return image
+
+
+def read_mask(path):
+    """A silhouette (H, W), float32 in [0, 1]: of an image whose alpha varies that, else the largest
+    of its colours. Of integers that are 0 or one other number, as in images of labels, that number
+    is 1; others are in parts of their type's maximum.
+    """
+    image = finite(read_pixels(path), path)
+    if image.ndim == 3:
+        alpha = image[..., -1] if image.shape[2] in (2, 4) else None
+        colours = image[..., : 3 if image.shape[2] >= 3 else 1].max(axis=2)
+        image = colours if alpha is None or alpha.min() == alpha.max() else alpha
+    scale = 1
+    if image.dtype.kind != "f":
+        highest = max(int(image.max()), 1)
+        labels = ((image == 0) | (image == highest)).all()
+        scale = highest if labels else np.iinfo(image.dtype).max
+    return np.clip(image.astype(np.float32) / scale, 0, 1)
 
 
 def read_rgb(path):

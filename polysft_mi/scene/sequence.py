@@ -17,7 +17,7 @@ from polysft_mi.body import Carrier
 from polysft_mi.errors import InputError
 
 from .evidence import DepthImages, Tracks
-from .images import checked_size, finite, list_images, read_pixels
+from .images import checked_size, finite, list_images, read_mask, read_pixels
 
 _LEAST_AREA = 0.01  # of the first mask's area; what is smaller is no mask
 # of the largest value: the most that a grey image's channels differ by, in 99 % of its pixels, as
@@ -167,18 +167,12 @@ class Sequence:
     def mask(self, i: int) -> np.ndarray | None:
         """Silhouette i, (H, W) float32 in [0, 1]; None without masks.
 
-        The largest of the colour channels, in parts of the type's maximum (an 8 or 16 bit mask with
-        no value above 1 is taken as it is). With ``drop_stray``, blobs away from the sheet are
-        removed (:func:`drop_stray_components`).
+        As :func:`polysft_mi.scene.images.read_mask` has it. With ``drop_stray``, blobs away from
+        the sheet are removed (:func:`drop_stray_components`).
         """
         if self.mask_files is None:
             return None
-        path = self.mask_files[i]
-        image = read_pixels(path)
-        if image.ndim == 3:
-            image = image[..., :3].max(axis=2) if image.shape[2] >= 3 else image[..., 0]
-        scale = 1 if image.dtype.kind == "f" or image.max() <= 1 else np.iinfo(image.dtype).max
-        mask = np.clip(finite(image, path).astype(np.float32) / scale, 0, 1)
+        mask = read_mask(self.mask_files[i])
         return drop_stray_components(mask) if self._drop_stray else mask
 
 

@@ -180,11 +180,11 @@ def iou(a, b):
 
 def beyond(mask, silhouette):
     """How far a mask passes a silhouette [pixels], the median along its border; negative where it
-    does not reach it, 0 where one of them is empty.
+    does not reach it, 0 where one of them is empty, or the mask is all of the image.
     """
     inside = (silhouette > 127).astype(np.uint8)
     border = inside - cv2.erode(inside, _disc(1), borderValue=1)
-    if not border.any() or not (mask > 127).any():
+    if not border.any() or not (mask > 127).any() or (mask > 127).all():
         return 0.0
     return float(np.median(_depths(mask)[border > 0])) - 0.5
 

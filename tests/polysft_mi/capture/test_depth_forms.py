@@ -105,7 +105,11 @@ def test_a_scene_is_prepared_with_it(tmp_path, capsys):
     # of the camera of the frames, it stays where it is
     alike = Intrinsics(*(x / 2 for x in (110.4, 110.4, 48.75, 35.5)), 48, 36)
     same = scannet(tmp_path / "same", alike)
-    prepare.main([str(folder), "--depth", str(same), "--overwrite"])
+    words_of_same = [str(folder), "--depth", str(same), "--overwrite"]
+    assert "must be wrong (0.00063 would fit)" in refused(prepare.main, words_of_same)
+    for path in (same / "depth").iterdir():
+        write_png(path, np.full((36, 48), 500, np.uint16))  # where the template is
+    prepare.main(words_of_same)
     text = (folder / "scene.xml").read_text()
     assert f'<default name="depth" value="{same / "depth"}"/>' in text
     assert '<default name="depth_unit" value="0.001"/>' in text

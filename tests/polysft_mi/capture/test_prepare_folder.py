@@ -113,7 +113,7 @@ def test_tracks_and_depth_are_checked_and_named(tmp_path, capsys):
 
 def test_a_picture_shows_how_all_of_it_lies_in_the_first_frame(tmp_path):
     truth = synthetic.cloth(tmp_path / "a", frames=2)
-    np.savez(tmp_path / "tracks.npz", tracks=np.full((2, 1, 2), (10.0, 60.0)))
+    np.savez(tmp_path / "tracks.npz", tracks=np.tile(((10.0, 60.0), (48.0, 36.0)), (2, 1, 1)))
     (tmp_path / "depth").mkdir()
     near = np.full((72, 96), 500, np.uint16)  # [mm]: the sheet is flat, and faces the camera
     near[:, 48:] += 30
@@ -224,6 +224,12 @@ def test_template_and_frames_are_checked(tmp_path):
     assert "behind the camera" in refused(str(truth.folder))
     synthetic.write_obj(obj, truth.vertices[0] + (5, 0, 0), truth.uv, truth.faces)
     assert "out of view" in refused(str(truth.folder))
+    obj.write_text(good)
+    masks = sorted((truth.folder / "masks").iterdir())
+    kept = cv2.imread(str(masks[0]), 0)
+    cv2.imwrite(str(masks[0]), 255 - kept)
+    assert "is it inverted? White is the sheet" in refused(str(truth.folder))
+    cv2.imwrite(str(masks[0]), kept)
     obj.write_text(
         "\n".join(
             line.replace("/", " ") if line[0] == "f" else line

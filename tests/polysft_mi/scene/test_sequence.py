@@ -6,10 +6,11 @@ import cv2
 import numpy as np
 import pytest
 import synthetic
+from PIL import Image
 
 from polysft_mi.errors import InputError
 from polysft_mi.pictures.exr import write_exr
-from polysft_mi.scene.images import image_size, list_images
+from polysft_mi.scene.images import image_size, list_images, read_mask
 from polysft_mi.scene.sequence import Sequence, drop_stray_components
 
 
@@ -113,7 +114,8 @@ def test_frames_without_colours_are_known(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "dtype, high", [(np.uint8, 255), (np.uint8, 1), (np.uint16, 65535), (np.uint16, 1)]
+    "dtype, high",
+    [(np.uint8, 255), (np.uint8, 1), (np.uint8, 38), (np.uint16, 65535), (np.uint16, 1)],
 )
 @pytest.mark.parametrize("channels", [1, 3])
 def test_mask_scale(tmp_path, video, dtype, high, channels):
@@ -125,6 +127,19 @@ def test_mask_scale(tmp_path, video, dtype, high, channels):
     s = Sequence.open(video.folder / "frames" / "000.png", masks)
     assert s.mask(0).dtype == np.float32
     np.testing.assert_array_equal(s.mask(0), mask > 0)
+
+
+@pytest.mark.parametrize("colours", [1, 3])
+def test_masks_in_alpha(tmp_path, colours):
+    """As cut-outs have them, white or in the picture's colours; alpha that is all full is none."""
+    rng, mask = np.random.default_rng(0), np.zeros((36, 48), np.uint8)
+    mask[10:20, 12:30] = 255
+    picture = rng.integers(1, 256, (36, 48, colours), dtype=np.uint8)
+    image = Image.fromarray(np.dstack([picture, mask]).squeeze(), "LA" if colours == 1 else "RGBA")
+    image.save(tmp_path / "a.png")
+    np.testing.assert_array_equal(read_mask(str(tmp_path / "a.png")), mask > 0)
+    Image.fromarray(np.dstack([mask] * 3 + [np.full_like(mask, 255)])).save(tmp_path / "b.png")
+    np.testing.assert_array_equal(read_mask(str(tmp_path / "b.png")), mask > 0)
 
 
 def test_mask_keeps_antialiasing(video):
