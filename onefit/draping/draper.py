@@ -146,6 +146,11 @@ class Draper:
         """
         if isinstance(garment, Garment):
             return garment
+        if not isinstance(garment, str | os.PathLike):
+            raise InputError(
+                f"garment of type {type(garment).__name__}; a Garment (Garment.of_mesh makes one of"
+                " arrays), a template's name or a file's is needed"
+            )
         name, state = str(garment), None
         if name not in TEMPLATES + LOOSE and os.path.exists(name):
             name, now = os.path.realpath(name), os.stat(name)

@@ -16,7 +16,7 @@ from polyfit import mesh
 from polyfit.errors import InputError
 
 from .binding import standard_body, surface_of
-from .fitting import check_place, in_pose, lowered_stand, standard_on
+from .fitting import Place, check_place, in_pose, lowered_stand, standard_on
 
 _CLOTH3D_HIPS = 0.15  # [rad] by which each leg stands aside in CLOTH3D's rest pose
 POSES = ("cloth3d", "T-pose")
@@ -53,21 +53,23 @@ def aligned(
     *,
     loose: bool = False,
     where: str = "garment",
+    place: Place | None = None,
 ) -> np.ndarray:
     """Vertices (N, 3) [m] of a garment around ``body`` (at rest in the standard stand) in ``pose``
     (24, 3) [rad], brought to the standard body in the T-pose.
 
     Each vertex goes with the body's vertex nearest to it, by the difference of both bodies there;
     one iteration of Laplacian smoothing follows. Of ``loose`` garments (dresses, skirts), which do
-    not adhere to the legs, only the difference in shape is corrected: the pose stays. Raises
-    InputError where the garment does not lie on the body, or was made for its rest.
+    not adhere to the legs, only the difference in shape is corrected: the pose stays. ``place``:
+    how it was brought here, for what an error suggests. Raises InputError where the garment does
+    not lie on the body, or was made for its rest.
     """
     worn = wearer(body, pose)
     rest = lowered_stand(
         surface_of(wearer(body, standard_body().rest_pose)),
         "the garment itself to onefit.drape (on another body: to Garment.read, with made_for)",
     )
-    check_place(vertices[np.unique(faces)], surface_of(worn), where, rest)
+    check_place(vertices[np.unique(faces)], surface_of(worn), where, rest, place)
     target = in_pose(standard_body(), pose if loose else torch.zeros_like(pose))
     source = worn.vertices.double().numpy()
     nearest = cKDTree(source).query(vertices)[1]

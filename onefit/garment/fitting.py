@@ -54,6 +54,26 @@ def up_of(path, up=None):
     return up or ("y" if Path(path).suffix.lower() in (".glb", ".gltf") else "z")
 
 
+@dataclass(frozen=True)
+class Place:
+    """How a mesh was brought to metres and OneFit's axes, by :func:`placed`; ``usual``: the axis
+    that is up in its file where nothing is said.
+    """
+
+    scale: float = 1.0
+    up: str = "z"
+    turn: float = 0.0
+    offset: Any = (0.0, 0.0, 0.0)
+    usual: str = "z"
+
+    def back(self, V):
+        """Vertices (N, 3) [m] as the file has them."""
+        V = placed(np.asarray(V) - np.asarray(self.offset), turn=-self.turn)
+        if self.up == "y":
+            V = V[:, [0, 2, 1]] * (1, 1, -1)
+        return V / self.scale
+
+
 def placed(V, scale=1.0, up="z", turn=0.0, offset=(0.0, 0.0, 0.0)):
     """Vertices (N, 3) scaled to metres, turned from ``up`` ("z" or "y") to z up and by ``turn``
     [degrees] about z, then moved by ``offset`` [m].
@@ -134,9 +154,9 @@ class OffBody(InputError):
         self.why = why
 
 
-def check_place(V, surface, where, other=None):
+def check_place(V, surface, where, other=None, place=None):
     """Raises InputError, with a suggestion, where vertices (N, 3) [m] do not lie on the body of
-    ``surface``.
+    ``surface``, to which a :class:`Place` has brought them.
 
     They do if they are 15 cm from it on average at most, at most 2 % of them more than 3 cm inside,
     and no other place or stand would fit much better: half the misfit where it is above 4 cm, 0.87
@@ -149,7 +169,9 @@ def check_place(V, surface, where, other=None):
     stands = not (there < 0.87 * own and own - there > 0.005)
     if lies and stands and own < 0.04:
         return
-    best = _best_place(seen, surface, [1.0] if lies else list(UNITS), other)
+    place = place or Place()
+    scales = [place.scale] if lies else sorted({*UNITS, place.scale}, reverse=True)
+    best = _best_place(place, place.back(seen), surface, scales, other)
     if not stands and (there < 0.04 or not (best and best[0] < 0.5 * there)):
         fits = f"{_mm(there)} from the body there, {_mm(own)} from it in the stand it is read in"
         give = _advice([other.give], other.flags)
@@ -188,9 +210,10 @@ def _mm(distance):
     )
 
 
-def _best_place(seen, surface, scales, other):
+def _best_place(place, seen, surface, scales, other):
     """``(misfit [m], what it looks like, what to give)`` of the plainest place in which the
-    vertices lie on a body, or None.
+    vertices, as their file has them, lie on a body, or None. What ``place`` has beside what is
+    usual is told, too, if only to leave it out.
     """
     bodies = [(surface, None)] + ([(other.surface, other)] if other else [])
     found = []
@@ -199,8 +222,10 @@ def _best_place(seen, surface, scales, other):
         if not 0.15 < np.ptp(V, axis=0).max() < 2.3:
             continue
         for (at, pose), moved in product(bodies, range(3)):
-            offset = _offset(V, at) if moved == 2 else moved * _GROUND_OFFSET
-            worse = (scale != 1) + (up != "z") + (turn != 0) + 0.5 * (pose is not None) + moved
+            offset = _offset(V, at) if moved == 2 else moved * _GROUND_OFFSET + 0.0
+            worse = (
+                (scale != 1) + (up != place.usual) + (turn != 0) + 0.5 * (pose is not None) + moved
+            )
             found.append(
                 (
                     misfit(at, V + offset) * 1.25**worse,
@@ -218,31 +243,31 @@ def _best_place(seen, surface, scales, other):
     if value > 0.12:
         return None
     looks, give, flags = [], [], []
-    if scale != 1:
-        looks.append(UNITS[scale])
+    if scale != 1 or place.scale != 1:
+        looks.append(UNITS.get(scale, f"units of {scale:g} m"))
         give.append(f"scale={scale:g}")
         flags.append(f"--scale {scale:g}")
-    if up != "z":
-        looks.append("y up")
+    if up != place.usual or place.up != place.usual:
+        looks.append(f"{up} up")
         give.append(f"up='{up}'")
         flags.append(f"--up {up}")
-    if turn:
-        looks.append("facing backwards")
+    if turn or place.turn:
+        looks.append("facing backwards" if turn else "facing forward")
         give.append(f"turn={turn}")
         flags.append(f"--turn {turn}")
     if pose:
         looks.append(pose.looks)
         give.append(pose.give)
         flags.extend(pose.flags)
-    if offset.any():
-        looks.append(
-            "on a body that stands on the ground"
-            if (offset == _GROUND_OFFSET).all()
-            else "in another place"
-        )
+    if offset.any() or np.any(place.offset):
+        known = {(0.0, 0.0, 0.0): "in its place"}
+        known[tuple(_GROUND_OFFSET)] = "on a body that stands on the ground"
+        looks.append(known.get(tuple(offset), "in another place"))
         give.append(f"offset=({', '.join(f'{o:g}' for o in offset)})")
         flags.append(f"--offset {' '.join(f'{o:g}' for o in offset)}")
-    return (value, ", ".join(looks), _advice(give, flags)) if give else None
+    same = scale == place.scale and up == place.up and turn == place.turn and not pose
+    same &= np.array_equal(offset, place.offset)
+    return None if same else (value, ", ".join(looks), _advice(give, flags))
 
 
 def _advice(give, flags):

@@ -132,14 +132,10 @@ class Garment:
         axis, where = fitting.up_of(path, up), str(path)
         if axis != (up or "z"):
             where += " (read with y up, as glTF has it; else up='z', or --up z)"
-        garment = cls.of_mesh(
-            name or Path(path).stem,
-            fitting.placed(V, scale, axis, turn, offset),
-            F,
-            texcoords,
-            made_for=made_for,
-            loose=loose,
-            where=where,
+        place = fitting.Place(scale, axis, turn, offset, fitting.up_of(path))
+        vertices = fitting.placed(V, scale, axis, turn, offset)
+        garment = cls._of_mesh(
+            name or Path(path).stem, vertices, F, texcoords, made_for, loose, where, place
         )
         return garment if count is None else garment.remeshed(count)
 
@@ -176,6 +172,10 @@ class Garment:
         """The garment of any triangle mesh (N, 3) [m], (F, 3) in OneFit's axes, anything like
         arrays, with its texture coordinates or None; otherwise as :meth:`read`.
         """
+        return cls._of_mesh(name, vertices, faces, texcoords, made_for, loose, where)
+
+    @classmethod
+    def _of_mesh(cls, name, vertices, faces, texcoords, made_for, loose, where, place=None):
         other = fitting.t_stand() if made_for is None else None
         if isinstance(made_for, str) and made_for == fitting.T_POSE:
             made_for, other = fitting.t_posed(), fitting.lowered_stand()
@@ -186,7 +186,7 @@ class Garment:
         surface = standard_surface() if made_for is None else fitting.surface_of(made_for)
         vertices, faces = mesh.as_arrays(vertices, faces, where)
         check(vertices, faces, where)
-        fitting.check_place(vertices[np.unique(faces)], surface, where, other)
+        fitting.check_place(vertices[np.unique(faces)], surface, where, other, place)
         V, F, told = mended(vertices, faces, where, surface)
         fitting.check_reach(V, surface, where)
         turned = fitting.inward(V, F, surface)

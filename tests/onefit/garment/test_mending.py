@@ -334,6 +334,21 @@ class TestRefusals:
             assert np.abs(read.vertices.numpy() - g.vertices.numpy()).max() < 1e-4
         with pytest.raises(InputError, match="b.glb .read with y up, as glTF has it; else up='z'"):
             Garment.read(tmp_path / "b.glb")
+        with pytest.raises(InputError, match="looks like z up: give up='z', or --up z$"):
+            Garment.read(tmp_path / "b.glb")
+
+    def test_what_was_given_wrongly_is_told(self, templates, tmp_path):
+        """What is suggested is given in its place, not beside it."""
+        g, path = templates["tank"], tmp_path / "tank.ply"
+        write_ply(path, 1000 * g.vertices.double().numpy(), g.faces.numpy())
+        for given, told in (
+            (dict(scale=0.01), "millimetres: give scale=0.001, or --scale 0.001"),
+            (dict(scale=0.001, turn=180), "facing forward: give scale=0.001, turn=0, or"),
+            (dict(scale=0.001, offset=(0, 0, 0.5)), "in its place: give scale=0.001, offset="),
+        ):
+            with pytest.raises(InputError) as error:
+                Garment.read(path, **given)
+            assert told in str(error.value)
 
     def test_nothing_fits(self):
         V, F = tube(0.5, 0.4)
