@@ -58,6 +58,11 @@ def main(arguments=None):
     if "--" in arguments:
         k = arguments.index("--")
         arguments, extra = arguments[:k], arguments[k + 1 :]
+    for word in extra:
+        if word.startswith("--output") or (word.startswith("-o") and not word.startswith("--")):
+            raise InputError(
+                f"{word} after --: each result has its own folder in that of -o, before --"
+            )
     options = parser().parse_args(arguments)
     commands.definitions(options.define)
     drapes = bool(options.garments or options.motions)

@@ -64,12 +64,11 @@ def parser():
 
 def main(arguments=None):
     options = parser().parse_args(arguments)
+    if options.frames < 1:
+        raise InputError(f"--frames {options.frames}: at least one is needed")
     scale = 1.0 if options.scale is None else options.scale
-    if options.frames < 1 or not (math.isfinite(scale) and scale > 0):
-        raise InputError(
-            f"--frames {options.frames} --scale {options.scale}: at least one frame and a positive"
-            " number of millimetres are needed"
-        )
+    if not (math.isfinite(scale) and scale > 0):
+        raise InputError(f"--scale {scale:g}: a positive number of millimetres is needed")
     if options.output is not None:
         folder = os.path.dirname(os.path.abspath(options.output))
         if not os.path.isdir(folder):

@@ -24,6 +24,12 @@ _BETAS = 10  # of SMPL's, that a body has
 _ROOT = 0.0, 0.0, 0.9  # [m] about where a body of ours at rest has its root
 _SIZES = 0.4, 3.0  # [m] of a body's longest side
 _TO_Z = {"z": 0, "y": 90, "-y": -90}  # degrees about x that turn what is up to z
+_UPRIGHT = 0.5  # least cosine of the angle from a standing body to what is up
+
+
+def _up_of(up):
+    """The turn from a world with ``up`` to one whose z is up."""
+    return Rotation.from_euler("x", _TO_Z[up], degrees=True)
 
 
 class _World:
@@ -34,7 +40,7 @@ class _World:
     @property
     def upright(self) -> Rotation:
         """Turns the scene's world to one whose z is up."""
-        return Rotation.from_euler("x", _TO_Z[self.up], degrees=True)
+        return _up_of(self.up)
 
 
 @dataclass(frozen=True)
@@ -130,10 +136,21 @@ class BodyMotion(_World):
 
     @property
     def note(self) -> str:
-        """A line about what is not used of it, or ""."""
-        if not self.model or self.shape is None or not np.any(self.shape[_BETAS:]):
-            return ""
-        return f"note: {self.path}: {len(self.shape)} betas; the first {_BETAS} of them count"
+        """A line about what is not used of it, or of a body that does not stand, or ""."""
+        said = []
+        if self.model and self.shape is not None and np.any(self.shape[_BETAS:]):
+            said.append(f"{len(self.shape)} betas; the first {_BETAS} of them count")
+        length = Rotation.from_rotvec(self.poses[:, 0]).apply(
+            (0, 0, 1)
+        )  # from the feet to the head
+        upright = {up: np.median(_up_of(up).apply(length)[:, 2]) for up in _TO_Z}
+        best = max(upright, key=lambda up: upright[up])
+        if upright[self.up] < _UPRIGHT < upright[best]:
+            said.append(
+                f"with {self.up} up the body lies or leans most of the time; --body-up {best} (or"
+                f" body_up = {best}) lets it stand"
+            )
+        return f"note: {self.path}: {'; '.join(said)}" if said else ""
 
 
 @dataclass(frozen=True)

@@ -142,6 +142,12 @@ def check_surface(surface: Mapping[str, ArrayLike], where: str) -> None:
             f"{where}: holds no {', '.join(missing)}; vertices (T,N,3), faces (F,3) and frames (T,)"
             " are needed"
         )
+    up = str(np.asarray(surface.get("up", "camera")))
+    if up != "camera":
+        raise InputError(
+            f"{where}: an export with {up} up; the surface.npz of the run, in the camera"
+            " frame, is needed, or an export by --up camera"
+        )
     V, F, frames = (np.asarray(surface[name]) for name in ("vertices", "faces", "frames"))
     if (
         V.ndim != 3

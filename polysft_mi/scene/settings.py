@@ -168,6 +168,7 @@ class Settings:
         " bend",
         low=0,
         auto=True,
+        solver="gauss-newton",
     )
     rgb_norm: str = _setting(
         "cauchy",
@@ -317,12 +318,13 @@ class Settings:
         return dataclasses.replace(self, **decided)
 
     def check_read(self, solver: str, where: str) -> None:
-        """Raise InputError where a value that is not the default is for another solver; ``where``:
-        the scene's path.
+        """Raise InputError where a value that is not the default, nor a weight of 0, is for another
+        solver; ``where``: the scene's path.
         """
         for f in dataclasses.fields(self):
             value, reader = getattr(self, f.name), f.metadata["solver"]
-            if reader not in (None, solver) and value != f.default:
+            off = f.name.startswith("k_") and value == 0
+            if reader not in (None, solver) and value != f.default and not off:
                 raise InputError(
                     f"{where}: setting {f.name} = {value:g} is read by solver = {reader} alone, and"
                     f" this is {solver}; leave it at {f.default:g}, or take solver = {reader}"

@@ -24,6 +24,7 @@ def create(objective: Objective) -> Solver:
         solver: Solver = GaussNewton(objective.rules)
     else:
         solver = Adam(objective.settings)
-    objective.settings.check_read(name, objective.problem.experiment.path)
+    experiment = objective.problem.experiment
+    experiment.settings.check_read(name, experiment.path)
     solver.check(objective)
     return solver

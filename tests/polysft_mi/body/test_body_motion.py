@@ -60,6 +60,17 @@ def test_what_cannot_be_used_is_refused(known, tmp_path, change, message):
         read(tmp_path / "body.npz", **arrays)
 
 
+def test_a_body_that_does_not_stand_is_told(tmp_path):
+    """Its root turned as in a world with -y up, as SMPL's programs write it for a level camera."""
+    poses = np.zeros((FRAMES, 24, 3))
+    poses[:, 0] = np.pi / 2, 0, 0
+    np.savez(tmp_path / "body.npz", poses=poses, translation=np.zeros((FRAMES, 3)))
+    read = lambda up: BodyMotion.read(tmp_path / "body.npz", FRAMES, range(FRAMES), up=up)
+    assert not read("-y").note
+    for up in ("z", "y"):
+        assert f"with {up} up the body lies" in read(up).note and "--body-up -y" in read(up).note
+
+
 def test_of_another_video(known, tmp_path):
     with pytest.raises(InputError, match="6 poses; 9 frames, the video's, are needed"):
         read(tmp_path / "body.npz", range(9), 9, **known)

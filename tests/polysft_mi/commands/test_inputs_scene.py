@@ -217,6 +217,10 @@ def test_bad_value(sheet, setting, words):
             "rgb has brightness = gain; local or none is needed, or solver = adam",
         ),
         (["period=7"], "period = 7 is read by solver = adam alone, and this is gauss-newton"),
+        (
+            ["solver=adam", "k_relief=0.1"],
+            "k_relief = 0.1 is read by solver = gauss-newton alone, and this is adam",
+        ),
         (["preset=newest"], "preset = 'newest'; known values: none, paper"),
     ],
 )

@@ -181,6 +181,7 @@ GOOD = dict(vertices=np.ones((2, 3, 3)), faces=np.array([[0, 1, 2]]), frames=np.
         (dict(faces=np.array([[0.0, 1, 2]])), "float64"),
         (dict(vertices=np.full((2, 3, 3), np.inf)), "not finite"),
         (dict(frames=np.array([4, 4])), "surface.npz: frames holds 4 more than once"),
+        (dict(up="y"), "surface.npz: an export with y up; the surface.npz of the run"),
     ],
 )
 def test_refuses_a_surface_of_another_form(tmp_path, change, words):
