@@ -51,13 +51,6 @@ TRAININGS = {
     "jumpsuit": ["jumpsuit"],
     "jumpsuit-tuned": ["jumpsuit", "--from", "RUNS/six/weights.safetensors", "--epochs", "12"],
 }
-LONGER = "-longer"  # the same training of more steps
-TRAININGS |= {
-    name + LONGER: TRAININGS[name]
-    for name in ("dress", "tank", "tank-no-mesh-inext", "tank-no-inext", "tank-no-col")
-}
-PACKAGE = "package"  # the package's network by the preset
-SHORT = ["--epochs", "12", "--batch", "2000"]
 LOSSES = {
     "all losses": "tank",
     "no mesh inextensibility": "tank-no-mesh-inext",
@@ -67,6 +60,10 @@ LOSSES = {
     "frames by PCA alone": "tank-pca",
     "with our inputs and patches": "tank-ours",
 }
+LONGER = "-longer"  # the same training of more steps
+TRAININGS |= {name + LONGER: TRAININGS[name] for name in ("dress", *LOSSES.values())}
+PACKAGE = "package"  # the package's network by the preset
+SHORT = ["--epochs", "12", "--batch", "2000"]
 STYLES = {  # of the tank top: measures of its pattern [m]
     "as trained": {},
     "cropped": dict(hem=0.12),
