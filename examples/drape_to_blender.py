@@ -20,7 +20,10 @@ def main(out="out/blender", garment="tshirt", seconds=2.0):
     motion = onefit.Motion.generate("walk", seconds=seconds)
     drape = onefit.load().drape(garment, motion)
     Path(out).mkdir(parents=True, exist_ok=True)
-    parts = {garment: (drape.vertices, drape.faces), "body": (drape.body, drape.body_faces)}
+    parts = {
+        Path(garment).stem: (drape.vertices, drape.faces),
+        "body": (drape.body, drape.body_faces),
+    }
     paths = []
     for name, (vertices, faces) in parts.items():
         paths.append(Path(out) / f"{name}.usdc")

@@ -47,6 +47,8 @@ def main(argv=None):
     args = parser().parse_args(argv)
     if not args.output.lower().endswith(".ply"):
         raise InputError(f"{args.output}: a .ply file is needed")
+    if os.path.realpath(args.output) == os.path.realpath(args.garment):
+        raise InputError(f"{args.output}: is the garment itself; -o needs another name")
     if os.path.dirname(args.output) and not os.path.isdir(os.path.dirname(args.output)):
         raise InputError(f"{os.path.dirname(args.output)}: no such folder")
     require("torch", "anny")

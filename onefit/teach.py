@@ -10,6 +10,7 @@ seed; those that are there are kept, so that a run that was cut short goes on. G
 """
 
 import argparse
+import math
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -63,6 +64,12 @@ def main(argv=None):
     draper, folder = load(args.weights), Path(args.output)
     named = args.garments or (() if args.cuts else STANDARD)
     garments = [draper.garment(name) for name in named]
+    if not 0 < args.seconds < math.inf:
+        raise InputError(f"--seconds {args.seconds:g}: more than 0 is needed")
+    names = [garment.name for garment in garments]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"{name}: two garments have this name; lessons are kept by it")
     folder.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(0)
     shapes = [draper.model.standard_shape]

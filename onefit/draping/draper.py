@@ -284,6 +284,11 @@ class Draper:
     def _worn(self, garment, motion, shape):
         """The :class:`_Worn` of each garment of what :meth:`drape` takes."""
         garments = [self.garment(one) for one in outfit.several(garment)]
+        if not isinstance(motion, Motion | str | os.PathLike):
+            raise InputError(
+                f"motion of type {type(motion).__name__}; a Motion (of poses and translation), or"
+                " a file's name, is needed"
+            )
         motion = motion if isinstance(motion, Motion) else Motion.read(motion)
         motion = motion.resampled(FPS).to(self.device)
         body = self.model.body(shape)

@@ -45,6 +45,7 @@ UNITS = {
 }
 T_POSE = "T-pose"
 _GROUND_OFFSET = np.array([0.0, 0.0, -0.82])  # from a world in which the body stands at z = 0 [m]
+_PLACES = 10  # of the most likely, of which one must fit as check_place wants it
 _TRIAL_VERTICES = 400  # vertices that places are tried on
 _SMOOTHINGS = 30  # of cloth that passes through itself, at most
 
@@ -80,6 +81,10 @@ def placed(V, scale=1.0, up="z", turn=0.0, offset=(0.0, 0.0, 0.0)):
     """
     if up not in ("y", "z"):
         raise InputError(f"up={up!r}; 'z' or 'y' is needed")
+    if not 0 < scale < np.inf:
+        raise InputError(f"scale={scale:g}; more than 0 is needed")
+    if not (np.isfinite(turn) and np.isfinite(np.asarray(offset, dtype=np.float64)).all()):
+        raise InputError(f"turn={turn:g}, offset={tuple(offset)}; finite numbers are needed")
     moved = np.asarray(offset, dtype=np.float64)
     if moved.shape != (3,):
         raise InputError(f"offset={offset!r}; three numbers (x, y, z) are needed")
@@ -217,15 +222,17 @@ def _best_place(place, seen, surface, scales, other):
     """
     bodies = [(surface, None)] + ([(other.surface, other)] if other else [])
     found = []
-    for scale, up, turn in product(scales, ("z", "y"), (0, 180)):
+    turns, given = sorted({0, 180, place.turn}), np.asarray(place.offset, dtype=np.float64)
+    for scale, up, turn in product(scales, ("z", "y"), turns):
         V = placed(seen, scale, up, turn)
         if not 0.15 < np.ptp(V, axis=0).max() < 2.3:
             continue
-        for (at, pose), moved in product(bodies, range(3)):
-            offset = _offset(V, at) if moved == 2 else moved * _GROUND_OFFSET + 0.0
-            worse = (
-                (scale != 1) + (up != place.usual) + (turn != 0) + 0.5 * (pose is not None) + moved
-            )
+        for (at, pose), moved in product(bodies, range(3 + given.any())):
+            # what was given is as plain as what is usual
+            offset = given if moved == 3 else moved * _GROUND_OFFSET + 0.0
+            offset = _offset(V, at) if moved == 2 else offset
+            worse = (scale not in (1, place.scale)) + (up not in (place.usual, place.up))
+            worse += (turn not in (0, place.turn)) + 0.5 * (pose is not None) + moved % 3
             found.append(
                 (
                     misfit(at, V + offset) * 1.25**worse,
@@ -239,8 +246,12 @@ def _best_place(place, seen, surface, scales, other):
             )
     if not found:
         return None
-    _, value, scale, up, turn, pose, offset = min(found, key=lambda f: f[0])
-    if value > 0.12:
+    found.sort(key=lambda f: f[0])
+    for _, value, scale, up, turn, pose, offset in found[:_PLACES]:
+        d = (pose.surface if pose else surface)(placed(seen, scale, up, turn, offset), 1e9).distance
+        if value <= 0.12 and (d < -_PUSHED_DEPTH).mean() <= 0.02:
+            break
+    else:
         return None
     looks, give, flags = [], [], []
     if scale != 1 or place.scale != 1:

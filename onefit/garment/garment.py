@@ -33,6 +33,7 @@ TEMPLATES = (
 )
 # Garments with slack: a cut that fell once
 LOOSE = ("boxy_tshirt", "shirt", "waisted_dress", "circle_skirt", "wide_trousers")
+_MOST_VERTICES = 1_000_000
 FOLDER = Path(__file__).parents[1] / "data" / "garments"
 
 
@@ -183,6 +184,11 @@ class Garment:
             raise InputError(
                 f"{where}: made_for={made_for!r}; a Body or '{fitting.T_POSE}' is needed"
             )
+        if not isinstance(texcoords, TexCoords | None):
+            raise InputError(
+                f"{where}: texcoords of type {type(texcoords).__name__}; a TexCoords"
+                " (polyfit.mesh.TexCoords) is needed, or None"
+            )
         surface = standard_surface() if made_for is None else fitting.surface_of(made_for)
         vertices, faces = mesh.as_arrays(vertices, faces, where)
         check(vertices, faces, where)
@@ -323,5 +329,5 @@ class Garment:
 
 def _check_count(count):
     """Raises InputError for a number of vertices that no garment can have; None says none."""
-    if count is not None and not count >= 100:
-        raise InputError(f"count = {count}: at least 100 vertices are needed")
+    if count is not None and not 100 <= count <= _MOST_VERTICES:
+        raise InputError(f"count = {count}: 100 to {_MOST_VERTICES:,} vertices are needed")

@@ -173,7 +173,7 @@ def conduct(make, folder, *, device="cpu", resume=False, until=None, every=120.0
 
     ``until`` (steps) ends early, with a checkpoint and no weights (None); ``every`` [s]
     checkpoints; ``progress`` is a rich.progress.Progress. Raises InputError for a folder that holds
-    weights already, or nothing to ``resume``.
+    weights or a checkpoint already, or nothing to ``resume``.
     """
     from rich.console import Console
     from rich.progress import (
@@ -188,8 +188,9 @@ def conduct(make, folder, *, device="cpu", resume=False, until=None, every=120.0
     checkpoint, weights = folder / "checkpoint.safetensors", folder / "weights.safetensors"
     if resume and not checkpoint.exists():
         raise InputError(f"{checkpoint}: no such file, nothing to resume")
-    if not resume and weights.exists():
-        raise InputError(f"{weights}: exists; give another -o, or --resume")
+    for path in (weights, checkpoint):
+        if not resume and path.exists():
+            raise InputError(f"{path}: exists; give another -o, or --resume")
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),

@@ -299,6 +299,8 @@ class TestRefused:
         with pytest.raises(InputError, match="nothing to resume"):
             trainer.train(SMALL, tmp_path, resume=True)
         trainer.train(SMALL, tmp_path, until=1)
+        with pytest.raises(InputError, match="checkpoint.safetensors: exists; give another -o"):
+            trainer.train(SMALL, tmp_path)
         with pytest.raises(InputError, match="checkpoint of other settings"):
             trainer.train(replace(SMALL, seed=1), tmp_path, resume=True)
         (tmp_path / "checkpoint.safetensors").write_bytes(b"half of it")

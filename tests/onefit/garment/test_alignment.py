@@ -52,6 +52,8 @@ def test_alignment_refuses_what_is_not_on_the_body(tank, tmp_path):
     write_ply(tmp_path / "far.ply", V + [0.5, 0, 0], F)
     with pytest.raises(InputError, match="far.ply: does not lie on the body"):
         align.main([str(tmp_path / "far.ply"), "-o", str(tmp_path / "out.ply")])
+    with pytest.raises(InputError, match="is the garment itself"):
+        align.main([str(tmp_path / "far.ply"), "-o", str(tmp_path / "far.ply")])
     with pytest.raises(InputError, match="pose 'sitting': choose cloth3d or T-pose"):
         alignment.pose_of("sitting")
     assert not (tmp_path / "out.ply").exists()

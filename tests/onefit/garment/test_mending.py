@@ -260,6 +260,9 @@ class TestRefusals:
         V, F = tank
         self.refused(V, F[:0], "no faces")
         self.refused(V[:0], F[:0], "no faces")
+        self.refused(
+            V, F, "texcoords of type ndarray; a TexCoords", texcoords=np.zeros((len(V), 2))
+        )
         self.refused(V[:, :2], F, r"vertices of shape \(3000, 2\); \(N, 3\) is needed")
         self.refused([*V.tolist(), [0, 1]], F, r"vertices are no array of numbers; \(N, 3\) is")
         self.refused(V, F.astype(str), r"faces are no array of numbers; \(F, 3\) is needed")
@@ -349,6 +352,17 @@ class TestRefusals:
             with pytest.raises(InputError) as error:
                 Garment.read(path, **given)
             assert told in str(error.value)
+        for given in dict(scale=-1), dict(scale=0), dict(turn=np.nan), dict(offset=(0, 0, np.inf)):
+            with pytest.raises(InputError, match="^(scale|turn)=.* needed$"):
+                Garment.read(path, **given)
+
+    def test_what_is_suggested_is_taken(self, templates, tmp_path):
+        """Skirts look alike from all sides."""
+        g, path = templates["skirt"], tmp_path / "skirt.ply"
+        write_ply(path, 1000 * g.vertices.double().numpy() * (-1, -1, 1), g.faces.numpy())
+        with pytest.raises(InputError, match="give scale=0.001, turn=180, or"):
+            Garment.read(path, turn=180)
+        Garment.read(path, turn=180, scale=0.001)
 
     def test_nothing_fits(self):
         V, F = tube(0.5, 0.4)

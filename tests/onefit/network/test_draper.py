@@ -70,8 +70,10 @@ def test_arguments_of_a_wrong_kind_are_refused_in_one_line(draper, coarse):
         with pytest.raises(InputError, match=f"^device {device}: .*{message}"):
             onefit.load(device=device)
     for count in (0, 3):
-        with pytest.raises(InputError, match=f"^count = {count}: at least 100 vertices"):
+        with pytest.raises(InputError, match=f"^count = {count}: 100 to 1,000,000 vertices"):
             coarse.remeshed(count)
+    with pytest.raises(InputError, match="^motion of type ndarray; a Motion"):
+        draper.drape(coarse, np.zeros((3, 24, 3)))
 
 
 def test_each_frame_is_told(draper, coarse):
