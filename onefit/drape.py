@@ -16,7 +16,7 @@ arguments. OUT receives
     garment.usd, body.usd   animations that Blender and usdview open; of a mesh file its own
                             vertices, faces and texture coordinates
     frames/NNN.png          rendered by Mitsuba; drape.mp4 is their video
-    meshes/NNN.obj          one mesh a frame, with --meshes obj (or ply)
+    meshes/NNN.obj          one mesh a frame, with --meshes obj (or ply); frames.json: what is up
 
 Of several garments each has these in a folder of its own, 1_trousers, 2_tshirt, ...; figures.json,
 frames and the video are of all.
