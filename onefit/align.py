@@ -55,16 +55,16 @@ def main(argv=None):
     from polyfit.mesh import read_mesh, write_ply
 
     from .draping import inputs
-    from .garment import Place, aligned, placed, pose_of, up_of
+    from .garment import Place, aligned, pose_of, up_of
 
     vertices, faces, _ = read_mesh(args.garment)
     model = inputs.body_model(args.body)
     body = model.body(inputs.shape_of(model, args.shape))
     up = up_of(args.garment, args.up)
     place = Place(args.scale, up, args.turn, tuple(args.offset), up_of(args.garment))
-    vertices = placed(vertices, args.scale, up, args.turn, tuple(args.offset))
     told = dict(where=args.garment, place=place)
-    made = aligned(vertices, faces, body, pose_of(args.pose), loose=args.loose, **told)
+    pose = pose_of(args.pose)
+    made = aligned(place.apply(vertices), faces, body, pose, loose=args.loose, **told)
     write_ply(args.output, made, faces)
     print(f"written: {args.output}, around the standard body in the T-pose")
 

@@ -59,7 +59,7 @@ def main(arguments=None):
         k = arguments.index("--")
         arguments, extra = arguments[:k], arguments[k + 1 :]
     for word in extra:
-        if word.startswith("--output") or (word.startswith("-o") and not word.startswith("--")):
+        if word.startswith(("-o", "--output")):
             raise InputError(
                 f"{word} after --: each result has its own folder in that of -o, before --"
             )

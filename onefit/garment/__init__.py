@@ -16,7 +16,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
             "standard_surface",
         ],
         "charts": ["FRAMES", "Deformation", "PatchedGarment", "SparseMatrix"],
-        "fitting": ["OffBody", "Place", "inward", "placed", "untangled", "up_of"],
+        "fitting": ["OffBody", "Place", "inward", "untangled", "up_of"],
         "garment": ["FOLDER", "Garment", "LOOSE", "TEMPLATES"],
         "reading": ["RenderMesh", "Stitches", "mended", "parts"],
         "waistband": ["held", "held_below"],

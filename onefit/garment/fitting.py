@@ -57,8 +57,9 @@ def up_of(path, up=None):
 
 @dataclass(frozen=True)
 class Place:
-    """How a mesh was brought to metres and OneFit's axes, by :func:`placed`; ``usual``: the axis
-    that is up in its file where nothing is said.
+    """How a mesh is brought to metres and OneFit's axes: the arguments of :func:`placed`, ``turn``
+    in degrees, ``offset`` (3,) [m]. ``usual``: the axis that is up in its file where nothing is
+    said.
     """
 
     scale: float = 1.0
@@ -67,8 +68,12 @@ class Place:
     offset: Any = (0.0, 0.0, 0.0)
     usual: str = "z"
 
+    def apply(self, V):
+        """Vertices (N, 3) of the file, in metres and OneFit's axes."""
+        return placed(V, self.scale, self.up, self.turn, self.offset)
+
     def back(self, V):
-        """Vertices (N, 3) [m] as the file has them."""
+        """Vertices (N, 3) [m] as the file has them: the inverse of :meth:`apply`."""
         V = placed(np.asarray(V) - np.asarray(self.offset), turn=-self.turn)
         if self.up == "y":
             V = V[:, [0, 2, 1]] * (1, 1, -1)
@@ -169,7 +174,7 @@ def check_place(V, surface, where, other=None, place=None):
     """
     seen = V[np.linspace(0, len(V) - 1, min(_TRIAL_VERTICES, len(V))).astype(int)]
     d, own = surface(V, 1e9).distance, misfit(surface, seen)
-    lies = np.abs(d).mean() < 0.15 and (d < -_PUSHED_DEPTH).mean() <= 0.02
+    lies = _lies(d)
     there = misfit(other.surface, seen) if lies and other else np.inf
     stands = not (there < 0.87 * own and own - there > 0.005)
     if lies and stands and own < 0.04:
@@ -190,6 +195,11 @@ def check_place(V, surface, where, other=None, place=None):
     if best:
         advice = f"it looks like {best[1]}: give {best[2]}"
     raise OffBody(f"{where}: does not lie on the body: {why}; {advice}", why)
+
+
+def _lies(distances):
+    """Whether vertices at such ``distances`` (N,) [m] from a body lie on it."""
+    return np.abs(distances).mean() < 0.15 and (distances < -_PUSHED_DEPTH).mean() <= 0.02
 
 
 def check_reach(V, surface, where):
@@ -227,29 +237,20 @@ def _best_place(place, seen, surface, scales, other):
         V = placed(seen, scale, up, turn)
         if not 0.15 < np.ptp(V, axis=0).max() < 2.3:
             continue
-        for (at, pose), moved in product(bodies, range(3 + given.any())):
-            # what was given is as plain as what is usual
-            offset = given if moved == 3 else moved * _GROUND_OFFSET + 0.0
-            offset = _offset(V, at) if moved == 2 else offset
-            worse = (scale not in (1, place.scale)) + (up not in (place.usual, place.up))
-            worse += (turn not in (0, place.turn)) + 0.5 * (pose is not None) + moved % 3
-            found.append(
-                (
-                    misfit(at, V + offset) * 1.25**worse,
-                    misfit(at, V + offset),
-                    scale,
-                    up,
-                    turn,
-                    pose,
-                    offset,
-                )
-            )
+        # what was given is as plain as what is usual
+        plain = (scale in (1, place.scale), up in (place.usual, place.up), turn in (0, place.turn))
+        for at, pose in bodies:
+            offsets = (0, np.zeros(3)), (1, _GROUND_OFFSET), (2, _offset(V, at)), (0, given)
+            for moved, offset in offsets:
+                worse = plain.count(False) + 0.5 * (pose is not None) + moved
+                value = misfit(at, V + offset)
+                found.append((value * 1.25**worse, value, scale, up, turn, pose, offset))
     if not found:
         return None
     found.sort(key=lambda f: f[0])
     for _, value, scale, up, turn, pose, offset in found[:_PLACES]:
         d = (pose.surface if pose else surface)(placed(seen, scale, up, turn, offset), 1e9).distance
-        if value <= 0.12 and (d < -_PUSHED_DEPTH).mean() <= 0.02:
+        if value <= 0.12 and _lies(d):
             break
     else:
         return None

@@ -134,9 +134,8 @@ class Garment:
         if axis != (up or "z"):
             where += " (read with y up, as glTF has it; else up='z', or --up z)"
         place = fitting.Place(scale, axis, turn, offset, fitting.up_of(path))
-        vertices = fitting.placed(V, scale, axis, turn, offset)
         garment = cls._of_mesh(
-            name or Path(path).stem, vertices, F, texcoords, made_for, loose, where, place
+            name or Path(path).stem, place.apply(V), F, texcoords, made_for, loose, where, place
         )
         return garment if count is None else garment.remeshed(count)
 

@@ -35,7 +35,7 @@ __getattr__, __dir__, __all__ = lazy.attach(
         "plugins": ["register"],
         "rules": ["Rules"],
         "sequence": ["Sequence", "drop_stray_components", "inverted"],
-        "start": ["check_depth", "check_seen", "check_tracks"],
         "settings": ["PRESETS", "Settings", "defaults_xml", "properties_xml"],
+        "start": ["check_depth", "check_seen", "check_tracks"],
     },
 )

@@ -158,5 +158,10 @@ def test_what_is_missing_is_said(folder, tmp_path):
         teach.main(["shorts", "-o", str(tmp_path), "--kinds", "dance"])
     with pytest.raises(InputError, match="--vertices 3: 100 or more"):
         teach.main(["shorts", "-o", str(tmp_path), "--vertices", "3"])
+    with pytest.raises(InputError, match="shorts: two garments have this name"):
+        teach.main(["shorts", "shorts", "-o", str(tmp_path / "no")])
+    with pytest.raises(InputError, match="--seconds -1: more than 0"):
+        teach.main(["shorts", "-o", str(tmp_path / "no"), "--seconds", "-1"])
+    assert not (tmp_path / "no").exists()
     with pytest.raises(InputError, match="lessons have their own garments"):
         replace(SMALL, teacher="x", cuts=3)

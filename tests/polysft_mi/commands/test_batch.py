@@ -156,6 +156,7 @@ def test_refusals(tmp_path):
         ([scene, "--workers", "0", *out], "at least 1"),
         ([scene, "-D", "order", *out], "NAME=VALUE"),
         ([scene, "-o", str(full)], "holds no batch"),
+        ([scene, *out, "--", "-o", "foo"], "-o after --: each result has its own folder"),
     ]:
         with pytest.raises(InputError, match=words):
             batch.main(arguments)

@@ -196,8 +196,8 @@ def test_refusals_leave_nothing(finished_run, moved, tmp_path):
     for arguments, words in [
         ([str(out), str(tmp_path / "mine")], "holds no ground truth"),
         ([str(truth.folder), str(out)], "not the folder of a run"),
-        ([str(out), str(truth.folder), "--frames", "0"], "--frames 0"),
-        ([str(out), str(truth.folder), "--scale", "-1"], "--scale -1"),
+        ([str(out), str(truth.folder), "--frames", "0"], "--frames 0: at least one"),
+        ([str(out), str(truth.folder), "--scale", "-1"], "--scale -1: a positive number"),
         ([str(out), str(truth.folder), "-o", str(tmp_path / "a" / "b")], "no such folder"),
         ([str(out), str(truth.folder), "-o", str(tmp_path / "mine")], "holds other files"),
     ]:
