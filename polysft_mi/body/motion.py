@@ -140,10 +140,8 @@ class BodyMotion(_World):
         said = []
         if self.model and self.shape is not None and np.any(self.shape[_BETAS:]):
             said.append(f"{len(self.shape)} betas; the first {_BETAS} of them count")
-        length = Rotation.from_rotvec(self.poses[:, 0]).apply(
-            (0, 0, 1)
-        )  # from the feet to the head
-        upright = {up: np.median(_up_of(up).apply(length)[:, 2]) for up in _TO_Z}
+        spine = Rotation.from_rotvec(self.poses[:, 0]).apply((0, 0, 1))  # towards the head
+        upright = {up: np.median(_up_of(up).apply(spine)[:, 2]) for up in _TO_Z}
         best = max(upright, key=lambda up: upright[up])
         if upright[self.up] < _UPRIGHT < upright[best]:
             said.append(
