@@ -12,6 +12,7 @@ is the T-pose itself.
 import argparse
 import os
 
+from onefit.garment import add_place_arguments
 from polyfit.errors import InputError, Parser, cli, require
 
 
@@ -29,17 +30,7 @@ def parser():
     p.add_argument("--shape", nargs="*", default=[], metavar="NAME=VALUE", help="of that body")
     p.add_argument("--pose", choices=("cloth3d", "T-pose"), default="cloth3d", help="of that body")
     p.add_argument("--loose", action="store_true", help="a dress or skirt: by the shape alone")
-    p.add_argument("--scale", type=float, default=1.0, help="factor to metres (default: 1)")
-    p.add_argument(
-        "--up",
-        choices=("z", "y"),
-        help="the axis that points up (default: of .glb y, as glTF has it, or z)",
-    )
-    p.add_argument("--turn", type=float, default=0.0, help="about the vertical [degrees]")
-    p.add_argument(
-        "--offset", nargs=3, type=float, default=(0.0, 0.0, 0.0), metavar=("X", "Y", "Z"),
-        help="translation [m]",
-    )  # fmt: skip
+    add_place_arguments(p)
     return p
 
 

@@ -40,7 +40,7 @@ def _parser():
         help="what glTF and the page show, at 30 frames a second: files, or generated kinds"
         " (default: dance walk jumping_jack)",
     )
-    command.add_mesh_arguments(p)
+    command.add_garment_arguments(p)
     command.add_motion_arguments(p, SECONDS, SEED)
     p.add_argument(
         "--shape", nargs="*", default=[], metavar="NAME=VALUE", help="of the body: weight=0.7"

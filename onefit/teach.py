@@ -5,18 +5,24 @@
     python -m onefit.train --teacher LESSONS -o runs/taught
 
 LESSONS receives one file for each garment, and one for each of its drapes, by kind of motion and
-seed; those that are there are kept, so that a run that was cut short goes on. Garments have about
---vertices; every second lesson is of one of --shapes random bodies.
+seed; those that are there are kept, so that a run that was cut short goes on, or more are made in
+the same way (lessons.json says which). Garments have about --vertices; every second lesson is of
+one of --shapes random bodies.
 """
 
 import argparse
+import json
 import math
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+from onefit.garment import add_mesh_arguments, read_options
 from onefit.physics import MATERIALS, Material
 from polyfit.errors import InputError, Parser, cli, require
+from polyfit.files import aside
+
+_ALIKE = "vertices", "seconds", "shapes", "steps", "material", "weights"  # for all of a folder
 
 
 def parser():
@@ -37,6 +43,7 @@ def parser():
     p.add_argument("--steps", type=int, default=2, help="of cloth, a frame (default: 2)")
     p.add_argument("--material", default="cotton", help=f"one of {', '.join(MATERIALS)}")
     p.add_argument("--weights", default="six-garments", help="what drapes before the simulation")
+    add_mesh_arguments(p)
     return p
 
 
@@ -48,6 +55,7 @@ def main(argv=None):
     from rich.progress import Progress
 
     from .draping import load
+    from .garment import Garment
     from .garment.sewing.cuts import cuts
     from .motion import Motion, generate
     from .training import STANDARD, teacher
@@ -63,7 +71,8 @@ def main(argv=None):
             raise InputError(f"--kinds {kind}: choose among {', '.join(generate.TRAINING)}")
     draper, folder = load(args.weights), Path(args.output)
     named = args.garments or (() if args.cuts else STANDARD)
-    garments = [draper.garment(name) for name in named]
+    how = read_options(args.garments, args)
+    garments = [Garment.named(name, **how) for name in named]
     if not 0 < args.seconds < math.inf:
         raise InputError(f"--seconds {args.seconds:g}: more than 0 is needed")
     names = [garment.name for garment in garments]
@@ -71,6 +80,7 @@ def main(argv=None):
         if names.count(name) > 1:
             raise InputError(f"{name}: two garments have this name; lessons are kept by it")
     folder.mkdir(parents=True, exist_ok=True)
+    _check_alike(folder, {name: getattr(args, name) for name in _ALIKE})
     rng = np.random.default_rng(0)
     shapes = [draper.model.standard_shape]
     shapes += [draper.model.random_shape(rng) for _ in range(args.shapes)]
@@ -100,6 +110,23 @@ def main(argv=None):
                 teacher.write(path, made)
             progress.advance(task)
     print(args.output)
+
+
+def _check_alike(folder, how):
+    """Keep in ``folder`` ``how`` its lessons are made. Raises InputError where those that are there
+    were made otherwise.
+    """
+    path = folder / "lessons.json"
+    if path.exists():
+        there = json.loads(path.read_text())
+        other = [f"{n} {there.get(n)}" for n in how if there.get(n) != how[n]]
+        if other:
+            raise InputError(
+                f"{folder}: lessons made otherwise ({', '.join(other)}); give the same, or another"
+                " -o"
+            )
+    with aside(path) as temporary:
+        Path(temporary).write_text(json.dumps(how, indent=1) + "\n")
 
 
 def _resized(folder, garment, vertices):

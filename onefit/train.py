@@ -27,7 +27,7 @@ from polyfit.errors import Parser, cli, optional_imports
 with optional_imports(__name__):
     from polyfit.training import add_run_arguments, run
 
-    from .garment import FRAMES
+    from .garment import FRAMES, add_mesh_arguments, read_options
     from .motion import add_file_arguments
     from .network import EXTRAS
     from .objective import Weights
@@ -52,6 +52,7 @@ def parser():
         help="AMASS, NCS or BVH files (default: generated ones)",
     )
     add_file_arguments(p)
+    add_mesh_arguments(p)
     p.add_argument(
         "--from",
         dest="start",
@@ -121,14 +122,19 @@ def parser():
     return p
 
 
+def settings_of(args):
+    """The :class:`onefit.training.Settings` of parsed arguments. Raises InputError."""
+    weights = Weights(**{f.name: getattr(args, f.name) for f in fields(Weights)})
+    own = ("weights", "read")
+    values = {f.name: getattr(args, f.name) for f in fields(Settings) if f.name not in own}
+    values |= {name: tuple(getattr(args, name)) for name in ("garments", "motions", "extras")}
+    return Settings(**values, weights=weights, read=read_options(args.garments, args))
+
+
 def main(argv=None):
     args = parser().parse_args(argv)
-    weights = Weights(**{f.name: getattr(args, f.name) for f in fields(Weights)})
-    values = {f.name: getattr(args, f.name) for f in fields(Settings) if f.name != "weights"}
-    values |= {name: tuple(getattr(args, name)) for name in ("garments", "motions", "extras")}
     command = "python -m onefit.train " + shlex.join(sys.argv[1:] if argv is None else argv)
-    settings = Settings(**values, weights=weights)
-    run(train, settings, args, command)
+    run(train, settings_of(args), args, command)
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
+from onefit.garment import add_mesh_arguments, read_options
 from onefit.motion import add_file_arguments
 from onefit.network import DEFAULT
 from polyfit.errors import InputError, Parser, require
@@ -64,7 +65,7 @@ def parser(name: str, text: str) -> Parser:
         metavar="NAME=VALUE",
         help="the body's shape, e.g. weight=0.7; the rest is standard",
     )
-    add_mesh_arguments(p)
+    add_garment_arguments(p)
     add_motion_arguments(p, SECONDS, SEED)
     p.add_argument(
         "--skip", nargs="*", default=[], choices=("usd", "render"), help="results to leave out"
@@ -84,45 +85,14 @@ def parser(name: str, text: str) -> Parser:
     return p
 
 
-def add_mesh_arguments(p: Parser) -> None:
+def add_garment_arguments(p: Parser) -> None:
     """What :func:`garments_of` needs."""
-    group = p.add_argument_group("a garment's mesh that is not in metres around the standard body")
-    group.add_argument(
-        "--scale",
-        type=float,
-        default=1.0,
-        help="factor to metres: 0.01 for centimetres (default: 1)",
-    )
-    group.add_argument(
-        "--up",
-        choices=("z", "y"),
-        help="the axis that points up (default: of .glb y, as glTF has it, or z)",
-    )
-    group.add_argument(
-        "--turn", type=float, default=0.0, help="rotation about the vertical [degrees] (default: 0)"
-    )
-    group.add_argument(
-        "--offset",
-        nargs=3,
-        type=float,
-        default=(0.0, 0.0, 0.0),
-        metavar=("X", "Y", "Z"),
-        help="translation [m]",
-    )
-    group.add_argument(
-        "--made-for",
-        choices=("T-pose",),
-        help="T-pose: the standard body with its arms stretched out",
-    )
-    group.add_argument(
+    add_mesh_arguments(p).add_argument(
         "--vertices",
         type=int,
         metavar="N",
         help="about N vertices of cloth, which carry the file's mesh (default: its own; of a sewing"
         " pattern 4000)",
-    )
-    group.add_argument(
-        "--loose", action="store_true", help="a skirt or dress: the legs' pose is not followed"
     )
 
 
@@ -139,30 +109,15 @@ def add_motion_arguments(p: Parser, seconds: float, seed: int) -> None:
 
 
 def garments_of(names: Sequence[str], args: argparse.Namespace) -> list[Garment]:
-    """The garments called ``names``, by the flags of :func:`add_mesh_arguments`. Raises InputError,
-    also where none of them is a file, which such a flag speaks of.
+    """The garments called ``names``, by the flags of :func:`add_garment_arguments`. Raises
+    InputError, also where none of them is a file, which such a flag speaks of.
     """
-    from onefit.garment import LOOSE, TEMPLATES, Garment
+    from onefit.garment import Garment
 
     if args.vertices is not None and args.vertices < 100:
         raise InputError(f"--vertices {args.vertices}: at least 100 are needed")
-    placed = dict(
-        made_for=args.made_for,
-        loose=args.loose,
-        scale=args.scale,
-        up=args.up,
-        turn=args.turn,
-        offset=tuple(args.offset),
-    )
-    if all(name in TEMPLATES + LOOSE for name in names):
-        plain = (None, False, 1.0, None, 0.0, (0.0, 0.0, 0.0))
-        for (flag, value), default in zip(placed.items(), plain):
-            if value != default:
-                raise InputError(
-                    f"--{flag.replace('_', '-')}: for a garment's file; {names[0]} is a template,"
-                    " which lies on the body"
-                )
-    return [Garment.named(name, **placed, count=args.vertices) for name in names]
+    how = read_options(names, args)
+    return [Garment.named(name, **how, count=args.vertices) for name in names]
 
 
 def motions_of(

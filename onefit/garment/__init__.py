@@ -8,6 +8,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
         "alignment": ["aligned", "pose_of"],
+        "arguments": ["add_mesh_arguments", "add_place_arguments", "read_options"],
         "binding": [
             "Binding",
             "cotangent_laplacian",

@@ -180,7 +180,7 @@ def data_of(settings, folder, progress):
         named = settings.garments or taught(settings.teacher)
         garments = [garment_of(settings.teacher, name) for name in named]
     else:
-        garments = [Garment.named(name) for name in settings.garments or STANDARD]
+        garments = [Garment.named(name, **settings.read) for name in settings.garments or STANDARD]
     learned = [lessons(settings.teacher, g) for g in garments] if settings.teacher else ()
     motions = [
         Motion.read(path, settings.fps, settings.motion_up) for path in settings.motions

@@ -25,7 +25,8 @@ PRESETS = {
 @dataclass(frozen=True)
 class Settings:
     """What decides the result. ``garments``: by default those of the lessons, or else
-    :data:`STANDARD`; ``fps`` and ``motion_up``: of the files of ``motions``, as
+    :data:`STANDARD`; ``read``: options of :meth:`onefit.Garment.read`, for those that are files;
+    ``fps`` and ``motion_up``: of the files of ``motions``, as
     :meth:`onefit.Motion.read` takes them; ``batch``: patches of a step, all frames together
     (the paper's 20,000); ``lr`` for the first ``lr_epochs`` epochs, a tenth of it for the rest; an
     epoch has ``epoch_steps`` steps (0: as many as show each window of the motions once); ``cuts``:
@@ -38,6 +39,7 @@ class Settings:
     """
 
     garments: tuple = ()
+    read: dict = field(default_factory=dict)
     motions: tuple = ()
     fps: float | None = None
     motion_up: str | None = None
@@ -77,6 +79,9 @@ class Settings:
         Material.named(self.material)
         if self.teacher and self.cuts:
             raise InputError("--teacher and --cuts: lessons have their own garments and cuts")
+        if self.teacher and self.read:
+            flag = next(iter(self.read)).replace("_", "-")
+            raise InputError(f"--{flag}: for garments' files; --teacher has its own garments")
         if not 2 <= self.order <= 10:
             raise InputError(f"order = {self.order}; the order of OneFit's jets is 2 to 10")
         if not self.lr > 0:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from processes import two_ranks
+from rich.progress import Progress
 from safetensors.torch import load_file
 
 import onefit
@@ -14,6 +15,7 @@ from onefit.objective import Weights
 from onefit.training import OneFitTraining, Settings, data_of, loop
 from onefit.training.data import LENGTH
 from polyfit.errors import InputError
+from polyfit.mesh import write_ply
 from polyfit.training import Processes
 
 
@@ -229,12 +231,8 @@ def test_a_training_of_the_paper_s_network_goes_on_from_its_checkpoint(motion, t
     train.main([*flags, "-o", str(folder)])
     first = load_file(folder / "weights.safetensors")
     # as if the machine had been lost after a step: another goes on from its checkpoint
-    args = train.parser().parse_args([*flags, "-o", str(folder)])
-    weights = Weights(**{f: getattr(args, f) for f in Weights.__dataclass_fields__})
-    names = set(Settings.__dataclass_fields__) - {"weights"}
-    plain = {n: getattr(args, n) for n in names}
-    plain |= {n: tuple(plain[n]) for n in ("garments", "motions", "extras")}
-    assert loop.train(Settings(**plain, weights=weights), tmp_path / "lost", until=1) is None
+    settings = train.settings_of(train.parser().parse_args([*flags, "-o", str(folder)]))
+    assert loop.train(settings, tmp_path / "lost", until=1) is None
     shutil.copytree(tmp_path / "lost", tmp_path / "elsewhere")
     train.main([*flags, "-o", str(tmp_path / "elsewhere"), "--resume"])
     then = load_file(tmp_path / "elsewhere" / "weights.safetensors")
@@ -308,3 +306,15 @@ def test_a_wrong_name_is_told(tmp_path):
     with pytest.raises(InputError, match="^tuxedo.obj: no such file"):
         train.main(["tuxedo.obj", "-o", str(tmp_path / "out")])
     assert not (tmp_path / "out").exists()
+
+
+def test_garments_in_other_units_are_read_as_the_flags_say(small, tmp_path):
+    shorts, path = onefit.Garment.template("shorts"), tmp_path / "mine.ply"
+    write_ply(path, 100 * shorts.vertices.numpy(), shorts.faces.numpy())
+    with pytest.raises(InputError, match="looks like centimetres: .* or --scale 0.01"):
+        train.main([str(path), "-o", str(tmp_path / "no")])
+    with pytest.raises(InputError, match="--up: for a garment's file; tank is a template"):
+        train.main(["tank", "-o", str(tmp_path / "no"), "--up", "y"])
+    mine = replace(small, garments=(str(path),), read=dict(scale=0.01))
+    read = data_of(mine, tmp_path, Progress(disable=True)).garments[0][0].garment
+    assert torch.allclose(read.vertices, shorts.vertices, atol=1e-5)

@@ -89,7 +89,7 @@ def test_a_lesson_gives_the_drape_back():
 def test_lessons_that_are_there_are_kept(folder):
     path = path_of(folder, "shorts", "walk-0")
     before = path.stat().st_mtime_ns
-    teach.main([*ARGUMENTS, "-o", str(folder)])
+    teach.main([*ARGUMENTS, "-o", str(folder), "--steps", "1"])
     assert path.stat().st_mtime_ns == before
 
 
@@ -165,3 +165,10 @@ def test_what_is_missing_is_said(folder, tmp_path):
     assert not (tmp_path / "no").exists()
     with pytest.raises(InputError, match="lessons have their own garments"):
         replace(SMALL, teacher="x", cuts=3)
+    with pytest.raises(InputError, match="--scale: for garments' files"):
+        replace(SMALL, teacher="x", read=dict(scale=0.01))
+
+
+def test_lessons_that_were_made_otherwise_are_not_mixed_in(folder):
+    with pytest.raises(InputError, match=r"lessons made otherwise \(steps 1, material cotton\)"):
+        teach.main([*ARGUMENTS, "-o", str(folder), "--material", "silk"])
