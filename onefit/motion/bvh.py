@@ -3,6 +3,7 @@ told.
 """
 
 import re
+from textwrap import shorten
 
 import numpy as np
 import torch
@@ -171,7 +172,7 @@ def _joints(path, names, parents, offsets):
             if bone is None and joint not in _OPTIONAL:
                 raise InputError(
                     f"{path}: no {side} {joint} among its bones"
-                    f" ({', '.join(n for n in names if n)[:200]})"
+                    f" ({shorten(', '.join(n for n in names if n), 200)})"
                 )
             if bone is not None:
                 found[f"{side}_{joint}"] = bone
