@@ -215,7 +215,8 @@ SECTIONS = {
             figures.simulated,
             "The sequences cannot be had here. A folder of φ-SfT's form (`rgbs/`, `masks/`, an OBJ "
             "file, a texture, `camera.json`) runs as it is, and a test runs a small one; the truth "
-            "is a `gt.npz` with `vertices` (T, N, 3). The table has sheets of our own instead.",
+            "is a `gt.npz` with `vertices` (T, N, 3) and `faces` (F, 3). The table has sheets of "
+            "our own instead.",
         ),
         Entry(
             "Time",

@@ -17,11 +17,12 @@ import glob
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
 from argparse import ArgumentParser
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from importlib import metadata
 
 from .errors import InputError, cli
@@ -165,7 +166,8 @@ def set_variant(mode: str | None = None) -> str:
     except InputError:
         if mode.startswith("llvm"):
             raise
-    import mitsuba as mi
+    with _without_ctrl_c():
+        import mitsuba as mi
 
     known = [name for name in mi.variants() if name.endswith(_SUFFIX)]
     if mode not in known:
@@ -176,7 +178,8 @@ def set_variant(mode: str | None = None) -> str:
             " leave the mode out, or give llvm_ad_rgb"
         )
     try:
-        mi.set_variant(mode)
+        with _without_ctrl_c():
+            mi.set_variant(mode)
     except ImportError as error:
         raise InputError(
             f"mode {mode!r} cannot be used here: {' '.join(str(error).split())}"
@@ -184,6 +187,21 @@ def set_variant(mode: str | None = None) -> str:
     _refuse_llvm(mode)
     _fit_threads()
     return mode
+
+
+@contextlib.contextmanager
+def _without_ctrl_c() -> Iterator[None]:
+    """Ctrl-C waits for the end of the block: an extension that is interrupted while it is loaded
+    ends the process.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _refuse_llvm(mode: str) -> None:

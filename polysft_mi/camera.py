@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +14,9 @@ import numpy as np
 from .errors import InputError
 
 LARGEST = 1e9  # [pixels, m]: a number beyond it is a mistake, and overflows where it is squared
+_WIDEST = 170.0  # [degrees] across a pinhole's picture
+_LENS = re.compile("k[1-6]|p[12]|skew|gamma|.*(dist|radial|tangential|fisheye|model|coef).*", re.I)
+_PINHOLES = "pinhole", "simple_pinhole", "perspective", "opencv", "brown", "none"
 
 
 @dataclass(frozen=True)
@@ -43,6 +47,14 @@ class Intrinsics:
                 f"camera: image size {self.width:g}x{self.height:g}; both must be positive, and at"
                 f" most {LARGEST:g}"
             )
+        for focal, side in ((self.fx, self.width), (self.fy, self.height)):
+            angle = 2 * math.degrees(math.atan(side / (2 * focal)))
+            if angle > _WIDEST:
+                raise InputError(
+                    f"camera: a focal length of {focal:g} pixels sees {angle:.1f} degrees of"
+                    f" {side:g} pixels; at most {_WIDEST:g} can be used: pixels are needed, not"
+                    " shares of the picture"
+                )
 
     def matrix(self) -> np.ndarray:
         """K, shape (3, 3)."""
@@ -77,7 +89,9 @@ class Intrinsics:
 
     @classmethod
     def from_json(cls, path: str | os.PathLike[str]) -> Intrinsics:
-        """From a JSON file with the keys fx, fy, cx, cy, width, height."""
+        """From a JSON file with the keys fx, fy, cx, cy, width, height. Raises InputError, also for
+        a lens that is no pinhole.
+        """
         try:
             with open(path, encoding="utf-8-sig") as file:
                 data = json.load(file)
@@ -105,6 +119,7 @@ class Intrinsics:
         lens = number("fx"), number("fy"), number("cx"), number("cy")
         size = int(number("width", whole=True)), int(number("height", whole=True))
         try:
+            check_pinhole(data)
             return cls(*lens, *size)
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
@@ -158,3 +173,27 @@ class Intrinsics:
             "</sensor>",
         ]
         return "\n".join(indent + line for line in lines)
+
+
+def check_pinhole(known: dict[str, Any], *, distortion: bool = False) -> None:
+    """Raise InputError where what a camera's file holds, ``known``, says of the lens what no
+    pinhole has; ``distortion``: but under that name it may.
+    """
+
+    def told(name: str, value: Any) -> bool:
+        if not _LENS.fullmatch(name) or (distortion and name == "distortion"):
+            return False
+        if isinstance(value, str):
+            return value.lower() not in _PINHOLES
+        return bool(np.any(value))
+
+    found = next((name for name, value in known.items() if told(name, value)), None)
+    if found is None:
+        return
+    needed = (
+        "a lens is known by distortion alone, a list of OpenCV's k1, k2, p1, p2, k3, ..."
+        if distortion
+        else "frames without distortion are needed; polysft prepare VIDEO removes it (the folder of"
+        " the frames may be its VIDEO)"
+    )
+    raise InputError(f"{found} = {known[found]!r:.40}; {needed}")

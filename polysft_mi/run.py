@@ -252,15 +252,15 @@ def reconstruct(
         note = "the frames are grey, and so the texture is taken without its colours"
         print(f"note: {scene}: {note}", file=sys.stderr)
     tracker = FrameTracker(problem)
-    text = outputs.resolved_scene(experiment)
+    text, inputs = outputs.resolved_scene(experiment), folder.digest(experiment.inputs(sequence))
     if resume:
-        folder.check_same(out, text)
+        folder.check_same(out, text, inputs)
     elif overwrite:
         folder.clear(out)
     os.makedirs(out, exist_ok=True)
     if not resume:
         cameras = problem.camera, sequence.cameras
-        outputs.write_beginning(out, text, *cameras, command, fps)
+        outputs.write_beginning(out, text, *cameras, command, fps, inputs)
 
     gc.freeze()  # what is loaded by now stays: the collector need not go through it again and again
     about = {"scene": os.path.abspath(experiment.path), **outputs.versions()}
@@ -273,20 +273,24 @@ def reconstruct(
         done, interrupted = _track(tracker, out, resume, progress, drawing)
         if not done.states:
             return Outcome(out, interrupted=interrupted)
-        summary, plotted = outputs.write(
-            problem,
-            done,
-            out,
-            drawing,
-            fps=fps,
-            command=command,
-            say=progress.stage,
-            fits=tracker.objective.fits,
-        )
-        if sequence.cameras:
-            plotted()  # the page shows their pictures
-        page = _report(out, progress) if report else None
-        plotted()
+        try:
+            summary, plotted = outputs.write(
+                problem,
+                done,
+                out,
+                drawing,
+                fps=fps,
+                command=command,
+                say=progress.stage,
+                fits=tracker.objective.fits,
+            )
+            if sequence.cameras:
+                plotted()  # the page shows their pictures
+            page = _report(out, progress) if report else None
+            plotted()
+        except KeyboardInterrupt:
+            progress.say("interrupted while results were written; --resume writes them")
+            raise
     for frame, reason in summary["lost"].items():
         print(f"frame {frame}: {reason}; it keeps the state of the frame before", file=sys.stderr)
     return Outcome(out, summary, page, time.perf_counter() - began, interrupted)

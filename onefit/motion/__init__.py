@@ -9,6 +9,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     submod_attrs={
         "arguments": ["add_file_arguments"],
         "generate": ["KINDS"],
+        "likely": ["check_ways"],
         "motion": ["Motion"],
     },
 )

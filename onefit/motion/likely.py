@@ -103,7 +103,7 @@ def stood(path, poses, translation, fps, up, other):
         turn = to_z(axis)
         poses, translation = poses.copy(), turn.apply(translation)
         poses[:, 0] = (turn * Rotation.from_rotvec(poses[:, 0])).as_rotvec()
-    _check_ways(path, poses, translation, fps)
+    check_ways(path, poses, translation, fps)
     return poses, translation
 
 
@@ -122,14 +122,17 @@ def _lies(path, direction, other):
     )
 
 
-def _check_ways(path, poses, translation, fps):
+def check_ways(path, poses, translation, fps):
+    """Raises InputError for a root that flies, and for feet that slide, with ``poses`` (T, 24, 3)
+    [rad] and ``translation`` (T, 3) [m] at ``fps`` frames a second.
+    """
     if len(poses) < 2:
         return
     n = int(np.clip(round(_LIKELY.window * fps), 1, len(poses) - 1))
     speed = lambda x: np.linalg.norm(x[n:] - x[:-n], axis=-1) * fps / n
     fastest = np.percentile(speed(translation), 90)
     if fastest > _LIKELY.root:
-        unit = "; in centimetres? then divide trans by 100" if fastest < 100 * _LIKELY.root else ""
+        unit = "; in centimetres? then divide it by 100" if fastest < 100 * _LIKELY.root else ""
         raise InputError(
             f"{path}: its root moves at {fastest:.3g} m/s; metres and frames a second are"
             f" needed{unit}"

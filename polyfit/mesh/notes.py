@@ -10,7 +10,7 @@ def size_note(vertices: np.ndarray, where: str = "mesh", what: str = "mesh") -> 
     would make it likely; None for one that lies between a grain of rice and a house. ``vertices``
     (N, 3) [m].
     """
-    extent, rice, house = float(np.ptp(vertices, axis=0).max()), 0.005, 30.0
+    extent, rice, house = float(np.ptp(vertices, axis=0).max()), 0.005, 10.0
     if rice <= extent <= house:
         return None
     # in the order in which people use them

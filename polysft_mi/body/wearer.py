@@ -55,6 +55,7 @@ def _on_joints(vertices, faces, motion):
 
     import onefit
     from onefit.garment import OffBody
+    from onefit.motion import check_ways
 
     smpl = onefit.SmplBody(motion.model) if motion.model else None
     draper = onefit.load(model=smpl)
@@ -103,6 +104,7 @@ def _on_joints(vertices, faces, motion):
         torch.as_tensor(upright.apply(translation + root) - root).float(),
         motion.fps,
     )
+    check_ways(motion.path, poses, as_onefit.translation.numpy(), motion.fps)
     worn = draper.simulate(garment, as_onefit, shape).render_vertices().astype(float)
     worn = upright.inv().apply(worn.reshape(-1, 3)).reshape(worn.shape)
     at = np.arange(len(motion.poses)) * (_NETWORK_FPS / motion.fps)

@@ -9,7 +9,7 @@ import numpy as np
 from polyfit.backend import set_variant
 from polyfit.colours import srgb
 from polyfit.files import aside
-from polyfit.mesh import TexCoords, size_note
+from polyfit.mesh import TexCoords, read_textured, size_note
 from polysft_mi.body import check_model, read_motion
 from polysft_mi.errors import InputError
 from polysft_mi.scene import (
@@ -106,7 +106,10 @@ def prepare_folder(
         )
     else:
         where = os.path.join(folder, layout.obj)
-        vertices, faces, uv = meshio.read_textured_template(where)
+        read = read_textured(where, what="template")
+        vertices, faces, uv, _, left_out = meshio.cleaned(*read)
+        if left_out:
+            warn(f"note: {where}: {left_out}")
     meshio.check_template(vertices, faces, uv, where)
     placed = vertices * ((-1, -1, 1) if layout.flip else 1)
     if not body:
@@ -124,7 +127,7 @@ def prepare_folder(
             )
     folders = {}
     if rig and rig.ours:
-        open_cameras(rig.path, len(sequence))
+        open_cameras(rig.path, sequence.count)
         evidence["cameras"] = rig.path
     elif rig:
         known = lambda path: os.path.isfile(os.path.join(path, "camera.json"))

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from polyfit.mesh import edges_of
 from polysft_mi.errors import InputError
 
 from .metrics import (
@@ -26,6 +27,7 @@ from .metrics import (
 )
 from .truth import Truth, check_surface, read_surface
 
+_ALIKE = 5.0  # times as large as each other, at most, a surface and what it is compared with
 LABELS = {
     "frames": "frames compared",
     "rmse_mm": "vertex RMSE [mm]",
@@ -115,6 +117,7 @@ def per_frame(surface, truth):
     meshes = np.asarray(surface["vertices"], dtype=np.float64)
     faces = np.asarray(surface["faces"], dtype=np.int64)
     at = {int(k): V for k, V in zip(surface["frames"], meshes)}
+    _check_alike(meshes[0], faces, truth)
     rng = np.random.default_rng(0)  # one stream through all frames, so that figures repeat
     rows = [{"frame": k, **_figures(at[k], faces, truth, k, rng)} for k in truth.places if k in at]
     if not rows:
@@ -122,6 +125,33 @@ def per_frame(surface, truth):
             f"{truth.path}: has no frame in common with the surface's frames {min(at)} to {max(at)}"
         )
     return {name: [row[name] for row in rows] for name in rows[0]}
+
+
+def _check_alike(V, faces, truth):
+    """Raise InputError where true meshes cannot be of the surface with vertices V (N, 3) [m] and
+    ``faces`` (F, 3): in another unit, in another frame, or with vertices in another order.
+    """
+    if truth.kind != "mesh":
+        return
+    G = truth.at(min(truth.places))
+    size = np.linalg.norm(np.ptp(G, axis=0)) / max(np.linalg.norm(np.ptp(V, axis=0)), 1e-12)
+    if not 1 / _ALIKE < size < _ALIKE:
+        raise InputError(
+            f"{truth.path}: {size:.3g} times as large as the surface; both are needed in metres"
+        )
+    if (G[:, 2] <= 0).all():
+        raise InputError(
+            f"{truth.path}: lies behind the camera; the camera's frame is needed: x right, y down,"
+            " z forward"
+        )
+    key = lambda faces: np.unique(np.sort(edges_of(faces)[0], axis=1), axis=0)
+    if len(V) == len(G):  # quads may have been cut the other way
+        ours, theirs = ({tuple(e) for e in key(f).tolist()} for f in (faces, truth.faces))
+        if 2 * len(ours & theirs) < len(theirs):
+            raise InputError(
+                f"{truth.path}: its faces join other vertices than the surface's; the template's"
+                " own vertices, in its order, are needed"
+            )
 
 
 def _figures(V, faces, truth, frame, rng):
@@ -133,6 +163,11 @@ def _figures(V, faces, truth, frame, rng):
     if truth.kind == "clouds":
         return {"chamfer_1e4": 1e4 * chamfer(sample_surface(V, faces, len(G), rng), G)}
     error, share = depth_rmse(V, faces, G)
+    if not share:
+        raise InputError(
+            f"{truth.path}: frame {frame}: no point lies on a ray that meets the surface; metres in"
+            " the camera's frame (x right, y down, z forward) are needed"
+        )
     row = {"depth_rmse_mm": 1e3 * error, "hit": share}
     if truth.K is not None:
         all_pixels = float(np.sqrt(image_share(V, faces, truth.K)))

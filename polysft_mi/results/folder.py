@@ -1,8 +1,11 @@
 """The folder that a run writes to: whether it may be used, and what of an earlier run goes."""
 
 import glob
+import hashlib
+import json
 import os
 import shutil
+from collections.abc import Iterable
 
 from polysft_mi.errors import InputError
 
@@ -61,20 +64,39 @@ def clear(out):
         shutil.rmtree(os.path.join(out, name), ignore_errors=True)
 
 
-def check_same(out, scene):
-    """Raise InputError where the run in ``out`` had another resolved scene (text) than ``scene``:
-    resumed, it would give a result that no scene describes.
+def digest(files: Iterable[str]) -> str:
+    """What tells the contents of these files, in this order, from others."""
+    found = hashlib.blake2b(digest_size=8)
+    for path in files:
+        with open(path, "rb") as file:
+            found.update(hashlib.blake2b(file.read()).digest())
+    return found.hexdigest()
+
+
+def check_same(out, scene, inputs):
+    """Raise InputError where the run in ``out`` had another resolved scene (text) than ``scene``,
+    or files of another :func:`digest` than ``inputs``: resumed, it would give a result that no
+    scene describes.
     """
-    path = os.path.join(out, "scene.xml")
-    try:
-        with open(path, encoding="utf-8") as file:
-            same = file.read() == scene
-    except OSError:
-        raise InputError(
-            f"{path}: missing; the run cannot be resumed, give --overwrite to start again"
-        ) from None
-    if not same:
+    found = {}
+    for name in ("scene.xml", "run.json"):
+        path = os.path.join(out, name)
+        try:
+            with open(path, encoding="utf-8") as file:
+                found[name] = file.read() if name == "scene.xml" else json.load(file)
+        except (OSError, ValueError) as error:
+            why = "missing" if isinstance(error, OSError) else "broken"
+            raise InputError(
+                f"{path}: {why}; the run cannot be resumed, give --overwrite to start again"
+            ) from None
+    if found["scene.xml"] != scene:
+        path = os.path.join(out, "scene.xml")
         raise InputError(
             f"{out}: was run with another scene or other settings (see {path}); resume with those,"
             " or give --overwrite"
+        )
+    if found["run.json"].get("inputs", inputs) != inputs:
+        raise InputError(
+            f"{out}: the template, a texture, frames, masks or evidence have changed since the run"
+            " began; put them back to resume it, or give --overwrite"
         )

@@ -199,10 +199,11 @@ def _means(per_frame):
     return {name: float(np.mean(values)) for name, values in finite.items() if values}
 
 
-def write_beginning(out, scene, camera, others, command, fps):
+def write_beginning(out, scene, camera, others, command, fps, inputs):
     """What stands in the folder from the first second: the resolved scene (text), the
     :class:`polysft_mi.render.pinhole.Pinhole`, the ``others``
-    (:class:`polysft_mi.scene.cameras.OtherCamera`), and what the run is.
+    (:class:`polysft_mi.scene.cameras.OtherCamera`), and what the run is; ``inputs``: what
+    :func:`polysft_mi.results.folder.digest` says of its files.
     """
     with (
         aside(os.path.join(out, "scene.xml")) as temporary,
@@ -218,5 +219,6 @@ def write_beginning(out, scene, camera, others, command, fps):
         "started": time.strftime("%Y-%m-%dT%H:%M:%S"),
         "fps": fps,
         "versions": versions(),
+        "inputs": inputs,
     }
     write_json(os.path.join(out, "run.json"), about)

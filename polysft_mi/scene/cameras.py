@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from polysft_mi.camera import LARGEST, Intrinsics
+from polysft_mi.camera import LARGEST, Intrinsics, check_pinhole
 from polysft_mi.errors import InputError
 
 from .sequence import Sequence
@@ -52,7 +52,7 @@ class OtherCamera:
 
 def open_cameras(
     folder: str,
-    count: int,
+    count: int | None,
     first: int = 0,
     last: int = -1,
     stride: int = 1,
@@ -60,9 +60,9 @@ def open_cameras(
 ) -> list[OtherCamera]:
     """The cameras of a folder that holds a folder for each: ``camera.json`` (fx, fy, cx, cy, width,
     height [pixels], ``world_to_camera``), ``frames``, and ``masks`` where there are some. Of each
-    the frames ``first`` to ``last`` in steps of ``stride`` are used, ``count`` in all. ``known``:
-    intrinsics and world_to_camera (4, 4) of those that need no ``camera.json``, by name. Raises
-    InputError.
+    the frames ``first`` to ``last`` in steps of ``stride`` are used, of ``count`` (None: of any
+    number). ``known``: intrinsics and world_to_camera (4, 4) of those that need no ``camera.json``,
+    by name. Raises InputError.
     """
     known = known or {}
     if not os.path.isdir(folder):
@@ -134,10 +134,10 @@ def _open(folder, camera, count, selected):
         *selected,
         (intrinsics.width, intrinsics.height),
     )
-    if len(sequence) != count:
+    if count is not None and sequence.count != count:
         raise InputError(
-            f"{folder}: {len(sequence)} frames, and the scene's camera has {count}; one for each of"
-            " its frames is needed"
+            f"{folder}: {sequence.count} frames, and the scene's camera has {count}; one for each"
+            " of its frames is needed"
         )
     return OtherCamera(os.path.basename(folder), intrinsics, pose, sequence)
 
@@ -167,12 +167,8 @@ def _camera(known, where):
         ) from None
     except (ValueError, TypeError, OverflowError) as error:
         raise InputError(f"{where}: not a camera as JSON ({error})") from None
-    if np.any(known.get("distortion")):
-        raise InputError(
-            f"{where}: distortion; frames without are needed, as polysft prepare VIDEO --cameras"
-            " makes them"
-        )
     try:
+        check_pinhole(known)
         intrinsics = Intrinsics(*numbers, *size)
     except InputError as error:
         raise InputError(f"{where}: {error}") from None

@@ -2,18 +2,22 @@
 name is told at once.
 """
 
+import dataclasses
 import difflib
 import os
+import re
 import xml.etree.ElementTree as ET
 
 from polysft_mi.errors import InputError
 
 from . import settings
 
+_NAMES = {f.name for f in dataclasses.fields(settings.Settings)}
+
 
 def known_defaults(path):
     """Name to value of every ``<default>`` of a scene file. Raises InputError where the file is
-    missing or not XML.
+    missing or not XML, and for a default that nothing in it uses: its name is misspelt.
     """
     if not os.path.isfile(path):
         inside = os.path.join(path, "scene.xml")
@@ -23,7 +27,19 @@ def known_defaults(path):
         root = ET.parse(path).getroot()
     except (ET.ParseError, ValueError, LookupError) as error:  # the latter two: encodings
         raise InputError(f"{path}: not a readable XML scene: {error}") from None
-    return {e.get("name"): e.get("value") for e in root.iter("default") if e.get("name")}
+    known = {e.get("name"): e.get("value") for e in root.iter("default") if e.get("name")}
+    values = " ".join(value for e in root.iter() for value in e.attrib.values())
+    for name in known if root.find(".//include") is None else ():
+        used = re.search(rf"\${re.escape(name)}(?![A-Za-z0-9_])", values)
+        near = "" if used or name in _NAMES else _near(name, _NAMES - set(known))
+        if near:
+            raise InputError(f"{path}: <default name={name!r}>: nothing in it uses ${name}{near}")
+    return known
+
+
+def _near(name, names):
+    near = difflib.get_close_matches(name, names, 1)
+    return f", did you mean {near[0]}?" if near else ""
 
 
 def resolved_defaults(path, overrides):
@@ -34,10 +50,8 @@ def resolved_defaults(path, overrides):
     known = known_defaults(path)
     for name in overrides:
         if name not in known:
-            near = difflib.get_close_matches(name, known, 1)
-            hint = f", did you mean {near[0]}?" if near else ""
             raise InputError(
-                f"-D {name}: {path} has no such setting{hint}; known:"
+                f"-D {name}: {path} has no such setting{_near(name, known)}; known:"
                 f" {', '.join(sorted(known)) or 'none'}"
             )
     preset = {**known, **overrides}.get("preset") or "none"

@@ -42,7 +42,7 @@ class Experiment:
     vertices along texture seams); ``defaults`` maps each ``<default>`` to the value in force;
     ``sensors``: intrinsics and world_to_camera (4, 4) [m] of the scene's other sensors, by id;
     ``notes``: what was left out of the template's file, and what of the scene is not used, a line
-    each.
+    each; ``named``: the files that the scene names: the template's, textures.
     """
 
     path: str
@@ -58,6 +58,7 @@ class Experiment:
     defaults: dict = field(default_factory=dict)
     sensors: dict = field(default_factory=dict)
     notes: list = field(default_factory=list)
+    named: list = field(default_factory=list)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -65,13 +66,23 @@ class Experiment:
         width, height = self.sensor.film().crop_size()
         return int(width), int(height)
 
+    def inputs(self, sequence: Sequence) -> list[str]:
+        """All files that a run of the ``sequence`` depends on, beside the scene's own."""
+        s, files = self.settings, list(self.named)
+        for video in (sequence, *(camera.sequence for camera in sequence.cameras)):
+            files += [*video.files, *(video.mask_files or ())]
+        files += sequence.depth.files if sequence.depth else []
+        files += [self._located(name) for name in (s.tracks, s.body, s.body_model) if name]
+        return [file for file in files if os.path.isfile(file)]
+
+    def _located(self, name):
+        return os.path.normpath(located(self.path, name)) if name else ""
+
     def sequence(self) -> Sequence:
         """The :class:`Sequence` of the frames that the settings select. Raises InputError."""
         s = self.settings
-        tracks, depth, cameras, body, model = (
-            os.path.normpath(located(self.path, name)) if name else ""
-            for name in (s.tracks, s.depth, s.cameras, s.body, s.body_model)
-        )
+        names = s.tracks, s.depth, s.cameras, s.body, s.body_model
+        tracks, depth, cameras, body, model = map(self._located, names)
         sequence = Sequence.open(
             self.frames,
             self.masks,
@@ -98,7 +109,7 @@ class Experiment:
                         " folder; its frames are needed there"
                     )
             selected = s.first, s.last, s.stride
-            sequence.cameras = open_cameras(cameras, len(sequence), *selected, self.sensors)
+            sequence.cameras = open_cameras(cameras, sequence.count, *selected, self.sensors)
             videos = [sequence, *(camera.sequence for camera in sequence.cameras)]
             is_grey = any(video.grey for video in videos)  # all are compared with one texture
             for video in videos:
@@ -131,6 +142,8 @@ def load(
             " give -D data=FOLDER"
         )
     config, state, shape = _parsed(path, given)
+    names = (node.props.get("filename") for node in state.nodes)
+    named = [name for name in names if isinstance(name, str)]
     source = _source(shape)
     try:
         scene = _instance(path, config, state)
@@ -167,7 +180,7 @@ def load(
             f"note: {path}: its sensors {', '.join(sensors)} are not used; cameras names the folder"
             " of their frames"
         )
-    return Experiment(path, *shown, *files, settings, defaults, sensors, notes)
+    return Experiment(path, *shown, *files, settings, defaults, sensors, notes, named)
 
 
 def _further(sensors, path):

@@ -12,6 +12,7 @@ from polyfit.colours import srgb
 from polyfit.files import silent_decoders
 from polysft_mi.errors import InputError
 
+_ORIENTATION = 0x0112  # the tag of Exif
 EXTENSIONS = tuple(".png .jpg .jpeg .jpe .bmp .tif .tiff .webp .ppm .pgm .pnm .exr .hdr".split())
 
 
@@ -104,6 +105,18 @@ def checked_size(path, decode=True):
             raise InputError(
                 f"{path}: not a readable image ({getattr(error, 'strerror', None) or error})"
             ) from None
+
+
+def check_upright(path):
+    """Raise InputError where an image is to be turned, as its Exif orientation says, to be seen as
+    it was taken: its pixels would be used as they are.
+    """
+    if (orientation := _exif(path).get(_ORIENTATION, 1)) in range(2, 9):
+        raise InputError(
+            f"{path}: its Exif orientation ({orientation}) turns it; frames and masks are read as"
+            " their pixels stand. Store them upright, without it; polysft prepare VIDEO, where"
+            " VIDEO may be their folder, does so"
+        )
 
 
 def read_pixels(path, depth=False):
@@ -206,7 +219,7 @@ def read_rgb(path):
     if alpha is not None:
         a = alpha.astype(np.uint16)
         colour = ((colour * a + 255 * (255 - a) + 127) // 255).astype(np.uint8)
-    return np.ascontiguousarray(upright(colour, _exif(path).get(0x0112, 1)))
+    return np.ascontiguousarray(upright(colour, _exif(path).get(_ORIENTATION, 1)))
 
 
 def upright(image, orientation):

@@ -5,6 +5,8 @@ the start and read one frame at a time.
 from __future__ import annotations
 
 import functools
+import os
+import re
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -17,7 +19,7 @@ from polysft_mi.body import Carrier
 from polysft_mi.errors import InputError
 
 from .evidence import DepthImages, Tracks
-from .images import checked_size, finite, list_images, read_mask, read_pixels
+from .images import check_upright, checked_size, finite, list_images, read_mask, read_pixels
 
 _LEAST_AREA = 0.01  # of the first mask's area; what is smaller is no mask
 # of the largest value: the most that a grey image's channels differ by, in 99 % of its pixels, as
@@ -106,10 +108,12 @@ class Sequence:
                     f"{masks}: {len(mask_paths)} masks for the {len(paths)} images of {frames}; one"
                     " mask an image is needed"
                 )
+            _check_numbers(paths, mask_paths)
             mask_files = [mask_paths[k] for k in indices]
 
         everything = files + (mask_files or [])
         with ThreadPoolExecutor(min(8, cores())) as pool:
+            list(pool.map(check_upright, everything))
             sizes = dict(zip(everything, pool.map(checked_size, everything)))
         wanted, why = (
             ((size[0], size[1]), "the camera's film has")
@@ -174,6 +178,23 @@ class Sequence:
             return None
         mask = read_mask(self.mask_files[i])
         return drop_stray_components(mask) if self._drop_stray else mask
+
+
+def _check_numbers(frames, masks):
+    """Raise InputError where most masks have the last number in the name of their frame, but not
+    all: one is missing, and another too many.
+    """
+    numbers = [
+        [re.findall("[0-9]+", os.path.basename(p)) for p in paths] for paths in (frames, masks)
+    ]
+    alike = [bool(a and b) and int(a[-1]) == int(b[-1]) for a, b in zip(*numbers)]
+    if all(alike) or 2 * sum(alike) < len(alike):
+        return
+    k = alike.index(False)
+    raise InputError(
+        f"{masks[k]}: pairs with {frames[k]}, by their order, but their numbers differ, and those"
+        " of most do not; one mask for each image is needed, of the same number"
+    )
 
 
 def inverted(mask, sheet):

@@ -192,6 +192,7 @@ class Settings:
         0.0,
         "standard deviation of the Gaussian blur of both masks before they are compared [pixels]",
         low=0,
+        high=100,
     )
     rgb_region: str = _setting(
         "sheet",
@@ -231,6 +232,7 @@ class Settings:
         "standard deviation of the Gaussian blur of both images before they are compared [pixels];"
         " -1: coarse to fine, in three stages, by the size of the sheet",
         low=0,
+        high=100,
         auto=True,
     )
     starts: str = _setting(
@@ -451,11 +453,11 @@ def _accepted(meta):
         return ", ".join(f"`{c}`" for c in meta["choices"])
     if meta["above"] is not None:
         return f"above {meta['above']}"
-    if meta["auto"]:
-        return f"at least {meta['low']}, or -1"
     if math.isinf(meta["high"]):
-        return f"at least {meta['low']}" if math.isfinite(meta["low"]) else "any"
-    return f"{meta['low']} to {meta['high']}"
+        found = f"at least {meta['low']}" if math.isfinite(meta["low"]) else "any"
+    else:
+        found = f"{meta['low']} to {meta['high']}"
+    return f"{found}, or -1" if meta["auto"] else found
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from polyfit.files import silent_decoders
-from polysft_mi.camera import LARGEST, Intrinsics
+from polysft_mi.camera import LARGEST, Intrinsics, check_pinhole
 from polysft_mi.errors import InputError
 
 from .lens import Lens
@@ -59,7 +59,7 @@ def _parsed(text, size):
             values = json.loads(text)
         except json.JSONDecodeError as error:
             raise InputError(f"not JSON ({error})") from None
-        if "camera_matrix" in values:
+        if any(K in values for K, _ in _OPENCV):
             return _opencv(text, size)
         if any(key in values for key in ("fl_x", "camera_angle_x", "frames")):
             return nerfstudio_camera(values, size)
@@ -86,6 +86,7 @@ def _numbers(values, names, default=None):
 
 def own_camera(values):
     """(Intrinsics, distortion) of a camera file of ours. Raises InputError."""
+    check_pinhole(values, distortion=True)
     *pinhole, width, height = _numbers(values, ("fx", "fy", "cx", "cy", "width", "height"))
     distortion = values.get("distortion") or []
     try:
@@ -98,22 +99,33 @@ def own_camera(values):
     return Intrinsics(*pinhole, int(width), int(height)), distortion
 
 
+# what calibrations by OpenCV call their matrix and their distortion
+_OPENCV = (
+    ("camera_matrix", "distortion_coefficients"),
+    ("cameraMatrix", "distCoeffs"),
+    ("Camera_Matrix", "Distortion_Coefficients"),
+    ("mtx", "dist"),
+)
+
+
 def _opencv(text, size):
     """A file as OpenCV's calibration program writes it."""
     with silent_decoders():
         try:
             storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-            K, distortion = (
-                storage.getNode(name).mat() for name in ("camera_matrix", "distortion_coefficients")
-            )
+            there = set(storage.root().keys())
+            named = next((names for names in _OPENCV if names[0] in there), _OPENCV[0])
+            K, distortion = (storage.getNode(name).mat() for name in named)
             nodes = [storage.getNode(name) for name in ("image_width", "image_height")]
             sizes = [int(n.real()) if n.isInt() else k for n, k in zip(nodes, size)]
         except (cv2.error, SystemError) as error:
             reason = " ".join(str(getattr(error, "err", None) or "unreadable").split())
             raise InputError(f"not a file of OpenCV's FileStorage ({reason})") from None
     if K is None:
-        raise InputError("no matrix camera_matrix; OpenCV's calibration writes one")
-    c = Intrinsics.from_matrix(K, *sizes, where="camera_matrix")
+        raise InputError(
+            f"no matrix {' or '.join(K for K, _ in _OPENCV)}; it has {', '.join(sorted(there))}"
+        )
+    c = Intrinsics.from_matrix(K, *sizes, where=named[0])
     camera = Intrinsics(c.fx, c.fy, c.cx + 0.5, c.cy + 0.5, c.width, c.height)
     return camera, [] if distortion is None else np.ravel(distortion).astype(float).tolist()
 

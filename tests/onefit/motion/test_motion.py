@@ -249,7 +249,7 @@ def test_motion_files_that_cannot_be_used(tmp_path):
         ({"trans": trans[:5]}, r"12 frames of poses and a translation of shape \(5, 3\)"),
         (
             {"trans": far},
-            "its root moves at 818 m/s; .*; in centimetres\\? then divide trans by 100",
+            "its root moves at 818 m/s; .*; in centimetres\\? then divide it by 100",
         ),
         ({"mocap_framerate": -1.0}, "-1 frames a second; 1 to 1000 can be used"),
     ):

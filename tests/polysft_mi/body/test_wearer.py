@@ -113,6 +113,11 @@ def test_a_template_that_is_not_on_the_body_is_told(garment, motion, tmp_path):
     assert not any(word in str(told.value) for word in ("made_for", "offset"))
 
 
+def test_a_translation_in_centimetres_is_told(garment, motion, tmp_path):
+    with pytest.raises(InputError, match="body.npz: its (feet slide|root moves) at .*centimetres"):
+        put(garment, tmp_path / "body.npz", poses=motion[0], translation=100 * motion[1])
+
+
 def test_smpl_s_forms_say_the_same(motion, smpl, tmp_path):
     poses, trans = as_smpl(motion, smpl)
     read = lambda name: BodyMotion.read(tmp_path / name, FRAMES, [0, 1, 2], smpl, "y")

@@ -14,6 +14,9 @@ FX, FY, CX, CY, SIZE = 600.0, 610.0, 322.5, 241.0, (640, 480)
 DISTORTION = (-0.18, 0.06, 0.001, -0.002)
 
 
+OURS = '{"fx": 600, "fy": 600, "cx": 320, "cy": 240, "width": 640, "height": 480, %s}'
+
+
 def opencv(path, kind="yaml", **change):
     """As OpenCV's calibration program writes it; its pixels are whole at their centres."""
     K = np.array([[FX, 0, CX - 0.5], [0, FY, CY - 0.5], [0, 0, 1]])
@@ -139,13 +142,17 @@ def test_our_own_form(tmp_path):
         ("1 PINHOLE 640 480 1 1 1 x\n", "not a number"),
         ("1 PINHOLE 640 480 nan 1 1 1\n", "finite"),
         ("1 PINHOLE 640 480 1 1 1 1\n2 PINHOLE 640 480 2 2 1 1\n", "2 cameras that differ"),
-        ("1 PINHOLE 100 480 1 1 1 1\n", "another shape"),
+        ("1 PINHOLE 100 480 500 500 1 1\n", "another shape"),
         ('{"camera_model": "OPENCV_FISHEYE", "fl_x": 1}', "OPENCV_FISHEYE"),
         ('{"fl_x": 1, "is_fisheye": true}', "FISHEYE"),
         ('{"frames": [{"fl_x": 1}]}', "no fl_x"),
         ('{"camera_angle_x": 4}', "camera_angle_x = 4"),
         ('{"fl_x": 600, "k4": 1}', "k4"),
         ('{"fl_x": "wide"}', "fl_x = 'wide'"),
+        (OURS % '"k1": -0.2', "k1 = -0.2; a lens is known by distortion alone"),
+        (OURS % '"dist_coeffs": [0, 0.1]', "dist_coeffs = [0, 0.1]; a lens is known by"),
+        (OURS % '"model": "fisheye"', "model = 'fisheye'; a lens is known by"),
+        (OURS.replace("600", "1.25") % '"name": "a"', "1.25 pixels sees 179.6 degrees"),
     ],
 )
 def test_bad_files_are_told_in_one_line(text, said, tmp_path, capfd):
@@ -167,3 +174,19 @@ def test_skew_of_opencv(tmp_path):
     K = np.array([[600.0, 3, 320], [0, 600, 240], [0, 0, 1]])
     path = opencv(tmp_path / "a", camera_matrix=K)
     assert "skew" in refused(read_lens, path, *SIZE)
+
+
+def test_opencv_by_other_names(tmp_path):
+    path = opencv(tmp_path / "camera", "yml")
+    text = (tmp_path / "camera.yml").read_text()
+    text = text.replace("camera_matrix", "cameraMatrix")
+    (tmp_path / "camera.yml").write_text(text.replace("distortion_coefficients", "distCoeffs"))
+    lens = read_lens(path, *SIZE)
+    assert_camera(lens)
+    assert lens.distortion == pytest.approx((*DISTORTION, 0))
+
+
+def test_what_says_that_a_lens_is_a_pinhole_does_not_matter(tmp_path):
+    path = tmp_path / "camera.json"
+    path.write_text(OURS % '"camera_model": "PINHOLE", "k1": 0, "distortion": [0, 0, 0, 0]')
+    assert not any(read_lens(str(path), *SIZE).distortion)

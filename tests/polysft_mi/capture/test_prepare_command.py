@@ -164,7 +164,9 @@ def test_what_does_not_go_together(clip, tmp_path):
     own = dict(size=None, template=str(DEMO / "template.obj"), resolution=9)
     assert "--resolution 9: of a flat sheet; " in call(**own)
     camera = tmp_path / "camera.json"
-    camera.write_text(json.dumps({"fx": 1, "fy": 1, "cx": 1, "cy": 1, "width": 100, "height": 100}))
+    camera.write_text(
+        json.dumps({"fx": 99, "fy": 99, "cx": 1, "cy": 1, "width": 100, "height": 100})
+    )
     assert "320x240" in call(camera=str(camera))
     text = '{"fx": 330, "fy": 330, "cx": 160, "cy": 120, "width": 320, "height": 240,'
     camera.write_text(text + ' "distortion": [1, 2]}')

@@ -79,6 +79,17 @@ def test_nothing_to_resume(good, finished, tmp_path):
     )
 
 
+def test_files_that_have_changed_since_the_run_began(sheet, tmp_path):
+    scene, out = sheet / "scene.xml", tmp_path / "out"
+    assert run.main([str(scene), "-o", str(out), *QUICK]) == 0
+    for name in ("template.obj", "texture.png", "frames/001.png"):
+        before = (sheet / name).read_bytes()
+        (sheet / name).write_bytes(before + b"\n")
+        has(refused(scene, "--resume", *QUICK, out=out), "have changed since the run began")
+        (sheet / name).write_bytes(before)
+    assert run.main([str(scene), "-o", str(out), "--resume", *QUICK]) == 0
+
+
 @pytest.mark.parametrize("keep", [0, 1 / 2])
 def test_checkpoint_that_cannot_be_read(good, finished, tmp_path, keep):
     out = tmp_path / "out"

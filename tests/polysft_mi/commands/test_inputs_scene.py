@@ -11,6 +11,7 @@ import synthetic
 from refusals import SIZE, edited, has, line_of, refused
 
 from polysft_mi import capture
+from polysft_mi.errors import InputError
 
 
 def test_no_scene(tmp_path):
@@ -248,3 +249,16 @@ def test_order_too_high_for_the_vertices(tmp_path):
 )
 def test_bad_numbers_of_flags(sheet, options):
     has(refused(sheet / "scene.xml", *options), " ".join(options), "is needed")
+
+
+def test_a_default_that_nothing_uses_is_told(sheet):
+    path = edited(sheet, '<default name="k_mi"', '<default name="k_im"')
+    path.write_text(path.read_text().replace("$k_mi", "100"))
+    has(refused(path), "<default name='k_im'>: nothing in it uses $k_im, did you mean k_mi?")
+
+
+def test_a_lens_in_the_camera_s_file_is_told(sheet):
+    camera = sheet / "camera.json"
+    camera.write_text(camera.read_text().replace("{", '{"distortion": [0.1, 0, 0, 0], ', 1))
+    with pytest.raises(InputError, match=r"camera\.json: distortion = \[0\.1, 0, 0, 0\]; frames"):
+        capture.prepare_folder(str(sheet), overwrite=True)

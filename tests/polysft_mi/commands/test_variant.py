@@ -62,3 +62,25 @@ for name in polysft_mi.__all__:
 print("drjit" in sys.modules, "Problem" in refused, "Run" in refused)
 """
     assert python("-c", code).stdout.split() == ["False", "True", "False"]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
+def test_ctrl_c_while_mitsuba_is_loaded_waits_for_its_end():
+    code = """
+import builtins, os, signal
+from polyfit.backend import set_variant
+load = builtins.__import__
+def interrupted(name, *how):
+    if name == "drjit":
+        builtins.__import__ = load
+        os.kill(os.getpid(), signal.SIGINT)
+    return load(name, *how)
+builtins.__import__ = interrupted
+try:
+    set_variant()
+except KeyboardInterrupt:
+    set_variant()
+    import drjit
+    print("Ctrl-C", float(drjit.sum(drjit.arange(drjit.llvm.Float, 4))[0]))
+"""
+    assert python("-c", code).stdout.split() == ["Ctrl-C", "6.0"]

@@ -227,3 +227,42 @@ def test_bad_input_is_told(run_folder):
     (run_folder / "out" / "metrics.json").write_text("{")
     with pytest.raises(InputError, match="metrics.json: not JSON"):
         evaluate.main([str(run_folder / "out"), str(run_folder / "seq")])
+
+
+ORDER = np.random.default_rng(0).permutation(64)
+
+
+@pytest.mark.parametrize(
+    "change, said",
+    [
+        (lambda V, F: (1000 * V, F), "1e+03 times as large as the surface"),
+        (lambda V, F: (V * (1, -1, -1), F), "lies behind the camera"),
+        (lambda V, F: (V[:, ORDER], np.argsort(ORDER)[F]), "its faces join other vertices"),
+    ],
+)
+def test_truth_that_cannot_be_of_the_surface_is_told(change, said, tmp_path):
+    x, y = np.meshgrid(*2 * [np.linspace(0, 0.3, 8)], indexing="ij")
+    V = np.stack([x, y, 1 + x * y], -1).reshape(1, -1, 3)
+    V[0, :5, 2] += 0.1  # nothing is symmetric
+    a = np.arange(64).reshape(8, 8)
+    corners = a[:-1, :-1], a[1:, :-1], a[1:, 1:], a[:-1, 1:]
+    p, q, r, s = (c.ravel() for c in corners)
+    F = np.concatenate([np.stack([p, q, r], 1), np.stack([p, r, s], 1)])
+    surface = {"vertices": V, "faces": F, "frames": np.array([0])}
+    other, faces = change(V, F)
+    np.savez(tmp_path / "gt.npz", vertices=other, faces=faces)
+    with pytest.raises(InputError) as error:
+        evaluation.score(surface, tmp_path / "gt.npz")
+    assert said in str(error.value)
+    # quads that are cut the other way are the same surface
+    cut = np.concatenate([np.stack([p, q, s], 1), np.stack([q, r, s], 1)])
+    np.savez(tmp_path / "gt.npz", vertices=V, faces=cut)
+    assert evaluation.score(surface, tmp_path / "gt.npz")["rmse_mm"] < 1e-6
+
+
+def test_points_that_no_ray_of_the_surface_meets_are_told(tmp_path):
+    V = np.array([[[0, 0, 1], [0.1, 0, 1], [0, 0.1, 1.0]]])
+    surface = {"vertices": V, "faces": np.array([[0, 1, 2]]), "frames": np.array([0])}
+    np.savez(tmp_path / "gt.npz", points=np.full((1, 9, 3), [5, 5, 1.0]), frames=[0])
+    with pytest.raises(InputError, match="frame 0: no point lies on a ray that meets the surface"):
+        evaluation.score(surface, tmp_path / "gt.npz")

@@ -60,10 +60,12 @@ def test_a_byte_order_mark_does_not_matter(folder):
 
 
 def test_the_selected_frames_are_used(folder):
-    (camera,) = open_cameras(str(folder), 2, 0, 2, 2)
+    (camera,) = open_cameras(str(folder), 3, 0, 2, 2)
     assert camera.sequence.indices == [0, 2]
     with pytest.raises(InputError, match="3 frames, and the scene's camera has 4"):
         open_cameras(str(folder), 4, 0, -1, 1)
+    with pytest.raises(InputError, match="3 frames, and the scene's camera has 4"):
+        open_cameras(str(folder), 4, 0, -1, 2)  # two frames of each, of other moments
 
 
 @pytest.mark.parametrize(

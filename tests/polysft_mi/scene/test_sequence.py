@@ -258,3 +258,23 @@ def test_real_masks_lose_their_blobs(shared_data):
     clean = Sequence.open(folder / "rgbs", folder / "masks", **options).mask(0)
     assert raw[950:].sum() > 4000 and clean[950:].sum() == 0
     np.testing.assert_array_equal(raw[:950], clean[:950])
+
+
+def test_masks_of_other_numbers_than_their_frames_are_told(video):
+    masks = video.folder / "masks"
+    (masks / "003.png").rename(masks / "0035.png")
+    with pytest.raises(InputError, match=r"masks.004\.png: pairs with .*frames.003\.png"):
+        Sequence.open(video.folder / "frames", masks)
+    for k in range(5):  # all by another number: as they come
+        left = sorted(masks.glob("[0-9]*.png"))
+        left[0].rename(masks / f"mask_{k + 100}.png")
+    assert len(Sequence.open(video.folder / "frames", masks)) == 5
+
+
+def test_frames_that_are_to_be_turned_are_told(video):
+    path = video.folder / "frames" / "002.png"
+    exif = Image.Exif()
+    exif[0x0112] = 3
+    Image.open(path).save(path, exif=exif)
+    with pytest.raises(InputError, match=r"002\.png: its Exif orientation \(3\) turns it"):
+        Sequence.open(video.folder / "frames")

@@ -20,7 +20,7 @@ from polysft_mi.surface.meshio import read_template
         (1e12, "if it is in another unit"),
         (0.297, None),
         (0.01, None),
-        (20.0, None),  # a sheet over a house
+        (9.0, None),  # a sheet over a house
     ],
 )
 def test_size_note(extent, said):

@@ -138,7 +138,7 @@ def test_what_stays_undecided_is_shown(undecided):
     problem, done, out = undecided
     cameras = problem.camera, problem.sequence.cameras
     text = outputs.resolved_scene(problem.experiment)
-    outputs.write_beginning(out, text, *cameras, "the command", 15)
+    outputs.write_beginning(out, text, *cameras, "the command", 15, "")
     with Drawing(problem, {}, out, exr_frames=0, about={}) as drawing:
         summary, plotted = outputs.write(problem, done, out, drawing, fps=15, command="the command")
         plotted()
