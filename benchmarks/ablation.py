@@ -107,8 +107,7 @@ SWITCHES = (
     Switch("triangles' blur", {"shading_blur": 0.05}),  # OpenCV has no blur of 0
     Switch("exposure", {"exposure": False}),
     Switch("light's prior", {"light_ridge": 0.0}),
-    Switch("shading's outliers", {"light_scale": math.inf}),
-    Switch("shading's least trust", {"light_most": 1.0}),
+    Switch("shading's robust norm", {"light_scale": 1.0}),
     Switch("few refits", {"light_refits": 60}),
     Switch("light's memory", {"light_kept": 1.0}),
     Switch("joints", settings={"k_coupling": 0.0}, rounded=True),

@@ -24,8 +24,7 @@ NEEDED = {  # rules that stay where they pay on one sequence alone, and why
     "mirror images": "they are for plain textures (tracker.md has those that gain)",
     "rims": "they are for plain textures (tracker.md has those that gain)",
     "exposure": "it is for cameras whose exposure changes; that of the simulated ones does not",
-    "shading's outliers": "without it flag loses its corner",
-    "few refits": "more take longer, and flag loses its corner",
+    "few refits": "more take longer, and flag loses its corner more often",
 }
 OF_CHANCE = (
     "Where folds come and go, the smallest change grows from frame to frame. So the tracker also"

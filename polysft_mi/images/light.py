@@ -18,9 +18,6 @@ from .triangles import cross, luminance
 
 _SIZE = 7  # of the unknowns (l_0, l, g)
 _UPPER = np.triu_indices(_SIZE)
-# standard deviation of a normal distribution over the median of its absolute values
-_NORMAL_DEVIATION = 1.4826
-_LEAST_SCALE = 1e-4  # where a light explains all, as in a rendering
 
 
 @dataclass
@@ -43,19 +40,16 @@ class Fit:
 @dataclass(frozen=True)
 class Light:
     """What the frames so far say of the light, the last ones most: normal equations ``matrix`` (7,
-    7) and ``right`` (7,) of (l_0, l, g), over the mean of the texture's luminance, in triangles;
-    ``deviations``: the sum of the residuals' standard deviations in ``frames`` frames.
+    7) and ``right`` (7,) of (l_0, l, g), over the mean of the texture's luminance, in triangles.
     """
 
     matrix: np.ndarray
     right: np.ndarray
-    deviations: float
-    frames: int
     rules: Rules
 
     @classmethod
     def unknown(cls, rules):
-        return cls(np.zeros((_SIZE, _SIZE)), np.zeros(_SIZE), 0.0, 0, rules)
+        return cls(np.zeros((_SIZE, _SIZE)), np.zeros(_SIZE), rules)
 
     @classmethod
     def of(cls, numbers, rules):
@@ -63,15 +57,17 @@ class Light:
         if numbers is None:
             return cls.unknown(rules)
         matrix = np.zeros((_SIZE, _SIZE))
-        *upper, deviations, frames = numbers
-        matrix[_UPPER] = upper[:-_SIZE]
-        return cls(
-            matrix + np.triu(matrix, 1).T, np.array(upper[-_SIZE:]), deviations, int(frames), rules
-        )
+        matrix[_UPPER] = numbers[:-_SIZE]
+        return cls(matrix + np.triu(matrix, 1).T, np.array(numbers[-_SIZE:]), rules)
 
     def numbers(self):
         """All of it as a list of numbers."""
-        return [*self.matrix[_UPPER].tolist(), *self.right.tolist(), self.deviations, self.frames]
+        return [*self.matrix[_UPPER].tolist(), *self.right.tolist()]
+
+    @property
+    def is_known(self):
+        """Whether any frame has told of it."""
+        return bool(self.matrix.any())
 
     def mirrored(self, normal, distance):
         """What the same frames would say, had they shown the mirror images of their surfaces at the
@@ -87,20 +83,11 @@ class Light:
         # to the last bit, as numbers() has it: a run that is resumed is the same
         return replace(self, matrix=(matrix + matrix.T) / 2, right=turn.T @ self.right)
 
-    @property
-    def scale(self):
-        """The residual, over the texture's mean luminance, from which on one hardly counts."""
-        most = self.rules.light_most
-        if not self.frames:
-            return most
-        found = self.rules.light_scale * self.deviations / self.frames
-        return min(max(found, _LEAST_SCALE), most)
-
     def coefficients(self, triangles):
         """(l_0, l, g) (7,), of a sheet of so many triangles; the same from all sides where nothing
         is known.
         """
-        if not self.frames:
+        if not self.is_known:
             return np.eye(_SIZE)[0]
         return np.linalg.solve(self._prior_curvature(triangles), self.right)
 
@@ -123,9 +110,9 @@ class Light:
         value = shade.luminance
         if self.rules.exposure:
             value = value / _exposure(value[shade.seen], (rows @ before)[shade.seen])
-        found = before
+        found, scale = before, self.rules.light_scale
         for _ in range(self.rules.light_refits):
-            weighted = (area / (1 + ((value - rows @ found) / self.scale) ** 2))[:, None] * rows
+            weighted = (area / (1 + ((value - rows @ found) / scale) ** 2))[:, None] * rows
             matrix, right = weighted.T @ rows, weighted.T @ value
             matrix = np.triu(matrix) + np.triu(matrix, 1).T  # as a checkpoint has it
             found = np.linalg.solve(held + matrix, held @ before + right)
@@ -136,15 +123,9 @@ class Light:
         """The light after a frame whose surface had the triangles ``shade``."""
         if shade.seen.sum() < _SIZE:
             return self
-        fit = self.fit(shade)
-        deviation = _NORMAL_DEVIATION * float(np.median(np.abs(fit.residual[shade.seen])))
-        return Light(
-            self.rules.light_kept * (self.matrix + fit.matrix),
-            self.rules.light_kept * (self.right + fit.right),
-            self.deviations + deviation,
-            self.frames + 1,
-            self.rules,
-        )
+        fit, kept = self.fit(shade), self.rules.light_kept
+        matrix, right = kept * (self.matrix + fit.matrix), kept * (self.right + fit.right)
+        return replace(self, matrix=matrix, right=right)
 
 
 @dataclass
@@ -222,7 +203,7 @@ def residuals(shade, light, weight):
     and the derivatives (F, 3, 3) of r by the corners [1/m]. The light follows the surface; at its
     best, the energy has no slope along it.
     """
-    fit, scale = light.fit(shade), light.scale
+    fit, scale = light.fit(shade), light.rules.light_scale
     weight = weight / max(shade.seen.sum(), 1)
     over = (fit.residual / scale) ** 2
     energy = weight * (scale**2 * float((fit.area * np.log1p(over)).sum()) + fit.departure)

@@ -139,7 +139,7 @@ class Objective:
         if stage.blur == self.rules.far_blur or not self.rules.appearance:
             return None
         # colours as they are say that there is no light
-        lit = self.data.normalise and light.frames
+        lit = self.data.normalise and light.is_known
         coefficients = light.coefficients(len(self.data.faces)) if lit else None
         shaded = self.settings.compares_triangles and stage.last
         vertices = self.atlas.surface(state).vertices

@@ -197,13 +197,10 @@ class Rules:
         0.8, "share", "of what earlier frames say of light, a frame later", row="light's memory"
     )
     light_scale: float = _rule(
-        8.0, "deviations", "at which a triangle's residual is an outlier", row="shading's outliers"
-    )
-    light_most: float = _rule(
         0.05,
         "share",
-        "of the mean luminance, the most that this may be, and what it is at first",
-        row="shading's least trust",
+        "of the mean luminance, at which a triangle's residual is an outlier",
+        row="shading's robust norm",
     )
 
     def for_patches(self, count: int) -> "Rules":

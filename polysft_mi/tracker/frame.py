@@ -210,7 +210,7 @@ class FrameTracker:
         vertices = self._atlas.surface(state).vertices
         own_cost = self._cost(state, context)
         light = context.light(self.objective.rules)
-        if light.frames:  # learned from surfaces that this one takes to be mirror images
+        if light.is_known:  # learned from surfaces that this one takes to be mirror images
             middle, normal = plane_of(vertices)
             brightness = self.objective.data.brightness
             distance = (middle - brightness.centre) @ normal / brightness.unit

@@ -68,4 +68,4 @@ class Shading(Term):
 
     @staticmethod
     def _counts(stage, light):
-        return stage.last and light.frames > 0
+        return stage.last and light.is_known

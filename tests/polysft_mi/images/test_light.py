@@ -55,9 +55,9 @@ def shade_of(found, vertices, image, seen=1e9, mask=None):
     )
 
 
-def known(light=LIGHT, frames=1):
+def known(light=LIGHT):
     """A light that has been seen often."""
-    return Light(1e9 * np.eye(7), 1e9 * light, 0.01 * frames, frames, Rules())
+    return Light(1e9 * np.eye(7), 1e9 * light, Rules())
 
 
 def wavy(seed=0, size=0.004):
@@ -88,7 +88,7 @@ def test_residuals_and_derivatives():
     np.testing.assert_allclose(residual, 0.8 / exposure - lit(vertices), atol=1e-6)
     a, b, c = (vertices[FACES[:, k]] for k in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    scale = known().scale
+    scale = Rules().light_scale
     assert energy == pytest.approx(
         12 * scale**2 * (area / area.sum() * np.log1p((residual / scale) ** 2)).sum(), rel=1e-5
     )
@@ -114,8 +114,6 @@ def test_the_light_follows_the_surface_and_the_energy_has_no_slope_along_it():
     light = Light(
         np.diag([5.0, 1, 1, 1, 2, 2, 2]),
         np.diag([5.0, 1, 1, 1, 2, 2, 2]) @ LIGHT,
-        0.01,
-        1,
         Rules(light_refits=60),
     )
     shade = shade_of(found, vertices, 0.4)
@@ -207,20 +205,15 @@ def test_a_frame_larger_than_its_triangles_need_is_shrunk():
 def test_the_light_is_learned_from_surfaces_that_bend():
     rng = np.random.default_rng(1)
     found, light = brightness(masked=True), Light.unknown(Rules())
-    assert light.scale == 0.05
+    assert not light.is_known
     for k in range(20):
         shade = shade_of(found, wavy(k, 0.01), 0.4)
         value = lit(wavy(k, 0.01)) + 0.005 * rng.normal(size=len(FACES))
         value[rng.random(len(FACES)) < 0.1] += 0.5  # a highlight, a shadow's end
         light = light.updated(dataclasses.replace(shade, luminance=value))
     learned = light.coefficients(len(FACES))
-    assert light.frames == 20 and learned * (LIGHT[0] / learned[0]) == pytest.approx(
-        LIGHT, abs=0.03
-    )
-    assert (
-        light.scale == 0.05 and 0.004 < light.deviations / 20 < 0.008
-    )  # a little more than 0.005 for the outliers
-    assert 0.03 < dataclasses.replace(light, deviations=0.005 * 20).scale < 0.05  # eight deviations
+    assert light.is_known
+    assert learned * (LIGHT[0] / learned[0]) == pytest.approx(LIGHT, abs=0.03)
     assert Light.of(light.numbers(), Rules()).numbers() == light.numbers()
 
 
@@ -251,10 +244,10 @@ def test_the_light_of_mirror_images_is_the_mirror_image_of_the_light():
             shade = shade_of(found, v, 0.5)
             rows = np.column_stack([np.ones(len(FACES)), shade.normal, shade.centre])
             matrix, right = matrix + rows.T @ rows, right + rows.T @ bright
-        lights.append(Light(matrix, right, 0.01, 3, Rules()))
+        lights.append(Light(matrix, right, Rules()))
     distance = (middle - found.centre) @ normal / found.unit
     mirrored = lights[0].mirrored(normal, distance)
-    assert np.allclose(mirrored.matrix, lights[1].matrix) and mirrored.frames == 3
+    assert np.allclose(mirrored.matrix, lights[1].matrix)
     assert np.allclose(mirrored.right, lights[1].right)
     kept = Light.of(mirrored.numbers(), mirrored.rules)  # as a checkpoint does
     assert np.array_equal(kept.matrix, mirrored.matrix)
@@ -278,7 +271,8 @@ def test_a_flat_sheet_says_nothing_of_where_the_light_comes_from():
 
 
 def test_what_no_frame_tells_is_an_unknown_light():
-    assert Light.of(None, Rules()).frames == 0 and Light.of(known().numbers(), Rules()).frames == 1
+    assert not Light.of(None, Rules()).is_known
+    assert Light.of(known().numbers(), Rules()).is_known
 
 
 # -- in the tracker ----------------------------------------------------------
@@ -301,9 +295,9 @@ def tracked(truth, tmp_path_factory):
 def test_the_tracker_learns_the_light_and_follows_it(truth, tracked, tmp_path):
     problem = problem_of(truth.folder, k_shading=0.0)
     off = track(FrameTracker(problem), 3, str(tmp_path))
-    assert off.memories[-1].light.frames == 0 and "shading" not in off.totals[-1]
+    assert not off.memories[-1].light.is_known and "shading" not in off.totals[-1]
     found = tracked.memories[-1].light
-    assert found.frames == 5
+    assert found.is_known
     assert tracked.totals[0]["shading"] == 0 < tracked.totals[-1]["shading"]
     # the sheet rolls about the image's upright: that is where the light's slope shows
     slope = found.coefficients(len(truth.faces))[1]
