@@ -15,6 +15,7 @@ import numpy as np
 
 import onefit
 import polyfit
+from polyfit.errors import cli, number
 
 GARMENT = "tshirt"
 
@@ -23,6 +24,8 @@ def main(out="out/patches", patch=0, bend=0.6, parts=2):
     """Returns vertices (N, 3) [m] before and after."""
     rest = onefit.Garment.template(GARMENT)
     surface = polyfit.PatchedSurface.from_mesh(rest.vertices.numpy(), rest.faces.numpy())
+    patch = number("--patch", patch, 0, len(surface) - 1, whole=True)
+    bend = number("--bend", bend)
     u2 = polyfit.exponents(int(surface.order.max())).tolist().index([2, 0])
     alpha = surface.alpha.clone()
     alpha[patch, u2] += bend  # curvature, in the unit of the patch's own frame
@@ -37,7 +40,7 @@ def main(out="out/patches", patch=0, bend=0.6, parts=2):
     return found
 
 
-if __name__ == "__main__":
+def command():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--patch", type=int, default=0)
     parser.add_argument("--bend", type=float, default=0.6)
@@ -47,3 +50,7 @@ if __name__ == "__main__":
     print(
         f"{(moved > 1e-4).mean():.0%} of the vertices moved, by {1e3 * moved.max():.0f} mm at most"
     )
+
+
+if __name__ == "__main__":
+    cli(command)

@@ -14,12 +14,14 @@ from pathlib import Path
 import torch
 
 import polysft_mi
+from polyfit.errors import cli, number
 
 DEMO = Path(__file__).parents[1] / "scenes" / "demo.xml"
 
 
 def main(steps=30):
     """Returns the distances [mm] of the sheet from its place, one a step."""
+    steps = number("--steps", steps, 1, whole=True)
     polysft_mi.set_variant()
     from polysft_mi import bridge
 
@@ -45,8 +47,12 @@ def main(steps=30):
     return distances
 
 
-if __name__ == "__main__":
+def command():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--steps", type=int, default=30)
     found = main(parser.parse_args().steps)
     print(f"distance: {found[0]:.2f} mm after the first step, {found[-1]:.2f} mm after the last")
+
+
+if __name__ == "__main__":
+    cli(command)

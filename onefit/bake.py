@@ -12,9 +12,9 @@ It drapes the garment in some minutes of generated motion, and takes minutes its
 """
 
 import argparse
+import os
 from functools import partial
 from pathlib import Path
-from re import fullmatch
 
 from onefit.draping import command
 from onefit.network import DEFAULT
@@ -83,10 +83,15 @@ def main(argv=None):
 
 
 def _is_ours(folder, path):
-    """Whether the file ``path`` in ``folder`` is one that baking wrote."""
-    return path in ("baked.npz", "baked.html") or (
-        fullmatch(r"[^/]+\.glb", path) and b'"polyfit"' in (folder / path).read_bytes()
-    )
+    """Whether the file ``path`` in ``folder`` is one that baking wrote: of the .glb those of the
+    motions that the page plays.
+    """
+    page, (motion, extension) = folder / "baked.html", os.path.splitext(path)
+    if extension == ".glb" and page.is_file():
+        from onefit.baking import is_in_page
+
+        return is_in_page(page, motion)
+    return path in ("baked.npz", "baked.html")
 
 
 def _progress():

@@ -20,7 +20,7 @@ from pathlib import Path
 from onefit.garment import add_mesh_arguments, read_options
 from onefit.physics import MATERIALS, Material
 from polyfit.errors import InputError, Parser, cli, require
-from polyfit.files import aside
+from polyfit.files import aside, make_folder
 
 _ALIKE = "vertices", "seconds", "shapes", "steps", "material", "weights"  # for all of a folder
 
@@ -72,14 +72,15 @@ def main(argv=None):
     draper, folder = load(args.weights), Path(args.output)
     named = args.garments or (() if args.cuts else STANDARD)
     how = read_options(args.garments, args)
-    garments = [Garment.named(name, **how) for name in named]
+    garments = Garment.all_named(named, **how)
     if not 0 < args.seconds < math.inf:
         raise InputError(f"--seconds {args.seconds:g}: more than 0 is needed")
-    names = [garment.name for garment in garments]
+    Motion.generate(kinds[0], seconds=args.seconds)  # which refuses what is too long
+    names = [teacher.path_of("", garment.name).stem for garment in garments]
     for name in names:
         if names.count(name) > 1:
             raise InputError(f"{name}: two garments have this name; lessons are kept by it")
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     _check_alike(folder, {name: getattr(args, name) for name in _ALIKE})
     rng = np.random.default_rng(0)
     shapes = [draper.model.standard_shape]

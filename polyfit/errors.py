@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import importlib.util
 import logging
+import math
 import os
 import signal
 import sys
@@ -19,6 +20,40 @@ class InputError(ValueError):
 
     The message is one line: it names the file or property, its value, and what would be accepted.
     """
+
+
+def as_number(value: Any) -> float:
+    """``value`` as a float; NaN for what is no number, as "1" and None."""
+    try:
+        return math.nan if isinstance(value, str | bytes) else float(value)
+    except (TypeError, ValueError, OverflowError, RuntimeError):
+        return math.nan
+
+
+def number(
+    name: str,
+    value: Any,
+    least: float | None = None,
+    most: float | None = None,
+    *,
+    above: float | None = None,
+    whole: bool = False,
+) -> Any:
+    """``value`` as a float, or as an int, which ``whole`` asks for: at least ``least``, at most
+    ``most``, more than ``above``. Raises InputError, which calls it ``name``, for all others.
+    """
+    found = as_number(value)
+    low, high = -math.inf if least is None else least, math.inf if most is None else most
+    good = math.isfinite(found) and low <= found <= high and (above is None or found > above)
+    if good and not (whole and found % 1):
+        return int(value) if whole else found
+    needed = "a whole number" if whole else "a finite number"
+    if above is not None:
+        needed += f" above {above:,}"
+    elif least is not None:
+        needed += f", {least:,} or more," if most is None else f", {least:,} to {most:,},"
+    given = repr(value) if isinstance(value, str | bytes) else " ".join(str(value).split())
+    raise InputError(f"{name} = {given[:60]}; {needed} is needed")
 
 
 class Notice(RuntimeWarning):

@@ -14,7 +14,7 @@ import threading
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,23 @@ NOT_NPZ = (
     OSError, ValueError, EOFError, AttributeError, TypeError, NotImplementedError,
     zipfile.BadZipFile, zlib.error, tokenize.TokenError,
 )  # fmt: skip
+
+
+def read_npz(path: str | os.PathLike[str], keys: Iterable[str], what: str) -> dict[str, np.ndarray]:
+    """Those of the arrays ``keys`` that a ``.npz`` has, by name. Raises InputError for a file that
+    is none, which cannot be read as ``what``.
+    """
+    try:
+        with open(path, "rb") as file:
+            if file.read(2) != b"PK":  # of other files NumPy would say that they are pickles
+                raise ValueError("no .npz file")
+        with np.load(path, allow_pickle=False) as arrays:
+            return {key: arrays[key] for key in keys if key in arrays.files}
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except NOT_NPZ as error:
+        why = " ".join(str(error).split())[:200]
+        raise InputError(f"{path}: cannot be read as {what} ({why})") from None
 
 
 _LITTER = ".DS_Store", "Thumbs.db", "desktop.ini"
@@ -116,6 +133,23 @@ def aside(path: str | os.PathLike[str]) -> Iterator[str]:
         raise
 
 
+def make_folder(path: str | os.PathLike[str]) -> None:
+    """Make the folder ``path`` and its parents, as far as they are not there. Raises InputError
+    where it is a file.
+    """
+    try:
+        os.makedirs(path, exist_ok=True)
+    except FileExistsError:
+        raise InputError(f"{path}: is a file; a folder is needed") from None
+
+
+def as_path(path: Any, what: str) -> str:
+    """The path of the file ``what`` as text. Raises InputError for what is no path, as None."""
+    if not isinstance(path, str | os.PathLike):
+        raise InputError(f"{what} of type {type(path).__name__}; a file's name is needed")
+    return os.fspath(path)
+
+
 @contextlib.contextmanager
 def folder_for(path: str | os.PathLike[str]) -> Iterator[None]:
     """``with folder_for(path):`` the folder ``path`` and its parents exist inside the block.
@@ -124,7 +158,7 @@ def folder_for(path: str | os.PathLike[str]) -> Iterator[None]:
     """
     path = Path(path)
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
-    path.mkdir(parents=True, exist_ok=True)
+    make_folder(path)
     try:
         yield
     except BaseException:

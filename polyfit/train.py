@@ -99,6 +99,8 @@ def parser():
 
 
 def _cut(text):
+    if text != "paper" and not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"{text}: numbers of patches, or paper, are needed")
     return text if text == "paper" else int(text)
 
 

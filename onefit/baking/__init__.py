@@ -10,7 +10,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
         "evaluation": ["Baked", "Stream"],
-        "files": ["write_glb", "write_page"],
+        "files": ["is_in_page", "write_glb", "write_page"],
         "making": ["Sampling", "bake"],
     },
 )

@@ -81,6 +81,12 @@ def write_page(
         Path(temporary).write_text(page, encoding="utf-8")
 
 
+def is_in_page(path: str | os.PathLike[str], motion: str) -> bool:
+    """Whether a page of :func:`write_page` plays the motion of that name."""
+    begins = json_text({"name": motion, "poses": 0}).removesuffix("0}").replace("<", "\\u003c")
+    return begins in Path(path).read_text(encoding="utf-8", errors="replace")
+
+
 def _strongest(body):
     """The four joints (V, 4) int64 that move each vertex of a body most, and their weights."""
     largest = body.blend_weights.topk(4, 1)

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from polyfit.errors import InputError
-from polyfit.files import NOT_NPZ
+from polyfit.files import as_path, read_npz
 from polyfit.mesh import checked
 
 from . import skeleton, skinning
@@ -79,7 +79,12 @@ def _reduced(path, weights, joints, parents):
 def _rested(path, vertices, faces, weights, joints, rest_pose, shape, kind):
     """The :class:`~onefit.Body` of arrays in OneFit's axes, brought from the stand
     ``rest_pose`` to the standard A-pose by skinning."""
-    tall = np.ptp(vertices[:, 2])
+    wide, deep, tall = np.ptp(vertices, axis=0)
+    if tall < 0.6 * max(wide, deep):
+        raise InputError(
+            f"{path}: a body {tall:.2g} units tall, {wide:.2g} wide and {deep:.2g} deep; one that"
+            " stands upright is needed (in SMPL's files y is up)"
+        )
     if not 0.4 < tall < 2.8:
         unit = next(
             (
@@ -94,6 +99,12 @@ def _rested(path, vertices, faces, weights, joints, rest_pose, shape, kind):
     if not (np.isfinite(weights).all() and (weights > -1e-6).all() and (sums > 1e-3).all()):
         raise InputError(
             f"{path}: blend weights that are negative, not finite, or zero for a whole vertex"
+        )
+    low, high = vertices.min(0) - 0.1, vertices.max(0) + 0.1
+    if ((joints < low) | (joints > high)).any() or np.ptp(joints[:, 2]) < 0.5 * tall:
+        raise InputError(
+            f"{path}: its joints are not all over the body, from feet to head; those that belong to"
+            " its vertices are needed"
         )
     tensor = lambda a: torch.as_tensor(np.ascontiguousarray(a), dtype=torch.float32)
     body = Body(
@@ -262,11 +273,10 @@ class PlainBody(BodyModel):
 
 def _read(path, keys):
     """Arrays by name from an ``.npz`` or ``.pkl`` file. Raises InputError."""
-    path = str(path)
+    path = as_path(path, "body")
     try:
         if path.lower().endswith(".npz"):
-            with np.load(path, allow_pickle=False) as file:
-                data = {key: file[key] for key in keys if key in file.files}
+            data = read_npz(path, keys, "a body")
         elif path.lower().endswith(".pkl"):
             with open(path, "rb") as file:
                 held = _Arrays(file, encoding="latin1").load()
@@ -279,7 +289,7 @@ def _read(path, keys):
         raise InputError(f"{path}: no such file") from None
     except InputError:
         raise
-    except (*NOT_NPZ, *_UNPICKLING) as error:
+    except (OSError, ValueError, EOFError, *_UNPICKLING) as error:
         raise InputError(
             f"{path}: cannot be read as a body ({' '.join(str(error).split())[:200]})"
         ) from None

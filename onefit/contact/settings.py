@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from polyfit.errors import InputError
+from polyfit.errors import number
 
 # What a simulation does not read, all in metres:
 #: that a garment gets where it lies in the body, or in another one: more than the clearance, for
@@ -55,5 +55,4 @@ class ContactSettings:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if not 0 <= value < float("inf"):
-                raise InputError(f"{name} = {value}: a number, 0 or more")
+            number(name, value, 0)

@@ -117,7 +117,7 @@ def garments_of(names: Sequence[str], args: argparse.Namespace) -> list[Garment]
     if args.vertices is not None and args.vertices < 100:
         raise InputError(f"--vertices {args.vertices}: at least 100 are needed")
     how = read_options(names, args)
-    return [Garment.named(name, **how, count=args.vertices) for name in names]
+    return Garment.all_named(names, args.vertices, **how)
 
 
 def motions_of(

@@ -16,7 +16,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import torch
 
-from onefit.body import AnnyBody, ClosestSurface, skinning
+from onefit.body import AnnyBody, BodyModel, ClosestSurface, skinning
 from onefit.contact import Flesh
 from onefit.garment import (
     LOOSE,
@@ -33,14 +33,14 @@ from onefit.network.weights import load as load_weights
 from onefit.objective import crossings, posed
 from onefit.physics import Material, Settings
 from polyfit import mesh
-from polyfit.errors import InputError
+from polyfit.errors import InputError, number
 from polyfit.training import device_of
 
 from . import ease, outfit
 from .post import PostProcessing, pull
 
 if TYPE_CHECKING:
-    from onefit.body import Body, BodyModel
+    from onefit.body import Body
     from onefit.garment import RenderMesh
     from onefit.objective import Measures
 
@@ -245,9 +245,10 @@ class Draper:
         """
         from .simulation import simulated
 
-        if not isinstance(steps, int) or steps < 1:
-            raise InputError(f"steps = {steps}; steps a frame, a whole number, 1 or more")
-        settings = settings or Settings()
+        steps = number("steps", steps, 1, whole=True)
+        settings = Settings() if settings is None else settings
+        if not isinstance(settings, Settings):
+            raise InputError(f"settings = {settings}; onefit.physics.Settings are needed")
         materials = Material.of_each(material, len(outfit.several(garment)))
         worn = self._worn(garment, motion, shape)
         body, moved = worn[0].body, worn[0].motion
@@ -480,4 +481,6 @@ def load(
     ``model``: a body model, by default :class:`onefit.AnnyBody`; ``device``: "cpu" or "cuda", or
     one of several as "cuda:1". Raises InputError.
     """
+    if not (model is None or isinstance(model, BodyModel)):
+        raise InputError(f"model = {model!r}; a body model, as onefit.AnnyBody(), is needed")
     return Draper(load_weights(name), model, device_of(str(device)))

@@ -17,6 +17,7 @@ from polyfit.errors import InputError
 
 from .binding import standard_body, surface_of
 from .fitting import Place, check_place, in_pose, lowered_stand, standard_on
+from .reading import check
 
 _CLOTH3D_HIPS = 0.15  # [rad] by which each leg stands aside in CLOTH3D's rest pose
 POSES = ("cloth3d", "T-pose")
@@ -64,6 +65,7 @@ def aligned(
     how it was brought here, for what an error suggests. Raises InputError where the garment does
     not lie on the body, or was made for its rest.
     """
+    check(vertices, faces, where)
     worn = wearer(body, pose)
     rest = lowered_stand(
         surface_of(wearer(body, standard_body().rest_pose)),

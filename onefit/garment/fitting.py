@@ -20,7 +20,7 @@ from onefit.body import skeleton, skinning
 from onefit.contact import MADE
 from onefit.objective import crossing_faces
 from polyfit import mesh
-from polyfit.errors import InputError
+from polyfit.errors import InputError, as_number
 
 from .binding import (
     Binding,
@@ -86,13 +86,13 @@ def placed(V, scale=1.0, up="z", turn=0.0, offset=(0.0, 0.0, 0.0)):
     """
     if up not in ("y", "z"):
         raise InputError(f"up={up!r}; 'z' or 'y' is needed")
-    if not 0 < scale < np.inf:
-        raise InputError(f"scale={scale:g}; more than 0 is needed")
-    if not (np.isfinite(turn) and np.isfinite(np.asarray(offset, dtype=np.float64)).all()):
-        raise InputError(f"turn={turn:g}, offset={tuple(offset)}; finite numbers are needed")
-    moved = np.asarray(offset, dtype=np.float64)
+    if not 0 < as_number(scale) < np.inf:
+        raise InputError(f"scale={scale!r}; more than 0 is needed")
+    moved = np.array([as_number(x) for x in offset] if np.iterable(offset) else [])
     if moved.shape != (3,):
         raise InputError(f"offset={offset!r}; three numbers (x, y, z) are needed")
+    if not np.isfinite([as_number(turn), *moved]).all():
+        raise InputError(f"turn={turn!r}, offset={tuple(offset)}; finite numbers are needed")
     x, y, z = scale * np.asarray(V, dtype=np.float64).T
     if up == "y":
         y, z = -z, y

@@ -5,6 +5,7 @@ to the body's shapes.
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,8 @@ import torch
 
 from onefit.body import Body, ClosestSurface
 from polyfit import mesh
-from polyfit.errors import InputError
+from polyfit.errors import InputError, as_number
+from polyfit.files import as_path
 from polyfit.mesh import TexCoords, read_textured
 
 from . import fitting, remesh
@@ -74,11 +76,14 @@ class Garment:
 
     @classmethod
     def named(cls, name: str | os.PathLike[str], **options: Any) -> Garment:
-        """A template by its name, or else the garment of a mesh file, with the ``options`` of
-        :meth:`read`. Raises InputError.
+        """A template by its name, of which ``count`` vertices can be asked, or else the garment of
+        a mesh file, with the ``options`` of :meth:`read`. Raises InputError.
         """
+        name = as_path(name, "garment")
         if name in TEMPLATES + LOOSE:
-            garment, count = cls.template(str(name)), options.get("count")
+            if other := [option for option in options if option != "count"]:
+                raise InputError(f"garment '{name}': {other[0]} is for files; this is a template")
+            garment, count = cls.template(name), options.get("count")
             return garment if count is None else garment.remeshed(count)
         if not Path(name).suffix and not Path(name).exists():
             raise InputError(
@@ -86,6 +91,14 @@ class Garment:
                 " give an .obj, .ply or .glb file, or a sewing pattern (.json)"
             )
         return cls.read(name, **options)
+
+    @classmethod
+    def all_named(
+        cls, names: Iterable[str | os.PathLike[str]], count: int | None = None, **options: Any
+    ) -> list[Garment]:
+        """:meth:`named` of each; the ``options`` but ``count`` are for those that are files."""
+        of = lambda name: {} if name in TEMPLATES + LOOSE else options
+        return [cls.named(name, count=count, **of(name)) for name in names]
 
     @classmethod
     def read(
@@ -116,9 +129,11 @@ class Garment:
         Body in the standard stand, by default one of GarmentCode's mean size. Raises InputError, in
         one line, for a mesh that is no garment or does not lie on the body.
         """
-        extension = Path(path).suffix.lower()
+        extension = Path(as_path(path, "garment")).suffix.lower()
+        _check_count(count)
         if extension == ".json":
-            if (loose, scale, up, turn, *offset) != (False, 1.0, None, 0.0, 0.0, 0.0, 0.0):
+            plain = (False, 1.0, None, 0.0, (0.0, 0.0, 0.0))
+            if (loose, scale, up, turn, tuple(np.ravel(offset))) != plain:
                 raise InputError(
                     f"{path}: scale, up, turn, offset and loose are for meshes; a sewing pattern"
                     " says its unit and place itself"
@@ -191,6 +206,8 @@ class Garment:
         surface = standard_surface() if made_for is None else fitting.surface_of(made_for)
         vertices, faces = mesh.as_arrays(vertices, faces, where)
         check(vertices, faces, where)
+        if texcoords is not None:
+            texcoords.check(len(faces), where)
         fitting.check_place(vertices[np.unique(faces)], surface, where, other, place)
         V, F, told = mended(vertices, faces, where, surface)
         fitting.check_reach(V, surface, where)
@@ -328,5 +345,5 @@ class Garment:
 
 def _check_count(count):
     """Raises InputError for a number of vertices that no garment can have; None says none."""
-    if count is not None and not 100 <= count <= _MOST_VERTICES:
+    if count is not None and not 100 <= as_number(count) <= _MOST_VERTICES:
         raise InputError(f"count = {count}: 100 to {_MOST_VERTICES:,} vertices are needed")

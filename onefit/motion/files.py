@@ -13,8 +13,8 @@ import os
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from polyfit.errors import InputError
-from polyfit.files import NOT_NPZ
+from polyfit.errors import InputError, as_number
+from polyfit.files import as_path, read_npz
 
 from . import likely
 from .bvh import read_bvh
@@ -29,7 +29,9 @@ def read(path, fps=None, up=None):
     """``(poses (T, 24, 3) [rad], translation (T, 3) [m], fps, name)`` of a file, as
     :class:`onefit.Motion` takes them; see :meth:`onefit.Motion.read`.
     """
-    path = str(path)
+    path = as_path(path, "motion")
+    if fps is not None and np.isnan(as_number(fps)):
+        raise InputError(f"{path}: fps = {fps!r}; a number of frames a second is needed")
     name = os.path.splitext(os.path.basename(path))[0]
     if up not in (None, "y", "z"):
         raise InputError(f"up = {up!r}; y or z is needed")
@@ -46,18 +48,7 @@ def read(path, fps=None, up=None):
 
 def _read_npz(path, fps, up):
     """(poses (T, 24, 3) [rad], translation (T, 3) [m], fps, what may be up instead)."""
-    try:
-        file = np.load(path, allow_pickle=False)
-        if isinstance(file, np.ndarray):
-            raise ValueError("it holds one array, as .npy; poses and trans are needed")
-        with file:
-            data = {key: file[key] for key in ("poses", "trans", *_RATES) if key in file.files}
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except NOT_NPZ as error:
-        raise InputError(
-            f"{path}: cannot be read as .npz ({' '.join(str(error).split())[:200]})"
-        ) from None
+    data = read_npz(path, ("poses", "trans", *_RATES), "a motion")
     for key in ("poses", "trans"):
         if key not in data:
             raise InputError(
@@ -77,9 +68,11 @@ def _read_npz(path, fps, up):
     likely.check_rate(path, fps)
     if up is None:  # AMASS names its rate after its motion capture
         up = "z" if rate is None or rate.startswith("mocap") else "y"
-    quaternions = poses.ndim == 3 and poses.shape[2] == 4
     count = poses.shape[1] if poses.ndim == 3 else poses.shape[1] / 3 if poses.ndim == 2 else None
-    if count not in _COUNTS or quaternions:
+    if poses.ndim == 3 and count in _COUNTS and poses.shape[2] not in (3, 4):
+        needed = f"axis-angle vectors (T, {count}, 3) are needed"
+        raise InputError(f"{path}: poses of shape {poses.shape}; {needed}")
+    if count not in _COUNTS or (poses.ndim == 3 and poses.shape[2] != 3):
         raise InputError(
             f"{path}: poses of shape {poses.shape}; axis-angle vectors of 22, 24 (SMPL), 52"
             " (SMPL-H) or 55 (SMPL-X) joints are needed"

@@ -13,7 +13,7 @@ import numpy as np
 from onefit.body import skeleton
 from onefit.motion.figures import figure, footwork, gaits, heldout, postures
 from onefit.motion.figures.script import wander
-from polyfit.errors import InputError
+from polyfit.errors import InputError, as_number, number
 
 HELD_OUT_SEEDS = 1_000_000  # seeds from here up are never trained on
 
@@ -28,13 +28,13 @@ def generate(name, seconds=10.0, seed=0, fps=30.0):
     """
     if name not in KINDS:
         raise InputError(f"no kind of motion {name!r}; there are {', '.join(KINDS)}")
-    if not (0 < fps < 10_000 and 1 <= seconds * fps <= 1e6):
+    length, rate = as_number(seconds), as_number(fps)
+    if not (0 < rate < 10_000 and 1 <= length * rate <= 1e6):
         raise InputError(
             f"a motion of {seconds} s at {fps} frames a second; at least one frame, at most a"
             " million are needed"
         )
-    if seed < 0:
-        raise InputError(f"seed = {seed}; 0 or more is needed")
+    seed = number("seed", seed, 0, whole=True)
     rng = np.random.default_rng([zlib.crc32(name.encode()), seed])
     flipped = rng.random() < 0.5
     t = np.arange(round(seconds * fps)) / fps

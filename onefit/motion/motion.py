@@ -10,7 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from onefit.body import Body, skeleton
-from polyfit.errors import InputError
+from polyfit.errors import InputError, as_number
 
 from . import files, generate
 
@@ -61,7 +61,7 @@ class Motion:
                     f"motion {self.name}: {what} are not finite in {where}; cut them out or fill"
                     " them in"
                 )
-        if not 0 < self.fps < 10_000:
+        if not 0 < as_number(self.fps) < 10_000:
             raise InputError(
                 f"motion {self.name}: {self.fps} frames a second; a positive number is needed"
             )
@@ -156,7 +156,7 @@ class Motion:
         along straight lines. Where the old rate is a multiple of the new one, frames are taken as
         they are.
         """
-        if not 0 < fps < 10_000:
+        if not 0 < as_number(fps) < 10_000:
             raise InputError(f"{fps} frames a second; a positive number is needed")
         if fps == self.fps or len(self) == 1:
             return replace(self, fps=float(fps))

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 from polyfit.errors import InputError
+from polyfit.files import as_path
 from polyfit.network import load_into, read_weights, write_weights
 
 VERSION = 4  # of the network's shape and the meaning of its weights
@@ -62,7 +63,7 @@ def load(name: str | os.PathLike[str]) -> Trained:
     """
     from .network import OneFit
 
-    path = Path(name)
+    path = Path(as_path(name, "weights"))
     if not path.exists():
         path = FOLDER / f"{name}.safetensors"
         if not path.exists():

@@ -20,7 +20,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from polyfit.errors import InputError
+from polyfit.errors import InputError, number
 
 GRAVITY = 9.81  # [m/s^2], along -z
 AIR = 1.2  # [kg/m^3], the density of air at 20 degrees
@@ -49,11 +49,9 @@ class Material:
 
     def __post_init__(self) -> None:
         for field in ("stretch", "density", "thickness"):
-            if not 0 < getattr(self, field) < float("inf"):
-                raise InputError(f"material: {field} = {getattr(self, field)}; above 0 is needed")
+            number(f"material: {field}", getattr(self, field), above=0)
         for field in ("bending", "friction", "drag"):
-            if not 0 <= getattr(self, field) < float("inf"):
-                raise InputError(f"material: {field} = {getattr(self, field)}; 0 or more is needed")
+            number(f"material: {field}", getattr(self, field), 0)
 
     @property
     def shear(self) -> float:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 from onefit.contact import ContactSettings
-from polyfit.errors import InputError
+from polyfit.errors import InputError, number
 
 
 @dataclass(frozen=True)
@@ -36,11 +36,9 @@ class Settings:
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if name in ("newton", "iterations", "parts"):
-                if not isinstance(value, int) or value < 1:
-                    raise InputError(f"{name} = {value}: a whole number, 1 or more")
-            elif name != "contact" and not 0 <= value < float("inf"):
-                raise InputError(f"{name} = {value}: a number, 0 or more")
-        if not self.stride:
-            raise InputError(f"stride = {self.stride}: a number above 0")
+                object.__setattr__(self, name, number(name, value, 1, whole=True))
+            elif name != "contact":
+                number(name, value, 0)
+        number("stride", self.stride, above=0)
         if not isinstance(self.contact, ContactSettings):
             raise InputError(f"contact = {self.contact}: ContactSettings are needed")

@@ -6,6 +6,7 @@ import os
 import sys
 from dataclasses import asdict, fields
 from functools import partial
+from hashlib import sha256
 
 import torch
 
@@ -40,6 +41,7 @@ class OneFitTraining(Training):
             else _network(settings, len(data.standard.joints), data.shapes.shape[1])
         )
         plain = json.loads(json.dumps(asdict(settings) | dict(objective=settings.lowered)))
+        plain["meshes"] = [f"{one.name} {_digest(one)}" for one in self._own()]
         network = network.to(processes.device).train()
         windows = min(self._windows(garment, processes) for garment, *_ in data.garments)
         self.epoch_steps = settings.epoch_steps or -(-len(data) // windows)
@@ -52,8 +54,12 @@ class OneFitTraining(Training):
         )
 
     def write_weights(self, path):
-        names = [garment.garment.name for garment, *_ in self.data.garments]
-        save(path, self.network, self.data.model, names[: len(names) - self.given.cuts])
+        save(path, self.network, self.data.model, [one.name for one in self._own()])
+
+    def _own(self):
+        """The garments that were given: those before the cuts."""
+        count = len(self.data.garments) - self.given.cuts
+        return [patched.garment for patched, *_ in self.data.garments[:count]]
 
     def _windows(self, garment, processes):
         """Windows of a step, so that it has about ``batch`` patches, and each process the same
@@ -168,6 +174,12 @@ class OneFitTraining(Training):
         return dict(loss=self.last, stepped_over=1.0)
 
 
+def _digest(garment):
+    """A few digits that tell a garment's mesh from another one of the same name."""
+    arrays = (x.cpu().numpy().tobytes() for x in (garment.vertices, garment.faces))
+    return sha256(b"".join(arrays)).hexdigest()[:12]
+
+
 def _network(settings, joints, shape):
     s = settings
     return OneFit(s.order, joints, shape, s.extras, s.frames, s.acvd)
@@ -180,7 +192,7 @@ def data_of(settings, folder, progress):
         named = settings.garments or taught(settings.teacher)
         garments = [garment_of(settings.teacher, name) for name in named]
     else:
-        garments = [Garment.named(name, **settings.read) for name in settings.garments or STANDARD]
+        garments = Garment.all_named(settings.garments or STANDARD, **settings.read)
     learned = [lessons(settings.teacher, g) for g in garments] if settings.teacher else ()
     motions = [
         Motion.read(path, settings.fps, settings.motion_up) for path in settings.motions

@@ -18,7 +18,7 @@ from onefit.contact import ContactSettings
 from onefit.garment import Garment
 from onefit.physics import Settings
 from polyfit.errors import InputError
-from polyfit.files import aside
+from polyfit.files import aside, read_npz
 
 from .projection import unposed
 
@@ -79,9 +79,16 @@ def garment_of(folder, name: str) -> Garment:
     path = path_of(folder, name)
     if not path.exists():
         raise InputError(f"{folder}: no lesson of {name}; onefit.teach makes them")
-    with np.load(path) as file:
-        of_cut = dict(cut=file.get("cut"), lengths=file.get("lengths"))
-        return Garment.bound(path.stem, file["vertices"], file["faces"], **of_cut)
+    found = _arrays(path, ("vertices", "faces"), ("cut", "lengths"))
+    return Garment.bound(path.stem, **found)
+
+
+def _arrays(path, needed, more=()):
+    """The arrays ``needed`` of a file, and those of ``more`` that it has. Raises InputError."""
+    found = read_npz(path, (*needed, *more), "a lesson")
+    if missing := [name for name in needed if name not in found]:
+        raise InputError(f"{path}: no lesson, for it misses {', '.join(missing)}")
+    return found
 
 
 def taught(folder) -> tuple[str, ...]:
@@ -99,8 +106,8 @@ def lessons(folder, garment: Garment) -> list[Lesson]:
     """
     found = []
     for path in sorted(Path(folder).glob(path_of("", garment.name, "*").name)):
-        with np.load(path) as file:
-            lesson = Lesson(*(torch.as_tensor(file[n]) for n in Lesson.__annotations__))
+        arrays = _arrays(path, Lesson.__annotations__)
+        lesson = Lesson(**{name: torch.as_tensor(x) for name, x in arrays.items()})
         if len(lesson.displacement) != len(garment):
             raise InputError(
                 f"{path}: of {len(lesson.displacement)} vertices, not {len(garment)}: another mesh"

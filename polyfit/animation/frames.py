@@ -5,11 +5,11 @@ import os
 
 import numpy as np
 
-from polyfit.errors import InputError
+from polyfit.errors import InputError, number
 from polyfit.files import folder_aside
 from polyfit.mesh import write_ply
 
-from .moving import checked, encoded
+from .moving import check_up, checked, encoded
 
 _ABOUT = "frames.json"
 
@@ -23,7 +23,9 @@ def write_frames(folder, kind, vertices, faces, uv=None, texture=None, *, labels
     this function wrote is replaced, if nothing was added to it.
     """
     vertices, faces, uv = checked(vertices, faces, uv, 1)
-    labels = [int(k) for k in (range(len(vertices)) if labels is None else labels)]
+    check_up(up)
+    labels = range(len(vertices)) if labels is None else labels
+    labels = [number("animation: label", k, 0, whole=True) for k in labels]
     if kind not in ("obj", "ply"):
         raise InputError(f"animation: kind = {kind!r}; obj or ply is needed")
     if not len(labels) == len(set(labels)) == len(vertices):

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from polyfit.errors import InputError
 from polyfit.files import aside
 
-from .moving import checked, encoded, normals
+from .moving import check_up, checked, encoded, normals
 
 GREY = (0.72, 0.72, 0.72)
 
@@ -209,8 +209,10 @@ def write_skinned_glb(path, meshes, skeleton, *, fps=24.0, up="z"):
     pygltflib.
     """
     _check_name(path)
+    check_up(up)
     for mesh in meshes:
         checked(np.asarray(mesh.vertices)[None], mesh.faces, None, fps)
+    _check(skeleton, meshes)
     file, count = _File(), len(skeleton.rotations)
     gltf, out = file.gltf, file.out
     joints = range(len(skeleton.names))
@@ -241,6 +243,44 @@ def write_skinned_glb(path, meshes, skeleton, *, fps=24.0, up="z"):
             channels.append((node, "weights", np.asarray(mesh.weights).ravel(), gltf.SCALAR))
     file.animate(channels, count, fps)
     file.write(path, [top, *range(top + 1, len(out.nodes))])
+
+
+def _check(skeleton, meshes):
+    """Raises InputError where arrays do not fit each other, or are not as the classes say."""
+    count, frames = len(skeleton.names), len(skeleton.rotations)
+    needed = dict(offsets=(count, 3), inverse=(count, 4, 4), translation=(frames, 3))
+    needed["rotations"] = (max(frames, 1), count, 3)
+    _check_numbers("skeleton", skeleton, needed)
+    parents = [*skeleton.parents]
+    before = len(parents) == count and all(-1 <= p < k for k, p in enumerate(parents))
+    if not before or parents.count(-1) != 1 or count > 256:
+        raise InputError(
+            f"animation: parents of {count} joints, at most 256: of each one that stands before it"
+            " is needed, and -1 of one root"
+        )
+    for mesh in meshes:
+        size, shapes = len(mesh.vertices), len(mesh.shapes)
+        needed = dict(joint_of=(size, 4), joint_weights=(size, 4))
+        more = dict(shapes=(shapes, size, 3), weights=(frames, shapes)) if shapes else {}
+        _check_numbers(mesh.name, mesh, needed | more)
+        weights = np.asarray(mesh.joint_weights)
+        if weights.min() < 0 or np.abs(weights.sum(1) - 1).max() > 1e-3:
+            why = "rows that sum to 1, none negative, are needed"
+            raise InputError(f"animation: {mesh.name}: joint_weights: {why}")
+        if not np.isin(np.asarray(mesh.joint_of)[weights > 0], np.arange(count)).all():
+            why = f"0 to {count - 1}, the numbers of joints, are needed"
+            raise InputError(f"animation: {mesh.name}: joint_of: {why}")
+
+
+def _check_numbers(where, holder, needed):
+    for name, shape in needed.items():
+        try:
+            array = np.asarray(getattr(holder, name), np.float64)
+        except (TypeError, ValueError):
+            array = np.array(np.nan)
+        if array.shape != shape or not np.isfinite(array).all():
+            found = f"{name} {array.shape}; {shape} of finite numbers is needed"
+            raise InputError(f"animation: {where}: {found}")
 
 
 def _skinned(file, mesh):

@@ -7,7 +7,7 @@ import io
 
 import numpy as np
 
-from polyfit.errors import InputError
+from polyfit.errors import InputError, as_number
 from polyfit.files import silent_decoders
 from polyfit.mesh import TexCoords, as_arrays, vertex_normals
 
@@ -56,7 +56,7 @@ def checked(vertices, faces, uv, fps):
     _, F = as_arrays(V[0], faces, "animation")
     if not np.isfinite(V).all():
         raise InputError("animation: positions that are not finite")
-    if not (np.isfinite(fps) and fps > 0):
+    if not 0 < as_number(fps) < np.inf:
         raise InputError(f"animation: {fps} frames a second; a positive number is needed")
     if uv is not None:
         if not isinstance(uv, TexCoords):
@@ -64,10 +64,7 @@ def checked(vertices, faces, uv, fps):
             if uv.shape != (V.shape[1], 2):
                 raise InputError(f"animation: uv {uv.shape}; ({V.shape[1]}, 2) is needed")
             uv = TexCoords(uv, F)
-        elif uv.faces.shape != F.shape:
-            raise InputError(
-                f"animation: uv of {len(uv.faces)} faces; those of the {len(F)} are needed"
-            )
+        uv.check(len(F), "animation")
         coordinates = np.nan_to_num(np.asarray(uv.coordinates, np.float32))
         bare = uv.faces < 0  # corners without a coordinate take (0, 0)
         if bare.any():

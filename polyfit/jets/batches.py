@@ -17,7 +17,7 @@ from polyfit.errors import InputError
 
 from . import jet
 from .chebyshev import DETERMINED_RMS, Box, determined_order, values
-from .frames import check_points
+from .frames import check_points, of_points
 from .least_squares import JetFit
 from .monomials import check_order, exponents, size_of
 
@@ -34,7 +34,7 @@ def fit(
     Differentiable once in points and weights, at the cost of evaluating two jets. Raises InputError
     where a patch has no points or weight, or where numbers are not finite.
     """
-    check_order(order)
+    order = check_order(order)
     check_points(points)
     if not isinstance(points, Tensor):
         raise InputError(f"points are {type(points)}; a tensor of torch is needed")
@@ -42,13 +42,14 @@ def fit(
     if shape[-1] == 0:
         raise InputError("patch 0 has no points")
     flat = points.reshape(-1, *points.shape[-2:])
+    mask, weights = of_points(points, "mask", mask), of_points(points, "weights", weights)
     if mask is not None:
-        mask = mask.expand(shape).reshape(flat.shape[:2])
+        mask = mask.reshape(flat.shape[:2])
     if weights is None:
         weights = flat.new_ones(1, 1) if mask is None else mask.to(flat.dtype)
         weights = weights.expand(flat.shape[:2])
     else:
-        weights = weights.expand(shape).reshape(flat.shape[:2])
+        weights = weights.reshape(flat.shape[:2])
         if mask is not None:
             weights = torch.where(mask, weights, 0)
     if mask is not None:
@@ -136,18 +137,14 @@ class _Once(torch.autograd.Function):
 
 def _normalised(weights: Tensor, points: Tensor) -> tuple[Tensor | None, Tensor]:
     """The weights divided by their sum, float64, or None where all are 1; and the sum, (B, 1)."""
-    if weights.stride() == (0, 0) and weights.numel():
+    if weights.stride() == (0, 0) and weights.numel() and weights[0, 0] == 1:
         return None, weights.new_full((len(points), 1), points.shape[1], dtype=torch.float64)
     weights = weights.to(torch.float64)
     total = weights.sum(1, keepdim=True)
     bad = ~((total > 0) & total.isfinite() & (weights >= 0).all(1, keepdim=True))
     if bad.any():
         k = int(bad[:, 0].to(torch.uint8).argmax())
-        what = (
-            "no points"
-            if not weights[k].abs().sum() > 0
-            else "weights that are negative or not finite"
-        )
+        what = "no points" if (weights[k] == 0).all() else "weights that are negative or not finite"
         raise InputError(f"patch {k} has {what}")
     return weights / total, total
 

@@ -34,8 +34,8 @@ class CanonicalFrame:
         to the side where the third moment of the coordinate is positive. For a symmetric patch they
         point to the first point that is at least half as far out as the farthest. z follows by the
         right hand. Computed in float64, returned in the points' dtype. Without gradient: a frame is
-        a choice of coordinates. Raises InputError where a patch has no points, or points that are
-        not finite or all the same.
+        a choice of coordinates. Raises InputError where a patch has no points or weight, or points
+        that are not finite or all the same, and for a mask or weights of another kind.
         """
         check_points(points)
         xp = namespace(points)
@@ -44,18 +44,23 @@ class CanonicalFrame:
             dtype, points = points.dtype, m.asarray(points, dtype=m.float64)
             if points.shape[-2] == 0:
                 raise InputError("patches without points")
+            mask, weights = of_points(points, "mask", mask), of_points(points, "weights", weights)
             w = None if weights is None else m.asarray(weights, dtype=m.float64)
             if mask is not None:
                 w = where(mask, m.ones_like(points[..., 0]) if w is None else w, 0)
                 points = where(mask[..., None], points, 0)
-            w = None if w is None else w / w.sum(-1)[..., None]
+            weighed = None
+            if w is not None:
+                total = w.sum(-1)
+                weighed = (w >= 0).all(-1) & (total > 0) & m.isfinite(total)
+                w = w / where(weighed, total, 1)[..., None]
             T = points.mean(-2) if w is None else (w[..., None, :] @ points)[..., 0, :]
             centred = points - T[..., None, :]
             distance = (centred**2).sum(-1)
             if mask is not None:
                 distance = where(mask, distance, 0)
             s = m.sqrt(m.amax(distance, -1))
-            _check(points, mask, s)
+            _check(points, mask, s, weighed)
             x = centred / s[..., None, None]
             spread = x.mT @ x / x.shape[-2] if w is None else (w[..., None] * x).mT @ x
             axes = m.linalg.eigh(spread)[1]
@@ -146,15 +151,42 @@ def _pointed(x: Any, axis: Any, w: Any, level: float) -> Any:
 
 
 def check_points(points: Any) -> None:
-    """Raises InputError where ``points`` are no array of NumPy or torch (..., P, 3) of floats."""
+    """Raises InputError where ``points`` are no array of NumPy or torch (..., P, 3) of floats, or
+    of no patch.
+    """
     shape, kind = tuple(getattr(points, "shape", ())), getattr(points, "dtype", type(points))
     if len(shape) < 2 or shape[-1] != 3 or "float" not in str(kind):
         raise InputError(f"points of shape {shape}, {kind}; (..., points, 3) of floats is needed")
+    if 0 in shape[:-2]:
+        raise InputError(f"points of shape {shape}; one patch or more is needed")
 
 
-def _check(points: Any, mask: Any, s: Any) -> None:
+def of_points(points: Any, name: str, given: Any) -> Any:
+    """What is ``given`` of each of the ``points`` (..., P, 3), a "mask" or "weights", as an array
+    (..., P) like theirs; None stays. Raises InputError, also for a mask that is not of bool.
+    """
+    if given is None:
+        return None
+    xp, shape = namespace(points), tuple(points.shape[:-1])
+    try:
+        if not hasattr(given, "shape") or namespace(given) is not xp:
+            given = xp.module.asarray(given, device=points.device)
+        array = xp.module.broadcast_to(given, shape)
+    except (TypeError, ValueError, RuntimeError):
+        array = None
+    kinds = ("bool",) if name == "mask" else ("float", "int", "bool")
+    if array is None or not any(kind in str(array.dtype) for kind in kinds):
+        found = (
+            f"shape {tuple(getattr(given, 'shape', ()))}, {getattr(given, 'dtype', type(given))}"
+        )
+        raise InputError(f"{name} of {found}; {shape} of {kinds[0]} is needed")
+    return array
+
+
+def _check(points: Any, mask: Any, s: Any, weighed: Any) -> None:
     m = namespace(points).module
     bad = ~((s > 1e-12 * m.amax(abs(points), (-1, -2))) & m.isfinite(s))
+    bad = bad if weighed is None else bad | ~weighed
     if not bad.any():
         return
     at = tuple(np.argwhere(bad.tolist())[0].tolist())
@@ -164,4 +196,6 @@ def _check(points: Any, mask: Any, s: Any) -> None:
         raise InputError(f"{name} has no points")
     if not m.isfinite(points[at]).all():
         raise InputError(f"{name} has points that are not finite")
+    if weighed is not None and not weighed[at]:
+        raise InputError(f"{name} has weights that are negative, not finite, or all 0")
     raise InputError(f"{name}: its {count} points coincide")

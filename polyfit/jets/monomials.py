@@ -4,7 +4,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from polyfit.errors import InputError
+from polyfit.errors import InputError, as_number
 
 
 @lru_cache
@@ -20,10 +20,11 @@ def size_of(order: int) -> int:
     return (order + 1) * (order + 2) // 2
 
 
-def check_order(order: int) -> None:
-    """Raises InputError where no jet of this ``order`` is fitted: 1 to 10 are."""
-    if order not in range(1, 11):
-        raise InputError(f"order = {order}; the order of a jet is 1 to 10")
+def check_order(order: int) -> int:
+    """The ``order`` of a jet. Raises InputError where none of it is fitted: 1 to 10 are."""
+    if not (1 <= as_number(order) <= 10 and as_number(order) % 1 == 0):
+        raise InputError(f"order = {order!r}; the order of a jet is 1 to 10")
+    return int(order)
 
 
 def order_of(size: int) -> int:

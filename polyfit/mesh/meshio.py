@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from polyfit.errors import InputError
-from polyfit.files import aside
+from polyfit.files import as_path, aside
 
 from .obj import read_obj
 from .ply import read_ply
@@ -75,7 +75,7 @@ def read_textured(path: str | os.PathLike[str], what: str = "mesh") -> _Textured
     """As :func:`read_mesh`, with a :class:`polyfit.mesh.TexCoords`, seams included, or None where
     the file has no texture coordinates at all. Corners without any name the coordinate -1.
     """
-    path = os.fspath(path)
+    path = as_path(path, what)
     extension = os.path.splitext(path)[1].lower()
     if os.path.isdir(path):
         raise InputError(f"{path}: is a folder; a {what} is an .obj, .ply or .glb file")

@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from polyfit.errors import InputError
+
 
 @dataclass(frozen=True)
 class TexCoords:
@@ -18,6 +20,24 @@ class TexCoords:
     def corners(self) -> np.ndarray:
         """The coordinates of the faces' corners, (F, 3, 2); NaN for those without."""
         return self._at(self.faces)
+
+    def check(self, count: int, where: str) -> None:
+        """Raises InputError, which starts with ``where``, unless they are of ``count`` faces and
+        name coordinates that are there.
+        """
+        coordinates, faces = np.shape(self.coordinates), np.asarray(self.faces)
+        if len(coordinates) != 2 or coordinates[1] != 2 or faces.shape != (count, 3):
+            raise InputError(
+                f"{where}: texture coordinates {coordinates} of faces {faces.shape}; (M, 2) and"
+                f" ({count}, 3) are needed"
+            )
+        if count and not (
+            faces.dtype.kind in "iu" and -1 <= faces.min() <= faces.max() < coordinates[0]
+        ):
+            raise InputError(
+                f"{where}: faces name texture coordinates {faces.min()} to {faces.max()}; 0 to"
+                f" {coordinates[0] - 1}, or -1, exist"
+            )
 
     def _at(self, index: np.ndarray) -> np.ndarray:
         """The coordinates (..., 2) with the numbers ``index`` (...,)."""

@@ -153,8 +153,7 @@ class PolyFit(torch.nn.Module):
 
     def __init__(self, order: int = 4, stn: SpatialTransformer | None = None) -> None:
         super().__init__()
-        jets.check_order(order)
-        self.order = order
+        self.order = jets.check_order(order)
         self.stn = stn
 
     def frame(

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from polyfit import mesh
-from polyfit.errors import InputError
+from polyfit.errors import InputError, as_number
 
 from .clusters import clusters, plain, split_in_two
 
@@ -86,8 +86,9 @@ class Patches:
         area = mesh.areas(V, given)
         if count is None:
             count = max(parts, min(len(V), patch_count(area.sum())))
-        if count != int(count):
+        if as_number(count) % 1:
             raise InputError(f"{where}: {count} patches; a whole number is needed")
+        count = int(count)
         if not 1 <= count <= len(V):
             raise InputError(
                 f"{where}: {count} patches; 1 to {len(V)}, the number of its vertices, are possible"
@@ -213,6 +214,11 @@ class Patches:
             raise InputError(
                 f"faces {face.shape}, barycentric {barycentric.shape}; (P,) and (P, 3) are needed"
             )
+        numbers = all(x.dtype.kind in "iuf" for x in (face, barycentric))
+        if not numbers or (face % 1 != 0).any():
+            raise InputError("faces: whole numbers, which name those of the mesh, are needed")
+        if not np.allclose(barycentric.sum(-1), 1, rtol=0, atol=1e-3):
+            raise InputError("barycentric: rows of finite numbers that sum to 1 are needed")
         if len(face) and not 0 <= face.min() <= face.max() < len(self.given):
             raise InputError(
                 f"faces {face.min()} to {face.max()}; 0 to {len(self.given) - 1} exist"

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from polyfit import jets, mesh
-from polyfit.errors import InputError
+from polyfit.errors import InputError, number
 from polyfit.jets import CanonicalFrame
 
 from .patches import Patches
@@ -67,6 +67,7 @@ class PatchedSurface:
         ``polyfit``, a :class:`polyfit.PolyFit`, finds frames and jets in its own way and order
         instead.
         """
+        _check_how(polyfit, dtype, device)
         index, exists = patches.padded
         tensor = lambda x, kind=dtype: torch.as_tensor(x, dtype=kind, device=device)
         points, mask = (
@@ -109,6 +110,7 @@ class PatchedSurface:
         mesh that lies too far from the origin for single precision
         (:func:`polyfit.mesh.centred`).
         """
+        rounds = number("rounds", rounds, 0, whole=True)
         patches = Patches.cut(vertices, faces, count, acvd=acvd, where=where)
         options: dict[str, Any] = dict(polyfit=polyfit, dtype=dtype, device=device)
         if mesh.centred(patches.vertices)[1] is not None:
@@ -174,6 +176,10 @@ class PatchedSurface:
 
     def _of(self, function: Callable[[Tensor, Tensor], Any], patch: Tensor, uv: Tensor) -> Any:
         """``function`` of jets at single points."""
+        if patch.numel() and not 0 <= int(patch.min()) <= int(patch.max()) < len(self):
+            raise InputError(
+                f"patches {int(patch.min())} to {int(patch.max())}; 0 to {len(self) - 1} exist"
+            )
         found = function(self.alpha[patch], uv[..., None, :])
         squeeze = lambda x: x.squeeze(patch.ndim)
         return tuple(map(squeeze, found)) if isinstance(found, tuple) else squeeze(found)
@@ -216,7 +222,8 @@ class PatchedSurface:
         """``count`` points drawn evenly from the mesh's area, on the surface: a tuple of what
         ``what`` names, as in :meth:`at`.
         """
-        rng = np.random.default_rng(seed)
+        count = number("count", count, 0, whole=True)
+        rng = np.random.default_rng(number("seed", seed, 0, whole=True))
         area = mesh.areas(self.patches.vertices, self.patches.faces)
         face = rng.choice(len(area), count, p=area / area.sum())
         barycentric = rng.dirichlet((1, 1, 1), count)
@@ -229,8 +236,8 @@ class PatchedSurface:
         The given mesh's vertices come first. ``smoothing``: how often :meth:`smoothed` is applied.
         Raises InputError for ``parts`` below 1.
         """
-        if parts < 1 or parts != int(parts):
-            raise InputError(f"parts = {parts}; a whole number, 1 or more, is needed")
+        parts = number("parts", parts, 1, whole=True)
+        smoothing = number("smoothing", smoothing, 0, whole=True)
         faces, face, barycentric = mesh.refined(self.patches.given, parts)
         vertices = self.at(face, barycentric)
         seam = self.patches.on_boundary[self.patches.locate(face, barycentric)[0]]
@@ -295,13 +302,29 @@ class PatchedSurface:
         )
 
 
+def _check_how(polyfit: Any, dtype: Any, device: Any) -> None:
+    """Raises InputError for what :meth:`PatchedSurface.fit` cannot be done with."""
+    if polyfit is not None and not callable(polyfit):
+        raise InputError(f"polyfit = {polyfit!r}; a PolyFit (PolyFit.pretrained()) is needed")
+    if dtype not in (torch.float32, torch.float64):
+        raise InputError(f"dtype = {dtype!r}; torch.float32 or torch.float64 is needed")
+    try:
+        torch.empty(0, device=device)
+    except (TypeError, ValueError, RuntimeError, AssertionError):  # the last without CUDA
+        raise InputError(f"device = {device!r}; one that this torch has is needed") from None
+
+
 def smoothed(vertices: Tensor, faces: Tensor, where: Tensor, times: int = 1) -> Tensor:
     """Vertices (N, 3) with those of ``where`` (N,) bool moved ``times`` times halfway to the mean
-    of their neighbours (Laplacian smoothing).
+    of their neighbours (Laplacian smoothing). Raises InputError for another ``where``.
 
     Vertices at the mesh's own boundary only feel their neighbours along it, so that the outline
     does not shrink. Differentiable.
     """
+    times = number("times", times, 0, whole=True)
+    if where.dtype != torch.bool or where.shape != vertices.shape[:1]:
+        found = f"where of shape {tuple(where.shape)}, {where.dtype}"
+        raise InputError(f"{found}; ({len(vertices)},) of bool is needed")
     if not times:
         return vertices
     sides = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).sort(1).values

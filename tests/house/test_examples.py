@@ -11,6 +11,8 @@ import pytest
 from places import ROOT
 from scripts import load
 
+from polyfit import InputError
+
 torch_loss, own_unknowns, drape_to_blender, bend_a_patch = (
     load(f"examples/{name}.py")
     for name in ("torch_loss", "own_unknowns", "drape_to_blender", "bend_a_patch")
@@ -43,6 +45,18 @@ def test_one_patch_moves_and_the_rest_stays(tmp_path):
     moved = np.linalg.norm(after - before, axis=1)
     assert 0.005 < moved.max() < 0.1 and 0 < (moved > 1e-6).mean() < 0.3
     assert (tmp_path / "before.ply").stat().st_size == (tmp_path / "after.ply").stat().st_size
+
+
+def test_arguments_that_cannot_be_used_are_named(tmp_path):
+    for how, message in (
+        (dict(patch=9999), "--patch = 9999; a whole number, 0 to "),
+        (dict(bend=np.nan), "--bend = nan; a finite number is needed"),
+    ):
+        with pytest.raises(InputError, match=message):
+            bend_a_patch.main(tmp_path / "no", **how)
+    with pytest.raises(InputError, match="--steps = 0; a whole number, 1 or more, is needed"):
+        torch_loss.main(steps=0)
+    assert not (tmp_path / "no").exists()
 
 
 def test_the_notebook_runs_from_top_to_bottom(tmp_path, monkeypatch):

@@ -134,3 +134,22 @@ def test_what_has_no_frame_is_named():
     for wrong in torch.arange(12).reshape(4, 3), torch.rand(4, 2), [[0.0, 1.0, 2.0]] * 4:
         with pytest.raises(InputError, match=r"\(..., points, 3\) of floats is needed"):
             CanonicalFrame.from_points(wrong)
+    with pytest.raises(InputError, match=r"\(0, 20, 3\); one patch or more is needed"):
+        CanonicalFrame.from_points(torch.rand(0, 20, 3))
+
+
+@pytest.mark.parametrize("kind", [torch.as_tensor, np.asarray])
+def test_masks_and_weights_that_do_not_fit_are_named(kind):
+    points, mask = (kind(x) for x in patches())
+    for how, message in (
+        (dict(weights=-1.0), "patch 0 has weights that are negative, not finite, or all 0"),
+        (dict(weights=0), "patch 0 has weights that are negative, not finite, or all 0"),
+        (dict(weights=[np.nan]), "patch 0 has weights that are negative, not finite, or all 0"),
+        (dict(weights=np.ones(7)), r"weights of shape \(7,\), .*; \(3, 300\) of float is needed"),
+        (dict(mask=np.ones((3, 300), int)), r"mask of shape .*int64; \(3, 300\) of bool is needed"),
+        (dict(mask="all"), r"; \(3, 300\) of bool is needed"),
+    ):
+        with pytest.raises(InputError, match=message):
+            CanonicalFrame.from_points(points, **how)
+    found = CanonicalFrame.from_points(points, mask.tolist(), weights=np.ones((3, 300)))
+    assert abs(found.R - CanonicalFrame.from_points(points, mask).R).max() < 1e-9

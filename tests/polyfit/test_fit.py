@@ -171,7 +171,32 @@ def test_what_cannot_be_fitted_is_named():
         "torch.int32; (..., points, 3) of floats": lambda: jets.fit(points.int(), 2),
         "a tensor of torch is needed": lambda: jets.fit(points.numpy(), 2),
         "order = 2.5; the order of a jet is 1 to 10": lambda: jets.fit(points, 2.5),
+        "order = '4'; the order of a jet is 1 to 10": lambda: jets.fit(points, "4"),
+        "(0, 20, 3); one patch or more is needed": lambda: jets.fit(points[:0], 2),
+        "mask of shape (2, 20), torch.int64; (2, 20) of bool": lambda: jets.fit(
+            points, 2, mask=torch.ones(2, 20).long()
+        ),
+        "mask of shape (7,), torch.bool; (2, 20) of bool": lambda: jets.fit(
+            points, 2, mask=torch.ones(7).bool()
+        ),
+        "weights of shape (), <class 'list'>; (2, 20) of float": lambda: jets.fit(
+            points, 2, weights=["a"]
+        ),
+        "patch 0 has weights that": lambda: jets.fit(points, 2, weights=torch.tensor(-1.0)),
+        "patch 0 has weights that are negative or not": lambda: jets.fit(
+            points, 2, weights=torch.full((2, 20), float("nan"))
+        ),
     }.items():
         with pytest.raises(InputError) as error:
             call()
         assert message in str(error.value)
+
+
+def test_masks_weights_and_orders_that_are_plainly_meant():
+    points, _, mask = patches(3)
+    weights = torch.rand(mask.shape)
+    found = jets.fit(points, 3, weights=weights, mask=mask).alpha
+    given = dict(weights=weights.numpy(), mask=mask.tolist())
+    assert torch.equal(jets.fit(points, 3.0, **given).alpha, found)
+    twice = jets.fit(points, 3, weights=torch.tensor(2.0)).alpha
+    assert torch.allclose(twice, jets.fit(points, 3).alpha)

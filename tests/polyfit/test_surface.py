@@ -365,3 +365,42 @@ def test_bad_input_is_named():
         surface.at([0], [[0.5, 0.5]])
     with pytest.raises(InputError, match="what = 'colours'; points or normals is needed"):
         surface.sample(1, what=("colours",))
+    for face, barycentric, said in (
+        ([0], [[1, 1, 1]], "barycentric: rows of finite numbers that sum to 1"),
+        ([0], [[np.nan, 0, 1]], "barycentric: rows of finite numbers that sum to 1"),
+        ([0.7], [[1, 0, 0]], "faces: whole numbers"),
+        (["0"], [[1, 0, 0]], "faces: whole numbers"),
+    ):
+        with pytest.raises(InputError, match=said):
+            surface.at(face, barycentric)
+    with pytest.raises(InputError, match="patches -1 to -1; 0 to 1 exist"):
+        surface.points(torch.tensor([-1]), torch.zeros(1, 2))
+    vertices, faces = surface.resampled(2.0, smoothing=1.0)
+    for where in torch.ones(len(vertices)).long(), torch.ones(3).bool():
+        with pytest.raises(InputError, match=rf"; \({len(vertices)},\) of bool is needed"):
+            smoothed(vertices, faces, where)
+    assert torch.equal(surface.resampled(2, 1)[0], vertices)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda s, m: s.resampled("4"), "parts = '4'; a whole number, 1 or more, is needed"),
+        (lambda s, m: s.resampled(None), "parts = None; a whole number, 1 or more, is needed"),
+        (lambda s, m: s.resampled(smoothing="4"), "smoothing = '4'; a whole number, 0 or more"),
+        (lambda s, m: s.sample(-1), "count = -1; a whole number, 0 or more"),
+        (lambda s, m: s.from_mesh(*m, np.nan), "nan patches; a whole number is needed"),
+        (lambda s, m: s.from_mesh(*m, "2"), "2 patches; a whole number is needed"),
+        (lambda s, m: s.from_mesh(*m, 2, rounds="a"), "rounds = 'a'; a whole number, 0 or more"),
+        (lambda s, m: s.from_mesh(*m, 2, device="gpu"), "device = 'gpu'; one that this torch has"),
+        (lambda s, m: s.from_mesh(*m, 2, device="cuda:99"), "device = 'cuda:99'; one that this"),
+        (lambda s, m: s.from_mesh(*m, 2, dtype="float64"), "dtype = 'float64'; torch.float32 or"),
+        (lambda s, m: s.from_mesh(*m, 2, polyfit="paper"), "polyfit = 'paper'; a PolyFit"),
+        (lambda s, m: read_mesh(None), "mesh of type NoneType; a file's name is needed"),
+    ],
+)
+def test_arguments_of_another_kind_are_named(call, message):
+    sheet = surfaces.sheet(n=4)
+    surface = PatchedSurface.from_mesh(*sheet, 2.0, 4.0, rounds=0.0)
+    with pytest.raises(InputError, match=message):
+        call(surface, sheet)

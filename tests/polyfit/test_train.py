@@ -323,3 +323,8 @@ class TestRefused:
         with pytest.raises(InputError, match="the loss is nan at step 1"):
             trainer.train(SMALL, tmp_path)
         assert not (tmp_path / "weights.safetensors").exists()
+
+
+def test_cuts_that_are_no_numbers_are_named(capsys):
+    with pytest.raises(InputError, match="--cuts: foo: numbers of patches, or paper, are needed"):
+        train.main(["tank.obj", "-o", "OUT", "--cuts", "foo"])

@@ -8,7 +8,7 @@ import numpy as np
 
 from onefit.garment.binding import standard_body
 from polyfit import mesh
-from polyfit.files import aside
+from polyfit.files import aside, make_folder
 from polyfit.mesh import loops
 
 from .block import Block
@@ -19,7 +19,7 @@ from .sew import sewn
 
 def write(names, folder):
     """Sew the named templates into ``folder``; those with slack fall once, and keep their cut."""
-    os.makedirs(folder, exist_ok=True)
+    make_folder(folder)
     body = standard_body()
     block = Block(body.vertices.numpy(), body.faces.numpy())
     for name in names:

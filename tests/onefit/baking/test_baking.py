@@ -291,10 +291,15 @@ def test_overwriting_replaces_what_was_baked_and_nothing_else(
 ):
     out, words = tmp_path / "out", ["skirt", "--motions", "walk", "--seconds", "0.2", "--overwrite"]
     monkeypatch.setattr("onefit.baking.bake", lambda *_, **__: baked)
-    command.main([*words, "-o", str(out)])
-    write_glb(out / "older.glb", baked, draper.model.body(), motion)
+    command.main([*words[:2], "run", *words[2:], "-o", str(out)])
+    assert (out / "run-1000000.glb").exists()
     command.main([*words, "-o", str(out)])
     assert {p.name for p in out.iterdir()} == {"baked.npz", "baked.html", "walk-1000000.glb"}
+    for name in ("mine.glb", "skirt.glb"):  # of the same writer, though of no motion of the page
+        write_glb(out / name, baked, draper.model.body(), motion)
+        with pytest.raises(InputError, match=f"holds {name}, which is not of a baked drape"):
+            command.main([*words, "-o", str(out)])
+        (out / name).unlink()
     for name in ("mine.glb", "notes.txt", "photos/1.png"):
         (out / name).parent.mkdir(exist_ok=True)
         (out / name).write_text("mine")

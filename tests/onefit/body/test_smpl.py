@@ -145,9 +145,13 @@ def test_fingers_and_face_of_larger_skeletons_are_folded_into_24_joints(smpl, tm
             {"v_template": np.full((13348, 3), np.nan)},
             "v_template holds values that are not finite numbers",
         ),
+        ({"J_regressor": np.zeros((24, 13348))}, "its joints are not all over the body"),
+        ({"v_template": slice(None)}, "deep; one that stands upright is needed"),
     ],
 )
 def test_smpl_files_that_cannot_be_used(smpl, tmp_path, change, message):
+    if isinstance(change.get("v_template"), slice):  # z is up
+        change = {"v_template": smpl["v_template"][:, [0, 2, 1]] * [1, -1, 1]}
     np.savez(tmp_path / "model.npz", **{k: v for k, v in (smpl | change).items() if v is not None})
     with pytest.raises(InputError, match=message) as error:
         SmplBody(tmp_path / "model.npz").body()
@@ -217,7 +221,7 @@ def test_plain_files_that_cannot_be_used(standard, tmp_path):
             PlainBody(tmp_path / "body.npz")
         assert "\n" not in str(error.value)
     (tmp_path / "body.npz").write_bytes(b"no archive")
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match=r"cannot be read as a body \(no .npz file\)"):
         PlainBody(tmp_path / "body.npz")
     with pytest.raises(InputError, match="no such file"):
         PlainBody(tmp_path / "none.npz")

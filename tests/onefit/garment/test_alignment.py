@@ -52,6 +52,11 @@ def test_alignment_refuses_what_is_not_on_the_body(tank, tmp_path):
     write_ply(tmp_path / "far.ply", V + [0.5, 0, 0], F)
     with pytest.raises(InputError, match="far.ply: does not lie on the body"):
         align.main([str(tmp_path / "far.ply"), "-o", str(tmp_path / "out.ply")])
+    write_ply(tmp_path / "nan.ply", np.where(np.arange(len(V))[:, None] == 3, np.nan, V), F)
+    with pytest.raises(
+        InputError, match="nan.ply: 1 vertices have coordinates that are not finite"
+    ):
+        align.main([str(tmp_path / "nan.ply"), "-o", str(tmp_path / "out.ply")])
     with pytest.raises(InputError, match="is the garment itself"):
         align.main([str(tmp_path / "far.ply"), "-o", str(tmp_path / "far.ply")])
     with pytest.raises(InputError, match="pose 'sitting': choose cloth3d or T-pose"):

@@ -272,3 +272,37 @@ def winding_number(x, T):
     top = np.einsum("nfd,nfd->nf", a, np.cross(b, c))
     bottom = la * lb * lc + (a * b).sum(2) * lc + (b * c).sum(2) * la + (c * a).sum(2) * lb
     return 2 * np.arctan2(top, bottom).sum(axis=1) / (4 * np.pi)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda path: Garment.named("tank", scale=2.0), "'tank': scale is for files; this is a"),
+        (lambda path: Garment.named("tank", foo=2), "'tank': foo is for files; this is a template"),
+        (lambda path: Garment.named(None), "garment of type NoneType; a file's name is needed"),
+        (lambda path: Garment.read(path, scale="1"), "scale='1'; more than 0 is needed"),
+        (lambda path: Garment.read(path, turn="a"), "turn='a', offset=.*; finite numbers are"),
+        (lambda path: Garment.read(path, offset=None), "offset=None; three numbers"),
+        (lambda path: Garment.read(path, count="300"), "count = 300: 100 to 1,000,000 vertices"),
+    ],
+)
+def test_what_a_garment_cannot_be_read_with_is_named(templates, tmp_path, call, message):
+    path, tank = tmp_path / "tank.ply", templates["tank"]
+    mesh.write_ply(path, tank.vertices, tank.faces)
+    with pytest.raises(InputError, match=message):
+        call(path)
+
+
+def test_options_of_many_are_for_those_that_are_files(templates, tmp_path):
+    path, tank = tmp_path / "large.ply", templates["tank"]
+    mesh.write_ply(path, 100 * tank.vertices, tank.faces)
+    one, other = Garment.all_named(["tank", path], scale=0.01)
+    assert (one.vertices - other.vertices).abs().max() < 1e-4
+
+
+def test_texture_coordinates_of_another_mesh_are_refused(templates):
+    V, F = (x.numpy() for x in (templates["tank"].vertices, templates["tank"].faces))
+    with pytest.raises(InputError, match="^garment: texture coordinates .* are needed"):
+        Garment.of_mesh("tank", V, F, mesh.TexCoords(V[:, :2], F[1:]))
+    with pytest.raises(InputError, match="^garment: faces name texture coordinates"):
+        Garment.of_mesh("tank", V, F, mesh.TexCoords(V[:100, :2], F))

@@ -246,6 +246,11 @@ def test_motion_files_that_cannot_be_used(tmp_path):
         ({"poses": nan}, "poses are not finite in 1 of 12 frames, the first is frame 3"),
         ({"poses": np.zeros((12, 63))}, r"poses of shape \(12, 63\); axis-angle vectors of 22, 24"),
         ({"poses": np.zeros((12, 65, 4))}, r"poses of shape \(12, 65, 4\); axis-angle vectors"),
+        ({"poses": np.zeros((12, 24, 4))}, r"\(12, 24, 4\); axis-angle vectors of 22, 24"),
+        *(
+            ({"poses": np.zeros((12, 24, k))}, rf"24, {k}\); axis-angle vectors \(T, 24, 3\) are")
+            for k in (2, 6, 9)
+        ),
         ({"trans": trans[:5]}, r"12 frames of poses and a translation of shape \(5, 3\)"),
         (
             {"trans": far},
@@ -273,15 +278,34 @@ def test_motion_files_that_cannot_be_used(tmp_path):
         (tmp_path / f"damaged{start}.npz").write_bytes(damaged)
     for name, message in (
         ("none.npz", "no such file"),
-        ("bad.npz", "cannot be read as .npz"),
-        ("one.npz", "cannot be read as .npz .it holds one array, as .npy; poses and trans are"),
+        ("bad.npz", r"cannot be read as a motion \(no .npz file\)"),
+        ("one.npz", r"cannot be read as a motion \(no .npz file\)"),
         ("text.npz", r"poses of type \|S4; numbers are needed"),
-        ("damaged70.npz", "cannot be read as .npz"),
-        ("damaged2000.npz", "cannot be read as .npz"),
+        ("damaged70.npz", "cannot be read as a motion"),
+        ("damaged2000.npz", "cannot be read as a motion"),
         ("walk.fbx", "read from .npz"),
     ):
         with pytest.raises(InputError, match=message):
             Motion.read(tmp_path / name)
+    with pytest.raises(InputError, match="motion of type NoneType; a file's name is needed"):
+        Motion.read(None)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda m: Motion.generate("walk", seconds="1"), "a motion of 1 s at 30.0 frames"),
+        (lambda m: Motion.generate("walk", fps="30"), "at 30 frames a second; at least one"),
+        (lambda m: Motion.generate("walk", 1.0, seed="a"), "seed = 'a'; a whole number, 0 or more"),
+        (lambda m: Motion.generate("walk", 1.0, seed=0.5), "seed = 0.5; a whole number, 0 or more"),
+        (lambda m: Motion(m.poses, m.translation, "30"), "30 frames a second; a positive number"),
+        (lambda m: m.resampled("25"), "25 frames a second; a positive number"),
+        (lambda m: Motion.read("walk.npz", fps="30"), "fps = '30'; a number of frames"),
+    ],
+)
+def test_what_is_no_number_is_named(call, message):
+    with pytest.raises(InputError, match=message):
+        call(Motion.generate("walk", seconds=0.1))
 
 
 def test_a_motion_is_led_in_from_the_bodys_rest_to_its_first_pose():

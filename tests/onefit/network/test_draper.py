@@ -9,9 +9,10 @@ import pytest
 import torch
 
 import onefit
+from onefit.contact import ContactSettings
 from onefit.garment import Garment
 from onefit.objective import crossings
-from onefit.physics import Settings
+from onefit.physics import Material, Settings
 from polyfit.errors import InputError
 from polyfit.mesh import write_ply
 
@@ -53,15 +54,16 @@ def test_arguments_of_a_wrong_kind_are_refused_in_one_line(draper, coarse):
     for how, message in (
         (dict(material=None), "^material 'None': choose among cotton"),
         (dict(material=7), "^material '7': choose among cotton"),
-        (dict(steps=1.5), "^steps = 1.5; steps a frame, a whole number, 1 or more$"),
+        (dict(steps=1.5), "^steps = 1.5; a whole number, 1 or more, is needed$"),
     ):
         with pytest.raises(InputError, match=message):
             draper.simulate(coarse, walk, **how)
     for how, message in (
-        (dict(newton=0), "^newton = 0: a whole number, 1 or more$"),
-        (dict(iterations=2.5), "^iterations = 2.5: a whole number, 1 or more$"),
-        (dict(parts=0), "^parts = 0: a whole number, 1 or more$"),
-        (dict(stride=0), "^stride = 0: a number above 0$"),
+        (dict(newton=0), "^newton = 0; a whole number, 1 or more, is needed$"),
+        (dict(iterations=2.5), "^iterations = 2.5; a whole number, 1 or more, is needed$"),
+        (dict(parts=0), "^parts = 0; a whole number, 1 or more, is needed$"),
+        (dict(stride=0), "^stride = 0; a finite number above 0 is needed$"),
+        (dict(damping="a"), "^damping = 'a'; a finite number, 0 or more, is needed$"),
         (dict(contact=None), "^contact = None: ContactSettings are needed$"),
     ):
         with pytest.raises(InputError, match=message):
@@ -69,7 +71,17 @@ def test_arguments_of_a_wrong_kind_are_refused_in_one_line(draper, coarse):
     for device, message in (("foo", "cpu or cuda is needed"), ("cuda:99", "no such CUDA device")):
         with pytest.raises(InputError, match=f"^device {device}: .*{message}"):
             onefit.load(device=device)
-    for count in (0, 3):
+    for call, message in (
+        (lambda: onefit.load(None), "^weights of type NoneType; a file's name is needed"),
+        (lambda: onefit.load(model="smpl"), "^model = 'smpl'; a body model, as"),
+        (lambda: draper.simulate(coarse, walk, settings={"room": 0}), "Settings are needed"),
+        (lambda: ContactSettings(room="a"), "^room = 'a'; a finite number, 0 or more, is needed"),
+        (lambda: replace(Material.named("silk"), drag="a"), "^material: drag = 'a'; a finite"),
+        (lambda: replace(Material.named("silk"), density=0), "density = 0; a finite number above"),
+    ):
+        with pytest.raises(InputError, match=message):
+            call()
+    for count in (0, 3, "300"):
         with pytest.raises(InputError, match=f"^count = {count}: 100 to 1,000,000 vertices"):
             coarse.remeshed(count)
     with pytest.raises(InputError, match="^motion of type ndarray; a Motion"):

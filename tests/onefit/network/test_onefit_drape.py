@@ -158,7 +158,7 @@ def test_a_folder_that_cannot_be_written_is_told_before_the_work(tmp_path):
         (("shorts", "walk", "--fps", "60"), "--fps: for a motion file; walk is generated"),
         (("shorts", "walk", "--motion-up", "y"), "--motion-up: for a motion file"),
         ((str(ROOT / "tests"), "walk"), "tests: is a folder; a garment is an .obj"),
-        (("shorts", "walk", "--seed", "-1"), "seed = -1; 0 or more is needed"),
+        (("shorts", "walk", "--seed", "-1"), "seed = -1; a whole number, 0 or more"),
         (("shorts", "walk", "--device", "foo"), "device foo: cpu or cuda is needed"),
         (("shorts", "walk", "--device", "cuda:99"), "device cuda:99: this torch sees no such"),
         (("shorts", "walk", "--body", "nobody.npz"), "--body nobody.npz: no such file"),

@@ -216,6 +216,18 @@ def test_a_resumed_training_ends_where_an_uninterrupted_one_does(small, tmp_path
     assert 0 < max(changes) < 0.01
 
 
+def test_a_checkpoint_of_another_mesh_of_the_same_name_is_refused(small, tmp_path):
+    path, out, shorts = tmp_path / "own.ply", tmp_path / "out", onefit.Garment.template("shorts")
+    write_ply(path, shorts.vertices, shorts.faces)
+    settings = replace(small, garments=(str(path),))
+    assert loop.train(settings, out, until=1) is None
+    write_ply(path, shorts.vertices * torch.tensor([1.0, 1.01, 1.0]), shorts.faces)
+    with pytest.raises(InputError, match=r"a checkpoint of other settings \(meshes \['own "):
+        loop.train(settings, out, resume=True)
+    with pytest.raises(InputError, match="own.ply: is a file; a folder is needed"):
+        loop.train(settings, path)
+
+
 def test_the_paper_s_preset_has_the_paper_s_numbers():
     args = train.parser().parse_args(["-o", "OUT", "--preset", "paper", "--k-c", "0"])
     found = {name: getattr(args, name) for name in ("k_b", "k_mi", "k_g", "k_c", "k_i", "k_in")}
@@ -266,14 +278,14 @@ def test_two_processes_have_the_curve_of_one(small, tmp_path):
     apart = torch.cat([(two[k] - one[k]).abs().flatten() for k in one if k.startswith("network.")])
     assert apart.max() < 1e-3 and apart.mean() < 1e-5
     fresh = OneFitTraining(
-        replace(small, epochs=1, epoch_steps=3), _Nothing(), Processes("cpu")
+        replace(small, epochs=1, epoch_steps=3, cuts=1), _Nothing(), Processes("cpu")
     ).network.state_dict()
     moved = torch.cat([(one[f"network.{k}"] - v).abs().flatten() for k, v in fresh.items()])
     assert moved.mean() > 10 * apart.mean()
 
 
 class _Nothing:
-    """Just enough of the data for a fresh network."""
+    """Just enough of the data for a fresh network: a cut, whose mesh is not told from others."""
 
     garments = [(range(100),)]
     standard = type("Body", (), {"joints": range(24)})

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import onefit
-from onefit import teach
+from onefit import tailor, teach
 from onefit.body import skinning
 from onefit.garment.sewing import cuts
 from onefit.objective import Weights
@@ -15,6 +15,7 @@ from onefit.training import OneFitTraining, Settings, TrainingData, data
 from onefit.training.projection import Projection, unposed
 from onefit.training.teacher import SETTINGS, garment_of, lesson, lessons, path_of, taught
 from polyfit.errors import InputError
+from polyfit.mesh import write_ply
 from polyfit.training import Processes
 
 SMALL = Settings(batch=240, epochs=1, lr_epochs=1, epoch_steps=40, shapes=0)
@@ -162,11 +163,38 @@ def test_what_is_missing_is_said(folder, tmp_path):
         teach.main(["shorts", "shorts", "-o", str(tmp_path / "no")])
     with pytest.raises(InputError, match="--seconds -1: more than 0"):
         teach.main(["shorts", "-o", str(tmp_path / "no"), "--seconds", "-1"])
+    with pytest.raises(InputError, match=r"a motion of 1000000000.0 s at 30.0 frames a second"):
+        teach.main(["shorts", "-o", str(tmp_path / "no"), "--seconds", "1e9"])
+    shorts = onefit.Garment.template("shorts")
+    for name in ("s-1.ply", "s_1.ply"):
+        write_ply(tmp_path / name, shorts.vertices, shorts.faces)
+    with pytest.raises(InputError, match="s_1: two garments have this name"):
+        teach.main(
+            [str(tmp_path / name) for name in ("s-1.ply", "s_1.ply")] + ["-o", str(tmp_path / "no")]
+        )
+    with pytest.raises(InputError, match="s-1.ply: is a file; a folder is needed"):
+        teach.main(["shorts", "-o", str(tmp_path / "s-1.ply"), "--seconds", "1"])
+    with pytest.raises(InputError, match="s-1.ply: is a file; a folder is needed"):
+        tailor.main(["skirt", "-o", str(tmp_path / "s-1.ply")])
     assert not (tmp_path / "no").exists()
     with pytest.raises(InputError, match="lessons have their own garments"):
         replace(SMALL, teacher="x", cuts=3)
     with pytest.raises(InputError, match="--scale: for garments' files"):
         replace(SMALL, teacher="x", read=dict(scale=0.01))
+
+
+@pytest.mark.parametrize("broken", [b"no archive", b"PK of another kind"])
+def test_a_broken_lesson_is_named(folder, tmp_path, broken):
+    garment, (whole, _) = garment_of(folder, "shorts"), sorted(folder.glob("*--*.npz"))
+    (tmp_path / whole.name).write_bytes(broken)
+    (tmp_path / "shorts.npz").write_bytes(broken)
+    with pytest.raises(InputError, match=f"{whole.name}: cannot be read as a lesson"):
+        lessons(tmp_path, garment)
+    with pytest.raises(InputError, match="shorts.npz: cannot be read as a lesson"):
+        garment_of(tmp_path, "shorts")
+    np.savez(tmp_path / "shorts.npz", vertices=garment.vertices)
+    with pytest.raises(InputError, match="shorts.npz: no lesson, for it misses faces"):
+        garment_of(tmp_path, "shorts")
 
 
 def test_lessons_that_were_made_otherwise_are_not_mixed_in(folder):
