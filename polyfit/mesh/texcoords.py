@@ -26,14 +26,13 @@ class TexCoords:
         name coordinates that are there.
         """
         coordinates, faces = np.shape(self.coordinates), np.asarray(self.faces)
-        if len(coordinates) != 2 or coordinates[1] != 2 or faces.shape != (count, 3):
+        fits = coordinates[1:] == (2,) and faces.shape == (count, 3)
+        if not fits or faces.dtype.kind not in "iu":
             raise InputError(
                 f"{where}: texture coordinates {coordinates} of faces {faces.shape}; (M, 2) and"
-                f" ({count}, 3) are needed"
+                f" ({count}, 3) of whole numbers are needed"
             )
-        if count and not (
-            faces.dtype.kind in "iu" and -1 <= faces.min() <= faces.max() < coordinates[0]
-        ):
+        if count and not -1 <= faces.min() <= faces.max() < coordinates[0]:
             raise InputError(
                 f"{where}: faces name texture coordinates {faces.min()} to {faces.max()}; 0 to"
                 f" {coordinates[0] - 1}, or -1, exist"

@@ -22,8 +22,9 @@ MESH = SkinnedMesh(
 @pytest.mark.parametrize(
     ("uv", "message"),
     [
-        (TexCoords(np.zeros((3, 2)), F[:0]), r"of faces \(0, 3\); \(M, 2\) and \(1, 3\) are"),
+        (TexCoords(np.zeros((3, 2)), F[:0]), r"of faces \(0, 3\); \(M, 2\) and \(1, 3\) of"),
         (TexCoords(np.zeros((2, 2)), F), "name texture coordinates 0 to 2; 0 to 1, or -1, exist"),
+        (TexCoords(np.zeros((3, 2)), F + 0.5), r"\(1, 3\) of whole numbers are needed"),
         (TexCoords(np.zeros((3, 3)), F), r"texture coordinates \(3, 3\) of faces"),
     ],
 )
