@@ -12,7 +12,6 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from polyfit.mesh import edges_of
 from polysft_mi.errors import InputError
 
 from .metrics import (
@@ -131,6 +130,8 @@ def _check_alike(V, faces, truth):
     """Raise InputError where true meshes cannot be of the surface with vertices V (N, 3) [m] and
     ``faces`` (F, 3): in another unit, in another frame, or with vertices in another order.
     """
+    from polyfit.mesh import edges_of
+
     if truth.kind != "mesh":
         return
     G = truth.at(min(truth.places))

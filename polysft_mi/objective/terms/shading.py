@@ -36,7 +36,7 @@ class Shading(Term):
         data, vertices = self._inputs.data, np.array(dr.detach(at.vertices), dtype=np.float64).T
         seen = data.evaluate(vertices, at.context.frame, at.stage.blur, 1.0, k_silhouette=0.0).seen
         shade = data.shade(vertices, at.context.frame, seen, at.appearance)
-        fit, scale = light.fit(shade), light.scale
+        fit, scale = light.fit(shade), light.rules.light_scale
         slope, gradient = fit.coefficients[1:4], fit.coefficients[4:]
         lit = shade.normal @ slope + shade.centre @ gradient
         shown = fit.residual + shade.texture * lit  # but for the light that is the same everywhere

@@ -62,9 +62,8 @@ def objective_of(problem, *names, **settings):
 def context_of(objective, rng, frame=1, hold=0.0):
     """A frame after others: noise, a light that is known, and a part that no pixel sees."""
     atlas, rules = objective.atlas, objective.rules
-    light = Light(
-        20 * np.eye(7), 20 * np.array([0.8, 0.1, 0.2, -0.4, 0.05, 0.0, 0.1]), 0.02, 1, rules
-    )
+    known = np.array([0.8, 0.1, 0.2, -0.4, 0.05, 0.0, 0.1])
+    light = Light(20 * np.eye(7), 20 * known, rules)
     anchor = some_state(atlas, rng, 0.01)
     memory = FrameMemory(0.06, least_misfit=0.06, light=light, nat=1e-3, noises={"tracks": 2.0})
     return FrameContext(frame, anchor, memory, objective.visibility(anchor), hold)

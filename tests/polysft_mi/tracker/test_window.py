@@ -56,7 +56,7 @@ def test_looking_back_smooths_and_keeps_what_frames_know(truth, tracked, tmp_pat
     back = track(FrameTracker(problem), 4, str(tmp_path))
     assert back.finished and not tracked.finished
     assert len(back.totals) == len(back.certainty) == 4
-    assert all(m.least_misfit > 0 and m.light.frames for m in back.memories[1:])
+    assert all(m.least_misfit > 0 and m.light.is_known for m in back.memories[1:])
     least, usual, smooth = (
         rough(truth.vertices),
         *(
