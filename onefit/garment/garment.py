@@ -270,8 +270,14 @@ class Garment:
 
     def graded(self, body: Body) -> torch.Tensor:
         """Rest vertices (N, 3) [m] moved with the shape of ``body``: a Body in the standard stand.
-        The standard shape leaves them where they are.
+        The standard shape leaves them where they are. Raises InputError for a garment that is not
+        bound to the standard body.
         """
+        if self._binding is None:
+            raise InputError(
+                f"garment '{self.name}': made by its constructor; Garment.of_mesh makes one that"
+                " can be worn"
+            )
         rest = self.vertices.cpu().double().numpy()
         moved = self._binding.moved(
             rest, standard_body().vertices.double().numpy(), fitting.standard_on(body)

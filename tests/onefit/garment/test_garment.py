@@ -306,3 +306,10 @@ def test_texture_coordinates_of_another_mesh_are_refused(templates):
         Garment.of_mesh("tank", V, F, mesh.TexCoords(V[:, :2], F[1:]))
     with pytest.raises(InputError, match="^garment: faces name texture coordinates"):
         Garment.of_mesh("tank", V, F, mesh.TexCoords(V[:100, :2], F))
+
+
+def test_a_garment_that_its_constructor_made_is_told():
+    tank = Garment.template("tank")
+    bare = Garment("bare", tank.vertices, tank.faces, tank.blend_weights)
+    with pytest.raises(InputError, match="made by its constructor; Garment.of_mesh makes one"):
+        bare.graded(standard_body())
