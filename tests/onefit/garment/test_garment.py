@@ -313,3 +313,12 @@ def test_a_garment_that_its_constructor_made_is_told():
     bare = Garment("bare", tank.vertices, tank.faces, tank.blend_weights)
     with pytest.raises(InputError, match="made by its constructor; Garment.of_mesh makes one"):
         bare.graded(standard_body())
+
+
+@pytest.mark.parametrize("name", ["skirt", "circle_skirt", "dress"])
+def test_what_hangs_on_nothing_is_not_worn(name):
+    """A skirt of a body that stands on the ground is around the head."""
+    skirt = Garment.template(name)
+    raised = skirt.vertices.double().numpy() + (0, 0, 0.82)
+    with pytest.raises(InputError, match="on a body that stands on the ground.*--offset 0 0 -0.82"):
+        Garment.of_mesh(name, raised, skirt.faces.numpy())
