@@ -19,7 +19,7 @@ import numpy as np
 from polyfit.errors import InputError, Parser, cli
 from polysft_mi.results.truth import load_npz
 
-HOLD = 10.0  # [N/m] of the spring at each vertex in view; a gram hangs .1 mm down
+HOLD = 10.0  # [N/m] of the spring at each vertex in view; one of .1 g hangs .1 mm down
 STEPS, SETTLING = 2, 24  # steps of a frame; before the motion
 FPS = 60.0  # of simulate.py
 RIM = 1e-3  # [m] below the highest vertex

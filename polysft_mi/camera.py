@@ -16,7 +16,7 @@ from .errors import InputError
 LARGEST = 1e9  # [pixels, m]: a number beyond it is a mistake, and overflows where it is squared
 _WIDEST = 170.0  # [degrees] across a pinhole's picture
 _LENS = re.compile("k[1-6]|p[12]|skew|gamma|.*(dist|radial|tangential|fisheye|model|coef).*", re.I)
-_PINHOLES = "pinhole", "simple_pinhole", "perspective", "opencv", "brown", "none"
+_NO_PINHOLE = re.compile("fish|omni|radial|equidistant|kannala|spheric|division|prism", re.I)
 
 
 @dataclass(frozen=True)
@@ -183,8 +183,8 @@ def check_pinhole(known: dict[str, Any], *, distortion: bool = False) -> None:
     def told(name: str, value: Any) -> bool:
         if not _LENS.fullmatch(name) or (distortion and name == "distortion"):
             return False
-        if isinstance(value, str):
-            return value.lower() not in _PINHOLES
+        if isinstance(value, str):  # a lens's, or a phone's
+            return bool(_NO_PINHOLE.search(value))
         return bool(np.any(value))
 
     found = next((name for name, value in known.items() if told(name, value)), None)

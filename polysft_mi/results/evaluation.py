@@ -123,6 +123,11 @@ def per_frame(surface, truth):
         raise InputError(
             f"{truth.path}: has no frame in common with the surface's frames {min(at)} to {max(at)}"
         )
+    if truth.kind == "points" and not any(row["hit"] for row in rows):
+        raise InputError(
+            f"{truth.path}: no point lies on a ray that meets the surface; metres in the camera's"
+            " frame (x right, y down, z forward) are needed"
+        )
     return {name: [row[name] for row in rows] for name in rows[0]}
 
 
@@ -164,11 +169,6 @@ def _figures(V, faces, truth, frame, rng):
     if truth.kind == "clouds":
         return {"chamfer_1e4": 1e4 * chamfer(sample_surface(V, faces, len(G), rng), G)}
     error, share = depth_rmse(V, faces, G)
-    if not share:
-        raise InputError(
-            f"{truth.path}: frame {frame}: no point lies on a ray that meets the surface; metres in"
-            " the camera's frame (x right, y down, z forward) are needed"
-        )
     row = {"depth_rmse_mm": 1e3 * error, "hit": share}
     if truth.K is not None:
         all_pixels = float(np.sqrt(image_share(V, faces, truth.K)))

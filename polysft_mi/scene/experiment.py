@@ -72,7 +72,13 @@ class Experiment:
         for video in (sequence, *(camera.sequence for camera in sequence.cameras)):
             files += [*video.files, *(video.mask_files or ())]
         files += sequence.depth.files if sequence.depth else []
-        files += [self._located(name) for name in (s.tracks, s.body, s.body_model) if name]
+        for path in map(self._located, (s.tracks, s.body, s.body_model)):
+            folder = os.path.isdir(path)  # of the body's meshes
+            files += (
+                [os.path.join(path, name) for name in sorted(os.listdir(path))]
+                if folder
+                else [path]
+            )
         return [file for file in files if os.path.isfile(file)]
 
     def _located(self, name):

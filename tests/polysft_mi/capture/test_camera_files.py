@@ -188,5 +188,8 @@ def test_opencv_by_other_names(tmp_path):
 
 def test_what_says_that_a_lens_is_a_pinhole_does_not_matter(tmp_path):
     path = tmp_path / "camera.json"
-    path.write_text(OURS % '"camera_model": "PINHOLE", "k1": 0, "distortion": [0, 0, 0, 0]')
+    path.write_text(
+        OURS
+        % '"camera_model": "PINHOLE", "model": "iPhone 12", "k1": 0, "distortion": [0, 0, 0, 0]'
+    )
     assert not any(read_lens(str(path), *SIZE).distortion)
